@@ -46,7 +46,7 @@ bench: $(STAMP)
 MINUTES ?= 60
 SOAK := tests/trials/test_trial_soak.py
 trials: $(STAMP)
-	$(BIN)/python -m pip install --no-compile --disable-pip-version-check -q -c constraints.txt -e '.[$(EXTRAS),trials]'
+	$(BIN)/python -m pip install --no-compile --disable-pip-version-check -qq -c constraints.txt -e '.[$(EXTRAS),trials]'
 	@export SKYRELIEF_TRIALS=whole SKYRELIEF_SOAK_MINUTES=$(MINUTES); \
 	  export SKYRELIEF_TRIALS_TABLE=docs/reports/trials.md SKYRELIEF_BOOT_LOG=docs/reports/boot-log.md; \
 	  $(BIN)/python -m pytest -m trial $(SOAK) -k flights $(ARGS) & flights=$$!; \
@@ -66,7 +66,7 @@ bundle: $(STAMP)
 # deploy/locked: pins and hashes of what is installed, renewed after a change of constraints.txt.
 lock: $(STAMP)
 	@test -x $(VENV)/lock/bin/uv || { $(BIN)/python -m venv $(VENV)/lock && \
-	  $(VENV)/lock/bin/python -m pip install --disable-pip-version-check -q uv==0.13.9; }
+	  $(VENV)/lock/bin/python -m pip install --disable-pip-version-check -qq uv==0.13.9; }
 	$(BIN)/python deploy/lock.py $(abspath $(VENV))/lock/bin/uv
 
 # What a bundle holds, again: requirements.txt, sbom.cdx.json and THIRD_PARTY_NOTICES.
@@ -82,13 +82,15 @@ clean:
 $(CORE): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' || \
 	  { echo "skyrelief needs Python 3.10 to 3.13; say which with: make $(MAKECMDGOALS) PYTHON=python3.12" >&2; exit 2; }
-	@echo "installing skyrelief into $(VENV): once, a minute or two"
+	@echo "installing skyrelief and some 40 packages into $(VENV): once, a minute or two"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --no-compile --disable-pip-version-check -q -c constraints.txt -e '.[portal]'
+	@$(BIN)/python -m pip install --no-compile --disable-pip-version-check -qq -c constraints.txt -e '.[portal]' & \
+	  s=0; while kill -0 $$! 2>/dev/null; do sleep 1; s=$$((s + 1)); test ! -t 1 || printf '\r%s packages, %s s' \
+	  $$(ls -d $(VENV)/lib/python*/site-packages/*.dist-info | wc -l) $$s; done; test ! -t 1 || echo; wait $$!
 	@touch $(CORE)
 
 $(STAMP): $(CORE)
-	$(BIN)/python -m pip install --no-compile --disable-pip-version-check -q -c constraints.txt $(PIP_FLAGS) -e '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install --no-compile --disable-pip-version-check -qq -c constraints.txt $(PIP_FLAGS) -e '.[$(EXTRAS)]'
 	@touch $(STAMP)
 
 # MAVProxy, a ground station for the tests, in an environment of its own without its graphical
@@ -96,6 +98,6 @@ $(STAMP): $(CORE)
 $(PEERS): constraints.txt | $(STAMP)
 	@test -x $(VENV)/peers/bin/python || $(BIN)/python -m venv $(VENV)/peers
 	@PIP="$(VENV)/peers/bin/python -m pip --disable-pip-version-check --retries 1 --timeout 15"; \
-	  { $$PIP install -q -c constraints.txt pymavlink pyserial && \
-	    $$PIP install -q --no-deps MAVProxy==1.8.75 && touch $@; } || \
+	  { $$PIP install -qq -c constraints.txt pymavlink pyserial && \
+	    $$PIP install -qq --no-deps MAVProxy==1.8.75 && touch $@; } || \
 	  echo "could not install MAVProxy; its tests are skipped" >&2

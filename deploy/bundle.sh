@@ -31,7 +31,7 @@ cp -r "$here/deploy" "$here/systemd" "$here/pyproject.toml" "$here/README.md" "$
 builder=$(mktemp -d)
 trap 'rm -rf "$builder"' EXIT
 "$python" -m venv "$builder"
-pinned() { "$builder/bin/python" -m pip "$@" -q --disable-pip-version-check --require-hashes --only-binary=:all:; }
+pinned() { "$builder/bin/python" -m pip "$@" -qq --disable-pip-version-check --require-hashes --only-binary=:all:; }
 builders=(-r "$here/deploy/locked/build.txt")
 if [[ $extras != *ground* ]]; then
   export SKYRELIEF_NO_PORTAL=1
@@ -39,7 +39,7 @@ elif ! command -v npm >/dev/null; then
   builders+=(-r "$here/deploy/locked/node.txt")
 fi
 pinned install "${builders[@]}"
-"$builder/bin/python" -m pip wheel -q --disable-pip-version-check --no-deps --no-build-isolation \
+"$builder/bin/python" -m pip wheel -qq --disable-pip-version-check --no-deps --no-build-isolation \
   -w "$out/wheels" "$here"
 
 tags=()

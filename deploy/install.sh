@@ -1,16 +1,16 @@
 #!/usr/bin/env bash
 # Installs, upgrades or removes skyrelief on a drone's computer or a ground station: Jetson
 # (JetPack 6) or any Debian or Ubuntu machine with Python 3.10 to 3.13. May be run again at any
-# time. Each version has its own folder; the switch is one rename, made when the new version has
-# compiled its kernels, and undone when it does not come up healthy.
+# time. Each version has its own folder. The switch is one rename, after the new version has compiled
+# its kernels. A version that does not stay up is rolled back.
 #
 #   sudo deploy/install.sh                      from this clone, with pip's package index
 #   sudo deploy/install.sh --bundle DIR         offline, from what 'make bundle' prepared
 #   sudo deploy/install.sh --ground             the ground receiver instead of the onboard service
 #   sudo deploy/install.sh --profile NAME       settings of deploy/profiles/NAME.toml for a fresh
 #                                               configuration; without it the board is recognised
-#   sudo deploy/install.sh --rollback           back to the version before
-#   sudo deploy/install.sh --uninstall          remove it; scans and configuration stay
+#   sudo deploy/install.sh --rollback           return to the previous version
+#   sudo deploy/install.sh --uninstall          remove it; keeps scans and configuration
 set -euo pipefail
 
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
@@ -108,18 +108,18 @@ build_version() {
   mkdir -p "$versions"
   site=$(site_packages)
   if [[ -z $from ]]; then
-    say "downloading what it needs"
+    say "downloading packages"
     from=$(mktemp -d -p /var/tmp)
     # shellcheck disable=SC2064  # this folder, now
     trap "rm -rf '$from'" EXIT
     PYTHON=$python "$here/deploy/bundle.sh" --extras "$(wanted_extras "$site")" --out "$from/bundle" ||
-      die "could not download it; see above, or use --bundle"
+      die "the download failed; see above, or use --bundle"
     from=$from/bundle
   fi
   say "making $target${site:+ (with the packages of the system)}"
   # shellcheck disable=SC2086  # empty or one word
   "$python" -m venv $site "$part"
-  "$part/bin/python" -m pip install -q --disable-pip-version-check --no-index \
+  "$part/bin/python" -m pip install -qq --disable-pip-version-check --no-index \
     --find-links "$from/wheels" --require-hashes -r "$from/requirements.txt"
   # A virtual environment holds its own path in the scripts it writes.
   grep -rlIZ --fixed-strings "$part" "$part/bin" "$part/pyvenv.cfg" |
@@ -194,10 +194,10 @@ prepare_machine() {
 # Compiles the kernels of version $1 as the service's user, before the first flight.
 warm_up() {
   live && [[ $unit == skyrelief ]] || return 0
-  say "warming up: the kernels are compiled, some minutes on a small board"
+  say "compiling kernels: a minute or two on a PC, longer on a small board"
   runuser -u skyrelief -- env NUMBA_CACHE_DIR="$cache" HOME=/var/lib/skyrelief \
     "$versions/$1/bin/skyrelief" warm-up --config "$etc/skyrelief.toml" ||
-    say "it did not warm up; the first scan will take longer to begin"
+    say "the kernels are not compiled: the first scan starts later"
 }
 
 # True when the service is up and stays up without a restart.
@@ -225,7 +225,7 @@ sys.exit(not (camera.source and camera.model))
 PY
 }
 
-# Starts version $2; when that fails, $1 is put back with $3 as the one before it.
+# Starts version $2; when that fails, $1 is restored with $3 as its previous version.
 start_or_roll_back() {
   local old=$1 new=$2 before=$3
   if ! live || ((!start)); then
@@ -235,19 +235,19 @@ start_or_roll_back() {
   systemctl enable "$unit.service" >/dev/null
   if ! is_configured; then
     say "installed, not started: set camera.source and camera.model in $etc/skyrelief.toml," \
-      "look with sudo -u skyrelief $current/bin/skyrelief doctor, then systemctl restart $unit"
+      "run 'sudo -u skyrelief $current/bin/skyrelief doctor', then 'systemctl restart $unit'"
     return 0
   fi
-  say "starting $unit; watching it for $health_s s"
+  say "starting $unit; it must stay up for $health_s s"
   if healthy; then
-    say "$unit $new is up"
+    say "$unit $new is running"
   elif [[ -n $old && $old != "$new" ]]; then
     switch_to "$old"
     remember "$before"
     systemctl restart "$unit.service" || true
-    die "$new did not come up; $old is back in place (journalctl -u $unit)"
+    die "$new did not stay up; $old is back in place (journalctl -u $unit)"
   else
-    die "$new did not come up; see journalctl -u $unit and 'skyrelief config check'"
+    die "$new did not stay up; see journalctl -u $unit and 'skyrelief config check'"
   fi
 }
 
@@ -276,9 +276,9 @@ version_to_install() {
 }
 
 do_install() {
-  [[ -z $bundle || -d $bundle/wheels ]] || die "$bundle holds no wheels/; make one with 'make bundle'"
+  [[ -z $bundle || -d $bundle/wheels ]] || die "$bundle contains no wheels/; make one with 'make bundle'"
   [[ -z $bundle || -r $bundle/requirements.txt ]] ||
-    die "$bundle holds no requirements.txt with hashes; make it again with 'make bundle'"
+    die "$bundle contains no requirements.txt with hashes; make it again with 'make bundle'"
   [[ -z $bundle ]] || bundle=$(cd "$bundle" && pwd)
   [[ -z $profile || -r ${bundle:-$here}/deploy/profiles/$profile.toml ]] ||
     die "no profile $profile; there are $(cd "${bundle:-$here}/deploy/profiles" && echo ./*.toml)"
@@ -302,15 +302,15 @@ do_install() {
 }
 
 do_rollback() {
-  [[ -L $home/previous ]] || die "there is no version before"
+  [[ -L $home/previous ]] || die "there is no previous version"
   local now previous
   now=$(version_now)
   previous=$(basename "$(readlink "$home/previous")")
-  [[ -x $versions/$previous/bin/skyrelief ]] || die "version $previous is gone"
+  [[ -x $versions/$previous/bin/skyrelief ]] || die "version $previous was deleted"
   switch_to "$previous"
   remember "versions/$now"
   if live; then systemctl restart "$unit.service"; fi
-  say "version $previous is in place, $now is the one before"
+  say "version $previous is in place; --rollback returns to $now"
 }
 
 do_uninstall() {
@@ -322,7 +322,7 @@ do_uninstall() {
     "$root"/usr/lib/{sysusers.d,tmpfiles.d}/skyrelief.conf \
     "$root/etc/udev/rules.d/60-skyrelief.rules" "$root/etc/polkit-1/rules.d/50-skyrelief.rules"
   if live; then systemctl daemon-reload; fi
-  say "removed; $etc and $root/var/lib/skyrelief stay"
+  say "removed; $etc and $root/var/lib/skyrelief are kept"
 }
 
 "do_$action"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -80,6 +80,10 @@ class Rows:
     rate: F64  # (6,) per s
     change: F64  # (6,) per s^2
 
+    def now(self) -> Rows:
+        """These rows with the readout as known now, which a search may change."""
+        return replace(self, clock=self.clock.reading(self.clock.readout_s))
+
     def twists(self, ray: F64) -> F64:
         """(N, 6) motion from the middle row to the rows that expose the rays (N, 3)."""
         t = self.clock.seconds(ray)[:, None]
@@ -147,6 +151,11 @@ class RowTrack:
     def is_rolling(self) -> bool:
         """False for a global shutter."""
         return self._clock is not None
+
+    @property
+    def is_known(self) -> bool:
+        """True for a rolling shutter whose readout is known or found."""
+        return self._clock is not None and self._clock.readout_s != 0.0
 
     def needs_telemetry(self, time_ns: int) -> bool:
         """True where too few frames are near ``time_ns`` to show the turn within a readout."""

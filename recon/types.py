@@ -6,7 +6,7 @@ reference and the meaning of ``T_a_b`` are in :mod:`recon.frames`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
@@ -219,7 +219,6 @@ class Registration:
     rms_m: float  # point-to-plane, inliers
     inlier_share: float  # of the source's valid points
     iterations: int = 0
-    weak_directions: F64 = field(default_factory=lambda: np.zeros((0, 6)))  # (k, 6) unit rows
 
     @property
     def converged(self) -> bool:

@@ -16,7 +16,7 @@ import typer.core
 import typer.main
 
 from service.errors import InputError, SkyreliefError
-from service.journal import log_handler
+from service.init_system import log_handler
 from service.packages import needing
 from service.redaction import without_credentials
 from service.version import software
@@ -40,7 +40,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "mesh": ("service.commands.deliverables:mesh", "Make a textured mesh of a scan folder."),
     "refine": ("service.commands.refine:refine", "Adjust a finished scan as a whole."),
     "refly": ("service.commands.refine:refly", "Plan a mission over poorly covered areas."),
-    "site": ("service.commands.site:site", "Join scans into one site; measure what changed."),
+    "site": (
+        "service.commands.deliverables:site",
+        "Join scans into one site; measure what changed.",
+    ),
     "inspect": (
         "service.commands.deliverables:inspect",
         "Draw every stage of a keyframe as one image.",

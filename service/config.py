@@ -163,8 +163,7 @@ class ComputeConfig:
     iterations: int = key(5, "iterations of belief propagation per level; the paper's is 5")
     guide_width: int = key(
         1280,
-        "width to which wider images are reduced, but for a third more; what guides the "
-        "upsampling is read from them",
+        "images over a third wider are reduced to this width; the upsampling is guided by them",
     )
     upsample: bool = key(True, "joint bilateral upsampling; without it depth is coarser and faster")
     pairs: int = key(4, "maximum number of stereo pairs fused into a keyframe")
@@ -178,8 +177,8 @@ class ComputeConfig:
         2_000_000,
         "map voxels in memory, about 40 bytes each; the oldest are paged to the scan's folder",
     )
-    hottest_c: float = key(90.0, "too hot from this temperature, degrees C", live=True)
-    least_memory_mib: float = key(300.0, "short of memory below this", live=True)
+    hottest_c: float = key(90.0, "temperature from which the load is shed, degrees C", live=True)
+    least_memory_mib: float = key(300.0, "free memory below which the load is shed", live=True)
 
     def __post_init__(self) -> None:
         """Check ranges."""

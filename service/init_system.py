@@ -1,10 +1,18 @@
-"""Notifications to the init system (sd_notify(3)): one datagram, no packages."""
+"""Notifications (sd_notify(3)) and log records to systemd, one datagram each, without packages.
+
+Records have priority, logger and thread as separate fields. In the journal's native protocol a
+record is lines of ``NAME=value``; values of several lines are preceded by their length.
+"""
 
 from __future__ import annotations
 
 import logging
 import os
 import socket
+import struct
+import sys
+
+from service.redaction import without_credentials
 
 log = logging.getLogger(__name__)
 
@@ -53,3 +61,87 @@ class Notifier:
             self._socket.sendto(text.encode(), self._address)
         except OSError as error:
             log.debug("systemd does not listen: %s", error)
+
+
+SOCKET = "/run/systemd/journal/socket"
+PRIORITIES = (
+    (logging.CRITICAL, 2),
+    (logging.ERROR, 3),
+    (logging.WARNING, 4),
+    (logging.INFO, 6),
+    (logging.DEBUG, 7),
+)
+MAX_BYTES = 100_000
+
+
+class JournalHandler(logging.Handler):
+    """Sends every record to the journal; rejected ones go to standard error."""
+
+    def __init__(self, address: str = SOCKET) -> None:
+        super().__init__()
+        self._address = address
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send one record."""
+        text = self.format(record)
+        try:
+            self._socket.sendto(packed(record, text), self._address)
+        except OSError:
+            print(f"{record.levelname} {record.name}: {text}", file=sys.stderr)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+        super().close()
+
+
+def packed(record: logging.LogRecord, text: str) -> bytes:
+    """The record as a datagram of the journal."""
+    fields = {
+        "MESSAGE": text[:MAX_BYTES],
+        "PRIORITY": str(next((p for level, p in PRIORITIES if record.levelno >= level), 7)),
+        "SYSLOG_IDENTIFIER": "skyrelief",
+        "LOGGER": record.name,
+        "THREAD_NAME": record.threadName or "",
+        "CODE_FILE": record.pathname,
+        "CODE_LINE": str(record.lineno),
+        "CODE_FUNC": record.funcName or "",
+    }
+    return b"".join(_field(name, value) for name, value in fields.items())
+
+
+def _field(name: str, value: str) -> bytes:
+    data = value.encode(errors="replace")
+    if b"\n" in data:
+        return name.encode() + b"\n" + struct.pack("<Q", len(data)) + data + b"\n"
+    return name.encode() + b"=" + data + b"\n"
+
+
+class PublicFormatter(logging.Formatter):
+    """Formats a record, including its traceback, with credentials hidden."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The text of one record."""
+        return without_credentials(super().format(record))
+
+
+def log_handler() -> logging.Handler:
+    """A handler for the journal if it reads our standard error, otherwise for standard error."""
+    if _journal_reads_us() and os.path.exists(SOCKET):
+        handler: logging.Handler = JournalHandler()
+        handler.setFormatter(PublicFormatter("%(message)s"))
+        return handler
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PublicFormatter("%(levelname)s %(name)s: %(message)s"))
+    return handler
+
+
+def _journal_reads_us() -> bool:
+    """True when standard error is the stream that JOURNAL_STREAM names (device:inode)."""
+    device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
+    try:
+        found = os.fstat(sys.stderr.fileno())
+    except (OSError, ValueError):
+        return False
+    return (str(found.st_dev), str(found.st_ino)) == (device, inode)

@@ -19,6 +19,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from service.errors import InputError
+
 log = logging.getLogger(__name__)
 
 Peer = tuple[str, int]
@@ -150,6 +152,14 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def parse_address(text: str, what: str) -> tuple[str, int]:
+    """(host, port) of ``HOST:PORT``, the value of ``what``; InputError for anything else."""
+    host, _, port = text.rpartition(":")
+    if not host or not (port.isascii() and port.isdigit() and int(port) < 65536):
+        raise InputError(f"{what} {text!r}: give HOST:PORT, such as 127.0.0.1:8080")
+    return host.strip("[]"), int(port)
 
 
 def host_name(header: str) -> str:

@@ -1,5 +1,6 @@
 """Progress and cancellation of long work, for the portal and the terminal. The work reports to it
 and is stopped by it: after :meth:`Progress.cancel` the next report raises :class:`CancelledError`.
+A :class:`Stopwatch` sums up the time of each stage.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ MIN_SHARE, MIN_S = 0.02, 2.0
 
 
 class CancelledError(Exception):
-    """The work was cancelled. It is no failure, so handlers of failures do not catch it."""
+    """The work was cancelled. It is not a failure, so handlers of failures do not catch it."""
 
 
 class Progress:
@@ -112,3 +113,25 @@ class Progress:
         if self._is_cancelled and self._may_stop:
             raise CancelledError("cancelled")
         self._show(self)
+
+
+class Stopwatch:
+    """Adds up seconds and calls per named stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.calls: dict[str, int] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time the block as ``stage``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+            self.calls[stage] = self.calls.get(stage, 0) + 1
+
+    def mean_ms(self) -> dict[str, float]:
+        """Stage to mean milliseconds per call."""
+        return {s: 1e3 * t / self.calls[s] for s, t in self.seconds.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +11,12 @@ import service.bench.portal as bench
 class Page(bench.Page):
     """One page; dialogs are accepted with :attr:`dialog` as the text."""
 
-    def __init__(self, *where: Any) -> None:
+    def __init__(self, page: Any) -> None:
         self.requests: list[str] = []
         self.dialog = ""  # what the next prompt is answered with
-        super().__init__(*where)
-
-    def _note(self, event: dict[str, Any]) -> None:
-        if event.get("method") == "Network.requestWillBeSent":
-            self.requests.append(event["params"]["request"]["url"])
-        if event.get("method") == "Page.javascriptDialogOpening":
-            self._send("Page.handleJavaScriptDialog", {"accept": True, "promptText": self.dialog})
+        page.on("request", lambda request: self.requests.append(request.url))
+        page.on("dialog", lambda dialog: dialog.accept(self.dialog))
+        super().__init__(page)
 
     def click(self, text: str) -> None:
         """Click the button with this text, as an event of its own."""
@@ -32,18 +27,15 @@ class Page(bench.Page):
 
     def mouse(self, x: float, y: float, *, to: tuple[float, float] | None = None) -> None:
         """Click at a place of the page, or press there and release at ``to``; CSS pixels."""
-        one = {"button": "left", "clickCount": 1}
-        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-        self.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, **one)
+        self.page.mouse.move(x, y)
+        self.page.mouse.down()
         if to is not None:
-            x, y = to
-            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, **one)
-        self.call("Input.dispatchMouseEvent", type="mouseReleased", x=x, y=y, **one)
+            self.page.mouse.move(*to)
+        self.page.mouse.up()
 
     def key(self, name: str) -> None:
         """Press and release a key that writes nothing, such as Escape."""
-        for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=name, code=name)
+        self.page.keyboard.press(name)
 
     def screen(self, width: int, height: int, mobile: bool = False) -> None:
         """Show pages on a screen of this size, in CSS pixels."""
@@ -54,32 +46,17 @@ class Page(bench.Page):
             deviceScaleFactor=1,
             mobile=mobile,
         )
+        if not mobile:
+            self.wait(f"innerWidth === {width} && innerHeight === {height}")
 
     def image(self, path: Path) -> None:
         """Write what the page shows as PNG."""
-        data = self.call("Page.captureScreenshot", format="png")["data"]
-        path.write_bytes(base64.b64decode(data))
+        self.page.screenshot(path=path)
 
 
 class Browser(bench.Browser, Page):
     """A Chromium and its first page; close it at the end."""
 
-    def __init__(self, profile: Path, *flags: str) -> None:
-        self._profile = profile
-        self._others: list[bench.Page] = []
-        super().__init__(profile, *flags)
-
     def other(self) -> Page:
         """A page as of another person's browser: nothing is shared with the first."""
-        own = (self._profile / "DevToolsActivePort").read_text().split()[1]
-        whole = bench.Page(self.process, f"ws://{self.host}{own}", domains=())
-        context = whole.call("Target.createBrowserContext")["browserContextId"]
-        made = whole.call("Target.createTarget", url="about:blank", browserContextId=context)
-        page = Page(self.process, f"ws://{self.host}/devtools/page/{made['targetId']}")
-        self._others += [page, whole]  # the context lives as long
-        return page
-
-    def close(self) -> None:
-        for page in self._others:
-            page.leave()
-        super().close()
+        return Page(self.browser.new_context(no_viewport=True).new_page())

@@ -21,8 +21,10 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 pytest.importorskip("websockets")
+pytest.importorskip("playwright")
 
 from person import Browser
+from playwright.sync_api import sync_playwright
 
 from service.bench.portal import chromium
 from service.ground.http import PAGE
@@ -138,8 +140,7 @@ def client(store: Path) -> Iterator[Client]:
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def browser() -> Iterator[Browser]:
     """One Chromium for all tests of a file."""
-    one = Browser(tmp_path_factory.mktemp("chromium"))
-    yield one
-    one.close()
+    with sync_playwright() as driver:
+        yield Browser(driver)

@@ -7,8 +7,8 @@ import pytest
 
 from recon import se3
 from recon.posegraph.alignment import Anchor, fit
-from recon.posegraph.altitude_datum import altitude_datum
 from recon.posegraph.between_keyframes import FixAverage
+from recon.posegraph.sensor_offsets import altitude_datum
 from recon.types import PosePrior
 
 SIGMA = np.array([1.0, 1.0, 1.5])

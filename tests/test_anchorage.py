@@ -15,10 +15,10 @@ import pytest
 from recon import se3
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
-from service.compute.stopwatch import Stopwatch
 from service.errors import OutsideError
 from service.flight.anchorage import Anchorage, Carriers, Key, PublishedFrame, PublishedFrames
 from service.flight.chain import Chain, KeyframeStep
+from service.progress import Stopwatch
 
 RNG = np.random.default_rng(4)
 

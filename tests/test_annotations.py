@@ -16,7 +16,12 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.ground.portal import Portal, PortalConfig
 from service.offline.exports.view import ExportOptions, ScanView, export
-from service.scans.annotations import ANNOTATIONS, add_annotation, read_annotations
+from service.scans.annotations import (
+    ANNOTATIONS,
+    add_annotation,
+    delete_annotation,
+    read_annotations,
+)
 
 if TYPE_CHECKING:
     from conftest import HouseFlight
@@ -81,6 +86,26 @@ def test_their_number_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(InputError, match="at most 3"):
         add_annotation(tmp_path, SPOT, "x", "me", 0.0)
     assert len(read_annotations(tmp_path).features) == 3
+
+
+def test_the_number_of_a_deleted_annotation_is_not_given_again(tmp_path: Path) -> None:
+    def add() -> int:
+        return add_annotation(tmp_path, SPOT, "x", "me", 0.0).id
+
+    assert [add(), add()] == [1, 2]
+    delete_annotation(tmp_path, 2)
+    assert add() == 3
+    for number in (1, 3):
+        delete_annotation(tmp_path, number)
+    assert read_annotations(tmp_path).features == [] and add() == 4
+    kept = json.loads((tmp_path / ANNOTATIONS).read_text())
+    del kept["last_id"]  # a file of an earlier version
+    (tmp_path / ANNOTATIONS).write_text(json.dumps(kept))
+    delete_annotation(tmp_path, 4)
+    assert add() == 5
+    (tmp_path / ANNOTATIONS).write_text(json.dumps({**kept, "last_id": 2**53}))
+    with pytest.raises(InputError, match="no number left"):
+        add()
 
 
 @pytest.mark.parametrize(

@@ -163,7 +163,7 @@ def test_what_cannot_be_used_is_said_in_one_line(tmp_path: Path) -> None:
         (broken, "cannot be read"),
         (text, "cannot be read"),
         (mbtiles(tmp_path / "v.mbtiles", TILES, "pbf"), "images are needed"),
-        (pmtiles(tmp_path / "v.pmtiles", TILES, kind=1), "no images"),
+        (pmtiles(tmp_path / "v.pmtiles", TILES, kind=1), "are not images"),
     ]:
         with pytest.raises(InputError, match=why):
             open_basemap(path)
@@ -228,7 +228,7 @@ def test_the_size_of_a_tile_is_read_before_it_is_decoded(suffix: str) -> None:
     large = bytearray(cv2.imencode(".png", shown)[1].tobytes())
     struct.pack_into(">II", large, 16, 1 << 20, 1 << 10)
     for data in (bytes(large), b"", b"RIFF", b"text"):
-        with pytest.raises(ValueError, match="no image of a tile's size"):
+        with pytest.raises(ValueError, match="not an image of a tile's size"):
             tile_px(data)
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recon import se3
-from recon.posegraph.boresight import BOUND_RAD, Boresight, Turns, boresight
+from recon.posegraph.sensor_offsets import BOUND_RAD, Boresight, Turns, boresight
 from recon.types import F64, PosePrior
 
 DOWN = np.diag([1.0, -1.0, -1.0])

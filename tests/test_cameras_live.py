@@ -232,6 +232,35 @@ def test_a_paced_recording_can_be_ended(tmp_path: Path) -> None:
     assert list(paces) == []
 
 
+def test_a_recording_is_not_closed_while_an_image_is_decoded(tmp_path: Path) -> None:
+    path = tmp_path / "v.mkv"
+    path.write_bytes(clip(3))
+    recording = open_camera(str(path))
+    events: list[str] = []
+    decoding, close = threading.Event(), recording.close
+
+    def slow(time_ns: int) -> bool:
+        decoding.set()
+        time.sleep(0.3)
+        events.append("decoded")
+        return True
+
+    def closed() -> None:
+        events.append("closed")
+        close()
+
+    recording.is_wanted = slow  # type: ignore[attr-defined]
+    recording.close = closed  # type: ignore[method-assign]
+    paces = Paced(recording)
+    reading = threading.Thread(target=lambda: list(paces))
+    reading.start()
+    assert decoding.wait(10.0)
+    paces.close()
+    assert events[:2] == ["decoded", "closed"]
+    reading.join(10.0)
+    assert not reading.is_alive()
+
+
 @pytest.mark.parametrize(
     "wrong", [{"first_retry_s": 9.0}, {"stall_s": 0.0}, {"frozen_s": -1.0}, {"first_retry_s": 0.0}]
 )
@@ -338,7 +367,7 @@ def has_gstreamer(*elements: str) -> bool:
     not has_gstreamer("qtdemux", "h264parse", "avdec_h264"), reason="needs GStreamer's decoders"
 )
 def test_a_gstreamer_decoder_with_padded_images_is_read(tmp_path: Path) -> None:
-    """A height that is no multiple of sixteen: the decoder's buffers are larger than images."""
+    """A height that is not a multiple of sixteen: the decoder's buffers are larger than images."""
     clip, made = tmp_path / "clip.mp4", "testsrc2=size=80x70:rate=20:duration=2"
     command = f"ffmpeg -v error -f lavfi -i {made} -pix_fmt yuv420p -c:v libx264 {clip}"
     subprocess.run(shlex.split(command), check=True)

@@ -136,6 +136,15 @@ def test_what_the_rim_of_the_survey_cuts_is_no_change() -> None:
     assert not change_between(surface(1, []), after).bodies
 
 
+def test_a_strip_that_a_box_hides_does_not_hide_the_change() -> None:
+    after = surface(2, [(100, 100, 20, 20, 1.5)])
+    after.height_m[98:122, 120:125] = np.nan
+    (body,) = change_between(surface(1, []), after).bodies
+    assert body.volume_m3 == pytest.approx(1.5 * 400 * CELL_M**2, rel=0.03)
+    after.height_m[98:122, 120:] = np.nan
+    assert not change_between(surface(1, []), after).bodies
+
+
 def test_ground_that_scatters_more_than_the_rest_needs_more() -> None:
     rng = np.random.default_rng(3)
     after = surface(2, [])

@@ -150,7 +150,7 @@ def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
     assert not look(False)
     assert scanning.is_closing
     assert look(True)
-    assert reported == ["Scan starts once the last one is closed"]
+    assert reported == ["Scan starts when the previous one is closed"]
     assert not look(False)  # and off again
     hung.step.set()
     assert look(True)

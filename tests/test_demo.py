@@ -39,8 +39,8 @@ def test_ground_holds_what_was_made_onboard(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr + (out / "ground.log").read_text()
     report = json.loads(done.stdout.splitlines()[-1])
-    assert "[1/3] open this page and see the map grow: http://127.0.0.1:" in done.stderr
-    assert "[2/3] flight: 5 images" in done.stderr
+    assert "[1/3] open this page to watch the map grow: http://127.0.0.1:" in done.stderr
+    assert "[2/3] flight: tracking and reconstructing 5 images" in done.stderr
     assert "INFO" not in done.stderr
     assert report["points"] > 10_000
     assert report["points"] == report["ground_points"]

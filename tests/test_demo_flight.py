@@ -35,7 +35,7 @@ def test_an_installed_wheel_brings_the_flight(
 
 
 def test_a_named_flight_alone_counts(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="nothing-here holds no frames"):
+    with pytest.raises(InputError, match="nothing-here contains no frames"):
         demo._flight(tmp_path / "nothing-here")
 
 

@@ -214,9 +214,9 @@ def test_uninstall_keeps_scans_and_configuration(machine: Machine) -> None:
 def test_wrong_usage_is_reported(machine: Machine) -> None:
     assert "no option --nonsense" in machine.install("--nonsense").stderr
     assert "sudo deploy/install.sh" in machine.install("--help").stdout
-    assert "no version before" in machine.install("--rollback").stderr
+    assert "no previous version" in machine.install("--rollback").stderr
     shutil.rmtree(machine.bundle / "wheels")
-    assert "holds no wheels" in machine.install().stderr
+    assert "contains no wheels" in machine.install().stderr
     assert not machine.home.exists()
 
 
@@ -271,5 +271,5 @@ def test_a_bundle_without_hashes_is_refused(machine: Machine) -> None:
     (machine.bundle / "requirements.txt").unlink()
     done = machine.install()
     assert done.returncode != 0
-    assert "holds no requirements.txt with hashes" in done.stderr
+    assert "contains no requirements.txt with hashes" in done.stderr
     assert not machine.home.exists()

@@ -123,12 +123,12 @@ def test_command_line(tmp_path: Path) -> None:
 
 def test_what_is_missing_to_fly_is_reported(tmp_path: Path) -> None:
     given = [f"scan.folder={tmp_path}", f"camera.source={DEMO / 'frames'}"]
-    assert findings(given[0])["to fly"] == (
+    assert findings(given[0])["settings"] == (
         BAD,
-        "set camera.source and camera.model; the service does not start without",
+        "set camera.source and camera.model; the service does not start without them",
     )
-    assert findings(*given)["to fly"][1].startswith("set camera.model;")
-    assert findings(*given, f"camera.model={DEMO / 'camera.yaml'}")["to fly"][0] == NOTE
+    assert findings(*given)["settings"][1].startswith("set camera.model;")
+    assert findings(*given, f"camera.model={DEMO / 'camera.yaml'}")["settings"][0] == NOTE
 
 
 def test_the_boards_settings_are_compared() -> None:

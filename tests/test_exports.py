@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +17,12 @@ from typer.testing import CliRunner
 
 from recon.types import F64
 from service.cli import app
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
 from service.offline.exports import EXPORTERS
 from service.offline.exports.clouds import octree
 from service.offline.exports.view import ExportOptions, ScanView, export
+from service.progress import Progress
 from service.scans.fused_cloud import adjusted_gps_s
 from service.stream.store import ScanStore
 
@@ -207,6 +209,19 @@ def test_dsm_says_what_is_filled(scan_dir: Path, tmp_path: Path) -> None:
     assert not (bands[0][2] == 1.0).any()
     assert ((strict_m == -9999.0) & (height != -9999.0) == (is_filled == 1.0)).all()
     assert (is_filled == 1.0).sum() > 100 and (sigma[is_filled == 1.0] > 0.0).all()
+
+
+def test_a_missing_package_is_reported_before_the_work(
+    scan_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    steps: list[str] = []
+    with (
+        ScanView(scan_dir, None, Progress(lambda now: steps.append(now.text))) as scan,
+        pytest.raises(OutsideError, match="export to dsm needs the package rasterio"),
+    ):
+        export(scan, "dsm", None, ExportOptions())
+    assert steps == []
 
 
 def test_ortho_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:

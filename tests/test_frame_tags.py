@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mavlink.telemetry.samples import VehicleState
-from service.flight.frame_tags import COLUMNS, FILE, FrameTags
+from service.flight.recorder import COLUMNS, TAGS_FILE, FrameTags
 
 STATE = VehicleState(
     0,
@@ -24,13 +24,13 @@ STATE = VehicleState(
 
 
 def test_each_frame_has_a_line_and_what_is_unknown_stays_empty(tmp_path: Path) -> None:
-    tags = FrameTags(tmp_path / FILE)
+    tags = FrameTags(tmp_path / TAGS_FILE)
     tags.write(1_700_000_000_123_456_789, STATE)
     tags.write(1_700_000_001_000_000_000, None)  # telemetry knows nothing of this one
     tags.close()
     tags.write(1_700_000_002_000_000_000, STATE)  # closed
     tags.close()
-    lines = (tmp_path / FILE).read_text().splitlines()
+    lines = (tmp_path / TAGS_FILE).read_text().splitlines()
     assert lines[0] == ",".join(COLUMNS)
     (row,) = csv.DictReader(lines)
     assert row["time_unix_s"] == "1700000000.123456789"
@@ -45,7 +45,7 @@ def test_each_frame_has_a_line_and_what_is_unknown_stays_empty(tmp_path: Path) -
 def test_a_full_disk_is_reported_once_and_costs_nothing_else(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    FrameTags(tmp_path / "missing" / FILE).write(0, STATE)
+    FrameTags(tmp_path / "missing" / TAGS_FILE).write(0, STATE)
     full = Path("/dev/full")
     if full.exists():
         tags = FrameTags(full)

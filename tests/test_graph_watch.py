@@ -10,7 +10,7 @@ import pytest
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
 from recon.types import F64, PosePrior
-from service.flight.graph_report import GraphWatch
+from service.flight.reports import GraphWatch
 
 NADIR = np.diag([1.0, -1.0, -1.0])
 COVARIANCE = np.diag([2e-4**2] * 3 + [0.02**2] * 3)

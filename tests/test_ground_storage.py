@@ -97,7 +97,7 @@ def test_two_cards_with_runs_of_one_time_are_kept_apart(
 
 
 def test_a_folder_without_scans_is_said(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds no scan"):
+    with pytest.raises(InputError, match="contains no scan"):
         take_in(tmp_path / "ground", tmp_path)
 
 
@@ -123,7 +123,7 @@ def test_links_and_devices_on_a_card_are_not_followed(tmp_path: Path, card: Path
     for name, target in (("one", "/dev/zero"), ("two", str(card / "scan-1" / "scan.db"))):
         (odd / name).mkdir(parents=True)
         (odd / name / "scan.db").symlink_to(target)
-    with pytest.raises(InputError, match="holds no scan"):
+    with pytest.raises(InputError, match="contains no scan"):
         take_in(tmp_path / "ground", odd)
 
 

@@ -73,7 +73,7 @@ def test_flipped_recordings_never_end_in_a_traceback(
 
 @pytest.mark.parametrize(("old", "new"), [
     (b"avc1\0\0\0\0", b"xyz1\0\0\0\0"),  # no decoder has that name
-    (b"abcdefghijklmnop", b"abc\xb0\xff\xfe\xb0\xb0jklmnop"),  # a comment that is no UTF-8
+    (b"abcdefghijklmnop", b"abc\xb0\xff\xfe\xb0\xb0jklmnop"),  # a comment that is not UTF-8
     (struct.pack(">HH", 96, 64), b"\xff\xff\xff\xff"),
 ])  # fmt: skip
 def test_a_recording_with_an_odd_index(tmp_path: Path, mp4: bytes, old: bytes, new: bytes) -> None:

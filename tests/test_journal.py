@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from service import journal
+from service import init_system
 
 
 def fields(datagram: bytes) -> dict[str, str]:
@@ -33,7 +33,7 @@ def test_records_arrive_with_their_fields(tmp_path: Path) -> None:
     logger = logging.getLogger("service.some.part")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as journald:
         journald.bind(path)
-        handler = journal.JournalHandler(path)
+        handler = init_system.JournalHandler(path)
         logger.addHandler(handler)
         try:
             logger.warning("camera %s: lost", "a=b")
@@ -56,7 +56,7 @@ def test_records_arrive_with_their_fields(tmp_path: Path) -> None:
 def test_without_a_journal_it_goes_to_standard_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    handler = journal.JournalHandler(str(tmp_path / "nobody"))
+    handler = init_system.JournalHandler(str(tmp_path / "nobody"))
     handler.handle(logging.LogRecord("a.b", logging.ERROR, "f", 1, "it %s", ("broke",), None))
     handler.close()
     assert capsys.readouterr().err == "ERROR a.b: it broke\n"
@@ -64,11 +64,11 @@ def test_without_a_journal_it_goes_to_standard_error(
 
 def test_the_journal_is_used_where_it_reads_us(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("JOURNAL_STREAM", raising=False)
-    assert isinstance(journal.log_handler(), logging.StreamHandler)
+    assert isinstance(init_system.log_handler(), logging.StreamHandler)
     with tempfile.TemporaryFile("w") as stream:
         found = os.fstat(stream.fileno())
         monkeypatch.setattr("sys.stderr", stream)
         monkeypatch.setenv("JOURNAL_STREAM", f"{found.st_dev}:{found.st_ino}")
-        assert journal._journal_reads_us()
+        assert init_system._journal_reads_us()
         monkeypatch.setenv("JOURNAL_STREAM", "1:2")
-        assert not journal._journal_reads_us()
+        assert not init_system._journal_reads_us()

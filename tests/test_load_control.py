@@ -204,7 +204,7 @@ def test_a_device_that_fails_is_reported_once_and_the_cpu_goes_on(
 
 
 def test_onnx_runtime_out_of_memory_falls_back_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its exceptions are no RuntimeErrors; neither running nor opening may end the scan."""
+    """Its exceptions are not RuntimeErrors; neither running nor opening may end the scan."""
     state = pytest.importorskip("onnxruntime.capi.onnxruntime_pybind11_state")
     pytest.importorskip("onnx")
     from recon.backends import onnx_backend

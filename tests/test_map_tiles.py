@@ -214,6 +214,21 @@ def test_a_long_scan_is_read_in_turns(
             assert found.version == min(read, 5)
 
 
+def test_a_map_gets_the_fine_layer_that_the_receiver_stores_later(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    folder = tmp_path / "scan"
+    maps = LiveMaps(min_age_s=0.0)
+    with house.flown(folder) as receiver:
+        one = house.keyframe(9, 30.0)
+        coarse, fine = encode(one, one.time_ns)
+        receiver.add_chunk(coarse)
+        assert maps.of(folder).version == 6
+        receiver.add_chunk(fine)
+        assert maps.of(folder).version == 7
+    maps.close()
+
+
 def enu(n: int) -> F64:
     return np.random.default_rng(n).uniform((-500, -500, -40), (500, 500, 60), (200, 3))
 

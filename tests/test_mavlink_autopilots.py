@@ -11,7 +11,7 @@ S = 1_000_000_000
 MS = 1_000_000
 
 
-# Components that are no autopilots
+# Components that are not autopilots
 
 
 @pytest.mark.parametrize("kind", [5, 6, 18, 26, 27, 30, 34, 36, 39, 42])

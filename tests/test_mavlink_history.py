@@ -30,8 +30,8 @@ from mavlink.telemetry.samples import (
     PositionSample,
     RangeSample,
     TerrainSample,
+    Track,
 )
-from mavlink.telemetry.track import Track
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -276,7 +276,7 @@ def test_the_recording_that_a_scan_names_is_found(
 def test_a_recording_found_by_itself_that_does_not_fit_is_left(
     tmp_path: Path, house: HouseFlight
 ) -> None:
-    """The scan names a file that is no video: the mesh is made from the store, and says so."""
+    """The scan names a file that is not a video: the mesh is made from the store, and says so."""
     house.flown(tmp_path).close()
     job = replace(jobs(tmp_path)[0], video=str(tmp_path / "none.mp4"))
     reported: list[str] = []

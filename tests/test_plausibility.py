@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
-from recon.mapping.plausibility import plausible
+from recon.stereo.reprojection import plausible
 from recon.types import F64, U8, DepthMap, PosePrior
 from service.flight.stages import Plausible
 from service.flight.viewpoints import StereoCandidate

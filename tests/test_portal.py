@@ -21,10 +21,11 @@ from recon import se3
 from service.errors import InputError, OutsideError
 from service.ground.library import Library
 from service.ground.live import SIGMA_STEP_M, LiveFeed, StoreIndex
-from service.ground.portal import Portal, PortalConfig, open_portal, parse_address
+from service.ground.portal import Portal, PortalConfig, open_portal
 from service.ground.scan_files import DARK
 from service.ground.scan_files import _closed as closed_image
 from service.ground.vehicle import Vehicle
+from service.listener import parse_address
 from service.stream.codec import encode
 from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore
@@ -442,11 +443,11 @@ def test_open_addresses_need_a_token(tmp_path: Path) -> None:
         PortalConfig(tmp_path, host=host, token=TOKEN)
     with pytest.raises(InputError, match="port"):
         PortalConfig(tmp_path, port=99999)
-    assert parse_address("127.0.0.1:8080") == ("127.0.0.1", 8080)
-    assert parse_address("[::1]:80") == ("::1", 80)
-    for bad in ("8080", "host:", "host:x", ""):
+    assert parse_address("127.0.0.1:8080", "portal") == ("127.0.0.1", 8080)
+    assert parse_address("[::1]:80", "portal") == ("::1", 80)
+    for bad in ("8080", "host:", "host:x", "host:65536", ""):
         with pytest.raises(InputError, match="HOST:PORT"):
-            parse_address(bad)
+            parse_address(bad, "portal")
 
 
 def test_on_open_addresses_reading_needs_the_token(store: Path) -> None:

@@ -136,7 +136,7 @@ def test_the_list_works_whatever_one_scan_holds(
 
 
 def test_a_damaged_schema_is_said(client: Client, store: Path) -> None:
-    """SQLite quotes the damaged place in its message, which then is no UTF-8."""
+    """SQLite quotes the damaged place in its message, which then is not UTF-8."""
     path = store / "drone-1/test-1/scan.db"
     data = path.read_bytes()
     assert data.count(b"CREATE TABLE chunks") == 1

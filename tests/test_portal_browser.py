@@ -1,4 +1,4 @@
-"""The portal's pages in a real browser (Chromium by its DevTools protocol); skipped without one."""
+"""The portal's pages in a real browser (Chromium); skipped without one."""
 
 from __future__ import annotations
 
@@ -168,8 +168,10 @@ def test_the_buttons_reach_the_vehicle_and_show_its_answer(browser: Browser, sca
         one.close()
 
 
-def test_without_webgl_the_view_says_so_and_the_list_works(tmp_path: Path, portal: Portal) -> None:
-    blind = Browser(tmp_path / "blind", "--disable-3d-apis")
+def test_without_webgl_the_view_says_so_and_the_list_works(
+    browser: Browser, portal: Portal
+) -> None:
+    blind = Browser(browser.driver, "--disable-3d-apis")
     try:
         blind.open(portal.url)
         blind.wait("document.querySelectorAll('article').length === 1")

@@ -166,22 +166,18 @@ def test_the_volume_of_the_house_its_profile_and_the_way_out(
     assert abs(ruler.number("Volume above") / (12.0 * 8.0 * 6.0) - 1.0) < 0.02
     assert ruler.number("Volume below") < 3.0
 
-    folder = tmp_path / "downloads"
-    ruler.page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
-    ruler.page.click("GeoJSON")
-    target = folder / "measurement.geojson"
-    ruler.page.until(target.is_file, 20)
-    feature = json.loads(target.read_text())["features"][0]
+    with ruler.page.page.expect_download() as download:
+        ruler.page.click("GeoJSON")
+    assert download.value.suggested_filename == "measurement.geojson"
+    feature = json.loads(download.value.path().read_text())["features"][0]
     ring = np.array(feature["geometry"]["coordinates"][0])
     assert np.array_equal(ring[0], ring[-1])
     back = ruler.frame.to_enu(ring[:-1][:, [1, 0, 2]])
     assert np.abs(back - found).max() < 0.03
     assert abs(feature["properties"]["volume_above_m3"] - ruler.number("Volume above")) < 0.6
 
-    ruler.page.call(
-        "Browser.grantPermissions", permissions=["clipboardReadWrite", "clipboardSanitizedWrite"]
-    )
-    ruler.page.call("Page.bringToFront")
+    ruler.page.page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    ruler.page.page.bring_to_front()
     ruler.page.click("Copy")
     ruler.page.wait("[...document.querySelectorAll('.note')].some(n => n.textContent === 'copied')")
     assert json.loads(ruler.page.run("navigator.clipboard.readText()"))["features"][0] == feature

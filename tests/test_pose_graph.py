@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from recon import se3
+from recon.posegraph.alignment import umeyama
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.smoother import NO_SCALE, Smoother, State, System
-from recon.posegraph.track_alignment import umeyama
 from recon.types import F64, Pose, PosePrior
 
 STEP_M = 6.0

@@ -21,7 +21,7 @@ from service.config import Config, keys, load_config
 from service.daemon.health import HealthServer
 from service.errors import InputError, OutsideError
 from service.flight.scan import ScanInputs, create_store
-from service.journal import PublicFormatter
+from service.init_system import PublicFormatter
 from service.redaction import SECRET_KEYS, without_credentials
 from service.scans.folder import write_deliverables
 

@@ -98,6 +98,16 @@ def start(seed: int, T: F64, shift_m: float = 0.27, turn_rad: float = 0.003) -> 
     return np.asarray(se3.exp(twist) @ T)
 
 
+UNKNOWN = 0.05
+"""Variances, m2 or rad2, above those of any direction that the surface shows."""
+
+
+def weak_directions(result: Registration) -> F64:
+    """(k, 6) unit rows: motions that the surface does not show."""
+    values, vectors = np.linalg.eigh(result.covariance)
+    return np.asarray(vectors.T[values > UNKNOWN])
+
+
 def ground_error(result: Registration, T: F64) -> F64:
     """(3,) m, where the ground below the source's centre ends up too far."""
     point = np.array([[0.0, 0.0, 60.0]])
@@ -152,8 +162,7 @@ def test_flat_ground_leaves_three_directions_open(sigma_m: float, blur_px: float
         guess = start(seed, T_A_B)
         result = register_projective(b, a, guess)
         assert result.verdict == "degenerate"
-        assert result.weak_directions.shape == (3, 6)
-        np.testing.assert_allclose(np.linalg.norm(result.weak_directions, axis=1), 1.0)
+        assert len(weak_directions(result)) == 3
         # What can be seen is right: height, roll and pitch.
         error = ground_error(result, T_A_B)
         assert abs(error[2]) < 0.03
@@ -172,10 +181,11 @@ def test_a_trench_leaves_one_direction_open() -> None:
     guess = start(0, T_A_B)
     result = register_projective(b, a, guess)
     assert result.verdict == "degenerate"
-    assert len(result.weak_directions) == 1
+    weak = weak_directions(result)
+    assert len(weak) == 1
     error = ground_error(result, T_A_B)
     assert abs(error[0]) < 0.03 and abs(error[2]) < 0.03
-    along = result.weak_directions[0, 3:] / np.linalg.norm(result.weak_directions[0, 3:])
+    along = weak[0, 3:] / np.linalg.norm(weak[0, 3:])
     assert abs(along[1]) > 0.98
 
 

@@ -18,6 +18,10 @@ import pytest
 from command_line import skyrelief
 from loopback import until
 
+from recon.types import Shutter
+from service.flight.scan import Scan
+from service.stream.store import ScanStore
+
 EPOCH = 1777629600  # of the simulated video; a transport stream does not carry it
 
 Run = subprocess.CompletedProcess[str]
@@ -108,6 +112,32 @@ def test_without_telemetry_it_still_reconstructs(flight: Path, tmp_path: Path) -
     assert any("scale" in warning for warning in summary["warnings"])
     report = score(out, flight)
     assert report["surface"]["similarity"]["median_m"] < 0.006 * 40.0
+
+
+def test_a_recording_begins_again_once_its_readout_is_found(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[Scan] = []
+
+    def found(scan: Scan) -> Shutter | None:
+        if not begun or begun[-1] is not scan:
+            begun.append(scan)
+        return Shutter(0.002, "up") if scan.recorder.keyframes else None
+
+    monkeypatch.setattr(Scan, "found_shutter", found)
+    out = tmp_path / "scan"
+    done = skyrelief(
+        "replay", flight / "flight.mp4", "--camera-model", flight / "camera.yaml",
+        "--out", out, "--json", *SPARSEST,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    first, second = begun
+    assert 0 < first.recorder.frames < second.recorder.frames == 40
+    assert second.inputs.camera.shutter == Shutter(0.002, "up")
+    with ScanStore.open(out / "scan.db", read_only=True) as store:
+        times = [pose.time_unix_ns for pose in store.poses()]
+        assert times == sorted(set(times)) and len(times) > first.recorder.frames
+        assert store.header.camera["readout_ms"] == pytest.approx(2.0)
 
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")

@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.posegraph.altitude_datum import AltitudeDatum
-from recon.posegraph.boresight import Boresight
 from recon.posegraph.pose_graph import PoseGraph
-from recon.posegraph.sensor_offsets import Constants
+from recon.posegraph.sensor_offsets import AltitudeDatum, Boresight, Constants
 from recon.types import PosePrior
-from service.flight.graph_report import graph_figures
+from service.flight.reports import graph_figures
 from service.scans.coverage import coverage_of
 from service.scans.folder import write_deliverables
 from service.scans.report import consistency, sensor_constants

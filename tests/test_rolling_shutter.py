@@ -14,10 +14,12 @@ from recon import se3
 from recon.camera_model import project, rays
 from recon.rolling_shutter import RowClock, Rows, RowTrack, row_times_s
 from recon.stereo.virtual_stereo import View, VirtualStereoConfig, at_middle_row, rectify
+from recon.tracking import readout_search
+from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry
 from recon.tracking.prediction import inverse_depth_plane
-from recon.tracking.readout_search import ReadoutEstimate
+from recon.tracking.readout_search import ReadoutEstimate, ReadoutSearch
 from recon.types import DIRECTIONS, F64, U8, Camera, PosePrior, Shutter, StereoPair
 from service.config import Config
 from service.flight.scan import Scan
@@ -294,6 +296,24 @@ def test_the_readout_is_found_from_the_images(readout_s: float, frames: int) -> 
     assert found.is_sure and used == found.readout_s
     assert found.readout_s == pytest.approx(readout_s, abs=5e-4)
     assert found.sigma_s < 5e-4
+
+
+@pytest.mark.parametrize(("sharpness", "expected"), [(1e-3, 0.03), (1e6, 0.012)])
+def test_a_known_readout_gives_way_to_sharp_images_alone(
+    monkeypatch: pytest.MonkeyPatch, sharpness: float, expected: float
+) -> None:
+    clock = RowClock(replace(PLAIN, shutter=Shutter(0.03)))
+
+    def cost(window: object, tried: RowClock, K: F64) -> tuple[float, int]:
+        return 100.0 + sharpness * (1e3 * (tried.readout_s - 0.012)) ** 2, 400
+
+    monkeypatch.setattr(readout_search, "_cost", cost)
+    search = ReadoutSearch(clock, PLAIN.K)
+    moving = SimpleNamespace(is_measured=True)
+    for first in range(0, 40, 10):
+        keys = [SimpleNamespace(seq=first + k, moving=moving) for k in range(5)]
+        search.look(cast("list[OdometryKeyframe]", keys))
+    assert clock.readout_s == pytest.approx(expected)
 
 
 def test_a_global_shutter_is_not_taken_for_a_rolling_one() -> None:

@@ -126,6 +126,31 @@ def test_a_lens_off_its_axis_is_found_where_turned_views_meet() -> None:
     assert np.abs(apart - apart.mean(axis=0)).max() < 1.0
 
 
+def _in_patches(seen: Sightings, amplitude_px: float, seed: int) -> Sightings:
+    """With an error that is smooth over each view and of its own in each."""
+    rng = np.random.default_rng(seed)
+    x, y = (2.5 * (seen.uv_px / np.array(SIZE) * 2.0 - 1.0)).T
+    waves = np.stack([np.sin(x + a) * np.sin(y + b) for a in (0.0, 1.57) for b in (0.0, 1.57)])
+    heights = rng.normal(size=(int(seen.view.max()) + 1, 2, 4)) * amplitude_px
+    off = np.einsum("mik,km->mi", heights[seen.view], waves)
+    return Sightings(seen.view, seen.landmark, seen.uv_px + off)
+
+
+@pytest.mark.parametrize("amplitude_px", [0.0, 0.3])
+def test_the_sigma_holds_where_the_sightings_of_a_view_err_alike(amplitude_px: float) -> None:
+    poses, sigmas = _oblique_turn(), []
+    for seed in range(8):
+        points, seen = _seen(poses, TRUE, seed)
+        seen = _in_patches(seen, amplitude_px, seed)
+        start, near = _guess(points, poses, seed)
+        fixes = poses[:, :3, 3] + np.random.default_rng(seed).normal(size=(len(poses), 3)) * 0.1
+        sigma, loose = np.full((len(poses), 3), 0.1), SelfCalibrationConfig(max_sigma_focal=0.05)
+        found = self_calibrate(WRONG, start, near, seen, fixes, sigma, loose)
+        assert not found.why_not
+        sigmas.append((found.camera.K[0, 0] / 960.0 - 1.0) / found.sigma_focal)
+    assert 0.4 < np.sqrt(np.mean(np.square(sigmas))) < 1.8
+
+
 def test_straight_down_from_one_height_it_is_not_determined() -> None:
     poses = _nadir((60.0, 60.0))
     points, seen = _seen(poses, TRUE)

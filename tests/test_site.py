@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sqlite3
 import struct
 from pathlib import Path
@@ -47,7 +48,11 @@ def merged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Path]]:
     other = Errors((shift[0], shift[1], shift[2]), (0.0, 0.002, -0.003), 0.998)
     one = write_scan(folder / "one", NORTH, WRONG)
     two = write_scan(folder / "two", EAST, other, frame=ELSEWHERE)
-    align_site([one, two], folder / "site")
+    done = CliRunner().invoke(
+        app, ["site", "align", "--out", str(folder / "site"), str(one), str(two)]
+    )
+    assert done.exit_code == 0, done.output
+    assert re.search(r"one - two: \d+ ties, \d\.\d\d -> 0\.\d\d m apart", done.output)
     return folder / "site", [one, two]
 
 
@@ -133,9 +138,9 @@ def test_bad_scans_are_named(tmp_path: Path) -> None:
         align_site([one, flying], tmp_path / "other")
     with pytest.raises(InputError, match="no usable scan"):
         align_site([nowhere], tmp_path / "third")
-    with pytest.raises(InputError, match="holds no scan"):
+    with pytest.raises(InputError, match="contains no scan"):
         align_site([tmp_path], tmp_path / "fourth")
-    with pytest.raises(InputError, match="is no site"):
+    with pytest.raises(InputError, match="is not a site"):
         align_site([one], one)
     with pytest.raises(InputError, match="one scan"):
         compare(one, one, tmp_path / "fifth")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.posegraph.site_alignment import ScanPrior, Similarity, SiteAlignment, Tie, align
+from recon.posegraph.site_alignment import ScanPrior, Similarity, SiteAlignment, Tie, align, alike
 from recon.types import F64
 
 SIGMA = np.array([0.005] * 3 + [1.0, 1.0, 1.5, 0.005])
@@ -56,6 +56,19 @@ def test_two_scans_meet_and_share_their_error() -> None:
         together.append(np.linalg.norm(off[0].mean(axis=0)))
     ratio = np.sqrt(np.mean(np.square(together)) / np.mean(np.square(alone)))
     assert 0.55 < ratio < 0.85  # one over the root of two is 0.71
+
+
+def test_like_receivers_share_their_sigma_and_a_better_one_keeps_its_own() -> None:
+    own = [[0.2, 1.0, 0.4], [1.0, 1.0, 0.4], [1.0, 0.02, 2.0]]
+    given = [
+        ScanPrior(CENTRE, np.concatenate([SIGMA[:3], sigma, SIGMA[6:]])) for sigma in np.array(own)
+    ]
+    shared = [prior.sigma for prior in alike(given)]
+    rms = np.sqrt((0.04 + 1.0 + 1.0) / 3), np.sqrt((0.16 + 0.16 + 4.0) / 3)
+    assert np.allclose([s[3] for s in shared], [rms[0], 1.0, 1.0])
+    assert np.allclose([s[4] for s in shared], [1.0, 1.0, 0.02])  # RTK
+    assert np.allclose([s[5] for s in shared], [rms[1], rms[1], 2.0])
+    assert all(np.array_equal(s[[0, 1, 2, 6]], SIGMA[[0, 1, 2, 6]]) for s in shared)
 
 
 def between_sigma_m(found: SiteAlignment, own: Sequence[ScanPrior]) -> F64:

@@ -223,7 +223,7 @@ def test_learned_model_is_checked_and_used(
         (good.replace('"disp"', '"depth"'), "'depth' was expected"),
         (good + 'layout = "nhwc"\n', "was expected, found"),
         (good + "colour = 3\n", "unknown colour"),
-        (good.replace("net.onnx", "other.onnx"), "no file"),
+        (good.replace("net.onnx", "other.onnx"), "not a file"),
         (good.replace("height = 96\n", ""), "height must be given"),
     ):
         declaration.write_text(wrong)

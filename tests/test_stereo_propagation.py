@@ -112,10 +112,10 @@ def test_one_row_finds_the_exact_minimum_of_the_energy() -> None:
 def test_census_against_its_definition() -> None:
     image = np.random.default_rng(1).integers(0, 256, (12, 15), np.uint8)
     words = census(image)
-    padded = np.pad(image, 3, mode="edge").astype(int)
+    padded = np.pad(image, 2, mode="edge").astype(int)
     for v, u in ((0, 0), (5, 7), (11, 14), (3, 0)):
-        window = padded[v : v + 7, u : u + 7].ravel()
-        bits = np.delete(window < int(image[v, u]), 24)
+        window = padded[v : v + 5, u : u + 5].ravel()
+        bits = np.delete(window < int(image[v, u]), 12)
         assert int(words[v, u]) == int("".join("1" if b else "0" for b in bits), 2)
 
 
@@ -204,6 +204,20 @@ def test_occluded_strip_is_unknown_and_edges_stay_sharp() -> None:
     assert np.isfinite(filled.px).sum() > known.sum()
     new = np.isfinite(filled.px) & ~known
     assert np.median(filled.confidence[new]) <= 0.051
+
+
+@pytest.mark.parametrize("contrast", [0, 30, 50])
+def test_a_raised_box_is_hardly_widened_over_weakly_textured_ground(contrast: int) -> None:
+    far, near = 90 - contrast + 0.3 * texture(100, 340, 3), texture(100, 340, 4) + contrast
+    u, v = np.meshgrid(np.arange(180), np.arange(100))
+    box, hidden = np.zeros((2, 100, 180), np.bool_)
+    box[30:70, 70:120], hidden[30:70, 68:70] = True, True
+    left = np.where(box, near[v, u + 74], far[v, u + 76])
+    right = np.where(np.roll(box, -6, axis=1), near[v, u + 80], far[v, u + 80])
+    px = belief_propagation(gray(left), gray(right), 16, BeliefPropagationConfig()).px
+    nearer = np.clip((px - np.where(box, 6, 4)) / 2, -1, 1)
+    known = np.isfinite(px[20:80, 60:130]) & ~hidden[20:80, 60:130]
+    assert abs(nearer[20:80, 60:130][known].sum()) / (2 * (50 + 40)) < 0.13  # px of its outline
 
 
 def test_no_label_whose_partner_lies_outside_the_right_image() -> None:
@@ -375,4 +389,4 @@ def test_bad_input_is_named() -> None:
         with pytest.raises(ValueError, match="must be"):
             BeliefPropagationConfig(**wrong)
     with pytest.raises(ValueError, match="census_truncation"):
-        MatchingCostConfig(census_truncation=60)
+        MatchingCostConfig(census_truncation=25)

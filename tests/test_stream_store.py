@@ -61,6 +61,26 @@ def test_what_goes_in_comes_out(tmp_path: Path) -> None:
         assert store.seqs()[-1] == 7
 
 
+def test_a_reader_follows_what_another_connection_writes(tmp_path: Path) -> None:
+    coarse, fine = codec.encode(keyframe(7), 123)
+    path = tmp_path / "scan.db"
+    with ScanStore.create(path, HEADER) as writer, ScanStore.open(path) as reader:
+        reported: list[str] = []
+        reader.listen(lambda kind, number: reported.append(kind))
+        for change in (
+            lambda: writer.add_chunk(coarse),
+            lambda: writer.add_chunk(fine),
+            lambda: writer.add_reposes([Repose(7, 1, np.eye(4), 1.0, np.eye(6))]),
+            lambda: writer.update_header(epsg=32632),
+            lambda: writer.finish({}),
+        ):
+            change()
+            assert reader.numbers() != writer.numbers()
+            reader.follow()
+            assert reader.numbers() == writer.numbers() and reader.header == writer.header
+        assert not reported
+
+
 def test_poses_at_once_are_those_one_by_one(tmp_path: Path) -> None:
     poses = [pose(k) for k in (3, 1, 2)]
     broken = PoseRecord(9, np.full((4, 4), np.nan), np.eye(6))

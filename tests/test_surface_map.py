@@ -12,9 +12,9 @@ import pytest
 from recon import se3
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from recon.types import F64, DepthMap
-from service.compute.stopwatch import Stopwatch
 from service.flight.surface_map import MAX_OVER, PagedMap, SurfaceMap
 from service.flight.viewpoints import StereoCandidate
+from service.progress import Stopwatch
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
 NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])

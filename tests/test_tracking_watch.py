@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from recon.tracking.odometry import Tracked, Tracking
-from service.flight.tracking_watch import TrackingWatch
+from service.flight.reports import TrackingWatch
 
 S = 1_000_000_000
 

@@ -306,3 +306,13 @@ def test_a_point_has_the_time_of_the_image_that_knows_it_best() -> None:
     fused = fuse(clouds, 0.5)
     assert fused.time_ns is not None and fused.time_ns.tolist() == [20, 10, 20]
     assert fuse([*clouds, cloud(places, [0.1] * 3)], 0.5).time_ns is None
+
+
+def test_a_cloud_leaves_out_depth_that_other_views_contradict() -> None:
+    depth = view(0.0, height_m=50.0, sigma_m=1.0)
+    depth.sigma_m[:30] = 20.0
+    depth.sigma_m[30:40] = np.nan
+    found = cloud_of(depth, np.zeros((90, 160, 3), np.uint8))
+    assert len(found) == 50 * 160 and found.sigma_m.max() == 1.0
+    depth.sigma_m[:70] = 20.0  # most of it: the rest agrees by chance
+    assert len(cloud_of(depth, np.zeros((90, 160, 3), np.uint8))) == 0

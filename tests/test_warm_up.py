@@ -16,7 +16,7 @@ from service.config import load_config
 from service.daemon.frame_gate import FrameGate
 from service.daemon.runtime import COMPILING_S, HUNG_S, Daemon
 from service.daemon.scan_run import ScanRun
-from service.daemon.warm_up import MadeUpGround, is_warm, warm_up
+from service.daemon.warm_up import SyntheticGround, is_warm, warm_up
 
 
 def test_made_up_ground_is_scanned_and_marked(
@@ -35,7 +35,7 @@ def test_made_up_ground_is_scanned_and_marked(
 
 
 def test_made_up_ground_is_the_same_each_time() -> None:
-    first, again = ([f.image for f in MadeUpGround(5)] for _ in range(2))
+    first, again = ([f.image for f in SyntheticGround(5)] for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
     assert not np.array_equal(first[0], first[1])
 
@@ -64,7 +64,7 @@ def test_a_frame_at_work_is_timed_and_a_silent_camera_is_not(tmp_path: Path) -> 
     asked = Event()
     gate: FrameGate
 
-    class Silent(MadeUpGround):
+    class Silent(SyntheticGround):
         """Gives one image, then nothing for a while."""
 
         def __iter__(self) -> Iterator[CameraFrame]:

@@ -122,7 +122,7 @@ def test_what_runs_is_shown_by_its_row() -> None:
 
     table.start("coverage", waits)
     table.start("camera", waits, lambda: 2, lambda: 0.5)
-    own = threading.Thread(target=release.wait, name="mavlink _beat")
+    own = threading.Thread(target=release.wait, name="mavlink beat")
     own.start()
     found = {entry["name"]: entry for entry in running()}
     release.set()
@@ -131,7 +131,7 @@ def test_what_runs_is_shown_by_its_row() -> None:
     assert (camera["waiting"], camera["bound"], camera["when_full"]) == (2, 2, "drop oldest")
     assert (camera["lag_s"], camera["state"]) == (0.5, "running")
     assert found["coverage"]["bound"] is None
-    assert found["mavlink _beat"]["state"] == "running"
+    assert found["mavlink beat"]["state"] == "running"
     assert list(found) == sorted(found, key=lambda name: ROWS.index(row_of(name)))
 
 

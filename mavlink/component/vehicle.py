@@ -132,7 +132,9 @@ class VehicleLink:
         """Open the links; the first heartbeat is sent before anything else."""
         self._inbox.put(self._companion.announce_kept)
         for target in (self._beat, self._run):
-            thread = threading.Thread(target=target, name=f"mavlink {target.__name__}", daemon=True)
+            thread = threading.Thread(
+                target=target, name=f"mavlink {target.__name__.strip('_')}", daemon=True
+            )
             self._threads.append(thread)
             thread.start()
         self._links.start()

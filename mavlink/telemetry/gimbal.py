@@ -180,7 +180,7 @@ def judge_frame(
     }
     rms = {frame: _disagreement(heads[frame], q_seen_steps) for frame in GimbalFrame}
     best = min(rms, key=lambda frame: rms[frame])
-    # A frame that always gives the same attitudes is no rival.
+    # A frame that always gives the same attitudes is not a rival.
     rivals = [f for f in GimbalFrame if _largest_angle(heads[f], heads[best]) > SAME_RAD]
     refuted = tuple(
         f for f in rivals if rms[f] > 2.0 * rms[best] and rms[f] - rms[best] > CLEAR_RAD

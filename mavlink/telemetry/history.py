@@ -13,20 +13,23 @@ import numpy as np
 from mavlink.telemetry.gimbal import GimbalConfig, steadiest_frame, to_earth
 from mavlink.telemetry.quaternion import Quaternion, down_component, slerp
 from mavlink.telemetry.samples import (
+    MAX_GAP_NS,
     RECEIVER_SIGMA_H_M,
     RECEIVER_SIGMA_V_M,
     AccuracySample,
     AttitudeSample,
+    Bracket,
     GimbalFrame,
     GimbalSample,
     PositionSample,
     RangeSample,
     ReceiverAltitude,
+    Row,
     Sample,
     TerrainSample,
+    Track,
     VehicleState,
 )
-from mavlink.telemetry.track import MAX_GAP_NS, Bracket, Row, Track
 
 M_PER_DEG = 111_319.49  # along a meridian, and along the equator
 ACCURACY_GAP_NS = 3_000_000_000

@@ -58,7 +58,9 @@ class Link:
             return
         for target in (self._read, self._write):
             thread = threading.Thread(
-                target=target, name=f"mavlink {self.spec.name} {target.__name__}", daemon=True
+                target=target,
+                name=f"mavlink {self.spec.name} {target.__name__.strip('_')}",
+                daemon=True,
             )
             self._threads.append(thread)
             thread.start()

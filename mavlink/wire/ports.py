@@ -139,7 +139,7 @@ class UdpPort:
         return bytes(self._buffer[:length])
 
     def write(self, data: bytes) -> None:
-        """Send to all; a missing peer is no failure of the link."""
+        """Send to all; a missing peer is not a failure of the link."""
         now = time.monotonic_ns()
         for peer, heard in list(self._peers.items()):
             if now - heard > PEER_NS:

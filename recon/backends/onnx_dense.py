@@ -75,7 +75,7 @@ def stereo_model(
 
 
 def _census(graph: Graph, image: Value, size: tuple[int, int]) -> Value:
-    """(48, h, w): 1 where the neighbour is darker."""
+    """(24, h, w): 1 where the neighbour is darker."""
     h, w = size
     r = CENSUS_RADIUS
     padded = image.pad([r, r], [r, r], None)

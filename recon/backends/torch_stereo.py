@@ -246,7 +246,7 @@ def inside(shape: torch.Size | tuple[int, ...], true: Tensor) -> Tensor:
 
 
 def census(image: Tensor) -> Tensor:
-    """(48, h, w) float32: 1 where the neighbour is darker than the pixel."""
+    """(24, h, w) float32: 1 where the neighbour is darker than the pixel."""
     h, w = image.shape
     r = CENSUS_RADIUS
     padded = F.pad(image[None, None], (r, r, r, r), mode="replicate")[0, 0]

@@ -214,7 +214,7 @@ def _warnings(
     """Reasons why the result is weak, in words for the operator."""
     out = []
     if len(views) < 10:
-        out.append(f"only {len(views)} views were used; 15 or more give a firmer result")
+        out.append(f"only {len(views)} views were used; 15 or more give a more accurate result")
     if coverage < 0.6:
         out.append(
             f"corners cover {coverage:.0%} of the image; the distortion is a guess in the rest"

@@ -20,6 +20,7 @@ from recon.calibration.global_bundle import (
     Problem,
     Sightings,
     Solution,
+    dispersion,
     errors_px,
     solve,
 )
@@ -104,19 +105,20 @@ def self_calibrate(
     )  # fmt: skip
     held = camera_information(camera, config)
 
-    def adjusted(some: Sightings, sigma_px: float) -> Solution:
+    def problem(some: Sightings, sigma_px: float) -> Problem:
         sigmas = np.full(len(some.view), sigma_px)
-        return solve(
-            Problem(camera, camera, poses, landmarks, some, sigmas, known, held), config.iterations
+        return Problem(
+            camera, camera, poses, landmarks, some, sigmas, known, held, config.huber_sigmas
         )
 
     seen = within(camera, poses, landmarks, seen, np.inf)
     before = errors_px(camera, poses, landmarks, seen)
-    first = adjusted(seen, config.pixel_sigma)
+    first = solve(problem(seen, config.pixel_sigma), config.iterations)
     # Once more without wild sightings and with the pixels' own scatter, on which sigmas rest.
     sigma = float(np.clip(np.median(first.errors_px) / RAYLEIGH_MEDIAN, 0.1, 2.0))
     seen = shared(seen, first.errors_px < config.gate_sigmas * sigma)
-    found = adjusted(seen, sigma)
+    last = problem(seen, sigma)
+    found = independent(last, solve(last, config.iterations), config.iterations)
     sigmas = camera_sigmas(found.camera_covariance)
     focal = float(sigmas[:2].max() / found.camera.K[0, 0])
     why_not = doubt(found.camera, camera, focal, config)
@@ -127,6 +129,19 @@ def self_calibrate(
         (float(sigmas[6]), float(sigmas[7])), middle(before), middle(found.errors_px),
         found.errors_px, found.poses, why_not,
     )  # fmt: skip
+
+
+def independent(problem: Problem, found: Solution, iterations: int = 40) -> Solution:
+    """``found`` again with sightings that weigh as much as independent ones would.
+
+    Huber's limit stays the same in pixels.
+    """
+    at = replace(problem, camera=found.camera, poses=found.poses, points=found.points)
+    wider = float(np.sqrt(dispersion(at)))
+    if not 1.0 < wider < np.inf:
+        return found
+    less = replace(at, sigma_px=wider * at.sigma_px, huber_sigmas=at.huber_sigmas / wider)
+    return solve(less, iterations)
 
 
 ROUNDS = ((8.0, 180.0), (1.0, 15.0))

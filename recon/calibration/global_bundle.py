@@ -109,11 +109,11 @@ def _pixel(P: F64, X: F64, k: F64, k3: float, out: F64) -> bool:
 
 @njit(cache=True, nogil=True)
 def _errors(T: F64, X: F64, k: F64, k3: float, view: I64, point: I64, uv: F64, out: F64) -> None:
-    """``out`` (M,) receives the lengths of the errors in pixels."""
+    """``out`` (M, 2) receives the sightings less their prediction; infinite behind the camera."""
     at = np.zeros(7)
     for m in range(view.size):
         if _pixel(T[view[m]], X[point[m]], k, k3, at):
-            out[m] = np.sqrt((at[0] - uv[m, 0]) ** 2 + (at[1] - uv[m, 1]) ** 2)
+            out[m, 0], out[m, 1] = uv[m, 0] - at[0], uv[m, 1] - at[1]
         else:
             out[m] = np.inf
 
@@ -221,11 +221,11 @@ def _mark_pairs(view: I64, start: I64, met: npt.NDArray[np.bool_]) -> None:
 
 def errors_px(camera: Camera, poses: F64, points: F64, seen: Sightings) -> F64:
     """(M,) lengths of the errors of sightings; infinite behind the camera, or of no point."""
-    out = np.zeros(len(seen.view))
+    out = np.zeros((len(seen.view), 2))
     T = np.array([se3.inverse(one) for one in poses])
     k, k3 = _vector(camera), float(camera.distortion[4])
     _errors(T, np.ascontiguousarray(points), k, k3, seen.view, seen.landmark, seen.uv_px, out)
-    return out
+    return np.asarray(np.hypot(out[:, 0], out[:, 1]))
 
 
 def solve(problem: Problem, iterations: int = 40, covariances: bool = False) -> Solution:
@@ -252,6 +252,18 @@ def solve(problem: Problem, iterations: int = 40, covariances: bool = False) -> 
             if damping > 1e6:
                 break
     return bundle.solution(state, covariances)
+
+
+def dispersion(problem: Problem) -> float:
+    """Variance of the camera over the one that independent sightings would give.
+
+    ``problem`` holds the adjusted state. What shifts a patch of a view shifts all sightings in it.
+    So the scatter of the views' pulls on the camera (poses and points follow) is compared with
+    that of independent sightings: the mean design effect (Rao and Scott 1984,
+    doi:10.1214/aos/1176346391) with views as clusters.
+    """
+    bundle = _Bundle(problem)
+    return bundle.dispersion(bundle.start)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -303,10 +315,13 @@ class _Bundle:
 
     # ---- cost -------------------------------------------------------------------------------
 
-    def _lengths(self, s: _State) -> F64:
-        out = np.zeros(len(self._view))
+    def _errors(self, s: _State) -> F64:
+        out = np.zeros((len(self._view), 2))
         _errors(s.T, s.X, s.k, self._k3, self._view, self._point, self._uv, out)
         return out
+
+    def _lengths(self, s: _State) -> F64:
+        return np.asarray(np.hypot(*self._errors(s).T))
 
     def cost(self, s: _State) -> float:
         """Half the sum of squares, robust losses applied."""
@@ -342,9 +357,16 @@ class _Bundle:
     def stepped(self, s: _State, damping: float) -> _State:
         """The state after one step."""
         eq = self._equations(s, damping)
-        dk = np.linalg.solve(eq.Hk, eq.gk)
-        dc = (eq.solved(eq.g) - eq.Z @ dk).reshape(-1, 6)
-        bp = eq.bp - np.einsum("pkc,k->pc", eq.Wk, dk)
+        dk = np.asarray(np.linalg.solve(eq.Hk, eq.gk), np.float64)
+        return self._moved(s, eq, dk, eq.solved(eq.g), eq.bp)
+
+    def _moved(self, s: _State, eq: _Equations, dk: F64, dc: F64, bp: F64) -> _State:
+        """The state after the camera's step ``dk`` (8,); poses and points follow it.
+
+        ``dc`` (6 N,) and ``bp`` (P, 3) are their own step and right-hand sides.
+        """
+        dc = (dc - eq.Z @ dk).reshape(-1, 6)
+        bp = bp - np.einsum("pkc,k->pc", eq.Wk, dk)
         carried = np.einsum("mac,ma->mc", eq.W, dc[self._view])
         np.subtract.at(bp, self._point, carried)
         T = np.array([se3.exp(d) @ one for d, one in zip(dc, s.T, strict=True)])
@@ -414,6 +436,25 @@ class _Bundle:
         for i in range(3):
             Hp[:, i, i] += sure[:, i] ** 2
         bp -= sure * points
+
+    def dispersion(self, s: _State) -> float:
+        """See :func:`dispersion`."""
+        eq, before = self._equations(s, 0.0), self._errors(s)
+        step = 0.1 * np.sqrt(np.abs(np.diag(np.linalg.inv(eq.Hk))))
+        still, none = np.zeros(eq.g.shape), np.zeros(eq.bp.shape)
+        moved = [self._errors(self._moved(s, eq, d, still, none)) for d in np.diag(step)]
+        D = np.stack([(before - after) / h for after, h in zip(moved, step, strict=True)], axis=2)
+        lengths = np.hypot(*before.T) / self._sigma
+        ok = np.isfinite(D).all(axis=(1, 2)) & np.isfinite(lengths)
+        huber = self._of.huber_sigmas
+        w = np.minimum(1.0, huber / np.maximum(lengths[ok], 1e-12)) / self._sigma[ok] ** 2
+        score, known = np.zeros((len(s.T), CAMERA)), np.zeros((len(s.T), CAMERA, CAMERA))
+        np.add.at(score, self._view[ok], np.einsum("mik,m,mi->mk", D[ok], w, before[ok]))
+        np.add.at(known, self._view[ok], np.einsum("mik,m,mil->mkl", D[ok], w, D[ok]))
+        share = np.linalg.solve(known.sum(axis=0), known)  # of each view in what all know
+        fitted = np.einsum("nij,nji->", share, share)
+        spread = np.trace(np.linalg.solve(known.sum(axis=0), score.T @ score))
+        return float(spread / max(CAMERA - fitted, 1.0))
 
     # ---- result -----------------------------------------------------------------------------
 

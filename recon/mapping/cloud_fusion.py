@@ -21,6 +21,10 @@ CORRELATION = 0.55
 _Fused = tuple[I64, PointCloud]
 """Keys of voxels, sorted, and the mean point of each."""
 
+MAX_SIGMA_SHARE = 0.1
+"""Of the depth. Stereo's own readings stay below 0.04; a larger sigma says that other views of the
+ground contradict the image. Where its median is larger, nothing of the image holds."""
+
 LONE_NEIGHBOURS = 3
 """A point with fewer occupied voxels than this among the 26 around it stands alone."""
 
@@ -272,13 +276,15 @@ def _lone_contradicted(keys: I64, xyz: F32, sigma: F32, views: U8) -> Bool:
 def cloud_of(
     depth: DepthMap, bgr: U8, mask: Bool | None = None, time_ns: int | None = None
 ) -> PointCloud:
-    """World points of the pixels with depth, in row order, where ``mask`` if given.
+    """World points of the pixels with a resolved depth, in row order, where ``mask`` if given.
 
     ``bgr`` is (h, w, 3) on the grid of the depth. Raises ValueError when sizes differ.
     """
     if bgr.shape[:2] != depth.depth_m.shape:
         raise ValueError(f"colour is {bgr.shape}, depth is {depth.depth_m.shape}")
     known = np.isfinite(depth.depth_m) & (depth.depth_m > 0.0) & np.isfinite(depth.sigma_m)
+    resolved = known & (depth.sigma_m < MAX_SIGMA_SHARE * depth.depth_m)
+    known = resolved & (2 * resolved.sum() >= known.sum())
     if mask is not None:
         known &= mask
     arrays = (depth.depth_m, bgr, depth.K, depth.T_world_camera)

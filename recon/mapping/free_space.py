@@ -205,16 +205,17 @@ def open_above(places_m: F64, heights_m: Sequence[float], views: Iterable[DepthM
 
 
 @njit(cache=True, nogil=True)
-def _pixel(x: float, y: float, z: float, K: F64, T: F64) -> tuple[int, int, float]:
-    """The pixel (u, v) of a place in the world and its depth; (-1, -1) behind the camera."""
+def pixel_of(K: F64, T: F64, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """The pixel (u, v) of a place and its depth; (-1, -1) nearer than 0.1 m or behind.
+
+    ``T`` is T_camera_world, at least its first three rows.
+    """
     cz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
     if cz <= 0.1:
-        return -1, -1, cz
+        return -1.0, -1.0, cz
     cx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
     cy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-    u = int(np.floor(K[0, 0] * cx / cz + K[0, 2] + 0.5))
-    v = int(np.floor(K[1, 1] * cy / cz + K[1, 2] + 0.5))
-    return u, v, cz
+    return K[0, 0] * cx / cz + K[0, 2], K[1, 1] * cy / cz + K[1, 2], cz
 
 
 @njit(cache=True, nogil=True)
@@ -233,7 +234,8 @@ def _look_above(
                 if seen[p] & (1 << j):
                     continue
                 x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2]) + up_m[j]
-                u, v, cz = _pixel(x, y, z, K, T)
+                at, down, cz = pixel_of(K, T, x, y, z)
+                u, v = int(np.floor(at + 0.5)), int(np.floor(down + 0.5))
                 if not (0 <= u < w and 0 <= v < h):
                     continue
                 if depth[v, u] - cz > AGREES_SIGMAS * float(depth_sigma[v, u]):
@@ -259,7 +261,8 @@ def _vote(
                 continue
             left += 1
             x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2])
-            u, v, cz = _pixel(x, y, z, K, T)
+            at, down, cz = pixel_of(K, T, x, y, z)
+            u, v = int(np.floor(at + 0.5)), int(np.floor(down + 0.5))
             if not (WINDOW_PX <= u < w - WINDOW_PX and WINDOW_PX <= v < h - WINDOW_PX):
                 continue
             asked[p] += 1

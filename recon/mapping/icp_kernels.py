@@ -176,7 +176,7 @@ def residuals(
             row[9] = information
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _lever(row: Any, first: int, centre: Any, J: Any) -> None:
     """Fill ``J`` (6,): change of the distance along the normal ``row[first:first + 3]``."""
     x, y, z = row[6] - centre[0], row[7] - centre[1], row[8] - centre[2]

@@ -26,7 +26,7 @@ lag."""
 
 
 MIN_PARTNERS = 50
-"""Minimum number of partners; fewer are no overlap."""
+"""Minimum number of partners; fewer do not count as an overlap."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +264,7 @@ def _judged(
     iterations: int, config: IcpConfig,
 ) -> Registration:  # fmt: skip
     """The registration with its verdict; ``limits_m`` are of the rms and of the correction."""
-    covariance, weak = _covariance(problem, config)
+    covariance = _covariance(problem, config)
     rms = float(np.sqrt(problem.sums[3] / max(problem.sums[0], 1e-9)))
     share = float(problem.sums[2]) / max(available, 1)
     change = T @ se3.inverse(T_start)
@@ -279,11 +279,11 @@ def _judged(
     )
     good = Verdict.CONVERGED if problem.strong.all() else Verdict.DEGENERATE
     verdict = Verdict.REJECTED if implausible else good
-    return Registration(T, covariance, verdict, rms, share, iterations, weak)
+    return Registration(T, covariance, verdict, rms, share, iterations)
 
 
-def _covariance(problem: _Problem, config: IcpConfig) -> tuple[F64, F64]:
-    """(6, 6) covariance of a left perturbation and the (k, 6) weak directions, unit rows."""
+def _covariance(problem: _Problem, config: IcpConfig) -> F64:
+    """(6, 6) covariance of a left perturbation."""
     weights, squares = float(problem.sums[0]), float(problem.sums[1])
     # Residuals of neighbours err together, so they count as fewer than they are.
     area = problem.area
@@ -298,9 +298,4 @@ def _covariance(problem: _Problem, config: IcpConfig) -> tuple[F64, F64]:
     # The rotation was about the centre; a left perturbation turns about the origin.
     move = se3.adjoint(se3.compose(np.eye(3), problem.centre))
     directions = move @ (problem.unit[:, None] * problem.vectors)
-    covariance = (directions * spread) @ directions.T
-    return np.asarray(covariance), _unit_rows(directions[:, ~problem.strong].T)
-
-
-def _unit_rows(rows: F64) -> F64:
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-30))
+    return np.asarray((directions * spread) @ directions.T)

@@ -17,8 +17,24 @@ from scipy.spatial.transform import Rotation
 
 from recon import se3
 from recon.posegraph.sensor_noise import MIN_READINGS, Noise, drift_noise, wander_noise
-from recon.posegraph.track_alignment import umeyama
 from recon.types import F64, I64, DepthMap, PosePrior
+
+
+def umeyama(source: F64, target: F64, weight: F64) -> tuple[float, F64, F64]:
+    """Scale, (3, 3) rotation about z and (3,) shift that best take ``source`` (N, 3) to ``target``.
+
+    Umeyama 1991, doi:10.1109/34.88573. ``weight`` (N,) is relative.
+    """
+    w = weight / weight.sum()
+    ms, mt = w @ source, w @ target
+    a, b = source - ms, target - mt
+    cross = (b * w[:, None]).T @ a
+    yaw = np.arctan2(cross[1, 0] - cross[0, 1], cross[0, 0] + cross[1, 1])
+    R = se3.so3_exp(np.array([0.0, 0.0, yaw]))
+    power = float(w @ np.sum(a**2, axis=1))
+    scale = float(np.sum(R * cross)) / max(power, 1e-12)
+    return scale, R, np.asarray(mt - scale * R @ ms)
+
 
 WANDER_SHARE = 0.4
 """Share of a fix's sigma that differs between fixes of one flight; the rest is common to all."""

@@ -1,4 +1,4 @@
-"""Telemetry between two keyframes: the mean of fixes, the way by velocity, the motion.
+"""Telemetry between two keyframes: the mean of fixes, the distance by velocity, the motion.
 
 Between two instants of one run the difference of two travels is the displacement, with an error
 that grows with time only. That gives the scale of the odometry better than fixes, whose error

@@ -38,7 +38,7 @@ STEPS = 60
 """Maximum number of steps of the solution."""
 
 HELD, HELD_PLACE, HELD_SIGMA = "held", "held place", 1e-5
-"""Kinds of factors that hold what is no unknown; rad and m."""
+"""Kinds of factors that hold what is not an unknown; rad and m."""
 
 MARK = np.dtype(
     [("key", int), ("point", int), ("scale", int), ("ray", float, (3,)), ("depth", float),

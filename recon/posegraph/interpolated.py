@@ -1,4 +1,4 @@
-"""Keyframes that are no nodes of the pose graph: carried by the nodes on both sides of them.
+"""Keyframes that are not nodes of the pose graph: carried by the nodes on both sides of them.
 
 A keyframe continues from the node before it by vision. The misclosure of vision at the next node is
 spread evenly over the keyframes between, as a screw motion. Both nodes belong to the keyframe's

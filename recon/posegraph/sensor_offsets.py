@@ -11,12 +11,198 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from recon import se3
 from recon.posegraph.alignment import EXACT_HEIGHTS, Anchor, Similarity, height_ratios
-from recon.posegraph.altitude_datum import AltitudeDatum, altitude_datum
-from recon.posegraph.boresight import Boresight, Turns, boresight
 from recon.types import F64, PosePrior
+
+SIGMA_RAD = np.radians(2.0)
+"""How well a camera is aligned before anything is known."""
+
+BOUND_RAD = np.radians(5.0)
+"""A larger angle is not a boresight but another fault."""
+
+MIN_ATTITUDES = 8
+"""Minimum number of attitudes of a stretch."""
+
+HUBER = 2.5
+"""Whitened residuals beyond this lose weight."""
+
+WILD = 5.0
+"""Median of the whitened residuals beyond which attitudes and images do not belong together."""
+
+SURE = 9.0
+"""Squared sigmas by which a boresight must differ from none before attitudes are corrected."""
+
+ROUNDS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Boresight:
+    """``R_world_camera = R_reported @ exp(turn)``."""
+
+    turn: F64 = field(default_factory=lambda: np.zeros(3))  # rad, in the camera's frame
+    sigma: F64 = field(default_factory=lambda: np.full(3, SIGMA_RAD))
+
+    @property
+    def is_sure(self) -> bool:
+        """True when it is significant; otherwise it is not applied."""
+        return float(np.sum(np.square(self.turn / self.sigma))) > SURE
+
+    def applied(self, prior: PosePrior) -> PosePrior:
+        """The prior with the camera's own attitude, once that is sure to be another."""
+        R = prior.R_world_camera
+        if R is None or not self.is_sure:
+            return prior
+        return replace(prior, R_world_camera=R @ se3.so3_exp(self.turn))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turns:
+    """One segment: the camera's rotations and those by telemetry."""
+
+    R_odom: F64  # (N, 3, 3)
+    R_reported: F64  # (N, 3, 3) world from camera
+    sigma: F64  # (N, 3) rad about the world's axes; a heading over 1 rad is not known
+
+    @staticmethod
+    def of(poses: Sequence[F64], priors: Sequence[PosePrior]) -> Turns | None:
+        """Of poses (4, 4) in one frame and their priors; None of too few attitudes."""
+        rows = [
+            (T[:3, :3], p.R_world_camera, (p.sigma_tilt_rad, p.sigma_tilt_rad, p.sigma_yaw_rad))
+            for T, p in zip(poses, priors, strict=True)
+            if p.R_world_camera is not None
+        ]
+        if len(rows) < MIN_ATTITUDES:
+            return None
+        odom, reported, sigma = (np.array(c, np.float64) for c in zip(*rows, strict=True))
+        return Turns(odom, reported, sigma)
+
+
+def boresight(stretches: Sequence[Turns], span_s: float, wander_s: float = 40.0) -> Boresight:
+    """The boresight by all stretches of a flight of ``span_s``; small where turns are missing.
+
+    Vision turns with the camera, telemetry with the gimbal or the body. Between flights' headings
+    the two differ by one rotation in the world (the odometry's frame) and one in the camera (the
+    boresight); turns separate them, as in hand-eye calibration (Park and Martin 1994,
+    doi:10.1109/70.326576). About the vertical they stay one as long as the camera only turns about
+    it: a boresight in heading is then a compass error, which the track of the fixes takes out.
+
+    Attitudes err together over ``wander_s``, so all of them count as
+    1 + span / (2 wander) readings.
+    """
+    count = sum(len(s.R_odom) for s in stretches)
+    if count == 0:
+        return Boresight()
+    share = min(1.0, (1.0 + span_s / (2.0 * max(wander_s, 1e-3))) / count)
+    turn, H, norms = np.zeros(3), np.eye(3), np.zeros(0)
+    frames = [_mean_frame(s) for s in stretches]
+    for _ in range(ROUNDS):
+        H, g, all_norms = np.eye(3) / SIGMA_RAD**2, -turn / SIGMA_RAD**2, []
+        for k, stretch in enumerate(stretches):
+            frames[k], S, s, norm = _stretch(stretch, frames[k], turn)
+            H, g = H + share * S, g + share * s
+            all_norms.append(norm)
+        norms = np.concatenate(all_norms)
+        step = np.linalg.solve(H, g)
+        turn = turn + step
+        length = float(np.linalg.norm(turn))
+        turn *= min(1.0, BOUND_RAD / max(length, 1e-12))
+        if np.abs(step).max() < 1e-6:
+            break
+    if float(np.median(norms)) > WILD:
+        return Boresight()
+    return Boresight(turn, np.sqrt(np.diag(np.linalg.inv(H))))
+
+
+def _mean_frame(stretch: Turns) -> F64:
+    """(3, 3) a first rotation from the stretch's frame to the world."""
+    turns = stretch.R_reported @ stretch.R_odom.transpose(0, 2, 1)
+    return np.asarray(Rotation.from_matrix(turns).mean().as_matrix(), np.float64)
+
+
+def _stretch(stretch: Turns, frame: F64, turn: F64) -> tuple[F64, F64, F64, F64]:
+    """One Gauss-Newton step: the segment's better frame, its contribution to the boresight as
+    information (3, 3) and right-hand side (3,), and the whitened residuals (N,)."""
+    Q = stretch.R_reported @ se3.so3_exp(turn)
+    r = Rotation.from_matrix(frame @ stretch.R_odom @ Q.transpose(0, 2, 1)).as_rotvec()
+    info = np.where(stretch.sigma < 1.0, stretch.sigma, np.inf) ** -2.0  # (N, 3)
+    norms = np.sqrt(np.sum(info * r**2, axis=1))
+    info = info * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9))[:, None]
+    # r + w - Q b, with the frame's turn w eliminated.
+    A_ww = np.diag(info.sum(axis=0) + 1e-9)
+    A_wb = -np.einsum("ni,nij->ij", info, Q)
+    A_bb = np.einsum("nki,nk,nkj->ij", Q, info, Q)
+    g_w, g_b = -np.einsum("ni,ni->i", info, r), np.einsum("nki,nk->i", Q, info * r)
+    gain = A_wb.T @ np.linalg.inv(A_ww)
+    w = np.linalg.solve(A_ww, g_w)
+    return se3.so3_exp(w) @ frame, A_bb - gain @ A_wb, g_b - gain @ g_w, norms
+
+
+MIN_INTERVALS = 3
+"""Minimum number of intervals between keyframes with fixes."""
+
+STEADY_SHARE = 0.1
+"""Share of the claimed sigma that always stays: one flight cannot show all errors of a receiver."""
+
+OFF_SIGMAS = 4.0
+"""Intervals further from the median than so many of the scatter and the sigma do not count."""
+
+WILD_STEPS = 36.0
+"""Squared steps from fix to fix beyond so many of their median are jumps, not scatter."""
+
+
+@dataclass(frozen=True, slots=True)
+class AltitudeDatum:
+    """Correction to add to altitudes, and the sigma of what is then left of the constant."""
+
+    shift_m: float = 0.0
+    sigma_m: float = float("inf")
+
+    def applied(self, prior: PosePrior) -> PosePrior:
+        """The prior with its position raised."""
+        if self.shift_m == 0.0 or prior.position_m is None:
+            return prior
+        return replace(prior, position_m=prior.position_m + np.array([0.0, 0.0, self.shift_m]))
+
+
+def altitude_datum(
+    priors: Sequence[PosePrior], span_s: float, wander_s: float = 60.0
+) -> AltitudeDatum:
+    """The datum by all fixes of a flight of ``span_s``, in the order of time.
+
+    An autopilot's altitude follows its barometer, whose zero is off by decimetres to metres. The
+    receiver's own altitudes scatter more, but about another mean. The part of the receiver's
+    claimed sigma that shows as scatter from fix to fix averages out; the rest wanders (first-order
+    Gauss-Markov, as in :mod:`recon.posegraph.readings`) and stays. The autopilot's altitude rests
+    on the same receiver, so the receiver's mean is taken over only as far as it is the better one.
+    Where the scatter could be all of the sigma, it is taken to be.
+
+    ``wander_s`` is the time constant of a receiver's wander.
+    """
+    rows = [
+        (p.above_m, p.above_fixes, p.sigma_position_m[2])
+        for p in priors
+        if p.above_m is not None and p.above_fixes > 0 and p.sigma_position_m is not None
+    ]
+    if len(rows) < MIN_INTERVALS:
+        return AltitudeDatum()
+    above, fixes, claimed = np.array(rows, np.float64).T
+    sigma = float(np.median(claimed))
+    steps = np.diff(above) ** 2 / (1.0 / fixes[1:] + 1.0 / fixes[:-1])
+    usual = steps[steps <= WILD_STEPS * np.median(steps)]
+    white = float(np.sqrt(usual.mean()))  # of one fix
+    doubt = 1.0 + 2.0 * np.sqrt(3.0 / len(usual))  # of a variance by so many steps
+    apart = np.abs(above - np.median(above))
+    near = apart <= OFF_SIGMAS * np.sqrt(white**2 / fixes + sigma**2)
+    mean = float(np.average(above[near], weights=fixes[near]))
+    slow = max(sigma**2 - doubt * white**2, (STEADY_SHARE * sigma) ** 2)
+    slow /= 1.0 + max(span_s, 0.0) / (2.0 * max(wander_s, 1e-3))
+    left = slow + white**2 / float(fixes[near].sum())
+    share = max(0.0, 1.0 - 2.0 * left / sigma**2)
+    return AltitudeDatum(float(share * mean), float(np.sqrt(left)) if share > 0 else sigma)
+
 
 PRIOR_SIGMA = 0.1
 """rad and share; how far fixes may be turned and stretched against the frame."""

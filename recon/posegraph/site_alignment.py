@@ -9,7 +9,7 @@ better placed than each. Gauss-Newton with Cauchy weights (Barfoot 2017, ch. 5.3
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from recon.types import F64, Bool
 STEPS = 12
 CAUCHY_SIGMAS = 2.0
 """Sigmas of a tie's error, per component, beyond which it loses weight."""
+
+ALIKE = 5.0
+"""Sigmas of place that differ less than so many times may be of receivers that are equally good."""
 
 UNKNOWNS = 7
 """Unknowns of a scan: rotation vector, shift of its centre, logarithm of the scale."""
@@ -41,6 +44,22 @@ class ScanPrior:
 
     centre_m: F64  # (3,) about which it turns and grows
     sigma: F64  # (7,) rad, m, share
+
+
+def alike(priors: Sequence[ScanPrior]) -> list[ScanPrior]:
+    """The priors with sigmas of place that scans of like receivers share.
+
+    A flight shows its receiver's error by a few independent fixes only, so equal receivers get
+    sigmas that differ several times, and a lucky one would place the whole site. None is taken to
+    be better than the rms of all, unless it is ALIKE times better.
+    """
+    own = np.array([prior.sigma[3:6] for prior in priors])
+    usual = np.sqrt((own**2).mean(axis=0))
+    shared = np.where(own * ALIKE > usual, np.maximum(own, usual), own)
+    return [
+        replace(prior, sigma=np.concatenate([prior.sigma[:3], place, prior.sigma[6:]]))
+        for prior, place in zip(priors, shared, strict=True)
+    ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -336,7 +336,7 @@ class Trajectory:
         self._ledger.amend(row, rows)
         return int(rows["published"][0]) - 1, placed.scale / float(rows["first_scale"][0])
 
-    # ---- keyframes that are no nodes -----------------------------------------------------------
+    # ---- keyframes that are not nodes -----------------------------------------------------------
 
     def _follow(self) -> None:
         """Drop cached data of marginalised keyframes."""

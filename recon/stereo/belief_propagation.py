@@ -45,11 +45,11 @@ class BeliefPropagationConfig:
     iterations: int = 5  # per level; one iteration updates one colour of the checkerboard
     levels: int = 5  # of the pyramid; fewer when the image is small
     smoothness_truncation: float = 2.5  # labels; a larger jump costs no more
-    edge_floor: float = 0.4  # share of the smoothness that is left across strong edges
+    edge_floor: float = 0.2  # share of the smoothness that is left across strong edges
     edge_contrast: int = 32  # gray levels between neighbours that make a strong edge
     min_disparity: int = 0  # px, disparity of label 0
     cost: MatchingCostConfig = field(default_factory=MatchingCostConfig)
-    min_evidence: float = 0.2  # how much better than the mean label, 0 to 1; 0: accept all
+    min_evidence: float = 0.22  # how much better than the mean label, 0 to 1; 0: accept all
     min_contrast: float = 0.5  # gray levels of standard deviation in 9x9; 0: accept all
     occlusion_tolerance: float = 1.0  # labels; a surface seen behind another one; < 0: no check
     fill_occluded: bool = False  # with the farther neighbour of the row, at low confidence

@@ -1,7 +1,8 @@
 """Cost of a left pixel at a label: census and absolute difference, truncated.
 
 Census (Zabih and Woodfill, https://doi.org/10.1007/BFb0028345) survives changes of exposure,
-the absolute difference keeps edges in their place. Costs are integers so that belief
+the absolute difference keeps edges in their place. Of wider census windows the edge of a near
+surface decides about more of the background next to it. Costs are integers so that belief
 propagation runs on SIMD lanes of 16 bits; ``COST_UNIT`` of them are one label of smoothness.
 """
 
@@ -20,15 +21,16 @@ from numba.extending import intrinsic
 from recon.bands import in_bands
 from recon.types import I16, U8
 
-U64 = npt.NDArray[np.uint64]
+U32 = npt.NDArray[np.uint32]
 
 COST_UNIT = 128
 """Integer cost of a disparity step of one label between neighbours."""
 
-CENSUS_RADIUS = 3
-"""The census window is 7x7: 48 comparisons in one 64-bit word."""
+CENSUS_RADIUS = 2
+"""The census window is 5x5: 24 comparisons in one 32-bit word."""
 
 _WINDOW = 2 * CENSUS_RADIUS + 1
+CENSUS_BITS = _WINDOW**2 - 1
 
 MAX_SPARE = 8
 """Memory this many times larger than requested is released."""
@@ -42,15 +44,17 @@ class MatchingCostConfig:
     each part stops growing at its truncation.
     """
 
-    census_weight: float = 0.08
-    census_truncation: int = 24  # bits
+    census_weight: float = 0.16
+    census_truncation: int = 14  # bits
     difference_weight: float = 0.04
-    difference_truncation: int = 30  # gray levels
+    difference_truncation: int = 20  # gray levels
     unseen: float = 1.0  # of a label whose partner is outside the image, above the best one
 
     def __post_init__(self) -> None:
-        if not 0 <= self.census_truncation <= 48:
-            raise ValueError(f"census_truncation is 0 to 48 bits, not {self.census_truncation}")
+        if not 0 <= self.census_truncation <= CENSUS_BITS:
+            raise ValueError(
+                f"census_truncation is 0 to {CENSUS_BITS} bits, not {self.census_truncation}"
+            )
         if not 0 <= self.difference_truncation <= 255:
             raise ValueError(
                 f"difference_truncation is 0 to 255 levels, not {self.difference_truncation}"
@@ -114,13 +118,13 @@ def check_pair(left: U8, right: U8, labels: int) -> None:
         raise ValueError(f"labels must be 2 to 1024, not {labels}")
 
 
-def census(image: U8) -> U64:
-    """Census word of every pixel, (h, w) uint64: bit set where a neighbour is darker.
+def census(image: U8) -> U32:
+    """Census word of every pixel, (h, w) uint32: bit set where a neighbour is darker.
 
-    The window is 7x7; beyond the border the image repeats its last row and column.
+    The window is 5x5; beyond the border the image repeats its last row and column.
     """
     padded = np.pad(image, CENSUS_RADIUS, mode="edge")
-    words = np.empty(image.shape, np.uint64)
+    words = np.empty(image.shape, np.uint32)
     in_bands(_census, len(image), padded, words)
     return words
 
@@ -129,7 +133,7 @@ def census(image: U8) -> U64:
 def _census(begin: int, end: int, padded: Any, words: Any) -> None:  # pragma: no cover - compiled
     """Eight comparisons at a time in bytes, of which a vector register holds the most."""
     width = words.shape[1]
-    parts = np.empty((_WINDOW * _WINDOW // 8, width), np.uint8)
+    parts = np.empty((CENSUS_BITS // 8, width), np.uint8)
     for v in range(begin, end):
         centre = padded[v + CENSUS_RADIUS, CENSUS_RADIUS : CENSUS_RADIUS + width]
         bit = 0
@@ -142,20 +146,20 @@ def _census(begin: int, end: int, padded: Any, words: Any) -> None:  # pragma: n
                         row[u] = np.uint8(row[u] << 1) | np.uint8(shifted[u] < centre[u])
                     bit += 1
         for u in range(width):
-            word = np.uint64(0)
+            word = np.uint32(0)
             for k in range(parts.shape[0]):
-                word = (word << np.uint64(8)) | np.uint64(parts[k, u])
+                word = np.uint32(word << np.uint32(8)) | np.uint32(parts[k, u])
             words[v, u] = word
 
 
 @intrinsic
 def _popcount(typingctx: Any, word: Any) -> Any:
-    """How many bits of a 64-bit word are set: one instruction, or a few on vector registers."""
+    """How many bits of a 32-bit word are set: one instruction, or a few on vector registers."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.ctpop(args[0])
 
-    return types.uint64(types.uint64), codegen
+    return types.uint32(types.uint32), codegen
 
 
 @njit(cache=True, nogil=True)
@@ -189,7 +193,8 @@ def _cost_volume(
             cb = census_right[v, first - shift : last - shift]
             low = best[first:last]
             for i in range(count):
-                bits = min(np.int32(_popcount(ca[i] ^ cb[i])), np.int32(census_truncation))
+                differ = np.int32(_popcount(np.uint32(ca[i] ^ cb[i])))
+                bits = min(differ, np.int32(census_truncation))
                 gray = min(abs(np.int32(a[i]) - np.int32(b[i])), np.int32(difference_truncation))
                 value = np.int16(bits * census_weight + gray * difference_weight)
                 row[i] = value

@@ -1,16 +1,16 @@
-"""From disparity to depth (paper section 2.2, Eq. 3), and several pairs' depths fused."""
+"""From disparity to depth (paper section 2.2, Eq. 3): several pairs' depths fused, sky left out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numba import njit
 
 from recon.bands import in_bands
-from recon.types import F32, F64, DepthMap, DisparityMap, StereoPair
+from recon.types import F32, F64, Bool, DepthMap, DisparityMap, PosePrior, StereoPair
 
 LABEL_SIGMA_PX = 0.075
 """Sigma of a label of full confidence, in pixels of the grid that was matched."""
@@ -132,7 +132,7 @@ def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: Fusion
     the sigma is the larger of the propagated one and the spread inside the group. ``views``
     counts the group. Where several pairs read and none comes within ``max_sigma_share`` of
     another nothing is known. Where that is so at more pixels than those at which two agree, what
-    they see is no rigid surface, or their motion is false, and the whole map is unknown. Raises
+    they see is not a rigid surface, or their motion is false, and the whole map is unknown. Raises
     ValueError without any pair.
     """
     if not pairs:
@@ -231,3 +231,35 @@ def _fuse(
             e = np.sqrt(variance) * z * z * (single_view if views == 1 else 1.0)
             out_depth[v, u] = z
             out_sigma[v, u] = max(e, min_share * z)
+
+
+TILT_SIGMAS = 2.0
+
+
+def plausible(depth: DepthMap, prior: PosePrior) -> DepthMap | None:
+    """``depth`` without surface that only one pair sees above the horizon; None with nothing left.
+
+    Below the horizon a ray ends at the ground. Above it there may be nothing but sky, so a
+    surface there takes two pairs that agree.
+    """
+    if prior.R_world_camera is not None:
+        sky = _above_horizon(depth, prior.R_world_camera[2], TILT_SIGMAS * prior.sigma_tilt_rad)
+        sky &= depth.views == 1
+        if sky.any():
+            nothing = np.float32(np.nan)
+            depth = replace(
+                depth,
+                depth_m=np.where(sky, nothing, depth.depth_m),
+                sigma_m=np.where(sky, nothing, depth.sigma_m),
+                views=np.where(sky, np.uint8(0), depth.views),
+            )
+    return depth if np.isfinite(depth.depth_m).any() else None
+
+
+def _above_horizon(depth: DepthMap, up: F64, margin_rad: float) -> Bool:
+    """(h, w) pixels whose ray rises by more than the margin; ``up`` (3,) in the camera's frame."""
+    h, w = depth.depth_m.shape
+    K = depth.K
+    x, y = (np.arange(w) - K[0, 2]) / K[0, 0], (np.arange(h)[:, None] - K[1, 2]) / K[1, 1]
+    rise = up[0] * x + up[1] * y + up[2]
+    return np.asarray(rise > np.sin(margin_rad) * np.sqrt(1.0 + x**2 + y**2))

@@ -5,7 +5,7 @@ normal (Lague et al. 2013, doi:10.1016/j.isprsjprs.2013.04.009). The low-frequen
 by the two flights' bending is estimated robustly and subtracted. The sigma of a mean is what the
 surfaces' own sigmas say, times what most of the site shows: the empirical null of Efron 2004
 (doi:10.1198/016214504000000089), so correlated errors count. Steps that two surveys place some
-cells apart are no change: an object stands out of all heights that the other date has around it.
+cells apart are not a change: an object stands out of all heights that the other date has around it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class ChangeConfig:
     min_area_m2: float = 0.5
     min_height_m: float = 0.15
     edge_cells: int = 3  # that a step may lie aside, by matching windows and by what is hidden
-    min_known: float = 0.95  # share of the ground around an object that both surfaces have
+    min_known: float = 0.95  # share of the ground around an object that both surfaces have or hide
     local_m: float = 8.0  # of blocks that may scatter more than others
     bend_m: float = 10.0  # length over which flights bend, 1 sigma
     block_m: float = 4.0  # of blocks whose medians show the rest of it
@@ -173,7 +173,7 @@ def left_over_m(d: F32, cell_m: float, block_m: float) -> float:
                 middles.append(float(np.nanmedian(block)))
     if len(middles) < 5:
         return 0.0
-    return float(np.median(np.abs(middles)) / 0.6745)
+    return _robust(np.array(middles))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -316,10 +316,11 @@ def _bodies(
 def _body(
     d: F32, errors: SumErrors, labels: I32, label: int, cell_m: float, config: ChangeConfig
 ) -> Body | None:
-    """Area and volume of a change above the ground around it; None when that is no significant one.
+    """Area and volume of a change above the ground around it; None if not significant.
 
     At the rim of what both flights saw, where few views reach, nothing is a change: the ground
-    around it must be known. The rim that stereo smears belongs to the volume. Sigma also holds
+    around it must be known, but for strips that it may hide itself. The rim that stereo smears
+    belongs to the volume. Sigma also holds
     one cell all along the outline, as matching windows make what stands wider.
     """
     rim = config.edge_cells
@@ -328,7 +329,7 @@ def _body(
     d, labels, errors = d[window], labels[window], replace(errors, sigma=errors.sigma[window])
     inside = labels == label
     surround = _grown(inside, 2 * rim) & ~inside
-    if np.isfinite(d[surround]).mean() < config.min_known:
+    if np.mean(~_open(~np.isfinite(d))[surround]) < config.min_known:
         return None
     grown = _grown(inside, rim) & np.isfinite(d) & ((labels == 0) | inside)
     around = _grown(inside, 4 * rim) & ~_grown(labels > 0, rim) & np.isfinite(d)
@@ -345,6 +346,13 @@ def _body(
         float(np.hypot(noise, outline)) * cell_m**2, float(heights.mean()),
         float(heights[np.argmax(np.abs(heights))]),
     )  # fmt: skip
+
+
+def _open(unknown: Bool) -> Bool:
+    """The unknown cells that are connected with the border of the window."""
+    _, found = cv2.connectedComponents(unknown.astype(np.uint8), connectivity=8)
+    border = np.concatenate([found[0], found[-1], found[:, 0], found[:, -1]])
+    return unknown & np.isin(found, border)
 
 
 def _grown(cells: Bool, by: int) -> Bool:

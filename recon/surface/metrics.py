@@ -307,7 +307,7 @@ def patch_shifts(found: F32, truth: F32, known: Bool, reach_px: int) -> PatchShi
     Normalised cross-correlation over shifts of up to ``reach_px``, with a parabola through the
     peak. Shading broader than BROAD_PX is taken out of both first. A patch is tried where
     ``known`` holds nearly everywhere and the truth has texture; a peak at the end of the reach
-    or below MIN_LIKENESS is no match. Raises ValueError when the sizes differ.
+    or below MIN_LIKENESS is not a match. Raises ValueError when the sizes differ.
     """
     if found.shape != truth.shape or found.shape != known.shape or found.ndim != 2:
         raise ValueError(f"sizes differ: {found.shape}, {truth.shape}, {known.shape}")

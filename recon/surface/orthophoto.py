@@ -16,6 +16,7 @@ from numba import njit
 
 from recon.bands import in_bands
 from recon.image_quality import sharpness
+from recon.mapping.free_space import pixel_of
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import flat, sample
 from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, consistent, insert
@@ -139,7 +140,7 @@ def _look(
         for c in range(cols):
             if np.isnan(height[r, c]):
                 continue
-            u, v, z = _project(K, T, places[r, c, 0], places[r, c, 1], places[r, c, 2])
+            u, v, z = pixel_of(K, T, places[r, c, 0], places[r, c, 1], places[r, c, 2])
             if not (EDGE_PX <= u <= w - 1 - EDGE_PX and EDGE_PX <= v <= h - 1 - EDGE_PX):
                 continue
             if sample(flat_pixels, 0, h, w, u, v, colour) < 0.99:
@@ -151,17 +152,6 @@ def _look(
             score[n] = K[0, 0] / z * abs(ray[2]) / np.sqrt(np.sum(ray * ray))
             for k in range(3):
                 bgr[n, k] = colour[k]
-
-
-@njit(cache=True, nogil=True)
-def _project(K: F64, T: F64, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Pixel and depth of a place; the pixel is NaN behind the camera."""
-    depth = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-    if depth <= 1e-6:
-        return np.nan, np.nan, depth
-    u = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-    v = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-    return K[0, 0] * u / depth + K[0, 2], K[1, 1] * v / depth + K[1, 2], depth
 
 
 @njit(cache=True, nogil=True)
@@ -248,7 +238,7 @@ def _mix(
                 weight += share[m]
         if view < 0 or is_repeated or weight < 1e-3:
             continue
-        u, v, _ = _project(K[view], T[view], place[0], place[1], place[2])
+        u, v, _ = pixel_of(K[view], T[view], place[0], place[1], place[2])
         alpha = sample(pixels, start[view], sides[view, 0], sides[view, 1], u, v, colour)
         weight *= alpha
         total += weight

@@ -52,7 +52,7 @@ def affine_trend(uv: Any, moves: Any, first: Any, tolerance: float, trend: Any) 
             trend[k, 0], trend[k, 1] = g[k, 0], g[k, 1]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _window_products(image: Any, row0: int, row1: int, sums: Any) -> None:
     """Fill ``sums`` (3, rows, W) with Ix^2, Iy^2, Ix Iy under the binomial window w of Eq. 4."""
     H, W = image.shape

@@ -103,7 +103,6 @@ class Odometry:
         )
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
         self._depth = float("nan")  # median of the last keyframe's landmarks
-        self._max_gap_s = ROLLING_GAP_S if self._row_track.is_rolling else MAX_GAP_S
 
     # ---- one frame -------------------------------------------------------------------
 
@@ -115,7 +114,8 @@ class Odometry:
         if not self._metric or self._lost or self._motion is None:
             return False
         shift, gap_s = self._motion.shift(time_ns, prior, self._depth)
-        return gap_s < self._max_gap_s and shift < self.config.base_to_height / frames_per_step
+        max_gap_s = ROLLING_GAP_S if self._row_track.is_known else MAX_GAP_S
+        return gap_s < max_gap_s and shift < self.config.base_to_height / frames_per_step
 
     def needs_turn(self, time_ns: int) -> bool:
         """True where the prior of a frame should hold the camera's angular velocity."""
@@ -371,7 +371,6 @@ class Odometry:
         readout.look(self.keyframes)
         if readout.estimate is not None and readout.estimate.is_none:
             self._row_track.stop()
-            self._max_gap_s = MAX_GAP_S
 
     def _forget(self) -> None:
         """Drop images and corners that left the window, and landmarks out of sight."""

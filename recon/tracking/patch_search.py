@@ -5,6 +5,9 @@ unit length, so that the zero-mean SSD of two patches, each divided by its own c
 ``2 (1 - score)`` with ``score`` their correlation. Images are (H, W) uint8, points (N, 2)
 float64 pixels of their level; inverse warps are (N, 4) float64, rows of the 2x2 matrix that
 takes an offset in b to an offset in a.
+
+With ``fastmath`` a function that is compiled alone rounds otherwise than its copy in a caller, and
+which of the two runs depends on what was cached. So callees are inlined.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ CHUNK = 32  # points per parallel work item
 NO_SCORE = -2.0
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _sample(image: Any, u: float, v: float, w: Any, radius: int, patch: Any) -> bool:
     """Fill ``patch`` (2 radius + 1 squared) with ``image`` about (u, v); False when outside."""
     H, W = image.shape
@@ -48,7 +51,7 @@ def _sample(image: Any, u: float, v: float, w: Any, radius: int, patch: Any) -> 
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _normalise(patch: Any, n: int) -> float:
     """Contrast (standard deviation, gray levels) of the n x n ``patch``, made zero-mean, unit."""
     mean = 0.0
@@ -69,7 +72,7 @@ def _normalise(patch: Any, n: int) -> float:
     return float(contrast)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _scores(
     image: Any, cu: int, cv: int, reach: int, radius: int, template: Any, min_contrast: float,
     window: Any, scores: Any,
@@ -114,7 +117,7 @@ def _scores(
                 scores[y, x] = np.float32(NO_SCORE)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _divide_by_contrast(
     window: Any, pitch: int, S: int, n: int, min_contrast: float, scores: Any
 ) -> None:
@@ -150,7 +153,7 @@ def _divide_by_contrast(
             squares[x] -= old[x] * old[x]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _peaks(scores: Any, S: int) -> tuple[int, int, float, float]:
     """Column, row and score of the best centre, and the score of the next separate peak."""
     best, bx, by = np.float32(NO_SCORE), 0, 0
@@ -174,7 +177,7 @@ def _peaks(scores: Any, S: int) -> tuple[int, int, float, float]:
     return bx, by, float(best), float(second)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _vertex(line: Any, i: int, count: int) -> float:
     """Offset of a parabola's top from the peak ``line[i]``, -0.5 to 0.5."""
     if i == 0 or i == count - 1 or min(line[i - 1], line[i + 1]) <= -1.0:
@@ -224,7 +227,7 @@ def search(
             uv_found[p, 1] = cv - reach + by + _vertex(scores[:, bx], by, S)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _cubic(f: float, weights: Any) -> None:
     """Fill ``weights`` (4,) of Catmull-Rom interpolation at the fraction ``f``."""
     weights[0] = ((-0.5 * f + 1.0) * f - 0.5) * f
@@ -233,7 +236,7 @@ def _cubic(f: float, weights: Any) -> None:
     weights[3] = (0.5 * f - 0.5) * f * f
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _window(image: Any, u0: int, v0: int, pitch: int, window: Any) -> bool:
     """Fill flat ``window`` with the ``pitch`` squared pixels from (u0, v0); False when outside."""
     H, W = image.shape
@@ -246,7 +249,7 @@ def _window(image: Any, u0: int, v0: int, pitch: int, window: Any) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _interpolate(window: Any, fu: float, fv: float, pitch: int, rows: Any, out: Any) -> None:
     """Fill flat ``out`` with ``window`` moved by the fraction (fu, fv), Catmull-Rom.
 
@@ -265,7 +268,7 @@ def _interpolate(window: Any, fu: float, fv: float, pitch: int, rows: Any, out: 
         out[i] = w0 * rows[i] + w1 * below[i] + w2 * second[i] + w3 * third[i]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _template(large: Any, n: int, pitch: int, kernels: Any) -> float:
     """Fill kernels 0 to 2 of ``kernels`` (4, n * pitch) from ``large``; return its contrast.
 
@@ -318,7 +321,7 @@ def _template(large: Any, n: int, pitch: int, kernels: Any) -> float:
     return float(np.sqrt(power) / n)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(inline="always", fastmath=True)
 def _compare(kernels: Any, other: Any, n: int, sums: Any) -> None:
     """Fill ``sums`` (4,): score, step along u, step along v, contrast of ``other``."""
     patch, gx, gy, inside = kernels[0], kernels[1], kernels[2], kernels[3]

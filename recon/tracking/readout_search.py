@@ -116,7 +116,8 @@ class ReadoutSearch:
         spread = weights @ (readouts - mean) ** 2 / weights.sum() / max(len(weights) - 1, 1)
         sigma = float(np.sqrt(max(1.0 / weights.sum(), spread, floor_s**2)))
         self.estimate = ReadoutEstimate(mean, sigma, len(weights))
-        if self._clock.readout_s or abs(mean) > MIN_SIGMAS * sigma:
+        is_refined = self._clock.readout_s != 0.0 and sigma < GLOBAL_S
+        if is_refined or abs(mean) > MIN_SIGMAS * sigma:
             self._clock.readout_s = float(np.clip(mean, -MAX_READOUT_S, MAX_READOUT_S))
 
 

@@ -3,38 +3,37 @@
 Page load on loopback, from a keyframe in the receiver's store to its points in the browser,
 and ten million points: frame times while flying, and how long all of them take, slice by
 slice. SwiftShader draws on the processor: a graphics card is one to two orders of magnitude
-faster. The browser is driven over its DevTools protocol.
+faster. Playwright (extra ``bench``) drives the browser.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
 import statistics
-import subprocess
 import tempfile
 import time
-import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from service.bench import BenchOptions, BenchResult
 from service.bench.keyframes import make_keyframe
 from service.errors import OutsideError
 from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
+from service.packages import needing
 from service.stream.codec import encode
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
+if TYPE_CHECKING:
+    import playwright.sync_api as playwright
+
 FLAGS = (
-    "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader"
-    " --remote-debugging-port=0 --window-size=1280,800 --disable-extensions --no-first-run"
-    " --disable-background-networking --disable-dev-shm-usage"
+    "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --window-size=1280,800"
+    " --disable-dev-shm-usage"
 )
-ANSWER_S = 180.0
 
 
 def chromium() -> str:
@@ -46,96 +45,47 @@ def chromium() -> str:
 class Page:
     """One page of a browser."""
 
-    def __init__(
-        self,
-        process: subprocess.Popen[bytes],
-        address: str,
-        domains: tuple[str, ...] = ("Page", "Runtime", "Network"),
-    ) -> None:
-        """Take over the page whose DevTools answer at the WebSocket ``address``."""
-        from websockets.sync.client import connect
-
-        self.process = process
-        self._socket = connect(address, max_size=None)
-        self._number = 0
-        for domain in domains:
-            self.call(f"{domain}.enable")
-
-    def leave(self) -> None:
-        """Close the page."""
-        self._socket.close()
+    def __init__(self, page: playwright.Page) -> None:
+        self.page = page
+        self._tools = page.context.new_cdp_session(page)
+        self._tools.send("Page.enable")
 
     def call(self, method: str, **params: Any) -> Any:
-        """The result of a DevTools method; RuntimeError when it fails."""
-        wanted = self._send(method, params)
-        while True:
-            message = json.loads(self._socket.recv(timeout=ANSWER_S))
-            if message.get("id") == wanted:
-                if "error" in message:
-                    raise RuntimeError(f"{method}: {message['error']}")
-                return message["result"]
-            self._note(message)
-
-    def _send(self, method: str, params: dict[str, Any]) -> int:
-        self._number += 1
-        self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
-        return self._number
-
-    def _note(self, event: dict[str, Any]) -> None:
-        """Called with each event of the page."""
+        """The result of a DevTools method."""
+        return self._tools.send(method, params)
 
     def run(self, script: str) -> Any:
-        """The value of ``script``, awaited; RuntimeError when it throws."""
-        found = self.call(
-            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
-        )
-        if "exceptionDetails" in found:
-            raise RuntimeError(str(found["exceptionDetails"])[:300])
-        return found["result"].get("value")
+        """The value of ``script``, awaited."""
+        return self.page.evaluate(script)
 
     def open(self, url: str) -> None:
-        """Go to ``url``; does not wait."""
-        self.call("Page.navigate", url=url)
+        """Go to ``url``; does not wait until it is loaded."""
+        self.page.goto(url, wait_until="commit")
 
     def wait(self, script: str, timeout_s: float = 60.0) -> Any:
         """The first true value of ``script``; a page that is still loading has none."""
-        quiet = f"(() => {{ try {{ return {script} }} catch {{ return null }} }})()"
-        return self.until(lambda: self.run(quiet), timeout_s)
-
-    def until(self, true: Callable[[], Any], timeout_s: float = 60.0) -> Any:
-        """The first true value of ``true()``; RuntimeError after ``timeout_s``."""
+        quiet = f"(async () => {{ try {{ return await {script} }} catch {{ return null }} }})()"
         deadline = time.monotonic() + timeout_s
-        while not (value := true()):
+        while not (value := self.run(quiet)):
             if time.monotonic() >= deadline:
-                raise RuntimeError("the page did not get there")
-            if self.process.poll() is not None:
-                raise RuntimeError("the browser ended")
-            time.sleep(0.05)
+                raise RuntimeError("the page did not get there in time")
+            self.page.wait_for_timeout(50.0)
         return value
 
 
 class Browser(Page):
     """A Chromium and its first page; close it at the end."""
 
-    def __init__(self, profile: Path, *flags: str) -> None:
-        """Start Chromium with a fresh ``profile`` folder."""
-        self.process = subprocess.Popen(
-            [chromium(), *FLAGS.split(), *flags, f"--user-data-dir={profile}", "about:blank"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+    def __init__(self, driver: playwright.Playwright, *flags: str) -> None:
+        self.driver = driver
+        self.browser = driver.chromium.launch(
+            executable_path=chromium(), args=[*FLAGS.split(), *flags]
         )
-        port_file = profile / "DevToolsActivePort"
-        self.until(lambda: port_file.is_file() and port_file.read_text().count("\n") > 0)
-        self.host = f"127.0.0.1:{port_file.read_text().split()[0]}"
-        pages = json.load(urllib.request.urlopen(f"http://{self.host}/json"))
-        page = next(p for p in pages if p["type"] == "page")
-        super().__init__(self.process, page["webSocketDebuggerUrl"])
+        super().__init__(self.browser.new_page(no_viewport=True))
 
     def close(self) -> None:
         """End the browser."""
-        self.leave()
-        self.process.terminate()
-        self.process.wait(timeout=10)
+        self.browser.close()
 
 
 NOTE = "software rendering (SwiftShader), 1280x800"
@@ -229,13 +179,14 @@ def _large_scan(folder: Path) -> ScanStore:
 @contextmanager
 def _page(root: Path) -> Iterator[tuple[Browser, str]]:
     """A browser and the address of a portal on the scans below ``root``."""
+    with needing("bench portal"):
+        from playwright.sync_api import sync_playwright
     portal = Portal(PortalConfig(root / "scans", port=0, token=TOKEN))
     portal.start()
-    browser = Browser(root / "profile")
     try:
-        yield browser, portal.url.split("/?")[0]
+        with sync_playwright() as driver:
+            yield Browser(driver), portal.url.split("/?")[0]
     finally:
-        browser.close()
         portal.close()
 
 

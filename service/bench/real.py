@@ -25,7 +25,7 @@ from pyproj import Transformer
 from recon import se3
 from recon.camera_model import project, rays
 from recon.mapping.disagreement import NORMAL_MEDIAN
-from recon.posegraph.track_alignment import umeyama
+from recon.posegraph.alignment import umeyama
 from recon.types import F64, DepthMap
 from service.bench import BenchOptions, BenchResult
 from service.cameras import open_camera
@@ -106,8 +106,8 @@ def _replayed(one: RealSet, options: BenchOptions, folder: Path) -> Flight:
 
 def _skyrelief(*words: str) -> None:
     """Run a command. Raises OutsideError with its last line when it fails."""
-    start = "from service.cli import main; main()"
-    done = subprocess.run([sys.executable, "-c", start, *words], capture_output=True, text=True)
+    command = [sys.executable, "-m", "service.cli", *words]
+    done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no output"])[-1]
         raise OutsideError(f"skyrelief {words[0]} of {words[1]} failed: {last}")

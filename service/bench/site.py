@@ -99,7 +99,7 @@ def _replayed(
     """The scan of a flight whose sensors err by ``seed``."""
     simulation, out = flown[name], folder / f"{name}-{seed}"
     sensors = Sensors(
-        simulation.flight, simulation.options.noise, np.random.default_rng([seed, len(name)])
+        simulation.flight, simulation.options.noise, np.random.default_rng([seed, *name.encode()])
     )
     stream = packets(
         sensors, ORIGIN, EPOCH_UNIX_S, simulation.surface_range, simulation.options.telemetry

@@ -24,7 +24,7 @@ CAMERAS: dict[str, str] = {
     "pipe": "service.cameras.video:open_pipe",
     "rtsp": "service.cameras.live:open_rtsp",
     "v4l2": "service.cameras.live:open_v4l2",
-    "gst": "service.cameras.gstreamer:open_gst",
+    "gst": "service.cameras.live:open_gst",
     "stream": "service.cameras.live:open_stream",
     "sim": "service.cameras:open_sim",
 }
@@ -34,7 +34,7 @@ CAMERAS: dict[str, str] = {
 def open_camera(source: str) -> CameraSource:
     """The camera that ``source`` names, open and with its first image decoded.
 
-    Raises InputError when there is no such source or it holds no images, OutsideError when
+    Raises InputError when there is no such source or it contains no images, OutsideError when
     a device or a link does not answer.
     """
     word, rest, options = parse_source(source)

@@ -95,7 +95,7 @@ class ImagesSource:
                 why = " ".join(str(error).split())[:120] or type(error).__name__
                 self._warn(f"{path.name} is not a readable image ({why}); skipped")
         if not tagged:
-            raise InputError(f"{folder} holds no images (jpg, png, tif); give their folder")
+            raise InputError(f"{folder} contains no images (jpg, png, tif); give their folder")
         return tagged
 
     def _same_size(self, tagged: list[tuple[Path, Tags]]) -> list[tuple[Path, Tags]]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
-from threading import Event
+from threading import Event, Lock
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -123,6 +123,10 @@ def _read(
     return PROCESS.start(row, read, queue.__len__, lambda: queue.lag_s)
 
 
+CLOSE_S = 5.0
+"""For a recording's reader to end."""
+
+
 class Paced:
     """A source that delivers each image at its presentation time, as a camera does.
 
@@ -134,6 +138,7 @@ class Paced:
         self._source = source
         self._queue: Channel[CameraFrame] = Channel(kept, drops=True)
         self._closed = Event()
+        self._starting = Lock()
         self._reader: Worker | None = None
         self.description, self.size_px = source.description, source.size_px
         self.epoch_unix_ns, self.fps = source.epoch_unix_ns, source.fps
@@ -153,7 +158,8 @@ class Paced:
             due.close()
             self._source.close()
 
-        self._reader = _read("camera", self._queue, due, end)
+        with self._starting:  # close() finds the reader, or the reader finds it closed
+            self._reader = _read("camera", self._queue, due, end)
         yield from self._queue
         if self.dropped:
             self.warnings.append(f"{self.dropped} frames arrived faster than they could be used")
@@ -161,12 +167,17 @@ class Paced:
     def close(self) -> None:
         """End the iteration at once, from any thread, and close the source.
 
-        A recording is closed by the thread that reads it.
+        A recording is closed by the thread that reads it, which is waited for unless its input
+        hangs: a decoder must not be closed under it.
         """
         self._closed.set()
         self._queue.close()
-        if self._source.is_live or self._reader is None or self._reader.is_done:
+        with self._starting:
+            reader = self._reader
+        if self._source.is_live or reader is None:
             self._source.close()
+        else:
+            reader.join(CLOSE_S)
 
     def _due(self) -> Generator[CameraFrame, None, None]:
         """The images, each at its presentation time."""

@@ -84,7 +84,7 @@ class VideoSource:
         self.is_wanted: Callable[[int], bool] = lambda time_ns: True  # others are not converted
         if not container.streams.video:
             self.close()
-            raise InputError(f"{description}: holds no video stream; give a video of the flight")
+            raise InputError(f"{description}: contains no video stream; give a video of the flight")
         stream = video_stream(container)
         if stream is None:
             self.close()

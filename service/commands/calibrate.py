@@ -25,9 +25,9 @@ def calibrate(
     name: Annotated[str, typer.Option(help="Name of the camera in the file.")] = "camera",
     as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
 ) -> None:
-    """Intrinsics and radial distortion from a chessboard, as ROS camera_info YAML.
+    """Estimate intrinsics and radial distortion from a chessboard, as ROS camera_info YAML.
 
-    Writes an image of where the corners were, next to the model.
+    Also writes an image of the corners found, next to the camera model.
     """
     from recon.calibration.board import MIN_VIEWS, CalibrationConfig
     from recon.calibration.board import calibrate as fit

@@ -23,9 +23,7 @@ ACTIONS = (
 
 def ctl(
     action: Annotated[str, typer.Argument(help=", ".join(ACTIONS))],
-    metres: Annotated[
-        float | None, typer.Argument(help="for baseline: metres, 0 follows the altitude")
-    ] = None,
+    metres: Annotated[float | None, typer.Argument(help="baseline: metres; 0: by altitude")] = None,
     connect: Annotated[
         str, typer.Option(help="where the vehicle's MAVLink comes from")
     ] = "udpin://0.0.0.0:14550",

@@ -1,11 +1,11 @@
-"""``skyrelief export``, ``mesh`` and ``inspect``: files and images of a scan folder."""
+"""``skyrelief export``, ``mesh``, ``inspect`` and ``site``: files of one scan, or of several."""
 
 from __future__ import annotations
 
 import json
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -42,7 +42,7 @@ def export(
     ] = None,
     vertical_datum: Annotated[
         str | None,
-        typer.Option(help="what the heights are above, if known: ellipsoid, EGM96 or EGM2008"),
+        typer.Option(help="vertical datum of the heights, if known: ellipsoid, EGM96 or EGM2008"),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -150,10 +150,10 @@ def inspect(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Raw and rectified frames, anaglyph, disparity, depth and sigma of a keyframe.
+    """Draw raw and rectified frames, anaglyph, disparity, depth and sigma of a keyframe.
 
-    The stages before the depth need a scan made with --set scan.keep_debug=true; otherwise the
-    stored keyframe is shown.
+    The stages before depth need a scan made with --set scan.keep_debug=true; other scans show
+    the stored keyframe.
     """
     import cv2
     import numpy as np
@@ -166,7 +166,7 @@ def inspect(
         seqs = scan.store.seqs()
         seq = middle_keyframe(scan_dir, seqs) if keyframe is None else keyframe
         if not seqs or seq is None:
-            raise InputError(f"{scan_dir} holds no keyframes yet; nothing to inspect")
+            raise InputError(f"{scan_dir} contains no keyframes yet; nothing to inspect")
         found = scan.store.keyframe(seq) if seq in seqs else None
         if found is None:
             raise InputError(f"{scan_dir}: no keyframe {seq}; there are {seqs[0]} to {seqs[-1]}")
@@ -196,3 +196,66 @@ def inspect(
     print(f"{path}: keyframe {seq}, {figures['points']} points")
     if not complete:
         print("only what the store holds; replay with --set scan.keep_debug=true for every stage")
+
+
+ACTIONS = ("align", "compare")
+
+
+def site(
+    action: Annotated[str, typer.Argument(help="align or compare")],
+    scans: Annotated[list[Path], typer.Argument(help="scan folders; compare: before and after")],
+    out: Annotated[Path, typer.Option("--out", help="folder of the site")],
+    cell_m: Annotated[
+        float | None, typer.Option("--cell-m", help="compare: cell size; default: pixel on ground")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+) -> None:
+    """Join scans that overlap into one site, or measure what changed between two.
+
+    The scans are not changed. A site's folder is a scan folder: export, mesh and refine --gcp
+    work on it.
+    """
+    if action not in ACTIONS:
+        raise InputError(f"site {action}: there are {', '.join(ACTIONS)}")
+    if action == "align":
+        from service.offline.site.alignment import align_site
+
+        figures = align_site(scans, out).document
+        print(json.dumps(figures) if as_json else "\n".join(_aligned_lines(out, figures)))
+        return
+    from service.offline.site.compare import compare
+    from service.packages import needing
+
+    if len(scans) != 2:
+        raise InputError(f"site compare takes two scans, before and after, not {len(scans)}")
+    with needing("a change map"):
+        figures = compare(scans[0], scans[1], out, cell_m)
+    print(json.dumps(figures) if as_json else "\n".join(_change_lines(out, figures)))
+
+
+def _aligned_lines(out: Path, figures: dict[str, Any]) -> list[str]:
+    lines = [f"{out}: {len(figures['scans'])} scan(s), revision {figures['revision']}"]
+    for scan in figures["scans"]:
+        east, north, up = scan["moved_m"]
+        lines.append(
+            f"  {scan['name']:<20}{scan['placed']:<14} moved {east:+.2f} {north:+.2f} {up:+.2f} m, "
+            f"{scan['turned_deg']:.2f} deg, scale {scan['scale']:.4f}"
+        )
+    for pair in figures["pairs"]:
+        lines.append(
+            f"  {pair['a']} - {pair['b']}: {pair['ties']} ties, "
+            f"{pair['apart_before_m']:.2f} -> {pair['apart_after_m']:.2f} m apart"
+        )
+    return lines + [f"note: {note}" for note in figures["notes"]]
+
+
+def _change_lines(out: Path, figures: dict[str, Any]) -> list[str]:
+    lines = [figures["in_words"]]
+    for number, one in enumerate(figures["objects"], 1):
+        lines.append(
+            f"  {number:>3} {one['kind']:<8} {one['area_m2']:7.1f} m2 {one['volume_m3']:+8.2f} "
+            f"+- {1.96 * one['sigma_m3']:.2f} m3 at {one['east_m']:.1f} {one['north_m']:.1f}"
+        )
+    return [*lines, f"written to {out}: change.tif, change.gpkg, change.html, change.json"] + [
+        f"note: {note}" for note in figures["notes"]
+    ]

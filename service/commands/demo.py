@@ -28,14 +28,14 @@ def demo(
     out: Annotated[Path, typer.Option(help="folder for the output")] = Path("demo-output"),
     flight: Annotated[
         Path | None,
-        typer.Option(help="folder with frames/ and camera.yaml; default: its own"),
+        typer.Option(help="folder with frames/ and camera.yaml; default: the included one"),
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="section.key=value for the replay")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:
-    """Replay a small real flight onboard while the ground receiver takes it over the datalink."""
+    """Replay a small real flight while a ground station receives it over the datalink."""
     from service.bench.link_emulator import free_port
 
     source = _flight(flight)
@@ -45,17 +45,17 @@ def demo(
     portal = f"127.0.0.1:{free_port()}" if _has_portal() else ""
     compilers = _compile_meanwhile()
     if compilers:
-        _say(1, "the first flight after an installation compiles its kernels: a minute or two")
-    _say(1, "ground station")
+        _say(1, "compiling kernels in the background: once, a minute or two")
+    _say(1, "starting the ground station")
     ground = _start_ground(out, endpoint, portal)
     try:
         _said(ground, out, "ground station at ")
         if portal:
-            _say(1, f"open this page and see the map grow: {_said(ground, out, 'portal: ')}")
+            _say(1, f"open this page to watch the map grow: {_said(ground, out, 'portal: ')}")
         images = sum(1 for _ in (source / "frames").iterdir())
-        _say(2, f"flight: {images} images of {source}")
+        _say(2, f"flight: tracking and reconstructing {images} images")
         _replay(source, out, endpoint, set_ or [])
-        _say(3, "ground station: receives the rest, writes its files")
+        _say(3, "ground station: receiving the rest, writing the files")
         received = _wait_for_ground(ground, out)
     finally:
         for process in (ground, *compilers):
@@ -114,7 +114,9 @@ def _flight(flight: Path | None) -> Path:
     for folder in folders:
         if (folder / "frames").is_dir() and (folder / "camera.yaml").is_file():
             return folder
-    raise InputError(f"{folders[0]} holds no frames/ and camera.yaml; name a flight with --flight")
+    raise InputError(
+        f"{folders[0]} contains no frames/ and camera.yaml; name a flight with --flight"
+    )
 
 
 def _prepare(out: Path) -> None:
@@ -227,19 +229,19 @@ def _figures(out: Path, received: Path, seconds: float) -> dict[str, Any]:
 
 def _in_words(report: dict[str, Any]) -> str:
     onboard, ground = report["scan_folder"], report["ground_folder"]
+    program = os.path.relpath(Path(sys.executable).with_name("skyrelief"))
     return f"""
-Scan made onboard:    {onboard}
+Scan onboard:         {onboard}
 Received at ground:   {ground}
   {report["points"]:,} points from {report["keyframes"]} keyframes over {report["area_m2"]:,.0f} m2,
   {report["distance_m"]:.0f} m flown, median sigma {report["sigma_median_m"]:.2f} m, \
-{report["seconds"]:.0f} s in all; the ground holds {report["ground_points"]:,} points
-Look at it:
-  {onboard}/preview.jpg   colour and relief from above; any image viewer
-  {onboard}/cloud.laz     coloured points, EPSG:{report["epsg"]}, metres above sea level;
-                          CloudCompare, QGIS, Potree
-  {onboard}/trajectory.csv and scan.json: where the camera was, what was used, how good it is
-  skyrelief ground --store {report["ground_store"]} --portal 127.0.0.1:8080   in a browser
-                          (pip install -e '.[ground]' adds exports and meshes)"""
+{report["seconds"]:.0f} s in all
+Look at:
+  {onboard}/preview.jpg   image: colour and relief from above
+  {onboard}/report.html   map, accuracy and faults, in a browser
+  {onboard}/cloud.laz     coloured points for CloudCompare or QGIS (EPSG:{report["epsg"]})
+  {program} ground --store {report["ground_store"]} --portal 127.0.0.1:8080
+                          the map in 3D, in a browser"""
 
 
 def _read(path: Path) -> dict[str, Any]:

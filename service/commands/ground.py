@@ -50,7 +50,7 @@ def ground(
     ] = None,
     listen: Annotated[
         list[str] | None,
-        typer.Option(help="where drones call: tls/0.0.0.0:7447; default: this machine only"),
+        typer.Option(help="where drones connect: tls/0.0.0.0:7447; default: this machine only"),
     ] = None,
     store: Annotated[Path, typer.Option(help="folder of received scans")] = Path("ground-scans"),
     keys: Annotated[
@@ -85,6 +85,10 @@ def ground(
     basemap: Annotated[
         Path | None, typer.Option(help="MBTiles or PMTiles basemap of the portal's maps")
     ] = None,
+    foxglove: Annotated[
+        str | None,
+        typer.Option(help="serve growing scans to Foxglove at HOST:PORT, such as 127.0.0.1:8765"),
+    ] = None,
     vehicle: Annotated[
         str | None,
         typer.Option(help="MAVLink of the vehicle for the portal: udpin://0.0.0.0:14550"),
@@ -113,7 +117,7 @@ def ground(
         page = PortalOptions(portal, portal_token, portal_tls, vehicle, basemap)
     _receive(
         ReceiverConfig(store, session, limits, name, refresh, sites),
-        mavlink or [], page, take or [], Until(once, idle_exit_s), as_json,
+        mavlink or [], page, foxglove, take or [], Until(once, idle_exit_s), as_json,
     )  # fmt: skip
 
 
@@ -160,8 +164,8 @@ def _session(
 
 
 def _receive(
-    config: ReceiverConfig, mavlink: list[str], portal: PortalOptions | None, take: list[Path],
-    until: Until, as_json: bool,
+    config: ReceiverConfig, mavlink: list[str], portal: PortalOptions | None,
+    foxglove: str | None, take: list[Path], until: Until, as_json: bool,
 ) -> None:  # fmt: skip
     """Receive until a signal, or as ``until`` decides; then write the files that are due, and
     report."""
@@ -174,6 +178,11 @@ def _receive(
     taken = _take_in(config.store, take)
     stop, workers = stop_by_signals(), Workers()
     receiver = Receiver(config, workers)
+    viewers = None
+    if foxglove is not None:
+        from service.ground.foxglove import FoxgloveServer
+
+        viewers = FoxgloveServer(foxglove, config.store, config.session.plain, workers)
     radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in mavlink]
     receiver.start()
     for folder in taken:
@@ -186,6 +195,9 @@ def _receive(
     try:
         if portal is not None:
             page = _open_portal(portal, config.store, receiver, workers)
+        if viewers is not None:
+            viewers.start()
+            print(f"Foxglove: ws://{foxglove}", file=sys.stderr, flush=True)
         notifier.ready()
         _watch(stop, receiver, workers, notifier, radios, until)
         entries = receiver.progress()
@@ -194,6 +206,8 @@ def _receive(
         closing = workers.start("closing", lambda worker: _ask_for_time(notifier, worker))
         if page is not None:
             page.close()
+        if viewers is not None:
+            viewers.close()
         for radio in radios:
             radio.close()
         receiver.close()

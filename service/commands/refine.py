@@ -36,9 +36,9 @@ def refine(
     undo: Annotated[bool, typer.Option("--undo", help="restore the scan as flown")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """All keyframes adjusted at once with loops, telemetry and ground control points.
+    """Adjust all keyframes at once to loops, telemetry and ground control points.
 
-    Chunks keep their numbers and the state before is kept in the store. Deliverables are
+    Keyframes keep their numbers; --undo restores the poses of the flight. The scan's files are
     written again.
     """
     from service.errors import InputError
@@ -147,7 +147,7 @@ def refly(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Lines over gaps, places seen too seldom and places of large sigma, as a mission file."""
+    """Plan a mission over gaps, places in too few images and places of large sigma."""
     from service.errors import InputError
 
     path = out or scan_dir / "refly.plan"
@@ -184,7 +184,7 @@ def _flight(
     with ScanView(scan_dir) as scan:
         found = coverage_of(scan.store)
         if found is None:
-            raise InputError(f"{scan_dir} holds no surface; there is nothing to compare with")
+            raise InputError(f"{scan_dir} contains no surface; there is nothing to compare with")
         found = replace(found, limits=replace(found.limits, **limits))
         heights = [p.agl_m for p in scan.poses if p.agl_m is not None]
         height = float(np.median(heights)) if heights else None

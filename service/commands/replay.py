@@ -5,7 +5,11 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -14,10 +18,10 @@ from service.commands import ConfigFile, Overrides, stop_by_signals
 
 if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
-    from recon.types import Camera
+    from recon.types import Camera, Shutter
     from service.cameras.source import CameraSource
     from service.config import Config
-    from service.flight.scan import Scan
+    from service.flight.scan import Scan, ScanInputs
 
 
 WIDTH, STEREO_WIDTH_PX = "compute.stereo_width", 640
@@ -48,11 +52,12 @@ def replay(
     set_: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:
-    """Recorded video, a folder of images or a pipe through the onboard path into a scan."""
+    """Reconstruct a recording (video, folder of images or pipe) into a scan folder."""
     from service.daemon.machine import one_pool
 
     one_pool()
     from service.cameras import open_camera
+    from service.cameras.source import Paced
     from service.config import is_given, load_config
 
     overrides = list(set_ or [])
@@ -62,13 +67,16 @@ def replay(
     camera = _load_model(camera_model, chosen)
     log = _load_telemetry(telemetry, chosen)
     source = open_camera(video)
+    played = Paced(source) if realtime else source
     try:
         if not (realtime or chosen.compute.model or is_given(WIDTH, config, overrides)):
             chosen = denser(chosen, source)
         own = None if camera or realtime or not find_lens else _own_lens(source, chosen)
-        summary = _replay(source, camera, own, log, video_epoch, out, chosen, realtime, as_json)
+        summary = _replay(
+            video, source, played, camera, own, log, video_epoch, out, chosen, as_json
+        )
     finally:
-        source.close()
+        played.close()
     _report(summary, as_json)
 
 
@@ -108,22 +116,21 @@ def _load_telemetry(path: Path | None, config: Config) -> TelemetryLog | None:
 
 
 def _replay(
+    video: str,
     source: CameraSource,
+    played: CameraSource,
     camera: Camera | None,
     own: Camera | None,
     log: TelemetryLog | None,
     video_epoch: float | None,
     out: Path | None,
     config: Config,
-    realtime: bool,
     as_json: bool,
 ) -> dict[str, Any]:
-    from service.cameras.source import Paced
+    from recon.types import Shutter
+    from service.cameras import open_camera, parse_source
     from service.compute.backend_choice import open_backend
-    from service.daemon.machine import give_back
-    from service.flight.datalink import open_datalink
-    from service.flight.scan import Scan, ScanInputs, create_store
-    from service.scans.folder import write_deliverables
+    from service.flight.scan import ScanInputs
 
     notes: list[str] = []
     assumed: tuple[str, ...] = ()
@@ -144,7 +151,7 @@ def _replay(
     chosen = open_backend(config.compute, source.size_px)
     notes += log.warnings if log is not None else ()
     inputs = ScanInputs(
-        Paced(source) if realtime else source,
+        played,
         camera,
         config,
         chosen,
@@ -156,21 +163,64 @@ def _replay(
         assumed=assumed,
         extra={"backend": chosen.name, "source": source.description},
     )
-    store = create_store(inputs)
-    link = open_datalink(store, config)
-    scan = Scan(inputs, store)
+    progress = None if as_json or not sys.stderr.isatty() else _progress
     stop = stop_by_signals()
+    can_begin_again = played is source and parse_source(video)[0] == "file"
+    found = _fly(inputs, stop, progress, can_begin_again)
+    if isinstance(found, Shutter):
+        with closing(open_camera(video)) as again:
+            found = _fly(_with_readout(inputs, found, again), stop, progress)
+    assert isinstance(found, dict)
+    return found | {"scan_folder": str(folder)}
+
+
+def _fly(
+    inputs: ScanInputs,
+    stop: Event,
+    progress: Callable[[Scan], None] | None,
+    can_begin_again: bool = False,
+) -> dict[str, Any] | Shutter:
+    """The scan's figures; or its shutter, once the images show a readout that was not known.
+
+    The images before that are bent, so such a scan is discarded, unless it goes to the ground.
+    """
+    from service.daemon.machine import give_back
+    from service.flight.datalink import open_datalink
+    from service.flight.scan import Scan, create_store
+    from service.scans.folder import write_deliverables
+
+    store = create_store(inputs)
+    link = open_datalink(store, inputs.config)
+    can_begin_again = can_begin_again and link is None
+    scan = Scan(inputs, store)
+    shutter = None
     try:
-        scan.run(stop, None if as_json or not sys.stderr.isatty() else _progress)
+        if can_begin_again:
+            scan.run(stop, progress, is_enough=Scan.found_shutter)
+            shutter = None if stop.is_set() else scan.found_shutter()
+        else:
+            scan.run(stop, progress)
     finally:
-        summary = scan.close()
-        if link is not None:
-            summary["datalink_complete"] = link.drain(config.datalink.drain_s)
-            link.close()
-        give_back(collect=True)
-        summary |= write_deliverables(folder, store, {})
-        store.close()
-    return summary | {"scan_folder": str(folder)}
+        if shutter is not None:
+            scan.discard()
+        else:
+            summary = scan.close()
+            if link is not None:
+                summary["datalink_complete"] = link.drain(inputs.config.datalink.drain_s)
+                link.close()
+            give_back(collect=True)
+            summary |= write_deliverables(inputs.folder, store, {})
+            store.close()
+    return shutter or summary
+
+
+def _with_readout(inputs: ScanInputs, shutter: Shutter, source: CameraSource) -> ScanInputs:
+    """The scan from its start with the readout that its images show; the search goes on."""
+    from service.config import change
+
+    camera = replace(inputs.camera, shutter=shutter)
+    config = change(inputs.config, "camera.readout_ms", "auto")
+    return replace(inputs, source=source, camera=camera, config=config)
 
 
 def _fitted(camera: Camera, source: CameraSource, notes: list[str]) -> Camera:
@@ -197,7 +247,7 @@ def _tagged_camera(source: CameraSource, notes: list[str]) -> Camera | None:
     f, side = source.lens.focal, max(source.size_px)
     notes.append(
         f"no camera model given: taken from {source.lens.source} ({f * side:.0f} px); "
-        "make one with 'skyrelief calibrate' for shapes to be true"
+        "make one with 'skyrelief calibrate' for true shapes"
     )
     return source.camera
 
@@ -226,7 +276,7 @@ def _assumed_camera(source: CameraSource, notes: list[str]) -> Camera:
     f = max(W, H) / 2 / np.tan(np.radians(35.0))
     notes.append(
         "no camera model given: a lens of 70 degrees without distortion is assumed; "
-        "make one with 'skyrelief calibrate' for shapes to be true"
+        "make one with 'skyrelief calibrate' for true shapes"
     )
     K = np.array([[f, 0.0, (W - 1) / 2], [0.0, f, (H - 1) / 2], [0.0, 0.0, 1.0]])
     return Camera(K, np.zeros(5), (W, H))
@@ -242,7 +292,7 @@ def _epoch(
         epoch_ns = round(video_epoch * 1e9)
     elif log is not None and log.clock != "unix":  # time 0 of the video, or of the autopilot
         epoch_ns = 0 if log.clock == "video" else log.first_ns
-        notes.append(f"the log holds no date: times count from the start of the {log.clock}")
+        notes.append(f"the log has no date: times count from the start of the {log.clock}")
     elif source.epoch_unix_ns is not None:
         epoch_ns = source.epoch_unix_ns
     elif log is not None:
@@ -266,8 +316,8 @@ def _utc(time_ns: int) -> str:
 def _progress(scan: Scan) -> None:
     r = scan.recorder
     print(
-        f"\r{r.frames} frames, {scan.pipeline.pairs} pairs, {r.keyframes} keyframes, "
-        f"{r.points / 1e6:.2f} M points, {r.distance_m:.0f} m flown ",
+        f"\r{r.frames} frames, {r.distance_m:.0f} m flown, {scan.pipeline.pairs} stereo pairs, "
+        f"{r.keyframes} keyframes ",
         end="",
         file=sys.stderr,
         flush=True,
@@ -284,10 +334,11 @@ def _report(summary: dict[str, Any], as_json: bool) -> None:
         print(f"note: {warning}")
     for name, why in summary["failed"].items():
         print(f"not written: {name}: {why}")
-    refused = ", ".join(f"{k} ({n})" for k, n in summary["refusals"].items()) or "none"
     print(
-        f"{summary['scan_folder']}: {summary['frames']} frames, {summary['pairs']} pairs, "
-        f"{summary['clouds']} clouds, {summary['points']} points, "
+        f"{summary['scan_folder']}: {summary['frames']} frames, "
         f"{summary['distance_m']:.0f} m flown in {summary['segments']} segment(s), "
-        f"{summary['clouds_per_second']:g} clouds/s\nnot used: {refused}"
+        f"{summary['pairs']} stereo pairs, {summary['clouds_per_second']:g} a second"
     )
+    if summary["refusals"]:
+        refused = (f"{why} ({n})" for why, n in summary["refusals"].items())
+        print(f"stereo pairs not used: {', '.join(refused)}")

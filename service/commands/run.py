@@ -23,9 +23,9 @@ def run(
     config: ConfigFile = None,
     set_: Overrides = None,
 ) -> None:
-    """Wait for the operator's commands and scan; ends on Ctrl-C or a TERM signal.
+    """Scan on the operator's commands; end with Ctrl-C or SIGTERM.
 
-    A HUP signal reads the configuration again; a broken one changes nothing.
+    SIGHUP reloads the configuration; an invalid one changes nothing.
     """
     from service.daemon.machine import one_pool
 
@@ -106,4 +106,4 @@ def _reload(
         wanted = load_config(path, overrides)
         daemon.reload(wanted if flight is None else flight.configured(wanted))
     except InputError as error:
-        log.error("the configuration stays as it was: %s", error)
+        log.error("the configuration is unchanged: %s", error)

@@ -27,7 +27,7 @@ def config(
 ) -> None:
     """Check a configuration file, show what is in force, or print the documented default.
 
-    ``default FILE`` prints the documented default with what FILE sets, such as a board's profile.
+    'default FILE' prints it with the settings of FILE, such as a board's profile.
     """
     if action not in ACTIONS:
         raise InputError(f"config {action}: there are {', '.join(ACTIONS)}")
@@ -85,7 +85,7 @@ def doctor(
     for finding in examine(load_config(chosen, set_ or []), listen_s):
         findings.append(finding)
         if not as_json:
-            print(f"{finding.verdict.value}  {finding.what:<13}{finding.text}", flush=True)
+            print(f"{finding.verdict.value:<4}  {finding.what:<13}{finding.text}", flush=True)
     bad = [finding.what for finding in findings if finding.verdict is BAD]
     if as_json:
         print(json.dumps({"ok": not bad, "findings": [asdict(f) for f in findings]}))
@@ -94,7 +94,7 @@ def doctor(
 
 
 def keys(
-    folder: Annotated[Path, typer.Argument(help="where the fleet's keys are kept")],
+    folder: Annotated[Path, typer.Argument(help="folder of the fleet's keys")],
     drone: Annotated[list[str] | None, typer.Option(help="a drone's name; may be repeated")] = None,
     ground: Annotated[
         list[str] | None, typer.Option(help="a ground station's name; may be repeated")
@@ -106,11 +106,11 @@ def keys(
     days: Annotated[int, typer.Option(help="validity of the certificates", min=1)] = 365,
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:
-    """Make keys for drones, ground stations and viewers; those that exist stay as they are.
+    """Make keys for drones, ground stations and viewers; existing keys are kept.
 
     Copy FOLDER/drone/NAME to the drone and FOLDER/ground/NAME to the ground station. Keep
-    FOLDER/authority to yourself: whoever has it can join the fleet. --revoke NAME takes the
-    rights of a drone or viewer; for a ground station all others get new keys.
+    FOLDER/authority private: with it anyone can join the fleet. --revoke NAME removes the rights
+    of a drone or viewer; revoking a ground station makes new keys for all others.
     """
     from service.errors import InputError
     from service.stream import keys as fleet_keys
@@ -130,7 +130,7 @@ def keys(
     for path in made:
         print(f"made {path}")
     if not made:
-        print("all of them have keys already")
+        print("all of them already have keys")
 
 
 def _say_revoked(member: str, paths: list[Path], as_json: bool) -> None:
@@ -148,7 +148,7 @@ def warm_up(
     set_: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
-    """Scan a made-up ground once, so that no flight waits for the compilers.
+    """Compile all kernels before the first flight, by a scan of synthetic ground.
 
     Run it as the service's user with its NUMBA_CACHE_DIR; the installer does.
     """
@@ -158,4 +158,4 @@ def warm_up(
     if as_json:
         print(json.dumps({"seconds": round(seconds, 2), "keyframes": keyframes}))
     else:
-        print(f"warm after {seconds:.1f} s: {keyframes} keyframes of synthetic ground")
+        print(f"kernels compiled in {seconds:.1f} s ({keyframes} keyframes of synthetic ground)")

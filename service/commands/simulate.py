@@ -98,10 +98,10 @@ def simulate(
     until_stdin_ends: Annotated[bool, typer.Option("--until-stdin-ends", hidden=True)] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
 ) -> None:
-    """A rendered flight: flight.mp4, flight.tlog, camera.yaml, and truth/ to score against.
+    """Render a flight: flight.mp4, flight.tlog, camera.yaml, and truth/ to score against.
 
-    With --live the flight is then played in real time, as a camera's stream and an autopilot's
-    MAVLink; a folder that already holds a flight is played as it is.
+    --live plays it in real time, as a camera's stream and an autopilot's MAVLink. A flight that
+    exists is not rendered again.
     """
     from service.cameras.camera_file import shutter_of
     from service.sim import recording
@@ -236,7 +236,7 @@ def score(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
 ) -> None:
-    """Accuracy, completeness and trajectory error of a scan of a simulated flight."""
+    """Measure accuracy, completeness and trajectory error of a scan of a simulated flight."""
     from service.sim import scoring
 
     report = scoring.score(scan_dir, truth_dir, deliverables)

@@ -37,11 +37,11 @@ def stereo(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Disparity of a rectified pair: left pixel (u, v) matches right pixel (u - d, v).
+    """Compute the disparity of a rectified pair: left pixel (u, v) matches right pixel (u - d, v).
 
-    As complete as the pair allows: surface hidden from the right image takes the disparity of the
-    surface behind; only blank areas and surface outside the right image stay unknown. With
-    --checked, as in flight, only verified disparities are kept.
+    Surface hidden from the right image takes the disparity of the surface behind it; blank areas
+    and surface outside the right image are unknown. --checked keeps only verified disparities,
+    as in flight.
     """
     gray_left, gray_right = read_gray(left), read_gray(right)
     if gray_left.shape != gray_right.shape:

@@ -284,7 +284,7 @@ def load_learned_model(declaration: Path) -> LearnedStereoBackend:
                 f"{declaration}: "
                 + (f"unknown {', '.join(strange)}; known are model, {', '.join(known)}" if strange
                    else f"{', '.join(missing)} must be given" if missing
-                   else f"model = {model.name!r} is no file next to it")
+                   else f"model = {model.name!r} is not a file next to it")
             )  # fmt: skip
         config = LearnedStereoConfig(**given)
         return LearnedStereoBackend(model.read_bytes(), config, engine_folder())

@@ -73,7 +73,9 @@ class ControlActions:
             return Answer(Result.TEMPORARILY_REJECTED, "still starting")
         is_closing = self._scanning.is_closing
         self._scanning.start()
-        return Answer(text="Scan starts once the last one is closed") if is_closing else ACCEPTED
+        if is_closing:
+            return Answer(text="Scan starts when the previous one is closed")
+        return ACCEPTED
 
     def stop_scan(self) -> Answer:
         """Close the running scan and drop retries; its files are written after the answer."""

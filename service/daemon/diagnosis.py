@@ -95,7 +95,7 @@ def examine(config: Config, listen_s: float) -> Iterator[Finding]:
         lambda: examine_links(config, listen_s, running),
         lambda: _datalink(config),
         lambda: _certificate(config),
-        lambda: _to_fly(config),
+        lambda: _settings(config),
         lambda: _service(running),
     )
     for check in checks:
@@ -160,21 +160,21 @@ def _board(config: Config, model: str) -> Iterator[Finding]:
         yield Finding("board", GOOD, f"the settings of {name} are in force")
 
 
-def _to_fly(config: Config) -> Iterator[Finding]:
+def _settings(config: Config) -> Iterator[Finding]:
     """Settings that the service requires, or without which a flight is poor."""
     needed = [n for n in ("source", "model") if not getattr(config.camera, n)]
     if is_simulated(config):
-        yield Finding("to fly", GOOD, "nothing required: camera and autopilot are simulated")
+        yield Finding("settings", GOOD, "nothing required: camera and autopilot are simulated")
         return
     if needed:
         names = " and ".join(f"camera.{n}" for n in needed)
-        yield Finding("to fly", BAD, f"set {names}; the service does not start without")
+        yield Finding("settings", BAD, f"set {names}; the service does not start without them")
     elif not config.mavlink.links:
         yield Finding(
-            "to fly", NOTE, "set mavlink.links: without it no commands, scale or georeference"
+            "settings", NOTE, "set mavlink.links: without it no commands, scale or georeference"
         )
     else:
-        yield Finding("to fly", GOOD, "all required settings are present")
+        yield Finding("settings", GOOD, "all required settings are present")
 
 
 def _clock() -> Iterator[Finding]:

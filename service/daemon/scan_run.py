@@ -39,7 +39,7 @@ class ScanRun:
     """One attempt at a scan, from opening the camera until its files are written."""
 
     def __init__(self, host: Scanning, is_asked: bool) -> None:
-        """``is_asked``: a command waits for this attempt; it is no retry."""
+        """``is_asked``: a command waits for this attempt; it is not a retry."""
         self.stop = threading.Event()
         self.scan: Scan | None = None
         self.gate: FrameGate | None = None
@@ -154,14 +154,19 @@ class ScanRun:
 
     def _inputs(self, source: CameraSource) -> tuple[ScanInputs, FrameGate]:
         """Inputs of the scan, with its camera behind a gate."""
-        from service.cameras.camera_file import check_size
+        from service.cameras.camera_file import check_size, seeks_readout
+        from service.config import change
+        from service.daemon.camera_memory import measured
         from service.daemon.frame_gate import FrameGate
         from service.flight.scan import ScanInputs
 
         host, vehicle = self._host, self._host.vehicle
         camera, backend = host.equipment()
-        if host.shutter is not None:
-            camera = replace(camera, shutter=host.shutter)
+        config = host.config
+        earlier = measured(Path(host.config.scan.folder), source.description, source.size_px)
+        if earlier.shutter is not None and seeks_readout(camera, config.camera):
+            camera = replace(camera, shutter=earlier.shutter)
+            config = change(config, "camera.readout_ms", "auto")  # sought on from there
         check_size(camera, source.size_px, source.description)
         zero_ns, offset_ns = _zero_ns(source), vehicle.unix_offset_ns()
         unix_s = 1e-9 * (time.monotonic_ns() + offset_ns)
@@ -174,7 +179,7 @@ class ScanRun:
         inputs = ScanInputs(
             gate,
             camera,
-            host.config,
+            config,
             backend,
             folder,
             scan_id,
@@ -182,7 +187,7 @@ class ScanRun:
             unix_offset_ns=offset_ns,
             history=vehicle.history,
             extra={"backend": backend.name, "source": source.description},
-            latency_ms=host.latency_ms,
+            latency_ms=earlier.latency_ms,
             warn=lambda text: vehicle.statustext(text, WARNING),
             on_step=odometry_reporter(host.config, vehicle),
             on_keyframe=self._on_keyframe,
@@ -204,9 +209,6 @@ class ScanRun:
             on_fault.callback(store.finish, {"interrupted": True})
             summary = scan.close()
             on_fault.pop_all()
-        if scan.check.latency is not None and scan.check.latency.is_settled:
-            self._host.latency_ms = scan.check.latency.latency_ms
-        self._host.shutter = scan.found_shutter() or self._host.shutter
         self._host.vehicle.statustext(
             f"Scan {scan.inputs.scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
         )

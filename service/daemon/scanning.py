@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from recon.backends import Backend
-    from recon.types import Camera, Shutter
+    from recon.types import Camera
     from service.daemon.frame_gate import FrameGate
     from service.flight.scan import Scan
     from service.stream.store import ScanStore
@@ -52,8 +52,6 @@ class Scanning:
         self.level = Level.FULL
         self.is_warm = is_warm()  # all kernels are compiled
         self.camera: Camera | None = None  # the model; None before it is loaded
-        self.latency_ms: float | None = None  # camera latency measured by the last scan
-        self.shutter: Shutter | None = None  # of the camera, by the images of an earlier scan
         self.link = DaemonLink()
         self.made: set[str] = set()  # names of the scans of this process
         self.resumption = Resumption(Path(config.scan.folder))

@@ -31,11 +31,11 @@ MARKER = "warm"
 INSTALLED, SERVICE_CACHE = "/opt/skyrelief", "/var/cache/skyrelief"
 
 
-class MadeUpGround:
+class SyntheticGround:
     """A camera on a straight flight over flat ground with a slab; deterministic."""
 
     def __init__(self, frames: int = FRAMES) -> None:
-        self.description, self.size_px = "made-up ground", SIZE_PX
+        self.description, self.size_px = "synthetic ground", SIZE_PX
         self.epoch_unix_ns: int | None = None
         self.start_monotonic_ns: int | None = None
         self.fps: float | None = 10.0
@@ -83,7 +83,7 @@ def warm_up(config: Config) -> tuple[float, int]:
     K = np.array([[FOCAL_PX, 0, W / 2 - 0.5], [0, FOCAL_PX, H / 2 - 0.5], [0, 0, 1.0]])
     with TemporaryDirectory(prefix="skyrelief-warm-") as folder:
         inputs = ScanInputs(
-            MadeUpGround(),
+            SyntheticGround(),
             Camera(K, np.zeros(5), SIZE_PX),
             config,
             open_backend(config.compute),

@@ -16,11 +16,11 @@ from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Placed, Trajectory
 from recon.tracking.odometry import Tracked, Tracking
 from recon.types import F64, DepthMap, Keyframe, PosePrior
-from service.compute.stopwatch import Stopwatch
 from service.flight.anchorage import Anchorage, Carriers, Key
-from service.flight.graph_report import GraphWatch
 from service.flight.loops import LoopSearch
+from service.flight.reports import GraphWatch
 from service.flight.viewpoints import StereoCandidate, UndistortedFrame
+from service.progress import Stopwatch
 from service.stream.records import Repose
 
 FARTHEST_M = 1e6
@@ -49,7 +49,7 @@ class News(NamedTuple):
 
 
 class Chain:
-    """Where keyframes are in the world, and by them every frame.
+    """Places keyframes in the world, and frames by them.
 
     :meth:`add` and :meth:`map_pose` belong to the thread that reconstructs, which alone knows the
     trajectory until all is done; the rest belongs to the thread that tracks, which goes by the
@@ -94,7 +94,7 @@ class Chain:
     def add(
         self, view: StereoCandidate, motion: KeyframeStep, depth: DepthMap | None
     ) -> Placed | None:
-        """Append a view and look for loops; None without depth, or where no drone flies."""
+        """Append a view and look for loops; None without depth, or at an impossible distance."""
         T_odom, step = view.view.T_odom_camera, motion.T_before_camera
         self._T_map = T_odom if step is None else self._T_map @ step
         up = T_odom[2, :3]

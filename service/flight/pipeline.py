@@ -119,13 +119,13 @@ class Pipeline:
     # ---- in flight ---------------------------------------------------------------------
 
     def set_baseline(self, config: ScanConfig) -> None:
-        """Follow another ``scan.baseline`` from the next frame on."""
+        """Apply a new ``scan.baseline`` from the next frame on."""
         views = self.stages.views.selection
         views.set_baseline(config)
         self.stages.rectify.set_min_base_to_height(views.min_base_to_height)
 
     def set_effort(self, compute: ComputeConfig) -> None:
-        """Follow another ``pairs``, ``stereo_width`` and ``upsample`` from the next view on."""
+        """Apply new ``pairs``, ``stereo_width`` and ``upsample`` from the next view on."""
         self.stages.views.selection.set_partners(compute.pairs)
         self.stages.rectify.set_effort(compute)
 

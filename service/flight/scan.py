@@ -22,13 +22,11 @@ from service.cameras.rig import ASSUMED_AGL_M, Rig
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config
 from service.errors import InputError
-from service.flight.frame_tags import FILE as TAGS
-from service.flight.frame_tags import FrameTags
 from service.flight.pipeline import Pipeline, Step
-from service.flight.recorder import Recorder
+from service.flight.recorder import TAGS_FILE, FrameTags, Recorder
+from service.flight.reports import TrackingWatch
 from service.flight.stages import build_stages
 from service.flight.telemetry_check import TelemetryCheck
-from service.flight.tracking_watch import TrackingWatch
 from service.redaction import public_configuration, redacted
 from service.scans.coverage import CoverageWriter
 from service.scans.retention import PAGES
@@ -132,7 +130,7 @@ class Scan:
             inputs.config.camera, inputs.history, inputs.warn, inputs.latency_ms
         )
         self.tracking = TrackingWatch(inputs.warn)
-        self.tags = FrameTags(inputs.folder / TAGS) if inputs.history is not None else None
+        self.tags = FrameTags(inputs.folder / TAGS_FILE) if inputs.history is not None else None
         self.tagged = self.odd_sized = self.heights = self.attitudes = 0
         self._started = time.monotonic()
 
@@ -179,8 +177,9 @@ class Scan:
         stop: Event,
         progress: Callable[[Scan], None] | None = None,
         paused: Event | None = None,
+        is_enough: Callable[[Scan], object] = lambda scan: False,
     ) -> None:
-        """Feed every frame of the source until it ends or ``stop`` is set.
+        """Feed every frame of the source until it ends, ``stop`` is set or it ``is_enough``.
 
         Frames that come while ``paused`` is set are passed over. A recording is decoded ahead.
         """
@@ -197,6 +196,8 @@ class Scan:
                 self.feed(frame)
                 if progress is not None:
                     progress(self)
+                if is_enough(self):
+                    break
 
     def close(self) -> dict[str, Any]:
         """Write the remaining results and close the scan in the store; return its figures."""
@@ -222,6 +223,14 @@ class Scan:
         summary["clouds_per_second"] = round(summary["clouds"] / elapsed, 2)
         self.store.finish(summary)
         return summary
+
+    def discard(self) -> None:
+        """End the scan and delete its store; another one may be made in its folder."""
+        self.pipeline.close()
+        if self.tags is not None:
+            self.tags.close()
+        self.store.close()
+        self.store.path.unlink()
 
     def found_shutter(self) -> Shutter | None:
         """The shutter by the images; None where it was not sought or is not sure."""
@@ -280,7 +289,7 @@ class Scan:
         if apart:
             out.append(
                 f"left out of the cloud: {len(apart)} of {self.pipeline.segments} "
-                "stretches of the flight, which neither fixes nor loops tie to the rest; "
+                "segments of the flight, which neither fixes nor loops tie to the rest; "
                 "fly with GNSS or more overlap"
             )
         if frames and self.recorder.keyframes == 0:

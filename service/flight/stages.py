@@ -17,14 +17,13 @@ from recon.backends import Backend, DenseStages, PathBackend
 from recon.bands import limit_threads
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
-from recon.mapping.plausibility import plausible
 from recon.mapping.registration import IcpConfig
 from recon.posegraph.interpolated import KEYFRAME
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.trajectory import Placed, Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.polar import reproject_polar
-from recon.stereo.reprojection import FusionConfig, PairDepth, fuse, reproject
+from recon.stereo.reprojection import FusionConfig, PairDepth, fuse, plausible, reproject
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.stereo.virtual_stereo import (
     PairRejection,
@@ -56,7 +55,6 @@ from recon.types import (
 )
 from service.background import BackgroundWorker
 from service.cameras.camera_file import seeks_readout, with_shutter
-from service.compute.stopwatch import Stopwatch
 from service.config import ComputeConfig, Config
 from service.flight.anchorage import VIEW, Carriers, Key
 from service.flight.chain import Chain, KeyframeStep
@@ -69,6 +67,7 @@ from service.flight.viewpoints import (
     UndistortedFrame,
     Viewpoints,
 )
+from service.progress import Stopwatch
 from service.scans.file_ledger import FileLedger
 
 MAX_TRACKING_WIDTH_PX = 1280

@@ -17,8 +17,8 @@ from recon.mapping.disagreement import Disagreement
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, Voxels, tile_of, tiles_under
 from recon.stereo.reprojection import LABEL_SIGMA_PX
 from recon.types import F32, F64, I64, Bool, DepthMap
-from service.compute.stopwatch import Stopwatch
 from service.flight.viewpoints import StereoCandidate
+from service.progress import Stopwatch
 
 log = logging.getLogger(__name__)
 

@@ -160,6 +160,7 @@ class TelemetryCheck:
                 "estimate_ms": round(found.latency_ms, 1),
                 "sigma_ms": round(found.sigma_ms, 1),
                 "correlation": round(found.correlation, 3),
+                "is_settled": found.is_settled,
             }
         seen = frame.frame.value if frame is not None and frame.decided else None
         gimbal = {"used": used.value if used is not None else None, "by_pictures": seen}

@@ -381,4 +381,4 @@ class StereoViews:
             return posed
         ground = se3.transform(se3.inverse(view.T_odom_camera), points)
         scene = inverse_depth_plane(ground[ground[:, 2] > 0])
-        return replace(posed, rows=rows, scene=scene)
+        return replace(posed, rows=rows.now(), scene=scene)

@@ -80,7 +80,7 @@ def tile_px(data: bytes) -> tuple[int, int]:
     else:
         w, h = image_size(data) or (0, 0)
     if not (0 < w <= MAX_SIDE_PX and 0 < h <= MAX_SIDE_PX):
-        raise ValueError("a tile is no image of a tile's size")
+        raise ValueError("a tile is not an image of a tile's size")
     return w, h
 
 
@@ -115,7 +115,7 @@ class MBTiles:
             at = zoom, x, (1 << zoom) - 1 - y
             row = database.execute(sql, (*at, MAX_TILE_BYTES)).fetchone()
         if row is not None and not isinstance(row[0], bytes):
-            raise ValueError("a tile is no image")
+            raise ValueError("a tile is not an image")
         return None if row is None else row[0]
 
 
@@ -126,13 +126,13 @@ class PMTiles:
         self._path, self._size = path, path.stat().st_size
         head = PM_HEADER.unpack(self._read(0, PM_HEADER.size))
         if head[:2] != (b"PMTiles", 3):
-            raise ValueError("it is no PMTiles of version 3")
+            raise ValueError("it is not PMTiles version 3")
         root, root_bytes, _, _, self._leaves, _, self._data = head[2:9]
         self._packing, packing, kind, low, self.max_zoom = head[14:19]
         if not low <= self.max_zoom <= MAX_ZOOM:
             raise ValueError(f"its zooms are {low} to {self.max_zoom}")
         if kind not in PM_MEDIA or packing not in (0, PM_PLAIN):
-            raise ValueError("its tiles are no images")
+            raise ValueError("its tiles are not images")
         if self._packing not in (PM_PLAIN, PM_GZIP):
             raise ValueError("its directories are neither plain nor packed by gzip")
         self.media_type = PM_MEDIA[kind]

@@ -86,7 +86,7 @@ def parse_tokens(text: str) -> dict[str, str]:
             raise InputError(f"line {number} is not TOKEN or NAME TOKEN with a new name")
         out[name] = found[2]
     if not out:
-        raise InputError("it holds no token")
+        raise InputError("it contains no token")
     return out
 
 
@@ -97,7 +97,7 @@ def read_tokens(path: Path) -> str:
         with open(handle, encoding="utf-8") as file:
             mode = os.fstat(handle).st_mode
             if not stat.S_ISREG(mode):
-                raise InputError(f"portal token {path} is no regular file")
+                raise InputError(f"portal token {path} is not a regular file")
             text = file.read(MAX_TOKEN_FILE_BYTES)
     except (OSError, ValueError) as error:
         raise InputError(f"portal token {path} cannot be read ({error})") from error
@@ -212,6 +212,8 @@ def _short(value: Any) -> Any:
 MAX_BODY_BYTES = 65_536
 BODY_S = 10.0
 """A request's whole body must arrive within this time."""
+UPLOAD, MAX_UPLOAD_BYTES, MIN_UPLOAD_HZ = "/api/upload", 16 << 30, 20_000
+"""The path whose body may be larger, and take the time that so many bytes a second need."""
 STALL_S = 120.0
 """A reader that has received nothing for so long is dropped."""
 CLOSE = {"connection": "close"}
@@ -235,7 +237,7 @@ class Limits:
         self._listener.begin(peer)
         try:
             if scope["type"] == "http":
-                await self._app(scope, bounded_receive(receive), _bounded_send(send))
+                await self._app(scope, bounded_receive(scope, receive), _bounded_send(send))
             else:
                 await self._app(scope, receive, _bounded_send(send))
         except _StalledError:
@@ -246,9 +248,24 @@ class Limits:
             self._listener.end(peer)
 
 
-def bounded_receive(receive: Receive) -> Receive:
+def _bounds(scope: Scope) -> tuple[int, float]:
+    """Bytes and seconds of a request's body at most."""
+    if scope["path"] != UPLOAD:
+        return MAX_BODY_BYTES, BODY_S
+    length = HTTPConnection(scope).headers.get("content-length", "")
+    most = min(int(length), MAX_UPLOAD_BYTES) if is_length(length) else 0
+    return most, STALL_S + most / MIN_UPLOAD_HZ
+
+
+def is_length(text: str) -> bool:
+    """Whether it is a number of bytes, written in few digits."""
+    return text.isascii() and text.isdigit() and len(text) < 12
+
+
+def bounded_receive(scope: Scope, receive: Receive) -> Receive:
     """``receive`` of one HTTP request that ends a body too large or too slow with 413 or 408."""
-    seen, complete, deadline = 0, False, asyncio.get_running_loop().time() + BODY_S
+    max_bytes, seconds = _bounds(scope)
+    seen, complete, deadline = 0, False, asyncio.get_running_loop().time() + seconds
 
     async def bounded() -> Message:
         nonlocal seen, complete
@@ -256,12 +273,12 @@ def bounded_receive(receive: Receive) -> Receive:
             return await receive()
         remaining = deadline - asyncio.get_running_loop().time()
         try:
-            message = await asyncio.wait_for(receive(), remaining)
+            message = await asyncio.wait_for(receive(), min(remaining, STALL_S))
         except asyncio.TimeoutError:
             raise HTTPException(408, "the request's body did not come in time", CLOSE) from None
         seen += len(message.get("body", b""))
         complete = not message.get("more_body", False)
-        if seen > MAX_BODY_BYTES:
+        if seen > max_bytes:
             raise HTTPException(413, "the request is too large", CLOSE)
         return message
 
@@ -349,9 +366,10 @@ class Guard:
         if not self._local and who is None and not opening:
             return 401, "the token is needed: open the address that skyrelief printed"
         length = headers.get("content-length", "0")
-        if not (length.isascii() and length.isdigit() and len(length) < 10):
-            return 413, "the request is too large"
-        return None if int(length) <= MAX_BODY_BYTES else (413, "the request is too large")
+        most = MAX_UPLOAD_BYTES if connection.scope["path"] == UPLOAD else MAX_BODY_BYTES
+        if is_length(length) and int(length) <= most:
+            return None
+        return 413, "the request is too large"
 
     def _open(self, connection: HTTPConnection) -> RedirectResponse:
         """The page, with a session where the token in the address is right."""

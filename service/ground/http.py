@@ -16,7 +16,7 @@ import msgspec
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import (
     FileResponse,
     HTMLResponse,
@@ -31,12 +31,23 @@ from starlette.websockets import WebSocket
 
 from service.errors import InputError, OutsideError
 from service.ground.basemap import open_basemap
-from service.ground.guard import CHANGING, WHO, AuditLog, Guard, Pace, Tokens, note
+from service.ground.guard import (
+    CHANGING,
+    UPLOAD,
+    WHO,
+    AuditLog,
+    Guard,
+    Pace,
+    Tokens,
+    is_length,
+    note,
+)
 from service.ground.library import ConflictError, Library
 from service.ground.live import serve_live
 from service.ground.map_tiles import map_routes
 from service.ground.scan_files import file_routes
 from service.ground.state import KINDS, Jobs, PortalState, names_of, state_of
+from service.ground.upload import Upload, check_parts
 from service.ground.vehicle import BUTTONS, Vehicle
 from service.scans.annotations import Spot, as_json, read_annotations
 from service.workers import Workers
@@ -135,6 +146,8 @@ def portal_app(
         Route("/api/bin", _bin),
         Route("/api/bin/{name}/restore", _restore, methods=["POST"]),
         Route("/api/import", _import, methods=["POST"]),
+        Route(UPLOAD, _may_upload, methods=["GET"]),
+        Route(UPLOAD, _upload, methods=["POST"]),
         Route("/api/status", _status),
         Route("/api/vehicle", _figures, methods=["GET"]),
         Route("/api/vehicle", _order, methods=["POST"]),
@@ -333,6 +346,46 @@ async def _import(request: Request) -> Response:
         raise InputError("give the folder or the .mcap to import")
     drone, scan = await run_in_threadpool(state_of(request).library.bring_in, Path(folder))
     note(request, "import", scan=f"{drone}/{scan}")
+    return JSONResponse({"drone": drone, "scan": scan}, 201)
+
+
+def _parts(request: Request) -> list[tuple[str, int]]:
+    """The ``name`` and ``bytes`` of each file of an upload."""
+    names, sizes = (request.query_params.getlist(key)[:5] for key in ("name", "bytes"))
+    if len(names) != len(sizes) or not all(map(is_length, sizes)):
+        raise InputError("give the name and the bytes of each file")
+    return [(name, int(size)) for name, size in zip(names, sizes, strict=True)]
+
+
+def _may_upload(request: Request) -> Response:
+    """Whether files, each with its ``name`` and ``bytes``, can be uploaded; else the reason."""
+    if request.scope[WHO] is None:
+        raise HTTPException(401, "an upload needs the token: open the printed address")
+    check_parts(state_of(request).library, _parts(request))
+    return JSONResponse({})
+
+
+async def _upload(request: Request) -> Response:
+    """Import the body: files one after the other, each with its ``name`` and ``bytes``. A ZIP of a
+    scan folder, its scan.db or an MCAP becomes a scan at once; a video with its flight log in a
+    job (202). 409 while another import runs."""
+    parts, state = _parts(request), state_of(request)
+    note(request, "upload", names=[name for name, _ in parts])
+    upload = await run_in_threadpool(Upload, state.library, parts)
+    try:
+        async for data in request.stream():
+            await run_in_threadpool(upload.write, data)
+        await run_in_threadpool(upload.end)
+        if upload.is_recording:
+            video = max(parts, key=lambda part: part[1])[0]
+            job = state.jobs.start(Path("upload") / Path(video).name[:100], "scan", upload.replay())
+            return JSONResponse(job, 202)
+        drone, scan = await run_in_threadpool(upload.finish)
+    except ClientDisconnect:
+        raise InputError("the upload was cancelled") from None
+    finally:
+        await run_in_threadpool(upload.close)
+    note(request, "upload", scan=f"{drone}/{scan}")
     return JSONResponse({"drone": drone, "scan": scan}, 201)
 
 

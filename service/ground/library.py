@@ -12,7 +12,7 @@ import re
 import sqlite3
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -215,22 +215,28 @@ class Library:
 
     def bring_in(self, source: Path) -> tuple[str, str]:
         """Import a scan folder or an MCAP; its drone and scan."""
-        if not self._import_lock.acquire(blocking=False):
-            raise ConflictError("another import is running; try again when it is done")
-        try:
+        with self.importing():
             if source.suffix.lower() == ".mcap":
                 return self.import_mcap(source)
             return self.import_folder(source)
+
+    @contextlib.contextmanager
+    def importing(self) -> Iterator[None]:
+        """The time of one import. Raises ConflictError while another one runs."""
+        if not self._import_lock.acquire(blocking=False):
+            raise ConflictError("another import is running; try again when it is done")
+        try:
+            yield
         finally:
             self._import_lock.release()
 
     def import_mcap(self, source: Path) -> tuple[str, str]:
         """Make a scan folder of an aircraft's MCAP, with its usual files.
 
-        Raises InputError when it is no scan's recording or the library has that scan already.
+        Raises InputError when it is not a scan's recording or the library has that scan already.
         """
         if not is_regular(source):
-            raise InputError(f"{str(source)[:200]} is no file; give the recording itself")
+            raise InputError(f"{str(source)[:200]} is not a file; give the recording itself")
         header = header_in(source)
 
         def fill(part: Path) -> ScanHeader:
@@ -249,12 +255,12 @@ class Library:
 
         def fill(part: Path) -> ScanHeader:
             if STORE_FILES[0] not in copy_files(source, part, STORE_FILES):
-                raise InputError(f"{str(source)[:200]} holds no scan.db; give a scan folder")
+                raise InputError(f"{str(source)[:200]} contains no scan.db; give a scan folder")
             try:
                 with ScanStore.open(part / STORE_FILES[0]) as store:
                     header = store.header
             except (sqlite3.Error, ValueError) as error:
-                raise InputError(f"{str(source)[:200]} holds no valid scan ({error})") from error
+                raise InputError(f"{str(source)[:200]} contains no valid scan ({error})") from error
             self._check_new(header)
             copy_files(source, part, ({*FILES, *OTHER_FILES} - {*STORE_FILES}))
             return header

@@ -240,6 +240,6 @@ class LiveMaps(OpenScans[LiveMap]):
     def of(self, folder: Path) -> LiveMap:
         """The map of the scan in ``folder``, at most ``min_age_s`` old. Hold :attr:`lock`.
 
-        Raises InputError when the folder holds no scan, or one without a georeference.
+        Raises InputError when the folder contains no scan, or one without a georeference.
         """
         return self.view(folder)

@@ -40,7 +40,7 @@ NOTE = "imported from an MCAP: covariances of rotation and settings are not know
 
 
 def header_in(path: Path) -> ScanHeader:
-    """The scan's header from the first log line; InputError when the file is no scan of ours."""
+    """The scan's header from the first log line; InputError when the file is not a scan of ours."""
     for topic, time_ns, message in messages(path, ("/log",)):
         found = HEADER.fullmatch(message.message) if topic == "/log" else None
         if found:
@@ -61,16 +61,16 @@ def header_in(path: Path) -> ScanHeader:
             )
             fault = read_header(header.to_json())
             if isinstance(fault, str):
-                raise InputError(f"{path}: its scan cannot be ({fault})")
+                raise InputError(f"{path}: its scan is invalid ({fault})")
             return header
-    raise InputError(f"{path} is no recording of a skyrelief scan")
+    raise InputError(f"{path} is not a recording of a skyrelief scan")
 
 
 def store_from_mcap(path: Path, out: Path) -> ScanStore:
     """A new store at ``out`` with the recording's keyframes and poses, open for reading.
 
     Keyframes whose points do not fit their camera are left out. Raises InputError for a file
-    that is not ours or holds no keyframe, OutsideError without the ``mcap`` package.
+    that is not ours or contains no keyframe, OutsideError without the ``mcap`` package.
     """
     store = ScanStore.create(out, header_in(path))
     try:
@@ -89,7 +89,7 @@ def store_from_mcap(path: Path, out: Path) -> ScanStore:
                 track.add(topic, time_ns, message)
         track.close()
         if not count:
-            raise InputError(f"{path} holds no keyframe; nothing to import")
+            raise InputError(f"{path} contains no keyframe; nothing to import")
         store.finish({"keyframes": count, "source": "mcap"})
     except BaseException:
         store.close()

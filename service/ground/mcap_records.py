@@ -68,7 +68,7 @@ _FIELDS: dict[str, list[tuple[str, int, int, str]]] = {
 def messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, Any]]:
     """(topic, time, message) in the order of the file; other topics are skipped.
 
-    Raises InputError for a file that is no valid MCAP or asks for more memory than a scan does,
+    Raises InputError for a file that is not a valid MCAP or asks for more memory than a scan does,
     OutsideError without the ``mcap`` package.
     """
     with needing("an MCAP"):
@@ -92,7 +92,7 @@ def messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, An
             if len(schemas) > MAX_CHANNELS or len(channels) > MAX_CHANNELS:
                 raise InputError(f"{path} has more channels than a scan's recording")
     except (McapError, DecodeError, struct.error, EOFError, MemoryError, *_BROKEN) as error:
-        raise InputError(f"{path} is no valid MCAP ({type(error).__name__})") from error
+        raise InputError(f"{path} is not a valid MCAP ({type(error).__name__})") from error
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror or error})") from error
 

@@ -26,6 +26,7 @@ from service.listener import (
     BoundedListener,
     ListenerLimits,
     is_loopback,
+    parse_address,
     raise_descriptor_limit,
 )
 from service.workers import Worker, Workers
@@ -65,14 +66,6 @@ class PortalConfig:
     def tls(self) -> bool:
         """True when the portal speaks HTTPS."""
         return bool(self.tls_certificate)
-
-
-def parse_address(text: str) -> tuple[str, int]:
-    """(host, port) of ``HOST:PORT``; InputError for anything else."""
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdigit():
-        raise InputError(f"portal {text!r}: give HOST:PORT, such as 127.0.0.1:8080")
-    return host.strip("[]"), int(port)
 
 
 class Portal:
@@ -220,7 +213,7 @@ def open_portal(
     ``token_file`` holds the tokens; without it one is made and kept in the store. ``tls`` are
     certificate and key. Raises InputError or OutsideError, in one line.
     """
-    host, port = parse_address(address)
+    host, port = parse_address(address, "portal")
     token = kept_token(store) if token_file is None else read_tokens(token_file)
     for path in tls or ():
         if not path.is_file():

@@ -159,5 +159,5 @@ def _from_store(store: ScanStore) -> Facts:
 def _small(path: Path) -> bytes:
     """The content of a small file. Raises InputError when it is not small, or a link."""
     if not is_regular(path):
-        raise InputError(f"{path.name} is no regular file")
+        raise InputError(f"{path.name} is not a regular file")
     return read_small(path, MAX_JSON_BYTES, "file of a scan")

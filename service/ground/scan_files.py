@@ -21,7 +21,7 @@ from service.errors import InputError
 from service.ground.state import names_of, state_of
 from service.ground.storage import is_regular
 from service.offline.exports import EXPORTERS
-from service.offline.exports.bundle import MANIFEST
+from service.offline.exports.maps import MANIFEST
 from service.stream.store import ScanStore
 
 TILE = re.compile(r"[A-Za-z0-9_]{1,80}\.(json|pnts|b3dm|glb)")

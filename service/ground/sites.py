@@ -43,7 +43,6 @@ ALIGN_S = 7200.0
 """One alignment may take so long."""
 
 NICE = 10
-START = "from service.cli import main; main()"
 MAX_SITE_BYTES = 4_000_000
 UNREADABLE = (InputError, OSError, ValueError, RecursionError)
 
@@ -78,7 +77,7 @@ class Sites:
         words = ["site", "align", *map(str, members), "--out", str(site)]
         with tempfile.TemporaryFile() as errors:
             process = open_process(
-                "alignment", [sys.executable, "-c", START, *words],
+                "alignment", [sys.executable, "-m", "service.cli", *words],
                 stdin=DEVNULL, stdout=DEVNULL, stderr=errors,
             )  # fmt: skip
             with contextlib.suppress(OSError):

@@ -48,6 +48,7 @@ class Job:
     error: str | None = None
     queued_unix_s: float = field(default_factory=time.time)
     ended_unix_s: float | None = None
+    work: Callable[[Progress], str] | None = None  # what makes it; None: its kind says
     progress: Progress = field(default_factory=Progress)
 
     @property
@@ -58,6 +59,7 @@ class Job:
     def end(self, state: str, error: str | None = None) -> None:
         """It is done, failed or cancelled."""
         self.state, self.error, self.ended_unix_s = state, error, time.time()
+        self.work = None  # and the files that it may own
 
     def shown(self) -> dict[str, Any]:
         """For JSON."""
@@ -79,6 +81,8 @@ class Job:
 
 def carry_out(job: Job) -> str:
     """Make the job's deliverable; the name of the file. Errors are passed on."""
+    if job.work is not None:
+        return job.work(job.progress)
     if job.kind == REFINE:
         from service.offline.refine.refinement import RefineOptions, refine
 
@@ -98,15 +102,17 @@ class Jobs:
         self._jobs: list[Job] = []
         self._number = 0
 
-    def start(self, folder: Path, kind: str) -> dict[str, Any]:
-        """Queue a job. InputError for an unknown kind or a full queue."""
-        if kind not in KINDS:
+    def start(
+        self, folder: Path, kind: str, work: Callable[[Progress], str] | None = None
+    ) -> dict[str, Any]:
+        """Queue a job, or ``work``. InputError for an unknown kind or a full queue."""
+        if work is None and kind not in KINDS:
             raise InputError(f"kind is one of {', '.join(KINDS)}")
         with self._lock:
             if sum(not job.has_ended for job in self._jobs) >= MAX_WAITING_JOBS:
                 raise InputError("too many deliverables are waiting; try again later")
             self._number += 1
-            job = Job(self._number, folder, kind)
+            job = Job(self._number, folder, kind, work=work)
             self._jobs = [*self._jobs[-KEPT:], job]
             if self._worker is None or self._worker.is_done:
                 self._worker = self._workers.start("exports", self._work)

@@ -163,13 +163,13 @@ def copy_files(
     """Copy the regular files called ``names`` from one folder to another; those there were.
 
     ``room_bytes`` bounds the copy; by default a tenth of the disk, at most 2 GiB, stays free.
-    Raises InputError when ``source`` is no folder, OutsideError for too little room and for a
+    Raises InputError when ``source`` is not a folder, OutsideError for too little room and for a
     failing disk.
     """
     try:
         folder = os.open(source, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     except (OSError, ValueError) as error:
-        raise InputError(f"{_short(source)} is no folder that can be read") from error
+        raise InputError(f"{_short(source)} is not a folder that can be read") from error
     files: dict[str, int] = {}
     try:
         for name in names:
@@ -177,7 +177,7 @@ def copy_files(
             if handle is not None:
                 files[name] = handle
         sizes = {name: os.fstat(handle).st_size for name, handle in files.items()}
-        _check_room(sum(sizes.values()), target, room_bytes)
+        check_room(sum(sizes.values()), target, room_bytes)
         for name, handle in files.items():
             _copy(handle, target / name, sizes[name])
     except OSError as error:
@@ -201,7 +201,9 @@ def _open_regular(folder: int, name: str) -> int | None:
     return None
 
 
-def _check_room(size: int, target: Path, room_bytes: int | None) -> None:
+def check_room(size: int, target: Path, room_bytes: int | None = None) -> None:
+    """Raise OutsideError when ``size`` bytes do not fit ``room_bytes``; by default a tenth of the
+    disk of ``target``, at most 2 GiB, stays free."""
     if room_bytes is None:
         disk = shutil.disk_usage(target)
         room_bytes = disk.free - min(int(KEPT_FREE * disk.total), KEPT_FREE_BYTES)
@@ -233,12 +235,12 @@ def take_in(store: Path, folder: Path) -> list[Path]:
 
     ``folder`` is a scan folder or a folder of them, such as a card's; nothing is written there.
     Items received before by radio or network are kept and completed. Raises InputError when there
-    is no scan, OutsideError when the disk is full.
+    is not a scan, OutsideError when the disk is full.
     """
     paths = [folder / STORE_FILES[0], *sorted(folder.glob(f"*/{STORE_FILES[0]}"))]
     paths = [path for path in paths if is_regular(path)]
     if not paths:
-        raise InputError(f"{folder} holds no scan; it should hold scan.db, or folders that do")
+        raise InputError(f"{folder} contains no scan; it should hold scan.db, or folders that do")
     return [_take(store, path.parent) for path in paths]
 
 

@@ -24,6 +24,10 @@ Spot = tuple[
 """Longitude and latitude in degrees, AMSL metres."""
 
 
+Number = Annotated[int, msgspec.Meta(ge=1, le=2**53)]
+"""Of an annotation; never given twice in a scan."""
+
+
 class Point(msgspec.Struct, forbid_unknown_fields=True):
     """A place in GeoJSON."""
 
@@ -43,7 +47,7 @@ class Annotation(msgspec.Struct, forbid_unknown_fields=True):
     """One annotation as a feature of GeoJSON."""
 
     type: Literal["Feature"]
-    id: Annotated[int, msgspec.Meta(ge=1, le=2**53)]
+    id: Number
     geometry: Point
     properties: About
 
@@ -53,6 +57,7 @@ class Annotations(msgspec.Struct, forbid_unknown_fields=True):
 
     type: Literal["FeatureCollection"] = "FeatureCollection"
     features: Annotated[list[Annotation], msgspec.Meta(max_length=MAX_ANNOTATIONS)] = []
+    last_id: Number | msgspec.UnsetType = msgspec.UNSET  # the highest ever given
 
 
 def read_annotations(folder: Path) -> Annotations:
@@ -71,20 +76,30 @@ def add_annotation(folder: Path, spot: Spot, text: str, by: str, unix_s: float) 
     found = read_annotations(folder)
     if len(found.features) >= MAX_ANNOTATIONS:
         raise InputError(f"a scan holds at most {MAX_ANNOTATIONS} annotations; delete some")
-    number = max((one.id for one in found.features), default=0) + 1
+    number = (_last_id(found) or 0) + 1
+    if number > 2**53:
+        raise InputError(f"{ANNOTATIONS} has no number left for one more annotation")
     about = About(_text(text), by[:100], round(unix_s, 3))
     new = Annotation("Feature", number, Point("Point", spot), about)
-    _write(folder, [*found.features, new])
+    _write(folder, Annotations(features=[*found.features, new], last_id=number))
     return new
 
 
 def delete_annotation(folder: Path, number: int) -> None:
     """Take one out and write the file. InputError when there is none of this number."""
-    found = read_annotations(folder).features
-    rest = [one for one in found if one.id != number]
-    if len(rest) == len(found):
+    found = read_annotations(folder)
+    rest = [one for one in found.features if one.id != number]
+    if len(rest) == len(found.features):
         raise InputError(f"no annotation {number}")
-    _write(folder, rest)
+    _write(folder, Annotations(features=rest, last_id=_last_id(found)))
+
+
+def _last_id(known: Annotations) -> Number | msgspec.UnsetType:
+    """The highest number given so far; unset before the first."""
+    given = [one.id for one in known.features]
+    if known.last_id is not msgspec.UNSET:
+        given.append(known.last_id)
+    return max(given, default=msgspec.UNSET)
 
 
 def _text(text: str) -> str:
@@ -96,9 +111,9 @@ def _text(text: str) -> str:
     return one_line
 
 
-def _write(folder: Path, features: list[Annotation]) -> None:
+def _write(folder: Path, known: Annotations) -> None:
     with writing(folder / ANNOTATIONS) as part:
-        part.write_bytes(msgspec.json.encode(Annotations(features=features)))
+        part.write_bytes(msgspec.json.encode(known))
 
 
 def as_json(document: Annotation | Annotations) -> Any:

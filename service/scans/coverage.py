@@ -177,7 +177,7 @@ class LiveCoverage:
         self._reposes = RangeSet()  # re-poses in force at that time
 
     def refresh(self) -> Coverage | None:
-        """The layer of the store's current content; None while it holds no surface."""
+        """The layer of the store's current content; None while it contains no surface."""
         self.found = self._layer()
         return self.found
 
@@ -291,9 +291,9 @@ class LiveCoverages(OpenScans[LiveCoverage]):
         super().__init__(LiveCoverage, min_age_s, max_scans)
 
     def of(self, folder: Path) -> Coverage | None:
-        """The layer of the scan in ``folder``; None while it holds no surface.
+        """The layer of the scan in ``folder``; None while it contains no surface.
 
-        Raises InputError when the folder holds no scan.
+        Raises InputError when the folder contains no scan.
         """
         with self.lock:
             return self.view(folder).found

@@ -36,13 +36,14 @@ class OpenScans(Generic[V]):
     def view(self, folder: Path) -> V:
         """The view of the scan in ``folder``. Hold :attr:`lock` while it is used.
 
-        Raises InputError when the folder holds no scan, and what the view raises.
+        Raises InputError when the folder contains no scan, and what the view raises.
         """
         with self.lock:
             if folder not in self._kept:
                 self._kept[folder] = self._opened(folder)
             found, store, then = self._kept[folder]
             if time.monotonic() - then >= self._min_age_s:
+                store.follow()
                 found.refresh()
                 then = time.monotonic()
             self._kept[folder] = (found, store, then)

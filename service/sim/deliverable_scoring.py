@@ -237,7 +237,7 @@ class _Raster:
     """A GeoTIFF in memory, with the way from its cells to the truth's frame."""
 
     def __init__(self, path: Path, frame: LocalFrame) -> None:
-        """Raises InputError for a file that is no north-up GeoTIFF."""
+        """Raises InputError for a file that is not a north-up GeoTIFF."""
         import rasterio
 
         try:
@@ -329,7 +329,7 @@ def view_from_above(
     vertices, triangles = read_surface(truth / "surface.ply")
     same = vertices.shape == scene.vertices.shape and triangles.shape == scene.triangles.shape
     if not (same and np.abs(vertices - scene.vertices).max() < 0.01):
-        raise InputError(f"{truth}: made by another version of simulate; fly it again")
+        raise InputError(f"{truth}: made by another version of simulate; simulate it again")
     rows, cols = shape
     focal = HEIGHT_M / cell_m
     K = np.array([[focal, 0.0, 0.5 * (cols - 1)], [0.0, focal, 0.5 * (rows - 1)], [0, 0, 1.0]])

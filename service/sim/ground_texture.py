@@ -376,7 +376,7 @@ def patchwork(folder: Path, size: tuple[int, int], seed: int) -> U8:
     """(H, W, 3) image of ``size`` (W, H): photographs side by side at their own resolution.
 
     They are shuffled, flipped and brought to the same mean brightness, and fade into each
-    other. InputError when the folder holds no readable photograph.
+    other. InputError when the folder contains no readable photograph.
     """
     if not folder.is_dir():
         raise InputError(f"photos {folder}: no such folder")

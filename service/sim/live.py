@@ -122,11 +122,11 @@ class MavlinkPlayer:
 def play(folder: Path, options: LiveOptions) -> dict[str, int]:
     """Play the flight in ``folder`` to its end, or for ever; counts of what was sent.
 
-    InputError when the folder holds no flight; OutsideError when the outputs cannot be opened.
+    InputError when the folder contains no flight; OutsideError when the outputs cannot be opened.
     """
     video, tlog = folder / "flight.mp4", folder / "flight.tlog"
     if not video.exists():
-        raise InputError(f"{folder} holds no flight.mp4 to play")
+        raise InputError(f"{folder} contains no flight.mp4 to play")
     player = MavlinkPlayer(options.mavlink_address, options.until_stdin_ends)
     frames = 0
     try:

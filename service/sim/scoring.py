@@ -221,7 +221,7 @@ def read_scan(folder: Path, frame: LocalFrame) -> ScanResult:
     summary = json_object(folder / "scan.json")
     points, sigma = _read_cloud(folder / "cloud.laz")
     if len(points) == 0:
-        raise InputError(f"scan {folder}: cloud.laz holds no points; nothing to score")
+        raise InputError(f"scan {folder}: cloud.laz contains no points; nothing to score")
     times, poses = read_tum(folder / "trajectory.tum")
     origin, epsg = summary.get("origin"), summary.get("epsg")
     if not origin or not epsg:

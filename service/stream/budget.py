@@ -75,8 +75,8 @@ class RateEstimate:
     Bytes sent and not yet received, beyond their recent minimum, are queued or lost. When two
     consecutive reports show more than half a second of them, the allowed rate falls below the best
     recent throughput; then it climbs, fast up to where the queue began and slowly from there. A
-    single stall of a lossy link is no queue. Losses that a lower rate does not reduce belong to the
-    link and are no reason to fall again.
+    single stall of a lossy link is not a queue. Losses that a lower rate does not reduce are the
+    link's: the rate does not fall again.
     """
 
     QUEUE_S = 0.5

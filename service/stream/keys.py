@@ -67,7 +67,7 @@ def load_fleet(path: Path) -> Fleet:
         members = {role: tuple(map(str, raw[role])) for role in ROLES if role in raw}
         revoked = {str(key): int(count) for key, count in raw.get("revoked", {}).items()}
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{path} names no fleet; make it with 'skyrelief keys'") from error
+        raise InputError(f"{path} is not a fleet.json; make it with 'skyrelief keys'") from error
     for names in members.values():
         for name in names:
             check_name(name, "fleet member")

@@ -31,9 +31,8 @@ from service.stream.database import (
     peek_meta,
     rescue,
 )
-from service.stream.inventory import Inventory, Listener
 from service.stream.radio_tiles import RadioStore
-from service.stream.ranges import RangeSet, is_number, ranges_from_pairs
+from service.stream.ranges import Inventory, Listener, RangeSet, is_number, ranges_from_pairs
 from service.stream.records import (
     PoseRecord,
     Repose,
@@ -106,7 +105,7 @@ class ScanStore:
         """An existing store, also after a crash; valid data is kept.
 
         With ``read_only`` nothing is written, and a damaged file is refused. Raises InputError
-        when there is no such file or it holds no scan, OutsideError when the disk fails.
+        when there is no such file or it contains no scan, OutsideError when the disk fails.
         """
         path = Path(path)
         if not path.is_file():
@@ -392,6 +391,12 @@ class ScanStore:
         """Kind to the numbers of stored items; only re-poses in force are listed."""
         return self._inventory.all()
 
+    def follow(self) -> None:
+        """Take in the header and :meth:`numbers` that another connection has written since."""
+        with self._lock:
+            if self._inventory.follow():
+                self._header = self._read_header()
+
     def numbers_of(self, kind: str) -> RangeSet:
         """The numbers of the stored items of one kind; do not modify."""
         return self._inventory.of(kind)
@@ -436,7 +441,7 @@ class ScanStore:
         text = self._db.get("header")
         schema = self._db.get("schema")
         if text is None or schema is None or not (schema.isdecimal() and len(schema) < 9):
-            raise InputError(f"{self.path} holds no scan header; it is not a scan database")
+            raise InputError(f"{self.path} contains no scan header; it is not a scan database")
         if int(schema) > SCHEMA_VERSION:
             raise InputError(f"{self.path} was written by a newer version; update skyrelief")
         header = read_header(text.encode())

@@ -67,7 +67,7 @@ SCHEMAS: dict[str, str] = {
     "CREATE VIRTUAL TABLE radio USING fts5(kind, number, part, data)",
     "view of itself": "DROP TABLE held; CREATE VIEW held AS SELECT * FROM held",
     "newer schema": "UPDATE meta SET value = '99999' WHERE key = 'schema'",
-    "schema is no number": "UPDATE meta SET value = 'x' WHERE key = 'schema'",
+    "schema is not a number": "UPDATE meta SET value = 'x' WHERE key = 'schema'",
     "schema of 5000 digits": f"UPDATE meta SET value = '{'9' * 5000}' WHERE key = 'schema'",
     "schema is a blob": "UPDATE meta SET value = x'ff' WHERE key = 'schema'",
     "header is a blob": "UPDATE meta SET value = CAST(value AS BLOB) WHERE key = 'header'",
@@ -96,7 +96,7 @@ CHUNKS: dict[str, str] = {
     "pose id negative": "UPDATE poses SET id = -id, time_unix_ns = -time_unix_ns",
     "pose id far": "UPDATE poses SET id = id + 9223372036854770000",
     "pose time a text": "UPDATE poses SET time_unix_ns = 'x' || id",
-    "held is no JSON": "INSERT INTO held VALUES ('p', 'k0', '[[')",
+    "held is not JSON": "INSERT INTO held VALUES ('p', 'k0', '[[')",
     "held is deep": f"INSERT INTO held VALUES ('p', 'k0', '{'[' * 9999}')",
     "held is wide": f"INSERT INTO held VALUES ('p', 'k0', '[[0,{BIG}],[-1,{10**30}]]')",
     "radio is noise": "INSERT INTO radio VALUES ('tile', 0, 0, randomblob(127)), "

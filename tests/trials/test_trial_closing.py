@@ -165,5 +165,5 @@ def test_taking_off_while_files_are_written(tmp_path: Path, record: Row) -> None
     for folder in scan_folders(service.scans):
         assert json.loads((folder / "scan.json").read_text())["finished"] is True
         assert (folder / "cloud.laz").is_file()
-    assert "Scan starts once the last one is closed" in autopilot.texts
+    assert "Scan starts when the previous one is closed" in autopilot.texts
     assert back_s < BACK_S

@@ -234,6 +234,6 @@ def test_gpu_out_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reco
     daemon.load_control.look(read_machine(Path("/")))
     assert daemon.snapshot()["backend"] == "cpu"
     daemon.scanning.end()
-    record("GPU out of memory (simulated)", 1, "the same scan goes on by the CPU", "-", back_s)
+    record("GPU out of memory (simulated)", 1, "the same scan continues on the CPU", "-", back_s)
     assert any("out of memory" in text for text in heard)
     assert not daemon.scanning.fault

@@ -267,7 +267,7 @@ def test_clock_set_back_by_a_power_cut(tmp_path: Path, record: Row) -> None:
     record(
         "power cut that sets the clock back by a month",
         1,
-        "the scan is closed, kept; the next has the autopilot's time",
+        "the scan is closed, kept; the next takes the autopilot's time",
         f"{len(lost)} of {len(acknowledged)} chunks",
         back_s,
     )
@@ -292,7 +292,7 @@ def test_wall_clock_steps(tmp_path: Path, record: Row) -> None:
         (folder,) = scan_folders(service.scans)
         assert service.stop() == 0
     times = [float(x.split()[0]) for x in (folder / "trajectory.tum").read_text().splitlines()]
-    record("wall clock steps", len(steps), "times of the scan go on evenly", "-", max(back_s))
+    record("wall clock steps", len(steps), "times of the scan stay even", "-", max(back_s))
     assert times == sorted(times)
     assert times[-1] - times[0] < 600.0
 
@@ -341,7 +341,9 @@ def test_broken_configuration_at_reload_changes_nothing(tmp_path: Path, record: 
             for broken in ("[scan\n", "[scan]\nbaselin = 3\n", "[scan]\nbaseline = -3\n", "\0\1\2"):
                 service.configuration.write_text(broken)
                 service.process.send_signal(signal.SIGHUP)
-                service.until(lambda: "stays as it was" in service.log.read_text(), "refusal")
+                service.until(
+                    lambda: "configuration is unchanged" in service.log.read_text(), "refusal"
+                )
                 service.log.write_text("")
             service.configuration.write_text(good.replace("[scan]\n", "[scan]\nbaseline = 3\n"))
             service.process.send_signal(signal.SIGHUP)

@@ -92,10 +92,10 @@ def _write(page: Path, kept: Path, lines: list[Line]) -> None:
         for x in lines
     ]
     page.write_text(
-        "# What was tried to break it\n\n"
-        f"Written by the trials ({machine}); rows of earlier runs stay until tried again.\n"
-        "*Lost*: of what the store had acknowledged; *scanning again* is the longest time\n"
-        "from the end of the cause to the next frame; *when* is in UTC. `make trials` is the\n"
+        "# Trials\n\n"
+        f"Written by the trials ({machine}); rows of earlier runs stay until they run again.\n"
+        "*Lost*: part of what the store had acknowledged; *scanning again*: longest time\n"
+        "from the end of the cause to the next frame; *when*: UTC. `make trials` is the\n"
         "whole form, `make test` has a short one.\n\n"
         "| fault | times | outcome | lost | scanning again | when |\n"
         "|---|---|---|---|---|---|\n" + "\n".join(rows) + "\n",

@@ -24,7 +24,7 @@ class TelemetryLog:
     """A log's history and what its reader reports."""
 
     history: VehicleHistory
-    clock: str  # "unix", or "boot" when the log holds no date
+    clock: str  # "unix", or "boot" when the log has no date
     first_ns: int
     last_ns: int
     warnings: tuple[str, ...]
@@ -34,7 +34,7 @@ class TelemetryLog:
 def load_telemetry(path: str | Path, config: HistoryConfig | None = None) -> TelemetryLog:
     """The vehicle history in a .tlog, .BIN, .ulg or DJI .SRT file, on the unix clock in ns.
 
-    ValueError in one line when there is no such file, or when it holds no usable attitude and
+    ValueError in one line when there is no such file, or when it contains no usable attitude and
     position. Damaged parts are skipped and counted.
     """
     path = Path(path)
@@ -59,7 +59,7 @@ def finish(
     warnings: list[str],
     clock: str = "unix",
 ) -> TelemetryLog:
-    """The log of a filled history; ValueError when it holds no usable data."""
+    """The log of a filled history; ValueError when it contains no usable data."""
     first, last = history.first_ns, history.last_ns
     if first is None or last is None:
         raise ValueError(f"{path}: no attitude and no position of a vehicle in this log")

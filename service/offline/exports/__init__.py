@@ -36,12 +36,13 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
     ),
     "3dtiles": ("clouds:write_tiles", "3dtiles", "Point tiles for Cesium."),
     "3dtiles-mesh": (
-        "mesh_tileset:write_mesh_tiles",
+        "model:write_mesh_tiles",
         "3dtiles-mesh",
         "Textured mesh, 3D Tiles 1.1.",
     ),
     "glb": ("model:write_glb", "mesh.glb", "Textured mesh, binary glTF."),
-    "all": ("bundle:write_all", "maps", "Clouds and maps with a manifest, one folder."),
+    "all": ("maps:write_all", "maps", "Clouds and maps with a manifest, one folder."),
     "mcap": ("recording:write_mcap", "flight.mcap", "Recording for Foxglove."),
+    "ros2": ("ros2:write_ros2", "ros2.mcap", "Recording for ROS 2 (CDR)."),
 }
 """Name to (``module:function`` of this package, usual name in the folder, one line of help)."""

@@ -187,5 +187,5 @@ def _camera(header: ScanHeader) -> Camera:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"scan {header.scan_id} holds no camera model; its video cannot be used"
+            f"scan {header.scan_id} contains no camera model; its video cannot be used"
         ) from error

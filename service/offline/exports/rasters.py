@@ -235,11 +235,11 @@ def _inside_runs(loop: Array, inside: Array) -> list[Array]:
 def write_coverage(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """coverage.tif: views, sigma and height as float32, -9999 where unknown, in the scan's UTM.
 
-    Raises InputError when the scan holds no surface.
+    Raises InputError when the scan contains no surface.
     """
     found = coverage_of(scan.store, options.cell_m)
     if found is None:
-        raise InputError(f"{scan.folder} holds no points yet; nothing to export")
+        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
     layer, grid = found.layer, found.layer.grid
     height = layer.height_m + (0.0 if scan.frame is None else scan.frame.alt_amsl_m)
     bands = np.stack([layer.views.astype(np.float32), layer.sigma_m, height]).astype(np.float32)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon import se3
 from recon.types import F64, Keyframe
@@ -177,10 +178,8 @@ class _Recording:
         self._write(self._camera, camera, time_ns)
 
 
-def _points(keyframe: Keyframe, stamp: Any) -> Any:
-    """The known pixels as points in the camera's frame, placed by the camera's pose."""
-    from foxglove.messages import PackedElementField, PackedElementFieldNumericType, PointCloud
-
+def known_points(keyframe: Keyframe) -> NDArray[np.void]:
+    """The known pixels as (N,) of POINT in the camera's frame."""
     depth = keyframe.depth
     v, u = np.nonzero(np.isfinite(depth.depth_m))
     z = depth.depth_m[v, u]
@@ -192,6 +191,13 @@ def _points(keyframe: Keyframe, stamp: Any) -> Any:
     points["bgra"][:, 3] = 255
     points["sigma_m"] = depth.sigma_m[v, u]
     points["views"] = depth.views[v, u]
+    return points
+
+
+def _points(keyframe: Keyframe, stamp: Any) -> Any:
+    """The keyframe's points, placed by the camera's pose."""
+    from foxglove.messages import PackedElementField, PackedElementFieldNumericType, PointCloud
+
     real, byte = PackedElementFieldNumericType.Float32, PackedElementFieldNumericType.Uint8
     fields = [
         PackedElementField(name=name, offset=offset, type=kind)
@@ -210,10 +216,10 @@ def _points(keyframe: Keyframe, stamp: Any) -> Any:
     return PointCloud(
         timestamp=stamp,
         frame_id="world",
-        pose=_pose(depth.T_world_camera),
+        pose=_pose(keyframe.depth.T_world_camera),
         point_stride=POINT.itemsize,
         fields=fields,
-        data=points.tobytes(),
+        data=known_points(keyframe).tobytes(),
     )
 
 

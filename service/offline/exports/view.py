@@ -69,11 +69,11 @@ class ScanView:
     def __init__(
         self, folder: Path, voxel_m: float | None = None, progress: Progress | None = None
     ) -> None:
-        """Raises InputError when ``folder`` is no scan folder."""
+        """Raises InputError when ``folder`` is not a scan folder."""
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder; give a scan folder (it holds scan.db)")
         if not (folder / "scan.db").is_file():
-            raise InputError(f"{folder} holds no scan.db; give a scan folder")
+            raise InputError(f"{folder} contains no scan.db; give a scan folder")
         self.folder = folder
         self.store = ScanStore.open(folder / "scan.db")
         self._voxel_m = voxel_m
@@ -138,7 +138,7 @@ class ScanView:
         with self.progress.part("fusing the cloud", FUSING):
             fused = fused_cloud(self.store, self._voxel_m, self.progress)
         if not len(fused.cloud):
-            raise InputError(f"{self.folder} holds no points yet; nothing to export")
+            raise InputError(f"{self.folder} contains no points yet; nothing to export")
         return fused
 
     @property
@@ -174,5 +174,7 @@ def export(view: ScanView, kind: str, out: Path | None, options: ExportOptions) 
     path = out or view.folder / usual
     module, _, name = target.partition(":")
     with needing(f"export to {kind}"):
+        if path.suffix == ".tif":
+            import_module("rasterio")  # missing: known before the work
         getattr(import_module(f"service.offline.exports.{module}"), name)(view, path, options)
     return path

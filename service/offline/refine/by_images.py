@@ -28,7 +28,7 @@ from recon.calibration.flight import (
     loosely_placed,
     network,
 )
-from recon.calibration.global_bundle import Knowledge, Sightings
+from recon.calibration.global_bundle import Knowledge, Problem, Sightings, dispersion
 from recon.calibration.tracks import with_distortion, without_distortion
 from recon.camera_model import project, rays
 from recon.posegraph.ground_control import (
@@ -134,8 +134,10 @@ def network_of(
     known = loosely_placed(poses, seen)
     held = camera_information(given, FREE)
     found = network(given, start, seen, known, held)
-    sigmas = camera_sigmas(found.solution.camera_covariance)
-    focal = float(sigmas[:2].max() / found.solution.camera.K[0, 0])
+    s, pixel = found.solution, np.full(len(found.seen.view), found.sigma_px)
+    settled = Problem(s.camera, given, s.poses, s.points, found.seen, pixel, known, held)
+    sigmas = camera_sigmas(s.camera_covariance) * np.sqrt(max(dispersion(settled), 1.0))
+    focal = float(sigmas[:2].max() / s.camera.K[0, 0])
     why = doubt(found.solution.camera, given, focal, FREE)
     if why:
         held = camera_information(given, HELD)

@@ -12,8 +12,8 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import project
+from recon.posegraph.alignment import umeyama
 from recon.posegraph.ground_control import Mark, consenting, map_position, placed_by_points
-from recon.posegraph.track_alignment import umeyama
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame

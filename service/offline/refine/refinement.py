@@ -165,7 +165,7 @@ def _open_target(folder: Path, out: Path | None) -> Path:
     """The folder to work in: the scan's own, or a copy of its store in ``out``."""
     path = folder / "scan.db"
     if not path.is_file():
-        raise InputError(f"{folder} holds no scan.db; give a scan folder")
+        raise InputError(f"{folder} contains no scan.db; give a scan folder")
     with ScanStore.open(path) as store:
         if not store.finished:
             raise InputError(f"{folder} is not finished; refine it when the flight is over")
@@ -314,8 +314,8 @@ class _Refinement:
         path = (self.options.out or self.folder) / own_camera.FILE
         save_camera(path, images.camera)
         self.notes.append(
-            f"the camera found from the images: {path.name}; surfaces keep the one that they were "
-            "made with: replay the flight with --camera-model and that file"
+            f"the camera found from the images: {path.name}; surfaces keep the "
+            "flight's: to correct them, replay with --camera-model and that file"
         )
 
     def _with_loops(self, track: Track) -> tuple[Track, int]:

@@ -73,9 +73,7 @@ class Revisions:
             msgspec.convert(self._note, _Note)
         except msgspec.ValidationError as error:
             self._db.close()
-            raise InputError(
-                f"{store.path}: the note of its refinement is bad ({error})"
-            ) from error
+            raise InputError(f"{store.path}: its refinement record is invalid ({error})") from error
 
     def close(self) -> None:
         """Give the connection back."""

@@ -22,7 +22,7 @@ from recon.posegraph.ground_control import (
     placed_by_points,
     supported,
 )
-from recon.posegraph.site_alignment import ScanPrior, SiteAlignment, Tie, align
+from recon.posegraph.site_alignment import ScanPrior, SiteAlignment, Tie, align, alike
 from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import F64, Bool, Keyframe
 from service.errors import InputError
@@ -109,7 +109,7 @@ def _known(out: Path) -> dict[str, Any]:
     if not (out / SITE).is_file():
         if out.is_dir() and not any(path.name[0] != "." for path in out.iterdir()):
             return {}  # empty, or left by a process that was killed
-        raise InputError(f"{out} exists and is no site; choose another folder")
+        raise InputError(f"{out} exists and is not a site; choose another folder")
     try:
         document = json.loads((out / SITE).read_text(encoding="utf-8"))
         scans = [Path(s["folder"]) for s in document["scans"]]
@@ -145,7 +145,7 @@ def _aligned(
             assert one is not None
             ties.append(_tie(loop, track, one, scans))
             kept.append(loop)
-    priors = [_prior(track, np.array(scans) == k) for k in range(len(members))]
+    priors = alike([_prior(track, np.array(scans) == k) for k in range(len(members))])
     found = align(ties, priors)
     bent = zip(*_bent(track, scans, found, kept, ties), strict=True)
     return found, priors, ties, dict(zip(seqs, bent, strict=True))

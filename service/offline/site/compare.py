@@ -95,7 +95,7 @@ def surfaces(view: ScanView, members: list[Member], cell_m: float | None) -> lis
     clouds = [fused_cloud(Part(view.store, member)) for member in members]
     for member, fused in zip(members, clouds, strict=True):
         if not len(fused.cloud):
-            raise InputError(f"{member.name} holds no points; nothing to compare")
+            raise InputError(f"{member.name} contains no points; nothing to compare")
     places = [placed(fused.cloud, view.frame) for fused in clouds]
     cell = cell_m or max(fused.voxel_m for fused in clouds)
     try:

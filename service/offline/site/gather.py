@@ -98,7 +98,7 @@ def gather(folders: Sequence[Path], path: Path, name: str) -> tuple[list[Member]
 
 def _opened(folder: Path) -> ScanStore:
     if not (folder / "scan.db").is_file():
-        raise InputError(f"{folder} holds no scan.db; give scan folders")
+        raise InputError(f"{folder} contains no scan.db; give scan folders")
     store = ScanStore.open(folder / "scan.db", read_only=True)
     if store.finished:
         return store
@@ -119,7 +119,7 @@ def _chosen(
         elif local_frame(store.header) is None:
             notes.append(f"{folder.name} has no georeference: left out; refine it with --gcp")
         elif not main_seqs(store):
-            notes.append(f"{folder.name} holds no surface: left out")
+            notes.append(f"{folder.name} contains no surface: left out")
         else:
             chosen.append((folder, store))
     if not chosen:
@@ -211,7 +211,7 @@ def _copied(store: ScanStore, site: ScanStore, member: Member) -> Member:
 def _copy_poses(
     stores: Sequence[ScanStore], site: ScanStore, members: Sequence[Member], origin: LocalFrame
 ) -> None:
-    """The trajectories one after the other; none where drones flew at once: one line is no path."""
+    """The trajectories one after the other; none where drones flew at the same time."""
     tracks = [(latest(s.poses()), k) for k, s in enumerate(stores)]
     tracks = sorted((t for t in tracks if t[0]), key=lambda t: t[0][0].time_unix_ns)
     ends = [(t[0][0].time_unix_ns, t[0][-1].time_unix_ns) for t in tracks]

@@ -113,6 +113,25 @@ export const restore = (name: string): Promise<unknown> =>
   ask(`/api/bin/${encodeURIComponent(name)}/restore`, "POST", {});
 export const importFolder = (folder: string): Promise<unknown> =>
   ask("/api/import", "POST", { folder });
+/** Sends files as a new scan; `progress` hears how much of them has gone, 0 to 1. */
+export async function upload(files: File[], progress: (share: number) => void): Promise<void> {
+  const parts = files.map((f) => `name=${encodeURIComponent(f.name)}&bytes=${f.size}`);
+  const where = `/api/upload?${parts.join("&")}`;
+  await ask(where); // the reason of a refusal, before much is sent
+  await new Promise<void>((done, failed) => {
+    const request = new XMLHttpRequest();
+    request.open("POST", where);
+    request.responseType = "json";
+    request.upload.onprogress = (event) => progress(event.loaded / Math.max(event.total, 1));
+    request.onerror = () => failed(new Error("the upload was cut off: the connection was lost"));
+    request.onload = () => {
+      const answer = request.response as { error?: string } | null;
+      if (request.status < 300) done();
+      else failed(new Refused(answer?.error ?? `${request.status}`, request.status));
+    };
+    request.send(new Blob(files));
+  });
+}
 export const file = (s: { drone: string; scan: string }, name: string): string =>
   `${place(s)}/files/${encodeURIComponent(name)}`;
 

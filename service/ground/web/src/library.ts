@@ -7,7 +7,7 @@ import { vehicleStrip } from "./vehicle";
 
 const KINDS = [
   "laz", "copc", "ply", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "kmz", "stac", "all", "glb", "3dtiles", "3dtiles-mesh", "geojson", "kml",
-  "mcap", "refine",
+  "mcap", "ros2", "refine",
 ];
 
 const REFRESH_MS = 3000;
@@ -23,8 +23,10 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   let scans: api.Scan[] = [];
   const title = (job: api.Job): string =>
     scans.find((s) => s.drone === job.drone && s.scan === job.scan)?.title ?? job.scan;
+  const [upload, line, endUploads] = uploads(again);
   root.replaceChildren(
-    el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again)),
+    el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again, upload)),
+    line,
     jobList(title),
     list,
     bin,
@@ -52,7 +54,10 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   }
   const refresh = setInterval(() => void (document.hidden || load().catch(() => undefined)), REFRESH_MS);
   await load().catch(notify);
-  return () => clearInterval(refresh);
+  return () => {
+    clearInterval(refresh);
+    endUploads();
+  };
 }
 
 interface Card {
@@ -94,18 +99,63 @@ function empty(filtered: boolean): HTMLElement {
     "div",
     { className: "empty" },
     el("h2", { textContent: "No scans yet" }),
-    el("p", { textContent: "They appear here as soon as a drone connects. You can import a scan folder or an MCAP from an aircraft's storage above." }),
+    el("p", { textContent: "They appear here as soon as a drone connects. Drop a ZIP of a scan folder, its scan.db, an MCAP, or a video with its flight log here, or import from this machine above." }),
   );
 }
 
-function importForm(again: () => void): HTMLElement {
+function importForm(again: () => void, upload: (files: FileList | null) => void): HTMLElement {
   const folder = el("input", { placeholder: "folder or .mcap on this machine", size: 30 });
   folder.setAttribute("aria-label", "folder to import");
   const act = el("button", {
     textContent: "Import",
     onclick: () => void api.importFolder(folder.value).then(again, notify),
   });
-  return el("span", { className: "import" }, folder, act);
+  const chosen = el("input", { type: "file", multiple: true, hidden: true });
+  chosen.onchange = () => upload(chosen.files);
+  const send = el("button", {
+    textContent: "Upload",
+    title: "or drop on this page: a ZIP of a scan folder, its scan.db, an MCAP, or a video with its flight log",
+    onclick: () => chosen.click(),
+  });
+  return el("span", { className: "import" }, folder, act, send, chosen);
+}
+
+/** Uploads files that are chosen, or dropped on the page; a video goes with the other files, which
+ * are its log and camera. Gives the way to choose, the line of progress, and what ends it. */
+function uploads(again: () => void): [(files: FileList | null) => void, HTMLElement, () => void] {
+  const line = el("p", { className: "upload", hidden: true });
+  line.setAttribute("role", "status");
+  let queue = Promise.resolve();
+  const upload = (list: FileList | null): void => {
+    const files = [...(list ?? [])];
+    const isScan = (file: File): boolean => /\.(zip|db|mcap)$/i.test(file.name);
+    const recording = files.filter((file) => !isScan(file));
+    const groups = files.filter(isScan).map((file) => [file]);
+    if (recording.length) groups.push(recording);
+    for (const group of groups)
+      queue = queue.then(async () => {
+        const name = group.map((file) => file.name).join(", ");
+        line.hidden = false;
+        const show = (share: number): void => {
+          line.textContent = share < 1 ? `${name}: ${Math.floor(100 * share)} % sent` : `${name}: importing`;
+        };
+        show(0);
+        await api.upload(group, show).then(again, notify);
+        line.hidden = true;
+      });
+  };
+  const over = (event: DragEvent): void => event.preventDefault();
+  const drop = (event: DragEvent): void => {
+    event.preventDefault();
+    upload(event.dataTransfer?.files ?? null);
+  };
+  window.addEventListener("dragover", over);
+  window.addEventListener("drop", drop);
+  const end = (): void => {
+    window.removeEventListener("dragover", over);
+    window.removeEventListener("drop", drop);
+  };
+  return [upload, line, end];
 }
 
 function card(s: api.Scan, again: () => void): HTMLElement {
@@ -173,7 +223,7 @@ function downloads(s: api.Scan): HTMLElement {
   return el(
     "details",
     {},
-    el("summary", { textContent: `${rows.length} files` }),
+    el("summary", { textContent: rows.length === 1 ? "1 file" : `${rows.length} files` }),
     el("ul", {}, ...rows),
   );
 }

@@ -1,0 +1,269 @@
+"""A scan that a browser uploads: a ZIP of its folder, its ``scan.db``, an MCAP, or a recording.
+
+The files stream to a folder of their own in the store, which is gone afterwards; the scan takes its
+place in one step. A recording (a video, its flight log, and perhaps its camera model) is replayed
+by a process of its own. Of an archive only the names of a scan's files are unpacked, wherever they
+lie in it, so that no path in it is ever used.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import struct
+import sys
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path, PurePosixPath
+from subprocess import DEVNULL
+from typing import IO, cast
+
+from service.errors import InputError, OutsideError
+from service.ground.guard import MAX_UPLOAD_BYTES
+from service.ground.library import FILES, Library
+from service.ground.storage import (
+    BLOCK_BYTES,
+    OTHER_FILES,
+    STORE_FILES,
+    TAKING,
+    check_room,
+    workplace,
+)
+from service.progress import Progress
+from service.workers import end_process, open_process
+
+KINDS = (".zip", ".db", ".mcap")
+"""Of an upload that is a scan already."""
+VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".ts", ".m4v")
+LOGS, CAMERAS = (".tlog", ".bin", ".ulg", ".srt"), (".yaml", ".yml")
+Part = tuple[str, int]
+"""Name and size in bytes of one uploaded file."""
+LOOK_S, NICE = 0.5, 10
+MAX_LISTING_BYTES = 4 << 20
+"""Size of an archive's table of contents, which is read whole."""
+OWN_PATH = re.compile(rf"\S*/{re.escape(TAKING)}[^/\s]+/(?:scan/|uploaded/)?")
+"""What an error says about the folder that the upload is in for a while."""
+NAMES = {*STORE_FILES, *FILES, *OTHER_FILES}
+BROKEN = (
+    zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, LookupError,
+)  # fmt: skip
+"""What a damaged, encrypted or hostile archive raises."""
+
+
+def check_parts(library: Library, parts: Sequence[Part]) -> None:
+    """Raise InputError for files that make no scan, OutsideError where the disk has no room."""
+    suffixes = sorted(PurePosixPath(name).suffix.lower() for name, _ in parts)
+    if not (len(suffixes) == 1 and suffixes[0] in KINDS) and not _is_recording(suffixes):
+        names = ", ".join(name[:100] for name, _ in parts[:5])
+        raise InputError(
+            f"{names or 'nothing'} cannot be uploaded: give a ZIP of a scan folder, its scan.db, "
+            "an .mcap, or a video with its flight log"
+        )
+    for name, size in parts:
+        if not 0 < size <= MAX_UPLOAD_BYTES:
+            most = f"{MAX_UPLOAD_BYTES >> 30} GiB"
+            raise InputError(f"{name[:100]}: 1 byte to {most} can be uploaded, not {size} bytes")
+    check_room(sum(size for _, size in parts), library.store)
+
+
+def _is_recording(suffixes: Sequence[str]) -> bool:
+    """Whether there is one video, one log, and at most one camera model."""
+    counts = [sum(s in kind for s in suffixes) for kind in (VIDEOS, LOGS, CAMERAS)]
+    return sum(counts) == len(suffixes) and counts in ([1, 1, 0], [1, 1, 1])
+
+
+class Upload:
+    """Files on their way into the library, one after the other; close it at the end. Not
+    thread-safe."""
+
+    def __init__(self, library: Library, parts: Sequence[Part]) -> None:
+        """Raises what :func:`check_parts` raises, and ConflictError while another import runs."""
+        check_parts(library, parts)
+        self._library = library
+        self._waiting = list(parts)
+        self._left = 0  # of the file that is being written
+        self._file: IO[bytes] | None = None
+        self._paths: list[Path] = []
+        self._files = contextlib.ExitStack()
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(library.importing())
+            self._place = self._files.enter_context(workplace(library.store))
+            self._opened = stack.pop_all()
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether it is a video with its log, which :meth:`replay` makes a scan of."""
+        return len(self._paths) > 1
+
+    def write(self, data: bytes) -> None:
+        """Append to the files. Raises InputError past their size, OutsideError for the disk."""
+        try:
+            while data:
+                if not self._left:
+                    self._next()
+                assert self._file is not None
+                self._file.write(data[: self._left])
+                data, self._left = data[self._left :], max(self._left - len(data), 0)
+        except OSError as error:
+            raise OutsideError(f"the upload cannot be stored ({error.strerror})") from error
+
+    def _next(self) -> None:
+        """Begin the next file."""
+        if not self._waiting:
+            raise InputError("the upload is longer than it said")
+        name, self._left = self._waiting.pop(0)
+        path = self._place / f"upload{PurePosixPath(name).suffix.lower()}"
+        if self._file is not None:
+            self._file.close()
+        self._file = open(path, "xb")  # noqa: SIM115
+        self._files.callback(self._file.close)
+        self._paths.append(path)
+
+    def end(self) -> None:
+        """All has come. Raises InputError when it has not."""
+        left = self._left + sum(size for _, size in self._waiting)
+        if left:
+            raise InputError(f"the upload ended {left} bytes early")
+        if self._file is not None:
+            self._file.close()
+
+    def finish(self) -> tuple[str, str]:
+        """Import the scan; its drone and name. InputError when it is none."""
+        (path,) = self._paths
+        try:
+            if path.suffix == ".mcap":
+                return self._library.import_mcap(path)
+            folder = self._place / "uploaded"
+            folder.mkdir(0o750)
+            if path.suffix == ".zip":
+                unpack(path, folder)
+                path.unlink()
+            else:
+                path.rename(folder / STORE_FILES[0])
+            return self._library.import_folder(folder)
+        except OSError as error:
+            raise OutsideError(f"the upload cannot be stored ({error.strerror})") from error
+        except InputError as error:
+            raise InputError(OWN_PATH.sub("", str(error))) from error
+
+    def replay(self) -> Callable[[Progress], str]:
+        """Work that makes a scan of the recording and imports it; it owns the files from now on."""
+        files, self._files = self._files.pop_all(), contextlib.ExitStack()
+        library, place, paths = self._library, self._place, self._paths
+
+        def work(progress: Progress) -> str:
+            with files:
+                folder = place / "replayed"
+                _replay(paths, folder, place / "errors", progress)
+                progress.commit("importing")
+                return "/".join(library.import_folder(folder))
+
+        return work
+
+    def close(self) -> None:
+        """Delete the files, and let other imports run."""
+        with self._opened:
+            self._files.close()
+
+
+def _replay(paths: Sequence[Path], out: Path, errors: Path, progress: Progress) -> None:
+    """Make the scan folder ``out`` of a video, a log and perhaps a camera model.
+
+    Raises InputError with the process's last line when it fails.
+    """
+    of = {
+        kind: path
+        for path in paths
+        for kind, suffixes in (
+            ("video", VIDEOS),
+            ("--telemetry", LOGS),
+            ("--camera-model", CAMERAS),
+        )
+        if path.suffix in suffixes
+    }
+    command = [sys.executable, "-m", "service.cli", "replay", str(of.pop("video"))]
+    command += [word for option, path in of.items() for word in (option, str(path))]
+    with open(errors, "wb") as said:
+        process = open_process(
+            "replay", [*command, "--out", str(out)], stdin=DEVNULL, stdout=DEVNULL, stderr=said
+        )
+    try:
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, process.pid, NICE)
+        while process.poll() is None:
+            progress(f"replay: {_last_line(errors)}"[:80])
+            time.sleep(LOOK_S)
+    finally:
+        end_process(process)
+    if process.returncode:
+        raise InputError(OWN_PATH.sub("", _last_line(errors)) or "the replay failed")
+
+
+def _last_line(path: Path) -> str:
+    """The last line of a log, from its last 2000 bytes."""
+    with open(path, "rb") as file:
+        file.seek(max(path.stat().st_size - 2000, 0))
+        lines = file.read(2000).decode(errors="replace").strip().splitlines()
+    return lines[-1][:300] if lines else ""
+
+
+def unpack(archive: Path, folder: Path) -> None:
+    """Unpack the scan in a ZIP into ``folder``: the files beside its only ``scan.db``.
+
+    Raises InputError for an archive that is broken or holds no scan or several, OutsideError
+    where the disk has no room for what it claims to hold.
+    """
+    try:
+        with open(archive, "rb") as file, zipfile.ZipFile(cast(IO[bytes], _Bounded(file))) as found:
+            members = _members(found.infolist())
+            check_room(sum(member.file_size for member in members.values()), folder)
+            for name, member in members.items():
+                _copy(found, member, folder / name)
+    except BROKEN as error:
+        raise InputError(f"the ZIP cannot be read ({error})"[:300]) from error
+
+
+def _members(entries: Iterable[zipfile.ZipInfo]) -> dict[str, zipfile.ZipInfo]:
+    """File name to entry, of the folder in the archive that holds the scan."""
+    found: dict[str, dict[str, zipfile.ZipInfo]] = {}
+    for entry in entries:
+        folder, _, name = entry.filename.rpartition("/")
+        if name in NAMES:
+            found.setdefault(folder, {})[name] = entry
+    scans = [files for files in found.values() if STORE_FILES[0] in files]
+    if len(scans) != 1:
+        raise InputError(f"the ZIP holds {len(scans) or 'no'} scans; give one scan folder")
+    return scans[0]
+
+
+def _copy(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path) -> None:
+    """Unpack one file; at most the bytes that it claims to have."""
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise InputError("the ZIP is compressed by another method than deflate")
+    left = member.file_size
+    with archive.open(member) as source, open(target, "xb") as out:
+        while block := source.read(BLOCK_BYTES):
+            left -= len(block)
+            if left < 0:
+                raise InputError("the ZIP holds more than it says")
+            out.write(block)
+
+
+class _Bounded:
+    """A file of which no read makes room for more than a table of contents."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
+
+    def read(self, size: int = -1) -> bytes:
+        """As of a file; ValueError for more than MAX_LISTING_BYTES."""
+        if size > MAX_LISTING_BYTES:
+            raise ValueError("its table of contents is too large")
+        data = self._file.read(size if size >= 0 else MAX_LISTING_BYTES + 1)
+        if len(data) > MAX_LISTING_BYTES:
+            raise ValueError("its table of contents is too large")
+        return data

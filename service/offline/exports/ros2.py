@@ -1,0 +1,181 @@
+"""A scan's keyframes and poses as ROS 2 messages in CDR, for a recording and for live clients.
+
+Frames follow REP-105 and REP-103: ``map`` is ENU metres about the scan's origin,
+``camera_optical`` looks along z with x right and y down. A keyframe's points are in
+``camera_optical`` at the keyframe's time, so that a later transform of that time corrects them.
+
+Topics: ``/tf`` TFMessage, and below ``/camera``: ``points`` PointCloud2, ``image/compressed``
+CompressedImage, ``camera_info`` CameraInfo (of the image, without distortion), ``fix`` NavSatFix
+(altitude AMSL). With a name, frames and topics begin with it, except ``/tf``.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon import se3
+from recon.types import F64, Keyframe
+from service.errors import InputError
+from service.offline.exports.recording import CHUNK_BYTES, JPEG_QUALITY, POINT, known_points
+from service.offline.exports.view import ExportOptions, ScanView
+from service.scans.main_piece import main_keyframes
+from service.scans.writing import writing
+from service.stream.records import PoseRecord
+
+MAX_STAMP_NS = (1 << 31) * 10**9 - 1
+"""Seconds of a ROS 2 time are an int32."""
+UINT8, UINT32, FLOAT32 = 2, 6, 7  # PointField
+FIELDS = (
+    ("x", 0, FLOAT32),
+    ("y", 4, FLOAT32),
+    ("z", 8, FLOAT32),
+    ("rgba", 12, UINT32),
+    ("sigma_m", 16, FLOAT32),
+    ("views", 20, UINT8),
+)
+"""Name, offset and type of the parts of POINT."""
+
+
+class Ros2Channels:
+    """Channels of one camera in ``context``, which a file or a server reads."""
+
+    def __init__(self, context: Any, name: str = "") -> None:
+        self._context = context
+        self._names = f"{name}/" if name else ""
+        self._map, self._camera = f"{self._names}map", f"{self._names}camera_optical"
+        self._tf = self._channel("/tf", "tf2_msgs/msg/TFMessage")
+        self._points = self._channel("points", "sensor_msgs/msg/PointCloud2")
+        self._image = self._channel("image/compressed", "sensor_msgs/msg/CompressedImage")
+        self._info = self._channel("camera_info", "sensor_msgs/msg/CameraInfo")
+        self._fix = self._channel("fix", "sensor_msgs/msg/NavSatFix")
+
+    def _channel(self, topic: str, kind: str) -> tuple[Any, str]:
+        import foxglove
+
+        text, _ = _types().generate_msgdef(kind, ros_version=2)
+        topic = topic if topic.startswith("/") else f"/{self._names}camera/{topic}"
+        schema = foxglove.Schema(name=kind, encoding="ros2msg", data=text.encode())
+        channel = foxglove.Channel(
+            topic, schema=schema, message_encoding="cdr", context=self._context
+        )
+        return channel, kind
+
+    def log_transform(self, T_map_camera: F64, time_ns: int) -> None:
+        """The camera's pose, (4, 4) m, at a time."""
+        w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(T_map_camera[:3, :3]))
+        e, n, u = (float(v) for v in T_map_camera[:3, 3])
+        transform = _new(
+            "geometry_msgs/msg/TransformStamped",
+            _header(self._map, time_ns),
+            self._camera,
+            _new(
+                "geometry_msgs/msg/Transform",
+                _new("geometry_msgs/msg/Vector3", e, n, u),
+                _new("geometry_msgs/msg/Quaternion", x, y, z, w),
+            ),
+        )
+        _log(self._tf, time_ns, [transform])
+
+    def log_fix(self, pose: PoseRecord) -> None:
+        """Where the camera was on the globe; nothing for a pose without a georeference."""
+        if pose.lat_deg is None or pose.lon_deg is None:
+            return
+        _log(
+            self._fix,
+            pose.time_unix_ns,
+            _header(self._camera, pose.time_unix_ns),
+            _new("sensor_msgs/msg/NavSatStatus", 0, 1),  # a fix, of GPS
+            pose.lat_deg,
+            pose.lon_deg,
+            np.nan if pose.alt_amsl_m is None else pose.alt_amsl_m,
+            np.ascontiguousarray(pose.covariance[3:, 3:], np.float64).ravel(),
+            3,  # the covariance is known
+        )
+
+    def log_keyframe(self, keyframe: Keyframe) -> None:
+        """The keyframe's pose, points, image and camera."""
+        time_ns, depth = keyframe.time_ns, keyframe.depth
+        header = _header(self._camera, time_ns)
+        self.log_transform(depth.T_world_camera, time_ns)
+        points = known_points(keyframe)
+        fields = [_new("sensor_msgs/msg/PointField", *field, 1) for field in FIELDS]
+        size = points.size * POINT.itemsize
+        data = points.view(np.uint8)
+        _log(
+            self._points, time_ns, header, 1, points.size, fields, False, POINT.itemsize, size,
+            data, True,
+        )  # fmt: skip
+        ok, jpeg = cv2.imencode(".jpg", keyframe.bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        if ok:
+            _log(self._image, time_ns, header, "jpeg", jpeg.ravel())
+        K = np.ascontiguousarray(depth.K, np.float64)
+        P = np.hstack([K, np.zeros((3, 1))])
+        whole = _new("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+        _log(
+            self._info, time_ns, header, *depth.depth_m.shape, "plumb_bob", np.zeros(5),
+            K.ravel(), np.eye(3).ravel(), P.ravel(), 0, 0, whole,
+        )  # fmt: skip
+
+
+@cache
+def _types() -> Any:
+    """Definitions and serializers of the messages."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def _new(kind: str, *parts: Any) -> Any:
+    return _types().types[kind](*parts)
+
+
+def _header(frame: str, time_ns: int) -> Any:
+    second, rest = divmod(min(max(time_ns, 0), MAX_STAMP_NS), 10**9)
+    return _new("std_msgs/msg/Header", _new("builtin_interfaces/msg/Time", second, rest), frame)
+
+
+def _log(to: tuple[Any, str], time_ns: int, *parts: Any) -> None:
+    channel, kind = to
+    data = _types().serialize_cdr(_new(kind, *parts), kind)
+    channel.log(bytes(data), log_time=min(max(time_ns, 0), MAX_STAMP_NS))
+
+
+_Item = tuple[int, int, Keyframe | PoseRecord]
+"""Time, order at one time, content."""
+
+
+def write_ros2(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """The scan's main piece as an MCAP of ROS 2 messages, in order of time."""
+    import foxglove
+    from foxglove.mcap import MCAPWriteOptions
+
+    _types()
+    context = foxglove.Context()
+    options_of_file = MCAPWriteOptions(chunk_size=CHUNK_BYTES, profile="ros2")
+    with writing(out) as part:
+        try:
+            writer = foxglove.open_mcap(
+                part, allow_overwrite=True, context=context, writer_options=options_of_file
+            )
+        except (OSError, RuntimeError) as error:
+            raise InputError(f"{out} cannot be written: {error}") from error
+        with writer:
+            channels = Ros2Channels(context)
+            keyframes: Iterator[_Item] = ((k.time_ns, 0, k) for k in main_keyframes(scan.store))
+            poses: Iterator[_Item] = ((p.time_unix_ns, 1, p) for p in scan.poses)
+            placed_ns = None  # the last keyframe, which has its own transform
+            for time_ns, _, item in heapq.merge(keyframes, poses, key=lambda entry: entry[:2]):
+                if isinstance(item, Keyframe):
+                    channels.log_keyframe(item)
+                    placed_ns = time_ns
+                    continue
+                if time_ns != placed_ns:
+                    channels.log_transform(item.T_world_camera, time_ns)
+                channels.log_fix(item)
