@@ -25,6 +25,7 @@ from service.cameras import CameraFrame, CameraSource, open_camera
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
 from service.cameras.source import Paced
 from service.errors import InputError, OutsideError
+from service.workers import PROCESS, Worker
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg command")
 QUICK = LiveConfig(stall_s=1.0, frozen_s=0.3, first_retry_s=0.01, longest_retry_s=0.05)
@@ -232,7 +233,18 @@ def test_a_paced_recording_can_be_ended(tmp_path: Path) -> None:
     assert list(paces) == []
 
 
-def test_a_recording_is_not_closed_while_an_image_is_decoded(tmp_path: Path) -> None:
+def test_a_recording_is_not_closed_while_an_image_is_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = PROCESS.start
+
+    def start_and_wait(*args: Any) -> Worker:
+        worker = start(*args)
+        decoding.wait(10.0)  # the image is decoded before the caller knows its reader
+        time.sleep(0.05)
+        return worker
+
+    monkeypatch.setattr(PROCESS, "start", start_and_wait)
     path = tmp_path / "v.mkv"
     path.write_bytes(clip(3))
     recording = open_camera(str(path))
