@@ -42,6 +42,10 @@ def test_ground_holds_what_was_made_onboard(tmp_path: Path) -> None:
     assert "[1/3] open this page to watch the map grow: http://127.0.0.1:" in done.stderr
     assert "[2/3] flight: tracking and reconstructing 5 images" in done.stderr
     assert "INFO" not in done.stderr
+    assert "datalink does not open" not in done.stderr  # the ground outlives the flight
+    parts = [line for line in done.stderr.splitlines() if line.startswith("replay: ")]
+    assert parts[0].endswith("tracking and reconstructing")
+    assert parts[-2:] == ["replay: sending the rest", "replay: writing the files"]
     assert report["points"] > 10_000
     assert report["points"] == report["ground_points"]
     onboard, ground = Path(report["scan_folder"]), Path(report["ground_folder"])

@@ -11,13 +11,14 @@ import sys
 import time
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.commands import showing
+from service.commands import replay, showing
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.progress import CancelledError, Progress
 
@@ -159,7 +160,7 @@ def test_without_a_terminal_each_step_is_a_line(monkeypatch: pytest.MonkeyPatch)
 
 SCRIPT = """
 import time
-from service.commands import showing
+from service.commands import replay, showing
 with showing("export") as progress, progress.part("fusing"):
     for _ in progress.over(range(4), 4):
         time.sleep(0.3)
@@ -184,3 +185,19 @@ def test_in_a_terminal_there_is_one_bar_with_percent_and_time_left() -> None:
     os.close(ours)
     text = shown.decode()
     assert "export: fusing" in text and "75%" in text and "0:00:0" in text
+
+
+def test_a_replay_shows_its_share_and_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[str, float]] = []
+    progress = Progress(lambda now: seen.append((now.text, round(now.share, 3))))
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    recorder = SimpleNamespace(frames=2, distance_m=31.4, keyframes=1)
+    with progress.part("tracking", of_rest=0.9):
+        show = replay._flown(cast(Any, SimpleNamespace(images=4)), progress)
+        for _ in range(4):
+            show(cast(Any, SimpleNamespace(recorder=recorder)))
+    assert seen[-1] == ("2 images, 31 m flown, 1 keyframes", 0.675)
+    assert [share for _, share in seen] == [0.0, 0.0, 0.225, 0.45, 0.675]
+    seen.clear()
+    replay._flown(cast(Any, object()), progress)(cast(Any, SimpleNamespace(recorder=recorder)))
+    assert seen == [("2 images, 31 m flown, 1 keyframes", 0.9)]  # a pipe: no share

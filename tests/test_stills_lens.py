@@ -58,4 +58,4 @@ def test_the_distortion_that_exif_does_not_give_is_found(tmp_path: Path, wanted:
 def test_the_stills_about_the_middle(tmp_path: Path) -> None:
     source = open_images(str(stills(tmp_path / "stills", 6)), {})
     assert [image.name for image in source.middle(3)] == ["01.jpg", "02.jpg", "03.jpg"]
-    assert len(source.middle(9)) == len(source) == 6
+    assert source.middle(9).images == source.images == 6

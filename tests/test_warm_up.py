@@ -17,6 +17,7 @@ from service.daemon.frame_gate import FrameGate
 from service.daemon.runtime import COMPILING_S, HUNG_S, Daemon
 from service.daemon.scan_run import ScanRun
 from service.daemon.warm_up import SyntheticGround, is_warm, warm_up
+from service.progress import Progress
 
 
 def test_made_up_ground_is_scanned_and_marked(
@@ -24,7 +25,7 @@ def test_made_up_ground_is_scanned_and_marked(
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     assert not is_warm()
-    seconds, keyframes = warm_up(load_config(None, ["compute.backend=cpu"]))
+    seconds, keyframes = warm_up(load_config(None, ["compute.backend=cpu"]), Progress())
     assert seconds > 0
     assert keyframes >= 5
     assert is_warm()

@@ -64,13 +64,14 @@ class ImagesSource:
             yield CameraFrame(image, time_ns, seq, tags.geotag, path.name)
             seq += 1
 
-    def __len__(self) -> int:
+    @property
+    def images(self) -> int:
         """Number of stills."""
         return len(self._stills)
 
     def middle(self, count: int) -> ImagesSource:
         """The same source with ``count`` stills at most, about the middle one."""
-        some, skip = copy(self), max(len(self) - count, 0) // 2
+        some, skip = copy(self), max(self.images - count, 0) // 2
         some._stills = self._stills[skip : skip + count]
         return some
 

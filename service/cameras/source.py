@@ -85,6 +85,16 @@ class CameraSource(Protocol):
 
 
 @runtime_checkable
+class Counted(Protocol):
+    """A recording that says how long it is."""
+
+    @property
+    def images(self) -> int:
+        """Their number by its index; 0 where it has none."""
+        ...
+
+
+@runtime_checkable
 class Dropping(Protocol):
     """A source that drops images that are not fetched in time."""
 

@@ -90,7 +90,7 @@ class VideoSource:
             self.close()
             raise InputError(f"{description}: its video has a format that cannot be decoded")
         self._stream = stream
-        self._expected = self._stream.frames
+        self.images = self._stream.frames  # by the index; 0 without one
         self._decoded = decoded_frames(container, self._stream, self._warn, self._damage)
         self._first = next(self._decoded, None)
         if self._first is None:
@@ -159,9 +159,9 @@ class VideoSource:
             self._warn(f"{self._damaged} damaged images were skipped")
         if self._unordered:
             self._warn(f"{self._unordered} images with non-increasing time were skipped")
-        if self._expected > decoded:
+        if self.images > decoded:
             self._warn(
-                f"{decoded} of the {self._expected} images in the index could be "
+                f"{decoded} of the {self.images} images in the index could be "
                 "decoded; the recording is cut off or damaged"
             )
 

@@ -21,7 +21,7 @@ FLIGHT = Path("demo") / "caliterra"
 MARKER = ".skyrelief-demo"
 COMPILE = "from service.commands.demo import compile_kernels; compile_kernels()"
 READY_S = 60.0
-DRAIN_S = 120.0
+END_S = 120.0
 
 
 def demo(
@@ -55,7 +55,7 @@ def demo(
         images = sum(1 for _ in (source / "frames").iterdir())
         _say(2, f"flight: tracking and reconstructing {images} images")
         _replay(source, out, endpoint, set_ or [])
-        _say(3, "ground station: receiving the rest, writing the files")
+        _say(3, "ground station: writing its files")
         received = _wait_for_ground(ground, out)
     finally:
         for process in (ground, *compilers):
@@ -99,10 +99,9 @@ def compile_kernels() -> None:
 
 def _compile_meanwhile() -> list[subprocess.Popen[str]]:
     """A process that compiles what the replay needs later; none when numba has its kernels."""
-    import recon
+    from service.daemon.warm_up import has_kernels
 
-    folder = os.environ.get("NUMBA_CACHE_DIR") or Path(recon.__file__).parent
-    if any(Path(folder).rglob("*.nbi")):
+    if has_kernels():
         return []
     return [subprocess.Popen([sys.executable, "-c", COMPILE], stdin=subprocess.DEVNULL, text=True)]
 
@@ -139,10 +138,8 @@ def _skyrelief(*arguments: str) -> list[str]:
 
 
 def _start_ground(out: Path, endpoint: str, portal: str) -> subprocess.Popen[str]:
-    """A receiver that ends when it holds a whole scan, with its report as JSON."""
-    command = _skyrelief(
-        "ground", "--store", str(out / "ground"), "--listen", endpoint, "--once", "--json"
-    )
+    """A receiver that ends on SIGINT, with its report as JSON."""
+    command = _skyrelief("ground", "--store", str(out / "ground"), "--listen", endpoint, "--json")
     if portal:
         command += ["--portal", portal]
     with (out / "ground.log").open("wb") as log:
@@ -185,13 +182,14 @@ def _replay(flight: Path, out: Path, endpoint: str, overrides: list[str]) -> Non
 
 
 def _wait_for_ground(ground: subprocess.Popen[str], out: Path) -> Path:
-    """The scan folder at the ground, once the receiver reports that it is complete."""
+    """The scan folder at the ground. The replay has ended, and so delivered what it could."""
+    ground.send_signal(signal.SIGINT)
     try:
-        report, _ = ground.communicate(timeout=DRAIN_S)
+        report, _ = ground.communicate(timeout=END_S)
         (scan,) = json.loads(report.splitlines()[-1])["scans"]
     except subprocess.TimeoutExpired as error:
         raise OutsideError(
-            f"the ground was not complete {DRAIN_S:.0f} s after the replay; see {out}/ground.log"
+            f"the ground station did not end {END_S:.0f} s after the replay; see {out}/ground.log"
         ) from error
     except (ValueError, IndexError, KeyError) as error:
         raise OutsideError(f"the ground receiver failed; see {out}/ground.log") from error

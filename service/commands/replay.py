@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import ConfigFile, Overrides, stop_by_signals
+from service.commands import ConfigFile, Overrides, showing, stop_by_signals
+from service.progress import Progress
 
 if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
@@ -163,13 +164,14 @@ def _replay(
         assumed=assumed,
         extra={"backend": chosen.name, "source": source.description},
     )
-    progress = None if as_json or not sys.stderr.isatty() else _progress
     stop = stop_by_signals()
     can_begin_again = played is source and parse_source(video)[0] == "file"
-    found = _fly(inputs, stop, progress, can_begin_again)
-    if isinstance(found, Shutter):
-        with closing(open_camera(video)) as again:
-            found = _fly(_with_readout(inputs, found, again), stop, progress)
+    with nullcontext(Progress()) if as_json else showing("replay") as progress:
+        found = _fly(inputs, stop, progress, can_begin_again)
+        if isinstance(found, Shutter):
+            progress("beginning again with the readout that was found")
+            with closing(open_camera(video)) as again:
+                found = _fly(_with_readout(inputs, found, again), stop, progress)
     assert isinstance(found, dict)
     return found | {"scan_folder": str(folder)}
 
@@ -177,7 +179,7 @@ def _replay(
 def _fly(
     inputs: ScanInputs,
     stop: Event,
-    progress: Callable[[Scan], None] | None,
+    progress: Progress,
     can_begin_again: bool = False,
 ) -> dict[str, Any] | Shutter:
     """The scan's figures; or its shutter, once the images show a readout that was not known.
@@ -185,6 +187,7 @@ def _fly(
     The images before that are bent, so such a scan is discarded, unless it goes to the ground.
     """
     from service.daemon.machine import give_back
+    from service.daemon.warm_up import has_kernels
     from service.flight.datalink import open_datalink
     from service.flight.scan import Scan, create_store
     from service.scans.folder import write_deliverables
@@ -195,20 +198,27 @@ def _fly(
     scan = Scan(inputs, store)
     shutter = None
     try:
-        if can_begin_again:
-            scan.run(stop, progress, is_enough=Scan.found_shutter)
-            shutter = None if stop.is_set() else scan.found_shutter()
-        else:
-            scan.run(stop, progress)
+        work = "tracking and reconstructing"
+        if not has_kernels():
+            work = f"compiling kernels, once, a minute or two; {work}"
+        with progress.part(work, of_rest=0.9):
+            show = _flown(inputs.source, progress)
+            if can_begin_again:
+                scan.run(stop, show, is_enough=Scan.found_shutter)
+                shutter = None if stop.is_set() else scan.found_shutter()
+            else:
+                scan.run(stop, show)
     finally:
         if shutter is not None:
             scan.discard()
         else:
             summary = scan.close()
             if link is not None:
+                progress("sending the rest")
                 summary["datalink_complete"] = link.drain(inputs.config.datalink.drain_s)
                 link.close()
             give_back(collect=True)
+            progress("writing the files")
             summary |= write_deliverables(inputs.folder, store, {})
             store.close()
     return shutter or summary
@@ -313,23 +323,25 @@ def _utc(time_ns: int) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(time_ns / 1e9))
 
 
-def _progress(scan: Scan) -> None:
-    r = scan.recorder
-    print(
-        f"\r{r.frames} frames, {r.distance_m:.0f} m flown, {scan.pipeline.pairs} stereo pairs, "
-        f"{r.keyframes} keyframes ",
-        end="",
-        file=sys.stderr,
-        flush=True,
-    )
+def _flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:
+    """The bar of a scan, whose figures only a terminal shows."""
+    from service.cameras.source import Counted
+
+    images = source.images if isinstance(source, Counted) else 0
+    say = progress.counting(images) if images else progress
+
+    def show(scan: Scan) -> None:
+        if sys.stderr.isatty():
+            r = scan.recorder
+            say(f"{r.frames} images, {r.distance_m:.0f} m flown, {r.keyframes} keyframes")
+
+    return show
 
 
 def _report(summary: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print(json.dumps(summary))
         return
-    if sys.stderr.isatty():
-        print(file=sys.stderr)
     for warning in summary["warnings"]:
         print(f"note: {warning}")
     for name, why in summary["failed"].items():

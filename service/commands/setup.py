@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands import ConfigFile, Overrides
+from service.commands import ConfigFile, Overrides, showing
 from service.config import keys as configuration_keys
 from service.config import load_config
 from service.errors import InputError, OutsideError
@@ -154,7 +154,8 @@ def warm_up(
     """
     from service.daemon.warm_up import warm_up as scan_made_up_ground
 
-    seconds, keyframes = scan_made_up_ground(load_config(config, set_ or []))
+    with showing("warm-up") as progress:
+        seconds, keyframes = scan_made_up_ground(load_config(config, set_ or []), progress)
     if as_json:
         print(json.dumps({"seconds": round(seconds, 2), "keyframes": keyframes}))
     else:

@@ -43,7 +43,7 @@ def lens_by_stills(source: ImagesSource, camera: Camera, config: Config) -> Came
     from service.offline.refine.refinement import lens
 
     some = source.middle(STILLS)
-    if len(some) < MIN_STILLS or source.lens is None:
+    if some.images < MIN_STILLS or source.lens is None:
         return None
     for key, value in COARSE.items():
         config = change(config, key, str(value).lower())

@@ -19,6 +19,7 @@ import numpy as np
 
 from service.cameras.source import CameraFrame
 from service.config import Config, change
+from service.progress import Progress
 from service.version import software
 
 log = logging.getLogger(__name__)
@@ -64,7 +65,7 @@ class SyntheticGround:
         """Nothing is open."""
 
 
-def warm_up(config: Config) -> tuple[float, int]:
+def warm_up(config: Config, progress: Progress) -> tuple[float, int]:
     """Scan the synthetic ground with the configured backend; returns (seconds, keyframes).
 
     Writes the marker that :func:`is_warm` checks.
@@ -76,6 +77,7 @@ def warm_up(config: Config) -> tuple[float, int]:
     from service.scans.folder import write_deliverables
 
     start = time.monotonic()
+    progress("compiling the kernels of stereo: once, a minute or two")
     warm_up_backend()  # the fallback of a device that fails
     for key in ("scan.assumed_agl_m=60", "scan.keep_debug=false", "scan.baseline=auto"):
         config = change(config, *key.split("="))
@@ -93,12 +95,22 @@ def warm_up(config: Config) -> tuple[float, int]:
         )
         store = create_store(inputs)
         scan = Scan(inputs, store)
-        scan.run(Event())
+        with progress.part("compiling the others by a scan of synthetic ground", of_rest=0.9):
+            say = progress.counting(FRAMES)
+            scan.run(Event(), lambda _: say(progress.text))
         summary = scan.close()
         write_deliverables(Path(folder), store, {})
         store.close()
     _mark()
     return time.monotonic() - start, int(summary["keyframes"])
+
+
+def has_kernels() -> bool:
+    """True when numba's cache holds compiled kernels, so that a start need not wait for them."""
+    import recon
+
+    folder = os.environ.get("NUMBA_CACHE_DIR") or Path(recon.__file__).parent
+    return any(Path(folder).rglob("*.nbi"))
 
 
 def is_warm() -> bool:
