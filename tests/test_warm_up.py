@@ -16,7 +16,7 @@ from service.config import load_config
 from service.daemon.frame_gate import FrameGate
 from service.daemon.runtime import COMPILING_S, HUNG_S, Daemon
 from service.daemon.scan_run import ScanRun
-from service.daemon.warm_up import SyntheticGround, is_warm, warm_up
+from service.daemon.warm_up import SyntheticGround, is_warm, warm_up, warm_up_command
 from service.progress import Progress
 
 
@@ -33,6 +33,12 @@ def test_made_up_ground_is_scanned_and_marked(
     assert not is_warm()
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     assert not is_warm()
+
+
+def test_the_command_fits_the_installation(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert warm_up_command() == "skyrelief warm-up"
+    monkeypatch.setattr("sys.prefix", "/opt/skyrelief/versions/0.1.0")
+    assert "NUMBA_CACHE_DIR=/var/cache/skyrelief /opt/skyrelief/current" in warm_up_command()
 
 
 def test_made_up_ground_is_the_same_each_time() -> None:

@@ -24,7 +24,7 @@ from service.config import Config, keys, load_config
 from service.daemon.machine import existing, read_machine
 from service.daemon.simulated import is_simulated
 from service.daemon.vehicle_config import watch_config
-from service.daemon.warm_up import is_warm
+from service.daemon.warm_up import is_warm, warm_up_command
 from service.errors import InputError, SkyreliefError
 from service.packages import unusable_packages
 
@@ -35,11 +35,6 @@ if TYPE_CHECKING:
 CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", "eclipse-zenoh")
 NEEDED_MIB = {"disk": 1000.0, "memory": 700.0}
 HOT_C = 85.0
-WARM_UP = (
-    "sudo -u skyrelief env NUMBA_CACHE_DIR=/var/cache/skyrelief "
-    "/opt/skyrelief/current/bin/skyrelief warm-up"
-)
-
 SOON_DAYS = 30  # a certificate that expires sooner gives a note
 
 
@@ -212,7 +207,7 @@ def _compute(config: Config) -> Iterator[Finding]:
     if is_warm():
         yield Finding("kernels", GOOD, "compiled for this version")
     else:
-        yield Finding("kernels", NOTE, f"the first scan may compile kernels; {WARM_UP}")
+        yield Finding("kernels", NOTE, f"the first scan may compile kernels; {warm_up_command()}")
 
 
 def _camera(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]:

@@ -30,6 +30,7 @@ STEP_PX = 10
 FRAMES = 40
 MARKER = "warm"
 INSTALLED, SERVICE_CACHE = "/opt/skyrelief", "/var/cache/skyrelief"
+AS_SERVICE = f"sudo -u skyrelief env NUMBA_CACHE_DIR={SERVICE_CACHE}"
 
 
 class SyntheticGround:
@@ -111,6 +112,13 @@ def has_kernels() -> bool:
 
     folder = os.environ.get("NUMBA_CACHE_DIR") or Path(recon.__file__).parent
     return any(Path(folder).rglob("*.nbi"))
+
+
+def warm_up_command() -> str:
+    """The command that compiles the kernels where this installation looks for them."""
+    if not _services_cache():
+        return "skyrelief warm-up"
+    return f"{AS_SERVICE} {INSTALLED}/current/bin/skyrelief warm-up"
 
 
 def is_warm() -> bool:
