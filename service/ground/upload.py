@@ -194,7 +194,7 @@ def _replay(paths: Sequence[Path], out: Path, errors: Path, progress: Progress) 
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, process.pid, NICE)
         while process.poll() is None:
-            progress(f"replay: {_last_line(errors)}"[:80])
+            progress((_last_line(errors) or "replay")[:80])
             time.sleep(LOOK_S)
     finally:
         end_process(process)
