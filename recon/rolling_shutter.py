@@ -82,7 +82,11 @@ class Rows:
 
     def now(self) -> Rows:
         """These rows with the readout as known now, which a search may change."""
-        return replace(self, clock=self.clock.reading(self.clock.readout_s))
+        return self.reading(self.clock.readout_s)
+
+    def reading(self, readout_s: float) -> Rows:
+        """The same motion, with the rows read in another time."""
+        return replace(self, clock=self.clock.reading(readout_s))
 
     def twists(self, ray: F64) -> F64:
         """(N, 6) motion from the middle row to the rows that expose the rays (N, 3)."""
@@ -104,10 +108,45 @@ class Rows:
 
 
 def _moved(K: F64, ray: F64, inverse_depth: F64, twist: F64) -> F64:
-    """(N, 2) pixels of points on rays (N, 3) after small motions (N, 6), to second order."""
-    step = np.cross(twist[:, :3], ray) + twist[:, 3:] * inverse_depth[:, None]
-    there = ray + step + 0.5 * np.cross(twist[:, :3], step)
+    """(N, 2) pixels of points on rays (N, 3) after small motions (N, 6)."""
+    there = _after(ray, inverse_depth, twist)
     return np.asarray(there[:, :2] / there[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2])
+
+
+def _after(ray: F64, inverse_depth: F64, twist: F64) -> F64:
+    """(N, 3) points on rays (N, 3) over their depth after small motions (N, 6), to second order."""
+    step = np.cross(twist[:, :3], ray) + twist[:, 3:] * inverse_depth[:, None]
+    return np.asarray(ray + step + 0.5 * np.cross(twist[:, :3], step))
+
+
+def _on_image(points: F64) -> F64:
+    """(N, 2) where points (N, 3) are at a depth of 1."""
+    return np.asarray(points[:, :2] / points[:, 2:])
+
+
+def depth_share(
+    view: Rows, partner: Rows, T_partner_view: F64, points: F64, readout_s: float
+) -> float:
+    """Error of depth over depth, rms, that a readout makes in a pair which knows of none.
+
+    ``points`` (N, 3) of the view's camera are what both see; T_partner_view (4, 4) is that of the
+    middle rows.
+    """
+    R, t = T_partner_view[:3, :3], T_partner_view[:3, 3]
+    ray, inverse_depth = points / points[:, 2:], 1.0 / points[:, 2]
+    there = ray @ R.T + t * inverse_depth[:, None]
+    parallax = _on_image(there) - _on_image(ray @ R.T)
+    there /= there[:, 2:]
+    here_off, there_off = (
+        _on_image(_after(at, inverse_depth, rows.reading(readout_s).twists(at))) - at[:, :2]
+        for at, rows in ((ray, view), (there, partner))
+    )
+    wrong = there_off - here_off @ R[:2, :2].T
+    square = float((parallax**2).sum())
+    if square == 0.0:
+        return 0.0
+    along = (wrong * parallax).sum(axis=1) / np.sqrt(square / len(points))
+    return float(np.sqrt((along**2).sum() / square))
 
 
 @dataclass(slots=True, eq=False)

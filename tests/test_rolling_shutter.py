@@ -12,7 +12,7 @@ import pytest
 
 from recon import se3
 from recon.camera_model import project, rays
-from recon.rolling_shutter import RowClock, Rows, RowTrack, row_times_s
+from recon.rolling_shutter import RowClock, Rows, RowTrack, depth_share, row_times_s
 from recon.stereo.virtual_stereo import View, VirtualStereoConfig, at_middle_row, rectify
 from recon.tracking import readout_search
 from recon.tracking.keyframe_window import OdometryKeyframe
@@ -320,3 +320,42 @@ def test_a_global_shutter_is_not_taken_for_a_rolling_one() -> None:
     found, used = searched(0.0, 140)
     assert not found.is_sure and abs(found.readout_s) < 3e-4
     assert found.is_none and used is None  # frames to come are tracked as those of a global one
+
+
+@pytest.mark.parametrize("t", [0.0, 0.3, 0.8])
+def test_the_share_of_depth_is_what_the_rows_do_to_it(t: float) -> None:
+    at = (t, t + 0.75)
+    poses = [swinging(s) for s in at]
+    rates = [se3.log(swinging(s + 1e-3) @ se3.inverse(swinging(s - 1e-3))) / 2e-3 for s in at]
+    view, partner = (Rows(RowClock(PLAIN), rate, np.zeros(6)) for rate in rates)
+    step = poses[1] @ se3.inverse(poses[0])
+    uv = np.random.default_rng(0).uniform([60, 50], [W - 60, H - 50], (300, 2))
+    up = poses[0][:3, 2]
+    plane = -up / 60.0  # the ground is 60 m below
+    points = rays(K, uv) / (rays(K, uv) @ plane)[:, None]
+    there = se3.transform(step, points)
+    left = rays(K, seen(points, rates[0], np.zeros(6), 0.02))
+    right = rays(K, seen(there, rates[1], np.zeros(6), 0.02))
+    ahead = left @ step[:3, :3].T  # triangulated as if each image were of one moment
+    flow = step[:2, 3] - step[2, 3] * right[:, :2]
+    off = right[:, :2] * ahead[:, 2:] - ahead[:, :2]
+    depth = (flow**2).sum(axis=1) / (flow * off).sum(axis=1)
+    error = depth / points[:, 2] - 1.0
+    share = depth_share(view, partner, step, points, 0.02)
+    assert share == pytest.approx(float(np.sqrt(np.mean(error**2))), rel=0.2)
+    assert share == pytest.approx(2.0 * depth_share(view, partner, step, points, 0.01), rel=0.05)
+    steady = Rows(RowClock(PLAIN), np.zeros(6), np.zeros(6))
+    assert depth_share(steady, steady, step, points, 0.02) == 0.0
+
+
+def test_the_doubt_about_a_readout_ends_when_it_is_found() -> None:
+    search = ReadoutSearch(RowClock(PLAIN), PLAIN.K)
+    assert search.doubt_s == readout_search.USUAL_S
+    search.estimate = ReadoutEstimate(0.012, 0.003, 1)  # seen, and not yet in use
+    assert search.doubt_s == pytest.approx(np.hypot(0.012, 0.003))
+    search.estimate = ReadoutEstimate(0.001, 0.2, 1)
+    assert search.doubt_s == readout_search.USUAL_S
+    search.estimate = ReadoutEstimate(1e-4, 2e-4, 3)
+    assert search.doubt_s < 3e-4
+    known = ReadoutSearch(RowClock(replace(PLAIN, shutter=Shutter(0.03))), PLAIN.K)
+    assert known.doubt_s == 0.0

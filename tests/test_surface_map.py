@@ -110,7 +110,7 @@ def test_an_assumed_lens_widens_what_is_stored_and_not_the_choice(is_lens_assume
     """2 % of the depth; a better view still counts as better."""
     surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], is_lens_assumed)
     first, better = (view(0.0, sigma_m=sigma) for sigma in (0.2, 0.05))
-    candidate = cast(StereoCandidate, SimpleNamespace(segment=0))
+    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=0.0))
     sigma, fresh = surface(candidate, first, first.T_world_camera)
     share = 0.02 if is_lens_assumed else 0.0
     np.testing.assert_allclose(sigma, np.hypot(0.2, share * first.depth_m), rtol=1e-5)
@@ -118,10 +118,23 @@ def test_an_assumed_lens_widens_what_is_stored_and_not_the_choice(is_lens_assume
     assert surface(candidate, better, better.T_world_camera)[1].all()
 
 
+def test_an_unknown_readout_widens_the_sigma_and_gives_way_to_what_is_seen_later() -> None:
+    surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0])
+    seen = view(0.0, sigma_m=0.05)
+    unsure, sure = (
+        cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=share)) for share in (0.03, 0.0)
+    )
+    sigma, _ = surface(unsure, seen, seen.T_world_camera)
+    np.testing.assert_allclose(sigma, np.hypot(0.05, 0.03 * seen.depth_m), rtol=1e-5)
+    sigma, better = surface(sure, seen, seen.T_world_camera)
+    np.testing.assert_allclose(sigma, 0.05, rtol=1e-5)
+    assert better.all()
+
+
 @pytest.mark.parametrize(("reduced", "expected"), [(1.0, 0.11 / 0.075), (1.2, 0.11 / 0.09), (2, 1)])
 def test_images_that_are_not_reduced_are_noisier(reduced: float, expected: float) -> None:
     surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), reduced * K[0, 0])
     seen = view(0.0)
-    candidate = cast(StereoCandidate, SimpleNamespace(segment=0))
+    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=0.0))
     sigma, _ = surface(candidate, seen, seen.T_world_camera)
     np.testing.assert_allclose(sigma, expected * 0.2, rtol=1e-5)

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 
 from recon import se3
 from recon.camera_model import Undistorter
-from recon.rolling_shutter import FrameRows
+from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.matching import Pyramid
-from recon.tracking.odometry import Tracked, Tracking
+from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.types import U8, Camera, PosePrior
 from service.config import ScanConfig
 from service.flight.anchorage import Anchorage
-from service.flight.viewpoints import Colour, Viewpoint, Viewpoints, frames_apart
+from service.flight.viewpoints import (
+    Colour,
+    StereoViews,
+    UndistortedFrame,
+    Viewpoint,
+    Viewpoints,
+    frames_apart,
+)
 
 
 def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Viewpoint:
@@ -165,3 +177,31 @@ def test_as_many_frames_are_needed_as_pair_up() -> None:
     assert np.isfinite(few.frames_per_step)
     steps_with_partners = 2.2 - 0.6  # ahead of the first view
     assert many.frames_per_step * steps_with_partners >= 30
+
+
+@pytest.mark.parametrize(("doubt_s", "expected"), [(0.0, False), (0.02, True)])
+def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
+    doubt_s: float, expected: bool
+) -> None:
+    K, size = np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), (32, 32)
+    ground, clock = Landmarks(), RowClock(Camera(K, np.zeros(5), size))
+    corners = np.random.default_rng(0).uniform(-20, 20, (40, 2))
+    ids = ground.add(np.c_[corners, np.full(40, 100.0)])
+    keys: list[OdometryKeyframe] = []
+    odometry = SimpleNamespace(segment=0, readout=SimpleNamespace(doubt_s=doubt_s), keyframes=keys)
+    views = StereoViews(
+        Viewpoints(ScanConfig()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
+        np.ones(size, np.uint8), Counter(),
+    )  # fmt: skip
+    for i in range(3):
+        plain = frame(i, 5.0 * i)
+        keys.append(replace(plain.key, uv=corners, landmark=ids, map=ground))
+        turn = np.array([0.0, 2.0 * i, 0.0, 0.0, 0.0, 0.0])
+        moving = FrameRows(i, PosePrior(), np.eye(4), Rows(clock, turn, np.zeros(6)))
+        image = UndistortedFrame(
+            i, i, PosePrior(), cast(Colour, plain.colour), plain.gray, plain.gray, None, False
+        )
+        state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
+        views.take(image, Tracked(state, 0, plain.T_odom_camera, moving=moving))
+    shares = [view.rows_share for view in views.ready(everything=True)]
+    assert len(shares) == 3 and all((share > 0.005) == expected for share in shares)

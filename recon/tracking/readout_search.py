@@ -49,6 +49,9 @@ GLOBAL_S = 5e-4
 
 HUBER_PX = 1.0
 
+USUAL_S = 0.02
+"""Sigma of a readout of which nothing is known: cameras of drones read in 0 to 35 ms."""
+
 
 @dataclass(frozen=True, slots=True)
 class ReadoutEstimate:
@@ -81,6 +84,14 @@ class ReadoutSearch:
         self._clock, self._K = clock, K
         self._last_seq = -1
         self._found: deque[tuple[float, float]] = deque(maxlen=4)  # readout, weight
+
+    @property
+    def doubt_s(self) -> float:
+        """Sigma of the readout in use."""
+        if self.estimate is None:
+            return USUAL_S if self._clock.readout_s == 0.0 else 0.0
+        off_s = self.estimate.readout_s - self._clock.readout_s
+        return min(float(np.hypot(self.estimate.sigma_s, off_s)), USUAL_S)
 
     def look(self, keyframes: list[OdometryKeyframe]) -> None:
         """Search once the newest of the ``keyframes``, all settled, ends a further window."""

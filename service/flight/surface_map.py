@@ -151,8 +151,8 @@ class SurfaceMap:
     def __call__(
         self, view: StereoCandidate, depth: DepthMap, T_map_camera: F64
     ) -> tuple[F32, Bool]:
-        """((h, w) sigma widened by disagreement between views and by an assumed lens, (h, w)
-        surface that is new or better)."""
+        """((h, w) sigma widened by disagreement between views, an unknown readout and an assumed
+        lens, (h, w) surface that is new or better)."""
         with self._stopwatch("map"):
             if view.segment != self._segment:
                 self._disagreement.forget()
@@ -161,7 +161,8 @@ class SurfaceMap:
             noise = np.float32(max(1.0, RECORDED_SIGMA_PX / LABEL_SIGMA_PX / reduced))
             in_map = replace(depth, sigma_m=depth.sigma_m * noise, T_world_camera=T_map_camera)
             wider = np.float32(self._disagreement.take(in_map))
-            in_map = replace(in_map, sigma_m=in_map.sigma_m * wider)
+            of_rows = np.float32(view.rows_share) * depth.depth_m
+            in_map = replace(in_map, sigma_m=np.hypot(in_map.sigma_m * wider, of_rows))
             known = self._map
             if known is None:
                 known = self._map = self._empty(depth)

@@ -16,7 +16,7 @@ import numpy as np
 from recon import se3
 from recon.camera_model import Undistorter
 from recon.posegraph.between_keyframes import FixAverage
-from recon.rolling_shutter import FrameRows
+from recon.rolling_shutter import FrameRows, depth_share
 from recon.stereo.virtual_stereo import View
 from recon.tracking.keyframe_window import OdometryKeyframe, landmarks, step_covariance
 from recon.tracking.odometry import Odometry, Tracked, Tracking
@@ -108,6 +108,7 @@ class StereoCandidate:
     points: F64  # (N, 3) landmarks in the view's camera
     covariance: F64  # (6, 6) of vision's motion from the view before, left, in the view's camera
     earlier: Mapping[int, F64]  # number to pose (4, 4) of the segment's last few views
+    rows_share: float = 0.0  # sigma of depth over depth, by a readout that is not sure
 
 
 class Viewpoints:
@@ -351,6 +352,7 @@ class StereoViews:
         points = se3.transform(se3.inverse(view.anchor.T_key_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         assert view.colour is not None
+        partners = self.selection.partners(view)
         return StereoCandidate(
             view.seq,
             view.time_ns,
@@ -358,12 +360,34 @@ class StereoViews:
             prior,
             view.colour.bgr,
             self._posed(view, in_odom),
-            tuple(self._posed(partner, in_odom) for partner in self.selection.partners(view)),
+            tuple(self._posed(partner, in_odom) for partner in partners),
             view.anchor,
             points,
             self._step_covariance(view),
             {v.seq: v.T_odom_camera for v in self._given if v.segment == view.segment},
+            self._rows_share(view, partners, points),
         )
+
+    def _rows_share(self, view: Viewpoint, partners: list[Viewpoint], points: F64) -> float:
+        """Sigma of depth over depth by what is not known of the readout.
+
+        ``points`` (N, 3) of the view's camera are the ground.
+        """
+        search = self._odometry.readout
+        doubt_s = 0.0 if search is None else search.doubt_s
+        rows = None if view.moving is None else view.moving.rows
+        if doubt_s == 0.0 or rows is None:
+            return 0.0
+        seen = points[points[:, 2] > 0]
+        shares = [
+            depth_share(
+                rows, partner.moving.rows, se3.inverse(partner.T_odom_camera) @ view.T_odom_camera,
+                seen, doubt_s,
+            )
+            for partner in partners
+            if partner.moving is not None and partner.moving.rows is not None
+        ]  # fmt: skip
+        return float(np.median(shares)) if shares else 0.0
 
     def _step_covariance(self, view: Viewpoint) -> F64:
         """(6, 6) of the motion since the view given before."""
