@@ -142,11 +142,12 @@ def rasterise(cloud: PointCloud, grid: Grid) -> Raster:
 def rasterise_points(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
     """As :func:`rasterise` for arrays: (N, 3) m in any frame with z up, (N, 3), (N,)."""
     rows, cols = grid.shape
-    local = np.asarray(xyz_m, np.float64) - np.array([grid.west_m, grid.north_m, 0.0])
     height, sigma, colour = _top_surface(
-        np.ascontiguousarray(local),
+        np.ascontiguousarray(xyz_m),
         np.ascontiguousarray(rgb, np.uint8),
         np.ascontiguousarray(sigma_m, np.float32),
+        grid.west_m,
+        grid.north_m,
         1.0 / grid.cell_m,
         rows,
         cols,
@@ -156,20 +157,26 @@ def rasterise_points(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Ras
 
 @njit(cache=True, nogil=True)
 def _top_surface(
-    xyz: F64, rgb: U8, sigma: F32, inverse: float, rows: int, cols: int
-) -> tuple[F32, F32, U8]:
-    """Height, sigma and colour per cell in two passes: the highest point, then its layer."""
+    xyz: F64 | F32, rgb: U8, sigma: F32, west: float, north: float, inverse: float,
+    rows: int, cols: int,
+) -> tuple[F32, F32, U8]:  # fmt: skip
+    """Height, sigma and colour per cell in two passes: the highest point, then its layer.
+
+    The upper left corner of the grid lies at (west, north) m; a cell has 1 over ``inverse`` m.
+    """
     floor = np.full((rows, cols), -np.inf)  # lowest height that still is the top surface
     top = np.full((rows, cols), -np.inf)
     n = xyz.shape[0]
     for p in range(n):
-        c, r = int(np.floor(xyz[p, 0] * inverse)), int(np.floor(-xyz[p, 1] * inverse))
+        c = int(np.floor((float(xyz[p, 0]) - west) * inverse))
+        r = int(np.floor((north - float(xyz[p, 1])) * inverse))
         if 0 <= r < rows and 0 <= c < cols and xyz[p, 2] > top[r, c]:
             top[r, c] = xyz[p, 2]
             floor[r, c] = xyz[p, 2] - TOP_SIGMAS * max(float(sigma[p]), 1e-6)
     sums = np.zeros((rows, cols, 5))
     for p in range(n):
-        c, r = int(np.floor(xyz[p, 0] * inverse)), int(np.floor(-xyz[p, 1] * inverse))
+        c = int(np.floor((float(xyz[p, 0]) - west) * inverse))
+        r = int(np.floor((north - float(xyz[p, 1])) * inverse))
         if 0 <= r < rows and 0 <= c < cols and xyz[p, 2] >= floor[r, c]:
             w = 1.0 / max(float(sigma[p]), 1e-6) ** 2
             sums[r, c, 0] += w

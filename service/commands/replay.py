@@ -213,6 +213,7 @@ def _fly(
             scan.discard()
         else:
             summary = scan.close()
+            del scan  # its images and its map
             if link is not None:
                 progress("sending the rest")
                 summary["datalink_complete"] = link.drain(inputs.config.datalink.drain_s)

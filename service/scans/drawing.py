@@ -71,11 +71,12 @@ def _relief(raster: Raster) -> F32:
 
 def _colour_panel(raster: Raster, shade: F32) -> U8:
     """Colour times shading, softened so that the image stays readable."""
-    light = np.clip(0.6 + 0.4 * np.nan_to_num(shade, nan=1.0), 0.0, 1.25)
+    light = np.clip(0.6 + 0.4 * np.nan_to_num(shade, nan=1.0), 0.0, 1.25, dtype=np.float32)
     bright = float(np.percentile(raster.rgb[raster.known], 98)) if raster.known.any() else 255.0
     gain = float(np.clip(230.0 / max(bright, 1.0), 1.0, 2.0))
-    bgr = gain * raster.rgb[..., ::-1] * light[..., None]
-    return _on_background(np.clip(bgr, 0, 255).astype(np.float32), raster.known)
+    bgr = raster.rgb[..., ::-1].astype(np.float32)
+    bgr *= (np.float32(gain) * light)[..., None]
+    return _on_background(bgr, raster.known)
 
 
 def _height_panel(raster: Raster, shade: F32) -> U8:
@@ -84,10 +85,10 @@ def _height_panel(raster: Raster, shade: F32) -> U8:
     unit = (np.nan_to_num(raster.height_m, nan=low) - low) / (high - low)
     tone = np.clip(np.rint(255 * unit), 0, 255).astype(np.uint8)
     bgr = cv2.applyColorMap(tone, cv2.COLORMAP_VIRIDIS).astype(np.float32)
-    light = np.clip(np.nan_to_num(shade, nan=1.0), 0.15, 1.3)
-    return _on_background(
-        np.clip((0.25 * 255 + 0.75 * bgr) * light[..., None], 0, 255), raster.known
-    )
+    bgr *= 0.75
+    bgr += 0.25 * 255
+    bgr *= np.clip(np.nan_to_num(shade, nan=1.0), 0.15, 1.3)[..., None]
+    return _on_background(bgr, raster.known)
 
 
 def _height_range(raster: Raster) -> tuple[float, float]:
@@ -99,8 +100,10 @@ def _height_range(raster: Raster) -> tuple[float, float]:
     return middle - half, middle + half
 
 
-def _on_background(bgr: F64 | F32, known: Bool) -> U8:
-    return np.asarray(np.where(known[..., None], bgr, np.array(BACKGROUND)), np.uint8)
+def _on_background(bgr: F32, known: Bool) -> U8:
+    out = np.clip(bgr, 0, 255, out=bgr).astype(np.uint8)
+    out[~known] = BACKGROUND
+    return out
 
 
 def _fit(panel: U8, largest_px: int) -> U8:

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 MIN_STRIP_POINTS, STRIP_POINTS = 100_000, 4_000_000
 """Points that a core fuses at once; the sums of a strip take some hundred bytes each."""
 
+STRIPS_PER_CORE = 4
+"""The sums of one strip per core are in memory at a time."""
+
 LARGEST_POINTS = 60_000_000
 """Maximum points before fusion; a scan with more gets larger voxels, and a note."""
 
@@ -79,7 +82,8 @@ def fused_cloud(
     if points > LARGEST_POINTS:
         size *= float(np.sqrt(points / LARGEST_POINTS))
         notes = (f"{points} points before fusion: voxels enlarged to {size:.3f} m",)
-    edges = strip_edges(extents, min(STRIP_POINTS, max(points // threads(), MIN_STRIP_POINTS)))
+    share = points // (STRIPS_PER_CORE * threads())
+    edges = strip_edges(extents, min(STRIP_POINTS, max(share, MIN_STRIP_POINTS)))
     with progress.part("fusing the cloud", 0.5):
         say = partial(progress.counting(len(extents)), progress.text)
         strips = [_strip(store, extents, held, a, b, say) for a, b in pairwise(edges)]
@@ -151,7 +155,7 @@ def _strip(
 
 
 SCALE_M = 0.001
-CHUNK_POINTS = 1_000_000
+CHUNK_POINTS = 200_000
 
 
 def placed(cloud: PointCloud, frame: LocalFrame | None) -> F64:
