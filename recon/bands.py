@@ -7,6 +7,7 @@ compile each.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
@@ -16,6 +17,8 @@ from typing import Any, TypeVar
 from numba import config
 
 T = TypeVar("T")
+
+GIVE_WAY_S = 1e-4
 
 _limit = 0  # threads that one call may use; 0: one per core
 
@@ -34,6 +37,15 @@ def limit_threads(threads: int) -> None:
 def threads() -> int:
     """How many threads a call may use."""
     return min(_limit or cores(), cores())
+
+
+def give_way() -> None:
+    """Let threads that wait for the interpreter run; to be called every few ms by long work.
+
+    Array operations give the interpreter up for an instant and get it back before a waiting thread
+    has woken up, so that this thread waits as long as the work lasts.
+    """
+    time.sleep(GIVE_WAY_S)
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from pathlib import Path
@@ -18,6 +19,7 @@ from service.config import load_config
 from service.daemon.intent import MARK, Left
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
+from service.flight.scan import short_collections
 
 MODEL = Path(__file__).parent.parent / "demo/caliterra/camera.yaml"
 
@@ -180,3 +182,10 @@ def test_a_scan_is_started_once(daemon: Daemon, monkeypatch: pytest.MonkeyPatch)
     end.set()
     until(lambda: not daemon.scanning.is_running)
     assert len(begun) == 1
+
+
+def test_the_collector_leaves_out_what_was_loaded_until_the_scan_ends() -> None:
+    with pytest.raises(KeyError), short_collections():
+        assert gc.get_freeze_count() > 10_000
+        raise KeyError
+    assert gc.get_freeze_count() == 0

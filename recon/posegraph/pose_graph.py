@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon import se3
+from recon import bands, se3
 from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.loop_book import Edge, LoopBook
 from recon.posegraph.motions import Motions
@@ -32,6 +32,9 @@ __all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
 log = logging.getLogger(__name__)
 
 SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
+
+GIVE_WAY_EVERY = 4
+"""Keyframes of a rebuild, in which other threads wait."""
 
 
 class PoseGraph:
@@ -264,7 +267,9 @@ class PoseGraph:
         """Rebuild the graph from all readings and the segments' present frames."""
         self._start()
         last: Node | None = None
-        for node in self._nodes.values():
+        for count, node in enumerate(self._nodes.values()):
+            if count % GIVE_WAY_EVERY == 0:
+                bands.give_way()
             self._insert(node, last)
             last = node
         for loop in self._book.taken:

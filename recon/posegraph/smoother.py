@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from recon import se3
+from recon import bands, se3
 from recon.posegraph.ledger import MemoryLedger, Rows
 from recon.types import F64, I64
 
@@ -170,6 +170,7 @@ class System:
     @staticmethod
     def of(factors: list[Factors], at: State) -> System:
         """That of all factors."""
+        bands.give_way()
         count, first_log = 6 * len(at.R) + len(at.logs), 6 * len(at.R)
         held = np.array([first_log + NO_SCALE])
         values, rows, columns, g, cost = [np.ones(1)], [held], [held], np.zeros(count), 0.0

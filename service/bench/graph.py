@@ -15,6 +15,7 @@ from recon.posegraph.trajectory import Placed, Trajectory
 from recon.types import F64, PosePrior
 from service.bench import BenchOptions, BenchResult
 from service.config import FusionConfig
+from service.flight.scan import short_collections
 
 KEYFRAMES = 5000
 STEP_M = 6.0
@@ -43,7 +44,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
     del options  # one flight is one round
     flight, flown = _flight(), _Flown()
     tracking = _Tracking(flown)
-    with tracking:
+    with short_collections(), tracking:
         for i in range(KEYFRAMES):
             time.sleep(PAUSE_S)
             _keyframe(flight, i, flown)
