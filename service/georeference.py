@@ -11,6 +11,7 @@ the offset over the Earth's radius, at most 17 mm per kilometre.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -64,8 +65,45 @@ class LocalFrame:
         out = _apply(_geodetic_projected(self.epsg), u[:, 0], u[:, 1], u[:, 2], inverse=True)
         return self.to_enu(out[:, [1, 0, 2]])
 
+    def from_utm_grid(self, x_m: F64, y_m: F64, height_m: Array) -> F64:
+        """(R, C, 3) ENU metres of eastings (C,), northings (R,) and AMSL metres (R, C).
+
+        As :meth:`from_utm` to within 3 mm over 10 km, and much faster.
+        """
+
+        def foot_and_up(xy: F64) -> F64:
+            low = self.from_utm(np.column_stack([xy, np.zeros(len(xy))]))
+            high = self.from_utm(np.column_stack([xy, np.full(len(xy), 1e3)]))
+            return np.column_stack([low, (high - low) / 1e3])
+
+        places = np.empty((*height_m.shape, 3))
+        found = between_nodes(x_m, y_m, foot_and_up)
+        for k in range(3):
+            places[..., k] = found[k] + height_m * found[3 + k]
+        return places
+
     def _geodetic_enu(self) -> Transformer:
         return _topocentric(float(self.lat_deg), float(self.lon_deg), float(self.alt_amsl_m))
+
+
+NODES = 33
+
+
+def between_nodes(x: F64, y: F64, function: Callable[[F64], Array]) -> Array:
+    """(K, R, C) of a smooth ``function`` from (N, 2) to (N, K), at all of x (C,) and y (R,).
+
+    It is called for NODES places along each side and interpolated linearly between them.
+    """
+    (at_x, from_x), (at_y, from_y) = _nodes(x), _nodes(y)
+    places = np.stack(np.meshgrid(at_x, at_y), axis=-1).reshape(-1, 2)
+    found = function(places).T.reshape(-1, len(at_y), len(at_x))
+    return np.asarray(from_y.astype(found.dtype) @ found @ from_x.T.astype(found.dtype))
+
+
+def _nodes(x: F64) -> tuple[F64, F64]:
+    """Evenly spaced nodes over ``x`` (N,), and (N, nodes) their shares in each of its values."""
+    nodes = np.linspace(x.min(), x.max(), NODES)
+    return nodes, np.column_stack([np.interp(x, nodes, one) for one in np.eye(NODES)])
 
 
 VERTICAL_DATUMS = {"ellipsoid": None, "EGM96": 5773, "EGM2008": 3855}

@@ -112,9 +112,37 @@ def test_images_that_are_not_wanted_are_passed_over(tmp_path: Path) -> None:
     write_video(str(path), "mp4")
     source = open_camera(str(path))
     assert isinstance(source, VideoSource)
-    source.is_wanted = lambda time_ns: time_ns in (80_000_000, 1_000_000_000)
+    source.only_near([1_000_000_000, 80_000_000], 0)
     assert [(f.seq, f.time_ns) for f in source] == [(2, 80_000_000), (5, 1_000_000_000)]
     assert source.warnings == []
+
+
+@pytest.mark.parametrize("container_format", ["mp4", "matroska"])
+def test_images_behind_the_last_wanted_one_are_not_decoded(
+    tmp_path: Path, container_format: str
+) -> None:
+    path = tmp_path / "v"
+    noise = np.random.default_rng(4).integers(0, 256, (60, 96, 128, 3), np.uint8)
+    with av.open(str(path), "w", format=container_format) as out:
+        stream: Any = out.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        stream.options = {"bf": "2", "g": "12", "sc_threshold": "0", "threads": "1"}
+        for pixels in noise:
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="bgr24")))
+        out.mux(stream.encode(None))
+    everything = {f.time_ns: f.image for f in open_camera(str(path))}
+    wanted = [list(everything)[n] for n in (0, 13, 47)]
+    source = open_camera(str(path))
+    assert isinstance(source, VideoSource)
+    source.only_near(wanted, 5_000_000)
+    found = {f.time_ns: f.image for f in source}
+    assert list(found) == wanted and source.warnings == []
+    for time_ns in wanted:
+        np.testing.assert_array_equal(found[time_ns], everything[time_ns])
+    if container_format == "mp4":  # its index says where the keyframes are: every twelfth
+        assert 30 <= source.passed <= 60 - 1 - 2 - 12
+    else:
+        assert not source.passed
 
 
 def test_file_epoch_is_the_creation_time(tmp_path: Path) -> None:

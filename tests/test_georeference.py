@@ -89,6 +89,20 @@ def test_utm_and_back() -> None:
     np.testing.assert_allclose(frame.from_utm(frame.to_utm(enu)), enu, atol=1e-5)
 
 
+def test_places_of_a_grid_are_those_of_its_cells() -> None:
+    frame = LocalFrame(-12.3, 179.9995, 30.0)
+    east, north, _ = frame.to_utm(np.zeros((1, 3)))[0]
+    x, y = east + np.linspace(-3000.0, 7000.0, 90), north + np.linspace(2000.0, -800.0, 70)
+    height = np.random.default_rng(2).uniform(-50.0, 400.0, (70, 90))
+    height[3, 5] = np.nan
+    cells = np.stack([*np.meshgrid(x, y), height], axis=-1).reshape(-1, 3)
+    found = frame.from_utm_grid(x, y, height)
+    assert np.isnan(found[3, 5]).all()
+    want = frame.from_utm(np.nan_to_num(cells)).reshape(70, 90, 3)
+    want[3, 5] = np.nan
+    np.testing.assert_allclose(found, want, atol=3e-3)
+
+
 def test_utm_agrees_with_a_direct_projection() -> None:
     frame = LocalFrame(59.3, 18.1, 25.0)
     direct = Transformer.from_crs(4326, frame.epsg, always_xy=True).transform(18.1, 59.3)

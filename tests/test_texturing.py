@@ -12,7 +12,7 @@ from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh, cut, height_mesh
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import BORDER_PX, lay_out, pack
-from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, consistent, look, median
+from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, consistent, look
 from recon.surface.texturing import PENALTY, choose, face_neighbours, fading, levels, texture
 from recon.types import F64, U8, Array
 
@@ -220,6 +220,27 @@ def test_a_car_in_one_of_five_views_is_left_out() -> None:
     assert consistent(found).view[0].tolist() == [1, 2, 3, 4, -1, -1]
 
 
+def test_outliers_differ_from_the_median_of_their_row() -> None:
+    rng = np.random.default_rng(8)
+    seen = rng.integers(1, 7, 300)
+    found = rows([[*rng.permutation(9)[:n]] for n in seen], rng.random((300, 6)).tolist())
+    found.bgr[:] = rng.uniform(80.0, 120.0, (300, 1, 3)) + rng.normal(0.0, 4.0, (300, 6, 3))
+    found.bgr[rng.random((300, 6)) < 0.15] += 60.0
+    out = consistent(found)
+    dropped = 0
+    for n, (view, px, bgr) in enumerate(zip(found.view, found.px_per_m, found.bgr, strict=True)):
+        colour = bgr[: seen[n]]
+        off = np.abs(colour - np.median(colour, axis=0)).max(axis=1, initial=0.0)
+        is_kept = (off <= 25.0 + 4.0 * np.median(off)) | (len(off) < 4)
+        kept = np.flatnonzero(is_kept)
+        dropped += len(off) - len(kept)
+        assert (out.view[n, len(kept) :] == -1).all()
+        np.testing.assert_array_equal(out.view[n, : len(kept)], view[kept])
+        np.testing.assert_array_equal(out.px_per_m[n, : len(kept)], px[kept])
+        np.testing.assert_array_equal(out.bgr[n, : len(kept)], bgr[kept])
+    assert dropped > 50
+
+
 def test_weights_fade_across_a_seam() -> None:
     mesh = sheet(cells=30)
     middle = mesh.vertices_m[mesh.faces].mean(axis=1)
@@ -274,12 +295,3 @@ def test_cutting_divides_triangles_at_the_border() -> None:
     for part in (west, east):
         assert (np.cross(*edges(part))[:, 2] > -1e-9).all() and part.rgb is not None
     assert len(cut(mesh, (50.0, 50.0, 60.0, 60.0)).faces) == 0
-
-
-def test_medians_are_those_of_numpy() -> None:
-    rng = np.random.default_rng(3)
-    values = rng.normal(size=(200, 9, 3)).astype(np.float32)
-    values[np.arange(9) >= rng.integers(1, 10, 200)[:, None]] = np.nan
-    values = values[:, rng.permutation(9)]
-    want = np.nanmedian(values, axis=1, keepdims=True)
-    assert np.allclose(median(values), want, atol=1e-6)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import itertools
 import logging
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from fractions import Fraction
@@ -38,6 +39,7 @@ EARLIEST_UNIX_S = 946_684_800  # 2000-01-01: cameras without a clock write 1904 
 OPTIONS = ("format", "video_size", "pixel_format", "framerate")
 
 HEAD_BYTES = 4096
+NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,9 @@ class VideoSource:
         self._damaged = 0
         self._unordered = 0
         self._open = True
-        self.is_wanted: Callable[[int], bool] = lambda time_ns: True  # others are not converted
+        self._wanted_ns: list[int] | None = None  # all
+        self._within_ns = self._late_ns = 0
+        self.passed = 0  # coded images that were not decoded
         if not container.streams.video:
             self.close()
             raise InputError(f"{description}: contains no video stream; give a video of the flight")
@@ -91,7 +95,9 @@ class VideoSource:
             raise InputError(f"{description}: its video has a format that cannot be decoded")
         self._stream = stream
         self.images = self._stream.frames  # by the index; 0 without one
-        self._decoded = decoded_frames(container, self._stream, self._warn, self._damage)
+        self._decoded = decoded_frames(
+            container, self._stream, self._warn, self._damage, self._is_needed
+        )
         self._first = next(self._decoded, None)
         if self._first is None:
             self.close()
@@ -127,14 +133,53 @@ class VideoSource:
                     f"{time_ns / 1e9:.2f} s; the rest is skipped"
                 )
                 break
-            if self.is_wanted(time_ns):
+            if self._is_wanted(time_ns, time_ns):
                 pixels = Decoded(frame, self.turned_deg)
                 yield CameraFrame(pixels, time_ns, seq, None, f"frame {seq}")
             last_ns = time_ns
             seq += 1
         else:
-            self._warn_losses(decoded)
+            self._warn_losses(decoded + self.passed)
         self.close()
+
+    def only_near(self, times_ns: Iterable[int], within_ns: int) -> None:
+        """Yield no other images than those near ``times_ns``.
+
+        Others are not converted. In a file with an index (mp4) they are not decoded either, unless
+        one that is wanted follows before the next keyframe.
+        """
+        self._wanted_ns, self._within_ns = sorted(times_ns), within_ns
+
+    def _is_wanted(self, first_ns: int, last_ns: int) -> bool:
+        """Whether one of the times wanted lies between two times, or near them."""
+        if self._wanted_ns is None:
+            return True
+        at = bisect_left(self._wanted_ns, first_ns - self._within_ns)
+        return at < len(self._wanted_ns) and self._wanted_ns[at] <= last_ns + self._within_ns
+
+    def _is_needed(self, packet: av.Packet) -> bool:
+        """Whether an image that is wanted may depend on ``packet``."""
+        entries = getattr(self._stream, "index_entries", None)
+        if self._wanted_ns is None or packet.dts is None or packet.time_base is None:
+            return True
+        if not entries or len(entries) != self.images:
+            return True
+        if packet.is_keyframe and packet.pts is not None:
+            self._late_ns = self._ns(packet.pts - packet.dts, packet.time_base)
+        start_ns = round(self._start_s * NS_PER_S)
+        first_ns = self._ns(packet.dts, packet.time_base) - start_ns
+        following = entries.search_timestamp(packet.dts + 1, backward=False)
+        last_ns = 1 << 62
+        if following >= 0:
+            dts = entries[following].timestamp
+            last_ns = self._ns(dts, packet.time_base) - start_ns + self._late_ns
+        is_needed = self._is_wanted(first_ns, last_ns)
+        self.passed += not is_needed
+        return is_needed
+
+    @staticmethod
+    def _ns(ticks: int, time_base: Fraction) -> int:
+        return round(ticks * time_base * NS_PER_S)
 
     def close(self) -> None:
         """Close the container."""
@@ -152,7 +197,7 @@ class VideoSource:
             step = 1e9 / self.fps if self.fps else 1e9 / 30.0
             return last_ns + int(step) if last_ns >= 0 else 0
         # Whole ticks first: floats of seconds lose nanoseconds after minutes.
-        return round((frame.pts * frame.time_base - self._start_s) * 1_000_000_000)
+        return round((frame.pts * frame.time_base - self._start_s) * NS_PER_S)
 
     def _warn_losses(self, decoded: int) -> None:
         if self._damaged:
@@ -185,11 +230,13 @@ def decoded_frames(
     stream: av.VideoStream,
     broke_off: Callable[[str], None],
     damaged: Callable[[Exception], None],
+    is_needed: Callable[[av.Packet], bool] = lambda packet: True,
 ) -> Iterator[av.VideoFrame]:
     """Every complete image of ``stream``, packet by packet: a damaged one affects no other.
 
     ``broke_off`` is called when the container ends with an error, ``damaged`` for each image
-    that does not decode or that the decoder concealed.
+    that does not decode or that the decoder concealed. Packets that are not ``is_needed`` are
+    passed over.
     """
     import av.error
 
@@ -200,6 +247,8 @@ def decoded_frames(
         except (av.error.FFmpegError, OSError) as error:
             broke_off(f"the recording is cut off: {error}")
             packet = None
+        if packet is not None and not is_needed(packet):
+            continue
         try:
             frames = stream.codec_context.decode(None) if packet is None else packet.decode()
         except av.error.EOFError:

@@ -139,22 +139,19 @@ def video_images(
     times = np.array([k.time_ns for k in keyframes], np.int64)
     found: dict[int, TextureView] = {}
 
-    def is_wanted(time_ns: int) -> bool:
-        past = time_ns + start - times
-        return bool((np.abs(past) <= SAME_TIME_NS).any() or (past > SAME_TIME_NS).all())
-
     if isinstance(source, VideoSource):
-        source.is_wanted = is_wanted
-    frames = (progress or Progress()).over((f for f in source if is_wanted(f.time_ns)), len(times))
+        source.only_near((times - start).tolist(), SAME_TIME_NS)
+    say = (progress or Progress()).counting(len(times))
     try:
-        for frame in frames:
+        for frame in source:
             time_ns = start + frame.time_ns
             nearest = int(np.abs(times - time_ns).argmin())
             if abs(int(times[nearest]) - time_ns) <= SAME_TIME_NS:
                 image = np.dstack([undistort.image(frame.image), undistort.valid])
                 pose = keyframes[nearest].depth.T_world_camera
                 found[nearest] = _view(image, camera, pose, shrink)
-            if time_ns > times.max() + SAME_TIME_NS:
+                say("reading the images")
+            if len(found) == len(times) or time_ns > times.max() + SAME_TIME_NS:
                 break
     finally:
         source.close()

@@ -13,8 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.bands import at_once, threads
+from recon.bands import at_once
+from recon.types import F32, F64
 from service.errors import InputError, SkyreliefError
+from service.georeference import between_nodes
 from service.offline.exports import EXPORTERS
 from service.offline.exports.rasters import contours_of, write_ortho
 from service.offline.exports.view import ExportOptions, ScanView, export
@@ -86,9 +88,10 @@ def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
 def _in_degrees(path: Path) -> tuple[Any, tuple[float, float, float, float]]:
     """(h, w, 4) BGRA of a raster in longitude and latitude, and its bounds in degrees."""
     import rasterio
+    from pyproj import Transformer
     from rasterio.enums import Resampling
     from rasterio.transform import array_bounds
-    from rasterio.warp import calculate_default_transform, reproject
+    from rasterio.warp import calculate_default_transform
 
     with rasterio.open(path) as image:
         to, w, h = calculate_default_transform(
@@ -97,14 +100,22 @@ def _in_degrees(path: Path) -> tuple[Any, tuple[float, float, float, float]]:
         shrink = max(1.0, max(w, h) / MAX_OVERLAY_PX)
         w, h = round(w / shrink), round(h / shrink)
         to = to * to.scale(shrink)
-        bands = np.zeros((4, h, w), np.uint8)
-        reproject(
-            rasterio.band(image, [1, 2, 3, 4]), bands, dst_transform=to, dst_crs="EPSG:4326",
-            resampling=Resampling.average if shrink > 1.0 else Resampling.bilinear,
-            num_threads=threads(),
-        )  # fmt: skip
+        size = round(image.height / shrink), round(image.width / shrink)
+        bands = image.read(out_shape=(4, *size), resampling=Resampling.average)
+        to_map = Transformer.from_crs("EPSG:4326", image.crs, always_xy=True)
+        from_map = ~(image.transform * image.transform.scale(
+            image.width / size[1], image.height / size[0]
+        ))  # fmt: skip
+
+    def pixels(lon_lat: F64) -> F32:
+        cols, rows = from_map * np.array(to_map.transform(*lon_lat.T))
+        return np.column_stack([cols - 0.5, rows - 0.5]).astype(np.float32)
+
+    lon, lat = to.c + to.a * (np.arange(w) + 0.5), to.f + to.e * (np.arange(h) + 0.5)
+    x, y = between_nodes(lon, lat, pixels)
+    bgra = np.ascontiguousarray(bands[[2, 1, 0, 3]].transpose(1, 2, 0))
     west, south, east, north = array_bounds(h, w, to)
-    return bands[[2, 1, 0, 3]].transpose(1, 2, 0), (west, south, east, north)
+    return cv2.remap(bgra, x, y, cv2.INTER_LINEAR), (west, south, east, north)
 
 
 RASTERS = {"ortho.tif": "visual", "dsm.tif": "data", "dtm.tif": "data", "coverage.tif": "data"}

@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.bands import threads
+from recon.bands import at_once, threads
 from recon.mapping.voxel_map import ground_sample_m
 from recon.surface.orthophoto import Terrain, orthophoto
 from recon.surface.raster import Grid, Raster, fill_holes, round_cell
@@ -21,13 +21,16 @@ from recon.types import F64, Array
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
 from service.offline.exports.images import scan_images
-from service.offline.exports.surface import bare_ground, surface_model
+from service.offline.exports.surface import bare_ground, cell_places, surface_model
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.coverage import coverage_of
 from service.scans.main_piece import main_keyframes
 from service.scans.writing import writing
 
 NODATA_M = -9999.0
+QUICKLY = {"level": 4, "overview_resampling": "AVERAGE"}
+"""Half the time of GDAL's defaults for 3 % larger files; the mean of heights never overshoots."""
+
 ORTHO_HOLE_CELLS = 8
 SHORTEST_CONTOUR_CELLS = 12
 MAX_CONTOURS = 5000
@@ -61,9 +64,17 @@ def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
     as those of the stored images where there is no recording.
     """
     keyframes = [k for k in main_keyframes(scan.store) if np.isfinite(k.depth.depth_m).any()]
-    with scan.progress.part("reading the images", 0.3):
-        views = scan_images(keyframes, scan.folder, scan.store.header, options, scan.progress)
-    terrain = _terrain(scan, views)
+    with scan.progress.part("reading the images", 0.6):
+        here, there = scan.progress.branches(2)
+        surface: list[Raster] = []
+        views: list[TextureView] = []
+        at_once(
+            lambda: surface.append(_closed_surface(scan.with_progress(here))),
+            lambda: views.extend(
+                scan_images(keyframes, scan.folder, scan.store.header, options, there)
+            ),
+        )
+    terrain = _terrain(scan, surface[0], views)
     sample_m = [
         (ground_sample_m(k.depth) or np.nan) * k.depth.K[0, 0] / v.K[0, 0]
         for k, v in zip(keyframes, views, strict=True)
@@ -77,21 +88,19 @@ def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
     write_cog(scan, out, grid, bands, ("red", "green", "blue", "opacity"))
 
 
-def _terrain(scan: ScanView, views: Sequence[TextureView]) -> Terrain:
+def _closed_surface(scan: ScanView) -> Raster:
     """The surface model with all its holes closed, as an orthophoto needs it."""
     measured = scan.raster(None)
     certain = surface_model(scan, None).raster
     height = np.where(certain.known, certain.height_m, measured.height_m)
-    raster = fill_holes(replace(measured, height_m=height.astype(np.float32)), ORTHO_HOLE_CELLS)
-    grid, (rows, cols) = raster.grid, np.indices(raster.grid.shape)
-    x = grid.west_m + (cols + 0.5) * grid.cell_m
-    y = grid.north_m - (rows + 0.5) * grid.cell_m
-    z = np.where(raster.known, raster.height_m, np.nanmedian(raster.height_m))
-    places = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    return fill_holes(replace(measured, height_m=height.astype(np.float32)), ORTHO_HOLE_CELLS)
+
+
+def _terrain(scan: ScanView, raster: Raster, views: Sequence[TextureView]) -> Terrain:
     eyes = np.array([v.T_world_camera[:3, 3] for v in views])
     if scan.frame is not None:
-        places, eyes = scan.frame.from_utm(places), scan.frame.to_utm(eyes)
-    return Terrain(raster, places.reshape(*grid.shape, 3), eyes)
+        eyes = scan.frame.to_utm(eyes)
+    return Terrain(raster, cell_places(scan, raster), eyes)
 
 
 def _over(grid: Grid, cell_m: float) -> Grid:
@@ -150,7 +159,7 @@ def write_cog(
                 image.colorinterp = kinds
         with memory.open() as image:
             predictor = "YES" if bands.dtype.kind == "f" else "STANDARD"
-            how = {"driver": "COG", "compress": "DEFLATE", "predictor": predictor}
+            how = {"driver": "COG", "compress": "DEFLATE", "predictor": predictor} | QUICKLY
             copy(image, str(part), **how, num_threads=threads())
 
 
@@ -166,14 +175,15 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
     places = [np.column_stack([line, np.full(len(line), height_m)]) for height_m, line in found]
     ends = np.cumsum([len(line) for line in places])[:-1]
     whole = frame.to_geodetic(frame.from_utm(np.concatenate([np.zeros((0, 3)), *places])))
-    for (height_m, _), geodetic in zip(found, np.split(whole, ends), strict=bool(found)):
+    lon_lat = np.round(whole[:, [1, 0]], 8)
+    for (height_m, _), line in zip(found, np.split(lon_lat, ends), strict=bool(found)):
         features.append(
             {
                 "type": "Feature",
                 "properties": {"height_amsl_m": round(height_m, 3)},
                 "geometry": {
                     "type": "LineString",
-                    "coordinates": [[round(p[1], 8), round(p[0], 8)] for p in geodetic],
+                    "coordinates": line.tolist(),
                 },
             }
         )

@@ -11,7 +11,7 @@ from recon.mapping.free_space import open_above
 from recon.surface.ground import BareGround, terrain
 from recon.surface.hole_filling import filled
 from recon.surface.raster import Raster, reliable, standing_height, without_cells
-from recon.types import Bool
+from recon.types import F64, Bool
 from service.offline.exports.view import ScanView
 from service.scans.main_piece import main_keyframes
 
@@ -54,6 +54,16 @@ def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> Surfac
     return Surface(*filled(certain, measured))
 
 
+def cell_places(scan: ScanView, raster: Raster) -> F64:
+    """(rows, cols, 3) places of the middles of the cells in the scan's frame; NaN where unknown."""
+    grid = raster.grid
+    x = grid.west_m + (np.arange(grid.shape[1]) + 0.5) * grid.cell_m
+    y = grid.north_m - (np.arange(grid.shape[0]) + 0.5) * grid.cell_m
+    if scan.frame is not None:
+        return scan.frame.from_utm_grid(x, y, raster.height_m)
+    return np.stack([*np.meshgrid(x, y), raster.height_m.astype(np.float64)], axis=-1)
+
+
 def _open_to_the_sky(scan: ScanView, raster: Raster) -> Raster:
     """``raster`` where the air above was seen to be free, as high as things stand on this site."""
     sideways = float(np.median(scan.off_nadir_deg)) > SIDEWAYS_DEG
@@ -61,19 +71,9 @@ def _open_to_the_sky(scan: ScanView, raster: Raster) -> Raster:
     heights_m = [float(m) for m in range(OPEN_STEP_M, math.ceil(highest) + 1, OPEN_STEP_M)]
     if not heights_m:
         return raster
-    rows, cols = np.nonzero(raster.known)
-    grid = raster.grid
-    places = np.column_stack(
-        [
-            grid.west_m + (cols + 0.5) * grid.cell_m,
-            grid.north_m - (rows + 0.5) * grid.cell_m,
-            raster.height_m[rows, cols].astype(np.float64),
-        ]
-    )
-    if scan.frame is not None:
-        places = scan.frame.from_utm(places)
+    places = cell_places(scan, raster)[raster.known]
     keyframes = scan.progress.over(main_keyframes(scan.store), len(scan.store.seqs()))
-    hidden = np.zeros(grid.shape, np.bool_)
+    hidden = np.zeros(raster.grid.shape, np.bool_)
     with scan.progress.part("surface that is open to the sky", 0.5):
-        hidden[rows, cols] = ~open_above(places, heights_m, (k.depth for k in keyframes))
+        hidden[raster.known] = ~open_above(places, heights_m, (k.depth for k in keyframes))
     return without_cells(raster, hidden)

@@ -157,7 +157,11 @@ class ScanView:
     def raster(self, cell_m: float | None) -> Raster:
         """The upper surface on :meth:`grid`, also where it is doubtful."""
         cloud = self.fused.cloud
-        return rasterise_points(self.xyz_m, cloud.rgb, cloud.sigma_m, self.grid(cell_m))
+
+        def make() -> Raster:
+            return rasterise_points(self.xyz_m, cloud.rgb, cloud.sigma_m, self.grid(cell_m))
+
+        return self.shared(("raster", cell_m), make)
 
     def needs_place(self, what: str) -> LocalFrame:
         """The frame; InputError when the scan has no georeference."""
