@@ -12,13 +12,14 @@ the offset over the Earth's radius, at most 17 mm per kilometre.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from recon.types import F64, Array
+from service.vertical_datum import HeightChange, vertical_code
 
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
@@ -31,6 +32,8 @@ class LocalFrame:
     lat_deg: float
     lon_deg: float
     alt_amsl_m: float
+    _: KW_ONLY
+    heights: HeightChange | None = None  # of all but ENU, from AMSL as flown
 
     def __post_init__(self) -> None:
         """Raise ValueError for an origin that is not on the globe."""
@@ -46,13 +49,16 @@ class LocalFrame:
     def to_enu(self, geodetic: Array) -> F64:
         """(N, 3) ENU metres of (N, 3) rows of latitude, longitude (degrees) and AMSL metres."""
         g = _rows(geodetic)
+        if self.heights is not None:
+            g = self.heights(g, undo=True)
         return _apply(self._geodetic_enu(), g[:, 1], g[:, 0], g[:, 2], inverse=False)
 
     def to_geodetic(self, enu_m: Array) -> F64:
         """(N, 3) latitude, longitude (degrees) and AMSL metres of (N, 3) ENU metres."""
         e = _rows(enu_m)
         out = _apply(self._geodetic_enu(), e[:, 0], e[:, 1], e[:, 2], inverse=True)
-        return out[:, [1, 0, 2]]
+        geodetic = out[:, [1, 0, 2]]
+        return geodetic if self.heights is None else self.heights(geodetic)
 
     def to_utm(self, enu_m: Array) -> F64:
         """(N, 3) easting, northing and AMSL metres in the zone ``epsg`` of (N, 3) ENU metres."""
@@ -106,12 +112,8 @@ def _nodes(x: F64) -> tuple[F64, F64]:
     return nodes, np.column_stack([np.interp(x, nodes, one) for one in np.eye(NODES)])
 
 
-VERTICAL_DATUMS = {"ellipsoid": None, "EGM96": 5773, "EGM2008": 3855}
-"""Names of what heights may be above, and the EPSG code of a geoid model's heights."""
-
-
 def map_crs(epsg: int, vertical: str | None = None) -> CRS:
-    """The map's coordinate system; with a name of VERTICAL_DATUMS that of its heights as well.
+    """The map's coordinate system; with the name of a vertical datum that of its heights as well.
 
     Nothing is converted, so no geoid grid is needed.
     """
@@ -120,7 +122,7 @@ def map_crs(epsg: int, vertical: str | None = None) -> CRS:
     flat = CRS.from_epsg(epsg)
     if vertical is None:
         return flat
-    heights = VERTICAL_DATUMS[vertical]
+    heights = vertical_code(vertical)
     return flat.to_3d() if heights is None else CRS(f"EPSG:{epsg}+{heights}")
 
 

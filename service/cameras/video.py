@@ -157,7 +157,7 @@ class VideoSource:
         at = bisect_left(self._wanted_ns, first_ns - self._within_ns)
         return at < len(self._wanted_ns) and self._wanted_ns[at] <= last_ns + self._within_ns
 
-    def _is_needed(self, packet: av.Packet) -> bool:
+    def _is_needed(self, packet: av.Packet[Any]) -> bool:
         """Whether an image that is wanted may depend on ``packet``."""
         entries = getattr(self._stream, "index_entries", None)
         if self._wanted_ns is None or packet.dts is None or packet.time_base is None:
@@ -230,7 +230,7 @@ def decoded_frames(
     stream: av.VideoStream,
     broke_off: Callable[[str], None],
     damaged: Callable[[Exception], None],
-    is_needed: Callable[[av.Packet], bool] = lambda packet: True,
+    is_needed: Callable[[av.Packet[Any]], bool] = lambda packet: True,
 ) -> Iterator[av.VideoFrame]:
     """Every complete image of ``stream``, packet by packet: a damaged one affects no other.
 

@@ -42,7 +42,10 @@ def export(
     ] = None,
     vertical_datum: Annotated[
         str | None,
-        typer.Option(help="vertical datum of the heights, if known: ellipsoid, EGM96 or EGM2008"),
+        typer.Option(help="of the heights as flown, if known: ellipsoid, EGM96, EGM2008, EPSG:n"),
+    ] = None,
+    to_datum: Annotated[
+        str | None, typer.Option(help="convert heights to this vertical datum, by PROJ's grids")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -65,6 +68,7 @@ def export(
             stored,
             _epoch_ns(video_epoch),
             vertical_datum,
+            to_datum,
         )
     except ValueError as error:
         raise InputError(f"export: {error}") from error

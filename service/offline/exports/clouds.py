@@ -44,7 +44,10 @@ def write_ply(scan: ScanView, out: Path, options: ExportOptions) -> None:
     rows["x"], rows["y"], rows["z"] = scan.xyz_m.T
     rows["red"], rows["green"], rows["blue"] = cloud.rgb.T
     rows["sigma_m"], rows["views"] = cloud.sigma_m, cloud.views
-    crs = "local ENU metres" if scan.frame is None else f"EPSG:{scan.frame.epsg}, AMSL metres"
+    crs = "local ENU metres"
+    if scan.frame is not None:
+        heights = "AMSL metres" if options.to_datum is None else f"metres {options.above}"
+        crs = f"EPSG:{scan.frame.epsg}, {heights}"
     head = ["ply", "format binary_little_endian 1.0", f"comment {crs}"]
     head += [f"element vertex {len(cloud)}"]
     head += [f"property {kind} {name}" for name, _, kind in PLY_TYPES]
@@ -61,7 +64,7 @@ def write_laz_file(scan: ScanView, out: Path, options: ExportOptions) -> None:
     with writing(out) as part:
         write_laz(
             part, scan.fused.cloud, scan.frame, started_ns, laz, classes(scan), scan.xyz_m,
-            options.vertical_datum,
+            options.datum,
         )  # fmt: skip
 
 
@@ -89,7 +92,7 @@ def write_copc(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """The fused cloud as COPC, with sigma_m and views and the EPSG code as WKT."""
     import copclib
 
-    vertical = options.vertical_datum
+    vertical = options.datum
     header = las_header(scan.xyz_m, scan.frame, scan.store.header.started_unix_ns, vertical)
     record = point_record(header, scan.xyz_m, scan.fused.cloud)
     record["classification"] = classes(scan)
@@ -190,8 +193,8 @@ EARTH_CENTRED = 4978
 def write_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """A folder with ``tileset.json`` and its point tiles, in earth-centred metres.
 
-    Heights go in as they are, above mean sea level: a globe with ellipsoidal terrain shows
-    the cloud lower or higher by the geoid's height.
+    Heights go in as they are. Unless they are converted to the ellipsoid, a globe with ellipsoidal
+    terrain shows the cloud lower or higher by the geoid's height.
     """
     from py3dtiles.convert import convert
     from pyproj import CRS

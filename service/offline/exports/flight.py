@@ -19,14 +19,14 @@ import numpy as np
 from recon import se3
 from recon.types import F64, Keyframe
 from service.errors import OutsideError
+from service.georeference import LocalFrame
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
 from service.scans.writing import writing
 
 
-def _geodetic(scan: ScanView, what: str) -> F64:
-    """(N, 3) latitude, longitude, AMSL metres of the trajectory."""
-    frame = scan.needs_place(what)
+def _geodetic(scan: ScanView, frame: LocalFrame) -> F64:
+    """(N, 3) latitude, longitude, height of the trajectory."""
     if not scan.poses:
         return np.zeros((0, 3))
     return frame.to_geodetic(np.array([p.T_world_camera[:3, 3] for p in scan.poses]))
@@ -39,7 +39,8 @@ def _iso(time_unix_ns: int) -> str:
 
 def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """The track as one line, and a point per keyframe with its time, attitude and sigma."""
-    geodetic = _geodetic(scan, "a map of the flight")
+    frame = scan.needs_place("a map of the flight")
+    geodetic = _geodetic(scan, frame)
     places = [[round(g[1], 8), round(g[0], 8), round(g[2], 3)] for g in geodetic.tolist()]
     header = scan.store.header
     features: list[dict[str, Any]] = []
@@ -51,7 +52,6 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
                 "geometry": {"type": "LineString", "coordinates": places},
             }
         )
-    frame = scan.needs_place("a map of the flight")
     for one in main_keyframes(scan.store):
         lat, lon, alt = frame.to_geodetic(one.depth.T_world_camera[None, :3, 3])[0]
         features.append(
@@ -74,8 +74,8 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 
 def write_kml(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """The track with its times, heights above mean sea level."""
-    geodetic = _geodetic(scan, "a map of the flight")
+    """The track with its times; heights above mean sea level, as KML demands."""
+    geodetic = _geodetic(scan, scan.flown_frame or scan.needs_place("a map of the flight"))
     whens = "".join(f"<when>{_iso(p.time_unix_ns)}</when>" for p in scan.poses)
     places = "".join(f"<gx:coord>{g[1]:.8f} {g[0]:.8f} {g[2]:.3f}</gx:coord>" for g in geodetic)
     name = escape(scan.store.header.scan_id)

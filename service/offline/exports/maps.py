@@ -47,18 +47,20 @@ def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> No
     """Contours and annotations as a GeoPackage: a layer each, in the scan's UTM zone."""
     frame = scan.needs_place("a contour map")
     found = contours_of(scan, options)
-    heights = {"height_amsl_m": [height_m for height_m, _ in found]}
+    heights = {options.height_key: [height_m for height_m, _ in found]}
     layers = [lines("contours", [line for _, line in found], heights)]
     notes = read_annotations(scan.folder).features
     if notes:
-        spots = np.array([one.geometry.coordinates for one in notes])
+        spots = np.array([one.geometry.coordinates for one in notes])[:, [1, 0, 2]]
+        if frame.heights is not None:
+            spots = frame.heights(spots)
         about = {
-            "height_amsl_m": spots[:, 2].tolist(),
+            options.height_key: spots[:, 2].tolist(),
             "text": [one.properties.text for one in notes],
             "by": [one.properties.by for one in notes],
             "made_unix_s": [one.properties.made_unix_s for one in notes],
         }
-        places = frame.to_utm(frame.to_enu(spots[:, [1, 0, 2]]))[:, :2]
+        places = frame.to_utm(frame.to_enu(spots))[:, :2]
         layers.append(points("annotations", places, about))
     write_layers(out, frame.epsg, layers)
 
@@ -249,6 +251,8 @@ def _heights(scan: ScanView, options: ExportOptions) -> str:
     if scan.frame is None:
         return "metres above the scan's origin"
     datum = options.vertical_datum
+    if options.to_datum is not None:
+        return f"metres above {options.to_datum}; above {datum} as flown, the operator says"
     return HEIGHTS if datum is None else f"metres above {datum}, as the operator says"
 
 

@@ -38,13 +38,13 @@ MAX_CONTOURS = 5000
 
 
 def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Heights in AMSL metres (float32, -9999 where unknown), their sigma, and 1 where filled."""
+    """Heights in metres (float32, -9999 where unknown), their sigma, and 1 where filled."""
     surface = surface_model(scan, options.cell_m, options.strict)
     known = surface.raster.known
     bands = [surface.raster.height_m, surface.raster.sigma_m, surface.is_filled]
     image = np.where(known, np.stack(bands), NODATA_M).astype(np.float32)
-    names = ("height AMSL, m", "sigma, m", "filled")
-    write_cog(scan, out, surface.raster.grid, image, names, NODATA_M, options.vertical_datum)
+    names = (f"height {options.above}, m", "sigma, m", "filled")
+    write_cog(scan, out, surface.raster.grid, image, names, NODATA_M, options.datum)
 
 
 def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -52,9 +52,9 @@ def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     raster, found = surface_model(scan, options.cell_m).raster, bare_ground(scan, options.cell_m)
     bands = np.stack([found.everywhere_m, found.is_bridged])
     image = np.where(found.is_inside, bands, NODATA_M)
-    names = ("ground AMSL, m", "bridged")
+    names = (f"ground {options.above}, m", "bridged")
     image = image.astype(np.float32)
-    write_cog(scan, out, raster.grid, image, names, NODATA_M, options.vertical_datum)
+    write_cog(scan, out, raster.grid, image, names, NODATA_M, options.datum)
 
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -180,7 +180,7 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
         features.append(
             {
                 "type": "Feature",
-                "properties": {"height_amsl_m": round(height_m, 3)},
+                "properties": {options.height_key: round(height_m, 3)},
                 "geometry": {
                     "type": "LineString",
                     "coordinates": line.tolist(),
@@ -251,14 +251,15 @@ def write_coverage(scan: ScanView, out: Path, options: ExportOptions) -> None:
     if found is None:
         raise InputError(f"{scan.folder} contains no points yet; nothing to export")
     layer, grid = found.layer, found.layer.grid
-    height = layer.height_m + (0.0 if scan.frame is None else scan.frame.alt_amsl_m)
+    origin = np.zeros((1, 3)) if scan.frame is None else scan.frame.to_geodetic(np.zeros((1, 3)))
+    height = layer.height_m + origin[0, 2]
     bands = np.stack([layer.views.astype(np.float32), layer.sigma_m, height]).astype(np.float32)
     bands[:, ~(layer.known | (layer.views > 0))] = np.nan
     if scan.frame is not None:
         grid, bands = _in_utm(bands, grid, scan.frame)
     bands = np.where(np.isfinite(bands), bands, np.float32(NODATA_M))
     names = ("views", "sigma, m", "height, m")
-    write_cog(scan, out, grid, bands, names, nodata=NODATA_M)
+    write_cog(scan, out, grid, bands, names, NODATA_M, options.to_datum)
 
 
 def _in_utm(bands: Array, grid: Grid, frame: LocalFrame) -> tuple[Grid, Array]:

@@ -57,8 +57,8 @@ def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> Surfac
 def cell_places(scan: ScanView, raster: Raster) -> F64:
     """(rows, cols, 3) places of the middles of the cells in the scan's frame; NaN where unknown."""
     grid = raster.grid
-    x = grid.west_m + (np.arange(grid.shape[1]) + 0.5) * grid.cell_m
-    y = grid.north_m - (np.arange(grid.shape[0]) + 0.5) * grid.cell_m
+    x: F64 = grid.west_m + (np.arange(grid.shape[1], dtype=np.float64) + 0.5) * grid.cell_m
+    y: F64 = grid.north_m - (np.arange(grid.shape[0], dtype=np.float64) + 0.5) * grid.cell_m
     if scan.frame is not None:
         return scan.frame.from_utm_grid(x, y, raster.height_m)
     return np.stack([*np.meshgrid(x, y), raster.height_m.astype(np.float64)], axis=-1)

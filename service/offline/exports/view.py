@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 from recon.surface.raster import Grid, Raster, grid_over, rasterise_points, round_cell
 from recon.types import F64
 from service.errors import InputError
-from service.georeference import VERTICAL_DATUMS, LocalFrame
+from service.georeference import LocalFrame
 from service.offline.exports import EXPORTERS
 from service.packages import needing
 from service.progress import Progress
@@ -26,6 +26,7 @@ from service.scans.main_piece import main_keyframes, main_poses, stretches_apart
 from service.scans.track import latest, local_frame
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
+from service.vertical_datum import height_change, vertical_code
 
 T = TypeVar("T")
 
@@ -50,17 +51,40 @@ class ExportOptions:
     video: Path | None = None  # None: the scan's recording, when it is still there
     stored: bool = False  # never look for the recording
     video_epoch_ns: int | None = None
-    vertical_datum: str | None = None  # what the heights are above, where the operator knows it
+    vertical_datum: str | None = None  # of the heights as flown, where the operator knows it
+    to_datum: str | None = None  # what they are converted to
 
     def __post_init__(self) -> None:
         """Raise ValueError for sizes that are not positive, and for an unknown datum."""
-        if self.vertical_datum not in (None, *VERTICAL_DATUMS):
-            known = ", ".join(VERTICAL_DATUMS)
-            raise ValueError(f"--vertical-datum {self.vertical_datum}: give {known}")
+        for option, datum in (("vertical", self.vertical_datum), ("to", self.to_datum)):
+            try:
+                _ = datum and vertical_code(datum)
+            except ValueError as error:
+                raise ValueError(f"--{option}-datum {error}") from error
+        if self.to_datum is not None and self.vertical_datum is None:
+            raise ValueError(
+                "--to-datum needs the datum of the heights as flown; give --vertical-datum "
+                "(autopilots: usually EGM96)"
+            )
         for name in ("voxel_m", "cell_m", "contour_m"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} is {value}, must be positive")
+
+    @property
+    def datum(self) -> str | None:
+        """What the written heights are above, where that is known."""
+        return self.to_datum or self.vertical_datum
+
+    @property
+    def height_key(self) -> str:
+        """Name of a property that holds a height."""
+        return "height_amsl_m" if self.to_datum is None else "height_m"
+
+    @property
+    def above(self) -> str:
+        """What the written heights are above, in words."""
+        return "AMSL" if self.to_datum is None else f"above {self.to_datum}"
 
 
 class ScanView:
@@ -80,6 +104,7 @@ class ScanView:
         self.progress = progress or Progress()
         self._shared: dict[Any, Any] = {}
         self._lock = threading.RLock()
+        self._datums: tuple[str, str] | None = None  # heights from the first to the second
         self.store.hold_decoded(HELD_BYTES)
 
     def __enter__(self) -> ScanView:
@@ -99,17 +124,38 @@ class ScanView:
         other.progress = progress
         return other
 
+    def converted(self, options: ExportOptions) -> ScanView:
+        """The same view with heights above the datum that ``options`` ask for.
+
+        Raises InputError when they cannot be converted.
+        """
+        if options.vertical_datum is None or options.to_datum is None:
+            return self
+        other = copy.copy(self)
+        other.__dict__.pop("frame", None)
+        other._datums = options.vertical_datum, options.to_datum
+        other.needs_place("a conversion of heights")
+        return other
+
     def shared(self, key: Any, make: Callable[[], T]) -> T:
         """What several deliverables are made from, made once; other threads wait for it."""
         with self._lock:
-            if key not in self._shared:
-                self._shared[key] = make()
-            found: T = self._shared[key]
+            if (self._datums, key) not in self._shared:
+                self._shared[self._datums, key] = make()
+            found: T = self._shared[self._datums, key]
             return found
 
     @cached_property
     def frame(self) -> LocalFrame | None:
-        """The scan's georeference, or None."""
+        """The scan's georeference, or None; its heights are those of the deliverables."""
+        frame = self.flown_frame
+        if frame is None or self._datums is None:
+            return frame
+        return replace(frame, heights=height_change(*self._datums, frame.lat_deg, frame.lon_deg))
+
+    @property
+    def flown_frame(self) -> LocalFrame | None:
+        """The scan's georeference with heights as the autopilot reports them, or None."""
         return local_frame(self.store.header)
 
     @cached_property
@@ -180,5 +226,6 @@ def export(view: ScanView, kind: str, out: Path | None, options: ExportOptions) 
     with needing(f"export to {kind}"):
         if path.suffix == ".tif":
             import_module("rasterio")  # missing: known before the work
-        getattr(import_module(f"service.offline.exports.{module}"), name)(view, path, options)
+        write = getattr(import_module(f"service.offline.exports.{module}"), name)
+        write(view.converted(options), path, options)
     return path
