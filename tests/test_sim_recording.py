@@ -325,9 +325,31 @@ def test_a_rolling_shutter_is_in_the_camera_file_and_the_truth_is_the_middle_row
     assert np.abs(a - b)[88:92].mean() < 0.5 * np.abs(a - b)[:8].mean()  # the middle is the same
 
 
+def test_an_open_shutter_blurs_along_the_motion_and_leaves_the_truth(tmp_path: Path) -> None:
+    flags = ["--swing-deg", "4", "--depth-frames", "1", "--duration-s", "0.5", "--fps", "10"]
+    simulate(tmp_path / "short", *flags)
+    simulate(tmp_path / "long", *flags, "--shutter-ms", "60")
+    np.testing.assert_array_equal(trajectory(tmp_path / "short"), trajectory(tmp_path / "long"))
+    before, _, after = trajectory(tmp_path / "long")[1:4]
+    R = [rotation_from_quaternion(row[[7, 4, 5, 6]]) for row in (before, after)]
+    on_axis = R[0] @ [0.0, 0.0, 60.0] + before[1:4] - after[1:4]
+    x, y, _ = R[1].T @ on_axis  # where it is two frames later
+    detail = []
+    for name in ("short", "long"):
+        image = frames(tmp_path / name / "flight.mp4")[2].to_ndarray(format="gray").astype(float)
+        gy, gx = np.gradient(image[40:-40, 60:-60])
+        along = (gx * x + gy * y) / np.hypot(x, y)
+        across = (gy * x - gx * y) / np.hypot(x, y)
+        detail.append([np.abs(along).mean(), np.abs(across).mean()])
+    left = np.divide(detail[1], detail[0])
+    assert left[0] < 0.6 and left[0] < 0.8 * left[1]
+
+
 def test_a_readout_longer_than_a_frame_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="readout of 150 ms is not within 0 and the 100 ms"):
         simulate(tmp_path / "long", "--readout-ms", "150", "--fps", "10")
+    with pytest.raises(InputError, match="exposure of 150 ms is not within 0 and the 100 ms"):
+        simulate(tmp_path / "long", "--shutter-ms", "150", "--fps", "10")
     with pytest.raises(InputError, match=r"readout_ms 200\.5 is not within"):
         simulate(tmp_path / "slow", "--readout-ms", "200.5")
     with pytest.raises(InputError, match="readout_direction 'around' is not one of down, up"):

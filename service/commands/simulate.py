@@ -50,6 +50,7 @@ def simulate(
     readout_direction: Annotated[
         str, typer.Option(help="Readout direction: down, up, right, left.")
     ] = "down",
+    shutter_ms: Annotated[float, typer.Option(help="Exposure, which blurs by motion.")] = 0.0,
     relief_m: Annotated[float, typer.Option(help="Height of the hills; 0 is flat.")] = 8.0,
     water_m: Annotated[
         float | None, typer.Option(help="Level of a sea with waves, above the origin's ground.")
@@ -137,7 +138,8 @@ def simulate(
             seed, _size(size), fps, focal,
             recording.DISTORTION if distortion else (0.0, 0.0, 0.0, 0.0, 0.0),
             relief_m, density, photos, depth_frames, crf, telemetry, video,
-            shutter_of(readout_ms, readout_direction), flight_seed, site_m, changes, date,
+            shutter_of(readout_ms, readout_direction), 1e-3 * shutter_ms,
+            flight_seed, site_m, changes, date,
         )  # fmt: skip
 
     show = LiveOptions(video_to, mavlink_to, loop, until_stdin_ends) if live else None

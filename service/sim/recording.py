@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.rolling_shutter import row_times_s
-from recon.se3 import quaternion_from_rotation
+from recon.se3 import inverse, quaternion_from_rotation, so3_log
 from recon.types import F64, GLOBAL_SHUTTER, U8, Camera, Shutter
 from service.cameras.camera_file import save_camera
 from service.errors import InputError, OutsideError
@@ -37,6 +37,9 @@ ORIGIN = LocalFrame(47.3977, 8.5456, 488.0)
 DISTORTION = (-0.12, 0.03, 0.0, 0.0, 0.0)
 TERRAIN_STEPS = 6
 """Steps to where a ray meets the terrain; hills are far flatter than the ray."""
+
+MAX_MOMENTS = 64
+"""Images at most that are averaged over an exposure."""
 
 LARGEST_TEXELS = 120_000_000
 REPEATABLE = "bframes=0:mbtree=0:scenecut=0"
@@ -73,6 +76,7 @@ class SimulationOptions:
     with_telemetry: bool = True
     with_video: bool = True
     shutter: Shutter = GLOBAL_SHUTTER
+    exposure_s: float = 0.0  # of each row, about its time
     flight_seed: int | None = None  # of the motion and the sensors; None: ``seed``
     site_m: float | None = None  # side of the place about the origin; None: what the flight sees
     changes: int = 0  # boxes that stand at one of two dates only
@@ -97,6 +101,11 @@ class SimulationOptions:
         if not 0 <= self.shutter.readout_s <= 1 / self.fps:
             raise ValueError(
                 f"readout of {1e3 * self.shutter.readout_s:g} ms is not within 0 and the "
+                f"{1e3 / self.fps:g} ms between frames"
+            )
+        if not 0 <= self.exposure_s <= 1 / self.fps:
+            raise ValueError(
+                f"exposure of {1e3 * self.exposure_s:g} ms is not within 0 and the "
                 f"{1e3 / self.fps:g} ms between frames"
             )
 
@@ -141,14 +150,39 @@ class Simulation:
             if self.times_s[index] >= start:
                 gain = factor
         look, time_s = replace(options.look, exposure=gain), float(self.times_s[index])
-        return self.renderer.frame(self._poses_of_rows(index), index, look, time_s)
+        first, *others = self._poses_while_open(index)
+        light = self.renderer.light(first, look, time_s)
+        for pose in others:
+            light += self.renderer.light(pose, look, time_s)
+        return self.renderer.develop(light / np.float32(1 + len(others)), index, look)
 
-    def _poses_of_rows(self, index: int) -> F64:
+    def _poses_while_open(self, index: int) -> list[F64]:
+        """Poses of frame ``index``, evenly over its exposure and about a pixel apart.
+
+        Each is (4, 4), or has one of each row (N, 4, 4) of a rolling shutter.
+        """
+        open_s = self.options.exposure_s
+        moments = int(np.clip(np.ceil(self._pixels_per_s(index) * open_s), 1, MAX_MOMENTS))
+        offsets = open_s * ((np.arange(moments) + 0.5) / moments - 0.5)
+        return [self._poses_of_rows(index, float(offset_s)) for offset_s in offsets]
+
+    def _pixels_per_s(self, index: int) -> float:
+        """Motion of the ground below in frame ``index``."""
+        near_s = self.times_s[index] + np.array([-5e-4, 5e-4])
+        before, after = self.flight.T_world_camera(near_s)
+        step = inverse(before) @ after
+        x, y, z = before[:3, 3]
+        away_m = max(z - float(self.scene.terrain.height(np.array([x]), np.array([y]))[0]), 1.0)
+        turned = float(np.linalg.norm(so3_log(step[:3, :3])))
+        moved = float(np.linalg.norm(step[:3, 3])) / away_m
+        return float(self.options.camera.K[0, 0] * (turned + moved) / 1e-3)
+
+    def _poses_of_rows(self, index: int, offset_s: float) -> F64:
         """(4, 4) pose of frame ``index``, or one of each row (N, 4, 4) of a rolling shutter."""
-        camera = self.options.camera
+        camera, time_s = self.options.camera, self.times_s[index] + offset_s
         if not camera.shutter.readout_s:
-            return np.asarray(self.poses[index])
-        return self.flight.T_world_camera(self.times_s[index] + row_times_s(camera))
+            return np.asarray(self.flight.T_world_camera(np.array([time_s]))[0])
+        return self.flight.T_world_camera(time_s + row_times_s(camera))
 
     def surface_range(self, origins: F64, directions: F64) -> F64:
         """(N,) metres from (N, 3) places along (N, 3) unit directions to the first surface.

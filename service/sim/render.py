@@ -80,7 +80,11 @@ class Renderer:
         self._trees = scene.trees if len(scene.trees) else np.zeros((1, 8))
 
     def frame(self, T_world_camera: F64, index: int, look: Look, time_s: float = 0.0) -> U8:
-        """(H, W, 3) BGR image as the distorted camera takes it.
+        """(H, W, 3) BGR image as the distorted camera takes it at one moment."""
+        return self.develop(self.light(T_world_camera, look, time_s), index, look)
+
+    def light(self, T_world_camera: F64, look: Look, time_s: float = 0.0) -> F32:
+        """(H, W, 3) BGR light that falls on the pixels.
 
         ``T_world_camera`` is one pose (4, 4), or one for each row (H, 4, 4); for each column
         (W, 4, 4) where the shutter moves sideways. Water moves with ``time_s``.
@@ -100,9 +104,13 @@ class Renderer:
         if look.water_m is not None:
             seen = colour, depth, self.rays, R, c, sideways, focal
             in_bands(flood, H, *seen, look.water_m, time_s)
-        out = np.empty((H, W, 3), np.uint8)
+        return colour
+
+    def develop(self, light: F32, index: int, look: Look) -> U8:
+        """(H, W, 3) the image that the sensor makes of the light (H, W, 3)."""
+        out = np.empty(light.shape, np.uint8)
         camera = look.noise, look.vignette, look.exposure
-        in_bands(_develop, H, colour, self.rays, *camera, index, out)
+        in_bands(_develop, len(out), light, self.rays, *camera, index, out)
         return out
 
     def depth(self, T_world_camera: F64, water_m: float | None = None) -> F32:
