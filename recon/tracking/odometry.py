@@ -17,7 +17,7 @@ from enum import Enum
 import numpy as np
 
 from recon import se3
-from recon.rolling_shutter import FrameRows, RowTrack
+from recon.rolling_shutter import NEAR_S, FrameRows, RowTrack
 from recon.tracking import matching, prediction, two_view
 from recon.tracking.common_view import FeatureCache
 from recon.tracking.keyframe_window import (
@@ -30,6 +30,7 @@ from recon.tracking.keyframe_window import (
 )
 from recon.tracking.localisation import Bridge, FirstViews, Localiser, Located, OdometryConfig
 from recon.tracking.matching import Pyramid, harris_grid
+from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.prediction import Motion
 from recon.tracking.readout_search import ReadoutSearch
 from recon.types import F64, I64, U8, Bool, Camera, PosePrior
@@ -90,6 +91,7 @@ class Odometry:
         self._missed_still: TrackingFrame | None = None  # the last frame, when it has no pose
         self._motion: Motion | None = None
         features = FeatureCache()
+        self.exposure = ExposureWatch()
         self._row_track = RowTrack(lens or camera, seeks_readout)
         clock = self._row_track.clock
         self.readout = ReadoutSearch(clock, self.K) if seeks_readout and clock else None
@@ -286,6 +288,7 @@ class Odometry:
         tracks = int(found.ok.sum())
         turned = float(np.linalg.norm(se3.so3_log(moved[:3, :3])))
         T_odom_camera = se3.inverse(T_camera_odom)
+        px_s = self._px_s(T_odom_camera, depth)
         self._moving.update(new.time_ns, T_odom_camera, new.prior)
         self._lost = 0
         due = self.config.base_to_height * (OVERDUE if new.blurred else 1.0)
@@ -293,6 +296,7 @@ class Odometry:
             self._row_track.add(new.moving, T_camera_odom)
             self._settle()
             return Tracked(Tracking.TRACKED, self.segment, T_odom_camera, tracks, moving=new.moving)
+        self.exposure.add(new.gray, px_s, 1e-9 * self._gap_ns)
         share = 0.5 * self.config.search_share
         whole = self._localiser.pose_from(key, new, T_camera_odom, share, self.config.min_tracks)
         found = found if isinstance(whole, str) else whole
@@ -307,6 +311,13 @@ class Odometry:
         return Tracked(
             Tracking.KEYFRAME, self.segment, last.T_odom_camera, tracks, moving=new.moving
         )
+
+    def _px_s(self, T_odom_camera: F64, depth: float) -> F64:
+        """(2,) motion of the image since the frame before; zero for stills, which are far apart."""
+        gap_s = 1e-9 * self._gap_ns
+        if not (0.0 < gap_s < NEAR_S and np.isfinite(depth)):
+            return np.zeros(2)
+        return np.asarray(self.K[0, 0] / gap_s * self._moving.across(T_odom_camera, depth))
 
     def _cross(self, new: TrackingFrame, bridge: Bridge) -> Tracked:
         """Make a keyframe of a frame that two views alone place."""

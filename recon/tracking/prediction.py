@@ -210,6 +210,13 @@ class Motion:
         turned = self._turn_rad_s * gap_s if turn is None else _angle(turn)
         return moved + turned, gap_s
 
+    def across(self, T_odom_camera: F64, depth: float) -> F64:
+        """(2,) rad by which the ground at ``depth`` on the optical axis has moved in the image
+        since the last frame."""
+        on_axis = np.array([[0.0, 0.0, depth]])
+        x, y, z = se3.transform(se3.inverse(T_odom_camera) @ self._last[1], on_axis)[0]
+        return np.asarray(np.array([x, y]) / max(z, 1e-6))
+
     def ahead(self, time_ns: int, prior: PosePrior) -> tuple[F64, F64 | None, float]:
         """T_odom_camera (4, 4) expected then, the turn R_new_last of telemetry, and seconds."""
         last_ns, T_last, last_prior = self._last

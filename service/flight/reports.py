@@ -11,6 +11,7 @@ import numpy as np
 
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.sensor_offsets import Constants
+from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Tracked, Tracking
 from recon.types import F64
 from service.stream.records import pack_covariance, pack_motion
@@ -186,3 +187,36 @@ class TrackingWatch:
             ((reason, _),) = self._reasons.most_common(1)
             self._warn(f"Tracking lost for {for_s:.0f} s ({reason}): nothing is scanned")
             self._is_reported = True
+
+
+class ShutterWatch:
+    """Reports once that the shutter is too slow for the speed."""
+
+    def __init__(
+        self, exposure: ExposureWatch, px_per_px: float, warn: Callable[[str], None]
+    ) -> None:
+        """``px_per_px``: pixels of the recording to one of the images that are tracked."""
+        self._exposure, self._px_per_px, self._warn = exposure, px_per_px, warn
+        self.summary: dict[str, Any] | None = None
+        """The strongest blur so far, fit for JSON; None while the images are sharp."""
+
+    def look(self) -> None:
+        """After every frame."""
+        blur_px, exposure_s = self._px_per_px * self._exposure.blur_px, self._exposure.exposure_s
+        if not blur_px or exposure_s is None:
+            return
+        if self.summary is None:
+            self._warn(f"Shutter too slow: images blur by {blur_px:.0f} px")
+        if self.summary is None or blur_px > self.summary["blur_px"]:
+            self.summary = {"blur_px": round(blur_px, 1), "exposure_ms": round(1e3 * exposure_s, 1)}
+
+    @property
+    def sentence(self) -> str | None:
+        """For the reader of the scan; None where the images are sharp."""
+        if self.summary is None:
+            return None
+        px, ms = self.summary["blur_px"], self.summary["exposure_ms"]
+        return (
+            f"motion blurs the images by {px:.0f} px: the shutter is open for about {ms:.0f} ms, "
+            f"{ms / px:.1f} ms would blur by one; set a shorter exposure or fly slower"
+        )

@@ -25,7 +25,7 @@ from service.config import Config
 from service.errors import InputError
 from service.flight.pipeline import Pipeline, Step
 from service.flight.recorder import TAGS_FILE, FrameTags, Recorder
-from service.flight.reports import TrackingWatch
+from service.flight.reports import ShutterWatch, TrackingWatch
 from service.flight.stages import build_stages
 from service.flight.telemetry_check import TelemetryCheck
 from service.redaction import public_configuration, redacted
@@ -145,6 +145,9 @@ class Scan:
             inputs.config.camera, inputs.history, inputs.warn, inputs.latency_ms
         )
         self.tracking = TrackingWatch(inputs.warn)
+        odometry = self.pipeline.stages.track.odometry
+        coarser = float(inputs.camera.K[0, 0] / odometry.K[0, 0])
+        self.shutter = ShutterWatch(odometry.exposure, coarser, inputs.warn)
         self.tags = FrameTags(inputs.folder / TAGS_FILE) if inputs.history is not None else None
         self.tagged = self.odd_sized = self.heights = self.attitudes = 0
         self._started = time.monotonic()
@@ -173,6 +176,7 @@ class Scan:
             step = self.pipeline.step(Frame(frame.image, exposed_ns, frame.seq, prior))
         self.check.add(time_ns, step.tracked)
         self.tracking.look(step.tracked, time_ns)
+        self.shutter.look()
         for doubt in self.pipeline.stages.chain.new_doubts():
             inputs.warn(doubt)
         self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)
@@ -229,6 +233,7 @@ class Scan:
         }
         extra["assumed"] = self._assumed()
         extra["camera_readout"] = self._readout()
+        extra["motion_blur"] = self.shutter.summary
         shutter = self.found_shutter()
         if shutter is not None:
             camera = self.store.header.camera | shutter_document(shutter)
@@ -288,6 +293,8 @@ class Scan:
             out.append(f"{self.odd_sized} frames were not {W}x{H} like the camera model: left out")
         if self.inputs.history is not None and self.tagged == 0 and self.recorder.frames:
             out.append("no frame lies inside the telemetry: poses rest on vision alone")
+        if self.shutter.sentence is not None:
+            out.append(self.shutter.sentence)
         shutter = self.found_shutter()
         if shutter is not None:
             out.append(

@@ -1,0 +1,110 @@
+"""Blur by motion: its length in images, the exposure behind it, and what the operator reads."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from painted_ground import painted_ground
+
+from recon import se3
+from recon.tracking.motion_blur import ExposureWatch, streak_px
+from recon.tracking.odometry import Odometry
+from recon.types import F64, U8, Camera, PosePrior
+from service.flight.reports import ShutterWatch
+
+K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
+CAMERA = Camera(K, np.zeros(5), (480, 360))
+FPS = 15.0
+
+
+def blurred(image: U8, length: float, angle_deg: float) -> U8:
+    """``image`` (H, W) smeared by ``length`` px in a direction."""
+    d = np.radians(angle_deg)
+    H, W = image.shape
+    total = np.zeros(image.shape, np.float32)
+    steps = np.linspace(-0.5, 0.5, 2 * int(length) + 3) * length
+    for s in steps:
+        M = np.array([[1.0, 0.0, s * np.cos(d)], [0.0, 1.0, s * np.sin(d)]])
+        total += cv2.warpAffine(image, M, (W, H), borderMode=cv2.BORDER_REFLECT)
+    return np.asarray(np.rint(total / len(steps)), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def image() -> U8:
+    return painted_ground()[600:960, 500:980]
+
+
+@pytest.mark.parametrize("length", [6.0, 10.0, 18.0])
+@pytest.mark.parametrize("angle_deg", [0.0, 35.0, -110.0])
+def test_the_streak_is_as_long_as_the_motion(image: U8, length: float, angle_deg: float) -> None:
+    d = np.radians(angle_deg)
+    along = np.array([np.cos(d), np.sin(d)])
+    smeared = blurred(image, length, angle_deg)
+    assert streak_px(smeared, along) == pytest.approx(length, rel=0.25)
+    assert streak_px(smeared, np.array([-along[1], along[0]])) < 3.0
+    soft = np.asarray(cv2.GaussianBlur(image, (0, 0), 1.5), np.uint8)  # out of focus
+    assert streak_px(soft, along) < 3.0
+
+
+def test_an_image_without_texture_has_no_streak() -> None:
+    assert np.isnan(streak_px(np.full((90, 120), 7, np.uint8), np.array([1.0, 0.0])))
+    ramp = np.tile(np.arange(120, dtype=np.uint8), (90, 1))
+    assert np.isnan(streak_px(ramp, np.array([1.0, 0.0])))
+
+
+def watch_of(image: U8, exposure_s: float, speeds: list[float]) -> ExposureWatch:
+    watch = ExposureWatch()
+    for speed in speeds:
+        shot = blurred(image, speed * exposure_s, 20.0) if exposure_s else image
+        d = np.radians(20.0)
+        watch.add(shot, speed * np.array([np.cos(d), np.sin(d)]), 1.0 / FPS)
+    return watch
+
+
+def test_the_exposure_follows_from_streaks_and_speeds(image: U8) -> None:
+    speeds = [300.0, 450.0, 600.0, 350.0, 500.0]
+    watch = watch_of(image, 0.02, speeds)
+    assert watch.exposure_s == pytest.approx(0.02, rel=0.2)
+    assert watch.blur_px == pytest.approx(9.0, rel=0.25)
+    assert watch_of(image, 0.0, speeds).blur_px == 0.0
+    assert watch_of(image, 0.02, speeds[:4]).exposure_s is None, "too few"
+    slow = watch_of(image, 0.02, [20.0] * 9)  # 1.3 px from frame to frame
+    assert slow.exposure_s is None
+
+
+def photograph(ground: U8, T_world_camera: F64) -> U8:
+    """The image of the plane z = 0, 240 m across."""
+    side = 240.0 / len(ground)
+    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    plane = np.array([[side, 0, -120.0], [0, side, -120.0], [0, 0, 1]])
+    H = K @ R.T @ (np.c_[np.eye(3)[:, :2], -t] @ plane)
+    return np.asarray(cv2.warpPerspective(ground, H, (480, 360), flags=cv2.INTER_AREA), np.uint8)
+
+
+def pose(t_s: float) -> F64:
+    """16 m/s at 60 m, nodding by 2.3 degrees at 1 Hz: 107 px/s and up to 100 px/s."""
+    nod = 0.04 * np.sin(2.0 * np.pi * t_s)
+    R = se3.so3_exp(np.array([0.0, nod, 0.0])) @ np.diag([1.0, -1.0, -1.0])
+    return se3.compose(R, np.array([16.0 * t_s - 60.0, 0.0, 60.0]))
+
+
+def test_a_shutter_too_slow_for_the_speed_is_reported_once() -> None:
+    ground, exposure_s = painted_ground(), 0.05
+    odometry, warnings = Odometry(CAMERA), list[str]()
+    watch = ShutterWatch(odometry.exposure, 2.0, warnings.append)
+    assert watch.sentence is None
+    for i in range(int(5 * FPS)):
+        t = i / FPS
+        moments = t + exposure_s * np.linspace(-0.5, 0.5, 7)
+        shots = [photograph(ground, pose(m)).astype(np.float32) for m in moments]
+        gray = np.asarray(np.rint(np.mean(shots, axis=0)), np.uint8)
+        T = pose(t)
+        prior = PosePrior(T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 2.0)
+        odometry.track(gray, i, round(1e9 * t), prior)
+        watch.look()
+    (text,) = warnings
+    assert text.startswith("Shutter too slow: images blur by ") and len(text) <= 50
+    assert watch.summary is not None and watch.sentence is not None
+    assert watch.summary["exposure_ms"] == pytest.approx(50.0, rel=0.3)
+    assert watch.summary["blur_px"] > 10.0, "px of the recording, twice as fine"
