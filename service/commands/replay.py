@@ -146,6 +146,7 @@ def _replay(
         camera = _tagged_camera(source, notes)
     if camera is None:
         camera, assumed = _assumed_camera(source, notes), ("lens",)
+    camera, config = _with_stated_readout(camera, config, video, source, notes)
     epoch_ns = _epoch(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
     folder = out or Path(f"scan-{scan_id}")
@@ -232,6 +233,30 @@ def _with_readout(inputs: ScanInputs, shutter: Shutter, source: CameraSource) ->
     camera = replace(inputs.camera, shutter=shutter)
     config = change(inputs.config, "camera.readout_ms", "auto")
     return replace(inputs, source=source, camera=camera, config=config)
+
+
+def _with_stated_readout(
+    camera: Camera, config: Config, video: str, source: CameraSource, notes: list[str]
+) -> tuple[Camera, Config]:
+    """Camera and configuration with the readout that the video states, where nothing else does.
+
+    The images refine it.
+    """
+    from service.cameras import parse_source
+    from service.cameras.camera_file import seeks_readout
+    from service.cameras.dji_metadata import stated_shutter
+    from service.config import change
+
+    kind, path = parse_source(video)[:2]
+    is_open = seeks_readout(camera, config.camera) and config.camera.readout_ms != "auto"
+    if kind != "file" or not is_open or getattr(source, "turned_deg", 0) != 0:
+        return camera, config
+    shutter = stated_shutter(path)
+    if shutter is None:
+        return camera, config
+    readout_ms = 1e3 * shutter.readout_s
+    notes.append(f"the video states a readout of {readout_ms:.1f} ms, {shutter.direction}")
+    return replace(camera, shutter=shutter), change(config, "camera.readout_ms", "auto")
 
 
 def _fitted(camera: Camera, source: CameraSource, notes: list[str]) -> Camera:
