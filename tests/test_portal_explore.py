@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,6 +33,22 @@ COLOURED = f"""(() => {{
   return n / (d.length / 4);
 }})()"""
 """Share of the scene's pixels that are neither gray nor background."""
+SELECT = "(() => {{ const f = document.querySelector('[aria-label=\"colour by\"]'); f.value = {!r};"
+SELECT += " f.dispatchEvent(new Event('change', {{ bubbles: true }})); }})()"
+LIKE = (
+    COLOURED.replace("{", "{{")
+    .replace("}", "}}")
+    .replace("Math.abs(d[i + 1] - d[i + 2]) > 20", "like([d[i], d[i + 1], d[i + 2]], [{}, {}, {}])")
+    .replace(
+        "let n = 0;",
+        """let n = 0;
+  const like = (a, b) => {{
+    const of = v => Math.hypot(...v), dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    return dot > 0.98 * of(a) * of(b);
+  }};""",
+    )
+)
+"""Share of the scene's pixels of the hue of a colour."""
 
 
 @pytest.fixture
@@ -53,6 +70,13 @@ def settle(page: Browser) -> None:
     """Wait until the page shows what was asked for."""
     page.run("new Promise(r => setTimeout(r, 100))")
     page.wait("document.body.dataset.still === 'yes'")
+
+
+def again(page: Browser) -> None:
+    """Open the same page again."""
+    address = page.run("location.href")
+    page.open("about:blank")
+    page.open(address)
 
 
 def drawn(page: Browser) -> int:
@@ -85,6 +109,36 @@ def test_the_clip_box_cuts_the_scene_and_gives_it_back(page: Browser) -> None:
     )
     settle(page)
     assert page.run(COLOURED) == pytest.approx(before, rel=0.02)
+
+
+def test_the_scans_of_a_site_have_colours_of_their_own(page: Browser, tmp_path: Path) -> None:
+    choices = "document.querySelector('[aria-label=\\'colour by\\']').textContent"
+    assert "scan" not in page.run(choices)
+    parts = [{"name": "west", "keyframes": [0, 1]}, {"name": "east", "keyframes": [2, 4]}, None]
+    site = tmp_path / "drone-1" / "test-1" / "site.json"
+    site.write_text(json.dumps({"scans": parts}))
+    again(page)
+    page.wait("document.body.dataset.points > 71000")
+    assert page.run(choices).endswith("scan")
+    page.run(SELECT.format("scan"))
+    page.click("Whole site")
+    settle(page)
+    keys = "[...document.querySelectorAll('.legend .keys span')].map(k => k.textContent).join()"
+    assert page.run(keys) == "west,east"
+    both = [page.run(LIKE.format(*rgb)) for rgb in ((230, 159, 0), (86, 180, 233))]
+    page.run(SET.format(".time input", "2"))  # the west alone
+    settle(page)
+    west, east = (page.run(LIKE.format(*rgb)) for rgb in ((230, 159, 0), (86, 180, 233)))
+    assert min(both) > 0.02 and west > 0.02 and east < 0.1 * both[1]
+    page.run(SELECT.format("colour"))
+    assert page.run("document.querySelector('.legend').hidden")
+
+
+def test_a_site_with_damaged_facts_is_shown(page: Browser, tmp_path: Path) -> None:
+    (tmp_path / "drone-1" / "test-1" / "site.json").write_text('{"scans": 7}')
+    again(page)
+    page.wait("document.querySelector('[role=alert]')?.textContent.includes('site.json')")
+    page.wait("document.body.dataset.points > 71000")
 
 
 def view(page: Browser) -> F64:

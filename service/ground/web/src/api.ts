@@ -65,6 +65,20 @@ async function ask<T>(path: string, method = "GET", body?: unknown): Promise<T> 
 const place = (s: { drone: string; scan: string }): string =>
   `/api/scans/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
 
+/** A scan of a site, and the numbers of its first and last keyframe there. */
+export interface Part {
+  name: string;
+  keyframes: [number, number];
+}
+
+/** The scans of a site; none for a single scan. */
+export async function parts(s: Scan): Promise<Part[]> {
+  if (!s.files.some((f) => f.name === "site.json")) return [];
+  const { scans } = await ask<{ scans?: (Part | null)[] }>(file(s, "site.json"));
+  if (!Array.isArray(scans)) throw new Error("site.json is damaged: it lists no scans");
+  return scans.filter((p): p is Part => Array.isArray(p?.keyframes));
+}
+
 /** The page that shows a scan on a map. */
 export const mapAddress = (s: { drone: string; scan: string }): string =>
   `#/map/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;

@@ -1,12 +1,16 @@
 // The cloud in the scene: one Points object per chunk, so that a correction is a matrix.
 
 import * as THREE from "three";
+import type { Part } from "./api";
 import type { Chunk } from "./live";
 import type { Gradual } from "./painter";
 import { length } from "./units";
 
-export const COLOURS = ["colour", "height", "sigma", "views", "age"] as const;
+export const COLOURS = ["colour", "height", "sigma", "views", "age", "scan"] as const;
 export type Colour = (typeof COLOURS)[number];
+
+/** Distinct also for the colour-blind (Okabe and Ito 2008). */
+const PARTS = ["#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7"];
 
 const VERTEX = /* glsl */ `
   attribute vec3 rgb;
@@ -19,6 +23,7 @@ const VERTEX = /* glsl */ `
   uniform float mode;
   uniform vec2 range;
   uniform float age;
+  uniform vec3 part;
   varying vec3 shown;
   #include <clipping_planes_pars_vertex>
 
@@ -42,6 +47,7 @@ const VERTEX = /* glsl */ `
     if (mode > 2.5) s = ramp(views * 255.0 / 8.0);
     if (mode > 3.5) s = ramp(age);
     shown = linear(s);
+    if (mode > 4.5) shown = part * (0.3 + 0.7 * dot(rgb, vec3(0.30, 0.59, 0.11)));
     vec4 mvPosition = seen;
     #include <clipping_planes_vertex>
   }
@@ -72,6 +78,8 @@ export class Cloud implements Gradual {
   drawn = 0;
   /** What is added to heights that are shown: the origin's altitude above the sea. */
   datum_m = 0;
+  /** The scans of a site, by the numbers of their keyframes; none for a single scan. */
+  parts: Part[] = [];
   private readonly chunks = new Map<number, Held>();
   private last = Infinity;
   private readonly shared = {
@@ -111,7 +119,7 @@ export class Cloud implements Gradual {
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
       clipping: true,
-      uniforms: { ...this.shared, age: { value: 0 }, apart: { value: chunk.apart } },
+      uniforms: { ...this.shared, age: { value: 0 }, apart: { value: chunk.apart }, part: { value: this.partOf(chunk.seq) } },
     });
     const object = new THREE.Points(geometry, material);
     object.matrixAutoUpdate = false;
@@ -146,7 +154,17 @@ export class Cloud implements Gradual {
     if (mode === "age") this.ages();
   }
 
-  /** The words at both ends of the colour scale; null for the camera's colours. */
+  /** The name and colour of each part. */
+  keys(): [string, string][] {
+    return this.parts.map(({ name }, k) => [name, PARTS[k % PARTS.length]!]);
+  }
+
+  private partOf(seq: number): THREE.Color {
+    const k = this.parts.findIndex(({ keyframes: [first, last] }) => first <= seq && seq <= last);
+    return new THREE.Color(k < 0 ? "#ffffff" : PARTS[k % PARTS.length]);
+  }
+
+  /** The words at both ends of the colour scale; null where there is none. */
   scale(): [string, string] | null {
     const { x, y } = this.shared.range.value;
     const words: Record<Colour, [string, string] | null> = {
@@ -155,6 +173,7 @@ export class Cloud implements Gradual {
       sigma: ["0 m", "σ 1 m"],
       views: ["1 view", "8 views"],
       age: ["first", "last"],
+      scan: null,
     };
     return words[COLOURS[this.shared.mode.value]!];
   }

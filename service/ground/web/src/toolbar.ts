@@ -54,13 +54,15 @@ function colours({ cloud, legend }: Parts): HTMLElement {
   const select = el(
     "select",
     {},
-    ...COLOURS.map((c) => el("option", { value: c, textContent: c })),
+    ...COLOURS.filter((c) => c !== "scan" || cloud.parts.length).map((c) => el("option", { value: c, textContent: c })),
   );
   select.setAttribute("aria-label", "colour by");
   select.onchange = () => {
     cloud.colour(select.value as Colour);
     const words = cloud.scale();
-    legend.hidden = words === null;
+    const parts = select.value === "scan";
+    legend.hidden = words === null && !parts;
+    if (parts) legend.replaceChildren(el("p", { className: "keys" }, ...cloud.keys().map(([name, colour]) => key(name, colour))));
     if (words)
       legend.replaceChildren(
         el("span", { textContent: words[0] }),

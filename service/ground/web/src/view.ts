@@ -2,7 +2,7 @@
 
 import * as api from "./api";
 import { Cameras } from "./cameras";
-import { count, el } from "./dom";
+import { count, el, notify } from "./dom";
 import { Images, takeView, timeSlider } from "./explore";
 import { jobList } from "./jobs";
 import { LinkState } from "./link";
@@ -20,7 +20,9 @@ const ASK_EVERY_MS = 2000;
 /** Shows a scan, or why there is none; gives what closes it. */
 export async function showView(root: HTMLElement, drone: string, name: string, place?: string): Promise<() => void> {
   try {
-    return view(root, await api.scan(drone, name), place);
+    const scan = await api.scan(drone, name);
+    const parts = await api.parts(scan).catch((error: unknown) => (notify(error), []));
+    return view(root, scan, parts, place);
   } catch (error) {
     root.replaceChildren(nothing(error));
     return () => undefined;
@@ -40,7 +42,7 @@ function nothing(error: unknown): HTMLElement {
   );
 }
 
-function view(root: HTMLElement, scan: api.Scan, place?: string): () => void {
+function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: string): () => void {
   const id = { drone: scan.drone, scan: scan.scan };
   const figures = el("dl", { className: "panel figures" });
   const link = new LinkState();
@@ -57,6 +59,7 @@ function view(root: HTMLElement, scan: api.Scan, place?: string): () => void {
   root.replaceChildren(page);
   const cloud = new Cloud();
   cloud.datum_m = scan.origin?.alt_amsl_m ?? 0;
+  cloud.parts = parts;
   let fused: number | undefined;
   const learn = (now: api.Scan): void => {
     fused = now.counts?.points;
