@@ -14,6 +14,7 @@ from recon.surface.change import (
     mean_surface,
     outlines,
     scatter_of_means,
+    sigmas_of_any,
     volumes,
 )
 from recon.surface.raster import Grid, Raster
@@ -56,6 +57,58 @@ def test_boxes_of_a_metre_and_forty_centimetres_are_found() -> None:
                for b in found.bodies}  # fmt: skip
     assert len(centres) >= 24 and len(found.bodies) <= 26
     assert all(b.volume_m3 > 0 for b in found.bodies)
+
+
+def uneven(seed: int, boxes: list[tuple[int, int, int, int, float]]) -> Raster:
+    """Ground whose errors reach over a metre, and are larger in some places than in others."""
+    rng = np.random.default_rng(seed)
+
+    def smooth(reach: float) -> F64:
+        noise = ndi.gaussian_filter(rng.normal(size=GRID.shape), reach)
+        return np.asarray(noise / noise.std())
+
+    errors = 0.5 * smooth(0.7) + 0.6 * smooth(3.0) + 0.6 * smooth(6.0)
+    flat = surface(seed, boxes)
+    z = 0.03 * errors * np.exp(0.2 * smooth(10.0))
+    for row, col, rows, cols, tall in boxes:
+        z[row : row + rows, col : col + cols] += tall
+    return Raster(GRID, z.astype(np.float32), flat.sigma_m, flat.rgb)
+
+
+def test_errors_that_neighbours_share_unevenly_are_no_change() -> None:
+    shown = (change_between(uneven(s, []), uneven(500 + s, [])).bodies for s in range(30))
+    assert sum(bool(bodies) for bodies in shown) <= 2
+
+
+def test_boxes_of_thirty_centimetres_are_found_in_errors_that_neighbours_share() -> None:
+    boxes = [(20 + 45 * (k // 5), 20 + 45 * (k % 5), 6, 6, 0.3) for k in range(25)]
+    found = change_between(uneven(1, []), uneven(2, boxes))
+    assert sum(bool(found.labels[r : r + 6, c : c + 6].any()) for r, c, *_ in boxes) >= 24
+    assert len(found.bodies) <= 26
+
+
+def test_objects_that_stereo_draws_worse_than_flat_ground_are_no_change() -> None:
+    cars = [(12 + 40 * (k // 6), 12 + 40 * (k % 6), 8, 20, 1.5) for k in range(36)]
+    added = [(30 + 40 * (k // 5), 34 + 40 * (k % 5), 6, 6, 0.5) for k in range(25)]
+    before, after = surface(1, cars), surface(2, [*cars, *added])
+    rng = np.random.default_rng(8)
+    for one in (before, after):
+        rough = ndi.gaussian_filter(rng.normal(size=GRID.shape), 2.0)
+        for row, col, rows, cols, _ in cars:
+            on = slice(row - 1, row + rows + 1), slice(col - 1, col + cols + 1)
+            one.height_m[on] += (0.15 * rough / rough.std())[on].astype(np.float32)
+    found = change_between(before, after)
+    on_cars = sum(bool(found.labels[r : r + 8, c : c + 20].any()) for r, c, *_ in cars)
+    assert on_cars <= 1
+    assert sum(bool(found.labels[r : r + 6, c : c + 6].any()) for r, c, *_ in added) >= 24
+
+
+@pytest.mark.parametrize("places", [1, 40, 1000])
+def test_the_largest_of_many_errors_exceeds_the_level_as_often_as_told(places: int) -> None:
+    rng = np.random.default_rng(places)
+    largest = np.abs(rng.normal(size=(4000, places))).max(axis=1)
+    share = float(np.mean(largest > sigmas_of_any(0.05, places)))
+    assert share == pytest.approx(0.05, abs=0.012)
 
 
 def test_volumes_are_right_within_their_sigma() -> None:
@@ -120,12 +173,13 @@ def test_roofs_that_two_surveys_draw_some_cells_apart_are_no_change() -> None:
 def test_a_grove_is_no_change_until_it_is_felled() -> None:
     rng = np.random.default_rng(5)
     surveys = [surface(seed, []) for seed in (1, 2)]
+    bare = surveys[1].height_m.copy()
     for one in surveys:
         crown = ndi.gaussian_filter(rng.normal(size=GRID.shape), 3.0)
         one.height_m[50:110, 50:110] += (8.0 + 1.5 * crown / crown.std())[50:110, 50:110]
     before, after = surveys
     assert len(change_between(before, after).bodies) <= 2
-    after.height_m[50:110, 50:110] -= 8.0
+    after.height_m[:] = bare
     assert any(b.volume_m3 < -800.0 for b in change_between(before, after).bodies)
 
 
@@ -206,6 +260,8 @@ def test_a_mean_surface_keeps_the_volume_at_the_rim() -> None:
 def test_bad_parameters_are_refused() -> None:
     with pytest.raises(ValueError, match="odd"):
         ChangeConfig(windows=(4,))
+    with pytest.raises(ValueError, match="false_alarm"):
+        ChangeConfig(false_alarm=0.0)
     other = Grid(0.0, 0.0, 0.2, (250, 250))
     a = surface(1, [])
     with pytest.raises(ValueError, match="one grid"):

@@ -10,9 +10,11 @@ cells apart are not a change: an object stands out of all heights that the other
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from statistics import NormalDist
 
 import cv2
 import numpy as np
@@ -27,12 +29,17 @@ NOISE_REACH = 1.5
 """Sigmas by which noise alone raises the highest nearby cell above a cell."""
 
 
+MIN_PLACES = 50
+"""Smallest objects that fit on ground whose errors are judged by themselves."""
+
+
 @dataclass(frozen=True, slots=True)
 class ChangeConfig:
     """Thresholds for a change."""
 
     windows: tuple[int, ...] = (3, 5)  # cells of a side, over which heights are averaged
     level_sigmas: float = 2.58  # 99 %: a cell belongs to a change
+    false_alarm: float = 0.05  # chance that ground without change shows any object
     core_sigmas: float = 4.0
     min_core_cells: int = 3  # beyond core_sigmas, of every object
     min_core_share: float = 0.3  # of an object's cells
@@ -50,6 +57,8 @@ class ChangeConfig:
             raise ValueError("windows must be odd, min_core_cells at least 1")
         if not 0 < self.level_sigmas <= self.core_sigmas:
             raise ValueError("level_sigmas must be positive, core_sigmas no less")
+        if not 0 < self.false_alarm < 1 or self.min_area_m2 <= 0:
+            raise ValueError("false_alarm must lie between 0 and 1, min_area_m2 above 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +139,15 @@ def change_between(before: Raster, after: Raster, config: ChangeConfig | None = 
     errors = SumErrors(scales[0].sigma, scales[0].window, scatter_of_means(d), left)
     bodies = _bodies(d, errors, labels, cell_m, config)
     return Change(before.grid, scales[0].mean, scales[0].sigma, labels, bodies, left)
+
+
+def sigmas_of_any(chance: float, places: float) -> float:
+    """Sigmas that errors alone exceed with a ``chance``, at any of so many independent places.
+
+    Sidak 1967 (doi:10.1080/01621459.1967.10482935), both signs.
+    """
+    one = -math.expm1(math.log1p(-chance) / max(places, 1.0))
+    return -NormalDist().inv_cdf(one / 2.0)
 
 
 def bending(d: F32, cell_m: float, length_m: float) -> F32:
@@ -232,33 +250,73 @@ def _scale(
         np.where(known, x, np.float32(np.nan))
         for x in (_mean(d, window), np.sqrt(_mean(own, window)))
     )
-    step = max(1, round(config.local_m / cell_m))
-    sigma = said * _scatter(mean / said, step, 2 * config.edge_cells)
+    ratio, lag = mean / said, 2 * config.edge_cells
+    enough = round(MIN_PLACES * config.min_area_m2 / cell_m**2)
+    more = np.maximum(
+        _more_in_blocks(ratio, max(1, round(config.local_m / cell_m)), lag),
+        _more_at_steps(ratio, _relief(heights, lag), lag, enough),
+    )
+    sigma = said * _robust(ratio[known]) * more
     return _Scale(window, (_mean(heights[0], window), _mean(heights[1], window)), mean, sigma)
 
 
-def _scatter(ratio: F32, step: int, lag: int) -> F32:
-    """(rows, cols) robust spread of a ratio: of the whole, or of the block of ``step`` cells.
+def _relief(heights: tuple[F32, F32], reach: int) -> F32:
+    """(rows, cols) m that both surfaces rise and fall by within ``reach`` cells; 0 where unknown.
 
-    A block's spread is that of differences ``lag`` cells apart, of which outlines of objects
-    in it touch few.
+    An object that only one of them has is no relief.
+    """
+    one, two = (high - low for high, low in (highest_lowest(h, reach) for h in heights))
+    return np.asarray(np.maximum(np.minimum(one, two), np.float32(0)), np.float32)
+
+
+def _more_at_steps(ratio: F32, relief: F32, lag: int, enough: int) -> F32:
+    """(rows, cols) by how much a ratio scatters more at steps than on usual ground.
+
+    Stereo errs more there. Cells whose relief is alike, by octaves above the median, are one class
+    with a null of its own (Efron 2008, doi:10.1214/07-AOAS141): the quantile of 90 % of differences
+    ``lag`` cells apart, as errors at steps have long tails. A class of fewer than ``enough`` cells
+    takes the factor of that below.
     """
     known = np.isfinite(ratio)
-    whole = _robust(ratio[known])
-    out = np.full(ratio.shape, whole, np.float32)
-    for r in range(0, ratio.shape[0], step):
-        for c in range(0, ratio.shape[1], step):
-            block = ratio[r : r + step, c : c + step]
-            steps = [
-                (block[lag:] - block[:-lag]).ravel(),
-                (block[:, lag:] - block[:, :-lag]).ravel(),
-            ]
-            some = np.concatenate(steps)
-            some = some[np.isfinite(some)]
+    if not known.any():
+        return np.ones(ratio.shape, np.float32)
+    octave = np.log2(np.maximum(relief, 1e-6) / max(float(np.median(relief[known])), 1e-6))
+    classes = np.where(known, np.maximum(np.floor(octave), 0.0), -1.0).astype(np.int64)
+    factors = [1.0]
+    usual = 1.0
+    for k in range(int(classes.max()) + 1):
+        some = np.abs(_steps(np.where(classes == k, ratio, np.float32(np.nan)), lag))
+        if len(some) < 2 * enough:
+            factors.append(factors[-1])
+            continue
+        spread = float(np.quantile(some, 0.9))
+        usual = max(spread, 1e-9) if k == 0 else usual
+        factors.append(max(1.0, spread / usual))
+    return np.asarray(np.array(factors, np.float32)[classes + 1])
+
+
+def _more_in_blocks(ratio: F32, step: int, lag: int) -> F32:
+    """(rows, cols) by how much a ratio scatters more in a block than on the whole.
+
+    Blocks of ``step`` cells overlap by half; the one that scatters most counts. Each is compared
+    with all by differences ``lag`` cells apart, of which outlines of objects in it touch few.
+    """
+    usual = max(_robust(_steps(ratio, lag)), 1e-9)
+    more = np.ones(ratio.shape, np.float32)
+    half = max(1, step // 2)
+    for r in range(0, ratio.shape[0], half):
+        for c in range(0, ratio.shape[1], half):
+            block = slice(r, r + step), slice(c, c + step)
+            some = _steps(ratio[block], lag)
             if len(some) > step:
-                spread = float(np.median(np.abs(some))) / (0.6745 * np.sqrt(2.0))
-                out[r : r + step, c : c + step] = max(whole, spread)
-    return out
+                more[block] = np.maximum(more[block], _robust(some) / usual)
+    return more
+
+
+def _steps(x: F32, lag: int) -> F32:
+    """The known differences of cells ``lag`` apart, along rows and along columns."""
+    steps = np.concatenate([(x[lag:] - x[:-lag]).ravel(), (x[:, lag:] - x[:, :-lag]).ravel()])
+    return np.asarray(steps[np.isfinite(steps)], np.float32)
 
 
 def _mean(x: F32, window: int) -> F32:
@@ -303,9 +361,15 @@ def _add_labels(
 def _bodies(
     d: F32, errors: SumErrors, labels: I32, cell_m: float, config: ChangeConfig
 ) -> tuple[Body, ...]:
-    """The changes that are significant as a whole; the others leave ``labels``."""
+    """The changes that are significant on ground of this size; the others leave ``labels``.
+
+    An object may lie anywhere, so its mean height is judged among as many places as the compared
+    ground has for the smallest object: more than there are independent ones.
+    """
+    places = np.count_nonzero(np.isfinite(d)) * cell_m**2 / config.min_area_m2
+    level = sigmas_of_any(config.false_alarm, places)
     found = (
-        _body(d, errors, labels, label, cell_m, config)
+        _body(d, errors, labels, label, cell_m, config, level)
         for label in range(1, int(labels.max(initial=0)) + 1)
     )
     bodies = tuple(body for body in found if body is not None)
@@ -314,9 +378,10 @@ def _bodies(
 
 
 def _body(
-    d: F32, errors: SumErrors, labels: I32, label: int, cell_m: float, config: ChangeConfig
-) -> Body | None:
-    """Area and volume of a change above the ground around it; None if not significant.
+    d: F32, errors: SumErrors, labels: I32, label: int, cell_m: float, config: ChangeConfig,
+    level: float,
+) -> Body | None:  # fmt: skip
+    """Area and volume of a change above the ground around it; None if below ``level`` sigmas.
 
     At the rim of what both flights saw, where few views reach, nothing is a change: the ground
     around it must be known, but for strips that it may hide itself. The rim that stereo smears
@@ -334,16 +399,16 @@ def _body(
     grown = _grown(inside, rim) & np.isfinite(d) & ((labels == 0) | inside)
     around = _grown(inside, 4 * rim) & ~_grown(labels > 0, rim) & np.isfinite(d)
     ground = float(np.median(d[around])) if np.count_nonzero(around) > 8 * rim else 0.0
-    heights = d[inside & np.isfinite(d)].astype(np.float64) - ground
+    own = inside & np.isfinite(d)
+    heights = d[own].astype(np.float64) - ground
     volume = float(np.sum(d[grown], dtype=np.float64) - ground * np.count_nonzero(grown))
-    noise = errors.of_sum(grown)
-    if abs(volume) < config.level_sigmas * noise:
+    if np.sign(volume) * heights.sum() < level * errors.of_sum(own):
         return None
     border = inside & _grown(~inside, 1) & np.isfinite(d)
     outline = float(np.abs(d[border] - ground).sum())
     return Body(
         label, float(inside.sum()) * cell_m**2, volume * cell_m**2,
-        float(np.hypot(noise, outline)) * cell_m**2, float(heights.mean()),
+        float(np.hypot(errors.of_sum(grown), outline)) * cell_m**2, float(heights.mean()),
         float(heights[np.argmax(np.abs(heights))]),
     )  # fmt: skip
 
