@@ -162,6 +162,25 @@ def test_no_deliverable_shows_what_is_apart(tmp_path: Path, house: HouseFlight) 
     assert len(features[0]["geometry"]["coordinates"]) == 3
 
 
+def test_a_piece_that_nothing_ties_is_a_cloud_of_its_own(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    """Three keyframes from 10 m east on, 40 m above the ground; two more are too few."""
+    with finished(house.flown(tmp_path), [[2, 4], [0, 1], *[[2, 9]] * 100]) as store:
+        summary = write_deliverables(tmp_path, store, {})
+        first = store.keyframe(2)
+        assert first is not None
+        assert [path.name for path in tmp_path.glob("piece-*")] == ["piece-1.laz"]
+        assert any(note.startswith("piece-1.laz: what is left out") for note in summary["notes"])
+        piece = laspy.read(tmp_path / "piece-1.laz")
+        high_m = first.depth.T_world_camera[2, 3]
+        assert len(piece) > 1000 and abs(np.median(piece.z) + high_m) < 1.0
+        assert abs(np.median(piece.x)) < 20.0 and piece.header.parse_crs() is None
+        set_refinement(store, {"apart": []})
+        write_deliverables(tmp_path, store, {})
+    assert not list(tmp_path.glob("piece-*"))
+
+
 def test_the_preview_says_what_is_left_out(tmp_path: Path, house: HouseFlight) -> None:
     sizes = []
     for name, apart in (("whole", []), ("apart", [[3, 4]])):

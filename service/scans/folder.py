@@ -2,7 +2,7 @@
 
 Drone and ground hold the same store, so both make the same files: ``cloud.laz``,
 ``trajectory.tum``, ``trajectory.csv``, ``scan.json``, ``preview.jpg``, ``coverage.png``,
-``coverage.json`` and ``report.html``.
+``coverage.json`` and ``report.html``; ``piece-1.laz`` and so on of what is not tied to the rest.
 Each is written to a temporary file and then renamed, so a reader never sees a partial file.
 """
 
@@ -12,6 +12,7 @@ import json
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,13 @@ from service.scans.coverage import IMAGE as COVERAGE
 from service.scans.coverage import Coverage, write_coverage_files
 from service.scans.drawing import blank_preview, draw_preview, middle_keyframe, stages
 from service.scans.fused_cloud import DEFAULT_VOXEL_M, FusedCloud, fused_cloud, write_laz
-from service.scans.main_piece import in_words, main_poses, main_seqs, stretches_apart
+from service.scans.main_piece import (
+    in_words,
+    main_poses,
+    main_seqs,
+    pieces_apart,
+    stretches_apart,
+)
 from service.scans.report import report_html
 from service.scans.track import csv_table, latest, local_frame, tum_lines
 from service.scans.trust import slope_deg, trust_of
@@ -58,6 +65,10 @@ NOTHING = FusedCloud(
     0,
 )
 """Replaces a cloud that could not be fused."""
+PIECE = "piece-{}.laz"
+PIECES = (
+    "{}: what is left out, each in metres about its first camera; scale and heading are its own"
+)
 NO_GEOREFERENCE = (
     "no georeference: coordinates are metres east, north and up of the scan's own origin"
 )
@@ -80,6 +91,7 @@ def write_deliverables(
     files = _Files(folder, store, voxel_m)
     files.write_trajectory()
     at_once(files.fuse, files.cover)
+    files.write_pieces()
     summary = files.summary(extra)
     at_once(partial(files.draw, summary), files.write_cloud)
     failures = files.failures
@@ -102,6 +114,7 @@ class _Files:
         self._fused = NOTHING
         self._raster: Raster | None = None
         self._coverage: Coverage | None = None
+        self._pieces: list[str] = []
 
     def write_trajectory(self) -> None:
         with self.failures.noted(TUM), writing(self._folder / TUM) as part:
@@ -117,6 +130,24 @@ class _Files:
         with self.failures.noted(PREVIEW):
             self._raster = surface(self._fused)
 
+    def write_pieces(self) -> None:
+        """Write each unconnected stretch as a cloud about its first camera."""
+        for n, piece in enumerate(pieces_apart(self._store), 1):
+            name = PIECE.format(n)
+            with self.failures.noted(name):
+                fused = fused_cloud(piece, self._voxel_m or _resolution_m(self._store.header)).cloud
+                first = piece.keyframe(piece.own[0])
+                if first is None or not len(fused):
+                    continue
+                centre_m = first.depth.T_world_camera[:3, 3].astype(np.float32)
+                cloud = replace(fused, xyz_m=fused.xyz_m - centre_m)
+                with writing(self._folder / name) as part:
+                    write_laz(part, cloud, None, self._store.header.started_unix_ns)
+                self._pieces.append(name)
+        for old in self._folder.glob(PIECE.format("*")):  # of an earlier state of the scan
+            if old.name not in self._pieces:
+                old.unlink(missing_ok=True)
+
     def cover(self) -> None:
         with self.failures.noted(COVERAGE):
             self._coverage = write_coverage_files(self._folder, self._store)
@@ -129,6 +160,8 @@ class _Files:
             store.header, self._frame, self._poses, self._fused, self._raster, run, store.finished
         )
         out["notes"] += [self._left_out] if self._left_out else []
+        if self._pieces:
+            out["notes"].append(PIECES.format(", ".join(self._pieces)))
         out["coverage"] = None if self._coverage is None else self._coverage.figures()
         out["refinement"] = store.refinement
         return out

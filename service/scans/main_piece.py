@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from recon.types import Keyframe
@@ -10,6 +11,9 @@ from service.stream.records import PoseRecord
 
 Stretch = tuple[int, int]
 """First and last keyframe."""
+
+MIN_PIECE = 3
+"""Keyframes from which on an unconnected stretch has a cloud of its own."""
 
 
 class Keyframes(Protocol):
@@ -46,6 +50,34 @@ def stretches_apart(store: Keyframes) -> list[Stretch]:
 def is_apart(seq: int, apart: Iterable[Stretch]) -> bool:
     """True for a keyframe within one of the stretches."""
     return any(first <= seq <= last for first, last in apart)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A stretch that is not tied to the rest, as a store of its own."""
+
+    whole: Keyframes
+    own: list[int]
+    summary: dict[str, Any] | None = None
+    refinement: dict[str, Any] | None = None
+
+    def seqs(self) -> list[int]:
+        """Numbers of its keyframes."""
+        return self.own
+
+    def keyframe(self, seq: int) -> Keyframe | None:
+        """One of them."""
+        return self.whole.keyframe(seq)
+
+
+def pieces_apart(store: Keyframes) -> list[Piece]:
+    """The unconnected stretches of at least MIN_PIECE keyframes; none counts twice."""
+    apart, own = stretches_apart(store), dict[int, list[int]]()
+    for seq in store.seqs():
+        k = next((k for k, (first, last) in enumerate(apart) if first <= seq <= last), None)
+        if k is not None:
+            own.setdefault(k, []).append(seq)
+    return [Piece(store, seqs) for seqs in own.values() if len(seqs) >= MIN_PIECE]
 
 
 def main_seqs(store: Keyframes) -> list[int]:
