@@ -97,6 +97,17 @@ def adjoint(T: F64) -> F64:
     return out
 
 
+def about(place: F64, covariance: F64) -> F64:
+    """(6, 6) covariance of a perturbation about the (3,) place, from one about the origin.
+
+    About a pose's own place, the last three are the place itself; a left perturbation's are those
+    of the origin, which a turn moves by its distance. ``about(-place, ...)`` is the inverse.
+    """
+    lever = np.eye(6)
+    lever[3:, :3] = -hat(place)
+    return np.asarray(lever @ covariance @ lever.T)
+
+
 def transform(T: F64, points: F64) -> F64:
     """(N, 3) ``points`` of frame b in frame a, for T_a_b."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])

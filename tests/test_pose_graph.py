@@ -16,6 +16,7 @@ from recon import bands, se3
 from recon.posegraph.alignment import umeyama
 from recon.posegraph.pose_graph import GIVE_WAY_EVERY, PoseGraph, PoseGraphConfig
 from recon.posegraph.smoother import NO_SCALE, Smoother, State, System
+from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, Pose, PosePrior
 
 STEP_M = 6.0
@@ -445,6 +446,36 @@ def test_wandering_fixes_do_not_bend_what_vision_sees_straight() -> None:
 
     alone = shape_m(np.array([T[:3, 3] for T in f.odom]))
     assert shape_m(graph.pose_array()[:, :3, 3]) < 1.3 * alone + 0.01
+
+
+@pytest.mark.parametrize(("claimed_m", "least", "most"), [(1.0, 0.6, 1.6), (2.0, 0.3, 0.8)])
+def test_the_place_is_as_sure_as_the_receiver(claimed_m: float, least: float, most: float) -> None:
+    """Ten flights far shorter than the wander of 1 m: true offset over the sigma, axis by axis."""
+    found = []
+    for seed in range(10):
+        f = flight(20, seed=seed, drift=0.0003)
+        rng, error, claimed = np.random.default_rng(seed), np.zeros(3), np.full(3, claimed_m)
+        error = rng.normal(size=3)
+        for i, T in enumerate(f.truth):
+            error = np.exp(-1 / 60) * error + np.sqrt(1 - np.exp(-2 / 60)) * rng.normal(size=3)
+            T[:3, 3] += [2000.0, -500.0, 0.0]  # turns about the origin are no part of it
+            height = T[2, 3] + 4.0  # the barometer's, whose zero is unknown
+            f.priors[i] = replace(
+                f.priors[i], position_m=T[:3, 3] + error, sigma_position_m=claimed,
+                altitude_m=height, sigma_altitude_m=0.5,
+            )  # fmt: skip
+        graph, _ = fly(f, PoseGraphConfig())
+        graph.solve()
+        track = Trajectory(graph=graph)
+        off, sigma = [], []
+        for i, T in enumerate(f.truth):
+            pose = track.place(i)
+            off.append(pose.T_world_camera[:3, 3] - T[:3, 3])
+            own = se3.about(pose.T_world_camera[:3, 3], pose.covariance)
+            sigma.append(np.sqrt(np.diag(own)[3:]))
+        found.append(np.mean(off, axis=0) / np.median(sigma, axis=0))
+    rms = np.sqrt(np.mean(np.square(found), axis=0))
+    assert least < rms.min() and rms.max() < most
 
 
 def test_a_lost_stretch_is_tied_by_two_loops_in_scale_and_heading() -> None:

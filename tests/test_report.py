@@ -18,7 +18,7 @@ from service.flight.reports import graph_figures
 from service.scans.coverage import coverage_of
 from service.scans.folder import write_deliverables
 from service.scans.report import consistency, sensor_constants
-from service.scans.report_map import map_figure, position_covariance
+from service.scans.report_map import map_figure
 from service.scans.track import latest
 from service.stream.records import PoseRecord, unpack_covariance, unpack_motion
 
@@ -73,7 +73,7 @@ def test_ellipses_are_those_of_sampled_poses() -> None:
     spread = A @ A.T
     samples = rng.multivariate_normal(np.zeros(6), spread, 20000)
     places = np.array([(se3.exp(x) @ T)[:3, 3] for x in samples[:6000]])
-    found = position_covariance(PoseRecord(0, T, spread))
+    found = PoseRecord(0, T, spread).position_covariance
     assert np.allclose(found, np.cov(places.T), rtol=0.15, atol=0.05 * np.trace(found))
 
 

@@ -55,7 +55,8 @@ def scan_folder(folder: Path, lat_deg: float | None = 47.0) -> Path:
             store.add_keyframe(seq, codec.encode(keyframe(seq, T), time_ns))
             for after_ns in (0, 400_000_000):
                 place = () if lat_deg is None else (47.0, 8.0, 450.0)
-                covariance = np.diag([1e-4] * 3 + [1.0, 2.0, 3.0])
+                own = np.diag([1e-4] * 3 + [1.0, 2.0, 3.0])
+                covariance = se3.about(-T[:3, 3], own)
                 store.add_pose(PoseRecord(time_ns + after_ns, T, covariance, *place))
         store.add_reposes([Repose(1, 1, camera_at(7.0), 1.0, np.eye(6))])
         store.finish({"keyframes": 3})
@@ -148,7 +149,8 @@ def test_image_camera_and_fix_belong_to_the_points(tmp_path: Path) -> None:
     assert len(found["/camera/fix"]) == 6
     fix = found["/camera/fix"][0][1]
     assert (fix.latitude, fix.longitude, fix.altitude) == (47.0, 8.0, 450.0)
-    np.testing.assert_allclose(np.diag(np.reshape(fix.position_covariance, (3, 3))), [1, 2, 3])
+    variances = np.diag(np.reshape(fix.position_covariance, (3, 3)))
+    np.testing.assert_allclose(variances, [1, 2, 3], rtol=1e-5)
     assert fix.position_covariance_type == 3
 
 

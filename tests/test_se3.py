@@ -143,3 +143,14 @@ def test_the_average_of_equals_is_halfway_and_symmetric(T: F64, twist: F64) -> N
     swapped, _ = se3.average(other, np.eye(6), T, np.eye(6))
     np.testing.assert_allclose(mean, swapped, atol=1e-7)
     np.testing.assert_allclose(covariance, np.eye(6) / 2)
+
+
+def test_the_covariance_of_a_place_is_that_of_perturbed_poses() -> None:
+    rng = np.random.default_rng(0)
+    T = se3.compose(se3.so3_exp(np.array([0.1, 0.2, 0.3])), np.array([40.0, -10.0, 60.0]))
+    A = rng.normal(0, 0.01, (6, 6))
+    own = se3.about(T[:3, 3], A @ A.T)
+    twists = rng.multivariate_normal(np.zeros(6), A @ A.T, 4000)
+    places = np.array([(se3.exp(x) @ T)[:3, 3] for x in twists])
+    np.testing.assert_allclose(own[3:, 3:], np.cov(places.T), atol=0.06 * np.trace(own[3:, 3:]))
+    np.testing.assert_allclose(se3.about(-T[:3, 3], own), A @ A.T, atol=1e-12)

@@ -162,3 +162,20 @@ def test_a_flight_does_without_the_statistics_package() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=root
     )
     assert run.stdout == "False\n"
+
+
+@pytest.mark.parametrize(
+    ("noise", "span_s", "expected"),
+    [
+        (Noise(0.1, 0.25, 60.0), 30.0, 1.0),  # hardly moves within the flight: all of the claim
+        (Noise(0.1, 1.0, 60.0), 30.0, 0.9),
+        (Noise(0.1, 1.0, 10.0), 2000.0, 0.1),  # a hundred independent errors
+        (Noise(1.0, 0.25, 60.0), 30.0, 0.25),  # the claim is white noise, which averages out
+        (Noise(0.0, 0.0, 60.0), 1e6, 1.0),
+    ],
+)
+def test_the_mean_error_of_a_flight_is_as_far_as_the_sensor_claims(
+    noise: Noise, span_s: float, expected: float
+) -> None:
+    assert noise.of_mean(1.0, span_s) == pytest.approx(expected, rel=0.15)
+    assert noise.of_mean(0.0, span_s) == 0.0

@@ -177,3 +177,16 @@ def test_the_end_publishes_each_sigma_as_it_is() -> None:
         published[p.seq] = p
     for seq, p in published.items():
         assert p.sigma_m == pytest.approx(trajectory.place(seq).sigma_m, rel=0.02), seq
+
+
+def test_a_scan_far_from_its_origin_is_as_sure_of_its_places() -> None:
+    sigmas = []
+    for away_m in (0.0, 3000.0):
+        out = Trajectory()
+        for i, T in enumerate(legs()):
+            fix = T[:3, 3] + [away_m, 0.0, 0.0]
+            known = replace(prior(T), position_m=fix, sigma_position_m=np.full(3, 1.0))
+            out.add(i, 0, T, known, (HEIGHT_M, 0.0), i * 10**9, COVARIANCE)
+        sigmas.append(out.place(5).sigma_m)
+    assert sigmas[1] == pytest.approx(sigmas[0], rel=1e-3)
+    assert 1.0 < sigmas[0] < 2.0

@@ -43,7 +43,9 @@ def step_at(enu: tuple[float, float, float], head: Rotation = HEAD, segment: int
     T = se3.compose(R, np.array(enu))
     tracked = Tracked(Tracking.TRACKED, segment, T, tracks=150)
     anchor = Anchorage(0, object.__new__(OdometryKeyframe), np.eye(4))
-    return Step(tracked, Placed(0, T, 1.0, COVARIANCE, ("vision",)), False, anchor)
+    return Step(
+        tracked, Placed(0, T, 1.0, se3.about(-T[:3, 3], COVARIANCE), ("vision",)), False, anchor
+    )
 
 
 def state() -> VehicleState:

@@ -86,6 +86,7 @@ class Similarity:
     covariance: F64  # (7, 7)
     sources: tuple[str, ...] = ()
     noise: ReadingNoise | None = None  # as measured by the fit; None without one
+    sigma_fixes: F64 | None = None  # (3,) m of the mean error of all fixes, where they wander
 
     @property
     def sigma_scale(self) -> float:
@@ -221,6 +222,17 @@ class ReadingNoise:
                 single[:, axes] = max(noise.total, MIN_FIX_M)
         return weighing, single
 
+    def of_mean(self, claimed: F64, times_s: F64) -> F64:
+        """(3,) sigma of the mean error of fixes with (m, 3) claimed sigmas at (m,) times."""
+        usual, span_s = np.median(claimed, axis=0), float(np.ptp(times_s))
+        kinds = (self.horizontal, self.horizontal, self.vertical)
+        return np.array(
+            [
+                one if noise is None else noise.of_mean(float(one), span_s)
+                for noise, one in zip(kinds, usual, strict=True)
+            ]
+        )
+
     def of_travels(self, seconds: F64, span_s: float) -> F64:
         """(k,) sigma of ways of so many seconds each; over all of them the rate adds up."""
         variance = self.walk_m_per_sqrt_s**2 + self.rate_m_s**2 * span_s
@@ -331,10 +343,12 @@ def fit(anchors: Sequence[Anchor], fix_s: float = 60.0, iterations: int = 30) ->
     best = _solve(readings, best.R, best.t, best.log_scale, iterations)
     inflation = max(1.0, 0.2 * len(usable)) if noise.horizontal is None else 1.0
     covariance = np.asarray(np.linalg.inv(best.H) * inflation, np.float64)
+    mean = None
     if len(readings.fix):
         covariance[3:6, 3:6] += np.diag(np.mean(np.square(readings.claimed), axis=0))
+        mean = noise.of_mean(readings.claimed, readings.fix_s) if fix_s > 0 else None
     scale = float(np.exp(best.log_scale))
-    return Similarity(scale, best.R, best.t, covariance, _sources(readings), noise)
+    return Similarity(scale, best.R, best.t, covariance, _sources(readings), noise, mean)
 
 
 def _measured(

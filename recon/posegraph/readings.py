@@ -67,8 +67,7 @@ class Readings:
         is_placed = drift_m is not None
         used = {"attitude"} if self._attitude(node, T, spread, is_placed) else set()
         if drift_m is not None:
-            lever = np.hstack([-se3.hat(T[:3, 3]), np.eye(3)])
-            place = np.diag(lever @ spread @ lever.T)
+            place = np.diag(se3.about(T[:3, 3], spread))[3:]
             used |= {"gnss"} if self._position(node, T, place, drift_m, noise) else set()
             used |= {"altitude"} if self._altitude(node, T) else set()
         return used

@@ -104,7 +104,9 @@ class SegmentFrames:
         frame = self._frames.get(segment)
         covariance = np.eye(7) if frame is None else frame.covariance
         sources = () if frame is None else frame.sources
-        self._frames[segment] = Similarity(scale, R, t, covariance, sources)
+        known = (one.sigma_fixes for one in self._frames.values() if one.sigma_fixes is not None)
+        sigma = next(known, None)  # one receiver places all that loops join
+        self._frames[segment] = Similarity(scale, R, t, covariance, sources, sigma_fixes=sigma)
         self._tied.add(segment)
 
     def forget(self, segment: int) -> bool:
@@ -135,6 +137,9 @@ class SegmentFrames:
             return False
         if "gnss" not in found.sources and nodes[0].key > 0:
             found = _kept_in_place(found, nodes[0], pose(nodes[0].key))
+        if found.sigma_fixes is not None:
+            most = np.array([np.inf, np.inf, fresh.datum.sigma_m])
+            found = replace(found, sigma_fixes=np.minimum(found.sigma_fixes, most))
         before = self._frames.get(segment)
         is_settled = seen >= SETTLED and not fresh.differ(self.constants(segment))
         if before is not None and is_settled and not _differ(before, found, nodes):

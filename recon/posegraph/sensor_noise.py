@@ -80,6 +80,17 @@ class Noise:
         independent = min(1.0 + span_s / (2.0 * self.tau_s), count)
         return float(np.sqrt(self.white**2 + self.wander**2 * count / independent))
 
+    def of_mean(self, claimed: float, span_s: float) -> float:
+        """The sigma of the mean error over ``span_s``, with a wander as far as the sensor claims.
+
+        A flight no longer than the time constant shows how fast a sensor wanders (wander^2 / tau),
+        not how far: its mean error is in no residual. Of the claim, only the white part averages
+        out.
+        """
+        far = max(claimed**2 - self.white**2, (MIN_WANDER * claimed) ** 2)
+        tau_s = self.tau_s * max(1.0, far / max(self.wander**2, 1e-12))
+        return float(np.sqrt(far / (1.0 + span_s / (2.0 * tau_s))))
+
 
 def wander_noise(times_s: F64, residuals: F64, usual_tau_s: float) -> Noise | None:
     """The noise of readings with (N, axes) ``residuals`` at (N,) times; None for too few.

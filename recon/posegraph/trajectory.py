@@ -59,7 +59,8 @@ class Placed:
     @property
     def sigma_m(self) -> float:
         """Of the place, in all three directions together."""
-        return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
+        own = se3.about(self.T_world_camera[:3, 3], self.covariance)
+        return float(np.sqrt(np.trace(own[3:, 3:])))
 
     def carry(self, T_key_camera: F64) -> Placed:
         """A frame in the world by its pose relative to this keyframe (odometry units)."""
@@ -193,9 +194,15 @@ class Trajectory:
             node = self.place(ends[0])
             return replace(node, seq=seq, T_world_camera=T[0], scale=float(scales[0]))
         pose = self.graph.pose(seq)
-        known = self.graph.similarity(self.graph.node(seq).segment) is not None
-        covariance = pose.covariance if known else np.eye(6)
-        return Placed(seq, pose.T_world_camera, self.graph.scale(seq), covariance, pose.sources)
+        frame = self.graph.similarity(self.graph.node(seq).segment)
+        T, covariance = pose.T_world_camera, pose.covariance
+        if frame is None:
+            covariance = se3.about(-T[:3, 3], np.eye(6))
+        elif frame.sigma_fixes is not None:  # the mean error of the fixes bends nothing
+            own = np.diag(se3.about(T[:3, 3], covariance))[3:]
+            unseen = np.maximum(frame.sigma_fixes**2 - own, 0.0)
+            covariance = covariance + np.diag([0.0, 0.0, 0.0, *unseen])
+        return Placed(seq, T, self.graph.scale(seq), covariance, pose.sources)
 
     def places(self, seqs: Sequence[int]) -> F64:
         """(N, 4, 4) T_world_camera of keyframes."""

@@ -180,7 +180,8 @@ class Chain:
         T_odom_camera = anchor.T_odom_camera
         carrier = self._carriers.of(anchor)
         if carrier is None:
-            return Placed(anchor.key.seq, T_odom_camera, 1.0, np.eye(6), ("vision",))
+            unsure = se3.about(-T_odom_camera[:3, 3], np.eye(6))
+            return Placed(anchor.key.seq, T_odom_camera, 1.0, unsure, ("vision",))
         # In flight no other view than the newest carries a new frame.
         known = self._newest or self.trajectory.place(carrier.seq)
         return known.carry(se3.inverse(carrier.T_odom_camera) @ T_odom_camera)
@@ -203,7 +204,7 @@ class Chain:
             if segment == self._aligned:
                 T = carried(before, prior, seen.T_world_camera, None, 0.0)
         tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
-        covariance = np.diag(np.square([tilt, tilt, yaw, *sigma]))
+        covariance = se3.about(-T[:3, 3], np.diag(np.square([tilt, tilt, yaw, *sigma])))
         return Placed(image.seq, T, 1.0, covariance, ("attitude", "gnss", "dead reckoning"))
 
 

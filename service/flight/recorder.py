@@ -202,7 +202,7 @@ class Recorder:
             distance_m=self.distance_m,
             turn_rate_rad_s=turn,
             sources=placed.sources,
-            sigma_m=float(np.sqrt(np.trace(placed.covariance[3:, 3:]))),
+            sigma_m=placed.sigma_m,
             keyframe_seq=frame.anchor.seq if frame.is_view and frame.anchor else None,
         )
 

@@ -56,7 +56,7 @@ class OdometryReport:
             (north, east, down),
             (w, x, y, z),
             (a, b, c),
-            _covariance(placed.covariance),
+            _covariance(se3.about(placed.T_world_camera[:3, 3], placed.covariance)),
             self.resets,
             max(1, quality),
         )

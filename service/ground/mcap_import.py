@@ -36,6 +36,10 @@ HEADER = re.compile(r"scan (\S+) of (\S+), (.*), origin (\S+), (\S+), (\S+) m")
 MAX_WAITING = 4
 """Keyframes of which something is missing: the recording has their parts one after the other."""
 USED = ("/points", "/image", "/camera", "/pose", "/fix", "/log")
+UNKNOWN = np.diag([0.1**2] * 3 + [1.0] * 3)
+"""Covariance of turn (rad) and place (m), which the file lacks; a larger turn would hide the
+position's in float32."""
+
 NOTE = "imported from an MCAP: covariances of rotation and settings are not known"
 
 
@@ -122,7 +126,7 @@ def _add_keyframe(store: ScanStore, parts: dict[str, Any], time_ns: int) -> bool
         time_ns,
         depth,
         np.asarray(bgr, np.uint8),
-        Pose(T, np.eye(6), ("vision",)),
+        Pose(T, se3.about(-T[:3, 3], UNKNOWN), ("vision",)),
         np.isfinite(depth.depth_m),
     )
     try:
@@ -180,14 +184,14 @@ class _Track:
             self._flown_m += step
             speed = step / max((self._time_ns - self._before[0]) / 1e9, 1e-3)
         self._before = (self._time_ns, T)
-        covariance = np.eye(6)
+        own = UNKNOWN.copy()
         if fix is not None and len(fix.position_covariance) == 9:
-            covariance[3:, 3:] = np.array(fix.position_covariance).reshape(3, 3)
-        spread = float(np.sqrt(max(np.trace(covariance[3:, 3:]) / 3.0, 0.0)))
+            own[3:, 3:] = np.array(fix.position_covariance).reshape(3, 3)
+        spread = float(np.sqrt(max(np.trace(own[3:, 3:]), 0.0)))
         record = PoseRecord(
             self._time_ns,
             T,
-            covariance,
+            se3.about(-T[:3, 3], own),
             speed_m_s=min(speed, 1e4),
             distance_m=self._flown_m,
             sources=("vision",),

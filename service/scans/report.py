@@ -19,7 +19,7 @@ from recon.surface.raster import Raster, grid_over
 from recon.types import F32, U8, PointCloud
 from service.scans.coverage import Coverage
 from service.scans.drawing import coloured
-from service.scans.report_map import loop_pairs, map_figure, position_covariance
+from service.scans.report_map import loop_pairs, map_figure
 from service.stream.records import PoseRecord
 
 LARGEST_MAP_PX = 900
@@ -324,7 +324,7 @@ def _drift(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[s
     """Estimated and observed drift of the track."""
     out = []
     if len(poses) >= 2:
-        sigma = [float(np.sqrt(np.trace(position_covariance(p)))) for p in poses]
+        sigma = [float(np.sqrt(np.trace(p.position_covariance))) for p in poses]
         words = ", ".join(f"{sigma[k]:.2f} m" for k in (0, len(sigma) // 2, -1))
         out.append(("sigma of the position at start, middle and end", words))
     scale = summary.get("run", {}).get("scale")

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from recon import se3
 from recon.types import F64
 from service.scans.coverage import BEST, GAP, SELDOM, UNSURE, Coverage
 from service.stream.records import PoseRecord
@@ -61,12 +60,6 @@ def map_figure(
     return f"<figure>{svg}<figcaption>{_caption(coverage, summary, grown)}</figcaption></figure>"
 
 
-def position_covariance(pose: PoseRecord) -> F64:
-    """(3, 3) covariance of the camera's position, from that of its pose."""
-    lever = np.hstack([-se3.hat(pose.T_world_camera[:3, 3]), np.eye(3)])
-    return np.asarray(lever @ pose.covariance @ lever.T)
-
-
 def _view(poses: Sequence[PoseRecord], coverage: Coverage | None) -> _View:
     spots = [p.T_world_camera[:2, 3] for p in poses]
     if coverage is not None:
@@ -101,7 +94,7 @@ def _ellipses(poses: Sequence[PoseRecord], view: _View) -> tuple[list[str], int]
     """Ellipses of the horizontal position at some keyframes, and their enlargement."""
     keys = [p for p in poses if p.keyframe_seq is not None] or list(poses)
     keys = keys[:: max(1, -(-len(keys) // MAX_ELLIPSES))]
-    shapes = [np.linalg.eigh(position_covariance(p)[:2, :2]) for p in keys]
+    shapes = [np.linalg.eigh(p.position_covariance[:2, :2]) for p in keys]
     usual = SIGMAS * float(np.median([np.sqrt(max(v[1], 0.0)) for v, _ in shapes]))
     grown = 1
     while usual > 0 and usual * grown * view.px_per_m < SMALLEST_ELLIPSE_PX and grown < 1000:

@@ -98,6 +98,11 @@ class PoseRecord:
     sigma_m: float = 0.0
     keyframe_seq: int | None = None
 
+    @property
+    def position_covariance(self) -> F64:
+        """(3, 3) m2 of the camera's position."""
+        return se3.about(self.T_world_camera[:3, 3], self.covariance)[3:, 3:]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Repose:

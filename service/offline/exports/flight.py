@@ -53,7 +53,9 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
             }
         )
     for one in main_keyframes(scan.store):
-        lat, lon, alt = frame.to_geodetic(one.depth.T_world_camera[None, :3, 3])[0]
+        place_m = one.depth.T_world_camera[:3, 3]
+        spread = se3.about(place_m, one.pose.covariance)[3:, 3:]
+        lat, lon, alt = frame.to_geodetic(place_m[None])[0]
         features.append(
             {
                 "type": "Feature",
@@ -61,7 +63,7 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
                     "keyframe": one.seq,
                     "time": _iso(one.time_ns),
                     "points": int(one.fresh.sum()),
-                    "sigma_m": round(float(np.sqrt(np.trace(one.pose.covariance[3:, 3:]))), 4),
+                    "sigma_m": round(float(np.sqrt(np.trace(spread))), 4),
                 },
                 "geometry": {
                     "type": "Point",

@@ -144,7 +144,7 @@ class _Recording:
             latitude=pose.lat_deg,
             longitude=pose.lon_deg,
             altitude=pose.alt_amsl_m or 0.0,
-            position_covariance=[float(v) for v in pose.covariance[3:, 3:].ravel()],
+            position_covariance=[float(v) for v in pose.position_covariance.ravel()],
             position_covariance_type=messages.LocationFixPositionCovarianceType.Known,
         )
         self._write(self._fix, fix, time_ns)

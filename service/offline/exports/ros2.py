@@ -95,7 +95,7 @@ class Ros2Channels:
             pose.lat_deg,
             pose.lon_deg,
             np.nan if pose.alt_amsl_m is None else pose.alt_amsl_m,
-            np.ascontiguousarray(pose.covariance[3:, 3:], np.float64).ravel(),
+            pose.position_covariance.ravel(),
             3,  # the covariance is known
         )
 

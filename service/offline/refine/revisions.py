@@ -282,8 +282,7 @@ def _record(
     lat = lon = alt = None
     if place is not None:
         lat, lon, alt = (float(v) for v in place.to_geodetic(T[None, :3, 3])[0])
-    lever = np.hstack([-se3.hat(T[:3, 3]), np.eye(3)])
-    sigma = float(np.sqrt(np.trace(lever @ spread @ lever.T)))
+    sigma = float(np.sqrt(np.trace(se3.about(T[:3, 3], spread)[3:, 3:])))
     return replace(
         frame, T_world_camera=T, covariance=spread, lat_deg=lat, lon_deg=lon, alt_amsl_m=alt,
         roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw, distance_m=distance_m, sigma_m=sigma,

@@ -220,8 +220,7 @@ def _tie(loop: Closure, track: Track, one: Keyframe, scans: Sequence[int]) -> Ti
 def _prior(track: Track, own: Bool) -> ScanPrior:
     """The placing of a scan by its own poses, those of the track that are ``own``."""
     centre = track.poses[own, :3, 3].mean(axis=0)
-    A = se3.adjoint(se3.compose(np.eye(3), -centre))
-    spread = A @ track.covariances[own].mean(axis=0) @ A.T
+    spread = se3.about(centre, track.covariances[own].mean(axis=0))
     sigma = np.append(np.sqrt(np.maximum(np.diag(spread), 0.0)), SIGMA_SCALE)
     return ScanPrior(centre, np.maximum(sigma, MIN_SIGMA))
 
