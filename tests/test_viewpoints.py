@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
@@ -49,7 +50,7 @@ def offer(
     return taken if views.offer(taken, tracked) else None
 
 
-def test_colour_is_undistorted_once_and_only_when_asked_for() -> None:
+def test_colour_is_undistorted_when_it_is_taken_and_not_kept() -> None:
     lens = Camera(np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), np.full(5, 0.05), (32, 32))
     undistorter, calls = Undistorter(lens), []
     image = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)
@@ -62,9 +63,11 @@ def test_colour_is_undistorted_once_and_only_when_asked_for() -> None:
 
     colour = Colour(image, Counted(lens))
     assert not calls
-    for _ in range(2):
-        np.testing.assert_array_equal(colour.bgr, want)
+    held = weakref.ref(image)
+    np.testing.assert_array_equal(colour.take(), want)
     assert len(calls) == 1
+    del image
+    assert held() is None
 
 
 def test_automatic_takes_the_odometrys_keyframes() -> None:

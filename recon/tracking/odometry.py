@@ -38,9 +38,9 @@ from recon.types import F64, I64, U8, Bool, Camera, PosePrior
 OVERDUE = 1.3
 """A blurred frame becomes a keyframe when the last is this many steps away."""
 
-MAX_GAP_S, ROLLING_GAP_S = 0.09, 0.05
-"""A frame this long after the last is followed: a gimbal trembles at a few Hz. A rolling shutter's
-rows need neighbours closer by."""
+MAX_GAP_S, SOUGHT_GAP_S, ROLLING_GAP_S = 0.17, 0.09, 0.05
+"""A frame this long after the last is followed: with a global shutter, while a readout is sought,
+and with a rolling shutter, whose rows need neighbours closer by."""
 
 
 class Tracking(str, Enum):
@@ -116,7 +116,8 @@ class Odometry:
         if not self._metric or self._lost or self._motion is None:
             return False
         shift, gap_s = self._motion.shift(time_ns, prior, self._depth)
-        max_gap_s = ROLLING_GAP_S if self._row_track.is_known else MAX_GAP_S
+        max_gap_s = SOUGHT_GAP_S if self._row_track.is_rolling else MAX_GAP_S
+        max_gap_s = ROLLING_GAP_S if self._row_track.is_known else max_gap_s
         return gap_s < max_gap_s and shift < self.config.base_to_height / frames_per_step
 
     def needs_turn(self, time_ns: int) -> bool:

@@ -28,8 +28,9 @@ from service.stream.store import ScanStore
 REPUBLISH_M = 0.05
 """A frame's pose that moved by more than this until the end is written again."""
 
-BATCH = 256
-"""Poses written again in one transaction; each takes a synchronised write of the disk."""
+BATCH, REPLAYED = 256, 16
+"""Poses in one transaction, which takes a synchronised write of the disk: those written again in
+the end, and those of a recording, which can be replayed."""
 
 
 class Recorder:
@@ -42,9 +43,12 @@ class Recorder:
         rig: Rig,
         clock_offset_ns: int = 0,
         on_keyframe: Callable[[Keyframe], None] | None = None,
+        batch: int = 1,
     ) -> None:
-        """``clock_offset_ns`` takes the frames' clock to unix time."""
+        """``clock_offset_ns`` takes the frames' clock to unix time; ``batch`` poses are written
+        at once."""
         self._on_keyframe = on_keyframe
+        self._batch, self._due = batch, list[PoseRecord]()
         self.store, self.pipeline, self._rig = store, pipeline, rig
         self._chain, self._is_settled = pipeline.stages.chain, pipeline.stages.track.is_settled
         self.points = self.keyframes = self.frames = self.chunk_bytes = 0
@@ -70,7 +74,9 @@ class Recorder:
         )
         self._frames.add(frame, self._is_settled)
         self.last = self._record(frame, step.placed)
-        self.store.add_pose(self.last)
+        self._due.append(self.last)
+        if len(self._due) >= self._batch:
+            self._write_due()
 
     def flush(self) -> None:
         """Write the pipeline's remaining results and correct the trajectory; call it once."""
@@ -89,8 +95,15 @@ class Recorder:
         self.store.finish(summary)
         return summary
 
+    def _write_due(self) -> None:
+        """Write the poses that wait for it."""
+        due, self._due = self._due, []
+        if due:
+            self.store.add_poses(due)
+
     def _correct_trajectory(self) -> None:
         """Write those poses again that corrections have moved; the newest of a time holds."""
+        self._write_due()
         self._last, self.distance_m = None, 0.0
         moved = self._moved()
         while batch := list(islice(moved, BATCH)):
@@ -156,6 +169,8 @@ class Recorder:
         self._origin_written = True
 
     def _write_keyframes(self, step: Step) -> None:
+        if step.keyframes:
+            self._write_due()
         for keyframe in step.keyframes:
             with self.pipeline.stages.stopwatch("encode"):
                 layers = encode(keyframe, keyframe.time_ns + self._offset_ns)

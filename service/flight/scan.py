@@ -24,7 +24,7 @@ from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config
 from service.errors import InputError
 from service.flight.pipeline import Pipeline, Step
-from service.flight.recorder import TAGS_FILE, FrameTags, Recorder
+from service.flight.recorder import REPLAYED, TAGS_FILE, FrameTags, Recorder
 from service.flight.reports import ShutterWatch, TrackingWatch
 from service.flight.stages import build_stages
 from service.flight.telemetry_check import TelemetryCheck
@@ -139,7 +139,12 @@ class Scan:
         )
         self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()
         self.recorder = Recorder(
-            store, self.pipeline, self.rig, inputs.unix_offset_ns, inputs.on_keyframe
+            store,
+            self.pipeline,
+            self.rig,
+            inputs.unix_offset_ns,
+            inputs.on_keyframe,
+            batch=1 if live else REPLAYED,
         )
         self.check = TelemetryCheck(
             inputs.config.camera, inputs.history, inputs.warn, inputs.latency_ms

@@ -39,19 +39,18 @@ LAST_VIEW_SHARE = 0.1
 
 
 class Colour:
-    """A frame's image in colour; undistorted on first use."""
+    """A frame's image in colour, until its view takes it."""
 
     def __init__(self, image: U8, undistorter: Undistorter) -> None:
         """``image`` (H, W, 3) is distorted."""
-        self._image, self._undistorter = image, undistorter
-        self._is_done = False
+        self._image: U8 | None = image
+        self._undistorter = undistorter
 
-    @property
-    def bgr(self) -> U8:
-        """(H, W, 3) without distortion."""
-        if not self._is_done:
-            self._image, self._is_done = self._undistorter.image(self._image), True
-        return self._image
+    def take(self) -> U8:
+        """(H, W, 3) without distortion; once, as the image is not kept."""
+        image, self._image = self._image, None
+        assert image is not None, "a view is given once"
+        return self._undistorter.image(image)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -352,14 +351,14 @@ class StereoViews:
         points = se3.transform(se3.inverse(view.anchor.T_key_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         assert view.colour is not None
-        partners = self.selection.partners(view)
+        partners, bgr = self.selection.partners(view), view.colour.take()
         return StereoCandidate(
             view.seq,
             view.time_ns,
             view.segment,
             prior,
-            view.colour.bgr,
-            self._posed(view, in_odom),
+            bgr,
+            replace(self._posed(view, in_odom), bgr=bgr),
             tuple(self._posed(partner, in_odom) for partner in partners),
             view.anchor,
             points,
@@ -397,9 +396,8 @@ class StereoViews:
         return step_covariance(keys or [view.key], T_camera_odom)
 
     def _posed(self, view: Viewpoint, points: F64) -> View:
-        """The view with its pose; ``points`` (N, 3) of the odometry are the ground before it."""
-        bgr = None if view.colour is None else view.colour.bgr
-        posed = View(bgr, view.gray, self._K, view.T_odom_camera, self._seen)
+        """The view in gray with its pose; ``points`` (N, 3) of the odometry are the ground."""
+        posed = View(None, view.gray, self._K, view.T_odom_camera, self._seen)
         rows = None if view.moving is None else view.moving.rows
         if rows is None or not rows.clock.readout_s:
             return posed

@@ -1,0 +1,50 @@
+"""What the recorder writes, and in how many transactions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.posegraph.trajectory import Placed
+from recon.tracking.odometry import Tracked, Tracking
+from service.cameras.rig import Rig
+from service.flight.pipeline import Pipeline, Step
+from service.flight.recorder import REPLAYED, Recorder
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+
+
+def step(seq: int) -> Step:
+    T = se3.compose(np.diag([1.0, -1.0, -1.0]), np.array([0.5 * seq, 0.0, 50.0]))
+    return Step(Tracked(Tracking.TRACKED, 0), Placed(seq, T, 1.0, np.eye(6), ()))
+
+
+@pytest.mark.parametrize(("batch", "transactions"), [(1, 20), (REPLAYED, 2)])
+def test_poses_of_a_recording_share_transactions(
+    tmp_path: Path, batch: int, transactions: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = Step(Tracked(Tracking.LOST, 0))
+    stages = SimpleNamespace(chain=None, track=SimpleNamespace(is_settled=None), debug=None)
+    pipeline = SimpleNamespace(stages=stages, drain=lambda: nothing, finish=lambda: nothing)
+    rig = SimpleNamespace(frame=None, georeference="none")
+    header = ScanHeader("recorded", "drone", 0)
+    with ScanStore.create(tmp_path / "scan.db", header) as store:
+        written: list[int] = []
+        add = store.add_poses
+
+        def counted(poses: Any) -> int:
+            written.append(len(poses))
+            return add(poses)
+
+        monkeypatch.setattr(store, "add_poses", counted)
+        recorder = Recorder(store, cast(Pipeline, pipeline), cast(Rig, rig), batch=batch)
+        for seq in range(20):
+            recorder.write(step(seq), 1_000_000 * seq, None)
+        recorder.flush()
+        assert [pose.time_unix_ns for pose in store.poses()] == [1_000_000 * n for n in range(20)]
+        assert len(written) == transactions and sum(written) == 20
