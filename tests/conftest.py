@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from trial_rig import Row, Table
 
 from recon import se3
@@ -14,6 +15,9 @@ from recon.types import F64, Array, DepthMap, Keyframe, Pose
 from service.stream.codec import encode
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
+
+settings.register_profile("loaded machines", deadline=None)
+settings.load_profile("loaded machines")
 
 
 class HouseFlight:

@@ -174,7 +174,7 @@ def test_ends_of_segments_stay() -> None:
             assert (seqs[0], seqs[-1]) == (7 * segment, 7 * segment + 6)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 9999), st.sampled_from([0.0, 1e-12, 1e-9, 1e-6, 1e-3, 1.0, 3.0]))
 def test_screws_are_exponentials(seed: int, turn: float) -> None:
     rng = np.random.default_rng(seed)

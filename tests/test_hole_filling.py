@@ -33,7 +33,7 @@ def roof(height_m: float = 6.0) -> F32:
     return np.where(COLS >= 30, height_m, 0.0).astype(np.float32)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.integers(0, 2**32 - 1))
 def test_pepper_on_a_slope_is_filled_by_the_slope(east: float, north: float, seed: int) -> None:
     plane = (CELL_M * (east * COLS - north * ROWS)).astype(np.float32)

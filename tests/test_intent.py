@@ -464,7 +464,7 @@ def test_any_order_of_commands_and_faults(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(scanning_module, "PROCESS", NoWorkers())
     monkeypatch.setattr(scanning_module, "give_back", lambda **_: None)
     monkeypatch.setattr(scanning_module.log, "exception", lambda *_: None)
-    chosen = settings(max_examples=40, stateful_step_count=30, deadline=None)
+    chosen = settings(max_examples=40, stateful_step_count=30)
     run_state_machine_as_test(AnyOrder, settings=chosen)
 
 

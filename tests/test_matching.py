@@ -119,7 +119,7 @@ def test_a_straight_edge_is_no_corner() -> None:
 # ---- matching --------------------------------------------------------------------------------
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(st.floats(-45, 45), st.floats(-45, 45))
 def test_shifts_are_found_to_a_twentieth_of_a_pixel(du: float, dv: float) -> None:
     a, b = gray(view(0, 0)), gray(view(du, dv))
@@ -293,7 +293,7 @@ def test_wrong_shapes_are_named() -> None:
 # ---- a start without a prediction ----------------------------------------------------------------
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(
     st.floats(-180, 180), st.floats(0.6, 1.6), st.floats(-90, 90), st.floats(-70, 70)
 )  # fmt: skip

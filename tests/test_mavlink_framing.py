@@ -76,7 +76,7 @@ def test_every_single_bit_error_is_noticed() -> None:
                 assert not got.known, (i, bit)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.binary(max_size=300), st.integers(0, 300))
 def test_length_and_check_take_any_bytes(data: bytes, at: int) -> None:
     length = packet_length(data, at)

@@ -61,7 +61,7 @@ class Station:
 # Any bytes
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(st.binary(max_size=300), max_size=8))
 def test_any_bytes_are_survived(chunks: list[bytes]) -> None:
     station = Station()

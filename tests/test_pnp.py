@@ -84,7 +84,7 @@ def test_the_camera_is_found_to_centimetres(
         assert result.rms_px == pytest.approx(0.3 * np.sqrt(2), rel=0.15)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 10_000))
 def test_without_noise_the_pose_is_exact(seed: int) -> None:
     s = scene(seed, count=80, noise_px=0.0, outliers=0.0)

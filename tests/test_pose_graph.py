@@ -103,7 +103,7 @@ def blind(prior: PosePrior, attitude: bool) -> PosePrior:
 # ---- the similarity of a track ---------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.floats(0.05, 20), st.floats(-3.1, 3.1), st.integers(0, 999))
 def test_umeyama_recovers_any_level_similarity(scale: float, yaw: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -586,7 +586,7 @@ def test_without_a_solution_keyframes_go_on_by_vision(monkeypatch: pytest.Monkey
     assert np.isfinite(graph.scales()).all() and graph.residuals() == {}
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 999))
 def test_the_gradient_is_the_costs_own(seed: int) -> None:
     """Against central differences; the drift of a rotation's logarithm is left out."""

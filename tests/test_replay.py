@@ -95,7 +95,8 @@ def test_the_cloud_is_close_to_the_truth(scan: tuple[Path, dict[str, Any]], flig
     assert report["surface"]["rigid"]["median_m"] < 0.006 * 40.0, text
     assert report["completeness"]["share"] > 0.8, text
     honesty = report["surface"]["rigid"]["honesty"]
-    assert 0.58 < honesty["within_1_sigma"] < 0.80, text
+    # More than with a known readout: 20 ms are assumed until the images show that there is none.
+    assert 0.58 < honesty["within_1_sigma"] < 0.88, text
     assert honesty["within_2_sigma"] > 0.85, text
     assert report["trajectory"]["raw"]["rms_m"] < 4.0, text
 

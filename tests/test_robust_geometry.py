@@ -74,7 +74,7 @@ counts = st.integers(4, 60)
 seeds = st.integers(0, 2**31)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(kind=kinds, count=counts, seed=seeds, second=st.booleans(), both=st.booleans())
 def test_matches_that_determine_no_motion_give_none(
     kind: str, count: int, seed: int, second: bool, both: bool
@@ -89,7 +89,7 @@ def test_matches_that_determine_no_motion_give_none(
         assert result is None or gives_affine_map
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(kind=kinds, count=counts, seed=seeds, pixels=st.booleans())
 def test_points_that_determine_no_pose_give_none(
     kind: str, count: int, seed: int, pixels: bool
@@ -104,7 +104,7 @@ def test_points_that_determine_no_pose_give_none(
         assert solve() is None
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(kind=kinds, seed=seeds, share=st.floats(0.2, 1.0), in_points=st.booleans())
 def test_a_pose_from_partly_degenerate_points_never_raises(
     kind: str, seed: int, share: float, in_points: bool

@@ -20,7 +20,7 @@ def positive(rng: np.random.Generator, n: int) -> F64:
     return np.asarray(turn @ np.diag(np.geomspace(1.0, 1e3, n)) @ turn.T)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 24), st.integers(1, 3))
 def test_solutions_are_those_of_lapack(seed: int, n: int, m: int) -> None:
     rng = np.random.default_rng(seed)
@@ -47,7 +47,7 @@ def test_nan_is_refused_also_below_a_kernel_that_ignores_it(
     assert not solve(np.full((2, 2), np.nan), np.ones((2, 1)))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
 def test_inverses_of_three_by_three(seed: int) -> None:
     A = positive(np.random.default_rng(seed), 3)

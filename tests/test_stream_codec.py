@@ -185,7 +185,7 @@ def resealed(data: bytes) -> bytes:
     return data[:at] + struct.pack("<I", crc) + data[at + 4 :]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.sampled_from(LAYERS),
     st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=8),
@@ -221,7 +221,7 @@ def test_an_embedded_image_that_lies_about_its_size_is_not_opened() -> None:
     assert planes.decode_colour(lying, 8, 8) is None
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(1, 30), st.integers(1, 30), st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_any_mask_comes_back(h: int, w: int, seed: int, share: float) -> None:
     known = np.random.default_rng(seed).random((h, w)) < share

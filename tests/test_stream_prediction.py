@@ -20,7 +20,7 @@ def bumpy(h: int, w: int, noise: float) -> U16:
     return np.asarray(np.rint(plane), np.uint16)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_any_plane_with_any_holes_comes_back(h: int, w: int, seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
@@ -48,7 +48,7 @@ def test_holes_do_not_show_in_the_bytes() -> None:
     assert encode_codes(codes, known) == encode_codes(other, known)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=200))
 def test_any_bytes_give_none_or_a_plane(data: bytes) -> None:
     known = np.ones((7, 9), bool)

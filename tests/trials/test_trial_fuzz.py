@@ -50,7 +50,6 @@ def test_any_bytes_are_borne(name: str, record: Row, tmp_path: Path) -> None:
 
     @settings(
         max_examples=EXAMPLES,
-        deadline=None,
         database=None,
         derandomize=not WHOLE,
         suppress_health_check=list(HealthCheck),
@@ -109,7 +108,7 @@ def test_health_page_answers_any_request(record: Row) -> None:
     server = HealthServer("127.0.0.1:0", lambda: snapshot)
     examples = 2000 if WHOLE else 50
 
-    @settings(max_examples=examples, deadline=None, database=None, derandomize=not WHOLE)
+    @settings(max_examples=examples, database=None, derandomize=not WHOLE)
     @given(PATHS, st.sampled_from(["GET", "POST", "PUT", "DELETE", "HEAD", "OPTIONS"]))
     def answered(path: str, method: str) -> None:
         request = urllib.request.Request(
@@ -146,7 +145,6 @@ def test_health_page_answers_as_described(tmp_path: Path, record: Row) -> None:
 
             @settings(
                 max_examples=100,
-                deadline=None,
                 database=None,
                 suppress_health_check=list(HealthCheck),
             )
@@ -179,7 +177,6 @@ def test_portal_answers_as_described(tmp_path: Path, record: Row) -> None:
 
         @settings(
             max_examples=100,
-            deadline=None,
             database=None,
             suppress_health_check=list(HealthCheck),
         )
