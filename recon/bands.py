@@ -7,11 +7,11 @@ compile each.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
+from threading import Event
 from typing import Any, TypeVar
 
 from numba import config
@@ -45,7 +45,7 @@ def give_way() -> None:
     Array operations give the interpreter up for an instant and get it back before a waiting thread
     has woken up, so that this thread waits as long as the work lasts.
     """
-    time.sleep(GIVE_WAY_S)
+    Event().wait(GIVE_WAY_S)
 
 
 @cache

@@ -251,7 +251,7 @@ def test_a_recording_is_not_closed_while_an_image_is_decoded(
     events: list[str] = []
     decoding, close = threading.Event(), recording.close
 
-    def slow(time_ns: int) -> bool:
+    def slow(first_ns: int, last_ns: int) -> bool:
         decoding.set()
         time.sleep(0.3)
         events.append("decoded")
@@ -261,7 +261,7 @@ def test_a_recording_is_not_closed_while_an_image_is_decoded(
         events.append("closed")
         close()
 
-    recording.is_wanted = slow  # type: ignore[attr-defined]
+    recording._is_wanted = slow  # type: ignore[attr-defined]
     recording.close = closed  # type: ignore[method-assign]
     paces = Paced(recording)
     reading = threading.Thread(target=lambda: list(paces))

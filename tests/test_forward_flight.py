@@ -73,7 +73,7 @@ def photograph(levels: list[U8], T: F64) -> U8:
 @pytest.fixture(scope="module")
 def keyframes() -> list[Keyframe]:
     levels = ground()
-    config = load_config(None, ["compute.upsample=false"])
+    config = load_config(None, ["compute.upsample=false", "camera.readout_ms=0"])
     pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
     out: list[Keyframe] = []
     for i in range(FRAMES):
