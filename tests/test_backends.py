@@ -62,7 +62,7 @@ def pair(height: int, width: int, labels: int, first: int = 0) -> tuple[U8, U8]:
         (36, 64, 16, {}),
         (45, 83, 7, {"iterations": 4, "levels": 3}),
         (24, 70, 33, {"min_disparity": -3}),
-        (30, 61, 5, {"min_disparity": 4, "smoothness_truncation": 4.0}),
+        (30, 61, 5, {"min_disparity": 4, "smoothness_truncation": 1.5}),
         (9, 40, 2, {"iterations": 1, "levels": 1, "edge_floor": 1.0}),
         (8, 8, 12, {}),
     ],

@@ -87,7 +87,7 @@ def close(got: F32, want: F32, relative: float, alike: float = 0.999) -> None:
     ("height", "width", "labels", "settings"),
     [
         (54, 96, 16, {}), (57, 101, 19, {}), (33, 65, 8, {"min_disparity": -2}),
-        (64, 96, 24, {"smoothness_truncation": 16.0}), (20, 31, 6, {"min_disparity": 3}),
+        (64, 96, 24, {"smoothness_truncation": 2.55}), (20, 31, 6, {"min_disparity": 3}),
     ],
 )  # fmt: skip
 def test_room_around_a_pair_changes_nothing(
@@ -273,7 +273,7 @@ def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -
     assert not isinstance(load_backend("cpu"), PathBackend)
 
 
-@pytest.mark.parametrize(("truncation", "exact"), [(1.0, True), (2.0, False), (2.5, False)])
+@pytest.mark.parametrize(("truncation", "exact"), [(1.0, True), (2.5, False)])
 def test_half_precision_holds_the_sums_of_small_truncations(
     device: str, truncation: float, exact: bool
 ) -> None:

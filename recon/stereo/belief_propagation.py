@@ -60,7 +60,7 @@ class BeliefPropagationConfig:
             raise ValueError("iterations must be 1 to 1000 and levels 1 to 16")
         if not 1 <= self.truncation <= MAX_TRUNCATION:
             raise ValueError(
-                f"smoothness_truncation must be above 0 and at most {MAX_TRUNCATION // COST_UNIT}"
+                f"smoothness_truncation must be above 0 and at most {MAX_TRUNCATION / COST_UNIT:g}"
                 f" labels, not {self.smoothness_truncation}"
             )
         if not 0 < self.edge_floor <= 1 or not 1 <= self.edge_contrast <= 255:
@@ -155,7 +155,7 @@ NOISE = 0.2 * COST_UNIT
 
 
 def select(
-    data: I16, messages: I16, cost: I16, min_disparity: int, truncation: int, min_evidence: float
+    data: I16, messages: U8, cost: I16, min_disparity: int, truncation: int, min_evidence: float
 ) -> tuple[F32, F32]:
     """Real-valued labels (h, w) and their confidence, 0 to 1; 0 where rejected.
 
@@ -242,11 +242,11 @@ def _best_labels(
         m1 = messages[1, v, parity, label, :count]
         m2 = messages[2, v + 1, 1 - parity, label, parity : parity + count]
         for i in range(count):
-            b[i] = np.int16(np.int16(d[i] + m0[i]) + np.int16(m1[i] + m2[i]))
+            b[i] = np.int16(d[i] + np.int16(m0[i] + m1[i]) + np.int16(m2[i]))
         after = b[1 - parity :]  # nothing arrives from the left of a row's first cell
         m3 = messages[3, v + 1, 1 - parity, label, : after.shape[0]]
         for i in range(after.shape[0]):
-            after[i] += m3[i]
+            after[i] += np.int16(m3[i])
         for i in range(count):
             best[i] = min(best[i], np.int32(np.int32(b[i]) << LABEL_BITS | np.int32(label)))
     second[:] = 2**31 - 1

@@ -23,7 +23,7 @@ from recon.types import I16, U8
 
 U32 = npt.NDArray[np.uint32]
 
-COST_UNIT = 128
+COST_UNIT = 100
 """Integer cost of a disparity step of one label between neighbours."""
 
 CENSUS_RADIUS = 2
@@ -210,8 +210,8 @@ def _cost_volume(
 
 
 class Workspace(threading.local):
-    """Memory for int16 arrays per thread, by name: pairs differ in size, and fresh pages cost as
-    much as the messages."""
+    """Memory for arrays per thread, by name: pairs differ in size, and fresh pages cost as much as
+    the messages."""
 
     def __init__(self) -> None:
         self._kept: dict[str, I16] = {}
@@ -223,3 +223,8 @@ class Workspace(threading.local):
         if memory is None or not size <= memory.size <= MAX_SPARE * size:
             memory = self._kept[name] = np.empty(size + size // 8, np.int16)
         return memory[:size].reshape(shape)
+
+    def take_bytes(self, name: str, shape: tuple[int, ...]) -> U8:
+        """The same of uint8."""
+        size = math.prod(shape)
+        return self.take(name, ((size + 1) // 2,)).view(np.uint8)[:size].reshape(shape)

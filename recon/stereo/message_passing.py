@@ -5,9 +5,9 @@ so that a SIMD register holds one label of neighbouring pixels of one colour and
 labels costs the same per label. A row of cells ends with at least one empty cell, and the
 messages have an empty row above and below: what lies beyond the border says nothing.
 
-Everything is a 16-bit integer. A cost further than four truncations above its pixel's best
-cannot win its pixel (a message is at most one truncation), so it is cut there, at every level
-before the next coarser one sums it, and no sum overflows.
+Data are 16-bit integers, messages 8-bit ones: the caches hold twice as many. A cost further than
+four truncations above its pixel's best cannot win its pixel (a message is at most one truncation),
+so it is cut there, at every level before the next coarser one sums it, and no sum overflows.
 
 The innermost step is written for vector registers: left to find them in loops over arrays, LLVM
 checks the arrays for overlap at every label, which took ten times as long.
@@ -42,7 +42,7 @@ def update_block(
     leaving: Any,
     mask: Any,
     scratch: Any,
-    stride: Any,
+    strides: Any,
     labels: Any,
     slopes: Any,
     cuts: Any,
@@ -51,18 +51,21 @@ def update_block(
 
     Addresses of: the data of label 0, the four messages that arrive (from below, above,
     right, left), the four that leave (up, down, left, right), the lanes that exist (-1 or 0)
-    and ``labels * 4 * LANES`` int16 of scratch. ``stride`` is bytes from label to label;
+    and ``labels * 4 * LANES`` int16 of scratch. ``strides`` are bytes from label to label of the
+    data and of the messages;
     ``slopes`` and ``cuts`` are the addresses of the smoothness of the four edges.
     """
     addresses = types.UniTuple(types.intp, 4)
     one = types.intp
-    signature = types.void(one, addresses, addresses, one, one, one, one, addresses, addresses)
+    two = types.UniTuple(types.intp, 2)
+    signature = types.void(one, addresses, addresses, one, one, two, one, addresses, addresses)
     return signature, _code
 
 
 def _code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     """LLVM of :func:`update_block`: lower envelope up the labels, then down."""
-    data, arriving, leaving, mask, scratch, stride, labels, slopes, cuts = args
+    data, arriving, leaving, mask, scratch, strides, labels, slopes, cuts = args
+    data_stride, stride = cgutils.unpack_tuple(builder, strides, 2)
     block = _Block(builder)
     m_from = cgutils.unpack_tuple(builder, arriving, 4)
     m_to = cgutils.unpack_tuple(builder, leaving, 4)
@@ -75,8 +78,8 @@ def _code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     lowest = [block.variable(_FAR) for _ in range(4)]
     with cgutils.for_range(builder, labels) as loop:
         offset = builder.mul(loop.index, stride)
-        total = block.load(builder.add(data, offset))
-        arrived = {a: block.load(builder.add(a, offset)) for a in m_from}
+        total = block.load(builder.add(data, builder.mul(loop.index, data_stride)))
+        arrived = {a: block.load_message(builder.add(a, offset)) for a in m_from}
         for message in arrived.values():
             total = builder.add(total, message)
         for k in range(4):
@@ -99,7 +102,7 @@ def _code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             best = block.least(builder.sub(best, builder.load(lowest[k])), cut[k])
             best = block.least(best, builder.add(builder.load(after[k]), slope[k]))
             builder.store(best, after[k])
-            block.save(builder.and_(best, exists), builder.add(m_to[k], offset))
+            block.save_message(builder.and_(best, exists), builder.add(m_to[k], offset))
     return context.get_dummy_value()
 
 
@@ -109,6 +112,7 @@ class _Block:
     def __init__(self, builder: Any) -> None:
         self.builder = builder
         self.type = ir.VectorType(ir.IntType(16), LANES)
+        self.message = ir.VectorType(ir.IntType(8), LANES)
 
     def load(self, address: Any) -> Any:
         """The lanes at an address, aligned or not."""
@@ -118,6 +122,16 @@ class _Block:
         """Put the lanes at an address."""
         pointer = self.builder.inttoptr(address, self.type.as_pointer())
         self.builder.store(value, pointer, align=2)
+
+    def load_message(self, address: Any) -> Any:
+        """The lanes of a message at an address."""
+        pointer = self.builder.inttoptr(address, self.message.as_pointer())
+        return self.builder.zext(self.builder.load(pointer, align=1), self.type)
+
+    def save_message(self, value: Any, address: Any) -> None:
+        """Put the lanes of a message at an address."""
+        pointer = self.builder.inttoptr(address, self.message.as_pointer())
+        self.builder.store(self.builder.trunc(value, self.message), pointer, align=1)
 
     def variable(self, value: int) -> Any:
         """A local variable with this value in all lanes."""
@@ -133,8 +147,8 @@ class _Block:
 BAND_ROWS = 80
 """Rows that are worth a thread: waiting for it costs more than a smaller band."""
 
-MAX_TRUNCATION = 2048
-"""The largest truncation for which no sum leaves 16 bits."""
+MAX_TRUNCATION = 255
+"""The largest truncation for which a message fits into 8 bits."""
 
 FULL_WEIGHT = 256
 
@@ -212,7 +226,7 @@ def _edges(
 
 def propagate(
     cost: I16, image: U8, iterations: int, levels: int, smoothness: Smoothness
-) -> tuple[I16, I16]:
+) -> tuple[I16, U8]:
     """Data (h, 2, L, cells) and messages (4, h + 2, 2, L, cells) of the finest level.
 
     ``cost`` is (h, L, w) int16, at least 0; ``image`` (h, w) uint8 says where surfaces may end.
@@ -222,24 +236,32 @@ def propagate(
     truncation = smoothness.truncation
     height, labels, width = cost.shape
     pyramid = [_space.take("data 0", (height, 2, labels, cells_of(width)))]
-    _split(cost, truncation, pyramid[0])
+    _by_rows(_split, height, cost, truncation, pyramid[0])
     weights = [smoothness.weights(image)]
     while len(pyramid) < levels and min(weights[-1].shape[1:]) >= 8:
         weights.append(_coarser_weights(weights[-1]))
         _, h, w = weights[-1].shape
         pyramid.append(_space.take(f"data {len(pyramid)}", (h, 2, labels, cells_of(w))))
-        _coarser(pyramid[-2], w, truncation, pyramid[-1])
-    messages = np.zeros((4, 1, 2, labels, 1), np.int16)
+        _by_rows(_coarser, h, pyramid[-2], w, truncation, pyramid[-1])
+    messages = np.zeros((4, 1, 2, labels, 1), np.uint8)
     for level in range(len(pyramid) - 1, -1, -1):
         data, weight = pyramid[level], weights[level]
         h, _, _, cells = data.shape
         w = weight.shape[2]
-        finer = _space.take(f"messages {level}", (4, h + 2, 2, labels, cells))
-        _start(messages, w, finer)
+        finer = _space.take_bytes(f"messages {level}", (4, h + 2, 2, labels, cells))
+        _by_rows(_start, h + 2, messages, w, finer)
         messages = finer
         edges = _edges(weight, cells, smoothness.slope, truncation)
         _sweeps(data, messages, edges, w, iterations)
     return pyramid[0], messages
+
+
+def _by_rows(kernel: Any, rows: int, *args: Any) -> None:
+    """``kernel(begin, end, ...)`` of all rows, on several threads where there are many."""
+    if rows < 2 * BAND_ROWS:
+        kernel(0, rows, *args)
+    else:
+        in_bands(kernel, rows, *args)
 
 
 def cells_of(width: int) -> int:
@@ -248,10 +270,12 @@ def cells_of(width: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _split(cost: Any, truncation: int, data: Any) -> None:  # pragma: no cover - compiled
+def _split(
+    begin: int, end: int, cost: Any, truncation: int, data: Any
+) -> None:  # pragma: no cover - compiled
     """(h, L, w) to (h, 2, L, cells), each pixel less its least cost and cut."""
-    height, labels, width = cost.shape
-    for v in range(height):
+    _, labels, width = cost.shape
+    for v in range(begin, end):
         low = cost[v, 0].copy()
         for label in range(1, labels):
             row = cost[v, label]
@@ -271,12 +295,11 @@ def _split(cost: Any, truncation: int, data: Any) -> None:  # pragma: no cover -
 
 @njit(cache=True, nogil=True)
 def _coarser(
-    fine: Any, width: int, truncation: int, data: Any
+    begin: int, end: int, fine: Any, width: int, truncation: int, data: Any
 ) -> None:  # pragma: no cover - compiled
     """Sum of the costs of 2x2 pixels, less its least, cut again to what can matter."""
     fine_height, _, labels, _ = fine.shape
-    height = (fine_height + 1) // 2
-    for v in range(height):
+    for v in range(begin, end):
         below = 2 * v + 1 < fine_height
         top = np.int16(4 * truncation)
         for parity in range(2):
@@ -301,14 +324,16 @@ def _coarser(
 
 
 @njit(cache=True, nogil=True)
-def _start(coarse: Any, width: int, messages: Any) -> None:  # pragma: no cover - compiled
+def _start(
+    begin: int, end: int, coarse: Any, width: int, messages: Any
+) -> None:  # pragma: no cover - compiled
     """The messages that a level starts from: those of the coarser cells that it divides.
 
     Only the colour that the first sweep reads is filled; the sweep writes the other.
     """
     height, labels, cells = messages.shape[1] - 2, messages.shape[3], messages.shape[4]
     known = coarse.shape[4]
-    for r in range(height + 2):
+    for r in range(begin, end):
         for direction in range(4):
             if r in (0, height + 1):
                 messages[direction, r] = 0
@@ -336,23 +361,25 @@ def _update_row(
     """Messages that leave the pixels of one colour of row ``v``."""
     _, _, labels, cells = data.shape
     parity = (v + colour) & 1
-    row = labels * cells * 2  # bytes
+    row = labels * cells  # bytes of the messages of one parity
     base = messages.ctypes.data
     step = (data.shape[0] + 2) * 2 * row  # from direction to direction
     here = base + (2 * (v + 1) + parity) * row
     adjacent = base + (2 * (v + 1) + 1 - parity) * row
-    d = data.ctypes.data + (2 * v + parity) * row
+    d = data.ctypes.data + (2 * v + parity) * 2 * row
     line = 2 * cells  # bytes of the edges of one parity of a row
     side = (data.shape[0] + 2) * 2 * line  # from vertical to horizontal edges
     for block in range(cells // LANES):
         at = 2 * LANES * block
+        start = here + LANES * block
+        beside = adjacent + LANES * block + parity
         arriving = (
-            here + 2 * row + UP * step + at,
-            here - 2 * row + DOWN * step + at,
-            adjacent + LEFT * step + at + 2 * parity,
-            adjacent + RIGHT * step + at + 2 * parity - 2,
+            start + 2 * row + UP * step,
+            start - 2 * row + DOWN * step,
+            beside + LEFT * step,
+            beside + RIGHT * step - 1,
         )
-        leaving = (here + at, here + step + at, here + 2 * step + at, here + 3 * step + at)
+        leaving = (start, start + step, start + 2 * step, start + 3 * step)
         e = edges.ctypes.data + at
         # smoothness towards above, below, left and right
         places = (
@@ -368,7 +395,7 @@ def _update_row(
             leaving,
             masks.ctypes.data + parity * 2 * cells + at,
             scratch.ctypes.data,
-            2 * cells,
+            (2 * cells, cells),
             labels,
             places,
             (places[0] + cut, places[1] + cut, places[2] + cut, places[3] + cut),
@@ -419,7 +446,7 @@ def _sweep_gap(
             _update_row(data, messages, v, t & 1, edges, masks, scratch)
 
 
-def _sweeps(data: I16, messages: I16, edges: Any, width: int, iterations: int) -> None:
+def _sweeps(data: I16, messages: U8, edges: Any, width: int, iterations: int) -> None:
     """All iterations of a level, in bands of rows; then what the bands left out between them."""
     height = data.shape[0]
     bands = max(1, min(threads(), height // max(BAND_ROWS, 2 * iterations)))
