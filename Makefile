@@ -85,8 +85,10 @@ $(CORE): pyproject.toml constraints.txt
 	@echo "installing skyrelief and some 40 packages into $(VENV): once, a minute or two"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --no-compile --disable-pip-version-check -qq -c constraints.txt -e '.[portal]' & \
-	  s=0; while kill -0 $$! 2>/dev/null; do sleep 1; s=$$((s + 1)); test ! -t 1 || printf '\r%s packages, %s s' \
-	  $$(ls -d $(VENV)/lib/python*/site-packages/*.dist-info | wc -l) $$s; done; test ! -t 1 || echo; wait $$!
+	  s=0; while kill -0 $$! 2>/dev/null; do sleep 1; s=$$((s + 1)); test ! -t 1 || { \
+	  n=$$(ls -d $(VENV)/lib/python*/site-packages/*.dist-info | wc -l); \
+	  printf '\r[%-40.40s] %s packages, %s s' "$$(printf '%*s' $$n '' | tr ' ' '=')" $$n $$s; }; \
+	  done; test ! -t 1 || echo; wait $$!
 	@touch $(CORE)
 
 $(STAMP): $(CORE)
