@@ -132,7 +132,8 @@ def change_between(before: Raster, after: Raster, config: ChangeConfig | None = 
     d = heights[1] - heights[0]
     own = before.sigma_m**2 + after.sigma_m**2
     labels = np.zeros(d.shape, np.int32)
-    scales = [_scale(heights, d, own, w, cell_m, config) for w in config.windows]
+    relief = _relief(heights, 2 * config.edge_cells)
+    scales = [_scale(heights, d, own, relief, w, cell_m, config) for w in config.windows]
     for sign in (1.0, -1.0):
         _add_labels(labels, d, scales, sign, cell_m, config)
     left = left_over_m(d, cell_m, config.block_m)
@@ -243,8 +244,9 @@ def _robust(x: F32) -> float:
 
 
 def _scale(
-    heights: tuple[F32, F32], d: F32, own: F32, window: int, cell_m: float, config: ChangeConfig
-) -> _Scale:
+    heights: tuple[F32, F32], d: F32, own: F32, relief: F32, window: int, cell_m: float,
+    config: ChangeConfig,
+) -> _Scale:  # fmt: skip
     known = np.isfinite(d)
     mean, said = (
         np.where(known, x, np.float32(np.nan))
@@ -254,7 +256,7 @@ def _scale(
     enough = round(MIN_PLACES * config.min_area_m2 / cell_m**2)
     more = np.maximum(
         _more_in_blocks(ratio, max(1, round(config.local_m / cell_m)), lag),
-        _more_at_steps(ratio, _relief(heights, lag), lag, enough),
+        _more_at_steps(ratio, relief, lag, enough),
     )
     sigma = said * _robust(ratio[known]) * more
     return _Scale(window, (_mean(heights[0], window), _mean(heights[1], window)), mean, sigma)
