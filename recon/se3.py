@@ -108,6 +108,12 @@ def about(place: F64, covariance: F64) -> F64:
     return np.asarray(lever @ covariance @ lever.T)
 
 
+def sigma_at(place: F64, covariance: F64) -> float:
+    """Sigma in m, in all three directions together, of a (3,) place that a (6, 6) covariance of a
+    perturbation about the origin moves."""
+    return float(np.sqrt(np.trace(about(place, covariance)[3:, 3:])))
+
+
 def transform(T: F64, points: F64) -> F64:
     """(N, 3) ``points`` of frame b in frame a, for T_a_b."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])

@@ -200,9 +200,7 @@ class System:
         unit = np.zeros((len(self.g), 6))
         unit[6 * key : 6 * key + 6] = np.eye(6)
         own = self.factors.solve(unit)[6 * key : 6 * key + 6]
-        lever = np.eye(6)
-        lever[3:, :3] = se3.hat(self.at.t[key])
-        return np.asarray(lever @ (0.5 * (own + own.T)) @ lever.T)
+        return se3.about(-self.at.t[key], 0.5 * (own + own.T))
 
 
 def solved(factors: list[Factors], start: State, steps: int) -> System:

@@ -59,8 +59,7 @@ class Placed:
     @property
     def sigma_m(self) -> float:
         """Of the place, in all three directions together."""
-        own = se3.about(self.T_world_camera[:3, 3], self.covariance)
-        return float(np.sqrt(np.trace(own[3:, 3:])))
+        return se3.sigma_at(self.T_world_camera[:3, 3], self.covariance)
 
     def carry(self, T_key_camera: F64) -> Placed:
         """A frame in the world by its pose relative to this keyframe (odometry units)."""

@@ -54,7 +54,6 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
         )
     for one in main_keyframes(scan.store):
         place_m = one.depth.T_world_camera[:3, 3]
-        spread = se3.about(place_m, one.pose.covariance)[3:, 3:]
         lat, lon, alt = frame.to_geodetic(place_m[None])[0]
         features.append(
             {
@@ -63,7 +62,7 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
                     "keyframe": one.seq,
                     "time": _iso(one.time_ns),
                     "points": int(one.fresh.sum()),
-                    "sigma_m": round(float(np.sqrt(np.trace(spread))), 4),
+                    "sigma_m": round(se3.sigma_at(place_m, one.pose.covariance), 4),
                 },
                 "geometry": {
                     "type": "Point",

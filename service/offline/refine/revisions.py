@@ -282,7 +282,7 @@ def _record(
     lat = lon = alt = None
     if place is not None:
         lat, lon, alt = (float(v) for v in place.to_geodetic(T[None, :3, 3])[0])
-    sigma = float(np.sqrt(np.trace(se3.about(T[:3, 3], spread)[3:, 3:])))
+    sigma = se3.sigma_at(T[:3, 3], spread)
     return replace(
         frame, T_world_camera=T, covariance=spread, lat_deg=lat, lon_deg=lon, alt_amsl_m=alt,
         roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw, distance_m=distance_m, sigma_m=sigma,

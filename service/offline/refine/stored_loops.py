@@ -150,7 +150,7 @@ def steps_m(loops: Sequence[Closure], poses: F64, scales: F64, ahead_m: float) -
     spot, sigma, steps = np.array([[0.0, 0.0, ahead_m]]), [], []
     for loop in loops:
         here = se3.transform(loop.T_a_b, spot)[0]
-        sigma.append(float(np.sqrt(np.trace(se3.about(here, loop.covariance)[3:, 3:]))))
+        sigma.append(se3.sigma_at(here, loop.covariance))
         seen = loop.T_a_b.copy()
         seen[:3, 3] *= scales[loop.a]
         there = se3.inverse(poses[loop.a]) @ poses[loop.b]
