@@ -2,11 +2,13 @@
 
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import MISSING, fields
+from inspect import Parameter, Signature
 from pathlib import Path
 from threading import Event
-from typing import Annotated
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
@@ -21,6 +23,34 @@ Voxel = Annotated[
     float | None, typer.Option("--voxel-m", help="fused voxel size; default: pixel on ground")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="one JSON object at the end")]
+
+Options = TypeVar("Options")
+
+
+def with_options(
+    of: type[Options],
+) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
+    """Give a command one option for each field of a dataclass, Annotated by ``typer.Option``."""
+    hints = get_type_hints(of, include_extras=True)
+    options = [
+        Parameter(
+            field.name,
+            Parameter.KEYWORD_ONLY,
+            default=Parameter.empty if field.default is MISSING else field.default,
+            annotation=hints[field.name],
+        )
+        for field in fields(of)  # type: ignore[arg-type]
+    ]
+
+    def wrap(command: Callable[[Options], None]) -> Callable[..., None]:
+        def run(**given: Any) -> None:
+            command(of(**given))
+
+        run.__name__, run.__doc__, run.__annotations__ = command.__name__, command.__doc__, hints
+        run.__signature__ = Signature(options)  # type: ignore[attr-defined]
+        return run
+
+    return wrap
 
 
 def stop_by_signals() -> Event:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import stop_by_signals
+from service.commands import stop_by_signals, with_options
 from service.errors import InputError, SkyreliefError
 from service.packages import needing
 
@@ -44,81 +44,96 @@ TokenFile = Annotated[
 ]
 
 
-def ground(
+@dataclass(frozen=True)
+class GroundOptions:
+    """Options of ``ground``, as they are given."""
+
     connect: Annotated[
         list[str] | None, typer.Option(help="router to join: tls/HOST:7447; may be repeated")
-    ] = None,
+    ] = None
     listen: Annotated[
         list[str] | None,
         typer.Option(help="where drones connect: tls/0.0.0.0:7447; default: this machine only"),
-    ] = None,
-    store: Annotated[Path, typer.Option(help="folder of received scans")] = Path("ground-scans"),
+    ] = None
+    store: Annotated[Path, typer.Option(help="folder of received scans")] = Path("ground-scans")
     keys: Annotated[
         Path | None, typer.Option(help="this station's keys, a folder of 'skyrelief keys'")
-    ] = None,
+    ] = None
     plain: Annotated[
         bool, typer.Option("--plain", help="allow endpoints without TLS beyond this machine")
-    ] = False,
+    ] = False
     quota_mb: Annotated[
         float | None, typer.Option(help="size of one scan; beyond it only coarse layers are kept")
-    ] = None,
+    ] = None
     drone_share: Annotated[
         float, typer.Option(help="percent of the disk that the scans of one drone may take")
-    ] = 50.0,
+    ] = 50.0
     reserve_mb: Annotated[
         float | None, typer.Option(help="disk space kept free; default: 5 %, at most 2 GiB")
-    ] = None,
+    ] = None
     mavlink: Annotated[
         list[str] | None,
         typer.Option(help="telemetry radio for the narrow fallback: udpin:0.0.0.0:14551"),
-    ] = None,
+    ] = None
     refresh_s: Annotated[
         float | None, typer.Option(help="interval for writing clouds of growing scans")
-    ] = None,
+    ] = None
     portal: Annotated[
         str | None, typer.Option(help="serve the web portal at HOST:PORT, such as 127.0.0.1:8080")
-    ] = None,
-    portal_token: TokenFile = None,
+    ] = None
+    portal_token: TokenFile = None
     portal_tls: Annotated[
         tuple[Path, Path] | None, typer.Option(help="the portal's certificate and key")
-    ] = None,
+    ] = None
     basemap: Annotated[
         Path | None, typer.Option(help="MBTiles or PMTiles basemap of the portal's maps")
-    ] = None,
+    ] = None
     foxglove: Annotated[
         str | None,
         typer.Option(help="serve growing scans to Foxglove at HOST:PORT, such as 127.0.0.1:8765"),
-    ] = None,
+    ] = None
     vehicle: Annotated[
         str | None,
         typer.Option(help="MAVLink of the vehicle for the portal: udpin://0.0.0.0:14550"),
-    ] = None,
+    ] = None
     take: Annotated[
         list[Path] | None,
         typer.Option(help="scans of an aircraft's storage, imported first; may be repeated"),
-    ] = None,
+    ] = None
     sites: Annotated[
         bool, typer.Option(help="align finished scans that show the same ground, in STORE/site")
-    ] = True,
-    once: Annotated[bool, typer.Option("--once", help="end when a scan is complete")] = False,
+    ] = True
+    once: Annotated[bool, typer.Option("--once", help="end when a scan is complete")] = False
     idle_exit_s: Annotated[
         float | None, typer.Option(help="end after so many seconds without new data")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
-) -> None:
+    ] = None
+    as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False
+
+
+@with_options(GroundOptions)
+def ground(given: GroundOptions) -> None:
     """Receive scans from drones; end with Ctrl-C. Scans are stored in STORE/DRONE/SCAN."""
     from service.ground.receiver import ReceiverConfig
 
-    name, session = _session(connect or [], listen or [], keys, plain)
-    refresh = refresh_s if refresh_s is not None else RADIO_REFRESH_S if mavlink else 0.0
-    limits = _limits(quota_mb, drone_share, reserve_mb)
+    name, session = _session(given.connect or [], given.listen or [], given.keys, given.plain)
+    refresh = given.refresh_s
+    if refresh is None:
+        refresh = RADIO_REFRESH_S if given.mavlink else 0.0
+    limits = _limits(given.quota_mb, given.drone_share, given.reserve_mb)
     page = None
-    if portal is not None:
-        page = PortalOptions(portal, portal_token, portal_tls, vehicle, basemap)
+    if given.portal is not None:
+        page = PortalOptions(
+            given.portal, given.portal_token, given.portal_tls, given.vehicle, given.basemap
+        )
     _receive(
-        ReceiverConfig(store, session, limits, name, refresh, sites),
-        mavlink or [], page, foxglove, take or [], Until(once, idle_exit_s), as_json,
-    )  # fmt: skip
+        ReceiverConfig(given.store, session, limits, name, refresh, given.sites),
+        given.mavlink or [],
+        page,
+        given.foxglove,
+        given.take or [],
+        Until(given.once, given.idle_exit_s),
+        given.as_json,
+    )
 
 
 @dataclass(frozen=True, slots=True)

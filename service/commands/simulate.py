@@ -7,147 +7,197 @@ import re
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import showing
+from service.commands import showing, with_options
 from service.errors import InputError
 
 if TYPE_CHECKING:
     from service.progress import Progress
+    from service.sim import recording
+    from service.sim.flight import FlightPlan, SensorNoise
     from service.sim.live import LiveOptions
-    from service.sim.recording import SimulationOptions
+    from service.sim.telemetry import TelemetryOptions
 
 VIDEO_TO = "udp://127.0.0.1:5600?pkt_size=1316"
 PAIR = re.compile(r"^(-?[0-9.]+):(-?[0-9.]+)$")
 
 
-def simulate(
-    out: Annotated[Path, typer.Option("--out", help="Folder for the flight and its truth.")],
-    seed: Annotated[int, typer.Option(help="Seed of the site and of all random numbers.")] = 1,
-    duration_s: Annotated[float, typer.Option(help="Length of the video.")] = 30.0,
-    height_m: Annotated[float, typer.Option(help="Height above the ground at the start.")] = 60.0,
-    speed_m_s: Annotated[float, typer.Option(help="Speed over ground.")] = 5.0,
-    pattern: Annotated[str, typer.Option(help="nadir, oblique, legs, orbit or hover.")] = "nadir",
-    legs: Annotated[int, typer.Option(help="Parallel legs of the pattern 'legs'.")] = 3,
-    spacing_m: Annotated[float | None, typer.Option(help="Distance between legs.")] = None,
-    heading_deg: Annotated[float, typer.Option(help="First leg, from north over east.")] = 35.0,
-    camera_pitch_deg: Annotated[float | None, typer.Option(help="-90 is straight down.")] = None,
-    size: Annotated[str, typer.Option(help="Width x height in pixels.")] = "1280x720",
-    fps: Annotated[float, typer.Option(help="Frames per second.")] = 30.0,
-    focal: Annotated[float, typer.Option(help="Focal length over image width.")] = 0.75,
-    distortion: Annotated[bool, typer.Option(help="Barrel distortion of the lens.")] = True,
-    wobble_deg: Annotated[float, typer.Option(help="Unsteadiness of the gimbal.")] = 1.0,
-    sway_m: Annotated[float, typer.Option(help="Unsteadiness of the path.")] = 0.15,
-    climb_m: Annotated[float, typer.Option(help="Height gained from start to end.")] = 0.0,
-    swing_deg: Annotated[float, typer.Option(help="Swing of the camera at about 1 Hz.")] = 0.0,
+@dataclass(frozen=True)
+class SimulateOptions:
+    """Options of ``simulate``, as they are given."""
+
+    out: Annotated[Path, typer.Option("--out", help="Folder for the flight and its truth.")]
+    seed: Annotated[int, typer.Option(help="Seed of the site and of all random numbers.")] = 1
+    duration_s: Annotated[float, typer.Option(help="Length of the video.")] = 30.0
+    height_m: Annotated[float, typer.Option(help="Height above the ground at the start.")] = 60.0
+    speed_m_s: Annotated[float, typer.Option(help="Speed over ground.")] = 5.0
+    pattern: Annotated[str, typer.Option(help="nadir, oblique, legs, orbit or hover.")] = "nadir"
+    legs: Annotated[int, typer.Option(help="Parallel legs of the pattern 'legs'.")] = 3
+    spacing_m: Annotated[float | None, typer.Option(help="Distance between legs.")] = None
+    heading_deg: Annotated[float, typer.Option(help="First leg, from north over east.")] = 35.0
+    camera_pitch_deg: Annotated[float | None, typer.Option(help="-90 is straight down.")] = None
+    size: Annotated[str, typer.Option(help="Width x height in pixels.")] = "1280x720"
+    fps: Annotated[float, typer.Option(help="Frames per second.")] = 30.0
+    focal: Annotated[float, typer.Option(help="Focal length over image width.")] = 0.75
+    distortion: Annotated[bool, typer.Option(help="Barrel distortion of the lens.")] = True
+    wobble_deg: Annotated[float, typer.Option(help="Unsteadiness of the gimbal.")] = 1.0
+    sway_m: Annotated[float, typer.Option(help="Unsteadiness of the path.")] = 0.15
+    climb_m: Annotated[float, typer.Option(help="Height gained from start to end.")] = 0.0
+    swing_deg: Annotated[float, typer.Option(help="Swing of the camera at about 1 Hz.")] = 0.0
     readout_ms: Annotated[
         float, typer.Option(help="Rolling shutter, first to last row; 0: global.")
-    ] = 0.0,
+    ] = 0.0
     readout_direction: Annotated[
         str, typer.Option(help="Readout direction: down, up, right, left.")
-    ] = "down",
-    shutter_ms: Annotated[float, typer.Option(help="Exposure, which blurs by motion.")] = 0.0,
-    relief_m: Annotated[float, typer.Option(help="Height of the hills; 0 is flat.")] = 8.0,
+    ] = "down"
+    shutter_ms: Annotated[float, typer.Option(help="Exposure, which blurs by motion.")] = 0.0
+    relief_m: Annotated[float, typer.Option(help="Height of the hills; 0 is flat.")] = 8.0
     water_m: Annotated[
         float | None, typer.Option(help="Level of a sea with waves, above the origin's ground.")
-    ] = None,
-    density: Annotated[float, typer.Option(help="Density of houses and trees; 0: none.")] = 1.0,
+    ] = None
+    density: Annotated[float, typer.Option(help="Density of houses and trees; 0: none.")] = 1.0
     site_m: Annotated[
         float | None,
         typer.Option(help="Side of the site, the flight in its middle; for several flights."),
-    ] = None,
+    ] = None
     flight_seed: Annotated[
         int | None, typer.Option(help="Seed of motion and sensors; default: --seed.")
-    ] = None,
+    ] = None
     changes: Annotated[
         int, typer.Option(help="Boxes; half stand at --date 1, half at --date 2.")
-    ] = 0,
-    date: Annotated[int, typer.Option(help="1 or 2: which half of the boxes stands.")] = 1,
-    photos: Annotated[Path | None, typer.Option(help="Aerial photos as the ground.")] = None,
-    gps_noise_m: Annotated[float, typer.Option(help="Wander of the GPS.")] = 1.0,
+    ] = 0
+    date: Annotated[int, typer.Option(help="1 or 2: which half of the boxes stands.")] = 1
+    photos: Annotated[Path | None, typer.Option(help="Aerial photos as the ground.")] = None
+    gps_noise_m: Annotated[float, typer.Option(help="Wander of the GPS.")] = 1.0
     gnss_noise: Annotated[
         str,
         typer.Option(help="wander: slow; white: from fix to fix; exact: no sensor errors."),
-    ] = "wander",
+    ] = "wander"
     boresight_deg: Annotated[
         str, typer.Option(help="RIGHT:UP degrees between camera and gimbal.")
-    ] = "0:0",
-    baro_noise_m: Annotated[float, typer.Option(help="Wander of the altitude.")] = 0.5,
-    attitude_noise_deg: Annotated[float, typer.Option(help="Wander of roll and pitch.")] = 0.3,
-    yaw_noise_deg: Annotated[float, typer.Option(help="Wander of the heading.")] = 1.0,
-    image_noise: Annotated[float, typer.Option(help="Sensor noise in gray levels.")] = 1.5,
-    telemetry: Annotated[bool, typer.Option(help="Write flight.tlog.")] = True,
-    video: Annotated[bool, typer.Option(help="Render flight.mp4.")] = True,
-    gimbal_frame: Annotated[str, typer.Option(help="Yaw of the gimbal: earth, vehicle.")] = "earth",
-    rangefinder: Annotated[bool, typer.Option(help="Send DISTANCE_SENSOR.")] = True,
-    gnss_accuracy: Annotated[bool, typer.Option(help="GPS_RAW_INT carries h_acc.")] = True,
-    home_above_m: Annotated[float, typer.Option(help="Take-off point above the site.")] = 0.0,
-    telemetry_gap: Annotated[str, typer.Option(help="FROM:TO seconds without packets.")] = "",
-    log_lead_s: Annotated[float, typer.Option(help="The log begins so much earlier.")] = 0.0,
-    blank: Annotated[list[str] | None, typer.Option(help="FRAME:COUNT black frames.")] = None,
-    exposure: Annotated[list[str] | None, typer.Option(help="SECOND:GAIN brightness step.")] = None,
-    depth_frames: Annotated[int, typer.Option(help="How many depth maps to keep.")] = 12,
-    crf: Annotated[int, typer.Option(help="H.264 quality; lower is better.")] = 18,
-    live: Annotated[bool, typer.Option("--live", help="Play the flight in real time.")] = False,
-    video_to: Annotated[str, typer.Option(help="Live: where H.264 in MPEG-TS goes.")] = VIDEO_TO,
-    mavlink_to: Annotated[str, typer.Option(help="Live: UDP host:port.")] = "127.0.0.1:14550",
-    loop: Annotated[bool, typer.Option("--loop", help="Live: repeat the flight.")] = False,
-    until_stdin_ends: Annotated[bool, typer.Option("--until-stdin-ends", hidden=True)] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
-) -> None:
+    ] = "0:0"
+    baro_noise_m: Annotated[float, typer.Option(help="Wander of the altitude.")] = 0.5
+    attitude_noise_deg: Annotated[float, typer.Option(help="Wander of roll and pitch.")] = 0.3
+    yaw_noise_deg: Annotated[float, typer.Option(help="Wander of the heading.")] = 1.0
+    image_noise: Annotated[float, typer.Option(help="Sensor noise in gray levels.")] = 1.5
+    telemetry: Annotated[bool, typer.Option(help="Write flight.tlog.")] = True
+    video: Annotated[bool, typer.Option(help="Render flight.mp4.")] = True
+    gimbal_frame: Annotated[str, typer.Option(help="Yaw of the gimbal: earth, vehicle.")] = "earth"
+    rangefinder: Annotated[bool, typer.Option(help="Send DISTANCE_SENSOR.")] = True
+    gnss_accuracy: Annotated[bool, typer.Option(help="GPS_RAW_INT carries h_acc.")] = True
+    home_above_m: Annotated[float, typer.Option(help="Take-off point above the site.")] = 0.0
+    telemetry_gap: Annotated[str, typer.Option(help="FROM:TO seconds without packets.")] = ""
+    log_lead_s: Annotated[float, typer.Option(help="The log begins so much earlier.")] = 0.0
+    blank: Annotated[list[str] | None, typer.Option(help="FRAME:COUNT black frames.")] = None
+    exposure: Annotated[list[str] | None, typer.Option(help="SECOND:GAIN brightness step.")] = None
+    depth_frames: Annotated[int, typer.Option(help="How many depth maps to keep.")] = 12
+    crf: Annotated[int, typer.Option(help="H.264 quality; lower is better.")] = 18
+    live: Annotated[bool, typer.Option("--live", help="Play the flight in real time.")] = False
+    video_to: Annotated[str, typer.Option(help="Live: where H.264 in MPEG-TS goes.")] = VIDEO_TO
+    mavlink_to: Annotated[str, typer.Option(help="Live: UDP host:port.")] = "127.0.0.1:14550"
+    loop: Annotated[bool, typer.Option("--loop", help="Live: repeat the flight.")] = False
+    until_stdin_ends: Annotated[bool, typer.Option("--until-stdin-ends", hidden=True)] = False
+    as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False
+
+    def simulation(self) -> recording.SimulationOptions:
+        """Raises ValueError for an impossible flight, InputError for unreadable text."""
+        from service.cameras.camera_file import shutter_of
+        from service.sim import recording
+        from service.sim.render import Look
+
+        return recording.SimulationOptions(
+            plan=self._plan(),
+            noise=self._noise(),
+            telemetry=self._telemetry(),
+            look=Look(noise=self.image_noise, water_m=self.water_m),
+            faults=self._faults(),
+            seed=self.seed,
+            size_px=_size(self.size),
+            fps=self.fps,
+            focal_share=self.focal,
+            distortion=recording.DISTORTION if self.distortion else (0.0,) * 5,
+            relief_m=self.relief_m,
+            density=self.density,
+            photos=self.photos,
+            depth_frames=self.depth_frames,
+            crf=self.crf,
+            with_telemetry=self.telemetry,
+            with_video=self.video,
+            shutter=shutter_of(self.readout_ms, self.readout_direction),
+            exposure_s=1e-3 * self.shutter_ms,
+            flight_seed=self.flight_seed,
+            site_m=self.site_m,
+            changes=self.changes,
+            date=self.date,
+        )
+
+    def _plan(self) -> FlightPlan:
+        from service.sim.flight import FlightPlan
+
+        return FlightPlan(
+            self.pattern, self.duration_s, self.height_m, self.speed_m_s, self.heading_deg,
+            self.camera_pitch_deg, self.legs, self.spacing_m, self.wobble_deg, self.sway_m,
+            self.climb_m, self.swing_deg, centred=self.site_m is not None,
+        )  # fmt: skip
+
+    def _noise(self) -> SensorNoise:
+        from service.sim.flight import SensorNoise
+
+        noise = SensorNoise(
+            gps_m=self.gps_noise_m,
+            baro_m=self.baro_noise_m,
+            attitude_deg=self.attitude_noise_deg,
+            yaw_deg=self.yaw_noise_deg,
+        )
+        return SensorNoise.of(self.gnss_noise, noise)
+
+    def _telemetry(self) -> TelemetryOptions:
+        from service.sim.telemetry import TelemetryOptions
+
+        return TelemetryOptions(
+            gimbal_frame=self.gimbal_frame,
+            rangefinder=self.rangefinder,
+            gap_s=_pair(self.telemetry_gap, "--telemetry-gap") if self.telemetry_gap else None,
+            lead_s=self.log_lead_s,
+            boresight_deg=_pair(self.boresight_deg, "--boresight-deg"),
+            accuracy=self.gnss_accuracy,
+            home_above_m=self.home_above_m,
+        )
+
+    def _faults(self) -> recording.Faults:
+        from service.sim.recording import Faults
+
+        blank = [_pair(value, "--blank") for value in self.blank or []]
+        exposure = [_pair(value, "--exposure") for value in self.exposure or []]
+        return Faults(tuple((int(a), int(b)) for a, b in blank), tuple(sorted(exposure)))
+
+
+@with_options(SimulateOptions)
+def simulate(given: SimulateOptions) -> None:
     """Render a flight: flight.mp4, flight.tlog, camera.yaml, and truth/ to score against.
 
     --live plays it in real time, as a camera's stream and an autopilot's MAVLink. A flight that
     exists is not rendered again.
     """
-    from service.cameras.camera_file import shutter_of
-    from service.sim import recording
-    from service.sim.flight import FlightPlan, SensorNoise
     from service.sim.live import LiveOptions
-    from service.sim.render import Look
-    from service.sim.telemetry import TelemetryOptions
 
-    def options() -> recording.SimulationOptions:
-        return recording.SimulationOptions(
-            FlightPlan(
-                pattern, duration_s, height_m, speed_m_s, heading_deg, camera_pitch_deg, legs,
-                spacing_m, wobble_deg, sway_m, climb_m, swing_deg,
-                centred=site_m is not None,
-            ),
-            SensorNoise.of(
-                gnss_noise,
-                SensorNoise(
-                    gps_m=gps_noise_m, baro_m=baro_noise_m, attitude_deg=attitude_noise_deg,
-                    yaw_deg=yaw_noise_deg,
-                ),
-            ),
-            TelemetryOptions(
-                gimbal_frame, rangefinder,
-                _pair(telemetry_gap, "--telemetry-gap") if telemetry_gap else None, log_lead_s,
-                _pair(boresight_deg, "--boresight-deg"), gnss_accuracy, home_above_m,
-            ),
-            Look(noise=image_noise, water_m=water_m),
-            recording.Faults(
-                tuple((int(a), int(b)) for a, b in (_pair(v, "--blank") for v in blank or [])),
-                tuple(sorted(_pair(v, "--exposure") for v in exposure or [])),
-            ),
-            seed, _size(size), fps, focal,
-            recording.DISTORTION if distortion else (0.0, 0.0, 0.0, 0.0, 0.0),
-            relief_m, density, photos, depth_frames, crf, telemetry, video,
-            shutter_of(readout_ms, readout_direction), 1e-3 * shutter_ms,
-            flight_seed, site_m, changes, date,
-        )  # fmt: skip
-
-    show = LiveOptions(video_to, mavlink_to, loop, until_stdin_ends) if live else None
-    _simulate(out, options, show, as_json)
+    show = None
+    if given.live:
+        show = LiveOptions(given.video_to, given.mavlink_to, given.loop, given.until_stdin_ends)
+    _simulate(given.out, given.simulation, show, given.as_json)
 
 
 def _simulate(
-    out: Path, options: Callable[[], SimulationOptions], live: LiveOptions | None, as_json: bool
+    out: Path,
+    options: Callable[[], recording.SimulationOptions],
+    live: LiveOptions | None,
+    as_json: bool,
 ) -> None:
     """Render the flight and, with ``live``, play it; play the one that ``out`` holds already."""
     from service.sim import recording
