@@ -12,6 +12,7 @@ from recon.surface.change import (
     change_between,
     left_over_m,
     mean_surface,
+    of_tile,
     outlines,
     scatter_of_means,
     sigmas_of_any,
@@ -124,7 +125,7 @@ def test_volumes_are_right_within_their_sigma() -> None:
             volume = cells * CELL_M**2
             assert body.volume_m3 == pytest.approx(volume, rel=0.05)
             ratios.append((body.volume_m3 - volume) / body.sigma_m3)
-        total = volumes(found)
+        total = volumes(found.bodies, found.alignment_m)
         assert total.fill[0] - total.cut[0] == pytest.approx(total.net[0])
         assert total.fill[0] == pytest.approx(true[0] * CELL_M**2, rel=0.05)
         assert total.fill[1] >= 0.01 * by_sign[0].area_m2
@@ -266,3 +267,27 @@ def test_bad_parameters_are_refused() -> None:
     a = surface(1, [])
     with pytest.raises(ValueError, match="one grid"):
         change_between(a, Raster(other, a.height_m, a.sigma_m, a.rgb))
+
+
+def test_tiles_count_each_object_once() -> None:
+    """Two tiles with a margin of 40 cells: a small object on their border, and a wide one."""
+    before, after = surface(1, []), surface(2, [(60, 110, 8, 20, 1.0), (130, 40, 20, 170, 1.5)])
+    whole = change_between(before, after)
+    halves = []
+    for first, last in ((0, 120), (120, 250)):
+        cut = slice(max(first - 40, 0), last + 40)
+        grid = GRID.part(slice(0, 250), slice(cut.start, min(cut.stop, 250)))
+        one, two = (
+            Raster(grid, r.height_m[:, cut], r.sigma_m[:, cut], r.rgb[:, cut])
+            for r in (before, after)
+        )
+        part = change_between(one, two, ground_m2=2500.0)
+        own = slice(first - cut.start, last - cut.start)
+        halves.append(of_tile(part, slice(0, 250), own, 40))
+    areas = sorted(round(b.area_m2, 1) for h in halves for b in h.bodies)
+    assert len(whole.bodies) == 2 and len(areas) == 3  # the wide one in two parts
+    small, wide = sorted(whole.bodies, key=lambda b: b.area_m2)
+    assert areas[0] == pytest.approx(small.area_m2, rel=0.1)
+    assert areas[1] + areas[2] == pytest.approx(wide.area_m2, rel=0.05)
+    volume = sum(b.volume_m3 for h in halves for b in h.bodies)
+    assert volume == pytest.approx(sum(b.volume_m3 for b in whole.bodies), rel=0.05)

@@ -23,17 +23,13 @@ from service.cameras import CameraFrame
 from service.cli import app
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
-from service.offline.exports import images, mesh_tiles, model
-from service.offline.exports.mesh_tiles import (
-    Footprint,
-    TileJob,
-    TilePart,
-    mesh_tile,
-    run_tiles,
-    tile_boxes,
-)
+from service.offline import tiles
+from service.offline.exports import images, model
+from service.offline.exports.mesh_tiles import TileJob, TilePart, mesh_tile
 from service.offline.exports.view import ExportOptions, ScanView, export
+from service.offline.tiles import Footprint, Tile, run_tiles, tile_boxes
 from service.progress import Progress
+from service.scans.fused_cloud import EVERYWHERE
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
@@ -45,12 +41,20 @@ def noting(said: list[str]) -> Progress:
     return Progress(lambda now: said.append(now.text))
 
 
-def jobs(folder: Path, tiles: int = 2) -> list[TileJob]:
-    edges = [-np.inf, *np.linspace(0, 20, tiles + 1)[1:-1], np.inf]
-    return [
-        TileJob(str(folder), (west, -np.inf, east, np.inf), 0.3, "height", 60_000, 2048)
+def jobs(folder: Path, count: int = 2) -> list[TileJob]:
+    edges = [-np.inf, *np.linspace(0, 20, count + 1)[1:-1], np.inf]
+    each = [
+        Tile(
+            str(folder), (west, -np.inf, east, np.inf), (west - 7.5, -np.inf, east + 7.5, np.inf),
+            (0, 1, 2, 3, 4),
+        )
         for west, east in pairwise(edges)
-    ]
+    ]  # fmt: skip
+    return [TileJob(tile, 0.3, "height", 60_000, 2048) for tile in each]
+
+
+def made(some: list[TileJob], scheduler: str | None, progress: Progress) -> list[TilePart]:
+    return [one for one in run_tiles(mesh_tile, some, scheduler, progress) if one is not None]
 
 
 def same(a: list[TilePart], b: list[TilePart]) -> None:
@@ -66,7 +70,7 @@ def test_boxes_cover_the_site_once_and_hold_no_more_than_asked() -> None:
     prints = [
         Footprint(n, 1000, 0.2, (10.0 * n, 5.0 * n, 10.0 * n + 30, 5.0 * n + 20)) for n in range(20)
     ]
-    assert tile_boxes(prints, 100_000) == [mesh_tiles.EVERYWHERE]
+    assert tile_boxes(prints, 100_000) == [EVERYWHERE]
     boxes = tile_boxes(prints, 3000)
     assert len(boxes) > 6
     rng = np.random.default_rng(0)
@@ -84,8 +88,8 @@ def test_boxes_cover_the_site_once_and_hold_no_more_than_asked() -> None:
 
 def test_tiles_together_are_the_whole(tmp_path: Path, house: HouseFlight) -> None:
     house.flown(tmp_path).close()
-    (whole,) = run_tiles(jobs(tmp_path, 1), None, Progress())
-    parts = run_tiles(jobs(tmp_path, 2), None, Progress())
+    (whole,) = made(jobs(tmp_path, 1), None, Progress())
+    parts = made(jobs(tmp_path, 2), None, Progress())
     assert len(parts) == 2
     x, y = (a.ravel() for a in np.meshgrid(np.linspace(-15, 35, 60), np.linspace(-10, 10, 40)))
     origins = np.column_stack([x, y, np.full(len(x), 100.0)])
@@ -117,8 +121,8 @@ def test_the_same_mesh_comes_from_a_cluster(
 ) -> None:
     house.flown(tmp_path).close()
     reported: list[str] = []
-    here = run_tiles(jobs(tmp_path), None, Progress())
-    there = run_tiles(jobs(tmp_path), cluster.scheduler_address, noting(reported))
+    here = made(jobs(tmp_path), None, Progress())
+    there = made(jobs(tmp_path), cluster.scheduler_address, noting(reported))
     assert [t for t in reported if "came from the cluster" in t] == [
         "tile 1 of 2 came from the cluster",
         "tile 2 of 2 came from the cluster",
@@ -130,7 +134,7 @@ def test_a_scheduler_that_goes_away_is_said_and_the_rest_made_here(
     tmp_path: Path, house: HouseFlight, cluster: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     house.flown(tmp_path).close()
-    here = run_tiles(jobs(tmp_path), None, Progress())
+    here = made(jobs(tmp_path), None, Progress())
     reported: list[str] = []
 
     def say(now: Progress) -> None:
@@ -138,7 +142,7 @@ def test_a_scheduler_that_goes_away_is_said_and_the_rest_made_here(
         if now.text.startswith("tile 1 of 2 came"):
             cluster.close()
 
-    same(here, run_tiles(jobs(tmp_path), cluster.scheduler_address, Progress(say)))
+    same(here, made(jobs(tmp_path), cluster.scheduler_address, Progress(say)))
     assert len([t for t in reported if "disconnected" in t]) == 1
 
 
@@ -147,9 +151,9 @@ def test_a_scheduler_that_is_not_there_ends_in_one_line(
 ) -> None:
     pytest.importorskip("distributed")
     house.flown(tmp_path).close()
-    monkeypatch.setattr(mesh_tiles, "CONNECT_S", 0.5)
+    monkeypatch.setattr(tiles, "CONNECT_S", 0.5)
     with pytest.raises(OutsideError, match="no Dask scheduler answers"):
-        run_tiles(jobs(tmp_path), "tcp://127.0.0.1:9", Progress())
+        made(jobs(tmp_path), "tcp://127.0.0.1:9", Progress())
 
 
 def test_the_command_cuts_a_large_site(tmp_path: Path, house: HouseFlight) -> None:

@@ -23,9 +23,9 @@ from recon.types import F64, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cli import app
 from service.flight.chain import Pieces
-from service.offline.exports.mesh_tiles import footprints
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.refine.by_images import MIN_COMMON, stretches_untied
+from service.offline.tiles import footprints
 from service.scans.coverage import LiveCoverage, coverage_of
 from service.scans.folder import write_deliverables
 from service.scans.main_piece import main_poses, main_seqs

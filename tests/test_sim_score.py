@@ -74,7 +74,12 @@ def write_scan(
         np.full(count, sigma_m, np.float32),
         np.full(count, 2, np.uint8),
     )
-    write_laz(folder / "cloud.laz", cloud, SCAN_AT if place else None, 1_777_629_600 * 10**9)
+    write_laz(
+        folder / "cloud.laz",
+        [(cloud, None, None)],
+        SCAN_AT if place else None,
+        1_777_629_600 * 10**9,
+    )
     table = np.column_stack([rows[:, 0], centres, turns.as_quat()])
     np.savetxt(folder / "trajectory.tum", table, "%.9f")
     origin = {"lat_deg": SCAN_AT.lat_deg, "lon_deg": SCAN_AT.lon_deg, "alt_amsl_m": 540.0}

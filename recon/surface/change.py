@@ -18,6 +18,7 @@ from statistics import NormalDist
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
 from recon.surface.raster import Grid, Raster, highest_lowest
 from recon.types import F32, F64, I32, U8, Bool
@@ -118,9 +119,15 @@ def mean_surface(xyz_m: F64, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
     return Raster(grid, height.reshape(shape), sigma.reshape(shape), shown.reshape(*shape, 3))
 
 
-def change_between(before: Raster, after: Raster, config: ChangeConfig | None = None) -> Change:
+def change_between(
+    before: Raster,
+    after: Raster,
+    config: ChangeConfig | None = None,
+    ground_m2: float | None = None,
+) -> Change:
     """The change from ``before`` to ``after``, two rasters of one grid.
 
+    ``ground_m2`` is the ground among which objects are judged, where these are a tile of more.
     Raises ValueError for different grids.
     """
     config = config or ChangeConfig()
@@ -138,7 +145,9 @@ def change_between(before: Raster, after: Raster, config: ChangeConfig | None = 
         _add_labels(labels, d, scales, sign, cell_m, config)
     left = left_over_m(d, cell_m, config.block_m)
     errors = SumErrors(scales[0].sigma, scales[0].window, scatter_of_means(d), left)
-    bodies = _bodies(d, errors, labels, cell_m, config)
+    if ground_m2 is None:
+        ground_m2 = np.count_nonzero(np.isfinite(d)) * cell_m**2
+    bodies = _bodies(d, errors, labels, cell_m, config, ground_m2)
     return Change(before.grid, scales[0].mean, scales[0].sigma, labels, bodies, left)
 
 
@@ -360,15 +369,45 @@ def _add_labels(
     labels[new > 0] = new[new > 0]
 
 
+def of_tile(change: Change, rows: slice, cols: slice, reach: int) -> Change:
+    """A change with the objects of these rows and columns only, the others being its neighbours'.
+
+    An object of at most ``reach`` cells in extent is theirs whole where its first cell is. Each
+    tile counts its own cells of a larger one. The cells around must reach as far.
+    """
+    labels, bodies = np.zeros_like(change.labels), []
+    boxes = ndimage.find_objects(change.labels)
+    for body in change.bodies:
+        box = boxes[body.label - 1]
+        inside = change.labels[box] == body.label
+        r, c = np.nonzero(inside)
+        r, c = r + box[0].start, c + box[1].start
+        own = (r >= rows.start) & (r < rows.stop) & (c >= cols.start) & (c < cols.stop)
+        if max(inside.shape) <= reach:
+            own[:] = own[0]  # the first in row order
+        if not own.any():
+            continue
+        labels[r[own], c[own]] = body.label
+        heights = np.nan_to_num(change.height_m[r, c])
+        share = float(heights[own].sum() / heights.sum()) if not own.all() else 1.0
+        bodies.append(
+            replace(
+                body, area_m2=body.area_m2 * float(own.mean()), volume_m3=body.volume_m3 * share,
+                sigma_m3=body.sigma_m3 * abs(share),
+            )
+        )  # fmt: skip
+    return replace(change, labels=labels, bodies=tuple(bodies))
+
+
 def _bodies(
-    d: F32, errors: SumErrors, labels: I32, cell_m: float, config: ChangeConfig
+    d: F32, errors: SumErrors, labels: I32, cell_m: float, config: ChangeConfig, ground_m2: float
 ) -> tuple[Body, ...]:
     """The changes that are significant on ground of this size; the others leave ``labels``.
 
     An object may lie anywhere, so its mean height is judged among as many places as the compared
     ground has for the smallest object: more than there are independent ones.
     """
-    places = np.count_nonzero(np.isfinite(d)) * cell_m**2 / config.min_area_m2
+    places = ground_m2 / config.min_area_m2
     level = sigmas_of_any(config.false_alarm, places)
     found = (
         _body(d, errors, labels, label, cell_m, config, level)
@@ -437,12 +476,12 @@ class Volumes:
     net: tuple[float, float]
 
 
-def volumes(change: Change) -> Volumes:
+def volumes(bodies: Sequence[Body], alignment_m: float) -> Volumes:
     """Sums over the bodies; errors of single bodies are independent, the alignment's is shared."""
-    area = np.array([b.area_m2 for b in change.bodies])
-    volume = np.array([b.volume_m3 for b in change.bodies])
-    sigma = np.array([b.sigma_m3 for b in change.bodies])
-    shared = change.alignment_m * area
+    area = np.array([b.area_m2 for b in bodies])
+    volume = np.array([b.volume_m3 for b in bodies])
+    sigma = np.array([b.sigma_m3 for b in bodies])
+    shared = alignment_m * area
     own = np.sqrt(np.maximum(sigma**2 - shared**2, 0.0))
 
     def part(chosen: Bool, sign: F64) -> tuple[float, float]:

@@ -62,6 +62,25 @@ class Grid:
             self.north_m,
         )
 
+    def window(self, box: tuple[float, float, float, float]) -> tuple[slice, slice]:
+        """Rows and columns of the cells whose centres lie in (west, south, east, north) m."""
+        west, south, east, north = box
+        rows, cols = self.shape
+        ends = np.array([west, east, self.north_m - north, self.north_m - south])
+        ends[:2] -= self.west_m
+        c0, c1, r0, r1 = np.ceil(ends / self.cell_m - 0.5)
+        return (
+            slice(int(np.clip(r0, 0, rows)), int(np.clip(r1, 0, rows))),
+            slice(int(np.clip(c0, 0, cols)), int(np.clip(c1, 0, cols))),
+        )
+
+    def part(self, rows: slice, cols: slice) -> Grid:
+        """The grid of some of its rows and columns."""
+        return Grid(
+            self.west_m + cols.start * self.cell_m, self.north_m - rows.start * self.cell_m,
+            self.cell_m, (rows.stop - rows.start, cols.stop - cols.start),
+        )  # fmt: skip
+
     def pixels(self, xy_m: F64) -> F64:
         """(N, 2) column and row, real-valued with whole numbers at cell centres, of (N, 2) m."""
         xy = np.asarray(xy_m, np.float64)

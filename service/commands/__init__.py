@@ -22,6 +22,12 @@ ScanDir = Annotated[Path, typer.Argument(help="scan folder (holds scan.db)")]
 Voxel = Annotated[
     float | None, typer.Option("--voxel-m", help="fused voxel size; default: pixel on ground")
 ]
+TilePoints = Annotated[
+    int, typer.Option(min=1000, help="stored points above which work is cut into tiles")
+]
+Scheduler = Annotated[
+    str | None, typer.Option(help="Dask scheduler that makes the tiles: tcp://HOST:8786")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="one JSON object at the end")]
 
 Options = TypeVar("Options")

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands import AsJson, ScanDir, Voxel, showing
+from service.commands import AsJson, ScanDir, Scheduler, TilePoints, Voxel, showing
 from service.errors import InputError
 from service.offline.exports import EXPORTERS
 
@@ -47,6 +47,8 @@ def export(
     to_datum: Annotated[
         str | None, typer.Option(help="convert heights to this vertical datum, by PROJ's grids")
     ] = None,
+    tile_points: TilePoints = 20_000_000,
+    scheduler: Scheduler = None,
     as_json: AsJson = False,
 ) -> None:
     """Write deliverables of a scan: clouds, surface model, orthophoto, tiles, mesh, flight."""
@@ -69,6 +71,8 @@ def export(
             _epoch_ns(video_epoch),
             vertical_datum,
             to_datum,
+            tile_points,
+            scheduler,
         )
     except ValueError as error:
         raise InputError(f"export: {error}") from error
@@ -104,12 +108,8 @@ def mesh(
     video_epoch: Annotated[
         float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
     ] = None,
-    tile_points: Annotated[
-        int, typer.Option(min=1000, help="above this number of points the mesh is made in tiles")
-    ] = 20_000_000,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Dask scheduler that makes the tiles: tcp://HOST:8786")
-    ] = None,
+    tile_points: TilePoints = 20_000_000,
+    scheduler: Scheduler = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="file to write; default: mesh.glb in the folder")
     ] = None,
@@ -121,14 +121,12 @@ def mesh(
     from service.offline.exports.view import ExportOptions, ScanView
 
     try:
-        options = ExportOptions(voxel_m=voxel_m)
+        options = ExportOptions(voxel_m=voxel_m, tile_points=tile_points, scheduler=scheduler)
     except ValueError as error:
         raise InputError(f"mesh: {error}") from error
     if stored and video is not None:
         raise InputError("mesh: give either --video or --stored")
-    how = MeshOptions(
-        method, faces, tile_points, scheduler, video, not stored, _epoch_ns(video_epoch)
-    )
+    how = MeshOptions(method, faces, video, not stored, _epoch_ns(video_epoch))
     path = out or scan_dir / "mesh.glb"
     started = time.monotonic()
     with showing("mesh") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
@@ -212,6 +210,8 @@ def site(
     cell_m: Annotated[
         float | None, typer.Option("--cell-m", help="compare: cell size; default: pixel on ground")
     ] = None,
+    tile_points: TilePoints = 20_000_000,
+    scheduler: Scheduler = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
 ) -> None:
     """Join scans that overlap into one site, or measure what changed between two.
@@ -233,7 +233,7 @@ def site(
     if len(scans) != 2:
         raise InputError(f"site compare takes two scans, before and after, not {len(scans)}")
     with needing("a change map"):
-        figures = compare(scans[0], scans[1], out, cell_m)
+        figures = compare(scans[0], scans[1], out, cell_m, tile_points, scheduler)
     print(json.dumps(figures) if as_json else "\n".join(_change_lines(out, figures)))
 
 

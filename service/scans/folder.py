@@ -142,7 +142,7 @@ class _Files:
                 centre_m = first.depth.T_world_camera[:3, 3].astype(np.float32)
                 cloud = replace(fused, xyz_m=fused.xyz_m - centre_m)
                 with writing(self._folder / name) as part:
-                    write_laz(part, cloud, None, self._store.header.started_unix_ns)
+                    write_laz(part, [(cloud, None, None)], None, self._store.header.started_unix_ns)
                 self._pieces.append(name)
         for old in self._folder.glob(PIECE.format("*")):  # of an earlier state of the scan
             if old.name not in self._pieces:
@@ -170,7 +170,7 @@ class _Files:
         if self._fused is not NOTHING:
             with self.failures.noted(CLOUD), writing(self._folder / CLOUD) as part:
                 started = self._store.header.started_unix_ns
-                write_laz(part, self._fused.cloud, self._frame, started)
+                write_laz(part, [(self._fused.cloud, None, None)], self._frame, started)
 
     def draw(self, summary: dict[str, Any]) -> None:
         """Write the preview and the report."""

@@ -10,7 +10,7 @@ import datetime as dt
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from recon.bands import threads
 from recon.mapping.cloud_fusion import cloud_of, fuse_strips, without
 from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
-from recon.types import F64, I64, U8, PointCloud
+from recon.types import F64, I64, U8, Keyframe, PointCloud
 from service.georeference import LocalFrame, map_crs
 from service.progress import Progress
 from service.scans.main_piece import Keyframes, main_keyframes
@@ -39,6 +39,11 @@ LARGEST_POINTS = 60_000_000
 
 SMALLEST_VOXEL_M = 1e-3
 DEFAULT_VOXEL_M = 0.25
+
+Box = tuple[float, float, float, float]
+"""West, south, east, north, m."""
+
+EVERYWHERE: Box = (-np.inf, -np.inf, np.inf, np.inf)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,16 +70,21 @@ class _Extent:
 
 
 def fused_cloud(
-    store: Keyframes, voxel_m: float | None = None, progress: Progress | None = None
+    store: Keyframes,
+    voxel_m: float | None = None,
+    progress: Progress | None = None,
+    box: Box = EVERYWHERE,
 ) -> FusedCloud:
     """The main piece of ``store`` fused; voxels of the ground sample distance by default.
+
+    Of the points only those in ``box`` (ENU m) count.
 
     Points that other keyframes see through are removed. A long scan is read several times, so that
     memory holds only the fused points and the sums of one strip of the site per core.
     """
     progress = progress or Progress()
     with progress.part("reading the keyframes", 0.2):
-        extents, held = _extents(store, progress)
+        extents, held = _extents(store, progress, box)
     points = sum(e.points for e in extents)
     sample = float(np.median([e.ground_sample_m for e in extents])) if extents else None
     size = max(voxel_m or sample or DEFAULT_VOXEL_M, SMALLEST_VOXEL_M)
@@ -86,7 +96,7 @@ def fused_cloud(
     edges = strip_edges(extents, min(STRIP_POINTS, max(share, MIN_STRIP_POINTS)))
     with progress.part("fusing the cloud", 0.5):
         say = partial(progress.counting(len(extents)), progress.text)
-        strips = [_strip(store, extents, held, a, b, say) for a, b in pairwise(edges)]
+        strips = [_strip(store, extents, held, box, a, b, say) for a, b in pairwise(edges)]
         cloud = fuse_strips(strips, edges, size)
         held.clear()
     if len(cloud):
@@ -97,14 +107,16 @@ def fused_cloud(
     return FusedCloud(cloud, size, sample, len(extents), points, notes)
 
 
-def _extents(store: Keyframes, progress: Progress) -> tuple[list[_Extent], dict[int, PointCloud]]:
+def _extents(
+    store: Keyframes, progress: Progress, box: Box
+) -> tuple[list[_Extent], dict[int, PointCloud]]:
     """The keyframes of the main piece with points, and the clouds of the first of them."""
     out: list[_Extent] = []
     held: dict[int, PointCloud] = {}
     room = STRIP_POINTS
     for keyframe in progress.over(main_keyframes(store), len(store.seqs())):
         sample = ground_sample_m(keyframe.depth)
-        cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh, keyframe.time_ns)
+        cloud = _points(keyframe, box)
         if sample is not None and len(cloud):
             x = cloud.xyz_m[:, 0]
             out.append(_Extent(keyframe.seq, len(cloud), sample, float(x.min()), float(x.max())))
@@ -112,6 +124,15 @@ def _extents(store: Keyframes, progress: Progress) -> tuple[list[_Extent], dict[
             if room >= 0:
                 held[keyframe.seq] = cloud
     return out, held
+
+
+def _points(keyframe: Keyframe, box: Box) -> PointCloud:
+    """The keyframe's points in the box."""
+    cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh, keyframe.time_ns)
+    if box == EVERYWHERE:
+        return cloud
+    x, y = cloud.xyz_m[:, 0], cloud.xyz_m[:, 1]
+    return without(cloud, (x < box[0]) | (x > box[2]) | (y < box[1]) | (y > box[3]))
 
 
 def strip_edges(extents: Iterable[_Extent], max_points: int) -> list[float]:
@@ -135,6 +156,7 @@ def _strip(
     store: Keyframes,
     extents: list[_Extent],
     held: dict[int, PointCloud],
+    box: Box,
     low_m: float,
     high_m: float,
     say: Callable[[], None],
@@ -149,7 +171,7 @@ def _strip(
             if seq in held:
                 yield held[seq]
             elif (keyframe := store.keyframe(seq)) is not None:
-                yield cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh, keyframe.time_ns)
+                yield _points(keyframe, box)
 
     return clouds
 
@@ -193,36 +215,40 @@ def las_header(
     return header
 
 
+LazPart = tuple[PointCloud, F64 | None, U8 | None]
+"""Points, their places (N, 3) in UTM where known, and their classes of LAS 1.4 where classified."""
+
+
 def write_laz(
     path: Path,
-    cloud: PointCloud,
+    parts: Iterable[LazPart],
     frame: LocalFrame | None,
     started_unix_ns: int,
     laz: bool = True,
-    classes: U8 | None = None,
-    xyz_m: F64 | None = None,
     vertical: str | None = None,
 ) -> None:
-    """Write ``cloud`` (ENU metres) to ``path``, in UTM with AMSL heights when there is a frame.
+    """Write clouds, at least one, to ``path``, in UTM with AMSL heights when there is a frame.
 
-    RGB are 16 bits as the format requires (8-bit value times 257). ``classes`` (N,) are codes of
-    LAS 1.4; without them points were never classified. ``xyz_m`` are the places in UTM, where
-    known.
+    They are in ENU metres. RGB are 16 bits as the format requires (8-bit value times 257).
     """
     import laspy
 
-    first = placed(_cut(cloud, slice(0, 1)), frame)
-    header = las_header(first, frame, started_unix_ns, vertical)
+    rest = iter(parts)
+    start = next(rest)
+    header = las_header(
+        placed(_cut(start[0], slice(0, 1)), frame), frame, started_unix_ns, vertical
+    )
     kind: dict[str, Any] = {"do_compress": laz, "closefd": False}
     with open(path, "wb") as file, laspy.open(file, "w", header=header, **kind) as out:
-        for at in range(0, len(cloud), CHUNK_POINTS):
-            cut = slice(at, at + CHUNK_POINTS)
-            part = _cut(cloud, cut)
-            places = placed(part, frame) if xyz_m is None else xyz_m[cut]
-            record = point_record(header, places, part)
-            if classes is not None:
-                record["classification"] = classes[cut]
-            out.write_points(record)
+        for cloud, xyz_m, classes in chain([start], rest):
+            for at in range(0, len(cloud), CHUNK_POINTS):
+                cut = slice(at, at + CHUNK_POINTS)
+                part = _cut(cloud, cut)
+                places = placed(part, frame) if xyz_m is None else xyz_m[cut]
+                record = point_record(header, places, part)
+                if classes is not None:
+                    record["classification"] = classes[cut]
+                out.write_points(record)
 
 
 def _cut(cloud: PointCloud, cut: slice) -> PointCloud:

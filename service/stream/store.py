@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
@@ -83,6 +83,7 @@ class ScanStore:
         self._held: dict[tuple[int, int], Keyframe] = {}  # by number and layer
         self._held_room: int | None = None  # bytes; None: nothing is held
         self._decoding = Lock()
+        self._only: frozenset[int] | None = None  # keyframes that a reader is restricted to
 
     @classmethod
     def create(
@@ -262,8 +263,14 @@ class ScanStore:
             if found is not None:
                 yield found
 
+    def only(self, seqs: Iterable[int]) -> None:
+        """From now on :meth:`seqs` gives these keyframes only."""
+        self._only = frozenset(seqs)
+
     def seqs(self) -> list[int]:
         """Numbers of the keyframes with any stored layer."""
+        if self._only is not None:
+            return sorted(self._only)
         sql = f"SELECT DISTINCT seq FROM chunks WHERE {is_number('seq')}"
         stored = {row[0] for row in self._db.all(sql)}
         return sorted(stored | self._radio.seqs())

@@ -8,17 +8,24 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from recon.mapping.cloud_fusion import without
 from recon.types import F64, I64, U8
+from service.errors import InputError
 from service.georeference import map_crs
 from service.offline.exports.flight import writing_folder
+from service.offline.exports.rasters import GROUND_MARGIN_M
 from service.offline.exports.surface import bare_ground, surface_model
-from service.offline.exports.view import ExportOptions, ScanView
-from service.scans.fused_cloud import SCALE_M, las_header, point_record, write_laz
+from service.offline.exports.view import ExportOptions, ProductJob, ScanView
+from service.offline.tiles import run_tiles
+from service.progress import Progress
+from service.scans.fused_cloud import SCALE_M, LazPart, las_header, point_record, write_laz
 from service.scans.writing import writing
 
 if TYPE_CHECKING:
@@ -61,11 +68,33 @@ def write_laz_file(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """LAZ, or plain LAS where the name ends so; points of the bare ground have class 2."""
     laz = out.suffix.lower() != ".las"
     started_ns = scan.store.header.started_unix_ns
-    with writing(out) as part:
-        write_laz(
-            part, scan.fused.cloud, scan.frame, started_ns, laz, classes(scan), scan.xyz_m,
-            options.datum,
-        )  # fmt: skip
+    cut = scan.tiling(options, GROUND_MARGIN_M)
+    if len(cut.tiles) == 1:
+        parts: Iterator[LazPart] = iter([(scan.fused.cloud, scan.xyz_m, classes(scan))])
+    else:
+        fixed = scan.for_tiles(options, cut)
+        jobs = [ProductJob(tile, "laz", replace(fixed, cell_m=None)) for tile in cut.tiles]
+        made = run_tiles(make_points, jobs, options.scheduler, scan.progress)
+        parts = (part for part in made if part is not None)
+    first = next(parts, None)
+    if first is None:
+        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
+    with writing(out) as file:
+        write_laz(file, chain([first], parts), scan.frame, started_ns, laz, options.datum)
+
+
+def make_points(job: ProductJob, progress: Progress | None = None) -> LazPart | None:
+    """The points of one tile; None without any."""
+    with ScanView(Path(job.tile.folder), job.options.voxel_m, progress, job.tile) as view:
+        if not view.has_points:
+            return None
+        scan = view.converted(job.options)
+        west, south, east, north = job.tile.box
+        x, y = scan.xyz_m[:, 0], scan.xyz_m[:, 1]
+        outside = (x < west) | (x >= east) | (y < south) | (y >= north)
+        if outside.all():
+            return None
+        return without(scan.fused.cloud, outside), scan.xyz_m[~outside], classes(scan)[~outside]
 
 
 UNCLASSIFIED, GROUND = 1, 2
@@ -202,7 +231,13 @@ def write_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
     frame = scan.needs_place("3D Tiles")
     with writing_folder(out) as part, tempfile.TemporaryDirectory() as work:
         las = Path(work) / "cloud.las"
-        write_laz(las, scan.fused.cloud, frame, scan.store.header.started_unix_ns, laz=False)
+        write_laz(
+            las,
+            [(scan.fused.cloud, None, None)],
+            frame,
+            scan.store.header.started_unix_ns,
+            laz=False,
+        )
         convert(
             las,
             outfolder=part,

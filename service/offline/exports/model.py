@@ -17,13 +17,13 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.flight import writing_folder
 from service.offline.exports.images import check_video, recording_of
-from service.offline.exports.mesh_tiles import TileJob, TilePart, footprints, run_tiles, tile_boxes
+from service.offline.exports.mesh_tiles import MARGIN_VOXELS, TileJob, TilePart, mesh_tile
 from service.offline.exports.view import ExportOptions, ScanView
+from service.offline.tiles import footprints, run_tiles, tiles_over
 from service.packages import needing
 from service.scans.writing import writing
 
 METHODS = ("auto", "height", "poisson")
-TILE_POINTS = 20_000_000
 LARGEST_ATLAS_PX = 8192
 TILED_ATLAS_PX = 4096
 
@@ -34,8 +34,6 @@ class MeshOptions:
 
     method: str = "auto"
     largest_faces: int = 400_000
-    tile_points: int = TILE_POINTS
-    scheduler: str | None = None
     video: Path | None = None  # None: the scan's recording, when it is still there
     recording: bool = True  # False: never look for the recording
     video_epoch_ns: int | None = None
@@ -97,22 +95,23 @@ def mesh_parts(
         recording = recording_of(scan.folder, scan.store.header)
         scan.progress(recording.words)
         video = recording.path
-    boxes = tile_boxes(prints, how.tile_points)
+    margin_m = MARGIN_VOXELS * voxel_m
+    tiles = tiles_over(scan.folder, prints, options.tile_points, margin_m)
     jobs = [
         TileJob(
-            str(scan.folder.resolve()),
-            box,
+            tile,
             voxel_m,
             method,
-            max(1000, how.largest_faces // len(boxes)),
-            LARGEST_ATLAS_PX if len(boxes) == 1 else TILED_ATLAS_PX,
+            max(1000, how.largest_faces // len(tiles)),
+            LARGEST_ATLAS_PX if len(tiles) == 1 else TILED_ATLAS_PX,
             None if video is None else str(video.resolve()),
             how.video_epoch_ns,
             how.video is not None,
         )
-        for box in boxes
+        for tile in tiles
     ]
-    parts = run_tiles(jobs, how.scheduler, scan.progress)
+    made = run_tiles(mesh_tile, jobs, options.scheduler, scan.progress)
+    parts = [part for part in made if part is not None]
     if not parts:
         raise InputError(f"{scan.folder}: cannot be meshed, there is too little surface")
     figures = {

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +22,22 @@ from recon.surface.texture_views import TextureView
 from recon.types import F64, Array
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
-from service.offline.exports.images import scan_images
+from service.offline.exports.images import recording_of, scan_images
 from service.offline.exports.surface import bare_ground, cell_places, surface_model
-from service.offline.exports.view import ExportOptions, ScanView
+from service.offline.exports.view import ExportOptions, ProductJob, ScanView
+from service.offline.tiles import run_tiles
+from service.progress import Progress
 from service.scans.coverage import coverage_of
-from service.scans.main_piece import main_keyframes
+from service.scans.fused_cloud import Box
+from service.scans.main_piece import main_keyframes, main_seqs
 from service.scans.writing import writing
 
 NODATA_M = -9999.0
 QUICKLY = {"level": 4, "overview_resampling": "AVERAGE"}
 """Half the time of GDAL's defaults for 3 % larger files; the mean of heights never overshoots."""
+
+RAW = {"tiled": True, "sparse_ok": True, "bigtiff": "IF_SAFER"}
+GDAL_CACHE_BYTES = 128_000_000
 
 ORTHO_HOLE_CELLS = 8
 SHORTEST_CONTOUR_CELLS = 12
@@ -37,27 +45,49 @@ MAX_CONTOURS = 5000
 """Heights at which contours are drawn: every metre up to the highest mountains."""
 
 
-def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
+DSM_MARGIN_M, ORTHO_MARGIN_M = 10.0, 20.0
+GROUND_MARGIN_M = 40.0
+"""Around a tile: the widest hole that is filled, the farthest that a building hides in a view, the
+widest object that the bare ground is bridged below."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layers:
+    """What a GeoTIFF holds."""
+
+    grid: Grid
+    bands: Array  # (bands, rows, cols)
+    names: tuple[str, ...]
+    nodata: float | None = None
+    vertical: str | None = None  # what service.georeference.map_crs takes
+
+    def within(self, box: Box) -> Layers:
+        """The cells whose centres lie in the box."""
+        rows, cols = self.grid.window(box)
+        bands = np.ascontiguousarray(self.bands[:, rows, cols])
+        return replace(self, grid=self.grid.part(rows, cols), bands=bands)
+
+
+def dsm(scan: ScanView, options: ExportOptions) -> Layers:
     """Heights in metres (float32, -9999 where unknown), their sigma, and 1 where filled."""
     surface = surface_model(scan, options.cell_m, options.strict)
     known = surface.raster.known
     bands = [surface.raster.height_m, surface.raster.sigma_m, surface.is_filled]
     image = np.where(known, np.stack(bands), NODATA_M).astype(np.float32)
     names = (f"height {options.above}, m", "sigma, m", "filled")
-    write_cog(scan, out, surface.raster.grid, image, names, NODATA_M, options.datum)
+    return Layers(surface.raster.grid, image, names, NODATA_M, options.datum)
 
 
-def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
+def dtm(scan: ScanView, options: ExportOptions) -> Layers:
     """Heights of the bare ground (float32, -9999 where unknown), and 1 where they are bridged."""
     raster, found = surface_model(scan, options.cell_m).raster, bare_ground(scan, options.cell_m)
     bands = np.stack([found.everywhere_m, found.is_bridged])
     image = np.where(found.is_inside, bands, NODATA_M)
     names = (f"ground {options.above}, m", "bridged")
-    image = image.astype(np.float32)
-    write_cog(scan, out, raster.grid, image, names, NODATA_M, options.datum)
+    return Layers(raster.grid, image.astype(np.float32), names, NODATA_M, options.datum)
 
 
-def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
+def ortho(scan: ScanView, options: ExportOptions) -> Layers:
     """Red, green, blue and opacity, one byte each; seen from straight above everywhere.
 
     Cells are as large as pixels of the recording on the ground, rounded down to a round length;
@@ -80,12 +110,82 @@ def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
         for k, v in zip(keyframes, views, strict=True)
     ]
     cell_m = options.cell_m or round_cell(float(np.nanmedian(sample_m)))
-    grid = _over(terrain.raster.grid, cell_m)
+    grid = over(terrain.raster.grid.bounds, cell_m)
     with scan.progress.part("orthophoto of {1} x {0} cells of {2:g} m".format(*grid.shape, cell_m)):
         rgb, known = orthophoto(terrain, views, grid, scan.progress.counting(len(views) + 1))
     opacity = np.where(known, 255, 0).astype(np.uint8)
     bands = np.concatenate([rgb.transpose(2, 0, 1), opacity[None]])
-    write_cog(scan, out, grid, bands, ("red", "green", "blue", "opacity"))
+    return Layers(grid, bands, ("red", "green", "blue", "opacity"))
+
+
+KINDS = {
+    "dsm": (dsm, DSM_MARGIN_M),
+    "dtm": (dtm, GROUND_MARGIN_M),
+    "ortho": (ortho, ORTHO_MARGIN_M),
+}
+
+
+def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """:func:`dsm` as GeoTIFF."""
+    _write(scan, out, options, "dsm")
+
+
+def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """:func:`dtm` as GeoTIFF."""
+    _write(scan, out, options, "dtm")
+
+
+def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """:func:`ortho` as GeoTIFF."""
+    _write(scan, out, options, "ortho")
+
+
+def _write(scan: ScanView, out: Path, options: ExportOptions, kind: str) -> None:
+    """One kind of raster, in tiles where there are more points than one may have."""
+    make, margin_m = KINDS[kind]
+    cut = scan.tiling(options, margin_m)
+    if len(cut.tiles) == 1:
+        layers = make(scan, options)
+        with mosaic(scan, out, layers.grid, layers) as image:
+            put(image, layers)
+        return
+    options = scan.for_tiles(options, cut, needs_cell=kind != "ortho")
+    if kind == "ortho" and options.cell_m is None:
+        finer = _finer(scan, options)
+        options = replace(options, cell_m=round_cell(cut.sample_m / finer))
+    assert options.cell_m is not None
+    west, south, east, north = cut.bounds
+    edge = 2.0 * max(options.cell_m, options.voxel_m or 0.0)
+    whole = over((west - edge, south - edge, east + edge, north + edge), options.cell_m)
+    jobs = [ProductJob(tile, kind, options) for tile in cut.tiles]
+    made = (one for one in run_tiles(make_tile, jobs, options.scheduler, scan.progress) if one)
+    first = next(made, None)
+    if first is None:
+        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
+    with mosaic(scan, out, whole, first) as image:
+        put(image, first)
+        for layers in made:
+            put(image, layers)
+
+
+def make_tile(job: ProductJob, progress: Progress | None = None) -> Layers | None:
+    """One tile of a raster; None without points."""
+    with ScanView(Path(job.tile.folder), job.options.voxel_m, progress, job.tile) as scan:
+        if not scan.has_points:
+            return None
+        return KINDS[job.kind][0](scan.converted(job.options), job.options).within(job.tile.box)
+
+
+def _finer(scan: ScanView, options: ExportOptions) -> float:
+    """By how much pixels of the recording are finer than those of the store; 1 without one."""
+    seqs, camera = main_seqs(scan.store), scan.store.header.camera
+    if options.video is None and (
+        options.stored or recording_of(scan.folder, scan.store.header).path is None
+    ):
+        return 1.0
+    first = scan.store.keyframe(seqs[0])
+    assert first is not None  # there is more than one tile
+    return float(camera["K"][0]) / float(first.depth.K[0, 0])
 
 
 def _closed_surface(scan: ScanView) -> Raster:
@@ -103,34 +203,26 @@ def _terrain(scan: ScanView, raster: Raster, views: Sequence[TextureView]) -> Te
     return Terrain(raster, cell_places(scan, raster), eyes)
 
 
-def _over(grid: Grid, cell_m: float) -> Grid:
+def over(bounds: Box, cell_m: float) -> Grid:
     """The grid of ``cell_m`` over the same ground, its edges on multiples of the cell."""
-    west, south, east, north = grid.bounds
+    west, south, east, north = bounds
     low = math.floor(west / cell_m + 1e-6), math.floor(south / cell_m + 1e-6)
     high = math.ceil(east / cell_m - 1e-6), math.ceil(north / cell_m - 1e-6)
     try:
         return Grid(low[0] * cell_m, high[1] * cell_m, cell_m, (high[1] - low[1], high[0] - low[0]))
     except ValueError as error:
-        raise InputError(f"orthophoto: {error} with --cell-m") from error
+        raise InputError(f"{error} with --cell-m") from error
 
 
-def write_cog(
-    scan: ScanView,
-    out: Path,
-    grid: Grid,
-    bands: Array,
-    names: tuple[str, ...],
-    nodata: float | None = None,
-    vertical: str | None = None,
-) -> None:
-    """Write (bands, rows, cols) as Cloud Optimized GeoTIFF in the scan's UTM zone.
+@contextmanager
+def mosaic(scan: ScanView, out: Path, grid: Grid, like: Layers) -> Iterator[Any]:
+    """A raster file over ``grid`` that is written piece by piece with :func:`put`, then stored as
+    Cloud Optimized GeoTIFF in the scan's UTM zone.
 
-    ``vertical`` is what :func:`service.georeference.map_crs` takes; heights above the ellipsoid
-    are a tag only.
+    Heights above the ellipsoid are a tag only.
     """
     import rasterio
     from rasterio.enums import ColorInterp
-    from rasterio.io import MemoryFile
     from rasterio.shutil import copy
     from rasterio.transform import from_origin
 
@@ -138,29 +230,46 @@ def write_cog(
         "driver": "GTiff",
         "height": grid.shape[0],
         "width": grid.shape[1],
-        "count": len(bands),
-        "dtype": bands.dtype,
+        "count": len(like.bands),
+        "dtype": like.bands.dtype,
         "transform": from_origin(grid.west_m, grid.north_m, grid.cell_m, grid.cell_m),
-        "nodata": nodata,
+        "nodata": like.nodata,
     }
     if scan.frame is not None:
-        coded = None if vertical == "ellipsoid" else vertical  # GeoTIFF has no code for it on a map
+        # GeoTIFF has no code for ellipsoidal heights on a map.
+        coded = None if like.vertical == "ellipsoid" else like.vertical
         profile["crs"] = rasterio.crs.CRS.from_wkt(map_crs(scan.frame.epsg, coded).to_wkt())
     heights = "metres above mean sea level" if scan.frame else "metres above the scan's origin"
-    if scan.frame is not None and vertical is not None:
-        heights = f"metres above {vertical}"
-    with writing(out) as part, MemoryFile() as memory:
-        with memory.open(**profile) as image:
-            image.write(bands)
-            image.descriptions = names
+    if scan.frame is not None and like.vertical is not None:
+        heights = f"metres above {like.vertical}"
+    with (
+        writing(out) as part,
+        tempfile.TemporaryDirectory(dir=out.parent) as folder,
+        rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_BYTES),
+    ):
+        raw = Path(folder) / "raw.tif"
+        with rasterio.open(raw, "w+", **profile, **RAW) as image:
+            image.descriptions = like.names
             image.update_tags(SCAN=scan.store.header.scan_id, HEIGHTS=heights)
-            if len(bands) == 4:
+            if len(like.bands) == 4:
                 kinds = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
                 image.colorinterp = kinds
-        with memory.open() as image:
-            predictor = "YES" if bands.dtype.kind == "f" else "STANDARD"
-            how = {"driver": "COG", "compress": "DEFLATE", "predictor": predictor} | QUICKLY
-            copy(image, str(part), **how, num_threads=threads())
+            yield image
+        predictor = "YES" if like.bands.dtype.kind == "f" else "STANDARD"
+        how = {"driver": "COG", "compress": "DEFLATE", "predictor": predictor} | QUICKLY
+        copy(str(raw), str(part), **how, num_threads=threads())
+
+
+def put(image: Any, layers: Layers) -> None:
+    """Write the layers into the open raster of the same cells, at their place."""
+    image.write(layers.bands, window=window_in(image, layers.grid))
+
+
+def window_in(image: Any, grid: Grid) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Rows and columns of a grid in an open raster of the same cells, which holds it."""
+    row = round((image.transform.f - grid.north_m) / grid.cell_m)
+    col = round((grid.west_m - image.transform.c) / grid.cell_m)
+    return (row, row + grid.shape[0]), (col, col + grid.shape[1])
 
 
 def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -259,7 +368,9 @@ def write_coverage(scan: ScanView, out: Path, options: ExportOptions) -> None:
         grid, bands = _in_utm(bands, grid, scan.frame)
     bands = np.where(np.isfinite(bands), bands, np.float32(NODATA_M))
     names = ("views", "sigma, m", "height, m")
-    write_cog(scan, out, grid, bands, names, NODATA_M, options.to_datum)
+    layers = Layers(grid, bands, names, NODATA_M, options.to_datum)
+    with mosaic(scan, out, grid, layers) as image:
+        put(image, layers)
 
 
 def _in_utm(bands: Array, grid: Grid, frame: LocalFrame) -> tuple[Grid, Array]:

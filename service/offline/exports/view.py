@@ -19,9 +19,10 @@ from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports import EXPORTERS
+from service.offline.tiles import TILE_POINTS, Tile, Tiling, tiling
 from service.packages import needing
 from service.progress import Progress
-from service.scans.fused_cloud import FusedCloud, fused_cloud, placed
+from service.scans.fused_cloud import EVERYWHERE, FusedCloud, fused_cloud, placed
 from service.scans.main_piece import main_keyframes, main_poses, stretches_apart
 from service.scans.track import latest, local_frame
 from service.stream.records import PoseRecord
@@ -53,6 +54,8 @@ class ExportOptions:
     video_epoch_ns: int | None = None
     vertical_datum: str | None = None  # of the heights as flown, where the operator knows it
     to_datum: str | None = None  # what they are converted to
+    tile_points: int = TILE_POINTS  # stored points above which products are made in tiles
+    scheduler: str | None = None  # of a Dask cluster that makes them
 
     def __post_init__(self) -> None:
         """Raise ValueError for sizes that are not positive, and for an unknown datum."""
@@ -87,13 +90,27 @@ class ExportOptions:
         return "AMSL" if self.to_datum is None else f"above {self.to_datum}"
 
 
+@dataclass(frozen=True, slots=True)
+class ProductJob:
+    """One tile of a product, in plain values."""
+
+    tile: Tile
+    kind: str
+    options: ExportOptions
+
+
 class ScanView:
     """An open scan folder; close it, or use it in a ``with``."""
 
     def __init__(
-        self, folder: Path, voxel_m: float | None = None, progress: Progress | None = None
+        self,
+        folder: Path,
+        voxel_m: float | None = None,
+        progress: Progress | None = None,
+        tile: Tile | None = None,
     ) -> None:
-        """Raises InputError when ``folder`` is not a scan folder."""
+        """``tile`` restricts the view to its points. Raises InputError when ``folder`` is not a
+        scan folder."""
         if not folder.is_dir():
             raise InputError(f"{folder} is not a folder; give a scan folder (it holds scan.db)")
         if not (folder / "scan.db").is_file():
@@ -105,6 +122,10 @@ class ScanView:
         self._shared: dict[Any, Any] = {}
         self._lock = threading.RLock()
         self._datums: tuple[str, str] | None = None  # heights from the first to the second
+        self._box = EVERYWHERE
+        if tile is not None:
+            self._box = tile.wide
+            self.store.only(tile.seqs)
         self.store.hold_decoded(HELD_BYTES)
 
     def __enter__(self) -> ScanView:
@@ -182,10 +203,33 @@ class ScanView:
 
     def _fuse(self) -> FusedCloud:
         with self.progress.part("fusing the cloud", FUSING):
-            fused = fused_cloud(self.store, self._voxel_m, self.progress)
+            fused = fused_cloud(self.store, self._voxel_m, self.progress, self._box)
         if not len(fused.cloud):
             raise InputError(f"{self.folder} contains no points yet; nothing to export")
         return fused
+
+    @property
+    def has_points(self) -> bool:
+        """Whether there is anything to make a deliverable of."""
+        try:
+            return bool(len(self.fused.cloud))
+        except InputError:
+            return False
+
+    def tiling(self, options: ExportOptions, margin_m: float) -> Tiling:
+        """Tiles over the scan in its UTM zone, each with the points ``margin_m`` around it."""
+        return self.shared(
+            ("tiling", margin_m, options.tile_points),
+            lambda: tiling(self.folder, self.store, options.tile_points, margin_m, self.frame),
+        )
+
+    def for_tiles(
+        self, options: ExportOptions, cut: Tiling, needs_cell: bool = True
+    ) -> ExportOptions:
+        """The options with the sizes that tiles by themselves would choose differently."""
+        voxel = options.voxel_m or self._voxel_m or cut.sample_m
+        cell = options.cell_m or (round_cell(voxel, up=True) if needs_cell else None)
+        return replace(options, voxel_m=voxel, cell_m=cell)
 
     @property
     def xyz_m(self) -> F64:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import base64
 import datetime as dt
 import json
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from recon.surface.change import (
     Change,
     change_between,
     mean_surface,
+    of_tile,
     outlines,
     volumes,
 )
@@ -25,11 +28,13 @@ from recon.surface.raster import Grid, Raster, fill_holes, grid_over, hillshade
 from recon.types import F64, U8, Bool, DepthMap
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.offline.exports.rasters import NODATA_M, write_cog
+from service.offline.exports.rasters import NODATA_M, Layers, mosaic, over, put, window_in
 from service.offline.exports.view import ScanView
 from service.offline.geopackage import write_polygons
 from service.offline.site.alignment import AlignedSite, align_site
 from service.offline.site.gather import Member, Part
+from service.offline.tiles import TILE_POINTS, Tile, grown, run_tiles, tiling
+from service.progress import Progress
 from service.scans.folder import write_deliverables
 from service.scans.fused_cloud import fused_cloud, placed
 from service.scans.track import local_frame
@@ -46,7 +51,53 @@ HOLE_CELLS = 2
 ADDED, REMOVED = (40, 90, 230), (220, 120, 30)  # BGR
 
 
-def compare(before: Path, after: Path, out: Path, cell_m: float | None = None) -> dict[str, Any]:
+MARGIN_M = 40.0
+"""Around a tile: bending is a mean over 10 m (1 sigma); a smaller object is measured whole."""
+
+PAGE_PX = 1400
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeJob:
+    """One tile of a comparison, in plain values."""
+
+    tile: Tile
+    parts: tuple[tuple[int, int], tuple[int, int]]  # first and last keyframe of both dates
+    voxels_m: tuple[float | None, ...]
+    cell_m: float | None
+    whole: Grid | None  # of all tiles; None: this is the only one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """One changed object."""
+
+    body: Body
+    about: dict[str, Any]
+    rings: list[list[F64]]  # polygons on the map
+    grid: Grid  # around it
+    cells: Bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChangePart:
+    """What changed on one tile."""
+
+    layers: Layers
+    objects: list[Found]
+    pictures: tuple[U8, U8]  # BGR, before and after
+    compared_m2: float
+    alignment_m: float
+
+
+def compare(
+    before: Path,
+    after: Path,
+    out: Path,
+    cell_m: float | None = None,
+    tile_points: int = TILE_POINTS,
+    scheduler: str | None = None,
+) -> dict[str, Any]:
     """Align two scans in the folder ``out``, and write what changed from one to the other.
 
     Returns the content of change.json. Raises InputError for scans that are one flight, that no
@@ -54,23 +105,138 @@ def compare(before: Path, after: Path, out: Path, cell_m: float | None = None) -
     """
     site = align_site([before, after], out, deliver=False)
     one, two = _pair(site, before, after)
+    pair = site.members[one], site.members[two]
     with ScanView(out) as view:
-        older, newer = surfaces(view, [site.members[one], site.members[two]], cell_m)
-        change = change_between(older, newer)
-        if change.compared_m2 == 0.0:
+        view.needs_place("a comparison")
+        parts = ((pair[0].first, pair[0].last), (pair[1].first, pair[1].last))
+        found = changes(view, out, parts, cell_m, tile_points, scheduler)
+        if found is None:
             raise InputError(f"{before} and {after} share no ground")
-        document = _document(site, change, one, two)
-        _write_map(view, out / CHANGE_TIF, change)
-        _write_polygons(view, out / CHANGE_GPKG, change)
+        document = _document(site, found, one, two)
+        _write_polygons(view, out / CHANGE_GPKG, found)
         with writing(out / CHANGE_PAGE) as part:
-            part.write_text(page(document, older, newer, change), encoding="utf-8")
+            part.write_text(page(document, found), encoding="utf-8")
         with writing(out / CHANGE_JSON) as part:
             part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    hide_changed(out / "scan.db", site.members[one], change)
+    hide_changed(out / "scan.db", site.members[one], out / CHANGE_TIF)
     with ScanStore.open(out / "scan.db") as store:
         store.update_header(notes=(*store.header.notes, document["in_words"]))
         write_deliverables(out, store, {})
     return document
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Changes:
+    """What changed on all tiles, but for the map, which is in its file."""
+
+    objects: list[Found]
+    pictures: tuple[U8, U8]
+    cell_m: float
+    compared_m2: float
+    alignment_m: float  # largest of the tiles
+
+
+def changes(
+    view: ScanView,
+    out: Path,
+    parts: tuple[tuple[int, int], tuple[int, int]],
+    cell_m: float | None = None,
+    tile_points: int = TILE_POINTS,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> Changes | None:
+    """Compare two dates of a site, ``parts`` of its keyframes, and write change.tif into ``out``.
+
+    None where they share no ground.
+    """
+    cut = tiling(view.folder, view.store, tile_points, MARGIN_M, view.frame)
+    whole: Grid | None = None
+    voxels: tuple[float | None, ...] = (None, None)
+    if len(cut.tiles) > 1:
+        usual = [
+            float(np.median([p.sample_m for p in cut.prints if a <= p.seq <= b] or [cut.sample_m]))
+            for a, b in parts
+        ]
+        voxels, whole = tuple(usual), over(grown(cut.bounds, 2.0), cell_m or max(usual))
+    jobs = [ChangeJob(tile, parts, voxels, cell_m, whole) for tile in cut.tiles]
+    made = run_tiles(change_tile, jobs, scheduler, progress or Progress())
+    compared = (part for part in made if part is not None)
+    first = next(compared, None)
+    if first is None:
+        return None
+    grid = whole or first.layers.grid
+    blank: U8 = np.full((*_page_shape(grid), 3), 255, np.uint8)
+    pictures = blank, blank.copy()
+    objects: list[Found] = []
+    area, alignment = 0.0, 0.0
+    with mosaic(view, out / CHANGE_TIF, grid, first.layers) as image:
+        for part in chain([first], compared):
+            put(image, part.layers)
+            rows, cols = _page_place(part.layers.grid, grid)
+            for canvas, picture in zip(pictures, part.pictures, strict=True):
+                canvas[rows, cols] = picture
+            area, alignment = area + part.compared_m2, max(alignment, part.alignment_m)
+            objects += part.objects
+        objects = _numbered(image, objects)
+    for picture in pictures:
+        _outline(picture, objects, grid)
+    return Changes(objects, pictures, grid.cell_m, area, alignment) if area else None
+
+
+def _numbered(image: Any, objects: list[Found]) -> list[Found]:
+    """The objects, their numbers written into the map; of two in one place the first."""
+    kept: list[Found] = []
+    for one in objects:
+        window = window_in(image, one.grid)
+        numbers = image.read(3, window=window)
+        if (numbers[one.cells] > 0).any():
+            continue
+        kept.append(one)
+        numbers[one.cells] = len(kept)
+        image.write(numbers, 3, window=window)
+    return kept
+
+
+def change_tile(job: ChangeJob, progress: Progress | None = None) -> ChangePart | None:
+    """What changed on one tile; None where it has no ground of both dates."""
+    with ScanView(Path(job.tile.folder), None, progress, job.tile) as view:
+        both = surfaces(view, job)
+        if both is None:
+            return None
+        site_m2 = None
+        if job.whole is not None:
+            site_m2 = float(np.prod(job.whole.shape)) * job.whole.cell_m**2
+        change = change_between(*both, ground_m2=site_m2)
+    grid = change.grid
+    rows, cols = grid.window(job.tile.box)
+    if rows.start >= rows.stop or cols.start >= cols.stop:
+        return None
+    if job.whole is not None:
+        change = of_tile(change, rows, cols, int(MARGIN_M / grid.cell_m))
+    known = np.isfinite(change.height_m)
+    flat = np.zeros(grid.shape, np.float32)
+    bands = np.stack(
+        [np.where(known, x, NODATA_M) for x in (change.height_m, change.sigma_m, flat)]
+    )
+    names = ("after less before, m", "sigma, m", "object")
+    layers = Layers(grid, bands.astype(np.float32), names, NODATA_M).within(job.tile.box)
+    place = _page_place(layers.grid, job.whole or layers.grid)
+    size = (place[1].stop - place[1].start, place[0].stop - place[0].start)
+    one, two = (drawn(raster, rows, cols, size) for raster in both)
+    return ChangePart(
+        layers, [_found(change, body, known) for body in change.bodies], (one, two),
+        float(known[rows, cols].sum()) * grid.cell_m**2, change.alignment_m,
+    )  # fmt: skip
+
+
+def _found(change: Change, body: Body, known: Bool) -> Found:
+    r, c = np.nonzero(change.labels == body.label)
+    rows, cols = (slice(int(x.min()), int(x.max()) + 1) for x in (r, c))
+    cells = (change.labels[rows, cols] == body.label) & known[rows, cols]
+    return Found(
+        body, _object(change, body), outlines(change, body.label),
+        change.grid.part(rows, cols), cells,
+    )  # fmt: skip
 
 
 def _pair(site: AlignedSite, before: Path, after: Path) -> tuple[int, int]:
@@ -90,32 +256,37 @@ def _pair(site: AlignedSite, before: Path, after: Path) -> tuple[int, int]:
     return one, two
 
 
-def surfaces(view: ScanView, members: list[Member], cell_m: float | None) -> list[Raster]:
-    """The mean surface of each member where the site has it, on one grid of the site's CRS."""
-    clouds = [fused_cloud(Part(view.store, member)) for member in members]
-    for member, fused in zip(members, clouds, strict=True):
-        if not len(fused.cloud):
-            raise InputError(f"{member.name} contains no points; nothing to compare")
+def surfaces(view: ScanView, job: ChangeJob) -> tuple[Raster, Raster] | None:
+    """The mean surface of both dates in the site, on one grid of its CRS; None without points."""
+    box = job.tile.wide
+    clouds = [
+        fused_cloud(Part(view.store, seqs), voxel, view.progress, box)
+        for seqs, voxel in zip(job.parts, job.voxels_m, strict=True)
+    ]
+    if not all(len(fused.cloud) for fused in clouds):
+        return None
     places = [placed(fused.cloud, view.frame) for fused in clouds]
-    cell = cell_m or max(fused.voxel_m for fused in clouds)
+    cell = job.cell_m or max(fused.voxel_m for fused in clouds)
     try:
         grid = grid_over(np.vstack([p[:, :2] for p in places]), cell, margin_cells=1)
     except ValueError as error:
         raise InputError(f"{view.folder}: {error} with --cell-m") from error
-    return [
+    one, two = (
         fill_holes(mean_surface(xyz, fused.cloud.rgb, fused.cloud.sigma_m, grid), HOLE_CELLS)
         for xyz, fused in zip(places, clouds, strict=True)
-    ]
+    )
+    return one, two
 
 
-def hide_changed(path: Path, earlier: Member, change: Change) -> None:
+def hide_changed(path: Path, earlier: Member, map_: Path) -> None:
     """Take what has changed since out of the earlier scan's keyframes in the site's store.
 
     Otherwise the site's surface would be the mean of both dates. The scan itself keeps it.
     """
-    changed = cv2.dilate((change.labels > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    import rasterio
+
     layers: dict[int, tuple[bytes, ...]] = {}
-    with ScanStore.open(path, read_only=True) as store:
+    with ScanStore.open(path, read_only=True) as store, rasterio.open(map_) as image:
         frame = local_frame(store.header)
         for seq in earlier.seqs:
             one = store.keyframe(seq)
@@ -123,7 +294,7 @@ def hide_changed(path: Path, earlier: Member, change: Change) -> None:
             own = codec.decode([data for data in coded if data is not None])
             if one is None or own is None:
                 continue
-            hidden = _inside(one.depth, changed, change.grid, frame)
+            hidden = _changed(one.depth, image, frame)
             if hidden.any():
                 depth = replace(own.depth, depth_m=np.where(hidden, np.nan, own.depth.depth_m))
                 layers[seq] = codec.encode(replace(own, depth=depth), own.time_ns)
@@ -135,23 +306,32 @@ def hide_changed(path: Path, earlier: Member, change: Change) -> None:
             store.add_keyframe(seq, coded_layers)
 
 
-def _inside(depth: DepthMap, cells: Bool, grid: Grid, frame: LocalFrame | None) -> Bool:
-    """(h, w) pixels whose surface lies in one of the ``cells`` of the grid."""
+def _changed(depth: DepthMap, image: Any, frame: LocalFrame | None) -> Bool:
+    """(h, w) pixels whose surface lies in or next to a cell of an object of the open map."""
     known = np.isfinite(depth.depth_m)
     out = np.zeros(known.shape, np.bool_)
     if not known.any():
         return out
     points, _ = points_of(depth, depth.T_world_camera)
     xy = (points if frame is None else frame.to_utm(points))[:, :2]
+    whole = Grid(image.transform.c, image.transform.f, image.transform.a, image.shape)
+    west, south = xy.min(axis=0) - 2.0 * whole.cell_m
+    east, north = xy.max(axis=0) + 2.0 * whole.cell_m
+    rows, cols = whole.window((west, south, east, north))
+    if rows.start >= rows.stop or cols.start >= cols.stop:
+        return out
+    grid = whole.part(rows, cols)
+    numbers = image.read(3, window=window_in(image, grid))
+    cells = cv2.dilate((numbers > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     out[known] = grid.holds(xy) & cells[grid.cells(xy)]
     return out
 
 
-def _document(site: AlignedSite, change: Change, one: int, two: int) -> dict[str, Any]:
+def _document(site: AlignedSite, change: Changes, one: int, two: int) -> dict[str, Any]:
     """The content of change.json."""
-    found = volumes(change)
+    found = volumes([each.body for each in change.objects], change.alignment_m)
     before, after = site.members[one], site.members[two]
-    count = len(change.bodies)
+    count = len(change.objects)
     net, sigma = found.net
     words = (
         f"Change {before.name} to {after.name}: {count} object(s) on "
@@ -162,14 +342,14 @@ def _document(site: AlignedSite, change: Change, one: int, two: int) -> dict[str
         "schema": 1,
         "before": _dated(before),
         "after": _dated(after),
-        "cell_m": round(change.grid.cell_m, 4),
+        "cell_m": round(change.cell_m, 4),
         "compared_m2": round(change.compared_m2, 1),
         "alignment_sigma_m": round(change.alignment_m, 4),
         "volumes_m3": {
             name: {"value": round(v, 2), "sigma": round(s, 2)}
             for name, (v, s) in (("cut", found.cut), ("fill", found.fill), ("net", found.net))
         },
-        "objects": [_object(change, body) for body in change.bodies],
+        "objects": [each.about for each in change.objects],
         "in_words": words,
         "notes": site.document["notes"],
     }
@@ -195,20 +375,10 @@ def _object(change: Change, body: Body) -> dict[str, Any]:
     }
 
 
-def _write_map(view: ScanView, path: Path, change: Change) -> None:
-    """change.tif: signed difference, its sigma, and the number of the object, else 0."""
-    layers = (change.height_m, change.sigma_m, change.labels.astype(np.float32))
-    known = np.isfinite(change.height_m)
-    bands = np.stack([np.where(known, x, NODATA_M) for x in layers]).astype(np.float32)
-    names = ("after less before, m", "sigma, m", "object")
-    write_cog(view, path, change.grid, bands, names, nodata=NODATA_M)
-
-
-def _write_polygons(view: ScanView, path: Path, change: Change) -> None:
-    objects = [_object(change, body) for body in change.bodies]
+def _write_polygons(view: ScanView, path: Path, change: Changes) -> None:
     names = ("kind", "area_m2", "volume_m3", "sigma_m3", "mean_m", "peak_m")
-    shapes = [outlines(change, body.label) for body in change.bodies]
-    columns = {name: [one[name] for one in objects] for name in names}
+    shapes = [each.rings for each in change.objects]
+    columns = {name: [each.about[name] for each in change.objects] for name in names}
     write_polygons(path, "changes", view.needs_place("a GeoPackage").epsg, shapes, columns)
 
 
@@ -230,7 +400,7 @@ end of the white line.</p>
 """
 
 
-def page(document: dict[str, Any], before: Raster, after: Raster, change: Change) -> str:
+def page(document: dict[str, Any], change: Changes) -> str:
     """A page without scripts, as the portal allows none: both dates under a slider, the objects."""
     from html import escape
 
@@ -244,8 +414,8 @@ def page(document: dict[str, Any], before: Raster, after: Raster, change: Change
         words=escape(document["in_words"]),
         before=escape(document["before"]["started"]),
         after=escape(document["after"]["started"]),
-        one=_embedded(drawn(before, change)),
-        two=_embedded(drawn(after, change)),
+        one=_embedded(change.pictures[0]),
+        two=_embedded(change.pictures[1]),
         rows=rows,
         notes="".join(f"<p>{escape(note)}</p>" for note in document["notes"]),
     )
@@ -256,21 +426,42 @@ def _embedded(image: U8) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data).decode()
 
 
-def drawn(raster: Raster, change: Change, width_px: int = 1400) -> U8:
-    """(H, W, 3) BGR of a surface in its colours and relief, with the changes outlined."""
+def drawn(raster: Raster, rows: slice, cols: slice, size: tuple[int, int]) -> U8:
+    """(h, w, 3) BGR of some cells of a surface in its colours and relief; ``size`` is (w, h)."""
     shade = np.nan_to_num(hillshade(raster.height_m, raster.grid.cell_m), nan=1.0)
     image = raster.rgb[..., ::-1] * (0.4 + 0.8 * shade[..., None])
     image[~raster.known] = 255
-    zoom = width_px / image.shape[1]
-    size = (width_px, max(1, round(image.shape[0] * zoom)))
-    out = cv2.resize(np.clip(image, 0, 255).astype(np.uint8), size, interpolation=cv2.INTER_LINEAR)
-    for body in change.bodies:
-        colour = ADDED if body.volume_m3 > 0 else REMOVED
-        for rings in outlines(change, body.label):
+    part = np.clip(image[rows, cols], 0, 255).astype(np.uint8)
+    if not all(size):
+        return np.zeros((size[1], size[0], 3), np.uint8)
+    return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
+def _page_shape(whole: Grid) -> tuple[int, int]:
+    """Rows and columns of the page's picture of a grid."""
+    return max(1, round(whole.shape[0] * PAGE_PX / whole.shape[1])), PAGE_PX
+
+
+def _page_place(part: Grid, whole: Grid) -> tuple[slice, slice]:
+    """Rows and columns of a part of a grid in the page's picture."""
+    zoom = PAGE_PX / whole.shape[1]
+    starts = (
+        (whole.north_m - part.north_m) / whole.cell_m,
+        (part.west_m - whole.west_m) / whole.cell_m,
+    )
+    ends = [
+        (min(max(round(start * zoom), 0), limit), min(round((start + count) * zoom), limit))
+        for start, count, limit in zip(starts, part.shape, _page_shape(whole), strict=True)
+    ]
+    return slice(*ends[0]), slice(*ends[1])
+
+
+def _outline(picture: U8, objects: Sequence[Found], whole: Grid) -> None:
+    """Draw the outlines of the objects into the page's picture."""
+    zoom = PAGE_PX / whole.shape[1]
+    for one in objects:
+        colour = ADDED if one.body.volume_m3 > 0 else REMOVED
+        for rings in one.rings:
             for ring in rings:
-                cv2.polylines(out, [_pixels(ring, change.grid, zoom)], True, colour, 2, cv2.LINE_AA)
-    return np.asarray(out, np.uint8)
-
-
-def _pixels(ring: F64, grid: Grid, zoom: float) -> Any:
-    return np.rint((grid.pixels(ring) + 0.5) * zoom).astype(np.int32)
+                at: Any = np.rint((whole.pixels(ring) + 0.5) * zoom).astype(np.int32)
+                cv2.polylines(picture, [at], True, colour, 2, cv2.LINE_AA)

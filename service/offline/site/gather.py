@@ -52,16 +52,16 @@ class Member:
 
 
 class Part:
-    """The keyframes of one member, read as a store's."""
+    """Keyframes ``first`` to ``last`` of a site, such as those of one member, read as a store's."""
 
-    def __init__(self, store: ScanStore, member: Member) -> None:
-        self._store, self._member = store, member
+    def __init__(self, store: ScanStore, seqs: tuple[int, int]) -> None:
+        self._store, self._ends = store, seqs
         self.summary: dict[str, Any] | None = None
         self.refinement: dict[str, Any] | None = None
 
     def seqs(self) -> list[int]:
-        """The member's."""
-        return list(self._member.seqs)
+        """Those that the site has."""
+        return [seq for seq in self._store.seqs() if self._ends[0] <= seq <= self._ends[1]]
 
     def keyframe(self, seq: int) -> Keyframe | None:
         """One of them, where the site has it."""

@@ -1,0 +1,122 @@
+"""Products of a site in tiles: the same as in one piece, here and on a Dask cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import laspy
+import numpy as np
+import pytest
+from site_scans import Errors, leg, write_scan
+
+from service.offline.exports import rasters
+from service.offline.exports.view import ExportOptions, ScanView, export
+from service.offline.site import compare
+from service.offline.site.alignment import align_site
+from service.offline.tiles import run_tiles
+
+rasterio = pytest.importorskip("rasterio")
+
+if TYPE_CHECKING:
+    from conftest import HouseFlight
+
+VOXEL_M = 0.3
+TILE_POINTS = 30_000  # the flight of the house has 72,000
+
+
+def exported(folder: Path, kind: str, out: Path, **options: Any) -> Path:
+    with ScanView(folder, VOXEL_M) as scan:
+        return export(scan, kind, out, ExportOptions(voxel_m=VOXEL_M, stored=True, **options))
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many tiles each raster is made of."""
+    counts: list[int] = []
+
+    def counting(make: Callable[..., Any], jobs: Any, *rest: Any) -> Any:
+        counts.append(len(jobs))
+        return run_tiles(make, jobs, *rest)
+
+    for module in (rasters, compare):
+        monkeypatch.setattr(module, "run_tiles", counting)
+    return counts
+
+
+@pytest.mark.parametrize(("kind", "far"), [("dsm", 0.02), ("dtm", 0.05), ("ortho", 40.0)])
+def test_a_raster_in_tiles_is_that_of_the_whole(
+    tmp_path: Path, house: HouseFlight, counted: list[int], kind: str, far: float
+) -> None:
+    house.flown(tmp_path / "scan").close()
+    whole = exported(tmp_path / "scan", kind, tmp_path / "whole.tif")
+    parts = exported(tmp_path / "scan", kind, tmp_path / "parts.tif", tile_points=TILE_POINTS)
+    assert counted and counted[0] > 2
+    with rasterio.open(whole) as one, rasterio.open(parts) as two:
+        assert one.crs == two.crs and one.res == two.res and one.descriptions == two.descriptions
+        rows = round((two.transform.f - one.transform.f) / one.res[0])
+        cols = round((one.transform.c - two.transform.c) / one.res[0])
+        window = (rows, rows + one.height), (cols, cols + one.width)
+        a, b = one.read(), two.read(window=window)
+        assert two.read_masks(1).sum() == two.read_masks(1, window=window).sum()
+        known, also = one.read_masks(1) > 0, two.read_masks(1, window=window) > 0
+    # Where nothing stands in a tile, ground at the border of the survey need not be seen from far.
+    assert (known & ~also).mean() < 0.005
+    same = np.abs(a[0].astype(float) - b[0])[known & also] <= far
+    assert same.mean() > 0.99
+
+
+def test_points_in_tiles_are_those_of_the_whole(tmp_path: Path, house: HouseFlight) -> None:
+    house.flown(tmp_path / "scan").close()
+    whole = laspy.read(exported(tmp_path / "scan", "laz", tmp_path / "whole.laz"))
+    tiled = exported(tmp_path / "scan", "laz", tmp_path / "parts.laz", tile_points=TILE_POINTS)
+    parts = laspy.read(tiled)
+    assert abs(len(parts) - len(whole)) < 0.003 * len(whole)
+    places = {tuple(p) for p in np.round(whole.xyz, 2)}
+    assert len({tuple(p) for p in np.round(parts.xyz, 2)}) > 0.99 * len(parts)  # each once
+    assert np.mean([tuple(p) in places for p in np.round(parts.xyz, 2)]) > 0.99
+    assert np.mean(parts.classification == 2) == pytest.approx(
+        np.mean(whole.classification == 2), abs=0.02
+    )
+
+
+def test_a_cluster_makes_the_same_raster(tmp_path: Path, house: HouseFlight) -> None:
+    distributed = pytest.importorskip("distributed")
+    house.flown(tmp_path / "scan").close()
+    here = exported(tmp_path / "scan", "dsm", tmp_path / "here.tif", tile_points=TILE_POINTS)
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as cluster:
+        there = exported(
+            tmp_path / "scan", "dsm", tmp_path / "there.tif", tile_points=TILE_POINTS,
+            scheduler=cluster.scheduler_address,
+        )  # fmt: skip
+    with rasterio.open(here) as one, rasterio.open(there) as two:
+        np.testing.assert_array_equal(one.read(), two.read())
+
+
+def test_changes_in_tiles_are_those_of_the_whole(tmp_path: Path, counted: list[int]) -> None:
+    box, gone = (-1.0, 4.0, 1.5, 7.0, 1.5), (-2.0, -9.0, 1.0, -6.5, 1.5)
+    one = write_scan(tmp_path / "one", leg(0.0), boxes=[gone])
+    two = write_scan(tmp_path / "two", leg(0.0), Errors((0.3, 0.0, 0.1)), boxes=[box], day=1)
+    site = align_site([one, two], tmp_path / "site", deliver=False)
+    parts = tuple((m.first, m.last) for m in site.members)
+    found = []
+    with ScanView(tmp_path / "site") as view:
+        for name, points in (("whole", 20_000_000), ("tiles", 120_000)):
+            (tmp_path / name).mkdir()
+            done = compare.changes(view, tmp_path / name, (parts[0], parts[1]), 0.25, points)
+            assert done is not None
+            found.append(done)
+    assert counted[0] == 1 and counted[1] > 1
+    whole, tiled = (sorted(f.objects, key=lambda o: o.body.volume_m3) for f in found)
+    assert [o.about["kind"] for o in whole] == ["removed", "added"]
+    assert [o.about["kind"] for o in tiled] == ["removed", "added"]
+    for a, b in zip(whole, tiled, strict=True):
+        assert a.body.volume_m3 == pytest.approx(b.body.volume_m3, rel=0.1)
+        assert a.about["east_m"] == pytest.approx(b.about["east_m"], abs=0.3)
+    assert found[0].compared_m2 == pytest.approx(found[1].compared_m2, rel=0.02)
+    with rasterio.open(tmp_path / "tiles" / "change.tif") as image:
+        numbers = image.read(3, masked=True)
+    assert sorted(np.unique(numbers.compressed())) == [0.0, 1.0, 2.0]
