@@ -42,6 +42,20 @@ def test_a_wander_is_not_taken_for_the_zero() -> None:
     assert 1.5 < altitude_datum(intervals(above), 1800.0).shift_m < 2.0
 
 
+def test_a_wander_under_the_scatter_is_seen_in_five_minutes() -> None:
+    """The scatter alone is all that the receiver claims, and its errors wander by 1.5 m as well."""
+    rng, ratios = np.random.default_rng(0), []
+    for _ in range(60):
+        wander = rng.normal() * 1.5
+        above = []
+        for _ in range(300):
+            wander = np.exp(-1 / 60) * wander + 1.5 * np.sqrt(1 - np.exp(-2 / 60)) * rng.normal()
+            above.append(wander + 1.5 * rng.normal() / np.sqrt(5))
+        found = altitude_datum(intervals(above), 300.0)
+        ratios.append(found.shift_m / found.sigma_m)  # of a zero that is right
+    assert np.sqrt(np.mean(np.square(ratios))) < 2.0
+
+
 def test_a_jump_of_the_receiver_does_not_count() -> None:
     rng = np.random.default_rng(1)
     above = 1.0 + rng.normal(size=40) * 0.67

@@ -448,34 +448,64 @@ def test_wandering_fixes_do_not_bend_what_vision_sees_straight() -> None:
     assert shape_m(graph.pose_array()[:, :3, 3]) < 1.3 * alone + 0.01
 
 
-@pytest.mark.parametrize(("claimed_m", "least", "most"), [(1.0, 0.6, 1.6), (2.0, 0.3, 0.8)])
-def test_the_place_is_as_sure_as_the_receiver(claimed_m: float, least: float, most: float) -> None:
+@pytest.mark.parametrize(
+    ("sigma_m", "is_claimed", "least", "most"),
+    [(1.0, True, 0.6, 1.6), (2.0, True, 0.3, 0.8), (2.0, False, 0.6, 1.6)],
+)
+def test_the_place_is_as_sure_as_the_receiver(
+    sigma_m: float, is_claimed: bool, least: float, most: float
+) -> None:
     """Ten flights far shorter than the wander of 1 m: true offset over the sigma, axis by axis."""
     found = []
     for seed in range(10):
         f = flight(20, seed=seed, drift=0.0003)
-        rng, error, claimed = np.random.default_rng(seed), np.zeros(3), np.full(3, claimed_m)
+        rng, error, sigma_fix = np.random.default_rng(seed), np.zeros(3), np.full(3, sigma_m)
         error = rng.normal(size=3)
         for i, T in enumerate(f.truth):
             error = np.exp(-1 / 60) * error + np.sqrt(1 - np.exp(-2 / 60)) * rng.normal(size=3)
             T[:3, 3] += [2000.0, -500.0, 0.0]  # turns about the origin are no part of it
             height = T[2, 3] + 4.0  # the barometer's, whose zero is unknown
             f.priors[i] = replace(
-                f.priors[i], position_m=T[:3, 3] + error, sigma_position_m=claimed,
-                altitude_m=height, sigma_altitude_m=0.5,
+                f.priors[i], position_m=T[:3, 3] + error, sigma_position_m=sigma_fix,
+                altitude_m=height, sigma_altitude_m=0.5, is_sigma_claimed=is_claimed,
             )  # fmt: skip
-        graph, _ = fly(f, PoseGraphConfig())
-        graph.solve()
-        track = Trajectory(graph=graph)
-        off, sigma = [], []
-        for i, T in enumerate(f.truth):
-            pose = track.place(i)
-            off.append(pose.T_world_camera[:3, 3] - T[:3, 3])
-            own = se3.about(pose.T_world_camera[:3, 3], pose.covariance)
-            sigma.append(np.sqrt(np.diag(own)[3:]))
-        found.append(np.mean(off, axis=0) / np.median(sigma, axis=0))
+        off, sigma = offset_and_sigma(f)
+        found.append(off / sigma)
     rms = np.sqrt(np.mean(np.square(found), axis=0))
     assert least < rms.min() and rms.max() < most
+
+
+def test_errors_that_are_new_in_each_fix_average_out() -> None:
+    """The receiver's scatter is all that it claims, so the filtered position has no other error."""
+    found = []
+    for seed in range(10):
+        f = flight(40, seed=seed, drift=0.0003)
+        rng, zero = np.random.default_rng(seed), np.random.default_rng(seed).normal()
+        for i, T in enumerate(f.truth):
+            scatter = 0.2 * rng.normal(size=3) + [0.0, 0.0, zero]  # and the barometer's zero
+            f.priors[i] = replace(
+                f.priors[i], position_m=T[:3, 3] + scatter, above_m=rng.normal() * 0.5 - zero,
+                above_fixes=4, sigma_position_m=np.ones(3),
+            )  # fmt: skip
+        found.append(offset_and_sigma(f))
+    off, sigma = np.swapaxes(found, 0, 1)
+    assert np.median(np.linalg.norm(sigma, axis=1)) < 0.6  # 1.7 m are claimed
+    ratio = np.linalg.norm(off, axis=1) / np.linalg.norm(sigma, axis=1)
+    assert 0.3 < np.sqrt(np.mean(ratio**2)) < 1.4
+
+
+def offset_and_sigma(f: Flight) -> tuple[F64, F64]:
+    """(3,) mean offset of the track from the truth, and the (3,) sigma of a place, in m."""
+    graph, _ = fly(f, PoseGraphConfig())
+    graph.solve()
+    track = Trajectory(graph=graph)
+    off, sigma = [], []
+    for i, T in enumerate(f.truth):
+        pose = track.place(i)
+        off.append(pose.T_world_camera[:3, 3] - T[:3, 3])
+        own = se3.about(pose.T_world_camera[:3, 3], pose.covariance)
+        sigma.append(np.sqrt(np.diag(own)[3:]))
+    return np.mean(off, axis=0), np.median(sigma, axis=0)
 
 
 def test_a_lost_stretch_is_tied_by_two_loops_in_scale_and_heading() -> None:

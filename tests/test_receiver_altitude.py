@@ -44,6 +44,23 @@ def test_an_accuracy_without_altitude_says_nothing() -> None:
     assert state is not None and state.receiver is None
 
 
+@pytest.mark.parametrize("h_acc_mm", [0, 900])
+def test_the_prior_says_whether_the_receiver_claims_its_accuracy(h_acc_mm: int) -> None:
+    history = climbing()
+    message = dialect.MAVLink_gps_raw_int_message(
+        0, 3, 470000000, 80000000, 501500, 80, 120, 0, 0, 14, 0, h_acc_mm, 1400, 0, 0
+    )
+    sample = decode(message)
+    assert isinstance(sample, AccuracySample)
+    history.add(sample, round(1.4 * S))
+    prior = Rig(CameraConfig(), ScanConfig(), FusionConfig()).prior(
+        history.state_at(round(1.4 * S)), None
+    )
+    assert prior.sigma_position_m is not None
+    assert prior.sigma_position_m[0] == pytest.approx(0.9 if h_acc_mm else 1.2, rel=0.01)
+    assert prior.is_sigma_claimed is bool(h_acc_mm)
+
+
 def test_only_a_fix_has_an_altitude() -> None:
     for kind, altitude in ((3, 612.345), (1, None)):
         message = dialect.MAVLink_gps_raw_int_message(

@@ -164,6 +164,13 @@ def test_a_flight_does_without_the_statistics_package() -> None:
     assert run.stdout == "False\n"
 
 
+def test_a_wander_reaches_as_far_as_claim_and_speed_say() -> None:
+    slow, fast = Noise(0.0, 0.5, 60.0), Noise(0.0, 3.0, 60.0)
+    assert slow.reach(2.0, 1.0) == fast.reach(2.0, 0.0) == 2.0  # claimed, or as fast as that
+    assert slow.reach(2.0, 0.1) == pytest.approx(1.0)  # between 0.5 and 2
+    assert Noise(0.5, 0.0, 60.0).reach(2.0, 0.01) == pytest.approx(0.2)
+
+
 @pytest.mark.parametrize(
     ("noise", "span_s", "expected"),
     [

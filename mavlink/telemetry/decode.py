@@ -61,7 +61,8 @@ def _gps_raw(m: Message) -> Sample | None:
     fix = m.fix_type >= 3
     sigma_h = m.h_acc * 1e-3 if m.h_acc else _from_dop(m.eph, RECEIVER_SIGMA_H_M)
     sigma_v = m.v_acc * 1e-3 if m.v_acc else _from_dop(m.epv, RECEIVER_SIGMA_V_M)
-    return AccuracySample(None, fix, sigma_h, sigma_v, m.alt * 1e-3 if fix else None)
+    alt_m = m.alt * 1e-3 if fix else None
+    return AccuracySample(None, fix, sigma_h, sigma_v, alt_m, is_claimed=m.h_acc > 0)
 
 
 def _from_dop(dop_cent: int, unknown_m: float) -> float:

@@ -74,7 +74,7 @@ class VehicleHistory:
         self._waiting = 0  # waiting readers
         self._attitude = Track()  # w x y z
         self._position = Track()  # lat lon alt relative vn ve vd, NaN where unknown
-        self._accuracy = Track()  # has_fix sigma_h sigma_v alt, NaN where unknown
+        self._accuracy = Track()  # has_fix sigma_h sigma_v alt (NaN: unknown) is_claimed
         self._range = Track()  # distance
         self._terrain = Track()  # agl sigma
         self._gimbals: dict[tuple[int, int], Track] = {}  # (rank, component): w x y z frame
@@ -190,8 +190,8 @@ class VehicleHistory:
             return self._position, (*where, relative, *velocity)
         if isinstance(sample, AccuracySample):
             alt = math.nan if sample.alt_amsl_m is None else sample.alt_amsl_m
-            row = (float(sample.has_fix), sample.sigma_h_m, sample.sigma_v_m, alt)
-            return self._accuracy, row
+            known = (float(sample.has_fix), sample.sigma_h_m, sample.sigma_v_m, alt)
+            return self._accuracy, (*known, float(sample.is_claimed))
         if isinstance(sample, RangeSample):
             return self._range, (sample.distance_m,)
         if isinstance(sample, TerrainSample):
@@ -335,6 +335,7 @@ class VehicleHistory:
             lon_deg=lon,
             v_ned_m_s=velocity,
             sigma_h_m=math.hypot(sigma_h, bend),
+            is_claimed=nearest is not None and bool(nearest[4]),
             receiver=_receiver_above(accuracy, self._position),
         )
         if math.isfinite(alt):

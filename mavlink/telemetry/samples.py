@@ -59,6 +59,7 @@ class AccuracySample(Sample):
     sigma_h_m: float
     sigma_v_m: float
     alt_amsl_m: float | None = None
+    is_claimed: bool = True  # False: typical of receivers, as this one states none
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +123,7 @@ class VehicleState:
     sigma_attitude_rad: float | None = None  # roll and pitch of the body
     sigma_yaw_rad: float | None = None
     sigma_gimbal_rad: float | None = None  # roll and pitch of the gimbal head
+    is_claimed: bool = True  # False: sigma_h_m and sigma_v_m are typical ones
     receiver: ReceiverAltitude | None = None  # of the fix nearest in time
     age_ms: Mapping[str, float] = field(default_factory=dict)  # source to ms from its next sample
     sources: tuple[str, ...] = ()  # of attitude, gimbal, gnss, rangefinder, terrain, relative

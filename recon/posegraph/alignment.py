@@ -16,7 +16,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recon import se3
-from recon.posegraph.sensor_noise import MIN_READINGS, Noise, drift_noise, wander_noise
+from recon.posegraph.sensor_noise import (
+    MIN_READINGS,
+    MIN_WANDER,
+    Noise,
+    drift_noise,
+    wander_noise,
+)
 from recon.types import F64, I64, DepthMap, PosePrior
 
 
@@ -87,6 +93,7 @@ class Similarity:
     sources: tuple[str, ...] = ()
     noise: ReadingNoise | None = None  # as measured by the fit; None without one
     sigma_fixes: F64 | None = None  # (3,) m of the mean error of all fixes, where they wander
+    sigma_counted: F64 | None = None  # (3,) m that the readings in the graph count for it
 
     @property
     def sigma_scale(self) -> float:
@@ -203,12 +210,13 @@ def height_ratios(anchors: Sequence[Anchor]) -> tuple[list[tuple[float, float]],
     return [h for h, off in zip(exact, apart, strict=True) if off <= limit], EXACT_HEIGHTS
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ReadingNoise:
     """How fixes and velocities err along one flight, 1 sigma per axis."""
 
     horizontal: Noise | None = None  # of a fix, m; None: as it claims
     vertical: Noise | None = None
+    reach_m: F64 | None = None  # (3,) how far fixes may wander
     walk_m_per_sqrt_s: float = 0.1  # of the integrated velocity
     rate_m_s: float = 0.05  # constant part of the velocity's error
 
@@ -222,16 +230,16 @@ class ReadingNoise:
                 single[:, axes] = max(noise.total, MIN_FIX_M)
         return weighing, single
 
-    def of_mean(self, claimed: F64, times_s: F64) -> F64:
-        """(3,) sigma of the mean error of fixes with (m, 3) claimed sigmas at (m,) times."""
+    def of_mean(self, claimed: F64, times_s: F64, fix_s: float) -> tuple[F64, F64]:
+        """(3,) sigma of the mean error of fixes with (m, 3) claimed sigmas at (m,) times, and what
+        the readings in a graph count for it."""
         usual, span_s = np.median(claimed, axis=0), float(np.ptp(times_s))
-        kinds = (self.horizontal, self.horizontal, self.vertical)
-        return np.array(
-            [
-                one if noise is None else noise.of_mean(float(one), span_s)
-                for noise, one in zip(kinds, usual, strict=True)
-            ]
-        )
+        if self.horizontal is None or self.vertical is None or self.reach_m is None:
+            return usual, usual / np.sqrt(1.0 + span_s / (2.0 * fix_s))
+        known = (self.horizontal, self.horizontal, self.vertical)
+        mean = [one.of_mean(float(m), span_s) for one, m in zip(known, self.reach_m, strict=True)]
+        counted = [one.of_each(len(claimed), span_s) / len(claimed) ** 0.5 for one in known]
+        return np.array(mean), np.array(counted)
 
     def of_travels(self, seconds: F64, span_s: float) -> F64:
         """(k,) sigma of ways of so many seconds each; over all of them the rate adds up."""
@@ -320,14 +328,17 @@ class _Readings:
         return np.where(self.heading_known[:, None], turn, tilt) * info, J
 
 
-def fit(anchors: Sequence[Anchor], fix_s: float = 60.0, iterations: int = 30) -> Similarity | None:
+def fit(
+    anchors: Sequence[Anchor], fix_s: float = 60.0, iterations: int = 30, slow_share: float = 1.0
+) -> Similarity | None:
     """The similarity that brings the anchors onto their priors, or None without any prior.
 
     The anchors stand in the order of time; ``fix_s`` is the usual time constant of a receiver's
     wander. How fixes and velocities err is measured by their
     residuals against the track of a first fit and weighs them in a second one. Attitudes of one
     flight err together, so the covariance is inflated by their number. The receiver's error that
-    all fixes share goes into the position's covariance.
+    all fixes share goes into the position's covariance. ``slow_share`` is the part of its variance
+    that may wander.
     """
     usable = [a for a in anchors if a.prior.R_world_camera is not None or _has_fix(a.prior)]
     if not usable:
@@ -338,21 +349,22 @@ def fit(anchors: Sequence[Anchor], fix_s: float = 60.0, iterations: int = 30) ->
         readings = _Readings(usable)
     found = [_solve(readings, *start, iterations) for start in _starts(usable, readings)]
     best = min(found, key=lambda f: f.cost)
-    noise = _measured(usable, best, fix_s, iterations)
+    noise = _measured(usable, best, fix_s, iterations, slow_share)
     readings = _Readings(usable, noise)
     best = _solve(readings, best.R, best.t, best.log_scale, iterations)
     inflation = max(1.0, 0.2 * len(usable)) if noise.horizontal is None else 1.0
     covariance = np.asarray(np.linalg.inv(best.H) * inflation, np.float64)
-    mean = None
+    mean = counted = None
     if len(readings.fix):
         covariance[3:6, 3:6] += np.diag(np.mean(np.square(readings.claimed), axis=0))
-        mean = noise.of_mean(readings.claimed, readings.fix_s) if fix_s > 0 else None
+    if len(readings.fix) and fix_s > 0:
+        mean, counted = noise.of_mean(readings.claimed, readings.fix_s, fix_s)
     scale = float(np.exp(best.log_scale))
-    return Similarity(scale, best.R, best.t, covariance, _sources(readings), noise, mean)
+    return Similarity(scale, best.R, best.t, covariance, _sources(readings), noise, mean, counted)
 
 
 def _measured(
-    anchors: Sequence[Anchor], start: _Solution, fix_s: float, iterations: int
+    anchors: Sequence[Anchor], start: _Solution, fix_s: float, iterations: int, slow_share: float
 ) -> ReadingNoise:
     """The noise of fixes and of velocities, each by its residuals to the track as it alone, with
     the tilt of the attitudes, has it: a compass that is off would look like a drift.
@@ -372,10 +384,15 @@ def _measured(
         along = wander_noise(fixes.fix_s, apart[:, 2:], fix_s)
         if across is not None and along is not None:
             claimed = np.median(fixes.claimed, axis=0)
+            flat, high = float(claimed[:2].mean()), float(claimed[2])
+            is_claimed = all(a.prior.is_sigma_claimed for a in level if _has_fix(a.prior))
+            least = 1.0 if is_claimed else MIN_WANDER
+            reach = across.reach(flat, min(least, slow_share))
             out = replace(
                 out,
-                horizontal=across.bounded(float(claimed[:2].mean()), fix_s),
-                vertical=along.bounded(float(claimed[2]), fix_s),
+                horizontal=across.bounded(across.reach(flat, slow_share), fix_s),
+                vertical=along.bounded(high, fix_s),
+                reach_m=np.array([reach, reach, along.reach(high, least)]),
             )
     ways = _Readings([replace(a, prior=replace(a.prior, position_m=None)) for a in level])
     if len(ways.way) >= MIN_READINGS:

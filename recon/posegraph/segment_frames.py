@@ -104,9 +104,12 @@ class SegmentFrames:
         frame = self._frames.get(segment)
         covariance = np.eye(7) if frame is None else frame.covariance
         sources = () if frame is None else frame.sources
-        known = (one.sigma_fixes for one in self._frames.values() if one.sigma_fixes is not None)
-        sigma = next(known, None)  # one receiver places all that loops join
-        self._frames[segment] = Similarity(scale, R, t, covariance, sources, sigma_fixes=sigma)
+        known = (one for one in self._frames.values() if one.sigma_fixes is not None)
+        placed = Similarity(scale, R, t, covariance, sources)
+        other = next(known, placed)  # one receiver places all that loops join
+        self._frames[segment] = replace(
+            placed, sigma_fixes=other.sigma_fixes, sigma_counted=other.sigma_counted
+        )
         self._tied.add(segment)
 
     def forget(self, segment: int) -> bool:
@@ -132,7 +135,7 @@ class SegmentFrames:
         self._fitted[segment] = seen
         fresh = self._newest_constants()
         anchors = self._anchors(segment, fresh)
-        found = alignment.fit(anchors, self._wander_s[0])
+        found = alignment.fit(anchors, self._wander_s[0], slow_share=fresh.datum.slow_share)
         if found is None:
             return False
         if "gnss" not in found.sources and nodes[0].key > 0:

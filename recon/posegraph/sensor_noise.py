@@ -91,6 +91,16 @@ class Noise:
         tau_s = self.tau_s * max(1.0, far / max(self.wander**2, 1e-12))
         return float(np.sqrt(far / (1.0 + span_s / (2.0 * tau_s))))
 
+    def reach(self, sigma: float, min_share: float) -> float:
+        """How far the sensor may wander: at most its ``sigma``, less where it wanders slowly.
+
+        The speed of a wander gives its size up to a time constant that is known to a factor of
+        two, and sensors that claim nothing differ as much from the typical one. Two estimates
+        as good as each other in their logarithm make the geometric mean. ``min_share`` of the
+        variance stays in any case.
+        """
+        return float(sigma * np.sqrt(np.clip(self.wander / max(sigma, 1e-9), min_share, 1.0)))
+
 
 def wander_noise(times_s: F64, residuals: F64, usual_tau_s: float) -> Noise | None:
     """The noise of readings with (N, axes) ``residuals`` at (N,) times; None for too few.

@@ -149,6 +149,9 @@ STEADY_SHARE = 0.1
 OFF_SIGMAS = 4.0
 """Intervals further from the median than so many of the scatter and the sigma do not count."""
 
+BY_CHANCE = 2.6
+"""The variance of four means exceeds the true one by more in one case of twenty."""
+
 WILD_STEPS = 36.0
 """Squared steps from fix to fix beyond so many of their median are jumps, not scatter."""
 
@@ -159,6 +162,7 @@ class AltitudeDatum:
 
     shift_m: float = 0.0
     sigma_m: float = float("inf")
+    slow_share: float = 1.0  # of the receiver's variance; the rest is new in each fix
 
     def applied(self, prior: PosePrior) -> PosePrior:
         """The prior with its position raised."""
@@ -177,7 +181,7 @@ def altitude_datum(
     claimed sigma that shows as scatter from fix to fix averages out; the rest wanders (first-order
     Gauss-Markov, as in :mod:`recon.posegraph.readings`) and stays. The autopilot's altitude rests
     on the same receiver, so the receiver's mean is taken over only as far as it is the better one.
-    Where the scatter could be all of the sigma, it is taken to be.
+    Where the scatter could be all of the sigma, it is taken to be, but for what is seen to wander.
 
     ``wander_s`` is the time constant of a receiver's wander.
     """
@@ -197,11 +201,25 @@ def altitude_datum(
     apart = np.abs(above - np.median(above))
     near = apart <= OFF_SIGMAS * np.sqrt(white**2 / fixes + sigma**2)
     mean = float(np.average(above[near], weights=fixes[near]))
-    slow = max(sigma**2 - doubt * white**2, (STEADY_SHARE * sigma) ** 2)
+    seen = min(_wandered(above[near], fixes[near], white), sigma**2)
+    slow = max(sigma**2 - doubt * white**2, seen, (STEADY_SHARE * sigma) ** 2)
+    slow_share = min(slow / sigma**2, 1.0)
     slow /= 1.0 + max(span_s, 0.0) / (2.0 * max(wander_s, 1e-3))
     left = slow + white**2 / float(fixes[near].sum())
     share = max(0.0, 1.0 - 2.0 * left / sigma**2)
-    return AltitudeDatum(float(share * mean), float(np.sqrt(left)) if share > 0 else sigma)
+    left_m = float(np.sqrt(left)) if share > 0 else sigma
+    return AltitudeDatum(float(share * mean), left_m, float(slow_share))
+
+
+def _wandered(above: F64, fixes: F64, white: float) -> float:
+    """m^2 by which quarters of (N,) altitudes differ beyond the scatter ``white`` of one fix; 0
+    where chance could be the reason, as for fewer than three in a quarter."""
+    if len(above) < 12:
+        return 0.0
+    quarters = zip(np.array_split(above, 4), np.array_split(fixes, 4), strict=True)
+    means, counts = np.array([(np.average(a, weights=n), n.sum()) for a, n in quarters]).T
+    scatter, apart = white**2 * float(np.mean(1.0 / counts)), float(np.var(means, ddof=1))
+    return apart - scatter if apart > BY_CHANCE * scatter else 0.0
 
 
 PRIOR_SIGMA = 0.1

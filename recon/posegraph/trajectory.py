@@ -197,10 +197,13 @@ class Trajectory:
         T, covariance = pose.T_world_camera, pose.covariance
         if frame is None:
             covariance = se3.about(-T[:3, 3], np.eye(6))
-        elif frame.sigma_fixes is not None:  # the mean error of the fixes bends nothing
+        elif frame.sigma_fixes is not None and frame.sigma_counted is not None:
             own = np.diag(se3.about(T[:3, 3], covariance))[3:]
-            unseen = np.maximum(frame.sigma_fixes**2 - own, 0.0)
-            covariance = covariance + np.diag([0.0, 0.0, 0.0, *unseen])
+            bent = np.maximum(own - frame.sigma_counted**2, 0.0)
+            # The mean error of the fixes bends nothing, and the graph cannot know it.
+            factor = np.r_[1.0, 1.0, 1.0, np.sqrt((bent + frame.sigma_fixes**2) / own)]
+            covariance = se3.about(T[:3, 3], covariance) * np.outer(factor, factor)
+            covariance = se3.about(-T[:3, 3], covariance)
         return Placed(seq, T, self.graph.scale(seq), covariance, pose.sources)
 
     def places(self, seqs: Sequence[int]) -> F64:

@@ -100,6 +100,7 @@ class Rig:
             R, tilt, yaw, position, sigma, agl, sigma_agl,
             is_at_rest=state is not None and _is_at_rest(state),
             is_agl_measured=source is HeightSource.MEASURED,
+            is_sigma_claimed=state is None or state.is_claimed,
         )  # fmt: skip
         if state is not None and state.v_ned_m_s is not None and self._fusion.gnss:
             prior = replace(prior, velocity_m_s=R_ENU_NED @ state.v_ned_m_s)

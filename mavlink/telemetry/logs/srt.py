@@ -93,7 +93,8 @@ def _place(text: str, fields: dict[str, float]) -> tuple[PositionSample, Accurac
     if lat is None or lon is None or not plausible_place(lat, lon):
         return None
     position = PositionSample(None, lat, lon, fields.get("abs_alt"), relative, None)
-    return position, AccuracySample(None, True, math.hypot(RECEIVER_SIGMA_H_M, coarse_m), 8.0)
+    sigma_h_m = math.hypot(RECEIVER_SIGMA_H_M, coarse_m)
+    return position, AccuracySample(None, True, sigma_h_m, 8.0, is_claimed=False)
 
 
 def _attitudes(history: VehicleHistory, text: str, fields: dict[str, float], time_ns: int) -> None:
