@@ -124,6 +124,7 @@ class StereoPair:
     guide: U8 | None = None  # (H, W, 3) rectified left in colour, as fine as (h, w) or finer
     left_seen: Bool | None = None  # (h, w) False where the left image has nothing
     right_seen: Bool | None = None  # (h, w) the same of the shifted right image
+    noise: float = 1.0  # sigma of a label over the usual one, by motion blur
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from recon import se3
+from recon.camera_model import rays
 from recon.types import F64, U8, Camera
 
 SIZE = (480, 360)
@@ -46,3 +47,10 @@ def pose(east_m: float, yaw_deg: float = 0.0, height_m: float = HEIGHT_M, seed: 
     tilt = np.random.default_rng(seed).normal(0.0, 0.03, 2)
     R = se3.so3_exp(np.array([0.0, 0.0, np.radians(yaw_deg)])) @ se3.so3_exp(np.r_[tilt, 0.0])
     return se3.compose(R @ DOWN, np.array([east_m, 0.1 * east_m, height_m]))
+
+
+def on_plane(K_grid: F64, size: tuple[int, int], T_world_camera: F64) -> F64:
+    """(w h, 3) where the pixels' rays meet the plane, in the camera's frame."""
+    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    ray = rays(K_grid, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
+    return np.asarray(ray * (HEIGHT_M / -(ray @ T_world_camera[2, :3]))[:, None])

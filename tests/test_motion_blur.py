@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import painted_ground as painted
 import pytest
 from painted_ground import painted_ground
 
 from recon import se3
+from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
+from recon.stereo.reprojection import reproject
+from recon.stereo.virtual_stereo import View, VirtualStereoConfig, drop_unseen, rectify
 from recon.tracking.motion_blur import ExposureWatch, streak_px
 from recon.tracking.odometry import Odometry
-from recon.types import F64, U8, Camera, PosePrior
+from recon.types import F64, U8, Camera, PosePrior, StereoPair
 from service.flight.reports import ShutterWatch
 
 K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
@@ -108,3 +112,51 @@ def test_a_shutter_too_slow_for_the_speed_is_reported_once() -> None:
     assert watch.summary is not None and watch.sentence is not None
     assert watch.summary["exposure_ms"] == pytest.approx(50.0, rel=0.3)
     assert watch.summary["blur_px"] > 10.0, "px of the recording, twice as fine"
+
+
+def shot(T_world_camera: F64, blur_px: F64) -> U8:
+    """The painted ground, smeared by a motion of the camera (2,) px."""
+    moments = np.linspace(-0.5, 0.5, 2 * int(np.abs(blur_px).max()) + 3)
+    total = np.zeros(painted.SIZE[::-1])
+    for s in moments:
+        T = T_world_camera.copy()
+        T[:3, 3] += T[:3, :3] @ np.r_[s * blur_px / painted.K[0, 0] * painted.HEIGHT_M, 0.0]
+        total += painted.still(T)
+    noise = 2.0 * np.random.default_rng(0).normal(size=total.shape)
+    return np.asarray(np.clip(np.rint(total / len(moments) + noise), 0, 255), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("left_px", "right_px"),
+    [
+        ((0.0, 0.0), (0.0, 0.0)),
+        ((8.0, 0.0), (8.0, 0.0)),
+        ((12.0, 0.0), (12.0, 0.0)),
+        ((8.0, 0.0), (4.0, 0.0)),
+        ((4.0, 0.0), (0.0, 4.0)),
+    ],
+)
+def test_the_sigma_of_stereo_covers_motion_blur(
+    left_px: tuple[float, float], right_px: tuple[float, float]
+) -> None:
+    """A known plane at the images' own resolution: share of depths within one sigma."""
+    views = []
+    for east_m, seed, blur in ((0.0, 1, left_px), (6.0, 2, right_px)):
+        T = painted.pose(east_m, seed=seed)
+        image, blur_px = shot(T, np.array(blur)), -np.array(blur)
+        views.append(View(None, image, painted.K, T, blur_px=blur_px))
+    left, right = views
+    on_plane = painted.on_plane(painted.K, painted.SIZE, left.T_odom_camera)
+    config = VirtualStereoConfig(width_px=painted.SIZE[0], guided=False)
+    pair = rectify(left, right, on_plane[::97], config)
+    assert isinstance(pair, StereoPair)
+    labels = belief_propagation(pair.left, pair.right, pair.labels, BeliefPropagationConfig())
+    found = reproject(drop_unseen(labels, pair), pair, painted.K, painted.SIZE)
+    off = np.abs(found.depth_m - on_plane[:, 2].reshape(found.depth_m.shape))
+    known = np.isfinite(off)
+    share = float(np.mean(off[known] < found.sigma_m[known]))
+    assert 0.58 < share < 0.92
+    is_blurred = any(left_px)
+    assert (pair.noise == 1.0) != is_blurred
+    if is_blurred and share < 0.8:  # which would be too few
+        assert np.mean(off[known] < found.sigma_m[known] / pair.noise) < 0.58

@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from painted_ground import CAMERA, HEIGHT_M, SIZE, K, pose, still
+from painted_ground import CAMERA, HEIGHT_M, SIZE, K, on_plane, pose, still
 
 from recon import se3
-from recon.camera_model import rays, scaled_K
+from recon.camera_model import scaled_K
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.reprojection import reproject
 from recon.stereo.upsampling import UpsamplingConfig, upsample
@@ -41,13 +41,6 @@ def heights(width_px: int, upsampled: bool, east_m: float) -> F64:
     off = HEIGHT_M * (1.0 - depth / truth)
     assert np.isfinite(off).mean() > 0.5
     return np.asarray(off[np.isfinite(off)], np.float64)
-
-
-def on_plane(K_grid: F64, size: tuple[int, int], T_world_camera: F64) -> F64:
-    """(w h, 3) where the pixels' rays meet the plane, in the camera's frame."""
-    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
-    ray = rays(K_grid, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
-    return np.asarray(ray * (HEIGHT_M / -(ray @ T_world_camera[2, :3]))[:, None])
 
 
 @pytest.mark.parametrize("east_m", [4.0, -4.0])

@@ -191,7 +191,10 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
     corners = np.random.default_rng(0).uniform(-20, 20, (40, 2))
     ids = ground.add(np.c_[corners, np.full(40, 100.0)])
     keys: list[OdometryKeyframe] = []
-    odometry = SimpleNamespace(segment=0, readout=SimpleNamespace(doubt_s=doubt_s), keyframes=keys)
+    odometry = SimpleNamespace(
+        segment=0, readout=SimpleNamespace(doubt_s=doubt_s), keyframes=keys,
+        exposure=SimpleNamespace(shown_s=0.0),
+    )  # fmt: skip
     views = StereoViews(
         Viewpoints(ScanConfig()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
         np.ones(size, np.uint8), Counter(),
@@ -208,3 +211,35 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
         views.take(image, Tracked(state, 0, plain.T_odom_camera, moving=moving))
     shares = [view.rows_share for view in views.ready(everything=True)]
     assert len(shares) == 3 and all((share > 0.005) == expected for share in shares)
+
+
+@pytest.mark.parametrize("exposure_s", [0.0, 0.05])
+def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: float) -> None:
+    """1 m in each tenth of a second, 50 m above points 100 m further on, at 30 px."""
+    K, size = np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), (32, 32)
+    ground, keys = Landmarks(), list[OdometryKeyframe]()
+    corners = np.random.default_rng(0).uniform(-20, 20, (40, 2))
+    ids = ground.add(np.c_[corners, np.full(40, 100.0)])
+    odometry = SimpleNamespace(
+        segment=0, readout=None, keyframes=keys, exposure=SimpleNamespace(shown_s=exposure_s)
+    )
+    views = StereoViews(
+        Viewpoints(ScanConfig()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
+        np.ones(size, np.uint8), Counter(),
+    )  # fmt: skip
+    for i in range(4):
+        plain = frame(i, float(i))
+        keys.append(replace(plain.key, uv=corners, landmark=ids, map=ground))
+        image = UndistortedFrame(
+            i, i * 10**8, PosePrior(), cast(Colour, plain.colour), plain.gray, plain.gray, None,
+            False,
+        )  # fmt: skip
+        state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
+        views.take(image, Tracked(state, 0, plain.T_odom_camera))
+    blurs = [candidate.view.blur_px for candidate in views.ready(everything=True)]
+    if not exposure_s:
+        assert blurs == [None] * 4
+        return
+    for blur in blurs:
+        assert blur is not None
+        np.testing.assert_allclose(blur, [-30.0 / 50.0 * 10.0 * exposure_s, 0.0], atol=1e-9)

@@ -36,7 +36,7 @@ def reproject(
     labels are always in pixels of (h, w). The rectified left camera sits where the keyframe's
     does and is only turned, so a keyframe pixel's ray meets exactly one of its pixels. With
     Eq. 3, ``z = f B / d`` where ``d = plane . (u, v, 1) + slope * label``; sigma is ``z / d``
-    times the label's sigma, which grows as confidence falls.
+    times the label's sigma, which grows with motion blur and as confidence falls.
 
     Args:
         K: (3, 3) intrinsics of the keyframe's grid of ``size_px`` (w, h).
@@ -54,7 +54,8 @@ def reproject(
     in_bands(
         _reproject, h, disparity.px, disparity.confidence, np.ascontiguousarray(to_left), finer,
         np.asarray(pair.plane, np.float64), float(pair.slope),
-        float(pair.K[0, 0] * pair.baseline_m), out.depth_m, out.sigma_m,
+        float(pair.K[0, 0] * pair.baseline_m), LABEL_SIGMA_PX * pair.noise, out.depth_m,
+        out.sigma_m,
     )  # fmt: skip
     return out
 
@@ -89,6 +90,7 @@ def _reproject(
     plane: Any,
     slope: float,
     focal_base: float,
+    sigma_px: float,
     depth_m: Any,
     sigma_m: Any,
 ) -> None:  # pragma: no cover - compiled
@@ -112,7 +114,7 @@ def _reproject(
                 continue
             depth = focal_base / d / z  # Eq. 3, along the keyframe's z
             depth_m[v, u] = depth
-            sigma_m[v, u] = depth / d * abs(slope) * LABEL_SIGMA_PX / np.sqrt(trust)
+            sigma_m[v, u] = depth / d * abs(slope) * sigma_px / np.sqrt(trust)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from recon.camera_model import rays, scaled_K
 from recon.image_quality import halved, stretch
 from recon.rolling_shutter import Rows
 from recon.stereo.polar import rectify_polar
+from recon.stereo.reprojection import LABEL_SIGMA_PX
 from recon.types import (
     F32,
     F64,
@@ -31,6 +32,10 @@ from recon.types import (
     RectifiedPair,
     StereoPair,
 )
+
+BLURRED, UNLIKE = 0.016, 0.012
+"""Sigma of a label by blur along the rows, over its length, and by two blurs that differ, over
+the difference of their squares (1/px): measured on a textured plane (docs/reports/accuracy.md)."""
 
 CELL = 8
 """Pixels between two places where the warp of a rolling shutter is computed."""
@@ -78,6 +83,9 @@ class View:
     seen: U8 | None = None  # (H, W) zero where the image has nothing; None: all of it
     rows: Rows | None = None  # how the camera moved while it read the image; None: not at all
     scene: F64 | None = None  # (3,) inverse depth of the ground, times a ray with z = 1; with rows
+    blur_px: F64 | None = (
+        None  # (2,) how far the image moved while it was exposed; None: not at all
+    )
 
     def inside(self, focal_px: float) -> U8:
         """(H, W) 1 where the image shows something, a pixel of that focal length from its rim."""
@@ -193,6 +201,26 @@ def rectify(
         guide=guide,
         left_seen=left_seen,
         right_seen=right_seen,
+        noise=_noise(left, right, R_rect_left, R_rect_right, K),
+    )
+
+
+def _noise(left: View, right: View, R_rect_left: F64, R_rect_right: F64, K: F64) -> float:
+    """Sigma of a label over the usual one, by the views' motion blur.
+
+    Blur along the rows leaves less gradient to match. Two blurs that differ shift what they show:
+    to second order an image blurred by b gains ``b' I'' b / 24``, and where the gains differ this
+    looks like a shift by their difference over the gradient.
+    """
+    if left.blur_px is None or right.blur_px is None:
+        return 1.0
+    scale = K[0, 0] / left.K[0, 0]
+    a = scale * R_rect_left[:2, :2] @ left.blur_px
+    b = scale * R_rect_right[:2, :2] @ right.blur_px
+    along = float(np.hypot(a[0], b[0])) / np.sqrt(2.0)
+    unlike = float(np.linalg.norm(np.outer(a, a) - np.outer(b, b)))
+    return float(
+        np.linalg.norm([1.0, BLURRED * along / LABEL_SIGMA_PX, UNLIKE * unlike / LABEL_SIGMA_PX])
     )
 
 

@@ -25,7 +25,8 @@ BOX_PER_ZERO = 1.25
 this is for images with detail at all scales, measured on photos blurred by 3 to 20 px."""
 
 SHOWN_PX = 2.0
-"""Motion between two frames below which a streak says nothing."""
+"""Motion between two frames below which a streak says nothing, and median streak below which
+images are sharp."""
 
 SLOW_PX = 5.0
 """A median streak beyond it is a shutter too slow. Fields and roads have a direction of their own:
@@ -86,9 +87,19 @@ class ExposureWatch:
         return float(np.median([streak / speed for streak, speed in self._streaks]))
 
     @property
+    def shown_s(self) -> float:
+        """The exposure where it smears the images; 0 where they are as sharp as others."""
+        exposure_s = self.exposure_s
+        is_shown = exposure_s is not None and self._typical > SHOWN_PX
+        return exposure_s if exposure_s is not None and is_shown else 0.0
+
+    @property
+    def _typical(self) -> float:
+        return float(np.median([streak for streak, _ in self._streaks]))
+
+    @property
     def blur_px(self) -> float:
         """Median streak of the last keyframes; 0 where it does no harm."""
         if len(self._streaks) < MIN_KNOWN:
             return 0.0
-        typical = float(np.median([streak for streak, _ in self._streaks]))
-        return typical if typical > SLOW_PX else 0.0
+        return self._typical if self._typical > SLOW_PX else 0.0

@@ -16,7 +16,7 @@ import numpy as np
 from recon import se3
 from recon.camera_model import Undistorter
 from recon.posegraph.between_keyframes import FixAverage
-from recon.rolling_shutter import FrameRows, depth_share
+from recon.rolling_shutter import NEAR_S, FrameRows, depth_share
 from recon.stereo.virtual_stereo import View
 from recon.tracking.keyframe_window import OdometryKeyframe, landmarks, step_covariance
 from recon.tracking.odometry import Odometry, Tracked, Tracking
@@ -33,6 +33,9 @@ NEAREST_PARTNER, FARTHEST_PARTNER = 0.6, 2.2
 PARTNER_SPAN = FARTHEST_PARTNER - NEAREST_PARTNER
 """Steps away that partners between the views are, and over how many they spread on one side: the
 first and the last view have no other."""
+
+TRACKED = 128
+"""Tracked frames whose places are remembered."""
 
 LAST_VIEW_SHARE = 0.1
 """A stretch's last frame becomes a view when it is this share of a usual step further on."""
@@ -301,6 +304,7 @@ class StereoViews:
         self._waiting: deque[tuple[Viewpoint, PosePrior]] = deque()
         self._given: deque[Viewpoint] = deque(maxlen=8)
         self._latest: Viewpoint | None = None  # the last tracked frame, unless it is a view
+        self._tracked: deque[tuple[int, Anchorage]] = deque(maxlen=TRACKED)  # times and places
 
     def take(self, image: UndistortedFrame, tracked: Tracked) -> tuple[Anchorage | None, bool]:
         """The frame's anchor, None without a pose, and whether it is a view."""
@@ -315,6 +319,7 @@ class StereoViews:
             image.seq, image.time_ns, image.prior, image.colour, image.gray, key, anchor,
             image.is_blurred, tracked.moving,
         )  # fmt: skip
+        self._tracked.append((image.time_ns, anchor))
         is_view = self.selection.offer(frame, tracked)
         self._fixes.take(tracked.T_odom_camera, image.prior)
         if is_view:
@@ -397,10 +402,41 @@ class StereoViews:
 
     def _posed(self, view: Viewpoint, points: F64) -> View:
         """The view in gray with its pose; ``points`` (N, 3) of the odometry are the ground."""
-        posed = View(None, view.gray, self._K, view.T_odom_camera, self._seen)
+        posed = View(
+            None, view.gray, self._K, view.T_odom_camera, self._seen,
+            blur_px=self._blur_px(view, points),
+        )  # fmt: skip
         rows = None if view.moving is None else view.moving.rows
         if rows is None or not rows.clock.readout_s:
             return posed
         ground = se3.transform(se3.inverse(view.T_odom_camera), points)
         scene = inverse_depth_plane(ground[ground[:, 2] > 0])
         return replace(posed, rows=rows.now(), scene=scene)
+
+    def _blur_px(self, view: Viewpoint, points: F64) -> F64 | None:
+        """(2,) px by which the middle of the image moved during the exposure, by the poses of the
+        frames before and after; None where images are sharp or those frames are too far away."""
+        exposure_s = self._odometry.exposure.shown_s
+        if not exposure_s:
+            return None
+        near = [
+            (t, at) for t, at in self._tracked
+            if abs(t - view.time_ns) < 1e9 * NEAR_S and at.key.segment == view.segment
+        ]  # fmt: skip
+        near = [one for one in near if one[0] <= view.time_ns][-2:] + [
+            one for one in near if one[0] > view.time_ns
+        ][:1]
+        if len(near) < 2:
+            return None
+        depth = np.median(se3.transform(se3.inverse(view.T_odom_camera), points)[:, 2])
+        on_axis = se3.transform(view.T_odom_camera, np.array([[0.0, 0.0, depth]]))
+        first, last = (
+            self._K[0, 0] * _on_image(se3.transform(se3.inverse(at.T_odom_camera), on_axis))
+            for _, at in (near[0], near[-1])
+        )
+        return np.asarray((last - first)[0] * exposure_s * 1e9 / (near[-1][0] - near[0][0]))
+
+
+def _on_image(points: F64) -> F64:
+    """(N, 2) where points (N, 3) are at a depth of 1."""
+    return np.asarray(points[:, :2] / points[:, 2:])
