@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from recon import bands
+from recon.stereo import message_passing
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.matching_cost import (
     COST_UNIT,
@@ -291,7 +292,7 @@ def test_result_does_not_depend_on_the_number_of_threads() -> None:
 
 def test_read_only_and_strided_images_compile_nothing_new() -> None:
     from recon.stereo import belief_propagation as labels
-    from recon.stereo import message_passing, upsampling
+    from recon.stereo import upsampling
     from recon.types import DisparityMap
 
     image = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
@@ -355,6 +356,21 @@ def test_memory_need_not_be_cleared_and_grows_no_further_than_needed(
             got = belief_propagation(left, right, 20, config)
         np.testing.assert_array_equal(got.px, want.px)
         np.testing.assert_array_equal(got.confidence, want.confidence)
+
+
+def test_coarse_levels_work_in_the_memory_of_the_finest_messages() -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
+    _, left, right = box_scene()
+
+    def held() -> tuple[int, int]:
+        belief_propagation(left, right, 20, BeliefPropagationConfig())
+        kept = message_passing._space._kept
+        return sum(a.nbytes for a in kept.values()), kept["messages"].nbytes
+
+    with ThreadPoolExecutor(1) as pool:
+        total, finest = pool.submit(held).result()
+    assert total < 1.9 * finest  # half for the data, a good quarter for the next level's messages
 
 
 def test_one_piece_of_memory_serves_sizes_that_are_alike() -> None:

@@ -15,6 +15,7 @@ checks the arrays for overlap at every label, which took ten times as long.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -235,25 +236,50 @@ def propagate(
     """
     truncation = smoothness.truncation
     height, labels, width = cost.shape
-    pyramid = [_space.take("data 0", (height, 2, labels, cells_of(width)))]
+    cells = cells_of(width)
+    pyramid = [_space.take("data", (height, 2, labels, cells))]
+    shape = (4, height + 2, 2, labels, cells)
+    coarse = _Coarse(_space.take_bytes("messages", shape).reshape(-1))
     _by_rows(_split, height, cost, truncation, pyramid[0])
     weights = [smoothness.weights(image)]
     while len(pyramid) < levels and min(weights[-1].shape[1:]) >= 8:
         weights.append(_coarser_weights(weights[-1]))
         _, h, w = weights[-1].shape
-        pyramid.append(_space.take(f"data {len(pyramid)}", (h, 2, labels, cells_of(w))))
+        pyramid.append(coarse.take((h, 2, labels, cells_of(w)), np.int16))
         _by_rows(_coarser, h, pyramid[-2], w, truncation, pyramid[-1])
     messages = np.zeros((4, 1, 2, labels, 1), np.uint8)
     for level in range(len(pyramid) - 1, -1, -1):
         data, weight = pyramid[level], weights[level]
         h, _, _, cells = data.shape
         w = weight.shape[2]
-        finer = _space.take_bytes(f"messages {level}", (4, h + 2, 2, labels, cells))
+        shape = (4, h + 2, 2, labels, cells)
+        if level > 1:
+            finer = coarse.take(shape, np.uint8)
+        else:
+            finer = _space.take_bytes("messages 1" if level else "messages", shape)
         _by_rows(_start, h + 2, messages, w, finer)
         messages = finer
         edges = _edges(weight, cells, smoothness.slope, truncation)
         _sweeps(data, messages, edges, w, iterations)
     return pyramid[0], messages
+
+
+class _Coarse:
+    """The memory of the finest messages, as long as coarser levels are worked on.
+
+    The messages of the second finest level, from which the finest ones start, are not in it.
+    """
+
+    def __init__(self, memory: U8) -> None:
+        self._memory = memory
+
+    def take(self, shape: tuple[int, ...], dtype: type[np.generic]) -> Any:
+        """An array whose values are undefined, in memory of its own where there is no more."""
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        if size > self._memory.size:
+            return np.empty(shape, dtype)
+        taken, self._memory = self._memory[:size], self._memory[size:]
+        return taken.view(dtype).reshape(shape)
 
 
 def _by_rows(kernel: Any, rows: int, *args: Any) -> None:
