@@ -38,6 +38,15 @@ def test_rotations_agree_with_scipy(w: F64) -> None:
     np.testing.assert_allclose(se3.so3_log(R), Rotation.from_matrix(R).as_rotvec(), atol=1e-7)
 
 
+@given(rotation_vectors, rotation_vectors)
+def test_rotations_of_many_agree_with_scipy(a: F64, b: F64) -> None:
+    w = np.stack([a, b, np.zeros(3), 1e-9 * a, np.array([0.0, np.pi, 0.0])])
+    R = se3.each_so3_exp(w)
+    np.testing.assert_allclose(R, Rotation.from_rotvec(w).as_matrix(), atol=1e-12)
+    back = Rotation.from_rotvec(se3.each_so3_log(R)).as_matrix()
+    np.testing.assert_allclose(back, R, atol=1e-7)
+
+
 @given(twists)
 def test_the_exponential_is_the_matrix_exponential(twist: F64) -> None:
     np.testing.assert_allclose(se3.exp(twist), scipy.linalg.expm(matrix(twist)), atol=1e-9)

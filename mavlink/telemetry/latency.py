@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from mavlink.telemetry.quaternion import Quaternion, multiply, normalised
 
@@ -287,8 +286,12 @@ def _between(times_s: F64, q: F64, at_s: F64) -> tuple[F64, Bool]:
 
 def rotation_vectors(first: F64, second: F64) -> F64:
     """(N, 3) rotations in rad from the first to the second (N, 4) attitudes, in the first axes."""
-    a, b = (Rotation.from_quat(q[:, [1, 2, 3, 0]]) for q in (first, second))
-    return np.asarray((a.inv() * b).as_rotvec())
+    a, b = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (first, second))
+    cosine = np.sum(a * b, axis=1, keepdims=True)
+    axis = a[:, :1] * b[:, 1:] - b[:, :1] * a[:, 1:] - np.cross(a[:, 1:], b[:, 1:])
+    axis = np.where(cosine < 0, -axis, axis)
+    half = np.arctan2(np.linalg.norm(axis, axis=1, keepdims=True), np.abs(cosine))
+    return np.asarray(2.0 / np.sinc(half / np.pi) * axis)
 
 
 def best_rotation(source: F64, target: F64) -> F64:

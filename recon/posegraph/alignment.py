@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recon import se3
 from recon.posegraph.sensor_noise import (
@@ -319,7 +318,7 @@ class _Readings:
         if n == 0:
             return np.zeros((0, 3)), J
         seen = R @ self.R_odom
-        turn = Rotation.from_matrix(seen @ self.R_prior.transpose(0, 2, 1)).as_rotvec()
+        turn = se3.each_so3_log(seen @ self.R_prior.transpose(0, 2, 1))
         up = np.einsum("nij,nj->ni", seen, self.R_prior[:, 2])  # where the prior's up points now
         tilt = np.column_stack([-up[:, 1], up[:, 0], np.zeros(n)])
         info = 1.0 / self.sigma_turn

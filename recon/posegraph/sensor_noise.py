@@ -11,8 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import nnls
-from scipy.special import gammaincinv
 
 from recon.types import F64
 
@@ -41,6 +39,9 @@ LAG_SHARE = 1.0 / 6.0
 """Longest lag as a share of the span: a fit to the readings hides correlations over longer lags."""
 
 LAGS = 12
+
+CHI_SQUARED_MEDIANS = (0.45493642311957283, 1.3862943611198906, 2.3659738843753377)
+"""Of one to three degrees of freedom."""
 
 MAX_PAIRED = 400
 """Readings that are compared with each other; of more, every n-th."""
@@ -115,9 +116,9 @@ def wander_noise(times_s: F64, residuals: F64, usual_tau_s: float) -> Noise | No
     taus = [tau for tau in TAUS_S if tau <= lag[-1] / TAUS_SEEN]
     for tau_s in [*taus, usual_tau_s] if usual_tau_s > 0 else []:
         columns = np.column_stack([np.full(len(lag), 2.0), 2.0 * (1.0 - np.exp(-lag / tau_s))])
-        parts, error = nnls(columns * weight[:, None], change * weight)
+        parts, error = nonnegative(columns * weight[:, None], change * weight)
         found.append((error, tau_s, parts))
-    white, flat_error = nnls(2.0 * weight[:, None], change * weight)
+    white, flat_error = nonnegative(2.0 * weight[:, None], change * weight)
     error, tau_s, parts = min(found, key=lambda one: one[0], default=(np.inf, 1.0, white))
     if flat_error < SURE_OF_WANDER * error:
         return Noise(float(np.sqrt(white[0])), 0.0, max(usual_tau_s, 1.0))
@@ -134,8 +135,22 @@ def drift_noise(times_s: F64, residuals: F64) -> tuple[float, float] | None:
         return None
     weight = np.sqrt(lag[-1] / lag) / np.maximum(change, 1e-12 + 0.01 * change.max())
     columns = np.column_stack([lag, lag**2])
-    parts, _ = nnls(columns * weight[:, None], change * weight)
+    parts, _ = nonnegative(columns * weight[:, None], change * weight)
     return float(np.sqrt(parts[0])), float(np.sqrt(parts[1]))
+
+
+def nonnegative(columns: F64, wanted: F64) -> tuple[F64, float]:
+    """The factors (C,), none below 0, of at most two ``columns`` (N, C) that sum up best to
+    ``wanted`` (N,), and the length of the rest."""
+    count = columns.shape[1]
+    best, least = np.zeros(count), float(np.linalg.norm(wanted))
+    for used in ([0], [1], [0, 1])[: 1 if count == 1 else 3]:
+        parts = np.zeros(count)
+        parts[used] = np.linalg.lstsq(columns[:, used], wanted, rcond=None)[0]
+        rest = float(np.linalg.norm(columns @ parts - wanted))
+        if parts.min() >= 0 and rest < least:
+            best, least = parts, rest
+    return best, least
 
 
 def variogram(times_s: F64, residuals: F64) -> tuple[F64, F64]:
@@ -156,5 +171,4 @@ def variogram(times_s: F64, residuals: F64) -> tuple[F64, F64]:
     used = [k for k in range(1, LAGS + 1) if np.count_nonzero(bins == k) >= MIN_READINGS // 2]
     lag = np.array([np.mean(h[bins == k]) for k in used])
     change = np.array([np.median(square[bins == k]) for k in used])
-    median = 2.0 * gammaincinv(0.5 * axes, 0.5)  # of chi-squared; scipy.stats takes 0.5 s to load
-    return lag, change * axes / median
+    return lag, change * axes / CHI_SQUARED_MEDIANS[axes - 1]

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recon import se3
 from recon.posegraph.alignment import EXACT_HEIGHTS, Anchor, Similarity, height_ratios
@@ -119,14 +118,14 @@ def boresight(stretches: Sequence[Turns], span_s: float, wander_s: float = 40.0)
 def _mean_frame(stretch: Turns) -> F64:
     """(3, 3) a first rotation from the stretch's frame to the world."""
     turns = stretch.R_reported @ stretch.R_odom.transpose(0, 2, 1)
-    return np.asarray(Rotation.from_matrix(turns).mean().as_matrix(), np.float64)
+    return se3.project_to_so3(se3.compose(turns.mean(axis=0), np.zeros(3)))[:3, :3]
 
 
 def _stretch(stretch: Turns, frame: F64, turn: F64) -> tuple[F64, F64, F64, F64]:
     """One Gauss-Newton step: the segment's better frame, its contribution to the boresight as
     information (3, 3) and right-hand side (3,), and the whitened residuals (N,)."""
     Q = stretch.R_reported @ se3.so3_exp(turn)
-    r = Rotation.from_matrix(frame @ stretch.R_odom @ Q.transpose(0, 2, 1)).as_rotvec()
+    r = se3.each_so3_log(frame @ stretch.R_odom @ Q.transpose(0, 2, 1))
     info = np.where(stretch.sigma < 1.0, stretch.sigma, np.inf) ** -2.0  # (N, 3)
     norms = np.sqrt(np.sum(info * r**2, axis=1))
     info = info * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9))[:, None]

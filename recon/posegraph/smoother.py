@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
-from scipy.spatial.transform import Rotation
 
 from recon import bands, se3
 from recon.posegraph.ledger import MemoryLedger, Rows
@@ -60,7 +59,7 @@ class State(NamedTuple):
         """The state after a step (6 N + M,)."""
         poses = step[: 6 * len(self.R)].reshape(-1, 6)
         return State(
-            Rotation.from_rotvec(poses[:, :3]).as_matrix() @ self.R,
+            se3.each_so3_exp(poses[:, :3]) @ self.R,
             self.t + poses[:, 3:],
             self.logs + step[6 * len(self.R) :],
         )
