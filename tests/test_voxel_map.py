@@ -59,6 +59,19 @@ def test_inserts_as_many_voxels_as_a_set_of_indices() -> None:
     assert voxel_map.insert(depth) == 0
 
 
+def test_known_surface_needs_no_more_memory() -> None:
+    depth = view(0.0, roof_m=6.0)
+    voxel_map = VoxelMap(VoxelMapConfig(voxel_m=5.0))
+    voxel_map.insert(depth)
+    held = voxel_map.nbytes
+    many = replace(depth, depth_m=np.tile(depth.depth_m, (8, 8)))
+    many = replace(many, sigma_m=np.tile(depth.sigma_m, (8, 8)))
+    assert many.depth_m.size > held / 16  # slots for all its pixels would double the table
+    nothing = np.zeros(many.depth_m.shape, np.bool_)
+    assert voxel_map.insert(many, nothing) == 0
+    assert voxel_map.nbytes == held
+
+
 def test_all_is_fresh_before_and_nothing_after() -> None:
     depth = view(0.0, roof_m=6.0)
     voxel_map = VoxelMap(VoxelMapConfig(voxel_m=1.0))

@@ -165,11 +165,11 @@ class VoxelMap:
 
     def insert(self, depth: DepthMap, mask: Bool | None = None) -> int:
         """Remember the surface of ``depth``, where ``mask`` if given; how many voxels are new."""
-        self._turn += 1
-        self._make_room(depth.depth_m.size)
         mask_ = np.ones(depth.depth_m.shape, np.bool_) if mask is None else mask
         if mask_.shape != depth.depth_m.shape:
             raise ValueError(f"mask is {mask_.shape}, depth is {depth.depth_m.shape}")
+        self._turn += 1
+        self._make_room(np.count_nonzero(mask_))
         before = self._count
         self._count = int(
             _insert(
