@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +124,21 @@ def test_tensorrt_keeps_its_engines_and_no_other_provider_is_reported(tmp_path: 
     assert provider_options(both, b"one", None)[0][1] == {}
     cpu = ["CPUExecutionProvider"]
     assert provider_options(cpu, b"one", str(tmp_path)) == [("CPUExecutionProvider", {})]
+
+
+@pytest.mark.parametrize("name", ["torch", "onnx"])
+def test_no_runtime_is_loaded_without_a_driver(name: str) -> None:
+    """Each takes tens of MiB for as long as the process lives."""
+    script = (
+        "import sys, importlib.util\n"
+        "from service.compute import backend_choice\n"
+        "backend_choice.find_spec = lambda name: 'found'\n"
+        "backend_choice.ctypes.util.find_library = lambda name: None\n"
+        f"assert 'no CUDA driver' in backend_choice.pointless('{name}')\n"
+        "assert not {'torch', 'onnx', 'onnxruntime'} & set(sys.modules)\n"
+    )
+    root = str(Path(__file__).resolve().parents[1])
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=root)
 
 
 def test_engines_are_kept_where_the_service_may_write(

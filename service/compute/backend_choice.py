@@ -201,14 +201,13 @@ def named_backend(name: str) -> Backend:
 
 def pointless(name: str) -> str | None:
     """Why ``auto`` skips this backend, or None; imports nothing heavy."""
-    if name == "torch":
-        if find_spec("torch") is None:
-            return "torch is not installed"
-        if ctypes.util.find_library("cuda") is None:
-            return "there is no CUDA driver, and on a CPU the cpu backend is faster"
+    if name == "torch" and find_spec("torch") is None:
+        return "torch is not installed"
+    if name == "onnx" and (find_spec("onnxruntime") is None or find_spec("onnx") is None):
+        return "onnx and onnxruntime are not installed"
+    if name != "cpu" and ctypes.util.find_library("cuda") is None:
+        return "there is no CUDA driver, and on a CPU the cpu backend is faster"
     if name == "onnx":
-        if find_spec("onnxruntime") is None or find_spec("onnx") is None:
-            return "onnx and onnxruntime are not installed"
         import onnxruntime  # type: ignore[import-untyped]
 
         providers = set(onnxruntime.get_available_providers())
