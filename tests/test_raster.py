@@ -81,6 +81,16 @@ def test_a_cell_is_the_weighted_mean_of_its_top_layer() -> None:
             assert np.abs(raster.rgb[row, col] - mean).max() <= 1.0
 
 
+def test_rows_that_are_summed_in_turn_join_without_a_seam() -> None:
+    rng = np.random.default_rng(2)
+    xyz = rng.uniform(0, [1024, 600, 5], (20_000, 3))
+    whole = rasterise(cloud(xyz), Grid(0.0, 600.0, 1.0, (600, 1024)))
+    for row in (0, 250, 500):
+        part = rasterise(cloud(xyz), Grid(0.0, 600.0 - row, 1.0, (100, 1024)))
+        np.testing.assert_array_equal(whole.height_m[row : row + 100], part.height_m)
+        np.testing.assert_array_equal(whole.rgb[row : row + 100], part.rgb)
+
+
 def test_a_roof_is_not_mixed_with_the_ground_below_it() -> None:
     xy = np.array([[0.5, 0.5]] * 30)
     z = np.r_[np.zeros(25), np.full(5, 6.0)]

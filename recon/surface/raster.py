@@ -119,6 +119,9 @@ class Raster:
         return float(self.known.sum()) * self.grid.cell_m**2
 
 
+SUMMED_CELLS, SUMMED_BANDS = 1 << 18, 8
+"""Cells that are summed up at a time, at least, and the most times that all points are read."""
+
 ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
 
@@ -182,37 +185,41 @@ def _top_surface(
     """Height, sigma and colour per cell in two passes: the highest point, then its layer.
 
     The upper left corner of the grid lies at (west, north) m; a cell has 1 over ``inverse`` m.
+    The passes take some rows at a time: their sums are 56 bytes a cell.
     """
-    floor = np.full((rows, cols), -np.inf)  # lowest height that still is the top surface
-    top = np.full((rows, cols), -np.inf)
-    n = xyz.shape[0]
-    for p in range(n):
-        c = int(np.floor((float(xyz[p, 0]) - west) * inverse))
-        r = int(np.floor((north - float(xyz[p, 1])) * inverse))
-        if 0 <= r < rows and 0 <= c < cols and xyz[p, 2] > top[r, c]:
-            top[r, c] = xyz[p, 2]
-            floor[r, c] = xyz[p, 2] - TOP_SIGMAS * max(float(sigma[p]), 1e-6)
-    sums = np.zeros((rows, cols, 5))
-    for p in range(n):
-        c = int(np.floor((float(xyz[p, 0]) - west) * inverse))
-        r = int(np.floor((north - float(xyz[p, 1])) * inverse))
-        if 0 <= r < rows and 0 <= c < cols and xyz[p, 2] >= floor[r, c]:
-            w = 1.0 / max(float(sigma[p]), 1e-6) ** 2
-            sums[r, c, 0] += w
-            sums[r, c, 1] += w * xyz[p, 2]
-            for k in range(3):
-                sums[r, c, 2 + k] += w * rgb[p, k]
     height = np.full((rows, cols), np.nan, np.float32)
     spread = np.full((rows, cols), np.nan, np.float32)
     colour = np.zeros((rows, cols, 3), np.uint8)
-    for r in range(rows):
-        for c in range(cols):
-            w = sums[r, c, 0]
-            if w > 0.0:
-                height[r, c] = sums[r, c, 1] / w
-                spread[r, c] = 1.0 / np.sqrt(w)
+    band = max(SUMMED_CELLS // cols, -(-rows // SUMMED_BANDS), 1)
+    for first in range(0, rows, band):
+        count = min(band, rows - first)
+        floor = np.full((count, cols), -np.inf)  # lowest height that still is the top surface
+        top = np.full((count, cols), -np.inf)
+        n = xyz.shape[0]
+        for p in range(n):
+            c = int(np.floor((float(xyz[p, 0]) - west) * inverse))
+            r = int(np.floor((north - float(xyz[p, 1])) * inverse)) - first
+            if 0 <= r < count and 0 <= c < cols and xyz[p, 2] > top[r, c]:
+                top[r, c] = xyz[p, 2]
+                floor[r, c] = xyz[p, 2] - TOP_SIGMAS * max(float(sigma[p]), 1e-6)
+        sums = np.zeros((count, cols, 5))
+        for p in range(n):
+            c = int(np.floor((float(xyz[p, 0]) - west) * inverse))
+            r = int(np.floor((north - float(xyz[p, 1])) * inverse)) - first
+            if 0 <= r < count and 0 <= c < cols and xyz[p, 2] >= floor[r, c]:
+                w = 1.0 / max(float(sigma[p]), 1e-6) ** 2
+                sums[r, c, 0] += w
+                sums[r, c, 1] += w * xyz[p, 2]
                 for k in range(3):
-                    colour[r, c, k] = int(sums[r, c, 2 + k] / w + 0.5)
+                    sums[r, c, 2 + k] += w * rgb[p, k]
+        for r in range(count):
+            for c in range(cols):
+                w = sums[r, c, 0]
+                if w > 0.0:
+                    height[first + r, c] = sums[r, c, 1] / w
+                    spread[first + r, c] = 1.0 / np.sqrt(w)
+                    for k in range(3):
+                        colour[first + r, c, k] = int(sums[r, c, 2 + k] / w + 0.5)
     return height, spread, colour
 
 

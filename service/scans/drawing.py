@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from recon.surface.raster import Grid, Raster, fill_holes, hillshade, smoothed
-from recon.types import F32, F64, U8, Array, Bool, Keyframe
+from recon.types import F32, F64, U8, Array, Keyframe
 from service.errors import InputError
 
 BACKGROUND = (250, 248, 246)  # BGR
@@ -26,6 +26,7 @@ TRACK = (40, 60, 235)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 MARGIN = 16
 LINE_PX = 24
+PAINTED_ROWS = 128
 
 
 def draw_preview(
@@ -42,8 +43,8 @@ def draw_preview(
     """
     shown = fill_holes(raster)
     shade = _relief(shown)
-    colour = _fit(_colour_panel(shown, shade), largest_px)
-    height = _fit(_height_panel(shown, shade), largest_px)
+    colour = _fit(_painted(shown, _colours(shown, shade)), largest_px)
+    height = _fit(_painted(shown, _heights(shown, shade)), largest_px)
     scale = _scale(raster.grid.shape, largest_px)
     for panel in (colour, height):
         _draw_track(panel, raster.grid, track_m, scale)
@@ -69,26 +70,35 @@ def _relief(raster: Raster) -> F32:
     return np.asarray(shade / level, np.float32)
 
 
-def _colour_panel(raster: Raster, shade: F32) -> U8:
-    """Colour times shading, softened so that the image stays readable."""
-    light = np.clip(0.6 + 0.4 * np.nan_to_num(shade, nan=1.0), 0.0, 1.25, dtype=np.float32)
+def _colours(raster: Raster, shade: F32) -> Callable[[slice], F32]:
+    """Paints rows in colour times shading, softened so that the image stays readable."""
     bright = float(np.percentile(raster.rgb[raster.known], 98)) if raster.known.any() else 255.0
     gain = float(np.clip(230.0 / max(bright, 1.0), 1.0, 2.0))
-    bgr = raster.rgb[..., ::-1].astype(np.float32)
-    bgr *= (np.float32(gain) * light)[..., None]
-    return _on_background(bgr, raster.known)
+
+    def paint(rows: slice) -> F32:
+        lit = np.nan_to_num(shade[rows], nan=1.0)
+        light = np.clip(0.6 + 0.4 * lit, 0.0, 1.25, dtype=np.float32)
+        bgr = raster.rgb[rows, :, ::-1].astype(np.float32)
+        bgr *= (np.float32(gain) * light)[..., None]
+        return np.asarray(bgr)
+
+    return paint
 
 
-def _height_panel(raster: Raster, shade: F32) -> U8:
-    """Height as hue times shading."""
+def _heights(raster: Raster, shade: F32) -> Callable[[slice], F32]:
+    """Paints rows in height as hue times shading."""
     low, high = _height_range(raster)
-    unit = (np.nan_to_num(raster.height_m, nan=low) - low) / (high - low)
-    tone = np.clip(np.rint(255 * unit), 0, 255).astype(np.uint8)
-    bgr = cv2.applyColorMap(tone, cv2.COLORMAP_VIRIDIS).astype(np.float32)
-    bgr *= 0.75
-    bgr += 0.25 * 255
-    bgr *= np.clip(np.nan_to_num(shade, nan=1.0), 0.15, 1.3)[..., None]
-    return _on_background(bgr, raster.known)
+
+    def paint(rows: slice) -> F32:
+        unit = (np.nan_to_num(raster.height_m[rows], nan=low) - low) / (high - low)
+        tone = np.clip(np.rint(255 * unit), 0, 255).astype(np.uint8)
+        bgr = cv2.applyColorMap(tone, cv2.COLORMAP_VIRIDIS).astype(np.float32)
+        bgr *= 0.75
+        bgr += 0.25 * 255
+        bgr *= np.clip(np.nan_to_num(shade[rows], nan=1.0), 0.15, 1.3)[..., None]
+        return bgr
+
+    return paint
 
 
 def _height_range(raster: Raster) -> tuple[float, float]:
@@ -100,9 +110,15 @@ def _height_range(raster: Raster) -> tuple[float, float]:
     return middle - half, middle + half
 
 
-def _on_background(bgr: F32, known: Bool) -> U8:
-    out = np.clip(bgr, 0, 255, out=bgr).astype(np.uint8)
-    out[~known] = BACKGROUND
+def _painted(raster: Raster, paint: Callable[[slice], F32]) -> U8:
+    """(rows, cols, 3) BGR on the background, some rows at a time: a whole panel of floats takes
+    more memory than all else."""
+    out = np.empty(raster.rgb.shape, np.uint8)
+    for top in range(0, len(out), PAINTED_ROWS):
+        rows = slice(top, top + PAINTED_ROWS)
+        bgr = paint(rows)
+        out[rows] = np.clip(bgr, 0, 255, out=bgr)
+    out[~raster.known] = BACKGROUND
     return out
 
 
