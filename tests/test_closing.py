@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import subprocess
+import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,11 +16,11 @@ from loopback import until
 from mavlink.component.control import Phase
 from service.config import load_config
 from service.daemon import runtime
-from service.daemon.machine import give_back, one_pool
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
 from service.daemon.scanning import Scanning
 from service.daemon.writing import ClosingWatch, sizes
+from service.memory import give_back, one_pool
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
@@ -169,6 +172,28 @@ def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
     scanning.follow_intent()
     assert not scanning.is_running  # the operator's stop holds until the next take-off
     hung.store.close()
+
+
+def test_large_arrays_stay_out_of_the_pool() -> None:
+    script = (
+        "import ctypes\n"
+        "from service.memory import POOLED_BYTES, one_pool\n"
+        "one_pool()\n"
+        "libc, size = ctypes.CDLL(None), 2 * POOLED_BYTES\n"
+        "libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]\n"
+        "libc.free.argtypes = [ctypes.c_void_p]\n"
+        "libc.free(libc.malloc(3 * size))\n"  # after this the library would pool what is smaller
+        "libc.malloc(size)\n"
+        "kinds = [('of', ctypes.c_size_t * 10)]\n"
+        "info = type('Info', (ctypes.Structure,), {'_fields_': kinds})\n"
+        "libc.mallinfo2.restype = info\n"
+        "print(libc.mallinfo2().of[4] >= size)\n"
+    )
+    if not hasattr(ctypes.CDLL(None), "mallinfo2"):
+        pytest.skip("the C library does not say what it holds")
+    root = Path(__file__).resolve().parents[1]
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=root)
+    assert run.stdout == "True\n", run.stderr
 
 
 def test_memory_settings_are_taken_where_the_library_has_them() -> None:

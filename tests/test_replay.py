@@ -267,8 +267,8 @@ def test_memory_is_pooled_before_anything_large_is_loaded() -> None:
     script = (
         "import sys\n"
         "sys.argv = ['skyrelief', 'replay', 'no-such-video']\n"
-        "import service.daemon.machine as machine\n"
-        "machine.one_pool = lambda: print('numpy' in sys.modules)\n"
+        "import service.memory as memory\n"
+        "memory.one_pool = lambda: print('numpy' in sys.modules)\n"
         "from service.cli import main\n"
         "main()\n"
     )

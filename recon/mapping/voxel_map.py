@@ -169,7 +169,7 @@ class VoxelMap:
         if mask_.shape != depth.depth_m.shape:
             raise ValueError(f"mask is {mask_.shape}, depth is {depth.depth_m.shape}")
         self._turn += 1
-        self._make_room(np.count_nonzero(mask_))
+        self._make_room(int(np.count_nonzero(mask_)))
         before = self._count
         self._count = int(
             _insert(

@@ -54,7 +54,7 @@ def replay(
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
 ) -> None:
     """Reconstruct a recording (video, folder of images or pipe) into a scan folder."""
-    from service.daemon.machine import one_pool
+    from service.memory import one_pool
 
     one_pool()
     from service.cameras import open_camera
@@ -187,10 +187,10 @@ def _fly(
 
     The images before that are bent, so such a scan is discarded, unless it goes to the ground.
     """
-    from service.daemon.machine import give_back
     from service.daemon.warm_up import has_kernels
     from service.flight.datalink import open_datalink
     from service.flight.scan import Scan, create_store
+    from service.memory import give_back
     from service.scans.folder import write_deliverables
 
     store = create_store(inputs)
@@ -350,15 +350,21 @@ def _utc(time_ns: int) -> str:
 
 
 def _flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:
-    """The bar of a scan, whose figures only a terminal shows."""
+    """The bar of a scan, whose figures only a terminal shows; returns memory at each keyframe."""
     from service.cameras.source import Counted
+    from service.memory import give_back
 
     images = source.images if isinstance(source, Counted) else 0
     say = progress.counting(images) if images else progress
+    keyframes = 0
 
     def show(scan: Scan) -> None:
+        nonlocal keyframes
+        r = scan.recorder
+        if r.keyframes > keyframes:
+            keyframes = r.keyframes
+            give_back()
         if sys.stderr.isatty():
-            r = scan.recorder
             say(f"{r.frames} images, {r.distance_m:.0f} m flown, {r.keyframes} keyframes")
 
     return show

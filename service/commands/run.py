@@ -27,7 +27,7 @@ def run(
 
     SIGHUP reloads the configuration; an invalid one changes nothing.
     """
-    from service.daemon.machine import one_pool
+    from service.memory import one_pool
 
     one_pool()  # before there are threads
     chosen, fault = _configuration(config, set_ or [])

@@ -1,17 +1,10 @@
 """Readings of the machine: heat, throttling, power, memory, disk, as far as available.
 
 All come from the kernel's files, so no package is needed; tests replace ``/`` by ``root``.
-
-The functions at the end keep unused memory from staying with the process: the C library gives each
-thread its own memory pool and keeps freed memory in it. Images are allocated and freed on several
-threads, so that each pool would grow to the maximum need of all; and only the first pool returns
-free memory at its end.
 """
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import os
 import shutil
 from dataclasses import asdict, dataclass
@@ -22,8 +15,6 @@ if TYPE_CHECKING:
     from mavlink.component.status import ComputerLoad
 
 THROTTLED_NOW = 0b1111  # Raspberry Pi: under-voltage, frequency capped, throttled, soft limit
-
-M_ARENA_MAX = -8  # mallopt(3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,31 +210,3 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="replace").strip("\0\n ")
     except OSError:
         return ""
-
-
-def one_pool() -> bool:
-    """Restrict the C library to one pool; True when it does. Running threads keep theirs.
-
-    Call it before NumPy is imported, which requests huge pages (2 MiB) for large arrays: any small
-    allocation that later uses such a place in the pool would occupy a whole one.
-    """
-    os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")
-    libc = _libc("mallopt")
-    return libc is not None and libc.mallopt(M_ARENA_MAX, 1) == 1
-
-
-def give_back(collect: bool = False) -> bool:
-    """Return freed memory to the system; True when it did. Takes a millisecond or two.
-
-    With ``collect`` reference cycles are freed first, as after a scan; that takes longer.
-    """
-    if collect:
-        gc.collect()
-    libc = _libc("malloc_trim")
-    return libc is not None and libc.malloc_trim(0) == 1
-
-
-def _libc(name: str) -> ctypes.CDLL | None:
-    """The C library if it has that function (as glibc does)."""
-    libc = ctypes.CDLL(None)
-    return libc if hasattr(libc, name) else None

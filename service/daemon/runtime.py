@@ -24,11 +24,12 @@ from service.daemon.control_actions import ControlActions
 from service.daemon.health import HealthServer
 from service.daemon.intent import Landing, LandingWatch
 from service.daemon.load_shedding import LoadControl
-from service.daemon.machine import CoreLoad, computer_load, give_back, read_machine
+from service.daemon.machine import CoreLoad, computer_load, read_machine
 from service.daemon.scanning import Scanning
 from service.daemon.vehicle_config import TUNABLES, parameters_of, vehicle_config
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.init_system import Notifier
+from service.memory import give_back
 from service.scans.retention import close_open_scans, make_room
 from service.version import software
 from service.workers import PROCESS, row_of, running

@@ -18,12 +18,12 @@ from mavlink.component.vehicle import VehicleLink
 from service.config import Config
 from service.daemon.intent import Intent, Resumption, Wanted
 from service.daemon.load_shedding import Level, lowered
-from service.daemon.machine import give_back
 from service.daemon.scan_run import ScanRun
 from service.daemon.warm_up import is_warm
 from service.daemon.writing import ClosingWatch, Writings
 from service.errors import InputError, SkyreliefError
 from service.flight.datalink import DaemonLink
+from service.memory import give_back
 from service.scans.retention import Claim
 from service.workers import PROCESS, Worker
 

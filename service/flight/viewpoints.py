@@ -302,7 +302,7 @@ class StereoViews:
         self._segment = odometry.segment
         self._fixes = FixAverage()
         self._waiting: deque[tuple[Viewpoint, PosePrior]] = deque()
-        self._given: deque[Viewpoint] = deque(maxlen=8)
+        self._given: deque[Anchorage] = deque(maxlen=8)
         self._latest: Viewpoint | None = None  # the last tracked frame, unless it is a view
         self._tracked: deque[tuple[int, Anchorage]] = deque(maxlen=TRACKED)  # times and places
 
@@ -348,7 +348,7 @@ class StereoViews:
                 self._refused["blurred"] += 1
             else:
                 candidate = self._candidate(view, prior)
-                self._given.append(view)
+                self._given.append(view.anchor)
                 yield candidate
 
     def _candidate(self, view: Viewpoint, prior: PosePrior) -> StereoCandidate:
@@ -368,7 +368,7 @@ class StereoViews:
             view.anchor,
             points,
             self._step_covariance(view),
-            {v.seq: v.T_odom_camera for v in self._given if v.segment == view.segment},
+            {a.seq: a.T_odom_camera for a in self._given if a.key.segment == view.segment},
             self._rows_share(view, partners, points),
         )
 

@@ -96,7 +96,7 @@ def _heights(raster: Raster, shade: F32) -> Callable[[slice], F32]:
         bgr *= 0.75
         bgr += 0.25 * 255
         bgr *= np.clip(np.nan_to_num(shade[rows], nan=1.0), 0.15, 1.3)[..., None]
-        return bgr
+        return np.asarray(bgr, np.float32)
 
     return paint
 

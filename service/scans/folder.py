@@ -25,6 +25,7 @@ from recon.surface.raster import Raster, grid_over, rasterise
 from recon.types import PointCloud
 from service.errors import OutsideError, SkyreliefError
 from service.georeference import LocalFrame
+from service.memory import give_back
 from service.redaction import public_configuration, redacted
 from service.scans.coverage import IMAGE as COVERAGE
 from service.scans.coverage import Coverage, write_coverage_files
@@ -91,6 +92,7 @@ def write_deliverables(
     files = _Files(folder, store, voxel_m)
     files.write_trajectory()
     at_once(files.fuse, files.cover)
+    give_back()
     files.write_pieces()
     summary = files.summary(extra)
     at_once(partial(files.draw, summary), files.write_cloud)
