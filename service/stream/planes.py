@@ -7,9 +7,9 @@ decoding it, so that they allocate no more than the caller's grid needs.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 
 import cv2
-import imagecodecs
 import numpy as np
 
 from recon.types import F32, U8, U16, Array, Bool, DepthMap
@@ -144,7 +144,7 @@ def encode_sigma(planes: Planes) -> bytes:
         return b""
     octaves = np.log2(np.maximum(mean, SIGMA_UNIT_M) / SIGMA_UNIT_M)
     codes = np.clip(np.rint(octaves * SIGMA_STEPS_PER_OCTAVE) + 1, 1, 255).astype(np.uint8)
-    return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(codes, has))))
+    return _jpeg_ls(_fill_back(codes, has))
 
 
 def decode_sigma(data: bytes, w: int, h: int) -> F32 | None:
@@ -166,7 +166,7 @@ def encode_views(planes: Planes) -> bytes:
     """The section of views: one count per block of VIEWS_BLOCK_PX, at most MAX_VIEWS."""
     views = np.where(planes.known, np.clip(planes.views, 1, MAX_VIEWS), np.uint8(255))
     low = _blocks(views, VIEWS_BLOCK_PX, 255).min(axis=0)
-    return bytes(imagecodecs.jpegls_encode(np.ascontiguousarray(_fill_back(low, low != 255))))
+    return _jpeg_ls(_fill_back(low, low != 255))
 
 
 def decode_views(data: bytes, w: int, h: int) -> U8 | None:
@@ -240,14 +240,37 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
+def _jpeg_ls(codes: Array) -> bytes:
+    """A JPEG-LS image of (h, w) uint8 codes, by FFmpeg."""
+    from av import VideoCodecContext, VideoFrame
+
+    encoder = VideoCodecContext.create("jpegls", "w")
+    encoder.thread_count = 1
+    encoder.height, encoder.width = codes.shape
+    encoder.pix_fmt, encoder.time_base = "gray", Fraction(1)
+    frame = VideoFrame.from_ndarray(np.ascontiguousarray(codes), format="gray")
+    return b"".join(bytes(part) for part in (*encoder.encode(frame), *encoder.encode(None)))
+
+
 def _open_jpeg_ls(data: bytes, w: int, h: int) -> Array | None:
     """(h, w) codes of a JPEG-LS image of exactly that size and one component."""
     if image_size(data) != (w, h):
         return None
+    from av import Packet, VideoCodecContext
+    from av.error import FFmpegError
+
+    decoder = VideoCodecContext.create("jpegls", "r")
+    decoder.thread_count = 1
+    decoder.options = {"max_pixels": str((w + 64) * (h + 64)), "err_detect": "explode"}
     try:
-        codes = imagecodecs.jpegls_decode(data)
-    except (imagecodecs.JpeglsError, ValueError, RuntimeError):
+        frames = [*decoder.decode(Packet(data)), *decoder.decode(None)]
+    except (FFmpegError, ValueError):
         return None
-    if codes.shape != (h, w) or codes.dtype not in (np.uint8, np.uint16):
+    if (
+        len(frames) != 1
+        or frames[0].is_corrupt
+        or frames[0].format.name not in ("gray", "gray16le")
+    ):
         return None
-    return np.asarray(codes)
+    codes = frames[0].to_ndarray()
+    return np.asarray(codes) if codes.shape == (h, w) else None
