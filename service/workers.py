@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from service.errors import SkyreliefError
+from service.errors import OutsideError, SkyreliefError
 
 log = logging.getLogger(__name__)
 
@@ -26,8 +26,8 @@ MAX_RESTARTS, WINDOW_S = 5, 60.0
 """A worker that fails more often than this within the window is not restarted again."""
 MAX_FAILED = 100
 """Workers that are no longer restarted, kept for the report."""
-PAUSE_S = 0.5
-"""Pause between a fault and the restart."""
+PAUSE_S, LOOK_S = 0.5, 0.5
+"""Pause between a fault and the restart; between two looks at a process."""
 DROP, WAIT = "drop oldest", "wait"
 """Policy of a full queue: drop its oldest entry, or make the filling thread wait."""
 
@@ -85,6 +85,7 @@ ROWS: tuple[Row, ...] = (
     Row("deliverables", "files of received scans", 4, restarts=True, is_essential=True),
     Row("sites", "aligns finished scans with those of the same ground", 4, restarts=True),
     Row("alignment", "process: one of them", 4),
+    Row("live site", "process: aligns scans in flight with the site", 4, restarts=True),
     Row("exports", "deliverables asked for in the portal", 4, 20, "refuse", is_awaited=True),
     Row("replay", "process: the scan of an uploaded recording", 4),
     Row("vehicle", "looks for the vehicle that the portal steers", 5, restarts=True),
@@ -293,6 +294,22 @@ def open_process(name: str, command: Sequence[str], **streams: Any) -> subproces
     process = subprocess.Popen(command, start_new_session=True, **streams)
     _PROCESSES.append((name, process))
     return process
+
+
+def run_process(worker: Worker, row: str, command: Sequence[str]) -> None:
+    """Keep a process of the table until the worker's stop, which ends its standard input too.
+
+    Raises OutsideError when it ends before.
+    """
+    process = open_process(row, command, stdin=subprocess.PIPE)
+    try:
+        while not worker.stop.wait(LOOK_S):
+            if process.poll() is not None:
+                raise OutsideError(f"the process {row} ended, code {process.returncode}")
+    finally:
+        end_process(process)
+        if process.stdin is not None:
+            process.stdin.close()
 
 
 def end_process(process: subprocess.Popen[bytes], patience_s: float = 2.0) -> None:

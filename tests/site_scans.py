@@ -112,6 +112,37 @@ def view(seq: int, T: F64, boxes: Sequence[Box] = (), ground: int = 1) -> Keyfra
     )  # fmt: skip
 
 
+def header_of(
+    name: str, frame: LocalFrame | None = FRAME, day: int = 0, drone: str = "drone"
+) -> ScanHeader:
+    """The header of a scan of the place."""
+    return ScanHeader(
+        name, drone, START_NS + day * 86_400 * 10**9,
+        origin_lat_deg=frame.lat_deg if frame else None,
+        origin_lon_deg=frame.lon_deg if frame else None,
+        origin_alt_amsl_m=frame.alt_amsl_m if frame else None,
+        epsg=frame.epsg if frame else None, georeference="gnss" if frame else "none",
+    )  # fmt: skip
+
+
+def layers(
+    seq: int, T: F64, errors: Errors | None = None, boxes: Sequence[Box] = (), ground: int = 1,
+    frame: LocalFrame = FRAME, day: int = 0, lift_m: float = 0.0,
+) -> list[bytes]:  # fmt: skip
+    """The coded keyframe at a true pose, wrongly placed by ``errors`` and ``lift_m`` up."""
+    from service.offline.site.gather import between_frames
+
+    one = view(seq, T, boxes, ground)
+    d, wrong = one.depth, (errors or Errors()).as_similarity()
+    grown = np.float32(wrong.growth)
+    lift = se3.compose(np.eye(3), np.array([0.0, 0.0, lift_m]))
+    placed = between_frames(frame, FRAME) @ lift @ wrong.pose(T)
+    depth = DepthMap(d.depth_m * grown, d.sigma_m * grown, d.views, d.K, placed)
+    pose = Pose(placed, one.pose.covariance, one.pose.sources)
+    placed_one = Keyframe(seq, one.time_ns, depth, one.bgr, pose, one.fresh)
+    return list(encode(placed_one, one.time_ns + day * 86_400 * 10**9))
+
+
 def write_scan(
     folder: Path, poses: Sequence[F64], errors: Errors | None = None, boxes: Sequence[Box] = (),
     ground: int = 1, frame: LocalFrame | None = FRAME, day: int = 0, finished: bool = True,
@@ -120,30 +151,12 @@ def write_scan(
 
     The truth is in ENU of FRAME.
     """
-    from service.offline.site.gather import between_frames
-
-    own = frame or FRAME
-    wrong = (errors or Errors()).as_similarity()
-    T_own_truth = between_frames(own, FRAME)
-    header = ScanHeader(
-        folder.name, "drone", START_NS + day * 86_400 * 10**9,
-        origin_lat_deg=own.lat_deg if frame else None,
-        origin_lon_deg=own.lon_deg if frame else None,
-        origin_alt_amsl_m=own.alt_amsl_m if frame else None,
-        epsg=own.epsg if frame else None, georeference="gnss" if frame else "none",
-    )  # fmt: skip
-    with ScanStore.create(folder / "scan.db", header) as store:
+    with ScanStore.create(folder / "scan.db", header_of(folder.name, frame, day)) as store:
         for seq, T in enumerate(poses):
-            one = view(seq, T, boxes, ground)
-            d = one.depth
-            grown = np.float32(wrong.growth)
-            bend = (errors or Errors()).bend_m * (2.0 * seq / max(len(poses) - 1, 1) - 1.0) ** 2
-            lift = se3.compose(np.eye(3), np.array([0.0, 0.0, bend]))
-            placed = T_own_truth @ lift @ wrong.pose(T)
-            depth = DepthMap(d.depth_m * grown, d.sigma_m * grown, d.views, d.K, placed)
-            pose = Pose(placed, one.pose.covariance, one.pose.sources)
-            placed_one = Keyframe(seq, one.time_ns, depth, one.bgr, pose, one.fresh)
-            store.add_keyframe(seq, encode(placed_one, one.time_ns + day * 86_400 * 10**9))
+            lift = (errors or Errors()).bend_m * (2.0 * seq / max(len(poses) - 1, 1) - 1.0) ** 2
+            store.add_keyframe(
+                seq, layers(seq, T, errors, boxes, ground, frame or FRAME, day, lift)
+            )
         if finished:
             store.finish({"frames": len(poses)})
     return folder

@@ -9,7 +9,7 @@ sigma. Check points take no part; :func:`map_position` says where the map has th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -139,7 +139,9 @@ def adjust(
     return Adjusted(*problem.states(), problem.residuals(), refused)
 
 
-def supported(loops: Sequence[Closure], poses: F64, window: int = 15) -> list[Closure]:
+def supported(
+    loops: Sequence[Closure], poses: F64 | Mapping[int, F64], window: int = 15
+) -> list[Closure]:
     """Those loops that another one confirms, whose ends lie within ``window`` keyframes.
 
     Both, joined by the track between their ends (trusted to 3 % of its length), must close on
@@ -155,7 +157,7 @@ def supported(loops: Sequence[Closure], poses: F64, window: int = 15) -> list[Cl
     return out
 
 
-def _agree(one: Closure, other: Closure, poses: F64) -> bool:
+def _agree(one: Closure, other: Closure, poses: F64 | Mapping[int, F64]) -> bool:
     T_a_a = se3.inverse(poses[one.a]) @ poses[other.a]
     T_b_b = se3.inverse(poses[other.b]) @ poses[one.b]
     return loops_agree(one, other, T_a_a, T_b_b, CHI2_LIMIT)

@@ -11,7 +11,6 @@ import math
 import resource
 import select
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -26,9 +25,9 @@ from service.listener import is_loopback, parse_address
 from service.offline.exports.ros2 import Ros2Channels
 from service.packages import needing
 from service.stream.store import ScanStore
-from service.workers import Worker, Workers, end_process, guarded, open_process
+from service.workers import Worker, Workers, guarded, run_process
 
-POLL_S, LOOK_S = 0.25, 0.5
+POLL_S = 0.25
 GROWING_S = 60.0
 """A scan that did not change for so long is no longer followed."""
 MAX_SCANS = 8
@@ -68,19 +67,8 @@ class FoxgloveServer:
         self._worker = self._workers.start("foxglove", self._run)
 
     def _run(self, worker: Worker) -> None:
-        process = open_process(
-            "foxglove",
-            [sys.executable, "-m", __name__, str(self._store), self._host, str(self._port)],
-            stdin=subprocess.PIPE,
-        )
-        try:
-            while not worker.stop.wait(LOOK_S):
-                if process.poll() is not None:
-                    raise OutsideError(f"the server for Foxglove ended, code {process.returncode}")
-        finally:
-            end_process(process)
-            if process.stdin is not None:
-                process.stdin.close()
+        command = [sys.executable, "-m", __name__, str(self._store), self._host, str(self._port)]
+        run_process(worker, "foxglove", command)
 
     def close(self) -> None:
         """End; clients are disconnected."""
@@ -146,8 +134,8 @@ class LiveScan:
         return True
 
 
-def growing(store: Path, now_unix_s: float) -> Iterator[Path]:
-    """The folder of each drone's newest scan, if it grows; MAX_SCANS of them at most."""
+def growing(store: Path, now_unix_s: float, most: int = MAX_SCANS) -> Iterator[Path]:
+    """The folder of each drone's newest scan, if it grows; ``most`` of them at most."""
     newest: dict[str, tuple[float, Path]] = {}
     for path in store.glob("*/*/scan.db*"):
         folder = path.parent
@@ -157,7 +145,7 @@ def growing(store: Path, now_unix_s: float) -> Iterator[Path]:
                 changed = path.lstat().st_mtime, folder
                 newest[drone] = max(newest.get(drone, (-math.inf, folder)), changed)
     found = sorted((entry for entry in newest.values()), reverse=True)
-    return (folder for changed, folder in found[:MAX_SCANS] if changed > now_unix_s - GROWING_S)
+    return (folder for changed, folder in found[:most] if changed > now_unix_s - GROWING_S)
 
 
 def _probe(host: str, port: int) -> None:

@@ -16,7 +16,8 @@ N       uint8 views
 ======  =======================================================================
 
 Points stay in the camera's frame, so a correction is a new matrix and scale. JSON texts have a
-``type``: ``repose``, ``track``, ``state``, and once a second ``link``.
+``type``: ``repose``, ``track``, ``state``, ``site`` (where this scan and those tied to it are
+shown), and once a second ``link``.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from recon.mapping.cloud_fusion import cloud_of
 from recon.types import F64, DepthMap, Keyframe
 from service.errors import SkyreliefError
+from service.ground.shown_site import SiteNews
 from service.scans.track import latest
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
@@ -265,10 +267,13 @@ async def serve_live(
         index = StoreIndex(store.path)
         feed = LiveFeed(store, index, _max_points(socket))
         gone = asyncio.create_task(_until_gone(socket))
-        said_at = -LINK_S
+        site, said_at = SiteNews(folder), -LINK_S
         while not gone.done():
             for message in await run_in_threadpool(lambda: list(feed.news())):
                 await _send(socket, message)
+            placed = await run_in_threadpool(site.message)
+            if placed is not None:
+                await socket.send_text(placed)
             if time.monotonic() - said_at >= LINK_S:
                 said_at = time.monotonic()
                 entry = _entry(folder, progress())

@@ -6,7 +6,8 @@ it. Everything may be killed at any time and started again.
 
 Threads, all of the table of workers: one that keeps the session, three that take messages
 from it, one per drone (:mod:`service.ground.drone`), one that writes deliverables, and one that
-aligns finished scans (:mod:`service.ground.sites`).
+aligns finished scans (:mod:`service.ground.sites`). A process aligns those in flight
+(:mod:`service.ground.live_site`).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from service.errors import InputError, SkyreliefError
 from service.ground.drone import Limits
 from service.ground.drones import Drones
 from service.ground.inbox import CHANNEL, Inbox, Replies
+from service.ground.live_site import run as run_live_site
 from service.ground.received import (
     ReceivedScan,
     begin_files,
@@ -103,12 +105,17 @@ class Receiver:
             start("deliverables", self._write_all),
             start("replies", self._replies.run),
             start("receiver", self._run),
-            *([start("sites", self._sites.run)] if self._config.sites else ()),
+            *(self._start_sites() if self._config.sites else ()),
         ]
         while not self._opened.wait(0.1):
             if self._failure is not None:
                 self.close()
                 raise self._failure
+
+    def _start_sites(self) -> list[Worker]:
+        in_flight = partial(run_live_site, self._config.store)
+        start = self.workers.start
+        return [start("sites", self._sites.run), start("live site", in_flight)]
 
     def close(self) -> None:
         """End, and write the deliverables of what has changed."""

@@ -13,7 +13,7 @@ import queue
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from subprocess import DEVNULL
@@ -22,7 +22,7 @@ import msgspec
 
 from service.errors import InputError
 from service.ground.drone import Limits
-from service.ground.scan_facts import Ground, ground_in
+from service.ground.scan_facts import Ground, Times, ground_in
 from service.ground.storage import DiskShare, is_regular
 from service.offline.site import DRONE, SITE
 from service.small_file import read_small
@@ -101,17 +101,34 @@ def companions(store: Path, folder: Path) -> list[Path]:
     except UNREADABLE:
         return []
     others = ((path, ground) for path, ground in _grounds(store) if path != folder)
-    return [path for path, ground in others if _is_shared(own, ground)]
+    return [
+        path for path, ground in others if _is_same_visit(own, ground) and _is_shared(own, ground)
+    ]
+
+
+def references(store: Path, started_unix_s: float, known: Collection[Path]) -> list[Path]:
+    """The sites and the scans of no site of one visit, the newest last, without ``known`` ones."""
+    held = {folder.resolve() for folder in known}
+    sites = {path: scans for path, scans in _sites(store) if not held & scans}
+    members = {member for folders in sites.values() for member in folders}
+    own = Ground(Times(started_unix_s), True)
+    found = [
+        (g.times.started_unix_s, path) for path, g in _grounds(store) if _is_same_visit(own, g)
+    ]
+    for path in sites:
+        with contextlib.suppress(*UNREADABLE):
+            ground = ground_in(path / "scan.json")
+            if _is_same_visit(own, ground):
+                found.append((ground.times.started_unix_s, path))
+    return [path for _, path in sorted(found) if path.resolve() not in held | members]
 
 
 def site_of(store: Path, members: Sequence[Path]) -> Path:
     """The folder of the site that has one of the members; else a new one, by the first of them."""
     known = {member.resolve() for member in members}
-    for path in sorted((store / DRONE).glob(f"*/{SITE}")):
-        with contextlib.suppress(*UNREADABLE):
-            site = msgspec.json.decode(read_small(path, MAX_SITE_BYTES, "site"), type=_Site)
-            if known & {Path(scan.folder) for scan in site.scans}:
-                return path.parent
+    for path, scans in _sites(store):
+        if known & scans:
+            return path
     first = min(members, key=lambda folder: (folder.name, folder.parent.name))
     return store / DRONE / f"{first.parent.name}-{first.name}"[:100]
 
@@ -124,6 +141,14 @@ class _Site(msgspec.Struct):
     scans: list[_Scan]
 
 
+def _sites(store: Path) -> Iterator[tuple[Path, set[Path]]]:
+    """The folders of the sites, each with those of its scans."""
+    for path in sorted((store / DRONE).glob(f"*/{SITE}")):
+        with contextlib.suppress(*UNREADABLE):
+            site = msgspec.json.decode(read_small(path, MAX_SITE_BYTES, "site"), type=_Site)
+            yield path.parent, {Path(scan.folder) for scan in site.scans}
+
+
 def _grounds(store: Path) -> Iterator[tuple[Path, Ground]]:
     for path in sorted(store.glob("*/*/scan.json")):
         drone = path.parent.parent.name
@@ -133,11 +158,15 @@ def _grounds(store: Path) -> Iterator[tuple[Path, Ground]]:
             yield path.parent, ground_in(path)
 
 
+def _is_same_visit(a: Ground, b: Ground) -> bool:
+    """True for finished scans that began within a day."""
+    apart_s = abs(a.times.started_unix_s - b.times.started_unix_s)
+    return a.finished and b.finished and apart_s <= SAME_VISIT_S
+
+
 def _is_shared(a: Ground, b: Ground) -> bool:
-    """True for finished scans of one visit whose extents overlap."""
-    if a.box is None or b.box is None or not (a.finished and b.finished):
-        return False
-    if abs(a.times.started_unix_s - b.times.started_unix_s) > SAME_VISIT_S:
+    """True for scans whose extents overlap."""
+    if a.box is None or b.box is None:
         return False
     common, areas = 1.0, [1.0, 1.0]
     for axis in range(2):

@@ -6,9 +6,10 @@ stretch, and verified against every earlier one that sees the same ground.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -38,6 +39,59 @@ LOOP_SCALE = 0.005
 """Sigma of a loop's length, as a share of it, from the scale of the depths that gave it."""
 
 
+class FilledViews:
+    """Keyframes of one track, each filled with what its neighbours on the same stretch add."""
+
+    def __init__(
+        self, keyframe: Callable[[int], Keyframe | None], stretches: Sequence[int], held: int = 96
+    ) -> None:
+        """``stretches`` has the number of each keyframe's stretch; it may grow."""
+        self.stretches = stretches
+        self._keyframe = keyframe
+        self._view = lru_cache(maxsize=held)(self._filled)
+
+    def view(self, k: int, reach: int = NEIGHBOURS) -> LoopView | None:
+        """A keyframe with what ``reach`` neighbours on each side add; None without any surface."""
+        return self._view(k, max(k - reach, 0), min(k + reach + 1, len(self.stretches)))
+
+    def at(self, k: int) -> Keyframe | None:
+        """A keyframe with any surface."""
+        found = self._keyframe(k)
+        return found if found is not None and np.isfinite(found.depth.depth_m).any() else None
+
+    def _filled(self, k: int, first: int, end: int) -> LoopView | None:
+        own = self.at(k)
+        if own is None:
+            return None
+        nearby = (j for j in range(first, end) if self.stretches[j] == self.stretches[k] and j != k)
+        others = [self.at(j) for j in nearby]
+        whole = filled(own, [one for one in others if one is not None])
+        gray = np.asarray(cv2.cvtColor(whole.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+        return LoopView(gray, whole.depth.K, whole.depth)
+
+
+def likely(view: LoopView, b: int, poses: Mapping[int, F64], config: SubmapLoopConfig) -> list[int]:
+    """Numbers of the ``poses`` that see what ``view``, of the last of them, ``b``, sees, best
+    first; few are worth a look."""
+    h, w = view.depth.depth_m.shape
+    options = LoopConfig(min_gap=1, min_overlap=config.min_overlap)
+    found = candidates(poses, b, view.K, (w, h), ground_seen(view.depth), options)
+    return [a for a, _ in found[:TRIES]]
+
+
+def verified(
+    a: int, b: int, views: tuple[LoopView | None, LoopView | None], guess: F64,
+    config: SubmapLoopConfig,
+) -> Closure | None:  # fmt: skip
+    """The loop between the keyframes ``a`` and ``b``, by what they see."""
+    if views[0] is None or views[1] is None:
+        return None
+    found = verify_surfaces(views[0], views[1], guess, config)
+    if found is None:
+        return None
+    return Closure(a, b, found.T_a_b, loose(found.T_a_b, found.covariance))
+
+
 class StoredLoops:
     """Finds loops; keyframes are numbered by their place on the track."""
 
@@ -52,81 +106,57 @@ class StoredLoops:
 
         With ``scans``, the number of each keyframe's scan, only loops between scans are sought.
         """
-        self._track, self._keyframe, self._config = track, keyframe, config
+        self._track, self._config = track, config
         self._scans = scans
-        self._breaks = np.cumsum(np.diff(track.times_s, prepend=track.times_s[0]) > BREAK_S)
-        self._view = lru_cache(maxsize=96)(self._filled)
+        pauses = np.diff(track.times_s, prepend=track.times_s[0])
+        self._views = FilledViews(keyframe, np.cumsum(pauses > BREAK_S).tolist())
 
     def find(self, progress: Progress | None = None) -> list[Closure]:
         """All pairs far apart in time that see the same place, verified."""
         tree = cKDTree(self._track.poses[:, :2, 3])
-        out = []
+        out: list[Closure] = []
         later = range(self._config.min_gap, len(self._track.poses))
         for b in (progress or Progress()).over(later, len(later)):
-            likely = self._likely(b, tree)
-            found = 0
-            for a in likely[:TRIES]:
-                closure = self._verified(a, b)
-                if closure is not None:
-                    out.append(closure)
-                    found += 1
-                if found == LOOPS_PER_KEYFRAME:
-                    break
-        return [replace(one, covariance=_alike(one, out) * one.covariance) for one in out]
+            found = (self._verified(a, b) for a in self._likely(b, tree))
+            out += islice(filter(None, found), LOOPS_PER_KEYFRAME)
+        return weighted(out)
 
     def _likely(self, b: int, tree: cKDTree) -> list[int]:
-        """Earlier keyframes that see what ``b`` sees, best first; few are worth a look."""
-        poses, own = self._track.poses, self._keyframe(b)
-        if own is None or not np.isfinite(own.depth.depth_m).any():
+        """Earlier keyframes that see what ``b`` sees, best first."""
+        poses, own = self._track.poses, self._views.at(b)
+        if own is None:
             return []
-        depth_m = float(np.nanmedian(own.depth.depth_m))
-        near = tree.query_ball_point(poses[b, :2, 3], 2.0 * depth_m)
+        near = tree.query_ball_point(poses[b, :2, 3], reach_m(own))
         earlier = sorted(a for a in near if a <= b - self._config.min_gap and self._wanted(a, b))
-        view = self._view(b, NEIGHBOURS) if earlier else None
+        view = self._views.view(b) if earlier else None
         if view is None:
             return []
-        h, w = view.depth.depth_m.shape
-        some = {a: poses[a] for a in (*earlier, b)}
-        options = LoopConfig(min_gap=1, min_overlap=self._config.min_overlap)
-        ground = ground_seen(view.depth)
-        return [a for a, _ in candidates(some, b, view.K, (w, h), ground, options)]
+        return likely(view, b, {a: poses[a] for a in (*earlier, b)}, self._config)
 
     def _wanted(self, a: int, b: int) -> bool:
         return self._scans is None or self._scans[a] != self._scans[b]
 
     def _verified(self, a: int, b: int) -> Closure | None:
         reach = self._reach(a, b)
-        one, two = self._view(a, reach), self._view(b, reach)
-        if one is None or two is None:
-            return None
+        views = self._views.view(a, reach), self._views.view(b, reach)
         guess = se3.inverse(self._track.poses[a]) @ self._track.poses[b]
-        found = verify_surfaces(one, two, guess, self._config)
-        if found is None:
-            return None
-        return Closure(a, b, found.T_a_b, loose(found.T_a_b, found.covariance))
+        return verified(a, b, views, guess, self._config)
 
     def _reach(self, a: int, b: int) -> int:
         """Neighbours to fill each of two views with, so that they share none."""
-        if self._breaks[a] != self._breaks[b]:
+        if self._views.stretches[a] != self._views.stretches[b]:
             return NEIGHBOURS
         return next((n for n in (NEIGHBOURS, NEIGHBOURS // 2, 2, 1) if 2 * n < b - a), 0)
 
-    def _filled(self, k: int, reach: int) -> LoopView | None:
-        """A keyframe with what ``reach`` neighbours add; None without any surface."""
-        own = self._at(k)
-        if own is None:
-            return None
-        last = len(self._track.poses) - 1
-        nearby = range(max(k - reach, 0), min(k + reach, last) + 1)
-        others = [self._at(j) for j in nearby if j != k and self._breaks[j] == self._breaks[k]]
-        whole = filled(own, [one for one in others if one is not None])
-        gray = np.asarray(cv2.cvtColor(whole.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-        return LoopView(gray, whole.depth.K, whole.depth)
 
-    def _at(self, k: int) -> Keyframe | None:
-        """A keyframe with any surface."""
-        found = self._keyframe(k)
-        return found if found is not None and np.isfinite(found.depth.depth_m).any() else None
+def reach_m(one: Keyframe) -> float:
+    """Between two cameras that may see the same ground."""
+    return 2.0 * float(np.nanmedian(one.depth.depth_m))
+
+
+def weighted(loops: Sequence[Closure]) -> list[Closure]:
+    """The loops, less sure where several rest on the same surfaces."""
+    return [replace(one, covariance=_alike(one, loops) * one.covariance) for one in loops]
 
 
 def _alike(one: Closure, loops: Sequence[Closure]) -> int:

@@ -24,7 +24,7 @@ from recon.posegraph.ground_control import (
 )
 from recon.posegraph.site_alignment import ScanPrior, SiteAlignment, Tie, align, alike
 from recon.posegraph.submap_loops import SubmapLoopConfig
-from recon.types import F64, Bool, Keyframe
+from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.offline.refine.stored_loops import BREAK_S, StoredLoops
 from service.offline.site import SITE
@@ -41,8 +41,8 @@ ALIGNED = 1
 MIN_TIES = 3
 """Between two scans; fewer may be chance."""
 
-MIN_SIGMA = np.array([0.003] * 3 + [0.05] * 3 + [0.003])
-"""Sigmas of a scan's own position, heading and scale: rad, m, share."""
+MIN_SIGMA, MAX_SIGMA = np.array([0.003] * 3 + [0.05] * 3 + [0.003]), 1e4
+"""Sigmas of a scan's own heading, position and scale: rad, m, share."""
 
 SIGMA_SCALE = 0.01
 """Sigma of the scale of a scan that states none."""
@@ -143,9 +143,11 @@ def _aligned(
         for loop in supported(loops, track.poses):
             one = keyframe(loop.b)
             assert one is not None
-            ties.append(_tie(loop, track, one, scans))
+            ends = scans[loop.a], scans[loop.b]
+            ties.append(tie(loop, ends, track.poses[loop.a], track.poses[loop.b], corners(one)))
             kept.append(loop)
-    priors = alike([_prior(track, np.array(scans) == k) for k in range(len(members))])
+    own = [np.array(scans) == k for k in range(len(members))]
+    priors = alike([prior(track.poses[mine], track.covariances[mine]) for mine in own])
     found = align(ties, priors)
     bent = zip(*_bent(track, scans, found, kept, ties), strict=True)
     return found, priors, ties, dict(zip(seqs, bent, strict=True))
@@ -201,28 +203,30 @@ def _joined(store: ScanStore, members: Sequence[Member]) -> tuple[Track, list[in
     return Track(np.array(poses), np.array(times), np.array(spread)), seqs, scans
 
 
-def _tie(loop: Closure, track: Track, one: Keyframe, scans: Sequence[int]) -> Tie:
-    """Four places of the later view's ground, as the loop has them in both scans."""
+def corners(one: Keyframe) -> F64:
+    """(4, 3) m places of a keyframe's ground in its camera's frame."""
     h, w = one.depth.depth_m.shape
-    here = rays(one.depth.K, CORNERS * [w, h]) * float(np.nanmedian(one.depth.depth_m))
+    return rays(one.depth.K, CORNERS * [w, h]) * float(np.nanmedian(one.depth.depth_m))
+
+
+def tie(loop: Closure, scans: tuple[int, int], T_a: F64, T_b: F64, here: F64) -> Tie:
+    """The places ``here`` (N, 3) in the loop's second camera, as it has them in both scans.
+
+    ``T_a`` and ``T_b`` are the (4, 4) poses of the loop's cameras in the site.
+    """
     there = se3.transform(loop.T_a_b, here)
-    R = track.poses[loop.a][:3, :3]
     J = np.concatenate([-se3.hat(there), np.tile(np.eye(3), (len(there), 1, 1))], axis=2)
-    spread = R @ (J @ loop.covariance @ J.transpose(0, 2, 1)) @ R.T
+    spread = T_a[:3, :3] @ (J @ loop.covariance @ J.transpose(0, 2, 1)) @ T_a[:3, :3].T
     count = len(there) * 3 / 6.0  # a motion has six numbers, four places twelve
-    return Tie(
-        scans[loop.a], scans[loop.b],
-        se3.transform(track.poses[loop.a], there), se3.transform(track.poses[loop.b], here),
-        count * spread,
-    )  # fmt: skip
+    return Tie(*scans, se3.transform(T_a, there), se3.transform(T_b, here), count * spread)
 
 
-def _prior(track: Track, own: Bool) -> ScanPrior:
-    """The placing of a scan by its own poses, those of the track that are ``own``."""
-    centre = track.poses[own, :3, 3].mean(axis=0)
-    spread = se3.about(centre, track.covariances[own].mean(axis=0))
+def prior(poses: F64, covariances: F64) -> ScanPrior:
+    """The placing of a scan by its own poses (N, 4, 4), with left covariances (N, 6, 6)."""
+    centre = poses[:, :3, 3].mean(axis=0)
+    spread = se3.about(centre, covariances.mean(axis=0))
     sigma = np.append(np.sqrt(np.maximum(np.diag(spread), 0.0)), SIGMA_SCALE)
-    return ScanPrior(centre, np.maximum(sigma, MIN_SIGMA))
+    return ScanPrior(centre, np.clip(sigma, MIN_SIGMA, MAX_SIGMA))
 
 
 def _reposes(
