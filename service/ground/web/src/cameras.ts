@@ -63,7 +63,7 @@ export class Cameras {
     for (const [seq, T] of this.taken) {
       if (seq > this.last) continue;
       for (const z of [0, this.reach / 12]) {
-        const p = new THREE.Vector3(0, 0, z).applyMatrix4(T).project(camera);
+        const p = new THREE.Vector3(0, 0, z).applyMatrix4(T).applyMatrix4(this.group.matrixWorld).project(camera);
         const seen = new THREE.Vector2((size.x / 2) * (1 + p.x), (size.y / 2) * (1 - p.y));
         const px = p.z < 1 ? seen.distanceTo(place) : Infinity;
         if (px <= near && px < (best?.px ?? Infinity)) best = { seq, px };
@@ -82,6 +82,11 @@ export class Cameras {
     this.now.matrix.fromArray(T).scale(new THREE.Vector3(s, s, s));
     this.now.matrixWorldNeedsUpdate = true;
     this.now.visible = true;
+  }
+
+  /** Moves all cameras as a whole. */
+  move(T: THREE.Matrix4): void {
+    T.decompose(this.group.position, this.group.quaternion, this.group.scale);
   }
 
   /** Puts the image of keyframe `seq` into its frustum. */

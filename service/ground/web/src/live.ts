@@ -34,7 +34,14 @@ export type News =
   | { type: "repose"; seq: number; scale: number; T: number[] }
   | { type: "track"; track: [number, number, number][]; last?: LastPose }
   | { type: "state"; finished: boolean; keyframes: number }
+  | SiteNews
   | Link;
+
+/** Where this scan and those tied to it are shown, in this scan's coordinates. */
+export interface SiteNews {
+  type: "site";
+  scans: { drone: string; scan: string; own: boolean; ties: number; sigma_m: [number, number, number]; T: number[] }[];
+}
 
 /** How the scan comes in, once a second. */
 export interface Link {

@@ -6,6 +6,9 @@ import type { Chunk } from "./live";
 import type { Gradual } from "./painter";
 import { length } from "./units";
 
+/** Between the keyframes' numbers of two scans that are drawn together. */
+export const STRIDE = 2 ** 33;
+
 export const COLOURS = ["colour", "height", "sigma", "views", "age", "scan"] as const;
 export type Colour = (typeof COLOURS)[number];
 
@@ -70,6 +73,8 @@ interface Held {
   unit_m: number;
   points: number;
   time: number;
+  T: number[];
+  scale: number;
 }
 
 export class Cloud implements Gradual {
@@ -80,6 +85,9 @@ export class Cloud implements Gradual {
   datum_m = 0;
   /** The scans of a site, by the numbers of their keyframes; none for a single scan. */
   parts: Part[] = [];
+  /** Called when there are parts to colour by. */
+  named = (): void => undefined;
+  private readonly moves = new Map<number, THREE.Matrix4>();
   private readonly chunks = new Map<number, Held>();
   private last = Infinity;
   private readonly shared = {
@@ -123,29 +131,48 @@ export class Cloud implements Gradual {
     });
     const object = new THREE.Points(geometry, material);
     object.matrixAutoUpdate = false;
-    const held = { object, unit_m: chunk.unit_m, points: chunk.points, time: chunk.time_unix_s };
+    const held = { object, unit_m: chunk.unit_m, points: chunk.points, time: chunk.time_unix_s, T: chunk.T, scale: 1 };
     this.chunks.set(chunk.seq, held);
-    object.visible = chunk.seq <= this.last;
-    this.place(held, chunk.T, 1);
+    object.visible = this.isShown(chunk.seq);
+    this.place(chunk.seq, held);
     this.group.add(object);
   }
 
   /** The keyframes and when they were taken, in order. */
   moments(): { seq: number; time: number }[] {
-    const all = [...this.chunks].map(([seq, held]) => ({ seq, time: held.time }));
+    const own = [...this.chunks].filter(([seq]) => seq < STRIDE);
+    const all = own.map(([seq, held]) => ({ seq, time: held.time }));
     return all.sort((a, b) => a.seq - b.seq);
   }
 
   /** Shows the keyframes up to `seq` only. */
   until(seq: number): void {
     this.last = seq;
-    for (const [own, { object }] of this.chunks) object.visible = own <= seq;
+    for (const [own, { object }] of this.chunks) object.visible = this.isShown(own);
+  }
+
+  private isShown(seq: number): boolean {
+    return seq <= this.last || seq >= STRIDE;
+  }
+
+  /** Moves all chunks of a scan, numbered from k * STRIDE on, as a whole. */
+  move(k: number, T: number[]): void {
+    this.moves.set(k, new THREE.Matrix4().fromArray(T));
+    for (const [seq, held] of this.chunks) if (Math.floor(seq / STRIDE) === k) this.place(seq, held);
+  }
+
+  /** Names the scans that are drawn together. */
+  name(names: string[]): void {
+    if (names.length === this.parts.length) return;
+    this.parts = names.map((name, k) => ({ name, keyframes: [k * STRIDE, (k + 1) * STRIDE - 1] }));
+    for (const [seq, { object }] of this.chunks) object.material.uniforms["part"]!.value = this.partOf(seq);
+    this.named();
   }
 
   /** Moves a chunk to its corrected pose; its points stay as they are. */
   repose(seq: number, T: number[], scale: number): void {
     const held = this.chunks.get(seq);
-    if (held) this.place(held, T, scale);
+    if (held) this.place(seq, Object.assign(held, { T, scale }));
   }
 
   colour(mode: Colour): void {
@@ -232,9 +259,11 @@ export class Cloud implements Gradual {
     }
   }
 
-  private place(held: Held, T: number[], scale: number): void {
-    const unit = held.unit_m * scale;
-    held.object.matrix.fromArray(T).scale(new THREE.Vector3(unit, unit, unit));
+  private place(seq: number, held: Held): void {
+    const unit = held.unit_m * held.scale;
+    held.object.matrix.fromArray(held.T).scale(new THREE.Vector3(unit, unit, unit));
+    const move = this.moves.get(Math.floor(seq / STRIDE));
+    if (move) held.object.matrix.premultiply(move);
     held.object.updateMatrixWorld(true);
   }
 

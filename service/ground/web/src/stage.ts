@@ -100,6 +100,12 @@ export class Stage {
     );
   }
 
+  /** Moves the track as a whole. */
+  moveTrack(T: THREE.Matrix4): void {
+    T.decompose(this.track.position, this.track.quaternion, this.track.scale);
+    this.touch();
+  }
+
   /** In follow mode the view goes along with the camera at T, which looks `reach` metres far. */
   goAlong(T: number[], reach: number): void {
     if (!this.follow) return;

@@ -54,8 +54,12 @@ function colours({ cloud, legend }: Parts): HTMLElement {
   const select = el(
     "select",
     {},
-    ...COLOURS.filter((c) => c !== "scan" || cloud.parts.length).map((c) => el("option", { value: c, textContent: c })),
+    ...COLOURS.map((c) => el("option", { value: c, textContent: c, hidden: c === "scan" && !cloud.parts.length })),
   );
+  cloud.named = () => {
+    select.options[COLOURS.indexOf("scan")]!.hidden = false;
+    if (select.value === "scan") select.dispatchEvent(new Event("change"));
+  };
   select.setAttribute("aria-label", "colour by");
   select.onchange = () => {
     cloud.colour(select.value as Colour);

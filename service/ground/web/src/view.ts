@@ -1,5 +1,6 @@
 // One scan in 3D: live cloud, track, cameras, key figures, image of a keyframe.
 
+import { Matrix4 } from "three";
 import * as api from "./api";
 import { Cameras } from "./cameras";
 import { count, el, notify } from "./dom";
@@ -10,6 +11,7 @@ import { LiveView, type LastPose, type News } from "./live";
 import { Ruler } from "./measure";
 import { Notes } from "./notes";
 import { Cloud } from "./points";
+import { SiteView } from "./site";
 import { canDraw, Stage } from "./stage";
 import { toolbar } from "./toolbar";
 import * as units from "./units";
@@ -88,6 +90,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   host.append(notes.overlay, ruler.overlay, ruler.cursor);
   side.prepend(ruler.panel, notes.panel);
   const site = { stage, cloud, cameras, id };
+  const others = new SiteView(stage, cloud, cameras);
   const images = new Images(site, () => !ruler.active && !notes.active);
   const time = timeSlider(site);
   side.append(images.element);
@@ -104,6 +107,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const news = (item: News): void => {
     if (item.type === "link") return link.news(item);
     stage.touch();
+    if (item.type === "site") others.news(item);
     if (item.type === "repose") {
       cloud.repose(item.seq, item.T, item.scale);
       cameras.put(item.seq, item.T);
@@ -113,7 +117,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
       last = item.last;
       if (last) {
         cameras.aircraft(last.T, reach());
-        stage.goAlong(last.T, reach());
+        stage.goAlong(others.own.clone().multiply(new Matrix4().fromArray(last.T)).toArray(), reach());
       }
     }
     if (item.type === "state") {
@@ -143,7 +147,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const clock = setInterval(() => {
     link.draw();
     if (cameras.refresh()) stage.touch();
-    figures.replaceChildren(...rows(cloud, stage, last, fused));
+    figures.replaceChildren(...rows(cloud, stage, last, fused, others.words));
     document.body.dataset["points"] = String(cloud.total);
     document.body.dataset["drawn"] = String(cloud.drawn);
     document.body.dataset["fps"] = stage.painter.frames_per_s.toFixed(1);
@@ -153,13 +157,14 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     clearInterval(asking);
     images.close();
     live.close();
+    others.close();
     ruler.close();
     notes.close();
     stage.close();
   };
 }
 
-function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined, fused: number | undefined): HTMLElement[] {
+function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined, fused: number | undefined, site: string): HTMLElement[] {
   const facts: [string, string][] = [
     ...(fused === undefined ? [] : [["Points", count(fused)] as [string, string]]),
     ["Samples", count(cloud.total)],
@@ -177,6 +182,7 @@ function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined, fused: num
     if (last.lat_deg !== null && last.lon_deg !== null)
       facts.push(["At", `${last.lat_deg.toFixed(6)}, ${last.lon_deg.toFixed(6)}`]);
   }
+  if (site) facts.push(["Site", site]);
   facts.push(["Drawing", `${stage.painter.frames_per_s.toFixed(stage.painter.frames_per_s < 3 ? 1 : 0)} /s`]);
   return facts.map(([k, v]) => el("div", {}, el("dt", { textContent: k }), el("dd", { textContent: v })));
 }
