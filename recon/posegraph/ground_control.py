@@ -90,6 +90,7 @@ class Closure:
     b: int
     T_a_b: F64  # (4, 4) m
     covariance: F64  # (6, 6) left perturbation in a's frame
+    growth: float = 1.0  # of b's depths, to fit a's
 
 
 @dataclass(frozen=True, slots=True, eq=False)

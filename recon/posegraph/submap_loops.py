@@ -95,7 +95,9 @@ def _fitted(
     spread = np.linalg.svd(here[inside] - here[inside].mean(axis=0), compute_uv=False)
     if spread[1] < config.min_spread * float(np.median(here[:, 2])) * np.sqrt(count):
         return None
-    return LoopClosure(T, _covariance(T, here, there, sigma, inside), count, ("points",))
+    size = [np.linalg.norm(p[inside] - p[inside].mean(axis=0)) for p in (here, there)]
+    covariance = _covariance(T, here, there, sigma, inside)
+    return LoopClosure(T, covariance, count, ("points",), float(size[0] / size[1]))
 
 
 def _on_surface(view: LoopView, uv: F64) -> tuple[F64, Bool]:

@@ -207,6 +207,10 @@ def site(
     action: Annotated[str, typer.Argument(help="align or compare")],
     scans: Annotated[list[Path], typer.Argument(help="scan folders; compare: before and after")],
     out: Annotated[Path, typer.Option("--out", help="folder of the site")],
+    start: Annotated[
+        list[str] | None,
+        typer.Option(help="align: SCAN:POINTS.json places a scan without georeference"),
+    ] = None,
     cell_m: Annotated[
         float | None, typer.Option("--cell-m", help="compare: cell size; default: pixel on ground")
     ] = None,
@@ -223,8 +227,13 @@ def site(
         raise InputError(f"site {action}: there are {', '.join(ACTIONS)}")
     if action == "align":
         from service.offline.site.alignment import align_site
+        from service.offline.site.start import read_start
 
-        figures = align_site(scans, out).document
+        pairs = [text.rpartition(":") for text in start or []]
+        if not all(scan and points for scan, _, points in pairs):
+            raise InputError("--start is SCAN:POINTS.json")
+        starts = {Path(scan): read_start(Path(points)) for scan, _, points in pairs}
+        figures = align_site(scans, out, starts=starts).document
         print(json.dumps(figures) if as_json else "\n".join(_aligned_lines(out, figures)))
         return
     from service.offline.site.compare import compare

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import select
 import sys
 import time
@@ -18,7 +17,7 @@ from pathlib import Path
 from service.errors import SkyreliefError
 from service.ground.foxglove import growing
 from service.ground.shown_site import FILE, write_shown
-from service.ground.sites import NICE, references
+from service.ground.sites import references
 from service.offline.site import DRONE
 from service.offline.site.live import LiveSite
 from service.workers import Worker, guarded, run_process
@@ -106,7 +105,6 @@ class Follower:
 
 def serve(store: Path) -> None:
     """Follow the scans below ``store`` until standard input ends."""
-    os.nice(NICE)
     follower, is_busy = Follower(store), False
     write_shown(store, [])
     while not select.select([sys.stdin], [], [], 0.0 if is_busy else POLL_S)[0]:

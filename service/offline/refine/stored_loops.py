@@ -89,7 +89,7 @@ def verified(
     found = verify_surfaces(views[0], views[1], guess, config)
     if found is None:
         return None
-    return Closure(a, b, found.T_a_b, loose(found.T_a_b, found.covariance))
+    return Closure(a, b, found.T_a_b, loose(found.T_a_b, found.covariance), found.growth)
 
 
 class StoredLoops:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from recon import se3
@@ -29,6 +30,8 @@ from service.errors import InputError
 from service.offline.refine.stored_loops import BREAK_S, StoredLoops
 from service.offline.site import SITE
 from service.offline.site.gather import Member, gather
+from service.offline.site.start import SIGMA_SCALE as START_SCALE
+from service.offline.site.start import Start, start_of
 from service.scans.folder import write_deliverables
 from service.scans.track import local_frame
 from service.scans.writing import writing
@@ -67,10 +70,14 @@ class AlignedSite:
     document: dict[str, Any]  # the content of site.json
 
 
-def align_site(folders: Sequence[Path], out: Path, deliver: bool = True) -> AlignedSite:
+def align_site(
+    folders: Sequence[Path], out: Path, deliver: bool = True,
+    starts: Mapping[Path, Start] | None = None,
+) -> AlignedSite:  # fmt: skip
     """Gather the scans into the folder ``out``, align them, and write the site's files.
 
     The scans of a site that lies there already come first; its earlier alignments stay listed.
+    ``starts`` place scans without georeference, by their folders.
     Raises InputError for scans that make no site, and when ``out`` holds anything else.
     """
     known = _known(out)
@@ -78,11 +85,20 @@ def align_site(folders: Sequence[Path], out: Path, deliver: bool = True) -> Alig
     gone = [f for f in earlier if not (f / "scan.db").is_file()]
     folders = [*(f for f in earlier if f not in gone), *folders]
     unique = list(dict.fromkeys(f.resolve() for f in folders))
+    known_starts = {
+        Path(s["folder"]): start_of(s["start"], str(out / SITE))
+        for s in known.get("scans", [])
+        if s.get("start") is not None
+    }
+    starts = known_starts | {folder.resolve(): start for folder, start in (starts or {}).items()}
+    strange = [str(folder) for folder in starts if folder not in unique]
+    if strange:
+        raise InputError(f"--start names {strange[0]}, which is none of the scans")
     out.mkdir(parents=True, exist_ok=True)
     fresh = out / ".scan.db.new"
     _remove(fresh)
     try:
-        members, notes = gather(unique, fresh, out.resolve().name)
+        members, notes = gather(unique, fresh, out.resolve().name, starts)
         notes += [f"{f} is no longer there: left out" for f in gone]
         with ScanStore.open(fresh) as store:
             found, priors, ties, adjusted = _aligned(store, members)
@@ -144,10 +160,17 @@ def _aligned(
             one = keyframe(loop.b)
             assert one is not None
             ends = scans[loop.a], scans[loop.b]
+            if members[ends[0]].start is None and members[ends[1]].start is None:
+                loop = replace(loop, growth=1.0)  # noise: their scales are known better
             ties.append(tie(loop, ends, track.poses[loop.a], track.poses[loop.b], corners(one)))
             kept.append(loop)
     own = [np.array(scans) == k for k in range(len(members))]
-    priors = alike([prior(track.poses[mine], track.covariances[mine]) for mine in own])
+    priors = [prior(track.poses[mine], track.covariances[mine]) for mine in own]
+    priors = alike([p for p, m in zip(priors, members, strict=True) if m.start is None]) + [
+        replace(p, sigma=np.append(p.sigma[:6], START_SCALE))
+        for p, m in zip(priors, members, strict=True)
+        if m.start is not None
+    ]  # gathered last
     found = align(ties, priors)
     bent = zip(*_bent(track, scans, found, kept, ties), strict=True)
     return found, priors, ties, dict(zip(seqs, bent, strict=True))
@@ -215,6 +238,7 @@ def tie(loop: Closure, scans: tuple[int, int], T_a: F64, T_b: F64, here: F64) ->
     ``T_a`` and ``T_b`` are the (4, 4) poses of the loop's cameras in the site.
     """
     there = se3.transform(loop.T_a_b, here)
+    there += (loop.growth - 1.0) * (there - there.mean(axis=0))
     J = np.concatenate([-se3.hat(there), np.tile(np.eye(3), (len(there), 1, 1))], axis=2)
     spread = T_a[:3, :3] @ (J @ loop.covariance @ J.transpose(0, 2, 1)) @ T_a[:3, :3].T
     count = len(there) * 3 / 6.0  # a motion has six numbers, four places twelve
@@ -258,7 +282,9 @@ def _document(
     notes = list(notes)
     for k, member in enumerate(members):
         if len(members) > 1 and not any(member.name in (p["a"], p["b"]) for p in pairs):
-            notes.append(f"{member.name} is tied to no other scan: it stays where its fixes put it")
+            notes.append(
+                f"{member.name} is tied to no other scan: it stays where its {_by(member)} put it"
+            )
         elif found.groups[k] != found.groups[0]:
             notes.append(f"{member.name} is not tied to {members[0].name}, nor through others")
     for pair in pairs:
@@ -298,13 +324,18 @@ def _scan(
         "scan": member.header.scan_id,
         "started_unix_s": member.header.started_unix_ns / 1e9,
         "keyframes": [member.first, member.last],
-        "placed": "aligned" if tied else "by its fixes",
+        "placed": "aligned" if tied else f"by its {_by(member)}",
+        "start": None if member.start is None else msgspec.to_builtins(member.start.pairs),
         "T_site_scan": np.round(move.pose(member.T_site_scan), 9).tolist(),
-        "scale": round(move.growth, 6),
+        "scale": round(member.scale * move.growth, 6),
         "moved_m": [round(float(v), 3) for v in moved],
         "turned_deg": round(float(np.degrees(np.linalg.norm(se3.so3_log(move.R)))), 4),
         "sigma_m": [round(float(v), 3) for v in sigma[3:6]],
     }
+
+
+def _by(member: Member) -> str:
+    return "fixes" if member.start is None else "points"
 
 
 def _pairs(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -18,10 +18,12 @@ from typing import Any
 import numpy as np
 
 from recon import se3
+from recon.posegraph.site_alignment import Similarity
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.site import DRONE
+from service.offline.site.start import Start
 from service.scans.main_piece import main_seqs
 from service.scans.track import latest, local_frame
 from service.stream import codec
@@ -43,7 +45,13 @@ class Member:
     T_site_scan: F64  # (4, 4) by the two origins alone
     first: int  # its keyframes' numbers in the site's store
     last: int
-    notes: tuple[str, ...] = ()
+    scale: float = 1.0  # of a scan that points place
+    start: Start | None = None
+
+    def placed(self, T: F64) -> F64:
+        """A (4, 4) pose of the scan in the site's frame."""
+        move = Similarity(self.T_site_scan[:3, :3], self.T_site_scan[:3, 3], self.scale)
+        return move.pose(T)
 
     @property
     def seqs(self) -> range:
@@ -68,27 +76,27 @@ class Part:
         return self._store.keyframe(seq)
 
 
-def gather(folders: Sequence[Path], path: Path, name: str) -> tuple[list[Member], list[str]]:
+def gather(
+    folders: Sequence[Path], path: Path, name: str, starts: Mapping[Path, Start] | None = None
+) -> tuple[list[Member], list[str]]:
     """Copy the keyframes of the scans in ``folders`` into a new store; its members, and notes.
 
-    A scan without georeference or surface is left out with a note, and so is one given twice.
-    Raises InputError for a folder without a finished scan, for scans too far apart, and where
-    nothing is left.
+    A scan without surface, or without georeference and points in ``starts``, is left out with a
+    note, and so is one given twice. Raises InputError for a folder without a finished scan, for
+    scans too far apart, for points that place no scan, and where nothing is left.
     """
+    starts = starts or {}
     with ExitStack() as stack:
         stores = [stack.enter_context(_opened(folder)) for folder in folders]
-        chosen, notes = _chosen(folders, stores)
-        frames = [_frame(s.header) for _, s in chosen]
-        origin = frames[0]
+        chosen, notes = _chosen(folders, stores, starts)
+        origin = _frame(chosen[0][1].header)
         header = _site_header(name, [s.header for _, s in chosen], origin)
         members: list[Member] = []
         with ScanStore.create(path, header) as site:
             names = _names([folder for folder, _ in chosen])
-            for (folder, store), frame, title in zip(chosen, frames, names, strict=True):
-                T = between_frames(origin, frame)
+            for (folder, store), title in zip(chosen, names, strict=True):
                 first = members[-1].last + 1 if members else 0
-                member = Member(title, folder, store.header, T, first, 0)
-                members.append(_copied(store, site, member))
+                members.append(_copied(store, site, origin, title, folder, first, starts))
             _copy_poses([s for _, s in chosen], site, members, origin)
             assumed = {w for _, s in chosen for w in (s.summary or {}).get("assumed") or []}
             summary = {"assumed": sorted(assumed), "scans": list(names)}
@@ -107,7 +115,7 @@ def _opened(folder: Path) -> ScanStore:
 
 
 def _chosen(
-    folders: Sequence[Path], stores: Sequence[ScanStore]
+    folders: Sequence[Path], stores: Sequence[ScanStore], starts: Mapping[Path, Start]
 ) -> tuple[list[tuple[Path, ScanStore]], list[str]]:
     """The scans that can be part of a site, and why others cannot."""
     chosen: list[tuple[Path, ScanStore]] = []
@@ -116,20 +124,27 @@ def _chosen(
         twin = next((f for f, s in chosen if _is_same_flight(s, store)), None)
         if twin is not None:
             notes.append(f"{folder.name} is the same flight as {twin.name}: counted once")
-        elif local_frame(store.header) is None:
-            notes.append(f"{folder.name} has no georeference: left out; refine it with --gcp")
+        elif local_frame(store.header) is None and folder.resolve() not in starts:
+            notes.append(
+                f"{folder.name} has no georeference: left out; refine it with --gcp, or place it "
+                "with --start"
+            )
         elif not main_seqs(store):
             notes.append(f"{folder.name} contains no surface: left out")
         else:
             chosen.append((folder, store))
-    if not chosen:
-        raise InputError("no usable scan for a site: " + "; ".join(notes))
-    origin = _frame(chosen[0][1].header)
-    for folder, store in chosen:
+    chosen.sort(key=lambda one: local_frame(one[1].header) is None)
+    located = [one for one in chosen if local_frame(one[1].header) is not None]
+    if not located:
+        raise InputError("; ".join(["no usable scan with a georeference for a site", *notes]))
+    origin = _frame(located[0][1].header)
+    for folder, store in located:
+        if folder.resolve() in starts:
+            raise InputError(f"{folder} has a georeference; --start is for scans without one")
         away = float(np.linalg.norm(between_frames(origin, _frame(store.header))[:3, 3]))
         if away > MAX_DISTANCE_M:
             raise InputError(f"{folder} lies {away / 1e3:.0f} km from {chosen[0][0]}: not one site")
-    zones = {_frame(s.header).epsg for _, s in chosen}
+    zones = {_frame(s.header).epsg for _, s in located}
     if len(zones) > 1:
         notes.append(f"scans of several zones {sorted(zones)}: the site takes EPSG {origin.epsg}")
     return chosen, notes
@@ -139,7 +154,8 @@ def _is_same_flight(a: ScanStore, b: ScanStore) -> bool:
     """True for one scan, or for two replays of one recording."""
     if a.header.identity == b.header.identity:
         return True
-    if a.header.started_unix_ns != b.header.started_unix_ns or local_frame(b.header) is None:
+    located = local_frame(a.header) is not None and local_frame(b.header) is not None
+    if a.header.started_unix_ns != b.header.started_unix_ns or not located:
         return False
     one, two = (latest(s.poses())[:1] for s in (a, b))
     if not one or not two or one[0].time_unix_ns != two[0].time_unix_ns:
@@ -184,8 +200,19 @@ def _names(folders: Sequence[Path]) -> list[str]:
     ]
 
 
-def _copied(store: ScanStore, site: ScanStore, member: Member) -> Member:
-    """Copy the layers of one scan's main piece under new numbers."""
+def _copied(
+    store: ScanStore, site: ScanStore, origin: LocalFrame, title: str, folder: Path, first: int,
+    starts: Mapping[Path, Start],
+) -> Member:  # fmt: skip
+    """Copy the layers of one scan's main piece under new numbers, from ``first`` on."""
+    frame, spread = local_frame(store.header), None
+    if frame is not None:
+        member = Member(title, folder, store.header, between_frames(origin, frame), first, 0)
+    else:
+        start = starts[folder.resolve()]
+        move, spread = start.placing(origin)
+        T = se3.compose(move.R, move.t)
+        member = Member(title, folder, store.header, T, first, 0, move.growth, start)
     reposes, new = [], member.first
     for seq in main_seqs(store):
         repose = store.repose(seq)
@@ -195,13 +222,17 @@ def _copied(store: ScanStore, site: ScanStore, member: Member) -> Member:
             if opened is not None:
                 head, sections = opened
                 T = head.T_world_camera if repose is None else repose.T_world_camera
-                head = replace(head, seq=new, T_world_camera=member.T_site_scan @ T)
+                head = replace(head, seq=new, T_world_camera=member.placed(T))
                 layers.append(codec.pack(head, sections))
         if not layers:
             continue  # only tiles of the narrow radio
         site.add_keyframe(new, layers)
-        if repose is not None:
-            T = member.T_site_scan @ repose.T_world_camera
+        if spread is not None:
+            T, scale = head.T_world_camera, 1.0 if repose is None else repose.scale
+            around = se3.about(-T[:3, 3], spread)
+            reposes.append(Repose(new, 0, T, member.scale * scale, around))
+        elif repose is not None:
+            T = member.placed(repose.T_world_camera)
             reposes.append(Repose(new, 0, T, repose.scale, repose.covariance))
         new += 1
     site.add_reposes(reposes)
@@ -219,7 +250,7 @@ def _copy_poses(
         return
     for track, k in tracks:
         for pose in track:
-            site.add_pose(placed_pose(pose, members[k].T_site_scan @ pose.T_world_camera, origin))
+            site.add_pose(placed_pose(pose, members[k].placed(pose.T_world_camera), origin))
 
 
 def placed_pose(pose: PoseRecord, T: F64, origin: LocalFrame) -> PoseRecord:

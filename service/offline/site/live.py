@@ -8,7 +8,7 @@ finished scans. Stores are only read: the result is for what is shown.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -233,7 +233,7 @@ class LiveSite:
             guess = T_a_b if second[0] is one else se3.inverse(T_a_b)
             loop, there = verified(*ends, views, guess, CONFIG), second[0].views.at(second[1])
             if loop is not None and there is not None:
-                self._keep(loop, corners(there))
+                self._keep(replace(loop, growth=1.0), corners(there))
                 found += 1
 
     def _keep(self, loop: Closure, here: F64) -> None:
