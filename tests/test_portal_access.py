@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+import threading
+import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 from person import Browser
-from portal_client import NEEDS, TOKEN, browser, flown_store
+from portal_client import NEEDS, ONE, TOKEN, browser, flown_store
 
+from service.ground import state
 from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
+from service.ground.state import Job
 
 if TYPE_CHECKING:
     from conftest import HouseFlight
@@ -41,7 +48,7 @@ def show(browser: Browser, address: str, size: tuple[int, int]) -> None:
     browser.open("about:blank")
     browser.open(address)
     browser.wait("!!document.querySelector('h1')")
-    if address.endswith("/test-1"):
+    if address.endswith(("/view/drone-1/test-1", "/site-1")):
         browser.wait("document.body.dataset.points === '72000'")
         browser.wait("document.body.dataset.image === '4'")
 
@@ -86,21 +93,93 @@ def test_choosing_a_deliverable_by_keyboard_starts_nothing(browser: Browser, bas
     assert browser.run(f"new Promise(r => setTimeout(r, 300)).then(() => {jobs})") == 0
 
 
+@pytest.fixture(scope="module")
+def busy(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Iterator[str]:
+    """A portal with a scan that is received, a site, a broken scan, a bin and a job that waits."""
+    store = flown_store(tmp_path_factory.mktemp("busy"), house)
+    scan = store / "drone-1/test-1"
+    site = Path(shutil.copytree(scan, store / "drone-1/site-1"))
+    parts = [{"name": "west", "keyframes": [0, 1]}, {"name": "east", "keyframes": [2, 4]}]
+    (site / "site.json").write_text(json.dumps({"scans": parts}))
+    broken = Path(shutil.copytree(scan, store / "drone-2/broken"))
+    (broken / "scan.json").write_text("{")
+    shutil.copytree(scan, store / ".bin/drone-1~old~1")
+    entry = {
+        "drone": "drone-1", "scan": "test-1", "heard_unix_s": time.time() + 600.0, "open": True,
+        "received_bytes": 1000, "lag_s": {"k0": 0.4}, "missing": {"k1": 2},
+    }  # fmt: skip
+    portal = Portal(PortalConfig(store, port=0, token=TOKEN), lambda: [entry])
+    portal.start()
+    yield portal.url.split("/?")[0]
+    portal.close()
+
+
+@pytest.fixture
+def job(monkeypatch: pytest.MonkeyPatch, busy: str) -> Iterator[None]:
+    """A job that is half done until the test ends."""
+    ended = threading.Event()
+
+    def half(job: Job) -> str:
+        for n in job.progress.over(range(2), 2):
+            if n:
+                ended.wait(60.0)
+        return "dsm.tif"
+
+    monkeypatch.setattr(state, "carry_out", half)
+    order = urllib.request.Request(
+        f"{busy}{ONE}/exports", b'{"kind": "dsm"}', {"Authorization": f"Bearer {TOKEN}"}
+    )
+    urllib.request.urlopen(order, timeout=10).close()
+    yield
+    ended.set()
+
+
+def axe(browser: Browser, page: str, image: Path) -> list[str]:
+    """What axe finds on the page that is shown."""
+    browser.run(AXE.read_text() + ";0")
+    browser.image(image / f"{page}.png")  # to look at
+    return [f"{page}: {finding}" for finding in browser.run(SERIOUS)]
+
+
 @pytest.mark.skipif(not AXE.is_file(), reason="needs axe-core (npm ci in service/ground/web)")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [(1440, 900), PHONE])
 def test_axe_finds_nothing_serious(
-    browser: Browser, base: str, size: tuple[int, int], tmp_path: Path
+    browser: Browser,
+    busy: str,
+    job: None,
+    size: tuple[int, int],
+    scheme: Literal["light", "dark"],
+    tmp_path: Path,
 ) -> None:
-    for page, address in {
-        "library": base,
-        "view": f"{base}/#/view/drone-1/test-1",
-        "unknown": f"{base}/#/view/drone-1/nothing",
-    }.items():
-        show(browser, address, size)
-        if page == "view":
-            for name in ("Measure", "Coverage"):
-                browser.click(name)
-            browser.run("document.querySelector('details.group').open = true")
-        browser.run(AXE.read_text() + ";0")
-        assert browser.run(SERIOUS) == [], page
-        browser.image(tmp_path / f"{page}.png")  # to look at
+    found: list[str] = []
+    browser.page.emulate_media(color_scheme=scheme)
+    show(browser, busy, size)
+    browser.wait("document.querySelectorAll('article').length === 3")
+    browser.wait("!document.querySelector('.jobs').hidden")
+    browser.run("document.querySelectorAll('details').forEach(d => d.open = true)")
+    found += axe(browser, "library", tmp_path)
+    show(browser, f"{busy}/#/view/drone-1/test-1", size)
+    browser.wait("document.querySelector('.state').classList.contains('receiving')")
+    for name in ("Measure", "Coverage"):
+        browser.click(name)
+    found += axe(browser, "live", tmp_path)
+    browser.click("Notes")
+    browser.run("document.querySelectorAll('details.group').forEach(d => d.open = true)")
+    found += axe(browser, "open", tmp_path)
+    show(browser, f"{busy}/#/view/drone-1/site-1", size)
+    browser.run(
+        "(s => { s.value = 'scan'; s.dispatchEvent(new Event('change', { bubbles: true })) })"
+        "(document.querySelector('[aria-label=\"colour by\"]'))"
+    )
+    browser.wait("!document.querySelector('.legend').hidden")
+    found += axe(browser, "site", tmp_path)
+    show(browser, f"{busy}/#/view/drone-1/nothing", size)
+    found += axe(browser, "unknown", tmp_path)
+    show(browser, f"{busy}/#/map/drone-1/test-1", size)
+    browser.wait("document.body.dataset.map === 'shown'")
+    found += axe(browser, "map", tmp_path)
+    browser.open((next(tmp_path.parent.glob("busy*")) / "drone-1/test-1/report.html").as_uri())
+    browser.wait("!!document.querySelector('h1')")
+    found += axe(browser, "report", tmp_path)
+    assert found == []
