@@ -192,3 +192,30 @@ def test_the_volume_of_the_house_its_profile_and_the_way_out(
     assert abs(low - datum) < 0.05 and abs(high - datum - 6.0) < 0.05
     assert abs(length - 24.0) < 0.6
     ruler.page.image(tmp_path / "profile.png")  # to look at
+
+
+BOXES = """[...document.querySelectorAll('.overlay text')].map(t => {
+  const b = t.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; })"""
+
+
+def test_labels_of_a_small_area_on_a_phone_cover_no_other(ruler: Ruler) -> None:
+    ruler.page.screen(390, 844, mobile=True)
+    settled = "document.body.dataset.still === 'yes'"
+    ruler.page.run("new Promise(r => setTimeout(r, 300))")
+    stage = ruler.page.wait(
+        f"{settled} && document.querySelector('.stage').getBoundingClientRect().toJSON()"
+    )
+    ruler.page.click("Whole site")
+    ruler.page.run("new Promise(r => setTimeout(r, 300))")
+    ruler.page.wait(settled)
+    x, y = stage["x"] + stage["width"] / 2, stage["y"] + 0.6 * stage["height"]
+    places = [(x, y), (x + 25, y), (x + 25, y + 12), (x, y + 12)]
+    for count, place in enumerate(places, 1):
+        ruler.pick(*place)
+        boxes = np.array(ruler.page.run(BOXES)).reshape(-1, 4)
+        assert len(boxes) == max(0, count - 1) + (count > 2)  # a label a step, and the area
+        for i, a in enumerate(boxes):
+            assert a[0] >= stage["left"] and a[2] <= stage["right"]
+            for b in boxes[:i]:
+                assert a[0] >= b[2] or b[0] >= a[2] or a[1] >= b[3] or b[1] >= a[3]
+    ruler.page.screen(1280, 800)

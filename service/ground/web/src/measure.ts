@@ -9,6 +9,8 @@ import { eachPoint, HOVER_POINTS, pick } from "./pick";
 import * as units from "./units";
 
 const CLICK_PX = 5; // a pointer that moved farther turned the view
+const LETTER_PX = 8;
+const LABEL_PX = 18; // height of a label with its outline
 const HOVER_MS = 120;
 
 export interface Scene {
@@ -41,6 +43,27 @@ export function onScreen({ canvas, camera }: Scene, place: THREE.Vector3): { x: 
   if (q.z > -1e-3) return null;
   q.applyMatrix4(camera.projectionMatrix);
   return { x: (canvas.clientWidth / 2) * (1 + q.x), y: (canvas.clientHeight / 2) * (1 - q.y) };
+}
+
+/** The middle of a label's base line and half its width, CSS pixels. */
+interface Label {
+  x: number;
+  y: number;
+  half: number;
+}
+
+/** The label as near to its place as it is seen whole and covers none of the others. */
+function free(wanted: Label, others: Label[], width: number, height: number): Label {
+  const { half } = wanted;
+  const x = Math.max(half, Math.min(width - half, wanted.x));
+  const covers = (y: number): boolean =>
+    others.some((o) => Math.abs(o.x - x) < o.half + half && Math.abs(o.y - y) < LABEL_PX);
+  const fits = (y: number): boolean => y >= LABEL_PX && y <= height && !covers(y);
+  const inside = Math.max(LABEL_PX, Math.min(height, wanted.y));
+  const heights = [inside, ...others.flatMap((o) => [o.y - LABEL_PX, o.y + LABEL_PX])].filter(fits);
+  const near = (y: number): number => Math.abs(y - inside);
+  const y = heights.reduce((a, b) => (near(b) < near(a) ? b : a), heights[0] ?? inside);
+  return { x, y, half };
 }
 
 export class Ruler {
@@ -82,8 +105,13 @@ export class Ruler {
     const inFront = seen.filter((p) => p !== null);
     const parts: SVGElement[] = [];
     const n = seen.length;
-    const text = (x: number, y: number, words: string): void =>
-      void parts.push(svg("text", { x: x.toFixed(1), y: (y - 7).toFixed(1) }, words));
+    const { clientWidth, clientHeight } = this.scene.canvas;
+    const labels: Label[] = [];
+    const text = (x: number, y: number, words: string): void => {
+      labels.push(free({ x, y: y - 7, half: (words.length * LETTER_PX) / 2 }, labels, clientWidth, clientHeight));
+      const at = labels.at(-1)!;
+      parts.push(svg("text", { x: at.x.toFixed(1), y: at.y.toFixed(1) }, words));
+    };
     seen.forEach((b, i) => {
       const a = seen[(i || n) - 1];
       if (!a || !b || n < 2 || (i === 0 && n < 3)) return;
