@@ -20,6 +20,7 @@ from service.georeference import LocalFrame
 from service.ground import live_map
 from service.ground.live_map import LiveMap, LiveMaps, degrees, mercator, on_map, pixel_m
 from service.ground.map_tiles import contour_mask, interval_m
+from service.scans.coverage import LiveCoverages
 from service.stream.codec import encode
 from service.stream.records import Repose
 from service.stream.store import ScanStore
@@ -102,6 +103,27 @@ def test_a_new_keyframe_and_a_correction_are_on_the_map(
     assert at(client, "ortho", moved_east)[3] == 255
     assert at(client, "ortho", east)[3] == 0  # it left
     assert np.abs(at(client, "ortho", ROOF)[:3].astype(int) - ROOF_BGR).max() < 12
+
+
+def test_the_version_of_a_layer_is_that_of_its_tiles(
+    store: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a page that saw the version of now would keep the tile of before."""
+    monkeypatch.setattr(LiveCoverages.__init__, "__defaults__", (1000.0, 4))
+    with serving(store) as client:
+
+        def versions() -> tuple[str, str]:
+            answers = [client.ask(f"{TILES}/{layer}.json") for layer in ("ortho", "coverage")]
+            assert all(headers["cache-control"] == "no-cache" for _, _, headers in answers)
+            return answers[0][1]["version"], answers[1][1]["version"]
+
+        east, before = (55.0, 0.0), versions()
+        with ScanStore.open(store / "drone-1/test-1/scan.db") as scan:
+            one = house.keyframe(5, 50.0)
+            scan.add_keyframe(5, encode(one, one.time_ns))
+        after = versions()
+        assert at(client, "ortho", east)[3] == 255 and after[0] != before[0]
+        assert at(client, "coverage", east)[3] == 0 and after[1] == before[1]  # 1000 s old
 
 
 def test_the_surest_point_of_a_place_is_shown(store: Path, house: HouseFlight) -> None:

@@ -1,9 +1,10 @@
 """``skyrelief bench portal``: the page in a headless Chromium, drawn in software.
 
-Page load on loopback, from a keyframe in the receiver's store to its points in the browser,
-and ten million points: frame times while flying, and how long all of them take, slice by
-slice. SwiftShader draws on the processor: a graphics card is one to two orders of magnitude
-faster. Playwright (extra ``bench``) drives the browser.
+Page load on loopback, from the list to the first points of a scan, from a keyframe in the
+receiver's store to its points in the browser and to the tiles of the map, and ten million points:
+frame times while flying, and how long all of them take, slice by slice. SwiftShader draws on the
+processor: a graphics card is one to two orders of magnitude faster. Playwright (extra ``bench``)
+drives the browser.
 """
 
 from __future__ import annotations
@@ -145,11 +146,15 @@ def run(options: BenchOptions) -> list[BenchResult]:
         growing = ScanStore.create(root / "scans" / "bench" / "live" / "scan.db", _header("live"))
         with store, growing, _page(root) as (browser, base):
             load = _page_loads(browser, base, max(3, options.rounds // 5))
+            first = _first_points(browser, base, max(3, options.rounds // 5))
             arrivals = _arrivals(browser, base, growing)
+            tiles = _tiles_arrive(browser, base, growing)
             flying, whole, stops = _frame_times(browser, base)
     return [
         _result("page load, cold cache, list drawn", load),
+        _result("from the list to the first points of 10.1 M", first),
         _result("keyframe in the store to points in the browser", arrivals),
+        _result("keyframe in the store to all tiles of the map", tiles),
         _result("frame while flying over 10.1 M points, thinned to keep up", flying),
         _result("all 10.1 M points drawn after a movement, slice by slice", whole),
         _result("longest stop of the page meanwhile", stops),
@@ -164,7 +169,7 @@ def _result(what: str, times_ms: list[float]) -> BenchResult:
 
 
 def _header(scan: str) -> ScanHeader:
-    return ScanHeader(scan, "bench", 1_700_000_000_000_000_000)
+    return ScanHeader(scan, "bench", 1_700_000_000_000_000_000, 47.39, 8.54, 408.0)
 
 
 def _large_scan(folder: Path) -> ScanStore:
@@ -204,10 +209,27 @@ def _page_loads(browser: Browser, base: str, rounds: int) -> list[float]:
     return times
 
 
+def _first_points(browser: Browser, base: str, rounds: int) -> list[float]:
+    """Milliseconds from a click on the large scan in the list to points in the scene."""
+    times = []
+    for _ in range(rounds):
+        browser.open(base)
+        browser.wait("document.querySelectorAll('article').length === 2")
+        browser.run("delete document.body.dataset.chunk")
+        started = browser.run(
+            "(document.querySelector('article h2 a[href$=\"/large\"]').click(), Date.now())"
+        )
+        at = browser.wait("document.body.dataset.chunk")
+        times.append(float(at.split()[1]) - started)
+        browser.open("about:blank")
+        browser.wait("location.href === 'about:blank'")
+    return times
+
+
 def _arrivals(browser: Browser, base: str, store: ScanStore) -> list[float]:
     """Milliseconds from a keyframe's commit to its points in the scene."""
     browser.open(f"{base}/#/view/bench/live")
-    browser.wait("document.querySelector('.state').classList.contains('receiving')")
+    browser.wait("!document.querySelector('.state').classList.contains('cut')")
     times = []
     for seq in range(ARRIVALS):
         layers = encode(make_keyframe(seq), seq)
@@ -218,6 +240,25 @@ def _arrivals(browser: Browser, base: str, store: ScanStore) -> list[float]:
         )
         times.append(float(at.split()[1]) - committed)
         time.sleep(0.07 * (seq % 5))  # every phase of the portal's own beat
+    return times
+
+
+MAP_SHOWN = "document.body.dataset.map === 'shown'"
+TILES = "[...document.querySelectorAll('.layer img')].map(i => i.src.split('?v=')[1])"
+
+
+def _tiles_arrive(browser: Browser, base: str, store: ScanStore) -> list[float]:
+    """Milliseconds from a keyframe's commit until the map shows it, no tile missing."""
+    browser.open(f"{base}/#/map/bench/live")
+    browser.wait(MAP_SHOWN)
+    times = []
+    for seq in range(ARRIVALS, 2 * ARRIVALS):
+        layers, before = encode(make_keyframe(seq), seq), browser.run(TILES)
+        started = time.perf_counter()
+        store.add_keyframe(seq, layers)
+        browser.wait(f"{MAP_SHOWN} && {TILES}.some(v => !{before}.includes(v))", 30)
+        times.append(1e3 * (time.perf_counter() - started))
+        time.sleep(0.13 * (seq % 15))  # every phase of the page's own round
     return times
 
 

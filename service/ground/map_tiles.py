@@ -6,6 +6,7 @@ the keyframes as they arrive.
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
@@ -48,8 +49,10 @@ CONTOUR_PX = 4.0
 """Interval of contours in pixels on the ground, rounded up to 1, 2 or 5 times a power of ten."""
 
 KML_TILES = 4
-REFRESH_S = 5
-FRESH = {"cache-control": "max-age=2"}
+REFRESH_S = 2
+FRESH = {"cache-control": "max-age=1"}
+NOW = {"cache-control": "no-cache"}
+"""Whoever asks for the version of a map wants that of now."""
 
 
 def map_routes() -> list[Route]:
@@ -257,6 +260,8 @@ def _tile_json_of(request: Request) -> Response:
     with state.maps.lock:
         live = state.maps.of(folder)
         bounds, version = _bounds(live), live.version
+    if layer == "coverage" and (found := state.coverages.of(folder)) is not None:
+        version = zlib.crc32(found.image().tobytes())
     raster = newer_raster(folder, layer)
     document = {
         "tilejson": "3.0.0",
@@ -267,7 +272,7 @@ def _tile_json_of(request: Request) -> Response:
         "maxzoom": MAX_ZOOM,
         "version": f"{version}.0.{0 if raster is None else int(raster.stat().st_mtime)}",
     }
-    return JSONResponse(document, headers=FRESH)
+    return JSONResponse(document, headers=NOW)
 
 
 def _path(folder: Path, layer: str) -> str:

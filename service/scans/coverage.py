@@ -287,7 +287,7 @@ class CoverageWriter:
 class LiveCoverages(OpenScans[LiveCoverage]):
     """Coverage of the scans viewed last."""
 
-    def __init__(self, min_age_s: float = 3.0, max_scans: int = 4) -> None:
+    def __init__(self, min_age_s: float = 2.0, max_scans: int = 4) -> None:
         super().__init__(LiveCoverage, min_age_s, max_scans)
 
     def of(self, folder: Path) -> Coverage | None:

@@ -35,6 +35,9 @@ function degreesOf({ x, y }: Place): [number, number] {
   return [(Math.atan(Math.sinh(Math.PI * (1 - 2 * y))) * 180) / Math.PI, 360 * (x - 0.5)];
 }
 
+const tileJson = (address: string): Promise<TileJson | null> =>
+  fetch(address).then((r) => (r.ok ? (r.json() as Promise<TileJson>) : null), () => null);
+
 /** The tiles of one layer in a box of their own. */
 class Layer {
   readonly element = el("div", { className: "layer" });
@@ -42,7 +45,15 @@ class Layer {
   version = "";
   private readonly tiles = new Map<string, HTMLImageElement>();
 
-  constructor(private readonly address: (z: number, x: number, y: number) => string) {}
+  /** `about` is the address of its TileJSON, whose version changes with the tiles. */
+  constructor(
+    private readonly address: (z: number, x: number, y: number) => string,
+    private readonly about?: string,
+  ) {}
+
+  async refresh(): Promise<void> {
+    if (this.about && this.shown) this.version = (await tileJson(this.about))?.version ?? "";
+  }
 
   opacity(share: number): void {
     this.element.style.opacity = String(share);
@@ -171,30 +182,35 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     layers.push(layer);
     host.append(layer.element);
     const box = el("input", { type: "checkbox", checked: on });
-    box.onchange = () => ((layer.shown = box.checked), draw());
+    box.onchange = () => {
+      layer.shown = box.checked;
+      void layer.refresh().then(draw);
+    };
     const share = el("input", { type: "range", min: "0", max: "1", step: "0.05", value: "1" });
     share.setAttribute("aria-label", `${title}, opacity`);
     share.oninput = () => layer.opacity(Number(share.value));
     panel.append(el("div", {}, el("label", {}, box, ` ${title}`), share));
   };
   const refresh = async (): Promise<void> => {
-    const found = (await fetch(`${at}/ortho.json`).then((r) => (r.ok ? r.json() : null), () => null)) as TileJson | null;
+    const [found, { features }] = await Promise.all([
+      tileJson(`${at}/ortho.json`),
+      api.annotations(id).catch(() => ({ features: [] })),
+      ...layers.map((layer) => layer.refresh()),
+    ]);
     none.hidden = found !== null;
-    const { features } = await api.annotations(id).catch(() => ({ features: [] }));
     notes = features.map(({ geometry: { coordinates }, properties }) => ({
       place: placeOf(coordinates[1], coordinates[0]),
       text: short(properties.text),
     }));
     if (found?.bounds && isFree) frame(found.bounds);
-    for (const layer of layers.slice(-LAYERS.length)) layer.version = found?.version ?? "";
     draw();
   };
 
-  const basemap = (await fetch("/tiles/basemap.json").then((r) => (r.ok ? r.json() : null), () => null)) as TileJson | null;
+  const basemap = await tileJson("/tiles/basemap.json");
   root.replaceChildren(el("div", { className: "view flat" }, head, host, panel));
   if (basemap) add(new Layer((z, x, y) => `/tiles/basemap/${z}/${x}/${y}`), "Basemap", true);
   for (const [layer, title, on] of LAYERS)
-    add(new Layer((z, x, y) => `${at}/${layer}/${z}/${x}/${y}.png`), title, on);
+    add(new Layer((z, x, y) => `${at}/${layer}/${z}/${x}/${y}.png`, `${at}/${layer}.json`), title, on);
   const nearer = el("button", { textContent: "+", title: "nearer", onclick: () => zoomTo(zoom + 1) });
   const farther = el("button", { textContent: "−", title: "farther", onclick: () => zoomTo(zoom - 1) });
   host.append(none, marks, cursor, bar, el("span", { className: "zoom" }, nearer, farther));
