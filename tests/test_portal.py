@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from loopback import until
-from portal_client import TOKEN, Client, FakeOperator, client, flown_store, serving, store
+from portal_client import ONE, TOKEN, Client, FakeOperator, client, flown_store, serving, store
 
 from recon import se3
 from service.errors import InputError, OutsideError
@@ -55,6 +55,23 @@ def test_downloads_and_their_ranges(client: Client, store: Path) -> None:
     status, content, headers = client.ask(path, headers={"Range": "bytes=100-199"})
     assert status == 206 and content == whole[100:200]
     assert headers["content-range"] == f"bytes 100-199/{len(whole)}"
+
+
+def test_pieces_of_a_scan_are_listed_given_and_imported(
+    client: Client, store: Path, tmp_path: Path
+) -> None:
+    folder = store / "drone-1/test-1"
+    for name in ("piece-1.laz", "piece-12.laz", "piece-x.laz"):
+        (folder / name).write_bytes(name.encode())
+    (folder / "piece-2.laz").symlink_to(folder / "scan.db")
+    listed = [f["name"] for f in client.ask(ONE)[1]["files"]]
+    assert [name for name in listed if "piece" in name] == ["piece-1.laz", "piece-12.laz"]
+    assert client.ask(f"{ONE}/files/piece-12.laz")[1] == b"piece-12.laz"
+    for name in ("piece-x.laz", "piece-2.laz", "piece-0.laz"):
+        assert client.ask(f"{ONE}/files/{name}")[0] == 404
+    drone, scan = Library(tmp_path / "other").bring_in(folder)
+    copied = (tmp_path / "other" / drone / scan).glob("piece-*")
+    assert sorted(path.name for path in copied) == ["piece-1.laz", "piece-12.laz"]
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ from service.ground.storage import (
     workplace,
 )
 from service.scans.annotations import Annotation, Spot, add_annotation, delete_annotation
-from service.scans.folder import SUMMARY, write_deliverables
+from service.scans.folder import PIECE, SUMMARY, write_deliverables
 from service.scans.writing import writing
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -48,6 +48,7 @@ UNREADABLE = (SkyreliefError, sqlite3.Error, OSError, ValueError, OverflowError,
 
 FILES: dict[str, str] = {
     "cloud.laz": "fused cloud",
+    **{PIECE.format(n): "piece that nothing ties to the rest" for n in range(1, 100)},
     "cloud.copc.laz": "cloud-optimised LAZ",
     "cloud.ply": "fused cloud, PLY",
     "dsm.tif": "surface model",
@@ -313,11 +314,13 @@ def _facts(folder: Path) -> dict[str, Any]:
 
 
 def _files(folder: Path) -> list[dict[str, Any]]:
-    out = []
+    out, there = [], set[str]()
+    with contextlib.suppress(OSError):
+        there.update(os.listdir(folder))
     for name, what in FILES.items():
         path = folder / name
         with contextlib.suppress(OSError):  # deleted meanwhile
-            if is_regular(path):
+            if name in there and is_regular(path):
                 out.append({"name": name, "what": what, "bytes": path.stat().st_size})
     return out
 
