@@ -6,6 +6,7 @@ import io
 import time
 import zipfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,58 @@ def test_a_scan_is_refined_from_the_portal(portal: Portal, tmp_path: Path) -> No
     assert "refined" in " ".join(client.ask(ONE)[1]["notes"])
     assert client.ask(f"/api/jobs/{job['number']}", "DELETE")[0] == 404
     assert client.ask("/api/jobs/1", "DELETE", token="")[0] == 401
+
+
+def test_a_product_is_made_above_the_datum_that_is_asked_for(
+    portal: Portal, tmp_path: Path
+) -> None:
+    rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
+    client = Client(portal)
+    for bad in ({"to_datum": "ellipsoid"}, {"vertical_datum": "NN"}, {"vertical_datum": 7}):
+        status, said, _ = client.ask(ONE + "/exports", "POST", {"kind": "dsm", **bad})
+        assert status == 400 and "not valid" in said["error"]
+    order = {"kind": "dsm", "vertical_datum": "EGM96", "to_datum": None}
+    assert client.ask(ONE + "/exports", "POST", order)[0] == 202
+    assert until(lambda: not portal_jobs(client))
+    with rasterio.open(tmp_path / "drone-1/test-1/dsm.tif") as image:
+        assert image.tags()["HEIGHTS"] == "metres above EGM96"
+
+
+def portal_jobs(client: Client) -> list[str]:
+    """States of the jobs that have not ended well."""
+    return [job["state"] for job in client.ask("/api/jobs")[1] if job["state"] != "done"]
+
+
+@pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
+def test_the_datum_is_chosen_on_the_page(
+    browser: Browser, portal: Portal, monkeypatch: pytest.MonkeyPatch, needs: None
+) -> None:
+    made: list[Job] = []
+
+    def carry_out(job: Job) -> str:
+        made.append(job)
+        return "dsm.tif"
+
+    def has_made(kind: str) -> bool:
+        return bool(made) and made[-1].kind == kind
+
+    monkeypatch.setattr(state, "carry_out", carry_out)
+    choose = (
+        "(() => {{ const s = document.querySelectorAll('article select')[{}];"
+        " s.value = [...s.options].find(o => o.text === '{}').value;"
+        " s.dispatchEvent(new Event('change')); }})()"
+    )
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    for kind in ("gpkg", "glb"):
+        browser.run(choose.format(1, "EGM96 to ellipsoid"))
+        browser.run(choose.format(0, kind))
+        browser.click("Make")
+        assert until(partial(has_made, kind))
+        shown = not browser.run("document.querySelectorAll('article select')[1].hidden")
+        assert shown == (kind == "gpkg")  # a mesh in local metres has no datum
+    options = [(job.options.vertical_datum, job.options.to_datum) for job in made]
+    assert options == [("EGM96", "ellipsoid"), (None, None)]
 
 
 def test_all_maps_come_in_one_zip(portal: Portal, tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +15,7 @@ import pytest
 from pyproj import datadir
 from typer.testing import CliRunner
 
+from recon.types import F64
 from service.cli import app
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -119,6 +122,46 @@ def test_points_and_lines_are_raised_by_the_geoid(
     heights = {line["properties"]["height_m"] for line in lines}
     assert heights and all(h % 2.5 == 0.0 for h in heights)
     assert min(heights) > flown.xyz[:, 2].min() + UP_M - 10.0
+
+
+@pytest.mark.parametrize("kind", ["copc", "ply"])
+def test_clouds_are_raised_by_the_geoid(
+    scan_dir: Path, house: HouseFlight, geoid: tuple[float, float], kind: str
+) -> None:
+    if kind == "copc":
+        pytest.importorskip("copclib")
+    flown, raised = (_xyz(path) for path in both(scan_dir, kind))
+    np.testing.assert_array_equal(raised[:, :2], flown[:, :2])
+    rise = geoid_m(geoid, *house.origin[:2])
+    np.testing.assert_allclose(raised[:, 2] - flown[:, 2], rise, atol=0.01)
+
+
+def _xyz(path: Path) -> F64:
+    """(N, 3) of a LAZ file or of our PLY, in order of place."""
+    data = path.read_bytes()
+    if not data.startswith(b"ply"):
+        xyz = np.asarray(laspy.read(path).xyz)
+        return np.asarray(xyz[np.lexsort(xyz.T[::-1])])
+    head, _, body = data.partition(b"end_header\n")
+    assert (b"above ellipsoid" if "new" in path.name else b"AMSL") in head
+    count = int(head.partition(b"element vertex ")[2].split()[0])
+    rows = np.frombuffer(body, np.uint8).reshape(count, -1)
+    return np.asarray(rows[:, :24].copy().view("<f8"))
+
+
+def test_contours_of_all_formats_are_above_the_other_datum(
+    scan_dir: Path, geoid: tuple[float, float]
+) -> None:
+    with ScanView(scan_dir) as scan:
+        paths = {kind: export(scan, kind, None, TO_ELLIPSOID) for kind in ("gpkg", "dxf")}
+        features = json.loads(export(scan, "contours", None, TO_ELLIPSOID).read_text())["features"]
+    want = sorted(line["properties"]["height_m"] for line in features)
+    assert want and min(want) > UP_M + 400.0  # the house stands at 408 m
+    with sqlite3.connect(paths["gpkg"]) as file:
+        found = file.execute("SELECT height_m FROM contours ORDER BY height_m").fetchall()
+    assert [height for (height,) in found] == want
+    layers = re.findall(r"POLYLINE\n8\nCONTOUR_(\S+)", paths["dxf"].read_text())
+    assert sorted(float(layer.replace("_", ".")) for layer in layers) == want
 
 
 def test_enu_metres_stay_and_places_return(house: HouseFlight, geoid: tuple[float, float]) -> None:

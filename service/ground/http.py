@@ -49,6 +49,7 @@ from service.ground.scan_files import file_routes
 from service.ground.state import KINDS, Jobs, PortalState, names_of, state_of
 from service.ground.upload import Upload, check_parts
 from service.ground.vehicle import BUTTONS, Vehicle
+from service.offline.exports.view import ExportOptions
 from service.scans.annotations import Spot, as_json, read_annotations
 from service.workers import Workers
 
@@ -93,9 +94,11 @@ class NewAnnotation(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class ExportOrder(msgspec.Struct, forbid_unknown_fields=True):
-    """A deliverable to make."""
+    """A deliverable to make; ``vertical_datum`` is that of the heights as flown."""
 
     kind: Annotated[str, msgspec.Meta(extra_json_schema={"enum": list(KINDS)})]
+    vertical_datum: str | None = None
+    to_datum: str | None = None
 
 
 class ImportOrder(msgspec.Struct, forbid_unknown_fields=True):
@@ -306,9 +309,14 @@ async def _export(request: Request) -> Response:
     """Make a deliverable in the background, or refine the scan; the job."""
     state, (drone, scan) = state_of(request), names_of(request)
     note(request, "export", scan=f"{drone}/{scan}")
-    kind = (await _body(request, ExportOrder)).kind
-    note(request, "export", kind=kind)
-    return JSONResponse(state.jobs.start(state.library.folder(drone, scan), kind), 202)
+    order = await _body(request, ExportOrder)
+    note(request, "export", **msgspec.structs.asdict(order))
+    folder = state.library.folder(drone, scan)
+    try:
+        options = ExportOptions(vertical_datum=order.vertical_datum, to_datum=order.to_datum)
+    except ValueError as error:
+        raise InputError(f"the request is not valid: {error}"[:300]) from error
+    return JSONResponse(state.jobs.start(folder, order.kind, options=options), 202)
 
 
 def _jobs(request: Request) -> Response:

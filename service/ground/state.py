@@ -49,6 +49,7 @@ class Job:
     queued_unix_s: float = field(default_factory=time.time)
     ended_unix_s: float | None = None
     work: Callable[[Progress], str] | None = None  # what makes it; None: its kind says
+    options: ExportOptions = field(default_factory=ExportOptions)
     progress: Progress = field(default_factory=Progress)
 
     @property
@@ -89,7 +90,7 @@ def carry_out(job: Job) -> str:
         refine(job.folder, RefineOptions(), job.progress)
         return "cloud.laz"
     with ScanView(job.folder, progress=job.progress) as scan:
-        return export(scan, job.kind, None, ExportOptions()).name
+        return export(scan, job.kind, None, job.options).name
 
 
 class Jobs:
@@ -103,7 +104,11 @@ class Jobs:
         self._number = 0
 
     def start(
-        self, folder: Path, kind: str, work: Callable[[Progress], str] | None = None
+        self,
+        folder: Path,
+        kind: str,
+        work: Callable[[Progress], str] | None = None,
+        options: ExportOptions | None = None,
     ) -> dict[str, Any]:
         """Queue a job, or ``work``. InputError for an unknown kind or a full queue."""
         if work is None and kind not in KINDS:
@@ -112,7 +117,7 @@ class Jobs:
             if sum(not job.has_ended for job in self._jobs) >= MAX_WAITING_JOBS:
                 raise InputError("too many deliverables are waiting; try again later")
             self._number += 1
-            job = Job(self._number, folder, kind, work=work)
+            job = Job(self._number, folder, kind, work=work, options=options or ExportOptions())
             self._jobs = [*self._jobs[-KEPT:], job]
             if self._worker is None or self._worker.is_done:
                 self._worker = self._workers.start("exports", self._work)

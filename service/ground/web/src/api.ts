@@ -92,8 +92,14 @@ export const scan = (drone: string, name: string): Promise<Scan> =>
 export const label = (s: Scan, body: { title?: string; tags?: string[] }): Promise<unknown> =>
   ask(place(s), "PATCH", { ...body, edition: s.edition });
 export const remove = (s: Scan): Promise<unknown> => ask(place(s), "DELETE");
-export const make = (s: Scan, kind: string): Promise<Job> =>
-  ask(`${place(s)}/exports`, "POST", { kind });
+/** What heights are above as flown, and what they are converted to; null: unknown, or as flown. */
+export interface Heights {
+  vertical_datum: string | null;
+  to_datum: string | null;
+}
+
+export const make = (s: Scan, kind: string, heights?: Heights): Promise<Job> =>
+  ask(`${place(s)}/exports`, "POST", { kind, ...heights });
 /** The scan, when its newest job of a kind has ended; throws the job's error. */
 export async function finished(s: Scan, kind: string): Promise<Scan> {
   for (;;) {

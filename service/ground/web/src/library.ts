@@ -10,6 +10,19 @@ const KINDS = [
   "mcap", "ros2", "refine",
 ];
 
+/** Those whose heights can be converted. */
+const WITH_HEIGHTS = new Set(["laz", "copc", "ply", "dsm", "dtm", "contours", "gpkg", "dxf", "coverage", "all", "3dtiles", "3dtiles-mesh", "geojson"]);
+const DATUMS = ["EGM96", "EGM2008", "ellipsoid"];
+const HEIGHTS: [string, api.Heights][] = [
+  ["heights as flown", { vertical_datum: null, to_datum: null }],
+  ...DATUMS.flatMap((vertical_datum): [string, api.Heights][] => [
+    [`flown above ${vertical_datum}`, { vertical_datum, to_datum: null }],
+    ...DATUMS.filter((to) => to !== vertical_datum).map((to_datum): [string, api.Heights] => [
+      `${vertical_datum} to ${to_datum}`, { vertical_datum, to_datum },
+    ]),
+  ]),
+];
+
 const REFRESH_MS = 3000;
 
 /** Shows the list and keeps it as the server has it; gives what ends that. */
@@ -77,7 +90,11 @@ function kept(old: Card | undefined, s: api.Scan, again: () => void): Card {
 /** Opens, chooses and focuses in `now` what is open, chosen and focused in `old`. */
 function leaveAsFound(old: HTMLElement, now: HTMLElement): void {
   now.querySelector("details")!.open = old.querySelector("details")!.open;
-  now.querySelector("select")!.value = old.querySelector("select")!.value;
+  const [before, after] = [old, now].map((e) => [...e.querySelectorAll("select")]) as [HTMLSelectElement[], HTMLSelectElement[]];
+  after.forEach((select, i) => {
+    select.value = before[i]?.value ?? select.value;
+    select.dispatchEvent(new Event("change"));
+  });
   const focused = document.activeElement;
   if (!focused || !old.contains(focused)) return;
   const same = [...now.querySelectorAll<HTMLElement>(focused.tagName)];
@@ -232,13 +249,18 @@ function downloads(s: api.Scan): HTMLElement {
 function makeMenu(s: api.Scan, again: () => void): HTMLElement {
   const kinds = el("select", {}, ...KINDS.map((kind) => el("option", { value: kind, textContent: kind })));
   kinds.setAttribute("aria-label", "deliverable");
-  const act = el("button", { textContent: "Make", onclick: () => void make(s, kinds.value).then(again, notify) });
+  const heights = el("select", {}, ...HEIGHTS.map(([text], i) => el("option", { value: String(i), textContent: text })));
+  heights.setAttribute("aria-label", "heights");
+  kinds.onchange = () => (heights.hidden = !s.origin || !WITH_HEIGHTS.has(kinds.value));
+  heights.hidden = !s.origin;
+  const chosen = (): api.Heights | undefined => (heights.hidden ? undefined : HEIGHTS[Number(heights.value)]![1]);
+  const act = el("button", { textContent: "Make", onclick: () => void make(s, kinds.value, chosen()).then(again, notify) });
   act.setAttribute("aria-label", `Make a deliverable of ${s.title}`);
-  return el("span", { className: "group" }, kinds, act);
+  return el("span", { className: "group" }, kinds, heights, act);
 }
 
-async function make(s: api.Scan, kind: string): Promise<void> {
-  await api.make(s, kind);
+async function make(s: api.Scan, kind: string, heights?: api.Heights): Promise<void> {
+  await api.make(s, kind, heights);
   await api.finished(s, kind);
 }
 
