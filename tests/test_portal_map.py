@@ -84,8 +84,8 @@ def test_layers_lie_over_the_basemap_and_nothing_comes_from_outside(page: Browse
 
 
 def colours(page: Browser, when: str) -> dict[str, float]:
-    """The map's colours ``s`` once they are as ``when`` says; a slow machine draws late."""
-    found: dict[str, float] = page.wait(f"({COLOURS}).then(s => s.red && {when} && s)")
+    """The map's colours ``s`` once no tile is missing and they are as ``when`` says."""
+    found: dict[str, float] = page.wait(f"({COLOURS}).then(s => {SHOWN} && s.red && {when} && s)")
     return found
 
 
