@@ -115,6 +115,9 @@ SAMPLES_PER_SIDE = 128
 
 LEAF_POINTS = 20_000
 DEEPEST = 16
+LEGACY_COUNTS_AT, FIRST_RETURNS_AT = 107, 255
+"""In the header of LAS 1.4: numbers of points for older readers, zero with point format 7; number
+of first returns, which all points are."""
 
 
 def write_copc(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -134,6 +137,11 @@ def write_copc(scan: ScanView, out: Path, options: ExportOptions) -> None:
             data = copclib.VectorChar(raw[rows].ravel())
             writer.AddNode(copclib.VoxelKey(*key), data)
         writer.Close()
+        with open(part, "r+b") as file:  # copclib fills the first and leaves out the second
+            file.seek(LEGACY_COUNTS_AT)
+            file.write(bytes(24))
+            file.seek(FIRST_RETURNS_AT)
+            file.write(len(record).to_bytes(8, "little"))
 
 
 def _cube(xyz: F64) -> tuple[F64, float]:
