@@ -36,7 +36,7 @@ function degreesOf({ x, y }: Place): [number, number] {
 }
 
 const tileJson = (address: string): Promise<TileJson | null> =>
-  fetch(address).then((r) => (r.ok ? (r.json() as Promise<TileJson>) : null), () => null);
+  fetch(address).then((r) => (r.ok ? (r.json() as Promise<TileJson>) : null)).catch(() => null);
 
 /** The tiles of one layer in a box of their own. */
 class Layer {
@@ -184,6 +184,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     const box = el("input", { type: "checkbox", checked: on });
     box.onchange = () => {
       layer.shown = box.checked;
+      document.body.dataset["map"] = "loading"; // until it is drawn
       void layer.refresh().then(draw);
     };
     const share = el("input", { type: "range", min: "0", max: "1", step: "0.05", value: "1" });
