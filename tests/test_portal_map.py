@@ -66,7 +66,7 @@ def layer(page: Page, name: str) -> None:
 
 
 def test_layers_lie_over_the_basemap_and_nothing_comes_from_outside(page: Browser) -> None:
-    with_base = page.wait(f"({COLOURS}).then(s => s.red && s)")
+    with_base = colours(page, "true")
     assert with_base["known"] == pytest.approx(1280 * (800 - 50), rel=0.03)  # the basemap is below
     layer(page, "Basemap")
     alone = page.run(COLOURS)
