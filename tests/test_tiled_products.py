@@ -106,7 +106,7 @@ def test_changes_in_tiles_are_those_of_the_whole(tmp_path: Path, counted: list[i
     with ScanView(tmp_path / "site") as view:
         for name, points in (("whole", 20_000_000), ("tiles", 120_000)):
             (tmp_path / name).mkdir()
-            done = compare.changes(view, tmp_path / name, (parts[0], parts[1]), 0.25, points)
+            done = compare.changes(view, tmp_path / name, (parts[0], parts[1]), 0.05, 0.25, points)
             assert done is not None
             found.append(done)
     assert counted[0] == 1 and counted[1] > 1

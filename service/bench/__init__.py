@@ -51,6 +51,7 @@ class BenchOptions:
     warm_up: int = 3
     backend: str = "cpu"
     device: str = ""  # of the benchmark gpu: "cuda", "cpu", or empty for what is there
+    scans: int = 0  # of the benchmark site: that many instead of two
     data: Path | None = None  # folder with ground truth, for the benchmarks that score
 
 

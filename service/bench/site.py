@@ -20,7 +20,7 @@ import numpy as np
 from recon import se3
 from recon.camera_model import rays
 from recon.types import F64, Keyframe
-from service.bench import BenchOptions, BenchResult
+from service.bench import BenchOptions, BenchResult, site_scale
 from service.bench.real import _skyrelief as skyrelief
 from service.georeference import LocalFrame
 from service.scans.track import local_frame
@@ -50,6 +50,8 @@ REAL = "caliterra_nadir/frames"
 
 def run(options: BenchOptions) -> list[BenchResult]:
     """Every figure; flights are rendered once and replayed for each seed."""
+    if options.scans:
+        return site_scale.run(options)
     with tempfile.TemporaryDirectory(prefix="skyrelief-site-") as folder:
         results = _simulated(Path(folder), options)
         if options.data is not None and (options.data / REAL).is_dir():

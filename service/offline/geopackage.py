@@ -47,16 +47,13 @@ class Layer:
     columns: Columns
 
 
-def write_polygons(
-    path: Path, table: str, epsg: int, shapes: Sequence[Sequence[Sequence[F64]]], columns: Columns
-) -> None:
-    """Write multipolygons with their columns as one layer.
+def polygons(table: str, shapes: Sequence[Sequence[Sequence[F64]]], columns: Columns) -> Layer:
+    """A layer of multipolygons.
 
     ``shapes[n]`` are polygons, each an outer ring and its holes, (N, 2) map metres, closed.
     """
     places = [ring for shape in shapes for rings in shape for ring in rings]
-    wkb = [_polygons(shape) for shape in shapes]
-    write_layers(path, epsg, [Layer(table, "MULTIPOLYGON", wkb, places, columns)])
+    return Layer(table, "MULTIPOLYGON", [_polygons(s) for s in shapes], places, columns)
 
 
 def lines(table: str, shapes: Sequence[F64], columns: Columns) -> Layer:

@@ -25,15 +25,16 @@ from recon.surface.change import (
     volumes,
 )
 from recon.surface.raster import Grid, Raster, fill_holes, grid_over, hillshade
-from recon.types import F64, U8, Bool, DepthMap
+from recon.surface.walls import Wall, walls_moved
+from recon.types import F32, F64, U8, Bool, DepthMap
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.rasters import NODATA_M, Layers, mosaic, over, put, window_in
-from service.offline.exports.view import ScanView
-from service.offline.geopackage import write_polygons
+from service.offline.exports.view import ExportOptions, ScanView
+from service.offline.geopackage import points, polygons, write_layers
 from service.offline.site.alignment import AlignedSite, align_site
 from service.offline.site.gather import Member, Part
-from service.offline.tiles import TILE_POINTS, Tile, grown, run_tiles, tiling
+from service.offline.tiles import TILE_POINTS, Tile, grown, run_tiles
 from service.progress import Progress
 from service.scans.folder import write_deliverables
 from service.scans.fused_cloud import fused_cloud, placed
@@ -55,6 +56,7 @@ MARGIN_M = 40.0
 """Around a tile: bending is a mean over 10 m (1 sigma); a smaller object is measured whole."""
 
 PAGE_PX = 1400
+WALL_COLUMNS = ("moved_m", "sigma_m", "towards_deg", "area_m2")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,7 @@ class ChangeJob:
     voxels_m: tuple[float | None, ...]
     cell_m: float | None
     whole: Grid | None  # of all tiles; None: this is the only one
+    alignment_m: float  # sigma, horizontal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,6 +88,7 @@ class ChangePart:
 
     layers: Layers
     objects: list[Found]
+    walls: list[Wall] | None  # None: py4dgeo is not installed
     pictures: tuple[U8, U8]  # BGR, before and after
     compared_m2: float
     alignment_m: float
@@ -109,7 +113,8 @@ def compare(
     with ScanView(out) as view:
         view.needs_place("a comparison")
         parts = ((pair[0].first, pair[0].last), (pair[1].first, pair[1].last))
-        found = changes(view, out, parts, cell_m, tile_points, scheduler)
+        apart = _apart_m(site, one, two)
+        found = changes(view, out, parts, apart, cell_m, tile_points, scheduler)
         if found is None:
             raise InputError(f"{before} and {after} share no ground")
         document = _document(site, found, one, two)
@@ -130,6 +135,7 @@ class Changes:
     """What changed on all tiles, but for the map, which is in its file."""
 
     objects: list[Found]
+    walls: list[Wall] | None
     pictures: tuple[U8, U8]
     cell_m: float
     compared_m2: float
@@ -140,6 +146,7 @@ def changes(
     view: ScanView,
     out: Path,
     parts: tuple[tuple[int, int], tuple[int, int]],
+    alignment_m: float,
     cell_m: float | None = None,
     tile_points: int = TILE_POINTS,
     scheduler: str | None = None,
@@ -147,9 +154,9 @@ def changes(
 ) -> Changes | None:
     """Compare two dates of a site, ``parts`` of its keyframes, and write change.tif into ``out``.
 
-    None where they share no ground.
+    ``alignment_m`` is what the two are misaligned by (1 sigma). None where they share no ground.
     """
-    cut = tiling(view.folder, view.store, tile_points, MARGIN_M, view.frame)
+    cut = view.tiling(ExportOptions(tile_points=tile_points), MARGIN_M)
     whole: Grid | None = None
     voxels: tuple[float | None, ...] = (None, None)
     if len(cut.tiles) > 1:
@@ -158,7 +165,7 @@ def changes(
             for a, b in parts
         ]
         voxels, whole = tuple(usual), over(grown(cut.bounds, 2.0), cell_m or max(usual))
-    jobs = [ChangeJob(tile, parts, voxels, cell_m, whole) for tile in cut.tiles]
+    jobs = [ChangeJob(tile, parts, voxels, cell_m, whole, alignment_m) for tile in cut.tiles]
     made = run_tiles(change_tile, jobs, scheduler, progress or Progress())
     compared = (part for part in made if part is not None)
     first = next(compared, None)
@@ -168,6 +175,7 @@ def changes(
     blank: U8 = np.full((*_page_shape(grid), 3), 255, np.uint8)
     pictures = blank, blank.copy()
     objects: list[Found] = []
+    walls: list[Wall] | None = []
     area, alignment = 0.0, 0.0
     with mosaic(view, out / CHANGE_TIF, grid, first.layers) as image:
         for part in chain([first], compared):
@@ -177,10 +185,11 @@ def changes(
                 canvas[rows, cols] = picture
             area, alignment = area + part.compared_m2, max(alignment, part.alignment_m)
             objects += part.objects
+            walls = None if walls is None or part.walls is None else [*walls, *part.walls]
         objects = _numbered(image, objects)
     for picture in pictures:
         _outline(picture, objects, grid)
-    return Changes(objects, pictures, grid.cell_m, area, alignment) if area else None
+    return Changes(objects, walls, pictures, grid.cell_m, area, alignment) if area else None
 
 
 def _numbered(image: Any, objects: list[Found]) -> list[Found]:
@@ -200,9 +209,10 @@ def _numbered(image: Any, objects: list[Found]) -> list[Found]:
 def change_tile(job: ChangeJob, progress: Progress | None = None) -> ChangePart | None:
     """What changed on one tile; None where it has no ground of both dates."""
     with ScanView(Path(job.tile.folder), None, progress, job.tile) as view:
-        both = surfaces(view, job)
-        if both is None:
+        made = surfaces(view, job)
+        if made is None:
             return None
+        both, clouds, voxel_m = made
         site_m2 = None
         if job.whole is not None:
             site_m2 = float(np.prod(job.whole.shape)) * job.whole.cell_m**2
@@ -213,6 +223,8 @@ def change_tile(job: ChangeJob, progress: Progress | None = None) -> ChangePart 
         return None
     if job.whole is not None:
         change = of_tile(change, rows, cols, int(MARGIN_M / grid.cell_m))
+    ground_m2 = site_m2 or change.compared_m2
+    walls = _walls(clouds, change, voxel_m, job, ground_m2)
     known = np.isfinite(change.height_m)
     flat = np.zeros(grid.shape, np.float32)
     bands = np.stack(
@@ -224,9 +236,34 @@ def change_tile(job: ChangeJob, progress: Progress | None = None) -> ChangePart 
     size = (place[1].stop - place[1].start, place[0].stop - place[0].start)
     one, two = (drawn(raster, rows, cols, size) for raster in both)
     return ChangePart(
-        layers, [_found(change, body, known) for body in change.bodies], (one, two),
+        layers, [_found(change, body, known) for body in change.bodies], walls, (one, two),
         float(known[rows, cols].sum()) * grid.cell_m**2, change.alignment_m,
     )  # fmt: skip
+
+
+def _walls(
+    clouds: tuple[tuple[F64, F32], tuple[F64, F32]], change: Change, voxel_m: float,
+    job: ChangeJob, ground_m2: float,
+) -> list[Wall] | None:  # fmt: skip
+    """The walls of the tile that moved, where both dates know the ground; None without py4dgeo."""
+    try:
+        moved = walls_moved(*clouds, change.grid, voxel_m, job.alignment_m, ground_m2)
+    except ImportError:
+        return None
+    west, south, east, north = job.tile.box
+    known = np.isfinite(change.height_m)
+    return [
+        wall for wall in moved
+        if west <= wall.east_m < east and south <= wall.north_m < north
+        and known[change.grid.cells(np.array([[wall.east_m, wall.north_m]]))].all()
+    ]  # fmt: skip
+
+
+def _apart_m(site: AlignedSite, one: int, two: int) -> float:
+    """Median distance of the ties between the two scans after the alignment, 0 without any."""
+    names = {site.members[one].name, site.members[two].name}
+    return max((p["apart_after_m"] for p in site.document["pairs"] if {p["a"], p["b"]} == names),
+               default=0.0)  # fmt: skip
 
 
 def _found(change: Change, body: Body, known: Bool) -> Found:
@@ -256,8 +293,11 @@ def _pair(site: AlignedSite, before: Path, after: Path) -> tuple[int, int]:
     return one, two
 
 
-def surfaces(view: ScanView, job: ChangeJob) -> tuple[Raster, Raster] | None:
-    """The mean surface of both dates in the site, on one grid of its CRS; None without points."""
+def surfaces(
+    view: ScanView, job: ChangeJob
+) -> tuple[tuple[Raster, Raster], tuple[tuple[F64, F32], tuple[F64, F32]], float] | None:
+    """The mean surface of both dates in the site, on one grid of its CRS, their points with their
+    sigmas, and the size of their voxels; None without points."""
     box = job.tile.wide
     clouds = [
         fused_cloud(Part(view.store, seqs), voxel, view.progress, box)
@@ -275,7 +315,8 @@ def surfaces(view: ScanView, job: ChangeJob) -> tuple[Raster, Raster] | None:
         fill_holes(mean_surface(xyz, fused.cloud.rgb, fused.cloud.sigma_m, grid), HOLE_CELLS)
         for xyz, fused in zip(places, clouds, strict=True)
     )
-    return one, two
+    seen = (places[0], clouds[0].cloud.sigma_m), (places[1], clouds[1].cloud.sigma_m)
+    return (one, two), seen, max(fused.voxel_m for fused in clouds)
 
 
 def hide_changed(path: Path, earlier: Member, map_: Path) -> None:
@@ -338,6 +379,11 @@ def _document(site: AlignedSite, change: Changes, one: int, two: int) -> dict[st
         f"{change.compared_m2:.0f} m2; cut {found.cut[0]:.1f}, fill {found.fill[0]:.1f}, "
         f"net {net:+.1f} +- {1.96 * sigma:.1f} m3 (95 %)"
     )
+    notes = list(site.document["notes"])
+    if change.walls is None:
+        notes.append("walls are not compared: pip install 'skyrelief[walls]'")
+    elif change.walls:
+        words += f"; {len(change.walls)} wall(s) moved"
     return {
         "schema": 1,
         "before": _dated(before),
@@ -350,8 +396,9 @@ def _document(site: AlignedSite, change: Changes, one: int, two: int) -> dict[st
             for name, (v, s) in (("cut", found.cut), ("fill", found.fill), ("net", found.net))
         },
         "objects": [each.about for each in change.objects],
+        "walls": [_wall(wall) for wall in change.walls or ()],
         "in_words": words,
-        "notes": site.document["notes"],
+        "notes": notes,
     }
 
 
@@ -375,11 +422,28 @@ def _object(change: Change, body: Body) -> dict[str, Any]:
     }
 
 
+def _wall(wall: Wall) -> dict[str, Any]:
+    return {
+        "east_m": round(wall.east_m, 2),
+        "north_m": round(wall.north_m, 2),
+        "moved_m": round(wall.moved_m, 3),
+        "sigma_m": round(wall.sigma_m, 3),
+        "towards_deg": round(wall.towards_deg, 1),
+        "area_m2": round(wall.area_m2, 2),
+    }
+
+
 def _write_polygons(view: ScanView, path: Path, change: Changes) -> None:
     names = ("kind", "area_m2", "volume_m3", "sigma_m3", "mean_m", "peak_m")
     shapes = [each.rings for each in change.objects]
     columns = {name: [each.about[name] for each in change.objects] for name in names}
-    write_polygons(path, "changes", view.needs_place("a GeoPackage").epsg, shapes, columns)
+    layers = [polygons("changes", shapes, columns)]
+    if change.walls:
+        rows = [_wall(wall) for wall in change.walls]
+        about = {name: [row[name] for row in rows] for name in WALL_COLUMNS}
+        places = np.array([[wall.east_m, wall.north_m] for wall in change.walls])
+        layers.append(points("walls", places, about))
+    write_layers(path, view.needs_place("a GeoPackage").epsg, layers)
 
 
 # ---- page --------------------------------------------------------------------------------------
