@@ -25,6 +25,7 @@ from service.packages import needing
 from service.progress import Progress
 from service.scans.fused_cloud import EVERYWHERE, Box
 from service.scans.main_piece import Keyframes, main_keyframes, main_seqs
+from service.stream.store import ScanStore
 
 Job = TypeVar("Job")
 Made = TypeVar("Made")
@@ -98,7 +99,9 @@ def tiling(
     first = store.keyframe(seqs[0]) if seqs else None
     if first is None or len(seqs) * first.fresh.size <= max_points:
         return Tiling((Tile(str(folder.resolve()), EVERYWHERE, EVERYWHERE, tuple(seqs)),))
-    prints = footprints(store)
+    # By a reader of its own, which does not hold what it has decoded.
+    with ScanStore.open(folder / "scan.db", read_only=True) as fresh:
+        prints = footprints(fresh)
     return Tiling(tuple(tiles_over(folder, prints, max_points, margin_m, frame)), tuple(
         _on_map(prints, frame)
     ))  # fmt: skip

@@ -218,12 +218,10 @@ class ScanView:
 
     def tiling(self, options: ExportOptions, margin_m: float) -> Tiling:
         """Tiles over the scan in its UTM zone, each with the points ``margin_m`` around it."""
-
-        def make() -> Tiling:  # by a reader of its own, which does not hold what it has decoded
-            with ScanStore.open(self.folder / "scan.db", read_only=True) as store:
-                return tiling(self.folder, store, options.tile_points, margin_m, self.frame)
-
-        return self.shared(("tiling", margin_m, options.tile_points), make)
+        return self.shared(
+            ("tiling", margin_m, options.tile_points),
+            lambda: tiling(self.folder, self.store, options.tile_points, margin_m, self.frame),
+        )
 
     def for_tiles(
         self, options: ExportOptions, cut: Tiling, needs_cell: bool = True
