@@ -22,6 +22,7 @@ from recon.posegraph.interpolated import KEYFRAME
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.trajectory import Placed, Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.depth_edges import drop_mixtures
 from recon.stereo.polar import reproject_polar
 from recon.stereo.reprojection import FusionConfig, PairDepth, fuse, plausible, reproject
 from recon.stereo.upsampling import UpsamplingConfig
@@ -287,7 +288,7 @@ class Plausible:
         """The plausible part of ``depth``; None where there is nothing."""
         if depth is None:
             return None
-        kept = plausible(depth, view.prior)
+        kept = plausible(drop_mixtures(depth), view.prior)
         self._balance[view.segment] += -1 if kept is None else 1
         if kept is not None and self._balance[view.segment] > 0:
             return kept
