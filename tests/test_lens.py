@@ -84,6 +84,28 @@ def test_the_focal_length_is_read(
     assert lens.camera((1600, 1200)).K[0, 0] == pytest.approx(fx_px, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("focal_mm", "full_frame_mm", "whole"),
+    [
+        (3.61, 20, (4000, 3000)),  # 1/2.3 inch
+        (8.8, 24, (5472, 3648)),  # one inch
+        (12.29, 24, (5280, 3956)),  # Four Thirds
+        (35.0, 35, (8192, 5460)),  # full frame
+    ],
+)
+def test_the_middle_rows_of_a_sensor_have_the_lens_of_all_rows(
+    tmp_path: Path, focal_mm: float, full_frame_mm: int, whole: tuple[int, int]
+) -> None:
+    focal = []
+    for rows in (whole[1], whole[0] * 9 // 16 // 2 * 2):
+        write_still(tmp_path / "a.jpg", (whole[0], rows), {37386: focal_mm, 41989: full_frame_mm})
+        lens = read_tags(tmp_path / "a.jpg").lens
+        assert lens is not None
+        focal.append(lens.camera((whole[0], rows)).K[0, 0])
+    assert focal[0] == pytest.approx(full_frame_mm * np.hypot(*whole) / 43.2666, rel=2e-3)
+    assert focal[1] == pytest.approx(focal[0], rel=2e-3)
+
+
 def test_whole_millimetres_are_less_sure_the_shorter_the_lens(tmp_path: Path) -> None:
     sigma = {}
     for mm in (12, 24, 200):

@@ -19,6 +19,9 @@ from recon.types import Camera
 
 DIAGONAL_35MM = 43.2666
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+MAX_CROP_ONE_INCH = 3.2
+"""Above this crop factor a sensor is smaller than one inch (2.7)."""
+
 MIN_FOCAL, MAX_FOCAL = 0.2, 20.0
 """Focal length over the longer side of the image; a tag outside this range is wrong."""
 
@@ -156,10 +159,23 @@ def _full_frame(photo: Mapping[int, Any], size_px: tuple[int, int]) -> Lens | No
     focal = _number(photo.get(41989))
     if focal is None:
         return None
-    share = math.hypot(*size_px) / max(size_px) / DIAGONAL_35MM
+    aspect = max(size_px) / min(size_px)
+    aspect = min(aspect, _sensor_aspect(focal, _number(photo.get(37386))))
+    share = math.hypot(1.0, 1.0 / aspect) / DIAGONAL_35MM
     rounded = 0.5 / math.sqrt(3.0) / focal  # whole millimetres
     sigma = math.hypot(SIGMA_FOCAL, rounded)
     return Lens(focal * share, source="the 35 mm equivalent in EXIF", sigma_focal=sigma)
+
+
+def _sensor_aspect(full_frame_mm: float, focal_mm: float | None) -> float:
+    """Width over height of the sensor.
+
+    Cameras give the 35 mm equivalent of the whole sensor also with images that are wider, which
+    are its middle rows: 16:9 of a 4:3 sensor by the image's own diagonal is 8 % too short.
+    Sensors below one inch and of Four Thirds are 4:3, others 3:2.
+    """
+    crop = full_frame_mm / focal_mm if focal_mm is not None else 1.0
+    return 4 / 3 if crop > MAX_CROP_ONE_INCH or 1.8 < crop < 2.2 else 3 / 2
 
 
 def _taken_side(photo: Mapping[int, Any], size_px: tuple[int, int]) -> float:
