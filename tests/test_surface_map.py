@@ -12,7 +12,7 @@ import pytest
 from recon import se3
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from recon.types import F64, DepthMap
-from service.flight.surface_map import MAX_OVER, PagedMap, SurfaceMap
+from service.flight.surface_map import MAX_OVER, SIGMA_K1, PagedMap, SurfaceMap
 from service.flight.viewpoints import StereoCandidate
 from service.progress import Stopwatch
 
@@ -105,17 +105,37 @@ def test_nonsense_limits_are_refused(tmp_path: Path) -> None:
         PagedMap(CONFIG, tmp_path, max_voxels=10)
 
 
-@pytest.mark.parametrize("is_lens_assumed", [False, True])
-def test_an_assumed_lens_widens_what_is_stored_and_not_the_choice(is_lens_assumed: bool) -> None:
+@pytest.mark.parametrize(("assumed", "share"), [((), 0.0), (("lens",), 0.02)])
+def test_an_assumed_lens_widens_what_is_stored_and_not_the_choice(
+    assumed: tuple[str, ...], share: float
+) -> None:
     """2 % of the depth; a better view still counts as better."""
-    surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], is_lens_assumed)
+    surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], assumed)
     first, better = (view(0.0, sigma_m=sigma) for sigma in (0.2, 0.05))
     candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=0.0))
     sigma, fresh = surface(candidate, first, first.T_world_camera)
-    share = 0.02 if is_lens_assumed else 0.0
     np.testing.assert_allclose(sigma, np.hypot(0.2, share * first.depth_m), rtol=1e-5)
     assert fresh.all() and sigma.dtype == np.float32
     assert surface(candidate, better, better.T_world_camera)[1].all()
+
+
+def test_an_unknown_distortion_widens_the_sigma_towards_the_corners() -> None:
+    """By the change of disparity that k1 of one sigma makes, on average over both axes."""
+    surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], ("distortion",))
+    seen = view(0.0, sigma_m=0.2)
+    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=0.0))
+    sigma, _ = surface(candidate, seen, seen.T_world_camera)
+    h = sigma.shape[0]
+    row, column, k1, b = h - 1, 0, SIGMA_K1, 1e-4
+    at = np.array([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]])
+    moved = []
+    for axis in np.eye(2):
+        left, right = at + 0.5 * b * axis, at - 0.5 * b * axis
+        shift = k1 * (left * (left @ left) - right * (right @ right))
+        moved.append(float(shift @ axis) / b)
+    expected = np.hypot(0.2, np.mean(moved) * seen.depth_m[row, column])
+    assert sigma[row, column] == pytest.approx(expected, rel=1e-3)
+    assert sigma.min() < 1.001 * 0.2
 
 
 def test_an_unknown_readout_widens_the_sigma_and_gives_way_to_what_is_seen_later() -> None:

@@ -32,6 +32,7 @@ SIGMA_FOCAL = 0.02
 """Relative sigma of a focal length in tags: it is that of the lens's model, and rounded; two real
 cameras had 0.5 % less and 3.7 % more (docs/reports/accuracy.md)."""
 
+CALIBRATED = "the maker's calibration"
 AGREEMENT = 0.1
 """A focal length that differs more from the 35 mm equivalent belongs to another size of the image:
 programs that shrink images keep such tags unchanged."""
@@ -44,8 +45,13 @@ class Lens:
     focal: float
     principal: tuple[float, float] = (0.0, 0.0)  # offset from the image centre
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    source: str = ""  # "the maker's calibration", "the focal length in EXIF", ...
+    source: str = ""  # CALIBRATED, "the focal length in EXIF", ...
     sigma_focal: float = SIGMA_FOCAL  # as a share
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the distortion is known."""
+        return self.source == CALIBRATED
 
     def camera(self, size_px: tuple[int, int]) -> Camera:
         """The camera for images of ``size_px`` (W, H) that are not cropped."""
@@ -118,14 +124,14 @@ def _maker(
     if numbers is not None:
         fx, _, cx, cy, k1, k2, p1, p2, k3 = numbers
         bent = (0.0, 0.0, 0.0, 0.0, 0.0) if is_straight else (k1, k2, p1, p2, k3)
-        return Lens(fx / side, (cx / side, cy / side), bent, "the maker's calibration")
+        return Lens(fx / side, (cx / side, cy / side), bent, CALIBRATED)
     focal = _number(xmp.get("CalibratedFocalLength"))
     if focal is None:
         return None
     W, H = (side * n / max(size_px) for n in size_px)
     x, y = (_number(xmp.get(f"CalibratedOpticalCenter{axis}")) for axis in "XY")
     middle = (0.0, 0.0) if x is None or y is None else ((x - W / 2) / side, (y - H / 2) / side)
-    return Lens(focal / side, middle, source="the maker's calibration")
+    return Lens(focal / side, middle, source=CALIBRATED)
 
 
 def _pix4d(
@@ -144,8 +150,7 @@ def _pix4d(
         middle = ((point[0] * per_mm - W / 2) / side, (point[1] * per_mm - H / 2) / side)
     bent = _numbers(xmp.get("PerspectiveDistortion", ""), 5) or [0.0] * 5
     k1, k2, k3, p1, p2 = bent
-    source = "the maker's calibration"
-    return Lens(focal * per_mm / side, middle, (k1, k2, p1, p2, k3), source)
+    return Lens(focal * per_mm / side, middle, (k1, k2, p1, p2, k3), CALIBRATED)
 
 
 def _focal(photo: Mapping[int, Any], size_px: tuple[int, int]) -> Lens | None:

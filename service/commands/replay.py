@@ -143,7 +143,7 @@ def _replay(
             f"no camera model given: found from the images themselves ({own.K[0, 0]:.0f} px)"
         )
     else:
-        camera = _tagged_camera(source, notes)
+        camera, assumed = _tagged_camera(source, notes)
     if camera is None:
         camera, assumed = _assumed_camera(source, notes), ("lens",)
     camera, config = _with_stated_readout(camera, config, video, source, notes)
@@ -274,18 +274,18 @@ def _fitted(camera: Camera, source: CameraSource, notes: list[str]) -> Camera:
     return model
 
 
-def _tagged_camera(source: CameraSource, notes: list[str]) -> Camera | None:
-    """A pinhole by the images' tags, with a note; None without tags."""
+def _tagged_camera(source: CameraSource, notes: list[str]) -> tuple[Camera | None, tuple[str, ...]]:
+    """The camera by the images' tags, with a note, and what they leave open; None without tags."""
     from service.cameras.images import ImagesSource
 
     if not isinstance(source, ImagesSource) or source.lens is None or source.camera is None:
-        return None
+        return None, ()
     f, side = source.lens.focal, max(source.size_px)
     notes.append(
         f"no camera model given: taken from {source.lens.source} ({f * side:.0f} px); "
         "make one with 'skyrelief calibrate' for true shapes"
     )
-    return source.camera
+    return source.camera, () if source.lens.is_calibrated else ("distortion",)
 
 
 def _own_lens(source: CameraSource, config: Config) -> Camera | None:

@@ -85,7 +85,7 @@ class ScanInputs:
     unix_offset_ns: int = 0  # history's clock to unix time
     history: VehicleHistory | None = None
     notes: tuple[str, ...] = ()
-    assumed: tuple[str, ...] = ()  # of "lens"
+    assumed: tuple[str, ...] = ()  # of "lens", "distortion"
     extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
     latency_ms: float | None = None  # the camera's as an earlier scan found it
     warn: Callable[[str], None] = log.warning  # the operator
@@ -134,7 +134,7 @@ class Scan:
                 inputs.backend,
                 live=live,
                 pages=pages,
-                is_lens_assumed="lens" in inputs.assumed,
+                assumed=inputs.assumed,
             )
         )
         self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()
@@ -282,7 +282,7 @@ class Scan:
         }
 
     def _assumed(self) -> list[str]:
-        """Quantities that were assumed in this scan, of "lens", "view" and "height"."""
+        """What was assumed in this scan, of "lens", "distortion", "view" and "height"."""
         out = list(self.inputs.assumed)
         if self.attitudes == 0:
             out.append("view")

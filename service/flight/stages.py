@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -383,13 +383,13 @@ def build_stages(
     backend: Backend,
     live: bool = False,
     pages: Path | None = None,
-    is_lens_assumed: bool = False,
+    assumed: Collection[str] = (),
 ) -> Stages:
     """The stages that the configuration asks for. Raises ValueError for an unusable camera model.
 
     ``live`` drops old work when reconstruction cannot keep up. ``pages`` is a folder for the oldest
     parts of the map and, in files without a name, for what is kept of every view. None: keep all
-    in memory, and drop the oldest parts of the map. ``is_lens_assumed`` widens sigmas.
+    in memory, and drop the oldest parts of the map. An ``assumed`` lens widens sigmas.
     """
     compute, stopwatch, resources = config.compute, Stopwatch(), ExitStack()
     limit_threads(compute.threads)
@@ -418,7 +418,7 @@ def build_stages(
     views = StereoViews(selection, odometry, undistort.camera, undistort.valid, refused)
     surface = SurfaceMap(
         pages, compute.map_voxels, config.scan.resolution_m, stopwatch, float(camera.K[0, 0]),
-        is_lens_assumed,
+        assumed,
     )  # fmt: skip
 
     def in_background(

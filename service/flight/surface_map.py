@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +30,10 @@ no better (docs/reports/accuracy.md)."""
 ASSUMED_LENS_SHARE = 0.02
 """Sigma of depth over depth where a lens without distortion is assumed: lenses of action cameras
 bend surfaces by that much."""
+
+SIGMA_K1 = 0.02
+"""Sigma of a lens's first radial coefficient where tags give its focal length alone: what is left
+in stills that drones straighten themselves."""
 
 MAX_OVER = 4
 
@@ -135,16 +140,18 @@ class SurfaceMap:
         resolution_m: float,
         stopwatch: Stopwatch,
         focal_px: float,
-        is_lens_assumed: bool = False,
+        assumed: Collection[str] = (),
     ) -> None:
         """``pages``: see :class:`PagedMap`; None: forget the oldest when memory is full.
 
-        ``focal_px`` is of the recorded images.
+        ``focal_px`` is of the recorded images. With "lens" or "distortion" among ``assumed``,
+        sigma covers the bending by it.
         """
         self._pages, self._max_voxels, self._resolution_m = pages, max_voxels, resolution_m
         self._stopwatch = stopwatch
         self._focal_px = focal_px
-        self._lens_share = ASSUMED_LENS_SHARE if is_lens_assumed else 0.0
+        self._lens_share = ASSUMED_LENS_SHARE if "lens" in assumed else 0.0
+        self._sigma_k1 = SIGMA_K1 if "distortion" in assumed else 0.0
         self._map: VoxelMap | PagedMap | None = None
         self._disagreement, self._segment = Disagreement(), -1
 
@@ -168,7 +175,20 @@ class SurfaceMap:
                 known = self._map = self._empty(depth)
             fresh = known.fresh(in_map)
             known.insert(in_map, fresh)
-            return np.hypot(in_map.sigma_m, np.float32(self._lens_share) * depth.depth_m), fresh
+            return np.hypot(in_map.sigma_m, self._bending(depth) * depth.depth_m), fresh
+
+    def _bending(self, depth: DepthMap) -> F32:
+        """Sigma by the lens over depth, (h, w) or a scalar.
+
+        k1 shifts a point at the radius r (of the focal length) by k1 r^3. A pair that sees it with
+        the baseline b shifts its disparity by b k1 (3 r^2 along it, r^2 across): 2 r^2 on average.
+        """
+        if not self._sigma_k1:
+            return np.asarray(self._lens_share, np.float32)
+        h, w = depth.depth_m.shape
+        K = depth.K
+        x, y = (np.arange(w) - K[0, 2]) / K[0, 0], (np.arange(h) - K[1, 2]) / K[1, 1]
+        return np.asarray(2.0 * self._sigma_k1 * np.add.outer(y * y, x * x), np.float32)
 
     def _empty(self, depth: DepthMap) -> VoxelMap | PagedMap:
         """A map as fine as the first view."""

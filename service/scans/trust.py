@@ -59,6 +59,9 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         return _said(Trust.RELATIVE, [f"the scale is uncertain by {scale_sigma:.0%}"])
     if georeference == "none":
         return _said(Trust.SCALED, ["no positions: the scan has its own origin and heading"])
+    if "distortion" in assumed:
+        bent = "the lens's distortion is unknown: surfaces bend by a percent of the distance"
+        return _said(Trust.GEOREFERENCED, [bent])
     return _said(Trust.GEOREFERENCED, [])
 
 
