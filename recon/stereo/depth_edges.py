@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from recon.bands import in_bands
-from recon.types import F64, Bool, DepthMap
+from recon.types import F32, F64, Bool, DepthMap
 
 FLAT_RADIUS, PLANE_RADIUS = 3, 5
 """Pixels: a level surface of 7x7, such as a small roof, or a slanted one of 11x11. A mixture over
@@ -26,6 +26,9 @@ the plane through the mixture fits."""
 
 FILL_PX = 15
 """Unknown pixels take the mean of the known ones in a window of this side."""
+
+Windows = tuple[F32, F32, F32, F32]
+"""(h, w) mean, slope along columns and along rows, and variance about them."""
 
 
 def drop_mixtures(depth: DepthMap) -> DepthMap:
@@ -39,14 +42,14 @@ def drop_mixtures(depth: DepthMap) -> DepthMap:
     known = np.isfinite(depth.depth_m)
     if not known.any():
         return depth
-    z = np.where(known, depth.depth_m, 1.0).astype(np.float64)
-    middle = float(np.median(z[known]))
-    nearness = np.where(known, middle / z - 1.0, 0.0)
+    z = np.where(known, depth.depth_m, np.float32(1.0))
+    middle = np.float32(z[known].mean())
+    nearness = np.where(known, middle / z - np.float32(1.0), np.float32(0.0))
     around = cv2.blur(nearness, (FILL_PX, FILL_PX)) / np.maximum(
-        cv2.blur(known.astype(np.float64), (FILL_PX, FILL_PX)), 1e-6
+        cv2.blur(known.astype(np.float32), (FILL_PX, FILL_PX)), np.float32(1e-6)
     )
     nearness = np.where(known, nearness, around)
-    noise = np.where(known, middle * depth.sigma_m / z**2, 0.0)
+    noise = np.where(known, middle * depth.sigma_m / (z * z), np.float32(0.0))
     mixed = known.copy()
     in_bands(
         _keep_mixtures, len(mixed), nearness, noise,
@@ -64,26 +67,25 @@ def drop_mixtures(depth: DepthMap) -> DepthMap:
     )
 
 
-def _windows(x: F64, radius: int, is_slanted: bool) -> F64:
-    """(h, w, 4) mean, slope along columns and along rows, and variance about them, of the window
-    of ``x`` (h, w) about each pixel."""
+def _windows(x: F32, radius: int, is_slanted: bool) -> Windows:
+    """Of the window of ``x`` (h, w) about each pixel."""
     size = 2 * radius + 1
     spread = (size**2 - 1) / 12.0
     mean = np.full(size, 1.0 / size)
     slope = np.arange(-radius, radius + 1) * (mean / spread if is_slanted else 0.0)
 
-    def filtered(values: F64, across: F64, down: F64) -> F64:
+    def filtered(values: F32, across: F64, down: F64) -> F32:
         found = cv2.sepFilter2D(values, -1, across, down, borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(found, np.float64)
+        return np.asarray(found, np.float32)
 
     m, dx, dy = (filtered(x, *k) for k in ((mean, mean), (slope, mean), (mean, slope)))
-    variance = filtered(x * x, mean, mean) - m * m - spread * (dx * dx + dy * dy)
-    return np.stack([m, dx, dy, np.maximum(variance, 0.0)], axis=2)
+    variance = filtered(x * x, mean, mean) - m * m - np.float32(spread) * (dx * dx + dy * dy)
+    return m, dx, dy, variance
 
 
 @njit(cache=True, nogil=True)
 def _keep_mixtures(
-    begin: int, end: int, x: F64, noise: F64, flat: F64, slanted: F64, mixed: Bool
+    begin: int, end: int, x: F32, noise: F32, flat: Windows, slanted: Windows, mixed: Bool
 ) -> None:  # pragma: no cover - compiled
     """Set ``mixed`` to False where the pixel lies on a surface."""
     for v in range(begin, end):
@@ -95,15 +97,15 @@ def _keep_mixtures(
 
 @njit(cache=True, nogil=True)
 def _is_off(
-    windows: F64, radius: int, u: int, v: int, here: float, noise: float
+    windows: Windows, radius: int, u: int, v: int, here: float, noise: float
 ) -> Any:  # pragma: no cover - compiled
     """True where a pixel does not lie on the steadiest of the windows that contain it."""
+    mean, across, down, variance = windows
     least, expected = np.inf, here
     for dv in (-radius, 0, radius):
         for du in (-radius, 0, radius):
             i, j = u - du, v - dv
-            if 0 <= i < windows.shape[1] and 0 <= j < windows.shape[0]:
-                at = windows[j, i]
-                if at[3] < least:
-                    least, expected = at[3], at[0] + at[1] * du + at[2] * dv
-    return abs(here - expected) > np.sqrt(least) + noise
+            if 0 <= i < mean.shape[1] and 0 <= j < mean.shape[0] and variance[j, i] < least:
+                least = variance[j, i]
+                expected = mean[j, i] + across[j, i] * du + down[j, i] * dv
+    return abs(here - expected) > np.sqrt(max(least, 0.0)) + noise
