@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from functools import partial
 
+import cv2
 import numpy as np
 import pytest
 from painted_ground import pose, still
 
 from recon.tracking import common_view
 from recon.tracking.common_view import FeatureCache, Features, Signatures, alike, features
-from recon.types import U8
+from recon.types import F64, U8
 
 
 def noisy(image: U8, seed: int) -> U8:
@@ -30,7 +31,7 @@ def test_the_strongest_features_come_first() -> None:
 def test_a_cache_forgets_what_was_not_asked_for_longest(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
 
-    def counted(gray: U8) -> Features:
+    def counted(gray: U8, *_: int) -> Features:
         made.append(int(gray[0, 0]))
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), 16)
 
@@ -49,3 +50,24 @@ def test_a_look_is_that_of_the_place_whatever_the_turn() -> None:
     )
     assert alike(here, turned) > 20 > 8 > alike(here, elsewhere)
     assert here.dtype == np.uint8 and here.nbytes <= 200 * 128
+
+
+def test_stills_that_share_fine_detail_alone_are_compared_in_fine_detail() -> None:
+    """Treetops: leaves look alike from two places, their masses do not."""
+    rng = np.random.default_rng(3)
+
+    def texture(size_px: float, shape: tuple[int, int] = (720, 1280)) -> F64:
+        noise = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), size_px)
+        return np.asarray(noise / noise.std(), np.float64)
+
+    leaves = texture(1.8, (720, 1380))
+    images = [
+        np.asarray(np.clip(120 + 35 * seen + 30 * texture(8.0), 0, 255), np.uint8)
+        for seen in (leaves[:, :1280], leaves[:, 100:])
+    ]
+    a, b = enumerate(images)
+    cache = FeatureCache()
+    assert cache.common_view(a, b, is_still=False) is None
+    view = cache.common_view(a, b, is_still=True)
+    assert view is not None
+    np.testing.assert_allclose(view.carry(np.array([[640.0, 360.0]])), [[540.0, 360.0]], atol=2.0)

@@ -24,6 +24,9 @@ WIDTH_PX = 480
 MOST = 1000
 """Features of an image."""
 
+FINE_WIDTH_PX, FINE_MOST = 960, 3000
+"""For stills that share too few of those: treetops look alike, or different, in a small image."""
+
 RATIO = 0.8
 """Distance to the best descriptor over that to the second best, at most."""
 
@@ -182,14 +185,26 @@ class FeatureCache:
 
     def __init__(self, kept: int = KEPT) -> None:
         self._kept = kept
-        self._of: dict[int, Features] = {}
+        self._of: dict[tuple[int, int], Features] = {}
 
-    def of(self, seq: int, gray: U8) -> Features:
+    def common_view(
+        self, a: tuple[int, U8], b: tuple[int, U8], is_still: bool
+    ) -> CommonView | None:
+        """What two images, each by number and pixels (H, W), share, or None.
+
+        Stills are compared in finer detail where they need it: they are few and far apart.
+        """
+        view = common_view(self.of(*a), self.of(*b))
+        if view is None and is_still:
+            view = common_view(*(self.of(*image, FINE_WIDTH_PX, FINE_MOST) for image in (a, b)))
+        return view
+
+    def of(self, seq: int, gray: U8, width_px: int = WIDTH_PX, most: int = MOST) -> Features:
         """Features of image ``seq``, which is ``gray`` (H, W)."""
-        known = self._of.pop(seq, None)
+        known = self._of.pop((seq, width_px), None)
         if known is None:
-            known = features(gray)
-        self._of[seq] = known
+            known = features(gray, width_px, most)
+        self._of[seq, width_px] = known
         while len(self._of) > self._kept:
             del self._of[next(iter(self._of))]
         return known

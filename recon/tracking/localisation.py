@@ -16,7 +16,7 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
-from recon.tracking.common_view import CommonView, FeatureCache, common_view
+from recon.tracking.common_view import CommonView, FeatureCache
 from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame, landmarks
 from recon.tracking.prediction import Motion
 from recon.types import F64, I64, Bool, Camera, PosePrior
@@ -168,7 +168,7 @@ class Localiser:
         The scale is that of the keyframe's landmarks, or where none is shared of the ground
         that they lie on.
         """
-        for key, view in self._views(new, keyframes):
+        for key, view in self._views(new, keyframes, is_still=True):
             guess = view.predict(key.uv, FEATURE_SHARE * self.camera.size_px[0])
             found = matching.match(
                 key.pyramid, key.uv.astype(np.float32), new.pyramid, guess.uv.astype(np.float32),
@@ -220,27 +220,27 @@ class Localiser:
             share = self.config.wide_search_share if still else self.config.search_share
             yield Start(key, by_motion, share)
         if still or lost:
-            yield from self._by_features(new, keyframes)
+            yield from self._by_features(new, keyframes, still)
         if not still or turn is None:
             yield Start(key, by_motion, self.config.wide_search_share)
 
     def _by_features(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe]
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], is_still: bool
     ) -> Iterator[Start]:
         """Poses by features that the frame shares with recent keyframes, the most first."""
-        for key, view in self._views(new, keyframes):
+        for key, view in self._views(new, keyframes, is_still):
             T_camera_odom = self._pose_by(key, view)
             if T_camera_odom is not None:
                 yield Start(key, T_camera_odom, FEATURE_SHARE, by_features=True)
 
     def _views(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe]
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], is_still: bool
     ) -> list[tuple[OdometryKeyframe, CommonView]]:
         """Recent keyframes that share features with the frame, the most first."""
-        here = self._features.of(new.seq, new.gray)
-        views = []
+        here, views = (new.seq, new.gray), []
         for key in keyframes[-RECALLED:]:
-            view = common_view(self._features.of(key.seq, key.pyramid.levels[0]), here)
+            there = key.seq, key.pyramid.levels[0]
+            view = self._features.common_view(there, here, is_still)
             if view is not None:
                 views.append((key, view))
         return sorted(views, key=lambda item: -len(item[1]))
@@ -383,7 +383,9 @@ class FirstViews:
         radius_px: float,
         features: FeatureCache,
     ) -> None:
+        """``radius_px`` is searched where motion or telemetry predicts the corners."""
         self._K, self._config, self._radius_px = camera.K, config, radius_px
+        self._near_px = FEATURE_SHARE * camera.size_px[0]
         self._features = features
         self._drift = np.eye(3)  # from the first frame's pixels to the last one's
 
@@ -423,10 +425,10 @@ class FirstViews:
         if R_b_a is not None:
             H = self._by_telemetry(new, first, R_b_a)
             yield prediction.by_homography(H, first.uv, self._radius_px)
-        here = self._features.of(new.seq, new.gray)
-        view = common_view(self._features.of(first.seq, first.pyramid.levels[0]), here)
+        images = (first.seq, first.pyramid.levels[0]), (new.seq, new.gray)
+        view = self._features.common_view(*images, still)
         if view is not None:
-            yield view.predict(first.uv, self._radius_px)
+            yield view.predict(first.uv, self._near_px)
 
     def _by_telemetry(self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64) -> F64:
         """(3, 3) homography of level ground by attitude, and by position and height if known."""
