@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import datetime as dt
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -24,7 +22,7 @@ from recon.surface.change import (
     outlines,
     volumes,
 )
-from recon.surface.raster import Grid, Raster, fill_holes, grid_over, hillshade
+from recon.surface.raster import Grid, Raster, fill_holes, grid_over
 from recon.surface.walls import Wall, walls_moved
 from recon.types import F32, F64, U8, Bool, DepthMap
 from service.errors import InputError
@@ -33,6 +31,7 @@ from service.offline.exports.rasters import NODATA_M, Layers, mosaic, over, put,
 from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.geopackage import points, polygons, write_layers
 from service.offline.site.alignment import AlignedSite, align_site
+from service.offline.site.change_page import draw_outlines, drawn, page, place_in, shape_of
 from service.offline.site.gather import Member, Part
 from service.offline.tiles import TILE_POINTS, Tile, grown, run_tiles
 from service.progress import Progress
@@ -49,13 +48,9 @@ CHANGE_JSON, CHANGE_PAGE = "change.json", "change.html"
 HOLE_CELLS = 2
 """Voxels and cells of one size leave lines of cells without a point."""
 
-ADDED, REMOVED = (40, 90, 230), (220, 120, 30)  # BGR
-
-
 MARGIN_M = 40.0
 """Around a tile: bending is a mean over 10 m (1 sigma); a smaller object is measured whole."""
 
-PAGE_PX = 1400
 WALL_COLUMNS = ("moved_m", "sigma_m", "towards_deg", "area_m2")
 
 
@@ -89,7 +84,7 @@ class ChangePart:
     layers: Layers
     objects: list[Found]
     walls: list[Wall] | None  # None: py4dgeo is not installed
-    pictures: tuple[U8, U8]  # BGR, before and after
+    images: tuple[U8, U8]  # BGR, before and after
     compared_m2: float
     alignment_m: float
 
@@ -120,7 +115,7 @@ def compare(
         document = _document(site, found, one, two)
         _write_polygons(view, out / CHANGE_GPKG, found)
         with writing(out / CHANGE_PAGE) as part:
-            part.write_text(page(document, found), encoding="utf-8")
+            part.write_text(page(document, found.images), encoding="utf-8")
         with writing(out / CHANGE_JSON) as part:
             part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     hide_changed(out / "scan.db", site.members[one], out / CHANGE_TIF)
@@ -136,7 +131,7 @@ class Changes:
 
     objects: list[Found]
     walls: list[Wall] | None
-    pictures: tuple[U8, U8]
+    images: tuple[U8, U8]
     cell_m: float
     compared_m2: float
     alignment_m: float  # largest of the tiles
@@ -172,24 +167,25 @@ def changes(
     if first is None:
         return None
     grid = whole or first.layers.grid
-    blank: U8 = np.full((*_page_shape(grid), 3), 255, np.uint8)
-    pictures = blank, blank.copy()
+    blank: U8 = np.full((*shape_of(grid), 3), 255, np.uint8)
+    images = blank, blank.copy()
     objects: list[Found] = []
     walls: list[Wall] | None = []
     area, alignment = 0.0, 0.0
-    with mosaic(view, out / CHANGE_TIF, grid, first.layers) as image:
+    with mosaic(view, out / CHANGE_TIF, grid, first.layers) as map_:
         for part in chain([first], compared):
-            put(image, part.layers)
-            rows, cols = _page_place(part.layers.grid, grid)
-            for canvas, picture in zip(pictures, part.pictures, strict=True):
-                canvas[rows, cols] = picture
+            put(map_, part.layers)
+            rows, cols = place_in(part.layers.grid, grid)
+            for canvas, image in zip(images, part.images, strict=True):
+                canvas[rows, cols] = image
             area, alignment = area + part.compared_m2, max(alignment, part.alignment_m)
             objects += part.objects
             walls = None if walls is None or part.walls is None else [*walls, *part.walls]
-        objects = _numbered(image, objects)
-    for picture in pictures:
-        _outline(picture, objects, grid)
-    return Changes(objects, walls, pictures, grid.cell_m, area, alignment) if area else None
+        objects = _numbered(map_, objects)
+    for image in images:
+        for one in objects:
+            draw_outlines(image, chain(*one.rings), one.body.volume_m3 > 0, grid)
+    return Changes(objects, walls, images, grid.cell_m, area, alignment) if area else None
 
 
 def _numbered(image: Any, objects: list[Found]) -> list[Found]:
@@ -232,7 +228,7 @@ def change_tile(job: ChangeJob, progress: Progress | None = None) -> ChangePart 
     )
     names = ("after less before, m", "sigma, m", "object")
     layers = Layers(grid, bands.astype(np.float32), names, NODATA_M).within(job.tile.box)
-    place = _page_place(layers.grid, job.whole or layers.grid)
+    place = place_in(layers.grid, job.whole or layers.grid)
     size = (place[1].stop - place[1].start, place[0].stop - place[0].start)
     one, two = (drawn(raster, rows, cols, size) for raster in both)
     return ChangePart(
@@ -444,88 +440,3 @@ def _write_polygons(view: ScanView, path: Path, change: Changes) -> None:
         places = np.array([[wall.east_m, wall.north_m] for wall in change.walls])
         layers.append(points("walls", places, about))
     write_layers(path, view.needs_place("a GeoPackage").epsg, layers)
-
-
-# ---- page --------------------------------------------------------------------------------------
-
-PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>
-<meta name="viewport" content="width=device-width">
-<style>body{{font:15px/1.5 system-ui,sans-serif;margin:1.5em;max-width:70em}}
-#map{{position:relative;line-height:0;width:1000px}}img{{width:1000px}}
-#over{{position:absolute;left:0;top:0;height:100%;width:50%;min-width:2em;max-width:100%;
-overflow:hidden;resize:horizontal;border-right:3px solid #fff;box-shadow:1px 0 3px #000}}
-td,th{{padding:.1em .8em;text-align:right}}</style>
-<h1>{title}</h1><p>{words}</p>
-<p>Left: {before}. Right: {after}. Red: added; blue: removed. Drag the corner at the lower
-end of the white line.</p>
-<div id="map"><img alt="after" src="{two}"><div id="over"><img alt="before" src="{one}"></div></div>
-<table><tr><th>object<th>kind<th>area, m2<th>volume, m3<th>95 %, m3<th>highest, m</tr>{rows}</table>
-{notes}</html>
-"""
-
-
-def page(document: dict[str, Any], change: Changes) -> str:
-    """A page without scripts, as the portal allows none: both dates under a slider, the objects."""
-    from html import escape
-
-    rows = "".join(
-        f"<tr><td>{n}<td>{one['kind']}<td>{one['area_m2']:.1f}<td>{one['volume_m3']:+.2f}"
-        f"<td>{1.96 * one['sigma_m3']:.2f}<td>{one['peak_m']:+.2f}</tr>"
-        for n, one in enumerate(document["objects"], 1)
-    )
-    return PAGE.format(
-        title=escape(f"Change {document['before']['scan']} to {document['after']['scan']}"),
-        words=escape(document["in_words"]),
-        before=escape(document["before"]["started"]),
-        after=escape(document["after"]["started"]),
-        one=_embedded(change.pictures[0]),
-        two=_embedded(change.pictures[1]),
-        rows=rows,
-        notes="".join(f"<p>{escape(note)}</p>" for note in document["notes"]),
-    )
-
-
-def _embedded(image: U8) -> str:
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
-    return "data:image/jpeg;base64," + base64.b64encode(data).decode()
-
-
-def drawn(raster: Raster, rows: slice, cols: slice, size: tuple[int, int]) -> U8:
-    """(h, w, 3) BGR of some cells of a surface in its colours and relief; ``size`` is (w, h)."""
-    shade = np.nan_to_num(hillshade(raster.height_m, raster.grid.cell_m), nan=1.0)
-    image = raster.rgb[..., ::-1] * (0.4 + 0.8 * shade[..., None])
-    image[~raster.known] = 255
-    part = np.clip(image[rows, cols], 0, 255).astype(np.uint8)
-    if not all(size):
-        return np.zeros((size[1], size[0], 3), np.uint8)
-    return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_LINEAR), np.uint8)
-
-
-def _page_shape(whole: Grid) -> tuple[int, int]:
-    """Rows and columns of the page's picture of a grid."""
-    return max(1, round(whole.shape[0] * PAGE_PX / whole.shape[1])), PAGE_PX
-
-
-def _page_place(part: Grid, whole: Grid) -> tuple[slice, slice]:
-    """Rows and columns of a part of a grid in the page's picture."""
-    zoom = PAGE_PX / whole.shape[1]
-    starts = (
-        (whole.north_m - part.north_m) / whole.cell_m,
-        (part.west_m - whole.west_m) / whole.cell_m,
-    )
-    ends = [
-        (min(max(round(start * zoom), 0), limit), min(round((start + count) * zoom), limit))
-        for start, count, limit in zip(starts, part.shape, _page_shape(whole), strict=True)
-    ]
-    return slice(*ends[0]), slice(*ends[1])
-
-
-def _outline(picture: U8, objects: Sequence[Found], whole: Grid) -> None:
-    """Draw the outlines of the objects into the page's picture."""
-    zoom = PAGE_PX / whole.shape[1]
-    for one in objects:
-        colour = ADDED if one.body.volume_m3 > 0 else REMOVED
-        for rings in one.rings:
-            for ring in rings:
-                at: Any = np.rint((whole.pixels(ring) + 0.5) * zoom).astype(np.int32)
-                cv2.polylines(picture, [at], True, colour, 2, cv2.LINE_AA)
