@@ -54,10 +54,10 @@ function colours({ cloud, legend }: Parts): HTMLElement {
   const select = el(
     "select",
     {},
-    ...COLOURS.map((c) => el("option", { value: c, textContent: c, hidden: c === "scan" && !cloud.parts.length })),
+    ...COLOURS.filter((c) => c !== "scan" || cloud.parts.length).map((c) => el("option", { value: c, textContent: c })),
   );
   cloud.named = () => {
-    select.options[COLOURS.indexOf("scan")]!.hidden = false;
+    if (select.options.length < COLOURS.length) select.append(el("option", { value: "scan", textContent: "scan" }));
     if (select.value === "scan") select.dispatchEvent(new Event("change"));
   };
   select.setAttribute("aria-label", "colour by");
