@@ -5,7 +5,9 @@ from __future__ import annotations
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -202,6 +204,18 @@ def test_odd_ones_are_left_out_and_reported(tmp_path: Path) -> None:
     reported = "\n".join(source.warnings)
     for name in ("bad.jpg", "empty.jpg", "1.jpg", "not 64x48"):
         assert name in reported
+
+
+def test_a_still_is_not_skipped_for_want_of_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_still(tmp_path / "a.jpg")
+    source = open_camera(str(tmp_path))
+    short = cv2.error("Failed to allocate 5760000 bytes")
+    short.code = cv2.Error.StsNoMem
+    monkeypatch.setattr(cv2, "imdecode", Mock(side_effect=short))
+    with pytest.raises(MemoryError, match=r"a\.jpg"):
+        list(source)
 
 
 def test_folders_without_images_are_refused(tmp_path: Path) -> None:

@@ -239,7 +239,8 @@ def _from_first(times_ns: list[int]) -> list[int]:
 def _load(path: Path, stored_px: tuple[int, int], turned_deg: int) -> U8 | None:
     """(H, W, 3) BGR, turned clockwise by ``turned_deg``.
 
-    None when the file does not decode, or its size is no longer ``stored_px`` (W, H).
+    None when the file does not decode, or its size is no longer ``stored_px`` (W, H). MemoryError
+    without memory for it, which is no fault of the file.
     """
     import cv2
 
@@ -248,7 +249,11 @@ def _load(path: Path, stored_px: tuple[int, int], turned_deg: int) -> U8 | None:
             return None
         data = np.fromfile(path, np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except (OSError, cv2.error):
+    except OSError:
+        return None
+    except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryError(f"no memory for {path.name}") from error
         return None
     if image is None:
         return None
