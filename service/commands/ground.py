@@ -120,39 +120,7 @@ def ground(given: GroundOptions) -> None:
     if refresh is None:
         refresh = RADIO_REFRESH_S if given.mavlink else 0.0
     limits = _limits(given.quota_mb, given.drone_share, given.reserve_mb)
-    page = None
-    if given.portal is not None:
-        page = PortalOptions(
-            given.portal, given.portal_token, given.portal_tls, given.vehicle, given.basemap
-        )
-    _receive(
-        ReceiverConfig(given.store, session, limits, name, refresh, given.sites),
-        given.mavlink or [],
-        page,
-        given.foxglove,
-        given.take or [],
-        Until(given.once, given.idle_exit_s),
-        given.as_json,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class PortalOptions:
-    """Where the portal is served, and to whom."""
-
-    address: str  # HOST:PORT
-    token: Path | None
-    tls: tuple[Path, Path] | None  # certificate and key
-    vehicle: str | None  # MAVLink endpoint
-    basemap: Path | None  # MBTiles or PMTiles
-
-
-@dataclass(frozen=True, slots=True)
-class Until:
-    """The condition under which the station ends."""
-
-    once: bool  # a scan is complete
-    idle_s: float | None  # nothing new came for so long
+    _receive(ReceiverConfig(given.store, session, limits, name, refresh, given.sites), given)
 
 
 def _session(
@@ -178,11 +146,8 @@ def _session(
     )
 
 
-def _receive(
-    config: ReceiverConfig, mavlink: list[str], portal: PortalOptions | None,
-    foxglove: str | None, take: list[Path], until: Until, as_json: bool,
-) -> None:  # fmt: skip
-    """Receive until a signal, or as ``until`` decides; then write the files that are due, and
+def _receive(config: ReceiverConfig, given: GroundOptions) -> None:
+    """Receive until a signal or the end that is asked for; then write the files that are due, and
     report."""
     from service.ground.receiver import Receiver
     from service.init_system import Notifier
@@ -190,15 +155,15 @@ def _receive(
     from service.workers import Workers
 
     notifier = Notifier()
-    taken = _take_in(config.store, take)
+    taken = _take_in(config.store, given.take or [])
     stop, workers = stop_by_signals(), Workers()
     receiver = Receiver(config, workers)
     viewers = None
-    if foxglove is not None:
+    if given.foxglove is not None:
         from service.ground.foxglove import FoxgloveServer
 
-        viewers = FoxgloveServer(foxglove, config.store, config.session.plain, workers)
-    radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in mavlink]
+        viewers = FoxgloveServer(given.foxglove, config.store, config.session.plain, workers)
+    radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in given.mavlink or []]
     receiver.start()
     for folder in taken:
         receiver.align(folder)
@@ -208,13 +173,13 @@ def _receive(
         radio.start()
     page = None
     try:
-        if portal is not None:
-            page = _open_portal(portal, config.store, receiver, workers)
+        if given.portal is not None:
+            page = _open_portal(given.portal, given, receiver, workers)
         if viewers is not None:
             viewers.start()
-            print(f"Foxglove: ws://{foxglove}", file=sys.stderr, flush=True)
+            print(f"Foxglove: ws://{given.foxglove}", file=sys.stderr, flush=True)
         notifier.ready()
-        _watch(stop, receiver, workers, notifier, radios, until)
+        _watch(stop, receiver, workers, notifier, radios, given)
         entries = receiver.progress()
     finally:
         notifier.stopping()
@@ -227,7 +192,7 @@ def _receive(
             radio.close()
         receiver.close()
         closing.join()
-    _report(entries, receiver.dropped, workers.report(), as_json)
+    _report(entries, receiver.dropped, workers.report(), given.as_json)
 
 
 def _limits(quota_mb: float | None, drone_share: float, reserve_mb: float | None) -> Limits:
@@ -257,23 +222,23 @@ def _take_in(store: Path, folders: list[Path]) -> list[Path]:
 
 
 def _open_portal(
-    options: PortalOptions, store: Path, receiver: Receiver, workers: Workers
+    address: str, given: GroundOptions, receiver: Receiver, workers: Workers
 ) -> Portal:
     """The portal, started; its address is printed."""
     with needing("the portal"):
         from service.ground.portal import open_portal
         from service.ground.vehicle import Vehicle
-    endpoint = options.vehicle
+    endpoint = given.vehicle
     vehicle = None if endpoint is None else Vehicle(endpoint, workers=workers)
     page = open_portal(
-        options.address,
-        store,
+        address,
+        given.store,
         receiver.progress,
-        options.token,
-        options.tls,
+        given.portal_token,
+        given.portal_tls,
         vehicle,
         workers,
-        options.basemap,
+        given.basemap,
     )
     if vehicle is not None:
         vehicle.start()
@@ -310,9 +275,9 @@ def _watch(
     workers: Workers,
     notifier: Notifier,
     radios: list[RadioLink],
-    until: Until,
+    given: GroundOptions,
 ) -> None:
-    """Return on a signal, or when the condition of ``until`` is met."""
+    """Return on a signal, or when ``--once`` or ``--idle-exit-s`` is met."""
     shown: dict[str, str] = {}
     shown_at = beat_at = 0.0
     while not stop.wait(0.2):
@@ -322,10 +287,13 @@ def _watch(
             _check(workers, notifier)
             for radio in radios:
                 radio.beat(MAV_TYPE_GCS)
-        if until.once and any(entry["complete"] for entry in entries):
+        if given.once and any(entry["complete"] for entry in entries):
             stop.wait(1.5)  # let the report reach the drone
             return
-        if until.idle_s is not None and time.monotonic() - receiver.last_news_at > until.idle_s:
+        if (
+            given.idle_exit_s is not None
+            and time.monotonic() - receiver.last_news_at > given.idle_exit_s
+        ):
             return
         if sys.stderr.isatty() and time.monotonic() - shown_at > SHOW_S:
             shown_at = time.monotonic()
