@@ -55,11 +55,7 @@ def export(
     from service.offline.exports.view import ExportOptions, ScanView
     from service.offline.exports.view import export as write
 
-    for kind in to:
-        if kind not in EXPORTERS:
-            raise InputError(f"--to {kind}: there are {', '.join(EXPORTERS)}")
-    if out is not None and len(to) > 1:
-        raise InputError("--out names one file; give one --to with it")
+    _check_kinds(to, out)
     try:
         options = ExportOptions(
             voxel_m,
@@ -87,6 +83,15 @@ def export(
             print(*written.values(), sep="\n", end="\n" if written else "")
     if as_json:
         print(json.dumps({"scan": str(scan_dir), "written": written}))
+
+
+def _check_kinds(to: list[str], out: Path | None) -> None:
+    """Raise InputError for a deliverable that there is not, or one file for several."""
+    for kind in to:
+        if kind not in EXPORTERS:
+            raise InputError(f"--to {kind}: there are {', '.join(EXPORTERS)}")
+    if out is not None and len(to) > 1:
+        raise InputError("--out names one file; give one --to with it")
 
 
 def _epoch_ns(seconds: float | None) -> int | None:

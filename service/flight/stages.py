@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -421,12 +422,6 @@ def build_stages(
         assumed,
     )  # fmt: skip
 
-    def in_background(
-        work: Callable[[StereoCandidate], Keyframe | None],
-    ) -> BackgroundWorker[StereoCandidate, Keyframe | None]:
-        name = "dense" if debug is None else None
-        return BackgroundWorker(name, work, MAX_WAITING, live)
-
     return Stages(
         undistort=undistort,
         track=track,
@@ -442,7 +437,12 @@ def build_stages(
         chain=_chain(config, pages, track.is_settled, rejected, stopwatch, resources),
         map=surface,
         keyframe=MakeKeyframe(debug),
-        in_background=in_background,
+        in_background=partial(
+            BackgroundWorker[StereoCandidate, Keyframe | None],
+            "dense" if debug is None else None,
+            bound=MAX_WAITING,
+            live=live,
+        ),
         stopwatch=stopwatch,
         refused=refused,
         rejected=rejected,
