@@ -64,6 +64,23 @@ def test_a_product_is_made_above_the_datum_that_is_asked_for(
         assert image.tags()["HEIGHTS"] == "metres above EGM96"
 
 
+def test_an_alignment_by_points_is_refused_with_its_reason(portal: Portal, tmp_path: Path) -> None:
+    client = Client(portal)
+    with ScanStore.open(tmp_path / "drone-1/test-1/scan.db") as store:
+        store.finish({"frames": 5})
+    place = {"scan": [0.0, 0.0, 0.0], "place": [8.5, 47.4, 400.0]}
+    order = {"drone": "drone-1", "scan": "test-1", "points": 3 * [place]}
+    for bad in ({"points": [{"scan": [0, 0]}]}, {"points": 7}, {"height": 3}):
+        status, said, _ = client.ask(ONE + "/alignment", "POST", {**order, **bad})
+        assert status == 400 and "not valid" in said["error"]
+    assert client.ask(ONE + "/alignment", "POST", {**order, "scan": "../x"})[0] == 404
+    assert client.ask(ONE + "/alignment", "POST", order, token="")[0] == 401
+    assert client.ask(ONE + "/alignment", "POST", order)[0] == 202
+    assert until(lambda: [j for j in client.ask("/api/jobs")[1] if j["state"] == "failed"])
+    assert "--start" in client.ask("/api/jobs")[1][0]["error"]  # it has a georeference
+    assert not (tmp_path / "site/drone-1-test-1").exists()
+
+
 def portal_jobs(client: Client) -> list[str]:
     """States of the jobs that have not ended well."""
     return [job["state"] for job in client.ask("/api/jobs")[1] if job["state"] != "done"]

@@ -14,7 +14,9 @@ import pytest
 from conftest import HouseFlight
 from person import Browser
 from portal_client import NEEDS, TOKEN, browser, flown_store
+from site_scans import FRAME, Errors, leg, write_scan
 
+from recon.posegraph.site_alignment import Similarity
 from recon.types import F64, Keyframe
 from service.georeference import LocalFrame
 from service.ground.portal import Portal, PortalConfig
@@ -57,11 +59,14 @@ class Ruler:
         return np.asarray(self.page.run(script), np.float64).reshape(-1, 2)
 
     def pick(self, x: float, y: float) -> F64:
-        """(3,) ENU metres of the place that a click picks, from the coordinates it shows."""
+        """(3,) local metres of the place that a click picks, from the coordinates it shows."""
         before = len(self.spots)
         self.page.mouse(x, y)
         self.page.wait(f"document.querySelectorAll('.overlay circle').length === {before + 1}", 10)
         text = self.page.run("document.querySelector('.cursor').textContent")
+        local = re.fullmatch(r"(\S+) m east · (\S+) m north · (\S+) m up", text)
+        if local is not None:  # without georeference
+            return np.array([float(v) for v in local.groups()])
         found = re.fullmatch(r"(\S+), (\S+) · UTM 32N (\S+) (\S+) · (\S+) m AMSL", text)
         assert found is not None, text
         lat, lon, east, north, height = map(float, found.groups())
@@ -219,3 +224,71 @@ def test_labels_of_a_small_area_on_a_phone_cover_no_other(ruler: Ruler) -> None:
             for b in boxes[:i]:
                 assert a[0] >= b[2] or b[0] >= a[2] or a[1] >= b[3] or b[1] >= a[3]
     ruler.page.screen(1280, 800)
+
+
+SPOTS = np.array([[-8.0, -6.0], [9.0, -4.0], [1.0, 8.0]])
+"""Of the place of the scans, ENU m."""
+
+
+def test_a_scan_without_georeference_is_placed_by_clicks_in_two_scans(
+    browser: Browser, tmp_path: Path
+) -> None:
+    wrong = Errors((310.0, -120.0, 35.0), (0.05, -0.02, 2.0), 0.4)  # where vision alone has it
+    write_scan(tmp_path / "drone-1/placed", leg(0.0))
+    write_scan(tmp_path / "drone-1/nowhere", leg(np.pi / 2), wrong, frame=None)
+    portal = Portal(PortalConfig(tmp_path, port=0, token=TOKEN))
+    portal.start()
+    browser.screen(1280, 800)
+    browser.open("about:blank")
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 2")
+    ruler = Ruler(browser, FRAME)
+    browser.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/nowhere")
+    clicked = click_spots(ruler, wrong.as_similarity(), "Measure")
+    assert np.abs(clicked[:, :2] - SPOTS).max() < 1.0
+    assert browser.run("document.querySelectorAll('.measure select option').length") == 1
+    browser.click("Place")
+    browser.wait("location.hash.endsWith('/placed')")
+    panel = "document.querySelector('.measure')"
+    browser.wait(f"{panel}.textContent.includes('point 1 of 3 of nowhere')")
+    browser.image(tmp_path / "placing.png")  # to look at
+    assert browser.run(f"{panel}.querySelector('.acts + .acts button').disabled")  # Align
+    click_spots(ruler, Errors().as_similarity(), None)
+    browser.click("Align")
+    ended = "document.querySelector('.jobs li.done, .jobs li.failed')?.textContent"
+    assert "done" in browser.wait(ended, 120)
+    document = json.loads((tmp_path / "site/drone-1-nowhere/site.json").read_text())
+    portal.close()
+    assert [(s["name"], s["placed"]) for s in document["scans"]] == [
+        ("placed", "aligned"), ("nowhere", "aligned"),
+    ]  # fmt: skip
+    assert document["scans"][1]["scale"] == pytest.approx(2.5, rel=0.01)
+    T = np.array(document["scans"][1]["T_site_scan"])
+    there = wrong.as_similarity().points(np.column_stack([SPOTS, np.zeros(3)]))
+    found = 2.5 * there @ T[:3, :3].T + T[:3, 3]
+    assert np.linalg.norm(found[:, :2] - SPOTS, axis=1).max() < 0.5
+
+
+def click_spots(ruler: Ruler, errors: Similarity, button: str | None) -> F64:
+    """Click SPOTS in the scan on the page, which has them off by ``errors``; (3, 3) m of the place
+    that the clicks picked."""
+    page = ruler.page
+    page.wait("document.body.dataset.points > 10000")
+    page.click("Whole site")
+    page.wait("document.body.dataset.still === 'yes'")
+    if button:
+        page.click(button)
+    grid = [(x, y) for x in (560, 640, 720) for y in (360, 420, 480)]
+    picked = np.array([ruler.pick(x, y) for x, y in grid])
+    true = inverse(errors, picked)
+    to_page, _ = cv2.findHomography(true[:, :2], ruler.spots)
+    for _ in grid:
+        page.key("Backspace")
+    page.wait("document.querySelectorAll('.overlay circle').length === 0")
+    spots = cv2.perspectiveTransform(SPOTS[None], to_page)[0]
+    return inverse(errors, np.array([ruler.pick(float(x), float(y)) for x, y in spots]))
+
+
+def inverse(errors: Similarity, points: F64) -> F64:
+    """(N, 3) true places of the points of a scan that is off by ``errors``."""
+    return np.asarray((points - errors.t) @ errors.R / errors.growth)

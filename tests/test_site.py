@@ -6,6 +6,7 @@ import json
 import re
 import sqlite3
 import struct
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from recon import se3
 from recon.types import F64
 from service.cli import app
 from service.errors import InputError
-from service.offline.site.alignment import align_site
+from service.offline.site.alignment import AlignedSite, align_site
 from service.offline.site.compare import compare
 from service.offline.site.gather import between_frames
 from service.stream.store import ScanStore
@@ -114,6 +115,21 @@ def test_aligning_again_keeps_the_history_and_adds_scans(
     assert document["revision"] == 2 and len(document["history"]) == 2
     assert [s["name"] for s in document["scans"]] == ["one", "two", "three"]
     assert len(document["pairs"]) >= 2
+
+
+def test_two_alignments_of_one_site_at_once_wait_for_each_other(tmp_path: Path) -> None:
+    names = ("one", "two", "three")
+    scans = [write_scan(tmp_path / n, NORTH[:2], day=k) for k, n in enumerate(names)]
+    align_site([scans[0]], tmp_path / "site", deliver=False)
+
+    def join(scan: Path) -> AlignedSite:
+        return align_site([scan], tmp_path / "site", deliver=False)
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(join, scans[1:]))
+    document = json.loads((tmp_path / "site/site.json").read_text())
+    assert {s["name"] for s in document["scans"]} == {"one", "two", "three"}
+    assert document["revision"] == 3
 
 
 def test_what_cannot_be_tied_stays_and_is_named(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -46,10 +47,12 @@ from service.ground.library import ConflictError, Library
 from service.ground.live import serve_live
 from service.ground.map_tiles import map_routes
 from service.ground.scan_files import file_routes
+from service.ground.sites import align_by_points
 from service.ground.state import KINDS, Jobs, PortalState, names_of, state_of
 from service.ground.upload import Upload, check_parts
 from service.ground.vehicle import BUTTONS, Vehicle
 from service.offline.exports.view import ExportOptions
+from service.offline.site.start import Pair, Start
 from service.scans.annotations import Spot, as_json, read_annotations
 from service.workers import Workers
 
@@ -101,6 +104,14 @@ class ExportOrder(msgspec.Struct, forbid_unknown_fields=True):
     to_datum: str | None = None
 
 
+class AlignOrder(msgspec.Struct, forbid_unknown_fields=True):
+    """A scan or a site with georeference, and three or more points of the scan on its ground."""
+
+    drone: str
+    scan: str
+    points: list[Pair]
+
+
 class ImportOrder(msgspec.Struct, forbid_unknown_fields=True):
     """A scan folder or a recording of this machine."""
 
@@ -143,6 +154,7 @@ def portal_app(
         *file_routes(one),
         *map_routes(),
         Route(one + "/exports", _export, methods=["POST"]),
+        Route(one + "/alignment", _align, methods=["POST"]),
         WebSocketRoute(one + "/live", _live),
         Route("/api/jobs", _jobs, methods=["GET"]),
         Route("/api/jobs/{number:int}", _cancel, methods=["DELETE"]),
@@ -319,6 +331,18 @@ async def _export(request: Request) -> Response:
     return JSONResponse(state.jobs.start(folder, order.kind, options=options), 202)
 
 
+async def _align(request: Request) -> Response:
+    """Place a scan without georeference by points, and align it with another or a site; the job."""
+    state, (drone, scan) = state_of(request), names_of(request)
+    note(request, "align", scan=f"{drone}/{scan}")
+    order = await _body(request, AlignOrder)
+    note(request, "align", to=f"{order.drone}/{order.scan}", points=len(order.points))
+    folder = state.library.folder(drone, scan)
+    other = state.library.folder(order.drone, order.scan)
+    work = partial(align_by_points, state.library.store, other, folder, Start(order.points))
+    return JSONResponse(state.jobs.start(folder, "align", work), 202)
+
+
 def _jobs(request: Request) -> Response:
     """Jobs that wait, run or have just ended: percent, what is being done, seconds left."""
     return JSONResponse(state_of(request).jobs.listed())
@@ -474,6 +498,7 @@ BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {
     _label: LabelChange,
     _annotate: NewAnnotation,
     _export: ExportOrder,
+    _align: AlignOrder,
     _import: ImportOrder,
     _order: VehicleOrder,
 }

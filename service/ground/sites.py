@@ -25,6 +25,8 @@ from service.ground.drone import Limits
 from service.ground.scan_facts import Ground, Times, ground_in
 from service.ground.storage import DiskShare, is_regular
 from service.offline.site import DRONE, SITE
+from service.offline.site.start import Start
+from service.progress import Progress
 from service.small_file import read_small
 from service.workers import Worker, end_process, guarded, open_process
 
@@ -94,6 +96,22 @@ class Sites:
         log.info("%s: %d scans are aligned", site, len(members))
 
 
+def align_by_points(
+    store: Path, other: Path, folder: Path, start: Start, progress: Progress
+) -> str:
+    """Align the scan in ``folder``, which points place, with the scan or site ``other``.
+
+    Returns the name of the site's file of ties. Raises InputError for points that place nothing.
+    """
+    from service.offline.site.alignment import align_site
+
+    members = [other, folder]
+    site = site_of(store, members)
+    scans = [one for one in members if one != site]
+    align_site(scans, site, starts={folder: start}, progress=progress)
+    return SITE
+
+
 def companions(store: Path, folder: Path) -> list[Path]:
     """The finished scans of the same visit that share ground with the one in ``folder``."""
     try:
@@ -124,10 +142,10 @@ def references(store: Path, started_unix_s: float, known: Collection[Path]) -> l
 
 
 def site_of(store: Path, members: Sequence[Path]) -> Path:
-    """The folder of the site that has one of the members; else a new one, by the first of them."""
+    """The folder of the site that is or has one of the members; else a new one, by the first."""
     known = {member.resolve() for member in members}
     for path, scans in _sites(store):
-        if known & scans:
+        if known & {path.resolve(), *scans}:
             return path
     first = min(members, key=lambda folder: (folder.name, folder.parent.name))
     return store / DRONE / f"{first.parent.name}-{first.name}"[:100]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -32,6 +34,7 @@ from service.offline.site import SITE
 from service.offline.site.gather import Member, gather
 from service.offline.site.start import SIGMA_SCALE as START_SCALE
 from service.offline.site.start import Start, start_of
+from service.progress import Progress
 from service.scans.folder import write_deliverables
 from service.scans.track import local_frame
 from service.scans.writing import writing
@@ -72,14 +75,36 @@ class AlignedSite:
 
 def align_site(
     folders: Sequence[Path], out: Path, deliver: bool = True,
-    starts: Mapping[Path, Start] | None = None,
+    starts: Mapping[Path, Start] | None = None, progress: Progress | None = None,
 ) -> AlignedSite:  # fmt: skip
     """Gather the scans into the folder ``out``, align them, and write the site's files.
 
     The scans of a site that lies there already come first; its earlier alignments stay listed.
-    ``starts`` place scans without georeference, by their folders.
+    ``starts`` place scans without georeference, by their folders. Waits while another process
+    aligns this site.
     Raises InputError for scans that make no site, and when ``out`` holds anything else.
     """
+    _known(out)
+    out.mkdir(parents=True, exist_ok=True)
+    with _locked(out):
+        return _align(folders, out, deliver, starts or {}, progress or Progress())
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder, when it is free."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _align(
+    folders: Sequence[Path], out: Path, deliver: bool, starts: Mapping[Path, Start],
+    progress: Progress,
+) -> AlignedSite:  # fmt: skip
     known = _known(out)
     earlier = [Path(s["folder"]) for s in known.get("scans", [])]
     gone = [f for f in earlier if not (f / "scan.db").is_file()]
@@ -90,18 +115,17 @@ def align_site(
         for s in known.get("scans", [])
         if s.get("start") is not None
     }
-    starts = known_starts | {folder.resolve(): start for folder, start in (starts or {}).items()}
+    starts = known_starts | {folder.resolve(): start for folder, start in starts.items()}
     strange = [str(folder) for folder in starts if folder not in unique]
-    if strange:
-        raise InputError(f"--start names {strange[0]}, which is none of the scans")
-    out.mkdir(parents=True, exist_ok=True)
     fresh = out / ".scan.db.new"
     _remove(fresh)
     try:
+        if strange:
+            raise InputError(f"--start names {strange[0]}, which is none of the scans")
         members, notes = gather(unique, fresh, out.resolve().name, starts)
         notes += [f"{f} is no longer there: left out" for f in gone]
         with ScanStore.open(fresh) as store:
-            found, priors, ties, adjusted = _aligned(store, members)
+            found, priors, ties, adjusted = _aligned(store, members, progress)
             store.add_reposes(_reposes(store, members, found, adjusted))
             document = _document(store, members, found, priors, ties, notes, known)
             store.update_header(notes=tuple(document["notes"]))
@@ -148,14 +172,16 @@ def _replace(fresh: Path, path: Path) -> None:
 
 
 def _aligned(
-    store: ScanStore, members: Sequence[Member]
+    store: ScanStore, members: Sequence[Member], progress: Progress
 ) -> tuple[SiteAlignment, list[ScanPrior], list[Tie], dict[int, tuple[F64, F64]]]:
     """The motions of the scans, their priors, the ties, and each keyframe's pose and covariance."""
     track, seqs, scans = _joined(store, members)
     keyframe = lru_cache(maxsize=KEPT)(lambda k: store.keyframe(seqs[k]))
     ties, kept = [], []
     if len(members) > 1:
-        loops = StoredLoops(track, keyframe, SubmapLoopConfig(min_gap=1), scans).find()
+        with progress.part("seeking ties", 0.9):
+            stored = StoredLoops(track, keyframe, SubmapLoopConfig(min_gap=1), scans)
+            loops = stored.find(progress)
         for loop in supported(loops, track.poses):
             one = keyframe(loop.b)
             assert one is not None

@@ -83,6 +83,10 @@ export async function parts(s: Scan): Promise<Part[]> {
 export const mapAddress = (s: { drone: string; scan: string }): string =>
   `#/map/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
 
+/** The page that shows a scan in 3D. */
+export const viewAddress = (s: { drone: string; scan: string }): string =>
+  `#/view/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
+
 /** Where everything of a scan lies. */
 export const scanAddress = place;
 
@@ -100,6 +104,18 @@ export interface Heights {
 
 export const make = (s: Scan, kind: string, heights?: Heights): Promise<Job> =>
   ask(`${place(s)}/exports`, "POST", { kind, ...heights });
+export type Triple = [number, number, number];
+
+/** A point in a scan without georeference, and its longitude, latitude, metres above mean sea level. */
+export interface Pair {
+  scan: Triple;
+  place: Triple;
+}
+
+/** Aligns a scan that points place with a scan or a site. */
+export const align = (s: Scan, { drone, scan }: Scan, points: Pair[]): Promise<Job> =>
+  ask(`${place(s)}/alignment`, "POST", { drone, scan, points });
+
 /** The scan, when its newest job of a kind has ended; throws the job's error. */
 export async function finished(s: Scan, kind: string): Promise<Scan> {
   for (;;) {

@@ -87,7 +87,7 @@ export function clipBox({ stage, cloud }: Site): HTMLElement {
 function linkOf({ stage, id }: Site): string {
   const numbers = [...stage.camera.position.toArray(), ...stage.controls.target.toArray()];
   const view = numbers.map((v) => v.toFixed(2)).join(",");
-  return `#/view/${encodeURIComponent(id.drone)}/${encodeURIComponent(id.scan)}/${view}`;
+  return `${api.viewAddress(id)}/${view}`;
 }
 
 /** Takes the view of an address; false when it holds none. */

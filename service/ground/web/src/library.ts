@@ -176,7 +176,7 @@ function uploads(again: () => void): [(files: FileList | null) => void, HTMLElem
 }
 
 function card(s: api.Scan, again: () => void): HTMLElement {
-  const open = `#/view/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
+  const open = api.viewAddress(s);
   const image = s.preview
     ? el("img", { src: api.file(s, "preview.jpg"), alt: `preview of ${s.title}`, loading: "lazy" })
     : el("div", { className: "blank", textContent: "no preview yet" });

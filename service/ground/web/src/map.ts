@@ -123,7 +123,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   const bar = svg("svg", { class: "scale", width: "200", height: "30" });
   const none = el("p", { className: "blank", textContent: "No surface yet." });
   const panel = el("fieldset", { className: "panel layers" }, el("legend", { textContent: "Layers" }));
-  const open = `#/view/${encodeURIComponent(id.drone)}/${encodeURIComponent(id.scan)}`;
+  const open = api.viewAddress(id);
   const head = el(
     "header",
     {},

@@ -73,6 +73,8 @@ export class Ruler {
   readonly cursor = el("output", { className: "cursor" });
   /** Called when the ruler is switched on or off. */
   changed: () => void = () => undefined;
+  /** What the panel offers with the places. */
+  offer: (places: THREE.Vector3[]) => HTMLElement | null = () => null;
   private readonly places: THREE.Vector3[] = [];
   private volume: Volume | null = null;
   private heights: Float64Array | null = null;
@@ -160,7 +162,8 @@ export class Ruler {
 
   /** Writes the figures again, in the units of now. */
   rewrite(): void {
-    this.panel.replaceChildren(...this.rows());
+    const offer = this.offer(this.places);
+    this.panel.replaceChildren(...this.rows(), ...(offer ? [offer] : []));
     this.draw();
   }
 

@@ -10,6 +10,7 @@ import { LinkState } from "./link";
 import { LiveView, type LastPose, type News } from "./live";
 import { Ruler } from "./measure";
 import { Notes } from "./notes";
+import { awaited, placing } from "./place";
 import { Cloud } from "./points";
 import { SiteView } from "./site";
 import { canDraw, Stage } from "./stage";
@@ -86,6 +87,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     origin: scan.origin,
   };
   const ruler = new Ruler(scene);
+  ruler.offer = placing(scan, () => ruler.rewrite());
   const notes = new Notes(scene, id, (point) => stage.lookAt(point));
   host.append(notes.overlay, ruler.overlay, ruler.cursor);
   side.prepend(ruler.panel, notes.panel);
@@ -100,6 +102,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   stage.add(cameras.group);
   stage.addAgain(cloud.group);
   bar.append(toolbar({ ...site, ruler, notes, legend, coverage }));
+  if (awaited(scan)) ruler.toggle();
 
   let last: LastPose | undefined;
   let framed = takeView(stage, place);
