@@ -151,16 +151,19 @@ def _ortho(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
 
 def _true_image(image: _Raster, shape: tuple[int, int], truth: Truth) -> F32:
     """(rows, cols) gray of the true place, rendered at half the cells and laid on the file's."""
-    row, col = np.indices(shape).reshape(2, -1)
-    ground = image.places(col, row, np.full(len(col), truth.frame.alt_amsl_m))
     step = 0.5 * image.cell_m
+    row, col = (axis.ravel() for axis in np.meshgrid(*([0.0, 0.5 * n, n - 1.0] for n in shape)))
+    ground = image.places(col, row, np.full(len(col), truth.frame.alt_amsl_m))[:, :2]
     west, north = ground[:, 0].min() - 2 * step, ground[:, 1].max() + 2 * step
-    width, height = (int(n) for n in np.ceil(np.ptp(ground[:, :2], axis=0) / step) + 4)
+    width, height = (int(n) for n in np.ceil(np.ptp(ground, axis=0) / step) + 4)
     true = view_from_above(truth.folder, west, north, step, (height, width))
     soft = cv2.GaussianBlur(cv2.cvtColor(true, cv2.COLOR_BGR2GRAY), (0, 0), 1.0)
-    x = ((ground[:, 0] - west) / step - 0.5).reshape(shape).astype(np.float32)
-    y = ((north - ground[:, 1]) / step - 0.5).reshape(shape).astype(np.float32)
-    return np.asarray(cv2.remap(soft.astype(np.float32), x, y, cv2.INTER_LINEAR), np.float32)
+    at_px = (ground - [west, north]) * [1.0, -1.0] / step - 0.5
+    # A map projection departs from its tangent by millimetres over the length of a flight.
+    cell = np.column_stack([col, row, np.ones(len(col))])
+    to_px = np.linalg.lstsq(cell, at_px, rcond=None)[0].T
+    onto = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(soft, to_px, shape[::-1], flags=onto).astype(np.float32)
 
 
 def _mesh(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
@@ -307,6 +310,8 @@ _READERS: dict[str, tuple[str, Callable[[Path, Truth, F64, Fits], dict[str, Any]
 
 HEIGHT_M = 200_000.0
 """Height of the eye: relief of 20 m at 500 m from the middle is displaced by 5 cm."""
+BAND_ROWS = 256
+"""Rows rendered at once: a ray takes some 200 bytes."""
 
 
 def view_from_above(
@@ -331,13 +336,21 @@ def view_from_above(
     if not (same and np.abs(vertices - scene.vertices).max() < 0.01):
         raise InputError(f"{truth}: made by another version of simulate; simulate it again")
     rows, cols = shape
-    focal = HEIGHT_M / cell_m
-    K = np.array([[focal, 0.0, 0.5 * (cols - 1)], [0.0, focal, 0.5 * (rows - 1)], [0, 0, 1.0]])
-    camera = Camera(K, np.zeros(5), (cols, rows))
-    T = np.eye(4)
-    T[:3, :3] = np.diag([1.0, -1.0, -1.0])
-    T[:3, 3] = west_m + 0.5 * cols * cell_m, north_m - 0.5 * rows * cell_m, HEIGHT_M
-    return Renderer(scene, simulation.renderer.texture, camera).frame(T, 0, Look(0.0, 0.0, 1.0))
+    out = np.empty((rows, cols, 3), np.uint8)
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    bands = -(-rows // BAND_ROWS)
+    for k in range(bands):
+        top, end = k * rows // bands, (k + 1) * rows // bands
+        T[:3, 3] = west_m + 0.5 * cols * cell_m, north_m - 0.5 * (top + end) * cell_m, HEIGHT_M
+        camera = _straight_down(HEIGHT_M / cell_m, cols, end - top)
+        band = Renderer(scene, simulation.renderer.texture, camera)
+        out[top:end] = band.frame(T, 0, Look(0.0, 0.0, 1.0))
+    return out
+
+
+def _straight_down(focal_px: float, cols: int, rows: int) -> Camera:
+    K = np.array([[focal_px, 0.0, 0.5 * (cols - 1)], [0.0, focal_px, 0.5 * (rows - 1)], [0, 0, 1]])
+    return Camera(K, np.zeros(5), (cols, rows))
 
 
 def options_of(values: dict[str, Any]) -> SimulationOptions:
