@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import HouseFlight
 from person import Browser, Page
@@ -12,8 +14,10 @@ from portal_client import NEEDS, TOKEN, browser, flown_store
 from test_basemap import TILES, mbtiles
 from test_portal_access import PHONE
 
+from service.georeference import LocalFrame
 from service.ground.live_map import LiveMaps
 from service.ground.portal import Portal, PortalConfig
+from service.offline.refine.refly import WAYPOINT
 from service.scans.coverage import LiveCoverages
 from service.stream.codec import encode
 from service.stream.store import ScanStore
@@ -141,6 +145,52 @@ def test_a_keyframe_is_on_the_map_after_its_next_round(
         scan.add_keyframe(5, encode(one, one.time_ns))
     page.page.clock.run_for(2000)
     page.wait(f"({COLOURS}).then(s => s.known > 1.1 * {before})")
+    page.page.context.close()
+    portal.close()
+
+
+DRAWN = "[...document.querySelectorAll('.refly polygon, .refly polyline')].length"
+ENDS = """[...document.querySelectorAll('.refly polyline')].flatMap(l =>
+  l.getAttribute('points').split(' ').map(p => p.split(',').map(Number)))"""
+
+
+def test_a_flight_over_weak_places_is_planned_while_the_scan_grows(
+    browser: Browser, scans: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(LiveCoverages.__init__, "__defaults__", (0.0, 3))
+    (scans / "drone-1/test-1/scan.json").unlink()  # it is in flight
+    portal = Portal(PortalConfig(scans, port=0, token=TOKEN))
+    portal.start()
+    page = browser.other()
+    page.page.clock.install()
+    page.open(f"{portal.url.split('/?')[0]}/#/map/drone-1/test-1")
+    page.wait(SHOWN)
+    page.run(f"{BOX.format('Fly again')}.querySelector('input').click()")
+    page.wait("document.querySelector('.layers').textContent.includes('nothing is weak')")
+
+    def fly(seq: int, east_m: float) -> None:
+        """A keyframe, then the page's next round."""
+        with ScanStore.open(scans / "drone-1/test-1/scan.db") as scan:
+            one = house.keyframe(seq, east_m)
+            scan.add_keyframe(seq, encode(one, one.time_ns))
+        page.page.clock.run_for(2000)
+
+    fly(5, 90.0)  # leaves a gap
+    page.wait(f"{DRAWN} > 0")
+    with page.page.expect_download() as download:
+        page.run("[...document.querySelectorAll('a')].find(a => a.text === '.plan').click()")
+    assert download.value.suggested_filename == "test-1-refly.plan"
+    items = json.loads(download.value.path().read_text())["mission"]["items"]
+    flown = np.array([i["params"][4:7] for i in items if i["command"] == WAYPOINT])
+    assert page.run(DRAWN) == len(flown)  # of each line its strip, and two places
+    places = LocalFrame(*house.origin).to_enu(flown)
+    assert 30.0 < places[:, 0].mean() < 90.0 and np.abs(places[:, 2] - house.height_m).max() < 0.1
+    along_m, along_px = np.diff(places[:, :2], axis=0)[0], np.diff(page.run(ENDS), axis=0)[0]
+    scale = np.hypot(*along_px) / np.hypot(*along_m)
+    assert np.abs(along_px - scale * along_m * (1, -1)).max() < 0.02 * np.hypot(*along_px)
+    fly(6, 60.0)
+    fly(7, 40.0)
+    page.wait(f"{DRAWN} === 0")
     page.page.context.close()
     portal.close()
 

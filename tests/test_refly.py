@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import pytest
 from loopback import free_port
@@ -134,6 +135,24 @@ def test_neighbours_are_flown_back_and_forth() -> None:
     assert flight is not None
     for a, b in zip(flight.lines, flight.lines[1:], strict=False):
         assert np.linalg.norm(b.start_m - a.end_m) < 1.5 * flight.spacing_m
+
+
+def test_the_strips_of_ground_hold_every_weak_cell() -> None:
+    coverage = covered(two_lines(forward=0.3))
+    flight = suggest(coverage, 5.0, HEIGHT_M)
+    assert flight is not None
+    rings = [
+        FRAME.to_enu(np.array([[lat, lon, FRAME.alt_amsl_m] for lon, lat in g["coordinates"][0]]))
+        for f in json.loads(refly.geojson(flight, FRAME))["features"]
+        if (g := f["geometry"])["type"] == "Polygon"
+    ]
+    assert len(rings) == len(flight.lines)
+    for x, y in weak_spots(coverage, flight):
+        inside = [
+            cv2.pointPolygonTest(r[:, :2].astype(np.float32), (x, y), True) > -0.1 for r in rings
+        ]
+        assert any(inside)
+    assert json.loads(refly.geojson(None, FRAME))["features"] == []
 
 
 def test_nothing_weak_needs_no_flight() -> None:

@@ -174,11 +174,9 @@ def _flight(
     without any."""
     from dataclasses import replace
 
-    import numpy as np
-
     from service.errors import InputError
     from service.offline.exports.view import ScanView
-    from service.offline.refine.refly import suggest
+    from service.offline.refine.refly import suggest_as_flown
     from service.scans.coverage import coverage_of
 
     with ScanView(scan_dir) as scan:
@@ -186,11 +184,7 @@ def _flight(
         if found is None:
             raise InputError(f"{scan_dir} contains no surface; there is nothing to compare with")
         found = replace(found, limits=replace(found.limits, **limits))
-        heights = [p.agl_m for p in scan.poses if p.agl_m is not None]
-        height = float(np.median(heights)) if heights else None
-        moving = [p.speed_m_s for p in scan.poses if p.speed_m_s > 0.2]
-        speed = float(np.median(moving)) if moving else 3.0
-        return suggest(found, speed, height, overlap, relative, photos)
+        return suggest_as_flown(found, scan.poses, overlap, relative, photos)
 
 
 def _write_plan(path: Path, flight: Refly) -> None:

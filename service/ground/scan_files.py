@@ -22,6 +22,9 @@ from service.ground.state import names_of, state_of
 from service.ground.storage import is_regular
 from service.offline.exports import EXPORTERS
 from service.offline.exports.maps import MANIFEST
+from service.offline.refine.refly import geojson, plan_json, suggest_as_flown, waypoints_text
+from service.scans.main_piece import main_poses, stretches_apart
+from service.scans.track import latest
 from service.stream.store import ScanStore
 
 TILE = re.compile(r"[A-Za-z0-9_]{1,80}\.(json|pnts|b3dm|glb)")
@@ -53,6 +56,7 @@ def file_routes(one: str) -> list[Route]:
         Route(one + "/keyframes/{seq}.jpg", _image),
         Route(one + "/coverage.png", _coverage),
         Route(one + "/coverage.json", _coverage),
+        Route(one + "/refly.{kind}", _refly),
     ]
 
 
@@ -195,3 +199,25 @@ def _coverage(request: Request) -> Response:
     if request.scope["path"].endswith(".png"):
         return Response(found.png_bytes(), media_type="image/png")
     return Response(found.json_bytes(), media_type="application/json")
+
+
+def _refly(request: Request) -> Response:
+    """A flight over the gaps and weak places as they are now: geojson (lines and the ground that
+    their images cover), plan (QGroundControl) or waypoints (Mission Planner)."""
+    state, kind = state_of(request), request.path_params["kind"]
+    if kind not in ("geojson", "plan", "waypoints"):
+        raise InputError("there is refly.geojson, refly.plan and refly.waypoints")
+    folder = state.library.folder(*names_of(request))
+    found = state.coverages.of(folder)
+    if found is None or found.frame is None:
+        raise InputError("no surface yet" if found is None else "the scan has no georeference")
+    with ScanStore.open(folder / "scan.db", read_only=True) as store:
+        poses = main_poses(latest(store.poses()), stretches_apart(store))
+    flight = suggest_as_flown(found, poses)
+    if kind == "geojson":
+        return Response(geojson(flight, found.frame), media_type="application/geo+json")
+    if flight is None:
+        raise InputError("no place is weak; no flight is needed")
+    text = plan_json(flight) if kind == "plan" else waypoints_text(flight)
+    name = f"{request.path_params['scan']}-refly.{kind}"
+    return Response(text, headers={"content-disposition": f'attachment; filename="{name}"'})

@@ -22,6 +22,7 @@ from recon.types import F64, Array, Bool
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.scans.coverage import Coverage
+from service.stream.records import PoseRecord
 
 MAX_LINES = 150
 TAKEOFF, WAYPOINT, RETURN, SPEED = 22, 16, 20, 178
@@ -220,6 +221,21 @@ def _entries(group: list[Line]) -> list[list[Line]]:
     return [group, swapped, group[::-1], swapped[::-1]]
 
 
+def suggest_as_flown(
+    coverage: Coverage,
+    poses: Sequence[PoseRecord],
+    overlap: float = 0.6,
+    relative: bool = False,
+    photos: bool = False,
+) -> Refly | None:
+    """:func:`suggest` at the height and the speed that ``poses`` were flown with."""
+    heights = [p.agl_m for p in poses if p.agl_m is not None]
+    height = float(np.median(heights)) if heights else None
+    moving = [p.speed_m_s for p in poses if p.speed_m_s > 0.2]
+    speed = float(np.median(moving)) if moving else 3.0
+    return suggest(coverage, speed, height, overlap, relative, photos)
+
+
 def suggest(
     coverage: Coverage,
     speed_m_s: float,
@@ -308,6 +324,32 @@ def _items(
         stop,
         MissionItem(RETURN, MISSION),
     ]
+
+
+def geojson(refly: Refly | None, frame: LocalFrame) -> str:
+    """Each line, and the ground that its images cover, as GeoJSON; no features without a flight."""
+    features = []
+    for number, line in enumerate(refly.lines if refly else (), 1):
+        assert refly is not None
+        swath = refly.swath
+        way = (line.end_m - line.start_m) / max(line.length_m, 1e-6)
+        aside = 0.5 * swath.across_m * np.array([-way[1], way[0]])
+        before, after = ((swath.ahead_m + k * swath.along_m) * way for k in (-0.5, 0.5))
+        ring = [line.start_m + before - aside, line.end_m + after - aside,
+                line.end_m + after + aside, line.start_m + before + aside]  # fmt: skip
+        route = _lon_lat([line.start_m, line.end_m], frame)
+        for geometry in (
+            {"type": "Polygon", "coordinates": [_lon_lat([*ring, ring[0]], frame)]},
+            {"type": "LineString", "coordinates": route},
+        ):
+            facts = {"line": number, "altitude_amsl_m": round(swath.altitude_amsl_m, 1)}
+            features.append({"type": "Feature", "properties": facts, "geometry": geometry})
+    return json.dumps({"type": "FeatureCollection", "features": features})
+
+
+def _lon_lat(places_m: Sequence[F64], frame: LocalFrame) -> list[list[float]]:
+    rows = frame.to_geodetic(np.column_stack([places_m, np.zeros(len(places_m))]))
+    return [[round(float(r[1]), 8), round(float(r[0]), 8)] for r in rows]
 
 
 def plan_json(refly: Refly) -> str:

@@ -135,6 +135,13 @@ export interface Annotation {
   properties: { text: string; by: string; made_unix_s: number };
 }
 
+/** The flight over weak places: of each line the ground that its images cover, and the line. */
+export interface Refly {
+  features: {
+    geometry: { type: "Polygon"; coordinates: [number, number][][] } | { type: "LineString"; coordinates: [number, number][] };
+  }[];
+}
+export const refly = (s: { drone: string; scan: string }): Promise<Refly> => ask(`${place(s)}/refly.geojson`);
 export const annotations = (s: { drone: string; scan: string }): Promise<{ features: Annotation[] }> =>
   ask(`${place(s)}/annotations`);
 export const annotate = (s: { drone: string; scan: string }, coordinates: number[], text: string): Promise<Annotation> =>

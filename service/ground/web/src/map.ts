@@ -133,6 +133,10 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     el("a", { href: `${at}/ortho.kml`, textContent: "KML" }),
   );
   const marks = svg("svg", { class: "overlay notes" });
+  const again = svg("svg", { class: "overlay refly" });
+  const plan = `${api.scanAddress(id)}/refly`;
+  let flight: { polygon: boolean; places: Place[] }[] = [];
+  let isPlanned = false; // whether the flight over weak places is shown
   let notes: { place: Place; text: string }[] = [];
   const layers: Layer[] = [];
   let middle: Place = { x: 0.5, y: 0.5 };
@@ -150,6 +154,11 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
         const at = { cx: x.toFixed(1), cy: y.toFixed(1), r: "5" };
         return [svg("circle", at), svg("text", { x: at.cx, y: (y - 10).toFixed(1) }, text)];
       }),
+    );
+    const path = (places: Place[]): string =>
+      places.map(({ x, y }) => `${((x - middle.x) * scale + w / 2).toFixed(1)},${((y - middle.y) * scale + h / 2).toFixed(1)}`).join(" ");
+    again.replaceChildren(
+      ...(isPlanned ? flight : []).map(({ polygon, places }) => svg(polygon ? "polygon" : "polyline", { points: path(places) })),
     );
     document.body.dataset["map"] = layers.some((layer) => layer.loading) ? "loading" : "shown";
   };
@@ -192,10 +201,20 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     share.oninput = () => layer.opacity(Number(share.value));
     panel.append(el("div", {}, el("label", {}, box, ` ${title}`), share));
   };
+  const plans = async (): Promise<void> => {
+    if (!isPlanned) return;
+    flight = (await api.refly(id)).features.map(({ geometry: g }) => {
+      const places = (g.type === "Polygon" ? g.coordinates[0]! : g.coordinates).map(([lon, lat]) => placeOf(lat, lon));
+      return { polygon: g.type === "Polygon", places };
+    });
+    lines.textContent = flight.length ? `${flight.length / 2} ${flight.length > 2 ? "lines" : "line"}` : "nothing is weak";
+    files.hidden = !flight.length;
+  };
   const refresh = async (): Promise<void> => {
     const [found, { features }] = await Promise.all([
       tileJson(`${at}/ortho.json`),
       api.annotations(id).catch(() => ({ features: [] })),
+      plans().catch((error) => (lines.textContent = String(error.message ?? error))),
       ...layers.map((layer) => layer.refresh()),
     ]);
     none.hidden = found !== null;
@@ -212,9 +231,25 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   if (basemap) add(new Layer((z, x, y) => `/tiles/basemap/${z}/${x}/${y}`), "Basemap", true);
   for (const [layer, title, on] of LAYERS)
     add(new Layer((z, x, y) => `${at}/${layer}/${z}/${x}/${y}.png`, `${at}/${layer}.json`), title, on);
+  const box = el("input", { type: "checkbox" });
+  const lines = el("output", {});
+  const files = el(
+    "span",
+    { hidden: true },
+    el("a", { href: `${plan}.plan`, textContent: ".plan", title: "mission for QGroundControl" }),
+    " ",
+    el("a", { href: `${plan}.waypoints`, textContent: ".waypoints", title: "mission for Mission Planner and MAVProxy" }),
+  );
+  box.onchange = () => {
+    isPlanned = box.checked;
+    lines.hidden = !isPlanned;
+    files.hidden = true;
+    void refresh().catch(notify);
+  };
+  panel.append(el("div", { title: "a flight over gaps and weak places" }, el("label", {}, box, " Fly again"), lines), files);
   const nearer = el("button", { textContent: "+", title: "nearer", onclick: () => zoomTo(zoom + 1) });
   const farther = el("button", { textContent: "−", title: "farther", onclick: () => zoomTo(zoom - 1) });
-  host.append(none, marks, cursor, bar, el("span", { className: "zoom" }, nearer, farther));
+  host.append(none, again, marks, cursor, bar, el("span", { className: "zoom" }, nearer, farther));
   host.addEventListener("tile", draw);
   listen(host, { move, zoomBy: (by, x, y) => zoomTo(zoom + by, x, y) }, (x, y) => {
     const [lat, lon] = degreesOf(under(x, y));
