@@ -1,6 +1,6 @@
 """Exported files under the validators of their formats, each skipped by name where it is missing.
 
-STAC is left out: its validators fetch schemas from the network (docs/reports/accuracy.md).
+The validators of STAC and 3D Tiles fetch their schemas: here they are in data/schemas.json.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ import json
 import shutil
 import struct
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import laspy
 import numpy as np
@@ -84,3 +85,74 @@ def test_clouds_follow_las(scan_dir: Path, kind: str) -> None:
         assert (
             head[375 + 2 : 375 + 6] == b"copc" and head[375 + 18 : 375 + 22] == b"\x01\x00\xa0\x00"
         )
+
+
+SCHEMAS = json.loads((Path(__file__).parent / "data/schemas.json").read_text())
+STAC = "https://schemas.stacspec.org/v1.0.0/item-spec/json-schema/item.json"
+TILES = "https://3d-tiles/"
+
+
+def violations(document: Any, uri: str) -> list[str]:
+    """What a document has against the schema at ``uri``; never asks the network."""
+    jsonschema = pytest.importorskip("jsonschema")
+    referencing = pytest.importorskip("referencing")
+    schemas = {name: schema for name, schema in SCHEMAS.items() if name != "about"}
+    registry = referencing.Registry().with_contents(schemas.items())
+    validator = jsonschema.validators.validator_for(schemas[uri])
+    check = validator({"$ref": uri}, registry=registry, format_checker=validator.FORMAT_CHECKER)
+    return [f"{e.json_path}: {e.message}" for e in check.iter_errors(document)]
+
+
+def test_the_item_follows_stac_and_its_projection_extension(scan_dir: Path) -> None:
+    pytest.importorskip("rasterio", exc_type=ImportError)
+    for kind in ("dsm", "ortho"):
+        written(scan_dir, kind)
+    item = json.loads(written(scan_dir, "stac").read_text())
+    (extension,) = item["stac_extensions"]
+    assert len(item["assets"]) >= 2
+    assert violations(item, STAC) == violations(item, extension) == []
+    wrong = item | {"properties": item["properties"] | {"proj:epsg": "32632", "datetime": 1}}
+    assert len(violations(wrong, STAC)) and len(violations(wrong, extension))
+
+
+def tiles_of(tileset: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any] | None, Path]]:
+    """Tile, parent and folder of all tiles, those of tilesets within tilesets included."""
+
+    def below(tile: dict[str, Any], parent: dict[str, Any] | None, path: Path) -> Any:
+        yield tile, parent, path.parent
+        for child in tile.get("children", ()):
+            yield from below(child, tile, path)
+        uri = tile.get("content", {}).get("uri", "")
+        if uri.endswith(".json"):
+            inner = path.parent / uri
+            yield from below(read(inner)["root"], tile, inner)
+
+    def read(path: Path) -> dict[str, Any]:
+        document: dict[str, Any] = json.loads(path.read_text())
+        assert violations(document, TILES + "tileset.schema.json") == [], path
+        return document
+
+    yield from below(read(tileset)["root"], None, tileset)
+
+
+@pytest.mark.parametrize("kind", ["3dtiles", "3dtiles-mesh"])
+def test_tilesets_follow_3d_tiles(scan_dir: Path, kind: str) -> None:
+    pytest.importorskip("py3dtiles" if kind == "3dtiles" else "open3d", exc_type=ImportError)
+    contents = 0
+    for tile, parent, folder in tiles_of(written(scan_dir, kind) / "tileset.json"):
+        assert parent is None or tile["geometricError"] <= parent["geometricError"]
+        if "content" not in tile:
+            continue
+        contents += 1
+        path = folder / tile["content"]["uri"]
+        assert path.is_relative_to(folder) and path.is_file()
+        data = path.read_bytes()
+        if path.suffix == ".pnts":
+            magic, version, length, head, body = struct.unpack_from("<4s4I", data)
+            assert (magic, version, length) == (b"pnts", 1, len(data))
+            assert (28 + head) % 8 == (28 + head + body) % 8 == length % 8 == 0
+            table = json.loads(data[28 : 28 + head])
+            assert violations(table, TILES + "TileFormats/pnts.featureTable.schema.json") == []
+            assert table["POINTS_LENGTH"] * 12 <= body
+    assert contents
+    assert violations({"asset": {"version": "1.1"}}, TILES + "tileset.schema.json")
