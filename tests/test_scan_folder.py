@@ -196,6 +196,13 @@ def test_the_report_says_what_was_flown_and_nothing_runs_in_it(
     assert page.count("data:image/png;base64,") == 3  # two maps and the coverage
     assert page.count("data:image/jpeg;base64,") == 2  # the preview and a keyframe's stages
     assert page.count("<svg") == 5  # the map; no height above ground was recorded
+    _, *curves = re.findall(r"<svg.*?</figure>", page)
+    for curve in curves:
+        *heights, _, _, _, _, _ = words = re.findall(r">([-+.0-9e]+)</text>", curve)
+        assert words[-5:] == ["0", "1", "2", "3", "4"] and heights  # seconds
+        low, high = map(float, re.findall(r": (\S+) to (\S+), over 4 s", curve)[0])
+        assert all(low - 0.01 <= float(height) <= high + 0.01 for height in heights)
+    assert "@media print" in page
     assert "http" not in page  # nothing is fetched
     rows = dict(re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td></tr>", page))
     assert rows["duration"] == "4 s"

@@ -159,11 +159,15 @@ def _draw_track(panel: U8, grid: Grid, track_m: F64, scale: float) -> None:
     cv2.circle(panel, (x, y), 5, TRACK, 1, cv2.LINE_AA)
 
 
+def round_length(most: float) -> float:
+    """The largest of 1, 2 or 5 times a power of ten up to ``most`` (positive)."""
+    power = 10.0 ** math.floor(math.log10(most))
+    return max(m * power for m in (1.0, 2.0, 5.0) if m * power <= most * (1.0 + 1e-12))
+
+
 def _draw_scale_bar(panel: U8, metres_per_px: float) -> None:
-    """A bar of 1, 2 or 5 times a power of ten metres, about a fifth of the panel wide."""
-    target = panel.shape[1] * metres_per_px / 5.0
-    power = 10.0 ** math.floor(math.log10(target))
-    length_m = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= target)
+    """A bar of round length, about a fifth of the panel wide."""
+    length_m = round_length(panel.shape[1] * metres_per_px / 5.0)
     length_px = round(length_m / metres_per_px)
     x, y = 12, panel.shape[0] - 14
     for colour, thick in ((BACKGROUND, 5), (INK, 2)):

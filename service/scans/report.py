@@ -18,7 +18,7 @@ import numpy as np
 from recon.surface.raster import Raster, grid_over
 from recon.types import F32, U8, PointCloud
 from service.scans.coverage import Coverage
-from service.scans.drawing import coloured
+from service.scans.drawing import coloured, round_length
 from service.scans.report_map import loop_pairs, map_figure
 from service.stream.records import PoseRecord
 
@@ -31,10 +31,14 @@ CURVE_PX = (820, 150)
 STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;color:#20252b;max-width:960px;margin:24px auto;"
     "padding:0 16px}h1{font-size:24px}h2{font-size:18px;margin-top:30px}table{border-collapse:"
-    "collapse;display:block;overflow-x:auto}svg{max-width:100%}td,th{overflow-wrap:anywhere;"
-    "padding:3px 14px 3px 0;text-align:left;border-bottom:1px solid #e3e7eb}"
+    "collapse;display:block;overflow-x:auto}svg{max-width:100%;height:auto}"
+    "td,th{overflow-wrap:break-word;padding:3px 14px 3px 0;text-align:left;"
+    "border-bottom:1px solid #e3e7eb}"
     "td+td{font-variant-numeric:tabular-nums}img{max-width:100%;border:1px solid #e3e7eb}"
-    "figure{margin:14px 0}figcaption{color:#56606a;font-size:13.5px}"
+    "figure{margin:14px 0}figcaption{color:#56606a;font-size:13.5px}text{font-size:11px}"
+    "@page{margin:14mm}@media print{body{margin:0;max-width:none;padding:0;font-size:12px;"
+    "print-color-adjust:exact}figure,tr,h2,h3{break-inside:avoid}h2,h3{break-after:avoid}"
+    "img,svg{max-height:230mm;width:auto}}"
 )
 
 
@@ -214,14 +218,34 @@ def _curve(name: str, t: np.typing.NDArray[Any], values: np.typing.NDArray[Any])
     step = max(1, len(t) // CURVE_PX[0])
     low, high = float(values.min()), float(values.max())
     w, h = CURVE_PX
-    x = 4 + (w - 8) * (t - t[0]) / max(float(t[-1] - t[0]), 1e-9)
-    y = h - 6 - (h - 12) * (values - low) / max(high - low, 1e-9)
+    left, bottom, span_s = 46, h - 18, float(t[-1] - t[0])
+    x = left + (w - left - 8) * (t - t[0]) / max(span_s, 1e-9)
+    y = bottom - 6 - (bottom - 12) * (values - low) / max(high - low, 1e-9)
     points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x[::step], y[::step], strict=True))
-    line = f'<polyline fill="none" stroke="#1a5fd0" points="{points}"/>'
-    frame = f'<rect width="{w}" height="{h}" fill="none" stroke="#d5dbe1"/>'
-    caption = f"{escape(name)}: {low:.2f} to {high:.2f}, over {t[-1] - t[0]:.0f} s"
-    svg = f'<svg viewBox="0 0 {w} {h}" width="{w}" height="{h}">{frame}{line}</svg>'
+    parts = [f'<path fill="none" stroke="#8a949e" d="M{left} 2V{bottom}H{w}"/>']
+    for value in _ticks(low, high, 3):
+        at = float(np.interp(value, [low, high], [bottom - 6, 6]))
+        parts.append(f'<path stroke="#e3e7eb" d="M{left} {at:.1f}H{w}"/>')
+        parts.append(_label(left - 5, at + 4, "end", value))
+    for value in _ticks(0.0, span_s, 4):
+        at = float(np.interp(value, [0.0, span_s], [left, w - 8]))
+        parts.append(_label(at, h - 4, "middle", value))
+    parts.append(f'<polyline fill="none" stroke="#1a5fd0" points="{points}"/>')
+    caption = f"{escape(name)}: {low:.2f} to {high:.2f}, over {span_s:.0f} s"
+    svg = f'<svg viewBox="0 0 {w} {h}" width="{w}" height="{h}">{"".join(parts)}</svg>'
     return f"<figure>{svg}<figcaption>{caption}</figcaption></figure>"
+
+
+def _ticks(low: float, high: float, count: int) -> list[float]:
+    """Round values within a range, from ``count`` to 2.5 times as many; its start without width."""
+    if not high - low > 1e-9:
+        return [low]
+    step = round_length((high - low) / count)
+    return [float(k * step) for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
+
+
+def _label(x: float, y: float, anchor: str, value: float) -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{value:.6g}</text>'
 
 
 def _rows(values: dict[str, Any], names: Sequence[str]) -> list[tuple[str, str]]:

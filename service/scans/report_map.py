@@ -13,6 +13,7 @@ import numpy as np
 
 from recon.types import F64
 from service.scans.coverage import BEST, GAP, SELDOM, UNSURE, Coverage
+from service.scans.drawing import round_length
 from service.stream.records import PoseRecord
 
 WIDTH_PX, LARGEST_HEIGHT_PX = 860, 900
@@ -159,10 +160,8 @@ def _survey(summary: dict[str, Any], view: _View) -> list[str]:
 
 
 def _scale_bar(view: _View) -> str:
-    """A bar of 1, 2 or 5 times a power of ten, and north."""
-    target = 0.2 * view.size_px[0] / view.px_per_m
-    power = 10.0 ** math.floor(math.log10(target))
-    length_m = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= target)
+    """A bar of round length, and north."""
+    length_m = round_length(0.2 * view.size_px[0] / view.px_per_m)
     length, y, x = length_m * view.px_per_m, view.size_px[1] - 12, view.size_px[0] - 16
     return (
         f'<path d="M12 {y - 5}v5h{length:.1f}v-5M{x} 34v-24m-4 8l4 -8l4 8" fill="none" '
