@@ -298,6 +298,13 @@ def test_the_readout_is_found_from_the_images(readout_s: float, frames: int) -> 
     assert found.sigma_s < 5e-4
 
 
+def test_three_keyframes_show_the_readout_first() -> None:
+    """Later ones are bent more by what was not known."""
+    found, used = searched(0.03, 40)
+    assert found.windows == 1 and used == found.readout_s
+    assert found.readout_s == pytest.approx(0.03, abs=1e-3)
+
+
 @pytest.mark.parametrize(("sharpness", "expected"), [(1e-3, 0.03), (1e6, 0.012)])
 def test_a_known_readout_gives_way_to_sharp_images_alone(
     monkeypatch: pytest.MonkeyPatch, sharpness: float, expected: float
@@ -350,12 +357,12 @@ def test_the_share_of_depth_is_what_the_rows_do_to_it(t: float) -> None:
 
 def test_the_doubt_about_a_readout_ends_when_it_is_found() -> None:
     search = ReadoutSearch(RowClock(PLAIN), PLAIN.K)
-    assert search.doubt_s == readout_search.USUAL_S
+    assert search.is_open and search.doubt_s == readout_search.USUAL_S
     search.estimate = ReadoutEstimate(0.012, 0.003, 1)  # seen, and not yet in use
-    assert search.doubt_s == pytest.approx(np.hypot(0.012, 0.003))
+    assert not search.is_open and search.doubt_s == pytest.approx(np.hypot(0.012, 0.003))
     search.estimate = ReadoutEstimate(0.001, 0.2, 1)
     assert search.doubt_s == readout_search.USUAL_S
     search.estimate = ReadoutEstimate(1e-4, 2e-4, 3)
     assert search.doubt_s < 3e-4
     known = ReadoutSearch(RowClock(replace(PLAIN, shutter=Shutter(0.03))), PLAIN.K)
-    assert known.doubt_s == 0.0
+    assert known.doubt_s == 0.0 and not known.is_open

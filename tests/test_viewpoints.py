@@ -213,6 +213,43 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
     assert len(shares) == 3 and all((share > 0.005) == expected for share in shares)
 
 
+@pytest.mark.parametrize(
+    ("is_open", "is_measured", "expected"),
+    [
+        (True, True, [0, 0, 0, 0, 1, 5]),
+        (True, False, [0, 0, 2, 3, 4, 5]),
+        (False, True, [0, 0, 2, 3, 4, 5]),
+    ],
+)
+def test_views_wait_for_the_first_word_on_their_readout(
+    is_open: bool, is_measured: bool, expected: list[int]
+) -> None:
+    """Not for stills, which never show it; the sixth view comes with that word."""
+    K, size = np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), (32, 32)
+    search, keys = SimpleNamespace(doubt_s=0.0, is_open=is_open), list[OdometryKeyframe]()
+    odometry = SimpleNamespace(
+        segment=0, readout=search, keyframes=keys, exposure=SimpleNamespace(shown_s=0.0)
+    )
+    views = StereoViews(
+        Viewpoints(ScanConfig()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
+        np.ones(size, np.uint8), Counter(),
+    )  # fmt: skip
+    given, counts = [], []
+    for i in range(6):
+        plain = frame(i, 5.0 * i)
+        keys.append(plain.key)
+        moving = FrameRows(i, PosePrior(), np.eye(4), is_measured=is_measured)
+        image = UndistortedFrame(
+            i, i, PosePrior(), cast(Colour, plain.colour), plain.gray, plain.gray, None, False
+        )
+        state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
+        views.take(image, Tracked(state, 0, plain.T_odom_camera, moving=moving))
+        search.is_open = is_open and i < 5
+        given += list(views.ready())
+        counts.append(len(given))
+    assert counts == expected
+
+
 @pytest.mark.parametrize("exposure_s", [0.0, 0.05])
 def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: float) -> None:
     """1 m in each tenth of a second, 50 m above points 100 m further on, at 30 px."""

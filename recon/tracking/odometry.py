@@ -380,7 +380,8 @@ class Odometry:
 
     def _seek(self, readout: ReadoutSearch) -> None:
         """Look for the readout, until it is known that there is none."""
-        readout.look(self.keyframes)
+        if readout.look(self.keyframes):
+            adjust_window(self.keyframes, self.K)
         if readout.estimate is not None and readout.estimate.is_none:
             self._row_track.stop()
 

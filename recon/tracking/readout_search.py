@@ -18,8 +18,9 @@ from recon.tracking import bundle
 from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.types import F64
 
-KEYFRAMES = 5
-"""Keyframes of a window; the next window begins at its last one."""
+KEYFRAMES, FIRST_KEYFRAMES = 5, 3
+"""Keyframes of a window, and until the readout is sure, as what is not known of it bends long ones;
+the next window begins at its last one."""
 
 COARSE_S = 1e-3 * np.arange(-40.0, 41.0, 10.0)
 """Readouts that are tried while none is sure."""
@@ -86,26 +87,40 @@ class ReadoutSearch:
         self._found: deque[tuple[float, float]] = deque(maxlen=4)  # readout, weight
 
     @property
+    def is_open(self) -> bool:
+        """True while nothing is known of the readout."""
+        return self.estimate is None and self._clock.readout_s == 0.0
+
+    @property
+    def _is_sure(self) -> bool:
+        return self.estimate is not None and self.estimate.is_sure
+
+    @property
     def doubt_s(self) -> float:
         """Sigma of the readout in use."""
         if self.estimate is None:
-            return USUAL_S if self._clock.readout_s == 0.0 else 0.0
+            return USUAL_S if self.is_open else 0.0
         off_s = self.estimate.readout_s - self._clock.readout_s
         return min(float(np.hypot(self.estimate.sigma_s, off_s)), USUAL_S)
 
-    def look(self, keyframes: list[OdometryKeyframe]) -> None:
-        """Search once the newest of the ``keyframes``, all settled, ends a further window."""
-        window = keyframes[-KEYFRAMES:]
-        if len(window) < KEYFRAMES or window[0].seq < self._last_seq:
-            return
+    def look(self, keyframes: list[OdometryKeyframe]) -> bool:
+        """Search once the newest of the ``keyframes``, all settled, ends a further window.
+
+        True where this changes the readout in use.
+        """
+        before_s = self._clock.readout_s
+        size = KEYFRAMES if self._is_sure or self.doubt_s == 0.0 else FIRST_KEYFRAMES
+        window = keyframes[-size:]
+        if len(window) < size or window[0].seq < self._last_seq:
+            return False
         if all(key.moving.is_measured for key in window):
             self._last_seq = window[-1].seq
             self._take(window)
+        return self._clock.readout_s != before_s
 
     def _take(self, window: list[OdometryKeyframe]) -> None:
         now = self._clock.readout_s
-        is_sure = self.estimate is not None and self.estimate.is_sure
-        tried = now + STEP_S * np.arange(-1.0, 2.0) if is_sure else COARSE_S
+        tried = now + STEP_S * np.arange(-1.0, 2.0) if self._is_sure else COARSE_S
         costs = [_cost(window, self._clock.reading(readout_s), self._K) for readout_s in tried]
         k = int(np.clip(np.argmin([cost for cost, _ in costs]), 1, len(tried) - 2))
         (below, _), (here, redundancy), (above, _) = costs[k - 1 : k + 2]

@@ -37,6 +37,10 @@ first and the last view have no other."""
 TRACKED = 128
 """Tracked frames whose places are remembered."""
 
+HELD = 5
+"""Views that wait at most for the first word on a readout that nobody states: all are among
+those kept."""
+
 LAST_VIEW_SHARE = 0.1
 """A stretch's last frame becomes a view when it is this share of a usual step further on."""
 
@@ -340,7 +344,7 @@ class StereoViews:
 
     def ready(self, everything: bool = False) -> Iterator[StereoCandidate]:
         """The views whose partners are there, in order."""
-        while self._waiting and (everything or self.selection.ready(self._waiting[0][0])):
+        while self._waiting and (everything or self._is_ready(self._waiting[0][0])):
             view, prior = self._waiting.popleft()
             if not self.selection.confirmed(view):
                 self._refused["seen by two views only"] += 1
@@ -350,6 +354,12 @@ class StereoViews:
                 candidate = self._candidate(view, prior)
                 self._given.append(view.anchor)
                 yield candidate
+
+    def _is_ready(self, view: Viewpoint) -> bool:
+        """True when its partners are there, and the images could show the readout."""
+        search, newest = self._odometry.readout, self._waiting[-1][0].moving
+        shows = search is not None and search.is_open and newest is not None and newest.is_measured
+        return self.selection.ready(view) and not (shows and len(self._waiting) < HELD)
 
     def _candidate(self, view: Viewpoint, prior: PosePrior) -> StereoCandidate:
         points, _ = landmarks(view.key)
