@@ -152,6 +152,7 @@ class PolarPair:
     guide: U8 | None = None  # (H, W, 3) left in colour, as fine as (h, w) or finer
     left_seen: Bool | None = None  # (h, w) False where the left view has nothing
     right_seen: Bool | None = None  # (h, w) the same of the shifted right view
+    noise: float = 1.0  # sigma of a label over the usual one, by motion blur
 
 
 RectifiedPair = StereoPair | PolarPair

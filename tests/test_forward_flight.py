@@ -11,7 +11,10 @@ import pytest
 
 from recon import se3
 from recon.backends import load_backend
-from recon.types import F64, U8, Camera, Frame, Keyframe, PosePrior
+from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
+from recon.stereo.polar import reproject_polar
+from recon.stereo.virtual_stereo import View, VirtualStereoConfig, drop_unseen, rectify
+from recon.types import F64, U8, Camera, Frame, Keyframe, PolarPair, PosePrior
 from service.config import load_config
 from service.flight.pipeline import Pipeline
 from service.flight.stages import build_stages
@@ -121,3 +124,39 @@ def test_the_sky_has_no_surface(keyframes: list[Keyframe]) -> None:
         T = pose(keyframe.seq)
         sky = ~np.isfinite(ground_depth(T, depth.K, (w, h)))
         assert np.isfinite(depth.depth_m[sky]).mean() < 0.02
+
+
+def shot(levels: list[U8], T: F64, blur_px: float) -> U8:
+    """(H, W) while the camera turns upwards by ``blur_px``, with noise of 2 levels."""
+    angles = np.linspace(-0.5, 0.5, 2 * int(abs(blur_px)) + 1) * blur_px / K[0, 0]
+    total = np.zeros(CAMERA.size_px[::-1])
+    for angle in angles:
+        turned = T.copy()
+        turned[:3, :3] = T[:3, :3] @ se3.so3_exp(np.array([angle, 0.0, 0.0]))
+        total += photograph(levels, turned)[..., 0]
+    noise = 2.0 * np.random.default_rng(0).normal(size=total.shape)
+    return np.asarray(np.clip(np.rint(total / len(angles) + noise), 0, 255), np.uint8)
+
+
+@pytest.mark.parametrize("blurs_px", [(0.0, 0.0), (8.0, 8.0), (8.0, 3.0)])
+def test_sigma_covers_motion_blur(blurs_px: tuple[float, float]) -> None:
+    """Of a pair with exact poses, at the images' own resolution."""
+    levels, views = ground(), []
+    for i, blur in zip((0, 7), blurs_px, strict=True):
+        blurred = np.array([0.0, blur])
+        views.append(View(None, shot(levels, pose(i), blur), K, pose(i), blur_px=blurred))
+    left, right = views
+    truth = ground_depth(left.T_odom_camera, K, CAMERA.size_px)
+    v, u = np.nonzero(truth < 200.0)
+    ahead = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.size)], 1)
+    config = VirtualStereoConfig(width_px=CAMERA.size_px[0], guided=False)
+    pair = rectify(left, right, (ahead * truth[v, u, None])[::97], config)
+    assert isinstance(pair, PolarPair)
+    labels = belief_propagation(pair.left, pair.right, pair.labels, BeliefPropagationConfig())
+    found = reproject_polar(drop_unseen(labels, pair), pair, K, CAMERA.size_px)
+    off = np.abs(found.depth_m - truth)
+    known = np.isfinite(off) & (truth < 150.0)
+    share = float(np.mean(off[known] < found.sigma_m[known]))
+    without = float(np.mean(off[known] < found.sigma_m[known] / pair.noise))
+    assert 0.48 < share < 0.92
+    assert without < 0.8 * share if any(blurs_px) else pair.noise == 1.0

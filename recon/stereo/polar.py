@@ -73,6 +73,15 @@ def polar_angles(rays: F64) -> tuple[F64, F64]:
     return away, np.arctan2(rays[..., 1], rays[..., 0])
 
 
+def axes_about(rays: F64, axis: F64) -> F64:
+    """(N, 2, 2) directions to ``axis`` (3,) and about it in the image at rays (N, 3), z = 1."""
+    ahead = axis * (rays**2).sum(axis=1)[:, None] - (rays @ axis)[:, None] * rays
+    towards = ahead[:, :2] - rays[:, :2] * ahead[:, 2:]
+    towards /= np.maximum(np.linalg.norm(towards, axis=1), 1e-12)[:, None]
+    about = np.stack([-towards[:, 1], towards[:, 0]], axis=1)
+    return np.stack([towards, about], axis=1)
+
+
 def directions(away: F64, about: F64) -> F64:
     """(..., 3) unit rays of the angles away from z and about it."""
     s = np.sin(away)
@@ -202,7 +211,7 @@ def rectify_polar(
     R_left = axis_rotation(T_left_right[:3, 3])
     R_right = R_left @ T_left_right[:3, :3]
     f = float(left.K[0, 0]) * config.width_px / left.gray.shape[1]
-    points, plane, rays = points_m @ R_left.T, R_left @ plane, _rays(left) @ R_left.T
+    points, plane, rays = points_m @ R_left.T, R_left @ plane, view_rays(left) @ R_left.T
     distance = float(np.median(np.linalg.norm(points, axis=1)))
     sector = sampling(rays, f, masked_rad(distance, baseline, f, config.max_sigma_share))
     usable = is_usable(rays, plane, baseline, f, config.max_sigma_share)
@@ -242,7 +251,7 @@ def rectify_polar(
     )
 
 
-def _rays(view: View) -> F64:
+def view_rays(view: View) -> F64:
     """(N, 3) rays of pixels spread evenly over the view, to its border."""
     H, W = view.gray.shape
     u, v = np.meshgrid(np.linspace(0, W - 1, SAMPLES[0]), np.linspace(0, H - 1, SAMPLES[1]))
@@ -317,7 +326,7 @@ def reproject_polar(
     out = PairDepth(np.empty((h, w), np.float32), np.empty((h, w), np.float32))
     sampling = [
         pair.px_per_rad, pair.rows_per_rad, pair.first_rad, pair.first_row_rad,
-        pair.first_label, pair.baseline_m, *pair.relief,
+        pair.first_label, pair.baseline_m, *pair.relief, LABEL_SIGMA_PX * pair.noise,
     ]  # fmt: skip
     in_bands(
         _reproject,
@@ -348,7 +357,7 @@ def _reproject(
     sigma_m: Any,
 ) -> None:  # pragma: no cover - compiled
     width = depth_m.shape[1]
-    f, rows_per_rad, first, first_row, lowest, base, low, high = sampling
+    f, rows_per_rad, first, first_row, lowest, base, low, high, sigma_px = sampling
     for v in range(begin, end):
         for u in range(width):
             depth_m[v, u] = np.nan
@@ -385,4 +394,4 @@ def _reproject(
             per_rad = base * np.sin(away) / (shift * shift)
             along = np.sqrt(x * x + y * y + z * z)  # the ray's length at depth 1
             depth_m[v, u] = distance / along
-            sigma_m[v, u] = per_rad * abs(slope) / along * LABEL_SIGMA_PX / f / np.sqrt(trust)
+            sigma_m[v, u] = per_rad * abs(slope) / along * sigma_px / f / np.sqrt(trust)

@@ -19,7 +19,7 @@ from recon import se3
 from recon.camera_model import rays, scaled_K
 from recon.image_quality import halved, stretch
 from recon.rolling_shutter import Rows
-from recon.stereo.polar import rectify_polar
+from recon.stereo.polar import axes_about, rectify_polar, view_rays
 from recon.stereo.reprojection import LABEL_SIGMA_PX
 from recon.types import (
     F32,
@@ -201,12 +201,15 @@ def rectify(
         guide=guide,
         left_seen=left_seen,
         right_seen=right_seen,
-        noise=_noise(left, right, R_rect_left, R_rect_right, K),
+        noise=_noise(left, right, (R_rect_left[:2, :2], R_rect_right[:2, :2]), K[0, 0]),
     )
 
 
-def _noise(left: View, right: View, R_rect_left: F64, R_rect_right: F64, K: F64) -> float:
+def _noise(left: View, right: View, axes: tuple[F64, F64], focal_px: float) -> float:
     """Sigma of a label over the usual one, by the views' motion blur.
+
+    ``axes`` (..., 2, 2) are the directions of the pair's rows and columns in left and right, and
+    ``focal_px`` its focal length.
 
     Blur along the rows leaves less gradient to match. Two blurs that differ shift what they show:
     to second order an image blurred by b gains ``b' I'' b / 24``, and where the gains differ this
@@ -214,14 +217,15 @@ def _noise(left: View, right: View, R_rect_left: F64, R_rect_right: F64, K: F64)
     """
     if left.blur_px is None or right.blur_px is None:
         return 1.0
-    scale = K[0, 0] / left.K[0, 0]
-    a = scale * R_rect_left[:2, :2] @ left.blur_px
-    b = scale * R_rect_right[:2, :2] @ right.blur_px
-    along = float(np.hypot(a[0], b[0])) / np.sqrt(2.0)
-    unlike = float(np.linalg.norm(np.outer(a, a) - np.outer(b, b)))
-    return float(
-        np.linalg.norm([1.0, BLURRED * along / LABEL_SIGMA_PX, UNLIKE * unlike / LABEL_SIGMA_PX])
+    a, b = (
+        focal_px / view.K[0, 0] * at @ view.blur_px
+        for view, at in zip((left, right), axes, strict=True)
     )
+    along = 0.5 * (a[..., 0] ** 2 + b[..., 0] ** 2)
+    squares = a[..., :, None] * a[..., None, :] - b[..., :, None] * b[..., None, :]
+    unlike = (squares**2).sum(axis=(-2, -1))
+    more = BLURRED**2 * along + UNLIKE**2 * unlike
+    return float(np.sqrt(1.0 + np.mean(more) / LABEL_SIGMA_PX**2))
 
 
 def _polar(
@@ -238,9 +242,18 @@ def _polar(
     fitted, _ = _fit_plane(xy[:, 0], xy[:, 1], config.width_px * depth / points[:, 2])
     plane = fitted * [1.0, 1.0, 1.0 / config.width_px] / depth
     low, high = relief_m
-    return rectify_polar(
+    pair = rectify_polar(
         _still(left), _still(right), points, plane, config, (low / depth, high / depth)
     )
+    if isinstance(pair, str):
+        return pair
+    T_left_right = se3.inverse(left.T_odom_camera) @ right.T_odom_camera
+    axis = T_left_right[:3, 3]
+    axes = (
+        axes_about(view_rays(left), axis),
+        axes_about(view_rays(right), T_left_right[:3, :3].T @ axis),
+    )
+    return replace(pair, noise=_noise(left, right, axes, pair.px_per_rad))
 
 
 def _row_baseline(
