@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,9 +10,12 @@ from typing import TYPE_CHECKING, Any
 import laspy
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from site_scans import Errors, leg, write_scan
 
-from service.offline.exports import rasters
+from recon.types import F64
+from service.offline.exports import EXPORTERS, clouds, rasters
+from service.offline.exports.clouds import PLY_TYPES, SAMPLES_PER_SIDE, octree_in_parts
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.site import compare
 from service.offline.site.alignment import align_site
@@ -40,7 +44,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         counts.append(len(jobs))
         return run_tiles(make, jobs, *rest)
 
-    for module in (rasters, compare):
+    for module in (rasters, clouds, compare):
         monkeypatch.setattr(module, "run_tiles", counting)
     return counts
 
@@ -79,6 +83,92 @@ def test_points_in_tiles_are_those_of_the_whole(tmp_path: Path, house: HouseFlig
     assert np.mean(parts.classification == 2) == pytest.approx(
         np.mean(whole.classification == 2), abs=0.02
     )
+
+
+@pytest.mark.parametrize("kind", ["ply", "copc"])
+def test_a_cloud_in_tiles_is_that_of_the_whole(
+    tmp_path: Path, house: HouseFlight, counted: list[int], kind: str
+) -> None:
+    pytest.importorskip("copclib")
+    house.flown(tmp_path / "scan").close()
+    usual = EXPORTERS[kind][1]
+    whole = exported(tmp_path / "scan", kind, tmp_path / usual)
+    tiled = exported(tmp_path / "scan", kind, tmp_path / f"2-{usual}", tile_points=TILE_POINTS)
+    assert counted and counted[0] > 2
+    one, two = places_in(whole), places_in(tiled)
+    assert abs(len(two) - len(one)) < 0.003 * len(one)
+    assert np.mean(cKDTree(one).query(two)[0] < 0.02) > 0.99
+    assert len(np.unique(np.round(two, 3), axis=0)) == len(two)  # each once
+
+
+def places_in(path: Path) -> F64:
+    """(N, 3) places of the points in a LAZ or a PLY."""
+    if path.suffix == ".laz":
+        return np.asarray(laspy.read(path).xyz)
+    head, _, data = path.read_bytes().partition(b"end_header\n")
+    rows = np.frombuffer(data, [(name, kind) for name, kind, _ in PLY_TYPES])
+    assert f"element vertex {len(rows)}\n".encode() in head
+    return np.column_stack([rows["x"], rows["y"], rows["z"]])
+
+
+def test_contours_in_tiles_are_those_of_the_whole(tmp_path: Path, counted: list[int]) -> None:
+    write_scan(tmp_path / "scan", leg(0.0, 8))
+    whole, parts = (
+        contours_in(exported(tmp_path / "scan", "contours", tmp_path / f"{points}.geojson",
+                             tile_points=points, contour_m=0.3))
+        for points in (20_000_000, 60_000)
+    )  # fmt: skip
+    assert counted and counted[0] > 2 and len(parts) > len(whole) > 4
+    tops = np.unique([line[0, 2] for line in whole])
+    assert np.array_equal(np.unique([line[0, 2] for line in parts]), tops)
+    one, two = np.concatenate(whole), np.concatenate(parts)
+    metres = np.array([1.3e-5, 9e-6, 0.1])  # of longitude, latitude; no other height is near
+    for a, b in ((one, two), (two, one)):
+        assert np.mean(cKDTree(a / metres).query(b / metres)[0] < 0.5) > 0.98
+
+
+def contours_in(path: Path) -> list[F64]:
+    """(N, 3) longitude, latitude, height of each line."""
+    lines = []
+    for row in json.loads(path.read_text())["features"]:
+        line = np.array(row["geometry"]["coordinates"])
+        height = np.full(len(line), row["properties"]["height_amsl_m"])
+        lines.append(np.column_stack([line, height]))
+    return lines
+
+
+def test_3d_tiles_of_a_site_in_tiles_hold_all_points(
+    tmp_path: Path, house: HouseFlight, counted: list[int]
+) -> None:
+    tileset = pytest.importorskip("py3dtiles.tileset.tileset")
+    house.flown(tmp_path / "scan").close()
+    folder = exported(tmp_path / "scan", "3dtiles", tmp_path / "t", tile_points=TILE_POINTS)
+    assert counted and counted[0] > 2
+    tiles = tileset.TileSet.from_file(folder / "tileset.json").root_tile.get_all_children()
+    leaves = [t.get_or_fetch_content(folder) for t in tiles if not t.children]
+    held = sum(content.body.feature_table.header.points_length for content in leaves)
+    with ScanView(tmp_path / "scan", VOXEL_M) as scan:
+        assert held == pytest.approx(len(scan.fused.cloud), rel=0.003)
+
+
+def test_an_octree_in_parts_has_every_point_once_in_its_node() -> None:
+    rng = np.random.default_rng(5)
+    xyz = np.column_stack([rng.uniform(0, 100, (300_000, 2)), rng.normal(50, 3, 300_000)])
+    low, side, seen = np.zeros(3), 100.0, []
+    samples: dict[tuple[int, ...], int] = {}
+    for key, rows in octree_in_parts(xyz, low, side, 30_000):
+        depth, *index = key
+        unit = (xyz[rows] - low) / side
+        assert (np.floor(unit * 2**depth).astype(int) == index).all() and key not in samples
+        samples[key] = len(rows)
+        seen.append(rows)
+        if depth < 2:  # at most one to a cell
+            cells = np.floor(unit * 2**depth * SAMPLES_PER_SIDE)
+            assert len(np.unique(cells, axis=0)) == len(rows)
+    assert np.array_equal(np.sort(np.concatenate(seen)), np.arange(len(xyz)))
+    assert samples[0, 0, 0, 0] > 10_000 and max(key[0] for key in samples) >= 2
+    for depth, *index in samples:  # each node hangs on one above
+        assert depth == 0 or (depth - 1, *(i // 2 for i in index)) in samples
 
 
 def test_a_cluster_makes_the_same_raster(tmp_path: Path, house: HouseFlight) -> None:

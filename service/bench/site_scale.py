@@ -37,7 +37,7 @@ SIZE_PX = (160, 90)
 SIGMA_M, PLACING_M = 0.05, 0.03
 TILE_POINTS = 1_000_000
 FOUND = "found.json"
-KINDS = ("dsm", "ortho", "laz", "change")
+KINDS = ("dsm", "ortho", "laz", "ply", "copc", "3dtiles", "contours", "change")
 WORKERS = (1, 2, 4)
 """Of a Dask cluster, for the first kind."""
 

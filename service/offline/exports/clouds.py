@@ -6,17 +6,17 @@ the globe for Cesium and three.js viewers.
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from recon.mapping.cloud_fusion import without
-from recon.types import F64, I64, U8
+from recon.types import F64, I64, U8, Array, PointCloud
 from service.errors import InputError
 from service.georeference import map_crs
 from service.offline.exports.flight import writing_folder
@@ -25,12 +25,15 @@ from service.offline.exports.surface import bare_ground, surface_model
 from service.offline.exports.view import ExportOptions, ProductJob, ScanView
 from service.offline.tiles import run_tiles
 from service.progress import Progress
-from service.scans.fused_cloud import SCALE_M, LazPart, las_header, point_record, write_laz
+from service.scans.fused_cloud import CHUNK_POINTS, SCALE_M, las_header, point_record, write_laz
 from service.scans.writing import writing
 
 if TYPE_CHECKING:
     import copclib
     import laspy
+
+VOXELS_MARGIN_M = 2.0
+"""Around a tile: points beside it contradict those at its border."""
 
 PLY_TYPES = [
     ("x", "<f8", "double"),
@@ -46,44 +49,67 @@ PLY_TYPES = [
 
 def write_ply(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """Binary PLY in UTM metres (doubles: single precision steps by half a metre there)."""
-    cloud = scan.fused.cloud
-    rows = np.zeros(len(cloud), np.dtype([(name, kind) for name, kind, _ in PLY_TYPES]))
-    rows["x"], rows["y"], rows["z"] = scan.xyz_m.T
-    rows["red"], rows["green"], rows["blue"] = cloud.rgb.T
-    rows["sigma_m"], rows["views"] = cloud.sigma_m, cloud.views
     crs = "local ENU metres"
     if scan.frame is not None:
         heights = "AMSL metres" if options.to_datum is None else f"metres {options.above}"
         crs = f"EPSG:{scan.frame.epsg}, {heights}"
-    head = ["ply", "format binary_little_endian 1.0", f"comment {crs}"]
-    head += [f"element vertex {len(cloud)}"]
-    head += [f"property {kind} {name}" for name, _, kind in PLY_TYPES]
-    head += ["end_header", ""]
+    count = 0
     with writing(out) as part, open(part, "wb") as file:
-        file.write("\n".join(head).encode("ascii"))
-        file.write(rows.tobytes())
+        file.write(_ply_head(crs, count))
+        for cloud, xyz_m, _ in points_of(scan, options, is_classified=False):
+            rows = np.zeros(len(cloud), np.dtype([(name, kind) for name, kind, _ in PLY_TYPES]))
+            rows["x"], rows["y"], rows["z"] = xyz_m.T
+            rows["red"], rows["green"], rows["blue"] = cloud.rgb.T
+            rows["sigma_m"], rows["views"] = cloud.sigma_m, cloud.views
+            file.write(rows.data)
+            count += len(rows)
+        file.seek(0)
+        file.write(_ply_head(crs, count))
+
+
+def _ply_head(crs: str, count: int) -> bytes:
+    """The header for ``count`` points, of one length for any: the comment is padded."""
+    head = ["ply", "format binary_little_endian 1.0", "comment " + crs.ljust(100 - len(str(count)))]
+    head += [f"element vertex {count}"]
+    head += [f"property {kind} {name}" for name, _, kind in PLY_TYPES]
+    return "\n".join([*head, "end_header", ""]).encode("ascii")
 
 
 def write_laz_file(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """LAZ, or plain LAS where the name ends so; points of the bare ground have class 2."""
     laz = out.suffix.lower() != ".las"
     started_ns = scan.store.header.started_unix_ns
-    cut = scan.tiling(options, GROUND_MARGIN_M)
-    if len(cut.tiles) == 1:
-        parts: Iterator[LazPart] = iter([(scan.fused.cloud, scan.xyz_m, classes(scan))])
-    else:
-        fixed = scan.for_tiles(options, cut)
-        jobs = [ProductJob(tile, "laz", replace(fixed, cell_m=None)) for tile in cut.tiles]
-        made = run_tiles(make_points, jobs, options.scheduler, scan.progress)
-        parts = (part for part in made if part is not None)
-    first = next(parts, None)
-    if first is None:
-        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
     with writing(out) as file:
-        write_laz(file, chain([first], parts), scan.frame, started_ns, laz, options.datum)
+        parts = points_of(scan, options)
+        write_laz(file, parts, scan.frame, started_ns, laz, options.datum)
 
 
-def make_points(job: ProductJob, progress: Progress | None = None) -> LazPart | None:
+def points_of(
+    scan: ScanView, options: ExportOptions, is_classified: bool = True
+) -> Iterator[tuple[PointCloud, F64, U8 | None]]:
+    """The fused cloud, tile by tile where there are more points than one may have.
+
+    Raises InputError, at the first, when there is not a single point.
+    """
+    cut = scan.tiling(options, GROUND_MARGIN_M if is_classified else VOXELS_MARGIN_M)
+    if len(cut.tiles) == 1:
+        yield scan.fused.cloud, scan.xyz_m, classes(scan) if is_classified else None
+        return
+    fixed = replace(scan.for_tiles(options, cut), cell_m=None)
+    kind = "classified" if is_classified else "points"
+    jobs = [ProductJob(tile, kind, fixed) for tile in cut.tiles]
+    is_empty = True
+    for part in run_tiles(make_points, jobs, options.scheduler, scan.progress):
+        if part is not None:
+            is_empty = False
+            yield part
+    if is_empty:
+        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
+
+
+def make_points(
+    job: ProductJob, progress: Progress | None = None
+) -> tuple[PointCloud, F64, U8 | None] | None:
     """The points of one tile; None without any."""
     with ScanView(Path(job.tile.folder), job.options.voxel_m, progress, job.tile) as view:
         if not view.has_points:
@@ -94,7 +120,8 @@ def make_points(job: ProductJob, progress: Progress | None = None) -> LazPart | 
         outside = (x < west) | (x >= east) | (y < south) | (y >= north)
         if outside.all():
             return None
-        return without(scan.fused.cloud, outside), scan.xyz_m[~outside], classes(scan)[~outside]
+        found = classes(scan)[~outside] if job.kind == "classified" else None
+        return without(scan.fused.cloud, outside), scan.xyz_m[~outside], found
 
 
 UNCLASSIFIED, GROUND = 1, 2
@@ -115,25 +142,26 @@ SAMPLES_PER_SIDE = 128
 
 LEAF_POINTS = 20_000
 DEEPEST = 16
+MAX_SHARED_LEVELS = 5
+"""Above nodes that are made by themselves: the cells taken there are held, at most millions."""
 LEGACY_COUNTS_AT, FIRST_RETURNS_AT = 107, 255
 """In the header of LAS 1.4: numbers of points for older readers, zero with point format 7; number
 of first returns, which all points are."""
 
 
 def write_copc(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """The fused cloud as COPC, with sigma_m and views and the EPSG code as WKT."""
+    """The fused cloud as COPC, with sigma_m and views and the EPSG code as WKT.
+
+    The points wait in a file beside ``out``: the upper levels of the octree are of all tiles.
+    """
     import copclib
 
     vertical = options.datum
-    header = las_header(scan.xyz_m, scan.frame, scan.store.header.started_unix_ns, vertical)
-    record = point_record(header, scan.xyz_m, scan.fused.cloud)
-    record["classification"] = classes(scan)
-    raw = np.frombuffer(record.memoryview(), np.int8).reshape(len(record), -1)
-    xyz = np.column_stack([record.x, record.y, record.z])
-    centre, half = _cube(xyz)
-    with writing(out) as part:
+    with writing(out) as part, tempfile.TemporaryDirectory(dir=out.parent) as work:
+        header, raw, xyz = _stored(scan, options, Path(work) / "points")
+        centre, half = _cube(xyz)
         writer = copclib.FileWriter(str(part), _config(header, scan, xyz, centre, half, vertical))
-        for key, rows in octree(xyz, centre - half, 2.0 * half):
+        for key, rows in octree_in_parts(xyz, centre - half, 2.0 * half, options.tile_points):
             data = copclib.VectorChar(raw[rows].ravel())
             writer.AddNode(copclib.VoxelKey(*key), data)
         writer.Close()
@@ -141,7 +169,28 @@ def write_copc(scan: ScanView, out: Path, options: ExportOptions) -> None:
             file.seek(LEGACY_COUNTS_AT)
             file.write(bytes(24))
             file.seek(FIRST_RETURNS_AT)
-            file.write(len(record).to_bytes(8, "little"))
+            file.write(len(raw).to_bytes(8, "little"))
+
+
+def _stored(
+    scan: ScanView, options: ExportOptions, path: Path
+) -> tuple[laspy.LasHeader, Array, F64]:
+    """LAS header, (N, bytes) records and (N, 3) places of all points, mapped from files."""
+    header, sizes = None, (0, 0)
+    with open(path, "wb") as file, open(path.with_suffix(".xyz"), "wb") as places:
+        for cloud, xyz_m, kinds in points_of(scan, options):
+            if header is None:
+                started_ns = scan.store.header.started_unix_ns
+                header = las_header(xyz_m, scan.frame, started_ns, options.datum)
+            record = point_record(header, xyz_m, cloud)
+            record["classification"] = kinds
+            file.write(record.memoryview())
+            places.write(np.column_stack([record.x, record.y, record.z]).data)
+            sizes = sizes[0] + len(record), record.point_size
+    assert header is not None  # else points_of raises
+    raw = np.memmap(path, np.int8, "r", shape=sizes)
+    xyz = np.memmap(path.with_suffix(".xyz"), np.float64, "r", shape=(sizes[0], 3))
+    return header, raw, xyz
 
 
 def _cube(xyz: F64) -> tuple[F64, float]:
@@ -192,30 +241,78 @@ def _extra_bytes(header: laspy.LasHeader) -> copclib.EbVlr:
         return copclib.LazReader(str(path)).laz_config.extra_bytes_vlr
 
 
-def octree(xyz: F64, low: F64, side: float) -> Iterator[tuple[tuple[int, int, int, int], I64]]:
+Node = tuple[int, int, int, int]
+
+
+def octree_in_parts(xyz: F64, low: F64, side: float, max_points: int) -> Iterator[tuple[Node, I64]]:
+    """As :func:`octree`, but below the first levels each node by itself.
+
+    The first levels are as many as leave about ``max_points`` to each node below, if points are
+    spread evenly over ground.
+    """
+    levels = min(max(0, math.ceil(0.5 * math.log2(len(xyz) / max_points))), MAX_SHARED_LEVELS)
+    level = np.full(len(xyz), levels, np.uint8)
+    node = np.empty(len(xyz), np.uint16)  # below the first levels
+    taken = [np.zeros(0, np.int64)] * levels  # sorted cells of each level
+    for at in range(0, len(xyz), CHUNK_POINTS):
+        some = slice(at, at + CHUNK_POINTS)
+        unit = (xyz[some] - low) / side
+        level[some] = _sampled(unit, taken)
+        node[some] = _packed(unit, 2**levels, MAX_SHARED_LEVELS)
+    for depth in range(levels):
+        rows = np.flatnonzero(level == depth)
+        unit = (xyz[rows] - low) / side
+        corners = np.floor(unit * 2**depth).astype(np.int64)
+        yield from _nodes(depth, corners, _packed(unit, 2**depth), rows)
+    lower = level == levels
+    for one in np.unique(node[lower]):
+        yield from octree(xyz, low, side, np.flatnonzero(lower & (node == one)), levels)
+
+
+def _sampled(unit: F64, taken: list[I64]) -> U8:
+    """(N,) level of each place: the first in a cell that is not ``taken`` there, else the one below
+    all. Cells become taken."""
+    level = np.full(len(unit), len(taken), np.uint8)
+    rows = np.arange(len(unit))
+    for depth, known in enumerate(taken):
+        cells, first = np.unique(
+            _packed(unit[rows], 2**depth * SAMPLES_PER_SIDE), return_index=True
+        )
+        new = ~np.isin(cells, known, assume_unique=True)
+        taken[depth] = np.union1d(known, cells[new])
+        level[rows[first[new]]] = depth
+        rows = np.delete(rows, first[new])
+    return level
+
+
+def _packed(unit: F64, count: int, bits: int = 21) -> I64:
+    """The number of each place's cell, of ``count`` along each side of the cube."""
+    cell = np.floor(unit * count).astype(np.int64)
+    return (cell[:, 0] << 2 * bits) | (cell[:, 1] << bits) | cell[:, 2]
+
+
+def octree(
+    xyz: F64, low: F64, side: float, rows: I64 | None = None, first_depth: int = 0
+) -> Iterator[tuple[Node, I64]]:
     """(depth, x, y, z) of each node and the rows of its points; every row appears once."""
-    rows = np.arange(len(xyz))
-    unit = (xyz - low) / side
-    for depth in range(DEEPEST + 1):
+    rows = np.arange(len(xyz)) if rows is None else rows
+    unit = (xyz[rows] - low) / side
+    for depth in range(first_depth, DEEPEST + 1):
         if not len(rows):
             return
-        node = np.floor(unit[rows] * 2**depth).astype(np.int64)
-        key = (node[:, 0] << 40) | (node[:, 1] << 20) | node[:, 2]
+        node = np.floor(unit * 2**depth).astype(np.int64)
+        key = _packed(unit, 2**depth)
         _, which, count = np.unique(key, return_inverse=True, return_counts=True)
         stays = count[which] <= LEAF_POINTS
         if depth == DEEPEST:
             stays[:] = True
-        cell = np.floor(unit[rows] * 2**depth * SAMPLES_PER_SIDE).astype(np.int64)
-        packed = (cell[:, 0] << 42) ^ (cell[:, 1] << 21) ^ cell[:, 2]
-        _, first = np.unique(packed, return_index=True)
+        _, first = np.unique(_packed(unit, 2**depth * SAMPLES_PER_SIDE), return_index=True)
         stays[first] = True
         yield from _nodes(depth, node[stays], key[stays], rows[stays])
-        rows = rows[~stays]
+        rows, unit = rows[~stays], unit[~stays]
 
 
-def _nodes(
-    depth: int, node: I64, key: I64, rows: I64
-) -> Iterator[tuple[tuple[int, int, int, int], I64]]:
+def _nodes(depth: int, node: I64, key: I64, rows: I64) -> Iterator[tuple[Node, I64]]:
     """The rows of each node of one level."""
     order = np.argsort(key, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0])
@@ -239,13 +336,8 @@ def write_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
     frame = scan.needs_place("3D Tiles")
     with writing_folder(out) as part, tempfile.TemporaryDirectory() as work:
         las = Path(work) / "cloud.las"
-        write_laz(
-            las,
-            [(scan.fused.cloud, None, None)],
-            frame,
-            scan.store.header.started_unix_ns,
-            laz=False,
-        )
+        parts = points_of(scan, options, is_classified=False)
+        write_laz(las, parts, frame, scan.store.header.started_unix_ns, laz=False)
         convert(
             las,
             outfolder=part,

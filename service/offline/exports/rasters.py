@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from service.offline.exports.view import ExportOptions, ProductJob, ScanView
 from service.offline.tiles import run_tiles
 from service.progress import Progress
 from service.scans.coverage import coverage_of
-from service.scans.fused_cloud import Box
+from service.scans.fused_cloud import EVERYWHERE, Box
 from service.scans.main_piece import main_keyframes, main_seqs
 from service.scans.writing import writing
 
@@ -301,21 +302,41 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 
 def contours_of(scan: ScanView, options: ExportOptions) -> list[tuple[float, F64]]:
-    """(height, (N, 2) UTM metres) of the contours; InputError without a georeference."""
+    """(height, (N, 2) UTM metres) of the contours; InputError without a georeference.
+
+    Where there are more points than one tile may have, lines end at the borders of tiles.
+    """
     scan.needs_place("a contour map")
 
     def lines() -> list[tuple[float, F64]]:
-        surface = fill_holes(scan.raster(options.cell_m))
-        return list(contour_lines(surface, options.contour_m))
+        cut = scan.tiling(options, DSM_MARGIN_M)
+        if len(cut.tiles) == 1:
+            surface = fill_holes(scan.raster(options.cell_m))
+            return list(contour_lines(surface, options.contour_m))
+        fixed = scan.for_tiles(options, cut)
+        jobs = [ProductJob(tile, "contours", fixed) for tile in cut.tiles]
+        return list(chain(*run_tiles(make_contours, jobs, options.scheduler, scan.progress)))
 
-    return scan.shared(("contours", options.cell_m, options.contour_m), lines)
+    return scan.shared(("contours", options), lines)
 
 
-def contour_lines(raster: Raster, step_m: float) -> Iterator[tuple[float, F64]]:
+def make_contours(job: ProductJob, progress: Progress | None = None) -> list[tuple[float, F64]]:
+    """The contours of one tile."""
+    options = job.options
+    with ScanView(Path(job.tile.folder), options.voxel_m, progress, job.tile) as view:
+        if not view.has_points:
+            return []
+        surface = fill_holes(view.converted(options).raster(options.cell_m))
+        return list(contour_lines(surface, options.contour_m, job.tile.box))
+
+
+def contour_lines(
+    raster: Raster, step_m: float, box: Box = EVERYWHERE
+) -> Iterator[tuple[float, F64]]:
     """(height, (N, 2) x y) of the closed or open contours at whole multiples of ``step_m``.
 
     A contour is the border of the cells at or above its height, cut where it runs along
-    unknown ground.
+    unknown ground, and at the border of ``box``: there the lines of both sides meet in a cell.
     """
     known = raster.known
     if not known.any():
@@ -328,13 +349,17 @@ def contour_lines(raster: Raster, step_m: float) -> Iterator[tuple[float, F64]]:
             f"contours every {step_m:g} m over {high - low:.0f} m of height are too many; "
             "give a larger --contour-m"
         )
-    inner = cv2.erode(np.pad(known, 1).astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1]
+    inner = cv2.erode(np.pad(known, 1).astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
+    rows, cols = raster.grid.window(box)
+    mine = np.zeros_like(known)
+    mine[rows.start : rows.stop + 1, cols.start : cols.stop + 1] = True
     for n in range(math.ceil(low / step_m), math.floor(high / step_m) + 1):
         above = ((smooth >= n * step_m) & known).astype(np.uint8)
         loops, _ = cv2.findContours(above, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         for loop in loops:
-            for run in _inside_runs(loop[:, 0], inner > 0):
-                if len(run) >= SHORTEST_CONTOUR_CELLS:
+            runs = (r for r in _inside_runs(loop[:, 0], inner) if len(r) >= SHORTEST_CONTOUR_CELLS)
+            for run in chain(*(_stretches(r, mine[r[:, 1], r[:, 0]]) for r in runs)):
+                if len(run) > 1:
                     x = raster.grid.west_m + (run[:, 0] + 0.5) * raster.grid.cell_m
                     y = raster.grid.north_m - (run[:, 1] + 0.5) * raster.grid.cell_m
                     yield n * step_m, np.column_stack([x, y])
@@ -346,9 +371,13 @@ def _inside_runs(loop: Array, inside: Array) -> list[Array]:
     if ok.all():
         return [np.concatenate([loop, loop[:1]])]
     start = int(np.argmin(ok))
-    loop, ok = np.roll(loop, -start, axis=0), np.roll(ok, -start)
+    return _stretches(np.roll(loop, -start, axis=0), np.roll(ok, -start))
+
+
+def _stretches(line: Array, ok: Array) -> list[Array]:
+    """The parts of a line whose vertices are all ``ok`` (N,)."""
     edges = np.flatnonzero(np.diff(np.r_[False, ok, False].astype(np.int8)))
-    return [loop[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [line[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def write_coverage(scan: ScanView, out: Path, options: ExportOptions) -> None:

@@ -1,0 +1,64 @@
+"""The benchmark of sites: many scans in tiles, and how boxes are counted against their truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.bench import BenchOptions, BenchResult, site, site_scale
+from service.sim.recording import ORIGIN
+
+rasterio = pytest.importorskip("rasterio")
+
+
+def test_a_site_of_scans_is_measured_by_its_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(site_scale, "KINDS", ("dsm", "change"))
+    monkeypatch.setattr(site_scale, "WORKERS", ())
+    results = site.run(BenchOptions(scans=4))
+    figures = {result.what: result for result in results}
+    peak = figures["dsm: peak memory"]
+    assert peak.note == "4 scans, 2 tiles" and 100 < peak.value < 2000
+    assert figures["change: processor time of a tile, median"].value > 0.0
+    assert 0.0 < figures["dsm: error of height, median"].value < site_scale.SIGMA_M
+    boxes = figures["change: objects"]
+    assert boxes.note == "12 boxes placed" and 6 <= boxes.value <= 12
+
+
+BOXES = [((0.0, 0.0), 2), ((10.0, 0.0), 1), ((0.0, 12.0), 2), ((-45.0, 0.0), 2)]
+"""Middle and date; the last is outside the map."""
+
+
+def counted(folder: Path, objects: list[tuple[float, float, float]]) -> dict[str, BenchResult]:
+    """The figures for these objects: m east and north of the truth's origin, and volume."""
+    (folder / "truth").mkdir()
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    boxes = [
+        {"outline_m": (square + middle).tolist(), "volume_m3": 4.0, "date": date}
+        for middle, date in BOXES
+    ]
+    (folder / "truth" / "changes.json").write_text(json.dumps(boxes))
+    east, north = ORIGIN.to_utm(np.zeros((1, 3)))[0, :2]
+    profile: dict[str, Any] = {
+        "driver": "GTiff", "height": 160, "width": 160, "count": 1, "dtype": "float32",
+        "nodata": -9999.0,
+        "transform": rasterio.transform.from_origin(east - 40.0, north + 40.0, 0.5, 0.5),
+    }  # fmt: skip
+    with rasterio.open(folder / "change.tif", "w", **profile) as image:
+        image.write(np.zeros((1, 160, 160), np.float32))
+    rows = [{"east_m": east + x, "north_m": north + y, "volume_m3": v} for x, y, v in objects]
+    change = {"objects": rows, "compared_m2": 5000.0}
+    results = site.change_results(change, folder, folder / "change.tif", np.zeros(3))
+    return {result.what: result for result in results}
+
+
+def test_boxes_count_by_place_and_sign(tmp_path: Path) -> None:
+    objects = [(0.4, 0.3, 4.4), (10.0, 0.2, 3.0), (25.0, 25.0, 1.0)]  # right, wrong sign, nothing
+    found = counted(tmp_path, objects)
+    assert found["boxes found"].value == pytest.approx(100.0 / 3.0)
+    assert found["boxes found"].note.startswith("of 3")
+    assert found["false objects"].value == pytest.approx(2.0)  # one on half a hectare
+    assert found["volume of the boxes found, error"].value == pytest.approx(10.0)
