@@ -28,6 +28,10 @@ STILL = "new Promise(r => setTimeout(r, 2000)).then(() => document.body.dataset.
 OPEN = (
     "[...document.querySelectorAll('details')].find(d => d.textContent.startsWith('{}')).open = {}"
 )
+FLY_AGAIN = (
+    "[...document.querySelectorAll('.layers label')].find(l => l.textContent.includes('Fly again'))"
+    ".querySelector('input').click()"
+)
 CLICKS = ((0.45, 0.55), (0.58, 0.5), (0.5, 0.62))
 """Places of the scene that are measured, in its widths and heights."""
 
@@ -98,6 +102,9 @@ def shots(browser: Browser, base: str, scan: Path, out: Path) -> None:
     browser.open(f"{base}/#/map/{where}")
     browser.wait("document.body.dataset.map === 'shown'", WAIT_S)
     shot("map")
+    browser.run(FLY_AGAIN)
+    browser.wait("document.querySelector('.layers output').textContent", WAIT_S)
+    shot("map-again")
     browser.open(f"{base}/#/view/{scan.parent.name}/no-such-scan")
     browser.wait("document.querySelector('h1')", WAIT_S)
     shot("unknown")

@@ -12,6 +12,7 @@ from loopback import until
 from service.errors import InputError
 from service.ground import state
 from service.ground.state import Jobs
+from service.offline.exports.view import ExportOptions
 from service.progress import Progress
 from service.workers import Workers
 
@@ -75,11 +76,16 @@ def test_jobs_say_how_far_they_are_and_can_be_cancelled(
     running = jobs.listed()[0]
     assert (running["percent"], running["doing"], running["state"]) == (50, "halfway", "running")
     assert (running["drone"], running["scan"], running["kind"]) == ("drone-1", "test-1", "kml")
+    again = [jobs.start(folder, kind)["number"] for kind in ("kml", "laz", "dsm")]
+    assert again == [first, second, third]  # asked for twice, made once
+    strict = ExportOptions(strict=True)
+    other = jobs.start(folder, "dsm", options=strict)["number"]
+    assert other > third and jobs.cancel(other)["state"] == "cancelled"
     assert jobs.cancel(second)["state"] == "cancelled"  # it waits: at once
     jobs.cancel(first)
     go_on.set()
     assert until(lambda: not jobs.busy(folder))
-    assert [job["state"] for job in jobs.listed()] == ["cancelled", "cancelled", "done"]
+    assert [j["state"] for j in jobs.listed()] == ["cancelled", "cancelled", "done", "cancelled"]
     for number in (first, third, 99):
         with pytest.raises(InputError, match=f"no job {number}"):
             jobs.cancel(number)

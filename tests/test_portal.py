@@ -132,6 +132,10 @@ def test_rename_and_tag_with_any_letters(client: Client, store: Path) -> None:
         "edition": 1,
     }
     assert client.ask(one)[1]["tags"] == ["a", "b"]
+    hidden = {"title": "\u202eexe.\x00 \u200d", "tags": ["\x07", "c\u2066"]}
+    labels = client.ask(one, "PATCH", hidden)[1]
+    assert (labels["title"], labels["tags"]) == ("exe. \u200d", ["c"])  # nothing hides
+    client.ask(one, "PATCH", {"tags": ["a", "b"]})
     client.ask(one, "PATCH", {"title": "only this"})
     assert client.ask(one)[1]["tags"] == ["a", "b"]
     for bad in (

@@ -325,18 +325,23 @@ def _files(folder: Path) -> list[dict[str, Any]]:
     return out
 
 
+JOINERS = "\u200c\u200d"
+"""Invisible characters that some scripts need within a word."""
+
+
 def _title(title: Any) -> str:
     if not isinstance(title, str) or len(title) > MAX_TITLE:
         raise InputError(f"a title is a text of at most {MAX_TITLE} letters")
     if any(0xD800 <= ord(letter) <= 0xDFFF for letter in title):
         raise InputError("a title holds an invalid character (a lone surrogate)")
-    return " ".join(title.split())
+    seen = (c if c.isprintable() or c in JOINERS else " " for c in title)  # nothing that hides
+    return " ".join("".join(seen).split())
 
 
 def _tags(tags: Any) -> tuple[str, ...]:
     if not isinstance(tags, (list, tuple)) or len(tags) > MAX_TAGS:
         raise InputError(f"tags are a list of at most {MAX_TAGS} texts")
-    return tuple(dict.fromkeys(_title(tag) for tag in tags if tag))
+    return tuple(dict.fromkeys(filter(None, map(_title, tags))))
 
 
 def _safe(name: str, what: str) -> str:

@@ -110,14 +110,22 @@ class Jobs:
         work: Callable[[Progress], str] | None = None,
         options: ExportOptions | None = None,
     ) -> dict[str, Any]:
-        """Queue a job, or ``work``. InputError for an unknown kind or a full queue."""
+        """Queue a job, or ``work``; the one there is where it is asked for twice.
+
+        InputError for an unknown kind or a full queue.
+        """
         if work is None and kind not in KINDS:
             raise InputError(f"kind is one of {', '.join(KINDS)}")
+        options = options or ExportOptions()
+        asked = (folder, kind, options)
         with self._lock:
+            for job in self._jobs if work is None else ():
+                if not job.has_ended and (job.folder, job.kind, job.options) == asked:
+                    return job.shown()
             if sum(not job.has_ended for job in self._jobs) >= MAX_WAITING_JOBS:
                 raise InputError("too many deliverables are waiting; try again later")
             self._number += 1
-            job = Job(self._number, folder, kind, work=work, options=options or ExportOptions())
+            job = Job(self._number, folder, kind, work=work, options=options)
             self._jobs = [*self._jobs[-KEPT:], job]
             if self._worker is None or self._worker.is_done:
                 self._worker = self._workers.start("exports", self._work)
