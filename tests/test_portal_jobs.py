@@ -135,6 +135,28 @@ def test_all_maps_come_in_one_zip(portal: Portal, tmp_path: Path) -> None:
         assert {name: found.read(name) for name in found.namelist()} == files
 
 
+@pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
+def test_all_maps_are_two_clicks_away(
+    browser: Browser, portal: Portal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, needs: None
+) -> None:
+    def carry_out(job: Job) -> str:
+        maps = job.folder / "maps"
+        maps.mkdir()
+        (maps / "manifest.json").write_text("{}")
+        return maps.name
+
+    monkeypatch.setattr(state, "carry_out", carry_out)
+    browser.screen(1280, 800)
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    browser.click("Make")
+    browser.wait(f"{ROW} && {ROW}.className === 'done' && !{ROW}.querySelector('a').hidden")
+    with browser.page.expect_download() as download:
+        browser.page.locator(".jobs li a").click()
+    with zipfile.ZipFile(download.value.path()) as found:
+        assert found.namelist() == ["manifest.json"]
+
+
 @pytest.mark.parametrize("where", ["/", "/#/view/drone-1/test-1"])
 @pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
 def test_a_job_shows_its_percent_and_is_cancelled_by_its_button(

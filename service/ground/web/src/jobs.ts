@@ -38,15 +38,26 @@ function row(job: api.Job, title: string): Row {
   const words = el("span", { className: "words" });
   const stop = el("button", { textContent: "Cancel", onclick: () => void api.cancel(job.number).catch(notify) });
   stop.setAttribute("aria-label", `Cancel ${job.kind} of ${title}`);
-  const element = el("li", {}, el("strong", { textContent: `${job.kind} of ${title}` }), bar, words, stop);
+  const get = el("a", { className: "button", textContent: "Download", hidden: true, download: "" });
+  get.setAttribute("aria-label", `Download ${job.kind} of ${title}`);
+  const element = el("li", {}, el("strong", { textContent: `${job.kind} of ${title}` }), bar, words, stop, get);
   const show = (now: api.Job): void => {
     const ended = now.state !== "waiting" && now.state !== "running";
     element.className = now.state;
     bar.hidden = stop.hidden = ended;
     bar.value = now.percent;
     words.textContent = wordsOf(now);
+    const address = now.state === "done" ? madeAt(now) : null;
+    get.hidden = !address;
+    if (address) get.href = address;
   };
   return { element, show };
+}
+
+/** The address of what a job has made; null for folders, which are no download. */
+function madeAt(job: api.Job): string | null {
+  if (job.kind === "all") return `${api.scanAddress(job)}/maps.zip`;
+  return job.file?.includes(".") ? api.file(job, job.file) : null;
 }
 
 function wordsOf(job: api.Job): string {

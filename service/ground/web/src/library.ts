@@ -6,7 +6,7 @@ import { jobList } from "./jobs";
 import { vehicleStrip } from "./vehicle";
 
 const KINDS = [
-  "laz", "copc", "ply", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "kmz", "stac", "all", "glb", "3dtiles", "3dtiles-mesh", "geojson", "kml",
+  "all", "laz", "copc", "ply", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "kmz", "stac", "glb", "3dtiles", "3dtiles-mesh", "geojson", "kml",
   "mcap", "ros2", "refine",
 ];
 
@@ -247,7 +247,7 @@ function downloads(s: api.Scan): HTMLElement {
 
 /** A kind to choose and a button that makes it. */
 function makeMenu(s: api.Scan, again: () => void): HTMLElement {
-  const kinds = el("select", {}, ...KINDS.map((kind) => el("option", { value: kind, textContent: kind })));
+  const kinds = el("select", {}, ...KINDS.map((kind) => el("option", { value: kind, textContent: kind === "all" ? "all maps" : kind })));
   kinds.setAttribute("aria-label", "deliverable");
   const heights = el("select", {}, ...HEIGHTS.map(([text], i) => el("option", { value: String(i), textContent: text })));
   heights.setAttribute("aria-label", "heights");
