@@ -92,6 +92,7 @@ def shots(browser: Browser, base: str, scan: Path, out: Path) -> None:
     shot("library-open")
     press("Make")(browser)
     shot("library-job")
+    press("Cancel")(browser)
     browser.open(f"{base}/#/view/{where}")
     browser.wait("Number(document.body.dataset.points) > 0", WAIT_S)
     for name, acts in view_states(scan):

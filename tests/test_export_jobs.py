@@ -11,7 +11,8 @@ from loopback import until
 
 from service.errors import InputError
 from service.ground import state
-from service.ground.state import Jobs
+from service.ground.portal import Portal, PortalConfig
+from service.ground.state import Job, Jobs
 from service.offline.exports.view import ExportOptions
 from service.progress import Progress
 from service.workers import Workers
@@ -89,6 +90,24 @@ def test_jobs_say_how_far_they_are_and_can_be_cancelled(
     for number in (first, third, 99):
         with pytest.raises(InputError, match=f"no job {number}"):
             jobs.cancel(number)
+
+
+def test_jobs_end_with_the_portal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    portal = Portal(PortalConfig(tmp_path, port=0))
+    jobs, running = portal._jobs, threading.Event()
+
+    def carry_out(job: Job) -> str:
+        while True:
+            job.progress("on and on")  # raises once it is cancelled
+            running.set()
+
+    monkeypatch.setattr(state, "carry_out", carry_out)
+    for kind in ("dsm", "laz"):
+        jobs.start(tmp_path, kind)
+    assert running.wait(10.0)
+    portal.close()
+    assert [job["state"] for job in jobs.listed()] == ["cancelled", "cancelled"]
+    assert not jobs.busy(tmp_path)
 
 
 def test_ended_jobs_leave_the_list_after_a_while(

@@ -134,11 +134,11 @@ def portal_app(
     audit: AuditLog,
     progress: Callable[[], list[dict[str, Any]]] | None = None,
     vehicle: Vehicle | None = None,
-    workers: Workers | None = None,
+    jobs: Jobs | None = None,
     basemap: Path | None = None,
 ) -> ASGIApp:
     """The portal as an ASGI application; ``local`` when only this machine can reach it."""
-    jobs = Jobs(workers or Workers())
+    jobs = jobs or Jobs(Workers())
     below = None if basemap is None else open_basemap(basemap)
     state = PortalState(Library(store), jobs, progress or list, vehicle, below)
     one = "/api/scans/{drone}/{scan}"

@@ -21,6 +21,7 @@ from service.ground.guard import (
     read_tokens,
 )
 from service.ground.http import portal_app
+from service.ground.state import Jobs
 from service.ground.vehicle import Vehicle
 from service.listener import (
     BoundedListener,
@@ -81,6 +82,7 @@ class Portal:
         """``progress`` gives one entry per scan being received (``Receiver.progress``)."""
         self.config = config
         self._workers = workers or Workers()
+        self._jobs = Jobs(self._workers)
         tokens = parse_tokens(config.token or secrets.token_urlsafe(24))
         self.token = next(iter(tokens.values()))
         self._app = portal_app(
@@ -90,7 +92,7 @@ class Portal:
             AuditLog(config.store),
             progress,
             vehicle,
-            self._workers,
+            self._jobs,
             config.basemap,
         )
         self._vehicle = vehicle
@@ -169,7 +171,8 @@ class Portal:
             self._listener.sweep()
 
     def close(self) -> None:
-        """End; open connections and the vehicle's link are closed."""
+        """End; open connections and the vehicle's link are closed, jobs cancelled."""
+        self._jobs.close()
         if self._server is not None and self._worker is not None:
             self._worker.stop.set()
             self._server.should_exit = True

@@ -31,6 +31,9 @@ KEPT = 100
 SHOWN_S = 60.0
 """A job that has ended is listed for so long."""
 
+CLOSE_S = 5.0
+"""Time to a running job's next step, when the station closes."""
+
 REFINE = "refine"
 KINDS = (*EXPORTERS, REFINE)
 """Products that a job may make."""
@@ -160,6 +163,17 @@ class Jobs:
             if found[0].state == "waiting":
                 found[0].end("cancelled")
             return found[0].shown()
+
+    def close(self) -> None:
+        """Cancel all jobs; wait a while until the one that runs has left its files."""
+        with self._lock:
+            for job in self._jobs:
+                job.progress.cancel()
+                if job.state == "waiting":
+                    job.end("cancelled")
+            worker = self._worker
+        if worker is not None:
+            worker.join(CLOSE_S)
 
     def _work(self, _: Worker) -> None:
         """Make what waits, one after the other."""
