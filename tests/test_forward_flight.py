@@ -5,6 +5,9 @@ The flight is exact: 40 m above a level, textured plane under a plain sky.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -13,9 +16,16 @@ from recon import se3
 from recon.backends import load_backend
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.polar import reproject_polar
-from recon.stereo.virtual_stereo import View, VirtualStereoConfig, drop_unseen, rectify
-from recon.types import F64, U8, Camera, Frame, Keyframe, PolarPair, PosePrior
+from recon.stereo.virtual_stereo import (
+    PairRejection,
+    View,
+    VirtualStereoConfig,
+    drop_unseen,
+    rectify,
+)
+from recon.types import F64, U8, Camera, Frame, Keyframe, PolarPair, PosePrior, RectifiedPair
 from service.config import load_config
+from service.flight import stages
 from service.flight.pipeline import Pipeline
 from service.flight.stages import build_stages
 
@@ -74,7 +84,25 @@ def photograph(levels: list[U8], T: F64) -> U8:
 
 
 @pytest.fixture(scope="module")
-def keyframes() -> list[Keyframe]:
+def rectified() -> list[tuple[int, int]]:
+    """Numbers of the images that made pairs."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def keyframes(rectified: list[tuple[int, int]]) -> Iterator[list[Keyframe]]:
+    def noted(left: View, right: View, *rest: Any) -> RectifiedPair | PairRejection:
+        found = rectify(left, right, *rest)
+        if not isinstance(found, PairRejection):
+            rectified.append((left.seq, right.seq))
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stages, "rectify", noted)
+        yield fly()
+
+
+def fly() -> list[Keyframe]:
     levels = ground()
     config = load_config(None, ["compute.upsample=false", "camera.readout_ms=0"])
     pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
@@ -103,6 +131,14 @@ def test_the_ground_ahead_is_measured(keyframes: list[Keyframe]) -> None:
         assert abs(scale - 1.0) < 0.04
         assert np.median(error) < 0.01
         assert np.mean(error > 0.05) < 0.02
+
+
+def test_two_images_are_matched_once(
+    keyframes: list[Keyframe], rectified: list[tuple[int, int]]
+) -> None:
+    """The other one takes its depth over; the depth of all keyframes is tested above."""
+    assert len(rectified) > len(keyframes)
+    assert len({frozenset(pair) for pair in rectified}) == len(rectified)
 
 
 def test_sigma_grows_with_the_distance(keyframes: list[Keyframe]) -> None:

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.stereo.reprojection import LABEL_SIGMA_PX, reproject
+from recon import se3
+from recon.stereo.reprojection import LABEL_SIGMA_PX, PairDepth, carry, reproject
 from recon.types import F64, DisparityMap, StereoPair
 
 K = np.array([[190.0, 0, 159.5], [0, 190.0, 89.5], [0, 0, 1]])
@@ -94,3 +95,45 @@ def test_unknown_doubtful_and_infinite_are_nan() -> None:
     assert np.isfinite(found.depth_m[2:]).all()
     with pytest.raises(ValueError, match="bad disparity"):
         reproject(DisparityMap(px, confidence[1:]), pair, K, SIZE)
+
+
+def seen_from(T: F64) -> F64:
+    """(h, w) depth of tilted ground 60 m away and a box 8 m high on it; ``T`` is T_world_camera."""
+    v, u = np.mgrid[0:180, 0:320]
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], axis=-1)
+    rays, at = rays @ T[:3, :3].T, T[:3, 3]
+    normal = np.array([0.1, 0.2, 1.0])
+    ground = (60.0 - normal @ at) / (rays @ normal)
+    top = (52.0 - at[2]) / rays[..., 2]
+    x, y = (at[k] + top * rays[..., k] for k in (0, 1))
+    roof = (np.abs(x) < 8.0) & (np.abs(y) < 8.0)
+    return np.where(roof, np.minimum(top, ground), ground)
+
+
+@pytest.mark.parametrize("move_m", [(6.0, 1.0, 0.0), (-5.0, 3.0, 0.0), (0.5, 0.5, 6.0)])
+def test_a_pairs_depth_is_carried_to_the_other_view(move_m: tuple[float, float, float]) -> None:
+    """Sideways, and a tenth nearer: nearly all of what both see, to a fraction of a sigma."""
+    turned = se3.so3_exp(np.array([0.01, -0.02, 0.08]))
+    T_there, T_here = np.eye(4), se3.compose(turned, np.array(move_m))
+    depth = seen_from(T_there).astype(np.float32)
+    pair = PairDepth(depth, 0.002 * depth)
+    found = carry(pair, K, se3.inverse(T_here) @ T_there)
+    truth = seen_from(T_here)
+    back = carry(
+        PairDepth(truth.astype(np.float32), pair.sigma_m), K, se3.inverse(T_there) @ T_here
+    )
+    both = np.isfinite(back.depth_m).sum()  # of their pixels meet the other view
+    known = np.isfinite(found.depth_m)
+    assert known.sum() > 0.95 * both > 0.7 * known.size
+    error = np.abs(found.depth_m[known] / truth[known] - 1.0)
+    assert np.median(error) < 1e-4 and np.mean(error > 0.002) < 0.02
+    np.testing.assert_allclose(found.sigma_m[known], 0.002 * found.depth_m[known], rtol=0.02)
+
+
+def test_the_nearer_surface_hides_what_is_behind_it() -> None:
+    depth = np.full((180, 320), 60.0, np.float32)
+    depth[:, :100] = 30.0  # moves twice as far
+    moved = np.eye(4)
+    moved[0, 3] = 60.0 * 20 / K[0, 0]
+    found = carry(PairDepth(depth, 0.01 * depth), K, moved).depth_m
+    assert (found[:, 45:135] == 30.0).all() and (found[:, 145:] == 60.0).all()

@@ -117,6 +117,83 @@ def _reproject(
             sigma_m[v, u] = depth / d * abs(slope) * sigma_px / np.sqrt(trust)
 
 
+AGREES_SIGMAS = 3.0
+"""Neighbours within so many sigmas of a pixel lie on its surface."""
+
+
+def carry(pair: PairDepth, K: F64, T_here_there: F64) -> PairDepth:
+    """The depth of ``pair``, seen from ``there``, on the same grid ``here``.
+
+    ``K`` (3, 3) is of both grids; T_here_there (4, 4). Of several places that meet a pixel the
+    nearest is taken, moved along its surface to the pixel's centre. Gaps of a pixel that the
+    magnification leaves are closed where both sides agree.
+    """
+    moved = PairDepth(*(np.full(pair.depth_m.shape, np.nan, np.float32) for _ in range(2)))
+    _carry(pair.depth_m, pair.sigma_m, K, T_here_there, moved.depth_m, moved.sigma_m)
+    whole = PairDepth(moved.depth_m.copy(), moved.sigma_m.copy())
+    _close_gaps(moved.depth_m, moved.sigma_m, whole.depth_m, whole.sigma_m)
+    return whole
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _slope(before: Any, here: Any, after: Any, sigma: Any) -> Any:  # pragma: no cover - compiled
+    """Change of the inverse depth from pixel to pixel; 0 at an edge or next to nothing."""
+    near = AGREES_SIGMAS * sigma / here
+    if abs(here / before - 1.0) < near and abs(here / after - 1.0) < near:
+        return 0.5 * (1.0 / after - 1.0 / before)
+    return 0.0
+
+
+@njit(cache=True, nogil=True)
+def _carry(
+    depth: Any, sigma: Any, K: Any, T: Any, out_depth: Any, out_sigma: Any
+) -> None:  # pragma: no cover - compiled
+    height, width = depth.shape
+    for v in range(height):
+        for u in range(width):
+            z, s = float(depth[v, u]), float(sigma[v, u])
+            if not z > 0:
+                continue
+            x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
+            there = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+            if not there > 1e-3 * z:
+                continue
+            U = K[0, 0] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / there + K[0, 2]
+            V = K[1, 1] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / there + K[1, 2]
+            if not (-0.5 < U < width - 0.5 and -0.5 < V < height - 0.5):
+                continue
+            i, j = int(np.rint(U)), int(np.rint(V))
+            across = down = 0.0
+            if 0 < u < width - 1:
+                across = _slope(float(depth[v, u - 1]), z, float(depth[v, u + 1]), s)
+            if 0 < v < height - 1:
+                down = _slope(float(depth[v - 1, u]), z, float(depth[v + 1, u]), s)
+            off_u, off_v = i - U, j - V
+            inverse = 1.0 / there
+            inverse += (T[0, 0] * across + T[0, 1] * down) * off_u
+            inverse += (T[1, 0] * across + T[1, 1] * down) * off_v
+            if inverse > 0.0 and not 1.0 / inverse >= out_depth[j, i]:
+                out_depth[j, i] = 1.0 / inverse
+                out_sigma[j, i] = s * (there / z)
+
+
+@njit(cache=True, nogil=True)
+def _close_gaps(
+    depth: Any, sigma: Any, out_depth: Any, out_sigma: Any
+) -> None:  # pragma: no cover - compiled
+    height, width = depth.shape
+    for v in range(1, height - 1):
+        for u in range(1, width - 1):
+            if not np.isnan(depth[v, u]):
+                continue
+            for dv, du in ((0, 1), (1, 0)):
+                a, b = depth[v - dv, u - du], depth[v + dv, u + du]
+                s = max(sigma[v - dv, u - du], sigma[v + dv, u + du])
+                if abs(a - b) <= AGREES_SIGMAS * s:
+                    out_depth[v, u], out_sigma[v, u] = 0.5 * (a + b), s
+                    break
+
+
 @dataclass(frozen=True, slots=True)
 class FusionConfig:
     """Parameters of the fusion of stereo pairs."""

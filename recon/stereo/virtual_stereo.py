@@ -86,6 +86,7 @@ class View:
     blur_px: F64 | None = (
         None  # (2,) how far the image moved while it was exposed; None: not at all
     )
+    seq: int = -1  # number of its frame
 
     def inside(self, focal_px: float) -> U8:
         """(H, W) 1 where the image shows something, a pixel of that focal length from its rim."""

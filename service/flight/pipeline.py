@@ -70,16 +70,18 @@ class Pipeline:
     def reconstruct(self, view: StereoCandidate) -> Keyframe | None:
         """One view: its depth from all its partners, its pose, and its new surface."""
         s, depth = self.stages, None
-        pairs, grid = s.rectify(view)  # virtual stereo pairs, section 2.1
+        grid = s.rectify.grid(view)
+        depths = s.carry(view, grid)  # by images that are matched already
+        pairs = s.rectify(view, depths)  # virtual stereo pairs, section 2.1
         if pairs:
-            depth = s.whole_path(pairs, grid)  # Eq. 1-3 at once, where a device does that
-        if pairs and depth is None:
-            depths = []
-            for pair in pairs:
+            depth = s.whole_path([*pairs.values()], grid)  # Eq. 1-3 at once, where a device can
+        if depth is None and (pairs or depths):
+            for partner, pair in pairs.items():
                 disparity = s.match(pair)  # belief propagation, Eq. 1
                 disparity = s.upsample(disparity, pair)  # joint bilateral upsampling, Eq. 2
-                depths.append(s.reproject(disparity, pair, grid))  # Eq. 3
-            depth = s.fuse(depths, grid)
+                depths[partner] = s.reproject(disparity, pair, grid)  # Eq. 3
+            s.carry.keep(view.seq, depths)
+            depth = s.fuse([*depths.values()], grid)
         depth = s.plausible(view, depth)  # nothing that cannot be
         s.rectify.learn(depth)  # how far the relief of the next pairs may reach
         motion = s.register(view, depth)  # ICP onto the keyframe before

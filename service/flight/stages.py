@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,7 +25,7 @@ from recon.posegraph.trajectory import Placed, Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.depth_edges import drop_mixtures
 from recon.stereo.polar import reproject_polar
-from recon.stereo.reprojection import FusionConfig, PairDepth, fuse, plausible, reproject
+from recon.stereo.reprojection import FusionConfig, PairDepth, carry, fuse, plausible, reproject
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.stereo.virtual_stereo import (
     PairRejection,
@@ -170,26 +170,34 @@ class Rectify:
         self._relief_m = (0.0, 0.0)
         self.pairs = 0
 
-    def __call__(self, candidate: StereoCandidate) -> tuple[list[RectifiedPair], Grid]:
-        """The pairs that stereo can use, and the grid of the view's depth."""
+    def grid(self, candidate: StereoCandidate) -> Grid:
+        """The grid of the view's depth."""
+        view, width = candidate.view, self._config.width_px
+        H, W = view.gray.shape
+        w, h = width, round(width * H / W)
+        return Grid(scaled_K(view.K, w / W, h / H), (w, h), view.T_odom_camera)
+
+    def __call__(
+        self, candidate: StereoCandidate, known: Collection[int]
+    ) -> dict[int, RectifiedPair]:
+        """The pairs that stereo can use by the number of the partner, which is not ``known``."""
         config = self._config  # another thread may set it meanwhile
         view = candidate.view
-        H, W = view.gray.shape
-        w, h = config.width_px, round(config.width_px * H / W)
-        grid = Grid(scaled_K(view.K, w / W, h / H), (w, h), view.T_odom_camera)
-        pairs: list[RectifiedPair] = []
+        pairs: dict[int, RectifiedPair] = {}
         for partner in candidate.partners:
+            if partner.seq in known:
+                continue
             with self._stopwatch("rectify"):
                 pair = rectify(view, partner, candidate.points, config, self._relief_m)
             if isinstance(pair, PairRejection):
                 self._rejected[pair.reason] += 1
                 continue
-            pairs.append(pair)
+            pairs[partner.seq] = pair
             if self._debug is not None:
                 self._debug.clear()
                 self._debug |= {"raw_left": candidate.bgr, "raw_right": partner.gray}
-        self.pairs += len(pairs)
-        return pairs, grid
+        self.pairs += len(pairs) + len(known)
+        return pairs
 
     def learn(self, depth: DepthMap | None) -> None:
         """Make room for as much relief as the last view showed."""
@@ -203,6 +211,36 @@ class Rectify:
     def set_effort(self, compute: ComputeConfig) -> None:
         """Reconstruct at another width, with or without upsampling, from the next view on."""
         self._config = replace(self._config, width_px=compute.stereo_width, guided=compute.upsample)
+
+
+class Carry:
+    """Depth by two images that were matched before, when the other one was the view.
+
+    Matched again they say the same: of a keyframe's pairs that is one in four. A device that keeps
+    the depth of pairs to itself matches them all.
+    """
+
+    def __init__(self, backend: Backend, stopwatch: Stopwatch) -> None:
+        self._is_kept, self._stopwatch = not isinstance(backend, PathBackend), stopwatch
+        self._kept: dict[tuple[int, int], PairDepth] = {}  # by view and partner
+
+    def __call__(self, candidate: StereoCandidate, grid: Grid) -> dict[int, PairDepth]:
+        """Depth on the view's grid by the number of the partner."""
+        view, found = candidate.view, dict[int, PairDepth]()
+        for partner in candidate.partners:
+            pair = self._kept.get((partner.seq, view.seq))
+            if pair is not None and pair.depth_m.shape == grid.size_px[::-1]:
+                with self._stopwatch("carry"):
+                    T = se3.inverse(view.T_odom_camera) @ partner.T_odom_camera
+                    found[partner.seq] = carry(pair, grid.K, T)
+        return found
+
+    def keep(self, seq: int, depths: Mapping[int, PairDepth]) -> None:
+        """Remember a view's depth by partners that are views later; what is past is dropped."""
+        if not self._is_kept:
+            return
+        later = {(seq, partner): depth for partner, depth in depths.items() if partner > seq}
+        self._kept = {key: depth for key, depth in self._kept.items() if key[1] > seq} | later
 
 
 class PairStages:
@@ -356,6 +394,7 @@ class Stages:
     undistort: Undistort
     track: Track
     views: StereoViews
+    carry: Carry
     rectify: Rectify
     whole_path: WholePath
     match: Callable[[RectifiedPair], DisparityMap]
@@ -426,6 +465,7 @@ def build_stages(
         undistort=undistort,
         track=track,
         views=views,
+        carry=Carry(backend, stopwatch),
         rectify=Rectify(stereo, rejected, debug, stopwatch),
         whole_path=whole_path(backend, dense, stopwatch) if debug is None else by_stages,
         match=pair.match,

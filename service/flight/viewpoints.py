@@ -414,7 +414,7 @@ class StereoViews:
         """The view in gray with its pose; ``points`` (N, 3) of the odometry are the ground."""
         posed = View(
             None, view.gray, self._K, view.T_odom_camera, self._seen,
-            blur_px=self._blur_px(view, points),
+            blur_px=self._blur_px(view, points), seq=view.seq,
         )  # fmt: skip
         rows = None if view.moving is None else view.moving.rows
         if rows is None or not rows.clock.readout_s:
