@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.ndimage as ndi
@@ -11,6 +13,7 @@ from recon.surface.change import (
     SumErrors,
     change_between,
     left_over_m,
+    level_filled,
     mean_surface,
     of_tile,
     outlines,
@@ -18,7 +21,7 @@ from recon.surface.change import (
     sigmas_of_any,
     volumes,
 )
-from recon.surface.raster import Grid, Raster
+from recon.surface.raster import Grid, Raster, fill_holes
 from recon.types import F32, F64
 
 CELL_M, SIGMA_M = 0.2, 0.06
@@ -48,6 +51,28 @@ def test_surfaces_without_change_show_none_in_nineteen_of_twenty() -> None:
         before, after = surface(seed, house), surface(100 + seed, [(61, 60, 40, 50, 6.0)], 0.02)
         shown += bool(change_between(before, after).bodies)
     assert shown <= 1
+
+
+def test_unknown_ground_around_a_box_does_not_make_it_wider() -> None:
+    boxes = [(20 + 40 * (k // 5), 20 + 40 * (k % 5), 10, 10, 1.5) for k in range(25)]
+    after = surface(2, boxes)
+    r, c = np.indices(GRID.shape)
+    height = after.height_m.copy()
+    for row, col, rows, cols, _ in boxes:  # two cells around it, as where it hides the ground
+        inside = [(r >= row - k) & (r < row + rows + k) & (c >= col - k) & (c < col + cols + k)
+                  for k in (0, 2)]  # fmt: skip
+        height[inside[1] & ~inside[0]] = np.nan
+    height[:, 7::23] = np.nan  # lines without a point
+    holed = replace(after, height_m=height)
+    true = 25 * 100 * CELL_M**2 * 1.5
+    errors = []
+    for surface_after in (level_filled(holed, 2), fill_holes(holed, 2)):
+        found = change_between(surface(1, []), surface_after).bodies
+        assert len(found) == 25
+        errors.append(sum(b.volume_m3 for b in found) / true - 1.0)
+    assert abs(errors[0]) < 0.02 < 0.1 < errors[1]
+    filled = level_filled(holed, 2)
+    assert np.isfinite(filled.height_m[2:15, 7::23]).all()  # level ground is closed
 
 
 def test_boxes_of_a_metre_and_forty_centimetres_are_found() -> None:

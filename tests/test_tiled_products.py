@@ -167,7 +167,7 @@ def test_an_octree_in_parts_has_every_point_once_in_its_node() -> None:
             assert len(np.unique(cells, axis=0)) == len(rows)
     assert np.array_equal(np.sort(np.concatenate(seen)), np.arange(len(xyz)))
     assert samples[0, 0, 0, 0] > 10_000 and max(key[0] for key in samples) >= 2
-    for depth, *index in samples:  # each node hangs on one above
+    for depth, *index in samples:  # each node is part of one above
         assert depth == 0 or (depth - 1, *(i // 2 for i in index)) in samples
 
 

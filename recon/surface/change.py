@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from recon.surface.raster import Grid, Raster, highest_lowest
+from recon.surface.raster import Grid, Raster, fill_holes, highest_lowest
 from recon.types import F32, F64, I32, U8, Bool
 
 BEND_CELLS, BEND_ROUNDS = 8, 8
@@ -117,6 +117,22 @@ def mean_surface(xyz_m: F64, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
     shown = np.where(known[:, None], np.clip(np.rint(colour), 0, 255), 0).astype(np.uint8)
     shape = grid.shape
     return Raster(grid, height.reshape(shape), sigma.reshape(shape), shown.reshape(*shape, 3))
+
+
+def level_filled(raster: Raster, cells: int) -> Raster:
+    """The surface with its holes up to ``cells`` wide filled, but not next to steps.
+
+    Ground next to a step is unknown because it is hidden, or because stereo mixed both heights
+    there: a mean of the two would make whatever stands wider. A step rises by more than 45 degrees
+    over the ``cells`` around.
+    """
+    filled = fill_holes(raster, cells)
+    high, low = highest_lowest(raster.height_m, cells)
+    is_step = ~raster.known & (high - low > 2 * cells * raster.grid.cell_m)
+    height, sigma = (
+        np.where(is_step, np.float32(np.nan), x) for x in (filled.height_m, filled.sigma_m)
+    )
+    return replace(filled, height_m=height, sigma_m=sigma)
 
 
 def change_between(

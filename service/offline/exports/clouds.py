@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import laspy
 
 VOXELS_MARGIN_M = 2.0
-"""Around a tile: points beside it contradict those at its border."""
+"""Around a tile: points next to it contradict those at its border."""
 
 PLY_TYPES = [
     ("x", "<f8", "double"),

@@ -17,12 +17,13 @@ from recon.surface.change import (
     Body,
     Change,
     change_between,
+    level_filled,
     mean_surface,
     of_tile,
     outlines,
     volumes,
 )
-from recon.surface.raster import Grid, Raster, fill_holes, grid_over
+from recon.surface.raster import Grid, Raster, grid_over
 from recon.surface.walls import Wall, walls_moved
 from recon.types import F32, F64, U8, Bool, DepthMap
 from service.errors import InputError
@@ -308,7 +309,7 @@ def surfaces(
     except ValueError as error:
         raise InputError(f"{view.folder}: {error} with --cell-m") from error
     one, two = (
-        fill_holes(mean_surface(xyz, fused.cloud.rgb, fused.cloud.sigma_m, grid), HOLE_CELLS)
+        level_filled(mean_surface(xyz, fused.cloud.rgb, fused.cloud.sigma_m, grid), HOLE_CELLS)
         for xyz, fused in zip(places, clouds, strict=True)
     )
     seen = (places[0], clouds[0].cloud.sigma_m), (places[1], clouds[1].cloud.sigma_m)
