@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,8 +16,11 @@ from loopback import free_port
 from person import Browser
 from portal_client import NEEDS, TOKEN, browser, flown_store
 from rehearsal import RehearsalVehicle
+from site_scans import Errors, leg, write_scan
 
+from service.ground.live_site import Follower
 from service.ground.portal import Portal, PortalConfig
+from service.ground.shown_site import FILE
 from service.ground.vehicle import Vehicle
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.stream.codec import encode
@@ -191,3 +195,42 @@ def test_an_empty_library_says_how_scans_get_there(browser: Browser, tmp_path: P
         browser.wait("document.querySelector('.empty h2').textContent === 'No scans yet'")
     finally:
         one.close()
+
+
+def test_a_scan_in_flight_is_drawn_with_those_it_is_tied_to(
+    browser: Browser, tmp_path: Path
+) -> None:
+    one = write_scan(tmp_path / "a/1", leg(0.0, 4), Errors((1.1, -0.7, 0.9)), finished=False)
+    write_scan(tmp_path / "b/2", leg(np.pi / 2, 4), finished=False)
+    follower = Follower(tmp_path)
+    portal = Portal(PortalConfig(tmp_path, port=0, token=TOKEN))
+    portal.start()
+    browser.screen(1280, 800)
+    browser.open("about:blank")
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 2")
+    browser.open(f"{base(portal)}/#/view/a/1")
+    alone = browser.wait(
+        f"Number(document.body.dataset.points) >= {samples(one)} && {samples(one)}"
+    )
+    assert browser.run("document.body.dataset.ties") is None
+    while follower.turn(time.time()):
+        pass
+    browser.wait("Number(document.body.dataset.ties) > 1")  # by the message `site` of the socket
+    browser.wait("document.querySelector('.figures').textContent.includes(' ties, ')")
+    browser.wait(f"Number(document.body.dataset.points) > {alone}")
+    choose = (
+        "(() => { const s = document.querySelector('.tools select'); s.value = 'scan';"
+        " s.dispatchEvent(new Event('change')); return s.value; })()"
+    )
+    assert browser.wait(choose) == "scan"
+    browser.wait("document.querySelector('.legend').textContent.includes('b/2')")
+    browser.image(tmp_path / "tied.png")  # to look at
+    (tmp_path / FILE).unlink()
+    portal.close()
+
+
+def samples(folder: Path) -> int:
+    """Points of all keyframes of a scan."""
+    with ScanStore.open(folder / "scan.db") as store:
+        return sum(int(one.fresh.sum()) for one in store.keyframes())
