@@ -66,6 +66,12 @@ def test_on_a_telephone_nothing_is_out_of_reach(browser: Browser, base: str) -> 
     browser.wait("document.querySelectorAll('article').length === 1")
     for selector in (".import input", ".import button", "article .acts"):
         assert 0 <= box(browser, selector)["left"] < box(browser, selector)["right"] <= PHONE[0]
+    acts = browser.run(
+        "[...document.querySelectorAll('article .acts :is(a, button, select)')]"
+        ".map(e => e.getBoundingClientRect().right)"
+    )
+    card = box(browser, "article")
+    assert len(acts) >= 7 and max(acts) < card["right"]  # what lies outside is cut off
     assert browser.run("document.documentElement.scrollWidth") <= PHONE[0]
     show(browser, f"{base}/#/view/drone-1/test-1", PHONE)
     browser.click("Measure")

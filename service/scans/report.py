@@ -36,6 +36,7 @@ STYLE = (
     "border-bottom:1px solid #e3e7eb}"
     "td+td{font-variant-numeric:tabular-nums}img{max-width:100%;border:1px solid #e3e7eb}"
     "figure{margin:14px 0}figcaption{color:#56606a;font-size:13.5px}text{font-size:11px}"
+    "@media(max-width:600px){text{font-size:22px}}"
     "@page{margin:14mm}@media print{body{margin:0;max-width:none;padding:0;font-size:12px;"
     "print-color-adjust:exact}figure,tr,h2,h3{break-inside:avoid}h2,h3{break-after:avoid}"
     "img,svg{max-height:230mm;width:auto}}"
@@ -218,7 +219,7 @@ def _curve(name: str, t: np.typing.NDArray[Any], values: np.typing.NDArray[Any])
     step = max(1, len(t) // CURVE_PX[0])
     low, high = float(values.min()), float(values.max())
     w, h = CURVE_PX
-    left, bottom, span_s = 46, h - 18, float(t[-1] - t[0])
+    left, bottom, span_s = 56, h - 18, float(t[-1] - t[0])
     x = left + (w - left - 8) * (t - t[0]) / max(span_s, 1e-9)
     y = bottom - 6 - (bottom - 12) * (values - low) / max(high - low, 1e-9)
     points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x[::step], y[::step], strict=True))
