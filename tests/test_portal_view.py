@@ -6,6 +6,7 @@ One browser and one portal serve all tests of this file.
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -138,6 +139,43 @@ def test_settings_change_the_image_and_go_back(browser: Browser, portal: Portal)
     assert ground.mean() > 1.5 * (plain.max(axis=2) > 60).mean()  # nearer, so larger
     setting(browser, "Field of view", "field.value = 60;" + CHANGED)
     assert difference(plain, drawn(browser)) < 0.03  # points in one place hide each other by turns
+
+
+def solid_share(image: U8) -> float:
+    """Share of the site's inner area where the background does not show through."""
+    shown = (cv2.absdiff(image, np.full_like(image, image[0, 0])).max(axis=2) > 4).astype(np.uint8)
+    closed = cv2.morphologyEx(shown, cv2.MORPH_CLOSE, np.ones((31, 31)))
+    inner = cv2.erode(closed, np.ones((15, 15))).astype(bool)
+    assert inner.mean() > 0.02
+    return float(shown[inner].mean())
+
+
+def test_ground_looks_like_ground_at_the_first_look(browser: Browser, portal: Portal) -> None:
+    open_scan(browser, portal)
+    browser.click("Whole site")
+    browser.click("Cameras")
+    plain = drawn(browser)
+    assert solid_share(plain) > 0.97
+    setting(browser, "Shading", "field.value = 0;" + CHANGED)
+    flat = drawn(browser)
+    darker = flat.astype(int).sum(axis=2) - plain.astype(int).sum(axis=2)
+    assert 150 < (darker > 60).sum() < 0.02 * darker.size  # along the steps of the house alone
+    setting(browser, "Point size", "field.value = 0.3;" + CHANGED)
+    assert solid_share(drawn(browser)) < solid_share(plain) - 0.02
+
+
+def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, store: Path) -> None:
+    summary = json.loads((store / "drone-1/test-1/scan.json").read_text())
+    points, quality = f"{summary['counts']['points']:,}", summary["quality"]
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    facts = browser.run("document.querySelector('article .facts').innerText")
+    assert f"{points} points" in facts
+    assert f"{quality['sigma_median_m']:.2f} m relative" in facts
+    assert f"{quality['position_sigma_median_m']:.2f} m absolute" in facts
+    open_scan(browser, portal)
+    browser.wait(f"document.querySelector('.figures').innerText.includes('{points}')")
+    assert f"Points\n{points}" in browser.run("document.querySelector('.figures').innerText")
 
 
 def test_tone_mapping_and_exposure_change_the_mesh(
