@@ -172,6 +172,19 @@ def test_an_empty_scan_still_makes_every_file(tmp_path: Path, house: HouseFlight
     assert cv2.imread(str(tmp_path / PREVIEW)) is not None
 
 
+def test_preview_and_report_say_what_limits_the_trust(tmp_path: Path, house: HouseFlight) -> None:
+    rows = []
+    for name, assumed in (("sure", []), ("lens", ["lens"])):
+        with house.flown(tmp_path / name) as store:
+            summary = write_deliverables(tmp_path / name, store, {"assumed": assumed})
+        image = cv2.imread(str(tmp_path / name / PREVIEW))
+        assert image is not None
+        rows.append(len(image))
+    assert summary["quality"]["trust"]["level"] == "doubtful"
+    assert rows[1] > rows[0]  # a line more
+    assert "doubtful; the lens is assumed" in (tmp_path / "lens" / REPORT).read_text("utf-8")
+
+
 def test_nothing_half_written_is_left(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as store:
         (tmp_path / "blocked").mkdir()
