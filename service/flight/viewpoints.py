@@ -38,7 +38,7 @@ TRACKED = 128
 """Tracked frames whose places are remembered."""
 
 HELD = 5
-"""Views that wait at most for the first word on a readout that nobody states: all are among
+"""Views that wait at most for the first word on a readout that is not stated: all are among
 those kept."""
 
 LAST_VIEW_SHARE = 0.1
