@@ -11,11 +11,8 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-from pathlib import Path
 
 M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -8, -3, -1  # mallopt(3)
-
-MADV_DONTNEED, MIN_CODE_BYTES = 4, 1 << 20  # madvise(2), and code worth a call of it
 
 POOLED_BYTES, SPARE_BYTES = 4 << 20, 8 << 20
 """The largest allocation in the pool, and what it keeps at its end."""
@@ -45,26 +42,6 @@ def give_back(collect: bool = False) -> bool:
         gc.collect()
     libc = _libc("malloc_trim")
     return libc is not None and libc.malloc_trim(0) == 1
-
-
-def give_back_code() -> int:
-    """Unmap the libraries' machine code; return the bytes that it may have held.
-
-    Most of it ran once, to load kernels and libraries. What runs again is mapped again, from the
-    system's cache of files. Only code is given back, which no one has written to.
-    """
-    libc, maps, given = _libc("madvise"), Path("/proc/self/maps"), 0
-    if libc is None or not maps.exists():
-        return 0
-    for line in maps.read_text(errors="replace").splitlines():
-        fields = line.split(maxsplit=5)  # addresses, permissions, …, path
-        if len(fields) == 6 and fields[1] == "r-xp" and fields[5].startswith("/"):
-            start, end = (int(at, 16) for at in fields[0].split("-"))
-            if end - start >= MIN_CODE_BYTES and not libc.madvise(
-                ctypes.c_void_p(start), ctypes.c_size_t(end - start), MADV_DONTNEED
-            ):
-                given += end - start
-    return given
 
 
 def _libc(name: str) -> ctypes.CDLL | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import re
 import subprocess
 import sys
 import threading
@@ -11,8 +10,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 from loopback import until
 
@@ -23,7 +20,7 @@ from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
 from service.daemon.scanning import Scanning
 from service.daemon.writing import ClosingWatch, sizes
-from service.memory import give_back, give_back_code, one_pool
+from service.memory import give_back, one_pool
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
@@ -203,21 +200,3 @@ def test_memory_settings_are_taken_where_the_library_has_them() -> None:
     assert one_pool()
     assert give_back() in (True, False)
     assert give_back(collect=True) in (True, False)
-
-
-def test_code_that_ran_once_is_given_back() -> None:
-    """It leaves memory, and what is needed again runs as before."""
-    smaps = Path("/proc/self/smaps")
-    if not smaps.exists():
-        pytest.skip("the system does not say what is resident")
-
-    def code_kib() -> int:
-        code = r"^\S+ r-xp \S+ \S+ \S+ +/(.*?)^VmFlags"
-        blocks = re.findall(code, smaps.read_text(), re.M | re.S)
-        return sum(int(re.findall(r"^Rss: +(\d+)", block, re.M)[0]) for block in blocks)
-
-    image = np.random.default_rng(0).integers(0, 255, (64, 64), np.uint8)
-    want, before = cv2.GaussianBlur(image, (0, 0), 2.0), code_kib()
-    assert give_back_code() > 1024 * before / 4
-    assert code_kib() < 0.6 * before
-    np.testing.assert_array_equal(cv2.GaussianBlur(image, (0, 0), 2.0), want)

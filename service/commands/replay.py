@@ -352,7 +352,7 @@ def _utc(time_ns: int) -> str:
 def _flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:
     """The bar of a scan, whose figures only a terminal shows; returns memory at each keyframe."""
     from service.cameras.source import Counted
-    from service.memory import give_back, give_back_code
+    from service.memory import give_back
 
     images = source.images if isinstance(source, Counted) else 0
     say = progress.counting(images) if images else progress
@@ -364,7 +364,6 @@ def _flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:
         if r.keyframes > keyframes:
             keyframes = r.keyframes
             give_back()
-            give_back_code()
         if sys.stderr.isatty():
             say(f"{r.frames} images, {r.distance_m:.0f} m flown, {r.keyframes} keyframes")
 
