@@ -190,6 +190,24 @@ def test_the_odometry_sees_level_ground_through_a_rolling_shutter(flown: list[U8
     assert known < 0.12 and ignored > 4 * known
 
 
+def test_frames_after_the_first_tell_how_its_rows_moved(flown: list[U8]) -> None:
+    """Telemetry's turn is a tenth of a second late."""
+    rolling = replace(PLAIN, shutter=Shutter(0.03))
+    odometry = Odometry(PLAIN, OdometryConfig(), lens=rolling)
+    for i, image in enumerate(flown[:16]):
+        T, turn = se3.inverse(swinging(i / 15)), -derivative(i / 15 - 0.1)[:3]
+        prior = PosePrior(
+            T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 1.0,
+            velocity_m_s=np.array([8.0, 1.0, 0.0]), turn_rad_s=turn,
+        )  # fmt: skip
+        odometry.track(image, i, int(i * 1e9 / 15), prior)
+    first = odometry.keyframes[0].moving
+    assert first.time_ns == 0 and first.is_measured and first.rows is not None
+    off = first.rows.rate[:3] - derivative(0.0)[:3]
+    late = derivative(-0.1)[:3] - derivative(0.0)[:3]
+    assert np.linalg.norm(off) < 0.7 * np.linalg.norm(late)
+
+
 def pair_of(rolling: bool) -> tuple[View, View, F64]:
     """Two views 6 m apart and points (N, 3) of rough ground in the left one's camera.
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from recon import se3
 from recon.rolling_shutter import NEAR_S, FrameRows, RowTrack
-from recon.tracking import matching, prediction, two_view
+from recon.tracking import matching, pnp, prediction, two_view
 from recon.tracking.common_view import FeatureCache
 from recon.tracking.keyframe_window import (
     Landmarks,
@@ -41,6 +41,10 @@ OVERDUE = 1.3
 MAX_GAP_S, SOUGHT_GAP_S, ROLLING_GAP_S = 0.17, 0.09, 0.05
 """A frame this long after the last is followed: with a global shutter, while a readout is sought,
 and with a rolling shutter, whose rows need neighbours closer by."""
+
+
+EARLY = 4
+"""Frames after a segment's first that show how its rows moved."""
 
 
 class Tracking(str, Enum):
@@ -96,6 +100,7 @@ class Odometry:
         clock = self._row_track.clock
         self.readout = ReadoutSearch(clock, self.K) if seeks_readout and clock else None
         self._unsettled: OdometryKeyframe | None = None  # its rows' motion will be known better
+        self._early: list[tuple[FrameRows, F64, Bool]] = []  # frames, the first one's corners there
         self._localiser = Localiser(camera, self.config, features, self._row_track)
         self._first_views = FirstViews(
             camera,
@@ -196,7 +201,7 @@ class Odometry:
         self._metric, self._lost = False, 0
         self._first_views.begin()
         self._row_track.begin()
-        self._unsettled = None
+        self._unsettled, self._early = None, []
         R = (
             new.prior.R_world_camera
             if new.prior.R_world_camera is not None
@@ -242,6 +247,8 @@ class Odometry:
             prediction.base_to_height(first.uv[ok], uv[ok], self.K, R_b_a)
             < 0.7 * self.config.base_to_height
         ):
+            if self._row_track.is_known and len(self._early) < EARLY:
+                self._early.append((new.moving, uv, ok))
             return Tracked(
                 Tracking.WAITING, self.segment, tracks=int(ok.sum()), reason="too little motion"
             )
@@ -258,6 +265,7 @@ class Odometry:
         matched = np.flatnonzero(ok)
         ok[matched[~view.inliers]] = False
         scale = self._first_landmarks(view, matched[view.inliers], new.prior)
+        self._place_early(first)
         second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
         T_camera_odom = second @ first.T_camera_odom
         self._metric = True
@@ -276,6 +284,18 @@ class Odometry:
         points = se3.transform(T_odom_a, view.points[view.inliers] * scale)
         first.landmark[rows] = first.map.add(points)
         return scale
+
+    def _place_early(self, first: OdometryKeyframe) -> None:
+        """Poses of the frames after the first; they say how its rows moved."""
+        for moving, uv, ok in self._early:
+            rows = np.flatnonzero(ok & first.map.known(first.landmark))
+            points = first.map[first.landmark[rows]]
+            depth = se3.transform(first.T_camera_odom, points)[:, 2]
+            at = moving.at_middle(self.K, uv[rows], 1.0 / depth)
+            found = pnp.solve(points, at, self.K, self.config.pnp, first.T_camera_odom)
+            if found is not None:
+                self._row_track.add(moving, found.T_camera_points)
+        self._early = []
 
     # ---- keyframes ---------------------------------------------------------------------
 
