@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from painted_ground import CAMERA, DOWN, FOOTPRINT_M, HEIGHT_M, SIZE, pose, still
 
+from recon.tracking.localisation import Localiser, Located, Start
 from recon.tracking.odometry import Odometry, Tracked
 from recon.types import F64, U8, PosePrior
 
 PLACED = ("started", "tracked", "keyframe")
+OFF = 0.1
 
 
 def flown(images: list[U8], sigma_yaw_rad: float = 3.0) -> list[Tracked]:
@@ -91,3 +97,35 @@ def test_stills_of_other_places_are_not_joined() -> None:
     assert found[3].state == "lost"
     assert [f.state for f in found[4:]] == ["keyframe"] * 2
     assert {f.segment for f in found[4:]} == {1}
+
+
+def test_corners_without_a_landmark_do_not_choose_the_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two starts the one whose pose explains more landmarks wins, however many corners match."""
+    track = [pose(0.3 * FOOTPRINT_M * (i - 3), seed=i) for i in range(6)]
+    starts_of, pose_from, locate_of = Localiser._starts, Localiser.pose_from, Localiser.locate
+    chosen: list[Located | str] = []
+
+    def starts(self: Localiser, *arguments: Any) -> Iterator[Start]:
+        for start in starts_of(self, *arguments):
+            yield replace(start, share=-1.0)  # marks the first of the two
+            yield start
+
+    def found(self: Localiser, key: Any, new: Any, T: F64, share: float, *rest: Any) -> Any:
+        out = pose_from(self, key, new, T, abs(share) if share > 0 else 0.09, *rest)
+        if share > 0 or not isinstance(out, Located):
+            return out
+        few = out.pose.inliers.copy()
+        few[len(few) // 3 :] = False
+        off = replace(out.pose, inliers=few)
+        return replace(out, pose=off, ok=np.ones_like(out.ok), found_share=OFF)
+
+    def locate(self: Localiser, *arguments: Any, **named: Any) -> Located | str:
+        chosen.append(locate_of(self, *arguments, **named))
+        return chosen[-1]
+
+    monkeypatch.setattr(Localiser, "_starts", starts)
+    monkeypatch.setattr(Localiser, "pose_from", found)
+    monkeypatch.setattr(Localiser, "locate", locate)
+    flown([still(T) for T in track])
+    placed = [one for one in chosen if isinstance(one, Located)]
+    assert len(placed) >= 3 and all(one.found_share != OFF for one in placed)

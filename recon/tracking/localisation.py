@@ -79,6 +79,11 @@ class Located:
     share: float  # of the keyframe's corners that are found, by those searched
     found_share: float  # of the corners searched
 
+    @property
+    def explained(self) -> int:
+        """Landmarks that the pose explains; corners without one do not test it."""
+        return int(np.count_nonzero(self.pose.inliers))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
@@ -146,7 +151,7 @@ class Localiser:
             if not self._agrees(found.pose.T_camera_points, new.prior, key, start.by_features):
                 reason = "vision and attitude disagree"
                 continue
-            if best is None or found.ok.sum() > best.ok.sum():
+            if best is None or found.explained > best.explained:
                 best = found
             if not still or found.found_share > CLEAR_SHARE:
                 break
