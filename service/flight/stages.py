@@ -387,6 +387,9 @@ class MakeKeyframe:
         return Keyframe(view.seq, view.time_ns, metric, bgr, pose, fresh)
 
 
+DenseWorker = BackgroundWorker[StereoCandidate, Keyframe | None]
+
+
 @dataclass(frozen=True, slots=True)
 class Stages:
     """One object for each box of the figure, in its order."""
@@ -406,10 +409,7 @@ class Stages:
     chain: Chain
     map: SurfaceMap
     keyframe: MakeKeyframe
-    in_background: Callable[
-        [Callable[[StereoCandidate], Keyframe | None]],
-        BackgroundWorker[StereoCandidate, Keyframe | None],
-    ]
+    in_background: Callable[[Callable[[StereoCandidate], Keyframe | None]], DenseWorker]
     stopwatch: Stopwatch
     refused: Counter[str]  # frames and views, by reason; written while tracking
     rejected: Counter[str]  # pairs and keyframes, by reason; written while reconstructing
@@ -435,6 +435,7 @@ def build_stages(
     limit_threads(compute.threads)
     refused, rejected = Counter[str](), Counter[str]()
     debug: dict[str, Array] | None = {} if config.scan.keep_debug else None
+    row = "dense" if debug is None else None
     camera = with_shutter(camera, config.camera)
     undistort = Undistort(camera, compute.guide_width, stopwatch)
     odometry = Odometry(
@@ -477,12 +478,7 @@ def build_stages(
         chain=_chain(config, pages, track.is_settled, rejected, stopwatch, resources),
         map=surface,
         keyframe=MakeKeyframe(debug),
-        in_background=partial(
-            BackgroundWorker[StereoCandidate, Keyframe | None],
-            "dense" if debug is None else None,
-            bound=MAX_WAITING,
-            live=live,
-        ),
+        in_background=partial(DenseWorker, row, bound=MAX_WAITING, live=live),
         stopwatch=stopwatch,
         refused=refused,
         rejected=rejected,
