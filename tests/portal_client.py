@@ -102,6 +102,17 @@ def serving(store: Path) -> Iterator[Client]:
         portal.close()
 
 
+@contextlib.contextmanager
+def listing(browser: Browser, store: Path, scans: int) -> Iterator[str]:
+    """The address of a portal on ``store``, whose list of that many scans the browser shows."""
+    with serving(store) as client:
+        browser.screen(1280, 800)
+        browser.open("about:blank")
+        browser.open(f"{client.base}/?token={TOKEN}")
+        browser.wait(f"document.querySelectorAll('article').length === {scans}")
+        yield client.base
+
+
 class FakeOperator:
     """Stands in for mavsdk: answers orders and lets a test say what the vehicle sends."""
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from loopback import free_port
 from person import Browser
-from portal_client import NEEDS, TOKEN, browser, flown_store
+from portal_client import NEEDS, TOKEN, browser, flown_store, listing
 from rehearsal import RehearsalVehicle
 from site_scans import Errors, leg, write_scan
 
@@ -203,31 +203,25 @@ def test_a_scan_in_flight_is_drawn_with_those_it_is_tied_to(
     one = write_scan(tmp_path / "a/1", leg(0.0, 4), Errors((1.1, -0.7, 0.9)), finished=False)
     write_scan(tmp_path / "b/2", leg(np.pi / 2, 4), finished=False)
     follower = Follower(tmp_path)
-    portal = Portal(PortalConfig(tmp_path, port=0, token=TOKEN))
-    portal.start()
-    browser.screen(1280, 800)
-    browser.open("about:blank")
-    browser.open(portal.url)
-    browser.wait("document.querySelectorAll('article').length === 2")
-    browser.open(f"{base(portal)}/#/view/a/1")
-    alone = browser.wait(
-        f"Number(document.body.dataset.points) >= {samples(one)} && {samples(one)}"
-    )
-    assert browser.run("document.body.dataset.ties") is None
-    while follower.turn(time.time()):
-        pass
-    browser.wait("Number(document.body.dataset.ties) > 1")  # by the message `site` of the socket
-    browser.wait("document.querySelector('.figures').textContent.includes(' ties, ')")
-    browser.wait(f"Number(document.body.dataset.points) > {alone}")
-    choose = (
-        "(() => { const s = document.querySelector('.tools select'); s.value = 'scan';"
-        " s.dispatchEvent(new Event('change')); return s.value; })()"
-    )
-    assert browser.wait(choose) == "scan"
-    browser.wait("document.querySelector('.legend').textContent.includes('b/2')")
-    browser.image(tmp_path / "tied.png")  # to look at
-    (tmp_path / FILE).unlink()
-    portal.close()
+    with listing(browser, tmp_path, 2) as base:
+        browser.open(f"{base}/#/view/a/1")
+        alone = browser.wait(
+            f"Number(document.body.dataset.points) >= {samples(one)} && {samples(one)}"
+        )
+        assert browser.run("document.body.dataset.ties") is None
+        while follower.turn(time.time()):
+            pass
+        browser.wait("Number(document.body.dataset.ties) > 1")  # by the message `site`
+        browser.wait("document.querySelector('.figures').textContent.includes(' ties, ')")
+        browser.wait(f"Number(document.body.dataset.points) > {alone}")
+        choose = (
+            "(() => { const s = document.querySelector('.tools select'); s.value = 'scan';"
+            " s.dispatchEvent(new Event('change')); return s.value; })()"
+        )
+        assert browser.wait(choose) == "scan"
+        browser.wait("document.querySelector('.legend').textContent.includes('b/2')")
+        browser.image(tmp_path / "tied.png")  # to look at
+        (tmp_path / FILE).unlink()
 
 
 def samples(folder: Path) -> int:

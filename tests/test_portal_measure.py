@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import HouseFlight
 from person import Browser
-from portal_client import NEEDS, TOKEN, browser, flown_store
+from portal_client import NEEDS, TOKEN, browser, flown_store, listing
 from site_scans import FRAME, Errors, leg, write_scan
 
 from recon.posegraph.site_alignment import Similarity
@@ -236,29 +236,23 @@ def test_a_scan_without_georeference_is_placed_by_clicks_in_two_scans(
     wrong = Errors((310.0, -120.0, 35.0), (0.05, -0.02, 2.0), 0.4)  # where vision alone has it
     write_scan(tmp_path / "drone-1/placed", leg(0.0))
     write_scan(tmp_path / "drone-1/nowhere", leg(np.pi / 2), wrong, frame=None)
-    portal = Portal(PortalConfig(tmp_path, port=0, token=TOKEN))
-    portal.start()
-    browser.screen(1280, 800)
-    browser.open("about:blank")
-    browser.open(portal.url)
-    browser.wait("document.querySelectorAll('article').length === 2")
-    ruler = Ruler(browser, FRAME)
-    browser.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/nowhere")
-    clicked = click_spots(ruler, wrong.as_similarity(), "Measure")
-    assert np.abs(clicked[:, :2] - SPOTS).max() < 1.0
-    assert browser.run("document.querySelectorAll('.measure select option').length") == 1
-    browser.click("Place")
-    browser.wait("location.hash.endsWith('/placed')")
-    panel = "document.querySelector('.measure')"
-    browser.wait(f"{panel}.textContent.includes('point 1 of 3 of nowhere')")
-    browser.image(tmp_path / "placing.png")  # to look at
-    assert browser.run(f"{panel}.querySelector('.acts + .acts button').disabled")  # Align
-    click_spots(ruler, Errors().as_similarity(), None)
-    browser.click("Align")
-    ended = "document.querySelector('.jobs li.done, .jobs li.failed')?.textContent"
-    assert "done" in browser.wait(ended, 120)
+    with listing(browser, tmp_path, 2) as base:
+        ruler = Ruler(browser, FRAME)
+        browser.open(f"{base}/#/view/drone-1/nowhere")
+        clicked = click_spots(ruler, wrong.as_similarity(), "Measure")
+        assert np.abs(clicked[:, :2] - SPOTS).max() < 1.0
+        assert browser.run("document.querySelectorAll('.measure select option').length") == 1
+        browser.click("Place")
+        browser.wait("location.hash.endsWith('/placed')")
+        panel = "document.querySelector('.measure')"
+        browser.wait(f"{panel}.textContent.includes('point 1 of 3 of nowhere')")
+        browser.image(tmp_path / "placing.png")  # to look at
+        assert browser.run(f"{panel}.querySelector('.acts + .acts button').disabled")  # Align
+        click_spots(ruler, Errors().as_similarity(), None)
+        browser.click("Align")
+        ended = "document.querySelector('.jobs li.done, .jobs li.failed')?.textContent"
+        assert "done" in browser.wait(ended, 120)
     document = json.loads((tmp_path / "site/drone-1-nowhere/site.json").read_text())
-    portal.close()
     assert [(s["name"], s["placed"]) for s in document["scans"]] == [
         ("placed", "aligned"), ("nowhere", "aligned"),
     ]  # fmt: skip
