@@ -23,8 +23,7 @@ from service.ground.storage import is_regular
 from service.offline.exports import EXPORTERS
 from service.offline.exports.maps import MANIFEST
 from service.offline.refine.refly import geojson, plan_json, suggest_as_flown, waypoints_text
-from service.scans.main_piece import main_poses, stretches_apart
-from service.scans.track import latest
+from service.scans.main_piece import main_track
 from service.stream.store import ScanStore
 
 TILE = re.compile(r"[A-Za-z0-9_]{1,80}\.(json|pnts|b3dm|glb)")
@@ -212,8 +211,7 @@ def _refly(request: Request) -> Response:
     if found is None or found.frame is None:
         raise InputError("no surface yet" if found is None else "the scan has no georeference")
     with ScanStore.open(folder / "scan.db", read_only=True) as store:
-        poses = main_poses(latest(store.poses()), stretches_apart(store))
-    flight = suggest_as_flown(found, poses)
+        flight = suggest_as_flown(found, main_track(store))
     if kind == "geojson":
         return Response(geojson(flight, found.frame), media_type="application/geo+json")
     if flight is None:

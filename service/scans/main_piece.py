@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from recon.types import Keyframe
+from service.scans.track import latest
 from service.stream.records import PoseRecord
+from service.stream.store import ScanStore
 
 Stretch = tuple[int, int]
 """First and last keyframe."""
@@ -103,6 +105,11 @@ def main_poses(poses: Iterable[PoseRecord], apart: Iterable[Stretch]) -> list[Po
         if not left_out:
             out.append(pose)
     return out
+
+
+def main_track(store: ScanStore) -> list[PoseRecord]:
+    """The main piece's trajectory in order of time, each pose as last corrected."""
+    return main_poses(latest(store.poses()), stretches_apart(store))
 
 
 def in_words(store: Keyframes) -> str:

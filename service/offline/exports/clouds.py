@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     import copclib
     import laspy
 
+PlacedPart = tuple[PointCloud, F64, U8 | None]
+"""Points, their places (N, 3) in UTM, and their classes of LAS 1.4 where classified."""
+
 VOXELS_MARGIN_M = 2.0
 """Around a tile: points next to it contradict those at its border."""
 
@@ -86,7 +89,7 @@ def write_laz_file(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 def points_of(
     scan: ScanView, options: ExportOptions, is_classified: bool = True
-) -> Iterator[tuple[PointCloud, F64, U8 | None]]:
+) -> Iterator[PlacedPart]:
     """The fused cloud, tile by tile where there are more points than one may have.
 
     Raises InputError, at the first, when there is not a single point.
@@ -107,9 +110,7 @@ def points_of(
         raise InputError(f"{scan.folder} contains no points yet; nothing to export")
 
 
-def make_points(
-    job: ProductJob, progress: Progress | None = None
-) -> tuple[PointCloud, F64, U8 | None] | None:
+def make_points(job: ProductJob, progress: Progress | None = None) -> PlacedPart | None:
     """The points of one tile; None without any."""
     with ScanView(Path(job.tile.folder), job.options.voxel_m, progress, job.tile) as view:
         if not view.has_points:

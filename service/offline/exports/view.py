@@ -23,8 +23,8 @@ from service.offline.tiles import TILE_POINTS, Tile, Tiling, tiling
 from service.packages import needing
 from service.progress import Progress
 from service.scans.fused_cloud import EVERYWHERE, FusedCloud, fused_cloud, placed
-from service.scans.main_piece import main_keyframes, main_poses, stretches_apart
-from service.scans.track import latest, local_frame
+from service.scans.main_piece import main_keyframes, main_track
+from service.scans.track import local_frame
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 from service.vertical_datum import height_change, vertical_code
@@ -182,7 +182,7 @@ class ScanView:
     @cached_property
     def poses(self) -> list[PoseRecord]:
         """The main piece's trajectory in order of time."""
-        return main_poses(latest(self.store.poses()), stretches_apart(self.store))
+        return main_track(self.store)
 
     @cached_property
     def oblique(self) -> bool:
