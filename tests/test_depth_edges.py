@@ -1,16 +1,17 @@
-"""Depth that mixes the two sides of an edge is dropped; surfaces stay."""
+"""Depth that mixes the two sides of an edge, or lies beyond it, is dropped; surfaces stay."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from recon.stereo.depth_edges import drop_mixtures
-from recon.types import F64, DepthMap
+from recon.stereo.depth_edges import drop_edges
+from recon.types import F64, U8, Bool, DepthMap
 
 K = np.array([[480.0, 0, 99.5], [0, 480.0, 79.5], [0, 0, 1]])
 SHAPE = (160, 200)
 SIGMA_M = 0.05
+GRAY = np.full((*SHAPE, 3), 120, np.uint8)
 
 
 def seen(depth_m: F64) -> DepthMap:
@@ -33,11 +34,32 @@ def blurred(true: F64) -> DepthMap:
     return seen(np.asarray(cv2.blur(cv2.blur(true, (5, 5)), (7, 7)), np.float64))
 
 
+def painted(roof: Bool) -> U8:
+    """Roofs and ground in different colours, both with texture and noise."""
+    rng = np.random.default_rng(8)
+    base = np.where(roof[..., None], [70.0, 80.0, 150.0], [90.0, 130.0, 110.0])
+    texture = cv2.GaussianBlur(rng.normal(0.0, 40.0, SHAPE), (0, 0), 1.2)[..., None]
+    return np.clip(base + texture + rng.normal(0.0, 3.0, base.shape), 0, 255).astype(np.uint8)
+
+
+def test_a_roof_that_spills_over_its_edge_ends_at_the_edge_of_its_colour() -> None:
+    """Matching puts a roof 2 pixels too far out on two sides; without colour nothing says so."""
+    true = np.full(SHAPE, 60.0)
+    true[50:100, 60:130] = 56.0
+    wide = np.full(SHAPE, 60.0)
+    wide[50:102, 60:132] = 56.0
+    spilt, roof = wide < true, true < 58.0
+    kept = np.isfinite(drop_edges(seen(wide), painted(roof)).depth_m)
+    assert kept[spilt].mean() < 0.15
+    assert kept[roof].mean() > 0.99 and kept[~roof & ~spilt].mean() > 0.99
+    assert np.isfinite(drop_edges(seen(wide), GRAY).depth_m).mean() > 0.99
+
+
 def test_what_a_window_mixes_at_an_edge_is_dropped() -> None:
     for side, height in ((12, 1.0), (24, 2.5)):
         true = box(side, height)
         found = blurred(true)
-        kept = np.isfinite(drop_mixtures(found).depth_m)
+        kept = np.isfinite(drop_edges(found, GRAY).depth_m)
         off = np.abs(found.depth_m - true)
         assert kept[off > 0.4 * height].mean() < 0.05
         assert kept[off < 0.1].mean() > 0.99
@@ -59,7 +81,7 @@ def test_ground_that_a_box_hides_from_aside_stays_unknown() -> None:
             return (np.bincount(cell, height, true.size) / count).reshape(SHAPE)
 
     exact, before = heights(seen(true)), heights(blurred(true))
-    after = heights(drop_mixtures(blurred(true)))
+    after = heights(drop_edges(blurred(true), GRAY))
     hidden = np.isnan(exact[70:82, 84:102])
     cell_m2 = 0.125**2
     fill = [float(np.nansum(h[70:82, 84:102][hidden])) * cell_m2 for h in (before, after)]
@@ -72,17 +94,17 @@ def test_slopes_roofs_and_noise_are_surfaces() -> None:
     slanted = 60.0 / (1.0 + 0.004 * (cols - 100) + 0.002 * (rows - 80))
     roof = 60.0 - 4.0 + 0.08 * np.abs(cols - 100)
     for surface in (np.full(SHAPE, 60.0), slanted, roof):
-        kept = np.isfinite(drop_mixtures(seen(surface)).depth_m)
+        kept = np.isfinite(drop_edges(seen(surface), painted(surface < 58.0)).depth_m)
         assert kept.mean() > 0.99
 
 
 def test_what_is_dropped_has_no_sigma_and_no_views() -> None:
     depth = blurred(box(24, 2.5))
     depth.depth_m[:40] = depth.sigma_m[:40] = np.nan
-    found = drop_mixtures(depth)
+    found = drop_edges(depth, GRAY)
     known = np.isfinite(found.depth_m)
     assert not known[:40].any() and known[40:].any() and not known[40:].all()
     np.testing.assert_array_equal(known, np.isfinite(found.sigma_m))
     np.testing.assert_array_equal(known[40:], found.views[40:] > 0)
     nothing = DepthMap(np.full(SHAPE, np.nan, np.float32), depth.sigma_m, depth.views, K, np.eye(4))
-    assert drop_mixtures(nothing) is nothing
+    assert drop_edges(nothing, GRAY) is nothing

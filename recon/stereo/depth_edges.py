@@ -1,7 +1,8 @@
-"""Depth that lies on no surface: matching windows see both sides of an edge and mix their depths.
+"""Depth that matching windows get wrong at edges, because they see both of an edge's sides.
 
-In the image the mixture is as wide as the windows. From aside it fills the strip of ground that a
-raised object hides, so that the object comes out wider than it is.
+They mix the depths of the two: such depth lies on no surface. From aside it fills the strip of
+ground that a raised object hides. And they spill the nearer surface over the edge, because its
+contour matches. Either makes an object wider than it is.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from recon.bands import in_bands
-from recon.types import F32, F64, Bool, DepthMap
+from recon.types import F32, F64, U8, Bool, DepthMap
 
 FLAT_RADIUS, PLANE_RADIUS = 3, 5
 """Pixels: a level surface of 7x7, such as a small roof, or a slanted one of 11x11. A mixture over
@@ -27,17 +28,28 @@ the plane through the mixture fits."""
 FILL_PX = 15
 """Unknown pixels take the mean of the known ones in a window of this side."""
 
+STEP_SIGMAS = 6.0
+"""A pixel that lies farther than the surface of another by more of both sigmas is behind it: about
+one label."""
+
+COLOUR_SIGMA, UNLIKE, ODDS = 15.0, 1e-6, 1.01
+"""Gray levels of the distance of two colours of one surface; likelihood of a colour unlike all; a
+pixel whose colour tells nothing stays."""
+
 Windows = tuple[F32, F32, F32, F32]
 """(h, w) mean, slope along columns and along rows, and variance about them."""
 
 
-def drop_mixtures(depth: DepthMap) -> DepthMap:
-    """``depth`` without the pixels that belong to no surface next to them.
+def drop_edges(depth: DepthMap, bgr: U8) -> DepthMap:
+    """``depth`` without mixtures of two surfaces and without spills of the nearer one.
 
-    Of the windows that contain a pixel, the one whose inverse depths vary least about a constant
-    (Kuwahara et al. 1976, doi:10.1007/978-1-4684-0769-3_13) or about a plane is its surface. A
-    pixel off both by more than its own sigma and their spread is a mixture. A plane's inverse
-    depth is affine in the image, so slanted ground stays.
+    ``bgr`` (h, w, 3) is the image on the grid of the depth. Of the windows that contain a pixel,
+    the one whose inverse depths vary least about a constant (Kuwahara et al. 1976,
+    doi:10.1007/978-1-4684-0769-3_13) or about a plane is its surface. A pixel off both by more
+    than its own sigma and their spread is a mixture. A plane's inverse depth is affine in the
+    image, so slanted ground stays. A pixel on a surface in front of another one is a spill if its
+    colour is more likely on the other one: the likelihood is the mean of a Gaussian kernel over
+    the pixels of each in a window.
     """
     known = np.isfinite(depth.depth_m)
     if not known.any():
@@ -50,20 +62,22 @@ def drop_mixtures(depth: DepthMap) -> DepthMap:
     )
     nearness = np.where(known, nearness, around)
     noise = np.where(known, middle * depth.sigma_m / (z * z), np.float32(0.0))
+    windows = _windows(nearness, FLAT_RADIUS, False), _windows(nearness, PLANE_RADIUS, True)
     mixed = known.copy()
-    in_bands(
-        _keep_mixtures, len(mixed), nearness, noise,
-        _windows(nearness, FLAT_RADIUS, False), _windows(nearness, PLANE_RADIUS, True), mixed,
-    )  # fmt: skip
-    if not mixed.any():
-        return depth
+    in_bands(_keep_mixtures, len(mixed), nearness, noise, *windows, mixed)
     closed = cv2.morphologyEx(mixed.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((CLOSED_PX,) * 2))
-    mixed = known & (closed > 0)
+    kept = known & (closed == 0)
+    farthest = cv2.erode(np.where(kept, nearness, np.inf), np.ones((2 * PLANE_RADIUS + 1,) * 2))
+    spilt = kept & (nearness - farthest > STEP_SIGMAS * noise)
+    in_bands(_keep_spills, len(spilt), nearness, noise, kept, bgr, *windows, spilt)
+    kept &= ~spilt
+    if kept.sum() == known.sum():
+        return depth
     return replace(
         depth,
-        depth_m=np.where(mixed, np.float32(np.nan), depth.depth_m),
-        sigma_m=np.where(mixed, np.float32(np.nan), depth.sigma_m),
-        views=np.where(mixed, np.uint8(0), depth.views),
+        depth_m=np.where(kept, depth.depth_m, np.float32(np.nan)),
+        sigma_m=np.where(kept, depth.sigma_m, np.float32(np.nan)),
+        views=np.where(kept, depth.views, np.uint8(0)),
     )
 
 
@@ -91,21 +105,70 @@ def _keep_mixtures(
     for v in range(begin, end):
         for u in range(x.shape[1]):
             if mixed[v, u]:
-                off = _is_off(flat, FLAT_RADIUS, u, v, x[v, u], noise[v, u])
-                mixed[v, u] = off and _is_off(slanted, PLANE_RADIUS, u, v, x[v, u], noise[v, u])
+                off = not _surface(flat, FLAT_RADIUS, u, v, x[v, u], noise[v, u])[0]
+                mixed[v, u] = (
+                    off and not _surface(slanted, PLANE_RADIUS, u, v, x[v, u], noise[v, u])[0]
+                )
 
 
 @njit(cache=True, nogil=True)
-def _is_off(
+def _surface(
     windows: Windows, radius: int, u: int, v: int, here: float, noise: float
 ) -> Any:  # pragma: no cover - compiled
-    """True where a pixel does not lie on the steadiest of the windows that contain it."""
+    """The steadiest of the windows that contain a pixel: whether it lies on it, its value at the
+    pixel, and its slopes along columns and along rows."""
     mean, across, down, variance = windows
-    least, expected = np.inf, here
+    least, row, col, expected = np.inf, v, u, here
     for dv in (-radius, 0, radius):
         for du in (-radius, 0, radius):
             i, j = u - du, v - dv
             if 0 <= i < mean.shape[1] and 0 <= j < mean.shape[0] and variance[j, i] < least:
-                least = variance[j, i]
+                least, row, col = variance[j, i], j, i
                 expected = mean[j, i] + across[j, i] * du + down[j, i] * dv
-    return abs(here - expected) > np.sqrt(max(least, 0.0)) + noise
+    is_on = abs(here - expected) <= np.sqrt(max(least, 0.0)) + noise
+    return is_on, expected, across[row, col], down[row, col]
+
+
+@njit(cache=True, nogil=True)
+def _keep_spills(
+    begin: int, end: int, x: F32, noise: F32, kept: Bool, bgr: U8, flat: Windows,
+    slanted: Windows, spilt: Bool,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Set ``spilt`` to False where a pixel's colour is that of its own surface."""
+    for v in range(begin, end):
+        for u in range(x.shape[1]):
+            if spilt[v, u]:
+                here, s = x[v, u], noise[v, u]
+                is_on, expected, across, down = _surface(slanted, PLANE_RADIUS, u, v, here, s)
+                if not is_on:
+                    is_on, expected, across, down = _surface(flat, FLAT_RADIUS, u, v, here, s)
+                plane = (expected, across, down)
+                spilt[v, u] = _is_spilt(u, v, plane, s, x, noise, kept, bgr)
+
+
+@njit(cache=True, nogil=True)
+def _is_spilt(
+    u: int, v: int, plane: tuple[float, float, float], sigma: float, x: F32, noise: F32,
+    kept: Bool, bgr: U8,
+) -> bool:  # fmt: skip  # pragma: no cover - compiled
+    """True where the colours of the surface behind are like the pixel's, more than its own are."""
+    expected, across, down = plane
+    sums = np.zeros((2, 2))  # likelihood and weight of the pixel's own surface, and behind it
+    for dv in range(-PLANE_RADIUS, PLANE_RADIUS + 1):
+        for du in range(-PLANE_RADIUS, PLANE_RADIUS + 1):
+            i, j = u + du, v + dv
+            if not (0 <= i < x.shape[1] and 0 <= j < x.shape[0] and kept[j, i]) or du == dv == 0:
+                continue
+            behind = expected + across * du + down * dv - x[j, i]
+            limit = STEP_SIGMAS * (sigma + noise[j, i])
+            if behind < -limit:
+                continue
+            which = 1 if behind > limit else 0
+            apart = 0.0
+            for k in range(3):
+                apart += (float(bgr[v, u, k]) - float(bgr[j, i, k])) ** 2
+            near = np.exp(-2.0 * (du * du + dv * dv) / PLANE_RADIUS**2)
+            like = np.exp(-0.5 * apart / COLOUR_SIGMA**2) + UNLIKE
+            sums[which, 0] += near * like
+            sums[which, 1] += near
+    return bool(sums[1, 0] * sums[0, 1] > ODDS * sums[0, 0] * sums[1, 1])

@@ -23,7 +23,7 @@ from recon.posegraph.interpolated import KEYFRAME
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.trajectory import Placed, Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.depth_edges import drop_mixtures
+from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
 from recon.stereo.reprojection import FusionConfig, PairDepth, carry, fuse, plausible, reproject
 from recon.stereo.upsampling import UpsamplingConfig
@@ -327,7 +327,7 @@ class Plausible:
         """The plausible part of ``depth``; None where there is nothing."""
         if depth is None:
             return None
-        kept = plausible(drop_mixtures(depth), view.prior)
+        kept = plausible(drop_edges(depth, _colours(view, depth)), view.prior)
         self._balance[view.segment] += -1 if kept is None else 1
         if kept is not None and self._balance[view.segment] > 0:
             return kept
@@ -374,17 +374,22 @@ class MakeKeyframe:
         self, view: StereoCandidate, depth: DepthMap, sigma_m: F32, fresh: Bool, placed: Placed
     ) -> Keyframe:
         """``depth`` and ``sigma_m`` (h, w) are in units of the odometry."""
-        h, w = depth.depth_m.shape
         scale = np.float32(placed.scale)
         metric = DepthMap(
             depth.depth_m * scale, sigma_m * scale, depth.views, depth.K, placed.T_world_camera
         )
-        bgr = at_middle_row(view.view, view.bgr)
-        bgr = np.asarray(cv2.resize(bgr, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
+        bgr = _colours(view, depth)
         if self._debug is not None:
             self._debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
         pose = Pose(placed.T_world_camera, placed.covariance, placed.sources)
         return Keyframe(view.seq, view.time_ns, metric, bgr, pose, fresh)
+
+
+def _colours(view: StereoCandidate, depth: DepthMap) -> U8:
+    """(h, w, 3) BGR of the view on the grid of its depth."""
+    h, w = depth.depth_m.shape
+    bgr = at_middle_row(view.view, view.bgr)
+    return np.asarray(cv2.resize(bgr, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 DenseWorker = BackgroundWorker[StereoCandidate, Keyframe | None]
