@@ -267,6 +267,7 @@ def _fuse(
     out_views: Any,
 ) -> None:  # pragma: no cover - compiled
     P, _, width = depth.shape
+    square = agree_sigmas * agree_sigmas
     for v in range(begin, end):
         w = np.empty(P)
         s = np.empty(P)
@@ -283,14 +284,15 @@ def _fuse(
             if count == 0:
                 continue
             centre = _largest_group(w, s, count, agree_sigmas)
-            total = mean = 0.0
+            total = mean = squares = 0.0
             views = 0
             for p in range(count):
-                limit = agree_sigmas * np.sqrt(s[p] ** 2 + s[centre] ** 2)
-                if abs(w[p] - w[centre]) <= limit:
-                    weight = 1.0 / s[p] ** 2
+                apart, variance = w[p] - w[centre], s[p] * s[p]
+                if apart * apart <= square * (variance + s[centre] * s[centre]):
+                    weight = 1.0 / variance
                     total += weight
-                    mean += weight * w[p]
+                    mean += weight * apart
+                    squares += weight * apart * apart
                     views += 1
             out_views[v, u] = views
             if views == 1 and count > 1:
@@ -299,14 +301,10 @@ def _fuse(
                     near += abs(w[p] - w[centre]) <= max_share * w[centre]
                 if near == 1:
                     continue
-            mean /= total
-            spread = 0.0
-            for p in range(count):
-                limit = agree_sigmas * np.sqrt(s[p] ** 2 + s[centre] ** 2)
-                if abs(w[p] - w[centre]) <= limit:
-                    spread += (w[p] - mean) ** 2 / s[p] ** 2
-            variance = 1.0 / total + spread / total / max(views - 1, 1)
-            z = 1.0 / mean
+            mean /= total  # from the centre, as small numbers lose nothing when squared
+            spread = max(squares / total - mean * mean, 0.0)
+            variance = 1.0 / total + spread / max(views - 1, 1)
+            z = 1.0 / (w[centre] + mean)
             e = np.sqrt(variance) * z * z * (single_view if views == 1 else 1.0)
             out_depth[v, u] = z
             out_sigma[v, u] = max(e, min_share * z)
