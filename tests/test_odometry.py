@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -132,6 +133,41 @@ def test_pure_rotation_makes_no_surface(ground: U8) -> None:
     assert not any(f.state == "keyframe" for f in found)
 
 
+def circling(angles_rad: Iterable[float]) -> list[F64]:
+    """Poses 60 m from a place that stays in the middle of the image."""
+    out = []
+    for angle in angles_rad:
+        R = se3.so3_exp(np.array([0.0, angle, 0.0])) @ DOWN
+        out.append(se3.compose(R, -60.0 * R[:, 2]))
+    return out
+
+
+@pytest.mark.parametrize("step_rad", [0.02, 0.12], ids=["video", "stills"])
+def test_a_camera_that_circles_a_place_moves(ground: U8, step_rad: float) -> None:
+    """Its image stays where it is, and no attitude says that it turned."""
+    track = circling(np.arange(-0.36, 0.37, step_rad))
+    odometry, found = Odometry(CAMERA, OdometryConfig()), []
+    for i, T in enumerate(track):
+        prior = PosePrior(DOWN, 0.4, 3.0, agl_m=60.0)
+        time_ns = round(i * step_rad * 1e10)
+        found.append(odometry.track(photograph(ground, T), i, time_ns, prior))
+    placed = [f.state in ("tracked", "keyframe") for f in found]
+    assert odometry.segment == 0 and sum(placed) > 0.6 * len(placed)
+    assert drift(track, found) < 0.02 * 60.0
+
+
+@pytest.mark.parametrize("focal_px", [400.0, 330.0])
+def test_a_turn_on_the_spot_without_attitude_makes_no_surface(ground: U8, focal_px: float) -> None:
+    """Not even with a lens that is not the camera's own."""
+    lens = replace(CAMERA, K=np.array([[focal_px, 0, 239.5], [0, focal_px, 179.5], [0, 0, 1]]))
+    odometry = Odometry(lens)
+    for i in range(15):
+        R = se3.so3_exp(np.array([0.004 * i, 0.0, 0.1 * i])) @ DOWN
+        image = photograph(ground, se3.compose(R, np.array([0.0, 0.0, 60.0])))
+        found = odometry.track(image, i, 200_000_000 * i, PosePrior(DOWN, 0.4, 3.0, agl_m=60.0))
+        assert found.state in ("started", "waiting")
+
+
 def test_another_place_begins_a_new_segment(ground: U8) -> None:
     """A jump to where nothing of the map is seen is a loss, then a fresh start."""
     track = poses(12)
@@ -158,12 +194,18 @@ def test_noise_is_not_followed() -> None:
 
 
 def skipping(
-    ground: U8, track: list[F64], fps: float, lens: Camera | None = None, seeks: bool = False
+    ground: U8,
+    track: list[F64],
+    fps: float,
+    lens: Camera | None = None,
+    seeks: bool = False,
+    attitude: bool = True,
 ) -> list[Tracked]:
     """Run the odometry with telemetry of constant error, without the frames that it can skip."""
     odometry, out = Odometry(CAMERA, OdometryConfig(), lens, seeks_readout=seeks), []
     for i, T in enumerate(track):
         time_ns, prior = round(i * 1e9 / fps), prior_of(T, np.random.default_rng(2))
+        prior = prior if attitude else replace(prior, R_world_camera=None)
         if odometry.can_skip(time_ns, prior, frames_per_step=6.0):
             out.append(Tracked(Tracking.SKIPPED, odometry.segment))
         else:
@@ -183,12 +225,25 @@ def test_frames_that_hardly_differ_are_skipped_and_cost_no_accuracy(ground: U8) 
 
 
 def test_no_frame_of_a_fast_turn_or_a_fast_flight_is_skipped(ground: U8) -> None:
-    swung = poses(40, step_m=0.2, wobble=0.03)
+    swung = poses(40, step_m=0.2, wobble=0.05)
     fast = poses(40, step_m=1.5, wobble=0.001)
     for track in (swung, fast):
         found = skipping(ground, track, fps=30.0)
         metric = next(i for i, f in enumerate(found) if f.state == "keyframe")
         assert np.mean([f.state == "skipped" for f in found[metric:]]) < 0.15
+
+
+def test_a_turn_that_telemetry_shows_is_followed_by_parts_of_a_keyframes_turn(ground: U8) -> None:
+    """A frame turns twice as far as it moves; what telemetry does not show counts as motion."""
+    track = poses(90, step_m=0.2, wobble=0.0)
+    for i, T in enumerate(track):
+        T[:3, :3] = se3.so3_exp(np.array([0.0, 0.0, 0.006 * i])) @ T[:3, :3]
+    for attitude, apart in ((True, 5), (False, 2)):
+        found = skipping(ground, track, 30.0, attitude=attitude)
+        metric = next(i for i, f in enumerate(found) if f.state == "keyframe")
+        followed = [i for i, f in enumerate(found[metric:]) if f.state != "skipped"]
+        assert np.median(np.diff(followed)) == apart
+        assert drift(track, found) < 0.05
 
 
 @pytest.mark.parametrize(("readout_s", "seeks", "apart"), [(1e-6, False, 2), (0.0, True, 3)])

@@ -35,6 +35,9 @@ from recon.tracking.prediction import Motion
 from recon.tracking.readout_search import ReadoutSearch
 from recon.types import F64, I64, U8, Bool, Camera, PosePrior
 
+MAX_TURN_RAD = 0.25
+"""A frame that turned this much since the last keyframe becomes one."""
+
 OVERDUE = 1.3
 """A blurred frame becomes a keyframe when the last is this many steps away."""
 
@@ -120,10 +123,11 @@ class Odometry:
         """
         if not self._metric or self._lost or self._motion is None:
             return False
-        shift, gap_s = self._motion.shift(time_ns, prior, self._depth)
+        moved, turned, gap_s = self._motion.shift(time_ns, prior, self._depth)
         max_gap_s = SOUGHT_GAP_S if self._row_track.is_rolling else MAX_GAP_S
         max_gap_s = ROLLING_GAP_S if self._row_track.is_known else max_gap_s
-        return gap_s < max_gap_s and shift < self.config.base_to_height / frames_per_step
+        step = max(moved / self.config.base_to_height, turned / MAX_TURN_RAD)
+        return gap_s < max_gap_s and step * frames_per_step < 1.0
 
     def needs_turn(self, time_ns: int) -> bool:
         """True where the prior of a frame should hold the camera's angular velocity."""
@@ -243,23 +247,17 @@ class Odometry:
         if ok.sum() < 2 * self.config.min_tracks:
             return self._missed(new, "too few matches with the first frame")
         self._lost = 0
-        if (
-            prediction.base_to_height(first.uv[ok], uv[ok], self.K, R_b_a)
-            < 0.7 * self.config.base_to_height
-        ):
+        least = 0.7 * self.config.base_to_height
+        moved = prediction.base_to_height(first.uv[ok], uv[ok], self.K, R_b_a)
+        view = None
+        if moved >= least or (R_b_a is None and self._is_no_turn(first.uv[ok], uv[ok])):
+            view = self._motion_of_two(new, uv, ok, R_b_a)
+        if moved < least and (view is None or view.parallax_rad < least):
             if self._row_track.is_known and len(self._early) < EARLY:
                 self._early.append((new.moving, uv, ok))
             return Tracked(
                 Tracking.WAITING, self.segment, tracks=int(ok.sum()), reason="too little motion"
             )
-        up_a = first.T_camera_odom[:3, 2]
-        turn = 0.12 if R_b_a is not None else np.pi
-        far = np.full(int(ok.sum()), 1.0 / new.prior.agl_m if new.prior.agl_m else 0.0)
-        uv_a = first.moving.at_middle(self.K, first.uv[ok], far)
-        uv_b = new.moving.at_middle(self.K, uv[ok], far)
-        view = two_view.solve(uv_a, uv_b, self.K, R_b_a, turn, up_a)
-        if view is None and R_b_a is not None and self._still:  # tags are often wrong
-            view = two_view.solve(uv_a, uv_b, self.K, None, np.pi, up_a)
         if view is None or view.parallax_rad < self.config.min_base_to_height:
             return self._missed(new, "no certain motion between two frames")
         matched = np.flatnonzero(ok)
@@ -275,6 +273,29 @@ class Odometry:
         return Tracked(
             Tracking.KEYFRAME, self.segment, T_odom_camera, int(ok.sum()), moving=new.moving
         )
+
+    def _is_no_turn(self, uv_a: F64, uv_b: F64) -> bool:
+        """True where no turn of the camera explains matched pixels (N, 2).
+
+        A camera that circles a place keeps it in the middle: it moves, but the image does not.
+        """
+        off_px = float(self.K[0, 0]) * prediction.beyond_turn(uv_a, uv_b, self.K)
+        return off_px > 2.0 * two_view.MAX_ERROR_PX
+
+    def _motion_of_two(
+        self, new: TrackingFrame, uv: F64, ok: Bool, R_b_a: F64 | None
+    ) -> two_view.TwoView | None:
+        """The motion since the first frame, whose corners are at ``uv`` (N, 2) where ``ok``."""
+        first = self.keyframes[0]
+        up_a = first.T_camera_odom[:3, 2]
+        turn = 0.12 if R_b_a is not None else np.pi
+        far = np.full(int(ok.sum()), 1.0 / new.prior.agl_m if new.prior.agl_m else 0.0)
+        uv_a = first.moving.at_middle(self.K, first.uv[ok], far)
+        uv_b = new.moving.at_middle(self.K, uv[ok], far)
+        view = two_view.solve(uv_a, uv_b, self.K, R_b_a, turn, up_a)
+        if view is None and R_b_a is not None and self._still:  # tags are often wrong
+            view = two_view.solve(uv_a, uv_b, self.K, None, np.pi, up_a)
+        return view
 
     def _first_landmarks(self, view: two_view.TwoView, rows: I64, prior: PosePrior) -> float:
         """Enter the two-view points into the table; return metres per unit of the baseline."""
@@ -313,7 +334,7 @@ class Odometry:
         self._moving.update(new.time_ns, T_odom_camera, new.prior)
         self._lost = 0
         due = self.config.base_to_height * (OVERDUE if new.blurred else 1.0)
-        if base < due and found.share > 0.45 and turned < 0.25:
+        if base < due and found.share > 0.45 and turned < MAX_TURN_RAD:
             self._row_track.add(new.moving, T_camera_odom)
             self._settle()
             return Tracked(Tracking.TRACKED, self.segment, T_odom_camera, tracks, moving=new.moving)

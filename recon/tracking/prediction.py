@@ -142,6 +142,18 @@ def base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:
     return float(np.linalg.norm(A[:, 2])) if A is not None else 0.0
 
 
+def beyond_turn(uv_a: F64, uv_b: F64, K: F64) -> float:
+    """Median angle in rad that the best turn of the camera leaves between matches (N, 2)."""
+    a, b = (ray / np.linalg.norm(ray, axis=1)[:, None] for ray in (rays(K, uv_a), rays(K, uv_b)))
+    weight, off = np.ones(len(a)), np.zeros(len(a))
+    for _ in range(5):
+        # Kabsch, A solution for the best rotation to relate two sets of vectors, 1976
+        U, _, Vt = np.linalg.svd((b * weight[:, None]).T @ a)
+        off = np.linalg.norm(b - a @ (U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt).T, axis=1)
+        weight = 1.0 / (1.0 + (off / (2.0 * max(float(np.median(off)), 1e-9))) ** 2)
+    return float(np.median(off))
+
+
 def metric_scale(
     view: two_view.TwoView, first: PosePrior, second: PosePrior, T_odom_a: F64
 ) -> float:
@@ -202,13 +214,15 @@ class Motion:
         time_ns, _, prior = self._last
         self._last = (time_ns, T_odom_camera, prior)
 
-    def shift(self, time_ns: int, prior: PosePrior, depth: float) -> tuple[float, float]:
+    def shift(self, time_ns: int, prior: PosePrior, depth: float) -> tuple[float, float, float]:
         """How far (rad) the ground at ``depth`` moves in the image from the last frame until then,
-        and the seconds. Without telemetry's turn the camera turns on as it did."""
+        by motion and by the turn that telemetry shows, and the seconds. A turn that it does not
+        show goes on as it was, and counts as motion."""
         _, turn, gap_s = self.ahead(time_ns, prior)
         moved = float(np.linalg.norm(self._velocity)) * gap_s / depth
-        turned = self._turn_rad_s * gap_s if turn is None else _angle(turn)
-        return moved + turned, gap_s
+        if turn is None:
+            return moved + self._turn_rad_s * gap_s, 0.0, gap_s
+        return moved, _angle(turn), gap_s
 
     def across(self, T_odom_camera: F64, depth: float) -> F64:
         """(2,) rad by which the ground at ``depth`` on the optical axis has moved in the image

@@ -16,6 +16,9 @@ from recon import se3
 from recon.tracking import bundle, robust_geometry
 from recon.types import F64, Bool
 
+MAX_ERROR_PX = 1.5
+"""Error of a match that a motion explains, at most."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoView:
@@ -134,7 +137,7 @@ def solve(
     R_b_a: F64 | None,
     max_turn_rad: float,
     up_a: F64,
-    max_error_px: float = 1.5,
+    max_error_px: float = MAX_ERROR_PX,
 ) -> TwoView | None:
     """The relative pose of two frames and their points, or None when it is not certain.
 
