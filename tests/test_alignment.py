@@ -11,7 +11,7 @@ import pytest
 from recon import se3
 from recon.camera_model import rays
 from recon.posegraph.alignment import Anchor, fit, height_above, height_below, scales
-from recon.types import F32, F64, DepthMap, PosePrior
+from recon.types import F32, F64, DepthMap, PosePrior, Travel
 
 
 def track(n: int = 30) -> list[F64]:
@@ -102,6 +102,40 @@ def test_scale_rests_on_the_height_without_gnss() -> None:
     assert found is not None
     assert found.scale == pytest.approx(3.0, rel=0.03)
     assert found.sources == ("attitude", "altitude")
+
+
+def assumed(prior: PosePrior) -> PosePrior:
+    """As with ``fusion.altitude=false``; the true height is 120 m."""
+    return replace(prior, agl_m=50.0, sigma_agl_m=25.0, is_agl_measured=False)
+
+
+@pytest.mark.parametrize("by", ["fixes", "velocities"])
+def test_an_assumed_height_has_no_part_in_a_scale_that_is_measured(by: str) -> None:
+    some, metres = [], np.zeros(3)
+    flight = anchors(np.eye(3), 1.0, np.zeros(3), seed=6, gnss_m=2.0)
+    for i, (a, T) in enumerate(zip(flight, track(), strict=True)):
+        metres = metres + (T[:3, 3] - track()[i - 1][:3, 3] if i else np.zeros(3))
+        prior = assumed(a.prior)
+        if by == "velocities":
+            travel = Travel(metres, float(i), 0)
+            prior = replace(prior, position_m=None, sigma_position_m=None, travel=travel)
+        some.append(Anchor(a.T_odom_camera, prior, 120.0, time_s=float(i)))
+    found = fit(some)
+    without = fit([replace(a, height=None) for a in some])
+    assert found is not None and without is not None
+    assert found.scale == pytest.approx(1.0, abs=0.03)
+    assert abs(math.log(found.scale / without.scale)) < 0.1 * without.sigma_scale
+    assert "altitude" not in found.sources
+
+
+def test_an_assumed_height_is_no_source_of_the_scale() -> None:
+    some = [
+        Anchor(a.T_odom_camera, assumed(replace(a.prior, position_m=None)), 120.0)
+        for a in anchors(np.eye(3), 1.0, np.zeros(3), seed=7)
+    ]
+    found = fit(some)
+    assert found is not None and found.scale == pytest.approx(50.0 / 120.0, rel=0.01)
+    assert found.sources == ("attitude",) and found.sigma_scale > 0.3
 
 
 def test_without_any_prior_there_is_no_alignment() -> None:

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
+from recon.frames import rotation_from_rpy
 from service.cameras import open_camera
 from service.cameras.exif import name_unix_ns, read_tags
 from service.cameras.images import natural_key
@@ -178,6 +179,32 @@ def test_dji_xmp_gives_attitude_height_and_accuracy(tmp_path: Path) -> None:
     assert tag.ypr_deg == (-91.3, -89.9, 0.0)
     assert tag.relative_alt_m == 60.02
     assert tag.sigma_h_m == 0.015
+
+
+@pytest.mark.parametrize(
+    ("pitch_roll_deg", "looks_at_ned"),
+    [((0, 0), (0, 0, 1)), ((10, 0), (0, 0.1736, 0.9848)), ((0, 10), (0.1736, 0, 0.9848))],
+)
+def test_pix4d_xmp_counts_angles_from_straight_down(
+    tmp_path: Path, pitch_roll_deg: tuple[int, int], looks_at_ned: tuple[float, ...]
+) -> None:
+    """Of a vehicle that heads east: nose up, it looks ahead; right wing down, to its left."""
+    pitch, roll = pitch_roll_deg
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description '
+        f'Camera:Yaw="90" Camera:Pitch="{pitch}" Camera:Roll="{roll}" '
+        'Camera:GPSXYAccuracy="2.138" Camera:GPSZAccuracy="3.362"/></x:xmpmeta>'
+    )
+    path = tmp_path / "IMG_0001.jpg"
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
+    tag = read_tags(path).geotag
+    assert tag is not None and tag.ypr_deg is not None
+    assert (tag.sigma_h_m, tag.sigma_v_m) == (2.138, 3.362)
+    yaw, pitch, roll = np.radians(tag.ypr_deg)
+    head = rotation_from_rpy(roll, pitch, yaw)
+    np.testing.assert_allclose(head[:, 0], looks_at_ned, atol=1e-4)
+    if pitch_roll_deg == (0, 0):
+        np.testing.assert_allclose(-head[:, 2], [0, 1, 0], atol=1e-9)  # its upper side
 
 
 def test_useless_gps_is_no_position(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.posegraph.alignment import Similarity
 from recon.posegraph.trajectory import Placed
 from recon.tracking.odometry import Tracked, Tracking
 from service.cameras.rig import Rig
@@ -48,3 +49,22 @@ def test_poses_of_a_recording_share_transactions(
         recorder.flush()
         assert [pose.time_unix_ns for pose in store.poses()] == [1_000_000 * n for n in range(20)]
         assert len(written) == transactions and sum(written) == 20
+
+
+@pytest.mark.parametrize(
+    ("sources", "sigma", "by"),
+    [
+        (("attitude", "gnss"), 0.01, "attitude, gnss"),
+        (("attitude",), 0.5, "an assumed height"),
+        (("attitude",), 0.02, "velocity"),
+        ((), 0.5, "an assumed height"),
+    ],
+)
+def test_the_scale_names_what_measured_it(sources: tuple[str, ...], sigma: float, by: str) -> None:
+    covariance = np.diag([0.0] * 6 + [sigma**2])
+    found = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
+    trajectory = SimpleNamespace(similarity=lambda segment: found)
+    recorder = Recorder.__new__(Recorder)
+    recorder.pipeline = cast(Pipeline, SimpleNamespace(segments=1))
+    recorder._chain = cast(Any, SimpleNamespace(trajectory=trajectory))
+    assert recorder._scale() == {"from": by, "sigma": sigma}

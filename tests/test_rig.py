@@ -108,6 +108,8 @@ def test_a_image_tag_serves_when_there_is_no_telemetry() -> None:
     bare = rig().prior(None, replace(tag, relative_alt_m=None))
     assert prior.sigma_position_m is not None and bare.sigma_position_m is not None
     assert prior.sigma_position_m[2] < 10.0 < bare.sigma_position_m[2]  # a drone's barometer
+    stated = rig().prior(None, replace(tag, relative_alt_m=None, sigma_v_m=3.4))
+    assert stated.sigma_position_m is not None and stated.sigma_position_m[2] == 3.4
     _, top, view = up_and_right(prior.R_world_camera)
     np.testing.assert_allclose(view, [0, 0, -1], atol=1e-9)
     np.testing.assert_allclose(top, [1, 0, 0], atol=1e-9)
@@ -139,6 +141,12 @@ def test_each_part_of_the_telemetry_can_be_switched_off() -> None:
     assert prior.position_m is None and prior.sigma_yaw_rad > 1.0
     assert prior.agl_m == ASSUMED_AGL_M
     assert rig().prior(state, None).agl_m == 70.0
+
+
+def test_a_tags_height_can_be_switched_off() -> None:
+    tag = GeoTag(30.0, -98.0, 300.0, ypr_deg=(90.0, -90.0, 0.0), relative_alt_m=80.0)
+    without = rig(fusion=FusionConfig(altitude=False))
+    assert without.prior(None, tag).agl_m == ASSUMED_AGL_M and not without.height_known(None, tag)
 
 
 def test_attitude_of_a_pose_is_that_of_the_head() -> None:

@@ -25,6 +25,7 @@ SURE: dict[str, Any] = {
         ({"assumed": ["height"]}, "none", "relative", "assumed height"),
         ({"scale": {"sigma": 0.2}}, "gnss", "relative", "20%"),
         ({"assumed": ["lens"]}, "gnss", "doubtful", "lens"),
+        ({"assumed": ["view", "level"]}, "gnss", "doubtful", "taken as level"),
         ({"assumed": ["distortion"]}, "gnss", "georeferenced", "distortion"),
         ({"assumed": ["height", "view"]}, "none", "relative", "assumed height"),
         ({"frames_tracked": 40}, "gnss", "doubtful", "40 of 100"),

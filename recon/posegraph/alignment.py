@@ -50,6 +50,9 @@ INDEPENDENT_HEIGHTS = 4.0
 UNMEASURED_HEIGHTS = 1.0
 """Heights above the take-off point, or assumed ones, count as so many: they share one offset."""
 
+GUESSED_SHARE = 0.5
+"""Relative sigma of a height that is assumed: it holds a scale that nothing else gives."""
+
 EXACT_HEIGHTS = 16.0
 """The same where the ground exactly below was measured: relief has no part in it."""
 
@@ -271,6 +274,7 @@ class _Readings:
         self.way_s = _stack([_seconds(a.prior, b.prior) for a, b in moved], ())
         self.sigma_way = noise.of_travels(self.way_s, float(np.sum(self.way_s)))
         self.has_measured_heights = bool(heights) and independent > UNMEASURED_HEIGHTS
+        self.has_heights = any(sigma < GUESSED_SHARE for _, sigma in heights)
         self.log_ratio = _stack([h[0] for h in heights], ())
         thinned = min(1.0, (independent / max(len(heights), 1)) ** 0.5)
         self.sigma_log = _stack([h[1] for h in heights], ()) / thinned
@@ -544,7 +548,7 @@ def _sources(readings: _Readings) -> tuple[str, ...]:
     out = []
     if readings.heading_known.any():
         out.append("attitude")
-    if len(readings.log_ratio):
+    if readings.has_heights:
         out.append("altitude")
     if len(readings.fix):
         out.append("gnss")

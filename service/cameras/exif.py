@@ -1,10 +1,12 @@
-"""Time and place of a still: EXIF, DJI's XMP block, or its file name.
+"""Time and place of a still: EXIF, the XMP block of DJI or Pix4D, or its file name.
 
-EXIF 2.32 (CIPA DC-008-2019) sections 4.6.5 and 4.6.6; XMP names as DJI writes them.
+EXIF 2.32 (CIPA DC-008-2019) sections 4.6.5 and 4.6.6; XMP names as DJI writes them, and those of
+http://pix4d.com/camera/1.0, which Parrot, senseFly and MicaSense write.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from dataclasses import dataclass
@@ -12,11 +14,12 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from recon.frames import rotation_from_rpy, rpy_from_rotation
 from service.cameras.lens import Lens, finite_number, finite_numbers, lens_of
 from service.cameras.source import GeoTag
 
 XMP_BYTES = 1 << 18  # DJI's block sits in the first 64 KiB
-DEFAULT_SIGMA_H_M = 5.0
+DEFAULT_SIGMA_H_M, MAX_SIGMA_M = 5.0, 1000.0
 NAME_TIME = re.compile(r"(?<!\d)(20\d{6})[T_-]?(\d{6})[._]?(\d{1,6})?Z(?![A-Za-z0-9])")
 TURNED_DEG = {3: 180, 6: 90, 8: 270}
 """EXIF orientation to degrees clockwise; no camera writes the mirrored ones."""
@@ -141,16 +144,27 @@ def _geotag(gps: dict[int, Any], xmp: dict[str, str]) -> GeoTag | None:
     altitude = finite_number(gps.get(6))
     if altitude is not None and gps.get(5) in (1, b"\x01"):
         altitude = -altitude
-    rtk = [_xmp_number(xmp, "RtkStdLat"), _xmp_number(xmp, "RtkStdLon")]
-    stated = max((s for s in rtk if s), default=None) or finite_number(gps.get(31))
+    across = _sigma(xmp, "RtkStdLat", "RtkStdLon", "GPSXYAccuracy")
+    stated = across or _plausible(finite_number(gps.get(31)))
     return GeoTag(
         lat_deg=lat,
         lon_deg=lon,
         alt_amsl_m=altitude if altitude is not None else _xmp_number(xmp, "AbsoluteAltitude"),
-        sigma_h_m=stated if stated and 0 < stated < 1000 else DEFAULT_SIGMA_H_M,
+        sigma_h_m=stated or DEFAULT_SIGMA_H_M,
+        sigma_v_m=_sigma(xmp, "RtkStdHgt", "GPSZAccuracy"),
         ypr_deg=_gimbal_ypr_deg(xmp),
         relative_alt_m=_xmp_number(xmp, "RelativeAltitude"),
     )
+
+
+def _sigma(xmp: dict[str, str], *names: str) -> float | None:
+    """The largest of the accuracies in metres that are there."""
+    found = [_plausible(_xmp_number(xmp, name)) for name in names]
+    return max((sigma for sigma in found if sigma), default=None)
+
+
+def _plausible(sigma_m: float | None) -> float | None:
+    return sigma_m if sigma_m and 0 < sigma_m < MAX_SIGMA_M else None
 
 
 def _gimbal_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:
@@ -158,8 +172,19 @@ def _gimbal_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:
     pitch = _xmp_number(xmp, "GimbalPitchDegree")
     roll = _xmp_number(xmp, "GimbalRollDegree")
     if yaw is None or pitch is None:
-        return None
+        return _pix4d_ypr_deg(xmp)
     return yaw, pitch, roll or 0.0
+
+
+def _pix4d_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:
+    """Pix4D's angles, with which a camera of zero pitch and roll looks down, as a gimbal's."""
+    yaw, pitch, roll = (_xmp_number(xmp, name) for name in ("Yaw", "Pitch", "Roll"))
+    if yaw is None or pitch is None or roll is None:
+        return None
+    level = rotation_from_rpy(math.radians(roll), math.radians(pitch), math.radians(yaw))
+    turned = rpy_from_rotation(level @ rotation_from_rpy(0.0, -math.pi / 2, 0.0))
+    roll, pitch, yaw = (math.degrees(angle) for angle in turned)
+    return yaw, pitch, roll
 
 
 def _xmp(path: Path) -> dict[str, str]:

@@ -12,6 +12,7 @@ import numpy as np
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy, rpy_from_rotation
+from recon.posegraph.level_ground import ASSUMED_TILT_RAD
 from recon.types import F64, PosePrior
 from service.cameras.source import GeoTag
 from service.config import CameraConfig, FusionConfig, ScanConfig
@@ -22,9 +23,6 @@ ASSUMED_AGL_M = 50.0
 
 ABOVE_HOME_SHARE = 0.25
 """Relative sigma of a height above the take-off point, used as a height above ground."""
-
-MOUNT_TILT_SIGMA_RAD = math.radians(6.0)
-"""Sigma of the camera's tilt from its nominal mount without a known attitude."""
 
 AT_REST_M_S, ON_GROUND_M = 0.3, 2.0
 """Below these a vehicle is on the ground."""
@@ -151,7 +149,7 @@ class Rig:
             yaw, pitch, roll = (math.radians(a) for a in tag.ypr_deg)
             R = R_ENU_NED @ rotation_from_rpy(roll, pitch, yaw) @ R_GIMBAL_CAMERA
             return R, math.radians(1.5), math.radians(5.0)
-        return R_ENU_NED @ self._R_body_camera, MOUNT_TILT_SIGMA_RAD, NO_YAW_RAD
+        return R_ENU_NED @ self._R_body_camera, ASSUMED_TILT_RAD, NO_YAW_RAD
 
     def _fix(self, state: VehicleState | None, tag: GeoTag | None) -> Fix | None:
         if not self._fusion.gnss:
@@ -167,7 +165,8 @@ class Rig:
             )
         if state is None and tag is not None and self.georeference != "gnss":
             self.georeference = "exif"
-            sigma_v = TAG_HEIGHT_M if tag.relative_alt_m is None else BAROMETER_M
+            usual_m = TAG_HEIGHT_M if tag.relative_alt_m is None else BAROMETER_M
+            sigma_v = tag.sigma_v_m or usual_m
             return Fix(tag.lat_deg, tag.lon_deg, tag.alt_amsl_m, tag.sigma_h_m, sigma_v)
         return None
 
@@ -201,7 +200,8 @@ class Rig:
                 if "relative" not in state.sources:
                     return raised, spread, HeightSource.MEASURED
                 return raised, max(spread, ABOVE_HOME_SHARE * agl), HeightSource.ABOVE_HOME
-        elif tag is not None and tag.relative_alt_m is not None and tag.relative_alt_m > 1.0:
+        elif self._fusion.altitude and tag is not None and (tag.relative_alt_m or 0.0) > 1.0:
+            assert tag.relative_alt_m is not None
             agl = tag.relative_alt_m
             return agl, ABOVE_HOME_SHARE * agl + 2.0, HeightSource.ABOVE_HOME
         return ASSUMED_AGL_M, 0.5 * ASSUMED_AGL_M, HeightSource.ASSUMED
@@ -212,7 +212,7 @@ class Rig:
 
     def attitude_known(self, state: VehicleState | None, tag: GeoTag | None) -> bool:
         """False when the view direction is that of the nominal mount."""
-        return self._rotation(state, tag)[1] < MOUNT_TILT_SIGMA_RAD
+        return self._rotation(state, tag)[1] < ASSUMED_TILT_RAD
 
 
 def _is_at_rest(state: VehicleState) -> bool:

@@ -24,6 +24,7 @@ class GeoTag:
     lon_deg: float
     alt_amsl_m: float | None = None  # as written; consumer cameras drift by tens of metres
     sigma_h_m: float = 5.0  # 1 sigma, horizontal; the default for tags without accuracy
+    sigma_v_m: float | None = None  # of the altitude; None: not stated
     ypr_deg: tuple[float, float, float] | None = None
     """Yaw from true north, pitch, roll of the gimbal head (FRD in NED); pitch -90 looks down."""
     relative_alt_m: float | None = None  # above the take-off point

@@ -12,6 +12,7 @@ import numpy as np
 from recon import se3
 from recon.posegraph.alignment import height_above, height_below
 from recon.posegraph.between_keyframes import carried
+from recon.posegraph.level_ground import levelled
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Placed, Trajectory
 from recon.tracking.odometry import Tracked, Tracking
@@ -67,6 +68,7 @@ class Chain:
         """``is_settled`` marks keyframes that the odometry no longer adjusts."""
         self.trajectory, self.watch = trajectory, GraphWatch(trajectory.graph)
         self.loops: LoopSearch | None = None
+        self.levelled = 0  # keyframes without an attitude whose ground is taken as level
         self._carriers, self._is_settled = carriers, is_settled
         self._rejected, self._stopwatch = rejected, stopwatch
         self._pieces = Pieces()
@@ -100,9 +102,10 @@ class Chain:
         up = T_odom[2, :3]
         below = height_below(depth, up) if depth is not None else None
         height = (below, 0.0) if below is not None else height_above(view.points, up)
+        prior = levelled(view.prior, view.points)
+        self.levelled += prior is not view.prior
         self.trajectory.add(
-            view.seq, view.segment, self._T_map, view.prior, height, view.time_ns,
-            motion.covariance,
+            view.seq, view.segment, self._T_map, prior, height, view.time_ns, motion.covariance,
         )  # fmt: skip
         if depth is not None and self.loops is not None:
             with self._stopwatch("loops"):

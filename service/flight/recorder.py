@@ -13,6 +13,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from mavlink.telemetry.samples import VehicleState
+from recon.posegraph.alignment import GUESSED_SHARE
 from recon.posegraph.trajectory import Placed
 from recon.tracking.odometry import Tracking
 from recon.types import F64, Keyframe
@@ -149,8 +150,12 @@ class Recorder:
         found = self._chain.trajectory.similarity(max(self.pipeline.segments - 1, 0))
         if found is None:
             return {"from": "first telemetry", "sigma": None}
+        by = ", ".join(found.sources)
+        if not {"altitude", "gnss"} & set(found.sources):
+            is_known = found.sigma_scale < GUESSED_SHARE / 2
+            by = "velocity" if is_known else "an assumed height"
         return {
-            "from": ", ".join(found.sources) or "an assumed height",
+            "from": by,
             "sigma": round(found.sigma_scale, 4),
         }
 

@@ -282,10 +282,12 @@ class Scan:
         }
 
     def _assumed(self) -> list[str]:
-        """What was assumed in this scan, of "lens", "distortion", "view" and "height"."""
+        """What was assumed in this scan: "lens", "distortion", "view", "level" and "height"."""
         out = list(self.inputs.assumed)
         if self.attitudes == 0:
             out.append("view")
+        if self.pipeline.stages.chain.levelled:
+            out.append("level")
         if self.heights == 0 and self.rig.georeference == "none":
             out.append("height")
         return out

@@ -48,6 +48,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         doubts.append(
             f"the view direction is assumed, and the site slopes by {slope_deg:.0f} degrees"
         )
+    if "level" in assumed:
+        doubts.append("no attitude, and not seen from straight above: the ground is taken as level")
     frames, tracked = _number(run, "frames"), _number(run, "frames_tracked")
     if frames and tracked is not None and tracked < MIN_PLACED_SHARE * (frames - 1):
         doubts.append(f"vision placed only {tracked:.0f} of {frames:.0f} frames")

@@ -1,0 +1,61 @@
+"""The tilt of a camera by the ground that it sees, where no attitude is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from recon import se3
+from recon.types import F64, PosePrior
+
+ASSUMED_TILT_RAD = math.radians(6.0)
+"""Sigma of the camera's tilt from its nominal mount without a known attitude."""
+
+MAX_SLOPE_RAD = math.radians(20.0)
+"""Few sites slope by more; a camera held by hand or by a kite line often does."""
+
+LEVEL_SIGMA_RAD = math.radians(10.0)
+"""How far sites that are taken as level slope."""
+
+MIN_POINTS = 30
+
+MAX_THICKNESS = 0.2
+"""Spread across a plane over its width; thicker ground has no normal."""
+
+
+def levelled(prior: PosePrior, points: F64) -> PosePrior:
+    """The prior with the tilt that lays the ground level, where the assumed mount is far from it.
+
+    ``points`` (N, 3) are ground in the camera's frame. A known attitude stays.
+    """
+    R = prior.R_world_camera
+    if R is None or prior.sigma_tilt_rad < ASSUMED_TILT_RAD:
+        return prior
+    normal = plane_normal(points)
+    if normal is None or normal @ R[2] > math.cos(MAX_SLOPE_RAD):
+        return prior
+    up = R @ normal
+    axis = np.array([up[1], -up[0], 0.0])
+    turn = axis * (math.acos(np.clip(up[2], -1.0, 1.0)) / max(float(np.linalg.norm(axis)), 1e-9))
+    return replace(prior, R_world_camera=se3.so3_exp(turn) @ R, sigma_tilt_rad=LEVEL_SIGMA_RAD)
+
+
+def plane_normal(points: F64) -> F64 | None:
+    """(3,) unit normal, towards the origin, of the plane through points (N, 3).
+
+    The direction of minimum spread, without points far off; None for too few, or where the
+    points lie on no plane.
+    """
+    for _ in range(3):
+        if len(points) < MIN_POINTS:
+            return None
+        middle = np.median(points, axis=0)
+        values, vectors = np.linalg.eigh((points - middle).T @ (points - middle))
+        normal = vectors[:, 0]
+        off = np.abs((points - middle) @ normal)
+        points = points[off <= max(3.0 * float(np.median(off)), 1e-9)]
+    if not values[0] < MAX_THICKNESS**2 * values[1]:
+        return None
+    return np.asarray(normal if normal @ middle < 0 else -normal, np.float64)
