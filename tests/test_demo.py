@@ -45,7 +45,7 @@ def test_ground_holds_what_was_made_onboard(tmp_path: Path) -> None:
     assert "datalink does not open" not in done.stderr  # the ground outlives the flight
     parts = [line for line in done.stderr.splitlines() if line.startswith("replay: ")]
     assert parts[0].endswith("tracking and reconstructing")
-    assert parts[-2:] == ["replay: sending the rest", "replay: writing the files"]
+    assert "replay: sending the rest" in parts and parts[-1] == "replay: writing the files"
     assert report["points"] > 10_000
     assert report["points"] == report["ground_points"]
     onboard, ground = Path(report["scan_folder"]), Path(report["ground_folder"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import time
 import zipfile
@@ -16,6 +17,7 @@ from person import Browser
 from portal_client import NEEDS, ONE, TOKEN, Client, browser, flown_store
 
 from service.ground import state
+from service.ground.drone import Limits
 from service.ground.portal import Portal, PortalConfig
 from service.ground.state import Job
 from service.stream.store import ScanStore
@@ -79,6 +81,23 @@ def test_an_alignment_by_points_is_refused_with_its_reason(portal: Portal, tmp_p
     assert until(lambda: [j for j in client.ask("/api/jobs")[1] if j["state"] == "failed"])
     assert "--start" in client.ask("/api/jobs")[1][0]["error"]  # it has a georeference
     assert not (tmp_path / "site/drone-1-test-1").exists()
+
+
+def test_an_alignment_by_points_that_does_not_fit_the_disk_share_is_refused(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    store, limits = flown_store(tmp_path, house), Limits(drone_share=1e-9, reserve_bytes=0)
+    place = {"scan": [0.0, 0.0, 0.0], "place": [8.5, 47.4, 400.0]}
+    order = {"drone": "drone-1", "scan": "test-1", "points": 3 * [place]}
+    with contextlib.closing(
+        Portal(PortalConfig(store, port=0, token=TOKEN, limits=limits))
+    ) as portal:
+        portal.start()
+        client = Client(portal)
+        assert client.ask(ONE + "/alignment", "POST", order)[0] == 202
+        assert until(lambda: [j for j in client.ask("/api/jobs")[1] if j["state"] == "failed"])
+        assert "has reached its share" in client.ask("/api/jobs")[1][0]["error"]
+    assert not (tmp_path / "site").exists()
 
 
 def portal_jobs(client: Client) -> list[str]:

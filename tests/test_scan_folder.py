@@ -20,6 +20,7 @@ from recon.types import F64
 from service.errors import OutsideError
 from service.georeference import LocalFrame
 from service.ground.scan_facts import facts_of
+from service.progress import Progress
 from service.scans.folder import CLOUD, CSV, PREVIEW, REPORT, SUMMARY, TUM, write_deliverables
 from service.scans.fused_cloud import _Extent, fused_cloud, strip_edges
 from service.scans.retention import close_open_scans
@@ -39,6 +40,16 @@ def enu_of(cloud: laspy.LasData, house: HouseFlight) -> F64:
         *utm.T
     )
     return LocalFrame(*house.origin).to_enu(np.column_stack([lat, lon, alt]))
+
+
+def test_writing_the_files_reports_how_far_it_is(tmp_path: Path, house: HouseFlight) -> None:
+    reported: list[tuple[str, float]] = []
+    progress = Progress(lambda p: reported.append((p.text, p.share)))
+    with house.flown(tmp_path) as store, progress.part("the files", 0.5):
+        write_deliverables(tmp_path, store, {}, progress=progress)
+    shares = [share for _, share in reported]
+    assert shares == sorted(shares) and len(set(shares)) > 5 and 0.3 < shares[-1] < 0.5
+    assert "fusing the cloud" in dict(reported) and reported[-1][0] == "writing the files"
 
 
 def test_cloud_is_where_the_house_stands(tmp_path: Path, house: HouseFlight) -> None:
@@ -211,8 +222,8 @@ def test_the_report_says_what_was_flown_and_nothing_runs_in_it(
     assert page.count("<svg") == 5  # the map; no height above ground was recorded
     _, *curves = re.findall(r"<svg.*?</figure>", page)
     for curve in curves:
-        *heights, _, _, _, _, _ = words = re.findall(r">([-+.0-9e]+)</text>", curve)
-        assert words[-5:] == ["0", "1", "2", "3", "4"] and heights  # seconds
+        heights = re.findall(r">([-+.0-9e]+)</text>", curve)
+        assert re.findall(r">(\d+) s</text>", curve) == ["0", "1", "2", "3", "4"] and heights
         low, high = map(float, re.findall(r": (\S+) to (\S+), over 4 s", curve)[0])
         assert all(low - 0.01 <= float(height) <= high + 0.01 for height in heights)
     assert "@media print" in page

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import re
 import sqlite3
 import struct
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+import site_scans
 from site_scans import ELSEWHERE, FRAME, HEIGHT_M, Box, Errors, height, leg, write_scan
 from typer.testing import CliRunner
 
@@ -18,6 +22,8 @@ from recon import se3
 from recon.types import F64
 from service.cli import app
 from service.errors import InputError
+from service.georeference import LocalFrame
+from service.offline.site import alignment
 from service.offline.site.alignment import AlignedSite, align_site
 from service.offline.site.compare import compare
 from service.offline.site.gather import between_frames
@@ -132,6 +138,36 @@ def test_two_alignments_of_one_site_at_once_wait_for_each_other(tmp_path: Path) 
     assert document["revision"] == 3
 
 
+def test_an_alignment_that_waits_for_one_that_fails_says_why_it_fails_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nowhere = write_scan(tmp_path / "nowhere", EAST[:2], frame=None)
+    held, waits, flock = threading.Event(), threading.Event(), fcntl.flock
+
+    def counted(handle: int, operation: int) -> None:
+        if held.is_set():
+            waits.set()  # the first one fails only now
+        flock(handle, operation)
+
+    def failing(*args: object) -> None:
+        held.set()
+        assert waits.wait(30.0)
+        time.sleep(0.2)
+        raise InputError("refused")
+
+    monkeypatch.setattr(fcntl, "flock", counted)
+    with ThreadPoolExecutor(1) as pool:
+        with monkeypatch.context() as broken:
+            broken.setattr(alignment, "gather", failing)
+            first = pool.submit(align_site, [nowhere], tmp_path / "site", deliver=False)
+            assert held.wait(30.0)
+        with pytest.raises(InputError, match="no usable scan"):
+            align_site([nowhere], tmp_path / "site", deliver=False)
+        with pytest.raises(InputError, match="refused"):
+            first.result()
+    assert not (tmp_path / "site").exists()
+
+
 def test_what_cannot_be_tied_stays_and_is_named(tmp_path: Path) -> None:
     one = write_scan(tmp_path / "one", NORTH[:3])
     winter = write_scan(tmp_path / "winter", EAST[:3], Errors((0.8, 0.0, 0.0)), ground=2)
@@ -141,6 +177,43 @@ def test_what_cannot_be_tied_stays_and_is_named(tmp_path: Path) -> None:
     assert document["scans"][1]["moved_m"] == [0.0, 0.0, 0.0]
     with pytest.raises(InputError, match="have no ties"):
         compare(one, winter, tmp_path / "change")
+
+
+def test_the_same_ground_in_other_light_is_tied(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noon = write_scan(tmp_path / "noon", NORTH, WRONG)
+    x = np.linspace(0.0, 40.0, 900)
+    dusk = 0.5 * site_scans.texture(1) + 15.0 * np.sin(x) + 10.0 * np.cos(x)[:, None]
+    monkeypatch.setattr(site_scans, "texture", lambda _: dusk)
+    evening = write_scan(tmp_path / "evening", EAST, day=1)
+    document = align_site([noon, evening], tmp_path / "site", deliver=False).document
+    assert document["pairs"][0]["ties"] >= 3 and document["notes"] == []
+    off = errors_m(tmp_path / "site", [*NORTH, *EAST])
+    assert np.linalg.norm(off[:6].mean(axis=0) - off[6:].mean(axis=0)) < 0.1
+
+
+def test_an_alignment_by_few_ties_is_called_uncertain(tmp_path: Path) -> None:
+    one, two = write_scan(tmp_path / "one", NORTH[2:3]), write_scan(tmp_path / "two", EAST[2:4])
+    document = align_site([one, two], tmp_path / "site", deliver=False).document
+    assert document["pairs"][0]["ties"] == 2
+    assert any(
+        "one and two share only 2 tie(s)" in n and "not sure" in n for n in document["notes"]
+    )
+
+
+def test_scans_of_two_zones_become_one_site(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    west, east = LocalFrame(47.39, 5.9998, 408.0), LocalFrame(47.39, 6.0003, 411.0)
+    monkeypatch.setattr(site_scans, "FRAME", west)  # of the truth
+    one = write_scan(tmp_path / "one", NORTH, Errors((0.5, 0.3, 0.2)), frame=west)
+    two = write_scan(tmp_path / "two", EAST, Errors((-0.5, -0.3, -0.2)), frame=east)
+    document = align_site([one, two], tmp_path / "site", deliver=False).document
+    assert document["epsg"] == 32631 and document["pairs"][0]["ties"] >= 3
+    assert any("several zones [32631, 32632]" in note for note in document["notes"])
+    off = errors_m(tmp_path / "site", [*NORTH, *EAST])
+    assert np.linalg.norm(off[:6].mean(axis=0) - off[6:].mean(axis=0)) < 0.1
 
 
 def test_bad_scans_are_named(tmp_path: Path) -> None:

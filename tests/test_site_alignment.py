@@ -58,6 +58,19 @@ def test_two_scans_meet_and_share_their_error() -> None:
     assert 0.55 < ratio < 0.85  # one over the root of two is 0.71
 
 
+def test_ties_that_disagree_do_not_shrink_the_site() -> None:
+    rng = np.random.default_rng(1)
+    wrong, ties = [drawn(rng) for _ in range(4)], []
+    for a in range(4):
+        for b in range(a + 1, 4):
+            for one in ties_between(a, b, wrong, rng, 70):
+                wander = rng.normal(size=3) * 0.2
+                ties.append(Tie(a, b, one.at_a + wander, one.at_b, one.covariance))
+    found = align(ties, priors(4))
+    scales = [move.growth * w.growth for move, w in zip(found.moves, wrong, strict=True)]
+    assert np.mean(scales) == pytest.approx(1.0, abs=0.015)
+
+
 def test_like_receivers_share_their_sigma_and_a_better_one_keeps_its_own() -> None:
     own = [[0.2, 1.0, 0.4], [1.0, 1.0, 0.4], [1.0, 0.02, 2.0]]
     given = [

@@ -151,6 +151,27 @@ def test_3d_tiles_of_a_site_in_tiles_hold_all_points(
         assert held == pytest.approx(len(scan.fused.cloud), rel=0.003)
 
 
+def test_the_files_of_a_site_in_tiles_are_those_of_the_whole(
+    tmp_path: Path, counted: list[int]
+) -> None:
+    scans = [write_scan(tmp_path / f"{k}", leg(k * np.pi / 2), day=k) for k in range(2)]
+    clouds_of, facts = [], []
+    for name, points in (("whole", 20_000_000), ("tiles", 60_000)):
+        align_site(scans, tmp_path / name, tile_points=points)
+        clouds_of.append(laspy.read(tmp_path / name / "cloud.laz"))
+        facts.append(json.loads((tmp_path / name / "scan.json").read_text()))
+        assert facts[-1]["failed"] == {} and (tmp_path / name / "report.html").is_file()
+    assert len(counted) == 1 and counted[0] > 1
+    one, two = (np.asarray(cloud.xyz) for cloud in clouds_of)
+    assert len(two) == pytest.approx(len(one), rel=0.003)
+    assert len(two) == facts[1]["counts"]["points"]
+    assert np.mean(cKDTree(one).query(two)[0] < 0.02) > 0.99
+    for key in ("keyframes", "points_before_fusion"):
+        assert facts[0]["counts"][key] == facts[1]["counts"][key]
+    for key, off in (("area_m2", 0.01), ("voxel_m", 0.001), ("sigma_median_m", 0.1)):
+        assert facts[1]["quality"][key] == pytest.approx(facts[0]["quality"][key], rel=off)
+
+
 def test_an_octree_in_parts_has_every_point_once_in_its_node() -> None:
     rng = np.random.default_rng(5)
     xyz = np.column_stack([rng.uniform(0, 100, (300_000, 2)), rng.normal(50, 3, 300_000)])

@@ -65,13 +65,7 @@ def fuse_strips(
 
     rows = zip(strips, borders[:-1], borders[1:], strict=True)
     keys, clouds = zip(*at_once(*(partial(fused, *row) for row in rows)), strict=True)
-    whole = PointCloud(
-        np.concatenate([cloud.xyz_m for cloud in clouds]),
-        np.concatenate([cloud.rgb for cloud in clouds]),
-        np.concatenate([cloud.sigma_m for cloud in clouds]),
-        np.concatenate([cloud.views for cloud in clouds]),
-        time_ns=_joined([cloud.time_ns for cloud in clouds]),
-    )
+    whole = joined(clouds)
     lone = _lone_contradicted(np.concatenate(keys), whole.xyz_m, whole.sigma_m, whole.views)
     return whole if not lone.any() else without(whole, lone)
 
@@ -84,10 +78,16 @@ def _first_of_each(times_ns: Sequence[I64 | None]) -> I64 | None:
     return np.array([t[0] if len(t) else 0 for t in known], np.int64)
 
 
-def _joined(times_ns: Sequence[I64 | None]) -> I64 | None:
-    """One array of all; None when one is None."""
-    known = [t for t in times_ns if t is not None]
-    return np.concatenate(known) if len(known) == len(times_ns) else None
+def joined(clouds: Sequence[PointCloud]) -> PointCloud:
+    """One cloud of all; without times when one has none."""
+    times = [cloud.time_ns for cloud in clouds if cloud.time_ns is not None]
+    return PointCloud(
+        np.concatenate([cloud.xyz_m for cloud in clouds]),
+        np.concatenate([cloud.rgb for cloud in clouds]),
+        np.concatenate([cloud.sigma_m for cloud in clouds]),
+        np.concatenate([cloud.views for cloud in clouds]),
+        time_ns=np.concatenate(times) if len(times) == len(clouds) else None,
+    )
 
 
 def without(cloud: PointCloud, mask: Bool) -> PointCloud:

@@ -134,7 +134,9 @@ def _equations(ties: Sequence[Tie], priors: Sequence[ScanPrior], state: F64) -> 
         ends = ((tie.a, tie.at_a, 1.0), (tie.b, tie.at_b, -1.0))
         for side, (scan, points, sign) in enumerate(ends):
             centre = priors[scan].centre_m + state[scan, 3:6]
-            sides[:, :, side] = sign * _lever(moves[scan].points(points) - centre).reshape(-1, 3, 7)
+            lever = _lever(moves[scan].points(points) - centre).reshape(-1, 3, 7)
+            sides[:, :, side] = sign * lever / _unit(tie, moves)
+            sides[:, :, side, 6] -= 0.5 * error
         J = sides.reshape(len(error), 3, 2 * UNKNOWNS)
         rows = np.concatenate([UNKNOWNS * s + np.arange(UNKNOWNS) for s in (tie.a, tie.b)])
         H[np.ix_(rows, rows)] += np.einsum("pki,pkl,plj->ij", J, W, J)
@@ -162,7 +164,12 @@ def _similarity(x: F64, prior: ScanPrior) -> Similarity:
 
 
 def _errors(ties: Sequence[Tie], moves: Sequence[Similarity]) -> list[F64]:
-    return [moves[t.a].points(t.at_a) - moves[t.b].points(t.at_b) for t in ties]
+    return [(moves[t.a].points(t.at_a) - moves[t.b].points(t.at_b)) / _unit(t, moves) for t in ties]
+
+
+def _unit(tie: Tie, moves: Sequence[Similarity]) -> float:
+    """Growth of both scans: in its units the error does not fall because everything shrinks."""
+    return float(np.sqrt(moves[tie.a].growth * moves[tie.b].growth))
 
 
 def _lengths(errors: Sequence[F64]) -> F64:

@@ -37,7 +37,10 @@ SIZE_PX = (160, 90)
 SIGMA_M, PLACING_M = 0.05, 0.03
 TILE_POINTS = 1_000_000
 FOUND = "found.json"
-KINDS = ("dsm", "ortho", "laz", "ply", "copc", "3dtiles", "contours", "change")
+FILES = "files"
+"""Those that ``site align`` leaves in the site's folder."""
+
+KINDS = ("dsm", "ortho", "laz", "ply", "copc", "3dtiles", "contours", "change", FILES)
 WORKERS = (1, 2, 4)
 """Of a Dask cluster, for the first kind."""
 
@@ -202,9 +205,6 @@ def _in_a_process(kind: str, site: Path, parts: Any, scheduler: str | None) -> M
 
 def made(kind: str, site: Path, parts: Any, scheduler: str | None) -> Measured:
     """Make one product in this process, and measure it."""
-    from service.offline.exports.view import ExportOptions, ScanView, export
-    from service.offline.site.compare import changes
-
     ticks: list[float] = []
     texts: list[str] = []
 
@@ -213,17 +213,28 @@ def made(kind: str, site: Path, parts: Any, scheduler: str | None) -> Measured:
             texts.append(now.text)
             ticks.append(time.process_time())
 
-    progress, begun = Progress(noted), time.monotonic()
-    options = ExportOptions(stored=True, tile_points=TILE_POINTS, scheduler=scheduler)
+    begun = time.monotonic()
+    _make(kind, site, parts, scheduler, Progress(noted))
+    ticks.append(time.process_time())
+    return Measured(peak_mib(), time.monotonic() - begun, np.diff(ticks).tolist())
+
+
+def _make(kind: str, site: Path, parts: Any, scheduler: str | None, progress: Progress) -> None:
+    from service.offline.exports.view import ExportOptions, ScanView, export
+    from service.offline.site.compare import changes
+    from service.offline.site.files import write_files
+
+    if kind == FILES:
+        write_files(site, TILE_POINTS, scheduler, progress)
+        return
     with ScanView(site, None, progress) as view:
         if kind == "change":
             found = changes(view, site, parts, PLACING_M, None, TILE_POINTS, scheduler, progress)
             count = 0 if found is None else len(found.objects)
             (site / FOUND).write_text(json.dumps(count), encoding="utf-8")
         else:
+            options = ExportOptions(stored=True, tile_points=TILE_POINTS, scheduler=scheduler)
             export(view, kind, None, options)
-    ticks.append(time.process_time())
-    return Measured(peak_mib(), time.monotonic() - begun, np.diff(ticks).tolist())
 
 
 def peak_mib() -> float:

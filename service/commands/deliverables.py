@@ -238,7 +238,8 @@ def site(
         if not all(scan and points for scan, _, points in pairs):
             raise InputError("--start is SCAN:POINTS.json")
         starts = {Path(scan): read_start(Path(points)) for scan, _, points in pairs}
-        figures = align_site(scans, out, starts=starts).document
+        made = align_site(scans, out, starts=starts, tile_points=tile_points, scheduler=scheduler)
+        figures = made.document
         print(json.dumps(figures) if as_json else "\n".join(_aligned_lines(out, figures)))
         return
     from service.offline.site.compare import compare

@@ -239,6 +239,7 @@ def _open_portal(
         vehicle,
         workers,
         given.basemap,
+        receiver.limits,
     )
     if vehicle is not None:
         vehicle.start()

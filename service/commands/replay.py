@@ -220,8 +220,7 @@ def _fly(
                 summary["datalink_complete"] = link.drain(inputs.config.datalink.drain_s)
                 link.close()
             give_back(collect=True)
-            progress("writing the files")
-            summary |= write_deliverables(inputs.folder, store, {})
+            summary |= write_deliverables(inputs.folder, store, {}, progress=progress)
             store.close()
     return shutter or summary
 

@@ -32,6 +32,7 @@ from starlette.websockets import WebSocket
 
 from service.errors import InputError, OutsideError
 from service.ground.basemap import open_basemap
+from service.ground.drone import Limits
 from service.ground.guard import (
     CHANGING,
     UPLOAD,
@@ -136,11 +137,13 @@ def portal_app(
     vehicle: Vehicle | None = None,
     jobs: Jobs | None = None,
     basemap: Path | None = None,
+    limits: Limits | None = None,
 ) -> ASGIApp:
     """The portal as an ASGI application; ``local`` when only this machine can reach it."""
     jobs = jobs or Jobs(Workers())
     below = None if basemap is None else open_basemap(basemap)
-    state = PortalState(Library(store), jobs, progress or list, vehicle, below)
+    limits = limits or Limits()
+    state = PortalState(Library(store), jobs, progress or list, vehicle, below, limits)
     one = "/api/scans/{drone}/{scan}"
     routes: list[Any] = [
         Route("/", _page),
@@ -339,7 +342,8 @@ async def _align(request: Request) -> Response:
     note(request, "align", to=f"{order.drone}/{order.scan}", points=len(order.points))
     folder = state.library.folder(drone, scan)
     other = state.library.folder(order.drone, order.scan)
-    work = partial(align_by_points, state.library.store, other, folder, Start(order.points))
+    store, start = state.library.store, Start(order.points)
+    work = partial(align_by_points, store, state.limits, other, folder, start)
     return JSONResponse(state.jobs.start(folder, "align", work), 202)
 
 

@@ -6,11 +6,12 @@ import asyncio
 import logging
 import secrets
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from service.errors import InputError, OutsideError
+from service.ground import drone
 from service.ground.guard import (
     MAX_BODY_BYTES,
     AuditLog,
@@ -51,6 +52,7 @@ class PortalConfig:
     tls_certificate: str = ""
     tls_key: str = ""
     basemap: Path | None = None  # an MBTiles or PMTiles file
+    limits: drone.Limits = field(default_factory=drone.Limits)  # of the disk
 
     def __post_init__(self) -> None:
         """Raise InputError for an address open to others without a token."""
@@ -94,6 +96,7 @@ class Portal:
             vehicle,
             self._jobs,
             config.basemap,
+            config.limits,
         )
         self._vehicle = vehicle
         self._listener: BoundedListener | None = None
@@ -210,6 +213,7 @@ def open_portal(
     vehicle: Vehicle | None = None,
     workers: Workers | None = None,
     basemap: Path | None = None,
+    limits: drone.Limits | None = None,
 ) -> Portal:
     """A started portal at ``HOST:PORT`` on the scans below ``store``.
 
@@ -222,7 +226,8 @@ def open_portal(
         if not path.is_file():
             raise InputError(f"portal certificate {path}: no such file")
     certificate, key = (str(path) for path in tls) if tls else ("", "")
-    config = PortalConfig(store, host, port, token, certificate, key, basemap)
+    limits = limits or drone.Limits()
+    config = PortalConfig(store, host, port, token, certificate, key, basemap, limits)
     portal = Portal(config, progress, vehicle, workers)
     portal.start()
     return portal

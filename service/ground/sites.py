@@ -53,8 +53,7 @@ class Sites:
     """Aligns the scans put in, one after the other, on one thread."""
 
     def __init__(self, store: Path, limits: Limits) -> None:
-        self._store = store
-        self._share = DiskShare(store / DRONE, limits.drone_share, limits.reserve_bytes)
+        self._store, self._limits = store, limits
         self._waiting: queue.Queue[Path] = queue.Queue()
 
     def put(self, folder: Path) -> None:
@@ -73,8 +72,7 @@ class Sites:
         members = [*companions(self._store, folder), folder]
         if len(members) == 1:
             return
-        sizes = (path.stat().st_size for m in members for path in m.glob("scan.db*"))
-        self._share.check(SIZES * sum(sizes))
+        _check_room(self._store, self._limits, members)
         site = site_of(self._store, members)
         words = ["site", "align", *map(str, members), "--out", str(site)]
         with tempfile.TemporaryFile() as errors:
@@ -96,16 +94,25 @@ class Sites:
         log.info("%s: %d scans are aligned", site, len(members))
 
 
+def _check_room(store: Path, limits: Limits, members: Sequence[Path]) -> None:
+    """Raise QuotaError when a site of these scans does not fit the sites' share of the disk."""
+    sizes = (path.stat().st_size for m in members for path in m.glob("scan.db*"))
+    share = DiskShare(store / DRONE, limits.drone_share, limits.reserve_bytes)
+    share.check(SIZES * sum(sizes))
+
+
 def align_by_points(
-    store: Path, other: Path, folder: Path, start: Start, progress: Progress
+    store: Path, limits: Limits, other: Path, folder: Path, start: Start, progress: Progress
 ) -> str:
     """Align the scan in ``folder``, which points place, with the scan or site ``other``.
 
-    Returns the name of the site's file of ties. Raises InputError for points that place nothing.
+    Returns the name of the site's file of ties. Raises InputError for points that place nothing,
+    QuotaError when the site does not fit the disk.
     """
     from service.offline.site.alignment import align_site
 
     members = [other, folder]
+    _check_room(store, limits, members)
     site = site_of(store, members)
     scans = [one for one in members if one != site]
     align_site(scans, site, starts={folder: start}, progress=progress)

@@ -15,6 +15,7 @@ from starlette.requests import HTTPConnection
 
 from service.errors import InputError, SkyreliefError
 from service.ground.basemap import Basemap
+from service.ground.drone import Limits
 from service.ground.library import Library
 from service.ground.live_map import LiveMaps
 from service.ground.vehicle import Vehicle
@@ -209,6 +210,7 @@ class PortalState:
     progress: Callable[[], list[dict[str, Any]]]  # one entry per scan being received
     vehicle: Vehicle | None
     basemap: Basemap | None = None
+    limits: Limits = field(default_factory=Limits)  # of the disk
     coverages: LiveCoverages = field(default_factory=LiveCoverages)
     maps: LiveMaps = field(default_factory=LiveMaps)
     live_views: int = 0

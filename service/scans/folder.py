@@ -21,16 +21,27 @@ import cv2
 import numpy as np
 
 from recon.bands import at_once
+from recon.mapping.cloud_fusion import joined
 from recon.surface.raster import Raster, grid_over, rasterise
 from recon.types import PointCloud
 from service.errors import OutsideError, SkyreliefError
 from service.georeference import LocalFrame
 from service.memory import give_back
+from service.progress import Progress
 from service.redaction import public_configuration, redacted
 from service.scans.coverage import IMAGE as COVERAGE
 from service.scans.coverage import Coverage, write_coverage_files
 from service.scans.drawing import blank_preview, draw_preview, middle_keyframe, stages
-from service.scans.fused_cloud import DEFAULT_VOXEL_M, FusedCloud, fused_cloud, write_laz
+from service.scans.fused_cloud import (
+    DEFAULT_VOXEL_M,
+    Box,
+    FusedCloud,
+    LazPart,
+    TiledCloud,
+    fused_cloud,
+    thinned,
+    write_laz,
+)
 from service.scans.main_piece import (
     in_words,
     main_poses,
@@ -76,7 +87,12 @@ NO_GEOREFERENCE = (
 
 
 def write_deliverables(
-    folder: Path, store: ScanStore, extra: dict[str, Any], voxel_m: float | None = None
+    folder: Path,
+    store: ScanStore,
+    extra: dict[str, Any],
+    voxel_m: float | None = None,
+    tiled: TiledCloud | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Write the scan folder's files from ``store``; returns the content of scan.json.
 
@@ -85,15 +101,19 @@ def write_deliverables(
         shall be identical at both ends.
         voxel_m: size of the fused voxels; by default ``scan.resolution_m`` of the scan's own
             configuration, else the ground sample distance.
+        tiled: the cloud, where it is too large for memory.
 
     A file that cannot be made is listed under ``failed``, with the reason, and logged; the others
     are written. Raises OutsideError, at the end, when the folder cannot be written.
     """
-    files = _Files(folder, store, voxel_m)
+    progress = progress or Progress()
+    files = _Files(folder, store, voxel_m, tiled)
     files.write_trajectory()
-    at_once(files.fuse, files.cover)
+    with progress.part("reading the keyframes", 0.7):
+        at_once(partial(files.fuse, progress), files.cover)
     give_back()
     files.write_pieces()
+    progress("writing the files")
     summary = files.summary(extra)
     at_once(partial(files.draw, summary), files.write_cloud)
     failures = files.failures
@@ -108,8 +128,11 @@ def write_deliverables(
 class _Files:
     """The parts of a scan's files, while they are made."""
 
-    def __init__(self, folder: Path, store: ScanStore, voxel_m: float | None) -> None:
-        self._folder, self._store, self._voxel_m = folder, store, voxel_m
+    def __init__(
+        self, folder: Path, store: ScanStore, voxel_m: float | None, tiled: TiledCloud | None
+    ) -> None:
+        self._folder, self._store, self._tiled = folder, store, tiled
+        self._voxel_m = voxel_m or resolution_m(store.header)
         self.failures = Failures(folder)
         self._frame, self._poses = local_frame(store.header), latest(store.poses())
         self._left_out = in_words(store)
@@ -124,20 +147,42 @@ class _Files:
         with self.failures.noted(CSV), writing(self._folder / CSV) as part:
             part.write_text(csv_table(self._poses), encoding="utf-8")
 
-    def fuse(self) -> None:
+    def fuse(self, progress: Progress) -> None:
         """Make the cloud and its surface."""
+        cell_m = None
         with self.failures.noted(CLOUD):
-            size = self._voxel_m or _resolution_m(self._store.header)
-            self._fused = fused_cloud(self._store, size)
+            if self._tiled is None:
+                self._fused = fused_cloud(self._store, self._voxel_m, progress)
+            else:
+                cell_m = preview_cell_m(self._tiled.bounds, self._tiled.voxel_m)
+                self._fused = self._written(self._tiled, cell_m)
         with self.failures.noted(PREVIEW):
-            self._raster = surface(self._fused)
+            self._raster = surface(self._fused, cell_m)
+
+    def _written(self, tiled: TiledCloud, cell_m: float) -> FusedCloud:
+        """Write the cloud tile by tile; of its points those that the preview shows."""
+        kept, count = [], 0
+
+        def parts() -> Iterator[LazPart]:
+            nonlocal count
+            for part in tiled.parts:
+                kept.append(thinned(part[0], cell_m))
+                count += len(part[0])
+                yield part
+
+        with writing(self._folder / CLOUD) as part:
+            write_laz(part, parts(), self._frame, self._store.header.started_unix_ns)
+        return FusedCloud(
+            joined(kept), tiled.voxel_m, tiled.ground_sample_m, tiled.keyframes, tiled.points_in,
+            points_out=count,
+        )  # fmt: skip
 
     def write_pieces(self) -> None:
         """Write each unconnected stretch as a cloud about its first camera."""
         for n, piece in enumerate(pieces_apart(self._store), 1):
             name = PIECE.format(n)
             with self.failures.noted(name):
-                fused = fused_cloud(piece, self._voxel_m or _resolution_m(self._store.header)).cloud
+                fused = fused_cloud(piece, self._voxel_m).cloud
                 first = piece.keyframe(piece.own[0])
                 if first is None or not len(fused):
                     continue
@@ -169,7 +214,7 @@ class _Files:
         return out
 
     def write_cloud(self) -> None:
-        if self._fused is not NOTHING:
+        if self._fused is not NOTHING and self._tiled is None:
             with self.failures.noted(CLOUD), writing(self._folder / CLOUD) as part:
                 started = self._store.header.started_unix_ns
                 write_laz(part, [(self._fused.cloud, None, None)], self._frame, started)
@@ -234,7 +279,7 @@ def _stages(folder: Path, store: ScanStore) -> bytes | None:
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
 
 
-def _resolution_m(header: ScanHeader) -> float | None:
+def resolution_m(header: ScanHeader) -> float | None:
     """``scan.resolution_m`` of the scan's configuration; None when it is automatic."""
     section = header.configuration.get("scan", {})
     value = section.get("resolution_m") if isinstance(section, dict) else None
@@ -243,19 +288,26 @@ def _resolution_m(header: ScanHeader) -> float | None:
     return float(value)
 
 
-def surface(fused: FusedCloud, max_cells: float = PREVIEW_CELLS) -> Raster | None:
+def surface(fused: FusedCloud, cell_m: float | None = None) -> Raster | None:
     """The upper surface in the scan's own ENU metres, or None without points.
 
-    Cells are the voxels, doubled until there are at most ``max_cells`` in the rectangle.
+    Cells are by default as of :func:`preview_cell_m`.
     """
     if not len(fused.cloud):
         return None
     xy = fused.cloud.xyz_m[:, :2].astype(np.float64)
-    cell = fused.voxel_m
-    span = np.array([np.ptp(c) for c in xy.T])  # one axis after the other takes a tenth of the time
-    while float(np.prod(span / cell + 2.0)) > max_cells:
-        cell *= 2.0
-    return rasterise(fused.cloud, grid_over(xy, cell, margin_cells=1))
+    ends = [(c.min(), c.max()) for c in xy.T]  # one axis after the other takes a tenth of the time
+    (west, east), (south, north) = ends
+    cell_m = cell_m or preview_cell_m((west, south, east, north), fused.voxel_m)
+    return rasterise(fused.cloud, grid_over(xy, cell_m, margin_cells=1))
+
+
+def preview_cell_m(bounds: Box, voxel_m: float) -> float:
+    """The voxel, doubled until at most PREVIEW_CELLS cover the rectangle."""
+    west, south, east, north = bounds
+    while ((east - west) / voxel_m + 2.0) * ((north - south) / voxel_m + 2.0) > PREVIEW_CELLS:
+        voxel_m *= 2.0
+    return voxel_m
 
 
 def _summary(
@@ -299,7 +351,7 @@ def _summary(
         "software": header.software,
         "counts": {
             "keyframes": fused.keyframes,
-            "points": len(fused.cloud),
+            "points": len(fused.cloud) if fused.points_out is None else fused.points_out,
             "points_before_fusion": fused.points_in,
             "poses": len(poses),
         },

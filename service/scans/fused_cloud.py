@@ -56,6 +56,7 @@ class FusedCloud:
     keyframes: int
     points_in: int
     notes: tuple[str, ...] = ()
+    points_out: int | None = None  # where ``cloud`` is only a sample of them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,6 +218,27 @@ def las_header(
 
 LazPart = tuple[PointCloud, F64 | None, U8 | None]
 """Points, their places (N, 3) in UTM where known, and their classes of LAS 1.4 where classified."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TiledCloud:
+    """A fused cloud that is read tile by tile, and its statistics as in :class:`FusedCloud`."""
+
+    parts: Iterable[LazPart]
+    voxel_m: float
+    ground_sample_m: float
+    keyframes: int
+    points_in: int
+    bounds: Box  # of the site, m
+
+
+def thinned(cloud: PointCloud, cell_m: float) -> PointCloud:
+    """The highest point of each cell of the ground plan."""
+    col, row = np.floor(cloud.xyz_m[:, :2] / cell_m).astype(np.int64).T
+    order = np.lexsort((-cloud.xyz_m[:, 2], row, col))
+    is_lower = np.zeros(len(cloud), np.bool_)
+    is_lower[order[1:]] = (np.diff(col[order]) == 0) & (np.diff(row[order]) == 0)
+    return without(cloud, is_lower)
 
 
 def write_laz(

@@ -34,8 +34,8 @@ from service.offline.site import SITE
 from service.offline.site.gather import Member, gather
 from service.offline.site.start import SIGMA_SCALE as START_SCALE
 from service.offline.site.start import Start, start_of
+from service.offline.tiles import TILE_POINTS
 from service.progress import Progress
-from service.scans.folder import write_deliverables
 from service.scans.track import local_frame
 from service.scans.writing import writing
 from service.stream.records import Repose
@@ -76,35 +76,49 @@ class AlignedSite:
 def align_site(
     folders: Sequence[Path], out: Path, deliver: bool = True,
     starts: Mapping[Path, Start] | None = None, progress: Progress | None = None,
+    tile_points: int = TILE_POINTS, scheduler: str | None = None,
 ) -> AlignedSite:  # fmt: skip
     """Gather the scans into the folder ``out``, align them, and write the site's files.
 
     The scans of a site that lies there already come first; its earlier alignments stay listed.
-    ``starts`` place scans without georeference, by their folders. Waits while another process
+    ``starts`` place scans without georeference, by their folders; ``tile_points`` and
+    ``scheduler`` are those of an export. Waits while another process
     aligns this site.
     Raises InputError for scans that make no site, and when ``out`` holds anything else.
     """
     _known(out)
-    out.mkdir(parents=True, exist_ok=True)
+    progress = progress or Progress()
     with _locked(out):
-        return _align(folders, out, deliver, starts or {}, progress or Progress())
+        site = _align(folders, out, starts or {}, progress)
+        if deliver:
+            from service.offline.site.files import write_files
+
+            write_files(out, tile_points, scheduler, progress)
+    return site
 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder, when it is free."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
+    """Hold the lock of a folder, when it is free; the folder is made."""
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        with contextlib.ExitStack() as stack:
+            try:
+                handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+                stack.callback(os.close, handle)
+                fcntl.flock(handle, fcntl.LOCK_EX)
+                is_there = os.path.samestat(os.fstat(handle), os.stat(folder))
+            except FileNotFoundError:
+                is_there = False
+            if is_there:
+                yield
+                return
+            # The process that held the lock has removed the folder.
 
 
 def _align(
-    folders: Sequence[Path], out: Path, deliver: bool, starts: Mapping[Path, Start],
-    progress: Progress,
-) -> AlignedSite:  # fmt: skip
+    folders: Sequence[Path], out: Path, starts: Mapping[Path, Start], progress: Progress
+) -> AlignedSite:
     known = _known(out)
     earlier = [Path(s["folder"]) for s in known.get("scans", [])]
     gone = [f for f in earlier if not (f / "scan.db").is_file()]
@@ -136,9 +150,6 @@ def _align(
         _remove(fresh)
         if not any(out.iterdir()):
             out.rmdir()
-    if deliver:
-        with ScanStore.open(out / "scan.db") as store:
-            write_deliverables(out, store, {})
     return AlignedSite(out, members, found, document)
 
 

@@ -33,10 +33,10 @@ from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.geopackage import points, polygons, write_layers
 from service.offline.site.alignment import AlignedSite, align_site
 from service.offline.site.change_page import draw_outlines, drawn, page, place_in, shape_of
+from service.offline.site.files import write_files
 from service.offline.site.gather import Member, Part
 from service.offline.tiles import TILE_POINTS, Tile, grown, run_tiles
 from service.progress import Progress
-from service.scans.folder import write_deliverables
 from service.scans.fused_cloud import fused_cloud, placed
 from service.scans.track import local_frame
 from service.scans.writing import writing
@@ -122,7 +122,7 @@ def compare(
     hide_changed(out / "scan.db", site.members[one], out / CHANGE_TIF)
     with ScanStore.open(out / "scan.db") as store:
         store.update_header(notes=(*store.header.notes, document["in_words"]))
-        write_deliverables(out, store, {})
+    write_files(out, tile_points, scheduler)
     return document
 
 
