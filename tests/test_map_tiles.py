@@ -200,6 +200,24 @@ def test_tilejson_and_kml_say_where_the_tiles_are(client: Client) -> None:
     assert low[0] <= west and low[1] <= south and high[2] >= east and high[3] >= north
 
 
+def test_wmts_shows_the_house_to_gdal(client: Client) -> None:
+    """GDAL's WMTS driver reads the capabilities and fetches the tiles that they name."""
+    rasterio = pytest.importorskip("rasterio")
+    status, text, headers = client.ask(f"{TILES}/wmts.xml")
+    assert status == 200 and headers["content-type"].startswith("application/xml")
+    name = {"o": "http://www.opengis.net/ows/1.1", "w": "http://www.opengis.net/wmts/1.0"}
+    layers = ElementTree.fromstring(text).findall("w:Contents/w:Layer/o:Identifier", name)
+    assert [one.text for one in layers] == ["ortho", "dsm", "contours", "coverage"]
+    address = f"WMTS:{client.base}{TILES}/wmts.xml,layer=ortho"
+    lat, lon, _ = FRAME.to_geodetic(np.array([[*ROOF, 0.0]]))[0]
+    with rasterio.open(address) as map_:
+        assert map_.crs.to_epsg() == 3857
+        row, col = map_.index(*TO_MERCATOR.transform(lon, lat))
+        window = rasterio.windows.Window(col - 1, row - 1, 3, 3)
+        shown = map_.read(window=window)[:, 1, 1]
+    assert np.abs(shown[:3].astype(int) - ROOF_BGR[::-1]).max() < 12 and shown[3] == 255
+
+
 @pytest.mark.parametrize(
     "path",
     [
@@ -209,6 +227,7 @@ def test_tilejson_and_kml_say_where_the_tiles_are(client: Client) -> None:
         f"{TILES}/secret/1/0/0.png",
         f"{TILES}/secret.json",
         "/tiles/drone-1/none/ortho/1/0/0.png",
+        "/tiles/drone-1/none/wmts.xml",
         "/tiles/..%2f/test-1/ortho.json",
         "/tiles/basemap.json",
         "/tiles/basemap/0/0/0",

@@ -1,4 +1,4 @@
-"""Maps of a scan over HTTP: XYZ tiles in Web Mercator, TileJSON, KML.
+"""Maps of a scan over HTTP: XYZ tiles in Web Mercator, TileJSON, WMTS, KML.
 
 A layer comes from the exported raster where that is newer than the scan's other files, else from
 the keyframes as they arrive.
@@ -48,6 +48,7 @@ SMOOTH_PX = 1.5
 CONTOUR_PX = 4.0
 """Interval of contours in pixels on the ground, rounded up to 1, 2 or 5 times a power of ten."""
 
+BOUNDS = ("west", "south", "east", "north")
 KML_TILES = 4
 REFRESH_S = 2
 FRESH = {"cache-control": "max-age=1"}
@@ -61,6 +62,7 @@ def map_routes() -> list[Route]:
     return [
         Route(one + ".json", _tile_json),
         Route(one + ".kml", _kml),
+        Route("/tiles/{drone}/{scan}/wmts.xml", _wmts),
         Route(one + "/{z:int}/{x:int}/{y:int}.png", _tile),
         Route("/tiles/basemap.json", _basemap_json),
         Route("/tiles/basemap/{z:int}/{x:int}/{y:int}", _basemap),
@@ -277,6 +279,59 @@ def _tile_json_of(request: Request) -> Response:
 
 def _path(folder: Path, layer: str) -> str:
     return f"tiles/{folder.parent.name}/{folder.name}/{layer}"
+
+
+SCALE = 559082264.0287178
+"""Denominator of the scale of zoom 0: pixels of 0.28 mm (OGC 07-057r7, annex E.4)."""
+
+WMTS = (
+    '<?xml version="1.0" encoding="UTF-8"?>\n<Capabilities version="1.0.0" '
+    'xmlns="http://www.opengis.net/wmts/1.0" xmlns:ows="http://www.opengis.net/ows/1.1" '
+    'xmlns:xlink="http://www.w3.org/1999/xlink"><ows:ServiceIdentification>'
+    "<ows:Title>{title}</ows:Title><ows:ServiceType>OGC WMTS</ows:ServiceType>"
+    "<ows:ServiceTypeVersion>1.0.0</ows:ServiceTypeVersion></ows:ServiceIdentification>"
+    "<Contents>{layers}<TileMatrixSet><ows:Identifier>GoogleMapsCompatible</ows:Identifier>"
+    "<ows:SupportedCRS>urn:ogc:def:crs:EPSG::3857</ows:SupportedCRS><WellKnownScaleSet>"
+    "urn:ogc:def:wkss:OGC:1.0:GoogleMapsCompatible</WellKnownScaleSet>{zooms}</TileMatrixSet>"
+    '</Contents><ServiceMetadataURL xlink:href="{own}"/></Capabilities>\n'
+)
+WMTS_LAYER = (
+    "<Layer><ows:Title>{name}</ows:Title><ows:WGS84BoundingBox><ows:LowerCorner>{west:.8f} "
+    "{south:.8f}</ows:LowerCorner><ows:UpperCorner>{east:.8f} {north:.8f}</ows:UpperCorner>"
+    "</ows:WGS84BoundingBox><ows:Identifier>{name}</ows:Identifier><Style isDefault="
+    '"true"><ows:Identifier>default</ows:Identifier></Style><Format>image/png</Format>'
+    "<TileMatrixSetLink><TileMatrixSet>GoogleMapsCompatible</TileMatrixSet></TileMatrixSetLink>"
+    '<ResourceURL format="image/png" resourceType="tile" template='
+    '"{tiles}/{name}/{{TileMatrix}}/{{TileCol}}/{{TileRow}}.png"/></Layer>'
+)
+WMTS_ZOOM = (
+    "<TileMatrix><ows:Identifier>{z}</ows:Identifier><ScaleDenominator>{scale!r}"
+    "</ScaleDenominator><TopLeftCorner>{left!r} {top!r}</TopLeftCorner><TileWidth>{side}"
+    "</TileWidth><TileHeight>{side}</TileHeight><MatrixWidth>{n}</MatrixWidth>"
+    "<MatrixHeight>{n}</MatrixHeight></TileMatrix>"
+)
+
+
+async def _wmts(request: Request) -> Response:
+    """All layers of a scan as WMTS 1.0.0 capabilities, whose tiles are the XYZ ones."""
+    return await run_in_threadpool(_wmts_of, request)
+
+
+def _wmts_of(request: Request) -> Response:
+    state, folder = state_of(request), state_of(request).library.folder(*names_of(request))
+    with state.maps.lock:
+        bounds = dict(zip(BOUNDS, _bounds(state.maps.of(folder)), strict=True))
+    tiles = escape(f"{request.base_url}tiles/{folder.parent.name}/{folder.name}")
+    layers = "".join(WMTS_LAYER.format(name=name, tiles=tiles, **bounds) for name in LAYERS)
+    corner = {"left": -0.5 * EQUATOR_M, "top": 0.5 * EQUATOR_M, "side": SIDE}
+    zooms = "".join(
+        WMTS_ZOOM.format(z=z, scale=SCALE / (1 << z), n=1 << z, **corner)
+        for z in range(MAX_ZOOM + 1)
+    )
+    text = WMTS.format(
+        title=escape(folder.name), layers=layers, zooms=zooms, own=f"{tiles}/wmts.xml"
+    )
+    return Response(text, media_type="application/xml", headers=NOW)
 
 
 async def _kml(request: Request) -> Response:
