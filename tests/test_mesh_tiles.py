@@ -316,3 +316,32 @@ def test_the_mesh_lies_on_the_globe_as_3d_tiles(tmp_path: Path, house: HouseFlig
         enu = LocalFrame(*house.origin).to_enu(np.column_stack([lat, lon, height]))
         assert np.abs(enu - up).max() < 1e-3
         assert up[:, 2].max() == pytest.approx(6.0, abs=0.5)  # the roof
+
+
+def test_the_mesh_as_obj_lies_in_its_utm_zone_with_its_texture(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    """Read by trimesh: vertices plus the offset, by PROJ, and uv are those of the glTF."""
+    trimesh = pytest.importorskip("trimesh")
+    from pyproj import CRS, Transformer
+
+    house.flown(tmp_path).close()
+    options = ExportOptions(voxel_m=0.3, stored=True)
+    with ScanView(tmp_path, 0.3) as scan:
+        folder = export(scan, "obj", None, options)
+        glb = export(scan, "glb", None, options)
+    read = trimesh.load(folder / "mesh.obj", force="mesh", process=False)
+    offset = np.array((folder / "mesh_offset.xyz").read_text().split(), float)
+    utm = CRS.from_wkt((folder / "mesh.prj").read_text())
+    lon, lat = Transformer.from_crs(utm, 4326, always_xy=True).transform(
+        *(read.vertices + offset)[:, :2].T
+    )
+    height = read.vertices[:, 2] + offset[2]
+    enu = LocalFrame(*house.origin).to_enu(np.column_stack([lat, lon, height]))
+    should = trimesh.load(glb, force="mesh", process=False)
+    up = np.column_stack([should.vertices[:, 0], -should.vertices[:, 2], should.vertices[:, 1]])
+    middle, faces = enu[read.faces].mean(axis=1), up[should.faces].mean(axis=1)
+    assert middle.shape == faces.shape and np.abs(middle - faces).max() < 2e-3
+    assert read.visual.material.image.size == should.visual.material.baseColorTexture.size
+    uv, uv_glb = (m.visual.uv[m.faces].mean(axis=1) for m in (read, should))
+    assert np.abs(uv - uv_glb).max() < 1e-5

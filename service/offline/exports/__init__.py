@@ -41,6 +41,7 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
         "Textured mesh, 3D Tiles 1.1.",
     ),
     "glb": ("model:write_glb", "mesh.glb", "Textured mesh, binary glTF."),
+    "obj": ("model:write_obj", "mesh-obj", "Textured mesh, OBJ, UTM less an offset."),
     "all": ("maps:write_all", "maps", "Clouds and maps with a manifest, one folder."),
     "mcap": ("recording:write_mcap", "flight.mcap", "Recording for Foxglove."),
     "ros2": ("ros2:write_ros2", "ros2.mcap", "Recording for ROS 2 (CDR)."),

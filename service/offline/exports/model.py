@@ -1,4 +1,4 @@
-"""The textured mesh of a scan as binary glTF, or as 3D Tiles 1.1 of it, placed on the globe."""
+"""The textured mesh of a scan as binary glTF, as 3D Tiles 1.1 of it, or as OBJ in its UTM zone."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from recon.surface.meshing import Mesh
 from recon.types import F64, U8
 from service.errors import InputError
-from service.georeference import LocalFrame
+from service.georeference import LocalFrame, map_crs
 from service.offline.exports.flight import writing_folder
 from service.offline.exports.images import check_video, recording_of
 from service.offline.exports.mesh_tiles import MARGIN_VOXELS, TileJob, TilePart, mesh_tile
@@ -280,3 +280,44 @@ def on_globe(frame: LocalFrame) -> F64:
     out[:3, :3] = (placed[1:] - placed[0]).T / SPAN_M
     out[:3, 3] = placed[0]
     return out
+
+
+def write_obj(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """A folder with ``mesh.obj``, its material and its JPEG textures; z is up.
+
+    Coordinates are UTM metres and heights less the whole metres in ``mesh_offset.xyz``, because
+    many readers keep single precision; ``mesh.prj`` is the coordinate system. Without a
+    georeference they are ENU metres.
+    """
+    parts, _ = mesh_parts(scan, default_mesh(options), options)
+    frame = scan.frame
+    places = [
+        p.mesh.vertices_m if frame is None else frame.to_utm(p.mesh.vertices_m) for p in parts
+    ]
+    offset_m = np.zeros(3) if frame is None else np.floor(places[0].min(axis=0))
+    materials, first = [], 1
+    with writing_folder(out) as folder:
+        with open(folder / "mesh.obj", "w", encoding="ascii") as file:
+            file.write("mtllib mesh.mtl\n")
+            for number, (part, xyz_m) in enumerate(zip(parts, places, strict=True)):
+                name = f"texture{number}"
+                file.write(f"o surface{number}\nusemtl {name}\n")
+                _write_object(file, part.mesh, xyz_m - offset_m, first)
+                first += len(xyz_m)
+                materials.append(f"newmtl {name}\nillum 0\nKd 1 1 1\nmap_Kd {name}.jpg\n")
+                (folder / f"{name}.jpg").write_bytes(_jpeg(part.image))
+        (folder / "mesh.mtl").write_text("".join(materials), encoding="ascii")
+        offset = " ".join(f"{v:.0f}" for v in offset_m)
+        (folder / "mesh_offset.xyz").write_text(offset + "\n", encoding="ascii")
+        if frame is not None:
+            wkt = map_crs(frame.epsg).to_wkt("WKT1_ESRI")
+            (folder / "mesh.prj").write_text(wkt + "\n", encoding="ascii")
+
+
+def _write_object(file: TextIO, mesh: Mesh, xyz_m: F64, first: int) -> None:
+    """Vertices, texture coordinates and faces; ``first`` is the number of the first vertex."""
+    assert mesh.uv is not None
+    uv = np.column_stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]])  # v counts upwards
+    np.savetxt(file, xyz_m, "v %.3f %.3f %.3f")
+    np.savetxt(file, uv, "vt %.6f %.6f")
+    np.savetxt(file, np.repeat(mesh.faces + first, 2, axis=1), "f %d/%d %d/%d %d/%d")

@@ -6,12 +6,12 @@ import { jobList } from "./jobs";
 import { vehicleStrip } from "./vehicle";
 
 const KINDS = [
-  "all", "laz", "copc", "ply", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "kmz", "stac", "glb", "3dtiles", "3dtiles-mesh", "geojson", "kml",
+  "all", "laz", "copc", "ply", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "kmz", "stac", "glb", "obj", "3dtiles", "3dtiles-mesh", "geojson", "kml",
   "mcap", "ros2", "refine",
 ];
 
 /** Those whose heights can be converted. */
-const WITH_HEIGHTS = new Set(["laz", "copc", "ply", "dsm", "dtm", "contours", "gpkg", "dxf", "coverage", "all", "3dtiles", "3dtiles-mesh", "geojson"]);
+const WITH_HEIGHTS = new Set(["laz", "copc", "ply", "dsm", "dtm", "contours", "gpkg", "dxf", "coverage", "all", "obj", "3dtiles", "3dtiles-mesh", "geojson"]);
 const DATUMS = ["EGM96", "EGM2008", "ellipsoid"];
 const HEIGHTS: [string, api.Heights][] = [
   ["heights as flown", { vertical_datum: null, to_datum: null }],
