@@ -30,7 +30,10 @@ GRID += [(x, 374) for x in (580, 610, 640, 670, 695)]
 
 
 class WalledFlight(HouseFlight):
-    """The flight, without the rays that would reach the ground through the walls of the house."""
+    """The flight, without the rays that would reach the ground through the walls of the house.
+
+    Next to the walls a few points stand too high, as stereo has them.
+    """
 
     def keyframe(self, seq: int, east_m: float, sigma_m: float = 0.05) -> Keyframe:
         one = super().keyframe(seq, east_m, sigma_m)
@@ -39,6 +42,8 @@ class WalledFlight(HouseFlight):
         x = east_m + (u - self.K[0, 2]) / self.K[0, 0] * depth
         y = -(v - self.K[1, 2]) / self.K[1, 1] * depth
         through = (depth > self.height_m - 1.0) & (self.roof_m(x, y) > 0.0)
+        beside = cv2.dilate(through.astype(np.uint8), np.ones((3, 3))) > 0
+        depth[beside & ~through & (depth > self.height_m - 1.0) & ((u + v) % 4 == 0)] -= 2.5
         return replace(one, fresh=~through)
 
 
@@ -168,7 +173,7 @@ def test_the_volume_of_the_house_its_profile_and_the_way_out(
     x, y = found[:, 0], found[:, 1]
     plan_m2 = abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2.0
     assert abs(ruler.number("Area") - plan_m2) < 0.2
-    assert abs(ruler.number("Volume above") / (12.0 * 8.0 * 6.0) - 1.0) < 0.02
+    assert abs(ruler.number("Volume above") / (12.0 * 8.0 * 6.0) - 1.0) < 0.018
     assert ruler.number("Volume below") < 3.0
 
     with ruler.page.page.expect_download() as download:

@@ -111,7 +111,14 @@ export function volume(places: Vector3[], points: Points): Volume | null {
   return { above_m3: above * per, below_m3: below * per, unseen: unseen / Math.max(1, cells) };
 }
 
-/** The heights with each hole (NaN) filled from the lower half of its border, nearest cell first. */
+const NEAR_CELLS = 8;
+
+/**
+ * The heights with each hole (NaN) filled from the lower half of its border, nearest cell first.
+ *
+ * A cell of the border counts with the median of those near it: the cells next to a wall hold
+ * points that stereo put too high, and a hole would spread them.
+ */
 function withoutHoles(heights: Float64Array, cols: number, rows: number): Float64Array {
   const out = heights.slice();
   const around = (i: number): number[] => {
@@ -130,13 +137,32 @@ function withoutHoles(heights: Float64Array, cols: number, rows: number): Float6
     const hole = spread([first], (i) => Number.isNaN(out[i]!) && !seen[i] && (seen[i] = 1) > 0);
     const border = hole.flatMap(around).filter((i) => !Number.isNaN(out[i]!));
     const [low, high] = border.reduce(([a, b], i) => [Math.min(a!, out[i]!), Math.max(b!, out[i]!)], [Infinity, -Infinity]);
-    spread(border.filter((i) => out[i]! <= (low! + high!) / 2), (i, from) => {
+    const lower = new Set(border.filter((i) => out[i]! <= (low! + high!) / 2));
+    const level = new Map([...lower].map((i) => [i, median(near(i, cols, lower).map((k) => out[k]!))]));
+    spread([...lower], (i, from) => {
       if (!Number.isNaN(out[i]!)) return false;
-      out[i] = out[from]!;
+      out[i] = level.get(from) ?? out[from]!;
       return true;
     });
   }
   return out;
+}
+
+/** Those of the cells that lie within NEAR_CELLS of one, rows and columns. */
+function near(i: number, cols: number, cells: Set<number>): number[] {
+  const found: number[] = [];
+  for (let row = -NEAR_CELLS; row <= NEAR_CELLS; row++)
+    for (let col = -NEAR_CELLS; col <= NEAR_CELLS; col++) {
+      const there = (i % cols) + col;
+      if (there >= 0 && there < cols && cells.has(i + row * cols + col)) found.push(i + row * cols + col);
+    }
+  return found;
+}
+
+function median(values: number[]): number {
+  const sorted = values.sort((a, b) => a - b);
+  const half = sorted.length >> 1;
+  return sorted.length % 2 ? sorted[half]! : (sorted[half - 1]! + sorted[half]!) / 2;
 }
 
 /** Mean heights along the way through the places, of points near it; NaN where there are none. */
