@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.bench import BenchOptions
+from recon.types import DepthMap
+from service.bench import BenchOptions, real
 from service.bench.keyframes import make_keyframe
-from service.bench.real import _apart, run
+from service.bench.real import Flight, _apart, level_ground, run
 from service.errors import InputError
 
 STILLS = sorted((Path(__file__).parents[1] / "demo" / "caliterra" / "frames").glob("*.jpg"))
@@ -52,3 +53,20 @@ def test_a_shifted_surface_shows_as_a_seam() -> None:
     off, sigma = found
     assert np.median(off) == pytest.approx(0.5, abs=0.05)
     assert np.median(sigma) == pytest.approx(np.sqrt(2) * np.nanmedian(depth.sigma_m), rel=0.1)
+
+
+def test_tilts_between_keyframes_are_told_from_the_bend_of_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    K = np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]])
+    level = np.full((90, 120), 80.0, np.float32)
+    maps = []
+    for n in range(6):
+        T = np.diag([1.0, -1, -1, 1])
+        T[:3, 3] = 0.0, 0.0, 80.0 + 2.0 * (n % 2)  # every second keyframe is 2 m too high
+        maps.append(DepthMap(level, 0.1 * level, np.ones_like(level, np.uint8), K, T))
+    monkeypatch.setattr(real, "_maps", lambda flight: maps)
+    figures = {what: value for what, value, _ in level_ground(Flight(tmp_path, "", tmp_path, {}))}
+    assert figures["flat ground, robust sigma about a plane"] == pytest.approx(1 / 0.6745, rel=0.01)
+    assert figures["flat ground, keyframes about their own planes"] == pytest.approx(0.0, abs=1e-6)
+    assert figures["flat ground, slope"] == pytest.approx(0.0, abs=1e-6)

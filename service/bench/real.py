@@ -43,6 +43,7 @@ REVISIT = 6
 SEAM_POINTS, SEAM_PAIRS = 400, 400
 MIN_OVERLAP = 0.2
 MIN_TARGET_DISTANCE_M = 10.0
+MIN_PLANE_POINTS = 30
 BOARD = ("--pattern", "9x6", "--square-m", "0.03")
 
 
@@ -230,26 +231,31 @@ def _off_fixes(
 
 
 def level_ground(flight: Flight) -> Iterator[tuple[str, float, str]]:
-    """Robust distance of points on nearly flat ground from one plane."""
+    """Robust distance of points on nearly flat ground from one plane, and each keyframe's own."""
     points = []
     for depth in _maps(flight):
         known = np.flatnonzero(np.isfinite(depth.depth_m))[::97]
         points.append(se3.transform(depth.T_world_camera, _points(depth, known)))
     if not points:
         return
-    xyz = np.concatenate(points)
+    sigma_m, slope = _off_plane(np.concatenate(points))
+    yield "flat ground, robust sigma about a plane", sigma_m, "m"
+    own = [_off_plane(xyz)[0] for xyz in points if len(xyz) > MIN_PLANE_POINTS]
+    if own:
+        yield "flat ground, keyframes about their own planes", float(np.median(own)), "m"
+    yield "flat ground, slope", slope, "deg"
+
+
+def _off_plane(xyz: F64) -> tuple[float, float]:
+    """Robust sigma in m of the heights of points (N, 3) about a plane, and its slope in degrees."""
     weight = np.ones(len(xyz))
     A = np.c_[xyz[:, :2] - xyz[:, :2].mean(axis=0), np.ones(len(xyz))]
     for _ in range(10):
         plane = np.linalg.lstsq(A * weight[:, None], xyz[:, 2] * weight, rcond=None)[0]
         r = xyz[:, 2] - A @ plane
         weight = 1.0 / (1.0 + (r / (2.0 * np.median(np.abs(r)) + 1e-9)) ** 2)
-    yield (
-        "flat ground, robust sigma about a plane",
-        float(np.median(np.abs(r))) / NORMAL_MEDIAN,
-        "m",
-    )
-    yield "flat ground, slope", float(np.degrees(np.arctan(np.hypot(*plane[:2])))), "deg"
+    slope = float(np.degrees(np.arctan(np.hypot(*plane[:2]))))
+    return float(np.median(np.abs(r))) / NORMAL_MEDIAN, slope
 
 
 def targets(flight: Flight) -> Iterator[tuple[str, float, str]]:
