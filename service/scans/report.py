@@ -38,8 +38,8 @@ STYLE = (
     "figure{margin:14px 0}figcaption{color:#56606a;font-size:13.5px}text{font-size:11px}"
     "@media(max-width:600px){text{font-size:22px}}"
     "@page{margin:14mm}@media print{body{margin:0;max-width:none;padding:0;font-size:12px;"
-    "print-color-adjust:exact}figure,tr,h2,h3{break-inside:avoid}h2,h3{break-after:avoid}"
-    "img,svg{max-height:230mm;width:auto}}"
+    "print-color-adjust:exact}figure,table,tr,h2,h3{break-inside:avoid}h2,h3{break-after:avoid}"
+    "img,svg{max-height:110mm;width:auto}}"
 )
 
 
@@ -230,7 +230,7 @@ def _curve(name: str, t: np.typing.NDArray[Any], values: np.typing.NDArray[Any])
         parts.append(_label(left - 5, at + 4, "end", value))
     for value in _ticks(0.0, span_s, 4):
         at = float(np.interp(value, [0.0, span_s], [left, w - 8]))
-        parts.append(_label(at, h - 4, "middle", value))
+        parts.append(_label(at, h - 4, "middle", value, " s"))
     parts.append(f'<polyline fill="none" stroke="#1a5fd0" points="{points}"/>')
     caption = f"{escape(name)}: {low:.2f} to {high:.2f}, over {span_s:.0f} s"
     svg = f'<svg viewBox="0 0 {w} {h}" width="{w}" height="{h}">{"".join(parts)}</svg>'
@@ -245,8 +245,8 @@ def _ticks(low: float, high: float, count: int) -> list[float]:
     return [float(k * step) for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
-def _label(x: float, y: float, anchor: str, value: float) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{value:.6g}</text>'
+def _label(x: float, y: float, anchor: str, value: float, unit: str = "") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{value:.6g}{unit}</text>'
 
 
 def _rows(values: dict[str, Any], names: Sequence[str]) -> list[tuple[str, str]]:
