@@ -213,8 +213,9 @@ def _sigma(weighted: F64, slope: F64, rest: F64, lasting: int) -> float:
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
-LONGEST_GAP_S = 0.25
-"""Attitudes further apart are not interpolated."""
+MAX_GAP_S = 0.45
+"""Attitudes further apart are not interpolated: a ground station's log has three or four a second,
+and a camera swings at up to 1 Hz."""
 
 FINER = 4
 """Steps from one attitude to the next."""
@@ -281,7 +282,7 @@ def _between(times_s: F64, q: F64, at_s: F64) -> tuple[F64, Bool]:
     gap = times_s[i] - times_s[i - 1]
     u = (at_s - times_s[i - 1]) / np.maximum(gap, 1e-9)
     mixed = q[i - 1] + np.clip(u, 0.0, 1.0)[:, None] * (q[i] - q[i - 1])
-    return mixed, (u > -1e-9) & (u < 1.0 + 1e-9) & (gap < LONGEST_GAP_S)
+    return mixed, (u > -1e-9) & (u < 1.0 + 1e-9) & (gap < MAX_GAP_S)
 
 
 def rotation_vectors(first: F64, second: F64) -> F64:
