@@ -53,14 +53,18 @@ def history_of(gimbal: str, strength: float, config: GimbalConfig | None = None)
 
 
 def fly(
-    check: TelemetryCheck, strength: float = 1.0, noise_rad: float = 5e-4, gap: bool = False
+    check: TelemetryCheck,
+    strength: float = 1.0,
+    noise_rad: float = 5e-4,
+    gap: bool = False,
+    hz: float = 15.0,
 ) -> list[int]:
     """Forty seconds of frames whose stamps are 70 ms late; the times of exposure."""
     rng = np.random.default_rng(2)
     mount = Rotation.from_euler("Y", -math.pi / 3)
     exposed = []
-    for k in range(40 * 15):
-        t = 1.0 + k / 15
+    for k in range(round(40 * hz)):
+        t = 1.0 + k / hz
         noise = Rotation.from_rotvec(rng.normal(0.0, noise_rad, 3))
         T = np.eye(4)
         T[:3, :3] = (body(t, strength) * mount * noise).as_matrix() @ R_GIMBAL_CAMERA
@@ -85,6 +89,20 @@ def test_the_latency_is_shown_and_not_applied_unless_asked(gimbal: str) -> None:
     assert latency["estimate_ms"] == pytest.approx(70.0, abs=10.0)
     assert abs(latency["estimate_ms"] - 70.0) < 3.0 * latency["sigma_ms"]
     assert len(reported) == 1 and reported[0].endswith("by the images, 0 ms is set")
+
+
+def test_stills_show_a_latency_too() -> None:
+    """A still every other second, turned to 0.4 degrees: enough to report, not to apply."""
+    reported: list[str] = []
+    check = TelemetryCheck(CameraConfig(latency="auto"), history_of("none", 1.0), reported.append)
+    fly(check, noise_rad=0.005, hz=0.5)
+    found = check.summary()["camera_latency"]
+    assert abs(found["estimate_ms"] - 70.0) < 3.0 * found["sigma_ms"] < 25.0
+    assert not found["is_settled"] and found["applied_ms"] == 0.0
+    off = found["estimate_ms"] > 5.0 * found["sigma_ms"]
+    assert off and reported == [
+        f"Camera latency {found['estimate_ms']:.0f} ms by the images, 0 ms is set"
+    ]
 
 
 def test_auto_applies_what_was_found_and_keeps_the_frames_in_order() -> None:

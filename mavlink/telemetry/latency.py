@@ -18,12 +18,13 @@ import numpy.typing as npt
 
 from mavlink.telemetry.quaternion import Quaternion, multiply, normalised
 
-MIN_WINDOWS = 50  # non-overlapping
+MIN_WINDOWS, MIN_SPAN_S = 12, 10.0  # non-overlapping, and their time together
+FITTED = 6  # windows that the rotation, the scatter and the time are worth
 MIN_CORRELATION = 0.7
 WINDOW_S = 0.2  # shorter rotations are mostly noise; longer ones hide the latency
 FLOOR_MS = 2.0  # accuracy of exposure times and telemetry stamps
 SETTLED_MS = 5.0  # maximum sigma of an estimate that may be applied
-MAX_SIGMA_MS = 25.0  # maximum sigma of an estimate that is reported
+MAX_SIGMA_MS = 40.0  # maximum sigma of an estimate that is reported
 RIVAL = 1.3  # a second solution, further away than RIVAL_APART_S, must fit worse by this factor
 RIVAL_APART_S = 0.15
 KEPT = 2000
@@ -97,7 +98,8 @@ class LatencyWatch:
         seen = self._turns(track.base_ns, max(WINDOW_S, 2.0 * track.spacing_s))
         inside = (seen.start_s - high > track.first_s) & (seen.end_s - low < track.last_s)
         seen = seen.only(inside)
-        if len(seen) < MIN_WINDOWS * seen.overlap:
+        span_s = float((seen.end_s - seen.start_s).sum()) / seen.overlap
+        if len(seen) < MIN_WINDOWS * seen.overlap or span_s < MIN_SPAN_S:
             return None
         lags = np.arange(low, high + COARSE_S / 2, COARSE_S)
         fits = [_fit(seen, track, float(lag)) for lag in lags]
@@ -185,6 +187,8 @@ def _refine(seen: _Turns, track: Attitudes, lag_s: float) -> LatencyEstimate | N
     slope = (after.ours - before.ours) / (2.0 * FINE_S)
     known = before.known & at.known & after.known
     sigma = _sigma(slope[known] @ weight, slope[known], at.rest[known], 2 * seen.overlap)
+    count = float(known.sum())
+    sigma *= count / max(count - FITTED * seen.overlap, 1.0)
     sigma_ms = float(np.hypot(1e3 * sigma, FLOOR_MS))
     if not sigma_ms <= MAX_SIGMA_MS:
         return None

@@ -7,6 +7,7 @@ the gimbal's frame when ``mavlink.gimbal_yaw_frame`` is "auto".
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -24,9 +25,10 @@ from service.config import CameraConfig
 log = logging.getLogger(__name__)
 
 LOOK_NS = 10_000_000_000
-REACH_NS = 60_000_000_000  # how far back telemetry is compared with frames
+REACH_NS = 60_000_000_000  # how far back telemetry is compared with frames, at least
 SLEW = 0.1  # of the time that passes, so that frames stay in order when the latency changes
-WORTH_TELLING_MS = 10.0
+WORTH_TELLING_MS, OFF_SIGMAS = 10.0, 5.0  # a latency that differs by less is not reported
+STILLS = 60  # images that are compared, where they come more slowly than REACH_NS holds
 
 
 class TelemetryCheck:
@@ -52,6 +54,7 @@ class TelemetryCheck:
         self._frames = None if history is None or self._fixed else FrameWatch(history)
         self._last: tuple[int, int, F64] | None = None  # stamp, segment, R_odom_camera
         self._seen_ns: int | None = None
+        self._stamps: deque[int] = deque(maxlen=STILLS)
         self._next_ns: int | None = None
 
     # ---- the latency in force ------------------------------------------------------------
@@ -83,6 +86,7 @@ class TelemetryCheck:
         """Add a frame's pose by vision, at its stamp; evaluate all of them now and then."""
         if self._history is None or tracked.state is Tracking.SKIPPED:
             return
+        self._stamps.append(stamp_ns)
         T = tracked.T_odom_camera
         last, self._last = self._last, None
         if T is not None:
@@ -109,27 +113,27 @@ class TelemetryCheck:
             self._look(self._history, self._seen_ns)
 
     def _look(self, history: VehicleHistory, now_ns: int) -> None:
-        since_ns = now_ns - REACH_NS
+        since_ns = min(now_ns - REACH_NS, *self._stamps)
         if self._fixed:
             bodies = [(t, sample.q_ned_body) for sample, t in history.attitudes()]
             found = self._turns.estimate([body for body in bodies if body[0] >= since_ns])
         else:
             found = self._turns.estimate(history.heads(since_ns))
         self.latency = found or self.latency
-        if found is not None and found.is_settled:
-            self._tell_latency(found)
+        if found is not None:
+            self._report_latency(found)
         if self._frames is not None:
             settled = self.latency is not None and self.latency.is_settled
             latency = self.latency.latency_ms if settled and self.latency else self.applied_ms
             self.frame = self._frames.verdict(latency) or self.frame
             self._judge_frame(history)
 
-    def _tell_latency(self, found: LatencyEstimate) -> None:
+    def _report_latency(self, found: LatencyEstimate) -> None:
         text = f"Camera latency {found.latency_ms:.0f} ms by the images"
         off_ms = abs(found.latency_ms - self.applied_ms)
-        if self._camera.latency == "auto":
+        if self._camera.latency == "auto" and found.is_settled:
             self._once("latency", f"{text}: applied")
-        elif off_ms > max(WORTH_TELLING_MS, 3.0 * found.sigma_ms):
+        elif off_ms > max(WORTH_TELLING_MS, OFF_SIGMAS * found.sigma_ms):
             self._once("latency", f"{text}, {self.applied_ms:.0f} ms is set")
 
     def _judge_frame(self, history: VehicleHistory) -> None:
