@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import av
 import cv2
@@ -13,11 +15,15 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.logs import TelemetryLog
 from recon.types import F64, U8, Camera
 from service.cameras import open_camera
 from service.cameras.exif import read_tags
 from service.cameras.lens import SIGMA_FOCAL, Lens, fitted, turned
+from service.cameras.source import CameraSource
 from service.cli import app
+from service.commands.replay import _assumed_camera
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 DEWARP = "2020-05-27;3666.66,3665.99,-27.8,30.0,-0.269,0.112,0.0003,-0.0001,-0.033"
@@ -205,6 +211,25 @@ def test_another_zoom_is_left_out(tmp_path: Path) -> None:
     source = open_camera(str(tmp_path))
     assert [frame.name for frame in source] == ["0.jpg", "1.jpg", "3.jpg"]
     assert any("focal length" in warning for warning in source.warnings)
+
+
+@pytest.mark.parametrize(
+    ("focal_35mm", "fx_px", "of"),
+    [
+        (None, 960 / math.tan(math.radians(35.0)), "70 degrees"),
+        (48.0, 48 * 1.25 / 43.2666 * 1920, "48 mm"),
+    ],
+)
+def test_a_video_without_a_model_has_the_lens_of_its_telemetry(
+    focal_35mm: float | None, fx_px: float, of: str
+) -> None:
+    log = TelemetryLog(VehicleHistory(), "video", 0, 1, (), {}, focal_35mm)
+    notes: list[str] = []
+    source = SimpleNamespace(size_px=(1920, 1080))
+    camera = _assumed_camera(cast(CameraSource, source), log, notes)
+    assert camera.K[0, 0] == pytest.approx(fx_px, rel=1e-4)
+    assert camera.K[:2, 2] == pytest.approx((959.5, 539.5)) and not camera.distortion.any()
+    assert len(notes) == 1 and of in notes[0]
 
 
 def test_a_video_is_turned_as_it_asks_players_to(tmp_path: Path) -> None:

@@ -365,6 +365,10 @@ SRT = {
         "1\n00:00:00,000 --> 00:00:01,000\n2022.06.21 16:06:17\n"
         "GPS(-34.2300,-58.8500,0.0M) BAROMETER:85.8M\n\n"
     ),
+    "mavic of 2017": (
+        "1\n00:00:00,000 --> 00:00:01,000\nHOME(-58.85,-34.23) 2017.8.5 14:11:51\n"
+        "GPS(-58.8500,-34.2300,16) Hb:85.8 Hs:1.9\nISO:100 TV:60 EV: 0 IR:F2.8\n\n"
+    ),
 }
 
 
@@ -379,7 +383,7 @@ def test_subtitles_of_several_drones(tmp_path: Path, layout: str) -> None:
     assert state.lat_deg == pytest.approx(-34.23) and state.lon_deg == pytest.approx(-58.85)
     assert state.alt_agl_m == pytest.approx(85.8)
     assert state.alt_amsl_m == (pytest.approx(210.5) if layout == "mavic" else None)
-    if layout != "matrice":
+    if layout in ("phantom", "mavic"):
         assert state.q_ned_gimbal_wxyz is not None
         q = quaternion.from_rpy(0.0, math.radians(-24.4), math.radians(110.4))
         assert angle(state.q_ned_gimbal_wxyz, q) < 1e-6
@@ -387,6 +391,47 @@ def test_subtitles_of_several_drones(tmp_path: Path, layout: str) -> None:
         assert state.q_ned_body_wxyz is not None
         q = quaternion.from_rpy(*map(math.radians, (-7.0, 2.7, 110.1)))
         assert angle(state.q_ned_body_wxyz, q) < 1e-6
+
+
+def cue(number: int, text: str) -> str:
+    start, end = number * 40, number * 40 + 40
+    return f"{number + 1}\n00:00:00,{start:03d} --> 00:00:00,{end:03d}\n{text}\n\n"
+
+
+def test_subtitles_of_a_drone_without_a_position_give_its_height(tmp_path: Path) -> None:
+    lost = "[latitude: 0.000000] [longitude: 0.000000] [rel_alt: 30.000 abs_alt: 269.1]"
+    found = "[latitude: 45.0] [longitude: 13.0] [rel_alt: 30.000 abs_alt: 269.1]"
+    path = tmp_path / "flight.SRT"
+    path.write_text("".join(cue(n, found if n > 2 else lost) for n in range(5)))
+    log = load_telemetry(path)
+    assert log.warnings == ("3 cues without a position",)
+    for time_ns in (0, 40_000_000, 100_000_000):  # the last between a cue without and one with
+        state = log.history.state_at(time_ns)
+        assert state is not None and state.lat_deg is None and state.alt_amsl_m is None
+        assert state.alt_agl_m == pytest.approx(30.0)
+    state = log.history.state_at(150_000_000)
+    assert state is not None and state.lat_deg == pytest.approx(45.0)
+
+
+@pytest.mark.parametrize(
+    ("focals", "median_mm", "zooms"),
+    [
+        (("240", "240", "240"), 24.0, False),
+        (("24.00", "24.00", "24.00"), 24.0, False),
+        (("162.00",) * 3, 162.0, False),
+        (("240", "240", "480"), 24.0, True),
+        (("0", "0", "0"), None, False),
+    ],
+)
+def test_subtitles_give_the_focal_length(
+    tmp_path: Path, focals: tuple[str, ...], median_mm: float | None, zooms: bool
+) -> None:
+    place = "[latitude: 45.0] [longitude: 13.0] [rel_alt: 30.0]"
+    path = tmp_path / "flight.SRT"
+    path.write_text("".join(cue(n, f"[focal_len : {f}] {place}") for n, f in enumerate(focals)))
+    log = load_telemetry(path)
+    assert log.focal_35mm == median_mm
+    assert any("zooms between 24 and 48 mm" in warning for warning in log.warnings) == zooms
 
 
 @pytest.mark.parametrize("name", ["p4_rtk.SRT", "mavic_air2.srt", "matrice_300.srt"])

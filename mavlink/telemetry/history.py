@@ -321,7 +321,8 @@ class VehicleHistory:
             return None
         accuracy = self._accuracy.around(state.time_ns, ACCURACY_GAP_NS, ACCURACY_GAP_NS)
         nearest = None if accuracy is None else accuracy.nearer
-        if nearest is not None and not nearest[0]:
+        is_placed = math.isfinite(at.before[0] + at.after[0])
+        if not is_placed or (nearest is not None and not nearest[0]):
             return at  # no fix: the estimated position is too uncertain for a tag
         sigma_h, sigma_v = RECEIVER_SIGMA_H_M, RECEIVER_SIGMA_V_M
         if nearest is not None:

@@ -44,7 +44,7 @@ class AttitudeSample(Sample):
 class PositionSample(Sample):
     """The estimator's position."""
 
-    lat_deg: float
+    lat_deg: float  # NaN, like the longitude: only the height above home is known
     lon_deg: float
     alt_amsl_m: float | None
     relative_alt_m: float | None  # above home

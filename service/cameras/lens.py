@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -164,12 +164,16 @@ def _full_frame(photo: Mapping[int, Any], size_px: tuple[int, int]) -> Lens | No
     focal = _number(photo.get(41989))
     if focal is None:
         return None
-    aspect = max(size_px) / min(size_px)
-    aspect = min(aspect, _sensor_aspect(focal, _number(photo.get(37386))))
+    lens = by_full_frame(focal, size_px, _sensor_aspect(focal, _number(photo.get(37386))))
+    return replace(lens, source="the 35 mm equivalent in EXIF")
+
+
+def by_full_frame(focal_mm: float, size_px: tuple[int, int], sensor_aspect: float = 4 / 3) -> Lens:
+    """The lens of a 35 mm equivalent in whole mm, for images as wide as the sensor or narrower."""
+    aspect = min(max(size_px) / min(size_px), sensor_aspect)
     share = math.hypot(1.0, 1.0 / aspect) / DIAGONAL_35MM
-    rounded = 0.5 / math.sqrt(3.0) / focal  # whole millimetres
-    sigma = math.hypot(SIGMA_FOCAL, rounded)
-    return Lens(focal * share, source="the 35 mm equivalent in EXIF", sigma_focal=sigma)
+    rounded = 0.5 / math.sqrt(3.0) / focal_mm
+    return Lens(focal_mm * share, sigma_focal=math.hypot(SIGMA_FOCAL, rounded))
 
 
 def _sensor_aspect(full_frame_mm: float, focal_mm: float | None) -> float:

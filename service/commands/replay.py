@@ -145,7 +145,7 @@ def _replay(
     else:
         camera, assumed = _tagged_camera(source, notes)
     if camera is None:
-        camera, assumed = _assumed_camera(source, notes), ("lens",)
+        camera, assumed = _assumed_camera(source, log, notes), ("lens",)
     camera, config = _with_stated_readout(camera, config, video, source, notes)
     epoch_ns = _epoch(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
@@ -301,20 +301,21 @@ def _own_lens(source: CameraSource, config: Config) -> Camera | None:
     return lens_by_stills(source, source.camera, config)
 
 
-def _assumed_camera(source: CameraSource, notes: list[str]) -> Camera:
-    """A pinhole of 70 degrees, with a note."""
-    import numpy as np
+def _assumed_camera(source: CameraSource, log: TelemetryLog | None, notes: list[str]) -> Camera:
+    """A lens without distortion, of the log's focal length or of 70 degrees, with a note."""
+    import math
 
-    from recon.types import Camera
+    from service.cameras.lens import Lens, by_full_frame
 
-    W, H = source.size_px
-    f = max(W, H) / 2 / np.tan(np.radians(35.0))
+    lens, of = Lens(0.5 / math.tan(math.radians(35.0))), "70 degrees"
+    if log is not None and log.focal_35mm is not None:
+        lens = by_full_frame(log.focal_35mm, source.size_px)
+        of = f"{log.focal_35mm:.0f} mm (35 mm equivalent in the telemetry)"
     notes.append(
-        "no camera model given: a lens of 70 degrees without distortion is assumed; "
+        f"no camera model given: a lens of {of} without distortion is assumed; "
         "make one with 'skyrelief calibrate' for true shapes"
     )
-    K = np.array([[f, 0.0, (W - 1) / 2], [0.0, f, (H - 1) / 2], [0.0, 0.0, 1.0]])
-    return Camera(K, np.zeros(5), (W, H))
+    return lens.camera(source.size_px)
 
 
 def _epoch(

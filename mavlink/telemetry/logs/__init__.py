@@ -29,6 +29,7 @@ class TelemetryLog:
     last_ns: int
     warnings: tuple[str, ...]
     counts: Mapping[str, int]  # messages by name, skipped_bytes, bad_checksums
+    focal_35mm: float | None = None  # the camera's, as the 35 mm equivalent in mm
 
 
 def load_telemetry(path: str | Path, config: HistoryConfig | None = None) -> TelemetryLog:

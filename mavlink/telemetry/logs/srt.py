@@ -3,7 +3,9 @@
 The times are the video's own presentation times: the dates in these files are local time of
 an unknown zone. Several layouts are read: ``[latitude: ..] [longitude: ..] [rel_alt: ..
 abs_alt: ..]`` with optional ``[gb_yaw: .. gb_pitch: .. gb_roll: ..]``; ``GPS (lon, lat, n)``
-with ``H`` and ``F.PRY``, ``G.PRY``; ``GPS(lat,lon,..M) BAROMETER:``.
+with ``H`` and ``F.PRY``, ``G.PRY``; ``GPS(lat,lon,..M) BAROMETER:``; ``GPS(lon,lat,n) Hb:``. A
+drone without a position writes zeros and still ``rel_alt``. ``focal_len`` is the 35 mm equivalent:
+in mm with a decimal point, in tenths of a millimetre without.
 """
 
 from __future__ import annotations
@@ -11,7 +13,9 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
+from statistics import median
 
 from mavlink.telemetry.decode import plausible_place
 from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
@@ -30,9 +34,14 @@ NUMBER = r"(-?\d+(?:\.\d+)?)"
 CUE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 FIELD = re.compile(rf"\b(\w+)\s*:\s*{NUMBER}")
 GPS = re.compile(rf"GPS\s*\(\s*{NUMBER}\s*,\s*{NUMBER}\s*,\s*{NUMBER}\s*(M?)", re.IGNORECASE)
+FOCAL = re.compile(r"\bfocal_len\s*:\s*([1-9]\d*)(\.\d+)?")
 HEIGHT = re.compile(rf"\bH\s+{NUMBER}\s*m\b")
 PRY = re.compile(rf"\b([FG])\.PRY\s*\(\s*{NUMBER}°?\s*,\s*{NUMBER}°?\s*,\s*{NUMBER}")
 LONGEST_LINE = 4096
+SAME_FOCAL = 0.02
+"""Relative tolerance of a focal length that does not zoom."""
+
+NAN = math.nan
 CAMERA = 100  # component id for the head's attitude
 
 
@@ -42,33 +51,52 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     counts: Counter[str] = Counter()
     time_ns: int | None = None
     text: list[str] = []
+    focals: list[float] = []
     with path.open(encoding="utf-8", errors="replace") as file:
         while line := file.readline(LONGEST_LINE):
             cue = CUE.match(line.strip())
             if cue is None:
                 text.append(line)
                 continue
-            _cue(history, counts, time_ns, " ".join(text))
+            _cue(history, counts, focals, time_ns, " ".join(text))
             text.clear()
             hours, minutes, seconds, fraction = cue.groups()
             ms = int(fraction.ljust(3, "0"))
             whole = int(hours) * 3600 + int(minutes) * 60 + int(seconds)
             time_ns = (whole * 1000 + ms) * 1_000_000
-    _cue(history, counts, time_ns, " ".join(text))
+    _cue(history, counts, focals, time_ns, " ".join(text))
     if not counts["cues"]:
         raise ValueError(f"{path}: not a subtitle file; no cue was found")
-    warnings = [f"{counts['unreadable']} cues without telemetry"] if counts["unreadable"] else []
-    return finish(path, history, counts, warnings, clock="video")
+    warnings = [f"{counts['unreadable']} cues without a position"] if counts["unreadable"] else []
+    if focals and max(focals) > (1.0 + SAME_FOCAL) * min(focals):
+        warnings.append(
+            f"the lens zooms between {min(focals):.0f} and {max(focals):.0f} mm (35 mm equivalent):"
+            " one lens is used for all, so shapes and scale are wrong"
+        )
+    log = finish(path, history, counts, warnings, clock="video")
+    return replace(log, focal_35mm=median(focals) if focals else None)
 
 
-def _cue(history: VehicleHistory, counts: Counter[str], time_ns: int | None, text: str) -> None:
+def _cue(
+    history: VehicleHistory,
+    counts: Counter[str],
+    focals: list[float],
+    time_ns: int | None,
+    text: str,
+) -> None:
+    """Add what one cue says to the history, its counts and its focal lengths in mm."""
     if time_ns is None:
         return
     counts["cues"] += 1
+    if (focal := FOCAL.search(text)) is not None:
+        whole, decimals = focal.groups()
+        focals.append(float(whole + decimals) if decimals else float(whole) / 10.0)
     fields = {name.lower(): float(value) for name, value in FIELD.findall(text)}
     place = _place(text, fields)
     if place is None:
         counts["unreadable"] += 1
+        if "rel_alt" in fields:
+            history.add(PositionSample(None, NAN, NAN, None, fields["rel_alt"], None), time_ns)
     else:
         counts["positions"] += 1
         history.add(place[0], time_ns)
@@ -78,7 +106,8 @@ def _cue(history: VehicleHistory, counts: Counter[str], time_ns: int | None, tex
 
 def _place(text: str, fields: dict[str, float]) -> tuple[PositionSample, AccuracySample] | None:
     lat, lon = fields.get("latitude"), fields.get("longitude", fields.get("longtitude"))
-    relative = fields.get("rel_alt", fields.get("altitude", fields.get("barometer")))
+    barometer = fields.get("barometer", fields.get("hb"))
+    relative = fields.get("rel_alt", fields.get("altitude", barometer))
     coarse_m = 0.0
     gps = GPS.search(text)
     if (lat is None or lon is None) and gps is not None:
