@@ -303,7 +303,9 @@ def test_a_stretch_without_vision_is_bridged_and_said() -> None:
             assert "dead reckoning" in pose.sources and "vision" not in pose.sources
             assert not graph.aligned
             assert np.sqrt(pose.covariance[3, 3]) > 1.0
+            assert graph.largest_similarity() is graph.similarity(0)
     assert graph.aligned
+    assert graph.largest_similarity() is graph.similarity(1)
     assert graph.scale(119) == pytest.approx(0.6, rel=0.02)
     poses = graph.poses()
     for i in (20, 49, 60, 80, 119):

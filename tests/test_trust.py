@@ -24,6 +24,7 @@ SURE: dict[str, Any] = {
         ({}, "none", "scaled", "no positions"),
         ({"assumed": ["height"]}, "none", "relative", "assumed height"),
         ({"scale": {"sigma": 0.2}}, "gnss", "relative", "20%"),
+        ({"scale": {"from": "first telemetry", "sigma": None}}, "exif", "relative", "too few"),
         ({"assumed": ["lens"]}, "gnss", "doubtful", "lens"),
         ({"assumed": ["view", "level"]}, "gnss", "doubtful", "taken as level"),
         ({"assumed": ["distortion"]}, "gnss", "georeferenced", "distortion"),

@@ -172,6 +172,10 @@ class PoseGraph:
         """The motion from a segment's odometry to the world; None before telemetry or a loop."""
         return self._segments.known(segment)
 
+    def largest_similarity(self) -> Similarity | None:
+        """That of the segment with the most keyframes; None before telemetry or a loop."""
+        return self._segments.largest()
+
     def constants(self) -> Constants:
         """Constant errors of the sensors, as known for the newest segment."""
         return self._segments.constants(self._newest().segment) if self._nodes else Constants()

@@ -59,6 +59,11 @@ class SegmentFrames:
         """The segment's similarity; None before telemetry or a loop gives it."""
         return self._frames.get(segment)
 
+    def largest(self) -> Similarity | None:
+        """Of the segment with the most keyframes, of those that readings place where some do."""
+        size = {s: (bool(f.sources), self._seen[s]) for s, f in self._frames.items()}
+        return self._frames[max(size, key=size.__getitem__)] if size else None
+
     def frame(self, segment: int) -> Similarity:
         """The segment's similarity; until there is one, its own frame turned to the attitude."""
         if segment in self._frames:

@@ -22,6 +22,7 @@ from service.flight.anchorage import PublishedFrame, PublishedFrames
 from service.flight.pipeline import Pipeline, Step
 from service.flight.reports import FOUND, graph_figures
 from service.scans.drawing import save_debug
+from service.scans.trust import FIRST_TELEMETRY
 from service.stream.codec import encode
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
@@ -146,10 +147,10 @@ class Recorder:
         return dict(self.pipeline.refusals()) | late
 
     def _scale(self) -> dict[str, Any]:
-        """Source of the metric scale, and its relative sigma."""
-        found = self._chain.trajectory.similarity(max(self.pipeline.segments - 1, 0))
+        """Source of the metric scale, and its relative sigma: of the largest segment."""
+        found = self._chain.trajectory.graph.largest_similarity()
         if found is None:
-            return {"from": "first telemetry", "sigma": None}
+            return {"from": FIRST_TELEMETRY, "sigma": None}
         by = ", ".join(found.sources)
         if not {"altitude", "gnss"} & set(found.sources):
             is_known = found.sigma_scale < GUESSED_SHARE / 2

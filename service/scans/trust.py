@@ -20,6 +20,10 @@ MIN_PLACED_SHARE = 0.5
 """Share of the frames; below it vision was lost for most of the flight."""
 
 
+FIRST_TELEMETRY = "first telemetry"
+"""``scale.from`` of a scan whose segments are all too short to be fitted to telemetry."""
+
+
 class Trust(Enum):
     """Quantities that may be measured in a scan, from the most to the least."""
 
@@ -40,7 +44,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     """
     assumed = run.get("assumed")
     assumed = assumed if isinstance(assumed, list) else []
-    scale_sigma = _number(run.get("scale"), "sigma")
+    scale = run.get("scale")
+    scale_sigma = _number(scale, "sigma")
     doubts = []
     if "lens" in assumed:
         doubts.append("the lens is assumed: shapes bend; calibrate the camera")
@@ -57,6 +62,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         return _said(Trust.DOUBTFUL, doubts)
     if "height" in assumed:
         return _said(Trust.RELATIVE, ["the scale comes from an assumed height above ground"])
+    if isinstance(scale, Mapping) and scale.get("from") == FIRST_TELEMETRY:
+        return _said(Trust.RELATIVE, ["too few keyframes in a row to measure the scale"])
     if scale_sigma is not None and scale_sigma > MAX_SCALE_SIGMA:
         return _said(Trust.RELATIVE, [f"the scale is uncertain by {scale_sigma:.0%}"])
     if georeference == "none":
