@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from painted_ground import CAMERA, HEIGHT_M, SIZE, K, on_plane, pose, still
+from painted_ground import CAMERA, FOOTPRINT_M, HEIGHT_M, SIZE, K, on_plane, pose, still
 
 from recon import se3
 from recon.camera_model import scaled_K
@@ -19,8 +19,9 @@ LARGEST_BIAS = 2e-4
 """Of the height."""
 
 
-def heights(width_px: int, upsampled: bool, east_m: float) -> F64:
-    """Heights above the plane of a tilted view paired with one ``east_m`` further on."""
+def heights(width_px: int, upsampled: bool, east_m: float, min_known: float = 0.5) -> F64:
+    """Heights above the plane of a tilted view paired with one ``east_m`` further on, where more
+    than ``min_known`` of the view has one."""
     views = []
     for T in (pose(0.0, 10.0, seed=1), pose(east_m, 10.0, seed=2)):
         T[:3, :3] = se3.so3_exp(np.array([0.1, 0.15, 0.0])) @ T[:3, :3]
@@ -39,7 +40,7 @@ def heights(width_px: int, upsampled: bool, east_m: float) -> F64:
     depth = reproject(labels, pair, K_grid, (w, h)).depth_m
     truth = on_plane(K_grid, (w, h), left.T_odom_camera)[:, 2].reshape(h, w)
     off = HEIGHT_M * (1.0 - depth / truth)
-    assert np.isfinite(off).mean() > 0.5
+    assert np.isfinite(off).mean() > min_known
     return np.asarray(off[np.isfinite(off)], np.float64)
 
 
@@ -51,3 +52,10 @@ def test_a_known_plane_is_found_without_bias(width_px: int, upsampled: bool, eas
 
 def test_a_grid_finer_than_the_image_has_no_bias_either() -> None:
     assert abs(np.median(heights(960, False, 4.0))) < LARGEST_BIAS * HEIGHT_M
+
+
+@pytest.mark.parametrize("overlap", [0.6, 0.5, 0.4])
+def test_views_of_a_survey_with_little_overlap_make_surface(overlap: float) -> None:
+    """Baselines of 0.48 to 0.72 of the height, by this lens."""
+    off = heights(240, False, (1.0 - overlap) * FOOTPRINT_M, overlap - 0.2)
+    assert np.percentile(np.abs(off), 90) < 2e-3 * HEIGHT_M

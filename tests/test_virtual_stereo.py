@@ -110,7 +110,7 @@ def test_refusals_name_their_reason() -> None:
     a = view(0, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0))
     cases = {
         "baseline too short": view(1, (0.5, 0.0, 60.0), (0.0, 0.0, 0.0)),
-        "baseline too long": view(1, (40.0, 0.0, 60.0), (0.0, 0.0, 0.0)),
+        "baseline too long": view(1, (50.0, 0.0, 60.0), (0.0, 0.0, 0.0)),
         "too little overlap": view(1, (5.0, 0.0, 60.0), (0.9, 0.0, 0.0)),
     }
     for reason, b in cases.items():

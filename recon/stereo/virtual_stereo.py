@@ -47,8 +47,8 @@ class VirtualStereoConfig:
 
     base_to_height: float = 0.1  # wanted baseline over distance
     min_base_to_height: float = 0.03
-    max_base_to_height: float = 0.45
-    min_overlap: float = 0.4  # share of the left view that the right one sees
+    max_base_to_height: float = 0.8
+    min_overlap: float = 0.25  # share of the left view that the right one sees
     width_px: int = 320  # of the stereo views, along the image's width
     guided: bool = True  # make the image that guides the upsampling
     labels: int = 16  # the fewest; relief may widen it
