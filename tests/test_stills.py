@@ -6,10 +6,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
+import painted_ground
 import pytest
 from painted_ground import CAMERA, DOWN, FOOTPRINT_M, HEIGHT_M, SIZE, pose, still
 
+from recon.camera_model import scaled
 from recon.tracking.localisation import Localiser, Located, Start
 from recon.tracking.odometry import Odometry, Tracked
 from recon.types import F64, U8, PosePrior
@@ -88,6 +91,26 @@ def test_two_views_bridge_what_has_no_landmarks() -> None:
     track = [pose(0.2 * FOOTPRINT_M * i - 60.0, seed=i) for i in range(3)]
     track += [pose(track[2][0, 3] + 0.6 * FOOTPRINT_M * i, seed=5 + i) for i in (1, 2, 3)]
     assert_one_piece(track, flown([still(T) for T in track]), 0.03)
+
+
+def test_rows_of_a_field_are_not_taken_for_one_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows every 10 px hide the little that differs between them from a wide search."""
+    rng = np.random.default_rng(3)
+
+    def layer(size: int) -> F64:
+        image = rng.normal(0.0, 1.0, (size, size)).astype(np.float32)
+        return np.asarray(cv2.resize(image, (2400, 2400), interpolation=cv2.INTER_CUBIC))
+
+    rows = np.cos(np.pi / 2 * (np.arange(2400)[:, None] + layer(40)))
+    ground = np.clip(128 + 30 * rows + 5 * layer(1200), 0, 255).astype(np.uint8)
+    camera = scaled(CAMERA, (1280, 960))
+    monkeypatch.setattr(painted_ground, "painted_ground", lambda: ground)
+    monkeypatch.setattr(painted_ground, "K", camera.K)
+    monkeypatch.setattr(painted_ground, "SIZE", camera.size_px)
+    track = [pose(0.45 * FOOTPRINT_M * i, 3.0 * i, seed=i) for i in range(3)]
+    odometry, prior = Odometry(camera), PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
+    found = [odometry.track(still(T), i, i * 2_000_000_000, prior) for i, T in enumerate(track)]
+    assert_one_piece(track, found, 0.02)
 
 
 def test_stills_of_other_places_are_not_joined() -> None:

@@ -51,8 +51,9 @@ class OdometryConfig:
 RECALLED = 4
 """Newest keyframes that a frame is compared with by features."""
 
-FEATURE_SHARE = 0.03
-"""Search radius around places that features predict."""
+FEATURE_SHARES = (0.01, 0.03)
+"""Search radii around places that features predict, in the order in which they are tried: where
+texture repeats, as the rows of a field do, a wide search finds a second place as good."""
 
 CLEAR_SHARE = 0.6
 """Share of the corners searched: if so many are found, no other start is tried."""
@@ -174,14 +175,16 @@ class Localiser:
         that they lie on.
         """
         for key, view in self._views(new, keyframes, is_still=True):
-            guess = view.predict(key.uv, FEATURE_SHARE * self.camera.size_px[0])
-            found = matching.match(
-                key.pyramid, key.uv.astype(np.float32), new.pyramid, guess.uv.astype(np.float32),
-                guess.radius_px, guess.warp.astype(np.float32), self.config.matching,
-            )  # fmt: skip
-            bridge = self._two_views(new, key, found.uv_px.astype(np.float64), found.ok)
-            if bridge is not None:
-                return bridge
+            for share in FEATURE_SHARES:
+                guess = view.predict(key.uv, share * self.camera.size_px[0])
+                found = matching.match(
+                    key.pyramid, key.uv.astype(np.float32), new.pyramid,
+                    guess.uv.astype(np.float32), guess.radius_px, guess.warp.astype(np.float32),
+                    self.config.matching,
+                )  # fmt: skip
+                bridge = self._two_views(new, key, found.uv_px.astype(np.float64), found.ok)
+                if bridge is not None:
+                    return bridge
         return None
 
     def _two_views(
@@ -236,7 +239,8 @@ class Localiser:
         for key, view in self._views(new, keyframes, is_still):
             T_camera_odom = self._pose_by(key, view)
             if T_camera_odom is not None:
-                yield Start(key, T_camera_odom, FEATURE_SHARE, by_features=True)
+                for share in FEATURE_SHARES:
+                    yield Start(key, T_camera_odom, share, by_features=True)
 
     def _views(
         self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], is_still: bool
@@ -390,7 +394,7 @@ class FirstViews:
     ) -> None:
         """``radius_px`` is searched where motion or telemetry predicts the corners."""
         self._K, self._config, self._radius_px = camera.K, config, radius_px
-        self._near_px = FEATURE_SHARE * camera.size_px[0]
+        self._near_px = [share * camera.size_px[0] for share in FEATURE_SHARES]
         self._features = features
         self._drift = np.eye(3)  # from the first frame's pixels to the last one's
 
@@ -433,7 +437,8 @@ class FirstViews:
         images = (first.seq, first.pyramid.levels[0]), (new.seq, new.gray)
         view = self._features.common_view(*images, still)
         if view is not None:
-            yield view.predict(first.uv, self._near_px)
+            for radius_px in self._near_px:
+                yield view.predict(first.uv, radius_px)
 
     def _by_telemetry(self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64) -> F64:
         """(3, 3) homography of level ground by attitude, and by position and height if known."""
