@@ -23,7 +23,7 @@ from service.cameras.exif import read_tags
 from service.cameras.lens import SIGMA_FOCAL, Lens, fitted, turned
 from service.cameras.source import CameraSource
 from service.cli import app
-from service.commands.replay import _assumed_camera
+from service.commands.own_lens import start_lens
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 DEWARP = "2020-05-27;3666.66,3665.99,-27.8,30.0,-0.269,0.112,0.0003,-0.0001,-0.033"
@@ -224,12 +224,12 @@ def test_a_video_without_a_model_has_the_lens_of_its_telemetry(
     focal_35mm: float | None, fx_px: float, of: str
 ) -> None:
     log = TelemetryLog(VehicleHistory(), "video", 0, 1, (), {}, focal_35mm)
-    notes: list[str] = []
     source = SimpleNamespace(size_px=(1920, 1080))
-    camera = _assumed_camera(cast(CameraSource, source), log, notes)
-    assert camera.K[0, 0] == pytest.approx(fx_px, rel=1e-4)
-    assert camera.K[:2, 2] == pytest.approx((959.5, 539.5)) and not camera.distortion.any()
-    assert len(notes) == 1 and of in notes[0]
+    start = start_lens(cast(CameraSource, source), log)
+    assert start.camera.K[0, 0] == pytest.approx(fx_px, rel=1e-4)
+    assert start.camera.K[:2, 2] == pytest.approx((959.5, 539.5))
+    assert not start.camera.distortion.any() and start.assumed == ("lens",) and of in start.note
+    assert start.search is not None and 3.0 * start.search.sigma_focal > 0.05
 
 
 def test_a_video_is_turned_as_it_asks_players_to(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
     from recon.types import Camera, Shutter
     from service.cameras.source import CameraSource
+    from service.commands.own_lens import StartLens
     from service.config import Config
     from service.flight.scan import Scan, ScanInputs
 
@@ -47,7 +48,7 @@ def replay(
     ] = False,
     find_lens: Annotated[
         bool,
-        typer.Option(help="for stills without a camera model: estimate it from 25 of them first"),
+        typer.Option(help="without a camera model: estimate it from 25 of the images first"),
     ] = True,
     config: ConfigFile = None,
     set_: Overrides = None,
@@ -72,10 +73,10 @@ def replay(
     try:
         if not (realtime or chosen.compute.model or is_given(WIDTH, config, overrides)):
             chosen = denser(chosen, source)
-        own = None if camera or realtime or not find_lens else _own_lens(source, chosen)
         summary = _replay(
-            video, source, played, camera, own, log, video_epoch, out, chosen, as_json
-        )
+            video, source, played, camera, find_lens and not realtime, log, video_epoch, out,
+            chosen, as_json,
+        )  # fmt: skip
     finally:
         played.close()
     _report(summary, as_json)
@@ -121,7 +122,7 @@ def _replay(
     source: CameraSource,
     played: CameraSource,
     camera: Camera | None,
-    own: Camera | None,
+    find_lens: bool,
     log: TelemetryLog | None,
     video_epoch: float | None,
     out: Path | None,
@@ -130,23 +131,17 @@ def _replay(
 ) -> dict[str, Any]:
     from recon.types import Shutter
     from service.cameras import open_camera, parse_source
+    from service.commands.own_lens import start_lens
     from service.compute.backend_choice import open_backend
     from service.flight.scan import ScanInputs
 
     notes: list[str] = []
-    assumed: tuple[str, ...] = ()
-    if camera:
-        camera = _fitted(camera, source, notes)
-    elif own:
-        camera = own
-        notes.append(
-            f"no camera model given: found from the images themselves ({own.K[0, 0]:.0f} px)"
-        )
+    if camera is not None:
+        start, lens = None, _fitted(camera, source, notes)
     else:
-        camera, assumed = _tagged_camera(source, notes)
-    if camera is None:
-        camera, assumed = _assumed_camera(source, log, notes), ("lens",)
-    camera, config = _with_stated_readout(camera, config, video, source, notes)
+        start = start_lens(source, log)
+        lens = start.camera
+    lens, config = _with_stated_readout(lens, config, video, source, notes)
     epoch_ns = _epoch(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
     folder = out or Path(f"scan-{scan_id}")
@@ -154,7 +149,7 @@ def _replay(
     notes += log.warnings if log is not None else ()
     inputs = ScanInputs(
         played,
-        camera,
+        lens,
         config,
         chosen,
         folder,
@@ -162,19 +157,35 @@ def _replay(
         epoch_ns,
         history=log.history if log is not None else None,
         notes=tuple(notes),
-        assumed=assumed,
         extra={"backend": chosen.name, "source": source.description},
     )
     stop = stop_by_signals()
-    can_begin_again = played is source and parse_source(video)[0] == "file"
+    is_file = parse_source(video)[0] == "file"
     with nullcontext(Progress()) if as_json else showing("replay") as progress:
-        found = _fly(inputs, stop, progress, can_begin_again)
+        if start is not None:
+            progress("finding the lens")
+            inputs = _with_lens(inputs, video, start, find_lens)
+        found = _fly(inputs, stop, progress, can_begin_again=played is source and is_file)
         if isinstance(found, Shutter):
             progress("beginning again with the readout that was found")
             with closing(open_camera(video)) as again:
                 found = _fly(_with_readout(inputs, found, again), stop, progress)
     assert isinstance(found, dict)
     return found | {"scan_folder": str(folder)}
+
+
+def _with_lens(inputs: ScanInputs, video: str, start: StartLens, find_lens: bool) -> ScanInputs:
+    """The scan with the lens by its own images, where they determine it, else as it is."""
+    from service.cameras import parse_source
+    from service.commands.own_lens import own_lens
+
+    found = None
+    if find_lens and start.search is not None and parse_source(video)[0] in ("file", "images"):
+        found = own_lens(inputs, video, start.search)
+    if found is None:
+        return replace(inputs, notes=(start.note, *inputs.notes), assumed=start.assumed)
+    note = f"no camera model given: found from the images themselves ({found.K[0, 0]:.0f} px)"
+    return replace(inputs, camera=found, notes=(note, *inputs.notes))
 
 
 def _fly(
@@ -271,51 +282,6 @@ def _fitted(camera: Camera, source: CameraSource, notes: list[str]) -> Camera:
         (w, h), (W, H) = camera.size_px, source.size_px
         notes.append(f"the camera model is for {w}x{h} images: scaled to {W}x{H}")
     return model
-
-
-def _tagged_camera(source: CameraSource, notes: list[str]) -> tuple[Camera | None, tuple[str, ...]]:
-    """The camera by the images' tags, with a note, and what they leave open; None without tags."""
-    from service.cameras.images import ImagesSource
-
-    if not isinstance(source, ImagesSource) or source.lens is None or source.camera is None:
-        return None, ()
-    f, side = source.lens.focal, max(source.size_px)
-    notes.append(
-        f"no camera model given: taken from {source.lens.source} ({f * side:.0f} px); "
-        "make one with 'skyrelief calibrate' for true shapes"
-    )
-    return source.camera, () if source.lens.is_calibrated else ("distortion",)
-
-
-def _own_lens(source: CameraSource, config: Config) -> Camera | None:
-    """The lens by the stills themselves, where their tags give no more than a focal length."""
-    from service.cameras.images import ImagesSource
-    from service.commands.stills_lens import lens_by_stills
-
-    if (
-        not isinstance(source, ImagesSource)
-        or source.camera is None
-        or source.camera.distortion.any()
-    ):
-        return None
-    return lens_by_stills(source, source.camera, config)
-
-
-def _assumed_camera(source: CameraSource, log: TelemetryLog | None, notes: list[str]) -> Camera:
-    """A lens without distortion, of the log's focal length or of 70 degrees, with a note."""
-    import math
-
-    from service.cameras.lens import Lens, by_full_frame
-
-    lens, of = Lens(0.5 / math.tan(math.radians(35.0))), "70 degrees"
-    if log is not None and log.focal_35mm is not None:
-        lens = by_full_frame(log.focal_35mm, source.size_px)
-        of = f"{log.focal_35mm:.0f} mm (35 mm equivalent in the telemetry)"
-    notes.append(
-        f"no camera model given: a lens of {of} without distortion is assumed; "
-        "make one with 'skyrelief calibrate' for true shapes"
-    )
-    return lens.camera(source.size_px)
 
 
 def _epoch(

@@ -93,6 +93,8 @@ def images_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[
     with closing(opened(str(video), {})) as source:
         for frame in source:
             apart = np.abs(wanted - (start_unix_ns + frame.time_ns))
+            if start_unix_ns + frame.time_ns > wanted.max(initial=0) + WITHIN_S * 1e9:
+                break
             k = int(np.argmin(apart))
             if apart[k] <= WITHIN_S * 1e9 and k not in found:
                 found[k] = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)

@@ -144,15 +144,15 @@ def intrinsics(
     return own_camera.write(found, given, out or folder) | {"notes": job.notes}
 
 
-def lens(folder: Path, stills: Path, sigma_focal: float) -> Camera:
-    """The camera by a scan's own stills; the scan's focal length is known to a share beforehand.
+def lens(folder: Path, images: Path, config: SelfCalibrationConfig) -> Camera:
+    """The camera by a scan's own images, a recording or a folder of stills.
 
-    Raises InputError, in one line, where they do not determine its distortion.
+    Raises InputError, in one line, where they do not determine it.
     """
     _open_target(folder, None)
     with ScanStore.open(folder / "scan.db") as store, Revisions(store) as revisions:
         job = _Refinement(folder, store, revisions, RefineOptions())
-        return job.own_camera(stills, own_camera.by_tags(sigma_focal))[0].camera
+        return job.own_camera(images, config)[0].camera
 
 
 def _deliver(target: Path, figures: dict[str, Any]) -> dict[str, Any]:

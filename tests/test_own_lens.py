@@ -1,10 +1,13 @@
-"""``replay`` of stills whose tags give a focal length and no distortion."""
+"""``replay`` without a camera model: the lens by the flight's own images."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from painted_ground import SIZE, K, pose, still
 from PIL import Image
 from typer.testing import CliRunner
 
+from recon.types import U8
 from service.cameras.images import open_images
 from service.cameras.lens import Lens
 from service.cli import app
@@ -21,9 +25,8 @@ BENT = 0.1
 EXIF_FOCAL = 29  # mm of a 35 mm camera: 402 px
 
 
-def stills(folder: Path, count: int) -> Path:
+def bent_images(count: int) -> Iterator[U8]:
     """Two strips in opposite directions by a lens that bends."""
-    folder.mkdir()
     v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(np.float64)
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
     lens = np.array([BENT, 0.0, 0.0, 0.0, 0.0])
@@ -33,23 +36,56 @@ def stills(folder: Path, count: int) -> Path:
         east, yaw = (6.0 * k, 0.0) if k < half else (6.0 * (count - 1 - k), 180.0)
         image = still(pose(east, yaw, 40.0 + k % 3, seed=k))
         bent = cv2.remap(image, straight[..., 0], straight[..., 1], cv2.INTER_CUBIC)
+        yield np.asarray(bent, np.uint8)
+
+
+def stills(folder: Path, count: int) -> Path:
+    """The images as JPEG files with a focal length."""
+    folder.mkdir()
+    for k, bent in enumerate(bent_images(count)):
         tags = Image.Exif()
         tags.get_ifd(0x8769)[41989] = EXIF_FOCAL
         Image.fromarray(bent).convert("RGB").save(folder / f"{k:02d}.jpg", quality=97, exif=tags)
     return folder
 
 
+def video(path: Path, count: int) -> Path:
+    """The images as a video, which states no lens."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=2, options={"crf": "12"})
+        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
+        for image in bent_images(count):
+            frame = av.VideoFrame.from_ndarray(np.dstack([image] * 3), format="bgr24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def replayed(source: Path, out: Path, *more: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The figures of a replay, and the camera that it stored."""
+    answer = CliRunner().invoke(app, ["replay", str(source), "--out", str(out), "--json", *more])
+    assert answer.exit_code == 0, answer.output
+    with ScanStore.open(out / "scan.db") as store:
+        return json.loads(answer.stdout.splitlines()[-1]), store.header.camera
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_the_lens_of_a_video_is_found(tmp_path: Path, wanted: bool) -> None:
+    """70 degrees are assumed, 343 px; without distortion the ground would be off by metres."""
+    more = [] if wanted else ["--no-find-lens"]
+    figures, camera = replayed(video(tmp_path / "flight.mp4", 12), tmp_path / "scan", *more)
+    assert ("lens" in figures["assumed"]) != wanted
+    assert camera["distortion"][0] == pytest.approx(BENT if wanted else 0.0, abs=0.01)
+    assert camera["K"][0] == pytest.approx(K[0, 0] if wanted else 342.7, rel=0.015)
+
+
 @pytest.mark.parametrize("wanted", [True, False])
 def test_the_distortion_that_exif_does_not_give_is_found(tmp_path: Path, wanted: bool) -> None:
     folder = stills(tmp_path / "stills", 10)
     more = [] if wanted else ["--no-find-lens"]
-    command = ["replay", str(folder), "--out", str(tmp_path / "scan"), "--json", *more]
-    answer = CliRunner().invoke(app, command)
-    assert answer.exit_code == 0, answer.output
-    notes = json.loads(answer.stdout.splitlines()[-1])["warnings"]
+    figures, camera = replayed(folder, tmp_path / "scan", *more)
+    notes = figures["warnings"]
     assert any("found from the images themselves" in note for note in notes) == wanted
-    with ScanStore.open(tmp_path / "scan" / "scan.db") as store:
-        camera = store.header.camera
     assert camera["distortion"][0] == pytest.approx(BENT if wanted else 0.0, abs=0.01)
     given = Lens(EXIF_FOCAL / 43.2666 * 1.25).camera(SIZE)
     assert camera["K"][0] == pytest.approx(K[0, 0] if wanted else given.K[0, 0], rel=0.003)

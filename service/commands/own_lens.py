@@ -1,0 +1,129 @@
+"""The lens of a recording without a camera model: by its tags, its log, or its own images.
+
+A lens that bends straight lines by a few percent turns every view of level ground a little and
+makes it a sixth too near: the images can be explained that way too, until the distortion is free.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event
+from typing import TYPE_CHECKING
+
+from recon.calibration.flight import SelfCalibrationConfig
+from service.cameras import open_camera
+from service.cameras.images import ImagesSource
+from service.cameras.lens import SIGMA_FOCAL, Lens, by_full_frame
+from service.config import change
+from service.errors import InputError
+from service.offline.refine.own_camera import by_tags
+
+if TYPE_CHECKING:
+    from mavlink.telemetry.logs import TelemetryLog
+    from recon.types import Camera
+    from service.cameras.source import CameraSource
+    from service.flight.scan import Scan, ScanInputs
+
+log = logging.getLogger(__name__)
+
+VIEWS = 25
+"""Number of stills about the middle of a flight, or of a video's first keyframes, that are used."""
+
+MIN_STILLS = 6
+"""Fewer stills do not determine a lens."""
+
+MAX_FRAMES = 5400
+"""Of a video, in which its first keyframes are sought."""
+
+ASSUMED = Lens(0.5 / math.tan(math.radians(35.0)), sigma_focal=0.2)
+"""70 degrees across; cameras of drones have 60 to 86."""
+
+OPEN = SelfCalibrationConfig(sigma_focal=ASSUMED.sigma_focal, max_sigma_focal=SIGMA_FOCAL)
+"""How such a lens is sought: one found counts if its focal length is as good as EXIF's."""
+
+COARSE = {"compute.stereo_width": 320, "compute.upsample": False, "fusion.loops": False}
+"""Poses are all that is needed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartLens:
+    """What is known about the lens before its images are looked at."""
+
+    camera: Camera
+    note: str
+    assumed: tuple[str, ...]  # of "lens", "distortion"
+    search: SelfCalibrationConfig | None  # how the images may change it; None: it is calibrated
+
+
+def start_lens(source: CameraSource, telemetry: TelemetryLog | None) -> StartLens:
+    """The lens by the images' tags, the log's focal length, or 70 degrees."""
+    if isinstance(source, ImagesSource) and source.lens is not None and source.camera is not None:
+        f, side, known = source.lens.focal, max(source.size_px), source.lens.is_calibrated
+        note = f"taken from {source.lens.source} ({f * side:.0f} px)"
+        search = None if source.camera.distortion.any() else by_tags(source.lens.sigma_focal)
+        return StartLens(source.camera, _advice(note), () if known else ("distortion",), search)
+    lens, of, search = ASSUMED, "70 degrees", OPEN
+    if telemetry is not None and telemetry.focal_35mm is not None:
+        lens = by_full_frame(telemetry.focal_35mm, source.size_px)
+        of = f"{telemetry.focal_35mm:.0f} mm (35 mm equivalent in the telemetry)"
+        search = by_tags(lens.sigma_focal)
+    note = f"a lens of {of} without distortion is assumed"
+    return StartLens(lens.camera(source.size_px), _advice(note), ("lens",), search)
+
+
+def _advice(note: str) -> str:
+    return f"no camera model given: {note}; make one with 'skyrelief calibrate' for true shapes"
+
+
+def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> Camera | None:
+    """The camera by a reconstruction of some images; None where they do not determine it.
+
+    ``inputs`` are those of the whole scan, with the lens to begin with; ``video`` is its
+    recording or its folder of stills.
+    """
+    if isinstance(inputs.source, ImagesSource):
+        some = inputs.source.middle(VIEWS)
+        if some.images < MIN_STILLS:
+            return None
+        return _found(replace(inputs, source=some), Path(video), search)
+    with closing(open_camera(video)) as source:
+        return _found(replace(inputs, source=source), Path(video), search, _is_enough)
+
+
+def _is_enough(scan: Scan) -> bool:
+    return scan.recorder.keyframes >= VIEWS or scan.recorder.frames >= MAX_FRAMES
+
+
+def _found(
+    inputs: ScanInputs,
+    images: Path,
+    search: SelfCalibrationConfig,
+    is_enough: Callable[[Scan], object] = lambda scan: False,
+) -> Camera | None:
+    from service.flight.scan import Scan, create_store
+    from service.offline.refine.refinement import lens
+
+    config = inputs.config
+    for key, value in COARSE.items():
+        config = change(config, key, str(value).lower())
+    with TemporaryDirectory(prefix="skyrelief-lens-") as temporary:
+        folder = Path(temporary) / "scan"
+        inputs = replace(inputs, config=config, folder=folder, scan_id="lens", warn=log.info)
+        store = create_store(inputs)
+        try:
+            scan = Scan(inputs, store)
+            scan.run(Event(), is_enough=is_enough)
+            scan.close()
+        finally:
+            store.close()
+        try:
+            return lens(folder, images, search)
+        except InputError as error:
+            log.info("the images do not determine their lens: %s", error)
+            return None
