@@ -16,6 +16,7 @@ import numpy.typing as npt
 from numba import njit
 
 from recon import se3
+from recon.small_matrices import invert_3x3
 from recon.types import F64, I64, Camera
 
 CAMERA = 8
@@ -143,6 +144,30 @@ def _linearise(P: F64, X: F64, k: F64, k3: float, at: F64, Jc: F64, Jp: F64, Jk:
 
 
 @njit(cache=True, nogil=True)
+def _product(A: F64, H: F64, out: F64) -> None:
+    """Fill ``out`` (n, 3) with A H, of (n, 3) and the symmetric (3, 3)."""
+    for i in range(A.shape[0]):
+        for j in range(3):
+            out[i, j] = A[i, 0] * H[j, 0] + A[i, 1] * H[j, 1] + A[i, 2] * H[j, 2]
+
+
+@njit(cache=True, nogil=True)
+def _subtract_product(A: F64, B: F64, out: F64) -> None:
+    """Take A B^T, of (n, 3) and (m, 3), from ``out`` (n, m)."""
+    for i in range(A.shape[0]):
+        for j in range(B.shape[0]):
+            out[i, j] -= A[i, 0] * B[j, 0] + A[i, 1] * B[j, 1] + A[i, 2] * B[j, 2]
+
+
+@njit(cache=True, nogil=True)
+def _eliminate(A: F64, B: F64, b: F64, H: F64, g: F64) -> None:
+    """Take what a point adds, A B^T and A b, from ``H`` (n, m) and ``g`` (n,)."""
+    _subtract_product(A, B, H)
+    for i in range(A.shape[0]):
+        g[i] -= A[i, 0] * b[0] + A[i, 1] * b[1] + A[i, 2] * b[2]
+
+
+@njit(cache=True, nogil=True)
 def _reduce(
     T: F64, X: F64, k: F64, k3: float, view: I64, start: I64, uv: F64, sigma: F64, huber: float,
     Hp: F64, bp: F64, damping: float, pair: I64, S: F64, g: F64, B: F64, Hk: F64, gk: F64,
@@ -155,7 +180,7 @@ def _reduce(
     the upper half only; ``B`` (N, 6, 8) and ``Hk`` (8, 8) the border.
     """
     at, Jc, Jp, Jk = np.zeros(7), np.zeros((2, 6)), np.zeros((2, 3)), np.zeros((2, 8))
-    r = np.zeros(2)
+    r, A, Ak = np.zeros(2), np.zeros((6, 3)), np.zeros((CAMERA, 3))
     for p in range(X.shape[0]):
         for m in range(start[p], start[p + 1]):
             v = view[m]
@@ -192,22 +217,15 @@ def _reduce(
         ridge = 1e-9 * (Hp[p, 0, 0] + Hp[p, 1, 1] + Hp[p, 2, 2]) + 1e-12
         for a in range(3):
             Hp[p, a, a] += damping * Hp[p, a, a] + ridge
-        Hp[p] = np.linalg.inv(Hp[p])
-        Ak = Wk[p] @ Hp[p]
-        gk -= Ak @ bp[p]
-        Hk -= Ak @ Wk[p].T
+        invert_3x3(Hp[p], Hp[p])
+        _product(Wk[p], Hp[p], Ak)
+        _eliminate(Ak, Wk[p], bp[p], Hk, gk)
         for m in range(start[p], start[p + 1]):
             v = view[m]
-            A = W[m] @ Hp[p]
-            g[v] -= A @ bp[p]
-            B[v] -= A @ Wk[p].T
+            _product(W[m], Hp[p], A)
+            _eliminate(A, Wk[p], bp[p], B[v], g[v])
             for n in range(m, start[p + 1]):  # views of a point are in order
-                q = pair[v, view[n]]
-                for a in range(6):
-                    for c in range(6):
-                        S[q, a, c] -= (
-                            A[a, 0] * W[n, c, 0] + A[a, 1] * W[n, c, 1] + A[a, 2] * W[n, c, 2]
-                        )
+                _subtract_product(A, W[n], S[pair[v, view[n]]])
 
 
 @njit(cache=True, nogil=True)
