@@ -22,7 +22,7 @@ from recon.posegraph.sensor_noise import (
     drift_noise,
     wander_noise,
 )
-from recon.types import F64, I64, DepthMap, PosePrior
+from recon.types import F64, DepthMap, PosePrior
 
 
 def umeyama(source: F64, target: F64, weight: F64) -> tuple[float, F64, F64]:
@@ -282,53 +282,53 @@ class _Readings:
         outlying = np.mean(self.sigma_fix / self.sigma_single, axis=1)
         self.outlying = np.concatenate([one[0], outlying, one[1], one[2]])
         """(groups,) what a group's whitened residual is multiplied by to find an outlier."""
+        counts = np.array([3] * (len(turned) + len(fixed) + len(moved)) + [1] * len(heights), int)
+        self.group = np.repeat(np.arange(len(counts)), counts)
+        """(M,) the group of each row."""
+        known = 1.0 / self.sigma_turn
+        known[~self.heading_known, 2] = 0.0
+        way = np.repeat(1.0 / self.sigma_way, 3)
+        self._whitening = np.concatenate(
+            [known.ravel(), 1.0 / self.sigma_fix.ravel(), way, 1.0 / self.sigma_log]
+        )
+        first, last = 3 * len(turned), 3 * (len(turned) + len(fixed) + len(moved))
+        self._scaled = slice(first, last)
+        self._J = np.zeros((len(self.group), 7))  # where it is constant
+        self._J[:first, :3] = np.tile(np.eye(3), (len(turned), 1))
+        self._J[first : first + 3 * len(fixed), 3:6] = np.tile(np.eye(3), (len(fixed), 1))
+        self._J[last:, 6] = 1.0
 
-    def linearised(self, R: F64, t: F64, log_scale: float) -> tuple[F64, F64, I64]:
-        """Whitened residuals (M,), Jacobian (M, 7) and the row's group (M,)."""
-        n, m, k, h = len(self.R_odom), len(self.fix), len(self.way), len(self.log_ratio)
-        turn, J_turn = self._turns(R)
-        fix, J_fix = self.placed(R, t, log_scale)
-        way, J_way = self.moved(R, log_scale)
-        J_height = np.zeros((h, 7))
-        J_height[:, 6] = 1.0 / self.sigma_log
-        sigma_way = self.sigma_way[:, None]
-        r = [turn.ravel(), (fix / self.sigma_fix).ravel(), (way / sigma_way).ravel()]
-        r.append((log_scale - self.log_ratio) / self.sigma_log)
-        J = [J_turn, J_fix / self.sigma_fix[:, :, None], J_way / sigma_way[:, :, None]]
-        rows = np.concatenate([*(part.reshape(-1, 7) for part in J), J_height])
-        last = n + m + k
-        group = np.r_[np.repeat(np.arange(last), 3), np.arange(last, last + h)]
-        return np.concatenate(r), rows, group
+    def linearised(self, R: F64, t: F64, log_scale: float) -> tuple[F64, F64]:
+        """Whitened residuals (M,) and Jacobian (M, 7)."""
+        fix, way = self.placed(R, t, log_scale), self.moved(R, log_scale)
+        J = self._J.copy()
+        y = np.concatenate([fix + self.fix - t, way + self.way])
+        of = J[self._scaled].reshape(-1, 3, 7)
+        of[:, 0, 1], of[:, 1, 2], of[:, 2, 0] = y[:, 2], y[:, 0], y[:, 1]
+        of[:, 0, 2], of[:, 1, 0], of[:, 2, 1] = -y[:, 1], -y[:, 2], -y[:, 0]
+        of[:, :, 6] = y
+        height = log_scale - self.log_ratio
+        r = np.concatenate([self._turns(R).ravel(), fix.ravel(), way.ravel(), height])
+        return r * self._whitening, J * self._whitening[:, None]
 
-    def placed(self, R: F64, t: F64, log_scale: float) -> tuple[F64, F64]:
-        """(m, 3) m from the fixes to where the similarity has them, and the (m, 3, 7) Jacobian."""
-        y = np.exp(log_scale) * self.x @ R.T
-        J = _turned_and_scaled(y)
-        J[:, :, 3:6] = np.eye(3)
-        return y + t - self.fix, J
+    def placed(self, R: F64, t: F64, log_scale: float) -> F64:
+        """(m, 3) m from the fixes to where the similarity has them."""
+        return np.asarray(np.exp(log_scale) * self.x @ R.T + t - self.fix)
 
-    def moved(self, R: F64, log_scale: float) -> tuple[F64, F64]:
-        """(k, 3) m from ways by velocity to those by vision, and the (k, 3, 7) Jacobian."""
-        y = np.exp(log_scale) * self.step @ R.T
-        return y - self.way, _turned_and_scaled(y)
+    def moved(self, R: F64, log_scale: float) -> F64:
+        """(k, 3) m from ways by velocity to those by vision."""
+        return np.asarray(np.exp(log_scale) * self.step @ R.T - self.way)
 
-    def _turns(self, R: F64) -> tuple[F64, F64]:
-        """(n, 3) whitened rotations from the attitudes and their (n, 3, 7) Jacobian.
-
-        Of an attitude whose heading is unknown, the tilt alone.
-        """
+    def _turns(self, R: F64) -> F64:
+        """(n, 3) rotations from the attitudes; of one whose heading is unknown, the tilt alone."""
         n = len(self.R_odom)
-        J = np.zeros((n, 3, 7))
         if n == 0:
-            return np.zeros((0, 3)), J
+            return np.zeros((0, 3))
         seen = R @ self.R_odom
         turn = se3.each_so3_log(seen @ self.R_prior.transpose(0, 2, 1))
         up = np.einsum("nij,nj->ni", seen, self.R_prior[:, 2])  # where the prior's up points now
         tilt = np.column_stack([-up[:, 1], up[:, 0], np.zeros(n)])
-        info = 1.0 / self.sigma_turn
-        info[~self.heading_known, 2] = 0.0
-        J[:, :, :3] = np.eye(3) * info[:, :, None]
-        return np.where(self.heading_known[:, None], turn, tilt) * info, J
+        return np.where(self.heading_known[:, None], turn, tilt)
 
 
 def fit(
@@ -382,7 +382,7 @@ def _measured(
     fixes = _Readings([replace(a, prior=replace(a.prior, travel=None)) for a in level])
     if len(fixes.fix) >= MIN_READINGS:
         alone = _solve(fixes, *at)
-        apart, _ = fixes.placed(alone.R, alone.t, alone.log_scale)
+        apart = fixes.placed(alone.R, alone.t, alone.log_scale)
         across = wander_noise(fixes.fix_s, apart[:, :2], fix_s)
         along = wander_noise(fixes.fix_s, apart[:, 2:], fix_s)
         if across is not None and along is not None:
@@ -400,7 +400,7 @@ def _measured(
     ways = _Readings([replace(a, prior=replace(a.prior, position_m=None)) for a in level])
     if len(ways.way) >= MIN_READINGS:
         alone = _solve(ways, *at)
-        drift, _ = ways.moved(alone.R, alone.log_scale)
+        drift = ways.moved(alone.R, alone.log_scale)
         found = drift_noise(np.cumsum(ways.way_s), np.cumsum(drift, axis=0))
         if found is not None:
             walk, rate = max(found[0], MIN_WALK), max(found[1], MIN_RATE_M_S)
@@ -464,15 +464,6 @@ def _seconds(a: PosePrior, b: PosePrior) -> float:
     return b.travel.seconds - a.travel.seconds
 
 
-def _turned_and_scaled(y: F64) -> F64:
-    """(n, 3, 7) Jacobian of (n, 3) vectors by rotation and log scale."""
-    J = np.zeros((len(y), 3, 7))
-    J[:, 0, 1], J[:, 1, 2], J[:, 2, 0] = y[:, 2], y[:, 0], y[:, 1]
-    J[:, 0, 2], J[:, 1, 0], J[:, 2, 1] = -y[:, 1], -y[:, 2], -y[:, 0]
-    J[:, :, 6] = y
-    return J
-
-
 def _stack(rows: Sequence[object], shape: tuple[int, ...]) -> F64:
     return np.asarray(rows, np.float64).reshape(len(rows), *shape)
 
@@ -490,15 +481,16 @@ class _Solution:
 
 def _solve(readings: _Readings, R: F64, t: F64, log_scale: float, iterations: int) -> _Solution:
     """Gauss-Newton with Huber's weights."""
-    kept = np.ones(len(readings.outlying))
-    H, cost = np.eye(7), np.inf
+    group, kept = readings.group, np.ones(len(readings.outlying))
+    H, cost, ridge = np.eye(7), np.inf, np.diag([1e-6] * 6 + [1e-4])
     for i in range(iterations + 10):
-        r, J, group = readings.linearised(R, t, log_scale)
+        r, J = readings.linearised(R, t, log_scale)
         norms = np.sqrt(np.bincount(group, weights=r**2, minlength=len(kept)))
         weight = (kept * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9)))[group]
         cost = float(np.sum(np.where(norms < HUBER, 0.5 * norms**2, HUBER * (norms - HUBER / 2))))
-        H = (J * weight[:, None]).T @ J + np.diag([1e-6] * 6 + [1e-4])
-        step = np.linalg.solve(H, -(J * weight[:, None]).T @ r)
+        JW = (J * weight[:, None]).T
+        H = JW @ J + ridge
+        step = np.linalg.solve(H, -JW @ r)
         step[:3] = np.clip(step[:3], -0.5, 0.5)
         step[6] = np.clip(step[6], -0.5, 0.5)
         R = se3.so3_exp(step[:3]) @ R
