@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
-
-pytest.importorskip("py4dgeo")
 
 from recon import se3
 from recon.mapping.cloud_fusion import cloud_of, fuse
@@ -15,6 +15,9 @@ from recon.types import F32, F64, DepthMap
 from service.sim import scene, shapes
 from service.sim.flight import FlightPlan
 from service.sim.recording import Simulation, SimulationOptions, prepare
+
+# It imports seaborn and pandas: seconds, for every worker that collects this file.
+pytestmark = pytest.mark.skipif(find_spec("py4dgeo") is None, reason="needs py4dgeo")
 
 VOXEL_M, SIGMA_M, TALL_M = 0.2, 0.04, 6.0
 CORNER = np.array([500_000.0, 5_200_000.0, 400.0])
