@@ -137,6 +137,8 @@ def open_session(model: bytes, providers: list[str], engines: str | None = None)
     """A session for an ONNX file; ValueError, with the reason, when it cannot be used."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
+    # Threads that spin while they wait take the cores from tracking.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     chosen = provider_options(providers, model, engines)
     try:
         return onnxruntime.InferenceSession(model, options, providers=chosen)
