@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import skyrelief
 
 NEEDS = {"torch": "torch", "onnx": "onnxruntime"}
 SMALL = ("compute.stereo_width=160", "compute.guide_width=320", "compute.pairs=1")
 
 
-def skyrelief(*arguments: str | Path) -> dict[str, Any]:
-    """The JSON that the command ends with."""
+def replayed(*arguments: str | Path) -> dict[str, Any]:
+    """The JSON that a replay in a process of its own ends with."""
     done = subprocess.run(
-        [sys.executable, "-m", "service.cli", *map(str, arguments), "--json"],
+        [sys.executable, "-m", "service.cli", "replay", *map(str, arguments), "--json"],
         capture_output=True, text=True, timeout=500, check=False,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
@@ -31,13 +32,15 @@ def skyrelief(*arguments: str | Path) -> dict[str, Any]:
 def scored(flight: Path, backend: str) -> dict[str, float]:
     """Points, surface error and completeness of the flight replayed with a backend."""
     out = flight.parent / backend
-    summary = skyrelief(
-        "replay", flight / "flight.mp4", "--telemetry", flight / "flight.tlog",
+    summary = replayed(
+        flight / "flight.mp4", "--telemetry", flight / "flight.tlog",
         "--camera-model", flight / "camera.yaml", "--out", out, "--backend", backend,
         *(word for setting in SMALL for word in ("--set", setting)),
     )  # fmt: skip
     assert summary["backend"] == backend
-    report = skyrelief("score", out, flight)
+    done = skyrelief("score", out, flight, "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout.splitlines()[-1])
     surface = report["surface"]["rigid"]
     return {
         "clouds": summary["clouds"],
@@ -52,11 +55,11 @@ def scored(flight: Path, backend: str) -> dict[str, float]:
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated nadir flight of 5 s."""
     folder = tmp_path_factory.mktemp("sim") / "flight"
-    command = [
+    made = skyrelief(
         "simulate", "--out", folder, "--size", "320x180", "--fps", "4", "--duration-s", "5",
         "--height-m", "40", "--speed-m-s", "6", "--seed", "3",
-    ]  # fmt: skip
-    subprocess.run([sys.executable, "-m", "service.cli", *map(str, command)], check=True)
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
     return folder
 
 
