@@ -1,4 +1,4 @@
-"""The benchmark of sites: many scans in tiles, and how boxes are counted against their truth."""
+"""The benchmark of sites: many scans in tiles, drones at once, boxes counted against truth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.bench import BenchOptions, BenchResult, site, site_scale
+from service.bench import BenchOptions, BenchResult, site, site_drones, site_scale
 from service.sim.recording import ORIGIN
 
 rasterio = pytest.importorskip("rasterio")
@@ -26,6 +26,18 @@ def test_a_site_of_scans_is_measured_by_its_products(monkeypatch: pytest.MonkeyP
     assert 0.0 < figures["dsm: error of height, median"].value < site_scale.SIGMA_M
     boxes = figures["change: objects"]
     assert boxes.note == "12 boxes placed" and 6 <= boxes.value <= 12
+
+
+def test_drones_at_once_are_shown_together_and_keep_their_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(site_drones, "HEADINGS_DEG", (0.0, 90.0))
+    figures = {result.what: result for result in site_drones.run(tmp_path, 8.0)}
+    assert figures["four drones: shown together, after the first overlap"].note.startswith("1 of 1")
+    apart = figures["four drones: shown apart at the end"]
+    assert apart.peer_value is not None and apart.value < 0.3 < 1.0 < apart.peer_value
+    assert abs(figures["four drones: site too small by"].value) < 1.0
+    assert figures["four drones: middles apart in the site"].note.startswith("one site, 1 pairs")
 
 
 BOXES = [((0.0, 0.0), 2), ((10.0, 0.0), 1), ((0.0, 12.0), 2), ((-45.0, 0.0), 2)]

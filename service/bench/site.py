@@ -1,8 +1,8 @@
 """Sites against the truth of simulated flights: seams, bias, changes, volumes; and a real set.
 
 Two flights cross one place. For each seed their receivers and attitudes wander on their own; the
-images stay. ``--rounds`` is the number of seeds. With ``--data`` the real nadir set is cut
-into even and odd images, as two flights.
+images stay. ``--rounds`` is the number of seeds. Four drones fly at once. With ``--data`` the
+real nadir set is cut into even and odd images, as two flights.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from recon import se3
 from recon.camera_model import rays
 from recon.types import F64, Keyframe
-from service.bench import BenchOptions, BenchResult, site_scale
+from service.bench import BenchOptions, BenchResult, site_drones, site_scale
 from service.bench.real import _skyrelief as skyrelief
 from service.georeference import LocalFrame
 from service.scans.track import local_frame
@@ -54,6 +54,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
         return site_scale.run(options)
     with tempfile.TemporaryDirectory(prefix="skyrelief-site-") as folder:
         results = _simulated(Path(folder), options)
+        results += site_drones.run(Path(folder) / "drones")
         if options.data is not None and (options.data / REAL).is_dir():
             results += _real(Path(folder) / "real", options.data / REAL, options)
     return results

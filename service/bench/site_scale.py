@@ -20,7 +20,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import rays
-from recon.types import F64, DepthMap, Keyframe, Pose
+from recon.types import F32, F64, U8, DepthMap, Keyframe, Pose
 from service.bench import BenchOptions, BenchResult
 from service.georeference import LocalFrame
 from service.offline.site.gather import Member, gather
@@ -130,19 +130,22 @@ def _write(
     wrong = se3.compose(np.eye(3), rng.normal(size=3) * PLACING_M)
     with ScanStore.create(folder / "scan.db", header) as store:
         for seq, (T, image, depth) in enumerate(views):
-            noisy = depth + rng.normal(size=depth.shape) * SIGMA_M
-            placed = wrong @ T
-            one = DepthMap(
-                noisy.astype(np.float32), np.full(depth.shape, SIGMA_M, np.float32),
-                np.full(depth.shape, 3, np.uint8), K, placed,
-            )  # fmt: skip
-            pose = Pose(placed, np.eye(6) * 1e-3, ("vision", "gnss"))
-            fresh = np.ones(depth.shape, np.bool_)
-            time_ns = start + seq * 10**9
-            store.add_keyframe(
-                seq, encode(Keyframe(seq, time_ns, one, image, pose, fresh), time_ns)
-            )
+            pose = Pose(wrong @ T, np.eye(6) * 1e-3, ("vision", "gnss"))
+            store.add_keyframe(seq, noisy(seq, start + seq * 10**9, image, depth, K, pose, rng))
         store.finish({"frames": len(views)})
+
+
+def noisy(
+    seq: int, time_ns: int, image: U8, depth: F32, K: F64, pose: Pose, rng: np.random.Generator
+) -> list[bytes]:  # fmt: skip
+    """The coded keyframe of a view: its true depth (h, w) with noise of SIGMA_M."""
+    one = DepthMap(
+        (depth + rng.normal(size=depth.shape) * SIGMA_M).astype(np.float32),
+        np.full(depth.shape, SIGMA_M, np.float32), np.full(depth.shape, 3, np.uint8), K,
+        pose.T_world_camera,
+    )  # fmt: skip
+    fresh = np.ones(depth.shape, np.bool_)
+    return list(encode(Keyframe(seq, time_ns, one, image, pose, fresh), time_ns))
 
 
 # ---- measuring -------------------------------------------------------------------------------
