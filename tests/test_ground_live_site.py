@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from site_scans import ELSEWHERE, FRAME, Errors, header_of, layers, leg, write_scan
+from site_scans import ELSEWHERE, FRAME, START_NS, Errors, header_of, layers, leg, write_scan
 
 from recon.types import F64
 from service.ground.live_site import MAX_SCANS, Follower, run
@@ -101,6 +101,24 @@ def test_a_scan_in_flight_meets_the_site_on_the_ground(tmp_path: Path) -> None:
     one = flying(tmp_path / "b" / "3", EAST, WRONG)
     followed(tmp_path)
     assert ("site", "a-1") in said(one) and ("a", "1") not in said(one)
+
+
+def test_the_last_visit_is_shown_as_an_earlier_date(tmp_path: Path) -> None:
+    for name, day in (("april", -60), ("may", -30)):
+        scan = write_scan(tmp_path / name / "1", NORTH, day=day)
+        with ScanStore.open(scan / "scan.db") as store:
+            write_deliverables(scan, store, {})
+        rested(scan)
+    may, now = tmp_path / "may" / "1", START_NS / 1e9
+    here, elsewhere = (FRAME.lat_deg, FRAME.lon_deg), (FRAME.lat_deg + 0.01, FRAME.lon_deg)
+    assert references(tmp_path, now, (), elsewhere) == references(tmp_path, now, ()) == []
+    assert references(tmp_path, now, (), here) == [may]
+    flown = flying(tmp_path / "b" / "3", EAST, WRONG)
+    followed(tmp_path)
+    shown = said(flown)
+    assert set(shown) == {("may", "1"), ("b", "3")}
+    assert shown["may", "1"]["earlier"] and not shown["b", "3"]["earlier"]
+    assert ("b", "3") not in said(may)  # a scan shows none that came later
 
 
 @pytest.mark.parametrize("damage", ["text", "empty", "pose", "gone"])

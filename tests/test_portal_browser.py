@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,13 +17,14 @@ from loopback import free_port
 from person import Browser
 from portal_client import NEEDS, TOKEN, browser, flown_store, listing
 from rehearsal import RehearsalVehicle
-from site_scans import Errors, leg, write_scan
+from site_scans import Box, Errors, leg, write_scan
 
 from service.ground.live_site import Follower
 from service.ground.portal import Portal, PortalConfig
 from service.ground.shown_site import FILE
 from service.ground.vehicle import Vehicle
 from service.offline.exports.view import ExportOptions, ScanView, export
+from service.scans.folder import write_deliverables
 from service.stream.codec import encode
 from service.stream.records import Repose
 from service.stream.store import ScanStore
@@ -222,6 +224,48 @@ def test_a_scan_in_flight_is_drawn_with_those_it_is_tied_to(
         browser.wait("document.querySelector('.legend').textContent.includes('b/2')")
         browser.image(tmp_path / "tied.png")  # to look at
         (tmp_path / FILE).unlink()
+
+
+def test_what_is_new_since_the_last_visit_has_its_colours(browser: Browser, tmp_path: Path) -> None:
+    boxes: list[Box] = [(2.0, 3.0, 7.0, 7.0, 1.5), (-9.0, -7.0, -4.0, -3.0, 1.5)]
+    last = write_scan(tmp_path / "a/may", leg(0.0), Errors((1.1, -0.7, 0.9)), boxes[:1], day=-30)
+    with ScanStore.open(last / "scan.db") as store:
+        write_deliverables(last, store, {})
+    for path in last.glob("scan.db*"):
+        os.utime(path, (0, 0))
+    now = write_scan(tmp_path / "b/june", leg(np.pi / 2), None, boxes[1:], finished=False)
+    follower = Follower(tmp_path)
+    while follower.turn(time.time()):
+        pass
+    with listing(browser, tmp_path, 2) as base:
+        browser.open(f"{base}/#/view/b/june")
+        browser.wait(f"Number(document.body.dataset.points) > {samples(now)}")
+        drawn = browser.wait("Number(document.body.dataset.drawn)")
+        assert drawn <= samples(now)  # the earlier date is only compared with
+        choose = (
+            "(() => { const s = document.querySelector('.tools select'); s.value = 'change';"
+            " s.dispatchEvent(new Event('change')); return s.value; })()"
+        )
+        assert browser.wait(choose) == "change"
+        browser.wait("document.querySelector('.legend').textContent.includes('not seen before')")
+        browser.click("Whole site")
+        red, blue = changed_px(browser, tmp_path / "change.png")
+        assert red > 300 and blue > 300
+        assert red + blue < 15_000  # of about 300,000 that show ground
+
+
+def changed_px(browser: Browser, path: Path) -> tuple[int, int]:
+    """Pixels of the scene that are clearly red and clearly blue, once there are any."""
+    script = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
+    end, found = time.monotonic() + 60.0, (0, 0)
+    while min(found) < 300 and time.monotonic() < end:
+        time.sleep(1.0)
+        data = np.frombuffer(base64.b64decode(browser.run(script)), np.uint8)
+        image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.int64)
+        b, g, r = np.moveaxis(image[..., :3], -1, 0)
+        found = int(np.sum(r - np.maximum(g, b) > 50)), int(np.sum(b - np.maximum(g, r) > 50))
+    browser.image(path)  # to look at
+    return found
 
 
 def samples(folder: Path) -> int:

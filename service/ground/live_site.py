@@ -42,7 +42,8 @@ def run(store: Path, worker: Worker) -> None:
 
 
 class Follower:
-    """Follows the scans that grow below ``store``, and the finished ones of the same visit.
+    """Follows the scans that grow below ``store``, and the finished ones of the same visit and
+    of the last one before.
 
     A scan that ends is followed until none is in flight: others are tied to it.
     """
@@ -78,8 +79,12 @@ class Follower:
         if one.is_finished:  # and only looked at
             self._site.remove(folder)
             return
-        started_unix_s = one.store.header.started_unix_ns / 1e9
-        for other in references(self._store, started_unix_s, self._site.scans)[-MAX_SCANS:]:
+        header = one.store.header
+        at = None
+        if header.origin_lat_deg is not None and header.origin_lon_deg is not None:
+            at = header.origin_lat_deg, header.origin_lon_deg
+        known = self._site.scans
+        for other in references(self._store, one.started_unix_s, known, at)[-MAX_SCANS:]:
             self._add(other, compare=False)
 
     def _add(self, folder: Path, compare: bool) -> bool:

@@ -12,7 +12,9 @@ import numpy as np
 from recon import se3
 from recon.types import F64
 from service.errors import InputError
+from service.ground.scan_facts import UnixTime
 from service.ground.storage import is_regular
+from service.offline.site import SAME_VISIT_S
 from service.offline.site.live import Placed
 from service.scans.writing import writing
 from service.small_file import read_small
@@ -29,6 +31,7 @@ class Shown(msgspec.Struct):
 
     drone: str
     scan: str
+    started_unix_s: UnixTime
     T_site_scan: Matrix  # row by row, by the two origins alone
     moved: Matrix  # row by row: in the site, with the scale
     sigma_m: tuple[Number, Number, Number]  # east, north, up
@@ -44,7 +47,7 @@ def write_shown(store: Path, placed: list[Placed]) -> None:
         matrices = (one.T_site_scan.ravel().tolist(), moved.ravel().tolist())
         sigma = (float(v) for v in np.minimum(one.sigma_m, 1e6))
         names = one.folder.parent.name, one.folder.name
-        found.append(Shown(*names, *matrices, (*sigma,), one.ties, one.group))  # type: ignore[arg-type]
+        found.append(Shown(*names, one.started_unix_s, *matrices, (*sigma,), one.ties, one.group))  # type: ignore[arg-type]
     with writing(store / FILE) as part:
         part.write_bytes(msgspec.json.encode(found))
 
@@ -71,7 +74,7 @@ class SiteNews:
         self._seen = written
         scans = self._read()
         own = next((one for one in scans if (one.drone, one.scan) == self._names), None)
-        near = [] if own is None else [one for one in scans if one.group == own.group]
+        near = [one for one in scans if own and _is_for(own, one)]
         return json.dumps({"type": "site", "scans": [_entry(own, one) for one in near if own]})
 
     def _read(self) -> list[Shown]:
@@ -83,10 +86,16 @@ class SiteNews:
             return []
 
 
+def _is_for(own: Shown, one: Shown) -> bool:
+    """True for a scan tied to this one, and not of a later visit."""
+    return one.group == own.group and one.started_unix_s <= own.started_unix_s + SAME_VISIT_S
+
+
 def _entry(own: Shown, one: Shown) -> dict[str, object]:
     T = se3.inverse(_matrix(own.T_site_scan)) @ _matrix(one.moved) @ _matrix(one.T_site_scan)
     return {
-        "drone": one.drone, "scan": one.scan, "own": one is own, "ties": one.ties,
+        "drone": one.drone, "scan": one.scan, "own": one is own,
+        "earlier": one.started_unix_s < own.started_unix_s - SAME_VISIT_S, "ties": one.ties,
         "sigma_m": one.sigma_m, "T": [round(float(v), 9) for v in T.T.ravel()],
     }  # fmt: skip
 

@@ -19,12 +19,14 @@ from pathlib import Path
 from subprocess import DEVNULL
 
 import msgspec
+import numpy as np
 
 from service.errors import InputError
+from service.georeference import LocalFrame
 from service.ground.drone import Limits
-from service.ground.scan_facts import Ground, Times, ground_in
+from service.ground.scan_facts import Corner, Ground, Times, ground_in
 from service.ground.storage import DiskShare, is_regular
-from service.offline.site import DRONE, SITE
+from service.offline.site import DRONE, SAME_VISIT_S, SITE
 from service.offline.site.start import Start
 from service.progress import Progress
 from service.small_file import read_small
@@ -32,8 +34,8 @@ from service.workers import Worker, end_process, guarded, open_process
 
 log = logging.getLogger(__name__)
 
-SAME_VISIT_S = 86_400.0
-"""Between the starts of two scans; ground seen further apart may differ, see ``site compare``."""
+NEAR_M = 500.0
+"""From where a flight begins to ground that it may see."""
 
 MIN_SHARED = 0.05
 """Minimum share of the smaller scan's extent that the other covers as well."""
@@ -131,21 +133,43 @@ def companions(store: Path, folder: Path) -> list[Path]:
     ]
 
 
-def references(store: Path, started_unix_s: float, known: Collection[Path]) -> list[Path]:
-    """The sites and the scans of no site of one visit, the newest last, without ``known`` ones."""
+def references(
+    store: Path, started_unix_s: float, known: Collection[Path], at: Corner | None = None
+) -> list[Path]:
+    """The sites and the scans of no site of one visit, and of the last visit before of the ground
+    near ``at`` (latitude, longitude); the newest last, without ``known`` ones."""
     held = {folder.resolve() for folder in known}
     sites = {path: scans for path, scans in _sites(store) if not held & scans}
     members = {member for folders in sites.values() for member in folders}
-    own = Ground(Times(started_unix_s), True)
-    found = [
-        (g.times.started_unix_s, path) for path, g in _grounds(store) if _is_same_visit(own, g)
-    ]
+    grounds = [(ground, path) for path, ground in _grounds(store)]
     for path in sites:
         with contextlib.suppress(*UNREADABLE):
-            ground = ground_in(path / "scan.json")
-            if _is_same_visit(own, ground):
-                found.append((ground.times.started_unix_s, path))
-    return [path for _, path in sorted(found) if path.resolve() not in held | members]
+            grounds.append((ground_in(path / "scan.json"), path))
+    grounds = [(g, path) for g, path in grounds if path.resolve() not in held | members]
+    own = Ground(Times(started_unix_s), True)
+    found = [(g, path) for g, path in grounds if _is_same_visit(own, g)]
+    before = [
+        (g, path)
+        for g, path in grounds
+        if g.finished and g.times.started_unix_s < started_unix_s - SAME_VISIT_S and _is_near(g, at)
+    ]
+    if before:
+        last, _ = max(before, key=_start)
+        found += [(g, path) for g, path in before if _is_same_visit(last, g)]
+    return [path for _, path in sorted(found, key=_start)]
+
+
+def _start(one: tuple[Ground, Path]) -> tuple[float, Path]:
+    return one[0].times.started_unix_s, one[1]
+
+
+def _is_near(ground: Ground, at: Corner | None) -> bool:
+    """True where ground of known extent lies within NEAR_M of a place."""
+    if ground.box is None or at is None:
+        return False
+    nearest = np.clip(at, *ground.box)
+    away = LocalFrame(*at, 0.0).to_enu(np.append(nearest, 0.0)[None])[0, :2]
+    return float(np.linalg.norm(away)) < NEAR_M
 
 
 def site_of(store: Path, members: Sequence[Path]) -> Path:

@@ -5,3 +5,6 @@ DRONE = "site"
 
 SITE = "site.json"
 """The scans of a site, their motions and ties."""
+
+SAME_VISIT_S = 86_400.0
+"""Between the starts of two scans; ground seen further apart may differ, see ``site compare``."""

@@ -53,6 +53,7 @@ class Placed:
     """Where a scan is shown."""
 
     folder: Path
+    started_unix_s: float
     T_site_scan: F64  # (4, 4) by the two origins alone
     move: Similarity  # in the site
     sigma_m: F64  # (3,) east, north, up, of its middle
@@ -74,6 +75,7 @@ class FollowedScan:
         try:
             self.origin, self.T_site_scan = _placing(self.store, origin)
             self.is_finished = self.store.finished
+            self.started_unix_s = self.store.header.started_unix_ns / 1e9
         except SkyreliefError:
             self.store.close()
             raise
@@ -277,6 +279,9 @@ class LiveSite:
         for one, move in zip(scans, found.moves, strict=True):
             one.move = move
         return [
-            Placed(one.folder, one.T_site_scan, one.move, sigma[i], ends[i], found.groups[i])
+            Placed(
+                one.folder, one.started_unix_s, one.T_site_scan, one.move, sigma[i], ends[i],
+                found.groups[i],
+            )
             for i, one in enumerate(scans)
-        ]
+        ]  # fmt: skip

@@ -40,7 +40,7 @@ export type News =
 /** Where this scan and those tied to it are shown, in this scan's coordinates. */
 export interface SiteNews {
   type: "site";
-  scans: { drone: string; scan: string; own: boolean; ties: number; sigma_m: [number, number, number]; T: number[] }[];
+  scans: { drone: string; scan: string; own: boolean; earlier: boolean; ties: number; sigma_m: [number, number, number]; T: number[] }[];
 }
 
 /** How the scan comes in, once a second. */

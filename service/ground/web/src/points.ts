@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import type { Part } from "./api";
+import { Before, CHANGE } from "./before";
 import type { Chunk } from "./live";
 import type { Gradual } from "./painter";
 import { length } from "./units";
@@ -9,11 +10,14 @@ import { length } from "./units";
 /** Between the keyframes' numbers of two scans that are drawn together. */
 export const STRIDE = 2 ** 33;
 
-export const COLOURS = ["colour", "height", "sigma", "views", "age", "scan"] as const;
+export const COLOURS = ["colour", "height", "sigma", "views", "age", "scan", "change"] as const;
 export type Colour = (typeof COLOURS)[number];
 
 /** Distinct also for the colour-blind (Okabe and Ito 2008). */
 const PARTS = ["#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7"];
+
+/** Of the change since an earlier date, as on the maps of `site compare`. */
+const CHANGES: [string, string][] = [["higher", "#d03027"], ["lower", "#2b6fd0"], ["as before", "#9a9a9a"], ["not seen before", "#3a3a3a"]];
 
 const VERTEX = /* glsl */ `
   attribute vec3 rgb;
@@ -27,9 +31,10 @@ const VERTEX = /* glsl */ `
   uniform vec2 range;
   uniform float age;
   uniform vec3 part;
+  uniform vec3 higher, lower, same, unseen;
   varying vec3 shown;
   #include <clipping_planes_pars_vertex>
-
+  ${CHANGE}
   vec3 linear(vec3 s) {
     return mix(s / 12.92, pow((s + 0.055) / 1.055, vec3(2.4)), step(0.04045, s));
   }
@@ -51,6 +56,11 @@ const VERTEX = /* glsl */ `
     if (mode > 3.5) s = ramp(age);
     shown = linear(s);
     if (mode > 4.5) shown = part * (0.3 + 0.7 * dot(rgb, vec3(0.30, 0.59, 0.11)));
+    if (mode > 5.5) {
+      float d = change(world.xyz, 0.15 + 3.0 * sigma * 5.1);
+      vec3 kind = d > 1e8 ? unseen : mix(same, d > 0.0 ? higher : lower, min(abs(d) / 0.3, 1.0));
+      shown = kind * (0.4 + 0.6 * dot(rgb, vec3(0.30, 0.59, 0.11)));
+    }
     vec4 mvPosition = seen;
     #include <clipping_planes_vertex>
   }
@@ -85,6 +95,11 @@ export class Cloud implements Gradual {
   datum_m = 0;
   /** The scans of a site, by the numbers of their keyframes; none for a single scan. */
   parts: Part[] = [];
+  /** Scans of an earlier date, as multiples of STRIDE: not drawn, but compared with. */
+  private readonly earlier = new Set<number>();
+  private readonly past = new THREE.Group();
+  private readonly before = new Before();
+  private isStale = false;
   /** Called when there are parts to colour by. */
   named = (): void => undefined;
   private readonly moves = new Map<number, THREE.Matrix4>();
@@ -96,6 +111,8 @@ export class Cloud implements Gradual {
     height_px: { value: 400 },
     mode: { value: 0 },
     range: { value: new THREE.Vector2(0, 1) },
+    ...this.before.uniforms,
+    ...Object.fromEntries(["higher", "lower", "same", "unseen"].map((name, k) => [name, { value: new THREE.Color(CHANGES[k]![1]) }])),
   };
 
   get total(): number {
@@ -135,7 +152,21 @@ export class Cloud implements Gradual {
     this.chunks.set(chunk.seq, held);
     object.visible = this.isShown(chunk.seq);
     this.place(chunk.seq, held);
-    this.group.add(object);
+    this.groupOf(chunk.seq).add(object);
+  }
+
+  private groupOf(seq: number): THREE.Group {
+    const isPast = this.earlier.has(Math.floor(seq / STRIDE));
+    this.isStale ||= isPast;
+    return isPast ? this.past : this.group;
+  }
+
+  /** Compares with what has come of the earlier date, when that is shown; true when it is news. */
+  refresh(): boolean {
+    if (!this.isStale || COLOURS[this.shared.mode.value] !== "change") return false;
+    this.isStale = false;
+    this.before.build(this.past);
+    return true;
   }
 
   /** The keyframes and when they were taken, in order. */
@@ -152,7 +183,7 @@ export class Cloud implements Gradual {
   }
 
   private isShown(seq: number): boolean {
-    return seq <= this.last || seq >= STRIDE;
+    return seq < STRIDE ? seq <= this.last : !this.earlier.has(Math.floor(seq / STRIDE));
   }
 
   /** Moves all chunks of a scan, numbered from k * STRIDE on, as a whole. */
@@ -161,11 +192,16 @@ export class Cloud implements Gradual {
     for (const [seq, held] of this.chunks) if (Math.floor(seq / STRIDE) === k) this.place(seq, held);
   }
 
-  /** Names the scans that are drawn together. */
-  name(names: string[]): void {
+  /** Names the scans that are together here; `earlier` are those of an earlier date. */
+  name(names: string[], earlier: number[]): void {
     if (names.length === this.parts.length) return;
     this.parts = names.map((name, k) => ({ name, keyframes: [k * STRIDE, (k + 1) * STRIDE - 1] }));
-    for (const [seq, { object }] of this.chunks) object.material.uniforms["part"]!.value = this.partOf(seq);
+    for (const k of earlier) this.earlier.add(k);
+    for (const [seq, { object }] of this.chunks) {
+      object.material.uniforms["part"]!.value = this.partOf(seq);
+      this.groupOf(seq).add(object);
+      object.visible = this.isShown(seq);
+    }
     this.named();
   }
 
@@ -181,9 +217,16 @@ export class Cloud implements Gradual {
     if (mode === "age") this.ages();
   }
 
-  /** The name and colour of each part. */
+  /** True for a colour that has something to show. */
+  offers(mode: Colour): boolean {
+    return (mode !== "scan" || this.parts.length > 0) && (mode !== "change" || this.earlier.size > 0);
+  }
+
+  /** The name and colour of each part or kind of change; none for other colours. */
   keys(): [string, string][] {
-    return this.parts.map(({ name }, k) => [name, PARTS[k % PARTS.length]!]);
+    const mode = COLOURS[this.shared.mode.value];
+    if (mode === "change") return CHANGES;
+    return mode !== "scan" ? [] : this.parts.map(({ name }, k) => [name, PARTS[k % PARTS.length]!]);
   }
 
   private partOf(seq: number): THREE.Color {
@@ -201,6 +244,7 @@ export class Cloud implements Gradual {
       views: ["1 view", "8 views"],
       age: ["first", "last"],
       scan: null,
+      change: null,
     };
     return words[COLOURS[this.shared.mode.value]!];
   }
@@ -264,13 +308,14 @@ export class Cloud implements Gradual {
     held.object.matrix.fromArray(held.T).scale(new THREE.Vector3(unit, unit, unit));
     const move = this.moves.get(Math.floor(seq / STRIDE));
     if (move) held.object.matrix.premultiply(move);
+    this.isStale ||= this.earlier.has(Math.floor(seq / STRIDE));
     held.object.updateMatrixWorld(true);
   }
 
   private remove(seq: number): void {
     const held = this.chunks.get(seq);
     if (!held) return;
-    this.group.remove(held.object);
+    held.object.removeFromParent();
     held.object.geometry.dispose();
     held.object.material.dispose();
     this.chunks.delete(seq);

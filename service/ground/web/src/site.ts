@@ -39,7 +39,9 @@ export class SiteView {
       const k = [...this.others.keys()].indexOf(name) + 1;
       if (k > 0) this.cloud.move(k, scan.T);
     }
-    if (this.others.size) this.cloud.name([`${own.drone}/${own.scan}`, ...this.others.keys()]);
+    const names = [`${own.drone}/${own.scan}`, ...this.others.keys()];
+    const earlier = scans.filter((s) => s.earlier).map((s) => names.indexOf(`${s.drone}/${s.scan}`));
+    if (this.others.size) this.cloud.name(names, earlier.filter((k) => k > 0));
     document.body.dataset["ties"] = String(own.ties);
   }
 

@@ -54,19 +54,20 @@ function colours({ cloud, legend }: Parts): HTMLElement {
   const select = el(
     "select",
     {},
-    ...COLOURS.filter((c) => c !== "scan" || cloud.parts.length).map((c) => el("option", { value: c, textContent: c })),
+    ...COLOURS.filter((c) => cloud.offers(c)).map((c) => el("option", { value: c, textContent: c })),
   );
   cloud.named = () => {
-    if (select.options.length < COLOURS.length) select.append(el("option", { value: "scan", textContent: "scan" }));
+    const known = [...select.options].map((o) => o.value);
+    for (const c of COLOURS.filter((one) => cloud.offers(one) && !known.includes(one))) select.append(el("option", { value: c, textContent: c }));
     if (select.value === "scan") select.dispatchEvent(new Event("change"));
   };
   select.setAttribute("aria-label", "colour by");
   select.onchange = () => {
     cloud.colour(select.value as Colour);
     const words = cloud.scale();
-    const parts = select.value === "scan";
-    legend.hidden = words === null && !parts;
-    if (parts) legend.replaceChildren(el("p", { className: "keys" }, ...cloud.keys().map(([name, colour]) => key(name, colour))));
+    const keys = cloud.keys();
+    legend.hidden = words === null && !keys.length;
+    if (keys.length) legend.replaceChildren(el("p", { className: "keys" }, ...keys.map(([name, colour]) => key(name, colour))));
     if (words)
       legend.replaceChildren(
         el("span", { textContent: words[0] }),

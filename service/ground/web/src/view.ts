@@ -150,6 +150,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const clock = setInterval(() => {
     link.draw();
     if (cameras.refresh()) stage.touch();
+    if (cloud.refresh()) stage.touch();
     figures.replaceChildren(...rows(cloud, stage, last, fused, others.words));
     document.body.dataset["points"] = String(cloud.total);
     document.body.dataset["drawn"] = String(cloud.drawn);
