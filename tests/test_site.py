@@ -307,6 +307,18 @@ def test_change_files_open_elsewhere(changed: Path) -> None:
         assert abs(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2 == pytest.approx(area, rel=0.3)
 
 
+def test_of_bare_ground_only_the_pit_is_shown(tmp_path: Path) -> None:
+    pit: Box = (2.0, 3.0, 6.0, 7.0, -1.0)
+    one = write_scan(tmp_path / "one", NORTH, Errors((0.6, 0.2, -0.8)), BOXES[1:])
+    two = write_scan(tmp_path / "two", EAST, Errors((-0.4, 0.5, 0.6)), [pit], day=30)
+    words = ["site", "compare", str(one), str(two), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*words, "--bare", "--json"])
+    assert done.exit_code == 0, done.output
+    (found,) = json.loads((tmp_path / "out/change.json").read_text())["objects"]
+    assert found["kind"] == "removed"
+    assert found["volume_m3"] == pytest.approx(-16.0, rel=0.15)
+
+
 def test_flights_without_change_show_none(tmp_path: Path) -> None:
     one = write_scan(tmp_path / "one", NORTH, Errors((0.6, 0.2, -0.8)), BOXES)
     two = write_scan(tmp_path / "two", EAST, Errors((-0.4, 0.5, 0.6)), BOXES, day=30)

@@ -219,6 +219,9 @@ def site(
     cell_m: Annotated[
         float | None, typer.Option("--cell-m", help="compare: cell size; default: pixel on ground")
     ] = None,
+    bare: Annotated[
+        bool, typer.Option("--bare", help="compare: bare ground only, as in `export --to dtm`")
+    ] = False,
     tile_points: TilePoints = 20_000_000,
     scheduler: Scheduler = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
@@ -248,7 +251,7 @@ def site(
     if len(scans) != 2:
         raise InputError(f"site compare takes two scans, before and after, not {len(scans)}")
     with needing("a change map"):
-        figures = compare(scans[0], scans[1], out, cell_m, tile_points, scheduler)
+        figures = compare(scans[0], scans[1], out, cell_m, tile_points, scheduler, bare)
     print(json.dumps(figures) if as_json else "\n".join(_change_lines(out, figures)))
 
 

@@ -23,6 +23,7 @@ from recon.surface.change import (
     outlines,
     volumes,
 )
+from recon.surface.ground import ground_cells
 from recon.surface.raster import Grid, Raster, grid_over
 from recon.surface.walls import Wall, walls_moved
 from recon.types import F32, F64, U8, Bool, DepthMap
@@ -65,6 +66,7 @@ class ChangeJob:
     cell_m: float | None
     whole: Grid | None  # of all tiles; None: this is the only one
     alignment_m: float  # sigma, horizontal
+    bare: bool  # only where both dates show bare ground
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,9 +99,11 @@ def compare(
     cell_m: float | None = None,
     tile_points: int = TILE_POINTS,
     scheduler: str | None = None,
+    bare: bool = False,
 ) -> dict[str, Any]:
     """Align two scans in the folder ``out``, and write what changed from one to the other.
 
+    With ``bare``, objects on the ground are left out at both dates.
     Returns the content of change.json. Raises InputError for scans that are one flight, that no
     tie joins, or that share no ground.
     """
@@ -110,7 +114,7 @@ def compare(
         view.needs_place("a comparison")
         parts = ((pair[0].first, pair[0].last), (pair[1].first, pair[1].last))
         apart = _apart_m(site, one, two)
-        found = changes(view, out, parts, apart, cell_m, tile_points, scheduler)
+        found = changes(view, out, parts, apart, cell_m, tile_points, scheduler, bare=bare)
         if found is None:
             raise InputError(f"{before} and {after} share no ground")
         document = _document(site, found, one, two)
@@ -147,6 +151,7 @@ def changes(
     tile_points: int = TILE_POINTS,
     scheduler: str | None = None,
     progress: Progress | None = None,
+    bare: bool = False,
 ) -> Changes | None:
     """Compare two dates of a site, ``parts`` of its keyframes, and write change.tif into ``out``.
 
@@ -161,7 +166,7 @@ def changes(
             for a, b in parts
         ]
         voxels, whole = tuple(usual), over(grown(cut.bounds, 2.0), cell_m or max(usual))
-    jobs = [ChangeJob(tile, parts, voxels, cell_m, whole, alignment_m) for tile in cut.tiles]
+    jobs = [ChangeJob(tile, parts, voxels, cell_m, whole, alignment_m, bare) for tile in cut.tiles]
     made = run_tiles(change_tile, jobs, scheduler, progress or Progress())
     compared = (part for part in made if part is not None)
     first = next(compared, None)
@@ -312,8 +317,16 @@ def surfaces(
         level_filled(mean_surface(xyz, fused.cloud.rgb, fused.cloud.sigma_m, grid), HOLE_CELLS)
         for xyz, fused in zip(places, clouds, strict=True)
     )
+    if job.bare:
+        one, two = _bare(one), _bare(two)
     seen = (places[0], clouds[0].cloud.sigma_m), (places[1], clouds[1].cloud.sigma_m)
     return (one, two), seen, max(fused.voxel_m for fused in clouds)
+
+
+def _bare(surface: Raster) -> Raster:
+    """The surface where it is bare ground."""
+    ground = ground_cells(surface)
+    return replace(surface, height_m=np.where(ground, surface.height_m, np.float32(np.nan)))
 
 
 def hide_changed(path: Path, earlier: Member, map_: Path) -> None:
