@@ -123,6 +123,17 @@ def test_aligning_again_keeps_the_history_and_adds_scans(
     assert len(document["pairs"]) >= 2
 
 
+def test_every_two_of_three_scans_of_one_place_are_tied(tmp_path: Path) -> None:
+    flown = [(leg(np.radians(turn)), shift) for turn, shift in ((0, 0.8), (90, -0.8), (30, 0.2))]
+    scans = [
+        write_scan(tmp_path / f"{k}", poses, Errors((shift, 0.0, 0.5)), day=k)
+        for k, (poses, shift) in enumerate(flown)
+    ]
+    document = align_site(scans, tmp_path / "site", deliver=False).document
+    assert len(document["pairs"]) == 3
+    assert all(pair["ties"] >= 3 for pair in document["pairs"]), document["pairs"]
+
+
 def test_two_alignments_of_one_site_at_once_wait_for_each_other(tmp_path: Path) -> None:
     names = ("one", "two", "three")
     scans = [write_scan(tmp_path / n, NORTH[:2], day=k) for k, n in enumerate(names)]

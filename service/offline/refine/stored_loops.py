@@ -30,7 +30,7 @@ BREAK_S = 10.0
 """A longer pause between keyframes ends a stretch."""
 
 LOOPS_PER_KEYFRAME, TRIES = 2, 5
-"""Loops that end in one keyframe, and verifications for them, at most."""
+"""Loops between one keyframe and another scan, or its own, and verifications for them, at most."""
 
 TELLING = 2.0
 """Loops less sure by this factor than the surest give no step between their ends."""
@@ -117,24 +117,31 @@ class StoredLoops:
         out: list[Closure] = []
         later = range(self._config.min_gap, len(self._track.poses))
         for b in (progress or Progress()).over(later, len(later)):
-            found = (self._verified(a, b) for a in self._likely(b, tree))
-            out += islice(filter(None, found), LOOPS_PER_KEYFRAME)
+            for earlier in self._near(b, tree):
+                found = (self._verified(a, b) for a in self._likely(b, earlier))
+                out += islice(filter(None, found), LOOPS_PER_KEYFRAME)
         return weighted(out)
 
-    def _likely(self, b: int, tree: cKDTree) -> list[int]:
-        """Earlier keyframes that see what ``b`` sees, best first."""
-        poses, own = self._track.poses, self._views.at(b)
+    def _near(self, b: int, tree: cKDTree) -> list[list[int]]:
+        """Earlier keyframes near ``b``, those of each other scan by themselves."""
+        own = self._views.at(b)
         if own is None:
             return []
-        near = tree.query_ball_point(poses[b, :2, 3], reach_m(own))
-        earlier = sorted(a for a in near if a <= b - self._config.min_gap and self._wanted(a, b))
+        near = tree.query_ball_point(self._track.poses[b, :2, 3], reach_m(own))
+        earlier = sorted(a for a in near if a <= b - self._config.min_gap)
+        if self._scans is None:
+            return [earlier]
+        scans = self._scans
+        others = sorted({scans[a] for a in earlier} - {scans[b]})
+        return [[a for a in earlier if scans[a] == other] for other in others]
+
+    def _likely(self, b: int, earlier: Sequence[int]) -> list[int]:
+        """Those of the ``earlier`` keyframes that see what ``b`` sees, best first."""
         view = self._views.view(b) if earlier else None
         if view is None:
             return []
-        return likely(view, b, {a: poses[a] for a in (*earlier, b)}, self._config)
-
-    def _wanted(self, a: int, b: int) -> bool:
-        return self._scans is None or self._scans[a] != self._scans[b]
+        poses = {a: self._track.poses[a] for a in (*earlier, b)}
+        return likely(view, b, poses, self._config)
 
     def _verified(self, a: int, b: int) -> Closure | None:
         reach = self._reach(a, b)
