@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import re
+import shutil
 import sqlite3
 import struct
 import threading
@@ -23,6 +24,7 @@ from recon.types import F64
 from service.cli import app
 from service.errors import InputError
 from service.georeference import LocalFrame
+from service.offline.refine.refinement import RefineOptions, refine
 from service.offline.site import alignment
 from service.offline.site.alignment import AlignedSite, align_site
 from service.offline.site.compare import compare
@@ -132,6 +134,32 @@ def test_every_two_of_three_scans_of_one_place_are_tied(tmp_path: Path) -> None:
     document = align_site(scans, tmp_path / "site", deliver=False).document
     assert len(document["pairs"]) == 3
     assert all(pair["ties"] >= 3 for pair in document["pairs"]), document["pairs"]
+
+
+def test_control_points_place_all_scans_of_a_site(
+    merged: tuple[Path, list[Path]], tmp_path: Path
+) -> None:
+    site = tmp_path / "site"
+    shutil.copytree(merged[0], site)
+    truth, shift = [*NORTH, *EAST], np.array([0.5, -0.3, 0.4])  # the survey's from the fixes
+    rows = ["name,x,y,z,lat,lon,alt_amsl_m"]
+    with ScanStore.open(site / "scan.db") as store:
+        for seq in (0, 2, 5, 6, 8):  # three in the first scan, two in the second
+            one = store.keyframe(seq)
+            assert one is not None
+            ahead = np.array([[0.0, 0.0, float(one.depth.depth_m[67, 119])]])
+            here = FRAME.to_utm(se3.transform(one.depth.T_world_camera, ahead))[0]
+            spot = truth[seq][:3, 3].copy()
+            spot[2] = height(spot[:1], spot[1:2])[0]
+            lat, lon, alt = FRAME.to_geodetic((spot + shift)[None])[0]
+            rows.append(
+                f"P{seq},{here[0]:.3f},{here[1]:.3f},{here[2]:.3f},{lat:.9f},{lon:.9f},{alt:.3f}"
+            )
+    (tmp_path / "points.csv").write_text("\n".join(rows))
+    assert refine(site, RefineOptions(tmp_path / "points.csv"))["changed"]
+    off = errors_m(site, truth)
+    for scan in (slice(0, 6), slice(6, 12)):
+        np.testing.assert_allclose(off[scan].mean(axis=0), shift[:2], atol=0.08)
 
 
 def test_two_alignments_of_one_site_at_once_wait_for_each_other(tmp_path: Path) -> None:
