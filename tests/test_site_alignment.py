@@ -71,6 +71,19 @@ def test_ties_that_disagree_do_not_shrink_the_site() -> None:
     assert np.mean(scales) == pytest.approx(1.0, abs=0.015)
 
 
+def test_ties_that_disagree_do_not_tilt_the_site() -> None:
+    rng = np.random.default_rng(1)
+    unsure = ScanPrior(CENTRE, np.array([0.06] * 3 + [3.0, 3.0, 40.0, 0.01]))  # no attitude
+    spread, ties = np.tile(np.diag([0.5, 0.25, 0.1]) ** 2, (4, 1, 1)), []
+    for _ in range(70):
+        places = rng.uniform(-40, 40, (4, 3)) * [1, 1, 0.05]
+        wander = rng.normal(size=3) * [0.0, 0.0, 0.4]
+        ties.append(Tie(0, 1, places + wander, places, spread))
+    found = align(ties, [unsure, unsure])
+    turned = np.degrees([se3.so3_log(move.R) for move in found.moves])
+    assert np.abs(turned).max() < 0.5
+
+
 def test_like_receivers_share_their_sigma_and_a_better_one_keeps_its_own() -> None:
     own = [[0.2, 1.0, 0.4], [1.0, 1.0, 0.4], [1.0, 0.02, 2.0]]
     given = [

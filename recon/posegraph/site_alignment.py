@@ -35,7 +35,7 @@ class Tie:
     b: int
     at_a: F64  # (P, 3) m
     at_b: F64  # (P, 3) m
-    covariance: F64  # (P, 3, 3) m2, of at_a - at_b
+    covariance: F64  # (P, 3, 3) m2, of at_a - at_b; it turns and grows with the scans
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,13 +130,14 @@ def _equations(ties: Sequence[Tie], priors: Sequence[ScanPrior], state: F64) -> 
     for tie, error in zip(ties, _errors(ties, moves), strict=True):
         weight = 1.0 / (1.0 + (_size(error, tie) / CAUCHY_SIGMAS) ** 2)
         W = weight * np.linalg.inv(tie.covariance)
-        sides = np.zeros((len(error), 3, 2, UNKNOWNS))
+        sides, R = np.zeros((len(error), 3, 2, UNKNOWNS)), moves[tie.a].R
         ends = ((tie.a, tie.at_a, 1.0), (tie.b, tie.at_b, -1.0))
         for side, (scan, points, sign) in enumerate(ends):
             centre = priors[scan].centre_m + state[scan, 3:6]
             lever = _lever(moves[scan].points(points) - centre).reshape(-1, 3, 7)
-            sides[:, :, side] = sign * lever / _unit(tie, moves)
+            sides[:, :, side] = sign * R.T @ lever / _unit(tie, moves)
             sides[:, :, side, 6] -= 0.5 * error
+        sides[:, :, 0, :3] += R.T @ se3.hat(error @ R.T)
         J = sides.reshape(len(error), 3, 2 * UNKNOWNS)
         rows = np.concatenate([UNKNOWNS * s + np.arange(UNKNOWNS) for s in (tie.a, tie.b)])
         H[np.ix_(rows, rows)] += np.einsum("pki,pkl,plj->ij", J, W, J)
@@ -164,7 +165,12 @@ def _similarity(x: F64, prior: ScanPrior) -> Similarity:
 
 
 def _errors(ties: Sequence[Tie], moves: Sequence[Similarity]) -> list[F64]:
-    return [(moves[t.a].points(t.at_a) - moves[t.b].points(t.at_b)) / _unit(t, moves) for t in ties]
+    """(P, 3) of each tie, along the first scan's axes, which are those of its covariance: it does
+    not fall because everything turns to where ties are less sure."""
+    return [
+        (moves[t.a].points(t.at_a) - moves[t.b].points(t.at_b)) @ moves[t.a].R / _unit(t, moves)
+        for t in ties
+    ]
 
 
 def _unit(tie: Tie, moves: Sequence[Similarity]) -> float:
