@@ -85,7 +85,8 @@ def _drone(simulation: Simulation, plan: FlightPlan, k: int) -> Drone:
     rng = np.random.default_rng([5, k])
     K, (w, h) = simulation.options.camera.K, SIZE_PX
     edges = rays(K, np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]))
-    poses = fly(plan, 10 + k).T_world_camera(np.arange(0.0, plan.duration_s, KEYFRAME_S))
+    times_s = KEYFRAME_S * np.arange(int(np.ceil(plan.duration_s / KEYFRAME_S)), dtype=np.float64)
+    poses = fly(plan, 10 + k).T_world_camera(times_s)
     wander = rng.normal(size=(len(poses), 3)) * WANDER_M
     errors = rng.normal(size=3) * OFF_M + np.cumsum(wander, axis=0)
     spread = np.diag([0.003**2] * 3 + [OFF_M**2] * 3)
