@@ -63,8 +63,7 @@ def test_poses_of_a_recording_share_transactions(
 def test_the_scale_names_what_measured_it(sources: tuple[str, ...], sigma: float, by: str) -> None:
     covariance = np.diag([0.0] * 6 + [sigma**2])
     found = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
-    trajectory = SimpleNamespace(similarity=lambda segment: found)
+    graph = SimpleNamespace(largest_similarity=lambda: found)
     recorder = Recorder.__new__(Recorder)
-    recorder.pipeline = cast(Pipeline, SimpleNamespace(segments=1))
-    recorder._chain = cast(Any, SimpleNamespace(trajectory=trajectory))
+    recorder._chain = cast(Any, SimpleNamespace(trajectory=SimpleNamespace(graph=graph)))
     assert recorder._scale() == {"from": by, "sigma": sigma}
