@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon.mapping.cloud_fusion import cloud_of
-from recon.mapping.free_space import MAX_VIEWS, Tiles, open_above, seen_through, spread
+from recon.mapping.free_space import MAX_VIEWS, Tiles, air_above, seen_through, spread
 from recon.types import F64, DepthMap, PointCloud
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def test_ground_is_open_where_a_ray_passes_above_it(house: HouseFlight) -> None:
     one = house.keyframe(0, -100.0).depth  # over level ground only
     x, y = np.meshgrid(np.linspace(-130.0, -70.0, 121), np.linspace(-16.0, 16.0, 65))
     ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    found = open_above(ground, (2.0, 4.0), [one])
+    found = air_above(ground, (2.0, 4.0), [one])[0].all(axis=1)
     half = 36.0 * np.array([80.0, 45.0]) / 140.0  # the image's half size, 4 m up
     gap = (np.abs(ground[:, :2] - [-100.0, 0.0]) - half).max(axis=1)
     assert found[gap < -0.3].all() and not found[gap > 0.3].any()
@@ -124,11 +124,17 @@ def test_ground_below_an_eave_is_not_open(house: HouseFlight) -> None:
     depth[40:50, 70:90] = 37.0
     roofed = replace(flat, depth_m=depth)
     below = np.array([[-100.0, 0.0, 0.0], [-90.0, 5.0, 0.0]])
-    assert open_above(below, (2.0,), [roofed]).tolist() == [False, True]
-    assert open_above(below, (2.0,), [roofed, flat]).all()  # another saw it before it was built
-    assert not open_above(below, (2.0,), []).any()
-    with pytest.raises(ValueError, match="1 to 8 heights"):
-        open_above(below, (), [flat])
+    is_open, behind = air_above(below, (2.0,), [roofed, roofed])
+    assert is_open.tolist() == [[False], [True]] and behind[0] == 2
+    assert air_above(below, (2.0,), [roofed, flat])[0].all()  # another saw it before it was built
+    is_open, behind = air_above(below, (2.0,), [])
+    assert not is_open.any() and not behind.any()
+    inside = below + [0.0, 0.0, 2.9]
+    is_open, behind = air_above(inside, (0.0, 2.0), [roofed])
+    assert is_open.tolist() == [[False, True], [True, True]] and behind[0].tolist() == [1, 0]
+    unknown = replace(flat, depth_m=np.full_like(depth, np.nan))
+    is_open, behind = air_above(below, (2.0,), [unknown])
+    assert not is_open.any() and not behind.any()
 
 
 def ground(n: int, seed: int = 0) -> F64:

@@ -121,6 +121,9 @@ MAX_VIEWS = 100
 """Maximum number of keyframes consulted per point: a camera that stays over one place has
 thousands. Their pairs, at most 255 each, are counted in 16 bits."""
 
+AIR_SLACK_M = 1.0
+"""Air that a surface of the whole image hides is looked at so far behind it."""
+
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 T = TypeVar("T")
 
@@ -170,20 +173,22 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
     return out
 
 
-def open_above(places_m: F64, heights_m: Sequence[float], views: Iterable[DepthMap]) -> Bool:
-    """(N,) places above which each of the heights has been seen to be empty by some keyframe.
+def air_above(
+    places_m: F64, heights_m: Sequence[float], views: Iterable[DepthMap]
+) -> tuple[Bool, U8]:
+    """(N, H) whether a keyframe sees through the air so far above each place, and (N, H) how many
+    keyframes see a surface in front of it or at it, counted up to 255 and until one sees through.
 
     A camera that looks sideways sees ground below a crown or an eave; where nothing above
     the ground was seen to be empty, the ground need not be the highest surface there. Places
-    are (N, 3) in the world of the depth maps. Raises ValueError for more than 8 heights.
+    are (N, 3) in the world of the depth maps.
     """
-    if not 0 < len(heights_m) <= 8:
-        raise ValueError(f"give 1 to 8 heights, not {len(heights_m)}")
     tiles = Tiles(places_m)
     up = np.asarray(heights_m, np.float64)
-    seen = np.zeros(len(places_m), np.uint8)
+    is_open = np.zeros((len(places_m), len(up)), np.bool_)
+    behind = np.zeros((len(places_m), len(up)), np.uint8)
     for depth in views:
-        reached = tiles.in_view(depth, up_m=float(up.max()))
+        reached = tiles.in_view(depth, AIR_SLACK_M, up_m=float(up.max(initial=0.0)))
         if len(reached):
             in_bands(
                 _look_above,
@@ -196,11 +201,12 @@ def open_above(places_m: F64, heights_m: Sequence[float], views: Iterable[DepthM
                 np.ascontiguousarray(depth.sigma_m, np.float32),
                 np.ascontiguousarray(depth.K, np.float64),
                 np.linalg.inv(depth.T_world_camera),
-                seen,
+                is_open,
+                behind,
                 tiles.is_decided,
             )
-    out: Bool = np.zeros(len(places_m), np.bool_)
-    out[tiles.order] = seen == (1 << len(up)) - 1
+    out: tuple[Bool, U8] = np.zeros_like(is_open), np.zeros_like(behind)
+    out[0][tiles.order], out[1][tiles.order] = is_open, behind
     return out
 
 
@@ -221,26 +227,28 @@ def pixel_of(K: F64, T: F64, x: float, y: float, z: float) -> tuple[float, float
 @njit(cache=True, nogil=True)
 def _look_above(
     begin: int, end: int, tiles: I64, first: I64, xyz: F32, up_m: F64, depth: F32,
-    depth_sigma: F32, K: F64, T: F64, seen: U8, is_decided: Bool,
+    depth_sigma: F32, K: F64, T: F64, is_open: Bool, behind: U8, is_decided: Bool,
 ) -> None:  # fmt: skip
-    """Set bit j of ``seen`` where a keyframe sees through the place ``up_m[j]`` higher, for the
-    places of ``tiles[begin:end]``."""
+    """Take what a keyframe sees of the air ``up_m[j]`` above the places of ``tiles[begin:end]``
+    into column j of ``is_open`` and ``behind``."""
     h, w = depth.shape
-    everything = (1 << up_m.shape[0]) - 1
     for tile in tiles[begin:end]:
         left = 0
         for p in range(first[tile], first[tile + 1]):
             for j in range(up_m.shape[0]):
-                if seen[p] & (1 << j):
+                if is_open[p, j]:
                     continue
+                left += 1
                 x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2]) + up_m[j]
                 at, down, cz = pixel_of(K, T, x, y, z)
                 u, v = int(np.floor(at + 0.5)), int(np.floor(down + 0.5))
                 if not (0 <= u < w and 0 <= v < h):
                     continue
                 if depth[v, u] - cz > AGREES_SIGMAS * float(depth_sigma[v, u]):
-                    seen[p] |= np.uint8(1 << j)
-            left += seen[p] != everything
+                    is_open[p, j] = True
+                    left -= 1
+                elif depth[v, u] > 0.0 and behind[p, j] < 255:
+                    behind[p, j] += np.uint8(1)
         is_decided[tile] = left == 0
 
 

@@ -36,11 +36,14 @@ def surface_model(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Raster
     return filled(reliable(measured), measured)[0]
 
 
-def filled(certain: Raster, measured: Raster, reach_m: float = REACH_M) -> tuple[Raster, Bool]:
+def filled(
+    certain: Raster, measured: Raster, reach_m: float = REACH_M, edge_cells: int = EDGE_CELLS
+) -> tuple[Raster, Bool]:
     """``certain`` with its holes filled, and (rows, cols) which cells were filled.
 
     ``measured`` holds all cells, also the doubtful ones: a hole is not filled below a doubtful
-    height. A filled cell has twice the sigma of its surroundings and half their range.
+    height, nor within ``edge_cells`` of something higher. A filled cell has twice the sigma of its
+    surroundings and half their range.
     """
     layers = np.dstack([certain.height_m, certain.sigma_m, certain.rgb]).astype(np.float32)
     doubtful = np.where(certain.known, np.float32(np.nan), measured.height_m)
@@ -49,7 +52,9 @@ def filled(certain: Raster, measured: Raster, reach_m: float = REACH_M) -> tuple
     holes = (near > 0) & ~certain.known
     out = layers.copy()
     rows, rise_m = len(layers), SLOPE * certain.grid.cell_m
-    in_bands(_fill, rows, layers, doubtful.astype(np.float32), holes, reach, rise_m, out)
+    in_bands(
+        _fill, rows, layers, doubtful.astype(np.float32), holes, reach, rise_m, edge_cells, out
+    )
     new = np.isfinite(out[..., 0]) & ~certain.known
     rgb = np.where(new[..., None], np.rint(out[..., 2:]), certain.rgb).astype(np.uint8)
     return Raster(certain.grid, out[..., 0].copy(), out[..., 1].copy(), rgb), new
@@ -58,7 +63,7 @@ def filled(certain: Raster, measured: Raster, reach_m: float = REACH_M) -> tuple
 @njit(cache=True, nogil=True)
 def _fill(
     begin: int, end: int, layers: F32, doubtful: F32, holes: Bool, reach: int, rise_m: float,
-    out: F32,
+    edge_cells: int, out: F32,
 ) -> None:  # fmt: skip
     """Fill rows of ``out`` from ``layers`` (rows, cols, 5: height, sigma, colour)."""
     near = np.empty((DIRECTIONS, 4))
@@ -79,7 +84,7 @@ def _fill(
                 continue
             if abs(doubtful[r, c] - height) > tolerance:
                 continue
-            if _to_higher(ordered[last:], above[:doubts], height) > EDGE_CELLS:
+            if _to_higher(ordered[last:], above[:doubts], height) > edge_cells:
                 _mean(layers, one, out[r, c])
 
 

@@ -29,6 +29,8 @@ EDGE_PRECISION = 1.25
 SPARSE_CELLS = 8
 SPARSE_SHARE = 0.5
 
+INNER_GAPS = 2
+
 LARGEST_CELLS = 200_000_000
 
 CELLS_PER_POINT, MIN_CELLS = 1000, 10_000_000
@@ -252,6 +254,16 @@ def reliable(raster: Raster) -> Raster:
     usual = float(np.median(held[known])) if known.any() else 1.0
     height[high & (held < SPARSE_SHARE * usual)] = np.nan
     return without_cells(raster, ~np.isfinite(height))
+
+
+def inner_doubtful(measured: Raster, sure: Raster) -> Bool:
+    """(rows, cols) cells that :func:`reliable` leaves out, but no step of STEP_M is next to, nor
+    more than INNER_GAPS unknown cells."""
+    known = measured.known
+    high, low = highest_lowest(measured.height_m, 1)
+    is_level = (high - measured.height_m <= STEP_M) & (measured.height_m - low <= STEP_M)
+    around = cv2.boxFilter(known.astype(np.uint8), -1, (3, 3), normalize=False)
+    return np.asarray(known & ~sure.known & is_level & (around >= 9 - INNER_GAPS))
 
 
 def without_cells(raster: Raster, unknown: Bool) -> Raster:

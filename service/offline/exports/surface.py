@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from recon.mapping.free_space import open_above
+from recon.mapping.free_space import air_above
 from recon.surface.ground import BareGround, terrain
 from recon.surface.hole_filling import filled
-from recon.surface.raster import Raster, reliable, standing_height, without_cells
-from recon.types import F64, Bool
+from recon.surface.raster import (
+    Raster,
+    highest_lowest,
+    inner_doubtful,
+    reliable,
+    standing_height,
+    without_cells,
+)
+from recon.types import F64, U8, Bool
 from service.offline.exports.view import ScanView
 from service.scans.main_piece import main_keyframes
 
@@ -22,10 +30,23 @@ MAX_OPEN_M, MAX_OPEN_SIDEWAYS_M = 4, 6
 every metre costs ground at the border of the survey. Looking sideways one sees more of the ground
 below them."""
 
+NEAR_M = 1.0
+"""So near to something higher, free air is required up to MAX_OPEN_SIDEWAYS_M in any case."""
+
+FILLED_UP_M = (4, 6, 8)
+"""Above a filled cell no surface may hide the air at these heights from all that look there: what
+hangs over the ground hides it at the same time."""
+
+FILLED_EDGE_CELLS = 1
+"""Cells may be filled closer to something higher than without keyframes that contradict."""
+
+PROBE_M = 1.0
+"""A surface is no surface where a keyframe sees through the place so far below it."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Heights of the upper surface, and (rows, cols) where a hole was filled."""
+    """Heights of the upper surface, and (rows, cols) those that are no certain measurements."""
 
     raster: Raster
     is_filled: Bool
@@ -35,7 +56,8 @@ def surface_model(scan: ScanView, cell_m: float | None, strict: bool = False) ->
     """The surface where it is certain and the air above it was seen, its holes filled.
 
     ``strict`` leaves the holes unknown. :func:`recon.surface.raster.reliable` removes uncertain
-    cells, :func:`recon.surface.hole_filling.filled` fills holes.
+    cells. Those of them that some keyframe ends at and none sees through come back as filled;
+    :func:`recon.surface.hole_filling.filled` fills the rest, where no keyframe contradicts it.
     """
     key = ("surface", cell_m, strict)
     return scan.shared(key, lambda: _surface_model(scan, cell_m, strict))
@@ -48,10 +70,19 @@ def bare_ground(scan: ScanView, cell_m: float | None) -> BareGround:
 
 def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> Surface:
     measured = scan.raster(cell_m)
-    certain = _open_to_the_sky(scan, reliable(measured))
+    sure = reliable(measured)
+    certain = _open_to_the_sky(scan, measured, sure)
     if strict:
         return Surface(certain, np.zeros(certain.grid.shape, np.bool_))
-    return Surface(*filled(certain, measured))
+    held = inner_doubtful(measured, sure)
+    is_open, behind = _air(scan, measured, held, (-PROBE_M,))
+    held[held] = ~is_open[:, 0] & (behind[:, 0] > 0)
+    known = without_cells(measured, ~(certain.known | held))
+    raster, new = filled(known, measured, edge_cells=FILLED_EDGE_CELLS)
+    is_open, behind = _air(scan, raster, new, (-PROBE_M, *FILLED_UP_M))
+    wrong = np.zeros_like(new)
+    wrong[new] = is_open[:, 0] | (~is_open & (behind > 0))[:, 1:].any(axis=1)
+    return Surface(without_cells(raster, wrong), (new & ~wrong) | held)
 
 
 def cell_places(scan: ScanView, raster: Raster) -> F64:
@@ -64,16 +95,28 @@ def cell_places(scan: ScanView, raster: Raster) -> F64:
     return np.stack([*np.meshgrid(x, y), raster.height_m.astype(np.float64)], axis=-1)
 
 
-def _open_to_the_sky(scan: ScanView, raster: Raster) -> Raster:
+def _open_to_the_sky(scan: ScanView, measured: Raster, raster: Raster) -> Raster:
     """``raster`` where the air above was seen to be free, as high as things stand on this site."""
     sideways = float(np.median(scan.off_nadir_deg)) > SIDEWAYS_DEG
-    highest = min(standing_height(raster), MAX_OPEN_SIDEWAYS_M if sideways else MAX_OPEN_M)
-    heights_m = [float(m) for m in range(OPEN_STEP_M, math.ceil(highest) + 1, OPEN_STEP_M)]
-    if not heights_m:
+    usual = MAX_OPEN_SIDEWAYS_M if sideways else MAX_OPEN_M
+    highest = math.ceil(min(standing_height(raster), MAX_OPEN_SIDEWAYS_M))
+    heights_m = np.arange(OPEN_STEP_M, highest + 1, OPEN_STEP_M, dtype=np.float64)
+    if not len(heights_m):
         return raster
-    places = cell_places(scan, raster)[raster.known]
-    keyframes = scan.progress.over(main_keyframes(scan.store), len(scan.store.seqs()))
+    known, reach = raster.known, max(1, round(NEAR_M / raster.grid.cell_m))
+    above_m = highest_lowest(measured.height_m, reach)[0] - raster.height_m
+    is_open, _ = _air(scan, raster, known, heights_m.tolist())
+    needed = (heights_m <= usual) | (above_m[known] > OPEN_STEP_M)[:, None]
     hidden = np.zeros(raster.grid.shape, np.bool_)
-    with scan.progress.part("surface that is open to the sky", 0.5):
-        hidden[raster.known] = ~open_above(places, heights_m, (k.depth for k in keyframes))
+    hidden[known] = ~(is_open | ~needed).all(axis=1)
     return without_cells(raster, hidden)
+
+
+def _air(scan: ScanView, raster: Raster, cells: Bool, up_m: Sequence[float]) -> tuple[Bool, U8]:
+    """:func:`recon.mapping.free_space.air_above` of the marked cells at these heights."""
+    lowest_m = min(up_m)
+    places = cell_places(scan, raster)[cells] + [0.0, 0.0, min(lowest_m, 0.0)]
+    heights_m = [one - min(lowest_m, 0.0) for one in up_m]
+    keyframes = scan.progress.over(main_keyframes(scan.store), len(scan.store.seqs()))
+    with scan.progress.part("surface that is open to the sky", 0.3):
+        return air_above(places, heights_m, (k.depth for k in keyframes))
