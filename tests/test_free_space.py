@@ -129,7 +129,7 @@ def test_ground_below_an_eave_is_not_open(house: HouseFlight) -> None:
     assert air_above(below, (2.0,), [roofed, flat])[0].all()  # another saw it before it was built
     is_open, behind = air_above(below, (2.0,), [])
     assert not is_open.any() and not behind.any()
-    inside = below + [0.0, 0.0, 2.9]
+    inside = below + np.array([0.0, 0.0, 2.9])
     is_open, behind = air_above(inside, (0.0, 2.0), [roofed])
     assert is_open.tolist() == [[False, True], [True, True]] and behind[0].tolist() == [1, 0]
     unknown = replace(flat, depth_m=np.full_like(depth, np.nan))

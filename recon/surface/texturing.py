@@ -255,11 +255,7 @@ def _pairs(found: Sightings) -> tuple[I32, I32, F64, F64]:
 def _solve(a: I32, b: I32, colour_a: F64, colour_b: F64, views: int) -> F64:
     """(views, 2) gain and offset of one channel."""
     n = len(a)
-    row = np.tile(np.arange(n), 4)
-    column = np.concatenate([2 * a, 2 * a + 1, 2 * b, 2 * b + 1])
     scale = 128.0  # so that gain and offset weigh alike
-    value = np.concatenate([colour_a, np.full(n, scale), -colour_b, np.full(n, -scale)])
-    A = sparse.csr_matrix((value, (row, column)), shape=(n, 2 * views))
     seen = np.bincount(np.concatenate([a, b]), minlength=views).astype(np.float64)
     pull = np.repeat(PULL * np.maximum(seen, 1.0) * scale**2, 2)
     # The mean gain is 1 and the mean offset 0, or noise would draw all of them to black.
@@ -267,13 +263,30 @@ def _solve(a: I32, b: I32, colour_a: F64, colour_b: F64, views: int) -> F64:
     fixed = 1e3 * n * scale**2 * (mean.T @ mean)
     start = np.tile([1.0, 0.0], views)
     x = start.copy()
-    weight = np.ones(n)
-    for _ in range(ROUNDS):
-        N = (A.T @ sparse.diags(weight) @ A).toarray() + np.diag(pull) + fixed
-        x = np.linalg.solve(N, pull * start + fixed @ start)
-        off = np.abs(A @ x)
-        weight = HUBER_LEVELS / np.maximum(off, HUBER_LEVELS)
+    for number in range(ROUNDS):
+        limit = HUBER_LEVELS if number else np.inf  # the first round weighs all alike
+        N = np.zeros((2 * views, 2 * views))
+        _add_pairs(a, b, colour_a, colour_b, scale, x, limit, N)
+        x = np.linalg.solve(N + np.diag(pull) + fixed, pull * start + fixed @ start)
     return np.column_stack([x[::2], scale * x[1::2]])
+
+
+@njit(cache=True, nogil=True)
+def _add_pairs(
+    a: I32, b: I32, colour_a: F64, colour_b: F64, scale: float, x: F64, limit: float, N: F64
+) -> None:
+    """Add the normal equations of all pairs to N, by Huber's weights at the solution ``x``."""
+    at, row = np.empty(4, np.int64), np.empty(4)
+    for n in range(len(a)):
+        at[0], at[1], at[2], at[3] = 2 * a[n], 2 * a[n] + 1, 2 * b[n], 2 * b[n] + 1
+        row[0], row[1], row[2], row[3] = colour_a[n], scale, -colour_b[n], -scale
+        off = 0.0
+        for i in range(4):
+            off += row[i] * x[at[i]]
+        weight = 1.0 if abs(off) <= limit else limit / abs(off)
+        for i in range(4):
+            for j in range(4):
+                N[at[i], at[j]] += weight * row[i] * row[j]
 
 
 def fading(faces: I32, label: I32, vertices: int, views: int) -> tuple[I32, F32]:
