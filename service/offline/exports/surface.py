@@ -75,11 +75,11 @@ def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> Surfac
     if strict:
         return Surface(certain, np.zeros(certain.grid.shape, np.bool_))
     held = inner_doubtful(measured, sure)
-    is_open, behind = _air(scan, measured, held, (-PROBE_M,))
+    is_open, behind = _air(scan, _places(scan, measured, held), (-PROBE_M,))
     held[held] = ~is_open[:, 0] & (behind[:, 0] > 0)
     known = without_cells(measured, ~(certain.known | held))
     raster, new = filled(known, measured, edge_cells=FILLED_EDGE_CELLS)
-    is_open, behind = _air(scan, raster, new, (-PROBE_M, *FILLED_UP_M))
+    is_open, behind = _air(scan, _places(scan, raster, new), (-PROBE_M, *FILLED_UP_M))
     wrong = np.zeros_like(new)
     wrong[new] = is_open[:, 0] | (~is_open & (behind > 0))[:, 1:].any(axis=1)
     return Surface(without_cells(raster, wrong), (new & ~wrong) | held)
@@ -105,18 +105,30 @@ def _open_to_the_sky(scan: ScanView, measured: Raster, raster: Raster) -> Raster
         return raster
     known, reach = raster.known, max(1, round(NEAR_M / raster.grid.cell_m))
     above_m = highest_lowest(measured.height_m, reach)[0] - raster.height_m
-    is_open, _ = _air(scan, raster, known, heights_m.tolist())
+    is_open, _ = _air(scan, cell_places(scan, raster)[known], heights_m.tolist())
     needed = (heights_m <= usual) | (above_m[known] > OPEN_STEP_M)[:, None]
     hidden = np.zeros(raster.grid.shape, np.bool_)
     hidden[known] = ~(is_open | ~needed).all(axis=1)
     return without_cells(raster, hidden)
 
 
-def _air(scan: ScanView, raster: Raster, cells: Bool, up_m: Sequence[float]) -> tuple[Bool, U8]:
-    """:func:`recon.mapping.free_space.air_above` of the marked cells at these heights."""
-    lowest_m = min(up_m)
-    places = cell_places(scan, raster)[cells] + [0.0, 0.0, min(lowest_m, 0.0)]
-    heights_m = [one - min(lowest_m, 0.0) for one in up_m]
+def _places(scan: ScanView, raster: Raster, cells: Bool) -> F64:
+    """(N, 3) places of the middles of some of the cells in the scan's frame."""
+    rows, cols = np.nonzero(cells)
+    grid = raster.grid
+    x = grid.west_m + (cols + 0.5) * grid.cell_m
+    y = grid.north_m - (rows + 0.5) * grid.cell_m
+    places = np.column_stack([x, y, raster.height_m[cells]])
+    return places if scan.frame is None else scan.frame.from_utm(places)
+
+
+def _air(scan: ScanView, places: F64, up_m: Sequence[float]) -> tuple[Bool, U8]:
+    """:func:`recon.mapping.free_space.air_above` at these heights above or below the places."""
+    lowest_m = min(0.0, *up_m)
     keyframes = scan.progress.over(main_keyframes(scan.store), len(scan.store.seqs()))
     with scan.progress.part("surface that is open to the sky", 0.3):
-        return air_above(places, heights_m, (k.depth for k in keyframes))
+        return air_above(
+            places + np.array([0.0, 0.0, lowest_m]),
+            [one - lowest_m for one in up_m],
+            (k.depth for k in keyframes),
+        )
