@@ -91,6 +91,7 @@ def shots(browser: Browser, base: str, scan: Path, out: Path) -> None:
     browser.run("document.querySelectorAll('article details').forEach(d => d.open = true)")
     shot("library-open")
     press("Make")(browser)
+    browser.wait("!document.querySelector('.jobs').hidden", WAIT_S)
     shot("library-job")
     press("Cancel")(browser)
     browser.open(f"{base}/#/view/{where}")
