@@ -108,7 +108,7 @@ def shots(browser: Browser, base: str, scan: Path, out: Path) -> None:
     browser.wait("document.querySelector('.layers output').textContent", WAIT_S)
     shot("map-again")
     browser.open(f"{base}/#/view/{scan.parent.name}/no-such-scan")
-    browser.wait("document.querySelector('h1')", WAIT_S)
+    browser.wait("document.querySelector('h1').textContent.startsWith('There is no')", WAIT_S)
     shot("unknown")
     if (scan / "report.html").is_file():
         browser.open((scan / "report.html").resolve().as_uri())

@@ -23,13 +23,9 @@ EYES_M = (-5.0, 0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 CELL_M = 0.25
 
 
-def model(
-    folder: Path, house: HouseFlight, change: Callable[[F64, Array], Array], strict: bool = False
-) -> tuple[Surface, F64]:
-    """The model, and (rows, cols, 3) places of its cells.
-
-    ``change`` takes where each pixel's ray is at the roof's height, east, and its depth.
-    """
+def flown(folder: Path, house: HouseFlight, change: Callable[[F64, Array], Array]) -> Path:
+    """A scan without a place. ``change`` takes where each pixel's ray is at the roof's height,
+    east, and its depth."""
     header = ScanHeader("test-1", "drone-1", house.start_ns, camera={"fx": 140.0}, software="0.0")
     with ScanStore.create(folder / "scan.db", header) as store:
         for seq, east_m in enumerate(EYES_M):
@@ -38,7 +34,14 @@ def model(
             depth = change(east_m + a * (house.height_m - 6.0), view.depth.depth_m.copy())
             view = replace(view, depth=replace(view.depth, depth_m=depth))
             store.add_keyframe(seq, encode(view, view.time_ns))
-    with ScanView(folder) as scan:
+    return folder
+
+
+def model(
+    folder: Path, house: HouseFlight, change: Callable[[F64, Array], Array], strict: bool = False
+) -> tuple[Surface, F64]:
+    """The model of such a scan, and (rows, cols, 3) places of its cells."""
+    with ScanView(flown(folder, house, change)) as scan:
         found = surface_model(scan, CELL_M, strict)
         return found, cell_places(scan, found.raster)
 

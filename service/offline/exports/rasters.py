@@ -40,7 +40,7 @@ QUICKLY = {"level": 4, "overview_resampling": "AVERAGE"}
 RAW = {"tiled": True, "sparse_ok": True, "bigtiff": "IF_SAFER"}
 GDAL_CACHE_BYTES = 128_000_000
 
-ORTHO_HOLE_CELLS = 8
+ORTHO_HOLE_M = 4.0
 SHORTEST_CONTOUR_CELLS = 12
 MAX_CONTOURS = 5000
 """Heights at which contours are drawn: every metre up to the highest mountains."""
@@ -194,7 +194,8 @@ def _closed_surface(scan: ScanView) -> Raster:
     measured = scan.raster(None)
     certain = surface_model(scan, None).raster
     height = np.where(certain.known, certain.height_m, measured.height_m)
-    return fill_holes(replace(measured, height_m=height.astype(np.float32)), ORTHO_HOLE_CELLS)
+    largest = max(1, round(ORTHO_HOLE_M / measured.grid.cell_m))
+    return fill_holes(replace(measured, height_m=height.astype(np.float32)), largest)
 
 
 def _terrain(scan: ScanView, raster: Raster, views: Sequence[TextureView]) -> Terrain:
