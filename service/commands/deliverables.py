@@ -52,8 +52,8 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write deliverables of a scan: clouds, surface model, orthophoto, tiles, mesh, flight."""
+    from service.offline.exports.maps import write_kinds
     from service.offline.exports.view import ExportOptions, ScanView
-    from service.offline.exports.view import export as write
 
     _check_kinds(to, out)
     try:
@@ -72,13 +72,13 @@ def export(
         )
     except ValueError as error:
         raise InputError(f"export: {error}") from error
-    written = {}
+    done: dict[str, Path] = {}
+    written: dict[str, str] = {}
     try:
         with showing("export") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
-            for number, kind in enumerate(to):
-                with progress.part(kind, 1.0 / (len(to) - number)):
-                    written[kind] = str(write(scan, kind, out, options))
+            write_kinds(scan, to, out, options, done)
     finally:
+        written = {kind: str(done[kind]) for kind in dict.fromkeys(to) if kind in done}
         if not as_json:
             print(*written.values(), sep="\n", end="\n" if written else "")
     if as_json:

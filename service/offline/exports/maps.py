@@ -6,7 +6,7 @@ import datetime as dt
 import hashlib
 import json
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -202,14 +202,14 @@ def write_all(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """
     out.mkdir(parents=True, exist_ok=True)
     done: dict[str, Path | SkyreliefError] = {}
-    rest = tuple(kind for kind in MAPS if kind not in (*FROM_IMAGES, *LAST))
-    branches = scan.progress.branches(2)
-    views = [scan.with_progress(branch) for branch in branches]
-    at_once(
-        lambda: _write(views[0], rest, out, options, done),
-        lambda: _write(views[1], FROM_IMAGES, out, options, done),
-    )
-    _write(scan, LAST, out, options, done)
+
+    def write(view: ScanView, kind: str) -> None:
+        try:
+            done[kind] = export(view, kind, out / EXPORTERS[kind][1], options)
+        except SkyreliefError as error:
+            done[kind] = error
+
+    _in_two_branches(scan, MAPS, write)
     failures = {k: error for k in MAPS if isinstance(error := done[k], SkyreliefError)}
     if len(failures) == len(MAPS):
         raise failures[MAPS[-1]]
@@ -225,20 +225,41 @@ def write_all(scan: ScanView, out: Path, options: ExportOptions) -> None:
     (out / MANIFEST).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
-def _write(
+def write_kinds(
     scan: ScanView,
     kinds: Sequence[str],
-    out: Path,
+    out: Path | None,
     options: ExportOptions,
-    done: dict[str, Path | SkyreliefError],
+    done: dict[str, Path],
 ) -> None:
-    """Write some kinds, one after the other; ``done`` takes each one's path, or its error."""
-    for number, kind in enumerate(kinds):
-        try:
-            with scan.progress.part(kind, 1.0 / (len(kinds) - number)):
-                done[kind] = export(scan, kind, out / EXPORTERS[kind][1], options)
-        except SkyreliefError as error:
-            done[kind] = error
+    """Write some kinds, those from images at the same time as the others; ``done`` takes each
+    one's path. Raises the first error, after the other branch has ended."""
+
+    def write(view: ScanView, kind: str) -> None:
+        done[kind] = export(view, kind, out, options)
+
+    _in_two_branches(scan, kinds, write)
+
+
+def _in_two_branches(
+    scan: ScanView, kinds: Sequence[str], write: Callable[[ScanView, str], None]
+) -> None:
+    """Call ``write`` for each kind: those from images in one thread, the others in another, and
+    LAST at the end."""
+    images = [kind for kind in kinds if kind in FROM_IMAGES]
+    rest = [kind for kind in kinds if kind not in (*FROM_IMAGES, *LAST)]
+
+    def work(view: ScanView, some: Sequence[str]) -> None:
+        for number, kind in enumerate(some):
+            with view.progress.part(kind, 1.0 / (len(some) - number)):
+                write(view, kind)
+
+    if images and rest:
+        views = [scan.with_progress(branch) for branch in scan.progress.branches(2)]
+        at_once(lambda: work(views[0], rest), lambda: work(views[1], images))
+    else:
+        work(scan, [*images, *rest])
+    work(scan, [kind for kind in kinds if kind in LAST])
 
 
 HEIGHTS = (
