@@ -111,7 +111,7 @@ def test_ground_is_open_where_a_ray_passes_above_it(house: HouseFlight) -> None:
     one = house.keyframe(0, -100.0).depth  # over level ground only
     x, y = np.meshgrid(np.linspace(-130.0, -70.0, 121), np.linspace(-16.0, 16.0, 65))
     ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    found = air_above(ground, (2.0, 4.0), [one])[0].all(axis=1)
+    found = np.asarray(air_above(ground, (2.0, 4.0), [one])[0].all(axis=1))
     half = 36.0 * np.array([80.0, 45.0]) / 140.0  # the image's half size, 4 m up
     gap = (np.abs(ground[:, :2] - [-100.0, 0.0]) - half).max(axis=1)
     assert found[gap < -0.3].all() and not found[gap > 0.3].any()

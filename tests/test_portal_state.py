@@ -96,6 +96,23 @@ def test_the_report_is_linked_when_the_scan_has_finished(
         browser.wait(f"!{report}.hidden", 30)
 
 
+def test_a_finished_scan_is_never_said_to_be_silent(browser: Browser, scans: Path) -> None:
+    """Not even while its keyframes load."""
+    with ScanStore.open(scans / "drone-1/test-1/scan.db") as store:
+        store.finish({})
+    with page_of(browser, scans, []) as base:
+        browser.run(
+            "window.said = new Set(); new MutationObserver(() => {"
+            " const now = document.querySelector('.state'); if (now) said.add(now.textContent) })"
+            ".observe(document.body, { subtree: true, childList: true })"
+        )
+        browser.run(f"location.href = '{base}/#/view/drone-1/test-1'")
+        browser.wait("document.body.dataset.points === '72000'")
+        kind(browser, "finished")
+        said = set(browser.run("[...said]"))
+        assert "finished" in said and said <= {"", "connecting", "connected", "finished"}
+
+
 def test_an_unknown_scan_is_said_to_be_unknown(browser: Browser, scans: Path) -> None:
     with page_of(browser, scans, []) as base:
         browser.open(f"{base}/#/view/drone-1/nothing")

@@ -66,6 +66,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   let fused: number | undefined;
   const learn = (now: api.Scan): void => {
     fused = now.counts?.points;
+    link.finished ||= now.finished;
     title.textContent = now.title;
     report.hidden = !now.files.some((f) => f.name === "report.html");
   };
