@@ -159,12 +159,11 @@ def _replay(
         notes=tuple(notes),
         extra={"backend": chosen.name, "source": source.description},
     )
-    stop = stop_by_signals()
     is_file = parse_source(video)[0] == "file"
     with nullcontext(Progress()) if as_json else showing("replay") as progress:
         if start is not None:
-            progress("finding the lens")
-            inputs = _with_lens(inputs, video, start, find_lens)
+            inputs = _with_lens(inputs, video, start, find_lens, progress)
+        stop = stop_by_signals()
         found = _fly(inputs, stop, progress, can_begin_again=played is source and is_file)
         if isinstance(found, Shutter):
             progress("beginning again with the readout that was found")
@@ -174,13 +173,18 @@ def _replay(
     return found | {"scan_folder": str(folder)}
 
 
-def _with_lens(inputs: ScanInputs, video: str, start: StartLens, find_lens: bool) -> ScanInputs:
+def _with_lens(
+    inputs: ScanInputs, video: str, start: StartLens, find_lens: bool, progress: Progress
+) -> ScanInputs:
     """The scan with the lens by its own images, where they determine it, else as it is."""
     from service.cameras import parse_source
     from service.commands.own_lens import own_lens
+    from service.flight.scan import check_new
 
     found = None
     if find_lens and start.search is not None and parse_source(video)[0] in ("file", "images"):
+        check_new(inputs.folder)
+        progress("finding the lens")
         found = own_lens(inputs, video, start.search)
     if found is None:
         return replace(inputs, notes=(start.note, *inputs.notes), assumed=start.assumed)

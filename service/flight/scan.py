@@ -93,13 +93,17 @@ class ScanInputs:
     on_keyframe: Callable[[Keyframe], None] | None = None
 
 
+def check_new(folder: Path) -> Path:
+    """The database of a scan to be made in ``folder``; InputError when it holds one already."""
+    path = folder / "scan.db"
+    if path.exists():
+        raise InputError(f"{folder} already holds a scan; give another --out, nothing was changed")
+    return path
+
+
 def create_store(inputs: ScanInputs) -> ScanStore:
     """The scan's folder and database; InputError when it holds a scan already."""
-    path = inputs.folder / "scan.db"
-    if path.exists():
-        raise InputError(
-            f"{inputs.folder} already holds a scan; give another --out, nothing was changed"
-        )
+    path = check_new(inputs.folder)
     W, H = inputs.camera.size_px
     header = ScanHeader(
         scan_id=inputs.scan_id,
