@@ -137,6 +137,7 @@ def test_a_keyframe_is_on_the_map_after_its_next_round(
     if name != "Orthophoto":
         layer(page, "Orthophoto")
         layer(page, name)
+    page.wait(f"({COLOURS}).then(s => s.known > 1000)")  # it shows the scan, not the world
     page.run("document.querySelector('[title=farther]').click()")  # now the map stays there
     page.wait(SHOWN)
     before = page.wait(f"({COLOURS}).then(s => s.known)")
