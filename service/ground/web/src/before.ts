@@ -4,7 +4,7 @@ import * as THREE from "three";
 import { eachPoint } from "./pick";
 
 const CELL_M = 0.5;
-const MOST_CELLS = 1024; // along a side
+const MAX_CELLS = 1024; // along a side
 
 /** GLSL: metres by which a place lies above (or, negative, below) the ground of the earlier date. */
 export const CHANGE = /* glsl */ `
@@ -39,7 +39,7 @@ export class Before {
     eachPoint(root, (x, y) => box.expandByPoint(new THREE.Vector2(x, y)));
     if (box.isEmpty()) return;
     const extent = box.getSize(new THREE.Vector2());
-    const cell = Math.max(CELL_M, Math.max(extent.x, extent.y) / (MOST_CELLS - 1));
+    const cell = Math.max(CELL_M, Math.max(extent.x, extent.y) / (MAX_CELLS - 1));
     const [w, h] = [extent.x, extent.y].map((m) => Math.floor(m / cell) + 1) as [number, number];
     const next = texture(w, h);
     const heights = next.image.data as Float32Array;
