@@ -102,6 +102,14 @@ def test_stills_show_a_latency_too() -> None:
     assert len(reported) == 1 and reported[0].endswith("by the images, 0 ms is set")
 
 
+def test_a_scan_that_ends_in_its_first_frame_has_no_latency() -> None:
+    reported: list[str] = []
+    check = TelemetryCheck(CameraConfig(latency="auto"), history_of("none", 1.0), reported.append)
+    check.exposed_ns(S)
+    check.finish()
+    assert check.latency is None and reported == []
+
+
 def test_auto_applies_what_was_found_and_keeps_the_frames_in_order() -> None:
     reported: list[str] = []
     check = TelemetryCheck(CameraConfig(latency="auto"), history_of("none", 1.0), reported.append)

@@ -86,6 +86,10 @@ class LatencyWatch:
         turned = multiply(self._frames[-1][2], step)
         self._frames.append((self._run, second_ns, normalised(turned) or turned))
 
+    def since_ns(self, frames: int) -> int | None:
+        """The stamp of the oldest of the newest ``frames``; None without any."""
+        return self._frames[-min(frames, len(self._frames))][1] if self._frames else None
+
     def estimate(self, attitudes: Sequence[tuple[int, Quaternion]]) -> LatencyEstimate | None:
         """The latency by attitudes (time in ns, attitude) over the same time, oldest first.
 

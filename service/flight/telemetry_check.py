@@ -7,7 +7,6 @@ the gimbal's frame when ``mavlink.gimbal_yaw_frame`` is "auto".
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -54,7 +53,6 @@ class TelemetryCheck:
         self._frames = None if history is None or self._fixed else FrameWatch(history)
         self._last: tuple[int, int, F64] | None = None  # stamp, segment, R_odom_camera
         self._seen_ns: int | None = None
-        self._stamps: deque[int] = deque(maxlen=STILLS)
         self._next_ns: int | None = None
 
     # ---- the latency in force ------------------------------------------------------------
@@ -86,7 +84,6 @@ class TelemetryCheck:
         """Add a frame's pose by vision, at its stamp; evaluate all of them now and then."""
         if self._history is None or tracked.state is Tracking.SKIPPED:
             return
-        self._stamps.append(stamp_ns)
         T = tracked.T_odom_camera
         last, self._last = self._last, None
         if T is not None:
@@ -113,7 +110,9 @@ class TelemetryCheck:
             self._look(self._history, self._seen_ns)
 
     def _look(self, history: VehicleHistory, now_ns: int) -> None:
-        since_ns = min(now_ns - REACH_NS, *self._stamps)
+        since_ns, stills_ns = now_ns - REACH_NS, self._turns.since_ns(STILLS)
+        if stills_ns is not None:
+            since_ns = min(since_ns, stills_ns)
         if self._fixed:
             bodies = [(t, sample.q_ned_body) for sample, t in history.attitudes()]
             found = self._turns.estimate([body for body in bodies if body[0] >= since_ns])
