@@ -106,6 +106,16 @@ def project_to_so3(T: F64) -> F64:
     return compose(U @ Vt, T[:3, 3])
 
 
+def nearest_rotation(M: F64) -> F64:
+    """(3, 3) rotation R that makes trace(R^T M) largest.
+
+    With the sum of b a^T over pairs of vectors for M it takes each a closest to its b (Kabsch 1976,
+    doi:10.1107/S0567739476001873).
+    """
+    U, _, Vt = np.linalg.svd(M)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
+
+
 def compose(R: F64, t: F64) -> F64:
     """(4, 4) motion with rotation ``R`` (3, 3) and translation ``t`` (3,)."""
     T = np.eye(4)

@@ -128,6 +128,19 @@ def test_slerp_takes_the_short_way_at_even_speed(q0: F64, q1: F64, share: float)
     assert np.linalg.norm(se3.so3_log(R.T @ R1)) == pytest.approx((1 - share) * whole, abs=1e-6)
 
 
+def test_the_nearest_rotation_is_that_of_scipy_and_never_a_mirror() -> None:
+    rng = np.random.default_rng(4)
+    for mirror in (1.0, -1.0):
+        for _ in range(20):
+            a = rng.normal(size=(8, 3))
+            b = mirror * a @ Rotation.random(random_state=rng).as_matrix().T
+            b += 0.1 * rng.normal(size=a.shape)
+            R = se3.nearest_rotation(b.T @ a)
+            assert np.linalg.det(R) == pytest.approx(1.0)
+            other = Rotation.align_vectors(b, a)[0].as_matrix()
+            assert pytest.approx(other, abs=1e-9) == R
+
+
 def test_the_average_weighs_by_information() -> None:
     rng = np.random.default_rng(0)
     truth = se3.exp(np.array([0.3, -0.2, 1.0, 5.0, 6.0, -7.0]))

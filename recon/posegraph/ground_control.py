@@ -231,8 +231,7 @@ def placed_by_points(mapped_m: F64, surveyed_m: F64) -> tuple[float, F64, F64] |
     spread = np.linalg.svd(a, compute_uv=False)
     if spread[1] < 0.05 * spread[0]:
         return None
-    U, _, Vt = np.linalg.svd(b.T @ a)
-    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    R = se3.nearest_rotation(b.T @ a)
     scale = float(np.sum(b * (a @ R.T)) / np.sum(a**2))
     return scale, R, np.asarray(surveyed_m.mean(axis=0) - scale * R @ mapped_m.mean(axis=0))
 

@@ -130,9 +130,7 @@ def _rigid(here: F64, there: F64, sigma: F64, guess: F64, gate: float) -> tuple[
             return T, np.zeros(len(here), bool)
         weight /= weight.sum()
         centre_a, centre_b = weight @ here, weight @ there
-        H = (there - centre_b).T @ ((here - centre_a) * weight[:, None])
-        U, _, Vt = np.linalg.svd(H)
-        R = Vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
+        R = se3.nearest_rotation(((here - centre_a) * weight[:, None]).T @ (there - centre_b))
         T = se3.compose(R, centre_a - R @ centre_b)
     inside = np.linalg.norm(here - se3.transform(T, there), axis=1) < gate * sigma
     return T, np.asarray(inside)

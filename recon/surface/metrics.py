@@ -95,8 +95,7 @@ def fit_trajectory(scan: F64, truth: F64, with_scale: bool) -> Fit:
         a_size, b_size = np.sqrt((a**2).sum()), np.sqrt((b**2).sum())
         weight *= b_size / max(a_size, 1e-12)
     M = np.einsum("nij,nkj->ik", truth[:, :3, :3], scan[:, :3, :3]) + weight * b.T @ a
-    U, _, Vt = np.linalg.svd(M)
-    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    R = se3.nearest_rotation(M)
     turned = a @ R.T
     scale = 1.0
     if with_scale and (turned**2).sum() > 1e-12:

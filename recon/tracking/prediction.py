@@ -147,9 +147,8 @@ def beyond_turn(uv_a: F64, uv_b: F64, K: F64) -> float:
     a, b = (ray / np.linalg.norm(ray, axis=1)[:, None] for ray in (rays(K, uv_a), rays(K, uv_b)))
     weight, off = np.ones(len(a)), np.zeros(len(a))
     for _ in range(5):
-        # Kabsch, A solution for the best rotation to relate two sets of vectors, 1976
-        U, _, Vt = np.linalg.svd((b * weight[:, None]).T @ a)
-        off = np.linalg.norm(b - a @ (U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt).T, axis=1)
+        R_b_a = se3.nearest_rotation((b * weight[:, None]).T @ a)
+        off = np.linalg.norm(b - a @ R_b_a.T, axis=1)
         weight = 1.0 / (1.0 + (off / (2.0 * max(float(np.median(off)), 1e-9))) ** 2)
     return float(np.median(off))
 
