@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -87,43 +86,36 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> C
     ``inputs`` are those of the whole scan, with the lens to begin with; ``video`` is its
     recording or its folder of stills.
     """
-    if isinstance(inputs.source, ImagesSource):
-        some = inputs.source.middle(VIEWS)
-        if some.images < MIN_STILLS:
-            return None
-        return _found(replace(inputs, source=some), Path(video), search)
-    with closing(open_camera(video)) as source:
-        return _found(replace(inputs, source=source), Path(video), search, _is_enough)
-
-
-def _is_enough(scan: Scan) -> bool:
-    return scan.recorder.keyframes >= VIEWS or scan.recorder.frames >= MAX_FRAMES
-
-
-def _found(
-    inputs: ScanInputs,
-    images: Path,
-    search: SelfCalibrationConfig,
-    is_enough: Callable[[Scan], object] = lambda scan: False,
-) -> Camera | None:
     from service.flight.scan import Scan, create_store
     from service.offline.refine.refinement import lens
 
-    config = inputs.config
+    source, config = inputs.source, inputs.config
+    if isinstance(source, ImagesSource):
+        source = source.middle(VIEWS)
+        if source.images < MIN_STILLS:
+            return None
+    else:
+        source = open_camera(video)
     for key, value in COARSE.items():
         config = change(config, key, str(value).lower())
-    with TemporaryDirectory(prefix="skyrelief-lens-") as temporary:
+    with closing(source), TemporaryDirectory(prefix="skyrelief-lens-") as temporary:
         folder = Path(temporary) / "scan"
-        inputs = replace(inputs, config=config, folder=folder, scan_id="lens", warn=log.info)
+        inputs = replace(
+            inputs, source=source, config=config, folder=folder, scan_id="lens", warn=log.info
+        )
         store = create_store(inputs)
         try:
             scan = Scan(inputs, store)
-            scan.run(Event(), is_enough=is_enough)
+            scan.run(Event(), is_enough=_is_enough)
             scan.close()
         finally:
             store.close()
         try:
-            return lens(folder, images, search)
+            return lens(folder, Path(video), search)
         except InputError as error:
             log.info("the images do not determine their lens: %s", error)
             return None
+
+
+def _is_enough(scan: Scan) -> bool:
+    return scan.recorder.keyframes >= VIEWS or scan.recorder.frames >= MAX_FRAMES

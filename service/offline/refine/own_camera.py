@@ -88,13 +88,14 @@ def images_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[
     ``video`` is a recording or a folder of stills.
     """
     wanted = np.array(times_ns, np.int64)
+    last_ns = wanted.max(initial=0) + WITHIN_S * 1e9
     found: dict[int, U8] = {}
     opened = open_images if video.is_dir() else open_file
     with closing(opened(str(video), {})) as source:
         for frame in source:
-            apart = np.abs(wanted - (start_unix_ns + frame.time_ns))
-            if start_unix_ns + frame.time_ns > wanted.max(initial=0) + WITHIN_S * 1e9:
+            if start_unix_ns + frame.time_ns > last_ns:
                 break
+            apart = np.abs(wanted - (start_unix_ns + frame.time_ns))
             k = int(np.argmin(apart))
             if apart[k] <= WITHIN_S * 1e9 and k not in found:
                 found[k] = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
