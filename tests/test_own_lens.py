@@ -61,7 +61,7 @@ def video(path: Path, count: int) -> Path:
     return path
 
 
-def replayed(source: Path, out: Path, *more: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def replayed(source: str | Path, out: Path, *more: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """The figures of a replay, and the camera that it stored."""
     answer = CliRunner().invoke(app, ["replay", str(source), "--out", str(out), "--json", *more])
     assert answer.exit_code == 0, answer.output
@@ -73,7 +73,8 @@ def replayed(source: Path, out: Path, *more: str) -> tuple[dict[str, Any], dict[
 def test_the_lens_of_a_video_is_found(tmp_path: Path, wanted: bool) -> None:
     """70 degrees are assumed, 343 px; without distortion the ground would be off by metres."""
     more = [] if wanted else ["--no-find-lens"]
-    figures, camera = replayed(video(tmp_path / "flight.mp4", 12), tmp_path / "scan", *more)
+    source = f"file:{video(tmp_path / 'flight.mp4', 12)}"
+    figures, camera = replayed(source, tmp_path / "scan", *more)
     assert ("lens" in figures["assumed"]) != wanted
     assert camera["distortion"][0] == pytest.approx(BENT if wanted else 0.0, abs=0.01)
     assert camera["K"][0] == pytest.approx(K[0, 0] if wanted else 342.7, rel=0.015)
@@ -83,7 +84,7 @@ def test_the_lens_of_a_video_is_found(tmp_path: Path, wanted: bool) -> None:
 def test_the_distortion_that_exif_does_not_give_is_found(tmp_path: Path, wanted: bool) -> None:
     folder = stills(tmp_path / "stills", 10)
     more = [] if wanted else ["--no-find-lens"]
-    figures, camera = replayed(folder, tmp_path / "scan", *more)
+    figures, camera = replayed(f"images:{folder}", tmp_path / "scan", *more)
     notes = figures["warnings"]
     assert any("found from the images themselves" in note for note in notes) == wanted
     assert camera["distortion"][0] == pytest.approx(BENT if wanted else 0.0, abs=0.01)

@@ -16,7 +16,7 @@ from threading import Event
 from typing import TYPE_CHECKING
 
 from recon.calibration.flight import SelfCalibrationConfig
-from service.cameras import open_camera
+from service.cameras import open_camera, parse_source
 from service.cameras.images import ImagesSource
 from service.cameras.lens import SIGMA_FOCAL, Lens, by_full_frame
 from service.config import change
@@ -83,8 +83,8 @@ def _advice(note: str) -> str:
 def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> Camera | None:
     """The camera by a reconstruction of some images; None where they do not determine it.
 
-    ``inputs`` are those of the whole scan, with the lens to begin with; ``video`` is its
-    recording or its folder of stills.
+    ``inputs`` are those of the whole scan, with the lens to begin with; ``video`` is its camera
+    source, a recording or a folder of stills.
     """
     from service.flight.scan import Scan, create_store
     from service.offline.refine.refinement import lens
@@ -111,7 +111,7 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> C
         finally:
             store.close()
         try:
-            return lens(folder, Path(video), search)
+            return lens(folder, Path(parse_source(video)[1]), search)
         except InputError as error:
             log.info("the images do not determine their lens: %s", error)
             return None
