@@ -200,9 +200,7 @@ class Rig:
                 if "relative" not in state.sources:
                     return raised, spread, HeightSource.MEASURED
                 return raised, max(spread, ABOVE_HOME_SHARE * agl), HeightSource.ABOVE_HOME
-        elif self._fusion.altitude and tag is not None and (tag.relative_alt_m or 0.0) > 1.0:
-            assert tag.relative_alt_m is not None
-            agl = tag.relative_alt_m
+        elif tag is not None and self._fusion.altitude and (agl := tag.relative_alt_m or 0.0) > 1.0:
             return agl, ABOVE_HOME_SHARE * agl + 2.0, HeightSource.ABOVE_HOME
         return ASSUMED_AGL_M, 0.5 * ASSUMED_AGL_M, HeightSource.ASSUMED
 
