@@ -48,14 +48,21 @@ def plane_normal(points: F64) -> F64 | None:
     The direction of minimum spread, without points far off; None for too few, or where the
     points lie on no plane.
     """
-    for _ in range(3):
-        if len(points) < MIN_POINTS:
-            return None
-        middle = np.median(points, axis=0)
-        values, vectors = np.linalg.eigh((points - middle).T @ (points - middle))
-        normal = vectors[:, 0]
-        off = np.abs((points - middle) @ normal)
-        points = points[off <= max(3.0 * float(np.median(off)), 1e-9)]
-    if not values[0] < MAX_THICKNESS**2 * values[1]:
+    if len(points) < MIN_POINTS:
         return None
-    return np.asarray(normal if normal @ middle < 0 else -normal, np.float64)
+    near, spread, normal = plane_through(points)
+    if len(near) < MIN_POINTS or not spread[0] < MAX_THICKNESS**2 * spread[1]:
+        return None
+    return np.asarray(-normal if normal @ np.median(near, axis=0) > 0 else normal, np.float64)
+
+
+def plane_through(points: F64) -> tuple[F64, F64, F64]:
+    """Points (N, 3) without those far off the plane through them, their summed squares along its
+    three axes, smallest first, and its unit normal (3,), the direction of minimum spread."""
+    for _ in range(3):
+        near, about = points, points - np.median(points, axis=0)
+        spread, axes = np.linalg.eigh(about.T @ about)
+        off = np.abs(about @ axes[:, 0])
+        limit = 3.0 * float(np.median(off))
+        points = near[off <= limit] if limit > 0.0 else near
+    return near, spread, np.asarray(axes[:, 0])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from recon.posegraph.level_ground import plane_through
 from recon.types import Array
 
 MAX_SCALE_SIGMA = 0.05
@@ -90,10 +91,5 @@ def slope_deg(xyz_m: Array) -> float:
     """
     if len(xyz_m) < 3:
         return 0.0
-    some = xyz_m[:: max(1, len(xyz_m) // 20_000)].astype(np.float64)
-    for _ in range(3):
-        about = some - np.median(some, axis=0)
-        normal = np.linalg.eigh(about.T @ about)[1][:, 0]
-        off = np.abs(about @ normal)
-        some = some[off <= 3.0 * np.median(off)] if np.median(off) > 0 else some
+    _, _, normal = plane_through(xyz_m[:: max(1, len(xyz_m) // 20_000)].astype(np.float64))
     return float(np.degrees(np.arccos(min(1.0, abs(normal[2])))))
