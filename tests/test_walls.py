@@ -6,6 +6,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from simulated_place import simulated_place
 
 from recon import se3
 from recon.mapping.cloud_fusion import cloud_of, fuse
@@ -13,8 +14,7 @@ from recon.surface.raster import Grid, grid_over
 from recon.surface.walls import Wall, walls_moved
 from recon.types import F32, F64, DepthMap
 from service.sim import scene, shapes
-from service.sim.flight import FlightPlan
-from service.sim.recording import Simulation, SimulationOptions, prepare
+from service.sim.recording import Simulation
 
 # It imports seaborn and pandas: seconds, for every worker that collects this file.
 pytestmark = pytest.mark.skipif(find_spec("py4dgeo") is None, reason="needs py4dgeo")
@@ -71,15 +71,6 @@ def test_flat_ground_has_no_walls() -> None:
     assert walls_moved((points[low], sigma[low]), (points, sigma), GRID, VOXEL_M, 0.05, 900.0) == []
 
 
-def place() -> Simulation:
-    return prepare(
-        SimulationOptions(
-            FlightPlan("hover", 1.0), seed=3, size_px=(320, 180), site_m=120.0, depth_frames=0,
-            distortion=(0.0, 0.0, 0.0, 0.0, 0.0),
-        )
-    )  # fmt: skip
-
-
 def orbited(simulation: Simulation, middle: F64, seed: int) -> tuple[F64, F32]:
     """The cloud of a flight around a house, from depth with noise, misplaced by centimetres."""
     rng = np.random.default_rng(seed)
@@ -102,7 +93,7 @@ def orbited(simulation: Simulation, middle: F64, seed: int) -> tuple[F64, F32]:
 
 
 def test_the_moved_wall_of_a_simulated_house_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = place()
+    before = simulated_place((320, 180))
     houses = [b for b in before.scene.blocks if b[shapes.KIND] < shapes.VEHICLE]
     house = min(houses, key=lambda b: float(np.hypot(b[shapes.X], b[shapes.Y])))
     out = np.array([-house[shapes.SIN], house[shapes.COS]])  # of one of its long walls
@@ -116,7 +107,7 @@ def test_the_moved_wall_of_a_simulated_house_is_found(monkeypatch: pytest.Monkey
         return rows
 
     monkeypatch.setattr(scene, "_houses", extended)
-    after = place()
+    after = simulated_place((320, 180))
     middle = np.append(house[[shapes.X, shapes.Y]], 0.5 * (house[shapes.BASE] + house[shapes.EAVE]))
     one, same, other = (orbited(s, middle, n) for n, s in enumerate((before, before, after)))
     grid = grid_over(np.vstack([one[0], other[0]])[:, :2], VOXEL_M, margin_cells=1)

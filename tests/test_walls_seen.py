@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from simulated_place import simulated_place
 
 from recon import se3
 from recon.backends import load_backend
@@ -14,20 +15,14 @@ from service.config import load_config
 from service.flight.pipeline import Pipeline
 from service.flight.stages import build_stages
 from service.sim import shapes
-from service.sim.flight import FlightPlan
-from service.sim.recording import Simulation, SimulationOptions, prepare
+from service.sim.recording import Simulation
 
 STEP_M, FRAMES, AWAY_M = 1.5, 20, 28.0
 
 
 @pytest.fixture(scope="module")
 def site() -> Simulation:
-    return prepare(
-        SimulationOptions(
-            FlightPlan("hover", 1.0), seed=3, size_px=(480, 270), site_m=120.0, depth_frames=0,
-            distortion=(0.0, 0.0, 0.0, 0.0, 0.0),
-        )
-    )  # fmt: skip
+    return simulated_place((480, 270))
 
 
 def house_of(site: Simulation) -> F64:
