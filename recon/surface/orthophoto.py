@@ -1,7 +1,7 @@
 """True orthophoto: each place of a surface model from the view that looks at it most steeply.
 
 Views that a higher part of the surface hides are left out, and so are those whose colour differs
-from most others (:func:`recon.surface.texture_views.consistent`). The views' exposures are
+from most others (:func:`recon.surface.texture_views.drop_outliers`). The views' exposures are
 levelled, and neighbouring views blend across one cell of the surface model.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from recon.image_quality import sharpness
 from recon.mapping.free_space import pixel_of
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import flat, sample
-from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, consistent, insert
+from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, drop_outliers, insert
 from recon.surface.texturing import levels
 from recon.types import F32, F64, I32, I64, U8, Bool
 
@@ -30,6 +31,9 @@ STEP_M = 0.5
 """Neighbours whose heights differ by more from the nearest cell's are not interpolated."""
 
 EDGE_PX = 1.0
+STEPS = 17
+"""Calls of ``progress`` in all."""
+
 SHARP_REACH = 3
 """Views before and after whose sharpness a view's is compared with."""
 
@@ -51,13 +55,13 @@ def orthophoto(
 ) -> tuple[U8, Bool]:
     """(rows, cols, 3) RGB on ``grid``, and the cells with a height.
 
-    Cells that no view shows take the colour of the surface model. ``progress`` is called for each
-    view and once more.
+    Cells that no view shows take the colour of the surface model. ``progress`` is called STEPS
+    times.
     """
-    found = consistent(_sightings(terrain, views, progress))
+    lens, images = _cameras(views), flat(views)
+    found = _sightings(terrain, views, (*lens, *images), progress)
     progress("painting the orthophoto")
     label = found.view[:, 0].reshape(terrain.raster.grid.shape)
-    pixels, start, sides = flat(views)
     rgb = np.zeros((*grid.shape, 3), np.uint8)
     known = np.zeros(grid.shape, np.bool_)
     old = terrain.raster.grid
@@ -68,8 +72,8 @@ def orthophoto(
     )
     in_bands(
         _paint, len(rgb), np.ascontiguousarray(terrain.places_m), terrain.raster.height_m,
-        terrain.raster.rgb, np.ascontiguousarray(label), *_cameras(views),
-        levels(found, len(views)), pixels, start, sides, to_cell, rgb, known,
+        terrain.raster.rgb, np.ascontiguousarray(label), *lens, levels(found, len(views)),
+        *images, to_cell, rgb, known,
     )  # fmt: skip
     return rgb, known
 
@@ -82,34 +86,30 @@ def _cameras(views: Sequence[TextureView]) -> tuple[F64, F64]:
 
 
 def _sightings(
-    terrain: Terrain, views: Sequence[TextureView], progress: Callable[[str], None]
+    terrain: Terrain,
+    views: Sequence[TextureView],
+    images: tuple[F64, F64, U8, I64, I64],
+    progress: Callable[[str], None],
 ) -> Sightings:
     """The views of each cell, the best first: pixels per metre times the cosine to the vertical,
-    less where an image is blurred."""
-    height = terrain.raster.height_m
-    count = height.size
+    less where an image is blurred; without those whose colour differs from most others."""
+    raster = terrain.raster
+    rows, cols = raster.grid.shape
     out = Sightings(
-        np.full((count, CANDIDATES), -1, np.int32),
-        np.zeros((count, CANDIDATES), np.float32),
-        np.zeros((count, CANDIDATES, 3), np.float32),
+        np.full((rows * cols, CANDIDATES), -1, np.int32),
+        np.zeros((rows * cols, CANDIDATES), np.float32),
+        np.zeros((rows * cols, CANDIDATES, 3), np.float32),
     )
-    highest = float(np.nanmax(height, initial=-np.inf))
-    sharp = _sharpness(views)
-    K, T = _cameras(views)
-    for number, view in enumerate(views):
+    eyes = np.column_stack([raster.grid.pixels(terrain.eyes_m[:, :2]), terrain.eyes_m[:, 2]])
+    centres = np.array([v.T_world_camera[:3, 3] for v in views]).reshape(-1, 3)
+    highest = float(np.nanmax(raster.height_m, initial=-np.inf))
+    places, sharp = np.ascontiguousarray(terrain.places_m), _sharpness(views)
+    edges = [rows * n // (STEPS - 1) for n in range(STEPS)]
+    for first, end in pairwise(edges):
         progress("choosing views for the orthophoto")
-        score, bgr = np.zeros(count, np.float32), np.zeros((count, 3), np.float32)
-        eye = terrain.raster.grid.pixels(terrain.eyes_m[number : number + 1, :2])[0]
-        at = (float(eye[0]), float(eye[1]), float(terrain.eyes_m[number, 2]))
-        centre = np.ascontiguousarray(view.T_world_camera[:3, 3])
         in_bands(
-            _look, len(height), np.ascontiguousarray(terrain.places_m), height, highest, at,
-            centre, K[number], T[number], view.bgra, score, bgr,
-        )  # fmt: skip
-        cells = np.flatnonzero(score > 0.0)
-        insert(
-            out.view, out.px_per_m, out.bgr, cells, number,
-            score[cells] * np.float32(sharp[number]), bgr[cells],
+            _look, end - first, first, places, raster.height_m, highest, eyes, centres, sharp,
+            *images, out.view, out.px_per_m, out.bgr,
         )  # fmt: skip
     return out
 
@@ -128,30 +128,34 @@ def _sharpness(views: Sequence[TextureView]) -> F64:
 
 @njit(cache=True, nogil=True)
 def _look(
-    begin: int, end: int, places: F64, height: F32, highest: float, eye: tuple[float, float, float],
-    centre: F64, K: F64, T: F64, bgra: U8, score: F32, bgr: F32,
+    begin: int, end: int, first: int, places: F64, height: F32, highest: float, eyes: F64,
+    centres: F64, sharp: F64, K: F64, T: F64, pixels: U8, start: I64, sides: I64, view: I32,
+    px: F32, bgr: F32,
 ) -> None:  # fmt: skip
-    """Score and colour of rows of cells in one view; the score stays 0 where it is not seen."""
+    """Fill the sightings of rows of cells, counted from the row ``first``."""
     cols = height.shape[1]
     colour = np.empty(3)
-    flat_pixels = bgra.reshape(-1)
-    h, w = bgra.shape[0], bgra.shape[1]
-    for r in range(begin, end):
-        for c in range(cols):
-            if np.isnan(height[r, c]):
-                continue
-            u, v, z = pixel_of(K, T, places[r, c, 0], places[r, c, 1], places[r, c, 2])
-            if not (EDGE_PX <= u <= w - 1 - EDGE_PX and EDGE_PX <= v <= h - 1 - EDGE_PX):
-                continue
-            if sample(flat_pixels, 0, h, w, u, v, colour) < 0.99:
-                continue
-            if _is_hidden(height, highest, r, c, eye):
-                continue
-            n = r * cols + c
-            ray = centre - places[r, c]
-            score[n] = K[0, 0] / z * abs(ray[2]) / np.sqrt(np.sum(ray * ray))
-            for k in range(3):
-                bgr[n, k] = colour[k]
+    for r in range(first + begin, first + end):
+        for number in range(len(K)):
+            h, w = sides[number, 0], sides[number, 1]
+            eye, centre = (eyes[number, 0], eyes[number, 1], eyes[number, 2]), centres[number]
+            for c in range(cols):
+                if np.isnan(height[r, c]):
+                    continue
+                x, y, z = places[r, c, 0], places[r, c, 1], places[r, c, 2]
+                u, v, depth = pixel_of(K[number], T[number], x, y, z)
+                if not (EDGE_PX <= u <= w - 1 - EDGE_PX and EDGE_PX <= v <= h - 1 - EDGE_PX):
+                    continue
+                if sample(pixels, start[number], h, w, u, v, colour) < 0.99:
+                    continue
+                if _is_hidden(height, highest, r, c, eye):
+                    continue
+                n = r * cols + c
+                east, north, up = x - centre[0], y - centre[1], z - centre[2]
+                score = K[number, 0, 0] / depth * abs(up) * sharp[number]
+                score /= np.sqrt(east**2 + north**2 + up**2)
+                insert(view[n], px[n], bgr[n], number, np.float32(score), colour)
+    drop_outliers((first + begin) * cols, (first + end) * cols, view, px, bgr)
 
 
 @njit(cache=True, nogil=True)

@@ -94,7 +94,7 @@ def look(
         places = np.concatenate([px[mesh.faces[faces]], middle_px[:, None]], axis=1)
         colour, seen = _mean_colour(view.bgra, places)
         good = seen & np.isfinite(resolution)
-        insert(
+        _insert_all(
             out.view, out.px_per_m, out.bgr, faces[good], number,
             resolution[good].astype(np.float32), colour[good],
         )  # fmt: skip
@@ -136,12 +136,12 @@ def consistent(found: Sightings) -> Sightings:
     Needs MIN_VOTES views of a triangle at least; the rest of its row moves up.
     """
     view, px, bgr = found.view.copy(), found.px_per_m.copy(), found.bgr.copy()
-    in_bands(_drop_outliers, len(view), view, px, bgr)
+    in_bands(drop_outliers, len(view), view, px, bgr)
     return Sightings(view, px, bgr)
 
 
 @njit(cache=True, nogil=True)
-def _drop_outliers(begin: int, end: int, view: I32, px: F32, bgr: F32) -> None:
+def drop_outliers(begin: int, end: int, view: I32, px: F32, bgr: F32) -> None:
     """Remove the outliers of rows of sightings, whose unused slots are the last ones."""
     slots = view.shape[1]
     off, ordered = np.empty(slots), np.empty(slots)
@@ -225,22 +225,27 @@ def _mean_colour(bgra: U8, px: F64) -> tuple[F32, Bool]:
 
 
 @njit(cache=True, nogil=True)
-def insert(
+def _insert_all(
     view: I32, px: F32, bgr: F32, faces: I64, number: int, resolution: F32, colour: F32
 ) -> None:
-    """Put one view's sightings into the rows, which stay sorted from fine to coarse."""
-    slots = view.shape[1]
+    """Put one view's sightings into the rows of their faces."""
     for n in range(len(faces)):
         f = faces[n]
-        k = slots
-        while k > 0 and (view[f, k - 1] < 0 or px[f, k - 1] < resolution[n]):
-            k -= 1
-        if k == slots:
-            continue
-        for j in range(slots - 1, k, -1):
-            view[f, j], px[f, j] = view[f, j - 1], px[f, j - 1]
-            for c in range(3):
-                bgr[f, j, c] = bgr[f, j - 1, c]
-        view[f, k], px[f, k] = number, resolution[n]
+        insert(view[f], px[f], bgr[f], number, resolution[n], colour[n])
+
+
+@njit(cache=True, nogil=True)
+def insert(view: I32, px: F32, bgr: F32, number: int, resolution: float, colour: F32 | F64) -> None:
+    """Put one sighting into a row, which stays sorted from fine to coarse."""
+    k = slots = len(view)
+    while k > 0 and (view[k - 1] < 0 or px[k - 1] < resolution):
+        k -= 1
+    if k == slots:
+        return
+    for j in range(slots - 1, k, -1):
+        view[j], px[j] = view[j - 1], px[j - 1]
         for c in range(3):
-            bgr[f, k, c] = colour[n, c]
+            bgr[j, c] = bgr[j - 1, c]
+    view[k], px[k] = number, resolution
+    for c in range(3):
+        bgr[k, c] = colour[c]

@@ -17,7 +17,7 @@ import numpy as np
 
 from recon.bands import at_once, threads
 from recon.mapping.voxel_map import ground_sample_m
-from recon.surface.orthophoto import Terrain, orthophoto
+from recon.surface.orthophoto import STEPS, Terrain, orthophoto
 from recon.surface.raster import Grid, Raster, fill_holes, round_cell
 from recon.surface.texture_views import TextureView
 from recon.types import F64, Array
@@ -113,7 +113,7 @@ def ortho(scan: ScanView, options: ExportOptions) -> Layers:
     cell_m = options.cell_m or round_cell(float(np.nanmedian(sample_m)))
     grid = over(terrain.raster.grid.bounds, cell_m)
     with scan.progress.part("orthophoto of {1} x {0} cells of {2:g} m".format(*grid.shape, cell_m)):
-        rgb, known = orthophoto(terrain, views, grid, scan.progress.counting(len(views) + 1))
+        rgb, known = orthophoto(terrain, views, grid, scan.progress.counting(STEPS))
     opacity = np.where(known, 255, 0).astype(np.uint8)
     bands = np.concatenate([rgb.transpose(2, 0, 1), opacity[None]])
     return Layers(grid, bands, ("red", "green", "blue", "opacity"))
