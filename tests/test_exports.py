@@ -24,10 +24,14 @@ from service.offline.exports.clouds import octree
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.progress import Progress
 from service.scans.fused_cloud import adjusted_gps_s
+from service.stream.records import Keyframe
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
     from conftest import HouseFlight
+
+
+HOLE_AT = (10.0, -7.0)
 
 
 @pytest.fixture
@@ -235,6 +239,37 @@ def test_ortho_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:
     enu = to_enu(np.column_stack([east, north, alt]), 32632, house)
     assert np.median(enu[:, 0]) == pytest.approx(10.0, abs=0.3)
     assert np.median(enu[:, 1]) == pytest.approx(2.0, abs=0.3)
+
+
+@pytest.mark.parametrize(("side_m", "is_closed"), [(3.0, True), (9.0, False)])
+def test_ortho_closes_small_holes(
+    tmp_path: Path,
+    house: HouseFlight,
+    monkeypatch: pytest.MonkeyPatch,
+    side_m: float,
+    is_closed: bool,
+) -> None:
+    """Level ground without depth, which the images show: small holes get its colours."""
+    rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
+    whole = type(house).keyframe
+
+    def without_depth(self: HouseFlight, seq: int, east_m: float) -> Keyframe:
+        one = whole(self, seq, east_m)
+        v, u = np.indices(one.depth.depth_m.shape)
+        ray = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(self.K).T
+        xy = ray[..., :2] * one.depth.depth_m[..., None] * (1.0, -1.0) + (east_m, 0.0)
+        one.depth.depth_m[(np.abs(xy - HOLE_AT) < side_m / 2).all(axis=-1)] = np.nan
+        return one
+
+    monkeypatch.setattr(type(house), "keyframe", without_depth)
+    house.flown(tmp_path).close()
+    with rasterio.open(written(tmp_path, "ortho")) as image:
+        place = LocalFrame(*house.origin).to_utm(np.array([[*HOLE_AT, 0.0]]))[0]
+        row, col = rasterio.transform.rowcol(image.transform, place[0], place[1])
+        rgb, opacity = image.read([1, 2, 3])[:, row, col], image.read(4)[row, col]
+    assert (opacity == 255) == is_closed
+    if is_closed:
+        assert (rgb > (65, 115, 55)).all() and (rgb < (115, 155, 95)).all()  # between both fields
 
 
 def test_contours_run_around_the_house(scan_dir: Path, house: HouseFlight) -> None:

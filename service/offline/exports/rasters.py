@@ -193,9 +193,11 @@ def _closed_surface(scan: ScanView) -> Raster:
     """The surface model with all its holes closed, as an orthophoto needs it."""
     measured = scan.raster(None)
     certain = surface_model(scan, None).raster
-    height = np.where(certain.known, certain.height_m, measured.height_m)
+    doubtful = measured.known & ~certain.known
+    height, rgb = certain.height_m.copy(), certain.rgb.copy()
+    height[doubtful], rgb[doubtful] = measured.height_m[doubtful], measured.rgb[doubtful]
     largest = max(1, round(ORTHO_HOLE_M / measured.grid.cell_m))
-    return fill_holes(replace(measured, height_m=height.astype(np.float32)), largest)
+    return fill_holes(replace(measured, height_m=height, rgb=rgb), largest)
 
 
 def _terrain(scan: ScanView, raster: Raster, views: Sequence[TextureView]) -> Terrain:
