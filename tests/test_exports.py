@@ -15,7 +15,7 @@ import pytest
 from pyproj import CRS, Transformer
 from typer.testing import CliRunner
 
-from recon.types import F64
+from recon.types import F64, Keyframe
 from service.cli import app
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
@@ -24,7 +24,6 @@ from service.offline.exports.clouds import octree
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.progress import Progress
 from service.scans.fused_cloud import adjusted_gps_s
-from service.stream.records import Keyframe
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:

@@ -19,6 +19,8 @@ from command_line import skyrelief
 from loopback import until
 
 from recon.types import Shutter
+from service.commands.replay import _subtitles
+from service.config import load_config
 from service.flight.scan import Scan
 from service.stream.store import ScanStore
 
@@ -99,6 +101,23 @@ def test_the_cloud_is_close_to_the_truth(scan: tuple[Path, dict[str, Any]], flig
     assert 0.58 < honesty["within_1_sigma"] < 0.88, text
     assert honesty["within_2_sigma"] > 0.85, text
     assert report["trajectory"]["raw"]["rms_m"] < 4.0, text
+
+
+def test_subtitles_next_to_a_video_are_its_telemetry(flight: Path, tmp_path: Path) -> None:
+    video = tmp_path / "DJI_0001.MP4"
+    shutil.copy(flight / "flight.mp4", video)
+    assert _subtitles(str(video), load_config(None, [])) is None
+    subtitles = tmp_path / "DJI_0001.SRT"
+    subtitles.write_text("1\n00:00:01,000 --> 00:00:02,000\n- Hello.\n", encoding="utf-8")
+    assert _subtitles(str(video), load_config(None, [])) is None
+    place = "[latitude: 47.1] [longitude: 8.5] [rel_alt: 40.000 abs_alt: 450.000]"
+    subtitles.write_text(f"1\n00:00:00,000 --> 00:00:00,033\n{place}\n", encoding="utf-8")
+    found = _subtitles(str(video), load_config(None, []))
+    assert found is not None and found.counts["positions"] == 1
+    assert any("DJI_0001.SRT" in warning for warning in found.warnings)
+    # They begin with the video: at any other date there is no telemetry.
+    done = skyrelief("replay", video, "--video-epoch", str(EPOCH), "--out", tmp_path / "scan")
+    assert done.returncode != 0 and "the telemetry covers 1970-01-01" in done.stderr
 
 
 def test_without_telemetry_it_still_reconstructs(flight: Path, tmp_path: Path) -> None:

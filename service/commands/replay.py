@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 import time
 from collections.abc import Callable
@@ -33,7 +34,8 @@ WIDTH, STEREO_WIDTH_PX = "compute.stereo_width", 640
 def replay(
     video: Annotated[str, typer.Argument(help="a video, a folder of images, or - for a pipe")],
     telemetry: Annotated[
-        Path | None, typer.Option(help="flight log: .tlog, .BIN, .ulg or .SRT")
+        Path | None,
+        typer.Option(help="flight log: .tlog, .BIN, .ulg or .SRT; default: the video's own .SRT"),
     ] = None,
     camera_model: Annotated[
         Path | None, typer.Option(help="camera_info YAML of 'skyrelief calibrate'")
@@ -67,7 +69,7 @@ def replay(
         overrides.append(f"compute.backend={backend}")
     chosen = load_config(config, overrides)
     camera = _load_model(camera_model, chosen)
-    log = _load_telemetry(telemetry, chosen)
+    log = _load_telemetry(telemetry, chosen) if telemetry else _subtitles(video, chosen)
     source = open_camera(video)
     played = Paced(source) if realtime else source
     try:
@@ -102,19 +104,36 @@ def _load_model(path: Path | None, config: Config) -> Camera | None:
     return None if chosen is None else load_camera(chosen)
 
 
-def _load_telemetry(path: Path | None, config: Config) -> TelemetryLog | None:
+def _load_telemetry(path: Path, config: Config) -> TelemetryLog:
     from mavlink.telemetry.gimbal import GimbalConfig
     from mavlink.telemetry.history import HistoryConfig
     from mavlink.telemetry.logs import load_telemetry
     from service.errors import InputError
 
-    if path is None:
-        return None
     gimbal = GimbalConfig(yaw_frame=config.mavlink.gimbal_yaw_frame)
     try:
         return load_telemetry(path, HistoryConfig(gimbal=gimbal))
     except ValueError as error:
         raise InputError(str(error)) from error
+
+
+def _subtitles(video: str, config: Config) -> TelemetryLog | None:
+    """The telemetry in the subtitles that DJI drones write next to a video, under its name."""
+    from service.cameras import parse_source
+    from service.errors import InputError
+
+    kind, name = parse_source(video)[:2]
+    places = [Path(name).with_suffix(end) for end in (".SRT", ".srt")] if kind == "file" else []
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        return None
+    try:
+        found = _load_telemetry(path, config)
+    except InputError as error:
+        logging.getLogger(__name__).warning("no telemetry: %s", error)
+        return None
+    note = f"telemetry from {path.name}, next to the video"
+    return replace(found, warnings=(note, *found.warnings))
 
 
 def _replay(
