@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -61,15 +61,11 @@ def test_a_stretch_that_was_refuted_needs_more_views_that_agree() -> None:
     rejected: Counter[str] = Counter()
     stage = Plausible(rejected)
     false, good = surface(np.zeros(SHAPE, np.uint8)), surface(np.full(SHAPE, 2, np.uint8))
-    image: dict[str, Any] = {
-        "view": SimpleNamespace(rows=None),
-        "bgr": np.zeros((*SHAPE, 3), np.uint8),
-    }
+    bgr = np.zeros((*SHAPE, 3), np.uint8)
     first, second = (
-        cast(StereoCandidate, SimpleNamespace(prior=PosePrior(), segment=n, **image))
-        for n in range(2)
+        cast(StereoCandidate, SimpleNamespace(prior=PosePrior(), segment=n)) for n in range(2)
     )
-    assert [stage(first, d) for d in (false, false, good, good)] == [None] * 4
-    assert stage(first, good) is good
-    assert stage(second, None) is None and stage(second, good) is good
+    assert [stage(first, d, bgr) for d in (false, false, good, good)] == [None] * 4
+    assert stage(first, good, bgr) is good
+    assert stage(second, None, bgr) is None and stage(second, good, bgr) is good
     assert sum(rejected.values()) == 4

@@ -82,14 +82,15 @@ class Pipeline:
                 depths[partner] = s.reproject(disparity, pair, grid)  # Eq. 3
             s.carry.keep(view.seq, depths)
             depth = s.fuse([*depths.values()], grid)
-        depth = s.plausible(view, depth)  # nothing that cannot be
+        bgr = s.rectify.colours(view, grid)
+        depth = s.plausible(view, depth, bgr)  # nothing that cannot be
         s.rectify.learn(depth)  # how far the relief of the next pairs may reach
         motion = s.register(view, depth)  # ICP onto the keyframe before
         placed = s.chain.add(view, motion, depth)  # pose graph
         if depth is None or placed is None:
             return None
         sigma_m, fresh = s.map(view, depth, s.chain.map_pose(view.seq))  # map: what is new
-        return s.keyframe(view, depth, sigma_m, fresh, placed)
+        return s.keyframe(view, depth, bgr, sigma_m, fresh, placed)
 
     def drain(self) -> Step:
         """The views still waiting for partners, up to one whose work failed."""

@@ -177,6 +177,11 @@ class Rectify:
         w, h = width, round(width * H / W)
         return Grid(scaled_K(view.K, w / W, h / H), (w, h), view.T_odom_camera)
 
+    def colours(self, candidate: StereoCandidate, grid: Grid) -> U8:
+        """(h, w, 3) BGR of the view on the grid."""
+        bgr = at_middle_row(candidate.view, candidate.bgr)
+        return np.asarray(cv2.resize(bgr, grid.size_px, interpolation=cv2.INTER_AREA), np.uint8)
+
     def __call__(
         self, candidate: StereoCandidate, known: Collection[int]
     ) -> dict[int, RectifiedPair]:
@@ -323,11 +328,11 @@ class Plausible:
         self._rejected = rejected
         self._balance: Counter[int] = Counter()  # views kept less those refuted, by segment
 
-    def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> DepthMap | None:
-        """The plausible part of ``depth``; None where there is nothing."""
+    def __call__(self, view: StereoCandidate, depth: DepthMap | None, bgr: U8) -> DepthMap | None:
+        """The plausible part of ``depth``, which has the colours ``bgr``; None without any."""
         if depth is None:
             return None
-        kept = plausible(drop_edges(depth, _colours(view, depth)), view.prior)
+        kept = plausible(drop_edges(depth, bgr), view.prior)
         self._balance[view.segment] += -1 if kept is None else 1
         if kept is not None and self._balance[view.segment] > 0:
             return kept
@@ -371,25 +376,23 @@ class MakeKeyframe:
         self._debug = debug
 
     def __call__(
-        self, view: StereoCandidate, depth: DepthMap, sigma_m: F32, fresh: Bool, placed: Placed
+        self,
+        view: StereoCandidate,
+        depth: DepthMap,
+        bgr: U8,
+        sigma_m: F32,
+        fresh: Bool,
+        placed: Placed,
     ) -> Keyframe:
         """``depth`` and ``sigma_m`` (h, w) are in units of the odometry."""
         scale = np.float32(placed.scale)
         metric = DepthMap(
             depth.depth_m * scale, sigma_m * scale, depth.views, depth.K, placed.T_world_camera
         )
-        bgr = _colours(view, depth)
         if self._debug is not None:
             self._debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
         pose = Pose(placed.T_world_camera, placed.covariance, placed.sources)
         return Keyframe(view.seq, view.time_ns, metric, bgr, pose, fresh)
-
-
-def _colours(view: StereoCandidate, depth: DepthMap) -> U8:
-    """(h, w, 3) BGR of the view on the grid of its depth."""
-    h, w = depth.depth_m.shape
-    bgr = at_middle_row(view.view, view.bgr)
-    return np.asarray(cv2.resize(bgr, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 DenseWorker = BackgroundWorker[StereoCandidate, Keyframe | None]
