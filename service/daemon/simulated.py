@@ -13,7 +13,6 @@ import logging
 import os
 import shutil
 import socket
-import subprocess
 import sys
 from pathlib import Path
 
@@ -21,13 +20,12 @@ from service.cameras import parse_source, reject_options
 from service.config import Config, ScanConfig
 from service.errors import InputError, OutsideError
 from service.init_system import Notifier
-from service.workers import PROCESS, Worker, end_process, open_process
+from service.workers import PROCESS, Worker, run_process
 
 log = logging.getLogger(__name__)
 
 OPERATOR = "udpout:127.0.0.1:14550"
 """Default endpoint of ``skyrelief ctl`` and ground stations."""
-LOOK_S = 0.5
 REPORT_EVERY = 25  # frames between two progress lines
 
 
@@ -85,15 +83,7 @@ class SimulatedFlight:
             "--loop", "--video-to", f"udp://127.0.0.1:{video}?pkt_size=1316",
             "--mavlink-to", f"127.0.0.1:{telemetry}", "--until-stdin-ends",
         ]  # fmt: skip
-        process = open_process(worker.name, command, stdin=subprocess.PIPE)
-        try:
-            while not worker.stop.wait(LOOK_S):
-                if process.poll() is not None:
-                    raise OutsideError(f"the simulated flight ended, code {process.returncode}")
-        finally:
-            end_process(process)
-            if process.stdin is not None:
-                process.stdin.close()
+        run_process(worker, worker.name, command)
 
 
 def is_simulated(config: Config) -> bool:
