@@ -31,18 +31,13 @@ class TorchBackend:
     """``device`` is "cuda" when torch has one, else "cpu"; RuntimeError when it cannot compute.
 
     On CUDA an operation is captured once per shape as a graph; a call then uploads, replays
-    and waits once, for its result. ``messages`` is the type of belief propagation's costs and
-    messages, "int16" or "float32"; the results are the same. One backend serves one thread at
-    a time.
+    and waits once, for its result. One backend serves one thread at a time.
     """
 
     name = "torch"
 
-    def __init__(self, device: str | None = None, messages: str = "int16") -> None:
-        if messages not in ("int16", "float32"):
-            raise ValueError(f"messages are 'int16' or 'float32', not {messages!r}")
+    def __init__(self, device: str | None = None) -> None:
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-        self.messages: torch.dtype = getattr(torch, messages)
         self._icp: DeviceIcp | None = None
         self._plans: dict[Any, Plan] = {}
         self._path: tuple[DenseStages, DensePath] | None = None
@@ -59,7 +54,7 @@ class TorchBackend:
         true = np.array([h, w, labels])
         px, confidence = self._run(
             ("stereo", *space, label_room, levels, config),
-            lambda: DenseStereo(label_room, levels, config, self.messages),
+            lambda: DenseStereo(label_room, levels, config),
             [part(left, (space[0], space[1])), part(right, (space[0], space[1])), part(true)],
             (left, right, true),
         )
@@ -109,9 +104,7 @@ class TorchBackend:
         if stages.matching.fill_occluded:
             return None
         if self._path is None or self._path[0] != stages:
-            path = DensePath(
-                self.device, stages.matching, stages.upsampling, stages.fusion, self.messages
-            )  # fmt: skip
+            path = DensePath(self.device, stages.matching, stages.upsampling, stages.fusion)
             self._path = stages, path
         return self._path[1].depth(pairs, K, size_px, T_world_camera)
 

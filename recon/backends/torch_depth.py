@@ -39,7 +39,6 @@ class DensePath:
         matching: BeliefPropagationConfig,
         upsampling: UpsamplingConfig,
         fusion: FusionConfig,
-        messages: torch.dtype = torch.int16,
     ) -> None:
         if matching.fill_occluded:
             raise ValueError("the path on the device does not fill occlusions")
@@ -47,7 +46,6 @@ class DensePath:
         self.matching = matching
         self.upsampling = upsampling
         self.fusion = fusion
-        self.messages = messages
         self._plans: dict[Any, Plan] = {}
 
     def depth(
@@ -96,7 +94,7 @@ class PairDepthStage(torch.nn.Module):
 
     def __init__(self, path: DensePath, labels: int, levels: int, size_px: tuple[int, int]) -> None:
         super().__init__()
-        self.stereo = DenseStereo(labels, levels, path.matching, path.messages)
+        self.stereo = DenseStereo(labels, levels, path.matching)
         self.upsampling = JointBilateral(path.upsampling)
         self.matching = path.matching
         self.size_px = size_px

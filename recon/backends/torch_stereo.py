@@ -45,7 +45,7 @@ class DenseStereo(torch.nn.Module):
         labels: int,
         levels: int,
         config: BeliefPropagationConfig,
-        messages: torch.dtype = torch.float32,
+        messages: torch.dtype = torch.int16,
     ) -> None:
         super().__init__()
         self.labels = labels
