@@ -13,7 +13,6 @@ from xml.sax.saxutils import escape
 
 import cv2
 import numpy as np
-from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
@@ -69,13 +68,9 @@ def map_routes() -> list[Route]:
     ]
 
 
-async def _tile(request: Request) -> Response:
+def _tile(request: Request) -> Response:
     """A map tile of a scan: ortho, dsm, contours or coverage; transparent where nothing is
     known."""
-    return await run_in_threadpool(_tile_png, request)
-
-
-def _tile_png(request: Request) -> Response:
     state, folder, layer = _asked(request)
     z, x, y = _place(request)
     image = tile_image(state, folder, layer, (z, x, y))
@@ -252,12 +247,8 @@ def _bounds(live: LiveMap) -> tuple[float, float, float, float]:
     return w, s, e, n
 
 
-async def _tile_json(request: Request) -> Response:
+def _tile_json(request: Request) -> Response:
     """A layer of a scan as TileJSON 3.0; ``version`` changes with the map."""
-    return await run_in_threadpool(_tile_json_of, request)
-
-
-def _tile_json_of(request: Request) -> Response:
     state, folder, layer = _asked(request)
     with state.maps.lock:
         live = state.maps.of(folder)
@@ -312,12 +303,8 @@ WMTS_ZOOM = (
 )
 
 
-async def _wmts(request: Request) -> Response:
+def _wmts(request: Request) -> Response:
     """All layers of a scan as WMTS 1.0.0 capabilities, whose tiles are the XYZ ones."""
-    return await run_in_threadpool(_wmts_of, request)
-
-
-def _wmts_of(request: Request) -> Response:
     state, folder = state_of(request), state_of(request).library.folder(*names_of(request))
     with state.maps.lock:
         bounds = dict(zip(BOUNDS, _bounds(state.maps.of(folder)), strict=True))
@@ -334,12 +321,8 @@ def _wmts_of(request: Request) -> Response:
     return Response(text, media_type="application/xml", headers=NOW)
 
 
-async def _kml(request: Request) -> Response:
+def _kml(request: Request) -> Response:
     """A layer as overlays for Google Earth and TAK, each fetched again every few seconds."""
-    return await run_in_threadpool(_kml_of, request)
-
-
-def _kml_of(request: Request) -> Response:
     state, folder, layer = _asked(request)
     with state.maps.lock:
         found = state.maps.of(folder).bounds
