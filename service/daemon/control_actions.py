@@ -18,10 +18,10 @@ from mavlink.component.control import (
     ScanStatus,
     Work,
 )
-from service.daemon.machine import existing
 from service.daemon.scanning import Scanning
 from service.daemon.vehicle_config import with_parameter
 from service.errors import InputError, OutsideError, SkyreliefError
+from service.scans.retention import existing
 from service.workers import PROCESS
 
 MIN_FREE_MIB = 500.0

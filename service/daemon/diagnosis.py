@@ -21,12 +21,13 @@ from urllib.request import urlopen
 
 from mavlink.telemetry.clock import EARLIEST_UNIX_S
 from service.config import Config, keys, load_config
-from service.daemon.machine import existing, read_machine
+from service.daemon.machine import read_machine
 from service.daemon.simulated import is_simulated
 from service.daemon.vehicle_config import watch_config
 from service.daemon.warm_up import is_warm, warm_up_command
 from service.errors import InputError, SkyreliefError
 from service.packages import unusable_packages
+from service.scans.retention import existing
 
 if TYPE_CHECKING:
     from mavlink.wire.messages import LinkReport

@@ -11,6 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from service.scans.retention import existing
+
 if TYPE_CHECKING:
     from mavlink.component.status import ComputerLoad
 
@@ -171,13 +173,6 @@ def _power_w(root: Path) -> float | None:
 def _load(root: Path) -> float | None:
     text = _text(root / "proc/loadavg")
     return float(text.split()[0]) / (os.cpu_count() or 1) if text else None
-
-
-def existing(folder: Path) -> Path:
-    """The folder, or the nearest of its parents that exists."""
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return folder
 
 
 def _disk_mib(disk: Path) -> tuple[float | None, float | None]:

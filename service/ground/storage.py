@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.errors import InputError, OutsideError
-from service.scans.retention import Claim
+from service.scans.retention import Claim, existing
 from service.stream.naming import check_name, split_scan_name
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore, header_of
@@ -77,7 +77,7 @@ class DiskShare:
         if now - self._looked_at >= LOOK_S:
             self._looked_at = now
             try:
-                usage = shutil.disk_usage(_existing(self._folder))
+                usage = shutil.disk_usage(existing(self._folder))
             except OSError as error:
                 raise OutsideError(f"cannot read the disk of {self._folder} ({error})") from error
             self._total_bytes, self._free_bytes = usage.total, usage.free
@@ -100,12 +100,6 @@ def folder_bytes(folder: Path) -> int:
         except OSError as error:
             log.debug("not measured: %s", error)
     return total
-
-
-def _existing(folder: Path) -> Path:
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return folder
 
 
 MAX_RUNS = 100

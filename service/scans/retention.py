@@ -71,6 +71,13 @@ def make_room(folder: Path, keep_free_mib: float, keep: Container[str] = ()) -> 
     return deleted
 
 
+def existing(folder: Path) -> Path:
+    """The folder, or the nearest of its parents that exists."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder
+
+
 def _finished(scan: Path) -> bool:
     from service.stream.store import ScanStore
 
