@@ -8,15 +8,18 @@ another worker, and the worker is restarted where its row says so.
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
 import subprocess
+import tempfile
 import threading
 import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import IO, Any
 
 from service.errors import OutsideError, SkyreliefError
 
@@ -28,6 +31,7 @@ MAX_FAILED = 100
 """Workers that are no longer restarted, kept for the report."""
 PAUSE_S, LOOK_S = 0.5, 0.5
 """Pause between a fault and the restart; between two looks at a process."""
+NICE = 10
 DROP, WAIT = "drop oldest", "wait"
 """Policy of a full queue: drop its oldest entry, or make the filling thread wait."""
 
@@ -310,6 +314,34 @@ def run_process(worker: Worker, row: str, command: Sequence[str]) -> None:
         end_process(process)
         if process.stdin is not None:
             process.stdin.close()
+
+
+def run_to_end(row: str, command: Sequence[str], goes_on: Callable[[str], bool]) -> str:
+    """Run a process of the table with low priority; why it failed, empty when it did not.
+
+    ``goes_on`` gets the last line that it wrote to standard error, every :data:`LOOK_S`; False
+    ends the process.
+    """
+    with tempfile.TemporaryFile() as said:
+        streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": said}
+        process = open_process(row, command, **streams)
+        try:
+            with contextlib.suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, process.pid, NICE)
+            while process.poll() is None:
+                if not goes_on(_last_line(said)):
+                    return ""
+                time.sleep(LOOK_S)
+        finally:
+            end_process(process)
+        return (_last_line(said) or "no reason given") if process.returncode else ""
+
+
+def _last_line(file: IO[bytes]) -> str:
+    """The last line of a log, from its last 2000 bytes."""
+    size = os.fstat(file.fileno()).st_size
+    text = os.pread(file.fileno(), 2000, max(size - 2000, 0)).decode(errors="replace")
+    return (text.strip().splitlines() or [""])[-1][:300]
 
 
 def end_process(process: subprocess.Popen[bytes], patience_s: float = 2.0) -> None:

@@ -12,7 +12,7 @@ from command_line import skyrelief
 from loopback import until
 from portal_client import TOKEN, Client, client, store
 
-from service.ground import upload as upload_module
+from service import workers
 from service.stream.store import ScanStore
 
 __all__ = ["client", "store"]  # the fixtures
@@ -59,7 +59,7 @@ def ended(client: Client, number: int) -> dict[str, Any]:
 def test_a_video_with_its_log_becomes_a_scan(
     client: Client, store: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(upload_module, "NICE", 0)  # the tests share the machine
+    monkeypatch.setattr(workers, "NICE", 0)  # the tests share the machine
     files = [recording / name for name in ("camera.yaml", "flight.mp4", "flight.tlog")]
     status, job = send_recording(client, *files)
     assert (status, job["kind"], job["scan"]) == (202, "scan", "flight.mp4")

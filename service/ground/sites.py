@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import queue
 import sys
-import tempfile
 import time
 from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from subprocess import DEVNULL
 
 import msgspec
 import numpy as np
@@ -30,7 +27,7 @@ from service.offline.site import DRONE, SAME_VISIT_S, SITE
 from service.offline.site.start import Start
 from service.progress import Progress
 from service.small_file import read_small
-from service.workers import Worker, end_process, guarded, open_process
+from service.workers import Worker, guarded, run_to_end
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +43,6 @@ SIZES = 3
 ALIGN_S = 7200.0
 """One alignment may take so long."""
 
-NICE = 10
 MAX_SITE_BYTES = 4_000_000
 UNREADABLE = (InputError, OSError, ValueError, RecursionError)
 
@@ -77,23 +73,17 @@ class Sites:
         _check_room(self._store, self._limits, members)
         site = site_of(self._store, members)
         words = ["site", "align", *map(str, members), "--out", str(site)]
-        with tempfile.TemporaryFile() as errors:
-            process = open_process(
-                "alignment", [sys.executable, "-m", "service.cli", *words],
-                stdin=DEVNULL, stdout=DEVNULL, stderr=errors,
-            )  # fmt: skip
-            with contextlib.suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, process.pid, NICE)
-            deadline = time.monotonic() + ALIGN_S
-            while process.poll() is None:
-                if worker.stop.wait(0.2) or time.monotonic() > deadline:
-                    end_process(process)
-                    return
-            if process.returncode:
-                errors.seek(max(errors.tell() - 2000, 0))
-                said = errors.read(2000).decode(errors="replace").strip().splitlines()
-                raise InputError(f"{site}: {said[-1] if said else 'no reason given'}")
-        log.info("%s: %d scans are aligned", site, len(members))
+        deadline = time.monotonic() + ALIGN_S
+
+        def goes_on(_: str) -> bool:
+            return not worker.stop.is_set() and time.monotonic() < deadline
+
+        command = [sys.executable, "-m", "service.cli", *words]
+        fault = run_to_end("alignment", command, goes_on)
+        if fault:
+            raise InputError(f"{site}: {fault}")
+        if goes_on(""):
+            log.info("%s: %d scans are aligned", site, len(members))
 
 
 def _check_room(store: Path, limits: Limits, members: Sequence[Path]) -> None:

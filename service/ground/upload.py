@@ -9,16 +9,13 @@ lie in it, so that no path in it is ever used.
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import struct
 import sys
-import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
-from subprocess import DEVNULL
 from typing import IO, cast
 
 from service.errors import InputError, OutsideError
@@ -33,7 +30,7 @@ from service.ground.storage import (
     workplace,
 )
 from service.progress import Progress
-from service.workers import end_process, open_process
+from service.workers import run_to_end
 
 KINDS = (".zip", ".db", ".mcap")
 """Of an upload that is a scan already."""
@@ -41,7 +38,6 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".ts", ".m4v")
 LOGS, CAMERAS = (".tlog", ".bin", ".ulg", ".srt"), (".yaml", ".yml")
 Part = tuple[str, int]
 """Name and size in bytes of one uploaded file."""
-LOOK_S, NICE = 0.5, 10
 MAX_LISTING_BYTES = 4 << 20
 """Size of an archive's table of contents, which is read whole."""
 OWN_PATH = re.compile(rf"\S*/{re.escape(TAKING)}[^/\s]+/(?:scan/|uploaded/)?")
@@ -157,7 +153,7 @@ class Upload:
         def work(progress: Progress) -> str:
             with files:
                 folder = place / "replayed"
-                _replay(paths, folder, place / "errors", progress)
+                _replay(paths, folder, progress)
                 progress.commit("importing")
                 return "/".join(library.import_folder(folder))
 
@@ -169,7 +165,7 @@ class Upload:
             self._files.close()
 
 
-def _replay(paths: Sequence[Path], out: Path, errors: Path, progress: Progress) -> None:
+def _replay(paths: Sequence[Path], out: Path, progress: Progress) -> None:
     """Make the scan folder ``out`` of a video, a log and perhaps a camera model.
 
     Raises InputError with the process's last line when it fails.
@@ -186,28 +182,14 @@ def _replay(paths: Sequence[Path], out: Path, errors: Path, progress: Progress) 
     }
     command = [sys.executable, "-m", "service.cli", "replay", str(of.pop("video"))]
     command += [word for option, path in of.items() for word in (option, str(path))]
-    with open(errors, "wb") as said:
-        process = open_process(
-            "replay", [*command, "--out", str(out)], stdin=DEVNULL, stdout=DEVNULL, stderr=said
-        )
-    try:
-        with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, process.pid, NICE)
-        while process.poll() is None:
-            progress((_last_line(errors) or "replay")[:80])
-            time.sleep(LOOK_S)
-    finally:
-        end_process(process)
-    if process.returncode:
-        raise InputError(OWN_PATH.sub("", _last_line(errors)) or "the replay failed")
 
+    def goes_on(line: str) -> bool:
+        progress((line or "replay")[:80])
+        return True
 
-def _last_line(path: Path) -> str:
-    """The last line of a log, from its last 2000 bytes."""
-    with open(path, "rb") as file:
-        file.seek(max(path.stat().st_size - 2000, 0))
-        lines = file.read(2000).decode(errors="replace").strip().splitlines()
-    return lines[-1][:300] if lines else ""
+    fault = run_to_end("replay", [*command, "--out", str(out)], goes_on)
+    if fault:
+        raise InputError(OWN_PATH.sub("", fault))
 
 
 def unpack(archive: Path, folder: Path) -> None:
