@@ -184,13 +184,11 @@ def decode_views(data: bytes, w: int, h: int) -> U8 | None:
 
 def encode_colour(planes: Planes, quality: int) -> bytes:
     """The box as a JPEG; blocks without known pixels are flat and cost little."""
-    whole = planes.known.all()
-    image = planes.bgr if whole else plane_kernels.calm(planes.bgr, planes.known, MCU_PX)
-    ok, data = cv2.imencode(
-        ".jpg",
-        np.ascontiguousarray(image),
-        [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1],
-    )
+    image = np.ascontiguousarray(planes.bgr)
+    if not planes.known.all():
+        image = plane_kernels.calm(image, np.ascontiguousarray(planes.known), MCU_PX)
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    ok, data = cv2.imencode(".jpg", image, options)
     if not ok:
         raise ValueError(f"JPEG refused an image of shape {image.shape}")
     return data.tobytes()
