@@ -27,7 +27,6 @@ import contextlib
 import json
 import logging
 import math
-import sqlite3
 import struct
 import time
 from collections.abc import Awaitable, Callable, Iterator
@@ -44,6 +43,7 @@ from recon.types import F64, DepthMap, Keyframe
 from service.errors import SkyreliefError
 from service.ground.shown_site import SiteNews
 from service.scans.track import latest
+from service.stream.database import Database
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
@@ -94,14 +94,16 @@ def columns(T: F64) -> list[float]:
 
 
 class StoreIndex:
-    """Contents of a store's file, also when another process writes it. Use from one thread."""
+    """Contents of a store's file, also when another process writes it. Use from one thread.
+
+    Raises OutsideError when the file cannot be read.
+    """
 
     RADIO = -1
     """The layer number of keyframes that came by the narrow radio only."""
 
     def __init__(self, path: Path) -> None:
-        uri = f"{path.resolve().as_uri()}?mode=ro"
-        self._db = sqlite3.connect(uri, uri=True, check_same_thread=False, timeout=10.0)
+        self._db = Database(path, read_only=True)
         self._version = -1
 
     def close(self) -> None:
@@ -110,7 +112,7 @@ class StoreIndex:
 
     def changed(self) -> bool:
         """True at the first call, and when the file changed since the last one."""
-        version = int(self._db.execute("PRAGMA data_version").fetchone()[0])
+        version = int(self._db.all("PRAGMA data_version")[0][0])
         news = version != self._version
         self._version = version
         return news
@@ -119,12 +121,12 @@ class StoreIndex:
         """Keyframe number to its finest stored layer."""
         radio = "SELECT number, -1 FROM radio WHERE kind = 'tile'"
         sql = f"SELECT seq, MAX(layer) FROM (SELECT seq, layer FROM chunks UNION {radio})"
-        return dict(self._db.execute(f"{sql} GROUP BY seq ORDER BY seq").fetchall())
+        return dict(self._db.all(f"{sql} GROUP BY seq ORDER BY seq"))
 
     def counts(self) -> tuple[int, int]:
         """Number of poses and of re-poses."""
         poses, radio, reposes = (
-            int(self._db.execute(f"SELECT COUNT(*) FROM {source}").fetchone()[0])
+            int(self._db.all(f"SELECT COUNT(*) FROM {source}")[0][0])
             for source in ("poses", "radio WHERE kind = 'pose'", "reposes")
         )
         return poses + radio, reposes
@@ -279,7 +281,7 @@ async def serve_live(
                 entry = _entry(folder, progress())
                 await socket.send_text(link_message(entry, feed.heard_unix_s))
             await asyncio.wait({gone}, timeout=POLL_S)
-    except (SkyreliefError, sqlite3.Error, WebSocketDisconnect, RuntimeError) as error:
+    except (SkyreliefError, WebSocketDisconnect, RuntimeError) as error:
         log.debug("live view of %s ended: %s", folder, error)
     finally:
         for opened in (index, store):
