@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from conftest import HouseFlight
 
+from recon.surface import coverage, raster
 from recon.types import DepthMap, Keyframe, Pose
 from service.errors import InputError
 from service.offline.exports.view import ExportOptions, ScanView, export
@@ -120,8 +121,14 @@ def at_the_pole(store: ScanStore, house: HouseFlight) -> None:
 
 @pytest.mark.parametrize("change", [strewn, wide, far, odd_words, at_the_pole])
 def test_extreme_records_within_bounds_give_files_or_one_line(
-    tmp_path: Path, house: HouseFlight, change: Callable[[ScanStore, HouseFlight], None]
+    tmp_path: Path,
+    house: HouseFlight,
+    change: Callable[[ScanStore, HouseFlight], None],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """The largest grids are a tenth of what they may be: they take most of the time."""
+    monkeypatch.setattr(coverage, "MAX_CELLS", coverage.MAX_CELLS // 10)
+    monkeypatch.setattr(raster, "MIN_CELLS", raster.MIN_CELLS // 10)
     with house.flown(tmp_path) as store:
         change(store, house)
         summary = write_deliverables(tmp_path, store, {})

@@ -37,6 +37,9 @@ LONG_S = 60.0 * MINUTES
 SHORT_S = LONG_S / FLIGHTS
 """Of the long scan, and of each of the flights."""
 
+SIZE = "480x270" if WHOLE else "320x180"
+"""Of the images."""
+
 WARM_SHARE = 0.3
 """Of the flights, before memory is watched: caches, pools and budgets fill."""
 
@@ -61,9 +64,9 @@ def there_and_back(folder: Path) -> tuple[Path, Path]:
     flight = Path(os.environ.get("SKYRELIEF_SOAK_FLIGHT", folder / "flight"))
     if not flight.is_dir():
         simulate = [sys.executable, "-m", "service.cli", "simulate", "--out", str(flight)]
-        size = ["--size", "480x270", "--duration-s", "24" if WHOLE else "4", "--fps", "10"]
+        plan = ["--size", SIZE, "--duration-s", "24" if WHOLE else "2", "--fps", "10"]
         subprocess.run(
-            [*simulate, *size, "--speed-m-s", "8"], check=True, capture_output=True, timeout=900
+            [*simulate, *plan, "--speed-m-s", "8"], check=True, capture_output=True, timeout=900
         )
     loop = folder / "loop.mp4"
     command = f"ffmpeg -v error -y -i {flight}/flight.mp4 -filter_complex"
@@ -256,7 +259,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     if WHOLE:  # as the installer does: who compiles keeps the compiler's memory
         warm_up = [sys.executable, "-m", "service.cli", "warm-up"]
         subprocess.run(warm_up, check=True, capture_output=True, timeout=900)
-    streamed = "480:270", f"-i {video}"
+    streamed = SIZE.replace("x", ":"), f"-i {video}"
     with aircraft(tmp_path, streamed, model, "on-arm", MAP, LOOPS) as (service, autopilot, sender):
         yield Bench(service, autopilot, sender, tmp_path)
 
