@@ -69,7 +69,10 @@ def run(project: Path, core: bool = True, works: bool = True) -> subprocess.Comp
     tools = project.parent / "tools"
     return subprocess.run(
         [str(project / ".ci" / "run")],
-        env={"PATH": str(tools), "PYTHON": sys.executable, "HOME": os.environ.get("HOME", "/")},
+        env={
+            "PATH": str(tools), "PYTHON": sys.executable, "HOME": os.environ.get("HOME", "/"),
+            "PYTEST_ADDOPTS": "-p no:dash",
+        },
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
 

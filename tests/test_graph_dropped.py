@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -14,7 +15,7 @@ from recon.posegraph.interpolated import KEYFRAME, left
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.thinning import moved_loops, over_gaps, surplus, thinned
-from recon.posegraph.trajectory import Trajectory
+from recon.posegraph.trajectory import Placed, Trajectory
 from recon.types import F64, PosePrior
 from service.bench.graph import HEIGHT_M, legs
 
@@ -49,15 +50,39 @@ def bounded() -> PoseGraph:
     return PoseGraph(PoseGraphConfig(max_nodes=MOST))
 
 
-def test_many_short_segments_keep_to_the_bound_and_near_the_truth() -> None:
-    whole = Trajectory(graph=PoseGraph())
-    assert fly(whole) == COUNT
+@dataclass(frozen=True, slots=True, eq=False)
+class Flown:
+    """A flight with a bound, landed, and the first keyframe that was dropped with its segment."""
+
+    trajectory: Trajectory
+    most: int  # nodes
+    poses: F64
+    dropped: int
+    published: Placed  # the dropped one's, before the landing
+    is_looped: bool  # a loop with it was taken
+    segments: tuple[int, int]  # of the nodes before and after it
+
+
+@pytest.fixture(scope="module")
+def flown() -> Flown:
     trajectory = Trajectory(graph=bounded())
-    assert fly(trajectory) <= MOST
+    most, graph = fly(trajectory), trajectory.graph
+    before, after = next((a, b) for a, b in pairwise(graph.seqs) if b - a > EACH)
+    published = trajectory.place(before + 1)
+    segments = graph.node(before).segment, graph.node(after).segment
+    is_looped = trajectory.add_loop(before + 1, COUNT - 1, np.eye(4), SPREAD)
+    poses = landed(trajectory, COUNT)
+    return Flown(trajectory, most, poses, before + 1, published, is_looped, segments)
+
+
+def test_many_short_segments_keep_to_the_bound_and_near_the_truth(flown: Flown) -> None:
+    whole, trajectory = Trajectory(graph=PoseGraph()), flown.trajectory
+    assert fly(whole) == COUNT
+    assert flown.most <= MOST
     assert trajectory.graph.counts["keyframe dropped"] > COUNT // 4
     apart = [
         np.linalg.norm((poses - np.array(flight()[0][:COUNT]))[:, :3, 3], axis=1)
-        for poses in (landed(trajectory, COUNT), landed(whole, COUNT))
+        for poses in (flown.poses, landed(whole, COUNT))
     ]
     rms = [float(np.sqrt(np.mean(a**2))) for a in apart]
     assert rms[0] < 1.5 * rms[1] < 1.5
@@ -86,21 +111,17 @@ def test_without_fixes_nothing_jumps_when_segments_go() -> None:
     assert worst < 0.01
 
 
-def test_dropped_keyframes_stay_as_published() -> None:
-    trajectory = Trajectory(graph=bounded())
-    fly(trajectory)
-    graph = trajectory.graph
-    before, after = next((a, b) for a, b in pairwise(graph.seqs) if b - a > EACH)
-    assert graph.node(after).segment > graph.node(before).segment + 1
-    published = trajectory.place(before + 1)
-    apart = np.linalg.norm((published.T_world_camera - flight()[0][before + 1])[:3, 3])
+def test_dropped_keyframes_stay_as_published(flown: Flown) -> None:
+    before, after = flown.segments
+    assert after > before + 1
+    published = flown.published.T_world_camera
+    apart = np.linalg.norm((published - flight()[0][flown.dropped])[:3, 3])
     assert 0.0 < apart < 5.0
-    assert not trajectory.add_loop(before + 1, COUNT - 1, np.eye(4), SPREAD)
-    landed(trajectory, COUNT)
-    assert graph.seqs[0] == 0
-    found = trajectory.place(before + 1)
-    np.testing.assert_array_equal(found.T_world_camera, published.T_world_camera)
-    assert found.scale == published.scale
+    assert not flown.is_looped
+    assert flown.trajectory.graph.seqs[0] == 0
+    found = flown.trajectory.place(flown.dropped)
+    np.testing.assert_array_equal(found.T_world_camera, published)
+    assert found.scale == flown.published.scale
 
 
 def nodes_of(sizes: list[int]) -> list[Node]:
