@@ -131,10 +131,7 @@ class _Problem:
     def step(self) -> F64:
         """(4, 4) left correction in the target frame; weak directions stay put."""
         part = np.where(self.strong, self.gradient / np.maximum(self.values, 1e-30), 0.0)
-        return self._about_centre(-self.vectors @ part)
-
-    def _about_centre(self, scaled_twist: F64) -> F64:
-        twist = self.unit * scaled_twist
+        twist = self.unit * (-self.vectors @ part)
         R = se3.so3_exp(twist[:3])
         return se3.compose(R, self.centre - R @ self.centre + twist[3:])
 

@@ -110,9 +110,8 @@ def drop_unreliable(
     if config.min_contrast > 0:
         confidence[_contrast(left) < config.min_contrast] = 0
     if config.occlusion_tolerance >= 0:
-        check_visibility(
-            px, confidence, config.min_disparity, config.occlusion_tolerance, config.fill_occluded
-        )
+        tolerance = float(config.occlusion_tolerance)
+        _check_visibility(px, confidence, config.min_disparity, tolerance, config.fill_occluded)
     else:
         px[confidence <= 0] = np.nan
     if config.speckle_px > 0:
@@ -173,20 +172,6 @@ def select(
         px, confidence,
     )  # fmt: skip
     return px, confidence
-
-
-def check_visibility(
-    px: F32, confidence: F32, min_disparity: int, tolerance: float, fill: bool
-) -> None:
-    """NaN, in place, where the right view would see a nearer surface (by ``tolerance`` labels).
-
-    Only accepted labels (confidence above 0) hide others. With ``fill`` a hidden pixel takes
-    the farther of the nearest accepted labels of its row, at ``FILLED_CONFIDENCE``, unless its
-    partner would lie outside the right image; so does an unknown strip to the left of a nearer
-    surface that is no wider than the step in disparity. What is neither accepted nor filled
-    becomes NaN.
-    """
-    _check_visibility(px, confidence, min_disparity, float(tolerance), bool(fill))
 
 
 @njit(cache=True, nogil=True)
@@ -346,6 +331,14 @@ def _select(
 def _check_visibility(
     px: Any, confidence: Any, min_disparity: int, tolerance: float, fill: bool
 ) -> None:  # pragma: no cover - compiled
+    """NaN, in place, where the right view would see a nearer surface (by ``tolerance`` labels).
+
+    Only accepted labels (confidence above 0) hide others. With ``fill`` a hidden pixel takes
+    the farther of the nearest accepted labels of its row, at ``FILLED_CONFIDENCE``, unless its
+    partner would lie outside the right image; so does an unknown strip to the left of a nearer
+    surface that is no wider than the step in disparity. What is neither accepted nor filled
+    becomes NaN.
+    """
     height, width = px.shape
     for v in range(height):
         row = px[v]

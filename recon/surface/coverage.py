@@ -166,8 +166,9 @@ class CoverageMap:
         at = self._row(seq)
         before = None if at is None else self._ledger.read(at, at + 1)[0]
         if before is not None:
-            if not finer and self._same(footprint_of(before), place):
-                return
+            shift_m = np.abs(footprint_of(before).corners_m - place.corners_m).max()
+            if not finer and shift_m < 0.25 * self.cell_m:
+                return  # too little to change any cell
             self._count(footprint_of(before), -1)
             self._stale |= self._within(before)
         self._count(place, +1)
@@ -260,10 +261,6 @@ class CoverageMap:
         )
 
     # ---- footprints ------------------------------------------------------------------------
-
-    def _same(self, a: Footprint, b: Footprint) -> bool:
-        """True when a keyframe moved too little to change any cell."""
-        return bool(np.abs(a.corners_m - b.corners_m).max() < 0.25 * self.cell_m)
 
     def _count(self, place: Footprint, change: int) -> None:
         """Add ``change`` to the views of all cells whose centre the footprint covers."""

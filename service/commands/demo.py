@@ -42,7 +42,8 @@ def demo(
     _prepare(out)
     began = time.monotonic()
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    portal = f"127.0.0.1:{free_port()}" if _has_portal() else ""
+    has_portal = all(find_spec(package) for package in ("starlette", "uvicorn", "websockets"))
+    portal = f"127.0.0.1:{free_port()}" if has_portal else ""
     compilers = _compile_meanwhile()
     if compilers:
         _say(1, "compiling kernels in the background: once, a minute or two")
@@ -72,11 +73,6 @@ def demo(
 def _say(step: int, what: str) -> None:
     """One line of progress, where it does not disturb the report."""
     print(f"[{step}/3] {what}", file=sys.stderr, flush=True)
-
-
-def _has_portal() -> bool:
-    """True when the packages of the extra ``portal`` are installed."""
-    return all(find_spec(package) for package in ("starlette", "uvicorn", "websockets"))
 
 
 def compile_kernels() -> None:

@@ -144,7 +144,9 @@ class Scanning:
                 return
             self.fault = ""
             run = self._run = ScanRun(self, is_asked=self.intent.failures == 0)
-            self._worker = PROCESS.start("scan", lambda _: self._carry_out(run), lag_s=self._lag_s)
+            self._worker = PROCESS.start(
+                "scan", lambda _: self._carry_out(run), lag_s=lambda: run.busy_s
+            )
 
     def fulfilled(self, run: ScanRun) -> None:
         """Note that the run's recording has ended by itself, which fulfils the request."""
@@ -205,9 +207,6 @@ class Scanning:
         """Seconds spent on the current frame or view; 0 while waiting for the camera."""
         run = self._run
         return 0.0 if run is None else run.busy_s
-
-    def _lag_s(self) -> float:
-        return self.busy_s
 
     @property
     def progress_s(self) -> float:

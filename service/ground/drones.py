@@ -141,7 +141,11 @@ class Drones:
     def _min_silent(self, now: float) -> dict[str, _Member]:
         """The silent drone that brought least, the one heard longest ago of several; or none."""
         silent = [
-            (_brought(member.drone), member.drone.heard_at, name)
+            (
+                sum(e["received_bytes"] + e["radio_messages"] for e in member.drone.entries),
+                member.drone.heard_at,
+                name,
+            )
             for name, member in self._members.items()
             if now - member.drone.heard_at > DRONE_TIMEOUT_S
             and not any(scan.is_writing for scan in member.drone.scans)
@@ -159,8 +163,3 @@ class Drones:
                 del self._members[name]
                 return True
         return False
-
-
-def _brought(drone: DroneReceiver) -> int:
-    """Amount received from a drone."""
-    return sum(entry["received_bytes"] + entry["radio_messages"] for entry in drone.entries)

@@ -145,7 +145,8 @@ def _align(
             store.update_header(notes=tuple(document["notes"]))
         with writing(out / SITE) as part:
             part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-        _replace(fresh, out / "scan.db")
+        _remove(out / "scan.db")
+        os.replace(fresh, out / "scan.db")
     finally:
         _remove(fresh)
         if not any(out.iterdir()):
@@ -172,11 +173,6 @@ def _known(out: Path) -> dict[str, Any]:
 def _remove(path: Path) -> None:
     for suffix in ("", "-wal", "-shm"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
-
-
-def _replace(fresh: Path, path: Path) -> None:
-    _remove(path)
-    os.replace(fresh, path)
 
 
 # ---- alignment ---------------------------------------------------------------------------------
