@@ -109,52 +109,59 @@ class GroundOptions:
     ] = None
     as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False
 
+    def receiver(self) -> ReceiverConfig:
+        """The receiver's configuration; InputError for impossible options."""
+        from service.ground.receiver import ReceiverConfig
+
+        refresh_s = self.refresh_s
+        if refresh_s is None:
+            refresh_s = RADIO_REFRESH_S if self.mavlink else 0.0
+        name, session = self._session()
+        return ReceiverConfig(self.store, session, self._limits(), name, refresh_s, self.sites)
+
+    def _session(self) -> tuple[str, SessionConfig]:
+        """The station's name on its certificate, and how it is reached."""
+        from service.stream.keys import member_name, tls_files
+        from service.stream.session import SessionConfig
+
+        connect, listen, has_keys = self.connect or [], self.listen or [], self.keys is not None
+        ca, certificate, key = tls_files(self.keys) if self.keys is not None else ("", "", "")
+        if not connect and not listen:
+            host = "tls/0.0.0.0" if has_keys else "tcp/127.0.0.1"
+            listen = [f"{host}:{DEFAULT_PORT}"]
+        return member_name(Path(certificate)) if certificate else "", SessionConfig(
+            mode="router" if listen or len(connect) > 1 else "client",
+            connect=tuple(connect),
+            listen=tuple(listen),
+            plain=self.plain,
+            tls_ca=ca,
+            tls_certificate=certificate,
+            tls_key=key,
+            fleet_rights=has_keys and bool(listen),
+        )
+
+    def _limits(self) -> Limits:
+        """Limits of one drone."""
+        from service.ground.drone import Limits
+
+        if not 0.0 < self.drone_share <= 100.0:
+            raise InputError("--drone-share is a percentage: more than 0, at most 100")
+        sizes_mb = (self.quota_mb, self.reserve_mb)
+        if any(size is not None and not size >= 0 for size in sizes_mb):
+            raise InputError("--quota-mb and --reserve-mb are 0 or more")
+        quota, reserve = (None if size is None else int(size * 1e6) for size in sizes_mb)
+        return Limits(quota, self.drone_share / 100.0, reserve)
+
 
 @with_options(GroundOptions)
 def ground(given: GroundOptions) -> None:
     """Receive scans from drones; end with Ctrl-C. Scans are stored in STORE/DRONE/SCAN."""
-    from service.ground.receiver import ReceiverConfig
-
-    name, session = _session(given.connect or [], given.listen or [], given.keys, given.plain)
-    refresh = given.refresh_s
-    if refresh is None:
-        refresh = RADIO_REFRESH_S if given.mavlink else 0.0
-    limits = _limits(given.quota_mb, given.drone_share, given.reserve_mb)
-    _receive(ReceiverConfig(given.store, session, limits, name, refresh, given.sites), given)
-
-
-def _session(
-    connect: list[str], listen: list[str], keys: Path | None, plain: bool
-) -> tuple[str, SessionConfig]:
-    """The station's name on its certificate, and how it is reached."""
-    from service.stream.keys import member_name, tls_files
-    from service.stream.session import SessionConfig
-
-    ca, certificate, key = tls_files(keys) if keys is not None else ("", "", "")
-    if not connect and not listen:
-        host = "tls/0.0.0.0" if keys is not None else "tcp/127.0.0.1"
-        listen = [f"{host}:{DEFAULT_PORT}"]
-    return member_name(Path(certificate)) if certificate else "", SessionConfig(
-        mode="router" if listen or len(connect) > 1 else "client",
-        connect=tuple(connect),
-        listen=tuple(listen),
-        plain=plain,
-        tls_ca=ca,
-        tls_certificate=certificate,
-        tls_key=key,
-        fleet_rights=keys is not None and bool(listen),
-    )
-
-
-def _receive(config: ReceiverConfig, given: GroundOptions) -> None:
-    """Receive until a signal or the end that is asked for; then write the files that are due, and
-    report."""
     from service.ground.receiver import Receiver
     from service.init_system import Notifier
     from service.radio import GROUND, RadioLink
     from service.workers import Workers
 
-    notifier = Notifier()
+    config, notifier = given.receiver(), Notifier()
     taken = _take_in(config.store, given.take or [])
     stop, workers = stop_by_signals(), Workers()
     receiver = Receiver(config, workers)
@@ -193,21 +200,6 @@ def _receive(config: ReceiverConfig, given: GroundOptions) -> None:
         receiver.close()
         closing.join()
     _report(entries, receiver.dropped, workers.report(), given.as_json)
-
-
-def _limits(quota_mb: float | None, drone_share: float, reserve_mb: float | None) -> Limits:
-    """Limits of one drone; InputError for impossible ones."""
-    from service.ground.drone import Limits
-
-    if not 0.0 < drone_share <= 100.0:
-        raise InputError("--drone-share is a percentage: more than 0, at most 100")
-    if (quota_mb is not None and not quota_mb >= 0) or (
-        reserve_mb is not None and not reserve_mb >= 0
-    ):
-        raise InputError("--quota-mb and --reserve-mb are 0 or more")
-    quota = None if quota_mb is None else int(quota_mb * 1e6)
-    reserve = None if reserve_mb is None else int(reserve_mb * 1e6)
-    return Limits(quota, drone_share / 100.0, reserve)
 
 
 def _take_in(store: Path, folders: list[Path]) -> list[Path]:

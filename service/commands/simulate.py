@@ -6,7 +6,6 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from service.progress import Progress
     from service.sim import recording
     from service.sim.flight import FlightPlan, SensorNoise
-    from service.sim.live import LiveOptions
     from service.sim.telemetry import TelemetryOptions
 
 VIDEO_TO = "udp://127.0.0.1:5600?pkt_size=1316"
@@ -185,56 +183,41 @@ def simulate(given: SimulateOptions) -> None:
     --live plays it in real time, as a camera's stream and an autopilot's MAVLink. A flight that
     exists is not rendered again.
     """
-    from service.sim.live import LiveOptions
-
-    show = None
-    if given.live:
-        show = LiveOptions(given.video_to, given.mavlink_to, given.loop, given.until_stdin_ends)
-    _simulate(given.out, given.simulation, show, given.as_json)
-
-
-def _simulate(
-    out: Path,
-    options: Callable[[], recording.SimulationOptions],
-    live: LiveOptions | None,
-    as_json: bool,
-) -> None:
-    """Render the flight and, with ``live``, play it; play the one that ``out`` holds already."""
     from service.sim import recording
 
-    if live is not None and (out / "flight.mp4").exists():
-        _play(out, live, as_json)
+    if given.live and (given.out / "flight.mp4").exists():
+        _play(given)
         return
     started = time.monotonic()
     try:
-        simulation = recording.prepare(options())
+        simulation = recording.prepare(given.simulation())
     except ValueError as error:
         raise InputError(f"simulate: {error}") from error
     with showing("simulate") as progress:
-        result = recording.write(simulation, out, partial(_frames, progress))
-    if live is None:
-        _report(out, result, time.monotonic() - started, as_json)
+        result = recording.write(simulation, given.out, partial(_frames, progress))
+    if not given.live:
+        _report(given.out, result, time.monotonic() - started, given.as_json)
         return
-    print(f"{out}: {result['frames']} frames rendered", file=sys.stderr)
-    _play(out, live, as_json)
+    print(f"{given.out}: {result['frames']} frames rendered", file=sys.stderr)
+    _play(given)
 
 
-def _play(folder: Path, options: LiveOptions, as_json: bool) -> None:
+def _play(given: SimulateOptions) -> None:
     """Play a flight until its end or Ctrl-C."""
-    from service.sim.live import play
+    from service.sim.live import LiveOptions, play
 
-    where = f"video to {options.video}, MAVLink to {options.mavlink}"
-    print(f"playing {folder}: {where}", file=sys.stderr)
+    where = f"video to {given.video_to}, MAVLink to {given.mavlink_to}"
+    print(f"playing {given.out}: {where}", file=sys.stderr)
+    options = LiveOptions(given.video_to, given.mavlink_to, given.loop, given.until_stdin_ends)
     try:
-        counts = play(folder, options)
+        counts = play(given.out, options)
     except ValueError as error:
         raise InputError(f"simulate --live: {error}") from error
     except KeyboardInterrupt:
         return
-    if as_json:
-        print(
-            json.dumps(counts), file=sys.stderr if options.video.startswith("pipe:") else sys.stdout
-        )
+    if given.as_json:
+        is_piped = given.video_to.startswith("pipe:")
+        print(json.dumps(counts), file=sys.stderr if is_piped else sys.stdout)
 
 
 def _pair(text: str, option: str) -> tuple[float, float]:
