@@ -49,6 +49,7 @@ ELSEWHERE = {
 
 SMALLER = {
     "simulate": "--size 320x180 --fps 4 --duration-s 6 --depth-frames 2",
+    "replay": "--set compute.stereo_width=160 --set compute.guide_width=320",
     "ctl watch": "--seconds 1",
     "refly": "--sigma-m 0.001",  # so that some place is weak
 }

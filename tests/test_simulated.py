@@ -34,7 +34,8 @@ class Service:
         self.log = folder / "run.log"
         settings = [
             f"camera.source={SOURCE}", "compute.backend=cpu", f"health.http=127.0.0.1:{port}",
-            f"scan.folder={folder / 'scans'}", "fusion.loops=false",
+            f"scan.folder={folder / 'scans'}", "fusion.loops=false", "compute.stereo_width=160",
+            "compute.guide_width=320",
         ]  # fmt: skip
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
