@@ -81,10 +81,16 @@ def test_a_thinned_graph_is_as_near_to_the_truth_as_the_whole_one(tmp_path: Path
     assert len(graph.loops) <= MOST and sum(edge.accepted for edge in graph.loops) > 5
 
 
-def test_nodes_stand_evenly_and_the_newest_all_stay() -> None:
+@cache
+def thin() -> Trajectory:
+    """The flight with a bound, before its landing; only to be read."""
     trajectory = Trajectory(graph=bounded())
     fly(trajectory)
-    seqs = np.array(trajectory.graph.seqs)
+    return trajectory
+
+
+def test_nodes_stand_evenly_and_the_newest_all_stay() -> None:
+    seqs = np.array(thin().graph.seqs)
     assert seqs[0] == 0 and seqs[-1] == COUNT - 1
     assert np.all(np.diff(seqs[-MOST // 5 :]) == 1)
     assert np.diff(seqs).max() <= 5 * COUNT / MOST
@@ -92,9 +98,8 @@ def test_nodes_stand_evenly_and_the_newest_all_stay() -> None:
 
 def test_riders_lie_between_their_nodes_as_vision_saw_them() -> None:
     """By closed form: seen from the node before, the miss at the node after shared out."""
-    trajectory = Trajectory(graph=bounded())
-    fly(trajectory)
-    graph, odom = trajectory.graph, flight()[1]
+    trajectory, odom = thin(), flight()[1]
+    graph = trajectory.graph
     a, b = next((a, b) for a, b in pairwise(graph.seqs) if b - a >= 4)
     T_a, T_b = graph.pose(a).T_world_camera, graph.pose(b).T_world_camera
 
