@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Literal, cast
 
@@ -40,14 +41,12 @@ TRUE = Camera(
 TEXEL_M = 0.16
 
 
-def _texture() -> F64:
+@cache
+def texture() -> F64:
     rng = np.random.default_rng(3)
     layers = [ndi.gaussian_filter(rng.normal(size=(1100, 1100)), 1.3 * 2.0**k) for k in range(5)]
     total = np.asarray(sum(2.0**k * layer / layer.std() for k, layer in enumerate(layers)))
     return np.asarray(128 + 45 * (total - total.mean()) / total.std())
-
-
-TEXTURE = _texture()
 
 
 def _height(x: F64, y: F64) -> F64:
@@ -64,7 +63,7 @@ def _image(T: F64, seed: int) -> U8:
         p = T[:3, 3] + ways * z[:, None]
         z += (p[:, 2] - _height(p[:, 0], p[:, 1])) / -ways[:, 2]
     p = (T[:3, 3] + ways * z[:, None])[:, :2] / TEXEL_M + 550
-    gray = ndi.map_coordinates(TEXTURE, p.T, order=1, mode="reflect").reshape(h, w)
+    gray = ndi.map_coordinates(texture(), p.T, order=1, mode="reflect").reshape(h, w)
     noise = np.random.default_rng(seed).normal(size=gray.shape)
     return np.asarray(np.clip(gray + noise, 0, 255), np.uint8)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import scipy.ndimage as ndi
@@ -20,14 +22,12 @@ HEIGHT_M, SIGMA_M, METRES = 60.0, 0.06, 0.22
 LOOPS = SubmapLoopConfig(min_gap=5)
 
 
+@cache
 def _texture(seed: int) -> F64:
     rng = np.random.default_rng(seed)
     layers = [ndi.gaussian_filter(rng.normal(size=(900, 900)), 1.3 * 2.0**k) for k in range(5)]
     total = np.asarray(sum(2.0**k * layer / layer.std() for k, layer in enumerate(layers)))
     return np.asarray(128 + 45 * (total - total.mean()) / total.std())
-
-
-GROUND, ELSEWHERE = _texture(1), _texture(2)
 
 
 def _height(x: F64, y: F64) -> F64:
@@ -42,9 +42,10 @@ def _oblique(along: float, across: float, back: bool) -> F64:
     return se3.compose(turn @ R, np.array([across, along, HEIGHT_M]))
 
 
-def _keyframe(seq: int, T: F64, texture: F64 = GROUND) -> Keyframe:
+def _keyframe(seq: int, T: F64, texture: F64 | None = None) -> Keyframe:
     """A view of the ground with noise in gray and depth."""
     rng = np.random.default_rng(seq)
+    texture = _texture(1) if texture is None else texture
     w, h = SIZE
     v, u = np.mgrid[0:h, 0:w].astype(np.float64)
     ways = rays(K, np.column_stack([u.ravel(), v.ravel()])) @ T[:3, :3].T
@@ -118,7 +119,7 @@ def test_opposite_oblique_views_agree_within_their_covariance(off_m: float) -> N
 
 def test_another_ground_and_views_without_any_are_no_loop() -> None:
     poses = _legs()
-    a, b = _keyframe(1, poses[1]), _keyframe(2, poses[6], ELSEWHERE)
+    a, b = _keyframe(1, poses[1]), _keyframe(2, poses[6], _texture(2))
     guess = se3.inverse(poses[1]) @ poses[6]
     assert verify_surfaces(_view(a), _view(b), guess) is None
     assert verify_surfaces(_view(a), _view(_masked(b, slice(0, 0))), guess) is None
@@ -128,7 +129,7 @@ def test_another_ground_and_views_without_any_are_no_loop() -> None:
 def test_a_repeated_texture_is_no_loop_at_the_wrong_place() -> None:
     """Every eight metres the same: a track that has slipped by as much finds perfect matches."""
     period = round(8.0 / METRES)
-    tiled = np.tile(GROUND[:period, :period], (900 // period + 1,) * 2)[:900, :900]
+    tiled = np.tile(_texture(1)[:period, :period], (900 // period + 1,) * 2)[:900, :900]
     poses = _legs()
     slip = se3.compose(np.eye(3), np.array([period * METRES, 0.0, 0.0]))
     loops = []
