@@ -124,6 +124,54 @@ def test_an_unknown_scan_is_said_to_be_unknown(browser: Browser, scans: Path) ->
         assert "no scan drone-1/nothing" in browser.run("document.body.textContent")
 
 
+def test_a_scan_that_cannot_be_read_is_said_with_its_reason(browser: Browser, scans: Path) -> None:
+    folder = scans / "drone-1/broken"
+    shutil.copytree(scans / "drone-1/test-1", folder)
+    (folder / "scan.db").write_bytes(b"no database")
+    with page_of(browser, scans, []) as base:
+        browser.open(f"{base}/#/view/drone-1/broken")
+        browser.wait(f"{STATE}.includes('is not a scan database')", 30)
+
+
+def test_list_and_map_say_whether_a_scan_is_heard(browser: Browser, scans: Path) -> None:
+    entry = {"drone": "drone-1", "scan": "test-1", "heard_unix_s": time.time() - 25.0, "open": True}
+    with page_of(browser, scans, [entry]) as base:
+        browser.wait("document.querySelector('.badge.silent')?.textContent === 'not finished'")
+        browser.open(f"{base}/#/map/drone-1/test-1")
+        kind(browser, "silent")
+        entry["heard_unix_s"] = time.time() + 600.0
+        kind(browser, "receiving")
+        browser.open(f"{base}/#/")
+        browser.wait("document.querySelector('.badge:not(.silent)')?.textContent === 'growing'")
+
+
+@pytest.mark.parametrize("page", ["", "map/drone-1/test-1"])
+def test_a_station_that_stops_is_said_until_it_is_back(
+    browser: Browser, scans: Path, page: str
+) -> None:
+    missing = (
+        "[...document.querySelectorAll('.stale, .state')].some(e => e.checkVisibility()"
+        " && e.textContent.startsWith('the ground station does not answer'))"
+    )
+    first = Portal(PortalConfig(scans, port=0, token=TOKEN))
+    first.start()
+    base = first.url.split("/?")[0]
+    browser.open("about:blank")
+    browser.open(f"{base}/#/{page}")
+    browser.wait("!!document.querySelector('.layer img, article')", 30)
+    assert not browser.run(missing)
+    first.close()
+    browser.wait(missing, 30)
+    assert browser.run("!!document.querySelector('.layer img, article')")  # what was there stays
+    again = Portal(PortalConfig(scans, port=int(base.rpartition(":")[2]), token=TOKEN))
+    again.start()
+    try:
+        browser.wait(f"!{missing}", 30)
+    finally:
+        browser.open("about:blank")
+        again.close()
+
+
 def test_the_list_follows_the_server(browser: Browser, scans: Path, house: HouseFlight) -> None:
     folder = scans / "drone-1/test-1"
     with page_of(browser, scans, []):

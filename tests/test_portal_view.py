@@ -164,6 +164,39 @@ def test_ground_looks_like_ground_at_the_first_look(browser: Browser, portal: Po
     assert solid_share(drawn(browser)) < solid_share(plain) - 0.02
 
 
+SLOW_CARD = """
+window.since = Infinity;
+const late = new WeakSet(), gl = WebGL2RenderingContext.prototype;
+const { fenceSync, clientWaitSync } = gl;
+gl.fenceSync = function (...a) {
+  const sync = fenceSync.apply(this, a);
+  if (performance.now() > window.since) late.add(sync);
+  return sync;
+};
+gl.clientWaitSync = function (sync, ...a) {
+  const busy = window.since < Infinity && late.has(sync);
+  return busy ? this.TIMEOUT_EXPIRED : clientWaitSync.call(this, sync, ...a);
+};
+"""
+"""A graphics card that ends no work given to it after ``since``, until that is infinite again."""
+
+
+def test_what_changes_while_the_graphics_card_is_busy_is_drawn(
+    browser: Browser, portal: Portal
+) -> None:
+    browser.screen(1280, 800)
+    open_scan(browser, portal)
+    browser.run(SLOW_CARD + ";0")
+    browser.run("dispatchEvent(new Event('input')); since = performance.now() + 510; 0")
+    browser.run("new Promise(r => setTimeout(r, 900))")  # the last frame is being drawn
+    browser.screen(1000, 700)  # clears the canvas
+    browser.run("new Promise(r => setTimeout(r, 900))")
+    browser.run("since = Infinity; 0")
+    corner = drawn(browser)[2, 2]
+    browser.screen(1280, 800)
+    assert corner.tolist() == [0x20, 0x1B, 0x17]  # the background, not black
+
+
 def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, store: Path) -> None:
     summary = json.loads((store / "drone-1/test-1/scan.json").read_text())
     points, quality = f"{summary['counts']['points']:,}", summary["quality"]
@@ -173,9 +206,16 @@ def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, s
     assert f"{points} points" in facts
     assert f"{quality['sigma_median_m']:.2f} m relative" in facts
     assert f"{quality['position_sigma_median_m']:.2f} m absolute" in facts
+    assert f"Trust\n{quality['trust']['level']}" in facts
     open_scan(browser, portal)
     browser.wait(f"document.querySelector('.figures').innerText.includes('{points}')")
-    assert f"Points\n{points}" in browser.run("document.querySelector('.figures').innerText")
+    figures = browser.run("document.querySelector('.figures').innerText")
+    assert f"Points\n{points}" in figures
+    for name in ("sigma_median_m", "position_sigma_median_m"):
+        assert f" \N{GREEK SMALL LETTER SIGMA}\n{quality[name]:.2f} m" in figures
+    assert "Speed" not in figures  # it has landed
+    follow = "[...document.querySelectorAll('button')].find(b => b.textContent === 'Follow')"
+    assert browser.run(f"{follow}.hidden")
 
 
 def test_tone_mapping_and_exposure_change_the_mesh(
@@ -256,7 +296,7 @@ def test_a_refused_stop_shows_the_companions_own_words(browser: Browser, store: 
             companion.control.answers["stop_scan"] = Answer(Result.DENIED, "the disk is in use")
             vehicle.start()
             browser.open(one.url)
-            browser.wait("document.querySelector('.vehicle').textContent.includes('connected')", 30)
+            browser.wait("!document.querySelector('.vehicle .state').hidden", 30)
             browser.click("Start scan")
             browser.wait("document.querySelector('.note').textContent === 'start: accepted'", 30)
             browser.click("Stop scan")

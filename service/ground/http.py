@@ -65,6 +65,9 @@ MAX_VIEWS_WITHOUT_TOKEN = 8
 ORDERS_HZ, ORDERS_AT_ONCE = 1.0, 10
 """Rate limit of orders to the vehicle; a stop always passes."""
 
+SILENT_S = 10.0
+"""A scan from which nothing was heard for so long does not grow."""
+
 NO_PAGE = (
     "<!doctype html><meta charset=utf-8><title>skyrelief</title><h1>skyrelief</h1>"
     "<p>The page was not built when skyrelief was installed. Build it with <code>npm ci</code>"
@@ -252,15 +255,27 @@ def _page(request: Request) -> Response:
     return FileResponse(index) if index.is_file() else HTMLResponse(NO_PAGE)
 
 
+def _growing(state: PortalState) -> set[tuple[str, str]]:
+    """Drone and scan of those that are received now."""
+    since = time.time() - SILENT_S
+    heard = [e for e in state.progress() if e.get("heard_unix_s", 0.0) > since]
+    return {(entry["drone"], entry["scan"]) for entry in heard}
+
+
 def _scans(request: Request) -> Response:
     """All scans, the newest first."""
-    return JSONResponse(state_of(request).library.scans())
+    state = state_of(request)
+    entries, growing = state.library.scans(), _growing(state)
+    for entry in entries:
+        entry["growing"] = not entry["finished"] and (entry["drone"], entry["scan"]) in growing
+    return JSONResponse(entries)
 
 
 def _scan(request: Request) -> Response:
     """One scan with its files and jobs."""
     state, names = state_of(request), names_of(request)
     entry = state.library.entry(*names)
+    entry["growing"] = not entry["finished"] and names in _growing(state)
     entry["jobs"] = state.jobs.of(state.library.folder(*names))
     return JSONResponse(entry)
 

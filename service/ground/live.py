@@ -51,6 +51,7 @@ log = logging.getLogger(__name__)
 
 SIGMA_STEP_M = 0.02
 TRACK_POINTS = 2000
+MAX_REASON_BYTES = 123  # of a WebSocket's close frame
 
 
 def chunk_message(keyframe: Keyframe, layer: int, max_points: int | None = None) -> bytes:
@@ -264,6 +265,7 @@ async def serve_live(
 ) -> None:
     """Send what is new in the scan of ``folder`` over an accepted socket; close it at the end."""
     store = index = None
+    reason = ""
     try:
         store = await run_in_threadpool(ScanStore.open, folder / "scan.db")
         index = StoreIndex(store.path)
@@ -283,12 +285,13 @@ async def serve_live(
             await asyncio.wait({gone}, timeout=POLL_S)
     except (SkyreliefError, WebSocketDisconnect, RuntimeError) as error:
         log.debug("live view of %s ended: %s", folder, error)
+        reason = str(error) if isinstance(error, SkyreliefError) else ""
     finally:
         for opened in (index, store):
             if opened is not None:
                 await run_in_threadpool(opened.close)
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
-            await socket.close()
+            await socket.close(reason=reason.encode()[:MAX_REASON_BYTES].decode(errors="ignore"))
 
 
 def _max_points(socket: WebSocket) -> int | None:

@@ -32,9 +32,15 @@ export interface Scan {
   started_unix_s: number | null;
   origin: Origin | null;
   finished: boolean;
+  growing: boolean;
   trouble: string | null;
   counts?: { keyframes?: number; points?: number };
-  quality?: Record<string, number | null>;
+  quality?: {
+    area_m2?: number | null;
+    sigma_median_m?: number | null;
+    position_sigma_median_m?: number | null;
+    trust?: { level: string; reasons: string[] } | null;
+  };
   notes?: string[];
   jobs?: Job[];
 }
@@ -49,14 +55,18 @@ export class Refused extends Error {
   }
 }
 
-/** The JSON answer; throws Refused when the portal refuses. */
-async function ask<T>(path: string, method = "GET", body?: unknown): Promise<T> {
+export const NO_ANSWER = "the ground station does not answer";
+
+/** The JSON answer; throws Refused when the portal refuses, and NO_ANSWER when nothing comes. */
+export async function ask<T>(path: string, method = "GET", body?: unknown): Promise<T> {
   const init: RequestInit = { method };
   if (body !== undefined) {
     init.body = JSON.stringify(body);
     init.headers = { "content-type": "application/json" };
   }
-  const answer = await fetch(path, init);
+  const answer = await fetch(path, init).catch(() => {
+    throw new Error(NO_ANSWER);
+  });
   const content = (await answer.json().catch(() => ({}))) as { error?: string };
   if (!answer.ok) throw new Refused(content.error ?? `the portal answered ${answer.status}`, answer.status);
   return content as T;

@@ -95,6 +95,8 @@ export class Cameras {
     if (!T) return;
     const texture = new THREE.Texture(shown);
     texture.colorSpace = THREE.SRGBColorSpace;
+    texture.generateMipmaps = false; // three.js counts them from the size in the page, not of the image
+    texture.minFilter = THREE.LinearFilter;
     texture.needsUpdate = true;
     this.image.material.map?.dispose();
     this.image.material.map = texture;

@@ -65,6 +65,8 @@ export function clipBox({ stage, cloud }: Site): HTMLElement {
     stage.renderer.clippingPlanes = planes;
     stage.touch();
   };
+  const text = (textContent: string): HTMLElement => el("span", { textContent });
+  panel.append(el("div", { className: "axis" }, text(""), text("from"), text("to")));
   for (const [name, axis] of axes) {
     const slide = (which: string, value: string): HTMLInputElement => {
       const input = el("input", { type: "range", min: "0", max: "100", value, oninput: cut });
@@ -73,7 +75,7 @@ export function clipBox({ stage, cloud }: Site): HTMLElement {
     };
     const field = { axis, low: slide("from", "0"), high: slide("to", "100") };
     fields.push(field);
-    panel.append(el("div", { className: "axis" }, el("span", { textContent: name }), field.low, field.high));
+    panel.append(el("div", { className: "axis" }, text(name), field.low, field.high));
   }
   const whole = (): void => {
     for (const { low, high } of fields) [low.value, high.value] = ["0", "100"];
@@ -115,6 +117,7 @@ export class Images {
   private newest = -1;
   private chosen: number | null = null;
   private shown = -1;
+  private version = 0;
   private down: { x: number; y: number } | null = null;
 
   constructor(private readonly site: Site, free: () => boolean) {
@@ -129,8 +132,11 @@ export class Images {
     clearInterval(this.timer);
   }
 
+  /** A keyframe came, or a finer layer of one: its image is fetched again. */
   arrived(seq: number): void {
     this.newest = Math.max(this.newest, seq);
+    this.version += 1;
+    if (seq === this.shown) this.shown = -1;
   }
 
   private click(event: MouseEvent): void {
@@ -150,7 +156,7 @@ export class Images {
     const image = new Image();
     image.alt = `keyframe ${seq}, seen from the aircraft`;
     image.onload = () => this.show(seq, image);
-    image.src = `${api.scanAddress(this.site.id)}/keyframes/${seq}.jpg`;
+    image.src = `${api.scanAddress(this.site.id)}/keyframes/${seq}.jpg?v=${this.version}`;
   }
 
   private show(seq: number, image: HTMLImageElement): void {

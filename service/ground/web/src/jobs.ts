@@ -33,14 +33,15 @@ export function jobList(title = (job: api.Job): string => job.scan): HTMLElement
 }
 
 function row(job: api.Job, title: string): Row {
+  const what = `${job.kind === "all" ? "all maps" : job.kind} of ${title}`;
   const bar = el("progress", { max: 100 });
-  bar.setAttribute("aria-label", `${job.kind} of ${title}`);
+  bar.setAttribute("aria-label", what);
   const words = el("span", { className: "words" });
   const stop = el("button", { textContent: "Cancel", onclick: () => void api.cancel(job.number).catch(notify) });
-  stop.setAttribute("aria-label", `Cancel ${job.kind} of ${title}`);
+  stop.setAttribute("aria-label", `Cancel ${what}`);
   const get = el("a", { className: "button", textContent: "Download", hidden: true, download: "" });
-  get.setAttribute("aria-label", `Download ${job.kind} of ${title}`);
-  const element = el("li", {}, el("strong", { textContent: `${job.kind} of ${title}` }), bar, words, stop, get);
+  get.setAttribute("aria-label", `Download ${what}`);
+  const element = el("li", {}, el("strong", { textContent: what }), bar, words, stop, get);
   const show = (now: api.Job): void => {
     const ended = now.state !== "waiting" && now.state !== "running";
     element.className = now.state;

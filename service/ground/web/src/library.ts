@@ -37,8 +37,11 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   const title = (job: api.Job): string =>
     scans.find((s) => s.drone === job.drone && s.scan === job.scan)?.title ?? job.scan;
   const [upload, line, endUploads] = uploads(again);
+  const cut = el("p", { className: "stale", hidden: true });
+  cut.setAttribute("role", "alert");
   root.replaceChildren(
     el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again, upload)),
+    cut,
     line,
     jobList(title),
     list,
@@ -57,7 +60,12 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   };
   search.oninput = draw;
   async function load(): Promise<void> {
-    const [found, deleted] = await Promise.all([api.scans(), api.bin()]);
+    const [found, deleted] = await Promise.all([api.scans(), api.bin()]).catch((error: Error) => {
+      cut.hidden = false;
+      cut.textContent = `${error.message}${seen && "; this list is not up to date"}`;
+      throw error;
+    });
+    cut.hidden = true;
     const news = JSON.stringify([found, deleted]);
     if (news === seen) return;
     seen = news;
@@ -66,7 +74,7 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
     bin.replaceChildren(...binRows(deleted, again));
   }
   const refresh = setInterval(() => void (document.hidden || load().catch(() => undefined)), REFRESH_MS);
-  await load().catch(notify);
+  await load().catch(() => undefined);
   return () => {
     clearInterval(refresh);
     endUploads();
@@ -116,7 +124,7 @@ function empty(filtered: boolean): HTMLElement {
     "div",
     { className: "empty" },
     el("h2", { textContent: "No scans yet" }),
-    el("p", { textContent: "They appear here as soon as a drone connects. Drop a ZIP of a scan folder, its scan.db, an MCAP, or a video with its flight log here, or import from this machine above." }),
+    el("p", { textContent: "They appear here as soon as a drone connects. Or upload (or drop here) a ZIP of a scan folder, its scan.db, an MCAP, or a video with its flight log." }),
   );
 }
 
@@ -188,7 +196,7 @@ function card(s: api.Scan, again: () => void): HTMLElement {
       "h2",
       {},
       el("a", { href: open, textContent: s.title }),
-      s.finished || s.trouble ? null : el("span", { className: "badge", textContent: "growing" }),
+      s.finished || s.trouble ? null : el("span", { className: s.growing ? "badge" : "badge silent", textContent: s.growing ? "growing" : "not finished" }),
     ),
     facts(s),
     s.trouble ? el("p", { className: "trouble", textContent: s.trouble }) : null,
@@ -209,7 +217,7 @@ function card(s: api.Scan, again: () => void): HTMLElement {
 function facts(s: api.Scan): HTMLElement {
   const rows: [string, string][] = [["Drone", s.drone], ["Flown", date(s.started_unix_s)]];
   if (s.origin) rows.push(["Place", `${s.origin.lat_deg.toFixed(5)}, ${s.origin.lon_deg.toFixed(5)}`]);
-  const { area_m2, sigma_median_m, position_sigma_median_m } = s.quality ?? {};
+  const { area_m2, sigma_median_m, position_sigma_median_m, trust } = s.quality ?? {};
   const size: string[] = [];
   if (s.counts?.points !== undefined) size.push(`${count(s.counts.points)} points`);
   else if (s.counts?.keyframes !== undefined) size.push(`${s.counts.keyframes} keyframes`);
@@ -219,6 +227,7 @@ function facts(s: api.Scan): HTMLElement {
   if (sigma_median_m) sigma.push(`${sigma_median_m.toFixed(2)} m relative`);
   if (s.origin && position_sigma_median_m) sigma.push(`${position_sigma_median_m.toFixed(2)} m absolute`);
   if (sigma.length) rows.push(["Sigma", sigma.join(", ")]);
+  if (trust) rows.push(["Trust", [trust.level, ...trust.reasons].join("; ")]);
   return el(
     "dl",
     { className: "facts" },

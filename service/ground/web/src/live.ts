@@ -1,5 +1,7 @@
 // The live WebSocket: binary chunks and JSON news, as service/ground/live.py describes them.
 
+import { NO_ANSWER } from "./api";
+
 export interface Chunk {
   seq: number;
   layer: number;
@@ -99,7 +101,7 @@ export class LiveView {
     };
     socket.onclose = ({ code, reason }) => {
       if (this.closed) return;
-      this.onState(code === 1008 ? reason || "refused" : "the portal does not answer; trying again");
+      this.onState(code === 1008 ? reason || "refused" : `${reason || NO_ANSWER}; trying again`);
       if (code !== 1008) setTimeout(() => this.closed || this.open(), 1500);
     };
   }

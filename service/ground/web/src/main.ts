@@ -1,7 +1,8 @@
 // Three pages behind the address: the list of scans, and one scan in 3D or on a map.
 
 import "./style.css";
-import { notify } from "./dom";
+import * as api from "./api";
+import { el } from "./dom";
 import { showLibrary } from "./library";
 
 const root = document.getElementById("app")!;
@@ -14,12 +15,38 @@ async function show(): Promise<void> {
   close = () => undefined;
   const [page, drone, scan, place] = location.hash.replace(/^#\//, "").split("/").map(decodeURIComponent);
   let end: () => void;
-  if (page === "view" && drone && scan) end = await (await import("./view")).showView(root, drone, scan, place);
-  else if (page === "map" && drone && scan) end = await (await import("./map")).showMap(root, drone, scan);
+  if (page === "view" && drone && scan) end = await (await loaded(import("./view"))).showView(root, drone, scan, place);
+  else if (page === "map" && drone && scan) end = await (await loaded(import("./map"))).showMap(root, drone, scan);
   else end = await showLibrary(root);
+  document.title = [...new Set([root.querySelector("h1")?.textContent, "skyrelief"])].filter(Boolean).join(" · ");
   if (mine === turn) close = end;
   else end(); // another page was asked for meanwhile
 }
 
-addEventListener("hashchange", () => void show().catch(notify));
-void show().catch(notify);
+const loaded = <T>(part: Promise<T>): Promise<T> =>
+  part.catch(() => {
+    throw new Error(api.NO_ANSWER);
+  });
+
+/** Shows what stands in place of a page that cannot be shown. */
+function fail(error: unknown): void {
+  const why = error instanceof Error ? error.message : String(error);
+  const unknown = error instanceof api.Refused && error.status === 404;
+  root.replaceChildren(
+    el(
+      "main",
+      { className: "empty" },
+      el("h1", { textContent: unknown ? "There is no such scan" : "This scan cannot be shown" }),
+      el("p", { textContent: unknown ? `${why}. It may have been deleted or not arrived yet.` : why }),
+      el("p", {}, el("button", { textContent: "Try again", onclick: () => location.reload() }), " ", el("a", { href: "#/", textContent: "All scans" })),
+    ),
+  );
+}
+
+function start(): void {
+  const shown = show();
+  const mine = turn;
+  void shown.catch((error: unknown) => mine === turn && fail(error));
+}
+addEventListener("hashchange", start);
+start();

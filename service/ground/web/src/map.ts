@@ -35,8 +35,12 @@ function degreesOf({ x, y }: Place): [number, number] {
   return [(Math.atan(Math.sinh(Math.PI * (1 - 2 * y))) * 180) / Math.PI, 360 * (x - 0.5)];
 }
 
+/** None where there is no such layer; throws when the ground station does not answer. */
 const tileJson = (address: string): Promise<TileJson | null> =>
-  fetch(address).then((r) => (r.ok ? (r.json() as Promise<TileJson>) : null)).catch(() => null);
+  api.ask<TileJson>(address).catch((error: unknown) => {
+    if (error instanceof api.Refused) return null;
+    throw error;
+  });
 
 /** The tiles of one layer in a box of their own. */
 class Layer {
@@ -121,14 +125,17 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   host.setAttribute("aria-label", "map: drag to move, plus and minus to zoom");
   const cursor = el("output", { className: "cursor" });
   const bar = svg("svg", { class: "scale", width: "200", height: "30" });
-  const none = el("p", { className: "blank", textContent: "No surface yet." });
+  const none = el("p", { className: "blank", textContent: scan.finished ? "This scan has no surface." : "No surface yet." });
   const panel = el("fieldset", { className: "panel layers" }, el("legend", { textContent: "Layers" }));
   const open = api.viewAddress(id);
+  const state = el("span", { className: "state" });
+  state.setAttribute("role", "status");
   const head = el(
     "header",
     {},
     el("a", { href: "#/", textContent: "‹ Scans" }),
     el("h1", { textContent: scan.title }),
+    state,
     el("a", { href: open, textContent: "3D" }),
     el("a", { href: `${at}/ortho.kml`, textContent: "KML" }),
   );
@@ -139,8 +146,8 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   let isPlanned = false; // whether the flight over weak places is shown
   let notes: { place: Place; text: string }[] = [];
   const layers: Layer[] = [];
-  let middle: Place = { x: 0.5, y: 0.5 };
-  let zoom = 2;
+  let middle = scan.origin ? placeOf(scan.origin.lat_deg, scan.origin.lon_deg) : { x: 0.5, y: 0.5 };
+  let zoom = 18;
   let isFree = true; // until somebody moves it the map shows the whole scan
 
   const draw = (): void => {
@@ -194,7 +201,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     box.onchange = () => {
       layer.shown = box.checked;
       document.body.dataset["map"] = "loading"; // until it is drawn
-      void layer.refresh().then(draw);
+      void layer.refresh().then(draw, notify);
     };
     const share = el("input", { type: "range", min: "0", max: "1", step: "0.05", value: "1" });
     share.setAttribute("aria-label", `${title}, opacity`);
@@ -210,14 +217,18 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     lines.textContent = flight.length ? `${flight.length / 2} ${flight.length > 2 ? "lines" : "line"}` : "nothing is weak";
     files.hidden = !flight.length;
   };
-  const refresh = async (): Promise<void> => {
-    const [found, { features }] = await Promise.all([
+  const load = async (): Promise<void> => {
+    const [now, found, { features }] = await Promise.all([
+      api.scan(drone, name),
       tileJson(`${at}/ortho.json`),
       api.annotations(id).catch(() => ({ features: [] })),
       plans().catch((error) => (lines.textContent = String(error.message ?? error))),
       ...layers.map((layer) => layer.refresh()),
     ]);
     none.hidden = found !== null;
+    if (now.finished) say("finished", "finished");
+    else if (now.growing) say("receiving", "receiving");
+    else say("silent", "silent");
     notes = features.map(({ geometry: { coordinates }, properties }) => ({
       place: placeOf(coordinates[1], coordinates[0]),
       text: short(properties.text),
@@ -225,6 +236,12 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     if (found?.bounds && isFree) frame(found.bounds);
     draw();
   };
+
+  const say = (kind: string, text: string): void => {
+    state.className = `state ${kind}`;
+    state.textContent = text;
+  };
+  const refresh = (): Promise<void> => load().catch((error: Error) => say("silent", error.message));
 
   const basemap = await tileJson("/tiles/basemap.json");
   root.replaceChildren(el("div", { className: "view flat" }, head, host, panel));
@@ -244,7 +261,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     isPlanned = box.checked;
     lines.hidden = !isPlanned;
     files.hidden = true;
-    void refresh().catch(notify);
+    void refresh();
   };
   panel.append(el("div", { title: "a flight over gaps and weak places" }, el("label", {}, box, " Fly again"), lines), files);
   const nearer = el("button", { textContent: "+", title: "nearer", onclick: () => zoomTo(zoom + 1) });
@@ -257,7 +274,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   });
   const resized = new ResizeObserver(draw);
   resized.observe(host);
-  await refresh().catch(notify);
+  await refresh();
   const timer = setInterval(() => void (document.hidden || refresh()), REFRESH_MS);
   return () => {
     clearInterval(timer);

@@ -122,11 +122,11 @@ export class Ruler {
       const step = this.places[i]!.distanceTo(this.places[(i || n) - 1]!);
       if (i) text((a.x + b.x) / 2, (a.y + b.y) / 2, units.length(step));
     });
-    for (const p of inFront) parts.push(svg("circle", { cx: p.x.toFixed(1), cy: p.y.toFixed(1), r: "4" }));
     const mean = (values: number[]): number => values.reduce((a, b) => a + b, 0) / n;
     if (n > 2 && inFront.length === n)
       text(mean(inFront.map((p) => p.x)), mean(inFront.map((p) => p.y)), units.area(area(this.places)));
-    this.overlay.replaceChildren(...parts);
+    const circles = inFront.map((p) => svg("circle", { cx: p.x.toFixed(1), cy: p.y.toFixed(1), r: "4" }));
+    this.overlay.replaceChildren(...circles, ...parts);
   };
 
   private clear(): void {

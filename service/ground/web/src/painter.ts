@@ -67,6 +67,7 @@ export class Painter {
    */
   tick(now: number, lively: boolean, before: readonly (() => void)[]): void {
     const presenting = this.renderer.xr.isPresenting;
+    if (lively) this.settled = false; // also while the graphics card is busy
     if (!presenting && this.work && !this.done(this.work, now)) return;
     if (presenting && this.work) this.paced(this.work, now);
     this.work = null;

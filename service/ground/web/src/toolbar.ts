@@ -19,6 +19,8 @@ export interface Parts {
   notes: Notes;
   legend: HTMLElement;
   coverage: HTMLElement;
+  time: HTMLElement;
+  finished: () => boolean;
   id: { drone: string; scan: string };
 }
 
@@ -29,18 +31,23 @@ export function toolbar(parts: Parts): HTMLElement {
   const follow = el("button", {
     textContent: "Follow",
     title: "follow the aircraft",
-    onclick: () => void (stage.follow = true),
+    onclick: () => ((stage.follow = !stage.follow), stage.touch()),
   });
+  stage.before.push(() => {
+    pressed(follow, stage.follow);
+    follow.hidden = parts.finished();
+  });
+  const colour = colours(parts);
   const whole = el("button", {
     textContent: "Whole site",
     title: "show all of it; W A S D R F fly",
     onclick: () => ((stage.follow = false), stage.frame()),
   });
   bar.append(
-    group(colours(parts)),
-    group(follow, whole, linkButton(parts)),
+    group(colour),
+    group(whole, follow, linkButton(parts)),
     group(...measure(parts), cameraButton(parts.cameras), coverageButton(parts)),
-    showGroup(parts),
+    showGroup(parts, colour),
     clipBox(parts),
     settings(parts),
   );
@@ -50,7 +57,7 @@ export function toolbar(parts: Parts): HTMLElement {
 
 const group = (...children: HTMLElement[]): HTMLElement => el("span", { className: "group" }, ...children);
 
-function colours({ cloud, legend }: Parts): HTMLElement {
+function colours({ cloud, legend }: Parts): HTMLSelectElement {
   const select = el(
     "select",
     {},
@@ -143,8 +150,8 @@ function coverageButton({ coverage, id }: Parts): HTMLElement {
   return button;
 }
 
-/** Points, tiles or mesh: one at a time. */
-function showGroup(parts: Parts): HTMLElement {
+/** Points, tiles or mesh: one at a time; colours and time are of the points. */
+function showGroup(parts: Parts, colour: HTMLSelectElement): HTMLElement {
   const { stage, cloud, id } = parts;
   let close: () => void = () => undefined;
   const points = el("button", { textContent: "Points", className: "on" });
@@ -158,7 +165,8 @@ function showGroup(parts: Parts): HTMLElement {
       close();
       close = next;
       cloud.group.visible = chosen === points;
-      parts.legend.hidden ||= chosen !== points;
+      colour.disabled = chosen !== points;
+      for (const part of [parts.legend, parts.time]) part.classList.toggle("off", chosen !== points);
       stage.touch();
       buttons.forEach((b) => pressed(b, b === chosen));
     } catch (error) {
@@ -172,7 +180,10 @@ function showGroup(parts: Parts): HTMLElement {
       await made(id, "glb", "mesh.glb", "There is no mesh yet. Make one now?");
       const remove = await stage.load(api.file(id, "mesh.glb"));
       document.body.dataset["mesh"] = "shown";
-      return remove;
+      return () => {
+        remove();
+        delete document.body.dataset["mesh"];
+      };
     });
   tiles.onclick = () =>
     void show(tiles, async () => {

@@ -6,16 +6,20 @@ import { el, notify } from "./dom";
 /** A strip of figures and buttons that keeps itself up to date while it is in the page. */
 export function vehicleStrip(): HTMLElement {
   const figures = el("span", { className: "state" });
-  const strip = el("span", { className: "vehicle", hidden: true }, figures);
-  for (const action of ["start", "stop"]) {
-    strip.append(el("button", { textContent: action === "start" ? "Start scan" : "Stop scan", onclick: () => give(action) }));
-  }
-  strip.append(el("button", { textContent: "Baseline", onclick: baseline }));
+  const none = el("button", { textContent: "No vehicle", onclick: () => notify(none.title) });
+  const acts = [
+    el("button", { textContent: "Start scan", onclick: () => give("start") }),
+    el("button", { textContent: "Stop scan", onclick: () => give("stop") }),
+    el("button", { textContent: "Baseline", onclick: baseline }),
+  ];
+  const strip = el("span", { className: "vehicle", hidden: true }, figures, none, ...acts);
   const refresh = async (): Promise<void> => {
     const now = await api.vehicle().catch(() => ({ connected: null }) as api.Vehicle);
     strip.hidden = now.connected === null;
-    figures.textContent = now.connected ? words(now) : `no vehicle: ${now.trouble ?? "looking"}`;
-    for (const button of strip.querySelectorAll("button")) button.disabled = !now.connected;
+    figures.textContent = words(now);
+    none.title = now.trouble ?? "looking for it";
+    none.hidden = now.connected === true;
+    for (const shown of [figures, ...acts]) shown.hidden = !now.connected;
     const wait = now.connected === null ? 10000 : 1000;
     setTimeout(() => strip.isConnected && void refresh(), wait);
   };
@@ -34,7 +38,7 @@ function words(v: api.Vehicle): string {
   add(v.speed_m_s, (x) => `${x.toFixed(1)} m/s`);
   add(v.height_above_home_m, (x) => `${x.toFixed(1)} m up`);
   add(v.home_distance_m, (x) => `${x.toFixed(0)} m from home`);
-  return parts.join(" · ") || "connected";
+  return ["vehicle", ...parts].join(" · ");
 }
 
 function give(action: string): void {

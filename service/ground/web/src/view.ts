@@ -20,29 +20,11 @@ import { vehicleStrip } from "./vehicle";
 
 const ASK_EVERY_MS = 2000;
 
-/** Shows a scan, or why there is none; gives what closes it. */
+/** Shows a scan; gives what closes it. */
 export async function showView(root: HTMLElement, drone: string, name: string, place?: string): Promise<() => void> {
-  try {
-    const scan = await api.scan(drone, name);
-    const parts = await api.parts(scan).catch((error: unknown) => (notify(error), []));
-    return view(root, scan, parts, place);
-  } catch (error) {
-    root.replaceChildren(nothing(error));
-    return () => undefined;
-  }
-}
-
-/** What stands in place of a scan that cannot be shown. */
-function nothing(error: unknown): HTMLElement {
-  const why = error instanceof Error ? error.message : String(error);
-  const unknown = error instanceof api.Refused && error.status === 404;
-  return el(
-    "main",
-    { className: "empty" },
-    el("h1", { textContent: unknown ? "There is no such scan" : "This scan cannot be shown" }),
-    el("p", { textContent: unknown ? `${why}. It may have been deleted or not arrived yet.` : why }),
-    el("p", {}, el("a", { href: "#/", textContent: "All scans" })),
-  );
+  const scan = await api.scan(drone, name);
+  const parts = await api.parts(scan).catch((error: unknown) => (notify(error), []));
+  return view(root, scan, parts, place);
 }
 
 function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: string): () => void {
@@ -56,16 +38,16 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const host = el("main", { className: "stage" });
   const legend = el("div", { className: "panel legend", hidden: true });
   const coverage = el("div", { className: "panel coverage", hidden: true });
-  const side = el("aside", { className: "side", tabIndex: 0 }, jobList(), figures, legend, coverage);
+  const side = el("aside", { className: "side", tabIndex: 0 }, jobList(), legend, coverage, figures);
   side.setAttribute("aria-label", "figures");
   const page = el("div", { className: "view" }, bar, host, side);
   root.replaceChildren(page);
   const cloud = new Cloud();
   cloud.datum_m = scan.origin?.alt_amsl_m ?? 0;
   cloud.parts = parts;
-  let fused: number | undefined;
+  let known = scan;
   const learn = (now: api.Scan): void => {
-    fused = now.counts?.points;
+    known = now;
     link.finished ||= now.finished;
     title.textContent = now.title;
     report.hidden = !now.files.some((f) => f.name === "report.html");
@@ -90,7 +72,8 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const ruler = new Ruler(scene);
   ruler.offer = placing(scan, () => ruler.rewrite());
   const notes = new Notes(scene, id, (point) => stage.lookAt(point));
-  host.append(notes.overlay, ruler.overlay, ruler.cursor);
+  const empty = el("p", { className: "blank", textContent: scan.finished ? "This scan has no points." : "No points yet." });
+  host.append(empty, notes.overlay, ruler.overlay, ruler.cursor);
   side.prepend(ruler.panel, notes.panel);
   const site = { stage, cloud, cameras, id };
   const others = new SiteView(stage, cloud, cameras);
@@ -102,7 +85,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   stage.drawGradually(cloud);
   stage.add(cameras.group);
   stage.addAgain(cloud.group);
-  bar.append(toolbar({ ...site, ruler, notes, legend, coverage }));
+  bar.append(toolbar({ ...site, ruler, notes, legend, coverage, time: time.element, finished: () => link.finished }));
   if (awaited(scan)) ruler.toggle();
 
   let last: LastPose | undefined;
@@ -139,6 +122,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
       cameras.put(chunk.seq, chunk.T);
       images.arrived(chunk.seq);
       time.refresh();
+      empty.hidden = true;
       document.body.dataset["chunk"] = `${chunk.seq} ${Date.now()}`;
       if (cloud.keyframes === 1 && !framed) stage.frame();
     },
@@ -152,7 +136,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     link.draw();
     if (cameras.refresh()) stage.touch();
     if (cloud.refresh()) stage.touch();
-    figures.replaceChildren(...rows(cloud, stage, last, fused, others.words));
+    figures.replaceChildren(...rows(cloud, known, link.finished, last, others.words));
     document.body.dataset["points"] = String(cloud.total);
     document.body.dataset["drawn"] = String(cloud.drawn);
     document.body.dataset["fps"] = stage.painter.frames_per_s.toFixed(1);
@@ -169,18 +153,21 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   };
 }
 
-function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined, fused: number | undefined, site: string): HTMLElement[] {
+/** The figures; of a finished scan none of the moment. */
+function rows(cloud: Cloud, { counts, quality }: api.Scan, finished: boolean, last: LastPose | undefined, site: string): HTMLElement[] {
   const facts: [string, string][] = [
-    ...(fused === undefined ? [] : [["Points", count(fused)] as [string, string]]),
+    ...(counts?.points === undefined ? [] : [["Points", count(counts.points)] as [string, string]]),
     ["Samples", count(cloud.total)],
-    ["Drawn", count(cloud.drawn)],
+    ...(cloud.total > cloud.budget ? [["Drawn", count(cloud.drawn)] as [string, string]] : []),
     ["Keyframes", String(cloud.keyframes)],
   ];
-  if (last) {
+  if (finished && quality?.sigma_median_m) facts.push(["Relative σ", units.length(quality.sigma_median_m)]);
+  if (finished && quality?.position_sigma_median_m) facts.push(["Absolute σ", units.length(quality.position_sigma_median_m)]);
+  if (last) facts.push(["Flown", units.length(last.distance_m, 0)]);
+  if (last && !finished) {
     facts.push(["Speed", units.speed(last.speed_m_s)]);
     if (last.agl_m !== null) facts.push(["Height", units.length(last.agl_m, 1)]);
     if (last.alt_amsl_m !== null) facts.push(["AMSL", units.length(last.alt_amsl_m, 1)]);
-    facts.push(["Flown", units.length(last.distance_m, 0)]);
     facts.push(["Camera", `${last.roll_deg}° ${last.pitch_deg}° ${last.yaw_deg}°`]);
     facts.push(["Absolute σ", units.length(last.sigma_m)]);
     facts.push(["From", last.sources.join(", ")]);
@@ -188,6 +175,5 @@ function rows(cloud: Cloud, stage: Stage, last: LastPose | undefined, fused: num
       facts.push(["At", `${last.lat_deg.toFixed(6)}, ${last.lon_deg.toFixed(6)}`]);
   }
   if (site) facts.push(["Site", site]);
-  facts.push(["Drawing", `${stage.painter.frames_per_s.toFixed(stage.painter.frames_per_s < 3 ? 1 : 0)} /s`]);
   return facts.map(([k, v]) => el("div", {}, el("dt", { textContent: k }), el("dd", { textContent: v })));
 }
