@@ -241,17 +241,25 @@ def test_a_keyframes_image_is_shown(client: Client, house: HouseFlight) -> None:
     assert np.median(error) < 6.0
 
 
+@pytest.mark.parametrize("elsewhere", [0, 15])
 def test_a_keyframe_that_brought_little_new_is_completed_from_those_before_it(
-    tmp_path: Path, house: HouseFlight
+    tmp_path: Path, house: HouseFlight, elsewhere: int
 ) -> None:
+    """Also when the drone was elsewhere since."""
     flown_store(tmp_path, house)
-    one = house.keyframe(9, 11.0)
+    one = house.keyframe(40, 11.0)
+    far = house.keyframe(4, 20.0)
+    away = far.depth.T_world_camera + 500.0 * np.eye(4)[:, :1] * np.eye(4)[3]
+    far = replace(far, depth=replace(far.depth, T_world_camera=away))
     with ScanStore.open(tmp_path / "drone-1/test-1/scan.db") as scan:
+        for seq in range(10, 10 + elsewhere):
+            scan.add_keyframe(seq, encode(replace(far, seq=seq), far.time_ns))
+            scan.add_pose(replace(house.record(seq, 20.0), T_world_camera=away))
         fresh = np.zeros_like(one.fresh)
         fresh[:, 150:] = True  # only the border is new
-        scan.add_keyframe(9, encode(replace(one, fresh=fresh), one.time_ns))
+        scan.add_keyframe(40, encode(replace(one, fresh=fresh), one.time_ns))
     with serving(tmp_path) as client:
-        _, data, _ = client.ask("/api/scans/drone-1/test-1/keyframes/9.jpg")
+        _, data, _ = client.ask("/api/scans/drone-1/test-1/keyframes/40.jpg")
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     error = np.abs(np.asarray(image, np.float64) - one.bgr).max(axis=2)
     assert np.median(error) < 10.0 and (error < 40.0).mean() > 0.9

@@ -126,7 +126,7 @@ def _tile(request: Request) -> Response:
 
 
 def _image(request: Request) -> Response:
-    """A keyframe's image as JPEG: its own colours, the rest from keyframes before it."""
+    """A keyframe's image as JPEG: its own colours, the rest from the nearest ones before it."""
     folder = state_of(request).library.folder(*names_of(request))
     if not SEQ.fullmatch(request.path_params["seq"]):
         raise InputError("no such keyframe")
@@ -135,8 +135,13 @@ def _image(request: Request) -> Response:
         keyframe = store.keyframe(seq)
         if keyframe is None:
             raise InputError("no such keyframe")
-        earlier = [s for s in store.seqs() if s < seq][-EARLIER_KEYFRAMES:]
-        bgr, known = _completed(keyframe, filter(None, map(store.keyframe, reversed(earlier))))
+        where = {p.keyframe_seq: p.T_world_camera[:3, 3] for p in store.poses()}
+        here = keyframe.depth.T_world_camera[:3, 3]
+        earlier = sorted(
+            (s for s in reversed(store.seqs()) if s < seq),  # a site's have no poses: the newest
+            key=lambda s: float(np.linalg.norm(where.get(s, here) - here)),
+        )[:EARLIER_KEYFRAMES]
+        bgr, known = _completed(keyframe, filter(None, map(store.keyframe, earlier)))
     ok, data = cv2.imencode(".jpg", _closed(bgr, known), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not ok:
         raise InputError("no image in this keyframe")
@@ -147,7 +152,7 @@ def _completed(keyframe: Keyframe, earlier: Iterable[Keyframe]) -> tuple[U8, Boo
     """(H, W, 3) colours of a keyframe and (H, W) which are known.
 
     A chunk has no colours where nothing is new. Earlier keyframes have them: their points are
-    projected into this camera, the newest first, the nearest point to each pixel.
+    projected into this camera, keyframe by keyframe, the nearest point to each pixel.
     """
     bgr, known = keyframe.bgr.copy(), keyframe.fresh.copy()
     K, T_camera_world = keyframe.depth.K, np.linalg.inv(keyframe.depth.T_world_camera)

@@ -19,7 +19,7 @@ PAGE_PX = 1400
 PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>
 <meta name="viewport" content="width=device-width">
 <style>body{{font:15px/1.5 system-ui,sans-serif;margin:1.5em;max-width:70em}}
-#map{{position:relative;line-height:0;width:1000px}}img{{width:1000px}}
+#map{{position:relative;line-height:0}}#map,img{{width:min(1000px,100vw - 3em)}}
 #over{{position:absolute;left:0;top:0;height:100%;width:50%;min-width:2em;max-width:100%;
 overflow:hidden;resize:horizontal;border-right:3px solid #fff;box-shadow:1px 0 3px #000}}
 td,th{{padding:.1em .8em;text-align:right}}</style>
@@ -27,7 +27,7 @@ td,th{{padding:.1em .8em;text-align:right}}</style>
 <p>Left: {before}. Right: {after}. Red: added; blue: removed. Drag the corner at the lower
 end of the white line.</p>
 <div id="map"><img alt="after" src="{two}"><div id="over"><img alt="before" src="{one}"></div></div>
-<table><tr><th>object<th>kind<th>area, m2<th>volume, m3<th>95 %, m3<th>highest, m</tr>{rows}</table>
+<table><tr><th>object<th>kind<th>area, m²<th>volume, m³<th>95 %, m³<th>highest, m</tr>{rows}</table>
 {notes}</html>
 """
 

@@ -34,7 +34,8 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const title = el("h1", {});
   const report = el("a", { href: api.file(id, "report.html"), textContent: "Report" });
   const map = el("a", { href: api.mapAddress(id), textContent: "Map", hidden: !scan.origin });
-  const bar = el("header", {}, el("a", { href: "#/", textContent: "‹ Scans" }), title, link.element, vehicleStrip(), map, report);
+  const changes = el("a", { href: api.file(id, "change.html"), textContent: "Changes" });
+  const bar = el("header", {}, el("a", { href: "#/", textContent: "‹ Scans" }), title, link.element, vehicleStrip(), map, report, changes);
   const host = el("main", { className: "stage" });
   const legend = el("div", { className: "panel legend", hidden: true });
   const coverage = el("div", { className: "panel coverage", hidden: true });
@@ -50,7 +51,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     known = now;
     link.finished ||= now.finished;
     title.textContent = now.title;
-    report.hidden = !now.files.some((f) => f.name === "report.html");
+    for (const page of [report, changes]) page.hidden = !now.files.some((f) => page.href.endsWith(`/${f.name}`));
   };
   learn(scan);
   if (!canDraw()) {
