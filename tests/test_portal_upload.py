@@ -220,7 +220,10 @@ DROP = """
   const data = new DataTransfer();
   data.items.add(new File([bytes], %r));
   const drop = { dataTransfer: data, bubbles: true, cancelable: true };
-  return document.querySelector("main").dispatchEvent(new DragEvent("drop", drop));
+  const send = kind => document.querySelector("main").dispatchEvent(new DragEvent(kind, drop));
+  send("dragover");
+  const invited = getComputedStyle(document.body, "::after").content;
+  return [invited, send("drop"), document.body.className];
 })()
 """
 
@@ -236,9 +239,12 @@ def test_a_file_dropped_on_the_page_becomes_a_card(
     browser.wait("document.querySelector('.empty h2') !== null")
     archive = zipped(tmp_path / "a.zip", ("flight/scan.db", flown / "scan.db"))
     data = base64.b64encode(archive.read_bytes()).decode()
-    assert browser.run(DROP % (data, "flight.mp4")) is False  # the browser does not open it
+    invited, opens, after = browser.run(DROP % (data, "flight.mp4"))
+    assert "Drop" in invited and opens is False  # the browser does not open it
+    assert after == ""
     browser.wait("document.querySelector('[role=alert]')?.textContent.includes('flight log')")
     browser.run(DROP % (data, "flight.zip"))
     browser.wait("document.querySelectorAll('article').length === 1")
+    browser.wait("document.body.textContent.includes('flight.zip has arrived')")
     assert browser.run("document.querySelector('.upload').hidden")
     assert [e["scan"] for e in client.ask("/api/scans")[1]] == ["test-1"]

@@ -38,7 +38,7 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
     scans.find((s) => s.drone === job.drone && s.scan === job.scan)?.title ?? job.scan;
   const [upload, line, endUploads] = uploads(again);
   const cut = el("p", { className: "stale", hidden: true });
-  cut.setAttribute("role", "alert");
+  cut.setAttribute("role", "status");
   root.replaceChildren(
     el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again, upload)),
     cut,
@@ -133,7 +133,7 @@ function importForm(again: () => void, upload: (files: FileList | null) => void)
   folder.setAttribute("aria-label", "folder to import");
   const act = el("button", {
     textContent: "Import",
-    onclick: () => void api.importFolder(folder.value).then(again, notify),
+    onclick: () => void api.importFolder(folder.value).then(() => (again(), notify(`${folder.value} is imported`)), notify),
   });
   const chosen = el("input", { type: "file", multiple: true, hidden: true });
   chosen.onchange = () => upload(chosen.files);
@@ -165,19 +165,24 @@ function uploads(again: () => void): [(files: FileList | null) => void, HTMLElem
           line.textContent = share < 1 ? `${name}: ${Math.floor(100 * share)} % sent` : `${name}: importing`;
         };
         show(0);
-        await api.upload(group, show).then(again, notify);
+        await api.upload(group, show).then(() => (again(), notify(`${name} has arrived`)), notify);
         line.hidden = true;
       });
   };
-  const over = (event: DragEvent): void => event.preventDefault();
-  const drop = (event: DragEvent): void => {
+  const over = (event: DragEvent): void => {
     event.preventDefault();
+    document.body.classList.toggle("drop", event.type === "dragover");
+  };
+  const drop = (event: DragEvent): void => {
+    over(event);
     upload(event.dataTransfer?.files ?? null);
   };
   window.addEventListener("dragover", over);
+  window.addEventListener("dragleave", over);
   window.addEventListener("drop", drop);
   const end = (): void => {
     window.removeEventListener("dragover", over);
+    window.removeEventListener("dragleave", over);
     window.removeEventListener("drop", drop);
   };
   return [upload, line, end];
