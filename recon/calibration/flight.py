@@ -18,6 +18,7 @@ import numpy as np
 from recon.calibration.global_bundle import (
     Knowledge,
     Problem,
+    RowMotion,
     Sightings,
     Solution,
     dispersion,
@@ -160,6 +161,7 @@ class Network:
 def network(
     camera: Camera, poses: F64, seen: Sightings, known: Knowledge, held: F64,
     marks: Sightings | None = None, mark_px: float = 1.0, covariances: bool = False,
+    rows: RowMotion | None = None,
 ) -> Network:  # fmt: skip
     """Views adjusted to their sightings, from poses that may be far off.
 
@@ -168,6 +170,7 @@ def network(
             numbered alike in ``seen`` and ``marks``.
         held: (8, 8) information of the camera given.
         marks: sightings of surveyed landmarks, which always take part with ``mark_px``.
+        rows: of a rolling shutter, to begin with.
 
     Raises ValueError where too few sightings agree.
     """
@@ -175,30 +178,33 @@ def network(
     marks = marks or Sightings(seen.view[:0], seen.landmark[:0], seen.uv_px[:0])
     for sigma, gate in (*ROUNDS, (0.0, 0.0)):
         if solution is not None and sigma == 0.0:
-            errors = errors_px(camera, poses, solution.points, kept)
+            errors = errors_px(camera, poses, solution.points, kept, rows)
             sigma = float(np.clip(np.median(errors) / RAYLEIGH_MEDIAN, 0.1, 2.0))
             gate = max(6.0 * sigma, 1.0)
-        points = crossings(poses, camera, joint(seen, marks), count)
-        kept = within(camera, poses, points, seen, gate)
-        points = crossings(poses, camera, joint(kept, marks), count)
-        kept = within(camera, poses, points, kept, np.inf)
+        points = crossings(poses, camera, joint(seen, marks), count, rows)
+        kept = within(camera, poses, points, seen, gate, rows)
+        points = crossings(poses, camera, joint(kept, marks), count, rows)
+        kept = within(camera, poses, points, kept, np.inf, rows)
         if len(kept.view) < MIN_SIGHTINGS:
             raise ValueError("too few places are found again in other images")
         points = np.where(np.isfinite(points), points, known.surveyed)
         every = joint(kept, marks)
         sigmas = np.append(np.full(len(kept.view), sigma), np.full(len(marks.view), mark_px))
         solution = solve(
-            Problem(camera, given, poses, points, every, sigmas, known, held),
+            Problem(camera, given, poses, points, every, sigmas, known, held, rows=rows),
             covariances=covariances and gate < 15.0,
         )
-        poses, camera = solution.poses, solution.camera
+        poses, camera, rows = solution.poses, solution.camera, solution.rows
     assert solution is not None
     return Network(solution, kept, sigma)
 
 
-def within(camera: Camera, poses: F64, points: F64, seen: Sightings, gate_px: float) -> Sightings:
+def within(
+    camera: Camera, poses: F64, points: F64, seen: Sightings, gate_px: float,
+    rows: RowMotion | None = None,
+) -> Sightings:  # fmt: skip
     """Sightings of known points that are off by less than ``gate_px``, two of each at least."""
-    return shared(seen, errors_px(camera, poses, points, seen) < gate_px)
+    return shared(seen, errors_px(camera, poses, points, seen, rows) < gate_px)
 
 
 def joint(a: Sightings, b: Sightings) -> Sightings:

@@ -3,7 +3,8 @@
 Levenberg-Marquardt with the Schur complement on the points (Triggs et al., Bundle Adjustment - A
 Modern Synthesis, 2000, doi:10.1007/3-540-44480-7_21). The reduced system of the poses is sparse:
 two of them meet only where they see a common point. The camera is a dense border of eight columns.
-Poses err by left perturbations of T_camera_world, rotation first.
+Poses err by left perturbations of T_camera_world, rotation first. Under a rolling shutter each view
+has three unknowns more: its turn from the first row to the last.
 """
 
 from __future__ import annotations
@@ -64,6 +65,53 @@ class Knowledge:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RowMotion:
+    """How N cameras move from the first row of an image to the last.
+
+    T_camera_world of a row is ``exp(share * (turn, move))`` times that of the middle row, where
+    ``share`` goes from -0.5 to 0.5. A turn is free about what is ``expected``: over flat ground
+    pixels alone do not determine it (arXiv:2209.08503).
+    """
+
+    turns: F64  # (N, 3) rad
+    moves: F64  # (N, 3) m, known
+    expected: F64  # (N, 3) rad
+    sigma_turns: F64  # (N, 3) rad
+
+    def by_row(self, camera: Camera, poses: F64, seen: Sightings) -> F64:
+        """(M, 4, 4) T_world_camera of the row of each sighting; ``poses`` (N, 4, 4) of the views."""
+        share = row_shares(camera, seen.uv_px)
+        T = np.array([se3.inverse(one) for one in poses])
+        return _inverses(_of_rows(T[seen.view], self.turns[seen.view], self.moves[seen.view], share))
+
+
+def row_shares(camera: Camera, uv_px: F64) -> F64:
+    """(M,) share of the readout, from the middle row, at which distorted pixels are exposed."""
+    axis = 0 if camera.shutter.direction in ("right", "left") else 1
+    sign = -1.0 if camera.shutter.direction in ("up", "left") else 1.0
+    return np.asarray(sign * ((uv_px[:, axis] + 0.5) / camera.size_px[axis] - 0.5))
+
+
+def _of_rows(T: F64, turns: F64, moves: F64, share: F64) -> F64:
+    """(M, 4, 4) T_camera_world of rows, to second order in the turn across the image."""
+    out = T.copy()
+    w, t = share[:, None] * turns, share[:, None] * moves
+    out[:, :3, :3] = se3.each_so3_exp(w) @ T[:, :3, :3]
+    turned = np.einsum("mij,mj->mi", se3.each_so3_exp(w), T[:, :3, 3])
+    out[:, :3, 3] = turned + t + 0.5 * np.cross(w, t)
+    return out
+
+
+def _inverses(T: F64) -> F64:
+    """(M, 4, 4) inverses of motions (M, 4, 4)."""
+    out = np.zeros_like(T)
+    out[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
+    out[:, :3, 3] = -np.einsum("mji,mj->mi", T[:, :3, :3], T[:, :3, 3])
+    out[:, 3, 3] = 1.0
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Solution:
     """The adjusted flight."""
 
@@ -74,6 +122,7 @@ class Solution:
     covariances: F64  # (N, 6, 6) left perturbation of T_world_camera; empty when not asked for
     camera_covariance: F64  # (8, 8) of CAMERA's parameters
     camera_step: F64  # (8,) that the equations at the result still ask for
+    rows: RowMotion | None = None  # None: a global shutter
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,6 +139,7 @@ class Problem:
     camera_information: F64
     huber_sigmas: float = 1.5
     cauchy_sigmas: float = 2.0  # of a fix
+    rows: RowMotion | None = None  # None: a global shutter
 
 
 @njit(cache=True, nogil=True)
@@ -109,11 +159,11 @@ def _pixel(P: F64, X: F64, k: F64, k3: float, out: F64) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _errors(T: F64, X: F64, k: F64, k3: float, view: I64, point: I64, uv: F64, out: F64) -> None:
+def _errors(T: F64, X: F64, k: F64, k3: float, pose: I64, point: I64, uv: F64, out: F64) -> None:
     """``out`` (M, 2) receives the sightings less their prediction; infinite behind the camera."""
     at = np.zeros(7)
-    for m in range(view.size):
-        if _pixel(T[view[m]], X[point[m]], k, k3, at):
+    for m in range(pose.size):
+        if _pixel(T[pose[m]], X[point[m]], k, k3, at):
             out[m, 0], out[m, 1] = uv[m, 0] - at[0], uv[m, 1] - at[1]
         else:
             out[m] = np.inf
@@ -169,34 +219,40 @@ def _eliminate(A: F64, B: F64, b: F64, H: F64, g: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def _reduce(
-    T: F64, X: F64, k: F64, k3: float, view: I64, start: I64, uv: F64, sigma: F64, huber: float,
-    Hp: F64, bp: F64, damping: float, pair: I64, S: F64, g: F64, B: F64, Hk: F64, gk: F64,
-    W: F64, Wk: F64,
+    T: F64, pose: I64, share: F64, X: F64, k: F64, k3: float, view: I64, start: I64, uv: F64,
+    sigma: F64, huber: float, Hp: F64, bp: F64, damping: float, pair: I64, S: F64, g: F64, B: F64,
+    Hk: F64, gk: F64, W: F64, Wk: F64,
 ) -> None:  # fmt: skip
     """Eliminate the points.
 
-    ``Hp`` (P, 3, 3) and ``bp`` (P, 3) hold what is known of the points and receive the inverses
-    and right-hand sides. ``S`` (Q, 6, 6) are the blocks of the poses numbered by ``pair`` (N, N),
-    the upper half only; ``B`` (N, 6, 8) and ``Hk`` (8, 8) the border.
+    ``T`` are the poses numbered by ``pose`` (M,). ``Hp`` (P, 3, 3) and ``bp`` (P, 3) hold what is
+    known of the points and receive the inverses and right-hand sides. A view has ``n`` unknowns:
+    its pose, and with nine its turn. ``S`` (Q, n, n) are the blocks of the views numbered by
+    ``pair`` (N, N), the upper half only; ``B`` (N, n, 8) and ``Hk`` (8, 8) the border.
     """
-    at, Jc, Jp, Jk = np.zeros(7), np.zeros((2, 6)), np.zeros((2, 3)), np.zeros((2, 8))
-    r, A, Ak = np.zeros(2), np.zeros((6, 3)), np.zeros((CAMERA, 3))
+    n_view = g.shape[1]
+    at, Jc, Jp, Jk = np.zeros(7), np.zeros((2, n_view)), np.zeros((2, 3)), np.zeros((2, 8))
+    r, A, Ak = np.zeros(2), np.zeros((n_view, 3)), np.zeros((CAMERA, 3))
     for p in range(X.shape[0]):
         for m in range(start[p], start[p + 1]):
             v = view[m]
             W[m] = 0.0
-            if not _pixel(T[v], X[p], k, k3, at):
+            P = T[pose[m]]
+            if not _pixel(P, X[p], k, k3, at):
                 continue
-            _linearise(T[v], X[p], k, k3, at, Jc, Jp, Jk)
+            _linearise(P, X[p], k, k3, at, Jc, Jp, Jk)
+            for i in range(2):
+                for a in range(6, n_view):  # the turn across the image, to first order
+                    Jc[i, a] = share[m] * Jc[i, a - 6]
             r[0], r[1] = uv[m, 0] - at[0], uv[m, 1] - at[1]
             length = np.sqrt(r[0] * r[0] + r[1] * r[1]) / sigma[m]
             w = min(1.0, huber / max(length, 1e-12)) / sigma[m] ** 2
             q = pair[v, v]
             for i in range(2):
-                for a in range(6):
+                for a in range(n_view):
                     wa = w * Jc[i, a]
                     g[v, a] += wa * r[i]
-                    for c in range(6):
+                    for c in range(n_view):
                         S[q, a, c] += wa * Jc[i, c]
                     for c in range(8):
                         B[v, a, c] += wa * Jk[i, c]
@@ -237,12 +293,16 @@ def _mark_pairs(view: I64, start: I64, met: npt.NDArray[np.bool_]) -> None:
                 met[view[m], view[n]] = True
 
 
-def errors_px(camera: Camera, poses: F64, points: F64, seen: Sightings) -> F64:
+def errors_px(
+    camera: Camera, poses: F64, points: F64, seen: Sightings, rows: RowMotion | None = None
+) -> F64:
     """(M,) lengths of the errors of sightings; infinite behind the camera, or of no point."""
-    out = np.zeros((len(seen.view), 2))
-    T = np.array([se3.inverse(one) for one in poses])
+    out, pose = np.zeros((len(seen.view), 2)), seen.view
+    if rows is not None:
+        poses, pose = rows.by_row(camera, poses, seen), np.arange(len(seen.view))
     k, k3 = _vector(camera), float(camera.distortion[4])
-    _errors(T, np.ascontiguousarray(points), k, k3, seen.view, seen.landmark, seen.uv_px, out)
+    X = np.ascontiguousarray(points)
+    _errors(_inverses(poses), X, k, k3, pose, seen.landmark, seen.uv_px, out)
     return np.asarray(np.hypot(out[:, 0], out[:, 1]))
 
 
@@ -289,21 +349,22 @@ class _State:
     T: F64  # (N, 4, 4) T_camera_world
     X: F64  # (P, 3)
     k: F64  # (8,)
+    turns: F64  # (N, 3) of the rows; unused under a global shutter
 
 
 @dataclass(slots=True, eq=False)
 class _Equations:
-    """The reduced system of the poses, factored, with its border."""
+    """The reduced system of N views with V unknowns each, factored, with its border."""
 
-    solved: Any  # solves for columns (6 N, n)
-    B: F64  # (6 N, 8)
-    Hk: F64  # (8, 8), reduced by the points and the poses
-    g: F64  # (6 N,)
+    solved: Any  # solves for columns (V N, n)
+    B: F64  # (V N, 8)
+    Hk: F64  # (8, 8), reduced by the points and the views
+    g: F64  # (V N,)
     gk: F64  # (8,)
-    Z: F64  # (6 N, 8) solved(B)
+    Z: F64  # (V N, 8) solved(B)
     Hp_inverse: F64  # (P, 3, 3)
     bp: F64  # (P, 3)
-    W: F64  # (M, 6, 3)
+    W: F64  # (M, V, 3)
     Wk: F64  # (P, 8, 3)
 
 
@@ -323,7 +384,11 @@ class _Bundle:
         self._sigma = np.ascontiguousarray(problem.sigma_px[self._order], np.float64)
         self._start_of = np.searchsorted(self._point, np.arange(P + 1)).astype(np.int64)
         T = np.array([se3.inverse(one) for one in problem.poses])
-        self.start = _State(T, np.array(problem.points, np.float64), _vector(problem.camera))
+        rows = problem.rows
+        self._unknowns = 6 if rows is None else 9  # of a view
+        self._share = row_shares(problem.camera, self._uv)
+        turns = np.zeros((len(T), 3)) if rows is None else rows.turns
+        self.start = _State(T, np.array(problem.points, np.float64), _vector(problem.camera), turns)
         self._k3 = float(problem.camera.distortion[4])
         met = np.eye(len(T), dtype=np.bool_)
         _mark_pairs(self._view, self._start_of, met)
@@ -333,9 +398,18 @@ class _Bundle:
 
     # ---- cost -------------------------------------------------------------------------------
 
+    def _of_sightings(self, s: _State) -> tuple[F64, I64]:
+        """T_camera_world (n, 4, 4), and which of them each sighting has."""
+        rows, v = self._of.rows, self._view
+        if rows is None:
+            return s.T, v
+        T = _of_rows(s.T[v], s.turns[v], rows.moves[v], self._share)
+        return T, np.arange(len(v))
+
     def _errors(self, s: _State) -> F64:
         out = np.zeros((len(self._view), 2))
-        _errors(s.T, s.X, s.k, self._k3, self._view, self._point, self._uv, out)
+        T, pose = self._of_sightings(s)
+        _errors(T, s.X, s.k, self._k3, pose, self._point, self._uv, out)
         return out
 
     def _lengths(self, s: _State) -> F64:
@@ -351,6 +425,7 @@ class _Bundle:
         bent = s.k - _vector(self._of.given)
         return float(
             pixels + loss + 0.5 * np.sum(attitude**2) + 0.5 * np.sum(points**2)
+            + 0.5 * np.sum(self._off_turns(s) ** 2)
             + 0.5 * np.einsum("ni,nij,nj->", placing, self._of.known.placing, placing)
             + 0.5 * bent @ self._of.camera_information @ bent
         )  # fmt: skip
@@ -370,6 +445,13 @@ class _Bundle:
             placing[n] = se3.log(s.T[n] @ known.placed[n])
         return fixes, attitude, placing, points
 
+    def _off_turns(self, s: _State) -> F64:
+        """(N, 3) whitened errors of the rows' turns; 0 under a global shutter."""
+        rows = self._of.rows
+        if rows is None:
+            return np.zeros((len(s.T), 3))
+        return np.asarray((s.turns - rows.expected) / rows.sigma_turns)
+
     # ---- steps ------------------------------------------------------------------------------
 
     def stepped(self, s: _State, damping: float) -> _State:
@@ -381,32 +463,34 @@ class _Bundle:
     def _moved(self, s: _State, eq: _Equations, dk: F64, dc: F64, bp: F64) -> _State:
         """The state after the camera's step ``dk`` (8,); poses and points follow it.
 
-        ``dc`` (6 N,) and ``bp`` (P, 3) are their own step and right-hand sides.
+        ``dc`` (V N,) and ``bp`` (P, 3) are their own step and right-hand sides.
         """
-        dc = (dc - eq.Z @ dk).reshape(-1, 6)
+        dc = (dc - eq.Z @ dk).reshape(len(s.T), -1)
         bp = bp - np.einsum("pkc,k->pc", eq.Wk, dk)
         carried = np.einsum("mac,ma->mc", eq.W, dc[self._view])
         np.subtract.at(bp, self._point, carried)
-        T = np.array([se3.exp(d) @ one for d, one in zip(dc, s.T, strict=True)])
-        return _State(T, s.X + np.einsum("pij,pj->pi", eq.Hp_inverse, bp), s.k + dk)
+        T = np.array([se3.exp(d) @ one for d, one in zip(dc[:, :6], s.T, strict=True)])
+        turns = s.turns if dc.shape[1] == 6 else s.turns + dc[:, 6:]
+        return _State(T, s.X + np.einsum("pij,pj->pi", eq.Hp_inverse, bp), s.k + dk, turns)
 
     def _equations(self, s: _State, damping: float) -> _Equations:
-        N, P, M = len(s.T), len(s.X), len(self._view)
-        S, g, B = np.zeros((len(self._rows), 6, 6)), np.zeros((N, 6)), np.zeros((N, 6, CAMERA))
+        N, P, M, V = len(s.T), len(s.X), len(self._view), self._unknowns
+        S, g, B = np.zeros((len(self._rows), V, V)), np.zeros((N, V)), np.zeros((N, V, CAMERA))
         Hk, gk = self._of.camera_information.copy(), np.zeros(CAMERA)
         gk += self._of.camera_information @ (_vector(self._of.given) - s.k)
         Hp, bp = np.zeros((P, 3, 3)), np.zeros((P, 3))
         self._add_known(s, S, g, Hp, bp)
-        W, Wk = np.zeros((M, 6, 3)), np.zeros((P, CAMERA, 3))
+        W, Wk = np.zeros((M, V, 3)), np.zeros((P, CAMERA, 3))
+        T, pose = self._of_sightings(s)
         _reduce(
-            s.T, s.X, s.k, self._k3, self._view, self._start_of, self._uv, self._sigma,
-            self._of.huber_sigmas, Hp, bp, damping, self._pair, S, g, B, Hk, gk, W, Wk,
+            T, pose, self._share, s.X, s.k, self._k3, self._view, self._start_of, self._uv,
+            self._sigma, self._of.huber_sigmas, Hp, bp, damping, self._pair, S, g, B, Hk, gk, W, Wk,
         )  # fmt: skip
         own = self._pair[np.arange(N), np.arange(N)]
-        for i in range(6):
+        for i in range(V):
             S[own, i, i] += damping * np.abs(S[own, i, i]) + 1e-9
         Hk[np.diag_indices(CAMERA)] *= 1.0 + damping
-        solved, border = self._factored(S, N), B.reshape(6 * N, CAMERA)
+        solved, border = self._factored(S, N), B.reshape(V * N, CAMERA)
         Z = solved(border)
         reduced, right = Hk - border.T @ Z, gk - Z.T @ g.ravel()
         return _Equations(solved, border, reduced, g.ravel(), right, Z, Hp, bp, W, Wk)
@@ -416,18 +500,18 @@ class _Bundle:
         from scipy.sparse import coo_matrix
         from scipy.sparse.linalg import splu
 
-        six = np.arange(6)
-        shape = S.shape
-        rows = np.broadcast_to(6 * self._rows[:, None, None] + six[:, None], shape).ravel()
-        columns = np.broadcast_to(6 * self._columns[:, None, None] + six, shape).ravel()
-        off = np.repeat(self._rows != self._columns, 36)
+        shape, V = S.shape, self._unknowns
+        each = np.arange(V)
+        rows = np.broadcast_to(V * self._rows[:, None, None] + each[:, None], shape).ravel()
+        columns = np.broadcast_to(V * self._columns[:, None, None] + each, shape).ravel()
+        off = np.repeat(self._rows != self._columns, V * V)
         data = S.ravel()
         both = coo_matrix(
             (
                 np.concatenate([data, data[off]]),
                 (np.concatenate([rows, columns[off]]), np.concatenate([columns, rows[off]])),
             ),
-            (6 * N, 6 * N),
+            (V * N, V * N),
         )
         options = {"SymmetricMode": True}
         return splu(
@@ -443,13 +527,18 @@ class _Bundle:
         J = -np.transpose(R, (0, 2, 1)) / known.sigma_fixes[:, :, None]  # of the translation
         J = np.nan_to_num(J)
         own = self._pair[np.arange(len(s.T)), np.arange(len(s.T))]
-        S[own, 3:, 3:] += weight[:, None, None] * np.einsum("nij,nik->njk", J, J)
-        g[:, 3:] -= weight[:, None] * np.einsum("nij,ni->nj", J, fixes)
+        S[own, 3:6, 3:6] += weight[:, None, None] * np.einsum("nij,nik->njk", J, J)
+        g[:, 3:6] -= weight[:, None] * np.einsum("nij,ni->nj", J, fixes)
         turn = np.nan_to_num(known.attitudes / known.sigma_attitudes[:, :, None])
         S[own, :3, :3] += np.einsum("nij,nik->njk", turn, turn)
         g[:, :3] -= np.einsum("nij,ni->nj", turn, attitude)
-        S[own] += known.placing
-        g -= np.einsum("nij,nj->ni", known.placing, placing)
+        S[own, :6, :6] += known.placing
+        g[:, :6] -= np.einsum("nij,nj->ni", known.placing, placing)
+        if self._of.rows is not None:
+            off, sigma = self._off_turns(s), self._of.rows.sigma_turns
+            for i in range(3):
+                S[own, 6 + i, 6 + i] += sigma[:, i] ** -2
+            g[:, 6:] -= off / sigma
         sure = np.nan_to_num(1.0 / known.sigma_surveyed)
         for i in range(3):
             Hp[:, i, i] += sure[:, i] ** 2
@@ -485,7 +574,8 @@ class _Bundle:
         poses = np.array([se3.inverse(one) for one in s.T])
         known = self._covariances(eq, spread, poses) if covariances else np.zeros((0, 6, 6))
         camera, step = _camera(self._of.camera, s.k), spread @ eq.gk
-        return Solution(poses, s.X, camera, errors, known, spread, step)
+        rows = None if self._of.rows is None else replace(self._of.rows, turns=s.turns)
+        return Solution(poses, s.X, camera, errors, known, spread, step, rows)
 
     def _covariances(self, eq: _Equations, spread: F64, poses: F64) -> F64:
         """(N, 6, 6) of a left perturbation of T_world_camera, the camera's own included."""
@@ -493,9 +583,9 @@ class _Bundle:
         some = np.unique(np.linspace(0, N - 1, min(N, MAX_COVARIANCES)).astype(int))
         out = []
         for n, T in zip(some, poses[some], strict=True):
-            unit = np.zeros((6 * N, 6))
-            unit[6 * n : 6 * n + 6] = np.eye(6)
-            rows = slice(6 * n, 6 * n + 6)
+            rows = slice(self._unknowns * n, self._unknowns * n + 6)
+            unit = np.zeros((self._unknowns * N, 6))
+            unit[rows] = np.eye(6)
             own = eq.solved(unit)[rows] + eq.Z[rows] @ spread @ eq.Z[rows].T
             A = se3.adjoint(T)
             out.append(0.5 * A @ (own + own.T) @ A.T)

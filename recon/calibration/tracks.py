@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon import se3
-from recon.calibration.global_bundle import Sightings
+from recon.calibration.global_bundle import RowMotion, Sightings
 from recon.camera_model import project, rays
 from recon.tracking import robust_geometry
 from recon.tracking.common_view import Features, features, mutual
@@ -163,17 +163,20 @@ def with_distortion(camera: Camera, uv_px: F64) -> F64:
     return np.asarray(out.reshape(-1, 2), np.float64)
 
 
-def crossings(poses: F64, camera: Camera, seen: Sightings, count: int) -> F64:
+def crossings(
+    poses: F64, camera: Camera, seen: Sightings, count: int, rows: RowMotion | None = None
+) -> F64:
     """(P, 3) world points nearest to the rays of each landmark's sightings; NaN where they are
     nearly parallel or the point is behind a camera.
 
-    ``poses`` (N, 4, 4) are T_world_camera.
+    ``poses`` (N, 4, 4) are T_world_camera, those of the middle rows.
     """
+    own = poses[seen.view] if rows is None else rows.by_row(camera, poses, seen)
     flat = without_distortion(camera, seen.uv_px)
     ways = rays(camera.K, flat)
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    ways = np.einsum("mij,mj->mi", poses[seen.view, :3, :3], ways)
-    centre = poses[seen.view, :3, 3]
+    ways = np.einsum("mij,mj->mi", own[:, :3, :3], ways)
+    centre = own[:, :3, 3]
     across = np.eye(3) - ways[:, :, None] * ways[:, None, :]
     H, g = np.zeros((count, 3, 3)), np.zeros((count, 3))
     np.add.at(H, seen.landmark, across)
