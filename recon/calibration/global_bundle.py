@@ -82,7 +82,9 @@ class RowMotion:
         """(M, 4, 4) T_world_camera of the row of each sighting; ``poses`` (N, 4, 4) of the views."""
         share = row_shares(camera, seen.uv_px)
         T = np.array([se3.inverse(one) for one in poses])
-        return _inverses(_of_rows(T[seen.view], self.turns[seen.view], self.moves[seen.view], share))
+        return _inverses(
+            _of_rows(T[seen.view], self.turns[seen.view], self.moves[seen.view], share)
+        )
 
 
 def row_shares(camera: Camera, uv_px: F64) -> F64:
@@ -344,6 +346,15 @@ def dispersion(problem: Problem) -> float:
     return bundle.dispersion(bundle.start)
 
 
+def step_covariances(problem: Problem) -> F64:
+    """(N, 6, 6) of the motion from the pose before to each, left perturbation of T_here_before.
+
+    ``problem`` holds the adjusted state. Zero for the first pose.
+    """
+    bundle = _Bundle(problem)
+    return bundle.step_covariances(bundle.start)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
     T: F64  # (N, 4, 4) T_camera_world
@@ -562,6 +573,19 @@ class _Bundle:
         fitted = np.einsum("nij,nji->", share, share)
         spread = np.trace(np.linalg.solve(known.sum(axis=0), score.T @ score))
         return float(spread / max(CAMERA - fitted, 1.0))
+
+    def step_covariances(self, s: _State) -> F64:
+        """See :func:`step_covariances`."""
+        eq, V, out = self._equations(s, 0.0), self._unknowns, np.zeros((len(s.T), 6, 6))
+        spread = np.linalg.inv(eq.Hk)
+        for n in range(1, len(s.T)):
+            rows = np.r_[V * (n - 1) : V * (n - 1) + 6, V * n : V * n + 6]
+            unit = np.zeros((V * len(s.T), 12))
+            unit[rows] = np.eye(12)
+            both = eq.solved(unit)[rows] + eq.Z[rows] @ spread @ eq.Z[rows].T
+            J = np.hstack([-se3.adjoint(s.T[n] @ se3.inverse(s.T[n - 1])), np.eye(6)])
+            out[n] = J @ both @ J.T
+        return 0.5 * (out + out.transpose(0, 2, 1))
 
     # ---- result -----------------------------------------------------------------------------
 

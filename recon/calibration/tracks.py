@@ -59,6 +59,22 @@ def image_of(gray: U8, camera: Camera) -> Image:
     return Image(found, without_distortion(camera, found.uv_px), place)
 
 
+MIN_COMMON = 12
+"""Places in both of two images that tie them."""
+
+
+def pieces(seen: Sightings, count: int) -> I64:
+    """(N,) which piece each of the first ``count`` views is in: a chain of images ties all of it."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n = max(count, int(seen.view.max(initial=0)) + 1)
+    shape = n, int(seen.landmark.max(initial=0)) + 1
+    sees = coo_array((np.ones(len(seen.view)), (seen.view, seen.landmark)), shape).tocsr()
+    piece = connected_components(sees @ sees.T >= MIN_COMMON, directed=False)[1]
+    return np.asarray(piece[:count], np.int64)
+
+
 def without_distortion(camera: Camera, uv_px: F64) -> F64:
     """(N, 2) pixels that the camera would show without distortion."""
     if len(uv_px) == 0 or not camera.distortion.any():

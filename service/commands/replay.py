@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from service.flight.scan import Scan, ScanInputs
 
 
+LATENCY = "camera.latency_ms"
 WIDTH, STEREO_WIDTH_PX = "compute.stereo_width", 640
 """Largest stereo width of a replay that is not tied to real time."""
 
@@ -77,7 +78,7 @@ def replay(
             chosen = denser(chosen, source)
         summary = _replay(
             video, source, played, camera, find_lens and not realtime, log, video_epoch, out,
-            chosen, as_json,
+            chosen, as_json, is_given(LATENCY, config, overrides),
         )  # fmt: skip
     finally:
         played.close()
@@ -147,9 +148,11 @@ def _replay(
     out: Path | None,
     config: Config,
     as_json: bool,
+    is_latency_given: bool,
 ) -> dict[str, Any]:
     from recon.types import Shutter
     from service.cameras import open_camera, parse_source
+    from service.commands.all_stills import all_stills
     from service.commands.own_lens import start_lens
     from service.compute.backend_choice import open_backend
     from service.flight.scan import ScanInputs
@@ -182,6 +185,9 @@ def _replay(
     with nullcontext(Progress()) if as_json else showing("replay") as progress:
         if start is not None:
             inputs = _with_lens(inputs, video, start, find_lens, progress)
+        if played is source:
+            progress("adjusting all stills together")
+            inputs = all_stills(inputs, is_latency_given)
         stop = stop_by_signals()
         found = _fly(inputs, stop, progress, can_begin_again=played is source and is_file)
         if isinstance(found, Shutter):

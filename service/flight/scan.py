@@ -17,6 +17,7 @@ from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
 from recon.posegraph.between_keyframes import Odometer
+from recon.tracking.known_track import KnownTrack
 from recon.types import F64, Camera, Frame, Keyframe, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter
 from service.cameras.rig import ASSUMED_AGL_M, Rig
@@ -88,6 +89,7 @@ class ScanInputs:
     assumed: tuple[str, ...] = ()  # of "lens", "distortion"
     extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
     latency_ms: float | None = None  # the camera's as an earlier scan found it
+    known: KnownTrack | None = None  # takes the odometry's place
     warn: Callable[[str], None] = log.warning  # the operator
     on_step: Callable[[Step, VehicleState | None, int], None] | None = None  # and its exposure
     on_keyframe: Callable[[Keyframe], None] | None = None
@@ -139,6 +141,7 @@ class Scan:
                 live=live,
                 pages=pages,
                 assumed=inputs.assumed,
+                known=inputs.known,
             )
         )
         self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()

@@ -35,6 +35,7 @@ from recon.stereo.virtual_stereo import (
     plane_relief,
     rectify,
 )
+from recon.tracking.known_track import AnyTrack, KnownTrack
 from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry, Tracked
 from recon.types import (
@@ -122,7 +123,7 @@ class Track:
 
     def __init__(
         self,
-        odometry: Odometry,
+        odometry: AnyTrack,
         selection: Viewpoints,
         refused: Counter[str],
         stopwatch: Stopwatch,
@@ -432,12 +433,14 @@ def build_stages(
     live: bool = False,
     pages: Path | None = None,
     assumed: Collection[str] = (),
+    known: KnownTrack | None = None,
 ) -> Stages:
     """The stages that the configuration asks for. Raises ValueError for an unusable camera model.
 
     ``live`` drops old work when reconstruction cannot keep up. ``pages`` is a folder for the oldest
     parts of the map and, in files without a name, for what is kept of every view. None: keep all
-    in memory, and drop the oldest parts of the map. An ``assumed`` lens widens sigmas.
+    in memory, and drop the oldest parts of the map. An ``assumed`` lens widens sigmas. A ``known`` track takes the odometry's
+    place.
     """
     compute, stopwatch, resources = config.compute, Stopwatch(), ExitStack()
     limit_threads(compute.threads)
@@ -446,7 +449,7 @@ def build_stages(
     row = "dense" if debug is None else None
     camera = with_shutter(camera, config.camera)
     undistort = Undistort(camera, compute.guide_width, stopwatch)
-    odometry = Odometry(
+    odometry = known or Odometry(
         undistort.tracking_camera,
         OdometryConfig(base_to_height=config.scan.base_to_height),
         camera,

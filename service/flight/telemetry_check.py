@@ -30,6 +30,12 @@ WORTH_TELLING_MS, OFF_SIGMAS = 10.0, 5.0  # a latency that differs by less is no
 STILLS = 60  # images that are compared, where they come more slowly than REACH_NS holds
 
 
+def differs(found: LatencyEstimate, applied_ms: float) -> bool:
+    """True where the latency found is surely another one than that applied."""
+    off_ms = abs(found.latency_ms - applied_ms)
+    return off_ms > max(WORTH_TELLING_MS, OFF_SIGMAS * found.sigma_ms)
+
+
 class TelemetryCheck:
     """Takes every tracked frame; gives the exposure times of frames, and its findings."""
 
@@ -129,10 +135,9 @@ class TelemetryCheck:
 
     def _report_latency(self, found: LatencyEstimate) -> None:
         text = f"Camera latency {found.latency_ms:.0f} ms by the images"
-        off_ms = abs(found.latency_ms - self.applied_ms)
         if self._camera.latency == "auto" and found.is_settled:
             self._once("latency", f"{text}: applied")
-        elif off_ms > max(WORTH_TELLING_MS, OFF_SIGMAS * found.sigma_ms):
+        elif differs(found, self.applied_ms):
             self._once("latency", f"{text}, {self.applied_ms:.0f} ms is set")
 
     def _judge_frame(self, history: VehicleHistory) -> None:

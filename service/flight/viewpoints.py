@@ -19,7 +19,8 @@ from recon.posegraph.between_keyframes import FixAverage
 from recon.rolling_shutter import NEAR_S, FrameRows, depth_share
 from recon.stereo.virtual_stereo import View
 from recon.tracking.keyframe_window import OdometryKeyframe, landmarks, step_covariance
-from recon.tracking.odometry import Odometry, Tracked, Tracking
+from recon.tracking.known_track import AnyTrack
+from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.prediction import inverse_depth_plane
 from recon.types import F64, U8, Camera, PosePrior
 from service.config import ScanConfig, parse_baseline
@@ -295,7 +296,7 @@ class StereoViews:
     def __init__(
         self,
         selection: Viewpoints,
-        odometry: Odometry,
+        odometry: AnyTrack,
         camera: Camera,
         seen: U8,
         refused: Counter[str],

@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from recon import se3
 from recon.calibration.flight import (
@@ -29,7 +27,7 @@ from recon.calibration.flight import (
     network,
 )
 from recon.calibration.global_bundle import Knowledge, Problem, Sightings, dispersion
-from recon.calibration.tracks import with_distortion, without_distortion
+from recon.calibration.tracks import pieces, with_distortion, without_distortion
 from recon.camera_model import project, rays
 from recon.posegraph.ground_control import (
     ATTITUDE_S,
@@ -52,9 +50,6 @@ FREE = SelfCalibrationConfig()
 HELD = replace(
     FREE, sigma_focal=1e-5, sigma_aspect=1e-5, sigma_centre=1e-6, sigma_k=1e-6, sigma_p=1e-7
 )
-
-MIN_COMMON = 12
-"""Places in both of two images that tie them."""
 
 MIN_FIXES = 3
 """Measured places that place a piece."""
@@ -100,10 +95,7 @@ def stretches_untied(seqs: Sequence[int], seen: Sightings, fixed: Bool) -> list[
 
     The main piece is the one with most keyframes.
     """
-    n = len(seqs)
-    shape = max(n, int(seen.view.max(initial=0)) + 1), int(seen.landmark.max(initial=0)) + 1
-    sees = coo_array((np.ones(len(seen.view)), (seen.view, seen.landmark)), shape).tocsr()
-    piece = connected_components(sees @ sees.T >= MIN_COMMON, directed=False)[1][:n]
+    piece = pieces(seen, len(seqs))
     main = np.bincount(piece).argmax()
     out: list[list[int]] = []
     before = main

@@ -1,0 +1,78 @@
+"""A track that is known before it is flown: stills that were adjusted all together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon import se3
+from recon.rolling_shutter import FrameRows, RowClock, Rows
+from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
+from recon.tracking.matching import Pyramid
+from recon.tracking.motion_blur import ExposureWatch
+from recon.tracking.odometry import Odometry, Tracked, Tracking
+from recon.tracking.readout_search import ReadoutSearch
+from recon.types import F64, I64, U8, Camera, PosePrior
+
+KEPT = 8
+"""Keyframes that are remembered."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownView:
+    """Where a still was taken, and what it shows."""
+
+    T_odom_camera: F64  # (4, 4) of its middle row, m
+    covariance: F64  # (6, 6) of the motion from the view before, left of T_here_before
+    rate: F64  # (6,) of T_camera_odom per s; unused under a global shutter
+    landmark: I64  # (n,) which of the points it shows
+
+
+class KnownTrack:
+    """Takes frames as :class:`recon.tracking.odometry.Odometry` does, and says what is known."""
+
+    def __init__(self, views: Mapping[int, KnownView], points: F64, lens: Camera) -> None:
+        """``views`` by the number of the frame; ``points`` (P, 3) m are finite.
+
+        ``lens`` is the camera with its distortion and shutter.
+        """
+        self.segment, self.keyframes = -1, list[OdometryKeyframe]()
+        self.exposure = ExposureWatch()
+        self.readout: ReadoutSearch | None = None
+        self.K = lens.K
+        self._views, self._map = views, Landmarks()
+        self._map.add(points)
+        self._clock = RowClock(lens) if lens.shutter.readout_s else None
+
+    def can_skip(self, time_ns: int, prior: PosePrior, frames_per_step: float) -> bool:
+        """False: every still counts."""
+        return False
+
+    def needs_turn(self, time_ns: int) -> bool:
+        """False: the turn of the rows is known."""
+        return False
+
+    def track(
+        self, gray: U8, seq: int, time_ns: int, prior: PosePrior, mask: U8 | None = None,
+        blurred: bool = False,
+    ) -> Tracked:  # fmt: skip
+        """The pose of a frame; arguments are those of ``Odometry.track``."""
+        view = self._views.get(seq)
+        if view is None:
+            return Tracked(Tracking.LOST, self.segment, reason="not tied to other stills")
+        state = Tracking.KEYFRAME if self.keyframes else Tracking.STARTED
+        self.segment = 0
+        T_camera_odom = se3.inverse(view.T_odom_camera)
+        rows = None if self._clock is None else Rows(self._clock, view.rate, np.zeros(6))
+        moving = FrameRows(time_ns, prior, T_camera_odom, rows, is_measured=True)
+        key = OdometryKeyframe(
+            seq, time_ns, 0, T_camera_odom, view.covariance, prior, Pyramid.build(gray, 1),
+            np.zeros((len(view.landmark), 2)), view.landmark, self._map, moving,
+        )  # fmt: skip
+        self.keyframes = [*self.keyframes[1 - KEPT :], key]
+        return Tracked(state, 0, view.T_odom_camera, len(view.landmark), moving=moving)
+
+
+AnyTrack = Odometry | KnownTrack

@@ -1,0 +1,214 @@
+"""Stills with a flight log, adjusted all together before any depth is made of them.
+
+Stills come too slowly to show how the camera turns while its rolling shutter reads, and when they
+were taken is often known to some tenths of a second. So they are tracked once for their latency,
+then matched at full size and adjusted with what the log says.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.latency import LatencyEstimate
+from recon import se3
+from recon.calibration.global_bundle import Knowledge
+from recon.calibration.together import Together, Turning, together
+from recon.calibration.tracks import pieces
+from recon.camera_model import scaled
+from recon.tracking.known_track import KnownTrack, KnownView
+from recon.types import U8, Camera, Frame, PosePrior
+from service.cameras.camera_file import seeks_readout, with_shutter
+from service.cameras.images import ImagesSource
+from service.cameras.rig import Rig
+from service.cameras.source import CameraFrame
+from service.config import change
+from service.errors import InputError
+from service.flight.scan import ScanInputs
+from service.flight.stages import build_stages
+from service.flight.telemetry_check import TelemetryCheck, differs
+from service.offline.refine.own_camera import sightings
+
+log = logging.getLogger(__name__)
+
+MIN_STILLS, MAX_STILLS = 6, 200
+"""Fewer determine nothing; the images of more do not fit into memory."""
+
+WIDTH_PX = 1920
+"""Width at which stills are matched, at most."""
+
+FIX_SIGMAS = 2.0
+"""What errors of fixes count for: they are common to neighbours."""
+
+RATE_RAD_S, CHANGE_RAD_S2 = 0.02, 1.0
+"""Sigma of a turn by telemetry, and how fast it changes between two attitudes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Still:
+    """One image with its telemetry, its pose all known."""
+
+    seq: int
+    gray: U8  # (H, W) distorted, WIDTH_PX wide at most
+    time_ns: int  # its stamp, on the history's clock
+    is_tracked: bool  # by the odometry
+
+
+def all_stills(inputs: ScanInputs, is_latency_given: bool) -> ScanInputs:
+    """The scan with the stills' latency, lens, shutter and poses, as far as they are found.
+
+    ``is_latency_given``: by the operator, and kept.
+    """
+    source, history = inputs.source, inputs.history
+    if not isinstance(source, ImagesSource) or history is None:
+        return inputs
+    if not MIN_STILLS <= source.images <= MAX_STILLS:
+        return inputs
+    stills, latency = _tracked(inputs, source, history)
+    config = inputs.config
+    if latency is not None and not is_latency_given:
+        if differs(latency, config.camera.latency_ms):
+            config = change(config, "camera.latency_ms", f"{latency.latency_ms:.1f}")
+            note = (
+                f"camera latency {latency.latency_ms:.0f} ms (sigma {latency.sigma_ms:.0f} ms) "
+                "found by the images, and applied"
+            )
+            inputs = replace(inputs, config=config, notes=(*inputs.notes, note))
+    try:
+        return _adjusted(inputs, stills, history)
+    except (ValueError, RuntimeError, np.linalg.LinAlgError, InputError) as error:
+        log.info("the stills are not adjusted together: %s", error)
+        return inputs
+
+
+def _tracked(
+    inputs: ScanInputs, source: ImagesSource, history: VehicleHistory
+) -> tuple[list[Still], LatencyEstimate | None]:
+    """The stills by the odometry, and how long before its stamp each was exposed."""
+    stages = build_stages(inputs.camera, inputs.config, inputs.backend)
+    rig = Rig(inputs.config.camera, inputs.config.scan, inputs.config.fusion)
+    check = TelemetryCheck(inputs.config.camera, history, log.info)
+    out = []
+    try:
+        for frame in source:
+            time_ns = inputs.epoch_ns + frame.time_ns
+            state = history.state_at(check.exposed_ns(time_ns))
+            prior = rig.prior(state, frame.geotag)
+            image = stages.undistort(Frame(frame.image, time_ns, frame.seq, prior))
+            tracked = stages.track(image)
+            check.add(time_ns, tracked)
+            is_tracked = tracked.T_odom_camera is not None
+            out.append(Still(frame.seq, _small(frame), time_ns, is_tracked))
+        check.finish()
+    finally:
+        stages.resources.close()
+    return out, check.latency
+
+
+def _small(frame: CameraFrame) -> U8:
+    gray = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
+    H, W = gray.shape
+    if W > WIDTH_PX:
+        size = WIDTH_PX, round(H * WIDTH_PX / W)
+        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(gray, np.uint8)
+
+
+def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHistory) -> ScanInputs:
+    """The scan by the stills' adjustment, where it places as many as the odometry does."""
+    config = inputs.config
+    rig = Rig(config.camera, config.scan, config.fusion)
+    latency_ns = round(1e6 * config.camera.latency_ms)
+    known = []
+    for still in stills:
+        time_ns = still.time_ns - latency_ns
+        prior = rig.prior(history.state_at(time_ns), None)
+        turn = rig.turn_at(history.state_at, time_ns)
+        if prior.position_m is not None and prior.velocity_m_s is not None and turn is not None:
+            known.append((still, replace(prior, turn_rad_s=turn)))
+    least = sum(still.is_tracked for still in stills)
+    if len(known) < max(least, MIN_STILLS):
+        raise ValueError(f"the log places {len(known)} of {len(stills)}")
+    priors = [prior for _, prior in known]
+    H, W = known[0][0].gray.shape
+    full = with_shutter(inputs.camera, config.camera)
+    camera = scaled(full, (W, H))
+    poses = np.array([se3.compose(p.R_world_camera, p.position_m) for p in priors])
+    ground_m = float(np.median([p.position_m[2] - (p.agl_m or 0.0) for p in priors]))
+    _, seen, poses = sightings(
+        {k: still.gray for k, (still, _) in enumerate(known)}, camera, poses, ground_m
+    )
+    seeks = seeks_readout(full, config.camera)
+    found = together(
+        camera, poses, seen, _knowledge(priors, int(seen.landmark.max()) + 1),
+        _turning(priors, history), seeks,
+    )  # fmt: skip
+    piece = pieces(found.seen, len(known))
+    tied = np.flatnonzero(piece == np.bincount(piece).argmax())
+    if len(tied) < least:
+        raise ValueError(f"{len(tied)} of {len(stills)} are tied, {least} are tracked")
+    log.info(
+        "%d stills adjusted together: readout %.1f ms, sigma %.1f ms, %.2f px",
+        len(tied), 1e3 * found.readout_s, 1e3 * found.sigma_readout_s, found.sigma_px,
+    )  # fmt: skip
+    lens = scaled(found.camera, full.size_px)
+    return replace(
+        inputs, camera=lens, config=change(config, "camera.readout_ms", "model"),
+        notes=(*inputs.notes, *_readout_note(found, seeks)),
+        known=_track(found, {known[k][0].seq: int(k) for k in tied}, lens),
+    )  # fmt: skip
+
+
+def _knowledge(priors: Sequence[PosePrior], points: int) -> Knowledge:
+    """Fixes and attitudes of the log."""
+    out = Knowledge.none(len(priors), points)
+    for k, p in enumerate(priors):
+        assert p.position_m is not None and p.sigma_position_m is not None
+        assert p.R_world_camera is not None
+        out.fixes[k], out.sigma_fixes[k] = p.position_m, FIX_SIGMAS * p.sigma_position_m
+        out.attitudes[k] = p.R_world_camera
+        out.sigma_attitudes[k] = p.sigma_tilt_rad, p.sigma_tilt_rad, p.sigma_yaw_rad
+    return out
+
+
+def _turning(priors: Sequence[PosePrior], history: VehicleHistory) -> Turning:
+    """How the camera moved at each exposure, by the log."""
+    rates = np.zeros((len(priors), 6))
+    for k, p in enumerate(priors):
+        assert p.turn_rad_s is not None and p.R_world_camera is not None
+        rates[k, :3], rates[k, 3:] = -p.turn_rad_s, -p.R_world_camera.T @ p.velocity_m_s
+    gap_s = 1e-9 * float(np.median(np.diff([t for _, t in history.attitudes()])))
+    return Turning(rates, float(np.hypot(RATE_RAD_S, CHANGE_RAD_S2 * gap_s / np.sqrt(12.0))))
+
+
+def _track(found: Together, views: dict[int, int], lens: Camera) -> KnownTrack:
+    """The track of ``views``: rows of ``found`` by the number of the frame."""
+    rows, known = found.seen.view, np.isfinite(found.points).all(axis=1)
+    number = np.cumsum(known) - 1
+    shown = known[found.seen.landmark]
+    return KnownTrack(
+        {
+            seq: KnownView(
+                found.poses[k], found.steps[k], found.rates[k],
+                number[found.seen.landmark[shown & (rows == k)]],
+            )
+            for seq, k in views.items()
+        },
+        found.points[known], lens,
+    )  # fmt: skip
+
+
+def _readout_note(found: Together, was_sought: bool) -> tuple[str, ...]:
+    """What the operator learns of the readout."""
+    shutter = found.camera.shutter
+    if not was_sought or not shutter.readout_s:
+        return ()
+    return (
+        f"the stills show a readout of {1e3 * shutter.readout_s:.0f} ms (sigma "
+        f"{1e3 * found.sigma_readout_s:.0f} ms), {shutter.direction}: applied",
+    )
