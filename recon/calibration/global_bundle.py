@@ -79,7 +79,7 @@ class RowMotion:
     sigma_turns: F64  # (N, 3) rad
 
     def by_row(self, camera: Camera, poses: F64, seen: Sightings) -> F64:
-        """(M, 4, 4) T_world_camera of the row of each sighting; ``poses`` (N, 4, 4) of the views."""
+        """(M, 4, 4) T_world_camera of each sighting's row; ``poses`` (N, 4, 4) of the views."""
         share = row_shares(camera, seen.uv_px)
         T = np.array([se3.inverse(one) for one in poses])
         return _inverses(

@@ -64,7 +64,7 @@ MIN_COMMON = 12
 
 
 def pieces(seen: Sightings, count: int) -> I64:
-    """(N,) which piece each of the first ``count`` views is in: a chain of images ties all of it."""
+    """(N,) which piece each of the first ``count`` views is in, tied by a chain of images."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

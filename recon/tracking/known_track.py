@@ -13,7 +13,7 @@ from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.matching import Pyramid
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry, Tracked, Tracking
-from recon.tracking.readout_search import ReadoutSearch
+from recon.tracking.readout_search import ReadoutEstimate
 from recon.types import F64, I64, U8, Camera, PosePrior
 
 KEPT = 8
@@ -30,17 +30,36 @@ class KnownView:
     landmark: I64  # (n,) which of the points it shows
 
 
+@dataclass(frozen=True, slots=True)
+class KnownReadout:
+    """What :class:`recon.tracking.readout_search.ReadoutSearch` says once it is done."""
+
+    estimate: ReadoutEstimate
+    is_open: bool = False
+
+    @property
+    def doubt_s(self) -> float:
+        """Sigma of the readout in use."""
+        return self.estimate.sigma_s
+
+
 class KnownTrack:
     """Takes frames as :class:`recon.tracking.odometry.Odometry` does, and says what is known."""
 
-    def __init__(self, views: Mapping[int, KnownView], points: F64, lens: Camera) -> None:
+    def __init__(
+        self, views: Mapping[int, KnownView], points: F64, lens: Camera, sigma_readout_s: float
+    ) -> None:
         """``views`` by the number of the frame; ``points`` (P, 3) m are finite.
 
-        ``lens`` is the camera with its distortion and shutter.
+        ``lens`` is the camera with its distortion and shutter; ``sigma_readout_s`` is 0 for one
+        that was given.
         """
         self.segment, self.keyframes = -1, list[OdometryKeyframe]()
         self.exposure = ExposureWatch()
-        self.readout: ReadoutSearch | None = None
+        self.readout = None
+        if sigma_readout_s:
+            found = ReadoutEstimate(lens.shutter.readout_s, sigma_readout_s, len(views))
+            self.readout = KnownReadout(found)
         self.K = lens.K
         self._views, self._map = views, Landmarks()
         self._map.add(points)

@@ -60,7 +60,7 @@ class Still:
 
 
 def all_stills(inputs: ScanInputs, is_latency_given: bool) -> ScanInputs:
-    """The scan with the stills' latency, lens, shutter and poses, as far as they are found.
+    """The scan with the stills' latency, shutter and poses, as far as they are found.
 
     ``is_latency_given``: by the operator, and kept.
     """
@@ -71,14 +71,14 @@ def all_stills(inputs: ScanInputs, is_latency_given: bool) -> ScanInputs:
         return inputs
     stills, latency = _tracked(inputs, source, history)
     config = inputs.config
-    if latency is not None and not is_latency_given:
-        if differs(latency, config.camera.latency_ms):
-            config = change(config, "camera.latency_ms", f"{latency.latency_ms:.1f}")
-            note = (
-                f"camera latency {latency.latency_ms:.0f} ms (sigma {latency.sigma_ms:.0f} ms) "
-                "found by the images, and applied"
-            )
-            inputs = replace(inputs, config=config, notes=(*inputs.notes, note))
+    is_new = latency is not None and differs(latency, config.camera.latency_ms)
+    if latency is not None and is_new and not is_latency_given:
+        config = change(config, "camera.latency_ms", f"{latency.latency_ms:.1f}")
+        note = (
+            f"camera latency {latency.latency_ms:.0f} ms (sigma {latency.sigma_ms:.0f} ms) "
+            "found by the images, and applied"
+        )
+        inputs = replace(inputs, config=config, notes=(*inputs.notes, note))
     try:
         return _adjusted(inputs, stills, history)
     except (ValueError, RuntimeError, np.linalg.LinAlgError, InputError) as error:
@@ -156,7 +156,7 @@ def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHisto
         "%d stills adjusted together: readout %.1f ms, sigma %.1f ms, %.2f px",
         len(tied), 1e3 * found.readout_s, 1e3 * found.sigma_readout_s, found.sigma_px,
     )  # fmt: skip
-    lens = scaled(found.camera, full.size_px)
+    lens = replace(full, shutter=found.camera.shutter)
     return replace(
         inputs, camera=lens, config=change(config, "camera.readout_ms", "model"),
         notes=(*inputs.notes, *_readout_note(found, seeks)),
@@ -199,7 +199,7 @@ def _track(found: Together, views: dict[int, int], lens: Camera) -> KnownTrack:
             )
             for seq, k in views.items()
         },
-        found.points[known], lens,
+        found.points[known], lens, found.sigma_readout_s,
     )  # fmt: skip
 
 

@@ -310,7 +310,7 @@ class Scan:
         if self.shutter.sentence is not None:
             out.append(self.shutter.sentence)
         shutter = self.found_shutter()
-        if shutter is not None:
+        if shutter is not None and self.inputs.known is None:
             out.append(
                 f"the images show a readout of {1e3 * shutter.readout_s:.1f} ms, "
                 f"{shutter.direction}: set camera.readout_ms and camera.readout_direction"

@@ -439,8 +439,8 @@ def build_stages(
 
     ``live`` drops old work when reconstruction cannot keep up. ``pages`` is a folder for the oldest
     parts of the map and, in files without a name, for what is kept of every view. None: keep all
-    in memory, and drop the oldest parts of the map. An ``assumed`` lens widens sigmas. A ``known`` track takes the odometry's
-    place.
+    in memory, and drop the oldest parts of the map. An ``assumed`` lens widens sigmas. A
+    ``known`` track takes the odometry's place.
     """
     compute, stopwatch, resources = config.compute, Stopwatch(), ExitStack()
     limit_threads(compute.threads)
@@ -455,7 +455,7 @@ def build_stages(
         camera,
         seeks_readout=seeks_readout(camera, config.camera),
     )
-    selection = Viewpoints(config.scan, compute.pairs)
+    selection = Viewpoints(config.scan, compute.pairs, all_known=known is not None)
     track = Track(odometry, selection, refused, stopwatch)
     stereo = VirtualStereoConfig(
         min_base_to_height=selection.min_base_to_height,

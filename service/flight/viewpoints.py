@@ -35,6 +35,13 @@ PARTNER_SPAN = FARTHEST_PARTNER - NEAREST_PARTNER
 """Steps away that partners between the views are, and over how many they spread on one side: the
 first and the last view have no other."""
 
+AHEAD, KNOWN_KEPT, KNOWN_PARTNERS = 4, 12, 2
+"""Views to come that a view of a known track waits for, views remembered there, and partners for
+each of ``compute.pairs``: such a track has no drift over wide baselines."""
+
+WIDEST = 0.45
+"""Base to height of such partners, at most."""
+
 TRACKED = 128
 """Tracked frames whose places are remembered."""
 
@@ -121,13 +128,16 @@ class StereoCandidate:
 class Viewpoints:
     """Selects views from tracked frames and remembers the last few as partners."""
 
-    def __init__(self, config: ScanConfig, partners: int = 4) -> None:
+    def __init__(self, config: ScanConfig, partners: int = 4, all_known: bool = False) -> None:
         """At most ``partners`` of the last :data:`KEPT` views pair up with one of them.
+
+        ``all_known``: the poses are final, and views wait for those on their far side.
 
         With more partners than the neighbouring views can be, tracked frames between them
         become partners too.
         """
-        self._kept: deque[Viewpoint] = deque(maxlen=KEPT)
+        self._all_known = all_known
+        self._kept: deque[Viewpoint] = deque(maxlen=KNOWN_KEPT if all_known else KEPT)
         self._between: deque[Viewpoint] = deque(maxlen=8 * partners if partners > KEPT - 2 else 0)
         self._recent: deque[Viewpoint] = deque(maxlen=6)  # a quarter of a step apart
         self._extra: tuple[Viewpoint, list[Viewpoint]] | None = None  # a last view's partner
@@ -238,6 +248,8 @@ class Viewpoints:
             return False
         if self._mode != "auto":
             return True
+        if self._all_known:
+            return sum(v.seq > view.seq for v in self._kept) >= AHEAD
         return sum(v.segment == view.segment for v in self._kept) >= 3
 
     def confirmed(self, view: Viewpoint) -> bool:
@@ -262,10 +274,18 @@ class Viewpoints:
             others.sort(key=lambda v: (v.seq < view.seq, abs(v.seq - view.seq)))
             return others[:1]
         others.sort(key=lambda v: _apart(v, view))
+        if self._all_known:
+            return self._wide(view, others)
         if not self._between:
             extra = self._extra[1] if self._extra and self._extra[0] is view else []
             return [*extra, *others[: self._partners]]
         return self._spread(view, others)
+
+    def _wide(self, view: Viewpoint, others: list[Viewpoint]) -> list[Viewpoint]:
+        """Partners of all baselines that stereo can bridge; the nearest where there are none."""
+        widest = WIDEST * float(np.median(landmarks(view.key)[1]))
+        good = [v for v in others if _apart(v, view) <= widest]
+        return _evenly(good, KNOWN_PARTNERS * self._partners) or others[: self._partners]
 
     def _spread(self, view: Viewpoint, others: list[Viewpoint]) -> list[Viewpoint]:
         """Partners between half and twice the keyframes' spacing, evenly spread."""
@@ -274,8 +294,13 @@ class Viewpoints:
         spacing = steps[0] if steps else 0.0
         near, far = NEAREST_PARTNER * spacing, FARTHEST_PARTNER * spacing
         good = [v for v, b in zip(others, base, strict=True) if near <= b <= far]
-        picked = np.unique(np.linspace(0, len(good) - 1, self._partners).round().astype(int))
-        return [good[i] for i in picked] if good else []
+        return _evenly(good, self._partners)
+
+
+def _evenly(views: list[Viewpoint], count: int) -> list[Viewpoint]:
+    """At most ``count`` of the views, evenly spread over their order."""
+    picked = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
+    return [views[i] for i in picked] if views else []
 
 
 def _apart(a: Viewpoint, b: Viewpoint) -> float:
