@@ -62,12 +62,6 @@ class SelfCalibrationConfig:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
 
 
-HELD = SelfCalibrationConfig(
-    sigma_focal=1e-5, sigma_aspect=1e-5, sigma_centre=1e-6, sigma_k=1e-6, sigma_p=1e-7
-)
-"""The camera stays as it is given."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SelfCalibrated:
     """The camera estimated from a flight, and how well it is determined."""

@@ -2,8 +2,7 @@
 
 Stills are too far apart to show how the camera turns within a readout, and telemetry is often too
 slow. So that turn is an unknown of each still, about what telemetry says. How the turns grow with
-telemetry's rates is the readout, where it is not known. The lens is held: it would make up for what
-the rows do.
+telemetry's rates is the readout, where it is not known.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon.calibration.flight import HELD, camera_information, network
+from recon.calibration.flight import SelfCalibrationConfig, camera_information, network
 from recon.calibration.global_bundle import (
     Knowledge,
     Problem,
@@ -25,13 +24,17 @@ from recon.calibration.global_bundle import (
 )
 from recon.types import F64, Camera, Shutter
 
+LENS = SelfCalibrationConfig(sigma_focal=0.003, sigma_centre=0.003, sigma_k=0.01, sigma_p=0.0005)
+"""How far a lens may be off that is calibrated, or found by the images. Held as it is, its errors
+bend the ground."""
+
 USUAL_S = 0.03
 """Readout that bounds the turns where none is known: cameras have 0 to 50 ms."""
 
 ROUNDS = 5
 """In which the readout and the turns settle."""
 
-MIN_SIGMAS = 2.0
+MIN_SIGMAS = 3.0
 """A readout that differs from none by less is not used."""
 
 
@@ -93,7 +96,7 @@ class _Adjustment:
 
     def __init__(self, camera: Camera, poses: F64, seen: Sightings, known: Knowledge) -> None:
         self._given, self._start, self._seen, self._known = camera, poses, seen, known
-        self._held = camera_information(camera, HELD)
+        self._held = camera_information(camera, LENS)
         self._problem: Problem | None = None
         self.found: Solution | None = None
 
@@ -142,7 +145,7 @@ class _Adjustment:
         way = self._given.shutter.direction
         if readout_s < 0.0:
             way = OPPOSITE[way]
-        camera = replace(self._given, shutter=Shutter(abs(readout_s), way))
+        camera = replace(s.camera, shutter=Shutter(abs(readout_s), way))
         return Together(
             camera, s.poses, s.points, self._problem.seen, rates, step_covariances(self._problem),
             float(self._problem.sigma_px[0]), readout_s, sigma_s,

@@ -55,12 +55,12 @@ class Still:
 
     seq: int
     gray: U8  # (H, W) distorted, WIDTH_PX wide at most
-    time_ns: int  # its stamp, on the history's clock
+    time_ns: int  # its stamp, since the source's time 0
     is_tracked: bool  # by the odometry
 
 
 def all_stills(inputs: ScanInputs, is_latency_given: bool) -> ScanInputs:
-    """The scan with the stills' latency, shutter and poses, as far as they are found.
+    """The scan with the stills' latency, lens, shutter and poses, as far as they are found.
 
     ``is_latency_given``: by the operator, and kept.
     """
@@ -70,15 +70,14 @@ def all_stills(inputs: ScanInputs, is_latency_given: bool) -> ScanInputs:
     if not MIN_STILLS <= source.images <= MAX_STILLS:
         return inputs
     stills, latency = _tracked(inputs, source, history)
-    config = inputs.config
-    is_new = latency is not None and differs(latency, config.camera.latency_ms)
-    if latency is not None and is_new and not is_latency_given:
-        config = change(config, "camera.latency_ms", f"{latency.latency_ms:.1f}")
+    if latency is not None and not is_latency_given and differs(latency, 0.0):
         note = (
-            f"camera latency {latency.latency_ms:.0f} ms (sigma {latency.sigma_ms:.0f} ms) "
-            "found by the images, and applied"
+            f"the images show that the stills' times are late by {latency.latency_ms:.0f} ms "
+            f"(sigma {latency.sigma_ms:.0f} ms): corrected"
         )
-        inputs = replace(inputs, config=config, notes=(*inputs.notes, note))
+        # The scan's start moves, so that whoever looks up an image by its time finds it.
+        epoch_ns = inputs.epoch_ns - round(1e6 * latency.latency_ms)
+        inputs = replace(inputs, epoch_ns=epoch_ns, notes=(*inputs.notes, note))
     try:
         return _adjusted(inputs, stills, history)
     except (ValueError, RuntimeError, np.linalg.LinAlgError, InputError) as error:
@@ -103,7 +102,7 @@ def _tracked(
             tracked = stages.track(image)
             check.add(time_ns, tracked)
             is_tracked = tracked.T_odom_camera is not None
-            out.append(Still(frame.seq, _small(frame), time_ns, is_tracked))
+            out.append(Still(frame.seq, _small(frame), frame.time_ns, is_tracked))
         check.finish()
     finally:
         stages.resources.close()
@@ -123,10 +122,10 @@ def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHisto
     """The scan by the stills' adjustment, where it places as many as the odometry does."""
     config = inputs.config
     rig = Rig(config.camera, config.scan, config.fusion)
-    latency_ns = round(1e6 * config.camera.latency_ms)
+    start_ns = inputs.epoch_ns - round(1e6 * config.camera.latency_ms)
     known = []
     for still in stills:
-        time_ns = still.time_ns - latency_ns
+        time_ns = start_ns + still.time_ns
         prior = rig.prior(history.state_at(time_ns), None)
         turn = rig.turn_at(history.state_at, time_ns)
         if prior.position_m is not None and prior.velocity_m_s is not None and turn is not None:
@@ -156,10 +155,10 @@ def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHisto
         "%d stills adjusted together: readout %.1f ms, sigma %.1f ms, %.2f px",
         len(tied), 1e3 * found.readout_s, 1e3 * found.sigma_readout_s, found.sigma_px,
     )  # fmt: skip
-    lens = replace(full, shutter=found.camera.shutter)
+    lens = scaled(found.camera, full.size_px)
     return replace(
         inputs, camera=lens, config=change(config, "camera.readout_ms", "model"),
-        notes=(*inputs.notes, *_readout_note(found, seeks)),
+        notes=(*inputs.notes, _note(full, lens, found, seeks)),
         known=_track(found, {known[k][0].seq: int(k) for k in tied}, lens),
     )  # fmt: skip
 
@@ -203,12 +202,13 @@ def _track(found: Together, views: dict[int, int], lens: Camera) -> KnownTrack:
     )  # fmt: skip
 
 
-def _readout_note(found: Together, was_sought: bool) -> tuple[str, ...]:
-    """What the operator learns of the readout."""
-    shutter = found.camera.shutter
-    if not was_sought or not shutter.readout_s:
-        return ()
-    return (
-        f"the stills show a readout of {1e3 * shutter.readout_s:.0f} ms (sigma "
-        f"{1e3 * found.sigma_readout_s:.0f} ms), {shutter.direction}: applied",
-    )
+def _note(before: Camera, lens: Camera, found: Together, was_sought: bool) -> str:
+    """What the operator learns of the lens and its readout."""
+    out = "all stills were adjusted together with the log"
+    change_share = lens.K[0, 0] / before.K[0, 0] - 1.0
+    out += f": focal length {before.K[0, 0]:.0f} px, {100.0 * change_share:+.1f} %"
+    if was_sought and lens.shutter.readout_s:
+        readout_ms, sigma_ms = 1e3 * lens.shutter.readout_s, 1e3 * found.sigma_readout_s
+        way = lens.shutter.direction
+        out += f"; a readout of {readout_ms:.0f} ms (sigma {sigma_ms:.0f} ms), {way}, is applied"
+    return out

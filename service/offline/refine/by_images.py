@@ -17,7 +17,6 @@ import numpy as np
 
 from recon import se3
 from recon.calibration.flight import (
-    HELD,
     Network,
     SelfCalibrationConfig,
     camera_information,
@@ -48,6 +47,9 @@ from service.offline.refine.survey_file import SurveyPoint
 from service.stream.records import PoseRecord, ScanHeader
 
 FREE = SelfCalibrationConfig()
+HELD = replace(
+    FREE, sigma_focal=1e-5, sigma_aspect=1e-5, sigma_centre=1e-6, sigma_k=1e-6, sigma_p=1e-7
+)
 
 MIN_FIXES = 3
 """Measured places that place a piece."""
