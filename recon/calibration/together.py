@@ -17,7 +17,6 @@ from recon.calibration.global_bundle import (
     Problem,
     RowMotion,
     Sightings,
-    Solution,
     dispersion,
     solve,
     step_covariances,
@@ -59,7 +58,7 @@ class Together:
     poses: F64  # (N, 4, 4) T_world_camera of the middle rows
     points: F64  # (P, 3) world, m
     seen: Sightings  # that took part
-    rates: F64  # (N, 6) of T_camera_world per s; unused under a global shutter
+    rates: F64  # (N, 6) of T_camera_world per s
     steps: F64  # (N, 6, 6) covariance of T_here_before, left perturbation; zero for the first
     sigma_px: float  # of a coordinate, as one of those that err independently
     readout_s: float  # as given or found; negative against the direction given
@@ -76,79 +75,62 @@ def together(
         camera: with its shutter; ``seeks_readout`` where that is not known.
         poses: (N, 4, 4) T_world_camera to begin with.
 
-    Raises ValueError where too few sightings agree.
+    Raises ValueError where too few sightings agree, or no readout shows.
     """
-    adjustment = _Adjustment(camera, poses, seen, known)
-    readout_s, sigma_s = camera.shutter.readout_s, 0.0
+    readout_s, sigma_s, rates = camera.shutter.readout_s, 0.0, turning.rates[:, :3]
+    free_rad = readout_s * turning.sigma_rad_s
     if seeks_readout:
-        readout_s, sigma_s = adjustment.find_readout(turning)
-        if abs(readout_s) < MIN_SIGMAS * sigma_s:
-            readout_s = 0.0
-    if readout_s:
-        adjustment.adjust(turning.rows(readout_s, abs(readout_s) * turning.sigma_rad_s))
-    else:
-        adjustment.adjust(None)
-    return adjustment.result(turning, readout_s, sigma_s)
+        free_rad = USUAL_S * float(np.hypot(turning.sigma_rad_s, np.sqrt(np.mean(rates**2))))
+    stills = _Adjustment(camera, poses, seen, known, turning.rows(readout_s, free_rad))
+    if seeks_readout:
+        for _ in range(ROUNDS):
+            stills.adjust(turning.rows(readout_s, free_rad))
+            readout_s, sigma_s = slope(rates, stills.turns)
+    if not readout_s or abs(readout_s) < MIN_SIGMAS * sigma_s:
+        found = f"{1e3 * readout_s:.1f} ms, sigma {1e3 * sigma_s:.1f} ms"
+        raise ValueError(f"the stills do not show a rolling shutter ({found})")
+    stills.adjust(turning.rows(readout_s, abs(readout_s) * turning.sigma_rad_s))
+    return stills.result(turning, readout_s, sigma_s)
 
 
 class _Adjustment:
-    """Sightings that weigh as much as independent ones would."""
+    """Stills, lens and turns with sightings that weigh as much as independent ones would."""
 
-    def __init__(self, camera: Camera, poses: F64, seen: Sightings, known: Knowledge) -> None:
-        self._given, self._start, self._seen, self._known = camera, poses, seen, known
-        self._held = camera_information(camera, LENS)
-        self._problem: Problem | None = None
-        self.found: Solution | None = None
-
-    def adjust(self, rows: RowMotion | None) -> F64:
-        """Adjust everything; the turns (N, 3) rad of the rows."""
-        if self._problem is None or (rows is None) != (self._problem.rows is None):
-            self._begin(rows)
-        assert self._problem is not None
-        if rows is not None and self._problem.rows is not None:
-            rows = replace(rows, turns=self._problem.rows.turns)
-        self.found = solve(replace(self._problem, rows=rows))
-        s = self.found
-        self._problem = replace(
-            self._problem, camera=s.camera, poses=s.poses, points=s.points, rows=s.rows
-        )
-        return np.zeros((len(s.poses), 3)) if s.rows is None else s.rows.turns
-
-    def _begin(self, rows: RowMotion | None) -> None:
+    def __init__(
+        self, camera: Camera, poses: F64, seen: Sightings, known: Knowledge, rows: RowMotion
+    ) -> None:
         """Leave out wild sightings, and weigh the others."""
-        net = network(self._given, self._start, self._seen, self._known, self._held, rows=rows)
+        held = camera_information(camera, LENS)
+        net = network(camera, poses, seen, known, held, rows=rows)
         s, pixel = net.solution, np.full(len(net.seen.view), net.sigma_px)
         problem = Problem(
-            s.camera, self._given, s.poses, s.points, net.seen, pixel, self._known, self._held,
-            rows=s.rows,
-        )  # fmt: skip
+            s.camera, camera, s.poses, s.points, net.seen, pixel, known, held, rows=s.rows
+        )
         wider = max(float(np.sqrt(dispersion(problem))), 1.0)
-        self._problem = replace(
+        self._at = replace(
             problem, sigma_px=wider * pixel, huber_sigmas=problem.huber_sigmas / wider
         )
 
-    def find_readout(self, turning: Turning) -> tuple[float, float]:
-        """The readout by which the rows' turns follow telemetry's rates, and its sigma, s."""
-        rates = turning.rates[:, :3]
-        free = USUAL_S * float(np.hypot(turning.sigma_rad_s, np.sqrt(np.mean(rates**2))))
-        readout_s = sigma_s = 0.0
-        for _ in range(ROUNDS):
-            readout_s, sigma_s = slope(rates, self.adjust(turning.rows(readout_s, free)))
-        return readout_s, sigma_s
+    @property
+    def turns(self) -> F64:
+        """(N, 3) rad from the first row to the last."""
+        assert self._at.rows is not None
+        return self._at.rows.turns
+
+    def adjust(self, rows: RowMotion) -> None:
+        """Adjust everything again from where it is, with what ``rows`` says of the turns."""
+        s = solve(replace(self._at, rows=replace(rows, turns=self.turns)))
+        self._at = replace(self._at, camera=s.camera, poses=s.poses, points=s.points, rows=s.rows)
 
     def result(self, turning: Turning, readout_s: float, sigma_s: float) -> Together:
         """The stills as they are adjusted now."""
-        assert self._problem is not None and self.found is not None
-        s, rates = self.found, turning.rates.copy()
-        if s.rows is not None:
-            rates[:, :3] = s.rows.turns / readout_s
-        way = self._given.shutter.direction
-        if readout_s < 0.0:
-            way = OPPOSITE[way]
-        camera = replace(s.camera, shutter=Shutter(abs(readout_s), way))
+        way = self._at.camera.shutter.direction
+        shutter = Shutter(abs(readout_s), way if readout_s > 0.0 else OPPOSITE[way])
+        rates = np.hstack([self.turns / readout_s, turning.rates[:, 3:]])
         return Together(
-            camera, s.poses, s.points, self._problem.seen, rates, step_covariances(self._problem),
-            float(self._problem.sigma_px[0]), readout_s, sigma_s,
+            replace(self._at.camera, shutter=shutter), self._at.poses, self._at.points,
+            self._at.seen, rates, step_covariances(self._at), float(self._at.sigma_px[0]),
+            readout_s, sigma_s,
         )  # fmt: skip
 
 

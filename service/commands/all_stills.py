@@ -119,8 +119,15 @@ def _small(frame: CameraFrame) -> U8:
 
 
 def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHistory) -> ScanInputs:
-    """The scan by the stills' adjustment, where it places as many as the odometry does."""
+    """The scan by the stills' adjustment, where it places as many as the odometry does.
+
+    Raises ValueError where it does not, or where the shutter is global.
+    """
     config = inputs.config
+    full = with_shutter(inputs.camera, config.camera)
+    seeks = seeks_readout(full, config.camera)
+    if not seeks and not full.shutter.readout_s:
+        raise ValueError("its shutter is global")
     rig = Rig(config.camera, config.scan, config.fusion)
     start_ns = inputs.epoch_ns - round(1e6 * config.camera.latency_ms)
     known = []
@@ -135,14 +142,12 @@ def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHisto
         raise ValueError(f"the log places {len(known)} of {len(stills)}")
     priors = [prior for _, prior in known]
     H, W = known[0][0].gray.shape
-    full = with_shutter(inputs.camera, config.camera)
     camera = scaled(full, (W, H))
     poses = np.array([se3.compose(p.R_world_camera, p.position_m) for p in priors])
     ground_m = float(np.median([p.position_m[2] - (p.agl_m or 0.0) for p in priors]))
     _, seen, poses = sightings(
         {k: still.gray for k, (still, _) in enumerate(known)}, camera, poses, ground_m
     )
-    seeks = seeks_readout(full, config.camera)
     found = together(
         camera, poses, seen, _knowledge(priors, int(seen.landmark.max()) + 1),
         _turning(priors, history), seeks,
