@@ -16,6 +16,7 @@ from painted_ground import CAMERA, FOOTPRINT_M, HEIGHT_M, pose, still
 from typer.testing import CliRunner
 
 from recon.calibration.global_bundle import Sightings
+from recon.calibration.tracks import MIN_COMMON
 from recon.posegraph.alignment import Similarity
 from recon.posegraph.loop_book import Edge
 from recon.posegraph.pose_graph import PoseGraph
@@ -24,7 +25,7 @@ from service.cameras.camera_file import save_camera
 from service.cli import app
 from service.flight.chain import Pieces
 from service.offline.exports.view import ExportOptions, ScanView, export
-from service.offline.refine.by_images import MIN_COMMON, stretches_untied
+from service.offline.refine.by_images import stretches_untied
 from service.offline.tiles import footprints
 from service.scans.coverage import LiveCoverage, coverage_of
 from service.scans.folder import write_deliverables

@@ -54,7 +54,7 @@ def rate_at(t: float) -> F64:
 
 
 def times() -> F64:
-    return START_S + STEP_S * np.arange(STILLS)
+    return np.asarray(START_S + STEP_S * np.arange(STILLS), np.float64)
 
 
 def sighted(camera: Camera, rng: np.random.Generator, noise_px: float) -> Sightings:
@@ -138,7 +138,7 @@ def drawn(t: float, readout_s: float) -> U8:
 def logged(hz: float) -> VehicleHistory:
     """The flight's log, its top of the image to the nose."""
     history, frame = VehicleHistory(HistoryConfig()), LocalFrame(-35.0, 149.0, 0.0)
-    for t in np.arange(0.0, START_S + STEP_S * STILLS + 3.0, 1.0 / hz):
+    for t in np.arange(0.0, START_S + STEP_S * STILLS + 3.0, 1.0 / hz).tolist():
         T, ns = true_pose(t), EPOCH_NS + round(1e9 * t)
         R = R_ENU_NED.T @ T[:3, :3] @ R_GIMBAL_CAMERA.T @ NADIR.T
         w, x, y, z = (float(q) for q in se3.quaternion_from_rotation(R))

@@ -96,12 +96,11 @@ def row_shares(camera: Camera, uv_px: F64) -> F64:
 
 def _of_rows(T: F64, turns: F64, moves: F64, share: F64) -> F64:
     """(M, 4, 4) T_camera_world of rows, to second order in the turn across the image."""
-    out = T.copy()
     w, t = share[:, None] * turns, share[:, None] * moves
-    out[:, :3, :3] = se3.each_so3_exp(w) @ T[:, :3, :3]
-    turned = np.einsum("mij,mj->mi", se3.each_so3_exp(w), T[:, :3, 3])
-    out[:, :3, 3] = turned + t + 0.5 * np.cross(w, t)
-    return out
+    rows = np.zeros_like(T)
+    rows[:, :3, :3], rows[:, 3, 3] = se3.each_so3_exp(w), 1.0
+    rows[:, :3, 3] = t + 0.5 * np.cross(w, t)
+    return np.asarray(rows @ T)
 
 
 def _inverses(T: F64) -> F64:
@@ -585,7 +584,7 @@ class _Bundle:
             both = eq.solved(unit)[rows] + eq.Z[rows] @ spread @ eq.Z[rows].T
             J = np.hstack([-se3.adjoint(s.T[n] @ se3.inverse(s.T[n - 1])), np.eye(6)])
             out[n] = J @ both @ J.T
-        return 0.5 * (out + out.transpose(0, 2, 1))
+        return np.asarray(0.5 * (out + out.transpose(0, 2, 1)))
 
     # ---- result -----------------------------------------------------------------------------
 

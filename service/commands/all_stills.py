@@ -22,7 +22,7 @@ from recon.calibration.together import Together, Turning, together
 from recon.calibration.tracks import pieces
 from recon.camera_model import scaled
 from recon.tracking.known_track import KnownTrack, KnownView
-from recon.types import U8, Camera, Frame, PosePrior
+from recon.types import F64, U8, Camera, Frame, PosePrior
 from service.cameras.camera_file import seeks_readout, with_shutter
 from service.cameras.images import ImagesSource
 from service.cameras.rig import Rig
@@ -143,11 +143,10 @@ def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHisto
     priors = [prior for _, prior in known]
     H, W = known[0][0].gray.shape
     camera = scaled(full, (W, H))
-    poses = np.array([se3.compose(p.R_world_camera, p.position_m) for p in priors])
-    ground_m = float(np.median([p.position_m[2] - (p.agl_m or 0.0) for p in priors]))
-    _, seen, poses = sightings(
-        {k: still.gray for k, (still, _) in enumerate(known)}, camera, poses, ground_m
-    )
+    poses = np.array([_pose(prior) for prior in priors])
+    ground_m = float(np.median(poses[:, 2, 3] - [prior.agl_m or 0.0 for prior in priors]))
+    images = {k: still.gray for k, (still, _) in enumerate(known)}
+    _, seen, poses = sightings(images, camera, poses, ground_m)
     found = together(
         camera, poses, seen, _knowledge(priors, int(seen.landmark.max()) + 1),
         _turning(priors, history), seeks,
@@ -166,6 +165,12 @@ def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHisto
         notes=(*inputs.notes, _note(full, lens, found, seeks)),
         known=_track(found, {known[k][0].seq: int(k) for k in tied}, lens),
     )  # fmt: skip
+
+
+def _pose(prior: PosePrior) -> F64:
+    """(4, 4) T_world_camera."""
+    assert prior.R_world_camera is not None and prior.position_m is not None
+    return se3.compose(prior.R_world_camera, prior.position_m)
 
 
 def _knowledge(priors: Sequence[PosePrior], points: int) -> Knowledge:
@@ -192,7 +197,7 @@ def _turning(priors: Sequence[PosePrior], history: VehicleHistory) -> Turning:
 
 def _track(found: Together, views: dict[int, int], lens: Camera) -> KnownTrack:
     """The track of ``views``: rows of ``found`` by the number of the frame."""
-    rows, known = found.seen.view, np.isfinite(found.points).all(axis=1)
+    rows, known = found.seen.view, np.asarray(np.isfinite(found.points).all(axis=1))
     number = np.cumsum(known) - 1
     shown = known[found.seen.landmark]
     return KnownTrack(
