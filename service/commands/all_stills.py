@@ -8,7 +8,7 @@ then matched at full size and adjusted with what the log says.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -29,7 +29,7 @@ from service.cameras.rig import Rig
 from service.cameras.source import CameraFrame
 from service.config import change
 from service.errors import InputError
-from service.flight.scan import ScanInputs
+from service.flight.scan import ScanInputs, check_new
 from service.flight.stages import build_stages
 from service.flight.telemetry_check import TelemetryCheck, differs
 from service.offline.refine.own_camera import sightings
@@ -59,7 +59,9 @@ class Still:
     is_tracked: bool  # by the odometry
 
 
-def all_stills(inputs: ScanInputs, is_latency_given: bool) -> ScanInputs:
+def all_stills(
+    inputs: ScanInputs, is_latency_given: bool, progress: Callable[[str], None] = log.info
+) -> ScanInputs:
     """The scan with the stills' latency, lens, shutter and poses, as far as they are found.
 
     ``is_latency_given``: by the operator, and kept.
@@ -69,6 +71,8 @@ def all_stills(inputs: ScanInputs, is_latency_given: bool) -> ScanInputs:
         return inputs
     if not MIN_STILLS <= source.images <= MAX_STILLS:
         return inputs
+    check_new(inputs.folder)
+    progress("adjusting all stills together")
     stills, latency = _tracked(inputs, source, history)
     if latency is not None and not is_latency_given and differs(latency, 0.0):
         note = (

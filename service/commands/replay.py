@@ -186,8 +186,7 @@ def _replay(
         if start is not None:
             inputs = _with_lens(inputs, video, start, find_lens, progress)
         if played is source:
-            progress("adjusting all stills together")
-            inputs = all_stills(inputs, is_latency_given)
+            inputs = all_stills(inputs, is_latency_given, progress)
         stop = stop_by_signals()
         found = _fly(inputs, stop, progress, can_begin_again=played is source and is_file)
         if isinstance(found, Shutter):
