@@ -20,8 +20,9 @@ from recon.tracking import matching, pnp
 from recon.tracking.common_view import common_view, features
 from recon.types import F32, F64, U8, Bool, DepthMap
 
-FEATURE_SHARE = 0.03
-"""Search radius around places that features predict, as a share of the width."""
+FEATURE_SHARES = (0.01, 0.03)
+"""Search radii around places that features predict, as shares of the width. The narrow one finds
+corners of rows that repeat."""
 
 MIN_RAD, MIN_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
@@ -167,10 +168,13 @@ def verify(
     solved = _pose(pyramids, uv, points, predicted, warp, b, T_b_a, config)
     if solved is None:
         view = common_view(features(a.gray), features(b.gray))
-        if view is not None:
-            near = replace(config, search_share=FEATURE_SHARE)
-            there = view.predict(uv, FEATURE_SHARE * b.gray.shape[1])
+        for share in FEATURE_SHARES if view is not None else ():
+            assert view is not None
+            there = view.predict(uv, share * b.gray.shape[1])
+            near = replace(config, search_share=share)
             solved = _pose(pyramids, uv, points, there.uv, there.warp, b, None, near)
+            if solved is not None:
+                break
     if solved is None:
         return None
     T_a_b = se3.inverse(solved.T_camera_points)

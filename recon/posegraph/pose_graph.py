@@ -23,7 +23,14 @@ from recon.posegraph.readings import Readings, is_frozen, sound
 from recon.posegraph.records import Loop, Node, PoseGraphConfig
 from recon.posegraph.segment_frames import SegmentFrames
 from recon.posegraph.sensor_offsets import Constants
-from recon.posegraph.smoother import MANY_STEPS, STEPS, Smoother, left_covariance, reversed_motion
+from recon.posegraph.smoother import (
+    MANY_STEPS,
+    NO_SCALE,
+    STEPS,
+    Smoother,
+    left_covariance,
+    reversed_motion,
+)
 from recon.posegraph.thinning import GONE_SHARE, thin
 from recon.types import F64, Pose, PosePrior
 
@@ -243,7 +250,8 @@ class PoseGraph:
 
     def residuals(self) -> dict[str, F64]:
         """Whitened residuals by kind of factor: "vision", "attitude", "position", "altitude",
-        "height", "loop", "link", "scale", "prior" and "prior place"; (n, dimension) each."""
+        "height", "loop", "loop scale", "link", "scale", "prior" and "prior place"; (n, dimension)
+        each."""
         self._solve(now=True)
         return self._smoother.residuals()
 
@@ -365,10 +373,24 @@ class PoseGraph:
 
     def _add_loop_factor(self, loop: Loop) -> None:
         a, b = self._nodes[loop.a].key, self._nodes[loop.b].key
-        loop = loop.scaled(self.scale(loop.a))
+        metric = loop.scaled(self._segments.frame(self._nodes[loop.a].segment).scale)
         self._sources[b].add("loop")
         # Not robust: two loops agreed, and a late one with a large misclosure would lose weight.
-        self._smoother.add_motion("loop", (a, b), loop.T_a_b, loop.covariance)
+        self._smoother.add_motion(
+            "loop", (a, b), metric.T_a_b, metric.covariance, self._motions.scale_of[a]
+        )
+        self._add_loop_scale(loop, a, b)
+
+    def _add_loop_scale(self, loop: Loop, a: int, b: int) -> None:
+        """The ratio of the depths at both ends, where each has a scale of its own."""
+        keys = self._motions.scale_of[a], self._motions.scale_of[b]
+        if keys[0] == keys[1] or NO_SCALE in keys:
+            return
+        frames = [self._segments.frame(self._nodes[seq].segment).scale for seq in loop.ends]
+        log = float(np.log(loop.ratio * frames[0] / frames[1]))
+        self._smoother.add_scale(
+            "loop scale", keys, log, self.config.sigma_loop_scale, self.config.huber_sigmas
+        )
 
     def _newest(self) -> Node:
         return next(reversed(self._nodes.values()))

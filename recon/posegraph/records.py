@@ -34,6 +34,7 @@ class PoseGraphConfig:
     sigma_link_m: float = 3.0  # per second without vision
     sigma_link_rad: float = 0.3
     frame_drift: float = 0.003  # share of the path flown by which a track may leave its frame
+    sigma_loop_scale: float = 0.002  # of the ratio of the depths at a loop's ends
     loop_drift: float = 0.05  # of the path between its ends; a loop off by more is impossible
     loop_slack_m: float = 2.0  # and this
     loop_turn_rad: float = 0.5

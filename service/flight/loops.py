@@ -38,7 +38,10 @@ MIN_ALIKE = 8
 """Features that two images of one place have in common, of their strongest."""
 
 PAUSE = 3
-"""Keyframes without a search after a loop was taken; neighbours would only repeat it."""
+"""Keyframes without a search after a loop was taken, as they would only repeat it; fewer where the
+view moves on by :data:`MOVED` of its diagonal."""
+
+MOVED = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +109,7 @@ class LoopSearch:
         self.trajectory = trajectory
         self._config = config or LoopConfig()
         self._kept: dict[int, _Kept] = {}
-        self._rest = 0
+        self._tied: _Kept | None = None  # the last end of a loop
         self._turn = 0
         self._signatures = Signatures()
 
@@ -122,9 +125,7 @@ class LoopSearch:
         """
         new = _packed(seq, self.trajectory.graph.entered - 1, segment, gray, K, depth)
         self._kept[seq] = new
-        if self._rest > 0:
-            self._rest -= 1
-        else:
+        if not self._repeats(new, depth):
             self._search(new)
         if len(self._kept) > self._max_views:
             self._thin()
@@ -137,8 +138,18 @@ class LoopSearch:
             known = self._kept[seq].unpacked(self.trajectory.scale(seq))
             found = verify(known, view, guess, self._config)
             if found is not None and self._add(seq, new, found):
-                self._rest = PAUSE
+                self._tied = new
                 return
+
+    def _repeats(self, new: _Kept, depth: DepthMap) -> bool:
+        """True when a loop here would only repeat the last one."""
+        tied = self._tied
+        if tied is None or tied.segment != new.segment or new.ordinal - tied.ordinal > PAUSE:
+            return False
+        distance = float(np.nanmedian(depth.depth_m))
+        step = self.trajectory.map_pose(new.seq) - self.trajectory.map_pose(tied.seq)
+        moved = float(np.linalg.norm(step[:3, 3] + distance * step[:3, 2]))
+        return moved < MOVED * distance * float(np.hypot(*new.size_px)) / float(new.K[0, 0])
 
     def _add(self, seq: int, new: _Kept, found: LoopClosure) -> bool:
         """True when the graph accepts the loop."""
