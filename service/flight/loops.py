@@ -42,6 +42,7 @@ PAUSE = 3
 view moves on by :data:`MOVED` of its diagonal."""
 
 MOVED = 0.25
+"""Of the view's diagonal, from which on a loop tells something new."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
