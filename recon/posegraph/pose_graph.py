@@ -373,12 +373,10 @@ class PoseGraph:
 
     def _add_loop_factor(self, loop: Loop) -> None:
         a, b = self._nodes[loop.a].key, self._nodes[loop.b].key
-        metric = loop.scaled(self._segments.frame(self._nodes[loop.a].segment).scale)
+        metric = loop.scaled(self.scale(loop.a))
         self._sources[b].add("loop")
         # Not robust: two loops agreed, and a late one with a large misclosure would lose weight.
-        self._smoother.add_motion(
-            "loop", (a, b), metric.T_a_b, metric.covariance, self._motions.scale_of[a]
-        )
+        self._smoother.add_motion("loop", (a, b), metric.T_a_b, metric.covariance)
         self._add_loop_scale(loop, a, b)
 
     def _add_loop_scale(self, loop: Loop, a: int, b: int) -> None:
