@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -312,6 +313,27 @@ def test_a_lost_stretch_is_found_by_its_look_among_many() -> None:
     search = search_along(poses, chain, [0] * 12 + [1] * 3)
     assert search.trajectory.graph.is_tied(1)
     assert apart_m(search, poses, 2, 13) < 0.3
+
+
+def test_after_a_loop_the_search_waits_until_the_view_has_moved_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """For a quarter of the view's diagonal, or three keyframes."""
+    seen, trajectory, searched = view(A, 1), Trajectory(), list[int]()
+    search = LoopSearch(trajectory)
+
+    def takes_a_loop(new: Any) -> None:
+        searched.append(new.seq)
+        search._tied = new
+
+    monkeypatch.setattr(search, "_search", takes_a_loop)
+    H, W = seen.gray.shape
+    diagonal_m = float(np.nanmedian(seen.depth.depth_m)) * float(np.hypot(W, H)) / K[0, 0]
+    for i, share in enumerate((0.0, 0.1, 0.2, 0.3, 0.31, 0.32, 0.33, 0.34)):
+        T = camera(share * diagonal_m, 0.0, 40.0, 0.0)
+        trajectory.add(i, 0, T, PosePrior(), None, i * 10**9, np.eye(6) * 1e-4)
+        search.look(i, 0, seen.gray, K, seen.depth)
+    assert searched == [0, 3, 7]
 
 
 def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
