@@ -77,8 +77,8 @@ def sighted(camera: Camera, rng: np.random.Generator, noise_px: float) -> Sighti
     return Sightings(np.array(view), np.array(landmark), np.array(uv) + noise)
 
 
-def told(rng: np.random.Generator, places: int) -> tuple[F64, Knowledge, Turning]:
-    """What a log says of the stills: poses, the same as knowledge, and rates it smooths."""
+def by_log(rng: np.random.Generator, places: int) -> tuple[F64, Knowledge, Turning]:
+    """A log of the stills: poses, the same as knowledge, and rates it smooths."""
     poses, known = [], Knowledge.none(STILLS, places)
     for k, t in enumerate(times()):
         T = true_pose(t)
@@ -102,7 +102,7 @@ def off_m(poses: F64) -> float:
 def test_the_readout_is_found_by_the_turns_of_the_rows(readout_s: float) -> None:
     rng = np.random.default_rng(4)
     seen = sighted(replace(CAMERA, shutter=Shutter(readout_s)), rng, 0.3)
-    poses, known, turning = told(rng, 900)
+    poses, known, turning = by_log(rng, 900)
     found = together(CAMERA, poses, seen, known, turning, seeks_readout=True)
     assert found.sigma_readout_s < 4e-3
     assert abs(found.readout_s - readout_s) < 3.0 * found.sigma_readout_s
@@ -116,7 +116,7 @@ def test_the_readout_is_found_by_the_turns_of_the_rows(readout_s: float) -> None
 def test_a_global_shutter_is_none() -> None:
     rng = np.random.default_rng(4)
     seen = sighted(CAMERA, rng, 0.3)
-    poses, known, turning = told(rng, 900)
+    poses, known, turning = by_log(rng, 900)
     with pytest.raises(ValueError, match="do not show a rolling shutter"):
         together(CAMERA, poses, seen, known, turning, seeks_readout=True)
 

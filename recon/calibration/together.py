@@ -118,7 +118,7 @@ class _Adjustment:
         return self._at.rows.turns
 
     def adjust(self, rows: RowMotion) -> None:
-        """Adjust everything again from where it is, with what ``rows`` says of the turns."""
+        """Adjust everything again from where it is, with the turns that ``rows`` expects."""
         s = solve(replace(self._at, rows=replace(rows, turns=self.turns)))
         self._at = replace(self._at, camera=s.camera, poses=s.poses, points=s.points, rows=s.rows)
 
