@@ -188,7 +188,7 @@ def test_the_buttons_reach_the_vehicle_and_show_its_answer(browser: Browser, sca
             browser.wait("!document.querySelector('.vehicle').hidden", 30)
             browser.wait("!document.querySelector('.vehicle .state').hidden", 30)
             browser.click("Start scan")
-            browser.wait("document.querySelector('.note').textContent === 'start: accepted'", 30)
+            browser.wait("document.querySelector('.note').textContent === 'start: accepted'")
             browser.dialog = "2.5"
             browser.click("Baseline")
             browser.wait(

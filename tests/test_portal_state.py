@@ -130,7 +130,7 @@ def test_a_scan_that_cannot_be_read_is_said_with_its_reason(browser: Browser, sc
     (folder / "scan.db").write_bytes(b"no database")
     with page_of(browser, scans, []) as base:
         browser.open(f"{base}/#/view/drone-1/broken")
-        browser.wait(f"{STATE}.includes('is not a scan database')", 30)
+        browser.wait(f"{STATE}.includes('is not a scan database')")
 
 
 def test_list_and_map_say_whether_a_scan_is_heard(browser: Browser, scans: Path) -> None:

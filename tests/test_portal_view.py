@@ -298,7 +298,7 @@ def test_a_refused_stop_shows_the_companions_own_words(browser: Browser, store: 
             browser.open(one.url)
             browser.wait("!document.querySelector('.vehicle .state').hidden", 30)
             browser.click("Start scan")
-            browser.wait("document.querySelector('.note').textContent === 'start: accepted'", 30)
+            browser.wait("document.querySelector('.note').textContent === 'start: accepted'")
             browser.click("Stop scan")
             browser.wait(
                 "[...document.querySelectorAll('.note')].some(n =>"

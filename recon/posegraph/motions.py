@@ -6,7 +6,6 @@ A segment that has a frame in the world leaves its scale open, block by block of
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,22 +20,16 @@ from recon.types import F64
 VELOCITY_S = 1.0
 FASTEST_M_S = 100.0
 
-
-@dataclass(slots=True)
-class _Block:
-    """Keyframes that share one scale."""
-
-    key: int  # of the scale
-    since: int  # its first node
-    held: int = 0  # keyframes that it stands for
-    variance: float = 0.0  # relative, of the scale, by what its steps leave open
+OPEN_LENGTH = 0.005
+"""Relative sigma of the length of a step from which on vision's scale may have changed there, as
+where stills turn and have little in common."""
 
 
-def _length_variance(node: Node, last: Node) -> float:
-    """Relative variance of the length of vision's step to a node."""
+def _length_sigma(node: Node, last: Node) -> float:
+    """Relative sigma of the length of vision's step to a node; 0 for none."""
     step = (se3.inverse(last.T_odom_camera) @ node.T_odom_camera)[:3, 3]
     square = float(step @ step)
-    return float(step @ node.covariance[3:, 3:] @ step) / square**2 if square > 0.0 else 0.0
+    return float(np.sqrt(step @ node.covariance[3:, 3:] @ step)) / square if square > 0.0 else 0.0
 
 
 class Motions:
@@ -53,7 +46,8 @@ class Motions:
         self._config, self._smoother = config, smoother
         self._segments, self._counts = segments, counts
         self.scale_of: list[int] = []  # key of each keyframe's scale, or NO_SCALE
-        self._blocks: dict[int, _Block] = {}  # by segment, its last
+        self._blocks: dict[int, tuple[int, int, int]] = {}
+        # by segment, its last scale, that scale's first node, and how many keyframes it stands for
 
     def first(self, node: Node) -> tuple[F64, F64]:
         """Pose and covariance of the first keyframe: loose where readings will follow.
@@ -80,35 +74,32 @@ class Motions:
         self._connect(node, last, motion, covariance)
         return motion, covariance
 
-    def scale_key(self, node: Node) -> int:
+    def scale_key(self, node: Node, jump: float = 0.0) -> int:
         """Key of the node's scale; made when missing.
 
-        A new one begins every twenty keyframes, and where steps of uncertain length let the scale
-        drift by as much as twenty others.
+        A new one begins every twenty keyframes, and where the scale may ``jump`` by that share.
         """
-        walk = self._config.sigma_scale_walk
-        block = self._blocks.get(node.segment)
-        if block is None or node.key - block.since >= BLOCK or block.variance > walk**2:
-            before, sigma = NO_SCALE, self._config.sigma_scale
-            if block is not None:
-                before = block.key
-                sigma = float(np.sqrt(walk**2 * max(1.0, block.held / BLOCK) + block.variance))
-            key = self._smoother.append_scale(float(self._smoother.logs()[before]))
+        key, since, held = self._blocks.get(node.segment, (NO_SCALE, 0, 0))
+        if key == NO_SCALE or node.key - since >= BLOCK or jump:
+            before, since = key, node.key
+            log = float(self._smoother.logs()[before])
+            sigma = self._config.sigma_scale
+            if before != NO_SCALE:
+                walk = self._config.sigma_scale_walk * np.sqrt(max(1.0, held / BLOCK))
+                sigma = float(np.hypot(walk, jump))
+            key, held = self._smoother.append_scale(log), 0
             self._smoother.add_scale("scale", (before, key), 0.0, sigma)
-            block = self._blocks[node.segment] = _Block(key, node.key)
-        if self.scale_of[node.key] != block.key:
-            block.held += node.weight
-        self.scale_of[node.key] = block.key
-        return block.key
+        if self.scale_of[node.key] != key:
+            self._blocks[node.segment] = (key, since, held + node.weight)
+        self.scale_of[node.key] = key
+        return key
 
     def _connect(self, node: Node, last: Node, motion: F64, covariance: F64) -> None:
         """The motion between two keyframes; of an aligned segment, with its scale left open."""
         kind, scale = "vision" if node.segment == last.segment else "link", NO_SCALE
         if kind == "vision" and self._segments.known(node.segment) is not None:
-            block = self._blocks.get(node.segment)
-            if block is not None:
-                block.variance += _length_variance(node, last)
-            scale = self.scale_key(node)
+            jump = _length_sigma(node, last)
+            scale = self.scale_key(node, jump if jump > OPEN_LENGTH else 0.0)
         self._smoother.add_motion(kind, (last.key, node.key), motion, covariance, scale)
 
     def _seen(self, node: Node, last: Node) -> tuple[F64, F64]:
