@@ -167,6 +167,9 @@ class ImagesSource:
         return [i * step_ns for i in range(len(tags))], unix[0]
 
     def _warn(self, text: str) -> None:
+        """Warn once, however often the stills are read."""
+        if text in self.warnings:
+            return
         self.warnings.append(text)
         log.warning("%s: %s", self.description, text)
 

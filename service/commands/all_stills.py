@@ -84,7 +84,7 @@ def all_stills(
         inputs = replace(inputs, epoch_ns=epoch_ns, notes=(*inputs.notes, note))
     try:
         return _adjusted(inputs, stills, history)
-    except (ValueError, RuntimeError, np.linalg.LinAlgError, InputError) as error:
+    except (ValueError, RuntimeError, MemoryError, np.linalg.LinAlgError, InputError) as error:
         log.info("the stills are not adjusted together: %s", error)
         return inputs
 
