@@ -285,7 +285,8 @@ async def serve_live(
             await asyncio.wait({gone}, timeout=POLL_S)
     except (SkyreliefError, WebSocketDisconnect, RuntimeError) as error:
         log.debug("live view of %s ended: %s", folder, error)
-        reason = str(error) if isinstance(error, SkyreliefError) else ""
+        if isinstance(error, SkyreliefError):
+            reason = str(error).replace(f"{folder}/", "")
     finally:
         for opened in (index, store):
             if opened is not None:

@@ -226,8 +226,8 @@ def with_site(folder: Path, code: str) -> dict[str, str]:
 
 
 def scan_folders(scans: Path) -> list[Path]:
-    """The folders of scans by name; the service keeps a file of its own among them."""
-    return sorted(path for path in scans.iterdir() if path.is_dir())
+    """The folders of scans by name, if any yet; the service keeps a file of its own among them."""
+    return sorted(path for path in scans.glob("*") if path.is_dir())
 
 
 def stored(scans: Path) -> set[Chunk]:
