@@ -17,12 +17,8 @@ from recon import se3
 from recon.camera_model import project, rays
 from recon.mapping.registration import IcpConfig, register_projective
 from recon.tracking import matching, pnp
-from recon.tracking.common_view import common_view, features
+from recon.tracking.common_view import FEATURE_SHARES, common_view, features
 from recon.types import F32, F64, U8, Bool, DepthMap
-
-FEATURE_SHARES = (0.01, 0.03)
-"""Search radii around places that features predict, as shares of the width. The narrow one finds
-corners of rows that repeat."""
 
 MIN_RAD, MIN_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
@@ -167,19 +163,28 @@ def verify(
     warp = warps(a.K, b.K, T_b_a, uv, points)
     solved = _pose(pyramids, uv, points, predicted, warp, b, T_b_a, config)
     if solved is None:
-        view = common_view(features(a.gray), features(b.gray))
-        for share in FEATURE_SHARES if view is not None else ():
-            assert view is not None
-            there = view.predict(uv, share * b.gray.shape[1])
-            near = replace(config, search_share=share)
-            solved = _pose(pyramids, uv, points, there.uv, there.warp, b, None, near)
-            if solved is not None:
-                break
+        solved = _by_features(pyramids, uv, points, a, b, config)
     if solved is None:
         return None
     T_a_b = se3.inverse(solved.T_camera_points)
     A = se3.adjoint(T_a_b)
     return _with_icp(a, b, T_a_b, A @ solved.covariance @ A.T, solved, config)
+
+
+def _by_features(
+    pyramids: tuple[matching.Pyramid, ...], uv: F64, points: F64, a: LoopView, b: LoopView,
+    config: LoopConfig,
+) -> pnp.PnpResult | None:  # fmt: skip
+    """As :func:`_pose`, by the features that both images share."""
+    view = common_view(features(a.gray), features(b.gray))
+    if view is None:
+        return None
+    for share in FEATURE_SHARES:
+        there, near = view.predict(uv, share * b.gray.shape[1]), replace(config, search_share=share)
+        solved = _pose(pyramids, uv, points, there.uv, there.warp, b, None, near)
+        if solved is not None:
+            return solved
+    return None
 
 
 def landmarks(view: LoopView, config: matching.MatchingConfig) -> tuple[F64, F64]:

@@ -39,6 +39,11 @@ MIN_MATCHES, MIN_MATCH_SHARE = 14, 0.5
 NEAR_SHARE = 0.06
 """Matches within this share of the width say how far a place is off the homography."""
 
+FEATURE_SHARES = (0.01, 0.03)
+"""Search radii around places that features predict, as shares of the width, in the order in which
+they are tried: where texture repeats, as the rows of a field do, a wide search finds a second place
+as good."""
+
 SIGNATURE_WIDTH_PX, SIGNATURE, SIGNATURE_STEPS = 320, 200, 400.0
 """Image width and number of features that describe a view's appearance, and levels of a
 descriptor's byte."""

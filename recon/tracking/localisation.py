@@ -16,7 +16,7 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
-from recon.tracking.common_view import CommonView, FeatureCache
+from recon.tracking.common_view import FEATURE_SHARES, CommonView, FeatureCache
 from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame, landmarks
 from recon.tracking.prediction import Motion
 from recon.types import F64, I64, Bool, Camera, PosePrior
@@ -50,10 +50,6 @@ class OdometryConfig:
 
 RECALLED = 4
 """Newest keyframes that a frame is compared with by features."""
-
-FEATURE_SHARES = (0.01, 0.03)
-"""Search radii around places that features predict, in the order in which they are tried: where
-texture repeats, as the rows of a field do, a wide search finds a second place as good."""
 
 CLEAR_SHARE = 0.6
 """Share of the corners searched: if so many are found, no other start is tried."""
