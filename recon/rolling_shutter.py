@@ -26,10 +26,15 @@ STEADY_S = 0.15
 
 def row_times_s(camera: Camera) -> F64:
     """(N,) times of the rows from the middle, of columns where the shutter moves sideways."""
-    W, H = camera.size_px
-    n = W if camera.shutter.direction in ("right", "left") else H
-    sign = -1.0 if camera.shutter.direction in ("up", "left") else 1.0
-    return np.asarray(sign * camera.shutter.readout_s * ((np.arange(n) + 0.5) / n - 0.5))
+    rows = np.arange(camera.size_px[camera.shutter.axis], dtype=np.float64)
+    return camera.shutter.readout_s * row_shares(camera, rows)
+
+
+def row_shares(camera: Camera, px: F64 | float) -> F64:
+    """(N,) share of the readout, from the middle row, at which the image's rows ``px`` (N,) are
+    exposed; columns where the shutter moves sideways."""
+    shutter = camera.shutter
+    return np.asarray(shutter.sign * ((px + 0.5) / camera.size_px[shutter.axis] - 0.5))
 
 
 class RowClock:
@@ -40,14 +45,12 @@ class RowClock:
 
         ``readout_s`` may be set; it is negative against the shutter's direction.
         """
-        W, H = camera.size_px
+        axis, sign = camera.shutter.axis, camera.shutter.sign
         self.readout_s = camera.shutter.readout_s
-        self._sideways = camera.shutter.direction in ("right", "left")
-        axis, n = (0, W) if self._sideways else (1, H)
-        sign = -1.0 if camera.shutter.direction in ("up", "left") else 1.0
+        self._sideways = axis == 0
         self._distortion = camera.distortion
-        self._scale = sign * camera.K[axis, axis] / n
-        self._offset = sign * ((camera.K[axis, 2] + 0.5) / n - 0.5)
+        self._scale = sign * camera.K[axis, axis] / camera.size_px[axis]
+        self._offset = float(row_shares(camera, camera.K[axis, 2]))
 
     def reading(self, readout_s: float) -> RowClock:
         """The same rows, read in another time."""

@@ -96,6 +96,15 @@ def inverse(T: F64) -> F64:
     return out
 
 
+def each_inverse(T: F64) -> F64:
+    """(N, 4, 4) inverses of the motions (N, 4, 4)."""
+    out = np.zeros_like(T)
+    out[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
+    out[:, :3, 3] = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
+    out[:, 3, 3] = 1.0
+    return out
+
+
 def project_to_so3(T: F64) -> F64:
     """(4, 4) ``T`` with its rotation replaced by the nearest one, which removes rounding errors
     (polar decomposition; Higham 1986, doi:10.1137/0907079).

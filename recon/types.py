@@ -27,6 +27,8 @@ Array = npt.NDArray[Any]
 DIRECTIONS = ("down", "up", "right", "left")
 """Ways in which a rolling shutter moves over the image."""
 
+OPPOSITE = {"down": "up", "up": "down", "right": "left", "left": "right"}
+
 
 @dataclass(frozen=True, slots=True)
 class Shutter:
@@ -34,6 +36,21 @@ class Shutter:
 
     readout_s: float = 0.0  # from the first row to the last; 0: a global shutter
     direction: str = "down"  # of DIRECTIONS; right and left: columns take the part of rows
+
+    @property
+    def axis(self) -> int:
+        """Coordinate of a pixel that tells its row: 0 where columns take their part, else 1."""
+        return 0 if self.direction in ("right", "left") else 1
+
+    @property
+    def sign(self) -> float:
+        """1 where that coordinate grows with time, else -1."""
+        return -1.0 if self.direction in ("up", "left") else 1.0
+
+    def reading(self, readout_s: float) -> Shutter:
+        """The same rows read in another time; a negative one turns the direction round."""
+        way = OPPOSITE[self.direction] if readout_s < 0.0 else self.direction
+        return Shutter(abs(readout_s), way)
 
 
 GLOBAL_SHUTTER = Shutter()

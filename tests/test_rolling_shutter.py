@@ -61,6 +61,15 @@ def test_the_clock_counts_rows_of_the_distorted_image(direction: str) -> None:
     assert (times[0] < 0) == (direction in ("down", "right"))
 
 
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_a_negative_readout_is_that_of_the_opposite_direction(direction: str) -> None:
+    there = replace(LENS, shutter=Shutter(0.02, direction))
+    back = replace(LENS, shutter=Shutter(0.0, direction).reading(-0.02))
+    assert back.shutter.readout_s == 0.02
+    np.testing.assert_allclose(row_times_s(back), -row_times_s(there))
+    assert there.shutter.reading(0.03) == Shutter(0.03, direction)
+
+
 def test_pixels_go_to_the_middle_row_and_back() -> None:
     rng = np.random.default_rng(1)
     uv = rng.uniform([10, 10], [W - 10, H - 10], (200, 2))

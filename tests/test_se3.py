@@ -81,6 +81,7 @@ def test_motions_form_a_group(A: F64, B: F64, C: F64) -> None:
     np.testing.assert_allclose((A @ B) @ C, A @ (B @ C), atol=1e-8)
     np.testing.assert_allclose(A @ se3.inverse(A), np.eye(4), atol=1e-10)
     np.testing.assert_allclose(se3.inverse(A), np.linalg.inv(A), atol=1e-9)
+    np.testing.assert_allclose(se3.each_inverse(np.stack([A, B]))[1], se3.inverse(B), atol=1e-12)
     np.testing.assert_allclose(se3.inverse(A @ B), se3.inverse(B) @ se3.inverse(A), atol=1e-9)
     np.testing.assert_allclose(A[:3, :3] @ A[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(A[:3, :3]) == pytest.approx(1.0)

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from numba import njit
 
 from recon import se3
+from recon.rolling_shutter import row_shares
 from recon.small_matrices import invert_3x3
 from recon.types import F64, I64, Camera
 
@@ -80,18 +81,9 @@ class RowMotion:
 
     def by_row(self, camera: Camera, poses: F64, seen: Sightings) -> F64:
         """(M, 4, 4) T_world_camera of each sighting's row; ``poses`` (N, 4, 4) of the views."""
-        share = row_shares(camera, seen.uv_px)
-        T = np.array([se3.inverse(one) for one in poses])
-        return _inverses(
-            _of_rows(T[seen.view], self.turns[seen.view], self.moves[seen.view], share)
-        )
-
-
-def row_shares(camera: Camera, uv_px: F64) -> F64:
-    """(M,) share of the readout, from the middle row, at which distorted pixels are exposed."""
-    axis = 0 if camera.shutter.direction in ("right", "left") else 1
-    sign = -1.0 if camera.shutter.direction in ("up", "left") else 1.0
-    return np.asarray(sign * ((uv_px[:, axis] + 0.5) / camera.size_px[axis] - 0.5))
+        share = row_shares(camera, seen.uv_px[:, camera.shutter.axis])
+        T, own = se3.each_inverse(poses), seen.view
+        return se3.each_inverse(_of_rows(T[own], self.turns[own], self.moves[own], share))
 
 
 def _of_rows(T: F64, turns: F64, moves: F64, share: F64) -> F64:
@@ -101,15 +93,6 @@ def _of_rows(T: F64, turns: F64, moves: F64, share: F64) -> F64:
     rows[:, :3, :3], rows[:, 3, 3] = se3.each_so3_exp(w), 1.0
     rows[:, :3, 3] = t + 0.5 * np.cross(w, t)
     return np.asarray(rows @ T)
-
-
-def _inverses(T: F64) -> F64:
-    """(M, 4, 4) inverses of motions (M, 4, 4)."""
-    out = np.zeros_like(T)
-    out[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
-    out[:, :3, 3] = -np.einsum("mji,mj->mi", T[:, :3, :3], T[:, :3, 3])
-    out[:, 3, 3] = 1.0
-    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -303,7 +286,7 @@ def errors_px(
         poses, pose = rows.by_row(camera, poses, seen), np.arange(len(seen.view))
     k, k3 = _vector(camera), float(camera.distortion[4])
     X = np.ascontiguousarray(points)
-    _errors(_inverses(poses), X, k, k3, pose, seen.landmark, seen.uv_px, out)
+    _errors(se3.each_inverse(poses), X, k, k3, pose, seen.landmark, seen.uv_px, out)
     return np.asarray(np.hypot(out[:, 0], out[:, 1]))
 
 
@@ -393,10 +376,10 @@ class _Bundle:
         self._uv = np.ascontiguousarray(seen.uv_px[self._order], np.float64)
         self._sigma = np.ascontiguousarray(problem.sigma_px[self._order], np.float64)
         self._start_of = np.searchsorted(self._point, np.arange(P + 1)).astype(np.int64)
-        T = np.array([se3.inverse(one) for one in problem.poses])
+        T = se3.each_inverse(problem.poses)
         rows = problem.rows
         self._unknowns = 6 if rows is None else 9  # of a view
-        self._share = row_shares(problem.camera, self._uv)
+        self._share = row_shares(problem.camera, self._uv[:, problem.camera.shutter.axis])
         turns = np.zeros((len(T), 3)) if rows is None else rows.turns
         self.start = _State(T, np.array(problem.points, np.float64), _vector(problem.camera), turns)
         self._k3 = float(problem.camera.distortion[4])
@@ -594,7 +577,7 @@ class _Bundle:
         spread = np.asarray(np.linalg.inv(eq.Hk), np.float64)
         errors = np.empty(len(self._view))
         errors[self._order] = self._lengths(s)
-        poses = np.array([se3.inverse(one) for one in s.T])
+        poses = se3.each_inverse(s.T)
         known = self._covariances(eq, spread, poses) if covariances else np.zeros((0, 6, 6))
         camera, step = _camera(self._of.camera, s.k), spread @ eq.gk
         rows = None if self._of.rows is None else replace(self._of.rows, turns=s.turns)

@@ -21,7 +21,7 @@ from recon.calibration.global_bundle import (
     solve,
     step_covariances,
 )
-from recon.types import F64, Camera, Shutter
+from recon.types import F64, Camera
 
 LENS = SelfCalibrationConfig(sigma_focal=0.003, sigma_centre=0.003, sigma_k=0.01, sigma_p=0.0005)
 """How far a lens may be off that is calibrated, or found by the images. Held as it is, its errors
@@ -124,17 +124,13 @@ class _Adjustment:
 
     def result(self, turning: Turning, readout_s: float, sigma_s: float) -> Together:
         """The stills as they are adjusted now."""
-        way = self._at.camera.shutter.direction
-        shutter = Shutter(abs(readout_s), way if readout_s > 0.0 else OPPOSITE[way])
+        shutter = self._at.camera.shutter.reading(readout_s)
         rates = np.hstack([self.turns / readout_s, turning.rates[:, 3:]])
         return Together(
             replace(self._at.camera, shutter=shutter), self._at.poses, self._at.points,
             self._at.seen, rates, step_covariances(self._at), float(self._at.sigma_px[0]),
             readout_s, sigma_s,
         )  # fmt: skip
-
-
-OPPOSITE = {"down": "up", "up": "down", "right": "left", "left": "right"}
 
 
 def slope(rates: F64, turns: F64) -> tuple[float, float]:

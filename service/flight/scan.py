@@ -270,10 +270,8 @@ class Scan:
         found = None if search is None else search.estimate
         if found is None or not found.is_sure:
             return None
-        way = with_shutter(self.inputs.camera, self.inputs.config.camera).shutter.direction
-        if found.readout_s < 0:
-            way = {"down": "up", "up": "down", "right": "left", "left": "right"}[way]
-        return Shutter(abs(found.readout_s), way)
+        camera = with_shutter(self.inputs.camera, self.inputs.config.camera)
+        return camera.shutter.reading(found.readout_s)
 
     def _readout(self) -> dict[str, Any] | None:
         """The readout by the images; None where it was not sought or does not show."""

@@ -94,7 +94,7 @@ class Renderer:
         depth = np.empty((H, W))
         body = np.empty((H, W), np.int32)
         tables = self._tables()
-        sideways = self.camera.shutter.direction in ("right", "left")
+        sideways = self.camera.shutter.axis == 0
         poses = np.broadcast_to(T_world_camera, (W if sideways else H, 4, 4))
         R, c = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
         focal = float(0.5 * (self.camera.K[0, 0] + self.camera.K[1, 1]))
