@@ -36,8 +36,9 @@ ZIP_PART_BYTES = 1 << 20
 SEQ = re.compile(r"[0-9]{1,9}")
 
 JPEG_QUALITY = 82
-EARLIER_KEYFRAMES = 12
-"""Keyframes that complete the image of one, where it brought nothing new."""
+EARLIER_KEYFRAMES, EARLIER_NS = 12, 300 * 10**9
+"""Keyframes that complete the image of one, where it brought nothing new, and how long before. In
+flight an image is asked for with each keyframe; to read all poses of an hour takes 2 s."""
 
 DARK = (45, 38, 32)
 SANDBOX = {
@@ -135,12 +136,16 @@ def _image(request: Request) -> Response:
         keyframe = store.keyframe(seq)
         if keyframe is None:
             raise InputError("no such keyframe")
-        where = {p.keyframe_seq: p.T_world_camera[:3, 3] for p in store.poses()}
+        where = {
+            p.keyframe_seq: p.T_world_camera[:3, 3]
+            for p in store.poses(keyframe.time_ns - EARLIER_NS)
+        }
         here = keyframe.depth.T_world_camera[:3, 3]
-        earlier = sorted(
-            (s for s in reversed(store.seqs()) if s < seq),  # a site's have no poses: the newest
-            key=lambda s: float(np.linalg.norm(where.get(s, here) - here)),
-        )[:EARLIER_KEYFRAMES]
+        before = [s for s in reversed(store.seqs()) if s < seq]
+        placed = [s for s in before if s in where] or before  # a site's have no poses: the newest
+        earlier = sorted(placed, key=lambda s: float(np.linalg.norm(where.get(s, here) - here)))[
+            :EARLIER_KEYFRAMES
+        ]
         bgr, known = _completed(keyframe, filter(None, map(store.keyframe, earlier)))
     ok, data = cv2.imencode(".jpg", _closed(bgr, known), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not ok:

@@ -309,11 +309,11 @@ class ScanStore:
             self._inventory.note("pose", number)
             return True
 
-    def poses(self) -> Iterator[PoseRecord]:
-        """All poses in order of time; of several at one time only the newest."""
-        newest = "SELECT MAX(id) FROM poses GROUP BY time_unix_ns"
+    def poses(self, since_unix_ns: int = -(1 << 63)) -> Iterator[PoseRecord]:
+        """All poses since then in order of time; of several at one time only the newest."""
+        newest = "SELECT MAX(id) FROM poses WHERE time_unix_ns >= ? GROUP BY time_unix_ns"
         for (data,) in self._db.all(
-            f"SELECT data FROM poses WHERE id IN ({newest}) ORDER BY time_unix_ns"
+            f"SELECT data FROM poses WHERE id IN ({newest}) ORDER BY time_unix_ns", (since_unix_ns,)
         ):
             pose = unpack_pose(blob(data))
             if pose is not None:
