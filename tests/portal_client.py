@@ -42,6 +42,8 @@ NEEDS = [
     pytest.mark.skipif(not (PAGE / "index.html").is_file(), reason="needs the built page"),
 ]
 """Marks of a test in a real browser."""
+VEHICLE_SHOWN = "document.querySelector('.vehicle:not([hidden]) .state:not([hidden])') !== null"
+"""The page shows a connected vehicle: before its first answer the strip alone is hidden."""
 
 
 class Client:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from loopback import free_port
 from person import Browser
-from portal_client import NEEDS, TOKEN, browser, flown_store, listing
+from portal_client import NEEDS, TOKEN, VEHICLE_SHOWN, browser, flown_store, listing
 from rehearsal import RehearsalVehicle
 from site_scans import Box, Errors, leg, write_scan
 
@@ -185,8 +185,7 @@ def test_the_buttons_reach_the_vehicle_and_show_its_answer(browser: Browser, sca
         with RehearsalVehicle(f"udpout:127.0.0.1:{port}") as daemon:
             vehicle.start()
             browser.open(one.url)
-            browser.wait("!document.querySelector('.vehicle').hidden", 30)
-            browser.wait("!document.querySelector('.vehicle .state').hidden", 30)
+            browser.wait(VEHICLE_SHOWN, 30)
             browser.click("Start scan")
             browser.wait("document.querySelector('.note').textContent === 'start: accepted'")
             browser.dialog = "2.5"

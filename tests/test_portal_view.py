@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from loopback import free_port
 from person import Browser, Page
-from portal_client import NEEDS, TOKEN, browser
+from portal_client import NEEDS, TOKEN, VEHICLE_SHOWN, browser
 from rehearsal import RehearsalVehicle
 
 from mavlink.component.control import Answer, Result
@@ -296,7 +296,7 @@ def test_a_refused_stop_shows_the_companions_own_words(browser: Browser, store: 
             companion.control.answers["stop_scan"] = Answer(Result.DENIED, "the disk is in use")
             vehicle.start()
             browser.open(one.url)
-            browser.wait("!document.querySelector('.vehicle .state').hidden", 30)
+            browser.wait(VEHICLE_SHOWN, 30)
             browser.click("Start scan")
             browser.wait("document.querySelector('.note').textContent === 'start: accepted'")
             browser.click("Stop scan")

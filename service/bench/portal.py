@@ -69,7 +69,7 @@ class Page:
         deadline = time.monotonic() + timeout_s
         while not (value := self.run(quiet)):
             if time.monotonic() >= deadline:
-                raise RuntimeError("the page did not get there in time")
+                raise RuntimeError(f"the page did not get there in {timeout_s:g} s: {script}")
             self.page.wait_for_timeout(50.0)
         return value
 
