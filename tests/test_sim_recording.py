@@ -133,6 +133,13 @@ def test_tlog_is_read_by_pymavlink_with_the_right_rates(exact: Path) -> None:
     for message in by_kind["SYSTEM_TIME"]:
         assert message.time_unix_usec / 1e6 == pytest.approx(message._timestamp, abs=0.002)
     assert {m.flags for m in by_kind["GIMBAL_DEVICE_ATTITUDE_STATUS"]} == {4 | 8 | 64}
+    gyroscopes = np.array([(m.rollspeed, m.pitchspeed, m.yawspeed) for m in by_kind["ATTITUDE"]])
+    turned = Rotation.from_euler("ZYX", [(m.yaw, m.pitch, m.roll) for m in by_kind["ATTITUDE"]])
+    lag = 25  # half a second, so that the noise of two attitudes counts little
+    between = (turned[:-lag].inv() * turned[lag:]).as_rotvec()
+    summed = np.array([gyroscopes[k : k + lag].sum(axis=0) for k in range(len(between))]) / 50.0
+    assert np.abs(between).max() > 0.03
+    np.testing.assert_allclose(summed, between, atol=0.008)
 
 
 def test_messages_give_the_true_camera_pose(exact: Path) -> None:

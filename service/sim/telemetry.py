@@ -144,11 +144,25 @@ def _attitude(sensors: Sensors, duration_s: float, dialect: Any) -> Iterator[Tim
     """ATTITUDE at 50 Hz."""
     t = _times(50.0, duration_s)
     rpy = sensors.vehicle_rpy(t)
-    rate = np.gradient(sensors.flight.vehicle_rpy(t), t, axis=0)
+    rates = _body_rates(sensors.flight.vehicle_rpy(t), t)
     for k, boot in enumerate(_boot_ms(t)):
         yaw = float((rpy[k, 2] + np.pi) % (2 * np.pi) - np.pi)
-        message = dialect.MAVLink_attitude_message(int(boot), rpy[k, 0], rpy[k, 1], yaw, *rate[k])
+        message = dialect.MAVLink_attitude_message(int(boot), rpy[k, 0], rpy[k, 1], yaw, *rates[k])
         yield message, 1, float(t[k])
+
+
+def _body_rates(rpy: F64, t: F64) -> F64:
+    """(T, 3) rad/s about the body's axes, as gyroscopes measure them."""
+    roll, pitch, _ = rpy.T
+    d_roll, d_pitch, d_yaw = np.gradient(rpy, t, axis=0).T
+    right, down = np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)
+    return np.column_stack(
+        [
+            d_roll - np.sin(pitch) * d_yaw,
+            np.cos(roll) * d_pitch + right * d_yaw,
+            -np.sin(roll) * d_pitch + down * d_yaw,
+        ]
+    )
 
 
 def _gimbal(
