@@ -123,6 +123,15 @@ def test_samples_make_sense_or_there_are_none() -> None:
     d = dialect
     assert sample(attitude(1, float("nan"))) is None
     assert sample(d.MAVLink_attitude_quaternion_message(1, 0, 0, 0, 0, 0, 0, 0)) is None
+    for kind, angles in (
+        (d.MAVLink_attitude_message, (0.1, 0.2, 0.3)),
+        (d.MAVLink_attitude_quaternion_message, (1.0, 0.0, 0.0, 0.0)),
+    ):
+        turning = sample(kind(1, *angles, 0.25, -0.5, 2.0))
+        assert turning.rates_rad_s == (0.25, -0.5, 2.0)
+        for rates in ((0.0, 0.0, 0.0), (0.1, float("nan"), 0.0), (0.1, 0.0, -36.0)):
+            unknown = sample(kind(1, *angles, *rates))
+            assert unknown.rates_rad_s is None and unknown.q_ned_body == turning.q_ned_body
     nowhere = d.MAVLink_global_position_int_message(1, 0, 0, 5, 5, 0, 0, 0, 0)
     assert sample(nowhere) is None
     off = d.MAVLink_global_position_int_message(1, 2**31 - 1, 0, 5, 5, 0, 0, 0, 0)

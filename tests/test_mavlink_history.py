@@ -166,6 +166,40 @@ def test_attitude_is_interpolated_along_the_shorter_arc_and_covered_by_its_sigma
         assert max(ratios) < 1.0  # this smooth a flight bends less than the sigma allows for
 
 
+@pytest.mark.parametrize("gap_s", [0.1, 0.3])
+def test_rates_at_both_ends_bend_the_way_between_two_attitudes(gap_s: float) -> None:
+    """A quadrotor rocks in gusts, its radio is slow."""
+
+    def truth(t: float) -> Rotation:
+        rocking = 0.12 * math.sin(5.0 * t), 0.05 * math.sin(3.3 * t + 1.0)
+        return Rotation.from_euler("ZYX", (0.9 * t, rocking[1], rocking[0]))
+
+    def rates(t: float) -> tuple[float, float, float]:
+        x, y, z = (truth(t - 1e-4).inv() * truth(t + 1e-4)).as_rotvec() / 2e-4
+        return (float(x), float(y), float(z))
+
+    errors, sigmas = [], []
+    for known in (False, True):
+        history = VehicleHistory()
+        for t in np.arange(0.0, 8.0, gap_s).tolist():
+            sample = AttitudeSample(None, of_scipy(truth(t)), rates(t) if known else None)
+            history.add(sample, T0 + round(t * S))
+        off = []
+        for t in np.linspace(0.5, 7.0, 200).tolist():
+            state = history.state_at(T0 + round(t * S))
+            assert state is not None and state.q_ned_body_wxyz is not None
+            off.append(angle(state.q_ned_body_wxyz, of_scipy(truth(t))))
+        errors.append(np.sqrt(np.mean(np.square(off))))
+        between = history.state_at(T0 + round((1.0 + gap_s / 2) * S))
+        assert between is not None and between.sigma_attitude_rad is not None
+        sigmas.append(between.sigma_attitude_rad)
+    assert errors[1] < 0.2 * errors[0] and max(off) < sigmas[1] < sigmas[0]
+    past = history.state_at((history.last_ns or 0) + 15 * MS)
+    assert past is not None and past.q_ned_body_wxyz is not None
+    t = ((history.last_ns or 0) - T0) / S + 0.015
+    assert angle(past.q_ned_body_wxyz, of_scipy(truth(t))) < 0.01
+
+
 def test_attitude_sigma_grows_with_the_gap() -> None:
     sigmas = []
     for gap_ms in (20, 200, 400, 800, 1000):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mavlink.telemetry.gimbal import frame_of_flags
-from mavlink.telemetry.quaternion import from_rpy, normalised
+from mavlink.telemetry.quaternion import Vector, from_rpy, normalised
 from mavlink.telemetry.samples import (
     RECEIVER_SIGMA_H_M,
     RECEIVER_SIGMA_V_M,
@@ -30,6 +30,7 @@ UNKNOWN_U16 = 65535
 UNIX_USEC = 10**15  # a time_usec beyond this is unix time, not time since boot
 TERRAIN_MODEL_SIGMA_M = 5.0
 CLEARANCE_SIGMA_M = 1.0
+MAX_RATE_RAD_S = 35.0  # the range of usual gyroscopes, 2000 degrees/s
 
 
 def decode(message: Message) -> Sample | None:
@@ -41,12 +42,19 @@ def decode(message: Message) -> Sample | None:
 def _attitude(m: Message) -> Sample | None:
     if not _finite(m.roll, m.pitch, m.yaw):
         return None
-    return AttitudeSample(m.time_boot_ms, from_rpy(m.roll, m.pitch, m.yaw))
+    return AttitudeSample(m.time_boot_ms, from_rpy(m.roll, m.pitch, m.yaw), _rates(m))
 
 
 def _attitude_quaternion(m: Message) -> Sample | None:
     q = normalised((m.q1, m.q2, m.q3, m.q4))
-    return None if q is None else AttitudeSample(m.time_boot_ms, q)
+    return None if q is None else AttitudeSample(m.time_boot_ms, q, _rates(m))
+
+
+def _rates(m: Message) -> Vector | None:
+    """Rates of the body by its gyroscopes; None where the sender fills in zeros."""
+    rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
+    is_plausible = _finite(*rates) and max(map(abs, rates)) <= MAX_RATE_RAD_S
+    return rates if is_plausible and any(rates) else None
 
 
 def _global_position(m: Message) -> Sample | None:

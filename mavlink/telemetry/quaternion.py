@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 
 Quaternion = tuple[float, float, float, float]
+Vector = tuple[float, float, float]
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -95,3 +96,40 @@ def slerp(a: Quaternion, b: Quaternion, fraction: float) -> Quaternion:
     w, x, y, z = (ka * p + kb * q for p, q in zip(a, b, strict=True))
     length = math.sqrt(w * w + x * x + y * y + z * z)
     return (w / length, x / length, y / length, z / length)
+
+
+def curve(
+    a: Quaternion, b: Quaternion, rates_a: Vector, rates_b: Vector, gap_s: float, fraction: float
+) -> Quaternion:
+    """The rotation ``fraction`` of the way from a to b, which are ``gap_s`` apart.
+
+    A cubic Hermite curve of the rotation vector from a. Rates are rad/s about the axes of the
+    body; at b they are taken to derivatives of that vector, to second order.
+    """
+    turn = rotation_vector(multiply(conjugate(a), b))
+    across = cross(turn, rates_b)
+    twice = cross(turn, across)
+    u = fraction
+    h10, h01, h11 = u * (1 - u) ** 2, u * u * (3 - 2 * u), u * u * (u - 1)
+    x, y, z = (
+        h10 * gap_s * rates_a[k]
+        + h01 * turn[k]
+        + h11 * gap_s * (rates_b[k] + across[k] / 2 + twice[k] / 12)
+        for k in range(3)
+    )
+    angle = math.sqrt(x * x + y * y + z * z)
+    scale = 0.5 if angle < 1e-6 else math.sin(angle / 2) / angle
+    return multiply(a, (math.cos(angle / 2), scale * x, scale * y, scale * z))
+
+
+def rotation_vector(q: Quaternion) -> Vector:
+    """Axis times angle, rad, of the shorter way."""
+    w, x, y, z = q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
+    length = math.sqrt(x * x + y * y + z * z)
+    scale = 2.0 if length < 1e-9 else 2.0 * math.atan2(length, w) / length
+    return (scale * x, scale * y, scale * z)
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """The vector product."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

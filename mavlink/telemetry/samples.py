@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from mavlink.telemetry.quaternion import Quaternion
+from mavlink.telemetry.quaternion import Quaternion, Vector
 
 RECEIVER_SIGMA_H_M, RECEIVER_SIGMA_V_M = 2.1, 3.5
 """1 sigma per axis of a receiver that reports no accuracy: a circular error of 2.5 m, from the data
@@ -38,6 +38,7 @@ class AttitudeSample(Sample):
     """Attitude of the body."""
 
     q_ned_body: Quaternion
+    rates_rad_s: Vector | None = None  # of the body, about its own axes
 
 
 @dataclass(frozen=True, slots=True)
