@@ -33,6 +33,10 @@ USUAL_S = 0.03
 ROUNDS = 5
 """In which the readout and the turns settle."""
 
+PATCHES = 25
+"""Of an image, whose sightings share an error. Over flat ground a turn that all images share shows
+only in differences far smaller than a pixel, so such errors would decide about it."""
+
 MIN_SIGMAS = 3.0
 """A readout that differs from none by less is not used."""
 
@@ -106,7 +110,8 @@ class _Adjustment:
         problem = Problem(
             s.camera, camera, s.poses, s.points, net.seen, pixel, known, held, rows=s.rows
         )
-        wider = max(float(np.sqrt(dispersion(problem))), 1.0)
+        crowd = np.median(np.bincount(net.seen.view)) / PATCHES
+        wider = float(np.sqrt(max(dispersion(problem), crowd, 1.0)))
         self._at = replace(
             problem, sigma_px=wider * pixel, huber_sigmas=problem.huber_sigmas / wider
         )
