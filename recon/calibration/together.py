@@ -93,6 +93,7 @@ def together(
     if not readout_s or abs(readout_s) < MIN_SIGMAS * sigma_s:
         found = f"{1e3 * readout_s:.1f} ms, sigma {1e3 * sigma_s:.1f} ms"
         raise ValueError(f"the stills do not show a rolling shutter ({found})")
+    stills.weigh_patches()
     stills.adjust(turning.rows(readout_s, abs(readout_s) * turning.sigma_rad_s))
     return stills.result(turning, readout_s, sigma_s)
 
@@ -110,11 +111,9 @@ class _Adjustment:
         problem = Problem(
             s.camera, camera, s.poses, s.points, net.seen, pixel, known, held, rows=s.rows
         )
-        crowd = np.median(np.bincount(net.seen.view)) / PATCHES
-        wider = float(np.sqrt(max(dispersion(problem), crowd, 1.0)))
-        self._at = replace(
-            problem, sigma_px=wider * pixel, huber_sigmas=problem.huber_sigmas / wider
-        )
+        self._at = _widened(problem, max(float(np.sqrt(dispersion(problem))), 1.0))
+        crowd = float(np.sqrt(np.median(np.bincount(net.seen.view)) / PATCHES))
+        self._of_patches = max(crowd * net.sigma_px / float(self._at.sigma_px[0]), 1.0)
 
     @property
     def turns(self) -> F64:
@@ -127,6 +126,10 @@ class _Adjustment:
         s = solve(replace(self._at, rows=replace(rows, turns=self.turns)))
         self._at = replace(self._at, camera=s.camera, poses=s.poses, points=s.points, rows=s.rows)
 
+    def weigh_patches(self) -> None:
+        """Take all sightings in a patch of an image for one."""
+        self._at = _widened(self._at, self._of_patches)
+
     def result(self, turning: Turning, readout_s: float, sigma_s: float) -> Together:
         """The stills as they are adjusted now."""
         shutter = self._at.camera.shutter.reading(readout_s)
@@ -138,13 +141,19 @@ class _Adjustment:
         )  # fmt: skip
 
 
+def _widened(problem: Problem, by: float) -> Problem:
+    """The problem with sightings that scatter more; Huber's limit stays the same in pixels."""
+    return replace(problem, sigma_px=by * problem.sigma_px, huber_sigmas=problem.huber_sigmas / by)
+
+
 def slope(rates: F64, turns: F64) -> tuple[float, float]:
     """Seconds by which turns (N, 3) rad follow rates (N, 3) rad/s, and their sigma.
 
-    The heading takes no part: flat ground shows its turn hardly apart from the pose.
+    Flat ground shows the heading's turn hardly apart from the pose, so it takes no part, nor a turn
+    that is common to all images.
     """
-    x, y = rates[:, :2].ravel(), turns[:, :2].ravel()
+    x, y = ((a[:, :2] - a[:, :2].mean(axis=0)).ravel() for a in (rates, turns))
     power = float(x @ x)
     found = float(x @ y) / power
     off = y - found * x
-    return found, float(np.sqrt(off @ off / (len(x) - 1) / power))
+    return found, float(np.sqrt(off @ off / (len(x) - 3) / power))
