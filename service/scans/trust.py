@@ -17,6 +17,10 @@ MAX_SCALE_SIGMA = 0.05
 MAX_SLOPE_DEG = 30.0
 """Above this slope, with an assumed view direction, the site was not seen from above."""
 
+MIN_LEAN_DEG = 3.0
+"""From this slope on, with an assumed view direction, the slope itself is in doubt: cameras that
+look 15 degrees ahead make level ground lean by 10."""
+
 MIN_PLACED_SHARE = 0.5
 """Share of the frames; below it vision was lost for most of the flight."""
 
@@ -81,6 +85,11 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     if "distortion" in assumed:
         limits.append(
             "the lens's distortion is unknown: surfaces bend by a percent of the distance"
+        )
+    if "view" in assumed and slope_deg > MIN_LEAN_DEG:
+        limits.append(
+            f"the view direction is assumed: the site's slope of {slope_deg:.0f} degrees may not "
+            "be real"
         )
     if refused > REFUSED_SHARE * measured:
         limits.append(f"{contradicted}: they are less certain than sigma says")
