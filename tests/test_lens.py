@@ -145,6 +145,11 @@ def test_the_images_may_correct_the_makers_calibration(tmp_path: Path) -> None:
     assert start.search.sigma_focal >= 0.01 and start.search.sigma_centre >= 0.014
 
 
+def test_the_makers_focal_length_alone_leaves_the_distortion_open(tmp_path: Path) -> None:
+    write_still(tmp_path / "a.jpg", (1600, 1200), {}, xmp_of({"CalibratedFocalLength": "1913.3"}))
+    assert start_lens(open_camera(str(tmp_path)), None).assumed == ("distortion",)
+
+
 @pytest.mark.parametrize(
     "photo", [{}, {37386: 0.0, 41989: 0}, {41989: 4}, {37386: 4.5, 41486: 1e9, 41488: 2}]
 )
