@@ -27,6 +27,7 @@ from service.commands.own_lens import start_lens
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 DEWARP = "2020-05-27;3666.66,3665.99,-27.8,30.0,-0.269,0.112,0.0003,-0.0001,-0.033"
+DEWARP_1600 = "2022-03-02;1973.1,1955.7,-19.0,-11.4,-0.423,0.369,0.0041,0.0041,-0.264"
 
 
 def marked(size_px: tuple[int, int]) -> U8:
@@ -136,6 +137,19 @@ def test_the_makers_distortion_and_middle_are_read(tmp_path: Path) -> None:
         assert camera.K[1, 2] == pytest.approx(1977.5 + 30.0)
 
 
+def test_the_images_may_correct_the_makers_calibration(tmp_path: Path) -> None:
+    write_still(tmp_path / "a.jpg", (1600, 1200), {}, xmp_of({"DewarpData": DEWARP_1600}))
+    start = start_lens(open_camera(str(tmp_path)), None)
+    assert start.camera.distortion[0] == pytest.approx(-0.423) and start.assumed == ()
+    # Of a real one, the focal length was off by 1 % and the middle by 1.4 % of the width.
+    assert start.search.sigma_focal >= 0.01 and start.search.sigma_centre >= 0.014
+
+
+def test_the_makers_focal_length_alone_leaves_the_distortion_open(tmp_path: Path) -> None:
+    write_still(tmp_path / "a.jpg", (1600, 1200), {}, xmp_of({"CalibratedFocalLength": "1913.3"}))
+    assert start_lens(open_camera(str(tmp_path)), None).assumed == ("distortion",)
+
+
 @pytest.mark.parametrize(
     "photo", [{}, {37386: 0.0, 41989: 0}, {41989: 4}, {37386: 4.5, 41486: 1e9, 41488: 2}]
 )
@@ -229,7 +243,7 @@ def test_a_video_without_a_model_has_the_lens_of_its_telemetry(
     assert start.camera.K[0, 0] == pytest.approx(fx_px, rel=1e-4)
     assert start.camera.K[:2, 2] == pytest.approx((959.5, 539.5))
     assert not start.camera.distortion.any() and start.assumed == ("lens",) and of in start.note
-    assert start.search is not None and 3.0 * start.search.sigma_focal > 0.05
+    assert 3.0 * start.search.sigma_focal > 0.05
 
 
 def test_a_video_is_turned_as_it_asks_players_to(tmp_path: Path) -> None:

@@ -45,8 +45,28 @@ def test_the_weakest_fact_sets_the_level(
 def test_a_site_that_leans_was_not_seen_from_above() -> None:
     leaning = trust_of(SURE | {"assumed": ["view"]}, "gnss", 60.0)
     assert leaning["level"] == "doubtful" and "60 degrees" in leaning["reasons"][0]
-    assert trust_of(SURE | {"assumed": ["view"]}, "gnss", 10.0)["level"] == "georeferenced"
+    unsure = trust_of(SURE | {"assumed": ["view"]}, "exif", 10.0)
+    assert unsure["level"] == "georeferenced"
+    assert "slope of 10 degrees may not be real" in unsure["reasons"][0]
+    assert trust_of(SURE | {"assumed": ["view"]}, "exif", 2.0)["reasons"] == []
     assert trust_of(SURE, "gnss", 60.0)["level"] == "georeferenced"
+
+
+@pytest.mark.parametrize(
+    ("refused", "level", "reason"),
+    [
+        (1, "georeferenced", ""),
+        (6, "georeferenced", "6 of 17 positions contradict the track: they are less certain"),
+        (12, "doubtful", "12 of 23 positions contradict the track"),
+    ],
+)
+def test_positions_that_contradict_the_track_limit_it(
+    refused: int, level: str, reason: str
+) -> None:
+    graph = {"left_out": {"position off": refused}, "residuals": {"position": {"count": 11}}}
+    found = trust_of(SURE | {"graph": graph}, "exif")
+    assert found["level"] == level
+    assert [reason] == [text[: len(reason)] for text in found["reasons"] or [""]]
 
 
 @pytest.mark.parametrize("angle", [0.0, 20.0, 80.0])
@@ -60,6 +80,8 @@ def test_the_slope_of_a_site_is_found_in_spite_of_towers(angle: float) -> None:
     assert slope_deg(flat[:2]) == 0.0
 
 
-@pytest.mark.parametrize("run", [{}, {"assumed": 3, "scale": [], "frames": "x"}])
+@pytest.mark.parametrize(
+    "run", [{}, {"assumed": 3, "scale": [], "frames": "x", "graph": {"residuals": 1}}]
+)
 def test_a_run_that_notes_nothing_limits_nothing(run: dict[str, Any]) -> None:
     assert trust_of(run, "gnss")["level"] == "georeferenced"

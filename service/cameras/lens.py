@@ -32,7 +32,7 @@ SIGMA_FOCAL = 0.02
 """Relative sigma of a focal length in tags: it is that of the lens's model, and rounded; two real
 cameras had 0.5 % less and 3.7 % more (docs/reports/accuracy.md)."""
 
-CALIBRATED = "the maker's calibration"
+CALIBRATED, FOCAL_ALONE = "the maker's calibration", "the maker's focal length"
 AGREEMENT = 0.1
 """A focal length that differs more from the 35 mm equivalent belongs to another size of the image:
 programs that shrink images keep such tags unchanged."""
@@ -117,7 +117,7 @@ def _is_sound(lens: Lens, size_px: tuple[int, int]) -> bool:
 def _maker(
     photo: Mapping[int, Any], xmp: Mapping[str, str], size_px: tuple[int, int]
 ) -> Lens | None:
-    """DJI's calibration: pixels of the full image."""
+    """DJI's calibration, or its focal length and centre alone: pixels of the full image."""
     side = _taken_side(photo, size_px)
     numbers = _numbers(xmp.get("DewarpData", "").partition(";")[2], 9)
     is_straight = xmp.get("DewarpFlag", "0").strip() == "1"
@@ -131,7 +131,7 @@ def _maker(
     W, H = (side * n / max(size_px) for n in size_px)
     x, y = (_number(xmp.get(f"CalibratedOpticalCenter{axis}")) for axis in "XY")
     middle = (0.0, 0.0) if x is None or y is None else ((x - W / 2) / side, (y - H / 2) / side)
-    return Lens(focal / side, middle, source=CALIBRATED)
+    return Lens(focal / side, middle, source=FOCAL_ALONE)
 
 
 def _pix4d(
@@ -148,7 +148,9 @@ def _pix4d(
     middle = (0.0, 0.0)
     if point is not None:
         middle = ((point[0] * per_mm - W / 2) / side, (point[1] * per_mm - H / 2) / side)
-    bent = _numbers(xmp.get("PerspectiveDistortion", ""), 5) or [0.0] * 5
+    bent = _numbers(xmp.get("PerspectiveDistortion", ""), 5)
+    if bent is None:
+        return Lens(focal * per_mm / side, middle, source=FOCAL_ALONE)
     k1, k2, k3, p1, p2 = bent
     return Lens(focal * per_mm / side, middle, (k1, k2, p1, p2, k3), CALIBRATED)
 

@@ -57,7 +57,7 @@ class StartLens:
     camera: Camera
     note: str
     assumed: tuple[str, ...]  # of "lens", "distortion"
-    search: SelfCalibrationConfig | None  # how the images may change it; None: it is calibrated
+    search: SelfCalibrationConfig  # how the images may change it
 
 
 def start_lens(source: CameraSource, telemetry: TelemetryLog | None) -> StartLens:
@@ -65,7 +65,7 @@ def start_lens(source: CameraSource, telemetry: TelemetryLog | None) -> StartLen
     if isinstance(source, ImagesSource) and source.lens is not None and source.camera is not None:
         f, side, known = source.lens.focal, max(source.size_px), source.lens.is_calibrated
         note = f"taken from {source.lens.source} ({f * side:.0f} px)"
-        search = None if source.camera.distortion.any() else by_tags(source.lens.sigma_focal)
+        search = by_tags(source.lens.sigma_focal)
         return StartLens(source.camera, _advice(note), () if known else ("distortion",), search)
     lens, of, search = ASSUMED, "70 degrees", OPEN
     if telemetry is not None and telemetry.focal_35mm is not None:

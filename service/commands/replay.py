@@ -206,7 +206,7 @@ def _with_lens(
     from service.flight.scan import check_new
 
     found = None
-    if find_lens and start.search is not None and parse_source(video)[0] in ("file", "images"):
+    if find_lens and parse_source(video)[0] in ("file", "images"):
         check_new(inputs.folder)
         progress("finding the lens")
         found = own_lens(inputs, video, start.search)

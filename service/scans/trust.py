@@ -17,9 +17,17 @@ MAX_SCALE_SIGMA = 0.05
 MAX_SLOPE_DEG = 30.0
 """Above this slope, with an assumed view direction, the site was not seen from above."""
 
+MIN_LEAN_DEG = 3.0
+"""From this slope on, with an assumed view direction, the slope itself is in doubt: cameras that
+look 15 degrees ahead make level ground lean by 10."""
+
 MIN_PLACED_SHARE = 0.5
 """Share of the frames; below it vision was lost for most of the flight."""
 
+
+REFUSED_SHARE, WRONG_SHARE = 0.2, 0.5
+"""Of the measured positions, that contradict the track. Above the first, positions are less certain
+than sigma says; above the second, either may be wrong."""
 
 FIRST_TELEMETRY = "first telemetry"
 """``scale.from`` of a scan whose segments are all too short to be fitted to telemetry."""
@@ -39,7 +47,7 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
 
     Args:
         run: figures of the scan's run: ``assumed``, ``scale``, ``frames``,
-            ``frames_tracked``. Missing or malformed ones limit nothing.
+            ``frames_tracked``, ``graph``. Missing or malformed ones limit nothing.
         georeference: of the scan's header; "none" without.
         slope_deg: of the plane through the cloud.
     """
@@ -59,6 +67,10 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     frames, tracked = _number(run, "frames"), _number(run, "frames_tracked")
     if frames and tracked is not None and tracked < MIN_PLACED_SHARE * (frames - 1):
         doubts.append(f"vision placed only {tracked:.0f} of {frames:.0f} frames")
+    refused, measured = _refused_positions(run)
+    contradicted = f"{refused:.0f} of {measured:.0f} positions contradict the track"
+    if refused > WRONG_SHARE * measured:
+        doubts.append(contradicted)
     if doubts:
         return _said(Trust.DOUBTFUL, doubts)
     if "height" in assumed:
@@ -69,10 +81,29 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         return _said(Trust.RELATIVE, [f"the scale is uncertain by {scale_sigma:.0%}"])
     if georeference == "none":
         return _said(Trust.SCALED, ["no positions: the scan has its own origin and heading"])
+    limits = []
     if "distortion" in assumed:
-        bent = "the lens's distortion is unknown: surfaces bend by a percent of the distance"
-        return _said(Trust.GEOREFERENCED, [bent])
-    return _said(Trust.GEOREFERENCED, [])
+        limits.append(
+            "the lens's distortion is unknown: surfaces bend by a percent of the distance"
+        )
+    if "view" in assumed and slope_deg > MIN_LEAN_DEG:
+        limits.append(
+            f"the view direction is assumed: the site's slope of {slope_deg:.0f} degrees may not "
+            "be real"
+        )
+    if refused > REFUSED_SHARE * measured:
+        limits.append(f"{contradicted}: they are less certain than sigma says")
+    return _said(Trust.GEOREFERENCED, limits)
+
+
+def _refused_positions(run: Mapping[str, Any]) -> tuple[float, float]:
+    """Number of measured positions that the pose graph left out, and of all."""
+    graph = run.get("graph")
+    graph = graph if isinstance(graph, Mapping) else {}
+    residuals = graph.get("residuals")
+    used = residuals.get("position") if isinstance(residuals, Mapping) else None
+    refused = _number(graph.get("left_out"), "position off") or 0.0
+    return refused, refused + (_number(used, "count") or 0.0)
 
 
 def _said(level: Trust, reasons: list[str]) -> dict[str, Any]:
