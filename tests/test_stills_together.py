@@ -113,6 +113,16 @@ def test_the_readout_is_found_by_the_turns_of_the_rows(readout_s: float) -> None
     assert np.sqrt(np.mean(turns**2)) < 3.0
 
 
+@pytest.mark.parametrize("share", [0.0, 1e-17])
+def test_a_log_of_a_steady_camera_shows_no_readout(share: float) -> None:
+    rng = np.random.default_rng(4)
+    seen = sighted(replace(CAMERA, shutter=Shutter(READOUT_S)), rng, 0.3)
+    poses, known, turning = by_log(rng, 900)
+    steady = replace(turning, rates=turning.rates * np.repeat([share, 1.0], 3))
+    with pytest.raises(ValueError, match="do not show a rolling shutter"):
+        together(CAMERA, poses, seen, known, steady, seeks_readout=True)
+
+
 def test_a_global_shutter_is_none() -> None:
     rng = np.random.default_rng(4)
     seen = sighted(CAMERA, rng, 0.3)
