@@ -69,10 +69,23 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         return _said(Trust.RELATIVE, [f"the scale is uncertain by {scale_sigma:.0%}"])
     if georeference == "none":
         return _said(Trust.SCALED, ["no positions: the scan has its own origin and heading"])
+    limits = []
     if "distortion" in assumed:
-        bent = "the lens's distortion is unknown: surfaces bend by a percent of the distance"
-        return _said(Trust.GEOREFERENCED, [bent])
-    return _said(Trust.GEOREFERENCED, [])
+        limits.append(
+            "the lens's distortion is unknown: surfaces bend by a percent of the distance"
+        )
+    if ratio := _number(scale, "gnss_over_heights"):
+        limits.append(scales_differ(ratio))
+    return _said(Trust.GEOREFERENCED, limits)
+
+
+def scales_differ(gnss_over_heights: float) -> str:
+    """A sentence on two scales of a scan by their ratio."""
+    which, ratio = "larger", gnss_over_heights
+    if ratio < 1.0:
+        which, ratio = "smaller", 1.0 / ratio
+    percent = 100.0 * (ratio - 1.0)
+    return f"GNSS makes the map {percent:.0f} % {which} than the height above ground does"
 
 
 def _said(level: Trust, reasons: list[str]) -> dict[str, Any]:
