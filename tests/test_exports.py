@@ -343,6 +343,21 @@ def test_3d_tiles_hold_all_points_on_the_globe(scan_dir: Path, house: HouseFligh
     assert lon == pytest.approx(house.origin[1], abs=1e-3)
 
 
+def test_3d_tiles_on_a_full_disk_end_in_one_line(
+    scan_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    convert = pytest.importorskip("py3dtiles.convert")
+    from py3dtiles.exceptions import WorkerException
+
+    def full(*_: object, **__: object) -> None:
+        raise WorkerException("builtins.OSError: [Errno 28] No space left on device")
+
+    monkeypatch.setattr(convert, "convert", full)
+    with pytest.raises(OutsideError, match=r"No space left on device.*check the disk"):
+        written(scan_dir, "3dtiles")
+    assert not list(scan_dir.glob(".3dtiles*"))
+
+
 def test_an_old_deliverable_stays_until_the_new_one_is_whole(scan_dir: Path) -> None:
     first = written(scan_dir, "colmap")
     (first / "mine.txt").write_text("old")
