@@ -7,6 +7,7 @@ import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import cv2
 import laspy
@@ -413,3 +414,17 @@ def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
     ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)).close()
     with pytest.raises(InputError, match="no points"):
         written(tmp_path, "laz")
+
+
+def test_the_orthophoto_of_an_empty_scan_reads_no_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from service.stream.records import ScanHeader
+
+    rasters = pytest.importorskip("service.offline.exports.rasters", exc_type=ImportError)
+    ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)).close()
+    read = Mock(return_value=[])
+    monkeypatch.setattr(rasters, "scan_images", read)
+    with pytest.raises(InputError, match="no points"):
+        written(tmp_path, "ortho")
+    read.assert_not_called()
