@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import logging
+import signal
 import sys
 import threading
 import traceback
@@ -124,8 +125,19 @@ def _root(
     logging.basicConfig(level=logging.DEBUG if verbose else quiet, handlers=[log_handler()])
 
 
+def _end_by_signals() -> None:
+    """Let a signal that would kill the process unwind it, so that it removes temporary files.
+
+    Commands that stop in order replace this; ``nohup`` stays in force.
+    """
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, lambda number, _: sys.exit(128 + number))
+
+
 def main() -> None:
     """Run the command line; exit codes: 0 done, 2 usage or input, 3 environment, 1 internal."""
+    _end_by_signals()
     threading.excepthook = lambda hook: _print_fault(
         hook.exc_type, hook.exc_value or hook.exc_type(), hook.exc_traceback
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -53,6 +54,35 @@ def test_every_command_has_help(name: str) -> None:
     assert "Usage" in result.output
     command = load_command(name)
     assert command.help, f"{name} says nothing of itself"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_command_that_is_killed_removes_its_temporary_files(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    (tmp_path / "slow.py").write_text(
+        "import tempfile, time\n"
+        "from service import cli\n"
+        "def slow() -> None:\n"
+        "    with tempfile.TemporaryDirectory(dir='.'):\n"
+        "        print('works', flush=True)\n"
+        "        time.sleep(60)\n"
+        "if __name__ == '__main__':\n"
+        "    cli.COMMANDS['slow'] = ('slow:slow', 'Work.')\n"
+        "    cli.main()\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "slow.py", "slow"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(Path(service.cli.__file__).parents[1])},
+        stdout=subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    with process.stdout:
+        assert process.stdout.readline() == b"works\n"
+        process.send_signal(number)
+        assert process.wait(timeout=20) == 128 + number
+    assert not list(tmp_path.glob("tmp*"))
 
 
 def test_no_command_imports_heavy_packages() -> None:

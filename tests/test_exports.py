@@ -7,6 +7,7 @@ import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import cv2
 import laspy
@@ -343,6 +344,21 @@ def test_3d_tiles_hold_all_points_on_the_globe(scan_dir: Path, house: HouseFligh
     assert lon == pytest.approx(house.origin[1], abs=1e-3)
 
 
+def test_3d_tiles_on_a_full_disk_end_in_one_line(
+    scan_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    convert = pytest.importorskip("py3dtiles.convert")
+    from py3dtiles.exceptions import WorkerException
+
+    def full(*_: object, **__: object) -> None:
+        raise WorkerException("builtins.OSError: [Errno 28] No space left on device")
+
+    monkeypatch.setattr(convert, "convert", full)
+    with pytest.raises(OutsideError, match=r"No space left on device.*check the disk"):
+        written(scan_dir, "3dtiles")
+    assert not list(scan_dir.glob(".3dtiles*"))
+
+
 def test_an_old_deliverable_stays_until_the_new_one_is_whole(scan_dir: Path) -> None:
     first = written(scan_dir, "colmap")
     (first / "mine.txt").write_text("old")
@@ -398,3 +414,17 @@ def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
     ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)).close()
     with pytest.raises(InputError, match="no points"):
         written(tmp_path, "laz")
+
+
+def test_the_orthophoto_of_an_empty_scan_reads_no_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from service.stream.records import ScanHeader
+
+    rasters = pytest.importorskip("service.offline.exports.rasters", exc_type=ImportError)
+    ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)).close()
+    read = Mock(return_value=[])
+    monkeypatch.setattr(rasters, "scan_images", read)
+    with pytest.raises(InputError, match="no points"):
+        written(tmp_path, "ortho")
+    read.assert_not_called()

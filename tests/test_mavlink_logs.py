@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -372,10 +373,27 @@ SRT = {
 }
 
 
+def with_commas(text: str) -> str:
+    """The same numbers with decimal commas."""
+    return re.sub(r": (-?\d+)\.(\d)", r": \1,\2", text)
+
+
 @pytest.mark.parametrize("layout", list(SRT))
-def test_subtitles_of_several_drones(tmp_path: Path, layout: str) -> None:
+@pytest.mark.parametrize(
+    "stored",
+    [
+        str.encode,
+        lambda text: text.encode("cp1252"),
+        lambda text: b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode(),
+        lambda text: with_commas(text).encode(),
+    ],
+    ids=["utf-8", "cp1252", "windows", "commas"],
+)
+def test_subtitles_of_several_drones(
+    tmp_path: Path, layout: str, stored: Callable[[str], bytes]
+) -> None:
     path = tmp_path / "flight.SRT"
-    path.write_text(SRT[layout], encoding="utf-8")
+    path.write_bytes(stored(SRT[layout]))
     log = load_telemetry(path)
     assert log.clock == "video" and log.first_ns == 0
     state = log.history.state_at(0)
@@ -418,6 +436,7 @@ def test_subtitles_of_a_drone_without_a_position_give_its_height(tmp_path: Path)
     [
         (("240", "240", "240"), 24.0, False),
         (("24.00", "24.00", "24.00"), 24.0, False),
+        (("24,00", "24,00", "24,00"), 24.0, False),
         (("162.00",) * 3, 162.0, False),
         (("240", "240", "480"), 24.0, True),
         (("0", "0", "0"), None, False),

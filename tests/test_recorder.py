@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.posegraph.alignment import Similarity
+from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.trajectory import Placed
 from recon.tracking.odometry import Tracked, Tracking
 from service.cameras.rig import Rig
@@ -63,7 +63,12 @@ def test_poses_of_a_recording_share_transactions(
 def test_the_scale_names_what_measured_it(sources: tuple[str, ...], sigma: float, by: str) -> None:
     covariance = np.diag([0.0] * 6 + [sigma**2])
     found = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
-    graph = SimpleNamespace(largest_similarity=lambda: found)
+    scales: list[Scale | None] = [None, None]
+    graph = SimpleNamespace(largest_similarity=lambda: found, largest_scales=lambda: scales)
     recorder = Recorder.__new__(Recorder)
     recorder._chain = cast(Any, SimpleNamespace(trajectory=SimpleNamespace(graph=graph)))
     assert recorder._scale() == {"from": by, "sigma": sigma}
+    scales[:] = Scale(1.2, 0.01), Scale(1.0, 0.03)
+    assert recorder._scale()["gnss_over_heights"] == pytest.approx(1.2)
+    scales[1] = Scale(1.0, 0.1)
+    assert "gnss_over_heights" not in recorder._scale()

@@ -22,9 +22,9 @@ from recon.calibration.together import LENS, Turning, together
 from recon.camera_model import project, rays
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.rolling_shutter import row_times_s
-from recon.types import F64, U8, Camera, Shutter
+from recon.types import F64, U8, Camera, PosePrior, Shutter
 from service.cameras.images import open_images
-from service.commands.all_stills import all_stills
+from service.commands.all_stills import all_stills, is_torn
 from service.compute.backend_choice import open_backend
 from service.config import change, load_config
 from service.flight.scan import Scan, ScanInputs, create_store
@@ -111,6 +111,27 @@ def test_the_readout_is_found_by_the_turns_of_the_rows(readout_s: float) -> None
     assert off_m(found.poses) < 0.7 * off_m(still.solution.poses)
     turns = np.degrees(found.rates[:, :2] - [rate_at(t)[:2] for t in times()])
     assert np.sqrt(np.mean(turns**2)) < 3.0
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-17])
+def test_a_log_of_a_steady_camera_shows_no_readout(share: float) -> None:
+    rng = np.random.default_rng(4)
+    seen = sighted(replace(CAMERA, shutter=Shutter(READOUT_S)), rng, 0.3)
+    poses, known, turning = by_log(rng, 900)
+    steady = replace(turning, rates=turning.rates * np.repeat([share, 1.0], 3))
+    with pytest.raises(ValueError, match="do not show a rolling shutter"):
+        together(CAMERA, poses, seen, known, steady, seeks_readout=True)
+
+
+def test_a_track_that_a_wild_fix_tore_is_seen() -> None:
+    poses = np.array([true_pose(t) for t in times()])
+    none = PosePrior(np.eye(3), 0.01, 0.05, np.zeros(3), np.full(3, 1.5), HEIGHT_M, 2.0)
+    priors = [replace(none, velocity_m_s=np.array([6.0, 0.0, 0.0]))] * STILLS
+    assert not is_torn(poses, times(), priors)
+    hovering = [replace(none, velocity_m_s=np.zeros(3))] * STILLS
+    assert not is_torn(poses[:1] + np.zeros((STILLS, 1, 1)), times(), hovering)
+    poses[6, :3, 3] += np.array([70.0, -30.0, 10.0])
+    assert is_torn(poses, times(), priors)
 
 
 def test_a_global_shutter_is_none() -> None:

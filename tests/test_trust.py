@@ -28,6 +28,7 @@ SURE: dict[str, Any] = {
         ({"assumed": ["lens"]}, "gnss", "doubtful", "lens"),
         ({"assumed": ["view", "level"]}, "gnss", "doubtful", "taken as level"),
         ({"assumed": ["distortion"]}, "gnss", "georeferenced", "distortion"),
+        ({"scale": {"gnss_over_heights": 0.8}}, "gnss", "georeferenced", "25 % smaller"),
         ({"assumed": ["height", "view"]}, "none", "relative", "assumed height"),
         ({"frames_tracked": 40}, "gnss", "doubtful", "40 of 100"),
         ({"frames": 101, "frames_tracked": 50}, "gnss", "georeferenced", ""),

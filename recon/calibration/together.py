@@ -27,8 +27,8 @@ LENS = SelfCalibrationConfig(sigma_focal=0.003, sigma_centre=0.003, sigma_k=0.01
 """How far a lens may be off that is calibrated, or found by the images. Held as it is, its errors
 bend the ground."""
 
-USUAL_S = 0.03
-"""Readout that bounds the turns where none is known: cameras have 0 to 50 ms."""
+USUAL_S, MAX_READOUT_S = 0.03, 0.05
+"""Readout that bounds the turns where none is known, and the longest that cameras have."""
 
 ROUNDS = 5
 """In which the readout and the turns settle."""
@@ -90,6 +90,7 @@ def together(
         for _ in range(ROUNDS):
             stills.adjust(turning.rows(readout_s, free_rad))
             readout_s, sigma_s = slope(rates, stills.turns)
+            readout_s = float(np.clip(readout_s, -MAX_READOUT_S, MAX_READOUT_S))
     if not readout_s or abs(readout_s) < MIN_SIGMAS * sigma_s:
         found = f"{1e3 * readout_s:.1f} ms, sigma {1e3 * sigma_s:.1f} ms"
         raise ValueError(f"the stills do not show a rolling shutter ({found})")
@@ -150,10 +151,12 @@ def slope(rates: F64, turns: F64) -> tuple[float, float]:
     """Seconds by which turns (N, 3) rad follow rates (N, 3) rad/s, and their sigma.
 
     Flat ground shows the heading's turn hardly apart from the pose, so it takes no part, nor a turn
-    that is common to all images.
+    that is common to all images. A steady camera shows nothing: its sigma is infinite.
     """
     x, y = ((a[:, :2] - a[:, :2].mean(axis=0)).ravel() for a in (rates, turns))
     power = float(x @ x)
+    if not power:
+        return 0.0, np.inf
     found = float(x @ y) / power
     off = y - found * x
     return found, float(np.sqrt(off @ off / (len(x) - 3) / power))

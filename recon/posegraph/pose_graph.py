@@ -183,6 +183,10 @@ class PoseGraph:
         """That of the segment with the most keyframes; None before telemetry or a loop."""
         return self._segments.largest()
 
+    def largest_scales(self) -> tuple[Scale | None, Scale | None]:
+        """The same segment's scale by fixes alone and by heights alone."""
+        return self._segments.largest_scales()
+
     def constants(self) -> Constants:
         """Constant errors of the sensors, as known for the newest segment."""
         return self._segments.constants(self._newest().segment) if self._nodes else Constants()
@@ -254,10 +258,6 @@ class PoseGraph:
         each."""
         self._solve(now=True)
         return self._smoother.residuals()
-
-    def newest_scales(self) -> tuple[Scale | None, Scale | None]:
-        """The newest segment's scale by fixes alone and by heights alone."""
-        return self._segments.scales(self._newest().segment) if self._nodes else (None, None)
 
     # ---- building ------------------------------------------------------------------------------
 

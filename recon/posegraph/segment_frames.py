@@ -61,8 +61,12 @@ class SegmentFrames:
 
     def largest(self) -> Similarity | None:
         """Of the segment with the most keyframes, of those that readings place where some do."""
+        segment = self._largest()
+        return None if segment is None else self._frames[segment]
+
+    def _largest(self) -> int | None:
         size = {s: (bool(f.sources), self._seen[s]) for s, f in self._frames.items()}
-        return self._frames[max(size, key=size.__getitem__)] if size else None
+        return max(size, key=size.__getitem__, default=None)
 
     def frame(self, segment: int) -> Similarity:
         """The segment's similarity; until there is one, its own frame turned to the attitude."""
@@ -176,12 +180,13 @@ class SegmentFrames:
         ]
         return float(np.median(apart)) if apart else None
 
-    def scales(self, segment: int) -> tuple[Scale | None, Scale | None]:
-        """The segment's scale by fixes alone and by heights alone."""
-        frame = self._frames.get(segment)
-        if frame is None:
+    def largest_scales(self) -> tuple[Scale | None, Scale | None]:
+        """The largest segment's scale by fixes alone and by heights alone."""
+        segment = self._largest()
+        if segment is None:
             return None, None
-        return alignment.scales(self._anchors(segment, self.constants(segment)), frame)
+        anchors = self._anchors(segment, self.constants(segment))
+        return alignment.scales(anchors, self._frames[segment])
 
     def _anchors(self, segment: int, known: Constants) -> list[Anchor]:
         return [

@@ -45,6 +45,10 @@ WIDTH_PX = 1920
 FIX_SIGMAS = 2.0
 """What errors of fixes count for: they are common to neighbours."""
 
+FASTER, SLACK_SIGMAS = 2.0, 5.0
+"""Times the vehicle's highest speed that the track between two stills may have, and sigmas of a
+fix by which it may exceed that."""
+
 RATE_RAD_S, CHANGE_RAD_S2 = 0.02, 1.0
 """Sigma of a turn by telemetry, and how fast it changes between two attitudes."""
 
@@ -159,6 +163,9 @@ def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHisto
     tied = np.flatnonzero(piece == np.bincount(piece).argmax())
     if len(tied) < least:
         raise ValueError(f"{len(tied)} of {len(stills)} are tied, {least} are tracked")
+    times_s = 1e-9 * np.array([still.time_ns for still, _ in known])
+    if is_torn(found.poses[tied], times_s[tied], [priors[k] for k in tied]):
+        raise ValueError("they would move faster than the vehicle: a fix is far off")
     log.info(
         "%d stills adjusted together: readout %.1f ms, sigma %.1f ms, %.2f px",
         len(tied), 1e3 * found.readout_s, 1e3 * found.sigma_readout_s, found.sigma_px,
@@ -169,6 +176,18 @@ def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHisto
         notes=(*inputs.notes, _note(full, lens, found, seeks)),
         known=_track(found, {known[k][0].seq: int(k) for k in tied}, lens),
     )  # fmt: skip
+
+
+def is_torn(poses: F64, times_s: F64, priors: Sequence[PosePrior]) -> bool:
+    """True where a track (N, 4, 4) is faster than the vehicle ever was by its log.
+
+    A fix that is off by more than the height starts a still where it does not find its place.
+    """
+    apart_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    speeds_m_s = np.linalg.norm(np.array([p.velocity_m_s for p in priors]), axis=1)
+    sigma_m = np.array([p.sigma_position_m for p in priors]).max()
+    reach_m = FASTER * speeds_m_s.max() * np.diff(times_s) + SLACK_SIGMAS * sigma_m
+    return bool((apart_m > reach_m).any())
 
 
 def _pose(prior: PosePrior) -> F64:

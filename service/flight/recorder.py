@@ -20,7 +20,7 @@ from recon.types import F64, Keyframe
 from service.cameras.rig import Rig, attitude_of
 from service.flight.anchorage import PublishedFrame, PublishedFrames
 from service.flight.pipeline import Pipeline, Step
-from service.flight.reports import FOUND, graph_figures
+from service.flight.reports import FOUND, gnss_over_heights, graph_figures
 from service.scans.drawing import save_debug
 from service.scans.trust import FIRST_TELEMETRY
 from service.stream.codec import encode
@@ -147,18 +147,19 @@ class Recorder:
         return dict(self.pipeline.refusals()) | late
 
     def _scale(self) -> dict[str, Any]:
-        """Source of the metric scale, and its relative sigma: of the largest segment."""
-        found = self._chain.trajectory.graph.largest_similarity()
+        """Source of the metric scale, its relative sigma, and what contradicts it: of the largest
+        segment."""
+        graph = self._chain.trajectory.graph
+        found = graph.largest_similarity()
         if found is None:
             return {"from": FIRST_TELEMETRY, "sigma": None}
         by = ", ".join(found.sources)
         if not {"altitude", "gnss"} & set(found.sources):
             is_known = found.sigma_scale < GUESSED_SHARE / 2
             by = "velocity" if is_known else "an assumed height"
-        return {
-            "from": by,
-            "sigma": round(found.sigma_scale, 4),
-        }
+        out = {"from": by, "sigma": round(found.sigma_scale, 4)}
+        ratio = gnss_over_heights(graph)
+        return out if ratio is None else out | {"gnss_over_heights": round(ratio, 3)}
 
     def _write_origin(self) -> None:
         """The origin goes into the header once the first position is known."""

@@ -14,6 +14,7 @@ from recon.posegraph.sensor_offsets import Constants
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Tracked, Tracking
 from recon.types import F64
+from service.scans.trust import scales_differ
 from service.stream.records import pack_covariance, pack_motion
 
 LEAST = 5
@@ -60,22 +61,14 @@ class GraphWatch:
 
     def _findings(self) -> dict[str, str]:
         """Sentences by kind."""
-        counts, scales = self._graph.counts, self._graph.newest_scales()
+        counts = self._graph.counts
         out = {
             kind: f"{counts[kind]} {text}" for kind, text in LEFT_OUT.items()
             if counts[kind] >= LEAST
         }  # fmt: skip
-        by_fixes, by_heights = scales
-        if by_fixes is not None and by_heights is not None:
-            apart = math.log(by_fixes.metres / by_heights.metres)
-            limit = max(SIGMAS * math.hypot(by_fixes.sigma, by_heights.sigma), MIN_SHARE)
-            if abs(apart) > limit:
-                percent = 100.0 * (math.exp(abs(apart)) - 1.0)
-                which = "larger" if apart > 0 else "smaller"
-                out["scale"] = (
-                    f"scale: GNSS makes the map {percent:.0f} % {which} than the height above "
-                    "ground does; check both"
-                )
+        ratio = gnss_over_heights(self._graph)
+        if ratio is not None:
+            out["scale"] = f"scale: {scales_differ(ratio)}; check both"
         off = _off_in_sigmas(self._graph.residuals().get("position"))
         if off > SIGMAS:
             out["track"] = (
@@ -83,6 +76,16 @@ class GraphWatch:
                 "shutter"
             )
         return out
+
+
+def gnss_over_heights(graph: PoseGraph) -> float | None:
+    """The scale of the largest segment by fixes over that by heights, where the two disagree."""
+    by_fixes, by_heights = graph.largest_scales()
+    if by_fixes is None or by_heights is None:
+        return None
+    ratio = by_fixes.metres / by_heights.metres
+    limit = max(SIGMAS * math.hypot(by_fixes.sigma, by_heights.sigma), MIN_SHARE)
+    return ratio if abs(math.log(ratio)) > limit else None
 
 
 def _off_in_sigmas(rows: F64 | None) -> float:

@@ -93,6 +93,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         )
     if refused > REFUSED_SHARE * measured:
         limits.append(f"{contradicted}: they are less certain than sigma says")
+    if ratio := _number(scale, "gnss_over_heights"):
+        limits.append(scales_differ(ratio))
     return _said(Trust.GEOREFERENCED, limits)
 
 
@@ -104,6 +106,15 @@ def _refused_positions(run: Mapping[str, Any]) -> tuple[float, float]:
     used = residuals.get("position") if isinstance(residuals, Mapping) else None
     refused = _number(graph.get("left_out"), "position off") or 0.0
     return refused, refused + (_number(used, "count") or 0.0)
+
+
+def scales_differ(gnss_over_heights: float) -> str:
+    """A sentence on two scales of a scan by their ratio."""
+    which, ratio = "larger", gnss_over_heights
+    if ratio < 1.0:
+        which, ratio = "smaller", 1.0 / ratio
+    percent = 100.0 * (ratio - 1.0)
+    return f"GNSS makes the map {percent:.0f} % {which} than the height above ground does"
 
 
 def _said(level: Trust, reasons: list[str]) -> dict[str, Any]:

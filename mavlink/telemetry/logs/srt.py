@@ -5,7 +5,7 @@ an unknown zone. Several layouts are read: ``[latitude: ..] [longitude: ..] [rel
 abs_alt: ..]`` with optional ``[gb_yaw: .. gb_pitch: .. gb_roll: ..]``; ``GPS (lon, lat, n)``
 with ``H`` and ``F.PRY``, ``G.PRY``; ``GPS(lat,lon,..M) BAROMETER:``; ``GPS(lon,lat,n) Hb:``. A
 drone without a position writes zeros and still ``rel_alt``. ``focal_len`` is the 35 mm equivalent:
-in mm with a decimal point, in tenths of a millimetre without.
+in mm with decimals, in tenths of a millimetre without. Decimals of named fields may follow a comma.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from mavlink.telemetry.samples import (
 
 NUMBER = r"(-?\d+(?:\.\d+)?)"
 CUE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
-FIELD = re.compile(rf"\b(\w+)\s*:\s*{NUMBER}")
+FIELD = re.compile(r"\b(\w+)\s*:\s*(-?\d+(?:[.,]\d+)?)")
 GPS = re.compile(rf"GPS\s*\(\s*{NUMBER}\s*,\s*{NUMBER}\s*,\s*{NUMBER}\s*(M?)", re.IGNORECASE)
-FOCAL = re.compile(r"\bfocal_len\s*:\s*([1-9]\d*)(\.\d+)?")
+FOCAL = re.compile(r"\bfocal_len\s*:\s*([1-9]\d*)(?:[.,](\d+))?")
 HEIGHT = re.compile(rf"\bH\s+{NUMBER}\s*m\b")
-PRY = re.compile(rf"\b([FG])\.PRY\s*\(\s*{NUMBER}°?\s*,\s*{NUMBER}°?\s*,\s*{NUMBER}")
+PRY = re.compile(rf"\b([FG])\.PRY\s*\(\s*{NUMBER}\W?\s*,\s*{NUMBER}\W?\s*,\s*{NUMBER}")
 LONGEST_LINE = 4096
 SAME_FOCAL = 0.02
 """Relative tolerance of a focal length that does not zoom."""
@@ -90,8 +90,8 @@ def _cue(
     counts["cues"] += 1
     if (focal := FOCAL.search(text)) is not None:
         whole, decimals = focal.groups()
-        focals.append(float(whole + decimals) if decimals else float(whole) / 10.0)
-    fields = {name.lower(): float(value) for name, value in FIELD.findall(text)}
+        focals.append(float(f"{whole}.{decimals}") if decimals else float(whole) / 10.0)
+    fields = {name.lower(): float(v.replace(",", ".")) for name, v in FIELD.findall(text)}
     place = _place(text, fields)
     if place is None:
         counts["unreadable"] += 1

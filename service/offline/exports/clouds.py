@@ -332,6 +332,7 @@ def write_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
     terrain shows the cloud lower or higher by the geoid's height.
     """
     from py3dtiles.convert import convert
+    from py3dtiles.exceptions import WorkerException
     from pyproj import CRS
 
     frame = scan.needs_place("3D Tiles")
@@ -339,14 +340,17 @@ def write_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
         las = Path(work) / "cloud.las"
         parts = points_of(scan, options, is_classified=False)
         write_laz(las, parts, frame, scan.store.header.started_unix_ns, laz=False)
-        convert(
-            las,
-            outfolder=part,
-            overwrite=True,
-            jobs=1,
-            crs_in=CRS.from_epsg(frame.epsg),
-            crs_out=CRS.from_epsg(EARTH_CENTRED),
-            force_crs_in=True,
-            pyproj_always_xy=True,
-            rgb=True,
-        )
+        try:
+            convert(
+                las,
+                outfolder=part,
+                overwrite=True,
+                jobs=1,
+                crs_in=CRS.from_epsg(frame.epsg),
+                crs_out=CRS.from_epsg(EARTH_CENTRED),
+                force_crs_in=True,
+                pyproj_always_xy=True,
+                rgb=True,
+            )
+        except WorkerException as error:  # its process has no memory, or no room on the disk
+            raise OSError(str(error)) from error

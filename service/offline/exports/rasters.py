@@ -95,6 +95,8 @@ def ortho(scan: ScanView, options: ExportOptions) -> Layers:
     as those of the stored images where there is no recording.
     """
     keyframes = [k for k in main_keyframes(scan.store) if np.isfinite(k.depth.depth_m).any()]
+    if not keyframes:
+        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
     with scan.progress.part("reading the images", 0.6):
         here, there = scan.progress.branches(2)
         surface: list[Raster] = []
