@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.surface.hole_filling import EDGE_CELLS, filled, surface_model
+from recon.surface.hole_filling import EDGE_CELLS, filled, outlined, surface_model
 from recon.surface.raster import Grid, Raster, grid_over, without_cells
 from recon.types import F32, Bool
 
@@ -105,3 +105,14 @@ def test_the_surface_model_of_a_plain_cloud_is_its_upper_surface() -> None:
     model = surface_model(xyz, colour, np.full(len(xyz), 0.02, np.float32), grid)
     assert model.known.mean() > 0.99
     assert np.nanmax(np.abs(model.height_m - 2.0)) < 0.06
+
+
+def test_a_hole_is_enclosed_and_a_bay_is_not() -> None:
+    known = np.zeros((40, 60), np.bool_)
+    known[5:35, 5:55] = True
+    known[10:20, 10:20] = False  # a hole
+    known[5:20, 35:45] = False  # a bay
+    known[30:35, 25:27] = False  # a gap of two cells in the rim
+    inside = outlined(known)
+    assert inside[10:20, 10:20].all() and inside[31:34, 25:27].all()
+    assert not inside[5:20, 36:44].any() and not inside[:4].any()

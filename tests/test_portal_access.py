@@ -19,6 +19,8 @@ from service.ground import state
 from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
 from service.ground.state import Job
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
     from conftest import HouseFlight
@@ -27,6 +29,8 @@ pytestmark = NEEDS
 __all__ = ["browser"]  # the fixture
 
 AXE = PAGE.parent / "node_modules/axe-core/axe.min.js"
+ALL = """axe.run().then(found => found.violations
+  .map(v => v.id + ': ' + v.nodes.map(n => n.html).join(' ').slice(0, 300)))"""
 SERIOUS = """axe.run().then(found => found.violations
   .filter(v => v.impact === 'serious' || v.impact === 'critical')
   .map(v => v.id + ': ' + v.nodes.map(n => n.html).join(' ').slice(0, 300)))"""
@@ -87,6 +91,13 @@ def test_on_a_telephone_nothing_is_out_of_reach(browser: Browser, base: str) -> 
     assert browser.run("document.documentElement.scrollWidth") <= PHONE[0]
 
 
+def test_no_panel_lies_over_the_time_slider(browser: Browser, base: str) -> None:
+    show(browser, f"{base}/#/view/drone-1/test-1", (760, 700))
+    time = box(browser, ".time")
+    for name in ("figures", "latest"):
+        assert box(browser, f".side .{name}")["bottom"] <= time["top"]
+
+
 def test_choosing_a_deliverable_by_keyboard_starts_nothing(browser: Browser, base: str) -> None:
     show(browser, base, (1440, 900))
     browser.wait("document.querySelectorAll('article').length === 1")
@@ -140,11 +151,11 @@ def job(monkeypatch: pytest.MonkeyPatch, busy: str) -> Iterator[None]:
     ended.set()
 
 
-def axe(browser: Browser, page: str, image: Path) -> list[str]:
+def axe(browser: Browser, page: str, image: Path, findings: str = SERIOUS) -> list[str]:
     """What axe finds on the page that is shown."""
     browser.run(AXE.read_text() + ";0")
     browser.image(image / f"{page}.png")  # to look at
-    return [f"{page}: {finding}" for finding in browser.run(SERIOUS)]
+    return [f"{page}: {finding}" for finding in browser.run(findings)]
 
 
 @pytest.mark.skipif(not AXE.is_file(), reason="needs axe-core (npm ci in service/ground/web)")
@@ -188,4 +199,31 @@ def test_axe_finds_nothing_serious(
     browser.open((next(tmp_path.parent.glob("busy*")) / "drone-1/test-1/report.html").as_uri())
     browser.wait("!!document.querySelector('h1')")
     found += axe(browser, "report", tmp_path)
+    assert found == []
+
+
+@pytest.mark.skipif(not AXE.is_file(), reason="needs axe-core (npm ci in service/ground/web)")
+def test_axe_finds_nothing_while_a_drone_begins_falls_silent_and_the_station_stops(
+    browser: Browser, house: HouseFlight, tmp_path: Path
+) -> None:
+    entry = {"drone": "drone-1", "scan": "begun", "heard_unix_s": time.time() + 600.0}
+    header = ScanHeader("begun", "drone-1", house.start_ns, software="0.0")
+    with ScanStore.create(tmp_path / "scans/drone-1/begun/scan.db", header) as store:
+        store.add_pose(house.record(0, 0.0))
+    portal = Portal(PortalConfig(tmp_path / "scans", port=0, token=TOKEN), lambda: [entry])
+    portal.start()
+    base = portal.url.split("/?")[0]
+    browser.open(portal.url)
+    show(browser, f"{base}/#/view/drone-1/begun", PHONE)
+    browser.wait("document.querySelector('.state').classList.contains('receiving')")
+    found = axe(browser, "first poses", tmp_path, ALL)
+    entry["heard_unix_s"] = time.time() - 60.0
+    browser.wait("document.querySelector('.state').classList.contains('silent')", 30)
+    found += axe(browser, "silent", tmp_path, ALL)
+    show(browser, f"{base}/#/map/drone-1/begun", PHONE)
+    browser.wait("document.querySelector('.state').textContent === 'silent'")
+    portal.close()
+    browser.wait("document.querySelector('.state').textContent.includes('does not answer')", 30)
+    found += axe(browser, "stopped", tmp_path, ALL)
+    browser.open("about:blank")
     assert found == []

@@ -26,6 +26,9 @@ SLOPE = 0.3
 """Heights around a hole that differ by more than LEVEL_M and SLOPE times their distance are two
 surfaces."""
 
+GAP_CELLS = 1
+"""The outline of known cells closes gaps of twice this width."""
+
 EDGE_CELLS = 2
 """This close to something higher, a cell next to a step may be roof or ground."""
 
@@ -58,6 +61,15 @@ def filled(
     new = np.isfinite(out[..., 0]) & ~certain.known
     rgb = np.where(new[..., None], np.rint(out[..., 2:]), certain.rgb).astype(np.uint8)
     return Raster(certain.grid, out[..., 0].copy(), out[..., 1].copy(), rgb), new
+
+
+def outlined(known: Bool) -> Bool:
+    """(rows, cols) the cells within the outline of the ``known`` ones: those and their holes."""
+    from scipy.ndimage import binary_fill_holes
+
+    square = np.ones((2 * GAP_CELLS + 1,) * 2, np.uint8)
+    closed = cv2.morphologyEx(known.astype(np.uint8), cv2.MORPH_CLOSE, square)
+    return np.asarray(binary_fill_holes(closed), np.bool_)
 
 
 @njit(cache=True, nogil=True)

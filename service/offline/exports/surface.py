@@ -10,8 +10,9 @@ import numpy as np
 
 from recon.mapping.free_space import air_above
 from recon.surface.ground import BareGround, terrain
-from recon.surface.hole_filling import filled
+from recon.surface.hole_filling import LEVEL_M, filled, outlined
 from recon.surface.raster import (
+    STEP_M,
     Raster,
     highest_lowest,
     inner_doubtful,
@@ -37,8 +38,16 @@ FILLED_UP_M = (4, 6, 8)
 """Above a filled cell no surface may hide the air at these heights from all that look there: what
 hangs over the ground hides it at the same time."""
 
+FILLED_REACH_M = 3.0
+"""Holes of twice this width are filled: on one side of the flight a roof or a crown of 8 m hides
+so much ground from all images."""
+
 FILLED_EDGE_CELLS = 1
 """Cells may be filled closer to something higher than without keyframes that contradict."""
+
+NEAR_UP_M, NEAR_CELLS = (1, 2, 3), 2
+"""So near to something higher, a filled cell needs free air at these heights as well: the edges of
+crowns that matching has lost lie low."""
 
 PROBE_M = 1.0
 """A surface is no surface where a keyframe sees through the place so far below it."""
@@ -56,8 +65,11 @@ def surface_model(scan: ScanView, cell_m: float | None, strict: bool = False) ->
     """The surface where it is certain and the air above it was seen, its holes filled.
 
     ``strict`` leaves the holes unknown. :func:`recon.surface.raster.reliable` removes uncertain
-    cells. Those of them that some keyframe ends at and none sees through come back as filled;
+    cells. Those of them that some keyframe ends at and none sees through come back as filled, and
+    so does level ground below air that was not seen, if nothing is known to hide it.
     :func:`recon.surface.hole_filling.filled` fills the rest, where no keyframe contradicts it.
+    Beyond the outline of the certain cells there are no holes, only guesses; a tile of a scan does
+    not know this outline.
     """
     key = ("surface", cell_m, strict)
     return scan.shared(key, lambda: _surface_model(scan, cell_m, strict))
@@ -74,15 +86,32 @@ def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> Surfac
     certain = _open_to_the_sky(scan, measured, sure)
     if strict:
         return Surface(certain, np.zeros(certain.grid.shape, np.bool_))
-    held = inner_doubtful(measured, sure)
-    is_open, behind = _air(scan, _places(scan, measured, held), (-PROBE_M,))
-    held[held] = ~is_open[:, 0] & (behind[:, 0] > 0)
+    holes = ~certain.known & (outlined(certain.known) if scan.is_whole else True)
+    held = holes & _unrefuted(scan, measured, inner_doubtful(measured, sure), ())
+    level = sure.known & _at_lowest(measured, certain)
+    held |= holes & _unrefuted(scan, measured, holes & level, (*NEAR_UP_M, *FILLED_UP_M))
     known = without_cells(measured, ~(certain.known | held))
-    raster, new = filled(known, measured, edge_cells=FILLED_EDGE_CELLS)
-    is_open, behind = _air(scan, _places(scan, raster, new), (-PROBE_M, *FILLED_UP_M))
-    wrong = np.zeros_like(new)
-    wrong[new] = is_open[:, 0] | (~is_open & (behind > 0))[:, 1:].any(axis=1)
-    return Surface(without_cells(raster, wrong), (new & ~wrong) | held)
+    raster, new = filled(known, measured, FILLED_REACH_M, FILLED_EDGE_CELLS)
+    top = np.fmax(*(highest_lowest(r.height_m, NEAR_CELLS)[0] for r in (raster, measured)))
+    below = new & (top - raster.height_m > STEP_M)
+    right = _unrefuted(scan, raster, new & holes, FILLED_UP_M)
+    right &= ~below | _unrefuted(scan, raster, below, NEAR_UP_M)
+    return Surface(without_cells(raster, new & ~right), right | held)
+
+
+def _at_lowest(measured: Raster, certain: Raster) -> Bool:
+    """(rows, cols) cells of ``measured`` level with the lowest certain one next to them."""
+    lowest_m = highest_lowest(certain.height_m, 1)[1]
+    return np.asarray(np.abs(measured.height_m - lowest_m) <= LEVEL_M)
+
+
+def _unrefuted(scan: ScanView, raster: Raster, cells: Bool, free_up_m: Sequence[float]) -> Bool:
+    """Those of the ``cells`` (rows, cols) that no keyframe sees through, and above which no surface
+    hides the air at these heights from all keyframes that look there."""
+    is_open, behind = _air(scan, _places(scan, raster, cells), (-PROBE_M, *free_up_m))
+    out: Bool = cells.copy()
+    out[cells] = ~is_open[:, 0] & ~(~is_open & (behind > 0))[:, 1:].any(axis=1)
+    return out
 
 
 def cell_places(scan: ScanView, raster: Raster) -> F64:

@@ -244,7 +244,9 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   const refresh = (): Promise<void> => load().catch((error: Error) => say("silent", error.message));
 
   const basemap = await tileJson("/tiles/basemap.json");
-  root.replaceChildren(el("div", { className: "view flat" }, head, host, panel));
+  const side = el("aside", {}, panel);
+  side.setAttribute("aria-label", "layers");
+  root.replaceChildren(el("div", { className: "view flat" }, head, host, side));
   if (basemap) add(new Layer((z, x, y) => `/tiles/basemap/${z}/${x}/${y}`), "Basemap", true);
   for (const [layer, title, on] of LAYERS)
     add(new Layer((z, x, y) => `${at}/${layer}/${z}/${x}/${y}.png`, `${at}/${layer}.json`), title, on);
