@@ -193,6 +193,11 @@ def test_rates_at_both_ends_bend_the_way_between_two_attitudes(gap_s: float) -> 
         between = history.state_at(T0 + round((1.0 + gap_s / 2) * S))
         assert between is not None and between.sigma_attitude_rad is not None
         sigmas.append(between.sigma_attitude_rad)
+        bodies = history.bodies(T0 + S)
+        gaps_ms = np.diff([t for t, _ in bodies]) / MS
+        np.testing.assert_allclose(gaps_ms, 100.0 if known else 1e3 * gap_s, atol=1e-3)
+        seen = [angle(q, of_scipy(truth((t - T0) / S))) for t, q in bodies]
+        assert max(seen) < (sigmas[-1] if known else 1e-6)
     assert errors[1] < 0.2 * errors[0] and max(off) < sigmas[1] < sigmas[0]
     past = history.state_at((history.last_ns or 0) + 15 * MS)
     assert past is not None and past.q_ned_body_wxyz is not None

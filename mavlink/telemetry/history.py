@@ -60,6 +60,9 @@ TURN_RAD_S2, ACCELERATION_M_S2 = 1.5, 1.0
 WITH_RATES = 0.5
 """Share of an angle's error that is left where its rates are known: on logs 0.3 to 0.75."""
 
+BETWEEN_NS = 100_000_000
+"""A rotation that is compared with images is wanted at least so often."""
+
 UNKNOWN_RATES = (math.nan, math.nan, math.nan)
 
 
@@ -110,6 +113,19 @@ class VehicleHistory:
         with self._lock:
             return [(AttitudeSample(None, _quaternion(r)), t) for t, r in self._attitude.items()]
 
+    def bodies(self, since_ns: int = 0) -> list[tuple[int, Quaternion]]:
+        """The body's attitude at every sample, and between slow samples whose rates are known."""
+        out = []
+        with self._lock:
+            samples = [one for one in self._attitude.items() if one[0] >= since_ns]
+        for (t, row), (later, next_row) in zip(samples, samples[1:] + samples[-1:], strict=True):
+            gap = Bracket(t, later, row, next_row, t)
+            is_curve = later - t <= MAX_GAP_NS and _has_rates(gap)
+            steps = max(1, (later - t) // BETWEEN_NS) if is_curve else 1
+            times = [t + (later - t) * k // steps for k in range(steps)]
+            out += [(at, _body(replace(gap, time_ns=at))) for at in times]
+        return out
+
     def claimed_at(self, time_ns: int) -> tuple[Quaternion, Quaternion] | None:
         """(the gimbal's quaternion as sent, ``q_ned_body``) at a time, if known."""
         with self._lock:
@@ -133,14 +149,13 @@ class VehicleHistory:
         with self._lock:
             tracks = self._gimbals.values()
             times = {t for track in tracks for t, _ in track.items() if t >= since_ns}
-            bodies = [(t, _quaternion(r)) for t, r in self._attitude.items() if t >= since_ns]
         states = [(t, self._state_at(t)) for t in sorted(times)]
         found = [
             (t, _quaternion(tuple(map(float, s.q_ned_gimbal_wxyz))))
             for t, s in states
             if s is not None and s.q_ned_gimbal_wxyz is not None
         ]
-        return found or bodies
+        return found or self.bodies(since_ns)
 
     def __len__(self) -> int:
         return len(self._attitude) + len(self._position)

@@ -120,8 +120,7 @@ class TelemetryCheck:
         if stills_ns is not None:
             since_ns = min(since_ns, stills_ns)
         if self._fixed:
-            bodies = [(t, sample.q_ned_body) for sample, t in history.attitudes()]
-            found = self._turns.estimate([body for body in bodies if body[0] >= since_ns])
+            found = self._turns.estimate(history.bodies(since_ns))
         else:
             found = self._turns.estimate(history.heads(since_ns))
         self.latency = found or self.latency
