@@ -39,12 +39,12 @@ def bent_images(count: int) -> Iterator[U8]:
         yield np.asarray(bent, np.uint8)
 
 
-def stills(folder: Path, count: int) -> Path:
+def stills(folder: Path, count: int, focal_mm: int = EXIF_FOCAL) -> Path:
     """The images as JPEG files with a focal length."""
     folder.mkdir()
     for k, bent in enumerate(bent_images(count)):
         tags = Image.Exif()
-        tags.get_ifd(0x8769)[41989] = EXIF_FOCAL
+        tags.get_ifd(0x8769)[41989] = focal_mm
         Image.fromarray(bent).convert("RGB").save(folder / f"{k:02d}.jpg", quality=97, exif=tags)
     return folder
 
@@ -90,6 +90,15 @@ def test_the_distortion_that_exif_does_not_give_is_found(tmp_path: Path, wanted:
     assert camera["distortion"][0] == pytest.approx(BENT if wanted else 0.0, abs=0.01)
     given = Lens(EXIF_FOCAL / 43.2666 * 1.25).camera(SIZE)
     assert camera["K"][0] == pytest.approx(K[0, 0] if wanted else given.K[0, 0], rel=0.003)
+
+
+def test_a_refused_lens_is_reported(tmp_path: Path) -> None:
+    """EXIF tells another focal length than the images; 2 % is what it counts as good to."""
+    folder = stills(tmp_path / "stills", 10, focal_mm=34)
+    figures, camera = replayed(f"images:{folder}", tmp_path / "scan")
+    assert "distortion" in figures["assumed"] and camera["distortion"][0] == 0.0
+    refused = [n for n in figures["warnings"] if "do not determine their lens" in n]
+    assert len(refused) == 1 and "too far" in refused[0]
 
 
 def test_the_stills_about_the_middle(tmp_path: Path) -> None:
