@@ -143,11 +143,14 @@ def test_the_images_may_correct_the_makers_calibration(tmp_path: Path) -> None:
     assert start.camera.distortion[0] == pytest.approx(-0.423) and start.assumed == ()
     # Of a real one, the focal length was off by 1 % and the middle by 1.4 % of the width.
     assert start.search.sigma_focal >= 0.01 and start.search.sigma_centre >= 0.014
+    assert start.search.sigma_k <= 0.1
 
 
 def test_the_makers_focal_length_alone_leaves_the_distortion_open(tmp_path: Path) -> None:
     write_still(tmp_path / "a.jpg", (1600, 1200), {}, xmp_of({"CalibratedFocalLength": "1913.3"}))
-    assert start_lens(open_camera(str(tmp_path)), None).assumed == ("distortion",)
+    start = start_lens(open_camera(str(tmp_path)), None)
+    assert start.assumed == ("distortion",)
+    assert start.search.max_sigmas * start.search.sigma_k > 0.5  # k1 of that camera: -0.43
 
 
 @pytest.mark.parametrize(
@@ -243,7 +246,7 @@ def test_a_video_without_a_model_has_the_lens_of_its_telemetry(
     assert start.camera.K[0, 0] == pytest.approx(fx_px, rel=1e-4)
     assert start.camera.K[:2, 2] == pytest.approx((959.5, 539.5))
     assert not start.camera.distortion.any() and start.assumed == ("lens",) and of in start.note
-    assert 3.0 * start.search.sigma_focal > 0.05
+    assert 3.0 * start.search.sigma_focal > 0.05 and 3.0 * start.search.sigma_k > 0.5
 
 
 def test_a_video_is_turned_as_it_asks_players_to(tmp_path: Path) -> None:

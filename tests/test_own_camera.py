@@ -136,7 +136,7 @@ def test_a_straight_line_looking_down_is_refused_in_one_line() -> None:
     fixes, sigma = poses[:, :3, 3], np.full((len(poses), 3), 1.0)
     with pytest.raises(InputError, match="does not determine the focal length") as refused:
         found_camera(images, WRONG, _off(poses), 0.0, fixes, sigma)
-    assert "\n" not in str(refused.value) and "nothing was changed" in str(refused.value)
+    assert "\n" not in str(refused.value)
 
 
 def test_images_of_something_else_are_refused() -> None:

@@ -19,6 +19,7 @@ from recon.types import U8
 from service.cameras.images import open_images
 from service.cameras.lens import Lens
 from service.cli import app
+from service.errors import InputError
 from service.stream.store import ScanStore
 
 BENT = 0.1
@@ -90,6 +91,19 @@ def test_the_distortion_that_exif_does_not_give_is_found(tmp_path: Path, wanted:
     assert camera["distortion"][0] == pytest.approx(BENT if wanted else 0.0, abs=0.01)
     given = Lens(EXIF_FOCAL / 43.2666 * 1.25).camera(SIZE)
     assert camera["K"][0] == pytest.approx(K[0, 0] if wanted else given.K[0, 0], rel=0.003)
+
+
+def test_a_lens_that_the_images_do_not_determine_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise InputError("the camera found is too far from the model given")
+
+    monkeypatch.setattr("service.flight.scan.Scan.run", lambda *_, **__: None)
+    monkeypatch.setattr("service.offline.refine.refinement.lens", refuse)
+    figures, _ = replayed(f"images:{stills(tmp_path / 'stills', 6)}", tmp_path / "scan")
+    assert "distortion" in figures["assumed"]
+    assert any("the camera found is too far" in note for note in figures["warnings"])
 
 
 def test_the_stills_about_the_middle(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from recon.calibration.flight import (
 )
 from recon.calibration.global_bundle import Sightings
 from recon.types import F64, Camera
+from service.offline.refine.own_camera import bent, by_tags
 
 SIZE = (1280, 720)
 TRUE = Camera(
@@ -210,8 +211,32 @@ def test_a_camera_whose_covariance_is_none_is_refused() -> None:
 
     assert camera_sigmas(without(0, 1, 5e-7)) == pytest.approx(np.full(8, 1e-3))
     for wrong in (without(6, 6, -1e-9), without(6, 6, np.nan), without(2, 6, 2e-6)):
-        focal = float(camera_sigmas(wrong)[0])
-        assert "does not determine" in doubt(TRUE, TRUE, focal, SelfCalibrationConfig())
+        sigmas = camera_sigmas(wrong)
+        assert "does not determine" in doubt(TRUE, TRUE, sigmas, SelfCalibrationConfig())
+
+
+BARREL = Camera(TRUE.K, np.array([-0.43, 0.2, 0.0, 0.0, 0.0]), SIZE)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_strong_distortion_is_found_where_nothing_states_another(stated: bool) -> None:
+    poses = _oblique_turn()
+    points, seen = _seen(poses, BARREL)
+    start, near = _guess(points, poses)
+    fixes, sigma = poses[:, :3, 3], np.full((len(poses), 3), 0.5)
+    search = by_tags(0.02) if stated else bent(by_tags(0.02))
+    found = self_calibrate(WRONG, start, near, seen, fixes, sigma, search)
+    assert found.why_not.startswith("the camera found is too far") == stated
+    if not stated:
+        assert not found.why_not
+        np.testing.assert_allclose(found.camera.distortion[:2], [-0.43, 0.2], atol=0.02)
+
+
+def test_an_open_distortion_that_the_flight_does_not_determine_is_refused() -> None:
+    search, sigmas = bent(by_tags(0.02)), np.array([3.0, 3.0, 2.0, 2.0, 0.01, 0.01, 1e-3, 1e-3])
+    assert not doubt(BARREL, WRONG, sigmas, search)
+    sigmas[4:6] = 0.05
+    assert "does not determine the distortion" in doubt(BARREL, WRONG, sigmas, search)
 
 
 def test_landmarks_without_a_place_take_no_part() -> None:

@@ -47,6 +47,7 @@ class SelfCalibrationConfig:
     sigma_k: float = 0.1  # of k1 and of k2
     sigma_p: float = 0.005  # of p1 and of p2
     max_sigma_focal: float = 0.003  # a less certain focal length is refused
+    max_sigma_bend: float = np.inf  # likewise of k1, as the share of depth it bends at a corner
     max_sigmas: float = 3.0  # from the model given; a camera further off is refused
     pixel_sigma: float = 0.5
     huber_sigmas: float = 1.5
@@ -122,7 +123,7 @@ def self_calibrate(
     found = independent(last, solve(last, config.iterations), config.iterations)
     sigmas = camera_sigmas(found.camera_covariance)
     focal = float(sigmas[:2].max() / found.camera.K[0, 0])
-    why_not = doubt(found.camera, camera, focal, config)
+    why_not = doubt(found.camera, camera, sigmas, config)
     if not why_not and (np.abs(found.camera_step) > MAX_STEP * sigmas).any():
         why_not = "the adjustment of the images does not settle"
     return SelfCalibrated(
@@ -239,13 +240,21 @@ def shared(seen: Sightings, kept: Bool) -> Sightings:
     return Sightings(seen.view[kept], seen.landmark[kept], seen.uv_px[kept])
 
 
-def doubt(found: Camera, given: Camera, sigma_focal: float, c: SelfCalibrationConfig) -> str:
-    """Return why the camera is refused; empty when it is accepted."""
+def doubt(found: Camera, given: Camera, sigmas: F64, c: SelfCalibrationConfig) -> str:
+    """Return why the camera, known to ``sigmas`` (8,), is refused; empty when it is accepted."""
+    sigma_focal = float(sigmas[:2].max() / found.K[0, 0])
     if sigma_focal > c.max_sigma_focal:
         return (
             f"the flight does not determine the focal length (to {100 * sigma_focal:.1f} %, asked "
             f"{100 * c.max_sigma_focal:.1f} %): seen straight down from one height it looks "
             "like another height; fly two heights or an oblique turn"
+        )
+    corner = 0.5 * float(np.hypot(*found.size_px)) / found.K[0, 0]
+    bend = 2.0 * float(sigmas[4]) * corner**2  # of a pair's disparity, on average over its ways
+    if bend > c.max_sigma_bend:
+        return (
+            f"the flight does not determine the distortion (to {100 * bend:.1f} % of depth at a "
+            f"corner, asked {100 * c.max_sigma_bend:.1f} %); let images overlap more"
         )
     off = abs(found.K[0, 0] / given.K[0, 0] - 1.0) / c.sigma_focal
     shift = np.abs(found.K[:2, 2] - given.K[:2, 2]).max()

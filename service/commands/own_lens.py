@@ -21,7 +21,7 @@ from service.cameras.images import ImagesSource
 from service.cameras.lens import SIGMA_FOCAL, Lens, by_full_frame
 from service.config import change
 from service.errors import InputError
-from service.offline.refine.own_camera import by_tags
+from service.offline.refine.own_camera import bent, by_tags
 
 if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
@@ -43,7 +43,7 @@ MAX_FRAMES = 5400
 ASSUMED = Lens(0.5 / math.tan(math.radians(35.0)), sigma_focal=0.2)
 """70 degrees across; cameras of drones have 60 to 86."""
 
-OPEN = SelfCalibrationConfig(sigma_focal=ASSUMED.sigma_focal, max_sigma_focal=SIGMA_FOCAL)
+OPEN = bent(SelfCalibrationConfig(sigma_focal=ASSUMED.sigma_focal, max_sigma_focal=SIGMA_FOCAL))
 """How such a lens is sought: one found counts if its focal length is as good as EXIF's."""
 
 COARSE = {"compute.stereo_width": 320, "compute.upsample": False, "fusion.loops": False}
@@ -66,12 +66,14 @@ def start_lens(source: CameraSource, telemetry: TelemetryLog | None) -> StartLen
         f, side, known = source.lens.focal, max(source.size_px), source.lens.is_calibrated
         note = f"taken from {source.lens.source} ({f * side:.0f} px)"
         search = by_tags(source.lens.sigma_focal)
-        return StartLens(source.camera, _advice(note), () if known else ("distortion",), search)
+        if known:
+            return StartLens(source.camera, _advice(note), (), search)
+        return StartLens(source.camera, _advice(note), ("distortion",), bent(search))
     lens, of, search = ASSUMED, "70 degrees", OPEN
     if telemetry is not None and telemetry.focal_35mm is not None:
         lens = by_full_frame(telemetry.focal_35mm, source.size_px)
         of = f"{telemetry.focal_35mm:.0f} mm (35 mm equivalent in the telemetry)"
-        search = by_tags(lens.sigma_focal)
+        search = bent(by_tags(lens.sigma_focal))
     note = f"a lens of {of} without distortion is assumed"
     return StartLens(lens.camera(source.size_px), _advice(note), ("lens",), search)
 
@@ -80,8 +82,8 @@ def _advice(note: str) -> str:
     return f"no camera model given: {note}; make one with 'skyrelief calibrate' for true shapes"
 
 
-def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> Camera | None:
-    """The camera by a reconstruction of some images; None where they do not determine it.
+def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> Camera | str:
+    """The camera by a reconstruction of some images, or why they do not determine it.
 
     ``inputs`` are those of the whole scan, with the lens to begin with; ``video`` is its camera
     source, a recording or a folder of stills.
@@ -93,7 +95,7 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> C
     if isinstance(source, ImagesSource):
         source = source.middle(VIEWS)
         if source.images < MIN_STILLS:
-            return None
+            return f"{source.images} stills are too few; {MIN_STILLS} needed"
     else:
         source = open_camera(video)
     for key, value in COARSE.items():
@@ -113,8 +115,7 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> C
         try:
             return lens(folder, Path(parse_source(video)[1]), search)
         except InputError as error:
-            log.info("the images do not determine their lens: %s", error)
-            return None
+            return str(error)
 
 
 def _is_enough(scan: Scan) -> bool:

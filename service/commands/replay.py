@@ -205,13 +205,15 @@ def _with_lens(
     from service.commands.own_lens import own_lens
     from service.flight.scan import check_new
 
-    found = None
+    found: Camera | str = ""
     if find_lens and parse_source(video)[0] in ("file", "images"):
         check_new(inputs.folder)
         progress("finding the lens")
         found = own_lens(inputs, video, start.search)
-    if found is None:
-        return replace(inputs, notes=(start.note, *inputs.notes), assumed=start.assumed)
+    if isinstance(found, str):
+        refused = (f"the images do not determine their lens: {found}",) if found else ()
+        notes = (start.note, *refused, *inputs.notes)
+        return replace(inputs, notes=notes, assumed=start.assumed)
     note = f"no camera model given: found from the images themselves ({found.K[0, 0]:.0f} px)"
     return replace(inputs, camera=found, notes=(note, *inputs.notes))
 

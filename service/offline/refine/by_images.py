@@ -130,7 +130,7 @@ def network_of(
     settled = Problem(s.camera, given, s.poses, s.points, found.seen, pixel, known, held)
     sigmas = camera_sigmas(s.camera_covariance) * np.sqrt(max(dispersion(settled), 1.0))
     focal = float(sigmas[:2].max() / s.camera.K[0, 0])
-    why = doubt(found.solution.camera, given, focal, FREE)
+    why = doubt(s.camera, given, sigmas, FREE)
     if why:
         held = camera_information(given, HELD)
         found = network(given, start, seen, known, held)

@@ -63,6 +63,12 @@ MIN_SHOWN = 0.3
 
 START = SelfCalibrationConfig()
 
+SIGMA_K = 0.25
+"""Of k1 and of k2 where nothing states them: wide lenses have a k1 of -0.5 to 0.2."""
+
+MAX_SIGMA_BEND = 0.02
+"""A lens found bends depth at a corner by no more: the scan's sigma does not cover it."""
+
 EXHAUSTIVE = 60
 """Up to so many images, all pairs are compared, regardless of their poses."""
 
@@ -118,6 +124,11 @@ def times_of_stills(folder: Path, start_unix_ns: int) -> dict[str, float]:
 def by_tags(sigma_focal: float) -> SelfCalibrationConfig:
     """A camera whose focal length is known to ``sigma_focal``, a share, and holds if left open."""
     return replace(START, sigma_focal=sigma_focal, max_sigma_focal=2.0 * sigma_focal)
+
+
+def bent(search: SelfCalibrationConfig) -> SelfCalibrationConfig:
+    """``search`` for a lens of which nothing states the distortion."""
+    return replace(search, sigma_k=SIGMA_K, max_sigma_bend=MAX_SIGMA_BEND)
 
 
 def sightings(
@@ -201,13 +212,11 @@ def found_camera(
     try:
         found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes, config)
     except ValueError as error:
-        raise InputError(f"--intrinsics: {error}") from error
+        raise InputError(str(error)) from error
     except (RuntimeError, np.linalg.LinAlgError) as error:  # an ill-posed problem
-        raise InputError(
-            "--intrinsics: too few corners tie the images together; nothing was changed"
-        ) from error
+        raise InputError("too few corners tie the images together") from error
     if found.why_not:
-        raise InputError(f"--intrinsics: {found.why_not}; nothing was changed")
+        raise InputError(found.why_not)
     return found
 
 
