@@ -93,36 +93,31 @@ class LiveScan:
     def forget(self) -> None:
         """Publish all of it once more."""
         self._sent: dict[int, tuple[int, float, int]] = {}  # layer, scale, revision
-        self._poses, self._last_ns, self._has_more = 0, -1, True
+        self._last_ns, self._has_more = -1, True
 
     def refresh(self) -> None:
         """Publish poses that are new, and keyframes that are new, finer or moved; AT_ONCE of
         these at most."""
         if not (self._index.changed() or self._has_more):
             return
-        poses, _ = self._index.counts()
-        if poses != self._poses:
-            self._poses = poses
-            for pose in self._store.poses():
-                if pose.time_unix_ns > self._last_ns:
-                    self._last_ns = pose.time_unix_ns
-                    self._channels.log_transform(pose.T_world_camera, pose.time_unix_ns)
-                    self._channels.log_fix(pose)
-        published = 0
+        for pose in self._store.poses(self._last_ns + 1):
+            self._last_ns = pose.time_unix_ns
+            self._channels.log_transform(pose.T_world_camera, pose.time_unix_ns)
+            self._channels.log_fix(pose)
+        published, revisions = 0, self._index.revisions()
         for seq, layer in self._index.layers().items():
-            published += self._publish(seq, layer)
+            published += self._publish(seq, layer, revisions.get(seq, -1))
             self._has_more = published == AT_ONCE
             if self._has_more:
                 return
 
-    def _publish(self, seq: int, layer: int) -> bool:
+    def _publish(self, seq: int, layer: int, revision: int) -> bool:
         """Publish a keyframe if it is new or finer, its new pose if only that changed."""
-        repose = self._store.repose(seq)
-        scale, revision = (1.0, -1) if repose is None else (repose.scale, repose.revision)
-        state = layer, scale, revision
         before = self._sent.get(seq)
-        if before == state:
+        if before is not None and before[::2] == (layer, revision):
             return False
+        repose = self._store.repose(seq)
+        state = layer, 1.0 if repose is None else repose.scale, revision
         keyframe = self._store.keyframe(seq)
         self._sent[seq] = state
         if keyframe is None:

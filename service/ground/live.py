@@ -42,8 +42,8 @@ from recon.mapping.cloud_fusion import cloud_of
 from recon.types import F64, DepthMap, Keyframe
 from service.errors import SkyreliefError
 from service.ground.shown_site import SiteNews
-from service.scans.track import latest
 from service.stream.database import Database
+from service.stream.ranges import RangeSet, is_number
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
@@ -124,13 +124,44 @@ class StoreIndex:
         sql = f"SELECT seq, MAX(layer) FROM (SELECT seq, layer FROM chunks UNION {radio})"
         return dict(self._db.all(f"{sql} GROUP BY seq ORDER BY seq"))
 
-    def counts(self) -> tuple[int, int]:
-        """Number of poses and of re-poses."""
-        poses, radio, reposes = (
-            int(self._db.all(f"SELECT COUNT(*) FROM {source}")[0][0])
-            for source in ("poses", "radio WHERE kind = 'pose'", "reposes")
-        )
-        return poses + radio, reposes
+    def revisions(self) -> dict[int, int]:
+        """Keyframe number to the revision of its newest re-pose; without one it is left out."""
+        sql = f"SELECT seq, MAX(revision) FROM reposes WHERE {is_number('revision')} GROUP BY seq"
+        return dict(self._db.all(sql))
+
+
+@dataclass(slots=True, eq=False)
+class Track:
+    """The flight path of a growing scan; a pose is read once."""
+
+    store: ScanStore
+    last: PoseRecord | None = None
+    _known: RangeSet = field(default_factory=RangeSet)
+    _at: dict[int, tuple[int, list[float]]] = field(default_factory=dict)
+    """By time: number of the newest pose, and its place (3,) m in the scan's frame."""
+    _count: int = -1
+
+    def grown(self) -> bool:
+        """Read the poses that are new; False without any. True at the first call."""
+        if not self._known:
+            self._at, self.last = {}, None  # those of the narrow radio
+        new = list(self.store.poses_beside(self._known))
+        for number, pose in new if self._known else ((-1, p) for p in self.store.poses()):
+            time_ns = pose.time_unix_ns
+            if number >= self._at.get(time_ns, (-1,))[0]:
+                place = [round(float(v), 3) for v in pose.T_world_camera[:3, 3]]
+                self._at[time_ns] = number, place
+                if self.last is None or time_ns >= self.last.time_unix_ns:
+                    self.last = pose
+        before, self._count = self._count, len(self._at)
+        return bool(new) or self._count != before
+
+    def places(self) -> list[list[float]]:
+        """(N, 3) places in order of time, thinned to about TRACK_POINTS."""
+        times = sorted(self._at)
+        step = max(1, math.ceil(len(times) / TRACK_POINTS))
+        thinned = times[::step] + (times[-1:] if times and (len(times) - 1) % step else [])
+        return [self._at[time_ns][1] for time_ns in thinned]
 
 
 @dataclass(slots=True, eq=False)
@@ -148,9 +179,13 @@ class LiveFeed:
     _sent: dict[int, int] = field(default_factory=dict)  # keyframe to the layer sent
     _scale: dict[int, float] = field(default_factory=dict)
     _revision: dict[int, int] = field(default_factory=dict)
-    _counts: tuple[int, int] = (-1, -1)
+    _track: Track = field(init=False)
     _finished: bool | None = None
     _more: bool = True  # the last call left something for the next
+
+    def __post_init__(self) -> None:
+        """Begin without any pose."""
+        self._track = Track(self.store)
 
     def news(self, max_chunks: int = 20) -> Iterator[str | bytes]:
         """Messages for what has changed; at most ``max_chunks`` keyframes at a time."""
@@ -168,15 +203,11 @@ class LiveFeed:
             if keyframe is not None:
                 self._note_repose(seq)
                 yield chunk_message(keyframe, finest[seq], self.max_points)
-        poses, reposes = self.index.counts()
-        before, self._counts = self._counts, (poses, reposes)
-        if reposes != before[1]:
-            yield from self._corrections()
-        if poses != before[0]:
-            track = latest(self.store.poses())
-            if not self.heard_unix_s and track:
-                self.heard_unix_s = track[-1].time_unix_ns / 1e9
-            yield track_message(track)
+        yield from self._corrections()
+        if self._track.grown():
+            if not self.heard_unix_s and self._track.last is not None:
+                self.heard_unix_s = self._track.last.time_unix_ns / 1e9
+            yield track_message(self._track)
         state = self.store.finished
         if state != self._finished and not self._more:
             self._finished = state
@@ -189,8 +220,9 @@ class LiveFeed:
 
     def _corrections(self) -> Iterator[str]:
         """Re-poses newer than the pose that a chunk was sent with."""
-        for seq, had in self._revision.items():
-            repose = self.store.repose(seq)
+        for seq, revision in self.index.revisions().items():
+            had = self._revision.get(seq, revision)
+            repose = self.store.repose(seq) if revision > had else None
             if repose is None or repose.revision <= had:
                 continue
             self._revision[seq] = repose.revision
@@ -204,16 +236,11 @@ class LiveFeed:
             )
 
 
-def track_message(poses: list[PoseRecord]) -> str:
+def track_message(track: Track) -> str:
     """The flight path, thinned, and the state of the last pose."""
-    step = max(1, math.ceil(len(poses) / TRACK_POINTS))
-    thinned = poses[::step] + (poses[-1:] if poses and (len(poses) - 1) % step else [])
-    message: dict[str, Any] = {
-        "type": "track",
-        "track": [[round(float(v), 3) for v in p.T_world_camera[:3, 3]] for p in thinned],
-    }
-    if poses:
-        last = poses[-1]
+    message: dict[str, Any] = {"type": "track", "track": track.places()}
+    last = track.last
+    if last is not None:
         message["last"] = {
             "time_unix_s": last.time_unix_ns / 1e9,
             "T": columns(last.T_world_camera),

@@ -32,7 +32,14 @@ from service.stream.database import (
     rescue,
 )
 from service.stream.radio_tiles import RadioStore
-from service.stream.ranges import Inventory, Listener, RangeSet, is_number, ranges_from_pairs
+from service.stream.ranges import (
+    MAX_NUMBER,
+    Inventory,
+    Listener,
+    RangeSet,
+    is_number,
+    ranges_from_pairs,
+)
 from service.stream.records import (
     PoseRecord,
     Repose,
@@ -319,7 +326,20 @@ class ScanStore:
             if pose is not None:
                 yield pose
         if not self._inventory.of("pose"):
-            yield from self._radio.poses()
+            yield from (p for p in self._radio.poses() if p.time_unix_ns >= since_unix_ns)
+
+    def poses_beside(self, known: RangeSet) -> Iterator[tuple[int, PoseRecord]]:
+        """Number and pose of those whose numbers are not ``known``; adds them to it.
+
+        Of the gaps in ``known``, the newest MAX_RANGES are read.
+        """
+        sql = "SELECT id, data FROM poses WHERE id BETWEEN ? AND ?"
+        for gap in (RangeSet([(0, MAX_NUMBER)]) - known).pairs():
+            for number, data in self._db.all(sql, gap):
+                known.add(number)
+                pose = unpack_pose(blob(data))
+                if pose is not None:
+                    yield number, pose
 
     def add_reposes(self, reposes: Sequence[Repose]) -> None:
         """Store several re-poses in one transaction, under the next numbers."""

@@ -87,13 +87,13 @@ def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> Surfac
     if strict:
         return Surface(certain, np.zeros(certain.grid.shape, np.bool_))
     holes = ~certain.known & (outlined(certain.known) if scan.is_whole else True)
-    held = holes & _unrefuted(scan, measured, inner_doubtful(measured, sure), ())
+    held = _unrefuted(scan, measured, holes & inner_doubtful(measured, sure), ())
     level = sure.known & _at_lowest(measured, certain)
-    held |= holes & _unrefuted(scan, measured, holes & level, (*NEAR_UP_M, *FILLED_UP_M))
+    held |= _unrefuted(scan, measured, holes & level, (*NEAR_UP_M, *FILLED_UP_M))
     known = without_cells(measured, ~(certain.known | held))
     raster, new = filled(known, measured, FILLED_REACH_M, FILLED_EDGE_CELLS)
-    top = np.fmax(*(highest_lowest(r.height_m, NEAR_CELLS)[0] for r in (raster, measured)))
-    below = new & (top - raster.height_m > STEP_M)
+    top_m = highest_lowest(measured.height_m, NEAR_CELLS)[0]
+    below = new & (top_m - raster.height_m > STEP_M)
     right = _unrefuted(scan, raster, new & holes, FILLED_UP_M)
     right &= ~below | _unrefuted(scan, raster, below, NEAR_UP_M)
     return Surface(without_cells(raster, new & ~right), right | held)
