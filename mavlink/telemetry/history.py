@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mavlink.telemetry.gimbal import GimbalConfig, steadiest_frame, to_earth
-from mavlink.telemetry.quaternion import Quaternion, Vector, curve, down_component, slerp
+from mavlink.telemetry.quaternion import Quaternion, Vector, curve, down_component, hermite, slerp
 from mavlink.telemetry.samples import (
     MAX_GAP_NS,
     RECEIVER_SIGMA_H_M,
@@ -450,7 +450,7 @@ def _position_at(at: Bracket) -> tuple[float, float, float, object]:
     )
     v0, v1 = at.before[4:7], at.after[4:7]
     u, h = at.fraction, at.gap_s
-    ned = [_hermite(step[k], v0[k] * h, v1[k] * h, u) for k in range(3)]
+    ned = [_way(step[k], v0[k] * h, v1[k] * h, u) for k in range(3)]
     lat = at.before[0] + ned[0] / M_PER_DEG
     lon = (at.before[1] + ned[1] / per_lon + 180.0) % 360.0 - 180.0
     known = all(map(math.isfinite, (*v0, *v1)))
@@ -458,15 +458,14 @@ def _position_at(at: Bracket) -> tuple[float, float, float, object]:
     return lat, lon, at.before[2] - ned[2], velocity
 
 
-def _hermite(step: float, m0: float, m1: float, u: float) -> float:
+def _way(step: float, m0: float, m1: float, u: float) -> float:
     """Distance covered at fraction u; linear when the velocities contradict the step."""
     straight = u * step
     if not (math.isfinite(m0) and math.isfinite(m1)) or not 0.0 <= u <= 1.0:
         return straight
     if abs(0.5 * (m0 + m1) - step) > 0.5 + 0.2 * abs(step):
         return straight
-    h10, h01, h11 = u * (1 - u) ** 2, u * u * (3 - 2 * u), u * u * (u - 1)
-    return h10 * m0 + h01 * step + h11 * m1
+    return hermite(step, m0, m1, u)
 
 
 def _receiver_above(accuracy: Bracket | None, positions: Track) -> ReceiverAltitude | None:

@@ -73,8 +73,7 @@ def down_component(q_ned_body: Quaternion) -> float:
 
 def angle_between(a: Quaternion, b: Quaternion) -> float:
     """Angle in rad of the rotation from a to b, 0 to pi."""
-    w, x, y, z = multiply(conjugate(a), b)
-    return 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
+    return math.hypot(*rotation_vector(multiply(conjugate(a), b)))
 
 
 def slerp(a: Quaternion, b: Quaternion, fraction: float) -> Quaternion:
@@ -109,17 +108,24 @@ def curve(
     turn = rotation_vector(multiply(conjugate(a), b))
     across = cross(turn, rates_b)
     twice = cross(turn, across)
-    u = fraction
-    h10, h01, h11 = u * (1 - u) ** 2, u * u * (3 - 2 * u), u * u * (u - 1)
     x, y, z = (
-        h10 * gap_s * rates_a[k]
-        + h01 * turn[k]
-        + h11 * gap_s * (rates_b[k] + across[k] / 2 + twice[k] / 12)
+        hermite(
+            turn[k],
+            gap_s * rates_a[k],
+            gap_s * (rates_b[k] + across[k] / 2 + twice[k] / 12),
+            fraction,
+        )
         for k in range(3)
     )
     angle = math.sqrt(x * x + y * y + z * z)
     scale = 0.5 if angle < 1e-6 else math.sin(angle / 2) / angle
     return multiply(a, (math.cos(angle / 2), scale * x, scale * y, scale * z))
+
+
+def hermite(step: float, begin: float, end: float, fraction: float) -> float:
+    """The way at ``fraction`` of a cubic over ``step`` with these derivatives at its ends."""
+    u = fraction
+    return u * (1 - u) ** 2 * begin + u * u * (3 - 2 * u) * step + u * u * (u - 1) * end
 
 
 def rotation_vector(q: Quaternion) -> Vector:
