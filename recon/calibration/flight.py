@@ -122,7 +122,7 @@ def self_calibrate(
     last = problem(seen, sigma)
     found = independent(last, solve(last, config.iterations), config.iterations)
     sigmas = camera_sigmas(found.camera_covariance)
-    focal = float(sigmas[:2].max() / found.camera.K[0, 0])
+    focal = focal_sigma(found.camera, sigmas)
     why_not = doubt(found.camera, camera, sigmas, config)
     if not why_not and (np.abs(found.camera_step) > MAX_STEP * sigmas).any():
         why_not = "the adjustment of the images does not settle"
@@ -134,16 +134,12 @@ def self_calibrate(
 
 
 def independent(problem: Problem, found: Solution, iterations: int = 40) -> Solution:
-    """``found`` again with sightings that weigh as much as independent ones would.
-
-    Huber's limit stays the same in pixels.
-    """
+    """``found`` again with sightings that weigh as much as independent ones would."""
     at = replace(problem, camera=found.camera, poses=found.poses, points=found.points)
     wider = float(np.sqrt(dispersion(at)))
     if not 1.0 < wider < np.inf:
         return found
-    less = replace(at, sigma_px=wider * at.sigma_px, huber_sigmas=at.huber_sigmas / wider)
-    return solve(less, iterations)
+    return solve(at.widened(wider), iterations)
 
 
 ROUNDS = ((8.0, 180.0), (1.0, 15.0))
@@ -242,7 +238,7 @@ def shared(seen: Sightings, kept: Bool) -> Sightings:
 
 def doubt(found: Camera, given: Camera, sigmas: F64, c: SelfCalibrationConfig) -> str:
     """Return why the camera, known to ``sigmas`` (8,), is refused; empty when it is accepted."""
-    sigma_focal = float(sigmas[:2].max() / found.K[0, 0])
+    sigma_focal = focal_sigma(found, sigmas)
     if sigma_focal > c.max_sigma_focal:
         return (
             f"the flight does not determine the focal length (to {100 * sigma_focal:.1f} %, asked "
@@ -264,6 +260,11 @@ def doubt(found: Camera, given: Camera, sigmas: F64, c: SelfCalibrationConfig) -
     if off > c.max_sigmas:
         return "the camera found is too far from the model given; calibrate with a chessboard"
     return ""
+
+
+def focal_sigma(found: Camera, sigmas: F64) -> float:
+    """Sigma of the focal length, as a share, of a camera known to ``sigmas`` (8,)."""
+    return float(sigmas[:2].max() / found.K[0, 0])
 
 
 def camera_information(given: Camera, c: SelfCalibrationConfig) -> F64:

@@ -125,6 +125,10 @@ class Problem:
     cauchy_sigmas: float = 2.0  # of a fix
     rows: RowMotion | None = None  # None: a global shutter
 
+    def widened(self, by: float) -> Problem:
+        """The same with sightings that scatter more; Huber's limit stays the same in pixels."""
+        return replace(self, sigma_px=by * self.sigma_px, huber_sigmas=self.huber_sigmas / by)
+
 
 @njit(cache=True, nogil=True)
 def _pixel(P: F64, X: F64, k: F64, k3: float, out: F64) -> bool:

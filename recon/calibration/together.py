@@ -21,14 +21,15 @@ from recon.calibration.global_bundle import (
     solve,
     step_covariances,
 )
+from recon.tracking.readout_search import MAX_READOUT_S
 from recon.types import F64, Camera
 
 LENS = SelfCalibrationConfig(sigma_focal=0.003, sigma_centre=0.003, sigma_k=0.01, sigma_p=0.0005)
 """How far a lens may be off that is calibrated, or found by the images. Held as it is, its errors
 bend the ground."""
 
-USUAL_S, MAX_READOUT_S = 0.03, 0.05
-"""Readout that bounds the turns where none is known, and the longest that cameras have."""
+USUAL_S = 0.03
+"""Readout that bounds the turns where none is known: cameras have 0 to 50 ms."""
 
 ROUNDS = 5
 """In which the readout and the turns settle."""
@@ -112,7 +113,7 @@ class _Adjustment:
         problem = Problem(
             s.camera, camera, s.poses, s.points, net.seen, pixel, known, held, rows=s.rows
         )
-        self._at = _widened(problem, max(float(np.sqrt(dispersion(problem))), 1.0))
+        self._at = problem.widened(max(float(np.sqrt(dispersion(problem))), 1.0))
         crowd = float(np.sqrt(np.median(np.bincount(net.seen.view)) / PATCHES))
         self._of_patches = max(crowd * net.sigma_px / float(self._at.sigma_px[0]), 1.0)
 
@@ -129,7 +130,7 @@ class _Adjustment:
 
     def weigh_patches(self) -> None:
         """Take all sightings in a patch of an image for one."""
-        self._at = _widened(self._at, self._of_patches)
+        self._at = self._at.widened(self._of_patches)
 
     def result(self, turning: Turning, readout_s: float, sigma_s: float) -> Together:
         """The stills as they are adjusted now."""
@@ -140,11 +141,6 @@ class _Adjustment:
             self._at.seen, rates, step_covariances(self._at), float(self._at.sigma_px[0]),
             readout_s, sigma_s,
         )  # fmt: skip
-
-
-def _widened(problem: Problem, by: float) -> Problem:
-    """The problem with sightings that scatter more; Huber's limit stays the same in pixels."""
-    return replace(problem, sigma_px=by * problem.sigma_px, huber_sigmas=problem.huber_sigmas / by)
 
 
 def slope(rates: F64, turns: F64) -> tuple[float, float]:

@@ -65,10 +65,6 @@ class KnownTrack:
         self._map.add(points)
         self._clock = RowClock(lens) if lens.shutter.readout_s else None
 
-    def view(self, seq: int) -> KnownView:
-        """What is known of a frame by its number. KeyError for others."""
-        return self._views[seq]
-
     def can_skip(self, time_ns: int, prior: PosePrior, frames_per_step: float) -> bool:
         """False: every still counts."""
         return False

@@ -23,6 +23,7 @@ from recon.calibration.flight import (
     camera_sigmas,
     doubt,
     first_held,
+    focal_sigma,
     loosely_placed,
     network,
 )
@@ -129,7 +130,7 @@ def network_of(
     s, pixel = found.solution, np.full(len(found.seen.view), found.sigma_px)
     settled = Problem(s.camera, given, s.poses, s.points, found.seen, pixel, known, held)
     sigmas = camera_sigmas(s.camera_covariance) * np.sqrt(max(dispersion(settled), 1.0))
-    focal = float(sigmas[:2].max() / s.camera.K[0, 0])
+    focal = focal_sigma(s.camera, sigmas)
     why = doubt(s.camera, given, sigmas, FREE)
     if why:
         held = camera_information(given, HELD)
