@@ -610,5 +610,6 @@ def test_the_command_reports_and_takes_no_other_video(flight: Flight) -> None:
     refused = run(app, ["refine", str(flight.scan), "--intrinsics", "--video", str(video)])
     assert isinstance(refused.exception, InputError)
     assert "other.mp4" in str(refused.exception)
+    assert "nothing was changed" in str(refused.exception)
     assert run(app, ["refine", str(flight.scan), "--undo"]).exit_code == 0
     assert errors(flight).min() > 2.0

@@ -140,7 +140,10 @@ def intrinsics(
     _open_target(folder, None)
     with ScanStore.open(folder / "scan.db") as store, Revisions(store) as revisions:
         job = _Refinement(folder, store, revisions, RefineOptions(telemetry=telemetry))
-        found, given = job.own_camera(video)
+        try:
+            found, given = job.own_camera(video)
+        except InputError as error:
+            raise InputError(f"--intrinsics: {error}; nothing was changed") from error
     return own_camera.write(found, given, out or folder) | {"notes": job.notes}
 
 
