@@ -131,7 +131,7 @@ class StoreIndex:
 
 
 @dataclass(slots=True, eq=False)
-class Track:
+class FlightPath:
     """The flight path of a growing scan; a pose is read once."""
 
     store: ScanStore
@@ -179,13 +179,13 @@ class LiveFeed:
     _sent: dict[int, int] = field(default_factory=dict)  # keyframe to the layer sent
     _scale: dict[int, float] = field(default_factory=dict)
     _revision: dict[int, int] = field(default_factory=dict)
-    _track: Track = field(init=False)
+    _track: FlightPath = field(init=False)
     _finished: bool | None = None
     _more: bool = True  # the last call left something for the next
 
     def __post_init__(self) -> None:
         """Begin without any pose."""
-        self._track = Track(self.store)
+        self._track = FlightPath(self.store)
 
     def news(self, max_chunks: int = 20) -> Iterator[str | bytes]:
         """Messages for what has changed; at most ``max_chunks`` keyframes at a time."""
@@ -236,7 +236,7 @@ class LiveFeed:
             )
 
 
-def track_message(track: Track) -> str:
+def track_message(track: FlightPath) -> str:
     """The flight path, thinned, and the state of the last pose."""
     message: dict[str, Any] = {"type": "track", "track": track.places()}
     last = track.last

@@ -93,8 +93,8 @@ def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> Surfac
     known = without_cells(measured, ~(certain.known | held))
     raster, new = filled(known, measured, FILLED_REACH_M, FILLED_EDGE_CELLS)
     top_m = highest_lowest(measured.height_m, NEAR_CELLS)[0]
-    below = new & (top_m - raster.height_m > STEP_M)
     right = _unrefuted(scan, raster, new & holes, FILLED_UP_M)
+    below = right & (top_m - raster.height_m > STEP_M)
     right &= ~below | _unrefuted(scan, raster, below, NEAR_UP_M)
     return Surface(without_cells(raster, new & ~right), right | held)
 
