@@ -28,7 +28,7 @@ def test_every_stage_is_compared_with_its_floor(
 
     for module in (bench_gpu, gpu_stages, gpu):
         monkeypatch.setattr(module, "SIZE", (96, 54))
-    for guide in ("GUIDE", "GUIDE_ON_DEVICE"):
+    for guide in ("GUIDE", "GUIDE_ON_DEVICE", "DEPTH_ON_DEVICE"):
         monkeypatch.setattr(bench_gpu, guide, (192, 108))
     device = str(request.config.getoption("--device"))
     for table in ("COPY_MB", "PRODUCT"):

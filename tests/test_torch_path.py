@@ -23,7 +23,7 @@ from recon.stereo.reprojection import reproject as compiled_reproject
 from recon.stereo.upsampling import UpsamplingConfig, guide_at_taps
 from recon.stereo.upsampling import upsample as compiled_upsample
 from recon.stereo.virtual_stereo import drop_unseen as compiled_drop
-from recon.types import F32, F64, U8, Array, DepthMap, DisparityMap, StereoPair
+from recon.types import F32, U8, Array, DepthMap, DisparityMap, StereoPair
 
 torch = pytest.importorskip("torch")
 
@@ -187,7 +187,7 @@ def test_fusion_equals_the_compiled_one(device: str, count: int) -> None:
 @pytest.mark.parametrize("finer", [1, 3])
 def test_reprojection_equals_the_compiled_one(device: str, finer: int) -> None:
     """Labels at the pair's size and finer, holes, edges and places outside among them."""
-    from recon.backends.torch_depth import reproject
+    from recon.backends.torch_depth import _inputs, reproject
 
     pair = stereo_pair(50, 90, 16, 1)
     rng = np.random.default_rng(1)
@@ -196,10 +196,9 @@ def test_reprojection_equals_the_compiled_one(device: str, finer: int) -> None:
     px[20:30, 20:40] += 5
     px[rng.random(px.shape) < 0.1] = np.nan
     confidence = rng.uniform(0, 1, px.shape).astype(np.float32)
+    pair = replace(pair, noise=1.7)
     want = compiled_reproject(DisparityMap(px, confidence), pair, K, SIZE)
-    to_left = pair.K @ pair.R_left_keyframe @ np.linalg.inv(K)
-    base: F64 = np.array([*pair.plane, pair.slope, pair.K[0, 0] * pair.baseline_m])
-    geometry = np.concatenate([to_left.ravel(), base])
+    geometry = _inputs(pair, K)[-1]
     true = torch.tensor([50, 90, 50 * finer, 90 * finer], device=device)
     wide = [np.pad(a, ((0, 7), (0, 5)), constant_values=3) for a in (px, confidence)]
     labels, sure, numbers = on(device, *wide, geometry)

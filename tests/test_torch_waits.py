@@ -61,15 +61,17 @@ def device(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def reads(device: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Grows by one with each read of a tensor on the host."""
-    made: list[int] = []
-    own = torch.Tensor.cpu
+    from recon.backends import torch_plan
 
-    def counted(tensor: Any, *given: Any, **more: Any) -> Any:
+    made: list[int] = []
+    own = torch_plan.to_host
+
+    def counted(tensor: Any) -> Any:
         made.append(tensor.numel())
         with waiting_allowed(device, True):
-            return own(tensor, *given, **more)
+            return own(tensor)
 
-    monkeypatch.setattr(torch.Tensor, "cpu", counted)
+    monkeypatch.setattr(torch_plan, "to_host", counted)
     return made
 
 
@@ -175,7 +177,7 @@ def test_nothing_is_made_on_the_host_between_upload_and_result() -> None:
     matching = BeliefPropagationConfig(iterations=1, speckle_px=1)
     path = DensePath("meta", matching, UpsamplingConfig(diameter_px=2), FusionConfig())
     pair = [empty(torch.uint8, 64, 96) for _ in range(4)]
-    pair += [empty(torch.uint8, 128, 192, 3), empty(torch.int64, 5), empty(torch.float64, 14)]
+    pair += [empty(torch.uint8, 128, 192, 3), empty(torch.int64, 5), empty(torch.float64, 15)]
     depth = [empty(torch.float32, 48, 60)] * 2 + [empty(torch.float64, 4)]
     with OffTheDevice() as off:
         found = [

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from recon.backends.room import kept, pyramid_levels, room
-from recon.backends.torch_plan import Plan, part, read
+from recon.backends.torch_plan import Plan, fused, part, read
 from recon.backends.torch_stereo import DenseStereo, drop_unreliable, drop_unseen
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX, FusionConfig
@@ -81,7 +81,7 @@ class DensePath:
 
         def build() -> Plan:
             stage = PairDepthStage(self, space[2], levels, size_px)
-            shapes = [space[:2]] * 4 + [(*(fine or (0, 0)), 3), (5,), (14,)]
+            shapes = [space[:2]] * 4 + [(*(fine or (0, 0)), 3), (5,), (15,)]
             given = _inputs(pair, np.eye(3))
             parts = [part(a, s) for a, s in zip(given, shapes, strict=True)]
             return Plan(self.device, stage, parts)
@@ -128,7 +128,7 @@ def _inputs(pair: StereoPair, K: F64) -> list[Array]:
         seen = [everywhere, everywhere]
     guide = np.zeros((0, 0, 3), np.uint8) if pair.guide is None else pair.guide
     to_left = pair.K @ pair.R_left_keyframe @ np.linalg.inv(K)
-    base = [pair.slope, pair.K[0, 0] * pair.baseline_m]
+    base = [pair.slope, pair.K[0, 0] * pair.baseline_m, LABEL_SIGMA_PX * pair.noise]
     geometry = np.concatenate([to_left.ravel(), pair.plane, base]).astype(np.float64)
     true = np.array([h, w, guide.shape[0], guide.shape[1], pair.labels], np.int64)
     return [pair.left, pair.right, *seen, guide, true, geometry]
@@ -150,11 +150,17 @@ class JointBilateral(torch.nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """``taps`` (h, w, 3) and ``guide`` (H, W, 3) in gray levels; ``true`` (4,) h, w, H, W."""
         layers = tap_layers(px, confidence, taps)
+        rows, log_y = window(px.shape[0], guide.shape[0], true[0], true[2], self.config)
+        columns, log_x = window(px.shape[1], guide.shape[1], true[1], true[3], self.config)
+        if fused(px):
+            from recon.backends import triton_dense
+
+            return triton_dense.bilateral(
+                layers, guide, (rows, log_y), (columns, log_x), self.config
+            )
         image = guide.float().permute(2, 0, 1)
         everything = torch.zeros_like(image[0])
         sums = torch.zeros_like(image)
-        rows, log_y = window(px.shape[0], guide.shape[0], true[0], true[2], self.config)
-        columns, log_x = window(px.shape[1], guide.shape[1], true[1], true[3], self.config)
         for j in range(self.config.diameter_px):
             row = layers.index_select(1, rows[j])
             for i in range(self.config.diameter_px):
@@ -217,10 +223,15 @@ def reproject(
 ) -> tuple[Tensor, Tensor]:
     """Depth and sigma in metres, float32, on the keyframe's grid of ``size_px`` (w, h).
 
-    As :func:`recon.stereo.reprojection.reproject`. ``geometry`` (14,) float64 is the
-    homography to the left image (9), the plane (3), slope and f B; ``true`` (4,) is the
-    size h, w of the pair and that of ``px``, which may be a larger array.
+    As :func:`recon.stereo.reprojection.reproject`. ``geometry`` (15,) float64 is the
+    homography to the left image (9), the plane (3), slope, f B, and sigma of a label of full
+    confidence in pixels; ``true`` (4,) is the size h, w of the pair and that of ``px``, which may
+    be a larger array.
     """
+    if fused(px):
+        from recon.backends import triton_dense
+
+        return triton_dense.reproject(px, confidence, geometry, true, size_px, MIN_REPROJECTED)
     u = torch.arange(size_px[0], device=px.device, dtype=torch.float64)[None, :]
     v = torch.arange(size_px[1], device=px.device, dtype=torch.float64)[:, None]
     H = geometry[:9].view(3, 3)
@@ -236,7 +247,7 @@ def reproject(
     d = geometry[9] * x + geometry[10] * y + geometry[11] + slope * label
     good = ahead & (label == label) & (trust >= MIN_REPROJECTED) & (d >= 1e-3)
     depth = geometry[13] / d / z  # Eq. 3, along the keyframe's z
-    sigma = depth / d * slope.abs() * LABEL_SIGMA_PX / trust.sqrt()
+    sigma = depth / d * slope.abs() * geometry[14] / trust.sqrt()
     return (
         torch.where(good, depth, math.nan).float(),
         torch.where(good, sigma, math.nan).float(),
@@ -275,6 +286,10 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Te
     As :func:`recon.stereo.reprojection.fuse`: inverse depth of the largest group that agrees,
     nothing where several pairs read and none comes near another.
     """
+    if fused(depth):
+        from recon.backends import triton_dense
+
+        return unrefuted(*triton_dense.fuse(depth, sigma, config))
     z, e = depth.double(), sigma.double()
     usable = (z > 0) & (e < config.max_sigma_share * z)
     inverse = torch.where(usable, 1 / z, 0.0)
@@ -286,21 +301,26 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Te
     views = member.sum(0)
     near = usable & ((inverse - centre).abs() <= config.max_sigma_share * centre)
     contradicted = (views == 1) & (usable.sum(0) > 1) & (near.sum(0) == 1)
-    refuted = contradicted.sum() > (views >= 2).sum()
-    seen = (views > 0) & ~contradicted & ~refuted
+    seen = (views > 0) & ~contradicted
     total = torch.where(seen, weight.sum(0), 1.0)
     mean = (weight * inverse).sum(0) / total
     scatter = (weight * (inverse - mean) ** 2).sum(0)
     variance = 1 / total + scatter / total / (views - 1).clamp(min=1)
-    fused = 1 / torch.where(seen, mean, 1.0)
+    found = torch.where(seen, 1 / torch.where(seen, mean, 1.0), math.nan)
     alone = torch.where(views == 1, config.single_view_sigma, 1.0)
-    error = (variance.sqrt() * fused**2 * alone).maximum(config.min_sigma_share * fused)
-    nan = math.nan
-    return (
-        torch.where(seen, fused, nan).float(),
-        torch.where(seen, error, nan).float(),
-        torch.where(seen, views, 0).float(),
-    )
+    error = (variance.sqrt() * found**2 * alone).maximum(config.min_sigma_share * found)
+    return unrefuted(found.float(), error.float(), views.float())
+
+
+def unrefuted(depth: Tensor, sigma: Tensor, views: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The three without pixels whose pairs contradict each other: NaN depth, some views.
+
+    Where those are more than the pixels at which two agree, nothing is left.
+    """
+    contradicted = (depth != depth) & (views > 0)
+    refuted = contradicted.sum() > (views >= 2).sum()
+    nothing = torch.where(refuted, math.nan, 0.0)
+    return depth + nothing, sigma + nothing, torch.where(contradicted | refuted, 0.0, views)
 
 
 def _largest_group(

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from recon.backends.room import kept
-from recon.backends.torch_plan import Plan, part
+from recon.backends.torch_plan import Plan, fused, part, read
 from recon.mapping.icp_kernels import MIN_PIXELS, REACH
 from recon.mapping.registration import (
     AREA_LAGS,
@@ -57,7 +57,7 @@ class DeviceIcp:
                 lambda: Plan(self.device, _descent(config), [part(a) for a in given]),
             )  # fmt: skip
             plan.upload(given)
-            rows = plan.run()[0].cpu().numpy()
+            (rows,) = read(plan.run())
         return _concluded(rows, start, config)
 
     def plan(self) -> Plan:
@@ -159,6 +159,10 @@ def weigh(
     config: IcpConfig,
 ) -> Weighed:  # fmt: skip
     """The problem of the points ``seen`` of ``a`` against ``b`` at the motion ``T`` (4, 4)."""
+    if fused(T):
+        from recon.backends import triton_icp
+
+        return triton_icp.weigh(seen, a, b, T, tukey, config)
     partners = match(seen, b, T, config)
     centre = T[:3, :3] @ a.centre + T[:3, 3]
     size = partners.residual.abs()
@@ -192,6 +196,10 @@ def advance(
     ``state`` (3,): 1 while there are partners enough, 1 while it moves, steps made. It stands
     still once a step is less than ``share`` of its own sigma.
     """
+    if fused(T):
+        from recon.backends import triton_icp
+
+        return triton_icp.advance(weighed, a, T, state, share, config)
     step, settled = _step(weighed, a.lever_m, share, config)
     overlap = state[0] * (weighed.partners >= MIN_PARTNERS)
     moving = state[1] * overlap

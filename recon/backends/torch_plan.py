@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from threading import Lock
 from typing import Any
 
@@ -116,6 +118,27 @@ def part(array: Array, shape: tuple[int, ...] | None = None) -> Part:
 
 
 def read(tensors: Sequence[Tensor]) -> list[Array]:
-    """Float32 results of one shape as arrays of the host: one copy, one wait."""
-    together = torch.stack(list(tensors)).cpu().numpy()
-    return [np.array(layer) for layer in together]
+    """Results of one shape and type as arrays of the host: one copy, one wait."""
+    return list(to_host(torch.stack(list(tensors))).numpy())
+
+
+def to_host(tensor: Tensor) -> Tensor:
+    """The tensor on the host; from CUDA in pinned memory, which a copy fills at full speed."""
+    if not tensor.is_cuda:
+        return tensor.cpu()
+    host = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
+    host.copy_(tensor, non_blocking=True)
+    torch.cuda.current_stream().synchronize()
+    return host
+
+
+def fused(tensor: Tensor) -> bool:
+    """Whether Triton's kernels compute with the tensor: on CUDA, where Triton is installed."""
+    return HAS_TRITON and (tensor.is_cuda or INTERPRETED)
+
+
+HAS_TRITON = find_spec("triton") is not None
+"""Some of torch's wheels for Jetsons come without it; plain torch then does the same."""
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+"""The kernels run on the processor, slowly: for tests."""

@@ -26,6 +26,7 @@ from service.bench.stereo import scene
 
 GUIDE = (640, 360)
 GUIDE_ON_DEVICE = (2704, 1520)
+DEPTH_ON_DEVICE = (1280, 720)
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
@@ -58,7 +59,8 @@ def torch_results(compiled: Backend, options: BenchOptions) -> list[BenchResult]
     for stage in stages(device, pair):
         results.append(against_floor(stage, floor, options))
     results += calls(backend, compiled, guide, options)
-    whole = whole_path(device, pair)
+    depth = DEPTH_ON_DEVICE if device == "cuda" else GUIDE
+    whole = whole_path(device, flown_pair(depth))
     results += [against_floor(stage, floor, options) for stage in whole]
     return results
 
@@ -120,7 +122,7 @@ def flown_pair(guide_px: tuple[int, int]) -> StereoPair:
         left=left,
         right=right,
         baseline_m=4.0,
-        K=camera(),
+        K=camera(SIZE),
         labels=LABELS,
         plane=np.array([0.0, 0.0, 8.0]),
         slope=1.0,
@@ -231,16 +233,17 @@ def propagation_work(config: BeliefPropagationConfig, bytes_each: int) -> tuple[
     return moved, operations
 
 
-def camera() -> Any:
-    """(3, 3) intrinsics at ``SIZE``."""
-    width, height = SIZE
-    return np.array([[190.0, 0, width / 2 - 0.5], [0, 190.0, height / 2 - 0.5], [0, 0, 1]])
+def camera(size_px: tuple[int, int]) -> Any:
+    """(3, 3) intrinsics of the same view at any size (w, h)."""
+    width, height = size_px
+    f = 0.6 * width
+    return np.array([[f, 0, width / 2 - 0.5], [0, f, height / 2 - 0.5], [0, 0, 1]])
 
 
 def ground(shift_m: float) -> DepthMap:
     """Rolling ground 50 m below, seen from ``shift_m`` further along."""
     width, height = SIZE
-    K = camera()
+    K = camera(SIZE)
     v, u = np.mgrid[0:height, 0:width]
     x, y = (u - K[0, 2]) / K[0, 0] * 50 + shift_m, (v - K[1, 2]) / K[1, 1] * 50
     depth = (50 + 2 * np.sin(x / 6) * np.cos(y / 7)).astype(np.float32)

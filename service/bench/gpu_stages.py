@@ -17,10 +17,10 @@ from recon.backends.torch_plan import Plan, part
 from recon.backends.torch_stereo import DenseStereo, drop_unreliable, drop_unseen
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import FusionConfig
+from recon.stereo.reprojection import LABEL_SIGMA_PX, FusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import Array, StereoPair
-from service.bench.gpu import LABELS, SIZE, Stage, ground, propagation_work
+from service.bench.gpu import LABELS, SIZE, Stage, camera, ground, propagation_work
 
 PAIRS = 4
 
@@ -124,9 +124,11 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
         px, sure, pair.guide, both,
     )  # fmt: skip
     fine = [t.cpu().numpy() for t in finer.run()]
-    geometry = np.array([*np.eye(3).ravel(), *pair.plane, pair.slope, 190.0 * pair.baseline_m])
+    to_left = pair.K @ np.linalg.inv(camera((W, H)))
+    base = [pair.slope, pair.K[0, 0] * pair.baseline_m, LABEL_SIGMA_PX]
+    geometry = np.array([*to_left.ravel(), *pair.plane, *base])
     depth = planned(
-        device, lambda p, s, g, true: reproject(p, s, g, true, SIZE), *fine, geometry, both
+        device, lambda p, s, g, true: reproject(p, s, g, true, (W, H)), *fine, geometry, both
     )
     z, sigma = (t.cpu().numpy() for t in depth.run())
     fused = planned(
@@ -140,10 +142,10 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
               20.0 * pixels, 60.0 * pixels, "contrast, visibility, speckles, both images"),
         staged(f"upsampling to {W}x{H}, exact, on the device", device, finer,
               11.0 * W * H, 20.0 * taps * W * H, f"{taps} taps"),
-        staged(f"reprojection to {w}x{h}, on the device", device, depth,
-              (8 * 5 + 8.0) * pixels, 60.0 * pixels),
-        staged(f"fusion of {PAIRS} pairs, on the device", device, fused,
-              (8.0 * PAIRS + 12) * pixels, 20.0 * PAIRS**2 * pixels),
+        staged(f"reprojection to {W}x{H}, on the device", device, depth,
+              16.0 * W * H, 60.0 * W * H),
+        staged(f"fusion of {PAIRS} pairs at {W}x{H}, on the device", device, fused,
+              (8.0 * PAIRS + 12) * W * H, 20.0 * PAIRS**2 * W * H),
     ]  # fmt: skip
 
 
@@ -151,16 +153,17 @@ def whole_path(device: str, pair: StereoPair) -> list[Stage]:
     """A cloud of one pair: inputs on the device, then images up and depth down, and four."""
     assert pair.guide is not None
     path = DensePath(device, BeliefPropagationConfig(), UpsamplingConfig(), FusionConfig())
-    path.depth([pair], pair.K, SIZE, np.eye(4))
+    H, W = pair.guide.shape[:2]
+    K = camera((W, H))
+    path.depth([pair], K, (W, H), np.eye(4))
     plan = next(iter(path._plans.values()))
     moved, operations = propagation_work(path.matching, 2)
-    H, W = pair.guide.shape[:2]
-    moved += 11.0 * W * H
+    moved += (11.0 + 12.0) * W * H
     operations += 20.0 * path.upsampling.diameter_px**2 * W * H
-    what = f"cloud of {SIZE[0]}x{SIZE[1]} guided by {W}x{H}"
+    what = f"cloud of {W}x{H} from pairs of {SIZE[0]}x{SIZE[1]}"
 
     def cloud(count: int) -> Callable[[], object]:
-        return lambda: path.depth([pair] * count, pair.K, SIZE, np.eye(4))
+        return lambda: path.depth([pair] * count, K, (W, H), np.eye(4))
 
     up = plan.upload_bytes / 1e6
     return [

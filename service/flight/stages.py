@@ -307,8 +307,8 @@ def whole_path(backend: Backend, config: DenseStages, stopwatch: Stopwatch) -> W
     def on_device(pairs: Sequence[RectifiedPair], grid: Grid) -> DepthMap | None:
         assert isinstance(backend, PathBackend)
         plain = [pair for pair in pairs if isinstance(pair, StereoPair)]
-        if len(plain) < len(pairs) or any(pair.noise != 1.0 for pair in plain):
-            return None  # no device knows polar pairs, or motion blur
+        if len(plain) < len(pairs):
+            return None  # no device knows polar pairs
         with stopwatch("dense path"):
             return backend.fused_depth(plain, grid.K, grid.size_px, grid.T_odom_camera, config)
 
