@@ -11,12 +11,12 @@ from torch import Tensor
 
 from recon.backends import DenseStages
 from recon.backends.room import kept, pyramid_levels, room
-from recon.backends.torch_depth import DensePath, JointBilateral
+from recon.backends.torch_depth import DensePath, Upsampling
 from recon.backends.torch_plan import Part, Plan, part, read
 from recon.backends.torch_stereo import DenseStereo
 from recon.stereo.belief_propagation import BeliefPropagationConfig, drop_unreliable
 from recon.stereo.matching_cost import check_pair
-from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps
+from recon.stereo.upsampling import UpsamplingConfig, check_guide
 from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, StereoPair
 
 if TYPE_CHECKING:
@@ -66,19 +66,14 @@ class TorchBackend:
         check_guide(coarse, guide)
         (h, w), (H, W) = coarse.px.shape, guide.shape[:2]
         small, large = room(h, w, 1)[:2], room(H, W, 1)[:2]
-        given = (
-            coarse.px, coarse.confidence, guide_at_taps(guide, (h, w)), guide,
-            np.array([h, w, H, W]),
-        )  # fmt: skip
+        given = (coarse.px, coarse.confidence, guide, np.array([h, w, H, W]))
+        rooms = (small, small, (*large, 3), (4,))
         px, confidence = self._run(
             ("upsample", *small, *large, config),
-            lambda: JointBilateral(config),
-            [
-                part(given[0], small), part(given[1], small), part(given[2], (*small, 3)),
-                part(guide, (*large, 3)), part(given[4]),
-            ],
+            lambda: Upsampling(config),
+            [part(a, shape) for a, shape in zip(given, rooms, strict=True)],
             given,
-        )  # fmt: skip
+        )
         return DisparityMap(px[:H, :W].copy(), confidence[:H, :W].copy())
 
     def register(

@@ -47,6 +47,7 @@ class DensePath:
         self.upsampling = upsampling
         self.fusion = fusion
         self._plans: dict[Any, Plan] = {}
+        self._fusions: dict[Any, tuple[Tensor, Plan]] = {}
 
     def depth(
         self, pairs: Sequence[StereoPair], K: F64, size_px: tuple[int, int], T_world_camera: F64
@@ -58,19 +59,21 @@ class DensePath:
         if not pairs:
             raise ValueError("no stereo pair to fuse")
         with torch.inference_mode():
+            found, fusion = kept(
+                self._fusions, (len(pairs), size_px), KEPT_PLANS,
+                lambda: self._fusion(len(pairs), size_px),
+            )  # fmt: skip
             for slot, pair in enumerate(pairs):
-                self._plan(pair, size_px).upload(_inputs(pair, K), slot)
-                if slot == 0:
-                    found = self._results(len(pairs), size_px)
-                for to, layer in zip(found, self._plan(pair, size_px).run(), strict=True):
-                    to[slot].copy_(layer)
-            depth, sigma, views = read(fuse(*found, self.fusion))
-        return DepthMap(depth, sigma, views.astype(np.uint8), K, T_world_camera)
+                plan = self._plan(pair, size_px)
+                plan.upload(_inputs(pair, K), slot)
+                found[:, slot].copy_(torch.stack(plan.run()))
+            depth, sigma, views = read(fusion.run())
+        return DepthMap(depth, sigma, views, K, T_world_camera)
 
-    def _results(self, pairs: int, size_px: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        """Room for depth and sigma of each pair, two (P, h, w)."""
-        both = torch.empty((2, pairs, size_px[1], size_px[0]), device=self.device)
-        return both[0], both[1]
+    def _fusion(self, pairs: int, size_px: tuple[int, int]) -> tuple[Tensor, Plan]:
+        """Room for depth and sigma of each pair, (2, P, h, w), and the plan that fuses them."""
+        found = torch.zeros((2, pairs, size_px[1], size_px[0]), device=self.device)
+        return found, Plan(self.device, lambda: fuse(found[0], found[1], self.fusion), [])
 
     def _plan(self, pair: StereoPair, size_px: tuple[int, int]) -> Plan:
         h, w = pair.left.shape
@@ -95,7 +98,7 @@ class PairDepthStage(torch.nn.Module):
     def __init__(self, path: DensePath, labels: int, levels: int, size_px: tuple[int, int]) -> None:
         super().__init__()
         self.stereo = DenseStereo(labels, levels, path.matching)
-        self.upsampling = JointBilateral(path.upsampling)
+        self.upsampling = Upsampling(path.upsampling)
         self.matching = path.matching
         self.size_px = size_px
 
@@ -110,8 +113,7 @@ class PairDepthStage(torch.nn.Module):
         px, confidence = drop_unseen(px, confidence, left_seen, right_seen, own)
         sizes = true[:4]
         if guide.shape[0] > 0:
-            taps = averaged(guide, (px.shape[0], px.shape[1]), sizes)
-            px, confidence = self.upsampling(px, confidence, taps, guide, sizes)
+            px, confidence = self.upsampling(px, confidence, guide, sizes)
         else:
             sizes = torch.cat([true[:2], true[:2]])
         return reproject(px, confidence, geometry, sizes, self.size_px)
@@ -138,7 +140,7 @@ FAR_TAP = -1.0e4
 """Log of the weight of a tap outside the coarse image."""
 
 
-class JointBilateral(torch.nn.Module):
+class Upsampling(torch.nn.Module):
     """From (h, w) to the size of the guide (H, W, 3); Eq. 2."""
 
     def __init__(self, config: UpsamplingConfig) -> None:
@@ -146,9 +148,10 @@ class JointBilateral(torch.nn.Module):
         self.config = config
 
     def forward(
-        self, px: Tensor, confidence: Tensor, taps: Tensor, guide: Tensor, true: Tensor
+        self, px: Tensor, confidence: Tensor, guide: Tensor, true: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """``taps`` (h, w, 3) and ``guide`` (H, W, 3) in gray levels; ``true`` (4,) h, w, H, W."""
+        """``guide`` (H, W, 3) in gray levels; ``true`` (4,) is h, w, H, W."""
+        taps = averaged(guide, (px.shape[0], px.shape[1]), true)
         layers = tap_layers(px, confidence, taps)
         rows, log_y = window(px.shape[0], guide.shape[0], true[0], true[2], self.config)
         columns, log_x = window(px.shape[1], guide.shape[1], true[1], true[3], self.config)
@@ -202,6 +205,10 @@ def averaged(guide: Tensor, room: tuple[int, int], true: Tensor) -> Tensor:
 
     As :func:`recon.stereo.upsampling.guide_at_taps`, where halves may round the other way.
     """
+    if fused(guide):
+        from recon.backends import triton_dense
+
+        return triton_dense.averaged(guide, room, true)
     down = _shares(room[0], guide.shape[0], true[0], true[2])
     across = _shares(room[1], guide.shape[1], true[1], true[3])
     image = guide.float().permute(2, 0, 1)
@@ -281,7 +288,7 @@ def _label(
 
 
 def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth, sigma and number of views (h, w) float32 of pairs (P, h, w); no view: NaN.
+    """Depth, sigma (h, w) float32 and number of views uint8 of pairs (P, h, w); no view: NaN.
 
     As :func:`recon.stereo.reprojection.fuse`: inverse depth of the largest group that agrees,
     nothing where several pairs read and none comes near another.
@@ -320,7 +327,8 @@ def unrefuted(depth: Tensor, sigma: Tensor, views: Tensor) -> tuple[Tensor, Tens
     contradicted = (depth != depth) & (views > 0)
     refuted = contradicted.sum() > (views >= 2).sum()
     nothing = torch.where(refuted, math.nan, 0.0)
-    return depth + nothing, sigma + nothing, torch.where(contradicted | refuted, 0.0, views)
+    views = torch.where(contradicted | refuted, 0.0, views).to(torch.uint8)
+    return depth + nothing, sigma + nothing, views
 
 
 def _largest_group(

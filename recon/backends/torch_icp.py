@@ -292,6 +292,10 @@ def rays(
 
 def surface_elements(depth: Tensor, sigma: Tensor, intrinsics: Tensor, edge_share: float) -> Tensor:
     """(h, w, 6) float32 elements: a plane fitted to the inverse depth of each 5x5 window."""
+    if fused(depth):
+        from recon.backends import triton_icp
+
+        return triton_icp.surface_elements(depth, sigma, intrinsics, edge_share)
     z, s = depth.to(DOUBLE), sigma.to(DOUBLE)
     value, along, across, rest, fits = _fitted(z)
     rms = rest.clamp(min=0).sqrt() * z * z
@@ -459,5 +463,9 @@ def median(values: Tensor, chosen: Tensor) -> Tensor:
 def scale_of(residual: Tensor, found: Tensor) -> Tensor:
     """() standard deviation of the residuals (N,) that are ``found``, by their median."""
     every = max(len(residual) // MEDIAN_OF, 1)
+    if fused(residual):
+        from recon.backends import triton_icp
+
+        return triton_icp.scale_of(residual[::every], found[::every])
     middle = median(residual[::every].abs(), found[::every] > 0)
     return (middle / 0.6745).clamp(min=1e-3)

@@ -61,6 +61,10 @@ class DenseStereo(torch.nn.Module):
         ``true`` (3,) is height, width and labels of the pair; beyond them the images repeat
         their last row and column, and the results mean nothing.
         """
+        if fused(left) and self.messages == torch.int16:
+            from recon.backends import triton_dense
+
+            return triton_dense.stereo(left, right, self.labels, self.levels, true, self.config)
         left, right = left.float(), right.float()
         cost = matching_cost(left, right, self.labels, true, self.config)
         edges = edge_weights(left, true, self.config)
@@ -111,7 +115,6 @@ def propagate(
         slope = torch.floor(weight * (COST_UNIT / FULL_WEIGHT)).to(kind)
         cut = torch.floor(weight * (config.truncation / FULL_WEIGHT)).to(kind)
         smooth = (_per_direction(slope), _per_direction(cut))
-        messages = messages.contiguous()
         for t in range(config.iterations):
             messages = sweep(data, messages, *smooth, t % 2, config.truncation)
     return pyramid[0] + _total(_arriving(messages))
@@ -124,11 +127,6 @@ def sweep(
 
     ``slope`` and ``cut`` (4, 1, h, w) are of the edge that each direction crosses.
     """
-    if fused(data) and data.dtype == torch.int16:
-        from recon.backends import triton_dense
-
-        triton_dense.sweep(data, messages, slope, cut, colour)
-        return messages
     _, h, w = data.shape
     rows = torch.arange(h, device=data.device)[:, None]
     ours = (rows + torch.arange(w, device=data.device)[None, :]) % 2 == colour
@@ -265,10 +263,6 @@ def matching_cost(
     left: Tensor, right: Tensor, labels: int, true: Tensor, config: BeliefPropagationConfig
 ) -> Tensor:
     """(L, h, w) cost of each label, see :mod:`recon.stereo.matching_cost`; 0 beyond."""
-    if fused(left):
-        from recon.backends import triton_dense
-
-        return triton_dense.matching_cost(left, right, labels, true, config)
     c = config.cost
     width = left.shape[1]
     bits_left, bits_right = census(left), census(right)
@@ -323,6 +317,10 @@ def drop_unreliable(
 def _contrast(image: Tensor) -> Tensor:
     """Standard deviation of the gray levels in 9x9, (h, w) float64; sums are exact."""
     r = CONTRAST_PX // 2
+    if fused(image):
+        from recon.backends import triton_dense
+
+        return triton_dense.contrast(image, r)
     wide = F.pad(image.float()[None], (r, r, r, r), mode="replicate")
 
     def mean(values: Tensor) -> Tensor:
@@ -358,11 +356,15 @@ def _speckles(px: Tensor, largest: int) -> Tensor:
     h, w = px.shape
     level = torch.where(px == px, px * SPECKLE_STEP, float(UNKNOWN)).int()
     known = level > UNKNOWN
+    if fused(px):
+        from recon.backends import triton_dense
+
+        return triton_dense.speckles(level, largest, UNKNOWN)
     across = ((level[:, 1:] - level[:, :-1]).abs() <= SPECKLE_STEP) & known[:, 1:] & known[:, :-1]
     down = ((level[1:] - level[:-1]).abs() <= SPECKLE_STEP) & known[1:] & known[:-1]
     own = torch.arange(h * w, device=px.device, dtype=torch.int32).view(h, w)
     for _ in range(largest):
-        own = _wandered(own, level, across, down)
+        own = torch.minimum(own, _of_neighbours(own, across, down, h * w, torch.minimum))
     most = _of_neighbours(own, across, down, -1, torch.maximum)
     least = _of_neighbours(own, across, down, h * w, torch.minimum)
     mixed = ((most > own) | (least < own)).int().view(-1)
@@ -371,15 +373,6 @@ def _speckles(px: Tensor, largest: int) -> Tensor:
     part = torch.zeros_like(mixed).scatter_reduce(0, index, mixed, "amax")
     small = (count[index] <= largest) & (part[index] == 0)
     return small.view(h, w) & known
-
-
-def _wandered(own: Tensor, level: Tensor, across: Tensor, down: Tensor) -> Tensor:
-    """The least index of each pixel and its connected neighbours."""
-    if fused(own):
-        from recon.backends import triton_dense
-
-        return triton_dense.wander(own, level, SPECKLE_STEP, UNKNOWN)
-    return torch.minimum(own, _of_neighbours(own, across, down, own.numel(), torch.minimum))
 
 
 def _of_neighbours(own: Tensor, across: Tensor, down: Tensor, none: int, best: object) -> Tensor:

@@ -1,7 +1,8 @@
-"""The dense stages as Triton kernels: cost, messages, speckles, upsampling and depth, Eq. 1 to 3.
+"""The dense stages as Triton kernels: cost, messages, labels, their checks and depth, Eq. 1 to 3.
 
-Each computes what the function of the same name in torch_stereo or torch_depth does, compiled once
-for all sizes.
+Each function computes what its namesake in torch_stereo or torch_depth does. A kernel is compiled
+once for all sizes. Costs and messages are (h, w, L) int16, L a power of two: a thread holds labels
+that lie side by side in memory. Sums have 32 bits, so all integers are exact.
 """
 
 # mypy: allow-untyped-defs, allow-incomplete-defs
@@ -15,61 +16,85 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.belief_propagation import (
+    NOISE,
+    RADIUS,
+    SPECKLE_STEP,
+    SURE_EVIDENCE,
+    BeliefPropagationConfig,
+)
 from recon.stereo.matching_cost import CENSUS_RADIUS, COST_UNIT
+from recon.stereo.message_passing import FULL_WEIGHT
 from recon.stereo.reprojection import FusionConfig
 from recon.stereo.upsampling import RANGE_FLOOR, UpsamplingConfig
 
 PIXELS = 128
-"""Pixels of one program."""
+"""Pixels of one program that holds one number each."""
+
+CELLS = 32
+"""Pixels of one program that holds all labels of each."""
+
+
+def stereo(
+    left: Tensor, right: Tensor, labels: int, levels: int, true: Tensor,
+    config: BeliefPropagationConfig,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Labels and confidence (h, w) of gray images (h, w) uint8, as ``DenseStereo``; Eq. 1."""
+    room = max(triton.next_power_of_2(labels), 8)
+    cost, data = matching_cost(left, right, room, true, config)
+    edges = edge_weights(left, true, config)
+    pyramid = [(data, edges)]
+    for level in range(1, levels):
+        pyramid.append(coarser(*pyramid[-1], true, level, config))
+    messages = torch.zeros((4, *pyramid[-1][0].shape), dtype=torch.int16, device=left.device)
+    for level in reversed(range(levels)):
+        data, edges = pyramid[level]
+        if messages.shape[1:] != data.shape:
+            messages = finer(messages, data, true, level)
+        for t in range(config.iterations):
+            sweep(data, messages, edges, t % 2, config)
+    return select(data, messages, cost, true, config)
+
+
+def blocks(pixels: int, each: int) -> int:
+    """How many programs of ``each`` pixels."""
+    return -(-pixels // each)
 
 
 def matching_cost(
-    left: Tensor, right: Tensor, labels: int, true: Tensor, config: BeliefPropagationConfig
-) -> Tensor:
-    """(L, h, w) float32, as :func:`recon.backends.torch_stereo.matching_cost`.
-
-    Census first: 49 comparisons of each pixel of both images, into two words of 24 bits. Then the
-    labels of a pixel: bits and gray levels that differ, the best of them, and a little more than
-    that for partners outside the image.
-    """
+    left: Tensor, right: Tensor, room: int, true: Tensor, config: BeliefPropagationConfig
+) -> tuple[Tensor, Tensor]:
+    """Cost of each label (h, w, L), and the same above the pixel's best and cut."""
     c = config.cost
-    height, width = left.shape
-    images = torch.stack([left, right]).contiguous()
-    words = torch.empty((2, 2, height, width), dtype=torch.int32, device=left.device)
-    grid = (triton.cdiv(height * width, PIXELS),)
-    _census[(grid[0], 2)](images, words, height, width, CENSUS_RADIUS, PIXELS)
-    cost = torch.empty((labels, height, width), device=left.device)
-    _cost[grid](
-        images, words, true, cost, labels, height, width, config.min_disparity,
-        c.census_truncation, round(c.census_weight * COST_UNIT), float(c.difference_truncation),
-        round(c.difference_weight * COST_UNIT), round(c.unseen * COST_UNIT), PIXELS,
+    h, w = left.shape
+    words = torch.empty((2, h, w), dtype=torch.int32, device=left.device)
+    _census[(blocks(h * w, PIXELS), 2)](left, right, words, h, w, CENSUS_RADIUS, PIXELS)
+    cost, data = torch.empty((2, h, w, room), dtype=torch.int16, device=left.device)
+    _cost[(blocks(h * w, CELLS),)](
+        left, right, words, true, cost, data, h, w, config.min_disparity, c.census_truncation,
+        round(c.census_weight * COST_UNIT), c.difference_truncation,
+        round(c.difference_weight * COST_UNIT), round(c.unseen * COST_UNIT),
+        4 * config.truncation, room, CELLS,
     )  # fmt: skip
-    return cost
+    return cost, data
 
 
 @triton.jit(do_not_specialize=["height", "width"])
-def _census(images, words, height, width, radius: tl.constexpr, PIXELS: tl.constexpr):
+def _census(left, right, words, height, width, radius: tl.constexpr, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
-    plane = height * width
-    image, words = images + tl.program_id(1) * plane, words + tl.program_id(1) * 2 * plane
-    here = at < plane
+    image = left
+    if tl.program_id(1) == 1:
+        image = right
+    here = at < height * width
     v, u = at // width, at % width
-    centre = tl.load(image + at, mask=here, other=0.0)
-    low = tl.full((PIXELS,), 0, tl.int32)
-    high = tl.full((PIXELS,), 0, tl.int32)
-    side: tl.constexpr = 2 * radius + 1
-    half: tl.constexpr = side * side // 2
-    for n in tl.static_range(side * side):  # the centre itself, in the middle, is not darker
-        y = tl.minimum(tl.maximum(v + n // side - radius, 0), height - 1)
-        x = tl.minimum(tl.maximum(u + n % side - radius, 0), width - 1)
-        darker = (tl.load(image + y * width + x, mask=here, other=0.0) < centre).to(tl.int32)
-        if n < half:
-            low = 2 * low + darker
-        else:
-            high = 2 * high + darker
-    tl.store(words + at, low, mask=here)
-    tl.store(words + plane + at, high, mask=here)
+    centre = tl.load(image + at, mask=here, other=0)
+    word = tl.full((PIXELS,), 0, tl.int32)
+    for n in tl.static_range((2 * radius + 1) * (2 * radius + 1)):
+        y = tl.minimum(tl.maximum(v + n // (2 * radius + 1) - radius, 0), height - 1)
+        x = tl.minimum(tl.maximum(u + n % (2 * radius + 1) - radius, 0), width - 1)
+        darker = tl.load(image + y * width + x, mask=here, other=0) < centre
+        word = 2 * word + darker.to(tl.int32)
+    tl.store(words + tl.program_id(1) * height * width + at, word, mask=here)
 
 
 @triton.jit
@@ -81,59 +106,188 @@ def _ones(word):
     return (word + (word >> 8) + (word >> 16) + (word >> 24)) & 63
 
 
-@triton.jit(do_not_specialize=["labels", "height", "width", "first"])
+@triton.jit(do_not_specialize=["height", "width", "first"])
 def _cost(
-    images, words, true, cost, labels, height, width, first, max_bits, bit_weight, max_gray,
-    gray_weight, unseen, PIXELS: tl.constexpr,
+    left, right, words, true, cost, data, height, width, first, max_bits, bit_weight, max_gray,
+    gray_weight, unseen, top, LABELS: tl.constexpr, CELLS: tl.constexpr,
 ):  # fmt: skip
-    at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    far = 1 << 20
+    pixel = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
     plane = height * width
-    here = at < plane
+    here = pixel < plane
+    v, u = pixel // width, pixel % width
+    rows, columns = tl.load(true).to(tl.int32), tl.load(true + 1).to(tl.int32)
+    label = tl.arange(0, LABELS)[None, :]
+    ours = label < tl.load(true + 2).to(tl.int32) + 0 * v[:, None]
+    partner = u[:, None] - label - first
+    seen = here[:, None] & (partner >= 0) & (partner < columns) & ours
+    there = pixel[:, None] - label - first
+    word = tl.load(words + pixel, mask=here, other=0)[:, None]
+    gray = tl.load(left + pixel, mask=here, other=0).to(tl.int32)[:, None]
+    bits = _ones(tl.load(words + plane + there, mask=seen, other=0) ^ word)
+    apart = tl.abs(tl.load(right + there, mask=seen, other=0).to(tl.int32) - gray)
+    value = tl.minimum(bits, max_bits) * bit_weight + tl.minimum(apart, max_gray) * gray_weight
+    best = tl.min(tl.where(seen, value, far), 1)
+    instead = tl.where(best < far, best + unseen, 0)[:, None]
+    value = tl.where(seen, value, instead)
+    value = tl.where((here & (v < rows) & (u < columns))[:, None], value, 0)
+    at = pixel[:, None] * LABELS + label
+    tl.store(cost + at, value.to(tl.int16), mask=here[:, None])
+    tl.store(data + at, _cut(value, ours, top).to(tl.int16), mask=here[:, None])
+
+
+@triton.jit
+def _cut(value, ours, top):
+    """Above the pixel's best, at most what can win; a label that is not of the pair cannot."""
+    least = tl.min(tl.where(ours, value, 1 << 20), 1)[:, None]
+    return tl.where(ours, tl.minimum(value - least, top), top)
+
+
+def edge_weights(image: Tensor, true: Tensor, config: BeliefPropagationConfig) -> Tensor:
+    """(2, h, w) int32 weight of the edge above and to the left, in 1 / FULL_WEIGHT."""
+    h, w = image.shape
+    edges = torch.empty((2, h, w), dtype=torch.int32, device=image.device)
+    fall = (1 - config.edge_floor) / config.edge_contrast
+    _edges[(blocks(h * w, PIXELS),)](
+        image, true, edges, h, w, fall, config.edge_floor, FULL_WEIGHT, PIXELS
+    )
+    return edges
+
+
+@triton.jit
+def _whole(x):
+    """The nearest whole number, halves to the even one."""
+    low = tl.floor(x)
+    part = x - low
+    odd = (low.to(tl.int32) & 1) == 1
+    return low + tl.where((part > 0.5) | ((part == 0.5) & odd), 1.0, 0.0)
+
+
+@triton.jit
+def _edge(here, there, fall, floor, full):
+    step = tl.abs(here - there).to(tl.float32)
+    return _whole(tl.maximum(1.0 - step * fall, floor) * full).to(tl.int32)
+
+
+@triton.jit(do_not_specialize=["height", "width"])
+def _edges(image, true, edges, height, width, fall, floor, full, PIXELS: tl.constexpr):
+    at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    here = at < height * width
     v, u = at // width, at % width
     rows, columns = tl.load(true).to(tl.int32), tl.load(true + 1).to(tl.int32)
-    count = tl.load(true + 2).to(tl.int32)
-    own = here & (v < rows) & (u < columns)
-    gray = tl.load(images + at, mask=here, other=0.0)
-    low = tl.load(words + at, mask=here, other=0)
-    high = tl.load(words + plane + at, mask=here, other=0)
-    best = tl.full((PIXELS,), 1.0e6, tl.float32)
-    for label in range(labels):
-        partner = u - label - first
-        seen = here & (partner >= 0) & (partner < columns) & (label < count + 0 * u)
-        there = at - label - first
-        a = tl.load(words + 2 * plane + there, mask=seen, other=0) ^ low
-        b = tl.load(words + 3 * plane + there, mask=seen, other=0) ^ high
-        bits = tl.minimum(_ones(a) + _ones(b), max_bits) * bit_weight
-        apart = tl.abs(gray - tl.load(images + plane + there, mask=seen, other=0.0))
-        value = bits.to(tl.float32) + tl.minimum(apart, max_gray) * gray_weight
-        best = tl.minimum(best, tl.where(seen, value, 1.0e6))
-        tl.store(cost + label * plane + at, tl.where(seen, value, -1.0), mask=here)
-    tl.debug_barrier()  # what a thread stored is read again below
-    instead = tl.where(best < 1.0e6, best + unseen, 0.0)
-    for label in range(labels):
-        value = tl.load(cost + label * plane + at, mask=here, other=0.0)
-        value = tl.where(value < 0, instead, value)
-        tl.store(cost + label * plane + at, tl.where(own, value, 0.0), mask=here)
+    gray = tl.load(image + at, mask=here, other=0).to(tl.int32)
+    above = tl.load(image + tl.where(v > 0, at - width, at), mask=here, other=0).to(tl.int32)
+    before = tl.load(image + tl.where(u > 0, at - 1, at), mask=here, other=0).to(tl.int32)
+    inside = (v < rows) & (u < columns)
+    across = tl.where(inside, _edge(gray, above, fall, floor, full), 0)
+    along = tl.where(inside, _edge(gray, before, fall, floor, full), 0)
+    tl.store(edges + at, across, mask=here)
+    tl.store(edges + height * width + at, along, mask=here)
 
 
-CELLS = 32
-"""Pixels of one program, whose one warp holds a pixel in each thread."""
+def coarser(
+    data: Tensor, edges: Tensor, true: Tensor, level: int, config: BeliefPropagationConfig
+) -> tuple[Tensor, Tensor]:
+    """Costs and edges of half the size, for ``level`` of the pyramid: sums of 2x2, means of two."""
+    h, w, room = data.shape
+    size = ((h + 1) // 2, (w + 1) // 2)
+    small = torch.empty((*size, room), dtype=torch.int16, device=data.device)
+    fewer = torch.empty((2, *size), dtype=torch.int32, device=data.device)
+    _coarser[(blocks(size[0] * size[1], CELLS),)](
+        data, edges, true, small, fewer, h, w, level, 4 * config.truncation, room, CELLS
+    )
+    return small, fewer
 
 
-def sweep(data: Tensor, messages: Tensor, slope: Tensor, cut: Tensor, colour: int) -> None:
+@triton.jit
+def _halved(n, level):
+    """A number of pixels at a level of the pyramid."""
+    for _ in range(level):
+        n = (n + 1) // 2
+    return n
+
+
+@triton.jit(do_not_specialize=["height", "width", "level"])
+def _coarser(
+    data, edges, true, small, fewer, height, width, level, top, LABELS: tl.constexpr,
+    CELLS: tl.constexpr,
+):  # fmt: skip
+    """``height`` and ``width`` of the finer level, the one before ``level``."""
+    rows = _halved(tl.load(true).to(tl.int32), level - 1)
+    columns = _halved(tl.load(true + 1).to(tl.int32), level - 1)
+    tall, wide = (height + 1) // 2, (width + 1) // 2
+    pixel = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
+    here = pixel < tall * wide
+    v, u = 2 * (pixel // wide), 2 * (pixel % wide)
+    label = tl.arange(0, LABELS)[None, :]
+    ours = label < tl.load(true + 2).to(tl.int32) + 0 * v[:, None]
+    total = tl.full((CELLS, LABELS), 0, tl.int32)
+    for part in tl.static_range(4):
+        y, x = v + part // 2, u + part % 2
+        near = (here & (y < height) & (x < width))[:, None]
+        total += tl.load(data + (y * width + x)[:, None] * LABELS + label, mask=near, other=0)
+    at = pixel[:, None] * LABELS + label
+    tl.store(small + at, _cut(total, ours, top).to(tl.int16), mask=here[:, None])
+    inside = here & (v < rows) & (u < columns)
+    first = v * width + u
+    after = v * width + tl.minimum(u + 1, columns - 1)
+    below = tl.minimum(v + 1, rows - 1) * width + u
+    plane = height * width
+    across = tl.load(edges + first, mask=inside, other=0)
+    across += tl.load(edges + after, mask=inside, other=0)
+    along = tl.load(edges + plane + first, mask=inside, other=0)
+    along += tl.load(edges + plane + below, mask=inside, other=0)
+    tl.store(fewer + pixel, across // 2, mask=here)
+    tl.store(fewer + tall * wide + pixel, along // 2, mask=here)
+
+
+def finer(messages: Tensor, data: Tensor, true: Tensor, level: int) -> Tensor:
+    """Messages (4, h, w, L) at the size of ``data``: those of the coarser pixel."""
+    h, w, room = data.shape
+    out = torch.empty((4, h, w, room), dtype=torch.int16, device=data.device)
+    _finer[(blocks(h * w, CELLS), 4)](
+        messages, out, true, h, w, messages.shape[1], messages.shape[2], level, room, CELLS
+    )
+    return out
+
+
+@triton.jit(do_not_specialize=["height", "width", "tall", "wide", "level"])
+def _finer(
+    messages, out, true, height, width, tall, wide, level, LABELS: tl.constexpr,
+    CELLS: tl.constexpr,
+):  # fmt: skip
+    rows = _halved(tl.load(true).to(tl.int32), level)
+    columns = _halved(tl.load(true + 1).to(tl.int32), level)
+    pixel = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
+    way = tl.program_id(1)
+    here = pixel < height * width
+    v, u = pixel // width, pixel % width
+    label = tl.arange(0, LABELS)[None, :]
+    inside = (here & (v < rows) & (u < columns))[:, None]
+    coarse = way * tall * wide + (v // 2) * wide + u // 2
+    value = tl.load(messages + coarse[:, None] * LABELS + label, mask=inside, other=0)
+    at = (way * height * width + pixel)[:, None] * LABELS + label
+    tl.store(out + at, value, mask=here[:, None])
+
+
+def sweep(
+    data: Tensor, messages: Tensor, edges: Tensor, colour: int, config: BeliefPropagationConfig
+) -> None:
     """Renew in place the messages that leave the pixels of ``colour``: v + u = colour modulo 2.
 
-    ``data`` (L, h, w) and ``messages`` (4, L, h, w) up, down, left and right, contiguous int16;
-    ``slope`` and ``cut`` (4, 1, h, w) int16 of the edge that each direction crosses. The lower
-    envelope (Felzenszwalb and Huttenlocher, doi:10.1007/s11263-006-7899-4) of a linear cost is a
-    running minimum of the costs less a ramp, up and down the labels. Sums have 32 bits: exact.
+    ``messages`` (4, h, w, L) go up, down, left and right. The lower envelope (Felzenszwalb and
+    Huttenlocher, doi:10.1007/s11263-006-7899-4) of a linear cost is a running minimum of the costs
+    less a ramp, up and down the labels.
     """
-    labels, height, width = data.shape
-    cells = height * ((width + 1) // 2)
-    _sweep[(triton.cdiv(cells, CELLS),)](
-        data, messages, slope, cut, colour, labels, height, width, triton.next_power_of_2(labels),
-        CELLS, num_warps=1,
+    h, w, room = data.shape
+    _sweep[(blocks(h * ((w + 1) // 2), SWEPT),)](
+        data, messages, edges, colour, h, w, COST_UNIT, config.truncation, FULL_WEIGHT, room, SWEPT,
+        num_warps=SWEEP_WARPS,
     )  # fmt: skip
+
+
+SWEPT, SWEEP_WARPS = 16, 1
+"""Pixels of one program of a sweep, and its warps."""
 
 
 @triton.jit
@@ -142,18 +296,18 @@ def _least(a, b):
 
 
 @triton.jit
-def _envelope(rest, slope, cut, label):
-    """The message (LABELS, CELLS) of the costs ``rest`` over an edge of ``slope`` and ``cut``."""
-    ramp = label * slope[None, :]
-    ahead = tl.associative_scan(rest - ramp, 0, _least) + ramp
-    behind = tl.associative_scan(rest + ramp, 0, _least, reverse=True) - ramp
-    best = tl.minimum(ahead, behind) - tl.min(rest, 0)[None, :]
-    return tl.minimum(best, cut[None, :]).to(tl.int16)
+def _envelope(rest, weight, unit, truncation, full, label):
+    """The message (CELLS, LABELS) int16 of the costs ``rest`` over edges of ``weight`` (CELLS,)."""
+    ramp = label * ((weight * unit) // full)[:, None]
+    ahead = tl.associative_scan(rest - ramp, 1, _least) + ramp
+    behind = tl.associative_scan(rest + ramp, 1, _least, reverse=True) - ramp
+    best = tl.minimum(ahead, behind) - tl.min(rest, 1)[:, None]
+    return tl.minimum(best, ((weight * truncation) // full)[:, None]).to(tl.int16)
 
 
-@triton.jit(do_not_specialize=["colour", "labels", "height", "width"])
+@triton.jit(do_not_specialize=["colour", "height", "width"])
 def _sweep(
-    data, messages, slope, cut, colour, labels, height, width, LABELS: tl.constexpr,
+    data, messages, edges, colour, height, width, unit, truncation, full, LABELS: tl.constexpr,
     CELLS: tl.constexpr,
 ):  # fmt: skip
     half = (width + 1) // 2
@@ -161,59 +315,203 @@ def _sweep(
     v = cell // half
     u = 2 * (cell % half) + (v + colour) % 2
     here = (v < height) & (u < width)
-    here_at = v * width + u
+    pixel = v * width + u
+    label = tl.arange(0, LABELS)[None, :]
+    own = here[:, None]
     plane = height * width
-    label = tl.arange(0, LABELS)[:, None]
-    own = here[None, :] & (label < labels)
-    at = label * plane + here_at[None, :]
-    up, down = messages, messages + labels * plane
-    left, right = down + labels * plane, down + 2 * labels * plane
-    below = tl.load(up + at + width, mask=own & (v + 1 < height)[None, :], other=0).to(tl.int32)
-    above = tl.load(down + at - width, mask=own & (v > 0)[None, :], other=0).to(tl.int32)
-    after = tl.load(left + at + 1, mask=own & (u + 1 < width)[None, :], other=0).to(tl.int32)
-    before = tl.load(right + at - 1, mask=own & (u > 0)[None, :], other=0).to(tl.int32)
+    at = pixel[:, None] * LABELS + label
+    row, volume = width * LABELS, plane * LABELS
+    up, down, left, right = messages, messages + volume, messages + 2 * volume, messages + 3 * volume
+    has_below, has_after = here & (v + 1 < height), here & (u + 1 < width)
+    below = tl.load(up + at + row, mask=has_below[:, None], other=0).to(tl.int32)
+    above = tl.load(down + at - row, mask=(here & (v > 0))[:, None], other=0).to(tl.int32)
+    after = tl.load(left + at + LABELS, mask=has_after[:, None], other=0).to(tl.int32)
+    before = tl.load(right + at - LABELS, mask=(here & (u > 0))[:, None], other=0)
+    before = before.to(tl.int32)
     total = tl.load(data + at, mask=own, other=0).to(tl.int32) + below + above + after + before
-    total = tl.where(own, total, 1 << 24)
-    for way in tl.static_range(4):
-        behind = above if way == 0 else below if way == 1 else before if way == 2 else after
-        s = tl.load(slope + way * plane + here_at, mask=here, other=0).to(tl.int32)
-        c = tl.load(cut + way * plane + here_at, mask=here, other=0).to(tl.int32)
-        to = messages + way * labels * plane + at
-        tl.store(to, _envelope(total - behind, s, c, label), mask=own)
+    weight = tl.load(edges + pixel, mask=here, other=0)
+    tl.store(up + at, _envelope(total - above, weight, unit, truncation, full, label), mask=own)
+    weight = tl.load(edges + pixel + width, mask=has_below, other=0)
+    tl.store(down + at, _envelope(total - below, weight, unit, truncation, full, label), mask=own)
+    weight = tl.load(edges + plane + pixel, mask=here, other=0)
+    tl.store(left + at, _envelope(total - before, weight, unit, truncation, full, label), mask=own)
+    weight = tl.load(edges + plane + pixel + 1, mask=has_after, other=0)
+    tl.store(right + at, _envelope(total - after, weight, unit, truncation, full, label), mask=own)
 
 
-def wander(own: Tensor, level: Tensor, step: int, unknown: int) -> Tensor:
-    """(h, w) int32 the least index of each pixel and its neighbours on the same surface."""
-    least = torch.empty_like(own)
-    height, width = own.shape
-    grid = (triton.cdiv(height * width, PIXELS),)
-    _wander[grid](own, level, least, height, width, step, unknown, PIXELS)
-    return least
+def select(
+    data: Tensor, messages: Tensor, cost: Tensor, true: Tensor, config: BeliefPropagationConfig
+) -> tuple[Tensor, Tensor]:
+    """Labels and confidence (h, w), as :func:`recon.backends.torch_stereo.select`."""
+    h, w, room = data.shape
+    px, confidence = torch.empty((2, h, w), device=data.device)
+    evidence = config.min_evidence if config.min_evidence > 0 else -math.inf
+    _select[(blocks(h * w, CELLS),)](
+        data, messages, cost, true, px, confidence, h, w, config.min_disparity,
+        2.0 * config.truncation, evidence, float(NOISE), SURE_EVIDENCE, RADIUS, room, CELLS,
+    )  # fmt: skip
+    return px, confidence
 
 
 @triton.jit
-def _met(own, level, there, inside, index, here, step, unknown):
-    """The index at ``there`` where it lies on the surface of ``here``, else ``index``."""
-    other = tl.load(level + there, mask=inside, other=unknown)
-    joined = inside & (other > unknown) & (here > unknown) & (tl.abs(other - here) <= step)
-    return tl.load(own + there, mask=joined, other=1 << 30)
+def _at(values, label, chosen):
+    """(CELLS,) the value of each row at its ``chosen`` label."""
+    return tl.sum(tl.where(label == chosen[:, None], values, 0), 1)
+
+
+@triton.jit(do_not_specialize=["height", "width", "first"])
+def _select(
+    data, messages, cost, true, px, confidence, height, width, first, full_margin, min_evidence,
+    noise, sure_evidence, radius: tl.constexpr, LABELS: tl.constexpr, CELLS: tl.constexpr,
+):  # fmt: skip
+    far = 1 << 20
+    pixel = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
+    here = pixel < height * width
+    v, u = pixel // width, pixel % width
+    rows, columns = tl.load(true).to(tl.int32), tl.load(true + 1).to(tl.int32)
+    count = tl.load(true + 2).to(tl.int32)
+    label = tl.arange(0, LABELS)[None, :]
+    ours = here[:, None] & (label < count)
+    at = pixel[:, None] * LABELS + label
+    row, volume = width * LABELS, height * width * LABELS
+    belief = tl.load(data + at, mask=here[:, None], other=0).to(tl.int32)
+    near = (here & (v + 1 < height))[:, None]
+    belief += tl.load(messages + at + row, mask=near, other=0)
+    near = (here & (v > 0))[:, None]
+    belief += tl.load(messages + volume + at - row, mask=near, other=0)
+    near = (here & (u + 1 < width))[:, None]
+    belief += tl.load(messages + 2 * volume + at + LABELS, mask=near, other=0)
+    near = (here & (u > 0))[:, None]
+    belief += tl.load(messages + 3 * volume + at - LABELS, mask=near, other=0)
+    belief = tl.where(ours, belief, far)
+    low = tl.min(belief, 1)
+    best = tl.min(tl.where(belief == low[:, None], label, LABELS), 1)
+    adjacent = tl.abs(label - best[:, None]) <= 1
+    second = tl.min(tl.where(adjacent, far, belief), 1)
+    box = tl.full((CELLS, LABELS), 0, tl.int32)
+    for j in range(-radius, radius + 1):
+        for i in range(-radius, radius + 1):
+            y, x = v + j, u + i
+            inside = here & (y >= 0) & (y < height) & (x >= 0) & (x < width)
+            there = cost + (y * width + x)[:, None] * LABELS + label
+            box += tl.load(there, mask=inside[:, None], other=0)
+    partner = u[:, None] - label - first
+    seen = ours & (partner >= 0) & (partner < columns)
+    many = tl.maximum(tl.sum(seen.to(tl.int32), 1), 1).to(tl.float32)
+    mean = tl.sum(tl.where(seen, box, 0), 1).to(tl.float32) / many
+    centre = _at(box, label, best)
+    a = (_at(box, label, tl.maximum(best - 1, 0)) - centre).to(tl.float32)
+    b = (_at(box, label, tl.minimum(best + 1, count - 1)) - centre).to(tl.float32)
+    steep = tl.maximum(a, b)
+    offset = (a - b) / (2 * tl.maximum(steep, 1.0))
+    offset = tl.minimum(tl.maximum(offset, -0.5), 0.5)
+    inner = (best > 0) & (best < count - 1) & (steep > 0)
+    area = (2 * radius + 1) * (2 * radius + 1)
+    evidence = (mean - centre.to(tl.float32)) / (mean + area * noise)
+    margin = (second - low).to(tl.float32) / full_margin
+    sure = tl.minimum(tl.maximum(evidence, 0.01) / sure_evidence, 1.0)
+    there = u - best - first
+    sees = (there >= 0) & (there < columns) & (v < rows) & (u < columns)
+    accepted = sees & (margin > 0) & (evidence >= min_evidence)
+    found = best.to(tl.float32) + tl.where(inner, offset, 0.0)
+    tl.store(px + pixel, tl.where(sees, found, float("nan")), mask=here)
+    trust = tl.where(accepted, tl.minimum(margin, 1.0) * sure, 0.0)
+    tl.store(confidence + pixel, trust, mask=here)
+
+
+def contrast(image: Tensor, radius: int) -> Tensor:
+    """(h, w) float64 standard deviation of the gray levels (h, w) uint8 in a square window."""
+    h, w = image.shape
+    out = torch.empty((h, w), dtype=torch.float64, device=image.device)
+    _contrast[(blocks(h * w, PIXELS),)](image, out, h, w, radius, PIXELS)
+    return out
 
 
 @triton.jit(do_not_specialize=["height", "width"])
-def _wander(own, level, least, height, width, step, unknown, PIXELS: tl.constexpr):
+def _contrast(image, out, height, width, radius, PIXELS: tl.constexpr):
+    at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    here = at < height * width
+    v, u = at // width, at % width
+    total = tl.full((PIXELS,), 0, tl.int32)
+    squares = total
+    for j in range(-radius, radius + 1):
+        y = tl.minimum(tl.maximum(v + j, 0), height - 1) * width
+        for i in range(-radius, radius + 1):
+            x = tl.minimum(tl.maximum(u + i, 0), width - 1)
+            gray = tl.load(image + y + x, mask=here, other=0).to(tl.int32)
+            total += gray
+            squares += gray * gray
+    area = ((2 * radius + 1) * (2 * radius + 1)).to(tl.float64)
+    mean = total.to(tl.float64) / area
+    spread = tl.maximum(squares.to(tl.float64) / area - mean * mean, 0.0)
+    tl.store(out + at, tl.sqrt(spread), mask=here)
+
+
+def speckles(level: Tensor, largest: int, unknown: int) -> Tensor:
+    """(h, w) True on surfaces of at most ``largest`` pixels; ``level`` (h, w) int32.
+
+    As in :func:`recon.backends.torch_stereo._speckles`, the least index wanders ``largest`` steps.
+    """
+    h, w = level.shape
+    grid = (blocks(h * w, PIXELS),)
+    own = torch.arange(h * w, dtype=torch.int32, device=level.device)
+    for _ in range(largest):
+        least = torch.empty_like(own)
+        _wander[grid](own, level, least, h, w, SPECKLE_STEP, unknown, PIXELS)
+        own = least
+    count = torch.zeros_like(own)
+    _measure[grid](own, level, count, h, w, SPECKLE_STEP, unknown, largest + 1, PIXELS)
+    return (count[own.long()].view(h, w) <= largest) & (level > unknown)
+
+
+@triton.jit
+def _neighbour(own, level, there, inside, here, step, unknown, none):
+    """The index at ``there`` where it lies on the surface of ``here``, else ``none``."""
+    other = tl.load(level + there, mask=inside, other=unknown)
+    joined = inside & (other > unknown) & (here > unknown) & (tl.abs(other - here) <= step)
+    return tl.load(own + there, mask=joined, other=none)
+
+
+@triton.jit
+def _extremes(own, level, at, index, inside, height, width, step, unknown):
+    """The least and the largest index of a pixel and its neighbours on the same surface."""
+    v, u = at // width, at % width
+    here = tl.load(level + at, mask=inside, other=unknown)
+    far = 1 << 30
+    least, most = index, index
+    for way in tl.static_range(4):
+        if way == 0:
+            there, near = at + 1, inside & (u + 1 < width)
+        elif way == 1:
+            there, near = at - 1, inside & (u > 0)
+        elif way == 2:
+            there, near = at + width, inside & (v + 1 < height)
+        else:
+            there, near = at - width, inside & (v > 0)
+        found = _neighbour(own, level, there, near, here, step, unknown, far)
+        least = tl.minimum(least, found)
+        most = tl.maximum(most, tl.where(found == far, -1, found))
+    return least, most
+
+
+@triton.jit(do_not_specialize=["height", "width"])
+def _wander(own, level, out, height, width, step, unknown, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     inside = at < height * width
-    v, u = at // width, at % width
     index = tl.load(own + at, mask=inside, other=0)
-    here = tl.load(level + at, mask=inside, other=unknown)
-    found = _met(own, level, at + 1, inside & (u + 1 < width), index, here, step, unknown)
-    index = tl.minimum(index, found)
-    found = _met(own, level, at - 1, inside & (u > 0), index, here, step, unknown)
-    index = tl.minimum(index, found)
-    found = _met(own, level, at + width, inside & (v + 1 < height), index, here, step, unknown)
-    index = tl.minimum(index, found)
-    found = _met(own, level, at - width, inside & (v > 0), index, here, step, unknown)
-    tl.store(least + at, tl.minimum(index, found), mask=inside)
+    least, _most = _extremes(own, level, at, index, inside, height, width, step, unknown)
+    tl.store(out + at, least, mask=inside)
+
+
+@triton.jit(do_not_specialize=["height", "width"])
+def _measure(own, level, count, height, width, step, unknown, many, PIXELS: tl.constexpr):
+    """Add up the pixels of each index; one that is not a whole surface counts as ``many``."""
+    at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    inside = at < height * width
+    index = tl.load(own + at, mask=inside, other=0)
+    least, most = _extremes(own, level, at, index, inside, height, width, step, unknown)
+    mixed = (least < index) | (most > index)
+    tl.atomic_add(count + index, tl.where(mixed, many, 1), mask=inside)
 
 
 ROWS, COLUMNS = 4, 64
@@ -237,7 +535,7 @@ def bilateral(
     layers = layers[:5].clone()
     layers[:3] *= scale
     out, sure = torch.empty((2, height, width), device=guide.device)
-    grid = (triton.cdiv(height, ROWS), triton.cdiv(width, COLUMNS))
+    grid = (blocks(height, ROWS), blocks(width, COLUMNS))
     _bilateral[grid](
         layers, guide.contiguous(), rows[0].int(), rows[1] * LOG2_E, columns[0].int(),
         columns[1] * LOG2_E, out, sure, height, width, w, h * w, scale, float(RANGE_FLOOR),
@@ -285,6 +583,49 @@ def _bilateral(
     tl.store(sure + at, tl.where(good, trusted / everything, 0.0), mask=here)
 
 
+def averaged(guide: Tensor, room: tuple[int, int], true: Tensor) -> Tensor:
+    """(h, w, 3) float32 means of the guide (H, W, 3) over each tap, in whole levels."""
+    H, W, _ = guide.shape
+    out = torch.empty((*room, 3), device=guide.device)
+    _averaged[(blocks(room[0] * room[1], PIXELS),)](guide, true, out, H, W, *room, PIXELS)
+    return out
+
+
+@triton.jit
+def _span(n, step, fine):
+    """First and last place that tap ``n`` of ``step`` fine pixels covers, of ``fine``."""
+    first = n.to(tl.float64) * step
+    return first, tl.minimum(first + step, fine)
+
+
+@triton.jit(do_not_specialize=["height", "width", "tall", "wide"])
+def _averaged(guide, true, out, height, width, tall, wide, PIXELS: tl.constexpr):
+    at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    here = at < tall * wide
+    v, u = at // wide, at % wide
+    rows, columns = tl.load(true + 2).to(tl.float64), tl.load(true + 3).to(tl.float64)
+    down, across = rows / tl.load(true).to(tl.float64), columns / tl.load(true + 1).to(tl.float64)
+    top, bottom = _span(v, down, rows)
+    first, last = _span(u, across, columns)
+    b = tl.full((PIXELS,), 0.0, tl.float32)
+    g, r = b, b
+    for j in range(tl.ceil(down).to(tl.int32) + 1):
+        y = tl.floor(top) + j
+        tall_share = tl.maximum(tl.minimum(bottom, y + 1) - tl.maximum(top, y), 0.0)
+        for i in range(tl.ceil(across).to(tl.int32) + 1):
+            x = tl.floor(first) + i
+            share = tl.maximum(tl.minimum(last, x + 1) - tl.maximum(first, x), 0.0)
+            weight = (tall_share * share / (down * across)).to(tl.float32)
+            pixel = guide + 3 * (y * width + x).to(tl.int32)
+            inside = here & (weight > 0) & (y < height) & (x < width)
+            b += weight * tl.load(pixel, mask=inside, other=0).to(tl.float32)
+            g += weight * tl.load(pixel + 1, mask=inside, other=0).to(tl.float32)
+            r += weight * tl.load(pixel + 2, mask=inside, other=0).to(tl.float32)
+    tl.store(out + 3 * at, _whole(b), mask=here)
+    tl.store(out + 3 * at + 1, _whole(g), mask=here)
+    tl.store(out + 3 * at + 2, _whole(r), mask=here)
+
+
 def reproject(
     px: Tensor, confidence: Tensor, geometry: Tensor, true: Tensor, size_px: tuple[int, int],
     min_confidence: float,
@@ -292,21 +633,11 @@ def reproject(
     """Depth and sigma (h, w) float32, as :func:`recon.backends.torch_depth.reproject`; Eq. 3."""
     width, height = size_px
     depth, sigma = torch.empty((2, height, width), device=px.device)
-    grid = (triton.cdiv(height * width, PIXELS),)
-    _reproject[grid](
+    _reproject[(blocks(height * width, PIXELS),)](
         px.contiguous(), confidence.contiguous(), geometry, true, depth, sigma, height, width,
         px.shape[1], min_confidence, PIXELS,
     )  # fmt: skip
     return depth, sigma
-
-
-@triton.jit
-def _whole(x):
-    """The nearest whole number, halves to the even one."""
-    low = tl.floor(x)
-    part = x - low
-    odd = (low.to(tl.int32) & 1) == 1
-    return low + tl.where((part > 0.5) | ((part == 0.5) & odd), 1.0, 0.0)
 
 
 @triton.jit(do_not_specialize=["height", "width", "pitch"])
@@ -362,8 +693,7 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> Tensor:
     """
     pairs, height, width = depth.shape
     out = torch.empty((3, height, width), device=depth.device)
-    grid = (triton.cdiv(height * width, FUSED_PIXELS),)
-    _fuse[grid](
+    _fuse[(blocks(height * width, FUSED_PIXELS),)](
         depth.contiguous(), sigma.contiguous(), out, height * width, config.agree_sigmas,
         config.max_sigma_share, config.single_view_sigma, config.min_sigma_share, pairs,
         FUSED_PIXELS,

@@ -1,13 +1,10 @@
-"""An iteration of projective ICP as three Triton kernels, with the median between them.
+"""Projective ICP as Triton kernels: surface elements, and an iteration in four of them.
 
-``weigh`` matches every point and writes its residual; the scale of the residuals is their
-median; then the points are matched again, weighed, and summed up, a row of partial sums for a
-block of points. ``advance`` is one program: the directions that the surface determines, the
-step along them, and what has settled. All numbers are float64, as on the host.
-
-Floor of N points and n iterations: a point reads 56 bytes of its own and 24 of its partner,
-twice, and writes 16: 176 N n bytes, from the caches; some 400 operations a point. What counts
-is the number of launches: about 25 an iteration, where plain torch has some 275.
+Each function computes what its namesake in torch_icp does. ``weigh`` matches every point and
+writes its residual; the scale of the residuals is their median; then the points are matched again,
+weighed, and summed up, a row of partial sums for a block of points. ``advance`` is one program: the
+directions that the surface determines, the step along them, and what has settled. All numbers are
+float64, as on the host. An iteration has some 15 launches, where plain torch has 275.
 """
 
 # mypy: allow-untyped-defs, allow-incomplete-defs
@@ -19,14 +16,16 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from recon.backends import torch_icp
 from recon.backends.torch_icp import (
     SHARED,
     SIGN_ROUNDS,
     DeviceSurface,
     SourcePoints,
     Weighed,
-    scale_of,
 )
+from recon.backends.triton_dense import blocks
+from recon.mapping.icp_kernels import MIN_PIXELS, REACH
 from recon.mapping.registration import MIN_PARTNERS, IcpConfig
 
 POINTS = 128
@@ -43,16 +42,16 @@ def weigh(
     """As :func:`recon.backends.torch_icp.weigh`."""
     count = len(seen.sigma)
     residual, found = torch.empty((2, count), dtype=torch.float64, device=T.device)
-    blocks = triton.cdiv(count, POINTS)
-    partial = torch.empty((blocks, ROW), dtype=torch.float64, device=T.device)
+    programs = blocks(count, POINTS)
+    partial = torch.empty((programs, ROW), dtype=torch.float64, device=T.device)
     h, w = b.elements.shape[:2]
     given = (seen.point, seen.normal, seen.sigma, b.elements, b.intrinsics, T)
-    _residuals[(blocks,)](
+    _residuals[(programs,)](
         *given, residual, found, count, h, w, config.gate_share, POINTS, num_warps=1
     )
-    scale = scale_of(residual, found)
+    scale = torch_icp.scale_of(residual, found)
     sigmas = config.tukey_sigmas if tukey else config.huber_sigmas
-    _normal_equations[(blocks,)](
+    _normal_equations[(programs,)](
         *given, a.centre, scale, partial, count, h, w, config.gate_share, sigmas, int(tukey),
         POINTS, ROW, num_warps=1,
     )  # fmt: skip
@@ -76,6 +75,100 @@ def advance(
         num_warps=1,
     )  # fmt: skip
     return T, state
+
+
+def surface_elements(
+    depth: Tensor, sigma: Tensor, intrinsics: Tensor, edge_share: float
+) -> Tensor:
+    """(h, w, 6) float32, a plane fitted to the inverse depth of each window."""
+    h, w = depth.shape
+    out = torch.empty((h, w, 6), device=depth.device)
+    _surface[(blocks(h * w, POINTS),)](
+        depth, sigma, intrinsics, out, h, w, edge_share, MIN_PIXELS, REACH, POINTS
+    )
+    return out
+
+
+@triton.jit(do_not_specialize=["height", "width"])
+def _surface(
+    depth, sigma, K, out, height, width, edge_share, min_pixels, reach: tl.constexpr,
+    PIXELS: tl.constexpr,
+):  # fmt: skip
+    at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    here = at < height * width
+    v, u = at // width, at % width
+    none = tl.full((PIXELS,), 0.0, tl.float64)
+    count, su, sv, suu, suv, svv = none, none, none, none, none, none
+    sw, sww, suw, svw = none, none, none, none
+    for n in tl.static_range((2 * reach + 1) * (2 * reach + 1)):
+        dy = n // (2 * reach + 1) - reach
+        dx = n % (2 * reach + 1) - reach
+        inside = here & (v + dy >= 0) & (v + dy < height) & (u + dx >= 0) & (u + dx < width)
+        z = tl.load(depth + at + dy * width + dx, mask=inside, other=0.0).to(tl.float64)
+        known = z > 0
+        q = tl.where(known, 1.0 / tl.where(known, z, 1.0), 0.0)
+        k = known.to(tl.float64)
+        count, sw, sww = count + k, sw + q, sww + q * q
+        su, suu, suw = su + k * dx, suu + k * (dx * dx), suw + q * dx
+        sv, svv, svw = sv + k * dy, svv + k * (dy * dy), svw + q * dy
+        suv += k * (dx * dy)
+    each = tl.where(count > 0, count, 1.0)
+    suu, suv, svv = suu - su * su / each, suv - su * sv / each, svv - sv * sv / each
+    suw, svw = suw - su * sw / each, svw - sv * sw / each
+    det = suu * svv - suv * suv
+    z = tl.load(depth + at, mask=here, other=0.0).to(tl.float64)
+    s = tl.load(sigma + at, mask=here, other=0.0).to(tl.float64)
+    good = here & (count >= min_pixels) & (det >= 1.0) & (z > 0) & (s > 0)
+    det = tl.where(good, det, 1.0)
+    along, across = (svv * suw - suv * svw) / det, (suu * svw - suv * suw) / det
+    value = (sw - along * su - across * sv) / each
+    rest = sww - sw * sw / each - along * suw - across * svw
+    rest = tl.maximum(rest / tl.maximum(count - 3, 1.0), 0.0)
+    rms = tl.sqrt(rest) * z * z
+    good = good & ((rms <= edge_share * z) | (rms <= 3 * s))
+    nx, ny = along * tl.load(K), across * tl.load(K + 1)
+    nz = value - along * (u.to(tl.float64) - tl.load(K + 2))
+    nz -= across * (v.to(tl.float64) - tl.load(K + 3))
+    square = nx * nx + ny * ny + nz * nz
+    length = 1.0 / tl.sqrt(tl.where(good, square, 1.0))
+    to = out + 6 * at
+    tl.store(to, tl.where(good, nx * length, 0.0).to(tl.float32), mask=here)
+    tl.store(to + 1, tl.where(good, ny * length, 0.0).to(tl.float32), mask=here)
+    tl.store(to + 2, tl.where(good, nz * length, 0.0).to(tl.float32), mask=here)
+    tl.store(to + 3, tl.where(good, length, 0.0).to(tl.float32), mask=here)
+    tl.store(to + 4, tl.where(good, s, 0.0).to(tl.float32), mask=here)
+    tl.store(to + 5, tl.where(good, rms, 0.0).to(tl.float32), mask=here)
+
+
+def scale_of(residual: Tensor, found: Tensor) -> Tensor:
+    """() standard deviation of the residuals (N,), of any stride, by their median."""
+    out = torch.empty((), dtype=torch.float64, device=residual.device)
+    count = len(residual)
+    _scale[(1,)](
+        residual, found, out, count, residual.stride(0), triton.next_power_of_2(count), num_warps=8
+    )
+    return out
+
+
+@triton.jit(do_not_specialize=["count", "stride"])
+def _scale(residual, found, out, count, stride, COUNT: tl.constexpr):
+    """The mean of the two middle sizes: the middle is between ``low`` and ``high``, ever nearer."""
+    i = tl.arange(0, COUNT)
+    chosen = tl.load(found + i * stride, mask=i < count, other=0.0) > 0
+    size = tl.abs(tl.load(residual + i * stride, mask=i < count, other=0.0))
+    size = tl.where(chosen, size, float("inf"))
+    many = tl.sum(chosen.to(tl.int32), 0)
+    lower, upper = tl.maximum(many - 1, 0) // 2, many // 2
+    high = tl.max(tl.where(chosen, size, 0.0), 0)
+    low = -1e-3 * high - 1e-300
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        enough = tl.sum((size <= middle).to(tl.int32), 0) > lower
+        high, low = tl.where(enough, middle, high), tl.where(enough, low, middle)
+    a = tl.min(tl.where(size > low, size, float("inf")), 0)
+    next_one = tl.min(tl.where(size > a, size, float("inf")), 0)
+    b = tl.where(tl.sum((size <= a).to(tl.int32), 0) > upper, a, next_one)
+    tl.store(out, tl.maximum(0.5 * (a + b) / 0.6745, 1e-3))
 
 
 @triton.jit

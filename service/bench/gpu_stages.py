@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from recon.backends.room import pyramid_levels
-from recon.backends.torch_depth import DensePath, JointBilateral, averaged, fuse, reproject
+from recon.backends.torch_depth import DensePath, Upsampling, fuse, reproject
 from recon.backends.torch_icp import DeviceIcp
 from recon.backends.torch_plan import Plan, part
 from recon.backends.torch_stereo import DenseStereo, drop_unreliable, drop_unseen
@@ -117,12 +117,7 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
         pair.left, px, sure, seen, seen, own,
     )  # fmt: skip
     px, sure = (t.cpu().numpy() for t in trusted.run())
-    bilateral = JointBilateral(upsampling)
-    finer = planned(
-        device,
-        lambda p, s, guide, true: bilateral(p, s, averaged(guide, (h, w), true), guide, true),
-        px, sure, pair.guide, both,
-    )  # fmt: skip
+    finer = planned(device, Upsampling(upsampling), px, sure, pair.guide, both)
     fine = [t.cpu().numpy() for t in finer.run()]
     to_left = pair.K @ np.linalg.inv(camera((W, H)))
     base = [pair.slope, pair.K[0, 0] * pair.baseline_m, LABEL_SIGMA_PX]
