@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -149,7 +150,10 @@ def test_engines_are_kept_where_the_service_may_write(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert engine_folder() == str(tmp_path / "skyrelief" / "engines")
     monkeypatch.setenv("CACHE_DIRECTORY", f"{tmp_path}/cache:/elsewhere")
+    monkeypatch.setenv("TRITON_CACHE_DIR", "")
+    monkeypatch.delenv("TRITON_CACHE_DIR")
     assert engine_folder() == str(tmp_path / "cache" / "engines")
+    assert os.environ["TRITON_CACHE_DIR"] == str(tmp_path / "cache" / "engines" / "triton")
 
 
 def test_a_learned_model_serves_the_whole_path(tmp_path: Path) -> None:

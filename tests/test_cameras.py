@@ -16,6 +16,7 @@ import pytest
 
 from recon.types import U8
 from service.cameras import CAMERAS, CameraFrame, CameraSource, open_camera, parse_source, video
+from service.cameras.container import open_container
 from service.cameras.video import PipeReader, VideoSource, index_at_end, parse_time_unix_ns
 from service.errors import InputError
 
@@ -383,3 +384,15 @@ def test_real_flight_video_has_true_times() -> None:
     gaps = np.diff(times_s)
     assert np.median(gaps) == pytest.approx(2.105, abs=0.05)
     assert gaps.max() == pytest.approx(6.3, abs=0.1)  # the two missing shots
+
+
+@pytest.mark.parametrize(("version", "asked"), [("18.1.0", True), ("19.0.2", False)])
+def test_tags_of_any_bytes_are_asked_for_only_where_pyav_knows_the_option(
+    version: str, asked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """PyAV 19 has no such option: it always reads them."""
+    given: dict[str, object] = {}
+    monkeypatch.setattr(av, "__version__", version)
+    monkeypatch.setattr(av, "open", lambda source, **options: given.update(options))
+    open_container("v.mp4", timeout=3.0)
+    assert given == {"timeout": 3.0} | ({"metadata_errors": "replace"} if asked else {})

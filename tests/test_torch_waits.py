@@ -192,10 +192,10 @@ def test_nothing_is_made_on_the_host_between_upload_and_result() -> None:
 
 
 def test_a_wait_would_be_seen(device: str) -> None:
-    """A value read, a mask counted, a median, an eigenvalue."""
+    """A value read, a mask counted, an eigenvalue."""
     values = torch.arange(12.0, device=device).view(3, 4)
     for work in (
-        lambda: float(values[0, 0]), lambda: values[values > 3], lambda: values.nanmedian(),
+        lambda: float(values[0, 0]), lambda: values[values > 3],
         lambda: torch.nonzero(values), lambda: torch.linalg.eigh(values @ values.T),
     ):  # fmt: skip
         if device == "cpu":

@@ -153,14 +153,12 @@ class Upsampling(torch.nn.Module):
         """``guide`` (H, W, 3) in gray levels; ``true`` (4,) is h, w, H, W."""
         taps = averaged(guide, (px.shape[0], px.shape[1]), true)
         layers = tap_layers(px, confidence, taps)
-        rows, log_y = window(px.shape[0], guide.shape[0], true[0], true[2], self.config)
-        columns, log_x = window(px.shape[1], guide.shape[1], true[1], true[3], self.config)
         if fused(px):
             from recon.backends import triton_dense
 
-            return triton_dense.bilateral(
-                layers, guide, (rows, log_y), (columns, log_x), self.config
-            )
+            return triton_dense.bilateral(layers, guide, true, self.config)
+        rows, log_y = window(px.shape[0], guide.shape[0], true[0], true[2], self.config)
+        columns, log_x = window(px.shape[1], guide.shape[1], true[1], true[3], self.config)
         image = guide.float().permute(2, 0, 1)
         everything = torch.zeros_like(image[0])
         sums = torch.zeros_like(image)
@@ -296,7 +294,7 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Te
     if fused(depth):
         from recon.backends import triton_dense
 
-        return unrefuted(*triton_dense.fuse(depth, sigma, config))
+        return triton_dense.fuse(depth, sigma, config)
     z, e = depth.double(), sigma.double()
     usable = (z > 0) & (e < config.max_sigma_share * z)
     inverse = torch.where(usable, 1 / z, 0.0)
@@ -308,27 +306,16 @@ def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Te
     views = member.sum(0)
     near = usable & ((inverse - centre).abs() <= config.max_sigma_share * centre)
     contradicted = (views == 1) & (usable.sum(0) > 1) & (near.sum(0) == 1)
-    seen = (views > 0) & ~contradicted
+    refuted = contradicted.sum() > (views >= 2).sum()
+    seen = (views > 0) & ~contradicted & ~refuted
     total = torch.where(seen, weight.sum(0), 1.0)
     mean = (weight * inverse).sum(0) / total
     scatter = (weight * (inverse - mean) ** 2).sum(0)
     variance = 1 / total + scatter / total / (views - 1).clamp(min=1)
-    found = torch.where(seen, 1 / torch.where(seen, mean, 1.0), math.nan)
+    fused_depth = torch.where(seen, 1 / torch.where(seen, mean, 1.0), math.nan)
     alone = torch.where(views == 1, config.single_view_sigma, 1.0)
-    error = (variance.sqrt() * found**2 * alone).maximum(config.min_sigma_share * found)
-    return unrefuted(found.float(), error.float(), views.float())
-
-
-def unrefuted(depth: Tensor, sigma: Tensor, views: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The three without pixels whose pairs contradict each other: NaN depth, some views.
-
-    Where those are more than the pixels at which two agree, nothing is left.
-    """
-    contradicted = (depth != depth) & (views > 0)
-    refuted = contradicted.sum() > (views >= 2).sum()
-    nothing = torch.where(refuted, math.nan, 0.0)
-    views = torch.where(contradicted | refuted, 0.0, views).to(torch.uint8)
-    return depth + nothing, sigma + nothing, views
+    error = (variance.sqrt() * fused_depth**2 * alone).maximum(config.min_sigma_share * fused_depth)
+    return fused_depth.float(), error.float(), torch.where(seen, views, 0).to(torch.uint8)
 
 
 def _largest_group(

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
+from subprocess import SubprocessError
 from threading import Lock
 from typing import Any
 
@@ -120,7 +121,7 @@ def part(array: Array, shape: tuple[int, ...] | None = None) -> Part:
 def read(tensors: Sequence[Tensor]) -> list[Array]:
     """Results as arrays of the host, wider types first: one copy, one wait."""
     together = to_host(torch.cat([t.reshape(-1).view(torch.uint8) for t in tensors]))
-    parts = together.split([t.numel() * t.element_size() for t in tensors])
+    parts = torch.split(together, [t.numel() * t.element_size() for t in tensors])
     pairs = zip(parts, tensors, strict=True)
     return [part.view(t.dtype).view(t.shape).numpy() for part, t in pairs]
 
@@ -142,6 +143,19 @@ def fused(tensor: Tensor) -> bool:
 
 HAS_TRITON = find_spec("triton") is not None
 """Some of torch's wheels for Jetsons come without it; plain torch then does the same."""
+
+
+def try_kernels(device: str) -> None:
+    """Compile and run one kernel; where that fails, plain torch computes from now on."""
+    global HAS_TRITON
+    try:
+        from recon.backends import triton_dense
+
+        triton_dense.contrast(torch.zeros((8, 8), dtype=torch.uint8, device=device), 1)
+    except (ImportError, OSError, RuntimeError, SubprocessError) as error:
+        HAS_TRITON = False
+        log.warning("Triton compiles no kernels here (%s): plain torch is slower", error)
+
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 """The kernels run on the processor, slowly: for tests."""

@@ -334,6 +334,10 @@ def _hidden(
     px: Tensor, confidence: Tensor, true: Tensor, config: BeliefPropagationConfig
 ) -> Tensor:
     """True where the right view would see a nearer, accepted surface."""
+    if fused(px):
+        from recon.backends import triton_dense
+
+        return triton_dense.hidden(px, confidence, true, config)
     w = px.shape[1]
     known = px == px
     label = torch.where(known, px, 0.0)
@@ -390,6 +394,10 @@ def drop_unseen(
     px: Tensor, confidence: Tensor, left_seen: Tensor, right_seen: Tensor, true: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The labels without those on masked pixels of either image; masks are 0 or 1."""
+    if fused(px):
+        from recon.backends import triton_dense
+
+        return triton_dense.drop_unseen(px, confidence, left_seen, right_seen, true)
     w = px.shape[1]
     known = px == px
     column = torch.arange(w, device=px.device)[None, :]

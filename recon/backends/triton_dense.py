@@ -321,7 +321,12 @@ def _sweep(
     plane = height * width
     at = pixel[:, None] * LABELS + label
     row, volume = width * LABELS, plane * LABELS
-    up, down, left, right = messages, messages + volume, messages + 2 * volume, messages + 3 * volume
+    up, down, left, right = (
+        messages,
+        messages + volume,
+        messages + 2 * volume,
+        messages + 3 * volume,
+    )
     has_below, has_after = here & (v + 1 < height), here & (u + 1 < width)
     below = tl.load(up + at + row, mask=has_below[:, None], other=0).to(tl.int32)
     above = tl.load(down + at - row, mask=(here & (v > 0))[:, None], other=0).to(tl.int32)
@@ -447,6 +452,84 @@ def _contrast(image, out, height, width, radius, PIXELS: tl.constexpr):
     tl.store(out + at, tl.sqrt(spread), mask=here)
 
 
+def hidden(px: Tensor, confidence: Tensor, true: Tensor, config: BeliefPropagationConfig) -> Tensor:
+    """(h, w) True where the right view would see a nearer, accepted surface."""
+    h, w = px.shape
+    nearest = torch.full((h, w), -1, dtype=torch.int32, device=px.device)
+    out = torch.empty((h, w), dtype=torch.bool, device=px.device)
+    given = (px, confidence, true, nearest, out, h * w, w, config.min_disparity)
+    for kernel in (_project, _compare):
+        kernel[(blocks(h * w, PIXELS),)](*given, float(config.occlusion_tolerance), PIXELS)
+    return out
+
+
+@triton.jit
+def _partners(px, true, at, here, width, first):
+    """Label of each pixel, its partner's place, and whether the right image has that."""
+    label = tl.load(px + at, mask=here, other=float("nan"))
+    known = label == label
+    label = tl.where(known, label, 0.0)
+    u = at % width
+    partner = u - tl.floor(label + 0.5).to(tl.int32) - first
+    sees = known & (partner >= 0) & (partner < tl.load(true + 1).to(tl.int32))
+    return label, at - u + partner, sees
+
+
+@triton.jit(do_not_specialize=["plane", "width", "first"])
+def _project(
+    px, confidence, true, nearest, out, plane, width, first, tolerance, PIXELS: tl.constexpr
+):
+    """The largest label at each place of the right image; labels in float32 order as integers."""
+    at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    here = at < plane
+    label, there, sees = _partners(px, true, at, here, width, first)
+    sees = sees & (tl.load(confidence + at, mask=here, other=0.0) > 0)
+    bits = tl.maximum(label, 0.0).to(tl.int32, bitcast=True)
+    tl.atomic_max(nearest + there, bits, mask=sees)
+
+
+@triton.jit(do_not_specialize=["plane", "width", "first"])
+def _compare(
+    px, confidence, true, nearest, out, plane, width, first, tolerance, PIXELS: tl.constexpr
+):
+    at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    here = at < plane
+    label, there, sees = _partners(px, true, at, here, width, first)
+    bits = tl.load(nearest + there, mask=sees, other=-1)
+    other = bits.to(tl.float32, bitcast=True)
+    tl.store(out + at, sees & (bits >= 0) & (other > label + tolerance), mask=here)
+
+
+def drop_unseen(
+    px: Tensor, confidence: Tensor, left_seen: Tensor, right_seen: Tensor, true: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The labels without those on masked pixels of either image; masks are 0 or 1."""
+    h, w = px.shape
+    label, trust = torch.empty((2, h, w), device=px.device)
+    _unseen[(blocks(h * w, PIXELS),)](
+        px, confidence, left_seen, right_seen, true, label, trust, h * w, w, PIXELS
+    )
+    return label, trust
+
+
+@triton.jit(do_not_specialize=["plane", "width"])
+def _unseen(
+    px, confidence, left_seen, right_seen, true, label, trust, plane, width, PIXELS: tl.constexpr
+):
+    at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    here = at < plane
+    found = tl.load(px + at, mask=here, other=float("nan"))
+    known = found == found
+    u = at % width
+    partner = _whole(u.to(tl.float64) - tl.where(known, found, 0.0).to(tl.float64)).to(tl.int32)
+    sees = known & (partner >= 0) & (partner < tl.load(true + 1).to(tl.int32))
+    sees = sees & (tl.load(left_seen + at, mask=here, other=0) > 0)
+    sees = sees & (tl.load(right_seen + at - u + partner, mask=sees, other=0) > 0)
+    sure = tl.load(confidence + at, mask=here, other=0.0)
+    tl.store(label + at, tl.where(sees, found, float("nan")), mask=here)
+    tl.store(trust + at, tl.where(sees, sure, 0.0), mask=here)
+
+
 def speckles(level: Tensor, largest: int, unknown: int) -> Tensor:
     """(h, w) True on surfaces of at most ``largest`` pixels; ``level`` (h, w) int32.
 
@@ -521,51 +604,63 @@ LOG2_E = 1 / math.log(2)
 
 
 def bilateral(
-    layers: Tensor, guide: Tensor, rows: tuple[Tensor, Tensor], columns: tuple[Tensor, Tensor],
-    config: UpsamplingConfig,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    layers: Tensor, guide: Tensor, true: Tensor, config: UpsamplingConfig
+) -> tuple[Tensor, Tensor]:
     """Labels and confidence (H, W) of a guide (H, W, 3); Eq. 2, all sums in registers.
 
-    ``layers`` (6, h, w) are those of :func:`recon.backends.torch_depth.tap_layers`; ``rows`` and
-    ``columns`` hold the coarse index (D, fine) and the log of the weight of each tap.
+    ``layers`` (6, h, w) are those of :func:`recon.backends.torch_depth.tap_layers`.
     """
     _, h, w = layers.shape
     height, width, _ = guide.shape
-    scale = math.sqrt(0.5 * LOG2_E) / config.range_sigma
+    tonal = math.sqrt(0.5 * LOG2_E) / config.range_sigma
+    spatial = math.sqrt(0.5 * LOG2_E) / config.spatial_sigma
     layers = layers[:5].clone()
-    layers[:3] *= scale
+    layers[:3] *= tonal
     out, sure = torch.empty((2, height, width), device=guide.device)
-    grid = (blocks(height, ROWS), blocks(width, COLUMNS))
-    _bilateral[grid](
-        layers, guide.contiguous(), rows[0].int(), rows[1] * LOG2_E, columns[0].int(),
-        columns[1] * LOG2_E, out, sure, height, width, w, h * w, scale, float(RANGE_FLOOR),
-        config.min_support, config.diameter_px, ROWS, COLUMNS,
+    _bilateral[(blocks(height, ROWS), blocks(width, COLUMNS))](
+        layers, guide.contiguous(), true, out, sure, height, width, h, w, tonal, spatial,
+        float(RANGE_FLOOR), config.min_support, config.diameter_px, ROWS, COLUMNS,
     )  # fmt: skip
     return out, sure
 
 
-@triton.jit(do_not_specialize=["height", "width", "pitch", "plane"])
+@triton.jit
+def _first_tap(n, taps, fine, diameter: tl.constexpr):
+    """The first of the taps around fine pixel ``n``, and how far it lies ahead, in taps."""
+    place = (n.to(tl.float64) + 0.5) * (taps.to(tl.float64) / fine.to(tl.float64)) - 0.5
+    first = tl.ceil(place - diameter / 2)
+    return first.to(tl.int32), (first - place).to(tl.float32)
+
+
+@triton.jit(do_not_specialize=["height", "width", "tall", "wide"])
 def _bilateral(
-    layers, guide, rows, log_y, columns, log_x, out, sure, height, width, pitch, plane, scale,
-    floor, support, diameter: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
+    layers, guide, true, out, sure, height, width, tall, wide, tonal_scale, spatial_scale, floor,
+    support, diameter: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """A tile of fine pixels; ``layers`` are three colours, trust, trust times label."""
     v = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     u = tl.program_id(1) * COLUMNS + tl.arange(0, COLUMNS)
-    tall, wide = v < height, u < width
-    here = tall[:, None] & wide[None, :]
+    here = (v < height)[:, None] & (u < width)[None, :]
     at = v[:, None] * width + u[None, :]
-    b = tl.load(guide + 3 * at, mask=here, other=0).to(tl.float32) * scale
-    g = tl.load(guide + 3 * at + 1, mask=here, other=0).to(tl.float32) * scale
-    r = tl.load(guide + 3 * at + 2, mask=here, other=0).to(tl.float32) * scale
+    b = tl.load(guide + 3 * at, mask=here, other=0).to(tl.float32) * tonal_scale
+    g = tl.load(guide + 3 * at + 1, mask=here, other=0).to(tl.float32) * tonal_scale
+    r = tl.load(guide + 3 * at + 2, mask=here, other=0).to(tl.float32) * tonal_scale
+    rows, columns = tl.load(true).to(tl.int32), tl.load(true + 1).to(tl.int32)
+    top, below = _first_tap(v, rows, tl.load(true + 2), diameter)
+    first, ahead = _first_tap(u, columns, tl.load(true + 3), diameter)
     everything = tl.full((ROWS, COLUMNS), 0.0, tl.float32)
     known, trusted, value = everything, everything, everything
+    plane = tall * wide
     for j in range(diameter):
-        row = tl.load(rows + j * height + v, mask=tall, other=0) * pitch
-        near_y = tl.load(log_y + j * height + v, mask=tall, other=0.0)
+        y = top + j
+        dy = (below + j) * spatial_scale
+        near_y = tl.where((y >= 0) & (y < rows), -dy * dy, -1e4)
+        row = tl.minimum(tl.maximum(y, 0), tall - 1) * wide
         for i in range(diameter):
-            column = tl.load(columns + i * width + u, mask=wide, other=0)
-            near_x = tl.load(log_x + i * width + u, mask=wide, other=0.0)
+            x = first + i
+            dx = (ahead + i) * spatial_scale
+            near_x = tl.where((x >= 0) & (x < columns), -dx * dx, -1e4)
+            column = tl.minimum(tl.maximum(x, 0), wide - 1)
             tap = layers + row[:, None] + column[None, :]
             db = b - tl.load(tap)
             dg = g - tl.load(tap + plane)
@@ -686,19 +781,31 @@ def _reproject(
     tl.store(sigma + at, tl.where(good, error, float("nan")).to(tl.float32), mask=here)
 
 
-def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> Tensor:
-    """(3, h, w) float32 depth, sigma and views of pairs (P, h, w).
-
-    A pixel where the pairs contradict each other has NaN depth and the views that agree.
-    """
+def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth and sigma (h, w) float32 and views uint8 of pairs (P, h, w)."""
     pairs, height, width = depth.shape
-    out = torch.empty((3, height, width), device=depth.device)
-    _fuse[(blocks(height * width, FUSED_PIXELS),)](
-        depth.contiguous(), sigma.contiguous(), out, height * width, config.agree_sigmas,
-        config.max_sigma_share, config.single_view_sigma, config.min_sigma_share, pairs,
-        FUSED_PIXELS,
+    plane, device = height * width, depth.device
+    out, error = torch.empty((2, height, width), device=device)
+    views = torch.empty((height, width), dtype=torch.uint8, device=device)
+    balance = torch.zeros(1, dtype=torch.int32, device=device)
+    _fuse[(blocks(plane, FUSED_PIXELS),)](
+        depth.contiguous(), sigma.contiguous(), out, error, views, balance, plane,
+        config.agree_sigmas, config.max_sigma_share, config.single_view_sigma,
+        config.min_sigma_share, pairs, FUSED_PIXELS,
     )  # fmt: skip
-    return out
+    _refute[(blocks(plane, FUSED_PIXELS),)](out, error, views, balance, plane, FUSED_PIXELS)
+    return out, error, views
+
+
+@triton.jit(do_not_specialize=["plane"])
+def _refute(out, error, views, balance, plane, PIXELS: tl.constexpr):
+    """Empty the map where more pixels are contradicted than confirmed."""
+    if tl.load(balance) > 0:
+        at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+        nothing = tl.full((PIXELS,), float("nan"), tl.float32)
+        tl.store(out + at, nothing, mask=at < plane)
+        tl.store(error + at, nothing, mask=at < plane)
+        tl.store(views + at, tl.full((PIXELS,), 0, tl.uint8), mask=at < plane)
 
 
 FUSED_PIXELS = 256
@@ -716,9 +823,10 @@ def _reading(depth, sigma, at, here, max_share):
 
 @triton.jit(do_not_specialize=["plane"])
 def _fuse(
-    depth, sigma, out, plane, agree, max_share, single, min_share, PAIRS: tl.constexpr,
-    PIXELS: tl.constexpr,
+    depth, sigma, out, error, out_views, balance, plane, agree, max_share, single, min_share,
+    PAIRS: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
+    """``balance`` grows by the pixels that are contradicted less those that two views confirm."""
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     here = at < plane
     best = tl.full((PIXELS,), -1, tl.int32)
@@ -758,9 +866,11 @@ def _fuse(
     ).to(tl.float64)
     z = 1.0 / tl.where(seen, centre + mean, 1.0)
     e = tl.sqrt(variance) * z * z * tl.where(views == 1, single, 1.0)
-    seen = seen & ~((views == 1) & (count > 1) & (close == 1))
-    nan = float("nan")
-    tl.store(out + at, tl.where(seen, z, nan).to(tl.float32), mask=here)
-    e = tl.where(seen, tl.maximum(e, min_share * z), nan)
-    tl.store(out + plane + at, e.to(tl.float32), mask=here)
-    tl.store(out + 2 * plane + at, views.to(tl.float32), mask=here)
+    contradicted = (views == 1) & (count > 1) & (close == 1)
+    seen = seen & ~contradicted
+    e = tl.maximum(e, min_share * z)
+    tl.store(out + at, tl.where(seen, z, float("nan")).to(tl.float32), mask=here)
+    tl.store(error + at, tl.where(seen, e, float("nan")).to(tl.float32), mask=here)
+    tl.store(out_views + at, tl.where(contradicted, 0, views).to(tl.uint8), mask=here)
+    votes = (here & contradicted).to(tl.int32) - (here & (views >= 2)).to(tl.int32)
+    tl.atomic_add(balance, tl.sum(votes, 0))

@@ -77,9 +77,7 @@ def advance(
     return T, state
 
 
-def surface_elements(
-    depth: Tensor, sigma: Tensor, intrinsics: Tensor, edge_share: float
-) -> Tensor:
+def surface_elements(depth: Tensor, sigma: Tensor, intrinsics: Tensor, edge_share: float) -> Tensor:
     """(h, w, 6) float32, a plane fitted to the inverse depth of each window."""
     h, w = depth.shape
     out = torch.empty((h, w, 6), device=depth.device)

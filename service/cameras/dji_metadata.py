@@ -14,6 +14,7 @@ from itertools import islice
 import av
 
 from recon.types import Shutter
+from service.cameras.container import open_container
 
 HANDLER = "DJI meta"
 MAX_BYTES = 1 << 16
@@ -31,7 +32,7 @@ DIRECTIONS = ("down", "down", "up", "up", "right", "left", "left", "right")
 def stated_shutter(path: str) -> Shutter | None:
     """The shutter that a DJI video states; None where it states none that can be."""
     try:
-        with av.open(path) as container:
+        with open_container(path) as container:
             tracks = [s for s in container.streams if s.metadata.get("handler_name") == HANDLER]
             for packet in islice(container.demux(), MAX_PACKETS) if tracks else ():
                 if packet.stream in tracks and packet.size:

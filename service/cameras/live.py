@@ -29,6 +29,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from recon.types import U8
 from service.cameras import reject_options
+from service.cameras.container import open_container
 from service.cameras.source import CameraFrame, CameraSource, Paced
 from service.cameras.video import decoded_frames, frame_bgr, video_stream
 from service.errors import InputError, OutsideError
@@ -271,15 +272,14 @@ def open_v4l2(rest: str, options: Mapping[str, str]) -> CameraSource:
 
 
 def _live(url: str, demuxer: dict[str, str], format_: str | None = None) -> CameraSource:
-    def open_container(stall_s: float) -> av.container.InputContainer:
-        import av
-
+    def opened(stall_s: float) -> av.container.InputContainer:
         timeout = (OPEN_S, stall_s)
-        return av.open(
-            url, format=format_, options=demuxer, timeout=timeout, metadata_errors="replace"
+        made: av.container.InputContainer = open_container(
+            url, format=format_, options=demuxer, timeout=timeout
         )
+        return made
 
-    return Paced(LiveSource(open_container, without_credentials(url)))
+    return Paced(LiveSource(opened, without_credentials(url)))
 
 
 TAIL = (

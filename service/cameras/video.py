@@ -22,6 +22,7 @@ import numpy as np
 
 from recon.types import U8
 from service.cameras import reject_options
+from service.cameras.container import open_container
 from service.cameras.source import CameraFrame
 from service.errors import InputError
 
@@ -327,7 +328,7 @@ def open_file(rest: str, options: Mapping[str, str]) -> VideoSource:
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty (0 bytes); copy it from the camera again")
     try:
-        container = av.open(str(path), metadata_errors="replace")
+        container = open_container(str(path))
     except av.error.InvalidDataError as error:
         raise InputError(_not_video(path)) from error
     except av.error.EOFError as error:
@@ -393,13 +394,7 @@ def open_pipe(rest: str, options: Mapping[str, str]) -> VideoSource:
         )
     demuxer = {key: value for key, value in options.items() if key != "format"}
     try:
-        container = av.open(
-            reader,
-            mode="r",
-            format=options.get("format"),
-            options=demuxer,
-            metadata_errors="replace",
-        )
+        container = open_container(reader, mode="r", format=options.get("format"), options=demuxer)
     except (av.error.FFmpegError, ValueError, OSError) as error:
         raise InputError(
             f"{name}: not a video stream that can be read ({error}); Matroska, MPEG-TS, "

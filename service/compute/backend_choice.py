@@ -131,7 +131,7 @@ def choose_backend(name: str = "auto") -> Backend:
 
 
 def engine_folder() -> str | None:
-    """Cache folder for compiled engines of GPU providers; None without one."""
+    """Cache folder for compiled engines of GPU providers and Triton's kernels; None without one."""
     given = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]  # as systemd sets it
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(given or Path(home) / "skyrelief") / "engines"
@@ -140,6 +140,7 @@ def engine_folder() -> str | None:
     except OSError as error:
         log.info("compiled engines are not cached: %s", error)
         return None
+    os.environ.setdefault("TRITON_CACHE_DIR", str(folder / "triton"))
     return str(folder)
 
 
