@@ -147,13 +147,13 @@ def test_engines_are_kept_where_the_service_may_write(
 ) -> None:
     """systemd's cache folder when it gives one, else the user's."""
     monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert engine_folder() == str(tmp_path / "skyrelief" / "engines")
-    monkeypatch.setenv("CACHE_DIRECTORY", f"{tmp_path}/cache:/elsewhere")
     monkeypatch.setenv("TRITON_CACHE_DIR", "")
     monkeypatch.delenv("TRITON_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert engine_folder() == str(tmp_path / "skyrelief" / "engines")
+    assert os.environ["TRITON_CACHE_DIR"] == str(tmp_path / "skyrelief" / "engines" / "triton")
+    monkeypatch.setenv("CACHE_DIRECTORY", f"{tmp_path}/cache:/elsewhere")
     assert engine_folder() == str(tmp_path / "cache" / "engines")
-    assert os.environ["TRITON_CACHE_DIR"] == str(tmp_path / "cache" / "engines" / "triton")
 
 
 def test_a_learned_model_serves_the_whole_path(tmp_path: Path) -> None:
