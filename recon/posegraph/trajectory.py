@@ -25,7 +25,7 @@ from recon.posegraph.interpolated import (
     moved_m,
     whole,
 )
-from recon.posegraph.ledger import Ledger, MemoryLedger, Rows
+from recon.posegraph.ledger import Ledger, Rows
 from recon.posegraph.pose_graph import PoseGraph
 from recon.types import F64, PosePrior
 
@@ -128,16 +128,12 @@ class Trajectory:
     """
 
     def __init__(
-        self,
-        config: TrajectoryConfig | None = None,
-        graph: PoseGraph | None = None,
-        ledger: Ledger | None = None,
+        self, config: TrajectoryConfig | None = None, graph: PoseGraph | None = None
     ) -> None:
-        """``graph`` places the keyframes; a :class:`PoseGraph` when left out. ``ledger`` takes
-        rows of :data:`recon.posegraph.interpolated.KEYFRAME`; memory when left out."""
+        """``graph`` places the keyframes; a :class:`PoseGraph` when left out."""
         self.config = config or TrajectoryConfig()
         self.graph = PoseGraph() if graph is None else graph
-        self._ledger: Ledger = MemoryLedger(KEYFRAME) if ledger is None else ledger
+        self._ledger = Ledger(KEYFRAME)
         self._published = _Published()
         self._seqs = array("q")  # numbers of all keyframes, as in the ledger
         self._nodes: list[int] = []  # their numbers, in order

@@ -251,14 +251,12 @@ class Scan:
             camera = self.store.header.camera | shutter_document(shutter)
             self.store.update_header(camera=camera)
         summary = self.recorder.close(redacted(extra | self.inputs.extra))
-        self.pipeline.close()
         summary["clouds_per_second"] = round(summary["clouds"] / elapsed, 2)
         self.store.finish(summary)
         return summary
 
     def discard(self) -> None:
         """End the scan and delete its store; another one may be made in its folder."""
-        self.pipeline.close()
         if self.tags is not None:
             self.tags.close()
         self.store.close()
