@@ -114,7 +114,7 @@ def test_carriers_keep_their_places_when_they_settle() -> None:
 
 def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None:
     """The graph is at work then on another thread: nothing asks it, nothing waits for it."""
-    chain: Any = Chain(Trajectory(), Carriers(), before(0), Counter(), Stopwatch())
+    chain: Any = Chain(Trajectory(), before(0), Counter(), Stopwatch())
     key = Refined(3, 0, some_pose())
     frame, anchor = Anchorage(7, key, some_pose()), Anchorage(5, key, some_pose())
     assert chain.place(frame).sources == ("vision",)  # nothing is reconstructed yet

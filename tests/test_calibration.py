@@ -12,7 +12,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from recon.calibration.board import Board, BoardView, CalibrationConfig, calibrate, find_board
+from recon.calibration.board import Board, BoardView, calibrate, find_board
 from recon.types import F32, F64, U8
 from service.cameras.camera_file import load_camera
 from service.cli import app
@@ -164,16 +164,10 @@ def test_wrong_input_is_refused() -> None:
     views = [BoardView("v", np.zeros((54, 2), np.float32))] * 3
     with pytest.raises(ValueError, match="too few"):
         calibrate(views, BOARD, SIZE)
-    with pytest.raises(ValueError, match="do not fit"):
-        calibrate([BoardView("v", np.zeros((9, 2), np.float32))] * 4, BOARD, SIZE)
-    with pytest.raises(ValueError, match="gray"):
-        find_board(np.zeros((48, 64, 3), np.uint8), BOARD)
     with pytest.raises(ValueError, match="squares"):
         Board(9, 6, -1.0)
     with pytest.raises(ValueError, match="too small"):
         Board(2, 6, 0.1)
-    with pytest.raises(ValueError, match="ratio"):
-        CalibrationConfig(outlier_ratio=0.5)
 
 
 def opencv_rms(paths: list[Path], pattern: tuple[int, int]) -> float:

@@ -9,7 +9,6 @@ import pytest
 import scipy.ndimage as ndi
 
 from recon.surface.change import (
-    ChangeConfig,
     SumErrors,
     change_between,
     left_over_m,
@@ -281,17 +280,6 @@ def test_a_mean_surface_keeps_the_volume_at_the_rim() -> None:
         xyz + np.array([100.0, 0.0, 0.0]), rgb, np.ones(len(xyz), np.float32), grid
     )
     assert not outside.known.any()
-
-
-def test_bad_parameters_are_refused() -> None:
-    with pytest.raises(ValueError, match="odd"):
-        ChangeConfig(windows=(4,))
-    with pytest.raises(ValueError, match="false_alarm"):
-        ChangeConfig(false_alarm=0.0)
-    other = Grid(0.0, 0.0, 0.2, (250, 250))
-    a = surface(1, [])
-    with pytest.raises(ValueError, match="one grid"):
-        change_between(a, Raster(other, a.height_m, a.sigma_m, a.rgb))
 
 
 def test_tiles_count_each_object_once() -> None:

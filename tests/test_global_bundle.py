@@ -222,5 +222,3 @@ def test_a_landmark_twice_in_a_view_is_refused() -> None:
     )  # fmt: skip
     with pytest.raises(ValueError, match="twice in one view"):
         solve(problem)
-    with pytest.raises(ValueError, match="sigma_px"):
-        solve(replace(problem, sigma_px=np.ones(3)))

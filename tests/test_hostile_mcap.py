@@ -20,7 +20,7 @@ from google.protobuf import descriptor_pb2  # noqa: E402
 from mcap.reader import make_reader  # noqa: E402
 
 from service.errors import InputError  # noqa: E402
-from service.ground import mcap_records  # noqa: E402
+from service.ground import mcap_import  # noqa: E402
 from service.ground.mcap_import import header_in, store_from_mcap  # noqa: E402
 from service.offline.exports.recording import export_mcap  # noqa: E402
 
@@ -62,7 +62,7 @@ def test_the_numbers_of_the_fields_are_those_that_recordings_describe(recording:
         for one in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
             for message in one.message_type:
                 described[message.name] = {field.name: field for field in message.field}
-    for name, fields in mcap_records._FIELDS.items():
+    for name, fields in mcap_import._FIELDS.items():
         for field, number, kind, holds in fields:
             there = described[name][field]
             assert (there.number, there.type) == (number, kind), (name, field)

@@ -351,10 +351,3 @@ def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPa
         search.look(i, 0, rng.integers(0, 255, seen.gray.shape, np.uint8), K, seen.depth)
         assert len(search) <= 6
     assert search.counts["tried"] == 0
-
-
-def test_wrong_parameters_are_named() -> None:
-    with pytest.raises(ValueError, match="min_gap"):
-        LoopConfig(min_gap=0)
-    with pytest.raises(ValueError, match="min_overlap"):
-        LoopConfig(min_overlap=0.0)

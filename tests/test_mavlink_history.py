@@ -460,8 +460,6 @@ def test_the_images_decide_between_frames() -> None:
 
 def test_judging_needs_matching_lists() -> None:
     ends = (IDENTITY, IDENTITY)
-    with pytest.raises(ValueError, match="as many of each"):
-        judge_frame([ends], [], [])
     assert judge_frame([], [], []) is None
     still = judge_frame([ends], [ends], [IDENTITY])
     assert still is not None and not still.decided
@@ -497,11 +495,9 @@ def test_a_live_history_does_not_wait_in_vain() -> None:
     assert history.state_at(now) is not None  # a stream that has dried up
 
 
-def test_a_live_history_forgets_and_a_wrong_sample_is_refused() -> None:
+def test_a_live_history_forgets() -> None:
     history = VehicleHistory(HistoryConfig(keep_s=2.0))
     for k in range(2000):
         history.add(AttitudeSample(None, IDENTITY), T0 + k * 10 * MS)
     assert len(history) < 700
     assert history.state_at(T0 + 19 * S) is not None
-    with pytest.raises(ValueError, match="positive"):
-        HistoryConfig(keep_s=0.0)

@@ -151,9 +151,3 @@ def test_a_wrong_tie_is_left_out() -> None:
     assert not found.used[0] and found.used[1:].all()
     off = [placed(m, w, np.zeros((1, 3)))[0] for m, w in zip(found.moves, wrong, strict=True)]
     assert np.abs(off[0] - off[1]).max() < 0.1
-
-
-def test_a_tie_of_a_scan_that_is_not_there_is_refused() -> None:
-    tie = Tie(0, 2, np.zeros((4, 3)), np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1)))
-    with pytest.raises(ValueError, match="2 different scans"):
-        align([tie], priors(2))

@@ -174,10 +174,3 @@ def test_stored_keyframes_alone_bring_two_oblique_legs_together() -> None:
     true = se3.inverse(truth[2]) @ truth[7]
     ahead = np.array([[0.0, 0.0, 66.0]])
     assert np.linalg.norm(se3.transform(left, ahead) - se3.transform(true, ahead)) < 0.2
-
-
-def test_wrong_parameters_are_named() -> None:
-    with pytest.raises(ValueError, match="min_gap"):
-        SubmapLoopConfig(min_gap=0)
-    with pytest.raises(ValueError, match="min_overlap"):
-        SubmapLoopConfig(search_shares=(0.9,))

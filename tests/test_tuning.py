@@ -187,7 +187,7 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         scan = Scan(inputs, store)
         scanning, link = operator.daemon.scanning, Budget()
         run = scanning._run = ScanRun(scanning, is_asked=True)
-        run.scan, scanning.link.flying = scan, link
+        run.scan, scanning.link.flying = scan, link  # type: ignore[assignment]
         operator.set("SR_LINK_KBIT_S", 64.0)
         assert link.budgets[-1] == (64.0, operator.config.datalink.share)
         operator.set("SR_BASELINE_M", 2.5)

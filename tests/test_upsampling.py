@@ -136,5 +136,3 @@ def test_bad_input_is_named() -> None:
         upsample(given, guide[:10], CONFIG)
     with pytest.raises(ValueError, match="guide must be"):
         upsample(given, guide[:, :, 0], CONFIG)
-    with pytest.raises(ValueError, match="share"):
-        UpsamplingConfig(min_support=2)

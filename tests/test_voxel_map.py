@@ -136,8 +136,6 @@ def test_insert_takes_only_the_masked_pixels() -> None:
     fresh = voxel_map.fresh(depth)
     assert not fresh[:, :40].any()
     assert fresh[:, 44:].all()
-    with pytest.raises(ValueError, match="mask"):
-        voxel_map.insert(depth, mask[:5])
 
 
 def test_memory_is_bounded_and_the_oldest_goes_first() -> None:
@@ -156,15 +154,6 @@ def test_far_and_broken_poses_do_no_harm() -> None:
     assert voxel_map.insert(view(1e7)) == 0
     assert voxel_map.insert(broken) == 0
     assert not voxel_map.fresh(broken).any()
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [{"voxel_m": 0.0}, {"voxel_m": float("nan")}, {"better_ratio": 0.5}, {"largest_voxels": 1}],
-)
-def test_config_is_checked(bad: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(bad))):
-        VoxelMapConfig(**bad)  # type: ignore[arg-type]
 
 
 def test_ground_sample_is_depth_over_focal_length() -> None:
@@ -265,11 +254,6 @@ def test_unusable_points_are_left_out() -> None:
     assert len(fuse([good, bad], 0.5)) == 1
 
 
-def test_voxel_size_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="voxel_m"):
-        fuse([], 0.0)
-
-
 def test_a_cloud_is_what_the_pinhole_formula_says_of_the_pixels_asked_for() -> None:
     rng = np.random.default_rng(11)
     flat = view(4.0, roof_m=6.0)
@@ -284,8 +268,6 @@ def test_a_cloud_is_what_the_pinhole_formula_says_of_the_pixels_asked_for() -> N
     np.testing.assert_allclose(found.xyz_m, world_points(depth)[known], rtol=1e-6, atol=1e-5)
     np.testing.assert_array_equal(found.rgb, bgr[known][:, ::-1])
     np.testing.assert_array_equal(found.sigma_m, depth.sigma_m[known])
-    with pytest.raises(ValueError, match="colour"):
-        cloud_of(depth, bgr[1:])
 
 
 def test_fusing_in_strips_gives_the_same_points() -> None:

@@ -153,13 +153,8 @@ class Odometry:
 
 
 def odometry_message(odometry: Odometry, boot_time_us: int) -> Any:
-    """The ODOMETRY at a time of the autopilot's boot clock.
-
-    ValueError when the covariance is not 6 x 6.
-    """
+    """The ODOMETRY at a time of the autopilot's boot clock."""
     rows = odometry.pose_covariance
-    if len(rows) != 6 or any(len(row) != 6 for row in rows):
-        raise ValueError(f"pose_covariance must be 6 x 6, got {len(rows)} rows")
     upper = [float(rows[i][j]) for i in range(6) for j in range(i, 6)]
     nan = math.nan
     return dialect.MAVLink_odometry_message(

@@ -166,9 +166,7 @@ class VehicleLink:
         self._inbox.put(lambda: self._companion.report(keyframe))
 
     def send_tunnel(self, payload_type: int, payload: bytes) -> None:
-        """Send up to 128 bytes to everyone by TUNNEL; ValueError when there are more."""
-        if len(payload) > TUNNEL_ROOM:
-            raise ValueError(f"a TUNNEL holds {TUNNEL_ROOM} bytes, got {len(payload)}")
+        """Send up to 128 bytes to everyone by TUNNEL."""
         padded = list(payload.ljust(TUNNEL_ROOM, b"\0"))
         message = dialect.MAVLink_tunnel_message(0, 0, payload_type, len(payload), padded)
         self._inbox.put(lambda: self._companion.send(message))

@@ -100,8 +100,6 @@ def fit_boot(stamp_ns: Sequence[int], boot_ms: Sequence[float]) -> BootFit:
     stamping computer's clock was set). When the clocks run at different rates, as in a
     simulation faster than real time, the boot clock is used, anchored at the first stamp.
     """
-    if len(stamp_ns) == 0 or len(stamp_ns) != len(boot_ms):
-        raise ValueError(f"fit_boot needs pairs, got {len(stamp_ns)} and {len(boot_ms)}")
     base = int(stamp_ns[0])
     stamps: F64 = (np.asarray(stamp_ns, dtype=np.int64) - base).astype(np.float64)
     boots: F64 = np.asarray(boot_ms, dtype=np.float64) * MS

@@ -164,11 +164,6 @@ def judge_frame(
     without pairs. ``decided`` requires the best frame to disagree less than half as much as
     every other frame with a different meaning.
     """
-    if not len(q_sent) == len(q_ned_body) == len(q_seen_steps):
-        raise ValueError(
-            f"judge_frame needs as many of each, got "
-            f"{len(q_sent)}, {len(q_ned_body)} and {len(q_seen_steps)}"
-        )
     if not q_sent:
         return None
     heads: dict[GimbalFrame, list[Ends]] = {

@@ -48,10 +48,6 @@ class HistoryConfig:
     keep_s: float = math.inf
     gimbal: GimbalConfig = field(default_factory=GimbalConfig)
 
-    def __post_init__(self) -> None:
-        if not self.keep_s > 0.0:
-            raise ValueError(f"history keep_s is {self.keep_s}; it must be positive")
-
 
 SIGMA_TILT_RAD, SIGMA_YAW_RAD, SIGMA_GIMBAL_RAD = 0.01, 0.05, 0.01
 TURN_RAD_S2, ACCELERATION_M_S2 = 1.5, 1.0

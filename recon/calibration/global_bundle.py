@@ -297,11 +297,8 @@ def errors_px(
 def solve(problem: Problem, iterations: int = 40, covariances: bool = False) -> Solution:
     """Adjust until a step lowers the cost by less than a millionth.
 
-    Raises ValueError for shapes that do not fit or a landmark seen twice in one view.
+    Raises ValueError for a landmark seen twice in one view.
     """
-    M = len(problem.seen.view)
-    if problem.seen.uv_px.shape != (M, 2) or problem.sigma_px.shape != (M,):
-        raise ValueError(f"{M} sightings need uv_px (M, 2) and sigma_px (M,)")
     bundle = _Bundle(problem)
     state = bundle.start
     cost, damping = bundle.cost(state), 1e-4

@@ -37,7 +37,6 @@ def fuse(clouds: Iterable[PointCloud], voxel_m: float) -> PointCloud:
     views; errors of clouds have :data:`CORRELATION`. A single-view point that
     stands alone is left out when surface seen more often, above or below it, contradicts it.
     Order is that of the voxel keys (x first), whatever the order of points in a cloud.
-    Raises ValueError for a voxel size that is not positive.
     """
     return fuse_strips([lambda: clouds], [-np.inf, np.inf], voxel_m)
 
@@ -51,8 +50,6 @@ def fuse_strips(
     points outside are skipped. Finite edges are moved to the voxel border below them, so the result
     is that of the whole.
     """
-    if not (np.isfinite(voxel_m) and voxel_m > 0.0):
-        raise ValueError(f"voxel_m is {voxel_m}, must be positive")
     borders = np.floor(np.asarray(edges_m, np.float64) / voxel_m)
 
     def fused(strip: Callable[[], Iterable[PointCloud]], low: float, high: float) -> _Fused:
@@ -278,10 +275,8 @@ def cloud_of(
 ) -> PointCloud:
     """World points of the pixels with a resolved depth, in row order, where ``mask`` if given.
 
-    ``bgr`` is (h, w, 3) on the grid of the depth. Raises ValueError when sizes differ.
+    ``bgr`` is (h, w, 3) on the grid of the depth.
     """
-    if bgr.shape[:2] != depth.depth_m.shape:
-        raise ValueError(f"colour is {bgr.shape}, depth is {depth.depth_m.shape}")
     known = np.isfinite(depth.depth_m) & (depth.depth_m > 0.0) & np.isfinite(depth.sigma_m)
     resolved = known & (depth.sigma_m < MAX_SIGMA_SHARE * depth.depth_m)
     known = resolved & (2 * resolved.sum() >= known.sum())

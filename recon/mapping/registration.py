@@ -46,18 +46,6 @@ class IcpConfig:
     weak_slope: float = 0.02  # rms slope of the ground that a direction needs to be observed
     unknown_sigma_m: float = 10.0  # given to directions that are not observed
 
-    def __post_init__(self) -> None:
-        """Raise ValueError when a parameter makes no sense."""
-        if not self.strides or len(self.strides) != len(self.iterations):
-            raise ValueError("strides and iterations must be of one length, at least 1")
-        if min(self.strides) < 1 or min(self.iterations) < 1:
-            raise ValueError("strides and iterations must be at least 1")
-        shares = (self.gate_share, self.edge_share, self.max_rms_share, self.max_step_share)
-        if min(shares) <= 0 or not 0 < self.min_inlier_share <= 1:
-            raise ValueError("shares must be positive, min_inlier_share at most 1")
-        if self.weak_slope <= 0 or self.unknown_sigma_m <= 0:
-            raise ValueError("weak_slope and unknown_sigma_m must be positive")
-
 
 def arrays_of(depth: DepthMap) -> tuple[F32, F32, F64]:
     """Depth and sigma (h, w) and (4,) fx fy cx cy; ValueError when shapes disagree."""

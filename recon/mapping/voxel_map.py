@@ -42,16 +42,6 @@ class VoxelMapConfig:
     largest_voxels: int = 8_000_000
     """Above this the half seen longest ago is dropped (and would be sent again)."""
 
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.voxel_m) and self.voxel_m > 0.0):
-            raise ValueError(f"voxel_m is {self.voxel_m}, must be positive")
-        if self.better_ratio < 1.0:
-            raise ValueError(f"better_ratio is {self.better_ratio}, must be at least 1")
-        if self.reach_sigma < 0.0 or self.largest_reach_voxels < 0:
-            raise ValueError("reach_sigma and largest_reach_voxels must not be negative")
-        if self.largest_voxels < 1000:
-            raise ValueError(f"largest_voxels is {self.largest_voxels}, must be at least 1000")
-
 
 @njit(cache=True, nogil=True, inline="always")
 def voxel_key(x: float, y: float, z: float, inverse: float) -> int:
@@ -166,8 +156,6 @@ class VoxelMap:
     def insert(self, depth: DepthMap, mask: Bool | None = None) -> int:
         """Remember the surface of ``depth``, where ``mask`` if given; how many voxels are new."""
         mask_ = np.ones(depth.depth_m.shape, np.bool_) if mask is None else mask
-        if mask_.shape != depth.depth_m.shape:
-            raise ValueError(f"mask is {mask_.shape}, depth is {depth.depth_m.shape}")
         self._turn += 1
         self._make_room(int(np.count_nonzero(mask_)))
         before = self._count

@@ -123,13 +123,10 @@ def adjust(
 ) -> Adjusted:
     """The adjustment of a track with control points; loops that contradict it are left out.
 
-    Raises ValueError for fewer than two keyframes or shapes that do not fit.
+    Raises ValueError for fewer than two keyframes.
     """
-    n = len(track.poses)
-    if n < 2 or track.poses.shape != (n, 4, 4) or track.covariances.shape != (n, 6, 6):
+    if len(track.poses) < 2:
         raise ValueError(f"expected two poses (N, 4, 4) or more, got {track.poses.shape}")
-    if len(track.times_s) != n or (track.priors and len(track.priors) != n):
-        raise ValueError("times and priors must be as many as poses")
     loops = list(range(len(track.loops)))
     problem = _Batch(track, loops, points, marks, config or BatchConfig())
     chi2 = np.sum(problem.residuals().get("loop", np.zeros((0, 6))) ** 2, axis=1)
@@ -181,9 +178,8 @@ def map_position(poses: F64, scales: F64, marks: Sequence[Mark]) -> tuple[F64, f
 
 
 def surface_point(poses: F64, scales: F64, mark: Mark) -> F64:
-    """(3,) world point of the surface at a mark. Raises ValueError for a mark without one."""
-    if mark.depth_m is None:
-        raise ValueError("the mark has no depth")
+    """(3,) world point of the surface at a mark that has one."""
+    assert mark.depth_m is not None
     here = scales[mark.keyframe] * mark.depth_m * mark.ray
     return np.asarray(se3.transform(poses[mark.keyframe] @ mark.T_key_camera, here[None])[0])
 

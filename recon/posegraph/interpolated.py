@@ -28,7 +28,7 @@ KEYFRAME = np.dtype(
         ("first_scale", np.float64),  # and as published first
     ]
 )
-"""A row of the file: the data of one keyframe."""
+"""A row of the ledger: the data of one keyframe."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

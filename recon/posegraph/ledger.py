@@ -1,8 +1,8 @@
-"""Rows of one kind, in the order of a number: written once, read and amended by their place."""
+"""Rows of one kind, in the order of a number: appended, read and amended by their place."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,30 +11,8 @@ Rows = npt.NDArray[Any]
 """(N,) of a structured type whose first field is ``seq``."""
 
 
-class Ledger(Protocol):
+class Ledger:
     """Rows that grow in number; ``seq`` grows from row to row."""
-
-    def __len__(self) -> int: ...
-
-    def append(self, rows: Rows) -> None:
-        """Put rows after the last one."""
-        ...
-
-    def read(self, first: int, end: int) -> Rows:
-        """A copy of the rows from ``first`` up to ``end``."""
-        ...
-
-    def amend(self, first: int, rows: Rows) -> None:
-        """Write over rows from ``first`` on."""
-        ...
-
-    def close(self) -> None:
-        """Release them all."""
-        ...
-
-
-class MemoryLedger:
-    """A ledger in memory."""
 
     def __init__(self, kind: np.dtype[Any]) -> None:
         self._rows = np.zeros(64, kind)
@@ -57,7 +35,3 @@ class MemoryLedger:
     def amend(self, first: int, rows: Rows) -> None:
         """Write over rows from ``first`` on."""
         self._rows[first : first + len(rows)] = rows
-
-    def close(self) -> None:
-        """Release them all."""
-        self._count = 0

@@ -5,40 +5,22 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from recon import se3
-from recon.posegraph.records import Loop, Node, PoseGraphConfig, loops_agree
+from recon.posegraph.records import Loop, PoseGraphConfig, loops_agree
 from recon.posegraph.thinning import Marginalised, moved_loops
-from recon.types import F64
+
+if TYPE_CHECKING:
+    from recon.posegraph.pose_graph import PoseGraph
 
 CHI2_LIMIT = 22.5
 """99.9 % of chi-square with six degrees of freedom."""
 
 MAX_PENDING = 50
 """Loops that wait for one that agrees; older ones are forgotten."""
-
-
-class Track(Protocol):
-    """The track that loops are held against."""
-
-    def node(self, seq: int) -> Node:
-        """The record of a keyframe."""
-        ...
-
-    def place(self, seq: int) -> F64:
-        """(4, 4) T_world_camera of a keyframe."""
-        ...
-
-    def scale(self, seq: int) -> float:
-        """Metres per unit of the odometry at a keyframe."""
-        ...
-
-    def path_m(self, a: int, b: int) -> float:
-        """Metres flown from one keyframe to a later one."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +35,7 @@ class Edge:
 class LoopBook:
     """Loops that were offered, and which of them the map rests on."""
 
-    def __init__(self, config: PoseGraphConfig, track: Track) -> None:
+    def __init__(self, config: PoseGraphConfig, track: PoseGraph) -> None:
         self.taken: list[Loop] = []
         self.pending: list[Loop] = []  # none that agrees was found yet
         self.counts: Counter[str] = Counter()

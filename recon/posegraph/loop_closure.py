@@ -44,13 +44,6 @@ class LoopConfig:
         """The same for keyframes that are known not to be neighbours."""
         return replace(self, min_gap=1)
 
-    def __post_init__(self) -> None:
-        """Raise ValueError when a parameter makes no sense."""
-        if self.min_gap < 1 or self.min_matches < 6:
-            raise ValueError("min_gap must be at least 1, min_matches at least 6")
-        if not (0 < self.min_overlap <= 1 and 0 < self.search_share <= 0.5):
-            raise ValueError("min_overlap must be in (0, 1], search_share in (0, 0.5]")
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopView:

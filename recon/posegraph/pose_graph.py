@@ -91,10 +91,6 @@ class PoseGraph:
             prior: telemetry at this moment; parts may be missing.
             height: above ground as :func:`recon.posegraph.alignment.height_above` gives it.
         """
-        if self._nodes and seq <= next(reversed(self._nodes)):
-            raise ValueError(f"keyframe {seq} does not come after {next(reversed(self._nodes))}")
-        if T_odom_camera.shape != (4, 4) or covariance.shape != (6, 6):
-            raise ValueError("T_odom_camera must be (4, 4) and covariance (6, 6)")
         above, lean = height if height is not None else (None, 0.0)
         node = Node(
             seq, len(self._nodes), time_ns, segment, np.array(T_odom_camera, np.float64),
@@ -120,8 +116,6 @@ class PoseGraph:
         must be multiplied by to fit a's. A single loop is not accepted: a repeated texture
         gives perfect matches at the wrong place. A second one nearby must close the same circle.
         """
-        if a not in self._nodes or b not in self._nodes or a == b:
-            raise ValueError(f"keyframes {a} and {b} are not two of the graph")
         if a > b:
             a, b, growth = b, a, 1.0 / growth
             T_a_b, covariance = reversed_motion(T_a_b, covariance)

@@ -11,9 +11,6 @@ from recon import se3
 from recon.posegraph.sensor_noise import PRECISE_TAU_S
 from recon.types import F64, PosePrior
 
-MIN_NODES = 50
-"""Lower limit for the maximum number of nodes."""
-
 
 @dataclass(frozen=True, slots=True)
 class PoseGraphConfig:
@@ -40,19 +37,6 @@ class PoseGraphConfig:
     loop_turn_rad: float = 0.5
     loop_window: int = 15  # keyframes within which two loops support each other
     max_nodes: int = 100_000  # keyframes in the graph; of more, some are interpolated
-
-    def __post_init__(self) -> None:
-        """Raise ValueError when a parameter makes no sense."""
-        for name in ("sigma_scale", "sigma_scale_walk", "sigma_step", "gate_sigmas",
-                     "huber_sigmas", "sigma_link_m", "sigma_link_rad"):  # fmt: skip
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if min(self.fix_s, self.precise_fix_s, self.attitude_s, self.altitude_s) < 0:
-            raise ValueError("time constants must not be negative")
-        if self.max_nodes < MIN_NODES:
-            raise ValueError(f"max_nodes must be at least {MIN_NODES}, got {self.max_nodes}")
-        if self.loop_window < 1 or self.min_anchors < 2:
-            raise ValueError("loop_window must be at least 1, min_anchors at least 2")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from recon import bands, se3
-from recon.posegraph.ledger import MemoryLedger, Rows
+from recon.posegraph.ledger import Ledger, Rows
 from recon.types import F64, I64
 
 MIN_WAIT, POSES_PER_WAIT = 2, 100
@@ -142,7 +142,7 @@ class Factors:
     ) -> None:  # fmt: skip
         """Whitened errors longer than ``huber`` lose weight; by ``cauchy`` they lose all of it."""
         self.form, self.huber, self.cauchy = form, huber, cauchy
-        self.rows = MemoryLedger(dtype)
+        self.rows = Ledger(dtype)
 
     def loss(self, length: F64) -> tuple[F64, F64]:
         """(n,) weights and costs of whitened errors of this length (n,)."""

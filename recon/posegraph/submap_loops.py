@@ -43,13 +43,6 @@ class SubmapLoopConfig:
         )
     )
 
-    def __post_init__(self) -> None:
-        """Raise ValueError when a parameter makes no sense."""
-        if self.min_gap < 1 or self.min_matches < 6:
-            raise ValueError("min_gap must be at least 1, min_matches at least 6")
-        if not 0 < self.min_overlap <= 1 or not all(0 < s <= 0.5 for s in self.search_shares):
-            raise ValueError("min_overlap must be in (0, 1], search_shares in (0, 0.5]")
-
 
 def verify_surfaces(
     a: LoopView, b: LoopView, T_a_b_guess: F64, config: SubmapLoopConfig | None = None

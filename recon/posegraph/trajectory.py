@@ -25,9 +25,13 @@ from recon.posegraph.interpolated import (
     moved_m,
     whole,
 )
-from recon.posegraph.ledger import Ledger, MemoryLedger, Rows
+from recon.posegraph.ledger import Ledger, Rows
 from recon.posegraph.pose_graph import PoseGraph
 from recon.types import F64, PosePrior
+
+REPOSE_M, REPOSE_SIGMAS = 0.05, 0.1
+"""In flight a corrected pose is published that moves the keyframe or its ground by more than this,
+and by more than this share of its sigma."""
 
 AT_ONCE = 200
 """Interpolated keyframes examined with one correction in flight, about; the rest follows with the
@@ -36,14 +40,6 @@ next."""
 
 SIGMA_SHARE = 0.01
 """A sigma that differs by more is published again at the end."""
-
-
-@dataclass(frozen=True, slots=True)
-class TrajectoryConfig:
-    """When corrected poses are worth telling."""
-
-    repose_m: float = 0.05  # a keyframe that moved or would move its ground by more
-    repose_sigmas: float = 0.1  # and by more than this share of the sigma, in flight
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,17 +123,10 @@ class Trajectory:
     them (:mod:`recon.posegraph.interpolated`), and little of each is kept, in a ledger.
     """
 
-    def __init__(
-        self,
-        config: TrajectoryConfig | None = None,
-        graph: PoseGraph | None = None,
-        ledger: Ledger | None = None,
-    ) -> None:
-        """``graph`` places the keyframes; a :class:`PoseGraph` when left out. ``ledger`` takes
-        rows of :data:`recon.posegraph.interpolated.KEYFRAME`; memory when left out."""
-        self.config = config or TrajectoryConfig()
+    def __init__(self, graph: PoseGraph | None = None) -> None:
+        """``graph`` places the keyframes; a :class:`PoseGraph` when left out."""
         self.graph = PoseGraph() if graph is None else graph
-        self._ledger: Ledger = MemoryLedger(KEYFRAME) if ledger is None else ledger
+        self._ledger = Ledger(KEYFRAME)
         self._published = _Published()
         self._seqs = array("q")  # numbers of all keyframes, as in the ledger
         self._nodes: list[int] = []  # their numbers, in order
@@ -244,7 +233,7 @@ class Trajectory:
     def moved(self, final: bool = False) -> list[Placed]:
         """Keyframes whose world pose has changed since it was published by more than a threshold.
 
-        In flight a change must exceed ``repose_m`` and a tenth of the pose's own sigma, or
+        In flight a change must exceed REPOSE_M and a tenth of the pose's own sigma, or
         each fix of a poor receiver would move the whole scan; those carried by nodes that moved
         follow gradually, :data:`AT_ONCE` at a time. At the end (``final``) the graph is solved
         again and every change is published, so that the result does not depend on when corrections
@@ -264,7 +253,7 @@ class Trajectory:
         published.checked = self.graph.version
         keys = published.keys
         T, scales = self.graph.pose_array()[keys], self.graph.scales()[keys]
-        least = np.maximum(self.config.repose_m, self.config.repose_sigmas * published.sigma)
+        least = np.maximum(REPOSE_M, REPOSE_SIGMAS * published.sigma)
         change, claimed = published.change(T, scales), published.sigma
         if final:
             now = [self.place(p.seq) for p in published.placed]
@@ -320,7 +309,7 @@ class Trajectory:
             for before, _ in spans
         ]
         sigma = np.array([one.sigma_m for one in known])[span]
-        least = np.maximum(self.config.repose_m, self.config.repose_sigmas * sigma)
+        least = np.maximum(REPOSE_M, REPOSE_SIGMAS * sigma)
         far = moved_m(rows, T, scales) > (1e-6 if final else least)
         return [
             replace(known[span[i]], seq=int(rows["seq"][i]), T_world_camera=T[i],

@@ -50,18 +50,6 @@ class MatchingCostConfig:
     difference_truncation: int = 20  # gray levels
     unseen: float = 1.0  # of a label whose partner is outside the image, above the best one
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.census_truncation <= CENSUS_BITS:
-            raise ValueError(
-                f"census_truncation is 0 to {CENSUS_BITS} bits, not {self.census_truncation}"
-            )
-        if not 0 <= self.difference_truncation <= 255:
-            raise ValueError(
-                f"difference_truncation is 0 to 255 levels, not {self.difference_truncation}"
-            )
-        if not (self.census_weight >= 0 and self.difference_weight >= 0 and 0 < self.ceiling <= 10):
-            raise ValueError("weights must be at least 0, and the largest cost at most 10 labels")
-
     @property
     def ceiling(self) -> float:
         """The largest possible cost, in labels of smoothness."""

@@ -148,9 +148,6 @@ class _Block:
 BAND_ROWS = 80
 """Rows that are worth a thread: waiting for it costs more than a smaller band."""
 
-MAX_TRUNCATION = 255
-"""The largest truncation for which a message fits into 8 bits."""
-
 FULL_WEIGHT = 256
 
 UP, DOWN, LEFT, RIGHT = 0, 1, 2, 3

@@ -43,10 +43,7 @@ def reproject(
 
     NaN where the label is unknown or not trusted, or the point at or beyond infinity. Between
     labels that agree within one the value is interpolated; at an edge the nearest is taken.
-    Raises ValueError for bad shapes.
     """
-    if disparity.px.ndim != 2 or disparity.px.shape != disparity.confidence.shape:
-        raise ValueError(f"bad disparity {disparity.px.shape}, {disparity.confidence.shape}")
     w, h = size_px
     out = PairDepth(np.empty((h, w), np.float32), np.empty((h, w), np.float32))
     to_left = pair.K @ pair.R_left_keyframe @ np.linalg.inv(K)
@@ -211,11 +208,8 @@ def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: Fusion
     the sigma is the larger of the propagated one and the spread inside the group. ``views``
     counts the group. Where several pairs read and none comes within ``max_sigma_share`` of
     another nothing is known. Where that is so at more pixels than those at which two agree, what
-    they see is not a rigid surface, or their motion is false, and the whole map is unknown. Raises
-    ValueError without any pair.
+    they see is not a rigid surface, or their motion is false, and the whole map is unknown.
     """
-    if not pairs:
-        raise ValueError("no stereo pair to fuse")
     depth = np.stack([p.depth_m for p in pairs])
     sigma = np.stack([p.sigma_m for p in pairs])
     shape = depth.shape[1:]

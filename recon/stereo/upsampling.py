@@ -56,14 +56,6 @@ class UpsamplingConfig:
     diameter_px: int = 10  # coarse pixels
     min_support: float = 0.5  # share of the weight that must fall on known taps
 
-    def __post_init__(self) -> None:
-        if not (self.filter_px > 0 and self.range_sigma > 0):
-            raise ValueError("filter_px and range_sigma must be positive")
-        if not 2 <= self.diameter_px <= 64:
-            raise ValueError(f"diameter_px is 2 to 64, not {self.diameter_px}")
-        if not 0 <= self.min_support <= 1:
-            raise ValueError(f"min_support is a share, 0 to 1, not {self.min_support}")
-
     @property
     def spatial_sigma(self) -> float:
         """Coarse pixels."""

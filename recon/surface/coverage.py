@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 
 from recon.camera_model import rays
-from recon.posegraph.ledger import Ledger, MemoryLedger, Rows
+from recon.posegraph.ledger import Ledger, Rows
 from recon.surface.raster import Grid
 from recon.types import F32, F64, I64, Array, Bool, DepthMap
 
@@ -124,17 +124,14 @@ def _near(keys: I64) -> I64:
 class CoverageMap:
     """The layer of one scan. Not safe between threads."""
 
-    def __init__(self, cell_m: float, ledger: Ledger | None = None) -> None:
-        """Raises ValueError unless ``cell_m`` is positive.
-
-        ``ledger`` takes rows of :data:`PLACE`, a keyframe each; memory when left out.
-        """
+    def __init__(self, cell_m: float) -> None:
+        """Raises ValueError unless ``cell_m`` is positive."""
         if not (np.isfinite(cell_m) and cell_m > 0):
             raise ValueError(f"cell_m is {cell_m}, must be positive")
         self.cell_m = float(cell_m)
         self.refused = 0  # tiles beyond MAX_TILES, and footprints too large to be one
         self._tiles: dict[Tile, _Cells] = {}
-        self._ledger: Ledger = MemoryLedger(PLACE) if ledger is None else ledger
+        self._ledger = Ledger(PLACE)  # of keyframes
         self._seqs, self._rows = array("q"), array("q")  # keyframes in order, and their rows
         self._stale: set[Tile] = set()
         self._first_ns: int | None = None

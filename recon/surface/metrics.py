@@ -83,11 +83,8 @@ def fit_trajectory(scan: F64, truth: F64, with_scale: bool) -> Fit:
     """The motion that best brings poses (N, 4, 4) of a scan onto those of the truth.
 
     Rotation from orientations and positions together (orthogonal Procrustes; 0.01 rad weigh as much
-    as 0.5 m), so that a straight flight determines the rotation fully. Raises ValueError for other
-    shapes or fewer than two poses.
+    as 0.5 m), so that a straight flight determines the rotation fully.
     """
-    if scan.shape != truth.shape or scan.ndim != 3 or len(scan) < 2:
-        raise ValueError(f"poses must be two (N, 4, 4), N >= 2; got {scan.shape}, {truth.shape}")
     a = scan[:, :3, 3] - scan[:, :3, 3].mean(axis=0)
     b = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
     weight = (0.01 / 0.5) ** 2
@@ -262,8 +259,6 @@ def poses_at(times_s: F64, poses: F64, at_s: F64) -> tuple[F64, Bool]:
 
 def trajectory_errors(scan: F64, truth: F64) -> TrajectoryErrors:
     """Errors of poses (N, 4, 4) against the truth at the same times, in the truth's frame."""
-    if scan.shape != truth.shape or len(scan) < 2:
-        raise ValueError(f"poses must be two (N, 4, 4), N >= 2; got {scan.shape}, {truth.shape}")
     gap = np.linalg.norm(scan[:, :3, 3] - truth[:, :3, 3], axis=1)
     turn = np.einsum("nji,njk->nik", scan[:, :3, :3], truth[:, :3, :3])
     cosine = np.clip((np.trace(turn, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
@@ -306,10 +301,8 @@ def patch_shifts(found: F32, truth: F32, known: Bool, reach_px: int) -> PatchShi
     Normalised cross-correlation over shifts of up to ``reach_px``, with a parabola through the
     peak. Shading broader than BROAD_PX is taken out of both first. A patch is tried where
     ``known`` holds nearly everywhere and the truth has texture; a peak at the end of the reach
-    or below MIN_LIKENESS is not a match. Raises ValueError when the sizes differ.
+    or below MIN_LIKENESS is not a match.
     """
-    if found.shape != truth.shape or found.shape != known.shape or found.ndim != 2:
-        raise ValueError(f"sizes differ: {found.shape}, {truth.shape}, {known.shape}")
     a, b = (_fine(image, known) for image in (found, truth))
     rows, cols = known.shape
     middles, shifts, likenesses, tried = [], [], [], 0

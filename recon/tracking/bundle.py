@@ -272,18 +272,8 @@ def adjust(
         huber_px: error at which the quadratic cost turns linear.
         sigma_px: pixel noise that the covariances are scaled with; None: as the residuals show.
         iterations: most Levenberg-Marquardt steps.
-
-    Raises ValueError when the shapes do not match or no camera is free.
     """
-    M = camera_index.shape[0]
-    if point_index.shape != (M,) or uv_px.shape != (M, 2) or free.shape != T_camera_world.shape[:1]:
-        raise ValueError(
-            f"shapes do not match: {camera_index.shape}, {point_index.shape}, {uv_px.shape}, "
-            f"{free.shape}, {T_camera_world.shape}"
-        )
     n_free = int(free.sum())
-    if n_free == 0:
-        raise ValueError("no free camera to adjust")
     order = np.argsort(point_index, kind="stable")
     start = np.searchsorted(point_index[order], np.arange(points_m.shape[0] + 1)).astype(np.int64)
     slot = np.where(free, np.cumsum(free) - 1, -1).astype(np.int64)
@@ -306,7 +296,7 @@ def adjust(
     joint = np.zeros((C, C, 6, 6))
     full = np.linalg.pinv(S, hermitian=True) * sigma_px**2
     joint[np.ix_(moving, moving)] = full.reshape(n_free, 6, n_free, 6).swapaxes(1, 2)
-    back = np.empty(M)
+    back = np.empty(len(uv_px))
     back[order] = residual
     return BundleResult(T, X, back, joint, bool(improved))
 

@@ -44,8 +44,6 @@ class OdometryConfig:
     def __post_init__(self) -> None:
         if not 0.0 < self.min_base_to_height <= self.base_to_height < 1.0:
             raise ValueError("0 < min_base_to_height <= base_to_height < 1 must hold")
-        if self.window < 3:
-            raise ValueError(f"window must hold 3 keyframes or more, got {self.window}")
 
 
 RECALLED = 4

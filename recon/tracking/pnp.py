@@ -35,15 +35,6 @@ class PnpConfig:
     prior_share: float = 0.7  # of the points near the prior's pixels: no random draw needed
     max_prior_rotation_rad: float = 0.35  # a pose this far from the prior needs most points
 
-    def __post_init__(self) -> None:
-        """Raise ValueError when a parameter makes no sense."""
-        if not (self.threshold_px > 0 and self.floor_px > 0 and self.max_sigma_share > 0):
-            raise ValueError("threshold_px, floor_px and max_sigma_share must be positive")
-        if self.min_inliers < 6 or self.iterations < 1:
-            raise ValueError("min_inliers must be at least 6 and iterations at least 1")
-        if not (0 < self.min_inlier_share <= 1 and 0 < self.confidence < 1):
-            raise ValueError("min_inlier_share must be in (0, 1], confidence in (0, 1)")
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PnpResult:
@@ -85,15 +76,10 @@ def solve(
     ``K`` (3, 3) is of the undistorted image. ``prior_T_camera_points`` (4, 4) competes with
     EPnP's answer as a start, and a result that turns far away from it must explain most of
     the points. Points or pixels that are not finite are outliers. None: too few inliers, too
-    loose a fit, or points so placed that the position stays open. Raises ValueError on wrong
-    shapes.
+    loose a fit, or points so placed that the position stays open.
     """
     config = config or PnpConfig()
     points, uv = np.asarray(points_m, np.float64), np.asarray(uv_px, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or uv.shape != (len(points), 2):
-        raise ValueError(f"points must be (N, 3) and pixels (N, 2), got {points.shape}, {uv.shape}")
-    if K.shape != (3, 3):
-        raise ValueError(f"K must be (3, 3), got {K.shape}")
     finite = np.isfinite(points).all(axis=1) & np.isfinite(uv).all(axis=1)
     if np.count_nonzero(finite) < config.min_inliers:
         return None

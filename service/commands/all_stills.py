@@ -101,19 +101,16 @@ def _tracked(
     rig = Rig(inputs.config.camera, inputs.config.scan, inputs.config.fusion)
     check = TelemetryCheck(inputs.config.camera, history, log.info)
     out = []
-    try:
-        for frame in source:
-            time_ns = inputs.epoch_ns + frame.time_ns
-            state = history.state_at(check.exposed_ns(time_ns))
-            prior = rig.prior(state, frame.geotag)
-            image = stages.undistort(Frame(frame.image, time_ns, frame.seq, prior))
-            tracked = stages.track(image)
-            check.add(time_ns, tracked)
-            is_tracked = tracked.T_odom_camera is not None
-            out.append(Still(frame.seq, _small(frame), frame.time_ns, is_tracked))
-        check.finish()
-    finally:
-        stages.resources.close()
+    for frame in source:
+        time_ns = inputs.epoch_ns + frame.time_ns
+        state = history.state_at(check.exposed_ns(time_ns))
+        prior = rig.prior(state, frame.geotag)
+        image = stages.undistort(Frame(frame.image, time_ns, frame.seq, prior))
+        tracked = stages.track(image)
+        check.add(time_ns, tracked)
+        is_tracked = tracked.T_odom_camera is not None
+        out.append(Still(frame.seq, _small(frame), frame.time_ns, is_tracked))
+    check.finish()
     return out, check.latency
 
 

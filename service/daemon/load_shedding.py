@@ -79,13 +79,6 @@ class LadderConfig:
     calm_s: float = 30.0  # without overload before a step up; doubled when that failed
     longest_calm_s: float = 240.0
 
-    def __post_init__(self) -> None:
-        """Check ranges."""
-        if not 0.0 < self.calm_s <= self.longest_calm_s:
-            raise ValueError("ladder: 0 < calm_s <= longest_calm_s must hold")
-        if min(self.patience_s, self.heat_patience_s, self.oldest_s, self.hopeless) <= 0:
-            raise ValueError("ladder: patience, age and hopeless must be positive")
-
 
 @dataclass(frozen=True, slots=True)
 class Strain:

@@ -10,14 +10,13 @@ import struct
 import tempfile
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from recon.posegraph.ledger import Ledger, MemoryLedger
 from recon.types import F64
 from service.errors import OutsideError
 
@@ -72,78 +71,32 @@ class Anchorage:
 UNMOVED = np.eye(4)
 
 
-VIEW = np.dtype([("seq", np.int64), ("segment", np.int64), ("odom", np.float64, (4, 4))])
-"""A row of the ledger of views that no longer change."""
-
-
 class Carriers:
     """Views on the chain of keyframes, in order; frames of their segment are carried by them."""
 
-    def __init__(self, ledger: Ledger | None = None) -> None:
-        """``ledger`` takes rows of :data:`VIEW`, those that no longer change; memory when left
-        out."""
-        self._settled: Ledger = MemoryLedger(VIEW) if ledger is None else ledger
-        self._newest: Anchorage | None = None  # of those settled
-        self._fresh: deque[Anchorage] = deque()  # may still be refined
+    def __init__(self) -> None:
+        self._views: list[Anchorage] = []
+        self._settled = 0  # the first so many no longer change
 
     def add(self, view: Anchorage) -> None:
         """Take the next view."""
-        self._fresh.append(view)
+        self._views.append(view)
 
     def settle(self, is_settled: Callable[[Key], bool]) -> None:
         """Release the keyframes that no longer change."""
-        while self._fresh and is_settled(self._fresh[0].key):
-            self._newest = view = self._fresh.popleft().settled()
-            row = np.zeros(1, VIEW)
-            row["seq"], row["segment"] = view.seq, view.key.segment
-            row["odom"] = view.T_odom_camera
-            self._settled.append(row)
+        for i in range(self._settled, len(self._views)):
+            if not is_settled(self._views[i].key):
+                return
+            self._views[i] = self._views[i].settled()
+            self._settled += 1
 
     def of(self, frame: Anchorage) -> Anchorage | None:
         """The view at or before a frame, or its segment's first; None without any."""
-        segment = frame.key.segment
-        at = self._before(frame.seq)
-        for i in (at, at + 1):
-            view = self._view(i)
-            if view is not None and view.key.segment == segment:
+        after = bisect_right(self._views, frame.seq, key=lambda view: view.seq)
+        for view in self._views[max(after - 1, 0) : after + 1]:
+            if view.key.segment == frame.key.segment:
                 return view
         return None
-
-    def _before(self, seq: int) -> int:
-        """Place of the last view whose number is ``seq`` or smaller; -1 without any."""
-        held = len(self._settled)
-        if self._newest is not None and seq < self._newest.seq:
-            return bisect_right(_Seqs(self._settled), seq) - 1
-        return held - 1 + bisect_right(self._fresh, seq, key=lambda view: view.seq)
-
-    def _view(self, i: int) -> Anchorage | None:
-        """The view at a place; None where there is none."""
-        held = len(self._settled)
-        if i == held - 1:
-            return self._newest
-        if not 0 <= i < held:
-            return self._fresh[i - held] if 0 <= i - held < len(self._fresh) else None
-        row = self._settled.read(i, i + 1)[0]
-        seq = int(row["seq"])
-        key = SettledKey(seq, int(row["segment"]), row["odom"])
-        return Anchorage(seq, key, UNMOVED)
-
-    def close(self) -> None:
-        """Release the ledger."""
-        self._settled.close()
-
-
-class _Seqs(Sequence[int]):
-    """The numbers of a ledger's rows, for a search."""
-
-    def __init__(self, ledger: Ledger) -> None:
-        self._ledger = ledger
-
-    def __len__(self) -> int:
-        return len(self._ledger)
-
-    def __getitem__(self, i: Any) -> Any:
-        return int(self._ledger.read(i, i + 1)["seq"][0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

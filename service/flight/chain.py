@@ -60,7 +60,6 @@ class Chain:
     def __init__(
         self,
         trajectory: Trajectory,
-        carriers: Carriers,
         is_settled: Callable[[Key], bool],
         rejected: Counter[str],
         stopwatch: Stopwatch,
@@ -69,7 +68,7 @@ class Chain:
         self.trajectory, self.watch = trajectory, GraphWatch(trajectory.graph)
         self.loops: LoopSearch | None = None
         self.levelled = 0  # keyframes without an attitude whose ground is taken as level
-        self._carriers, self._is_settled = carriers, is_settled
+        self._carriers, self._is_settled = Carriers(), is_settled
         self._rejected, self._stopwatch = rejected, stopwatch
         self._pieces = Pieces()
         self._T_map = np.eye(4)  # of the last keyframe

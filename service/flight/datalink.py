@@ -14,8 +14,8 @@ from service.workers import PROCESS
 
 if TYPE_CHECKING:
     from mavlink.component.vehicle import VehicleLink
-    from service.flight.scan import Datalink
     from service.radio import VehicleRadio
+    from service.stream.link import DatalinkSender
     from service.stream.store import ScanStore
     from service.stream.tunnel import Carrier
 
@@ -27,7 +27,7 @@ OWN_LINKS = "mavlink"
 
 def open_datalink(
     store: ScanStore, config: Config, own_links: Carrier | None = None
-) -> Datalink | None:
+) -> DatalinkSender | None:
     """A sender of what the store gets, or None when no ground station is configured.
 
     ``own_links`` are the vehicle's links; without a vehicle, as in a replay, there are none.
@@ -48,7 +48,7 @@ def _endpoint(endpoint: str) -> Carrier:
     return EndpointCarrier(endpoint)
 
 
-def open_backlog(config: Config) -> Datalink | None:
+def open_backlog(config: Config) -> DatalinkSender | None:
     """A sender of earlier scans that the ground lacks, for the time between flights.
 
     None when no ground station is configured or it has everything. Close it before a scan.
@@ -76,8 +76,8 @@ class DaemonLink:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self.flying: Datalink | None = None  # the sender of the scan that is flown
-        self._backlog: Datalink | None = None
+        self.flying: DatalinkSender | None = None  # the sender of the scan that is flown
+        self._backlog: DatalinkSender | None = None
         self._is_wanted = False  # the backlog
         self._serial = 0  # of the last wish for the backlog
         self._radio: VehicleRadio | None = None

@@ -140,10 +140,6 @@ class Pipeline:
         """Reset the map: all surface counts as unseen."""
         self.stages.map.clear()
 
-    def close(self) -> None:
-        """Stop the background work; call it last. The graph stays readable."""
-        self.stages.resources.close()
-
     # ---- figures -----------------------------------------------------------------------
 
     @property

@@ -11,7 +11,7 @@ from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event
-from typing import Any, Protocol
+from typing import Any
 
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
@@ -54,22 +54,6 @@ def short_collections() -> Iterator[None]:
         yield
     finally:
         gc.unfreeze()
-
-
-class Datalink(Protocol):
-    """The sending end, as a scan needs it."""
-
-    def drain(self, timeout_s: float) -> bool:
-        """Wait until the ground holds everything; False when the time is up."""
-        ...
-
-    def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
-        """Change the link's rate, in flight."""
-        ...
-
-    def close(self) -> None:
-        """Stop sending."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -251,14 +235,12 @@ class Scan:
             camera = self.store.header.camera | shutter_document(shutter)
             self.store.update_header(camera=camera)
         summary = self.recorder.close(redacted(extra | self.inputs.extra))
-        self.pipeline.close()
         summary["clouds_per_second"] = round(summary["clouds"] / elapsed, 2)
         self.store.finish(summary)
         return summary
 
     def discard(self) -> None:
         """End the scan and delete its store; another one may be made in its folder."""
-        self.pipeline.close()
         if self.tags is not None:
             self.tags.close()
         self.store.close()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,6 @@ from recon.bands import limit_threads
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
 from recon.mapping.registration import IcpConfig
-from recon.posegraph.interpolated import KEYFRAME
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.trajectory import Placed, Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
@@ -59,7 +57,7 @@ from recon.types import (
 from service.background import BackgroundWorker
 from service.cameras.camera_file import seeks_readout, with_shutter
 from service.config import ComputeConfig, Config
-from service.flight.anchorage import VIEW, Carriers, Key
+from service.flight.anchorage import Key
 from service.flight.chain import Chain, KeyframeStep
 from service.flight.loops import LoopSearch
 from service.flight.surface_map import SurfaceMap
@@ -71,7 +69,6 @@ from service.flight.viewpoints import (
     Viewpoints,
 )
 from service.progress import Stopwatch
-from service.scans.file_ledger import FileLedger
 
 MAX_TRACKING_WIDTH_PX = 1280
 MAX_WAITING = 3
@@ -423,7 +420,6 @@ class Stages:
     refused: Counter[str]  # frames and views, by reason; written while tracking
     rejected: Counter[str]  # pairs and keyframes, by reason; written while reconstructing
     debug: dict[str, Array] | None  # images of the last view's stages; None: not kept
-    resources: ExitStack  # what to close in the end
 
 
 def build_stages(
@@ -438,11 +434,10 @@ def build_stages(
     """The stages that the configuration asks for. Raises ValueError for an unusable camera model.
 
     ``live`` drops old work when reconstruction cannot keep up. ``pages`` is a folder for the oldest
-    parts of the map and, in files without a name, for what is kept of every view. None: keep all
-    in memory, and drop the oldest parts of the map. An ``assumed`` lens widens sigmas. A
-    ``known`` track takes the odometry's place.
+    parts of the map; without it they are dropped. An ``assumed`` lens widens sigmas. A ``known``
+    track takes the odometry's place.
     """
-    compute, stopwatch, resources = config.compute, Stopwatch(), ExitStack()
+    compute, stopwatch = config.compute, Stopwatch()
     limit_threads(compute.threads)
     refused, rejected = Counter[str](), Counter[str]()
     debug: dict[str, Array] | None = {} if config.scan.keep_debug else None
@@ -486,7 +481,7 @@ def build_stages(
         fuse=pair.fuse,
         plausible=Plausible(rejected),
         register=Register(backend, stopwatch),
-        chain=_chain(config, pages, track.is_settled, rejected, stopwatch, resources),
+        chain=_chain(config, track.is_settled, rejected, stopwatch),
         map=surface,
         keyframe=MakeKeyframe(debug),
         in_background=partial(DenseWorker, row, bound=MAX_WAITING, live=live),
@@ -494,27 +489,16 @@ def build_stages(
         refused=refused,
         rejected=rejected,
         debug=debug,
-        resources=resources,
     )
 
 
 def _chain(
-    config: Config,
-    pages: Path | None,
-    is_settled: Callable[[Key], bool],
-    rejected: Counter[str],
-    stopwatch: Stopwatch,
-    resources: ExitStack,
+    config: Config, is_settled: Callable[[Key], bool], rejected: Counter[str], stopwatch: Stopwatch
 ) -> Chain:
     """The pose graph and all that depends on it."""
     graph = PoseGraph(PoseGraphConfig(max_nodes=config.fusion.graph_keyframes))
-    trajectory, carriers = Trajectory(graph=graph), Carriers()
-    if pages is not None:
-        ledger = FileLedger(KEYFRAME, pages.parent)
-        resources.callback(ledger.close)
-        trajectory = Trajectory(graph=graph, ledger=ledger)
-        carriers = Carriers(FileLedger(VIEW, pages.parent))
-    chain = Chain(trajectory, carriers, is_settled, rejected, stopwatch)
+    trajectory = Trajectory(graph=graph)
+    chain = Chain(trajectory, is_settled, rejected, stopwatch)
     if config.fusion.loops:
         chain.loops = LoopSearch(trajectory, max_views=config.fusion.loop_views)
     return chain

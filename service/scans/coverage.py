@@ -18,9 +18,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.posegraph.ledger import Ledger, Rows
+from recon.posegraph.ledger import Rows
 from recon.surface.coverage import (
-    PLACE,
     CoverageGrid,
     CoverageMap,
     Footprint,
@@ -29,7 +28,6 @@ from recon.surface.coverage import (
 )
 from recon.types import U8, Array, DepthMap
 from service.georeference import LocalFrame
-from service.scans.file_ledger import FileLedger
 from service.scans.main_piece import Stretch, main_seqs, stretches_apart
 from service.scans.open_scans import OpenScans
 from service.scans.track import local_frame
@@ -157,19 +155,14 @@ class Coverage:
 class LiveCoverage:
     """The layer of an open store; :meth:`refresh` updates it."""
 
-    def __init__(
-        self, store: ScanStore, cell_m: float | None = None, ledger: Ledger | None = None
-    ) -> None:
-        """``ledger`` stores rows of :data:`recon.surface.coverage.PLACE`; in memory by default."""
-        self._store = store
-        self._cell_m, self._ledger = cell_m, ledger
+    def __init__(self, store: ScanStore, cell_m: float | None = None) -> None:
+        self._store, self._cell_m = store, cell_m
         self.found: Coverage | None = None  # by the last refresh
         self._begin([])
 
     def _begin(self, apart: list[Stretch]) -> None:
         """Start from nothing, without the keyframes of these stretches."""
         self._apart = apart
-        self._ledger = None if apart else self._ledger  # it holds places of the stretches
         self._map: CoverageMap | None = None
         self._seqs = array("q")  # processed keyframes, in order; and for each:
         self._fine = array("b")  # whether its fine layer was available
@@ -223,7 +216,7 @@ class LiveCoverage:
             cell = self._cell_m or usual_cell_m(keyframe.depth)
             if cell is None:
                 return
-            self._map = CoverageMap(cell, self._ledger)
+            self._map = CoverageMap(cell)
         self._map.put(seq, keyframe.time_ns, keyframe.depth, finer)
 
     def _depths(self, seqs: list[int]) -> Iterator[tuple[int, DepthMap]]:
@@ -264,8 +257,7 @@ class CoverageWriter:
 
     def __init__(self, store: ScanStore, every_s: float = WRITE_EVERY_S) -> None:
         self._folder = store.path.parent
-        self._ledger = FileLedger(PLACE, self._folder)
-        self._live = LiveCoverage(store, ledger=self._ledger)
+        self._live = LiveCoverage(store)
         self._every_s = every_s
         self._worker: Worker | None = None
 
@@ -276,7 +268,6 @@ class CoverageWriter:
     def __exit__(self, *_: object) -> None:
         if self._worker is not None:
             self._worker.join()
-        self._ledger.close()
 
     def _write(self) -> None:
         found = self._live.refresh()
