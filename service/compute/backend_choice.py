@@ -7,7 +7,6 @@ A learned model is an ONNX file and a TOML file next to it, which names the ONNX
 
 from __future__ import annotations
 
-import ctypes.util
 import logging
 import os
 import time
@@ -32,6 +31,7 @@ from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 from service.config import ComputeConfig
 from service.errors import InputError, OutsideError
+from service.packages import loads
 
 if TYPE_CHECKING:
     from recon.backends.learned_stereo import LearnedStereoBackend
@@ -206,7 +206,7 @@ def pointless(name: str) -> str | None:
         return "torch is not installed"
     if name == "onnx" and (find_spec("onnxruntime") is None or find_spec("onnx") is None):
         return "onnx and onnxruntime are not installed"
-    if name != "cpu" and ctypes.util.find_library("cuda") is None:
+    if name != "cpu" and not loads("libcuda.so.1"):
         return "there is no CUDA driver, and on a CPU the cpu backend is faster"
     if name == "onnx":
         import onnxruntime  # type: ignore[import-untyped]
