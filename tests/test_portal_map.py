@@ -98,6 +98,24 @@ def test_layers_lie_over_the_basemap_and_nothing_comes_from_outside(page: Browse
     assert [u for u in page.requests if not u.startswith((here, "data:", "about:"))] == []
 
 
+FAILED = "[...document.querySelectorAll('.layer img')].filter(i => i.complete && !i.naturalWidth)"
+DRAWN_BROKEN = f"{FAILED}.filter(i => i.getClientRects().length).length"
+
+
+def test_tiles_that_do_not_come_show_nothing_and_are_asked_for_again(page: Browser) -> None:
+    whole = steady(page)
+    page.page.route("**/tiles/**", lambda route: route.abort())
+    for button in ("nearer", "farther", "farther"):
+        page.run(f"document.querySelector('[title={button}]').click()")
+    page.wait(f"{FAILED}.length > 0")
+    page.wait("document.querySelector('.state').textContent.includes('does not answer')")
+    assert page.run(DRAWN_BROKEN) == 0
+    page.run("document.querySelector('[title=nearer]').click()")
+    page.page.unroute("**/tiles/**")
+    page.wait(f"{FAILED}.length === 0", 10)
+    assert steady(page) == whole
+
+
 def colours(page: Browser, when: str) -> dict[str, float]:
     """The map's colours ``s`` once no tile is missing and they are as ``when`` says."""
     found: dict[str, float] = page.wait(f"({COLOURS}).then(s => {SHOWN} && s.red && {when} && s)")

@@ -83,7 +83,7 @@ class Layer {
         wanted.add(name);
         if (!this.tiles.has(name)) this.tiles.set(name, this.load(z, x, y));
       }
-    const missing = [...wanted].some((name) => !this.tiles.get(name)!.complete);
+    const missing = [...wanted].map((name) => this.tiles.get(name)!).some((image) => !image.complete || image.hidden);
     for (const [name, image] of this.tiles) {
       if (!wanted.has(name) && (!missing || !image.complete || Number(image.dataset["at"]) < performance.now() - FADE_MS)) {
         image.remove();
@@ -106,9 +106,22 @@ class Layer {
     image.alt = "";
     image.draggable = false;
     image.onload = () => this.element.dispatchEvent(new Event("tile", { bubbles: true }));
+    image.onerror = () => {
+      image.hidden = true;
+      image.onload!(new Event("load"));
+    };
     image.src = `${this.address(z, x, y)}?v=${this.version}`;
     this.element.append(image);
     return image;
+  }
+
+  /** The tiles that did not come are asked for at the next drawing. */
+  retry(): void {
+    for (const [name, image] of this.tiles)
+      if (image.hidden) {
+        image.remove();
+        this.tiles.delete(name);
+      }
   }
 
   get loading(): boolean {
@@ -234,6 +247,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
       text: short(properties.text),
     }));
     if (found?.bounds && isFree) frame(found.bounds);
+    layers.forEach((layer) => layer.retry());
     draw();
   };
 
