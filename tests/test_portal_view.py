@@ -76,7 +76,7 @@ def store(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Path:
     folder = root / "drone-1" / "test-1"
     with house.flown(folder) as scan:
         scan.finish({})
-        write_deliverables(folder, scan, {})
+        write_deliverables(folder, scan, {"scale": {"from": "gnss", "sigma": 0.0065}})
     return root
 
 
@@ -213,6 +213,7 @@ def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, s
     assert f"Points\n{points}" in figures
     for name in ("sigma_median_m", "position_sigma_median_m"):
         assert f" \N{GREEK SMALL LETTER SIGMA}\n{quality[name]:.2f} m" in figures
+    assert "Scale \N{GREEK SMALL LETTER SIGMA}\n0.7 %" in figures
     assert "Speed" not in figures  # it has landed
     follow = "[...document.querySelectorAll('button')].find(b => b.textContent === 'Follow')"
     assert browser.run(f"{follow}.hidden")

@@ -21,6 +21,8 @@ export interface Scene {
   /** The cloud, for volumes and profiles. */
   cloud: THREE.Object3D;
   origin: Origin | null;
+  /** Relative sigma of the scan's scale; none where nothing states it. */
+  scaleSigma: () => number | null | undefined;
 }
 
 let down = { x: 0, y: 0 };
@@ -223,6 +225,11 @@ export class Ruler {
       words["Volume below"] = units.volume(this.volume.below_m3);
       words["Base"] = "plane through the points";
       words["Not seen"] = `${(100 * this.volume.unseen).toFixed(1)} % of the area`;
+    }
+    const sigma = this.scene.scaleSigma();
+    if (sigma) {
+      const share = units.share(sigma);
+      words["Scale σ"] = this.volume ? `${share}, of volumes ${units.share(3 * sigma)}` : share;
     }
     return words;
   }
