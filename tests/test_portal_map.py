@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -92,7 +93,14 @@ def test_layers_lie_over_the_basemap_and_nothing_comes_from_outside(page: Browse
     layer(page, "Surface")
     layer(page, "Contours")
     assert 0 < steady(page)["known"] < 0.1 * alone["known"]
+    words = page.run(BOX.format("Contours") + ".textContent")
+    assert re.fullmatch(r" Contours, [\d.]+ m", words)
+    keys = "document.querySelector('.layers .keys')"
+    assert page.run(f"{keys}.hidden")
     layer(page, "Coverage")
+    tops = page.run("[...document.querySelectorAll('.layers label')].map(l => l.textContent)")
+    assert tops.index(words) > tops.index(" Coverage")  # drawn above it
+    assert not page.run(f"{keys}.hidden") and "seldom seen" in page.run(f"{keys}.textContent")
     assert steady(page)["known"] > 0.5 * alone["known"]
     here = page.run("location.origin")
     assert [u for u in page.requests if not u.startswith((here, "data:", "about:"))] == []

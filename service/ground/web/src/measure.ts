@@ -223,13 +223,13 @@ export class Ruler {
     if (this.volume) {
       words["Volume above"] = units.volume(this.volume.above_m3);
       words["Volume below"] = units.volume(this.volume.below_m3);
-      words["Base"] = "plane through the points";
+      words["Base"] = "plane of the points";
       words["Not seen"] = `${(100 * this.volume.unseen).toFixed(1)} % of the area`;
     }
     const sigma = this.scene.scaleSigma();
     if (sigma) {
-      const share = units.share(sigma);
-      words["Scale σ"] = this.volume ? `${share}, of volumes ${units.share(3 * sigma)}` : share;
+      words["Scale σ"] = units.share(sigma);
+      if (this.volume) words["Volume σ"] = `${units.share(3 * sigma)} by the scale`;
     }
     return words;
   }
