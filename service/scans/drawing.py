@@ -153,7 +153,7 @@ def _padded_to(panel: U8, smallest_px: int = 160) -> U8:
 
 def _growth(panel: U8) -> float:
     """Size of a panel's labels over their usual one."""
-    return max(1.0, max(panel.shape[:2]) / SIGN_PX)
+    return max(1.0, float(max(panel.shape[:2])) / SIGN_PX)
 
 
 def _draw_track(panel: U8, grid: Grid, track_m: F64, scale: float) -> None:
