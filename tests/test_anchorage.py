@@ -47,7 +47,7 @@ def before(limit: int) -> Any:
 
 def published(seq: int, key: Key, agl_m: float | None = 41.5) -> PublishedFrame:
     anchor = Anchorage(seq, key, some_pose())
-    return PublishedFrame(10**18 + seq, anchor, RNG.normal(size=3), agl_m, seq % 2 == 0)
+    return PublishedFrame(10**18 + seq, anchor, RNG.normal(size=3), 0.5 + seq, agl_m, seq % 2 == 0)
 
 
 def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
@@ -63,6 +63,7 @@ def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
         assert one.anchor is not None
         assert other.anchor is not None
         assert (one.time_ns, one.agl_m, one.is_view) == (other.time_ns, other.agl_m, other.is_view)
+        assert one.sigma_m == other.sigma_m
         assert np.array_equal(one.position_m, other.position_m)
         assert np.array_equal(one.anchor.T_odom_camera, other.anchor.T_odom_camera)
         assert (one.anchor.seq, one.anchor.key.seq) == (other.anchor.seq, other.anchor.key.seq)
@@ -75,7 +76,7 @@ def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> 
     for seq in range(500):
         key = Refined(seq, 0, some_pose())
         kept.add(published(seq, key), before(seq - 9))
-        kept.add(PublishedFrame(10**18 + seq, None, np.zeros(3), None, False), before(seq - 9))
+        kept.add(PublishedFrame(10**18 + seq, None, np.zeros(3), 0.0, None, False), before(seq - 9))
     assert len(kept._fresh) <= 22
     assert len(list(kept.corrigible())) == 500
     kept.close()

@@ -93,6 +93,17 @@ def test_a_long_track_is_thinned_and_ends_at_the_last_pose(
     assert east[2:] == [*range(6, 4001, 3), 4001] and last == 4001.0
 
 
+def test_text_in_place_of_numbers_is_left_out(scan: ScanStore, feed: LiveFeed) -> None:
+    texts(feed)
+    chunk = "INSERT INTO chunks VALUES (?, ?, 1, 0, 0, 0, x'00')"
+    radio = "INSERT INTO radio VALUES ('tile', 'z', 0, x'00')"
+    scan._db.write([(chunk, (1, "x")), (chunk, ("y", 0)), (radio, ())])
+    index = StoreIndex(scan.path)
+    assert index.layers() == dict.fromkeys(range(5), 1)
+    index.close()
+    assert [m["type"] for m in texts(feed)] == []
+
+
 def heard(scan: ScanStore, number: int, pose: PoseRecord) -> None:
     """Store a pose of the narrow radio."""
     scan.add_radio("pose", number, 0, radio_messages.pack_pose(7, number, pose))

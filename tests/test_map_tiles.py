@@ -183,6 +183,10 @@ def test_tilejson_and_kml_say_where_the_tiles_are(client: Client) -> None:
     document = client.ask(f"{TILES}/dsm.json")[1]
     assert document["tilejson"] == "3.0.0"
     assert document["tiles"] == [f"{client.base}{TILES}/dsm/{{z}}/{{x}}/{{y}}.png"]
+    assert "intervals_m" not in document
+    intervals = client.ask(f"{TILES}/contours.json")[1]["intervals_m"]
+    assert intervals[ZOOM] == interval_m(pixel_m(ZOOM, 47.4))
+    assert intervals[24] == intervals[23]  # tiles beyond the finest are enlarged
     west, south, east, north = document["bounds"]
     assert west < 8.54 < east and south < 47.39 < north and east - west < 0.002
     status, text, headers = client.ask(f"{TILES}/ortho.kml")

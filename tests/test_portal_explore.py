@@ -110,6 +110,13 @@ def test_the_clip_box_cuts_the_scene_and_gives_it_back(page: Browser) -> None:
     page.run(SET.format("[aria-label='Height, from']", "50"))
     settle(page)
     assert page.run(COLOURED) < 0.6 * half  # the roof is left
+    said = page.run("[...document.querySelectorAll('.clip output')].map(o => o.value)")
+    (_, (west, east)), _, (_, (low, high)) = (
+        (text, [float(v) for v in re.findall(r"-?[\d.]+(?= m)", text)]) for text in said
+    )
+    assert west == pytest.approx(10.0, abs=3.0) and east > 30.0
+    datum = HouseFlight.origin[2]
+    assert (low, high) == pytest.approx((datum + 3.0, datum + 6.0), abs=0.2)
     page.run(
         "[...document.querySelectorAll('.clip button')].find(b => b.offsetParent || 1).click()"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -92,10 +93,35 @@ def test_layers_lie_over_the_basemap_and_nothing_comes_from_outside(page: Browse
     layer(page, "Surface")
     layer(page, "Contours")
     assert 0 < steady(page)["known"] < 0.1 * alone["known"]
+    words = page.run(BOX.format("Contours") + ".textContent")
+    assert re.fullmatch(r" Contours, [\d.]+ m", words)
+    keys = "document.querySelector('.layers .keys')"
+    assert page.run(f"{keys}.hidden")
     layer(page, "Coverage")
+    tops = page.run("[...document.querySelectorAll('.layers label')].map(l => l.textContent)")
+    assert tops.index(words) > tops.index(" Coverage")  # drawn above it
+    assert not page.run(f"{keys}.hidden") and "seldom seen" in page.run(f"{keys}.textContent")
     assert steady(page)["known"] > 0.5 * alone["known"]
     here = page.run("location.origin")
     assert [u for u in page.requests if not u.startswith((here, "data:", "about:"))] == []
+
+
+FAILED = "[...document.querySelectorAll('.layer img')].filter(i => i.complete && !i.naturalWidth)"
+DRAWN_BROKEN = f"{FAILED}.filter(i => i.getClientRects().length).length"
+
+
+def test_tiles_that_do_not_come_show_nothing_and_are_asked_for_again(page: Browser) -> None:
+    whole = steady(page)
+    page.page.route("**/tiles/**", lambda route: route.abort())
+    for button in ("nearer", "farther", "farther"):
+        page.run(f"document.querySelector('[title={button}]').click()")
+    page.wait(f"{FAILED}.length > 0")
+    page.wait("document.querySelector('.state').textContent.includes('does not answer')")
+    assert page.run(DRAWN_BROKEN) == 0
+    page.run("document.querySelector('[title=nearer]').click()")
+    page.page.unroute("**/tiles/**")
+    page.wait(f"{FAILED}.length === 0", 10)
+    assert steady(page) == whole
 
 
 def colours(page: Browser, when: str) -> dict[str, float]:

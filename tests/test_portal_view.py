@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -76,7 +77,7 @@ def store(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Path:
     folder = root / "drone-1" / "test-1"
     with house.flown(folder) as scan:
         scan.finish({})
-        write_deliverables(folder, scan, {})
+        write_deliverables(folder, scan, {"scale": {"from": "gnss", "sigma": 0.0065}})
     return root
 
 
@@ -213,9 +214,21 @@ def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, s
     assert f"Points\n{points}" in figures
     for name in ("sigma_median_m", "position_sigma_median_m"):
         assert f" \N{GREEK SMALL LETTER SIGMA}\n{quality[name]:.2f} m" in figures
+    assert "Scale \N{GREEK SMALL LETTER SIGMA}\n0.7 %" in figures
     assert "Speed" not in figures  # it has landed
     follow = "[...document.querySelectorAll('button')].find(b => b.textContent === 'Follow')"
     assert browser.run(f"{follow}.hidden")
+
+
+def test_the_colours_of_sigma_span_what_is_there(browser: Browser, portal: Portal) -> None:
+    open_scan(browser, portal)
+    browser.run(
+        "(s => { s.value = 'sigma'; s.dispatchEvent(new Event('change', { bubbles: true })) })"
+        "(document.querySelector('[aria-label=\"colour by\"]'))"
+    )
+    words = browser.wait("document.querySelector('.legend:not([hidden])')?.textContent")
+    found = re.search(r"([\d.]+) m and more", words)
+    assert found is not None and 0.03 < float(found.group(1)) < 0.1  # 0.05 m in the flight
 
 
 def test_tone_mapping_and_exposure_change_the_mesh(

@@ -42,6 +42,17 @@ def test_large_rasters_are_reduced() -> None:
     assert max(image.shape) < 1100
 
 
+def test_labels_grow_with_the_panel() -> None:
+    """The height of the dark letters of a line of text, over the image's height."""
+    shares = []
+    for rows in (400, 1400):
+        image = draw_preview(raster(rows, rows), np.zeros((0, 3)), ["Hill"], largest_px=rows)
+        below = image[2 * MARGIN + rows - 8 :]
+        dark = np.flatnonzero((below.max(axis=2) < 120).any(axis=1))
+        shares.append(np.ptp(dark) / rows)
+    assert shares[1] > 0.7 * shares[0]
+
+
 def test_unknown_ground_is_left_blank_and_far_tracks_do_no_harm() -> None:
     one = raster(40, 40)
     one.height_m[:, 20:] = np.nan

@@ -14,25 +14,40 @@ from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.trajectory import Placed
 from recon.tracking.odometry import Tracked, Tracking
 from service.cameras.rig import Rig
+from service.flight.anchorage import Anchorage, SettledKey
 from service.flight.pipeline import Pipeline, Step
 from service.flight.recorder import REPLAYED, Recorder
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
 
-def step(seq: int) -> Step:
+def placed(seq: int, sigma_m: float) -> Placed:
+    """A pose of this sigma in all three directions together."""
     T = se3.compose(np.diag([1.0, -1.0, -1.0]), np.array([0.5 * seq, 0.0, 50.0]))
-    return Step(Tracked(Tracking.TRACKED, 0), Placed(seq, T, 1.0, np.eye(6), ()))
+    covariance = se3.about(-T[:3, 3], np.eye(6) * sigma_m**2 / 3.0)
+    return Placed(seq, T, 1.0, covariance, ())
+
+
+def step(seq: int, sigma_m: float = 0.1) -> Step:
+    anchor = Anchorage(seq, SettledKey(0, 0, np.eye(4)), np.eye(4))
+    return Step(Tracked(Tracking.TRACKED, 0), placed(seq, sigma_m), anchor=anchor)
+
+
+def recorder_of(store: ScanStore, batch: int, sigma_m: float) -> Recorder:
+    """A recorder of frames that do not move, and whose sigma is ``sigma_m`` in the end."""
+    nothing = Step(Tracked(Tracking.LOST, 0))
+    chain = SimpleNamespace(place=lambda anchor: placed(anchor.seq, sigma_m))
+    track = SimpleNamespace(is_settled=lambda _key: False)
+    stages = SimpleNamespace(chain=chain, track=track, debug=None)
+    pipeline = SimpleNamespace(stages=stages, drain=lambda: nothing, finish=lambda: nothing)
+    rig = SimpleNamespace(frame=None, georeference="none")
+    return Recorder(store, cast(Pipeline, pipeline), cast(Rig, rig), batch=batch)
 
 
 @pytest.mark.parametrize(("batch", "transactions"), [(1, 20), (REPLAYED, 2)])
 def test_poses_of_a_recording_share_transactions(
     tmp_path: Path, batch: int, transactions: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    nothing = Step(Tracked(Tracking.LOST, 0))
-    stages = SimpleNamespace(chain=None, track=SimpleNamespace(is_settled=None), debug=None)
-    pipeline = SimpleNamespace(stages=stages, drain=lambda: nothing, finish=lambda: nothing)
-    rig = SimpleNamespace(frame=None, georeference="none")
     header = ScanHeader("recorded", "drone", 0)
     with ScanStore.create(tmp_path / "scan.db", header) as store:
         written: list[int] = []
@@ -43,12 +58,22 @@ def test_poses_of_a_recording_share_transactions(
             return add(poses)
 
         monkeypatch.setattr(store, "add_poses", counted)
-        recorder = Recorder(store, cast(Pipeline, pipeline), cast(Rig, rig), batch=batch)
+        recorder = recorder_of(store, batch, sigma_m=0.1)
         for seq in range(20):
             recorder.write(step(seq), 1_000_000 * seq, None)
         recorder.flush()
         assert [pose.time_unix_ns for pose in store.poses()] == [1_000_000 * n for n in range(20)]
         assert len(written) == transactions and sum(written) == 20
+
+
+def test_poses_published_before_the_scan_was_placed_get_their_sigma(tmp_path: Path) -> None:
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("rtk", "drone", 0)) as store:
+        recorder = recorder_of(store, 1, sigma_m=0.02)
+        for seq, sigma_m in enumerate([np.sqrt(3.0), np.sqrt(3.0), 0.021, 0.02]):
+            recorder.write(step(seq, sigma_m), 1_000_000 * seq, None)
+        recorder.flush()
+        found = [pose.sigma_m for pose in store.poses()]
+        assert found == pytest.approx([0.02, 0.02, 0.021, 0.02], abs=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -172,6 +172,18 @@ def test_scan_without_a_place_is_judged_after_a_similarity_fit(
     assert report["completeness"]["share"] > 0.97
 
 
+def test_a_wrong_scale_of_a_placed_scan_is_told_from_errors_of_its_surface(
+    flight: Path, tmp_path: Path
+) -> None:
+    dsm = {}
+    for scale in (1.0, 0.97):
+        folder, at = tmp_path / f"{scale}", np.eye(3) * scale
+        scan = write_scan(folder, flight, true_cloud(flight), True, at, np.zeros(3), 0.01)
+        dsm[scale] = score(scan, flight)["dsm"]
+    assert dsm[0.97]["rigid"]["rms_m"] > 1.5 * dsm[1.0]["rigid"]["rms_m"]
+    assert dsm[0.97]["similarity"]["rms_m"] < 1.1 * dsm[1.0]["similarity"]["rms_m"]
+
+
 def shrink(scan: Path, scale: float) -> None:
     """Scale a scan about its origin."""
     import laspy

@@ -106,11 +106,12 @@ class PublishedFrame:
     time_ns: int
     anchor: Anchorage | None  # None: by telemetry alone, never corrected
     position_m: F64  # (3,)
+    sigma_m: float
     agl_m: float | None
     is_view: bool
 
 
-_ROW = struct.Struct("<qqqi?16d3dd")
+_ROW = struct.Struct("<qqqi?16d3d2d")
 
 
 class PublishedFrames:
@@ -159,13 +160,14 @@ def _packed(frame: PublishedFrame, anchor: Anchorage) -> bytes:
     agl = np.nan if frame.agl_m is None else frame.agl_m
     return _ROW.pack(
         frame.time_ns, anchor.seq, anchor.key.seq, anchor.key.segment, frame.is_view,
-        *anchor.T_odom_camera.ravel(), *frame.position_m, agl,
+        *anchor.T_odom_camera.ravel(), *frame.position_m, frame.sigma_m, agl,
     )  # fmt: skip
 
 
 def _unpacked(row: bytes) -> PublishedFrame:
     time_ns, seq, key_seq, segment, is_view, *rest = _ROW.unpack(row)
+    *rest, sigma_m, agl = rest
     numbers = np.array(rest)
     key = SettledKey(key_seq, segment, numbers[:16].reshape(4, 4))
-    agl_m = None if np.isnan(numbers[19]) else float(numbers[19])
-    return PublishedFrame(time_ns, Anchorage(seq, key, UNMOVED), numbers[16:19], agl_m, is_view)
+    agl_m, anchor = None if np.isnan(agl) else agl, Anchorage(seq, key, UNMOVED)
+    return PublishedFrame(time_ns, anchor, numbers[16:19], sigma_m, agl_m, is_view)

@@ -27,8 +27,9 @@ from service.stream.codec import encode
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
-REPUBLISH_M = 0.05
-"""A frame's pose that moved by more than this until the end is written again."""
+REPUBLISH_M, REPUBLISH_SHARE = 0.05, 0.1
+"""A frame's pose is written again if by the end it moved by more than this, or its sigma changed by
+more than this share."""
 
 BATCH, REPLAYED = 256, 16
 """Poses in one transaction, which takes a synchronised write of the disk: those written again in
@@ -68,14 +69,15 @@ class Recorder:
         self.states[step.tracked.state] += 1
         self._write_origin()
         self._write_keyframes(step)
-        if step.placed is None:
+        placed = step.placed
+        if placed is None:
             return
-        position = step.placed.T_world_camera[:3, 3]
         frame = PublishedFrame(
-            time_ns + self._offset_ns, step.anchor, position, agl_m, step.is_view
-        )
+            time_ns + self._offset_ns, step.anchor, placed.T_world_camera[:3, 3], placed.sigma_m,
+            agl_m, step.is_view,
+        )  # fmt: skip
         self._frames.add(frame, self._is_settled)
-        self.last = self._record(frame, step.placed)
+        self.last = self._record(frame, placed)
         self._due.append(self.last)
         if len(self._due) >= self._batch:
             self._write_due()
@@ -112,11 +114,13 @@ class Recorder:
             self.store.add_poses(batch)
 
     def _moved(self) -> Iterator[PoseRecord]:
-        """The poses that corrections have moved."""
+        """The poses that corrections have moved, or whose sigma they have changed."""
         for frame in self._frames.corrigible():
             assert frame.anchor is not None
             record = self._record(frame, self._chain.place(frame.anchor))
-            if np.linalg.norm(record.T_world_camera[:3, 3] - frame.position_m) > REPUBLISH_M:
+            moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - frame.position_m)
+            change = abs(record.sigma_m - frame.sigma_m)
+            if moved_m > REPUBLISH_M or change > REPUBLISH_SHARE * record.sigma_m:
                 yield record
 
     def summary(self) -> dict[str, Any]:

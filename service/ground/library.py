@@ -60,7 +60,7 @@ FILES: dict[str, str] = {
     "contours.dxf": "contours, DXF",
     "stac.json": "STAC item",
     "coverage.tif": "coverage: views, sigma, height",
-    "coverage.png": "coverage, picture",
+    "coverage.png": "coverage, image",
     "mesh.glb": "textured mesh",
     "trajectory.tum": "trajectory, TUM",
     "trajectory.csv": "trajectory, table",

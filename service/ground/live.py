@@ -121,7 +121,8 @@ class StoreIndex:
     def layers(self) -> dict[int, int]:
         """Keyframe number to its finest stored layer."""
         radio = "SELECT number, -1 FROM radio WHERE kind = 'tile'"
-        sql = f"SELECT seq, MAX(layer) FROM (SELECT seq, layer FROM chunks UNION {radio})"
+        chunks = f"SELECT seq, layer FROM chunks WHERE {is_number('layer')}"
+        sql = f"SELECT seq, MAX(layer) FROM ({chunks} UNION {radio}) WHERE {is_number('seq')}"
         return dict(self._db.all(f"{sql} GROUP BY seq ORDER BY seq"))
 
     def revisions(self) -> dict[int, int]:

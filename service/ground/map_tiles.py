@@ -265,6 +265,11 @@ def _tile_json(request: Request) -> Response:
         "maxzoom": MAX_ZOOM,
         "version": f"{version}.0.{0 if raster is None else int(raster.stat().st_mtime)}",
     }
+    if layer == "contours":
+        latitude = 0.5 * (bounds[1] + bounds[3])
+        finest = MAX_ZOOM if raster is not None or live.zoom is None else live.zoom
+        zooms = (min(z, finest) for z in range(MAX_ZOOM + 1))
+        document["intervals_m"] = [interval_m(pixel_m(z, latitude)) for z in zooms]
     return JSONResponse(document, headers=NOW)
 
 

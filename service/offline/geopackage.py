@@ -72,7 +72,6 @@ def write_layers(path: Path, epsg: int, layers: Sequence[Layer]) -> None:
     from pyproj import CRS
 
     with writing(path) as part:
-        part.unlink(missing_ok=True)
         db = sqlite3.connect(part)
         try:
             db.execute(f"PRAGMA application_id = {APPLICATION_ID}")

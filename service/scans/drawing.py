@@ -26,6 +26,9 @@ TRACK = (40, 60, 235)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 MARGIN = 16
 LINE_PX = 24
+SIGN_PX = 500
+"""Panels this large have labels of their usual size; on larger ones labels grow, as pages show a
+panel about this large."""
 PAINTED_ROWS = 128
 
 
@@ -55,7 +58,7 @@ def draw_preview(
     stacked = w > 1.3 * h
     gap = np.full((MARGIN, w, 3) if stacked else (h, MARGIN, 3), BACKGROUND, np.uint8)
     both = np.concatenate([colour, gap, height], axis=0 if stacked else 1)
-    return _with_lines(both, lines)
+    return _with_lines(both, lines, _growth(colour))
 
 
 def blank_preview(lines: Sequence[str]) -> U8:
@@ -148,15 +151,21 @@ def _padded_to(panel: U8, smallest_px: int = 160) -> U8:
     return out
 
 
+def _growth(panel: U8) -> float:
+    """Size of a panel's labels over their usual one."""
+    return max(1.0, float(max(panel.shape[:2])) / SIGN_PX)
+
+
 def _draw_track(panel: U8, grid: Grid, track_m: F64, scale: float) -> None:
     """The flight path, with a ring at its start."""
     if not len(track_m):
         return
     px = (grid.pixels(track_m[:, :2]) + 0.5) * scale
     path = np.rint(np.clip(px, -1e6, 1e6) * 8).astype(np.int32)
-    cv2.polylines(panel, [path[:, None]], False, TRACK, 1, cv2.LINE_AA, shift=3)
+    thick = round(_growth(panel))
+    cv2.polylines(panel, [path[:, None]], False, TRACK, thick, cv2.LINE_AA, shift=3)
     x, y = (round(float(v)) for v in np.clip(px[0], -1e6, 1e6))
-    cv2.circle(panel, (x, y), 5, TRACK, 1, cv2.LINE_AA)
+    cv2.circle(panel, (x, y), 5 * thick, TRACK, thick, cv2.LINE_AA)
 
 
 def round_length(most: float) -> float:
@@ -169,48 +178,59 @@ def _draw_scale_bar(panel: U8, metres_per_px: float) -> None:
     """A bar of round length, about a fifth of the panel wide."""
     length_m = round_length(panel.shape[1] * metres_per_px / 5.0)
     length_px = round(length_m / metres_per_px)
-    x, y = 12, panel.shape[0] - 14
+    grown = _growth(panel)
+    x, y = round(12 * grown), panel.shape[0] - round(14 * grown)
     for colour, thick in ((BACKGROUND, 5), (INK, 2)):
-        cv2.line(panel, (x, y), (x + length_px, y), colour, thick, cv2.LINE_AA)
-    _text(panel, f"{length_m:g} m", (x, y - 8), 0.45)
+        cv2.line(panel, (x, y), (x + length_px, y), colour, round(thick * grown), cv2.LINE_AA)
+    _text(panel, f"{length_m:g} m", (x, y - round(8 * grown)), 0.45 * grown)
 
 
 def _draw_north(panel: U8) -> None:
-    x, y = panel.shape[1] - 20, 14
+    grown = _growth(panel)
+    right, top, foot, word = (round(v * grown) for v in (20, 14, 40, 56))
+    x = panel.shape[1] - right
     for colour, thick in ((BACKGROUND, 5), (INK, 2)):
-        cv2.arrowedLine(panel, (x, y + 26), (x, y), colour, thick, cv2.LINE_AA, tipLength=0.35)
-    _text(panel, "N", (x - 5, y + 42), 0.45)
+        ends = (x, foot), (x, top)
+        cv2.arrowedLine(panel, *ends, colour, round(thick * grown), cv2.LINE_AA, tipLength=0.35)
+    _text(panel, "N", (x - round(5 * grown), word), 0.45 * grown)
 
 
 def _draw_height_legend(panel: U8, raster: Raster, height_of_zero_m: float) -> None:
     """The colour scale with its two heights."""
     low, high = _height_range(raster)
-    length = min(120, panel.shape[0] // 3)
-    tones = np.linspace(255, 0, length).astype(np.uint8)[:, None].repeat(10, axis=1)
+    grown = _growth(panel)
+    edge, wide, words = (round(v * grown) for v in (12, 10, 28))
+    length = min(round(120 * grown), panel.shape[0] // 3)
+    tones = np.linspace(255, 0, length).astype(np.uint8)[:, None].repeat(wide, axis=1)
     bar = 0.25 * 255 + 0.75 * cv2.applyColorMap(tones, cv2.COLORMAP_VIRIDIS).astype(np.float32)
-    panel[12 : 12 + length, 12:22] = bar.astype(np.uint8)
-    _text(panel, f"{high + height_of_zero_m:.1f} m", (28, 22), 0.4)
-    _text(panel, f"{low + height_of_zero_m:.1f} m", (28, 12 + length), 0.4)
+    panel[edge : edge + length, edge : edge + wide] = bar.astype(np.uint8)
+    top = edge + wide
+    _text(panel, f"{high + height_of_zero_m:.1f} m", (words, top), 0.4 * grown)
+    _text(panel, f"{low + height_of_zero_m:.1f} m", (words, edge + length), 0.4 * grown)
 
 
 def _text(image: U8, text: str, at: tuple[int, int], size: float) -> None:
     """Dark text on a light label, readable on any ground."""
-    (w, h), below = cv2.getTextSize(text, FONT, size, 1)
+    thick = max(1, round(2 * size))
+    (w, h), below = cv2.getTextSize(text, FONT, size, thick)
     x, y = at
     cv2.rectangle(image, (x - 2, y - h - 2), (x + w + 1, y + below), BACKGROUND, cv2.FILLED)
-    cv2.putText(image, text, at, FONT, size, INK, 1, cv2.LINE_AA)
+    cv2.putText(image, text, at, FONT, size, INK, thick, cv2.LINE_AA)
 
 
-def _with_lines(image: U8, lines: Sequence[str]) -> U8:
-    """The image in a margin, wide enough for the lines of text below it."""
+def _with_lines(image: U8, lines: Sequence[str], growth: float = 1.0) -> U8:
+    """The image in a margin, wide enough for the lines of text below it, which grow as there is
+    room."""
     widest = max((cv2.getTextSize(t, FONT, 0.5, 1)[0][0] for t in lines), default=0)
     h, w = image.shape[:2]
-    size = (h + 2 * MARGIN + LINE_PX * len(lines) + 6, max(w, widest) + 2 * MARGIN, 3)
+    grown = max(1.0, min(growth, w / max(widest, 1)))
+    line_px, thick = round(LINE_PX * grown), round(grown)
+    size = (h + 2 * MARGIN + line_px * len(lines) + 6, max(w, widest) + 2 * MARGIN, 3)
     out = np.full(size, BACKGROUND, np.uint8)
     out[MARGIN : MARGIN + h, MARGIN : MARGIN + w] = image
     for n, text in enumerate(lines):
-        at = (MARGIN, h + 2 * MARGIN + 10 + LINE_PX * n)
-        cv2.putText(out, text, at, FONT, 0.5, INK, 1, cv2.LINE_AA)
+        at = (MARGIN, h + 2 * MARGIN + round(10 * grown) + line_px * n)
+        cv2.putText(out, text, at, FONT, 0.5 * grown, INK, thick, cv2.LINE_AA)
     return out
 
 

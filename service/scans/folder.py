@@ -51,7 +51,7 @@ from service.scans.main_piece import (
 )
 from service.scans.report import report_html
 from service.scans.track import csv_table, latest, local_frame, tum_lines
-from service.scans.trust import slope_deg, trust_of
+from service.scans.trust import scale_sigma, slope_deg, trust_of
 from service.scans.writing import writing
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
@@ -356,7 +356,10 @@ def _summary(
             "poses": len(poses),
         },
         "quality": _quality(fused, raster, poses)
-        | {"trust": trust_of(extra, header.georeference, slope_deg(fused.cloud.xyz_m))},
+        | {
+            "scale_sigma": scale_sigma(extra, header.georeference),
+            "trust": trust_of(extra, header.georeference, slope_deg(fused.cloud.xyz_m)),
+        },
         "notes": notes,
         "run": redacted(extra),
     }

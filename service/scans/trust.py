@@ -29,6 +29,9 @@ REFUSED_SHARE, WRONG_SHARE = 0.2, 0.5
 """Of the measured positions, that contradict the track. Above the first, positions are less certain
 than sigma says; above the second, either may be wrong."""
 
+BY_SURVEY = "control points"
+"""``georeference`` of a scan that control points have placed."""
+
 FIRST_TELEMETRY = "first telemetry"
 """``scale.from`` of a scan whose segments are all too short to be fitted to telemetry."""
 
@@ -54,7 +57,7 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     assumed = run.get("assumed")
     assumed = assumed if isinstance(assumed, list) else []
     scale = run.get("scale")
-    scale_sigma = _number(scale, "sigma")
+    sigma = _number(scale, "sigma")
     doubts = []
     if "lens" in assumed:
         doubts.append("the lens is assumed: shapes bend; calibrate the camera")
@@ -77,8 +80,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         return _said(Trust.RELATIVE, ["the scale comes from an assumed height above ground"])
     if isinstance(scale, Mapping) and scale.get("from") == FIRST_TELEMETRY:
         return _said(Trust.RELATIVE, ["too few keyframes in a row to measure the scale"])
-    if scale_sigma is not None and scale_sigma > MAX_SCALE_SIGMA:
-        return _said(Trust.RELATIVE, [f"the scale is uncertain by {scale_sigma:.0%}"])
+    if sigma is not None and sigma > MAX_SCALE_SIGMA:
+        return _said(Trust.RELATIVE, [f"the scale is uncertain by {sigma:.0%}"])
     if georeference == "none":
         return _said(Trust.SCALED, ["no positions: the scan has its own origin and heading"])
     limits = []
@@ -115,6 +118,12 @@ def scales_differ(gnss_over_heights: float) -> str:
         which, ratio = "smaller", 1.0 / ratio
     percent = 100.0 * (ratio - 1.0)
     return f"GNSS makes the map {percent:.0f} % {which} than the height above ground does"
+
+
+def scale_sigma(run: Mapping[str, Any], georeference: str) -> float | None:
+    """Relative sigma of the scale as the flight measured it; None where nothing did, or where
+    control points gave a better one."""
+    return None if georeference == BY_SURVEY else _number(run.get("scale"), "sigma")
 
 
 def _said(level: Trust, reasons: list[str]) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import glob
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -12,13 +14,15 @@ from service.errors import OutsideError
 
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
-    """A temporary path for ``path``; renamed onto it on success, otherwise removed.
+    """A temporary path of the calling thread for ``path``; renamed onto it on success, otherwise
+    removed.
 
     A disk failure becomes an OutsideError.
     """
-    part = path.with_name(f".{path.name}.part")
+    part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_abandoned(path)
         yield part
         with open(part, "rb+") as written:
             os.fsync(written.fileno())
@@ -30,3 +34,15 @@ def writing(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # a disk that cannot be written cannot be cleaned either
             part.unlink(missing_ok=True)
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Remove the temporary files for ``path`` of processes that ended by a kill or a power cut."""
+    for part in path.parent.glob(f".{glob.escape(path.name)}.*-*.part"):
+        pid = part.name.removeprefix(f".{path.name}.").partition("-")[0]
+        try:
+            os.kill(int(pid), 0)
+        except ProcessLookupError:
+            part.unlink(missing_ok=True)
+        except PermissionError:
+            pass  # another user's, alive

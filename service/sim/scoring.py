@@ -81,17 +81,14 @@ def score(scan_folder: Path, truth_folder: Path, deliverables: bool = False) -> 
     }
     best = "rigid" if scan.placed else "similarity"
     report["judged_after"] = best
-    report["dsm"] = {
-        name: _dsm(scan, truth, fit)
-        for name, fit in fits["surface"].items()
-        if name in ("raw", best)
-    }
+    # A wrong scale moves the rim of a placed map: only the similarity shows what else is wrong.
+    chosen = fits["surface"] if scan.placed else {best: fits["surface"][best]}
+    report["dsm"] = {name: _dsm(scan, truth, fit) for name, fit in chosen.items()}
     seen = seen_surface(truth)
     report["completeness"] = _completeness(scan, truth, seen, fits["surface"][best])
     for name, fit in fits["surface"].items():
         report["surface"][name]["fit"] = _fit_size(fit, scan.points)
     if deliverables:
-        chosen = {name: fit for name, fit in fits["surface"].items() if name in ("raw", best)}
         report["deliverables"] = score_files(scan_folder, truth, seen.places, chosen)
     return report
 

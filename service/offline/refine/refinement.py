@@ -65,6 +65,7 @@ from service.offline.refine.survey_file import SurveyPoint, at_times, read_surve
 from service.progress import Progress
 from service.scans.folder import write_deliverables
 from service.scans.track import local_frame
+from service.scans.trust import BY_SURVEY
 from service.stream.records import (
     Repose,
     ScanHeader,
@@ -82,7 +83,6 @@ MATCHING, SEARCHING, ADJUSTING = 0.7, 0.7, 0.5
 """Shares of the remaining refinement that its steps take."""
 
 MIN_SIGMA_SCALE = 0.003
-BY_SURVEY = "control points"
 MIN_OTHERS = 3
 """Control points that hold a scan without one of them."""
 

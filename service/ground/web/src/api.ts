@@ -39,6 +39,7 @@ export interface Scan {
     area_m2?: number | null;
     sigma_median_m?: number | null;
     position_sigma_median_m?: number | null;
+    scale_sigma?: number | null;
     trust?: { level: string; reasons: string[] } | null;
   };
   notes?: string[];

@@ -6,6 +6,7 @@ import type { Cameras } from "./cameras";
 import { copy, el, notify } from "./dom";
 import type { Cloud } from "./points";
 import type { Stage } from "./stage";
+import * as units from "./units";
 
 const IMAGE_EVERY_MS = 1500;
 const CLICK_PX = 5; // a pointer that moved farther turned the view
@@ -46,17 +47,20 @@ export function timeSlider({ stage, cloud, cameras }: Site): { element: HTMLElem
   return { element, refresh };
 }
 
-/** Six sliders that cut the scene to a box, as shares of the cloud's extent. */
+/** Six sliders that cut the scene to a box, as shares of the cloud's extent, with the lengths they stand for. */
 export function clipBox({ stage, cloud }: Site): HTMLElement {
   const panel = el("div", { className: "settings clip" });
   const axes: [string, "x" | "y" | "z"][] = [["East", "x"], ["North", "y"], ["Height", "z"]];
-  const fields: { axis: "x" | "y" | "z"; low: HTMLInputElement; high: HTMLInputElement }[] = [];
+  const fields: { axis: "x" | "y" | "z"; low: HTMLInputElement; high: HTMLInputElement; shown: HTMLOutputElement }[] = [];
   const cut = (): void => {
+    if (!cloud.keyframes) return;
     const box = new THREE.Box3().setFromObject(cloud.group);
     const size = box.getSize(new THREE.Vector3());
     const planes: THREE.Plane[] = [];
-    for (const { axis, low, high } of fields) {
+    for (const { axis, low, high, shown } of fields) {
       const at = (field: HTMLInputElement): number => box.min[axis] + (size[axis] * Number(field.value)) / 100;
+      const zero_m = axis === "z" ? cloud.datum_m : 0;
+      shown.value = [low, high].map((field) => units.length(at(field) + zero_m, 1)).join(" to ");
       const along = new THREE.Vector3();
       along[axis] = 1;
       if (low.value !== low.min) planes.push(new THREE.Plane(along.clone(), -at(low)));
@@ -73,16 +77,16 @@ export function clipBox({ stage, cloud }: Site): HTMLElement {
       input.setAttribute("aria-label", `${name}, ${which}`);
       return input;
     };
-    const field = { axis, low: slide("from", "0"), high: slide("to", "100") };
+    const field = { axis, low: slide("from", "0"), high: slide("to", "100"), shown: el("output", {}) };
     fields.push(field);
-    panel.append(el("div", { className: "axis" }, text(name), field.low, field.high));
+    panel.append(el("div", { className: "axis" }, text(name), field.low, field.high, field.shown));
   }
   const whole = (): void => {
     for (const { low, high } of fields) [low.value, high.value] = ["0", "100"];
     cut();
   };
   panel.append(el("button", { textContent: "Whole", onclick: whole }));
-  return el("details", { className: "group" }, el("summary", { textContent: "Clip" }), panel);
+  return el("details", { className: "group", ontoggle: cut }, el("summary", { textContent: "Clip" }), panel);
 }
 
 /** The address of this view of this scan. */

@@ -67,8 +67,9 @@ export interface Volume {
   unseen: number;
 }
 
-const POINTS_PER_CELL = 4;
+const POINTS_PER_CELL = 1.5; // about the points' distance: a point at a wall widens it by half a cell
 const MAX_CELLS = 1_000_000;
+const CORNER_CELLS = 5;
 
 /**
  * Volume between the cloud and the plane through the corners; null where there are no points.
@@ -77,8 +78,6 @@ const MAX_CELLS = 1_000_000;
  * what hides ground stands higher than the ground.
  */
 export function volume(places: Vector3[], points: Points): Volume | null {
-  const base = basePlane(places);
-  if (!base) return null;
   const xs = places.map((p) => p.x), ys = places.map((p) => p.y);
   const [west, east, south, north] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
   const found: number[] = [];
@@ -87,7 +86,8 @@ export function volume(places: Vector3[], points: Points): Volume | null {
   });
   const box = (east - west) * (north - south);
   const cell = Math.sqrt(box * Math.max((3 * POINTS_PER_CELL) / found.length, 1 / MAX_CELLS));
-  if (!found.length) return null;
+  const base = found.length ? basePlane(settled(places, points, CORNER_CELLS * cell)) : null;
+  if (!base) return null;
   const cols = Math.ceil((east - west) / cell), rows = Math.ceil((north - south) / cell);
   const sum = new Float64Array(cols * rows), n = new Uint32Array(cols * rows);
   for (let i = 0; i < found.length; i += 3) {
@@ -96,19 +96,48 @@ export function volume(places: Vector3[], points: Points): Volume | null {
     sum[row * cols + col]! += found[i + 2]! - base(found[i]!, found[i + 1]!);
     n[row * cols + col]! += 1;
   }
-  const heights = sum.map((s, i) => (n[i]! ? s / n[i]! : NaN));
+  let heights: Float64Array = sum.map((s, i) => (n[i]! ? s / n[i]! : NaN));
+  for (let round = 0; round < PINHOLE_ROUNDS; round++) heights = withoutPinholes(heights, cols, rows);
   const filled = withoutHoles(heights, cols, rows);
   let [above, below, cells, unseen] = [0, 0, 0, 0];
   filled.forEach((h, i) => {
     const x = west + ((i % cols) + 0.5) * cell, y = south + (Math.floor(i / cols) + 0.5) * cell;
     if (!inside(places, x, y)) return;
     cells += 1;
-    unseen += n[i] ? 0 : 1;
+    unseen += Number.isNaN(heights[i]!) ? 1 : 0;
     if (h > 0) above += h;
     else below -= h;
   });
   const per = area(places) / Math.max(1, cells);
   return { above_m3: above * per, below_m3: below * per, unseen: unseen / Math.max(1, cells) };
+}
+
+/** The corners at the median height of the points around each: a single point is off by its noise. */
+function settled(places: Vector3[], points: Points, reach_m: number): Vector3[] {
+  const around = places.map((): number[] => []);
+  const near = (a: number, b: number): boolean => Math.abs(a - b) < reach_m;
+  points((x, y, z) =>
+    places.forEach((p, i) => {
+      if (near(x, p.x) && near(y, p.y) && near(z, p.z)) around[i]!.push(z);
+    }),
+  );
+  return places.map((p, i) => new Vector3(p.x, p.y, around[i]!.length ? median(around[i]!) : p.z));
+}
+
+const PINHOLE_ROUNDS = 2;
+const PINHOLE_NEIGHBOURS = 5; // of 8: more than a straight edge has
+
+/** The heights with each cell that most neighbours surround at their mean. */
+function withoutPinholes(heights: Float64Array, cols: number, rows: number): Float64Array {
+  return heights.map((h, i) => {
+    if (!Number.isNaN(h)) return h;
+    const known: number[] = [];
+    for (let row = Math.floor(i / cols) - 1; row <= Math.floor(i / cols) + 1; row++)
+      for (let col = (i % cols) - 1; col <= (i % cols) + 1; col++)
+        if (row >= 0 && row < rows && col >= 0 && col < cols && !Number.isNaN(heights[row * cols + col]!))
+          known.push(heights[row * cols + col]!);
+    return known.length < PINHOLE_NEIGHBOURS ? h : known.reduce((a, b) => a + b) / known.length;
+  });
 }
 
 const NEAR_CELLS = 8;

@@ -2,6 +2,7 @@
 
 import * as api from "./api";
 import { el, notify, short, svg } from "./dom";
+import { coverageKeys } from "./keys";
 import * as units from "./units";
 
 const SIDE = 256;
@@ -9,11 +10,12 @@ const MAX_ZOOM = 24;
 const REFRESH_MS = 2000;
 const FADE_MS = 4000; // after which a tile that does not load gives way
 const EQUATOR_M = 2 * Math.PI * 6378137;
+const COVERAGE = "Coverage";
 const LAYERS: [string, string, boolean][] = [
   ["ortho", "Orthophoto", true],
   ["dsm", "Surface (shaded)", false],
+  ["coverage", COVERAGE, false],
   ["contours", "Contours", false],
-  ["coverage", "Coverage", false],
 ];
 
 /** A place in the square of Web Mercator: 0 to 1 from west and from north. */
@@ -25,6 +27,8 @@ interface Place {
 interface TileJson {
   bounds?: [number, number, number, number];
   version?: string;
+  /** Of contours, by zoom. */
+  intervals_m?: number[];
 }
 
 function placeOf(lat_deg: number, lon_deg: number): Place {
@@ -47,6 +51,7 @@ class Layer {
   readonly element = el("div", { className: "layer" });
   shown = true;
   version = "";
+  intervals_m: number[] = [];
   private readonly tiles = new Map<string, HTMLImageElement>();
 
   /** `about` is the address of its TileJSON, whose version changes with the tiles. */
@@ -56,18 +61,22 @@ class Layer {
   ) {}
 
   async refresh(): Promise<void> {
-    if (this.about && this.shown) this.version = (await tileJson(this.about))?.version ?? "";
+    if (!this.about || !this.shown) return;
+    const { version = "", intervals_m = [] } = (await tileJson(this.about)) ?? {};
+    Object.assign(this, { version, intervals_m });
   }
 
   opacity(share: number): void {
     this.element.style.opacity = String(share);
   }
 
+  static zoomOf = (zoom: number): number => Math.max(0, Math.min(MAX_ZOOM, Math.round(zoom)));
+
   /** Places the tiles that a view needs; older ones stay below until theirs have come. */
   draw(middle: Place, zoom: number, w: number, h: number): void {
     this.element.hidden = !this.shown;
     if (!this.shown) return;
-    const z = Math.max(0, Math.min(MAX_ZOOM, Math.round(zoom)));
+    const z = Layer.zoomOf(zoom);
     const n = 2 ** z;
     const scale = SIDE * 2 ** zoom;
     const wanted = new Set<string>();
@@ -83,7 +92,7 @@ class Layer {
         wanted.add(name);
         if (!this.tiles.has(name)) this.tiles.set(name, this.load(z, x, y));
       }
-    const missing = [...wanted].some((name) => !this.tiles.get(name)!.complete);
+    const missing = [...wanted].map((name) => this.tiles.get(name)!).some((image) => !image.complete || image.hidden);
     for (const [name, image] of this.tiles) {
       if (!wanted.has(name) && (!missing || !image.complete || Number(image.dataset["at"]) < performance.now() - FADE_MS)) {
         image.remove();
@@ -106,9 +115,22 @@ class Layer {
     image.alt = "";
     image.draggable = false;
     image.onload = () => this.element.dispatchEvent(new Event("tile", { bubbles: true }));
+    image.onerror = () => {
+      image.hidden = true;
+      image.onload!(new Event("load"));
+    };
     image.src = `${this.address(z, x, y)}?v=${this.version}`;
     this.element.append(image);
     return image;
+  }
+
+  /** The tiles that did not come are asked for at the next drawing. */
+  retry(): void {
+    for (const [name, image] of this.tiles)
+      if (image.hidden) {
+        image.remove();
+        this.tiles.delete(name);
+      }
   }
 
   get loading(): boolean {
@@ -146,6 +168,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   let isPlanned = false; // whether the flight over weak places is shown
   let notes: { place: Place; text: string }[] = [];
   const layers: Layer[] = [];
+  const captions: (() => void)[] = []; // write what the panel states about layers
   let middle = scan.origin ? placeOf(scan.origin.lat_deg, scan.origin.lon_deg) : { x: 0.5, y: 0.5 };
   let zoom = 18;
   let isFree = true; // until somebody moves it the map shows the whole scan
@@ -153,6 +176,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   const draw = (): void => {
     const { clientWidth: w, clientHeight: h } = host;
     for (const layer of layers) layer.draw(middle, zoom, w, h);
+    for (const write of captions) write();
     scaleBar(bar, middle, zoom);
     const scale = SIDE * 2 ** zoom;
     marks.replaceChildren(
@@ -206,7 +230,16 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     const share = el("input", { type: "range", min: "0", max: "1", step: "0.05", value: "1" });
     share.setAttribute("aria-label", `${title}, opacity`);
     share.oninput = () => layer.opacity(Number(share.value));
-    panel.append(el("div", {}, el("label", {}, box, ` ${title}`), share));
+    const words = el("span", { textContent: ` ${title}` });
+    panel.append(el("div", {}, el("label", {}, box, words), share));
+    captions.push(() => {
+      const step_m = layer.shown ? layer.intervals_m[Layer.zoomOf(zoom)] : undefined;
+      words.textContent = step_m ? ` ${title}, ${units.length(step_m, step_m < 1 ? 1 : 0)}` : ` ${title}`;
+    });
+    if (title !== COVERAGE) return;
+    const keys = coverageKeys();
+    panel.append(keys);
+    captions.push(() => (keys.hidden = !layer.shown));
   };
   const plans = async (): Promise<void> => {
     if (!isPlanned) return;
@@ -234,6 +267,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
       text: short(properties.text),
     }));
     if (found?.bounds && isFree) frame(found.bounds);
+    layers.forEach((layer) => layer.retry());
     draw();
   };
 

@@ -21,6 +21,8 @@ export interface Scene {
   /** The cloud, for volumes and profiles. */
   cloud: THREE.Object3D;
   origin: Origin | null;
+  /** Relative sigma of the scan's scale; none where nothing states it. */
+  scaleSigma: () => number | null | undefined;
 }
 
 let down = { x: 0, y: 0 };
@@ -221,8 +223,13 @@ export class Ruler {
     if (this.volume) {
       words["Volume above"] = units.volume(this.volume.above_m3);
       words["Volume below"] = units.volume(this.volume.below_m3);
-      words["Base"] = "plane through the points";
+      words["Base"] = "plane of the points";
       words["Not seen"] = `${(100 * this.volume.unseen).toFixed(1)} % of the area`;
+    }
+    const sigma = this.scene.scaleSigma();
+    if (sigma) {
+      words["Scale σ"] = units.share(sigma);
+      if (this.volume) words["Volume σ"] = `${units.share(3 * sigma)} by the scale`;
     }
     return words;
   }

@@ -19,7 +19,9 @@ const PARTS = ["#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00",
 /** Of the change since an earlier date, as on the maps of `site compare`. */
 const CHANGES: [string, string][] = [["higher", "#d03027"], ["lower", "#2b6fd0"], ["as before", "#9a9a9a"], ["not seen before", "#3a3a3a"]];
 
+const MAX_SIGMA_M = 5.1; // of the 255 steps of a chunk
 const VERTEX = /* glsl */ `
+  #define SIGMA_M float(${MAX_SIGMA_M})
   attribute vec3 rgb;
   attribute float sigma;
   attribute float views;
@@ -51,13 +53,13 @@ const VERTEX = /* glsl */ `
     gl_PointSize = clamp(gap * projectionMatrix[1][1] * height_px / max(-seen.z, 0.01), 1.5, 40.0);
     vec3 s = rgb;
     if (mode > 0.5) s = ramp((world.z - range.x) / max(range.y - range.x, 0.01));
-    if (mode > 1.5) s = ramp(sigma * 5.1 / 1.0);
+    if (mode > 1.5) s = ramp(sigma * SIGMA_M / max(range.y, 0.01));
     if (mode > 2.5) s = ramp(views * 255.0 / 8.0);
     if (mode > 3.5) s = ramp(age);
     shown = linear(s);
     if (mode > 4.5) shown = part * (0.3 + 0.7 * dot(rgb, vec3(0.30, 0.59, 0.11)));
     if (mode > 5.5) {
-      float d = change(world.xyz, 0.15 + 3.0 * sigma * 5.1);
+      float d = change(world.xyz, 0.15 + 3.0 * sigma * SIGMA_M);
       vec3 kind = d > 1e8 ? unseen : mix(same, d > 0.0 ? higher : lower, min(abs(d) / 0.3, 1.0));
       shown = kind * (0.4 + 0.6 * dot(rgb, vec3(0.30, 0.59, 0.11)));
     }
@@ -214,6 +216,7 @@ export class Cloud implements Gradual {
   colour(mode: Colour): void {
     this.shared.mode.value = COLOURS.indexOf(mode);
     if (mode === "height") this.heightScale();
+    if (mode === "sigma") this.sigmaScale();
     if (mode === "age") this.ages();
   }
 
@@ -240,7 +243,7 @@ export class Cloud implements Gradual {
     const words: Record<Colour, [string, string] | null> = {
       colour: null,
       height: [x, y].map((z) => length(z + this.datum_m, 1)) as [string, string],
-      sigma: ["0 m", "σ 1 m"],
+      sigma: [length(0), `σ ${length(y)} and more`],
       views: ["1 view", "8 views"],
       age: ["first", "last"],
       scan: null,
@@ -281,17 +284,28 @@ export class Cloud implements Gradual {
 
   /** Heights of the middle 96 % of a sample of the points, for the colour scale. */
   private heightScale(): void {
-    const heights: number[] = [];
     const p = new THREE.Vector3();
+    const height = this.sample("position", (xyz, i, { matrixWorld }) => p.fromBufferAttribute(xyz, i).applyMatrix4(matrixWorld).z);
+    this.shared.range.value.set(height(0.02), height(0.98));
+  }
+
+  /** The sigma that 2 % of a sample of the points exceed, for the colour scale. */
+  private sigmaScale(): void {
+    this.shared.range.value.set(0, MAX_SIGMA_M * this.sample("sigma", (sigma, i) => sigma.getX(i))(0.98));
+  }
+
+  /** Quantiles of a figure of 200 points of each chunk. */
+  private sample(
+    name: string,
+    figure: (values: THREE.BufferAttribute | THREE.InterleavedBufferAttribute, i: number, object: THREE.Object3D) => number,
+  ): (share: number) => number {
+    const found: number[] = [];
     for (const { object } of this.chunks.values()) {
-      const xyz = object.geometry.getAttribute("position");
-      for (let i = 0; i < Math.min(xyz.count, 200); i++) {
-        heights.push(p.fromBufferAttribute(xyz, i).applyMatrix4(object.matrixWorld).z);
-      }
+      const values = object.geometry.getAttribute(name);
+      for (let i = 0; i < Math.min(values.count, 200); i++) found.push(figure(values, i, object));
     }
-    heights.sort((a, b) => a - b);
-    const at = (share: number): number => heights[Math.floor(share * (heights.length - 1))] ?? 0;
-    this.shared.range.value.set(at(0.02), at(0.98));
+    found.sort((a, b) => a - b);
+    return (share) => found[Math.floor(share * (found.length - 1))] ?? 0;
   }
 
   private ages(): void {

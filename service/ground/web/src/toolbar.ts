@@ -5,6 +5,7 @@ import * as api from "./api";
 import type { Cameras } from "./cameras";
 import { el, notify } from "./dom";
 import { clipBox, linkButton } from "./explore";
+import { coverageKeys, key } from "./keys";
 import type { Ruler } from "./measure";
 import type { Notes } from "./notes";
 import { COLOURS, type Cloud, type Colour } from "./points";
@@ -118,23 +119,12 @@ function cameraButton(cameras: Cameras): HTMLElement {
   return button;
 }
 
-/** The colours of service/scans/coverage.py, over white. */
-const COVERAGE_KEYS = [
-  ["good", "#79d29a"], ["seldom seen", "#f8bd78"], ["unsure", "#f8e78d"], ["gap", "#e7787f"],
-] as const;
-
-function key(text: string, colour: string): HTMLElement {
-  const patch = el("i", {});
-  patch.style.background = colour;
-  return el("span", {}, patch, text);
-}
-
 /** The coverage layer next to the scene: gaps and weak places, new every few seconds. */
 function coverageButton({ coverage, id }: Parts): HTMLElement {
   const button = el("button", { textContent: "Coverage", title: "gaps and weak places so far" });
   const image = el("img", { alt: "coverage: gaps red, weak yellow, good green" });
   const none = el("p", { textContent: "No surface yet." });
-  const keys = el("p", { className: "keys" }, ...COVERAGE_KEYS.map(([text, colour]) => key(text, colour)));
+  const keys = coverageKeys();
   image.onerror = () => coverage.replaceChildren(none);
   image.onload = () => coverage.replaceChildren(image, keys);
   const refresh = (): void => {

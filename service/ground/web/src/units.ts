@@ -27,8 +27,15 @@ export const area = (m2: number): string =>
   imperial() ? `${(m2 / FOOT ** 2).toFixed(1)} ft²` : `${m2.toFixed(1)} m²`;
 
 /** Imperial volumes of earth are cubic yards. */
-export const volume = (m3: number): string =>
-  imperial() ? `${Math.round(m3 / (3 * FOOT) ** 3).toLocaleString("en")} yd³` : `${Math.round(m3).toLocaleString("en")} m³`;
+export const volume = (m3: number): string => {
+  const value = imperial() ? m3 / (3 * FOOT) ** 3 : m3;
+  const digits = value < 10 ? 2 : value < 100 ? 1 : 0;
+  const text = value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
+  return `${text} ${imperial() ? "yd³" : "m³"}`;
+};
 
 export const speed = (m_s: number): string =>
   imperial() ? `${((m_s * 3600) / 1609.344).toFixed(1)} mph` : `${m_s.toFixed(1)} m/s`;
+
+/** A small share of something. */
+export const share = (value: number): string => `${(100 * value).toFixed(value < 0.1 ? 1 : 0)} %`;

@@ -69,6 +69,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     target: () => (stage.model.children.length ? stage.model : cloud.group),
     cloud: cloud.group,
     origin: scan.origin,
+    scaleSigma: () => known.quality?.scale_sigma,
   };
   const ruler = new Ruler(scene);
   ruler.offer = placing(scan, () => ruler.rewrite());
@@ -164,6 +165,7 @@ function rows(cloud: Cloud, { counts, quality }: api.Scan, finished: boolean, la
   ];
   if (finished && quality?.sigma_median_m) facts.push(["Relative σ", units.length(quality.sigma_median_m)]);
   if (finished && quality?.position_sigma_median_m) facts.push(["Absolute σ", units.length(quality.position_sigma_median_m)]);
+  if (finished && quality?.scale_sigma) facts.push(["Scale σ", units.share(quality.scale_sigma)]);
   if (last) facts.push(["Flown", units.length(last.distance_m, 0)]);
   if (last && !finished) {
     facts.push(["Speed", units.speed(last.speed_m_s)]);

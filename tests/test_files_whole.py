@@ -1,0 +1,46 @@
+"""Files that appear whole or not at all, also when several write one at once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+from service.scans.writing import writing
+
+
+def test_two_writers_of_one_file_do_not_mix(tmp_path: Path) -> None:
+    path, both = tmp_path / "dsm.tif", threading.Barrier(2)
+    faults: list[Exception] = []
+
+    def write(text: str) -> None:
+        try:
+            with writing(path) as part:
+                part.write_text(text)
+                both.wait(10.0)
+        except Exception as error:
+            faults.append(error)
+
+    texts = ["a" * 1000, "b" * 2000]
+    threads = [threading.Thread(target=write, args=(text,)) for text in texts]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    assert faults == [] and path.read_text() in texts
+    assert [p.name for p in tmp_path.iterdir()] == ["dsm.tif"]
+
+
+def test_what_a_killed_process_left_goes_with_the_next_attempt(tmp_path: Path) -> None:
+    path = tmp_path / "cloud[1].laz"
+    killed = (
+        "import os, sys, pathlib; from service.scans.writing import writing\n"
+        "with writing(pathlib.Path(sys.argv[1])) as part:\n"
+        "    part.write_text('half'); os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", killed, str(path)], check=False)
+    assert len(list(tmp_path.iterdir())) == 1
+    with writing(path) as part:
+        part.write_text("whole")
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
