@@ -107,10 +107,12 @@ def create_store(inputs: ScanInputs) -> ScanStore:
     """The scan's folder and database; InputError when it holds a scan already."""
     path = check_new(inputs.folder)
     W, H = inputs.camera.size_px
+    # Poses have the times of exposures. Whoever looks up an image by its pose's time finds it.
+    latency_ms = inputs.config.camera.latency_ms
     header = ScanHeader(
         scan_id=inputs.scan_id,
         drone=inputs.config.scan.drone_name,
-        started_unix_ns=inputs.epoch_ns + inputs.unix_offset_ns,
+        started_unix_ns=inputs.epoch_ns + inputs.unix_offset_ns - round(1e6 * latency_ms),
         camera={
             "width": W,
             "height": H,
