@@ -311,10 +311,15 @@ def _by_telemetry(frame: FrameRows, clock: RowClock) -> Rows:
 
 
 def _with_telemetry(prior: PosePrior, rows: Rows) -> Rows:
-    """Motion by neighbours and by telemetry's turn, where there is one, each by its weight."""
+    """Motion by neighbours and by telemetry's turn, where there is one, each by its weight.
+
+    Few samples make the covariance; what it says of both parts of the motion together would throw
+    the velocity off.
+    """
     if prior.turn_rad_s is None:
         return rows
-    P = rows.covariance
-    gain = P[:, :3] @ np.linalg.inv(P[:3, :3] + prior.sigma_turn_rad_s**2 * np.eye(3))
-    rate = rows.rate - gain @ (rows.rate[:3] + prior.turn_rad_s)
-    return replace(rows, rate=rate, covariance=P - gain @ P[:3])
+    P, rate, spread = rows.covariance[:3, :3], rows.rate.copy(), np.zeros((6, 6))
+    gain = P @ np.linalg.inv(P + prior.sigma_turn_rad_s**2 * np.eye(3))
+    rate[:3] -= gain @ (rate[:3] + prior.turn_rad_s)
+    spread[:3, :3], spread[3:, 3:] = P - gain @ P, rows.covariance[3:, 3:]
+    return replace(rows, rate=rate, covariance=spread)
