@@ -313,8 +313,7 @@ def _by_telemetry(frame: FrameRows, clock: RowClock) -> Rows:
 def _with_telemetry(prior: PosePrior, rows: Rows) -> Rows:
     """Motion by neighbours and by telemetry's turn, where there is one, each by its weight.
 
-    Few samples make the covariance; what it says of both parts of the motion together would throw
-    the velocity off.
+    The velocity stays: few samples make the covariance, too few for the correlation of both.
     """
     if prior.turn_rad_s is None:
         return rows
