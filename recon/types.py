@@ -98,6 +98,7 @@ class PosePrior:
     velocity_m_s: F64 | None = None  # (3,) ENU, of the vehicle
     travel: Travel | None = None  # the velocity integrated up to this moment
     turn_rad_s: F64 | None = None  # (3,) angular velocity of the camera, in its own frame
+    sigma_turn_rad_s: float = 0.02  # of each axis
     is_sigma_claimed: bool = True  # by the receiver; False: sigma_position_m is a typical one
 
 

@@ -481,6 +481,11 @@ DATAFLASH = {
     "RFND": ("QBfBB", "TimeUS,Instance,Dist,Stat,Orient", "QBfBB"),
     "TERR": ("QBf", "TimeUS,Status,CHeight", "QBf"),
     "MNT": ("QBffff", "TimeUS,I,Roll,Pitch,YawB,YawE", "QBffff"),
+    "RATE": ("Qffffff", "TimeUS,RDes,R,PDes,P,YDes,Y", "Qffffff"),
+    "IMU": ("QBfff", "TimeUS,I,GyrX,GyrY,GyrZ", "QBfff"),
+    "UNIT": ("QB64s", "TimeUS,Id,Label", "QBZ"),
+    "MULT": ("QBd", "TimeUS,Id,Mult", "Qbd"),
+    "FMTU": ("QB16s16s", "TimeUS,FmtType,UnitIds,MultIds", "QBNN"),
 }
 
 
@@ -501,9 +506,17 @@ class DataflashWriter:
             "<BB4s16s64s", number, size, name, kinds, columns
         )
 
-    def add(self, name: str, *values: float) -> None:
+    def add(self, name: str, *values: float | bytes) -> None:
         self.data += bytes((0xA3, 0x95, self._numbers[name]))
         self.data += struct.pack("<" + DATAFLASH[name][0], *values)
+
+    def state_units_of_rate(self) -> None:
+        """As Copter does since 3.6."""
+        self.add("UNIT", 0, ord("s"), b"s")
+        self.add("UNIT", 0, ord("k"), b"deg/s")
+        self.add("MULT", 0, ord("F"), 1e-6)
+        self.add("MULT", 0, ord("?"), 1.0)
+        self.add("FMTU", 0, self._numbers["RATE"], b"skkkkkk", b"F??????")
 
 
 def dataflash_flight(dated: bool) -> DataflashWriter:
@@ -552,6 +565,36 @@ def test_an_ardupilot_onboard_log(tmp_path: Path, dated: bool) -> None:
     assert late is not None and late.sources[-1] == "rangefinder"
     path.write_bytes(dataflash_flight(dated).data[:-700])
     assert load_telemetry(path).counts["ATT"] > 190
+
+
+@pytest.mark.parametrize("has_rate", [True, False], ids=["RATE", "IMU"])
+def test_rates_of_an_onboard_log_turn_the_body_between_its_attitudes(
+    tmp_path: Path, has_rate: bool
+) -> None:
+    """Of a roll at 1 Hz, with an attitude ten times a second; RATE without a unit is not read."""
+    writer, swing = DataflashWriter(), 2.0 * math.pi
+    if has_rate:
+        writer.state_units_of_rate()
+    for k in range(400):
+        us, t = 30_000_000 + k * 10_000, 0.01 * k
+        if k % 4 == 1:
+            off = 100.0 if has_rate else 0.0  # read only where RATE is not
+            writer.add("IMU", us, 0, 0.35 * swing * math.cos(swing * t) + off, 0.0, 0.0)
+            writer.add("IMU", us, 1, 1.0, 2.0, 3.0)
+        if k % 10 == 0:
+            writer.add("ATT", us, round(math.degrees(35.0 * math.sin(swing * t))), 0, 0, 3)
+            deg_s = math.degrees(0.35 * swing * math.cos(swing * t))
+            writer.add("RATE", us, 0.0, deg_s if has_rate else 100.0 * deg_s, 0.0, 0.0, 0.0, 0.0)
+    path = tmp_path / "log.BIN"
+    path.write_bytes(writer.data)
+    history = load_telemetry(path).history
+    errors = []
+    for k in range(100, 300):
+        state = history.state_at(30_000_000_000 + k * 10_000_000)
+        assert state is not None and state.q_ned_body_wxyz is not None
+        true = quaternion.from_rpy(0.35 * math.sin(swing * 0.01 * k), 0.0, 0.0)
+        errors.append(angle(state.q_ned_body_wxyz, true))
+    assert max(errors) < math.radians(0.1)  # without rates 1.0
 
 
 class UlogWriter:

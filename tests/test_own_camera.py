@@ -19,11 +19,13 @@ from recon.backends import Backend
 from recon.camera_model import rays
 from recon.types import F64, U8, Camera, Shutter
 from service.cameras.camera_file import load_camera, save_camera
+from service.cameras.images import open_images
 from service.cameras.source import CameraSource
 from service.cli import app
-from service.config import Config
+from service.config import Config, load_config
 from service.errors import InputError
 from service.flight.scan import ScanInputs, create_store
+from service.flight.telemetry_check import TelemetryCheck
 from service.offline.refine.own_camera import (
     FILE,
     camera_of,
@@ -127,6 +129,23 @@ def test_a_folder_of_stills_is_a_recording_too(tmp_path: Path) -> None:
         assert cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((60, 80, 3), 40 * k, np.uint8))
     times = [int(2e18) + k * 10**9 for k in range(4)]
     found = images_at(tmp_path, times[0], times)
+    assert [int(found[k].mean()) for k in range(4)] == [0, 40, 80, 120]
+
+
+def test_images_are_found_by_the_times_of_their_exposures(tmp_path: Path) -> None:
+    """A keyframe's time is its stamp less the camera's latency."""
+    stills = tmp_path / "stills"
+    stills.mkdir()
+    for k in range(4):
+        assert cv2.imwrite(str(stills / f"{k}.png"), np.full((60, 80, 3), 40 * k, np.uint8))
+    config, source = load_config(None, ["camera.latency_ms=400"]), open_images(str(stills), {})
+    inputs = ScanInputs(
+        source, TRUE, config, cast(Backend, None), tmp_path / "scan", "late", int(2e18)
+    )
+    check = TelemetryCheck(config.camera, None, print)
+    times = [check.exposed_ns(inputs.epoch_ns + frame.time_ns) for frame in source]
+    with create_store(inputs) as store:
+        found = images_at(stills, store.header.started_unix_ns, times)
     assert [int(found[k].mean()) for k in range(4)] == [0, 40, 80, 120]
 
 

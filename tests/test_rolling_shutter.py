@@ -207,7 +207,7 @@ def test_frames_after_the_first_tell_how_its_rows_moved(flown: list[U8]) -> None
         T, turn = se3.inverse(swinging(i / 15)), -derivative(i / 15 - 0.1)[:3]
         prior = PosePrior(
             T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 1.0,
-            velocity_m_s=np.array([8.0, 1.0, 0.0]), turn_rad_s=turn,
+            velocity_m_s=np.array([8.0, 1.0, 0.0]), turn_rad_s=turn, sigma_turn_rad_s=0.2,
         )  # fmt: skip
         odometry.track(image, i, int(i * 1e9 / 15), prior)
     first = odometry.keyframes[0].moving

@@ -109,8 +109,10 @@ def test_the_readout_is_found_by_the_turns_of_the_rows(readout_s: float) -> None
     assert found.camera.shutter == Shutter(abs(found.readout_s), "down" if readout_s > 0 else "up")
     still = network(CAMERA, poses, seen, known, camera_information(CAMERA, LENS))
     assert off_m(found.poses) < 0.7 * off_m(still.solution.poses)
-    turns = np.degrees(found.rates[:, :2] - [rate_at(t)[:2] for t in times()])
-    assert np.sqrt(np.mean(turns**2)) < 3.0
+    off = found.rates[:, :3] - [rate_at(t)[:3] for t in times()]
+    assert np.sqrt(np.mean(off[:, :2] ** 2)) < np.radians(3.0)
+    sigmas = np.sqrt(np.diagonal(found.turn_covariances, axis1=1, axis2=2))
+    assert 0.3 < np.sqrt(np.mean((off / sigmas) ** 2)) < 2.0
 
 
 @pytest.mark.parametrize("share", [0.0, 1e-17])

@@ -13,7 +13,7 @@ from recon import se3
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from recon.types import F64, DepthMap
 from service.flight.surface_map import MAX_OVER, SIGMA_K1, PagedMap, SurfaceMap
-from service.flight.viewpoints import StereoCandidate
+from service.flight.viewpoints import KNOWN_ROWS, StereoCandidate
 from service.progress import Stopwatch
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
@@ -112,7 +112,7 @@ def test_an_assumed_lens_widens_what_is_stored_and_not_the_choice(
     """2 % of the depth; a better view still counts as better."""
     surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], assumed)
     first, better = (view(0.0, sigma_m=sigma) for sigma in (0.2, 0.05))
-    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=0.0))
+    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=KNOWN_ROWS))
     sigma, fresh = surface(candidate, first, first.T_world_camera)
     np.testing.assert_allclose(sigma, np.hypot(0.2, share * first.depth_m), rtol=1e-5)
     assert fresh.all() and sigma.dtype == np.float32
@@ -123,7 +123,7 @@ def test_an_unknown_distortion_widens_the_sigma_towards_the_corners() -> None:
     """By the change of disparity that k1 of one sigma makes, on average over both axes."""
     surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], ("distortion",))
     seen = view(0.0, sigma_m=0.2)
-    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=0.0))
+    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=KNOWN_ROWS))
     sigma, _ = surface(candidate, seen, seen.T_world_camera)
     h = sigma.shape[0]
     row, column, k1, b = h - 1, 0, SIGMA_K1, 1e-4
@@ -142,7 +142,11 @@ def test_an_unknown_readout_widens_the_sigma_and_gives_way_to_what_is_seen_later
     surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0])
     seen = view(0.0, sigma_m=0.05)
     unsure, sure = (
-        cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=share)) for share in (0.03, 0.0)
+        cast(
+            StereoCandidate,
+            SimpleNamespace(segment=0, rows_share=np.full((1, 1), share, np.float32)),
+        )
+        for share in (0.03, 0.0)
     )
     sigma, _ = surface(unsure, seen, seen.T_world_camera)
     np.testing.assert_allclose(sigma, np.hypot(0.05, 0.03 * seen.depth_m), rtol=1e-5)
@@ -155,6 +159,6 @@ def test_an_unknown_readout_widens_the_sigma_and_gives_way_to_what_is_seen_later
 def test_images_that_are_not_reduced_are_noisier(reduced: float, expected: float) -> None:
     surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), reduced * K[0, 0])
     seen = view(0.0)
-    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=0.0))
+    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=KNOWN_ROWS))
     sigma, _ = surface(candidate, seen, seen.T_world_camera)
     np.testing.assert_allclose(sigma, expected * 0.2, rtol=1e-5)

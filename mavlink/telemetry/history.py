@@ -109,6 +109,14 @@ class VehicleHistory:
         with self._lock:
             return [(AttitudeSample(None, _quaternion(r)), t) for t, r in self._attitude.items()]
 
+    def gap_s(self, time_ns: int) -> float:
+        """Seconds between the attitudes of the camera's head about a time, or of the body; 0 where
+        none are near."""
+        with self._lock:
+            tracks = [*(self._gimbals[key] for key in self._gimbal_order()), self._attitude]
+            around = [at for track in tracks if (at := track.around(time_ns)) is not None]
+        return around[0].gap_s if around else 0.0
+
     def bodies(self, since_ns: int = 0) -> list[tuple[int, Quaternion]]:
         """The body's attitude at every sample, and between slow samples whose rates are known."""
         out = []

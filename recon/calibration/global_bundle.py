@@ -338,6 +338,12 @@ def step_covariances(problem: Problem) -> F64:
     return bundle.step_covariances(bundle.start)
 
 
+def turn_covariances(problem: Problem) -> F64:
+    """(N, 3, 3) of the turns of the rows, in rad^2; ``problem`` holds the adjusted state."""
+    bundle = _Bundle(problem)
+    return bundle.turn_covariances(bundle.start)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
     T: F64  # (N, 4, 4) T_camera_world
@@ -560,15 +566,16 @@ class _Bundle:
     def step_covariances(self, s: _State) -> F64:
         """See :func:`step_covariances`."""
         eq, V, out = self._equations(s, 0.0), self._unknowns, np.zeros((len(s.T), 6, 6))
-        spread = np.linalg.inv(eq.Hk)
         for n in range(1, len(s.T)):
-            rows = np.r_[V * (n - 1) : V * (n - 1) + 6, V * n : V * n + 6]
-            unit = np.zeros((V * len(s.T), 12))
-            unit[rows] = np.eye(12)
-            both = eq.solved(unit)[rows] + eq.Z[rows] @ spread @ eq.Z[rows].T
+            both = _joint(eq, np.r_[V * (n - 1) : V * (n - 1) + 6, V * n : V * n + 6])
             J = np.hstack([-se3.adjoint(s.T[n] @ se3.inverse(s.T[n - 1])), np.eye(6)])
             out[n] = J @ both @ J.T
         return np.asarray(0.5 * (out + out.transpose(0, 2, 1)))
+
+    def turn_covariances(self, s: _State) -> F64:
+        """See :func:`turn_covariances`."""
+        eq, V = self._equations(s, 0.0), self._unknowns
+        return np.array([_joint(eq, np.r_[V * n + 6 : V * n + 9]) for n in range(len(s.T))])
 
     # ---- result -----------------------------------------------------------------------------
 
@@ -579,25 +586,29 @@ class _Bundle:
         errors = np.empty(len(self._view))
         errors[self._order] = self._lengths(s)
         poses = se3.each_inverse(s.T)
-        known = self._covariances(eq, spread, poses) if covariances else np.zeros((0, 6, 6))
+        known = self._covariances(eq, poses) if covariances else np.zeros((0, 6, 6))
         camera, step = _camera(self._of.camera, s.k), spread @ eq.gk
         rows = None if self._of.rows is None else replace(self._of.rows, turns=s.turns)
         return Solution(poses, s.X, camera, errors, known, spread, step, rows)
 
-    def _covariances(self, eq: _Equations, spread: F64, poses: F64) -> F64:
+    def _covariances(self, eq: _Equations, poses: F64) -> F64:
         """(N, 6, 6) of a left perturbation of T_world_camera, the camera's own included."""
         N = len(poses)
         some = np.unique(np.linspace(0, N - 1, min(N, MAX_COVARIANCES)).astype(int))
         out = []
         for n, T in zip(some, poses[some], strict=True):
-            rows = slice(self._unknowns * n, self._unknowns * n + 6)
-            unit = np.zeros((self._unknowns * N, 6))
-            unit[rows] = np.eye(6)
-            own = eq.solved(unit)[rows] + eq.Z[rows] @ spread @ eq.Z[rows].T
+            own = _joint(eq, np.r_[self._unknowns * n : self._unknowns * n + 6])
             A = se3.adjoint(T)
             out.append(0.5 * A @ (own + own.T) @ A.T)
         nearest = np.abs(np.arange(N)[:, None] - some).argmin(axis=1)
         return np.asarray(np.array(out)[nearest])
+
+
+def _joint(eq: _Equations, rows: I64) -> F64:
+    """Covariance of some unknowns of the views, the camera's own included."""
+    unit = np.zeros((len(eq.Z), len(rows)))
+    unit[rows] = np.eye(len(rows))
+    return np.asarray(eq.solved(unit)[rows] + eq.Z[rows] @ np.linalg.inv(eq.Hk) @ eq.Z[rows].T)
 
 
 def _vector(camera: Camera) -> F64:

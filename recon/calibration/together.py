@@ -20,6 +20,7 @@ from recon.calibration.global_bundle import (
     dispersion,
     solve,
     step_covariances,
+    turn_covariances,
 )
 from recon.tracking.readout_search import MAX_READOUT_S
 from recon.types import F64, Camera
@@ -64,6 +65,7 @@ class Together:
     points: F64  # (P, 3) world, m
     seen: Sightings  # that took part
     rates: F64  # (N, 6) of T_camera_world per s
+    turn_covariances: F64  # (N, 3, 3) of their rotation
     steps: F64  # (N, 6, 6) covariance of T_here_before, left perturbation; zero for the first
     sigma_px: float  # of a coordinate, as one of those that err independently
     readout_s: float  # as given or found; negative against the direction given
@@ -138,8 +140,8 @@ class _Adjustment:
         rates = np.hstack([self.turns / readout_s, turning.rates[:, 3:]])
         return Together(
             replace(self._at.camera, shutter=shutter), self._at.poses, self._at.points,
-            self._at.seen, rates, step_covariances(self._at), float(self._at.sigma_px[0]),
-            readout_s, sigma_s,
+            self._at.seen, rates, turn_covariances(self._at) / readout_s**2,
+            step_covariances(self._at), float(self._at.sigma_px[0]), readout_s, sigma_s,
         )  # fmt: skip
 
 

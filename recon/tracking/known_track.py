@@ -27,6 +27,7 @@ class KnownView:
     T_odom_camera: F64  # (4, 4) of its middle row, m
     covariance: F64  # (6, 6) of the motion from the view before, left of T_here_before
     rate: F64  # (6,) of T_camera_odom per s; unused under a global shutter
+    turn_covariance: F64  # (3, 3) of its rotation
     landmark: I64  # (n,) which of the points it shows
 
 
@@ -84,7 +85,11 @@ class KnownTrack:
         state = Tracking.KEYFRAME if self.keyframes else Tracking.STARTED
         self.segment = 0
         T_camera_odom = se3.inverse(view.T_odom_camera)
-        rows = None if self._clock is None else Rows(self._clock, view.rate, np.zeros(6))
+        rows = None
+        if self._clock is not None:
+            spread = np.zeros((6, 6))
+            spread[:3, :3] = view.turn_covariance
+            rows = Rows(self._clock, view.rate, np.zeros(6), spread)
         moving = FrameRows(time_ns, prior, T_camera_odom, rows, is_measured=True)
         key = OdometryKeyframe(
             seq, time_ns, 0, T_camera_odom, view.covariance, prior, Pyramid.build(gray, 1),

@@ -37,6 +37,9 @@ its height above the take-off point."""
 TURN_NS = 20_000_000
 """Before and after an exposure: how telemetry's attitude changes there is the camera's turn."""
 
+RATE_RAD_S, CHANGE_RAD_S2 = 0.02, 1.0
+"""Sigma of a turn by telemetry, and how fast it changes between two attitudes."""
+
 NO_YAW_RAD = 3.0
 """Sigma of an unknown heading."""
 
@@ -58,6 +61,12 @@ class Fix:
     alt_amsl_m: float | None
     sigma_h_m: float
     sigma_v_m: float
+
+
+def turn_sigma_rad_s(gap_s: float, sigma_time_s: float = 0.0) -> float:
+    """Sigma of a turn between two attitudes of telemetry ``gap_s`` apart."""
+    away_s = math.hypot(gap_s / math.sqrt(12.0), sigma_time_s)
+    return math.hypot(RATE_RAD_S, CHANGE_RAD_S2 * away_s)
 
 
 class Rig:

@@ -25,7 +25,7 @@ from recon.tracking.known_track import KnownTrack, KnownView
 from recon.types import F64, U8, Camera, Frame, PosePrior
 from service.cameras.camera_file import seeks_readout, with_shutter
 from service.cameras.images import ImagesSource
-from service.cameras.rig import Rig
+from service.cameras.rig import Rig, turn_sigma_rad_s
 from service.cameras.source import CameraFrame
 from service.config import change
 from service.errors import InputError
@@ -48,9 +48,6 @@ FIX_SIGMAS = 2.0
 FASTER, SLACK_SIGMAS = 2.0, 5.0
 """Times the vehicle's highest speed that the track between two stills may have, and sigmas of a
 fix by which it may exceed that."""
-
-RATE_RAD_S, CHANGE_RAD_S2 = 0.02, 1.0
-"""Sigma of a turn by telemetry, and how fast it changes between two attitudes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,7 +209,7 @@ def _turning(priors: Sequence[PosePrior], history: VehicleHistory) -> Turning:
         assert p.turn_rad_s is not None and p.R_world_camera is not None
         rates[k, :3], rates[k, 3:] = -p.turn_rad_s, -p.R_world_camera.T @ p.velocity_m_s
     gap_s = 1e-9 * float(np.median(np.diff([t for _, t in history.attitudes()])))
-    return Turning(rates, float(np.hypot(RATE_RAD_S, CHANGE_RAD_S2 * gap_s / np.sqrt(12.0))))
+    return Turning(rates, turn_sigma_rad_s(gap_s))
 
 
 def _track(found: Together, views: dict[int, int], lens: Camera) -> KnownTrack:
@@ -223,7 +220,7 @@ def _track(found: Together, views: dict[int, int], lens: Camera) -> KnownTrack:
     return KnownTrack(
         {
             seq: KnownView(
-                found.poses[k], found.steps[k], found.rates[k],
+                found.poses[k], found.steps[k], found.rates[k], found.turn_covariances[k],
                 number[found.seen.landmark[shown & (rows == k)]],
             )
             for seq, k in views.items()

@@ -18,9 +18,9 @@ from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
 from recon.posegraph.between_keyframes import Odometer
 from recon.tracking.known_track import KnownTrack
-from recon.types import F64, Camera, Frame, Keyframe, Shutter
+from recon.types import Camera, Frame, Keyframe, PosePrior, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter
-from service.cameras.rig import ASSUMED_AGL_M, Rig
+from service.cameras.rig import ASSUMED_AGL_M, Rig, turn_sigma_rad_s
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config
 from service.errors import InputError
@@ -91,10 +91,13 @@ def create_store(inputs: ScanInputs) -> ScanStore:
     """The scan's folder and database; InputError when it holds a scan already."""
     path = check_new(inputs.folder)
     W, H = inputs.camera.size_px
+    # Poses have the times of exposures. Whoever looks up an image by its pose's time finds it.
+    start_ns = inputs.epoch_ns + inputs.unix_offset_ns
+    start_ns -= round(1e6 * inputs.config.camera.latency_ms)
     header = ScanHeader(
         scan_id=inputs.scan_id,
         drone=inputs.config.scan.drone_name,
-        started_unix_ns=inputs.epoch_ns + inputs.unix_offset_ns,
+        started_unix_ns=max(start_ns, 0),
         camera={
             "width": W,
             "height": H,
@@ -166,7 +169,7 @@ class Scan:
         self.attitudes += self.rig.attitude_known(state, frame.geotag)
         prior = self._odometer.take(exposed_ns, self.rig.prior(state, frame.geotag))
         if self.pipeline.stages.track.odometry.needs_turn(exposed_ns):
-            prior = replace(prior, turn_rad_s=self._turn(exposed_ns))
+            prior = self._turning(prior, exposed_ns)
         step = self.pipeline.skip(exposed_ns, prior)
         if step is None:
             step = self.pipeline.step(Frame(frame.image, exposed_ns, frame.seq, prior))
@@ -180,12 +183,14 @@ class Scan:
             inputs.on_step(step, state, exposed_ns)
         return step
 
-    def _turn(self, exposed_ns: int) -> F64 | None:
-        """(3,) rad/s of the camera about the moment of exposure, in its frame, by telemetry."""
+    def _turning(self, prior: PosePrior, exposed_ns: int) -> PosePrior:
+        """The prior with the camera's turn about the moment of exposure, by telemetry."""
         history = self.inputs.history
-        if history is None:
-            return None
-        return self.rig.turn_at(history.state_at, exposed_ns)
+        turn = None if history is None else self.rig.turn_at(history.state_at, exposed_ns)
+        if history is None or turn is None:
+            return prior
+        sigma = turn_sigma_rad_s(history.gap_s(exposed_ns), self.check.doubt_s)
+        return replace(prior, turn_rad_s=turn, sigma_turn_rad_s=sigma)
 
     def run(
         self,

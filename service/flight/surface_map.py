@@ -12,6 +12,7 @@ from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from recon.mapping.disagreement import Disagreement
@@ -166,10 +167,11 @@ class SurfaceMap:
                 self._segment = view.segment
             reduced = self._focal_px / float(depth.K[0, 0])
             noise = np.float32(max(1.0, RECORDED_SIGMA_PX / LABEL_SIGMA_PX / reduced))
-            in_map = replace(depth, sigma_m=depth.sigma_m * noise, T_world_camera=T_map_camera)
+            share = cv2.resize(view.rows_share, depth.depth_m.shape[::-1])
+            sigma_m = np.hypot(depth.sigma_m * noise, share * depth.depth_m)
+            in_map = replace(depth, sigma_m=sigma_m, T_world_camera=T_map_camera)
             wider = np.float32(self._disagreement.take(in_map))
-            of_rows = np.float32(view.rows_share) * depth.depth_m
-            in_map = replace(in_map, sigma_m=np.hypot(in_map.sigma_m * wider, of_rows))
+            in_map = replace(in_map, sigma_m=in_map.sigma_m * wider)
             known = self._map
             if known is None:
                 known = self._map = self._empty(depth)

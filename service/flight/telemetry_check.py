@@ -7,6 +7,7 @@ the gimbal's frame when ``mavlink.gimbal_yaw_frame`` is "auto".
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +27,7 @@ log = logging.getLogger(__name__)
 LOOK_NS = 10_000_000_000
 REACH_NS = 60_000_000_000  # how far back telemetry is compared with frames, at least
 SLEW = 0.1  # of the time that passes, so that frames stay in order when the latency changes
+UNSEEN_S = 0.05  # sigma of a latency that the images have not shown yet
 WORTH_TELLING_MS, OFF_SIGMAS = 10.0, 5.0  # a latency that differs by less is not reported
 STILLS = 60  # images that are compared, where they come more slowly than REACH_NS holds
 
@@ -75,6 +77,14 @@ class TelemetryCheck:
             if self._earlier_ms is not None:
                 return self._earlier_ms
         return self._camera.latency_ms
+
+    @property
+    def doubt_s(self) -> float:
+        """Sigma of the latency applied, by the images."""
+        if self.latency is None:
+            return UNSEEN_S
+        off_ms = self.latency.latency_ms - self.applied_ms
+        return 1e-3 * math.hypot(self.latency.sigma_ms, off_ms)
 
     def exposed_ns(self, stamp_ns: int) -> int:
         """When the frame of this stamp was exposed; later for every later frame."""

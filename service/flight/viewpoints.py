@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,12 +17,13 @@ from recon import se3
 from recon.camera_model import Undistorter
 from recon.posegraph.between_keyframes import FixAverage
 from recon.rolling_shutter import NEAR_S, FrameRows, depth_share
+from recon.row_errors import turn_shares
 from recon.stereo.virtual_stereo import View
 from recon.tracking.keyframe_window import OdometryKeyframe, landmarks, step_covariance
 from recon.tracking.known_track import AnyTrack
 from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.prediction import inverse_depth_plane
-from recon.types import F64, U8, Camera, PosePrior
+from recon.types import F32, F64, U8, Camera, PosePrior
 from service.config import ScanConfig, parse_baseline
 from service.flight.anchorage import Anchorage
 
@@ -48,6 +49,9 @@ TRACKED = 128
 HELD = 5
 """Views that wait at most for the first word on a readout that is not stated: all are among
 those kept."""
+
+KNOWN_ROWS = np.zeros((1, 1), np.float32)
+"""No uncertain motion of rows adds to the sigma of depth."""
 
 LAST_VIEW_SHARE = 0.1
 """A stretch's last frame becomes a view when it is this share of a usual step further on."""
@@ -122,7 +126,8 @@ class StereoCandidate:
     points: F64  # (N, 3) landmarks in the view's camera
     covariance: F64  # (6, 6) of vision's motion from the view before, left, in the view's camera
     earlier: Mapping[int, F64]  # number to pose (4, 4) of the segment's last few views
-    rows_share: float = 0.0  # sigma of depth over depth, by a readout that is not sure
+    # (n, m), all over the image: sigma of depth over depth by readout and turns that are not sure
+    rows_share: F32 = field(default_factory=KNOWN_ROWS.copy)
 
 
 class Viewpoints:
@@ -408,26 +413,26 @@ class StereoViews:
             self._rows_share(view, partners, points),
         )
 
-    def _rows_share(self, view: Viewpoint, partners: list[Viewpoint], points: F64) -> float:
-        """Sigma of depth over depth by what is not known of the readout.
+    def _rows_share(self, view: Viewpoint, partners: list[Viewpoint], points: F64) -> F32:
+        """(n, m) sigma of depth over depth by what is not known of readout and turns.
 
         ``points`` (N, 3) of the view's camera are the ground.
         """
-        search = self._odometry.readout
-        doubt_s = 0.0 if search is None else search.doubt_s
         rows = None if view.moving is None else view.moving.rows
-        if doubt_s == 0.0 or rows is None:
-            return 0.0
-        seen = points[points[:, 2] > 0]
-        shares = [
-            depth_share(
-                rows, partner.moving.rows, se3.inverse(partner.T_odom_camera) @ view.T_odom_camera,
-                seen, doubt_s,
-            )
+        pairs = [
+            (partner.moving.rows, se3.inverse(partner.T_odom_camera) @ view.T_odom_camera)
             for partner in partners
             if partner.moving is not None and partner.moving.rows is not None
-        ]  # fmt: skip
-        return float(np.median(shares)) if shares else 0.0
+        ]
+        seen = points[points[:, 2] > 0]
+        if rows is None or not pairs or not len(seen):
+            return KNOWN_ROWS
+        search, of_readout = self._odometry.readout, 0.0
+        if search is not None and search.doubt_s:
+            shares = [depth_share(rows, other, T, seen, search.doubt_s) for other, T in pairs]
+            of_readout = float(np.median(shares))
+        of_turns = turn_shares(rows, pairs, seen, self._K, view.gray.shape[::-1])
+        return np.asarray(np.hypot(of_readout, of_turns), np.float32)
 
     def _step_covariance(self, view: Viewpoint) -> F64:
         """(6, 6) of the motion since the view given before."""

@@ -5,10 +5,18 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mavlink.telemetry.decode import DOWNWARD, TERRAIN_MODEL_SIGMA_M, plausible_place
+import numpy as np
+
+from mavlink.telemetry.decode import (
+    DOWNWARD,
+    MAX_RATE_RAD_S,
+    TERRAIN_MODEL_SIGMA_M,
+    plausible_place,
+)
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog, finish
 from mavlink.telemetry.quaternion import from_rpy
@@ -26,6 +34,9 @@ from mavlink.telemetry.samples import (
 HEADER = b"\xa3\x95"
 UNIX_FROM_S = 1e9
 FRESH_S = 0.25
+NEAR_S = 0.05
+"""Rates of the body are known so long before and after a sample of theirs."""
+
 GOOD = 4  # RangeFinder status
 
 
@@ -38,13 +49,19 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     counts: Counter[str] = Counter()
     reader = _Reader()
     first_s: float | None = None
+    attitudes: list[tuple[AttitudeSample, float]] = []
     for message in _messages(path):
         name = message.get_type()
         counts[name] += 1
         sample = reader.sample(name, message)
         if sample is not None:
             first_s = message._timestamp if first_s is None else first_s
-            history.add(sample, round(message._timestamp * 1e9))
+            if isinstance(sample, AttitudeSample):
+                attitudes.append((sample, message._timestamp))
+            else:
+                history.add(sample, round(message._timestamp * 1e9))
+    for attitude, time_s in reader.gyros.turning(attitudes):
+        history.add(attitude, round(time_s * 1e9))
     dated = first_s is not None and first_s > UNIX_FROM_S
     warnings = [] if dated else ["no GPS time in this log: its clock starts at boot"]
     return finish(path, history, counts, warnings, "unix" if dated else "boot")
@@ -70,10 +87,46 @@ def _messages(path: Path) -> Iterator[Any]:
         log.close()
 
 
-class _Reader:
-    """Messages into samples; remembers the last velocity, which has its own message."""
+class _Gyros:
+    """Rates of the body: those of the attitude's filter (RATE), else those of its IMU.
+
+    Copter before 3.6 states no unit of RATE, and it was another one before 3.4.
+    """
 
     def __init__(self) -> None:
+        self._samples: dict[str, list[tuple[float, ...]]] = {"RATE": [], "IMU": []}
+
+    def add(self, name: str, m: Any) -> None:
+        """A message RATE or IMU."""
+        if name == "RATE" and m.fmt.get_unit("R") == "deg/s":
+            self._samples[name].append((m._timestamp, *map(math.radians, (m.R, m.P, m.Y))))
+        elif name == "IMU" and getattr(m, "I", 0) == 0:
+            self._samples[name].append((m._timestamp, m.GyrX, m.GyrY, m.GyrZ))
+
+    def turning(
+        self, attitudes: list[tuple[AttitudeSample, float]]
+    ) -> Iterator[tuple[AttitudeSample, float]]:
+        """Attitudes and their times in s, with the rates where they are known."""
+        table = np.array(self._samples["RATE"] or self._samples["IMU"]).reshape(-1, 4)
+        table = table[(np.abs(table[:, 1:]) <= MAX_RATE_RAD_S).all(axis=1)]
+        times = np.array([time_s for _, time_s in attitudes])
+        if not len(table) or not len(times):
+            yield from attitudes
+            return
+        rates = np.column_stack([np.interp(times, table[:, 0], w) for w in table.T[1:]])
+        after = np.clip(np.searchsorted(table[:, 0], times), 1, max(len(table) - 1, 1))
+        around = table[np.minimum([after - 1, after], len(table) - 1), 0]
+        near = np.abs(around - times).min(axis=0) <= NEAR_S
+        for (attitude, time_s), rate, is_known in zip(attitudes, rates, near, strict=True):
+            x, y, z = rate.tolist()
+            yield (replace(attitude, rates_rad_s=(x, y, z)) if is_known else attitude), time_s
+
+
+class _Reader:
+    """Messages into samples; remembers velocities and rates, which have their own messages."""
+
+    def __init__(self) -> None:
+        self.gyros = _Gyros()
         self._velocity: tuple[float, tuple[float, float, float]] | None = None
         self._fix = True
         self._fix_alt_m: float | None = None
@@ -89,6 +142,10 @@ class _Reader:
         if not all(map(math.isfinite, angles)):
             return None
         return AttitudeSample(None, from_rpy(*map(math.radians, angles)))
+
+    def _rates(self, m: Any) -> Sample | None:
+        self.gyros.add(m.get_type(), m)
+        return None
 
     def _ekf_velocity(self, m: Any) -> Sample | None:
         if getattr(m, "C", 0) == 0:
@@ -134,6 +191,8 @@ class _Reader:
 
     TABLE: dict[str, Callable[[_Reader, Any], Sample | None]] = {  # noqa: RUF012
         "ATT": _attitude,
+        "RATE": _rates,
+        "IMU": _rates,
         "XKF1": _ekf_velocity,
         "NKF1": _ekf_velocity,
         "POS": _position,
