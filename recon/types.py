@@ -99,6 +99,7 @@ class PosePrior:
     travel: Travel | None = None  # the velocity integrated up to this moment
     turn_rad_s: F64 | None = None  # (3,) angular velocity of the camera, in its own frame
     is_sigma_claimed: bool = True  # by the receiver; False: sigma_position_m is a typical one
+    is_view_assumed: bool = False  # R_world_camera is the nominal mount on a level vehicle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
