@@ -100,6 +100,7 @@ class PosePrior:
     turn_rad_s: F64 | None = None  # (3,) angular velocity of the camera, in its own frame
     sigma_turn_rad_s: float = 0.02  # of each axis
     is_sigma_claimed: bool = True  # by the receiver; False: sigma_position_m is a typical one
+    is_view_assumed: bool = False  # R_world_camera is the nominal mount on a level vehicle
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -37,7 +37,10 @@ def ground_seen(R_world_camera: F64, relief_m: float = 0.0) -> F64:
     return np.asarray(ground @ R_world_camera)
 
 
-NADIR = PosePrior(R_world_camera=looking(-90), sigma_tilt_rad=ASSUMED_TILT_RAD, sigma_yaw_rad=3.0)
+NADIR = PosePrior(
+    R_world_camera=looking(-90), sigma_tilt_rad=ASSUMED_TILT_RAD, sigma_yaw_rad=3.0,
+    is_view_assumed=True,
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("pitch_deg", [-60, -40, -25])
@@ -51,7 +54,7 @@ def test_a_view_far_from_the_assumed_one_is_levelled_by_its_ground(pitch_deg: fl
 
 def test_a_known_attitude_and_a_slope_below_the_camera_stay() -> None:
     steep = ground_seen(looking(-40))
-    known = replace(NADIR, sigma_tilt_rad=0.02)
+    known = replace(NADIR, sigma_tilt_rad=0.02, is_view_assumed=False)
     assert levelled(known, steep) is known
     assert levelled(NADIR, ground_seen(looking(-75))) is NADIR
     blind = PosePrior()

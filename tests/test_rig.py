@@ -110,6 +110,12 @@ def test_a_image_tag_serves_when_there_is_no_telemetry() -> None:
     assert prior.sigma_position_m[2] < 10.0 < bare.sigma_position_m[2]  # a drone's barometer
     stated = rig().prior(None, replace(tag, relative_alt_m=None, sigma_v_m=3.4))
     assert stated.sigma_position_m is not None and stated.sigma_position_m[2] == 3.4
+    assert stated.is_sigma_claimed and not bare.is_sigma_claimed
+    flat = rig().prior(None, replace(tag, alt_amsl_m=None))  # no altitude: nothing to measure
+    assert flat.sigma_position_m is not None and flat.sigma_position_m[2] > 500.0
+    assert flat.is_sigma_claimed
+    assert not prior.is_view_assumed
+    assert rig().prior(None, replace(tag, ypr_deg=None)).is_view_assumed
     _, top, view = up_and_right(prior.R_world_camera)
     np.testing.assert_allclose(view, [0, 0, -1], atol=1e-9)
     np.testing.assert_allclose(top, [1, 0, 0], atol=1e-9)

@@ -46,11 +46,14 @@ def test_the_weakest_fact_sets_the_level(
 def test_a_site_that_leans_was_not_seen_from_above() -> None:
     leaning = trust_of(SURE | {"assumed": ["view"]}, "gnss", 60.0)
     assert leaning["level"] == "doubtful" and "60 degrees" in leaning["reasons"][0]
-    unsure = trust_of(SURE | {"assumed": ["view"]}, "exif", 10.0)
-    assert unsure["level"] == "georeferenced"
-    assert "slope of 10 degrees may not be real" in unsure["reasons"][0]
-    assert trust_of(SURE | {"assumed": ["view"]}, "exif", 2.0)["reasons"] == []
     assert trust_of(SURE, "gnss", 60.0)["level"] == "georeferenced"
+
+
+def test_what_is_level_is_as_sure_as_the_track_shows_it() -> None:
+    unsure = trust_of(SURE | {"assumed": ["view"], "lean_sigma_deg": 5.8}, "exif", 10.0)
+    assert unsure["level"] == "georeferenced" and "lean by 6 degrees" in unsure["reasons"][0]
+    shown = trust_of(SURE | {"assumed": ["view"], "lean_sigma_deg": 0.3}, "exif", 10.0)
+    assert shown["reasons"] == []
 
 
 @pytest.mark.parametrize(

@@ -9,15 +9,18 @@ height and robust weights added, solved by Gauss-Newton).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
 from recon import se3
+from recon.posegraph.level_ground import ASSUMED_TILT_RAD
 from recon.posegraph.sensor_noise import (
     MIN_READINGS,
     MIN_WANDER,
+    SURE_OF_WANDER,
     Noise,
     drift_noise,
     wander_noise,
@@ -80,8 +83,40 @@ KNOWN_YAW_RAD, NO_YAW_RAD = 1.0, 3.0
 MIN_FIX_M = 0.005
 """Sigma that no fix is better than."""
 
+UNKNOWNS = 11
+"""Rotation, shift and log scale; an assumed view's mount and the drift of altitudes."""
+
+ROUNDS = 4
+"""Times that the noise of altitudes and the tilt by them are found in turn."""
+
+TINY = 1e-6
+"""Sigma of what no reading has."""
+
 MIN_WALK, MIN_RATE_M_S = 0.02, 0.01
 """The same of an integrated velocity: m / sqrt(s), and the constant part of its error."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Common:
+    """Errors that readings of one kind have in common, where nothing states their accuracy."""
+
+    mount_rad: F64 = field(default_factory=lambda: np.zeros(3))  # turns an assumed view
+    drift_m: float = 0.0  # by which altitudes are too high at the end, and too low at the start
+    middle_s: float = 0.0
+    half_s: float = 1.0
+
+    def along(self, time_s: float | F64) -> F64:
+        """Times as -1 at the start of the readings to 1 at their end, and no further."""
+        return np.asarray(np.clip((time_s - self.middle_s) / self.half_s, -1.0, 1.0))
+
+    def applied(self, prior: PosePrior, time_s: float) -> PosePrior:
+        """The prior without them."""
+        R, position = prior.R_world_camera, prior.position_m
+        if R is not None and prior.is_view_assumed:
+            R = R @ se3.so3_exp(self.mount_rad)
+        if position is not None:
+            position = position - np.array([0.0, 0.0, self.drift_m * float(self.along(time_s))])
+        return replace(prior, R_world_camera=R, position_m=position)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,11 +131,20 @@ class Similarity:
     noise: ReadingNoise | None = None  # as measured by the fit; None without one
     sigma_fixes: F64 | None = None  # (3,) m of the mean error of all fixes, where they wander
     sigma_counted: F64 | None = None  # (3,) m that the readings in the graph count for it
+    common: Common = field(default_factory=lambda: Common())
+    lean: F64 | None = None  # (6, 6) of a left perturbation that tilts all; None: level is known
 
     @property
     def sigma_scale(self) -> float:
         """Relative 1-sigma uncertainty of the scale."""
         return float(np.sqrt(self.covariance[6, 6]))
+
+    @property
+    def sigma_lean_rad(self) -> float | None:
+        """1-sigma uncertainty of what is level, about the axis where it is largest."""
+        if self.lean is None:
+            return None
+        return float(np.sqrt(np.linalg.eigvalsh(self.lean[:2, :2])[-1]))
 
     def place(self, x_odom: F64) -> F64:
         """(3,) m of a place (3,) in the odometry."""
@@ -219,6 +263,7 @@ class ReadingNoise:
     horizontal: Noise | None = None  # of a fix, m; None: as it claims
     vertical: Noise | None = None
     reach_m: F64 | None = None  # (3,) how far fixes may wander
+    tilt: Noise | None = None  # of an assumed view about its mount, rad
     walk_m_per_sqrt_s: float = 0.1  # of the integrated velocity
     rate_m_s: float = 0.05  # constant part of the velocity's error
 
@@ -231,6 +276,14 @@ class ReadingNoise:
                 weighing[:, axes] = max(noise.of_each(len(claimed), span_s), MIN_FIX_M)
                 single[:, axes] = max(noise.total, MIN_FIX_M)
         return weighing, single
+
+    def of_tilts(self, claimed: F64, times_s: F64, attitude_s: float) -> F64:
+        """(n, 2) sigma with which assumed views weigh, of (n, 2) claimed ones at (n,) times."""
+        span_s = float(np.ptp(times_s)) if len(times_s) else 0.0
+        if self.tilt is not None:
+            return np.full_like(claimed, self.tilt.of_each(len(claimed), span_s))
+        independent = 1.0 + span_s / (2.0 * max(attitude_s, 1e-3))
+        return np.asarray(claimed * np.sqrt(max(1.0, len(claimed) / independent)))
 
     def of_mean(self, claimed: F64, times_s: F64, fix_s: float) -> tuple[F64, F64]:
         """(3,) sigma of the mean error of fixes with (m, 3) claimed sigmas at (m,) times, and what
@@ -249,10 +302,30 @@ class ReadingNoise:
         return np.asarray(np.sqrt(variance * np.maximum(seconds, 1e-3)))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """A similarity, and the errors that readings have in common."""
+
+    R: F64
+    t: F64
+    log_scale: float
+    mount: F64 = field(default_factory=lambda: np.zeros(3))
+    drift: float = 0.0
+
+    def moved(self, step: F64) -> _State:
+        """The state after a step (UNKNOWNS,)."""
+        return _State(
+            se3.so3_exp(step[:3]) @ self.R, self.t + step[3:6], self.log_scale + float(step[6]),
+            self.mount + step[7:10], self.drift + float(step[10]),
+        )  # fmt: skip
+
+
 class _Readings:
     """The anchors' readings as arrays, by kind; rows of one reading form a group."""
 
-    def __init__(self, anchors: Sequence[Anchor], noise: ReadingNoise | None = None) -> None:
+    def __init__(
+        self, anchors: Sequence[Anchor], noise: ReadingNoise | None = None, attitude_s: float = 40.0
+    ) -> None:
         turned = [a for a in anchors if a.prior.R_world_camera is not None]
         fixed = [a for a in anchors if _has_fix(a.prior)]
         moved = [(a, b) for a, b in pairwise(anchors) if _are_on_one_run(a.prior, b.prior)]
@@ -260,14 +333,20 @@ class _Readings:
         noise = noise or ReadingNoise()
         self.R_odom = _stack([a.T_odom_camera[:3, :3] for a in turned], (3, 3))
         self.R_prior = _stack([a.prior.R_world_camera for a in turned], (3, 3))
+        self.is_assumed = np.array([a.prior.is_view_assumed for a in turned], bool)
         self.sigma_turn = _stack(
             [[a.prior.sigma_tilt_rad] * 2 + [a.prior.sigma_yaw_rad] for a in turned], (3,)
         )
         self.heading_known = self.sigma_turn[:, 2] < KNOWN_YAW_RAD
+        self.tilt_s = _stack([a.time_s for a in turned if a.prior.is_view_assumed], ())
+        self.sigma_turn[self.is_assumed, :2] = noise.of_tilts(
+            self.sigma_turn[self.is_assumed, :2], self.tilt_s, attitude_s
+        )
         self.x = _stack([a.place_of_fix for a in fixed], (3,))
         self.fix = _stack([a.prior.position_m for a in fixed], (3,))
         self.claimed = _stack([a.prior.sigma_position_m for a in fixed], (3,))
         self.fix_s = _stack([a.time_s for a in fixed], ())
+        self.is_height_claimed = all(a.prior.is_sigma_claimed for a in fixed)  # so without any
         self.sigma_fix, self.sigma_single = noise.of_fixes(self.claimed, self.fix_s)
         self.step = _stack([b.place - a.place for a, b in moved], (3,))
         self.way = _stack([_way(a.prior, b.prior) for a, b in moved], (3,))
@@ -278,134 +357,211 @@ class _Readings:
         self.log_ratio = _stack([h[0] for h in heights], ())
         thinned = min(1.0, (independent / max(len(heights), 1)) ** 0.5)
         self.sigma_log = _stack([h[1] for h in heights], ()) / thinned
-        one = np.ones(len(turned)), np.ones(len(moved)), np.ones(len(heights))
+        one = np.ones(len(turned)), np.ones(len(moved)), np.ones(len(heights) + 1)
         outlying = np.mean(self.sigma_fix / self.sigma_single, axis=1)
         self.outlying = np.concatenate([one[0], outlying, one[1], one[2]])
         """(groups,) what a group's whitened residual is multiplied by to find an outlier."""
-        counts = np.array([3] * (len(turned) + len(fixed) + len(moved)) + [1] * len(heights), int)
+        three, single = len(turned) + len(fixed) + len(moved), len(heights)
+        counts = np.array([3] * three + [1] * single + [4], int)
         self.group = np.repeat(np.arange(len(counts)), counts)
         """(M,) the group of each row."""
         known = 1.0 / self.sigma_turn
         known[~self.heading_known, 2] = 0.0
         way = np.repeat(1.0 / self.sigma_way, 3)
         self._whitening = np.concatenate(
-            [known.ravel(), 1.0 / self.sigma_fix.ravel(), way, 1.0 / self.sigma_log]
-        )
-        first, last = 3 * len(turned), 3 * (len(turned) + len(fixed) + len(moved))
-        self._scaled = slice(first, last)
-        self._J = np.zeros((len(self.group), 7))  # where it is constant
-        self._J[:first, :3] = np.tile(np.eye(3), (len(turned), 1))
-        self._J[first : first + 3 * len(fixed), 3:6] = np.tile(np.eye(3), (len(fixed), 1))
-        self._J[last:, 6] = 1.0
+            [known.ravel(), 1.0 / self.sigma_fix.ravel(), way, 1.0 / self.sigma_log,
+             1.0 / self._sigma_common(turned)]
+        )  # fmt: skip
+        self._turned, self._fixed = 3 * len(turned), 3 * len(fixed)
+        self._scaled = slice(self._turned, 3 * three)
+        self._J = np.zeros((len(self.group), UNKNOWNS))  # where it is constant
+        self._J[: self._turned, :3] = np.tile(np.eye(3), (len(turned), 1))
+        rows = slice(self._turned, self._turned + self._fixed)
+        self._J[rows, 3:6] = np.tile(np.eye(3), (len(fixed), 1))
+        self._J[rows, 10] = np.outer(self.along, [0.0, 0.0, 1.0]).ravel()
+        self._J[3 * three : -4, 6] = 1.0
+        self._J[-4:, 7:] = np.eye(4)
 
-    def linearised(self, R: F64, t: F64, log_scale: float) -> tuple[F64, F64]:
-        """Whitened residuals (M,) and Jacobian (M, 7)."""
-        fix, way = self.placed(R, t, log_scale), self.moved(R, log_scale)
+    def _sigma_common(self, turned: Sequence[Anchor]) -> F64:
+        """(4,) of the assumed mount and of the altitudes' drift; next to none where there is
+        neither."""
+        tilts = [a.prior.sigma_tilt_rad for a in turned if a.prior.is_view_assumed]
+        mount = float(np.median(tilts)) if tilts else TINY
+        drift = TINY if self.is_height_claimed else float(np.median(self.claimed[:, 2]))
+        return np.array([mount] * 3 + [drift])
+
+    @cached_property
+    def spanned(self) -> Common:
+        """The times of the fixes."""
+        if len(self.fix_s) == 0:
+            return Common()
+        first, last = float(self.fix_s[0]), float(self.fix_s[-1])
+        return Common(middle_s=0.5 * (first + last), half_s=max(0.5 * (last - first), 1e-3))
+
+    @property
+    def along(self) -> F64:
+        """(m,) times of the fixes, -1 to 1."""
+        return self.spanned.along(self.fix_s)
+
+    def common(self, at: _State) -> Common:
+        """What the readings have in common."""
+        return replace(self.spanned, mount_rad=at.mount, drift_m=at.drift)
+
+    def linearised(self, at: _State) -> tuple[F64, F64]:
+        """Whitened residuals (M,) and Jacobian (M, UNKNOWNS)."""
+        fix, way = self.placed(at), self.moved(at)
+        turn, of_mount = self.turned(at)
         J = self._J.copy()
-        y = np.concatenate([fix + self.fix - t, way + self.way])
-        of = J[self._scaled].reshape(-1, 3, 7)
+        drifted = np.outer(self.along * at.drift, [0.0, 0.0, 1.0])
+        y = np.concatenate([fix + self.fix - drifted - at.t, way + self.way])
+        of = J[self._scaled].reshape(-1, 3, UNKNOWNS)
         of[:, 0, 1], of[:, 1, 2], of[:, 2, 0] = y[:, 2], y[:, 0], y[:, 1]
         of[:, 0, 2], of[:, 1, 0], of[:, 2, 1] = -y[:, 1], -y[:, 2], -y[:, 0]
         of[:, :, 6] = y
-        height = log_scale - self.log_ratio
-        r = np.concatenate([self._turns(R).ravel(), fix.ravel(), way.ravel(), height])
+        J[: self._turned, 7:10] = of_mount.reshape(-1, 3)
+        height, common = at.log_scale - self.log_ratio, np.r_[at.mount, at.drift]
+        r = np.concatenate([turn.ravel(), fix.ravel(), way.ravel(), height, common])
         return r * self._whitening, J * self._whitening[:, None]
 
-    def placed(self, R: F64, t: F64, log_scale: float) -> F64:
-        """(m, 3) m from the fixes to where the similarity has them."""
-        return np.asarray(np.exp(log_scale) * self.x @ R.T + t - self.fix)
+    def placed(self, at: _State) -> F64:
+        """(m, 3) m from the fixes, without their drift, to where the similarity has them."""
+        placed = np.exp(at.log_scale) * self.x @ at.R.T + at.t
+        return np.asarray(placed + np.outer(self.along * at.drift, [0.0, 0.0, 1.0]) - self.fix)
 
-    def moved(self, R: F64, log_scale: float) -> F64:
+    def moved(self, at: _State) -> F64:
         """(k, 3) m from ways by velocity to those by vision."""
-        return np.asarray(np.exp(log_scale) * self.step @ R.T - self.way)
+        return np.asarray(np.exp(at.log_scale) * self.step @ at.R.T - self.way)
 
-    def _turns(self, R: F64) -> F64:
-        """(n, 3) rotations from the attitudes; of one whose heading is unknown, the tilt alone."""
+    def turned(self, at: _State) -> tuple[F64, F64]:
+        """(n, 3) rotations from the attitudes; of one whose heading is unknown, the tilt alone.
+
+        And (n, 3, 3) how they change with the mount.
+        """
         n = len(self.R_odom)
         if n == 0:
-            return np.zeros((0, 3))
-        seen = R @ self.R_odom
-        turn = se3.each_so3_log(seen @ self.R_prior.transpose(0, 2, 1))
-        up = np.einsum("nij,nj->ni", seen, self.R_prior[:, 2])  # where the prior's up points now
+            return np.zeros((0, 3)), np.zeros((0, 3, 3))
+        seen, R_prior = at.R @ self.R_odom, self.R_prior.copy()
+        R_prior[self.is_assumed] = R_prior[self.is_assumed] @ se3.so3_exp(at.mount)
+        turn = se3.each_so3_log(seen @ R_prior.transpose(0, 2, 1))
+        up = np.einsum("nij,nj->ni", seen, R_prior[:, 2])  # where the prior's up points now
         tilt = np.column_stack([-up[:, 1], up[:, 0], np.zeros(n)])
-        return np.where(self.heading_known[:, None], turn, tilt)
+        of_up = (seen @ se3.hat(R_prior[:, 2])) * self.is_assumed[:, None, None]
+        of_mount = np.stack([-of_up[:, 1], of_up[:, 0], np.zeros((n, 3))], axis=1)
+        return np.where(self.heading_known[:, None], turn, tilt), of_mount
 
 
 def fit(
-    anchors: Sequence[Anchor], fix_s: float = 60.0, iterations: int = 30, slow_share: float = 1.0
+    anchors: Sequence[Anchor],
+    fix_s: float = 60.0,
+    attitude_s: float = 40.0,
+    iterations: int = 30,
+    slow_share: float = 1.0,
 ) -> Similarity | None:
     """The similarity that brings the anchors onto their priors, or None without any prior.
 
-    The anchors stand in the order of time; ``fix_s`` is the usual time constant of a receiver's
-    wander. How fixes and velocities err is measured by their
-    residuals against the track of a first fit and weighs them in a second one. Attitudes of one
-    flight err together, so the covariance is inflated by their number. The receiver's error that
-    all fixes share goes into the position's covariance. ``slow_share`` is the part of its variance
-    that may wander.
+    The anchors stand in the order of time; ``fix_s`` and ``attitude_s`` are the usual time
+    constants with which a receiver and assumed views wander. How fixes and velocities err is
+    measured by their residuals against the track of a first fit and weighs them in a second one.
+    An assumed view is off by one angle in all images, and altitudes of no stated accuracy drift:
+    both are fitted too. Attitudes of one flight err together, so the covariance is inflated by
+    their number. The receiver's error that all fixes share goes into the position's covariance.
+    ``slow_share`` is the part of its variance that may wander.
     """
     usable = [a for a in anchors if a.prior.R_world_camera is not None or _has_fix(a.prior)]
     if not usable:
         return None
-    readings = _Readings(usable)
+    readings = _Readings(usable, attitude_s=attitude_s)
     if _velocities_contradict(readings):
         usable = [replace(a, prior=replace(a.prior, travel=None)) for a in usable]
-        readings = _Readings(usable)
-    found = [_solve(readings, *start, iterations) for start in _starts(usable, readings)]
+        readings = _Readings(usable, attitude_s=attitude_s)
+    found = [_solve(readings, start, iterations) for start in _starts(usable, readings)]
     best = min(found, key=lambda f: f.cost)
-    noise = _measured(usable, best, fix_s, iterations, slow_share)
-    readings = _Readings(usable, noise)
-    best = _solve(readings, best.R, best.t, best.log_scale, iterations)
+    noise = _measured(usable, best.at, (fix_s, attitude_s), iterations, slow_share)
+    readings = _Readings(usable, noise, attitude_s)
+    best = _solve(readings, best.at, iterations)
     inflation = max(1.0, 0.2 * len(usable)) if noise.horizontal is None else 1.0
-    covariance = np.asarray(np.linalg.inv(best.H) * inflation, np.float64)
+    covariance = np.asarray(np.linalg.inv(best.H)[:7, :7] * inflation, np.float64)
     mean = counted = None
     if len(readings.fix):
         covariance[3:6, 3:6] += np.diag(np.mean(np.square(readings.claimed), axis=0))
     if len(readings.fix) and fix_s > 0:
         mean, counted = noise.of_mean(readings.claimed, readings.fix_s, fix_s)
-    scale = float(np.exp(best.log_scale))
-    return Similarity(scale, best.R, best.t, covariance, _sources(readings), noise, mean, counted)
+    at = best.at
+    similarity = Similarity(
+        float(np.exp(at.log_scale)), at.R, at.t, covariance, _sources(readings), noise, mean,
+        counted, readings.common(at),
+    )  # fmt: skip
+    if not readings.is_assumed.all() or not len(readings.fix):
+        return similarity
+    lean = np.zeros((6, 6))
+    lean[:2, :2] = covariance[:2, :2]
+    centre = similarity.place(readings.x.mean(axis=0))
+    return replace(similarity, lean=se3.about(-centre, lean))
 
 
 def _measured(
-    anchors: Sequence[Anchor], start: _Solution, fix_s: float, iterations: int, slow_share: float
+    anchors: Sequence[Anchor],
+    start: _State,
+    wander_s: tuple[float, float],
+    iterations: int,
+    slow_share: float,
 ) -> ReadingNoise:
     """The noise of fixes and of velocities, each by its residuals to the track as it alone, with
-    the tilt of the attitudes, has it: a compass that is off would look like a drift.
-
-    A slow difference may be vision's own drift, so a receiver's wander is bounded by what it
-    claims. Its white part is not: from one fix to the next vision does not err by as much.
-    """
-    out, at = ReadingNoise(), (start.R, start.t, start.log_scale, iterations)
+    the tilt of the attitudes, has it: a compass that is off would look like a drift."""
     level = [
         replace(a, height=None, prior=replace(a.prior, sigma_yaw_rad=NO_YAW_RAD)) for a in anchors
     ]
-    fixes = _Readings([replace(a, prior=replace(a.prior, travel=None)) for a in level])
-    if len(fixes.fix) >= MIN_READINGS:
-        alone = _solve(fixes, *at)
-        apart = fixes.placed(alone.R, alone.t, alone.log_scale)
-        across = wander_noise(fixes.fix_s, apart[:, :2], fix_s)
-        along = wander_noise(fixes.fix_s, apart[:, 2:], fix_s)
-        if across is not None and along is not None:
-            claimed = np.median(fixes.claimed, axis=0)
-            flat, high = float(claimed[:2].mean()), float(claimed[2])
-            is_claimed = all(a.prior.is_sigma_claimed for a in level if _has_fix(a.prior))
-            least = 1.0 if is_claimed else MIN_WANDER
-            reach = across.reach(flat, min(least, slow_share))
-            out = replace(
-                out,
-                horizontal=across.bounded(across.reach(flat, slow_share), fix_s),
-                vertical=along.bounded(high, fix_s),
-                reach_m=np.array([reach, reach, along.reach(high, least)]),
-            )
-    ways = _Readings([replace(a, prior=replace(a.prior, position_m=None)) for a in level])
+    fixed = [replace(a, prior=replace(a.prior, travel=None)) for a in level]
+    moved = [replace(a, prior=replace(a.prior, position_m=None)) for a in level]
+    out, fixes = ReadingNoise(), _Readings(fixed, None, wander_s[1])
+    # Altitudes that weigh too little leave a lean, which looks like a wander of theirs.
+    for _ in range(1 if fixes.is_height_claimed else ROUNDS):
+        at = _solve(fixes, start, iterations).at
+        out = _of_fixes(fixes, at, wander_s, slow_share)
+        fixes = _Readings(fixed, out, wander_s[1])
+    ways = _Readings(moved, None, wander_s[1])
     if len(ways.way) >= MIN_READINGS:
-        alone = _solve(ways, *at)
-        drift = ways.moved(alone.R, alone.log_scale)
+        drift = ways.moved(_solve(ways, start, iterations).at)
         found = drift_noise(np.cumsum(ways.way_s), np.cumsum(drift, axis=0))
         if found is not None:
             walk, rate = max(found[0], MIN_WALK), max(found[1], MIN_RATE_M_S)
             out = replace(out, walk_m_per_sqrt_s=walk, rate_m_s=rate)
     return out
+
+
+def _of_fixes(
+    fixes: _Readings, at: _State, wander_s: tuple[float, float], slow_share: float
+) -> ReadingNoise:
+    """The noise of fixes and of assumed views, by their residuals to a track.
+
+    A slow difference may be vision's own drift, so a wander is bounded by what the sensor claims.
+    Its white part is not: from one fix to the next vision does not err by as much. Altitudes whose
+    accuracy nothing states wander as they are seen to, and by a share of their drift: none is
+    steady.
+    """
+    fix_s, attitude_s = wander_s
+    if len(fixes.fix) < MIN_READINGS:
+        return ReadingNoise()
+    tilts = fixes.turned(at)[0][fixes.is_assumed, :2]
+    tilt = wander_noise(fixes.tilt_s, tilts, attitude_s, 1.0)
+    if tilt is not None:
+        tilt = tilt.bounded(ASSUMED_TILT_RAD, attitude_s, MIN_WANDER * ASSUMED_TILT_RAD)
+    apart, is_claimed = fixes.placed(at), fixes.is_height_claimed
+    across = wander_noise(fixes.fix_s, apart[:, :2], fix_s)
+    along = wander_noise(fixes.fix_s, apart[:, 2:], fix_s, SURE_OF_WANDER if is_claimed else 1.0)
+    if across is None or along is None:
+        return ReadingNoise(tilt=tilt)
+    claimed = np.median(fixes.claimed, axis=0)
+    flat, high = float(claimed[:2].mean()), float(claimed[2])
+    least = 1.0 if is_claimed else MIN_WANDER
+    reach = across.reach(flat, min(least, slow_share))
+    most, drift = across.reach(flat, slow_share), high if is_claimed else abs(at.drift)
+    return ReadingNoise(
+        horizontal=across.bounded(most, fix_s, MIN_WANDER * most),
+        vertical=along.bounded(high, fix_s, MIN_WANDER * drift),
+        reach_m=np.array([reach, reach, along.reach(high, least)]),
+        tilt=tilt,
+    )
 
 
 def _velocities_contradict(readings: _Readings) -> bool:
@@ -470,21 +626,19 @@ def _stack(rows: Sequence[object], shape: tuple[int, ...]) -> F64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solution:
-    """A similarity with its (7, 7) information and its robust cost."""
+    """The best state with its (UNKNOWNS, UNKNOWNS) information and its robust cost."""
 
-    R: F64
-    t: F64
-    log_scale: float
+    at: _State
     H: F64
     cost: float
 
 
-def _solve(readings: _Readings, R: F64, t: F64, log_scale: float, iterations: int) -> _Solution:
+def _solve(readings: _Readings, at: _State, iterations: int) -> _Solution:
     """Gauss-Newton with Huber's weights."""
     group, kept = readings.group, np.ones(len(readings.outlying))
-    H, cost, ridge = np.eye(7), np.inf, np.diag([1e-6] * 6 + [1e-4])
+    H, cost, ridge = np.eye(UNKNOWNS), np.inf, np.diag([1e-6] * 6 + [1e-4] + [0.0] * 4)
     for i in range(iterations + 10):
-        r, J = readings.linearised(R, t, log_scale)
+        r, J = readings.linearised(at)
         norms = np.sqrt(np.bincount(group, weights=r**2, minlength=len(kept)))
         weight = (kept * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9)))[group]
         cost = float(np.sum(np.where(norms < HUBER, 0.5 * norms**2, HUBER * (norms - HUBER / 2))))
@@ -492,14 +646,12 @@ def _solve(readings: _Readings, R: F64, t: F64, log_scale: float, iterations: in
         H = JW @ J + ridge
         step = np.linalg.solve(H, -JW @ r)
         step[:3] = np.clip(step[:3], -0.5, 0.5)
-        step[6] = np.clip(step[6], -0.5, 0.5)
-        R = se3.so3_exp(step[:3]) @ R
-        t = t + step[3:6]
-        log_scale += float(step[6])
+        step[6:10] = np.clip(step[6:10], -0.5, 0.5)
+        at = at.moved(step)
         stands = np.abs(step).max() < 1e-7 or i >= iterations - 1
         if stands and not (kept.all() and _leave_out(readings, norms * readings.outlying, kept)):
             break
-    return _Solution(R, t, log_scale, H, cost)
+    return _Solution(at, H, cost)
 
 
 def _leave_out(readings: _Readings, norms: F64, kept: F64) -> bool:
@@ -512,8 +664,8 @@ def _leave_out(readings: _Readings, norms: F64, kept: F64) -> bool:
     return not kept.all()
 
 
-def _starts(anchors: Sequence[Anchor], readings: _Readings) -> list[tuple[F64, F64, float]]:
-    """Rotation, shift and log scale to begin with: by the attitude, and by the track.
+def _starts(anchors: Sequence[Anchor], readings: _Readings) -> list[_State]:
+    """To begin with: by the attitude, and by the track.
 
     The second matters when the compass is far off or there is none: then only the track of
     the fixes determines the heading.
@@ -524,15 +676,15 @@ def _starts(anchors: Sequence[Anchor], readings: _Readings) -> list[tuple[F64, F
             R = a.prior.R_world_camera @ a.T_odom_camera[:3, :3].T
             break
     if not len(readings.fix):
-        return [(R, -R @ anchors[0].T_odom_camera[:3, 3], 0.0)]
+        return [_State(R, -R @ anchors[0].T_odom_camera[:3, 3], 0.0)]
     x = readings.x @ R.T
-    starts = [(R, np.asarray(np.median(readings.fix - x, axis=0)), 0.0)]
+    starts = [_State(R, np.asarray(np.median(readings.fix - x, axis=0)), 0.0)]
     if len(x) >= 4:
         weight = 1.0 / np.mean(readings.claimed**2, axis=1)
         scale, turn, _ = umeyama(x, readings.fix, weight)
         if scale > 0:
             shift = np.asarray(np.median(readings.fix - scale * x @ turn.T, axis=0))
-            starts.append((turn @ R, shift, float(np.log(scale))))
+            starts.append(_State(turn @ R, shift, float(np.log(scale))))
     return starts
 
 

@@ -31,7 +31,7 @@ def levelled(prior: PosePrior, points: F64) -> PosePrior:
     ``points`` (N, 3) are ground in the camera's frame. A known attitude stays.
     """
     R = prior.R_world_camera
-    if R is None or prior.sigma_tilt_rad < ASSUMED_TILT_RAD:
+    if R is None or not prior.is_view_assumed:
         return prior
     normal = plane_normal(points)
     if normal is None or normal @ R[2] > math.cos(MAX_SLOPE_RAD):
@@ -39,7 +39,10 @@ def levelled(prior: PosePrior, points: F64) -> PosePrior:
     up = R @ normal
     axis = np.array([up[1], -up[0], 0.0])
     turn = axis * (math.acos(np.clip(up[2], -1.0, 1.0)) / max(float(np.linalg.norm(axis)), 1e-9))
-    return replace(prior, R_world_camera=se3.so3_exp(turn) @ R, sigma_tilt_rad=LEVEL_SIGMA_RAD)
+    return replace(
+        prior, R_world_camera=se3.so3_exp(turn) @ R, sigma_tilt_rad=LEVEL_SIGMA_RAD,
+        is_view_assumed=False,
+    )  # fmt: skip
 
 
 def plane_normal(points: F64) -> F64 | None:

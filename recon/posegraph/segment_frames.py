@@ -81,6 +81,7 @@ class SegmentFrames:
         """The node without its sensors' constants, its fix brought to the camera."""
         prior = self.constants(node.segment).applied(node.prior)
         if node.segment in self._offsets:
+            prior = self._frames[node.segment].common.applied(prior, node.time_ns * 1e-9)
             prior = self._offsets[node.segment].applied(prior, node.lean)
         prior = self.at_camera(replace(node, prior=prior))
         return node if prior is node.prior else replace(node, prior=prior)
@@ -144,7 +145,7 @@ class SegmentFrames:
         self._fitted[segment] = seen
         fresh = self._newest_constants()
         anchors = self._anchors(segment, fresh)
-        found = alignment.fit(anchors, self._wander_s[0], slow_share=fresh.datum.slow_share)
+        found = alignment.fit(anchors, *self._wander_s, slow_share=fresh.datum.slow_share)
         if found is None:
             return False
         if "gnss" not in found.sources and nodes[0].key > 0:
@@ -157,7 +158,8 @@ class SegmentFrames:
         if before is not None and is_settled and not _differ(before, found, nodes):
             return False  # the graph itself follows such small changes
         self._frames[segment], self._constants[segment] = found, fresh
-        self._offsets[segment] = offsets(anchors, found)
+        freed = [replace(a, prior=found.common.applied(a.prior, a.time_s)) for a in anchors]
+        self._offsets[segment] = offsets(freed, found)
         return True
 
     def _newest_constants(self) -> Constants:

@@ -60,18 +60,17 @@ class Noise:
         """Of one reading."""
         return float(np.hypot(self.white, self.wander))
 
-    def bounded(self, claimed: float, usual_tau_s: float) -> Noise:
-        """The same with a wander between a share of what the sensor claims and all of that.
+    def bounded(self, claimed: float, usual_tau_s: float, least: float) -> Noise:
+        """The same with a wander between ``least`` and what the sensor claims.
 
-        A steady drift of the sensor looks like another scale and cannot be measured, so a share
+        A steady drift of the sensor looks like another scale and cannot be measured, so some
         is always there. What was measured beyond the claim is vision's own drift. In both cases
         the time constant is not the sensor's, and the usual one stands in for it.
         """
-        least, most = MIN_WANDER * claimed, claimed
-        if least <= self.wander <= most or usual_tau_s <= 0:
+        if least <= self.wander <= claimed or usual_tau_s <= 0:
             return self
         tau_s = PRECISE_TAU_S if claimed < PRECISE_M else usual_tau_s
-        return replace(self, wander=min(max(self.wander, least), most), tau_s=tau_s)
+        return replace(self, wander=min(max(self.wander, least), claimed), tau_s=tau_s)
 
     def of_each(self, count: int, span_s: float) -> float:
         """The sigma of each of ``count`` readings over ``span_s``, as if all were independent.
@@ -103,7 +102,9 @@ class Noise:
         return float(sigma * np.sqrt(np.clip(self.wander / max(sigma, 1e-9), min_share, 1.0)))
 
 
-def wander_noise(times_s: F64, residuals: F64, usual_tau_s: float) -> Noise | None:
+def wander_noise(
+    times_s: F64, residuals: F64, usual_tau_s: float, sure: float = SURE_OF_WANDER
+) -> Noise | None:
     """The noise of readings with (N, axes) ``residuals`` at (N,) times; None for too few.
 
     ``usual_tau_s`` is the time constant of a wander too slow to be measured; 0: none wanders.
@@ -120,7 +121,7 @@ def wander_noise(times_s: F64, residuals: F64, usual_tau_s: float) -> Noise | No
         found.append((error, tau_s, parts))
     white, flat_error = nonnegative(2.0 * weight[:, None], change * weight)
     error, tau_s, parts = min(found, key=lambda one: one[0], default=(np.inf, 1.0, white))
-    if flat_error < SURE_OF_WANDER * error:
+    if flat_error < sure * error:
         return Noise(float(np.sqrt(white[0])), 0.0, max(usual_tau_s, 1.0))
     return Noise(float(np.sqrt(parts[0])), float(np.sqrt(parts[1])), tau_s)
 

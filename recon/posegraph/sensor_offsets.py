@@ -71,7 +71,7 @@ class Turns:
         rows = [
             (T[:3, :3], p.R_world_camera, (p.sigma_tilt_rad, p.sigma_tilt_rad, p.sigma_yaw_rad))
             for T, p in zip(poses, priors, strict=True)
-            if p.R_world_camera is not None
+            if p.R_world_camera is not None and not p.is_view_assumed
         ]
         if len(rows) < MIN_ATTITUDES:
             return None

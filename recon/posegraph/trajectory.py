@@ -193,6 +193,8 @@ class Trajectory:
             factor = np.r_[1.0, 1.0, 1.0, np.sqrt((bent + frame.sigma_fixes**2) / own)]
             covariance = se3.about(T[:3, 3], covariance) * np.outer(factor, factor)
             covariance = se3.about(-T[:3, 3], covariance)
+        if frame is not None and frame.lean is not None:  # nothing in the graph shows it
+            covariance = covariance + frame.lean
         return Placed(seq, T, self.graph.scale(seq), covariance, pose.sources)
 
     def places(self, seqs: Sequence[int]) -> F64:

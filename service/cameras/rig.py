@@ -34,6 +34,9 @@ TAG_HEIGHT_M, BAROMETER_M = 50.0, 5.0
 """Sigma of an altitude in a still's tags: of a camera's receiver, and of a drone that also writes
 its height above the take-off point."""
 
+NO_ALTITUDE_M = 1000.0
+"""Sigma of the height of a position without an altitude."""
+
 TURN_NS = 20_000_000
 """Before and after an exposure: how telemetry's attitude changes there is the camera's turn."""
 
@@ -61,6 +64,7 @@ class Fix:
     alt_amsl_m: float | None
     sigma_h_m: float
     sigma_v_m: float
+    is_claimed: bool  # by the receiver, or there is no altitude; False: sigmas are typical ones
 
 
 def turn_sigma_rad_s(gap_s: float, sigma_time_s: float = 0.0) -> float:
@@ -107,7 +111,8 @@ class Rig:
             R, tilt, yaw, position, sigma, agl, sigma_agl,
             is_at_rest=state is not None and _is_at_rest(state),
             is_agl_measured=source is HeightSource.MEASURED,
-            is_sigma_claimed=state is None or state.is_claimed,
+            is_sigma_claimed=fix is None or fix.is_claimed,
+            is_view_assumed=tilt >= ASSUMED_TILT_RAD,
         )  # fmt: skip
         if state is not None and state.v_ned_m_s is not None and self._fusion.gnss:
             prior = replace(prior, velocity_m_s=R_ENU_NED @ state.v_ned_m_s)
@@ -171,12 +176,16 @@ class Rig:
                 state.alt_amsl_m,
                 state.sigma_h_m or 2.0,
                 state.sigma_v_m or 4.0,
+                state.is_claimed or state.alt_amsl_m is None,
             )
         if state is None and tag is not None and self.georeference != "gnss":
             self.georeference = "exif"
             usual_m = TAG_HEIGHT_M if tag.relative_alt_m is None else BAROMETER_M
             sigma_v = tag.sigma_v_m or usual_m
-            return Fix(tag.lat_deg, tag.lon_deg, tag.alt_amsl_m, tag.sigma_h_m, sigma_v)
+            is_claimed = tag.sigma_v_m is not None or tag.alt_amsl_m is None
+            return Fix(
+                tag.lat_deg, tag.lon_deg, tag.alt_amsl_m, tag.sigma_h_m, sigma_v, is_claimed
+            )  # fmt: skip
         return None
 
     def _position(self, fix: Fix | None) -> tuple[F64 | None, F64 | None]:
@@ -188,10 +197,10 @@ class Rig:
             altitude = None
         if self.frame is None:
             self.frame = LocalFrame(fix.lat_deg, fix.lon_deg, altitude or 0.0)
-        if altitude is None:
-            altitude = self.frame.alt_amsl_m
-        enu = self.frame.to_enu(np.array([[fix.lat_deg, fix.lon_deg, altitude]]))[0]
-        sigma = np.array([fix.sigma_h_m, fix.sigma_h_m, fix.sigma_v_m])
+        height = self.frame.alt_amsl_m if altitude is None else altitude
+        enu = self.frame.to_enu(np.array([[fix.lat_deg, fix.lon_deg, height]]))[0]
+        sigma_v_m = fix.sigma_v_m if altitude is not None else NO_ALTITUDE_M
+        sigma = np.array([fix.sigma_h_m, fix.sigma_h_m, sigma_v_m])
         return enu, np.maximum(sigma, MIN_SIGMA_M)
 
     def _agl(

@@ -139,6 +139,7 @@ class Recorder:
             "distance_m": round(self.distance_m, 2),
             "georeference": self._rig.georeference,
             "scale": self._scale(),
+            "lean_sigma_deg": self._lean_sigma_deg(),
             "stage_ms": {k: round(v, 2) for k, v in pipeline.stages.stopwatch.mean_ms().items()},
             "refusals": dict(pipeline.refusals()),
             "drops": self._drops(),
@@ -164,6 +165,12 @@ class Recorder:
         out = {"from": by, "sigma": round(found.sigma_scale, 4)}
         ratio = gnss_over_heights(graph)
         return out if ratio is None else out | {"gnss_over_heights": round(ratio, 3)}
+
+    def _lean_sigma_deg(self) -> float | None:
+        """Sigma of what is level, of the largest segment; None where attitudes show it."""
+        found = self._chain.trajectory.graph.largest_similarity()
+        sigma = None if found is None else found.sigma_lean_rad
+        return None if sigma is None else round(math.degrees(sigma), 2)
 
     def _write_origin(self) -> None:
         """The origin goes into the header once the first position is known."""

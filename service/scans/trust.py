@@ -17,9 +17,9 @@ MAX_SCALE_SIGMA = 0.05
 MAX_SLOPE_DEG = 30.0
 """Above this slope, with an assumed view direction, the site was not seen from above."""
 
-MIN_LEAN_DEG = 3.0
-"""From this slope on, with an assumed view direction, the slope itself is in doubt: cameras that
-look 15 degrees ahead make level ground lean by 10."""
+MAX_LEAN_SIGMA_DEG = 2.0
+"""Above this sigma of what is level, slopes are in doubt: cameras that look 15 degrees ahead make
+level ground lean by 10."""
 
 MIN_PLACED_SHARE = 0.5
 """Share of the frames; below it vision was lost for most of the flight."""
@@ -49,7 +49,7 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     """The level as ``level`` and what limits it as ``reasons``, both for scan.json.
 
     Args:
-        run: figures of the scan's run: ``assumed``, ``scale``, ``frames``,
+        run: figures of the scan's run: ``assumed``, ``scale``, ``lean_sigma_deg``, ``frames``,
             ``frames_tracked``, ``graph``. Missing or malformed ones limit nothing.
         georeference: of the scan's header; "none" without.
         slope_deg: of the plane through the cloud.
@@ -89,10 +89,11 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         limits.append(
             "the lens's distortion is unknown: surfaces bend by a percent of the distance"
         )
-    if "view" in assumed and slope_deg > MIN_LEAN_DEG:
+    lean_deg = _number(run, "lean_sigma_deg")
+    if lean_deg is not None and lean_deg > MAX_LEAN_SIGMA_DEG:
         limits.append(
-            f"the view direction is assumed: the site's slope of {slope_deg:.0f} degrees may not "
-            "be real"
+            f"the view direction is assumed: all may lean by {lean_deg:.0f} degrees; fly strips "
+            "both ways, several side by side"
         )
     if refused > REFUSED_SHARE * measured:
         limits.append(f"{contradicted}: they are less certain than sigma says")

@@ -1,0 +1,116 @@
+"""What is level, where no attitude says it: by altitudes, by turns, or not at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.posegraph.alignment import Anchor, Similarity, fit
+from recon.posegraph.level_ground import ASSUMED_TILT_RAD
+from recon.posegraph.trajectory import Trajectory
+from recon.types import F64, PosePrior
+
+NADIR = np.diag([1.0, -1.0, -1.0])
+STEP_M, STEP_S, STRIP_M, APART_M = 8.0, 6.0, 150.0, 22.0
+
+
+@dataclass(frozen=True)
+class Stills:
+    """Stills without attitude, 50 m up, with positions that state no accuracy of the altitude."""
+
+    anchors: list[Anchor]
+    level: F64  # (3, 3) world from odometry
+
+    def lean_deg(self, found: Similarity) -> float:
+        """Angle between what is taken as level and what is."""
+        up = (found.R @ self.level.T)[2]
+        return float(np.degrees(np.arccos(min(1.0, up[2]))))
+
+
+def stills(
+    strips: int, mount_deg: float, turns: bool = False, drift_m: float = 0.0, seed: int = 1
+) -> Stills:
+    """Strips flown to and fro by a camera that looks ``mount_deg`` ahead; ``turns``: nose first."""
+    rng = np.random.default_rng(seed)
+    x = np.arange(0.0, STRIP_M, STEP_M)
+    p = np.array([(b, s * APART_M, 0.0) for s in range(strips)
+                  for b in (x if s % 2 == 0 else x[::-1])])  # fmt: skip
+    p += rng.normal(0, (1.0, 1.0, 0.3), p.shape)
+    back = np.repeat(np.arange(strips) % 2, len(x)) * (np.pi if turns else 0.0)
+    t = np.arange(len(p)) * STEP_S
+    along = (t - t.mean()) / np.ptp(t) * 2.0
+    noise = rng.normal(0, (1.5, 1.5, 0.3), p.shape) + np.outer(along * drift_m, [0, 0, 1])
+    level = se3.so3_exp(np.array([0.2, -0.3, 0.4]))
+    mount = se3.so3_exp(np.array([0.0, np.radians(mount_deg), 0.0]))
+    anchors = []
+    for k in range(len(p)):
+        wobble = se3.so3_exp(np.r_[np.radians(rng.normal(0, 2.0, 2)), 0.0])
+        R = se3.so3_exp(np.array([0.0, 0.0, back[k]])) @ NADIR @ mount @ wobble
+        prior = PosePrior(
+            NADIR, ASSUMED_TILT_RAD, 3.0, p[k] + noise[k], np.array([5.0, 5.0, 50.0]),
+            is_sigma_claimed=False, is_view_assumed=True,
+        )  # fmt: skip
+        odom = se3.compose(level.T @ R, level.T @ p[k])
+        anchors.append(Anchor(odom, prior, None, 0.0, float(t[k])))
+    return Stills(anchors, level)
+
+
+@pytest.mark.parametrize("turns", [False, True])
+@pytest.mark.parametrize("mount_deg", [0.0, 15.0])
+def test_altitudes_that_agree_with_vision_level_strips(mount_deg: float, turns: bool) -> None:
+    """By the assumed view alone the map leans as far as the camera looks ahead."""
+    flown = stills(4, mount_deg, turns)
+    found = fit(flown.anchors)
+    assert found is not None and found.sigma_lean_rad is not None
+    assert flown.lean_deg(found) < 0.6
+    assert np.degrees(found.sigma_lean_rad) < 1.5
+    np.testing.assert_allclose(np.degrees(found.common.mount_rad), [0, mount_deg, 0], atol=1.0)
+
+
+def test_one_strip_does_not_show_whether_it_leans() -> None:
+    flown = stills(1, 8.0)
+    found = fit(flown.anchors)
+    assert found is not None and found.sigma_lean_rad is not None
+    assert 4.0 < flown.lean_deg(found) < 2.0 * np.degrees(found.sigma_lean_rad)
+
+
+def test_poses_say_that_all_may_lean() -> None:
+    flown, trajectory = stills(1, 0.0), Trajectory()
+    for k, anchor in enumerate(flown.anchors):
+        trajectory.add(
+            k, 0, anchor.T_odom_camera, anchor.prior, None, round(anchor.time_s * 1e9),
+            np.diag([1e-4**2] * 3 + [0.01**2] * 3),
+        )  # fmt: skip
+    trajectory.moved(final=True)
+    sigma_m = [
+        np.sqrt(se3.about(placed.T_world_camera[:3, 3], placed.covariance)[5, 5])
+        for k in (0, len(flown.anchors) // 2)
+        if (placed := trajectory.place(k))
+    ]
+    found = trajectory.similarity(0)
+    assert found is not None and found.sigma_lean_rad is not None
+    min_m = 0.5 * STRIP_M * found.sigma_lean_rad
+    assert np.hypot(min_m, sigma_m[1]) == pytest.approx(sigma_m[0], rel=0.25)
+
+
+def test_altitudes_that_drift_by_100_m_level_nothing() -> None:
+    """Turns do: the mean of the views is level."""
+    flown = stills(4, 4.0, turns=True, drift_m=50.0)
+    found = fit(flown.anchors)
+    assert found is not None and flown.lean_deg(found) < 1.5
+    assert found.common.drift_m == pytest.approx(50.0, abs=5.0)
+
+
+def test_the_drift_of_altitudes_does_not_bend_the_track() -> None:
+    flown, trajectory = stills(4, 4.0, turns=True, drift_m=50.0), Trajectory()
+    for k, anchor in enumerate(flown.anchors):
+        trajectory.add(
+            k, 0, anchor.T_odom_camera, anchor.prior, None, round(anchor.time_s * 1e9),
+            np.diag([1e-4**2] * 3 + [0.01**2] * 3),
+        )  # fmt: skip
+    trajectory.moved(final=True)
+    z = [trajectory.place(k).T_world_camera[2, 3] for k in range(len(flown.anchors))]
+    assert np.std(z) < 3.0
