@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from importlib.util import find_spec
 
 import pytest
 
@@ -47,6 +48,16 @@ def test_every_stage_is_compared_with_its_floor(
     assert {r.note.partition(" on ")[0] for r in nearby} >= {"torch"}
     (named,) = [r for r in results if r.what == "bandwidth of the device"]
     assert named.note and named.value > 0
+
+
+def test_onnx_on_the_processor_is_no_figure_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the device is named, what cannot run on it is a line that says so."""
+    if find_spec("onnxruntime") is None:
+        pytest.skip("onnxruntime is not installed")
+    monkeypatch.setattr(bench_gpu, "torch_results", lambda compiled, options: [])
+    (line,) = bench_gpu.run(BenchOptions(rounds=1, warm_up=0, device="cuda"))
+    assert (line.what, line.note) == ("onnx", "cannot run: ONNX Runtime has no GPU provider")
+    assert math.isnan(line.value)
 
 
 def test_floor_is_the_larger_of_bytes_and_operations() -> None:

@@ -68,6 +68,8 @@ def torch_results(compiled: Backend, options: BenchOptions) -> list[BenchResult]
 def onnx_results(compiled: Backend, options: BenchOptions) -> list[BenchResult]:
     """The calls of the ONNX backend with the providers that it finds."""
     backend = load_backend("onnx")
+    if options.device == "cuda" and backend.device == "cpu":
+        raise RuntimeError("ONNX Runtime has no GPU provider")
     return calls(backend, compiled, GUIDE if backend.device == "cpu" else GUIDE_ON_DEVICE, options)
 
 
