@@ -102,5 +102,3 @@ def test_tunnels_and_the_radios_state_pass_through_the_same_link() -> None:
         message = until(tunnel)
         assert message.payload_type == 40_000
         assert bytes(message.payload[: message.payload_length]) == b"tile"
-        with pytest.raises(ValueError, match="128 bytes"):
-            daemon.link.send_tunnel(40_000, bytes(129))

@@ -302,6 +302,7 @@ def test_plain_torch_computes_where_triton_compiles_nothing(
 ) -> None:
     """No C compiler: said once, and nothing fails."""
     from recon.backends import torch_plan
+    from service.compute.backend_choice import try_kernels
 
     class Kernels:
         """A module whose kernels do not compile."""
@@ -313,6 +314,6 @@ def test_plain_torch_computes_where_triton_compiles_nothing(
     monkeypatch.setattr(torch_plan, "HAS_TRITON", True)
     monkeypatch.setitem(sys.modules, "recon.backends.triton_dense", Kernels)
     monkeypatch.setattr(recon.backends, "triton_dense", Kernels, raising=False)
-    torch_plan.try_kernels("cpu")
+    try_kernels("cpu")
     assert not torch_plan.HAS_TRITON
     assert "Failed to find C compiler" in caplog.text

@@ -12,7 +12,7 @@ from torch import Tensor
 from recon.backends import DenseStages
 from recon.backends.room import kept, pyramid_levels, room
 from recon.backends.torch_depth import DensePath, Upsampling
-from recon.backends.torch_plan import Part, Plan, part, read, try_kernels
+from recon.backends.torch_plan import Part, Plan, part, read
 from recon.backends.torch_stereo import DenseStereo
 from recon.stereo.belief_propagation import BeliefPropagationConfig, drop_unreliable
 from recon.stereo.matching_cost import check_pair
@@ -42,8 +42,6 @@ class TorchBackend:
         self._plans: dict[Any, Plan] = {}
         self._path: tuple[DenseStages, DensePath] | None = None
         torch.zeros(8, device=self.device).add_(1).cpu()  # fails here rather than in flight
-        if self.device.startswith("cuda"):
-            try_kernels(self.device)
 
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig

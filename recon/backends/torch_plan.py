@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
-from subprocess import SubprocessError
 from threading import Lock
 from typing import Any
 
@@ -145,17 +143,5 @@ HAS_TRITON = find_spec("triton") is not None
 """Some of torch's wheels for Jetsons come without it; plain torch then does the same."""
 
 
-def try_kernels(device: str) -> None:
-    """Compile and run one kernel; where that fails, plain torch computes from now on."""
-    global HAS_TRITON
-    try:
-        from recon.backends import triton_dense
-
-        triton_dense.contrast(torch.zeros((8, 8), dtype=torch.uint8, device=device), 1)
-    except (ImportError, OSError, RuntimeError, SubprocessError) as error:
-        HAS_TRITON = False
-        log.warning("Triton compiles no kernels here (%s): plain torch is slower", error)
-
-
-INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
-"""The kernels run on the processor, slowly: for tests."""
+INTERPRETED = False
+"""Tests run the kernels on the processor, in Triton's interpreter."""

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import MISSING, fields
 from importlib.util import find_spec
 from pathlib import Path
+from subprocess import SubprocessError
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
@@ -157,7 +158,7 @@ def fastest_backend() -> Backend:
             log.info("backend %s: not tried, %s", candidate, reason)
             continue
         try:
-            backend = load_backend(candidate, engine_folder())
+            backend = loaded(candidate)
         except (ImportError, RuntimeError, ValueError) as error:
             log.info("backend %s: cannot run here, %s", candidate, error)
             continue
@@ -185,6 +186,29 @@ def fastest_backend() -> Backend:
     return chosen
 
 
+def loaded(name: str) -> Backend:
+    """The backend called ``name``; torch on a GPU with Triton's kernels, where one compiles."""
+    backend = load_backend(name, engine_folder())
+    if backend.name == "torch" and backend.device != "cpu":
+        try_kernels(backend.device)
+    return backend
+
+
+def try_kernels(device: str) -> None:
+    """Compile and run one kernel; where that fails, plain torch computes from now on."""
+    import torch
+
+    from recon.backends import torch_plan
+
+    try:
+        from recon.backends import triton_dense
+
+        triton_dense.contrast(torch.zeros((8, 8), dtype=torch.uint8, device=device), 1)
+    except (ImportError, OSError, RuntimeError, SubprocessError) as error:
+        torch_plan.HAS_TRITON = False
+        log.warning("Triton compiles no kernels here (%s): plain torch is slower", error)
+
+
 def named_backend(name: str) -> Backend:
     """The backend called ``name``, ready to run.
 
@@ -193,7 +217,7 @@ def named_backend(name: str) -> Backend:
     if name not in BACKENDS:
         raise InputError(f"backend {name}: available: auto, {', '.join(BACKENDS)}")
     try:
-        backend = load_backend(name, engine_folder())
+        backend = loaded(name)
     except (ImportError, RuntimeError, ValueError) as error:
         raise OutsideError(f"backend {name} cannot run here: {error}") from error
     log.info("backend %s on %s, as configured", backend.name, backend.device)
