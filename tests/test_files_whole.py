@@ -44,3 +44,15 @@ def test_what_a_killed_process_left_goes_with_the_next_attempt(tmp_path: Path) -
     with writing(path) as part:
         part.write_text("whole")
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_files_that_only_look_like_ours_stay(tmp_path: Path) -> None:
+    """On a stranger's card any name may be there; none keeps a file from being written."""
+    names = [
+        f".dsm.tif.{n}.part" for n in ("copy-of", "-1", "99999999999999999999-1", "7-a", "²-1")
+    ]
+    for name in names:
+        (tmp_path / name).touch()
+    with writing(tmp_path / "dsm.tif") as part:
+        part.write_text("whole")
+    assert {p.name for p in tmp_path.iterdir()} == {*names, "dsm.tif"}

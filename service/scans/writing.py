@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -39,9 +40,11 @@ def writing(path: Path) -> Iterator[Path]:
 def _remove_abandoned(path: Path) -> None:
     """Remove the temporary files for ``path`` of processes that ended by a kill or a power cut."""
     for part in path.parent.glob(f".{glob.escape(path.name)}.*-*.part"):
-        pid = part.name.removeprefix(f".{path.name}.").partition("-")[0]
+        writer = re.fullmatch(r"([0-9]{1,9})-[0-9]+\.part", part.name[len(path.name) + 2 :])
+        if writer is None:
+            continue  # a name that is not ours
         try:
-            os.kill(int(pid), 0)
+            os.kill(int(writer[1]), 0)
         except ProcessLookupError:
             part.unlink(missing_ok=True)
         except PermissionError:
