@@ -77,14 +77,21 @@ def test_one_strip_does_not_show_whether_it_leans() -> None:
     assert 4.0 < flown.lean_deg(found) < 2.0 * np.degrees(found.sigma_lean_rad)
 
 
-def test_poses_say_that_all_may_lean() -> None:
-    flown, trajectory = stills(1, 0.0), Trajectory()
+def settled(flown: Stills) -> Trajectory:
+    """The track of the stills by its pose graph."""
+    trajectory = Trajectory()
     for k, anchor in enumerate(flown.anchors):
         trajectory.add(
             k, 0, anchor.T_odom_camera, anchor.prior, None, round(anchor.time_s * 1e9),
             np.diag([1e-4**2] * 3 + [0.01**2] * 3),
         )  # fmt: skip
     trajectory.moved(final=True)
+    return trajectory
+
+
+def test_poses_say_that_all_may_lean() -> None:
+    flown = stills(1, 0.0)
+    trajectory = settled(flown)
     sigma_m = [
         np.sqrt(se3.about(placed.T_world_camera[:3, 3], placed.covariance)[5, 5])
         for k in (0, len(flown.anchors) // 2)
@@ -105,12 +112,7 @@ def test_altitudes_that_drift_by_100_m_level_nothing() -> None:
 
 
 def test_the_drift_of_altitudes_does_not_bend_the_track() -> None:
-    flown, trajectory = stills(4, 4.0, turns=True, drift_m=50.0), Trajectory()
-    for k, anchor in enumerate(flown.anchors):
-        trajectory.add(
-            k, 0, anchor.T_odom_camera, anchor.prior, None, round(anchor.time_s * 1e9),
-            np.diag([1e-4**2] * 3 + [0.01**2] * 3),
-        )  # fmt: skip
-    trajectory.moved(final=True)
+    flown = stills(4, 4.0, turns=True, drift_m=50.0)
+    trajectory = settled(flown)
     z = [trajectory.place(k).T_world_camera[2, 3] for k in range(len(flown.anchors))]
     assert np.std(z) < 3.0

@@ -137,9 +137,12 @@ class Rig:
         """(3,) rad/s of the camera in its own frame between two states; None without attitude."""
         if before is None or after is None or after.time_ns <= before.time_ns:
             return None
-        if not (self.attitude_known(before, None) and self.attitude_known(after, None)):
+        (R_before, tilt_before, _), (R_after, tilt_after, _) = (
+            self._rotation(state, None) for state in (before, after)
+        )
+        if max(tilt_before, tilt_after) >= ASSUMED_TILT_RAD:
             return None
-        turned = self._rotation(before, None)[0].T @ self._rotation(after, None)[0]
+        turned = R_before.T @ R_after
         return se3.so3_log(turned) * (1e9 / (after.time_ns - before.time_ns))
 
     def _lever(self, state: VehicleState | None) -> F64:
@@ -225,10 +228,6 @@ class Rig:
     def height_known(self, state: VehicleState | None, tag: GeoTag | None) -> bool:
         """False when the scan's scale depends on :data:`ASSUMED_AGL_M`."""
         return self._agl(state, tag)[2] is not HeightSource.ASSUMED
-
-    def attitude_known(self, state: VehicleState | None, tag: GeoTag | None) -> bool:
-        """False when the view direction is that of the nominal mount."""
-        return self._rotation(state, tag)[1] < ASSUMED_TILT_RAD
 
 
 def _is_at_rest(state: VehicleState) -> bool:

@@ -166,8 +166,9 @@ class Scan:
         if self.tags is not None:
             self.tags.write(exposed_ns + inputs.unix_offset_ns, state)
         self.heights += self.rig.height_known(state, frame.geotag)
-        self.attitudes += self.rig.attitude_known(state, frame.geotag)
-        prior = self._odometer.take(exposed_ns, self.rig.prior(state, frame.geotag))
+        prior = self.rig.prior(state, frame.geotag)
+        self.attitudes += not prior.is_view_assumed
+        prior = self._odometer.take(exposed_ns, prior)
         if self.pipeline.stages.track.odometry.needs_turn(exposed_ns):
             prior = self._turning(prior, exposed_ns)
         step = self.pipeline.skip(exposed_ns, prior)
@@ -186,8 +187,10 @@ class Scan:
     def _turning(self, prior: PosePrior, exposed_ns: int) -> PosePrior:
         """The prior with the camera's turn about the moment of exposure, by telemetry."""
         history = self.inputs.history
-        turn = None if history is None else self.rig.turn_at(history.state_at, exposed_ns)
-        if history is None or turn is None:
+        if history is None:
+            return prior
+        turn = self.rig.turn_at(history.state_at, exposed_ns)
+        if turn is None:
             return prior
         sigma = turn_sigma_rad_s(history.gap_s(exposed_ns), self.check.doubt_s)
         return replace(prior, turn_rad_s=turn, sigma_turn_rad_s=sigma)
