@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import recon.backends
 from recon.backends import Backend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from service.compute import backend_choice
@@ -191,3 +192,25 @@ def test_a_learned_model_that_does_not_fit_is_refused(
     model = str(declared(tmp_path, text))
     with pytest.raises(InputError, match=said):
         open_backend(ComputeConfig(backend=backend, model=model, stereo_width=width), image)
+
+
+def test_plain_torch_computes_where_triton_compiles_nothing(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No C compiler: said once, and nothing fails."""
+    pytest.importorskip("torch")
+    from recon.backends import torch_plan
+
+    class Kernels:
+        """A module whose kernels do not compile."""
+
+        @staticmethod
+        def contrast(*given: object) -> None:
+            raise RuntimeError("Failed to find C compiler")
+
+    monkeypatch.setattr(torch_plan, "HAS_TRITON", True)
+    monkeypatch.setitem(sys.modules, "recon.backends.triton_dense", Kernels)
+    monkeypatch.setattr(recon.backends, "triton_dense", Kernels, raising=False)
+    backend_choice.try_kernels("cpu")
+    assert not torch_plan.HAS_TRITON
+    assert "Failed to find C compiler" in caplog.text

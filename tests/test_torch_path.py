@@ -8,7 +8,6 @@ threshold differ in a few pixels).
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +15,6 @@ import cv2
 import numpy as np
 import pytest
 
-import recon.backends
 from recon.stereo import belief_propagation as compiled
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import FusionConfig, PairDepth
@@ -295,25 +293,3 @@ def test_half_precision_holds_the_sums_of_small_truncations(
         for kind in (torch.float16, torch.int16)
     )
     assert bool((half == whole).all()) is exact
-
-
-def test_plain_torch_computes_where_triton_compiles_nothing(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """No C compiler: said once, and nothing fails."""
-    from recon.backends import torch_plan
-    from service.compute.backend_choice import try_kernels
-
-    class Kernels:
-        """A module whose kernels do not compile."""
-
-        @staticmethod
-        def contrast(*given: object) -> None:
-            raise RuntimeError("Failed to find C compiler")
-
-    monkeypatch.setattr(torch_plan, "HAS_TRITON", True)
-    monkeypatch.setitem(sys.modules, "recon.backends.triton_dense", Kernels)
-    monkeypatch.setattr(recon.backends, "triton_dense", Kernels, raising=False)
-    try_kernels("cpu")
-    assert not torch_plan.HAS_TRITON
-    assert "Failed to find C compiler" in caplog.text
