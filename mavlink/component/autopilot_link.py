@@ -155,12 +155,6 @@ class AutopilotLink:
         if request is not None:
             self._outbox.put(ONBOARD, request, link)
 
-    def next_timers(self, now_ns: int) -> list[int]:
-        """Times in ns at which :meth:`tick` is due."""
-        if self._presence.autopilot is not None:
-            return [self.timesync.next_timer(), self._rates.next_timer()]
-        return [self.timesync.next_timer()] if self._presence.autopilots.others(now_ns) else []
-
     def boot_clock(self) -> BootClock | None:
         """The autopilot's clock; None before it was heard."""
         autopilot = self._presence.autopilot
@@ -235,7 +229,3 @@ class RateKeeper:
             return True
         want.wait = (want.wait + 1) % RARELY
         return want.wait == 0
-
-    def next_timer(self) -> int:
-        """Time in ns of the next check."""
-        return 0 if self._looked_ns is None else self._looked_ns + LOOK_NS

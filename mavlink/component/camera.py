@@ -137,13 +137,6 @@ class CameraComponent:
         if isinstance(handled, Answer) and handled.result is not Result.ACCEPTED:
             self._series = None
 
-    def next_timer(self) -> int | None:
-        """Time in ns at which :meth:`tick` is due."""
-        times = [self._waiting[0]] if self._waiting else []
-        if self._series is not None:
-            times.append(self._next_shot_ns)
-        return min(times, default=None)
-
     # Messages.
 
     def message(self, number: int, index: int) -> object | None:

@@ -207,10 +207,6 @@ class CommandDesk:
                 running.next_report_ns = now_ns + PROGRESS_EVERY_NS
                 self._progress(component, running.call, running.work)
 
-    def next_timer(self) -> int | None:
-        """Time in ns at which :meth:`tick` is due; None when nothing runs."""
-        return min((r.next_report_ns for r in self._running.values()), default=None)
-
     def _progress(self, component: int, call: Call, work: Work) -> None:
         percent = min(99, int(100 * work.fraction))
         self._ack(component, call, Result.IN_PROGRESS, percent)

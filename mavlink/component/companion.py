@@ -1,7 +1,7 @@
 """The companion computer on the vehicle's network: packets in, messages out.
 
-No sockets and no clocks: ``receive(link, packet, now_ns)``, ``tick(now_ns)``, ``take()`` and
-``next_timer()``. :mod:`mavlink.component.vehicle` connects it to real links.
+No sockets and no clocks: ``receive(link, packet, now_ns)``, ``tick(now_ns)`` and ``take()``.
+:mod:`mavlink.component.vehicle` connects it to real links.
 """
 
 from __future__ import annotations
@@ -229,15 +229,6 @@ class Companion:
         for text in self.watch.news(now_ns, self._is_recording and not was_recording):
             self.say(texts.WARNING, text)
         self.presence.is_ready = not any(t.is_grave for t in self.watch.troubles(now_ns))
-
-    def next_timer(self) -> int:
-        """Time in ns at which :meth:`tick` is due."""
-        times = [
-            t
-            for t in (self.camera.next_timer(), self.desk.next_timer(), self.streams.next_timer())
-            if t is not None
-        ]
-        return min([*times, *self.autopilot.next_timers(self._now_ns), self._now_ns + S])
 
     def say(self, severity: int, text: str, is_answer: bool = False) -> None:
         """Send a text to the operator; one that answers a command is never held back."""

@@ -29,6 +29,7 @@ class Answer:
 
 
 ACCEPTED = Answer()
+UNAVAILABLE = Answer(Result.DENIED, "no scanning service runs here")
 
 
 class Work:
@@ -105,39 +106,55 @@ class ScanControl(Protocol):
 
     def status(self) -> ScanStatus:
         """A snapshot."""
+        return ScanStatus()
 
     def start_scan(self) -> Handled:
         """Start a scan, resume a paused one, or retry at once; a second start changes nothing."""
+        return UNAVAILABLE
 
     def stop_scan(self) -> Handled:
         """Close the running scan and drop every retry; always possible."""
+        return UNAVAILABLE
 
     def capture_keyframe(self) -> Handled:
         """Make the next frame a keyframe and report it."""
+        return UNAVAILABLE
 
     def pause(self) -> Handled:
         """Take no frames without closing the scan."""
+        return UNAVAILABLE
 
     def resume(self) -> Handled:
         """Resume after a pause."""
+        return UNAVAILABLE
 
     def clear_map(self) -> Handled:
         """Forget the map of the running scan."""
+        return UNAVAILABLE
 
     def finalise(self) -> Handled:
         """Stop as :meth:`stop_scan` does, and answer when all files are written."""
+        return UNAVAILABLE
 
     def self_test(self) -> Handled:
         """Check camera, link, disk and compute."""
+        return UNAVAILABLE
 
     def erase_scans(self) -> Handled:
         """Delete the finished scans; called only while none runs."""
+        return UNAVAILABLE
 
     def power(self, action: Power) -> Handled:
         """Reboot or shut down; called only while disarmed."""
+        return UNAVAILABLE
 
     def parameter_changed(self, name: str, value: float) -> Answer:
         """Apply a new value of one of ``PARAMETERS``, or refuse it.
 
         The baseline always arrives as ``SR_BASELINE_M`` (0: automatic), whatever command set it.
         """
+        return UNAVAILABLE
+
+
+class NoScans(ScanControl):
+    """A link without a scanning service: it refuses every command."""

@@ -7,22 +7,14 @@ independently; there the symptom is that no ground station ever queries our came
 
 from __future__ import annotations
 
-import secrets
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from mavlink.component.autopilot_link import AutopilotLink
-from mavlink.component.presence import Health, Presence, PresenceConfig
-from mavlink.telemetry.history import VehicleHistory
+from mavlink.component.presence import Presence
 from mavlink.wire.dialect import numbers_of
 from mavlink.wire.first_beat import TYPES
-from mavlink.wire.framing import MAGIC_V1, Decoder, Packet
-from mavlink.wire.link import Inbox, Link, parse_link
-from mavlink.wire.messages import LinkReport, Links, Outbox
-from mavlink.wire.signing import Signing, read_key
+from mavlink.wire.framing import MAGIC_V1, Packet
 
 S = 1_000_000_000
 TYPE_GCS = 6
@@ -159,74 +151,3 @@ class LinkWatch:
         before = frozenset() if is_start else self._announced
         self._announced = frozenset(t.what for t in troubles)
         return [t.text for t in troubles if t.what not in before and not t.is_known]
-
-
-STEP_S = 0.02
-BACKLOG = 10_000
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """Result of a probe."""
-
-    links: tuple[LinkReport, ...]
-    autopilot: tuple[int, int] | None  # system and component
-    troubles: tuple[Trouble, ...]
-
-
-class LinkProbe:
-    """A short probe of the links. ValueError for an invalid link or key.
-
-    It sends heartbeats and requests telemetry, as the service does, because a port may carry
-    nothing before. It executes no command.
-    """
-
-    def __init__(
-        self,
-        links: Sequence[str],
-        system: int | None,
-        watch: WatchConfig,
-        signing_key: Path | None = None,
-    ) -> None:
-        signing = None if signing_key is None else Signing(read_key(signing_key), 0)
-        now_ns = time.monotonic_ns()
-        self._presence = Presence(PresenceConfig(system), secrets.randbits(32) or 1, now_ns)
-        self._outbox = Outbox()
-        history = VehicleHistory()
-        self._autopilot = AutopilotLink(
-            self._presence, history, self._outbox, lambda severity, text: None
-        )
-        self._watch = LinkWatch(watch, self._presence, now_ns)
-        self._decoder = Decoder()
-        self._inbox: Inbox[tuple[int, Packet, int]] = Inbox(BACKLOG)
-        opened = [Link(parse_link(text)) for text in links]
-        self._links = Links(opened, lambda *heard: self._inbox.gather(heard), signing)
-
-    def look(self, seconds: float) -> Found:
-        """Listen and request for this long."""
-        self._links.start()
-        end_ns = time.monotonic_ns() + round(seconds * S)
-        while time.monotonic_ns() < end_ns:
-            self._step(time.monotonic_ns())
-            time.sleep(STEP_S)
-        troubles = self._watch.troubles(time.monotonic_ns())
-        found = Found(self._links.report(), self._presence.autopilot, troubles)
-        self._links.stop()
-        return found
-
-    def _step(self, now_ns: int) -> None:
-        for index, packet, heard_ns in self._inbox.take(0.0)[0]:
-            self._hear(index, packet, heard_ns)
-        self._presence.confirm(Health.STANDBY, now_ns)
-        self._presence.autopilots.look(now_ns)
-        self._autopilot.follow()
-        self._autopilot.tick(now_ns)
-        messages = (*self._presence.due(now_ns), *self._outbox.take())
-        self._links.send(self._presence.system, messages)
-
-    def _hear(self, index: int, packet: Packet, now_ns: int) -> None:
-        message = self._decoder.message(packet)
-        if message is not None:
-            self._presence.autopilots.count(packet.system, packet.component)
-            self._autopilot.hear(message, packet, index, now_ns)
-            self._watch.hear(packet, message, now_ns)

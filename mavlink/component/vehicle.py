@@ -45,6 +45,7 @@ SAVE_EVERY_NS = 30 * S
 TELEMETRY = numbers_of(READERS)
 BACKLOG = 10_000  # packets queued for the protocol's thread
 STUCK_NS = 10 * S
+TICK_S = 0.01  # the fastest stream has 50 messages a second
 TUNNEL_ROOM = 128
 BEAT_NICE = -10  # needs LimitNICE or root, otherwise the priority stays normal
 
@@ -258,14 +259,10 @@ class VehicleLink:
     def _run(self) -> None:
         """The protocol's thread, the only one that uses the companion."""
         save_ns = time.monotonic_ns() + SAVE_EVERY_NS
-        timer_ns = 0
         while not self._stop.is_set():
-            wait_s = (timer_ns - time.monotonic_ns()) / S
-            is_served = self._serve(max(1e-4, wait_s))
+            self._serve(TICK_S)
             now_ns = self._alive_ns = time.monotonic_ns()
-            if now_ns >= timer_ns or is_served:
-                self._guard(partial(self._companion.tick, now_ns))
-                timer_ns = self._companion.next_timer()
+            self._guard(partial(self._companion.tick, now_ns))
             self._send(self._companion.take())
             if now_ns >= save_ns or self._is_stale():
                 save_ns = now_ns + SAVE_EVERY_NS
@@ -273,8 +270,8 @@ class VehicleLink:
         self._serve(0.0)
         self._send(self._companion.take())
 
-    def _serve(self, wait_s: float) -> bool:
-        """Run queued jobs and process telemetry; True when a job may have set a timer."""
+    def _serve(self, wait_s: float) -> None:
+        """Run queued jobs and process telemetry."""
         telemetry, jobs = self._inbox.take(wait_s)
         for job in jobs:  # first: a heartbeat identifies the telemetry that follows
             self._guard(job)
@@ -283,7 +280,6 @@ class VehicleLink:
                 self._hear(index, packet, now_ns)
             except Exception:
                 log.exception("fault while processing telemetry")
-        return bool(jobs)
 
     def _guard(self, job: Job) -> None:
         """Run a job; a fault in the service's handler must not end the link."""

@@ -328,10 +328,6 @@ class TimesyncFilter:
         self._asked.append(now_ns)
         return TimesyncRequest(now_ns, target)
 
-    def next_timer(self) -> int:
-        """Time in ns of the next request."""
-        return self._next_ns
-
     def round_trip_of(self, ts1: int, received_ns: int) -> int | None:
         """Time in ns since we sent this request; None when it is not a recent one of ours."""
         return received_ns - ts1 if ts1 in self._asked and received_ns >= ts1 else None

@@ -151,8 +151,6 @@ class Link:
                         self._port = None  # the reading thread reopens it
 
 
-GATHER_S = 0.04
-
 Job = Callable[[], object]
 T = TypeVar("T")
 
@@ -187,7 +185,7 @@ class Inbox(Generic[T]):
         """Queued telemetry and jobs, after waiting briefly for a job."""
         with self._wake:
             if not self._jobs:
-                self._wake.wait(min(GATHER_S, timeout_s))
+                self._wake.wait(timeout_s)
             jobs = list(self._jobs)
             self._jobs.clear()
         telemetry = [self._telemetry.popleft() for _ in range(len(self._telemetry))]

@@ -134,11 +134,6 @@ class Streams:
                 stream.next_ns = now_ns + stream.interval_us * 1000
                 stream.send()
 
-    def next_timer(self) -> int | None:
-        """Time in ns at which :meth:`tick` is due."""
-        running = [s.next_ns for s in self._streams.values() if s.interval_us > 0]
-        return min(running, default=None)
-
 
 @dataclass(frozen=True, slots=True)
 class LinkReport:

@@ -16,11 +16,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from unittest.mock import create_autospec
-
-if TYPE_CHECKING:
-    from mavlink.component.control import ScanControl
+from typing import Any
 
 BENCHMARKS: dict[str, str] = {
     "stereo": "service.bench.stereo:run",
@@ -167,15 +163,6 @@ def machine() -> str:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
         words.append(f"{memory:.0f} GiB")
     return ", ".join([*words, f"Python {platform.python_version()}"])
-
-
-def idle_control() -> ScanControl:
-    """A vehicle link's requests where nothing scans."""
-    from mavlink.component.control import ScanControl, ScanStatus
-
-    control: ScanControl = create_autospec(ScanControl, instance=True)
-    control.status.return_value = ScanStatus()  # type: ignore[attr-defined]
-    return control
 
 
 def _spread(values: list[float]) -> float:

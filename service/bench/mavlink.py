@@ -246,11 +246,11 @@ def _burn(done: Any) -> None:
 
 
 def _vehicle(mode: str, port: int, seconds: float) -> None:
+    from mavlink.component.control import NoScans
     from mavlink.component.presence import Health
     from mavlink.component.vehicle import VehicleConfig, VehicleLink
-    from service.bench import idle_control
 
-    vehicle = VehicleLink(VehicleConfig(links=(f"udpout:127.0.0.1:{port}",)), idle_control())
+    vehicle = VehicleLink(VehicleConfig(links=(f"udpout:127.0.0.1:{port}",)), NoScans())
     vehicle.start()
     vehicle.set_health(Health.STANDBY)
     if mode == "cost":

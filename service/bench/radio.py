@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mavlink.component.control import NoScans
 from mavlink.component.presence import Health
 from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from mavlink.wire.dialect import dialect
@@ -27,7 +28,6 @@ from mavlink.wire.framing import Framer
 from recon import se3
 from recon.posegraph.submap_loops import points_of
 from recon.types import F64, DepthMap, Keyframe, Pose
-from service.bench import idle_control
 from service.bench.link_emulator import free_port
 from service.config import DatalinkConfig
 from service.ground.received import ReceivedScan
@@ -140,7 +140,7 @@ def fly() -> RadioOutcome:
 
 def _fly(folder: Path) -> RadioOutcome:
     radio, flight = _Radio(), _Flight()
-    vehicle = VehicleLink(VehicleConfig(links=(radio.names[0],)), idle_control())
+    vehicle = VehicleLink(VehicleConfig(links=(radio.names[0],)), NoScans())
     vehicle.start()
     session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",))
     receiver = BareReceiver(ReceiverConfig(folder / "ground", session))

@@ -10,7 +10,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from http.client import HTTPException
 from importlib.metadata import PackageNotFoundError, version
@@ -23,7 +23,7 @@ from mavlink.telemetry.clock import EARLIEST_UNIX_S
 from service.config import Config, keys, load_config
 from service.daemon.machine import read_machine
 from service.daemon.simulated import is_simulated
-from service.daemon.vehicle_config import watch_config
+from service.daemon.vehicle_config import vehicle_config, watch_config
 from service.daemon.warm_up import is_warm, warm_up_command
 from service.errors import InputError, SkyreliefError
 from service.packages import unusable_packages
@@ -50,6 +50,7 @@ class Grade(str, Enum):
 GOOD, NOTE, BAD = Grade
 
 WAIT_S = 1.0
+CONFIRM_S = 0.1
 
 LARGEST_BYTES = 1 << 20
 
@@ -371,17 +372,27 @@ def _of_service(heard: dict[str, Any]) -> Iterator[Finding]:
 
 
 def _by_listening(config: Config, listen_s: float) -> Iterator[Finding]:
-    from mavlink.component.link_watch import LinkProbe
+    """Open the links as the service does; every command is refused meanwhile."""
+    from mavlink.component.companion import CompanionConfig
+    from mavlink.component.control import NoScans
+    from mavlink.component.presence import Health
+    from mavlink.component.vehicle import VehicleLink
 
-    mavlink = config.mavlink
     watch = watch_config(config, wait_s=listen_s / 2, ground_wait_s=listen_s / 2)
-    key = Path(mavlink.signing_key) if mavlink.signing_key else None
+    companion = CompanionConfig(watch=watch)
     try:
-        probe = LinkProbe(mavlink.links, mavlink.system_id or None, watch, key)
-    except ValueError as error:
+        settings = replace(vehicle_config(config), companion=companion, state_dir=None)
+        vehicle = VehicleLink(settings, NoScans())
+    except InputError as error:
         yield Finding("mavlink", BAD, str(error))
         return
-    found = probe.look(listen_s)
+    vehicle.start()
+    end_s = time.monotonic() + listen_s
+    while time.monotonic() < end_s:
+        vehicle.set_health(Health.STANDBY)
+        time.sleep(CONFIRM_S)
+    found = vehicle.report()
+    vehicle.stop()
     for link in found.links:
         if link.packets:
             heard = (f"system {s}: {n / listen_s:.0f}/s" for s, n in sorted(link.packets.items()))
