@@ -17,37 +17,40 @@ from service.errors import InputError
 from service.stream.radio_messages import MAX_BYTES, PAYLOAD_TYPE
 
 TUNNEL, RADIO_STATUS = 385, 109
-DRONE = (1, 191)  # system and component: the onboard computer
-GROUND = (254, 190)
+DRONE = (1, 191, dialect.MAV_TYPE_ONBOARD_CONTROLLER)  # system, component, type
+GROUND = (254, 190, dialect.MAV_TYPE_GCS)
 
 
 class RadioLink:
     """One MAVLink endpoint that carries tunnelled payloads; has its own threads.
 
-    ``on_payload`` gets the payloads of TUNNEL messages of our type, ``on_status`` the free
-    share of the radio's buffer in percent; both are called on the reading thread. Raises
+    ``on_payload`` gets the payloads of TUNNEL messages of our type, on the reading thread. Raises
     InputError for an invalid endpoint.
     """
 
     def __init__(
         self,
         endpoint: str,
-        identity: tuple[int, int],
-        on_payload: Callable[[bytes], None],
-        on_status: Callable[[int], None] = lambda _: None,
+        identity: tuple[int, int, int],
+        on_payload: Callable[[bytes], None] = lambda _: None,
     ) -> None:
         try:
             self._link = Link(parse_link(endpoint), self._receive)
         except ValueError as error:
             raise InputError(f"MAVLink {error}") from error
-        self._encoder = dialect.MAVLink(None, *identity)
+        system, component, self._kind = identity
+        self._encoder = dialect.MAVLink(None, system, component)
         self._on_payload = on_payload
-        self._on_status = on_status
+        self._on_status: Callable[[int], None] = lambda _: None
         self._framer = Framer()
         self._decoder = Decoder()
 
-    def start(self) -> None:
-        """Open the endpoint, and reopen it whenever it fails."""
+    def open(self, on_status: Callable[[int], None] = lambda _: None) -> None:
+        """Open the endpoint, and reopen it whenever it fails.
+
+        ``on_status`` gets the free share of the radio's buffer in percent, on the reading thread.
+        """
+        self._on_status = on_status
         self._link.start()
 
     def close(self) -> None:
@@ -59,9 +62,9 @@ class RadioLink:
         padded = list(payload.ljust(MAX_BYTES, b"\0"))
         self._send(dialect.MAVLink_tunnel_message(0, 0, PAYLOAD_TYPE, len(payload), padded))
 
-    def beat(self, kind: int) -> None:
-        """Send a heartbeat of MAV_TYPE ``kind``, so that routers forward messages to us."""
-        self._send(dialect.MAVLink_heartbeat_message(kind, 8, 0, 0, 4, 3))
+    def beat(self) -> None:
+        """Send a heartbeat, so that routers forward messages to us."""
+        self._send(dialect.MAVLink_heartbeat_message(self._kind, 8, 0, 0, 4, 3))
 
     def _send(self, message: Any) -> None:
         data = bytes(message.pack(self._encoder))
@@ -79,31 +82,6 @@ class RadioLink:
                 self._on_status(int(message.txbuf))
             elif message.payload_type == PAYLOAD_TYPE and message.payload_length <= MAX_BYTES:
                 self._on_payload(bytes(message.payload[: message.payload_length]))
-
-
-class EndpointCarrier:
-    """A radio on its own MAVLink endpoint; InputError for an invalid one."""
-
-    def __init__(self, endpoint: str) -> None:
-        self._on_status: Callable[[int], None] = lambda _: None
-        self._link = RadioLink(endpoint, DRONE, lambda _: None, lambda free: self._on_status(free))
-
-    def open(self, on_status: Callable[[int], None]) -> None:
-        """Open the endpoint."""
-        self._on_status = on_status
-        self._link.start()
-
-    def beat(self) -> None:
-        """Send a heartbeat, so that routers learn the route."""
-        self._link.beat(dialect.MAV_TYPE_ONBOARD_CONTROLLER)
-
-    def send(self, payload: bytes) -> None:
-        """Send a payload to all."""
-        self._link.send(payload)
-
-    def close(self) -> None:
-        """Close the endpoint."""
-        self._link.close()
 
 
 class VehicleRadio:

@@ -27,7 +27,7 @@ from service.config import Config, DatalinkConfig
 from service.flight.datalink import OWN_LINKS, DaemonLink
 from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
-from service.radio import GROUND, TUNNEL, EndpointCarrier, RadioLink
+from service.radio import DRONE, GROUND, TUNNEL, RadioLink
 from service.stream import codec
 from service.stream.link import DatalinkSender
 from service.stream.radio_messages import (
@@ -270,9 +270,9 @@ def test_over_a_real_link_into_the_ground_station(
     ground = Receiver(ReceiverConfig(tmp_path / "ground", session))
     ground.start()
     radio = RadioLink(f"udpin:127.0.0.1:{udp}", GROUND, ground.add_radio)
-    radio.start()
+    radio.open()
     store = ScanStore.create(tmp_path / "a.db", HEADER)
-    carrier = EndpointCarrier(f"udpout:127.0.0.1:{udp}")
+    carrier = RadioLink(f"udpout:127.0.0.1:{udp}", DRONE)
     sender = RadioSender(store, TunnelConfig(radio_bytes_s=50_000), carrier)
     try:
         store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))

@@ -151,7 +151,7 @@ def _fly(folder: Path) -> RadioOutcome:
         receiver.add_radio(payload)
 
     ear = RadioLink(radio.names[1], GROUND, heard)
-    ear.start()
+    ear.open()
     onboard = ScanStore.create(folder / "scan.db", ScanHeader("scan", "drone", 1))
     config = DatalinkConfig(radio_baud=BAUD, radio_share=SHARE)
     sender = DatalinkSender(onboard, config, radio=VehicleRadio(vehicle))

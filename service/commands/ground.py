@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 DEFAULT_PORT = 7447
 RADIO_REFRESH_S = 15.0
-MAV_TYPE_GCS = 6
 NOTIFY_S = 1.0
 SHOW_S = 2.0
 CLOSING_S = 900.0
@@ -177,7 +176,7 @@ def ground(given: GroundOptions) -> None:
     where = ", ".join((*config.session.listen, *config.session.connect))
     print(f"ground station at {where}, scans in {config.store}", file=sys.stderr, flush=True)
     for radio in radios:
-        radio.start()
+        radio.open()
     page = None
     try:
         if given.portal is not None:
@@ -279,7 +278,7 @@ def _watch(
             beat_at = time.monotonic() + NOTIFY_S
             _check(workers, notifier)
             for radio in radios:
-                radio.beat(MAV_TYPE_GCS)
+                radio.beat()
         if given.once and any(entry["complete"] for entry in entries):
             stop.wait(1.5)  # let the report reach the drone
             return

@@ -34,18 +34,16 @@ def open_datalink(
     """
     datalink, radio = config.datalink, own_links
     if datalink.radio != OWN_LINKS:
-        radio = _endpoint(datalink.radio) if datalink.radio else None
+        radio = None
+        if datalink.radio:
+            from service.radio import DRONE, RadioLink
+
+            radio = RadioLink(datalink.radio, DRONE)
     if not (datalink.connect or datalink.listen or radio):
         return None
     from service.stream.link import DatalinkSender
 
     return DatalinkSender(store, datalink, radio=radio)
-
-
-def _endpoint(endpoint: str) -> Carrier:
-    from service.radio import EndpointCarrier
-
-    return EndpointCarrier(endpoint)
 
 
 def open_backlog(config: Config) -> DatalinkSender | None:

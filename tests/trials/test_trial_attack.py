@@ -149,8 +149,8 @@ def test_hostile_records_stop_nothing(tmp_path: Path, cage: Cage, record: Row) -
 
 def tunnelled(endpoint: str, count: int) -> int:
     """Send hostile payloads of the narrow radio; how many."""
-    link = RadioLink(endpoint, DRONE, lambda _: None)
-    link.start()
+    link = RadioLink(endpoint, DRONE)
+    link.open()
     try:
         for number, payload in enumerate(hostile_tunnels(SEED, count)):
             link.send(payload)
