@@ -146,10 +146,10 @@ def test_a_mesh_without_its_package_or_video_fails_before_the_work(
 
     house.flown(tmp_path / "scan").close()
     monkeypatch.setattr(model, "footprints", lambda _: pytest.fail("the work has begun"))
-    missing = MeshOptions(video=tmp_path / "none.mp4")
+    missing = ExportOptions(video=tmp_path / "none.mp4")
     with ScanView(tmp_path / "scan") as scan:
         with pytest.raises(InputError, match=r"none\.mp4: no such file or folder"):
-            model.write_mesh(scan, tmp_path / "mesh.glb", missing, ExportOptions())
+            model.write_mesh(scan, tmp_path / "mesh.glb", MeshOptions(), missing)
         monkeypatch.setitem(sys.modules, "trimesh", None)
         with pytest.raises(OutsideError, match="a mesh file needs the package trimesh; pip"):
             model.write_mesh(scan, tmp_path / "mesh.glb", MeshOptions(), ExportOptions())

@@ -234,9 +234,9 @@ def test_the_file_names_no_path_of_this_machine(
     part = SimpleNamespace(mesh=mesh, image=None, figures=figures)
     monkeypatch.setattr(model, "run_tiles", lambda *_: [part])
     monkeypatch.setattr(model, "check_video", lambda *_: None)
-    how = model.MeshOptions(video=tmp_path / "flight.mp4")
+    options = ExportOptions(video=tmp_path / "flight.mp4")
     with ScanView(tmp_path / "scan") as scan:
-        said = model.write_mesh(scan, tmp_path / "mesh.glb", how, ExportOptions())
+        said = model.write_mesh(scan, tmp_path / "mesh.glb", model.MeshOptions(), options)
     written = (tmp_path / "mesh.glb").read_bytes()
     assert said["pictures"] == str(tmp_path / "flight.mp4")
     assert b'"pictures":"video"' in written and str(tmp_path).encode() not in written
@@ -278,16 +278,18 @@ def test_the_recording_that_a_scan_names_is_found(
 
 
 def test_a_recording_found_by_itself_that_does_not_fit_is_left(
-    tmp_path: Path, house: HouseFlight
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The scan names a file that is not a video: the mesh is made from the store, and says so."""
     house.flown(tmp_path).close()
-    job = replace(jobs(tmp_path)[0], video=str(tmp_path / "none.mp4"))
-    reported: list[str] = []
-    assert mesh_tile(replace(job, video_named=False), noting(reported)) is not None
+    video = tmp_path / "none.mp4"
+    video.touch()
+    monkeypatch.setattr(images, "recording_of", lambda *_: images.Recording(video, ""))
+    (job, *_), reported = jobs(tmp_path), list[str]()
+    assert mesh_tile(job, noting(reported)) is not None
     assert any("after all" in text for text in reported)
     with pytest.raises(InputError, match="its video cannot be used"):
-        mesh_tile(job, noting(reported))
+        mesh_tile(replace(job, options=ExportOptions(video=video)), noting(reported))
 
 
 def test_the_mesh_lies_on_the_globe_as_3d_tiles(tmp_path: Path, house: HouseFlight) -> None:

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from site_scans import Errors, leg, write_scan
 
 from recon.types import F64
-from service.offline.exports import EXPORTERS, clouds, rasters
+from service.offline.exports import EXPORTERS, view
 from service.offline.exports.clouds import PLY_TYPES, SAMPLES_PER_SIDE, octree_in_parts
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.site import compare
@@ -44,7 +44,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         counts.append(len(jobs))
         return run_tiles(make, jobs, *rest)
 
-    for module in (rasters, clouds, compare):
+    for module in (view, compare):
         monkeypatch.setattr(module, "run_tiles", counting)
     return counts
 

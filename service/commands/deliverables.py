@@ -126,16 +126,18 @@ def mesh(
     from service.offline.exports.view import ExportOptions, ScanView
 
     try:
-        options = ExportOptions(voxel_m=voxel_m, tile_points=tile_points, scheduler=scheduler)
+        options = ExportOptions(
+            voxel_m=voxel_m, video=video, stored=stored, video_epoch_ns=_epoch_ns(video_epoch),
+            tile_points=tile_points, scheduler=scheduler,
+        )  # fmt: skip
     except ValueError as error:
         raise InputError(f"mesh: {error}") from error
     if stored and video is not None:
         raise InputError("mesh: give either --video or --stored")
-    how = MeshOptions(method, faces, video, not stored, _epoch_ns(video_epoch))
     path = out or scan_dir / "mesh.glb"
     started = time.monotonic()
     with showing("mesh") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
-        figures = write_mesh(scan, path, how, options)
+        figures = write_mesh(scan, path, MeshOptions(method, faces), options)
     figures["seconds"] = round(time.monotonic() - started, 1)
     if as_json:
         print(json.dumps({"file": str(path)} | figures))

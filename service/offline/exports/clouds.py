@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,15 +16,19 @@ import numpy as np
 
 from recon.mapping.cloud_fusion import without
 from recon.types import F64, I64, U8, Array, PointCloud
-from service.errors import InputError
 from service.georeference import map_crs
 from service.offline.exports.flight import writing_folder
 from service.offline.exports.rasters import GROUND_MARGIN_M
 from service.offline.exports.surface import bare_ground, surface_model
-from service.offline.exports.view import ExportOptions, ProductJob, ScanView
-from service.offline.tiles import run_tiles
-from service.progress import Progress
-from service.scans.fused_cloud import CHUNK_POINTS, SCALE_M, las_header, point_record, write_laz
+from service.offline.exports.view import ExportOptions, ScanView, in_parts
+from service.scans.fused_cloud import (
+    CHUNK_POINTS,
+    SCALE_M,
+    Box,
+    las_header,
+    point_record,
+    write_laz,
+)
 from service.scans.writing import writing
 
 if TYPE_CHECKING:
@@ -94,35 +97,27 @@ def points_of(
 
     Raises InputError, at the first, when there is not a single point.
     """
-    cut = scan.tiling(options, GROUND_MARGIN_M if is_classified else VOXELS_MARGIN_M)
-    if len(cut.tiles) == 1:
-        yield scan.fused.cloud, scan.xyz_m, classes(scan) if is_classified else None
-        return
-    fixed = replace(scan.for_tiles(options, cut), cell_m=None)
-    kind = "classified" if is_classified else "points"
-    jobs = [ProductJob(tile, kind, fixed) for tile in cut.tiles]
-    is_empty = True
-    for part in run_tiles(make_points, jobs, options.scheduler, scan.progress):
-        if part is not None:
-            is_empty = False
-            yield part
-    if is_empty:
-        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
+    make, margin_m = (_classified, GROUND_MARGIN_M) if is_classified else (_placed, VOXELS_MARGIN_M)
+    return in_parts(scan, make, options, margin_m, needs_cell=False)
 
 
-def make_points(job: ProductJob, progress: Progress | None = None) -> PlacedPart | None:
-    """The points of one tile; None without any."""
-    with ScanView(Path(job.tile.folder), job.options.voxel_m, progress, job.tile) as view:
-        if not view.has_points:
-            return None
-        scan = view.converted(job.options)
-        west, south, east, north = job.tile.box
-        x, y = scan.xyz_m[:, 0], scan.xyz_m[:, 1]
-        outside = (x < west) | (x >= east) | (y < south) | (y >= north)
-        if outside.all():
-            return None
-        found = classes(scan)[~outside] if job.kind == "classified" else None
-        return without(scan.fused.cloud, outside), scan.xyz_m[~outside], found
+def _placed(
+    scan: ScanView, _: ExportOptions, box: Box, kinds: U8 | None = None
+) -> PlacedPart | None:
+    """The points in the box; None without any."""
+    west, south, east, north = box
+    x, y = scan.xyz_m[:, 0], scan.xyz_m[:, 1]
+    outside = (x < west) | (x >= east) | (y < south) | (y >= north)
+    if outside.all():
+        return None
+    if not outside.any():
+        return scan.fused.cloud, scan.xyz_m, kinds
+    kept = None if kinds is None else kinds[~outside]
+    return without(scan.fused.cloud, outside), scan.xyz_m[~outside], kept
+
+
+def _classified(scan: ScanView, options: ExportOptions, box: Box) -> PlacedPart | None:
+    return _placed(scan, options, box, classes(scan))
 
 
 UNCLASSIFIED, GROUND = 1, 2

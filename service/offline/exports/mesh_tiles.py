@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,13 @@ import numpy as np
 from recon.mapping.cloud_fusion import cloud_of
 from recon.surface.meshing import Mesh, cut, height_mesh, poisson_mesh
 from recon.surface.raster import fill_holes, grid_over, rasterise, smoothed
-from recon.surface.texture_views import TextureView
 from recon.surface.texturing import texture
 from recon.types import F64, U8, Keyframe, PointCloud
-from service.errors import SkyreliefError
-from service.offline.exports.images import stored_images, video_images
+from service.offline.exports.images import scan_images
+from service.offline.exports.view import ExportOptions
 from service.offline.tiles import Tile
 from service.progress import Progress
 from service.scans.fused_cloud import fused_cloud
-from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
@@ -40,9 +38,7 @@ class TileJob:
     method: str  # height or poisson
     largest_faces: int
     largest_texture_px: int
-    video: str | None = None
-    video_epoch_ns: int | None = None
-    video_named: bool = True  # False: found by itself; without it the stored images do
+    options: ExportOptions = field(default_factory=ExportOptions)  # where images come from
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +69,7 @@ def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None
         if not len(mesh.faces):
             return None
         with progress.part(f"{len(mesh.faces)} triangles; reading images", 0.25):
-            views = _images(job, keyframes, store.header, progress)
+            views = scan_images(keyframes, Path(tile.folder), store.header, job.options, progress)
     finally:
         store.close()
     with progress.part("texture"):
@@ -87,24 +83,6 @@ def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None
         "texture_px": [done.image.shape[1], done.image.shape[0]],
     }
     return TilePart(done.mesh, done.image, figures)
-
-
-def _images(
-    job: TileJob,
-    keyframes: Sequence[Keyframe],
-    header: ScanHeader,
-    progress: Progress,
-) -> list[TextureView]:
-    """The views of the job's video, else of the store."""
-    if job.video is None:
-        return stored_images(keyframes)
-    try:
-        return video_images(keyframes, header, Path(job.video), job.video_epoch_ns, progress)
-    except SkyreliefError as error:
-        if job.video_named:
-            raise
-        progress(f"textures from the scan's own images after all: {error}")
-        return stored_images(keyframes)
 
 
 def _surface(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -34,21 +34,11 @@ class MeshOptions:
 
     method: str = "auto"
     largest_faces: int = 400_000
-    video: Path | None = None  # None: the scan's recording, when it is still there
-    recording: bool = True  # False: never look for the recording
-    video_epoch_ns: int | None = None
 
 
 def write_glb(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """The mesh that ``skyrelief mesh`` makes by default."""
-    write_mesh(scan, out, default_mesh(options), options)
-
-
-def default_mesh(options: ExportOptions) -> MeshOptions:
-    """What ``skyrelief mesh`` does by default with these images."""
-    return MeshOptions(
-        video=options.video, recording=not options.stored, video_epoch_ns=options.video_epoch_ns
-    )
+    write_mesh(scan, out, MeshOptions(), options)
 
 
 def write_mesh(
@@ -81,8 +71,8 @@ def mesh_parts(
         raise InputError(f"mesh by {how.method!r}: there are {', '.join(METHODS)}")
     with needing("a mesh file"):
         import trimesh  # noqa: F401  # before the long work, not after it
-    if how.video is not None:
-        check_video(scan.store.header, how.video)
+    if options.video is not None:
+        check_video(scan.store.header, options.video)
     method = how.method
     if method == "auto":
         method = "poisson" if scan.oblique else "height"
@@ -90,11 +80,9 @@ def mesh_parts(
     if not prints:
         raise InputError(f"{scan.folder} contains no points yet; nothing to mesh")
     voxel_m = options.voxel_m or float(np.median([p.sample_m for p in prints]))
-    video = how.video
-    if video is None and how.recording:
-        recording = recording_of(scan.folder, scan.store.header)
-        scan.progress(recording.words)
-        video = recording.path
+    video = options.video
+    if video is None and not options.stored:
+        video = recording_of(scan.folder, scan.store.header).path
     margin_m = MARGIN_VOXELS * voxel_m
     tiles = tiles_over(scan.folder, prints, options.tile_points, margin_m)
     jobs = [
@@ -104,9 +92,7 @@ def mesh_parts(
             method,
             max(1000, how.largest_faces // len(tiles)),
             LARGEST_ATLAS_PX if len(tiles) == 1 else TILED_ATLAS_PX,
-            None if video is None else str(video.resolve()),
-            how.video_epoch_ns,
-            how.video is not None,
+            options if options.video is None else replace(options, video=options.video.resolve()),
         )
         for tile in tiles
     ]
@@ -241,7 +227,7 @@ SPAN_M = 1000.0
 def write_mesh_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """A folder with ``tileset.json`` and a glTF for each tile; heights are AMSL metres."""
     frame = scan.needs_place("3D Tiles")
-    parts, _ = mesh_parts(scan, default_mesh(options), options)
+    parts, _ = mesh_parts(scan, MeshOptions(), options)
     children = []
     with writing_folder(out) as folder:
         for number, part in enumerate(parts):
@@ -289,7 +275,7 @@ def write_obj(scan: ScanView, out: Path, options: ExportOptions) -> None:
     many readers keep single precision; ``mesh.prj`` is the coordinate system. Without a
     georeference they are ENU metres.
     """
-    parts, _ = mesh_parts(scan, default_mesh(options), options)
+    parts, _ = mesh_parts(scan, MeshOptions(), options)
     frame = scan.frame
     places = [
         p.mesh.vertices_m if frame is None else frame.to_utm(p.mesh.vertices_m) for p in parts

@@ -25,9 +25,8 @@ from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
 from service.offline.exports.images import recording_of, scan_images
 from service.offline.exports.surface import bare_ground, cell_places, surface_model
-from service.offline.exports.view import ExportOptions, ProductJob, ScanView
-from service.offline.tiles import run_tiles
-from service.progress import Progress
+from service.offline.exports.view import ExportOptions, Make, ScanView, in_parts
+from service.offline.tiles import grown
 from service.scans.coverage import coverage_of
 from service.scans.fused_cloud import EVERYWHERE, Box
 from service.scans.main_piece import main_keyframes, main_seqs
@@ -69,26 +68,26 @@ class Layers:
         return replace(self, grid=self.grid.part(rows, cols), bands=bands)
 
 
-def dsm(scan: ScanView, options: ExportOptions) -> Layers:
+def dsm(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
     """Heights in metres (float32, -9999 where unknown), their sigma, and 1 where filled."""
     surface = surface_model(scan, options.cell_m, options.strict)
     known = surface.raster.known
     bands = [surface.raster.height_m, surface.raster.sigma_m, surface.is_filled]
     image = np.where(known, np.stack(bands), NODATA_M).astype(np.float32)
     names = (f"height {options.above}, m", "sigma, m", "filled")
-    return Layers(surface.raster.grid, image, names, NODATA_M, options.datum)
+    return Layers(surface.raster.grid, image, names, NODATA_M, options.datum).within(box)
 
 
-def dtm(scan: ScanView, options: ExportOptions) -> Layers:
+def dtm(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
     """Heights of the bare ground (float32, -9999 where unknown), and 1 where they are bridged."""
     raster, found = surface_model(scan, options.cell_m).raster, bare_ground(scan, options.cell_m)
     bands = np.stack([found.everywhere_m, found.is_bridged])
-    image = np.where(found.is_inside, bands, NODATA_M)
+    image = np.where(found.is_inside, bands, NODATA_M).astype(np.float32)
     names = (f"ground {options.above}, m", "bridged")
-    return Layers(raster.grid, image.astype(np.float32), names, NODATA_M, options.datum)
+    return Layers(raster.grid, image, names, NODATA_M, options.datum).within(box)
 
 
-def ortho(scan: ScanView, options: ExportOptions) -> Layers:
+def ortho(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
     """Red, green, blue and opacity, one byte each; seen from straight above everywhere.
 
     Cells are as large as pixels of the recording on the ground, rounded down to a round length;
@@ -118,65 +117,40 @@ def ortho(scan: ScanView, options: ExportOptions) -> Layers:
         rgb, known = orthophoto(terrain, views, grid, scan.progress.counting(STEPS))
     opacity = np.where(known, 255, 0).astype(np.uint8)
     bands = np.concatenate([rgb.transpose(2, 0, 1), opacity[None]])
-    return Layers(grid, bands, ("red", "green", "blue", "opacity"))
-
-
-KINDS = {
-    "dsm": (dsm, DSM_MARGIN_M),
-    "dtm": (dtm, GROUND_MARGIN_M),
-    "ortho": (ortho, ORTHO_MARGIN_M),
-}
+    return Layers(grid, bands, ("red", "green", "blue", "opacity")).within(box)
 
 
 def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """:func:`dsm` as GeoTIFF."""
-    _write(scan, out, options, "dsm")
+    _write(scan, out, options, dsm, DSM_MARGIN_M)
 
 
 def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """:func:`dtm` as GeoTIFF."""
-    _write(scan, out, options, "dtm")
+    _write(scan, out, options, dtm, GROUND_MARGIN_M)
 
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """:func:`ortho` as GeoTIFF."""
-    _write(scan, out, options, "ortho")
+    _write(scan, out, options, ortho, ORTHO_MARGIN_M)
 
 
-def _write(scan: ScanView, out: Path, options: ExportOptions, kind: str) -> None:
+def _write(
+    scan: ScanView, out: Path, options: ExportOptions, make: Make[Layers], margin_m: float
+) -> None:
     """One kind of raster, in tiles where there are more points than one may have."""
-    make, margin_m = KINDS[kind]
-    cut = scan.tiling(options, margin_m)
-    if len(cut.tiles) == 1:
-        layers = make(scan, options)
-        with mosaic(scan, out, layers.grid, layers) as image:
+    cut, whole = scan.tiling(options, margin_m), None
+    if len(cut.tiles) > 1:
+        options = scan.for_tiles(options, cut, needs_cell=make is not ortho)
+        cell_m = options.cell_m or round_cell(cut.sample_m / _finer(scan, options))
+        edge = 2.0 * max(cell_m, options.voxel_m or 0.0)
+        whole = over(grown(cut.bounds, edge), cell_m)
+        options = replace(options, cell_m=cell_m)
+    parts = in_parts(scan, make, options, margin_m)
+    first = next(parts)
+    with mosaic(scan, out, whole or first.grid, first) as image:
+        for layers in chain([first], parts):
             put(image, layers)
-        return
-    options = scan.for_tiles(options, cut, needs_cell=kind != "ortho")
-    if kind == "ortho" and options.cell_m is None:
-        finer = _finer(scan, options)
-        options = replace(options, cell_m=round_cell(cut.sample_m / finer))
-    assert options.cell_m is not None
-    west, south, east, north = cut.bounds
-    edge = 2.0 * max(options.cell_m, options.voxel_m or 0.0)
-    whole = over((west - edge, south - edge, east + edge, north + edge), options.cell_m)
-    jobs = [ProductJob(tile, kind, options) for tile in cut.tiles]
-    made = (one for one in run_tiles(make_tile, jobs, options.scheduler, scan.progress) if one)
-    first = next(made, None)
-    if first is None:
-        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
-    with mosaic(scan, out, whole, first) as image:
-        put(image, first)
-        for layers in made:
-            put(image, layers)
-
-
-def make_tile(job: ProductJob, progress: Progress | None = None) -> Layers | None:
-    """One tile of a raster; None without points."""
-    with ScanView(Path(job.tile.folder), job.options.voxel_m, progress, job.tile) as scan:
-        if not scan.has_points:
-            return None
-        return KINDS[job.kind][0](scan.converted(job.options), job.options).within(job.tile.box)
 
 
 def _finer(scan: ScanView, options: ExportOptions) -> float:
@@ -314,25 +288,14 @@ def contours_of(scan: ScanView, options: ExportOptions) -> list[tuple[float, F64
     scan.needs_place("a contour map")
 
     def lines() -> list[tuple[float, F64]]:
-        cut = scan.tiling(options, DSM_MARGIN_M)
-        if len(cut.tiles) == 1:
-            surface = fill_holes(scan.raster(options.cell_m))
-            return list(contour_lines(surface, options.contour_m))
-        fixed = scan.for_tiles(options, cut)
-        jobs = [ProductJob(tile, "contours", fixed) for tile in cut.tiles]
-        return list(chain(*run_tiles(make_contours, jobs, options.scheduler, scan.progress)))
+        return list(chain(*in_parts(scan, _contours, options, DSM_MARGIN_M)))
 
     return scan.shared(("contours", options), lines)
 
 
-def make_contours(job: ProductJob, progress: Progress | None = None) -> list[tuple[float, F64]]:
-    """The contours of one tile."""
-    options = job.options
-    with ScanView(Path(job.tile.folder), options.voxel_m, progress, job.tile) as view:
-        if not view.has_points:
-            return []
-        surface = fill_holes(view.converted(options).raster(options.cell_m))
-        return list(contour_lines(surface, options.contour_m, job.tile.box))
+def _contours(scan: ScanView, options: ExportOptions, box: Box) -> list[tuple[float, F64]]:
+    surface = fill_holes(scan.raster(options.cell_m))
+    return list(contour_lines(surface, options.contour_m, box))
 
 
 def contour_lines(

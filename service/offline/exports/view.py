@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
@@ -19,10 +19,10 @@ from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports import EXPORTERS
-from service.offline.tiles import TILE_POINTS, Tile, Tiling, tiling
+from service.offline.tiles import TILE_POINTS, Tile, Tiling, run_tiles, tiling
 from service.packages import needing
 from service.progress import Progress
-from service.scans.fused_cloud import EVERYWHERE, FusedCloud, fused_cloud, placed
+from service.scans.fused_cloud import EVERYWHERE, Box, FusedCloud, fused_cloud, placed
 from service.scans.main_piece import main_keyframes, main_track
 from service.scans.track import local_frame
 from service.stream.records import PoseRecord
@@ -90,12 +90,16 @@ class ExportOptions:
         return "AMSL" if self.to_datum is None else f"above {self.to_datum}"
 
 
+Make = Callable[["ScanView", ExportOptions, Box], T | None]
+"""Makes the part of a product in a box; a module's own function, so that it can travel."""
+
+
 @dataclass(frozen=True, slots=True)
 class ProductJob:
     """One tile of a product, in plain values."""
 
     tile: Tile
-    kind: str
+    make: Make[Any]
     options: ExportOptions
 
 
@@ -278,3 +282,40 @@ def export(view: ScanView, kind: str, out: Path | None, options: ExportOptions) 
         write = getattr(import_module(f"service.offline.exports.{module}"), name)
         write(view.converted(options), path, options)
     return path
+
+
+def in_parts(
+    scan: ScanView,
+    make: Make[T],
+    options: ExportOptions,
+    margin_m: float,
+    needs_cell: bool = True,
+) -> Iterator[T]:
+    """A product as a whole, or tile by tile where there are more points than one may have.
+
+    Each tile is made from its points and those ``margin_m`` around it. Raises InputError, at the
+    first, when there is not a single point.
+    """
+    cut = scan.tiling(options, margin_m)
+    parts: Iterator[T | None]
+    if len(cut.tiles) == 1:
+        parts = iter([make(scan, options, EVERYWHERE)])
+    else:
+        fixed = scan.for_tiles(options, cut, needs_cell)
+        jobs = [ProductJob(tile, make, fixed) for tile in cut.tiles]
+        parts = run_tiles(make_part, jobs, options.scheduler, scan.progress)
+    count = 0
+    for part in parts:
+        if part is not None:
+            count += 1
+            yield part
+    if not count:
+        raise InputError(f"{scan.folder} contains no points yet; nothing to export")
+
+
+def make_part(job: ProductJob, progress: Progress | None = None) -> Any:
+    """One tile of a product; None without any points."""
+    with ScanView(Path(job.tile.folder), job.options.voxel_m, progress, job.tile) as scan:
+        if not scan.has_points:
+            return None
+        return job.make(scan.converted(job.options), job.options, job.tile.box)
