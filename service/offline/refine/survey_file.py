@@ -9,31 +9,57 @@ own image, or ``x,y,z`` in the delivered cloud's coordinates. Rows of one name a
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
 
 from service.errors import InputError
 from service.small_file import read_small
 
-PLACE = ("lat", "lon")
-HEIGHT = "alt_amsl_m"
-IMAGE = ("u_px", "v_px")
-MAP = ("x", "y", "z")
-WHICH = ("keyframe_seq", "time", "image")
-COLUMNS = (
-    "name", *WHICH, *IMAGE, *MAP, *PLACE, HEIGHT, "sigma_h_m", "sigma_v_m",
-    "role",
-)  # fmt: skip
-ROLES = ("control", "check")
-USUAL_SIGMA_H_M, USUAL_SIGMA_V_M = 0.03, 0.05
 LARGEST_BYTES = 10_000_000
+
+Finite = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Sigma = Annotated[float, Meta(gt=0.0, le=100.0)]
+
+
+class Row(msgspec.Struct, frozen=True):
+    """One row as it is written."""
+
+    name: Annotated[str, Meta(min_length=1)]
+    lat: Annotated[float, Meta(ge=-90.0, le=90.0)]
+    lon: Annotated[float, Meta(ge=-180.0, le=180.0)]
+    alt_amsl_m: Annotated[float, Meta(ge=-1000.0, le=10_000.0)] | None = None
+    sigma_h_m: Sigma = 0.03
+    sigma_v_m: Sigma = 0.05
+    role: Literal["control", "check"] = "control"
+    keyframe_seq: Annotated[int, Meta(ge=0)] | None = None
+    time: Finite | None = None
+    image: str = ""
+    u_px: Finite | None = None
+    v_px: Finite | None = None
+    x: Finite | None = None
+    y: Finite | None = None
+    z: Finite | None = None
+
+    def __post_init__(self) -> None:
+        which = (self.keyframe_seq is not None) + (self.time is not None) + bool(self.image)
+        pixel, place = [self.u_px, self.v_px], [self.x, self.y, self.z]
+        in_image = which == 1 and None not in pixel and place == [None] * 3
+        in_map = which == 0 and None not in place and pixel == [None] * 2
+        if not (in_image or in_map):
+            raise ValueError(
+                "give u_px and v_px with one of keyframe_seq, time (unix seconds) and image "
+                "(name of a still), or x, y and z"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """One row: a mark in an image, or a point of the cloud."""
+    """A mark in an image, or a point of the cloud."""
 
     line: int
     keyframe_seq: int | None = None
@@ -65,7 +91,7 @@ def read_survey(path: Path) -> list[SurveyPoint]:
     """
     points: dict[str, SurveyPoint] = {}
     for line, row in _rows(path):
-        point = _point(path, line, row)
+        point = _point(line, row)
         before = points.get(point.name)
         if before is None:
             points[point.name] = point
@@ -107,8 +133,8 @@ def _said(p: SurveyPoint) -> tuple[str, float, float, float | None, float, float
     return p.name, p.lat_deg, p.lon_deg, p.alt_amsl_m, p.sigma_h_m, p.sigma_v_m, p.is_check
 
 
-def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Line number and the filled cells by column."""
+def _rows(path: Path) -> Iterator[tuple[int, Row]]:
+    """Line number and content of each row."""
     try:
         text = read_small(path, LARGEST_BYTES, "CSV of surveyed points").decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -125,87 +151,34 @@ def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
                     f"{path} line {table.line_num}: {len(cells)} cells, but {len(header)} columns; "
                     "decimals take a point, not a comma"
                 )
-            filled = zip(header, (c.strip() for c in cells), strict=False)
-            yield table.line_num, {name: cell for name, cell in filled if cell}
+            filled = {k: v for k, c in zip(header, cells, strict=False) if (v := c.strip())}
+            yield table.line_num, msgspec.convert(filled, Row, strict=False)
     except csv.Error as error:
         raise InputError(f"{path} line {table.line_num}: not CSV ({error})") from error
+    except msgspec.ValidationError as error:
+        text, _, column = str(error).partition(" - at `$")
+        name = column.strip(".`")
+        where = f"{path} line {table.line_num}: {name + ': ' if name else ''}"
+        raise InputError(where + text) from error
 
 
 def _check_header(path: Path, header: list[str]) -> None:
-    unknown = [name for name in header if name not in COLUMNS]
-    missing = [name for name in ("name", *PLACE) if name not in header]
-    if any(";" in name or "\t" in name for name in header):
-        raise InputError(f"{path} line 1: columns must be separated by commas")
-    if unknown or len(set(header)) < len(header):
-        what = f"unknown column {unknown[0]!r}" if unknown else "a column twice"
-        raise InputError(f"{path} line 1: {what}; there are {', '.join(COLUMNS)}")
-    if missing:
+    known = Row.__struct_fields__
+    if len(set(header)) < len(header) or not {"name", "lat", "lon"} <= set(header) <= set(known):
         raise InputError(
-            f"{path} line 1: column {missing[0]} is missing; name, {', '.join(PLACE)} and either "
-            "u_px,v_px with keyframe_seq, time or image, or x,y,z are needed"
+            f"{path} line 1: columns {', '.join(header)[:200]!r}; name, lat and lon are needed, "
+            f"each once, separated by commas; there are {', '.join(known)}"
         )
-    if not (set(IMAGE) <= set(header) or set(MAP) <= set(header)):
-        raise InputError(f"{path} line 1: neither u_px,v_px nor x,y,z; where are the points seen?")
 
 
-def _point(path: Path, line: int, row: Mapping[str, str]) -> SurveyPoint:
+def _point(line: int, row: Row) -> SurveyPoint:
     """The point of one row, with its one sighting."""
-    where = f"{path} line {line}"
-    name = row.get("name", "")
-    if not name:
-        raise InputError(f"{where}: no name; give each point one")
-    lat, lon = (_number(where, row, key) for key in PLACE)
-    alt = _number(where, row, HEIGHT) if HEIGHT in row else None
-    if not abs(lat) <= 90.0 or not abs(lon) <= 180.0:
-        raise InputError(
-            f"{where}: lat {lat:g}, lon {lon:g} is not on the globe; degrees, latitude first"
-        )
-    if alt is not None and not -1000.0 < alt < 10_000.0:
-        raise InputError(f"{where}: alt_amsl_m {alt:g} is not metres above sea level")
-    sigma_h = _number(where, row, "sigma_h_m", USUAL_SIGMA_H_M)
-    sigma_v = _number(where, row, "sigma_v_m", USUAL_SIGMA_V_M)
-    if not (0.0 < sigma_h <= 100.0 and 0.0 < sigma_v <= 100.0):
-        raise InputError(f"{where}: a sigma must be over 0 and at most 100 m")
-    role = row.get("role", "control").lower()
-    if role not in ROLES:
-        raise InputError(f"{where}: role {role!r} is neither control nor check")
-    seen = _sighting(where, line, row)
-    return SurveyPoint(name, lat, lon, alt, sigma_h, sigma_v, role == "check", line, (seen,))
-
-
-def _sighting(where: str, line: int, row: Mapping[str, str]) -> Sighting:
-    in_map = [key for key in MAP if key in row]
-    in_image = [key for key in (*IMAGE, *WHICH) if key in row]
-    if in_map and in_image:
-        raise InputError(f"{where}: give {in_image[0]} or {in_map[0]}, not both in one row")
-    if in_map:
-        x, y, z = (_number(where, row, key) for key in MAP)
-        return Sighting(line, xyz_m=(x, y, z))
-    u, v = (_number(where, row, key) for key in IMAGE)
-    if sum(key in row for key in WHICH) != 1:
-        raise InputError(
-            f"{where}: give one of keyframe_seq, time (unix seconds), image (name of a still)"
-        )
-    if "image" in row:
-        return Sighting(line, image=row["image"], uv_px=(u, v))
-    if "time" in row:
-        return Sighting(line, time_unix_s=_number(where, row, "time"), uv_px=(u, v))
-    seq = _number(where, row, "keyframe_seq")
-    if seq != int(seq) or seq < 0:
-        raise InputError(f"{where}: keyframe_seq {row['keyframe_seq']} is not a whole number")
-    return Sighting(line, keyframe_seq=int(seq), uv_px=(u, v))
-
-
-def _number(where: str, row: Mapping[str, str], key: str, usual: float | None = None) -> float:
-    text = row.get(key)
-    if text is None:
-        if usual is None:
-            raise InputError(f"{where}: {key} is empty")
-        return usual
-    try:
-        value = float(text)
-    except ValueError:
-        raise InputError(f"{where}: {key} is {text[:40]!r}, not a number") from None
-    if not math.isfinite(value):
-        raise InputError(f"{where}: {key} is {text}, not a finite number")
-    return value
+    mark = Sighting(line, row.keyframe_seq, row.time, row.image)
+    if row.u_px is not None and row.v_px is not None:
+        mark = replace(mark, uv_px=(row.u_px, row.v_px))
+    elif row.x is not None and row.y is not None and row.z is not None:
+        mark = replace(mark, xyz_m=(row.x, row.y, row.z))
+    return SurveyPoint(
+        row.name, row.lat, row.lon, row.alt_amsl_m, row.sigma_h_m, row.sigma_v_m,
+        row.role == "check", line, (mark,),
+    )  # fmt: skip
