@@ -7,6 +7,7 @@ import random
 import re
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -271,7 +272,7 @@ def left_out_errors(log: TelemetryLog, keep_every: int) -> tuple[F64, F64]:
     thin = VehicleHistory()
     samples = log.history.attitudes()
     for sample, time_ns in samples[::keep_every]:
-        thin.add(sample, time_ns)
+        thin.add(replace(sample, rates_rad_s=None), time_ns)
     errors, sigmas = [], []
     for sample, time_ns in samples:
         state = thin.state_at(time_ns)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mavlink.telemetry.gimbal import GimbalConfig, steadiest_frame, to_earth
-from mavlink.telemetry.quaternion import Quaternion, Vector, curve, down_component, hermite, slerp
+from mavlink.telemetry.quaternion import Quaternion, curve, down_component, hermite, slerp
 from mavlink.telemetry.samples import (
     MAX_GAP_NS,
     RECEIVER_SIGMA_H_M,
@@ -24,7 +24,6 @@ from mavlink.telemetry.samples import (
     PositionSample,
     RangeSample,
     ReceiverAltitude,
-    Row,
     Sample,
     TerrainSample,
     Track,
@@ -33,7 +32,6 @@ from mavlink.telemetry.samples import (
 
 M_PER_DEG = 111_319.49  # along a meridian, and along the equator
 ACCURACY_GAP_NS = 3_000_000_000
-FRAMES = tuple(GimbalFrame)
 GIMBAL_DEVICES = (154, 171, 172, 173, 174, 175)
 JUDGE_EVERY_NS = 10_000_000_000  # between two checks of a gimbal's reference frame
 JUDGE_LAG_NS = 3_000_000_000
@@ -59,7 +57,7 @@ WITH_RATES = 0.5
 BETWEEN_NS = 100_000_000
 """A rotation that is compared with images is wanted at least so often."""
 
-UNKNOWN_RATES = (math.nan, math.nan, math.nan)
+UNKNOWN = (math.nan, math.nan, math.nan)
 
 
 class VehicleHistory:
@@ -76,12 +74,19 @@ class VehicleHistory:
         self._lock = threading.Lock()
         self._news = threading.Condition()
         self._waiting = 0  # waiting readers
-        self._attitude = Track()  # w x y z, rates or NaN
-        self._position = Track()  # lat lon alt relative vn ve vd, NaN where unknown
-        self._accuracy = Track()  # has_fix sigma_h sigma_v alt (NaN: unknown) is_claimed
-        self._range = Track()  # distance
-        self._terrain = Track()  # agl sigma
-        self._gimbals: dict[tuple[int, int], Track] = {}  # (rank, component): w x y z frame
+        self._attitude: Track[AttitudeSample] = Track()
+        self._position: Track[PositionSample] = Track()
+        self._accuracy: Track[AccuracySample] = Track()
+        self._range: Track[RangeSample] = Track()
+        self._terrain: Track[TerrainSample] = Track()
+        self._gimbals: dict[tuple[int, int], Track[GimbalSample]] = {}  # by rank and component
+        self._tracks: dict[type[Sample], Track[Any]] = {
+            AttitudeSample: self._attitude,
+            PositionSample: self._position,
+            AccuracySample: self._accuracy,
+            RangeSample: self._range,
+            TerrainSample: self._terrain,
+        }
         self._judged: dict[tuple[int, int], tuple[int, GimbalFrame | None]] = {}  # when
         self._seen: GimbalFrame | None = None  # by the images
 
@@ -107,7 +112,7 @@ class VehicleHistory:
     def attitudes(self) -> list[tuple[AttitudeSample, int]]:
         """Every attitude with its time in ns, oldest first."""
         with self._lock:
-            return [(AttitudeSample(None, _quaternion(r)), t) for t, r in self._attitude.items()]
+            return [(sample, time_ns) for time_ns, sample in self._attitude.items()]
 
     def gap_s(self, time_ns: int) -> float:
         """Seconds between the attitudes of the camera's head about a time, or of the body; 0 where
@@ -122,8 +127,8 @@ class VehicleHistory:
         out = []
         with self._lock:
             samples = [one for one in self._attitude.items() if one[0] >= since_ns]
-        for (t, row), (later, next_row) in zip(samples, samples[1:] + samples[-1:], strict=True):
-            gap = Bracket(t, later, row, next_row, t)
+        for (t, one), (later, next_one) in zip(samples, samples[1:] + samples[-1:], strict=True):
+            gap = Bracket(t, later, one, next_one, t)
             is_curve = later - t <= MAX_GAP_NS and _has_rates(gap)
             steps = max(1, (later - t) // BETWEEN_NS) if is_curve else 1
             times = [t + (later - t) * k // steps for k in range(steps)]
@@ -140,8 +145,7 @@ class VehicleHistory:
             for key in self._gimbal_order():
                 at = self._gimbals[key].around(time_ns)
                 if at is not None:
-                    sent = _slerp(at)
-                    return sent, q_body
+                    return slerp(at.before.q, at.after.q, at.fraction), q_body
         return None
 
     def _gimbal_order(self) -> list[tuple[int, int]]:
@@ -155,9 +159,10 @@ class VehicleHistory:
             times = {t for track in tracks for t, _ in track.items() if t >= since_ns}
         states = [(t, self._state_at(t)) for t in sorted(times)]
         found = [
-            (t, _quaternion(tuple(map(float, s.q_ned_gimbal_wxyz))))
+            (t, (w, x, y, z))
             for t, s in states
             if s is not None and s.q_ned_gimbal_wxyz is not None
+            for w, x, y, z in [s.q_ned_gimbal_wxyz.tolist()]
         ]
         return found or self.bodies(since_ns)
 
@@ -167,8 +172,8 @@ class VehicleHistory:
     def add(self, sample: Sample, time_ns: int) -> None:
         """Insert a sample at its time; order does not matter."""
         with self._lock:
-            track, row = self._place(sample)
-            track.add(time_ns, row)
+            track = self._track(sample)
+            track.add(time_ns, sample)
             if math.isfinite(self.config.keep_s):
                 track.forget_before(time_ns - int(self.config.keep_s * 1e9))
         if self._waiting:
@@ -184,9 +189,9 @@ class VehicleHistory:
         """The reference frame in use for the gimbal; None without a gimbal."""
         with self._lock:
             for key in self._gimbal_order():
-                row = self._gimbals[key].last_row
-                if row is not None:
-                    return self._frame(key, FRAMES[int(row[4])])
+                sample = self._gimbals[key].last
+                if sample is not None:
+                    return self._frame(key, sample.frame)
         return None
 
     def trust_images(self, frame: GimbalFrame) -> None:
@@ -197,33 +202,15 @@ class VehicleHistory:
     def clear(self) -> None:
         """Discard everything, as after a reboot of the autopilot."""
         with self._lock:
-            tracks = (self._attitude, self._position, self._accuracy, self._range, self._terrain)
-            for track in tracks:
+            for track in self._tracks.values():
                 track.clear()
             self._gimbals.clear()
             self._judged.clear()
 
-    def _place(self, sample: Sample) -> tuple[Track, Row]:
-        if isinstance(sample, AttitudeSample):
-            return self._attitude, (*sample.q_ned_body, *(sample.rates_rad_s or UNKNOWN_RATES))
-        if isinstance(sample, PositionSample):
-            relative = math.nan if sample.relative_alt_m is None else sample.relative_alt_m
-            velocity = sample.v_ned_m_s or (math.nan, math.nan, math.nan)
-            alt = math.nan if sample.alt_amsl_m is None else sample.alt_amsl_m
-            where = (sample.lat_deg, sample.lon_deg, alt)
-            return self._position, (*where, relative, *velocity)
-        if isinstance(sample, AccuracySample):
-            alt = math.nan if sample.alt_amsl_m is None else sample.alt_amsl_m
-            known = (float(sample.has_fix), sample.sigma_h_m, sample.sigma_v_m, alt)
-            return self._accuracy, (*known, float(sample.is_claimed))
-        if isinstance(sample, RangeSample):
-            return self._range, (sample.distance_m,)
-        if isinstance(sample, TerrainSample):
-            return self._terrain, (sample.agl_m, sample.sigma_m)
+    def _track(self, sample: Sample) -> Track[Any]:
         if isinstance(sample, GimbalSample):
-            track = self._gimbals.setdefault((sample.rank, sample.component), Track())
-            return track, (*sample.q, float(FRAMES.index(sample.frame)))
-        raise ValueError(f"the history does not store a {type(sample).__name__}")
+            return self._gimbals.setdefault((sample.rank, sample.component), Track())
+        return self._tracks[type(sample)]
 
     def state_at(self, time_ns: int) -> VehicleState | None:
         """The state interpolated at ``time_ns``, or None when no part of it is known.
@@ -262,7 +249,9 @@ class VehicleHistory:
             self._add_agl(state, q_body, relative)
         return state.finish()
 
-    def _add_attitude(self, state: _Assembly, at: Bracket | None) -> Quaternion | None:
+    def _add_attitude(
+        self, state: _Assembly, at: Bracket[AttitudeSample] | None
+    ) -> Quaternion | None:
         if at is None:
             return None
         q = _body(at)
@@ -288,11 +277,11 @@ class VehicleHistory:
             return
 
     def _gimbal_at(
-        self, key: tuple[int, int], at: Bracket, q_body: Quaternion | None
+        self, key: tuple[int, int], at: Bracket[GimbalSample], q_body: Quaternion | None
     ) -> Quaternion | None:
         """``q_ned_gimbal`` between two samples, in the frame in which the head rotated less."""
-        sent = _quaternion(at.before), _quaternion(at.after)
-        frame = self._frame(key, FRAMES[int(at.before[4])])
+        sent = at.before.q, at.after.q
+        frame = self._frame(key, at.before.frame)
         if frame is GimbalFrame.EARTH:
             return slerp(*sent, at.fraction)
         ends = self._attitude.around(at.before_ns), self._attitude.around(at.after_ns)
@@ -324,34 +313,34 @@ class VehicleHistory:
             self._judged[key] = (newest, better)
         return better or claimed
 
-    def _steadiest(self, track: Track) -> GimbalFrame | None:
+    def _steadiest(self, track: Track[GimbalSample]) -> GimbalFrame | None:
         """Uses a thinned track, because it runs repeatedly in flight."""
         sent: list[Quaternion] = []
         bodies: list[Quaternion] = []
         samples = track.items()
         samples = samples[:: max(1, len(samples) // JUDGED_SAMPLES)]
-        for time_ns, row in samples:
+        for time_ns, sample in samples:
             at = self._attitude.around(time_ns)
             if at is not None:
-                sent.append(_quaternion(row))
+                sent.append(sample.q)
                 bodies.append(_body(at))
         if len(samples) < 2:
             return None
         spacing_ns = (samples[-1][0] - samples[0][0]) / (len(samples) - 1)
         return steadiest_frame(sent, bodies, max(1, round(JUDGE_LAG_NS / spacing_ns)))
 
-    def _add_position(self, state: _Assembly) -> Bracket | None:
+    def _add_position(self, state: _Assembly) -> Bracket[PositionSample] | None:
         at = self._position.around(state.time_ns)
         if at is None:
             return None
         accuracy = self._accuracy.around(state.time_ns, ACCURACY_GAP_NS, ACCURACY_GAP_NS)
         nearest = None if accuracy is None else accuracy.nearer
-        is_placed = math.isfinite(at.before[0] + at.after[0])
-        if not is_placed or (nearest is not None and not nearest[0]):
+        is_placed = math.isfinite(at.before.lat_deg + at.after.lat_deg)
+        if not is_placed or (nearest is not None and not nearest.has_fix):
             return at  # no fix: the estimated position is too uncertain for a tag
         sigma_h, sigma_v = RECEIVER_SIGMA_H_M, RECEIVER_SIGMA_V_M
         if nearest is not None:
-            sigma_h, sigma_v = nearest[1], nearest[2]
+            sigma_h, sigma_v = nearest.sigma_h_m, nearest.sigma_v_m
         bend = ACCELERATION_M_S2 * at.curvature_s2
         lat, lon, alt, velocity = _position_at(at)
         state.set(
@@ -361,7 +350,7 @@ class VehicleHistory:
             lon_deg=lon,
             v_ned_m_s=velocity,
             sigma_h_m=math.hypot(sigma_h, bend),
-            is_claimed=nearest is not None and bool(nearest[4]),
+            is_claimed=nearest is not None and nearest.is_claimed,
             receiver=_receiver_above(accuracy, self._position),
         )
         if math.isfinite(alt):
@@ -369,21 +358,19 @@ class VehicleHistory:
         return at
 
     def _add_agl(
-        self, state: _Assembly, q_body: Quaternion | None, position: Bracket | None
+        self, state: _Assembly, q_body: Quaternion | None, position: Bracket[PositionSample] | None
     ) -> None:
         at = self._range.around(state.time_ns)
         if at is not None and q_body is not None and down_component(q_body) > 0.5:
-            agl = _mix(at, 0) * down_component(q_body)
+            agl = at.mixed("distance_m") * down_component(q_body)
             state.set_agl("rangefinder", at.age_ms, agl, 0.1 + 0.02 * agl)
             return
-        at = self._terrain.around(state.time_ns)
-        if at is not None and _mix(at, 0) >= 0.0:
-            state.set_agl("terrain", at.age_ms, _mix(at, 0), at.before[1])
+        terrain = self._terrain.around(state.time_ns)
+        if terrain is not None and (agl := terrain.mixed("agl_m")) >= 0.0:
+            state.set_agl("terrain", terrain.age_ms, agl, terrain.before.sigma_m)
             return
-        if position is not None and math.isfinite(position.before[3] + position.after[3]):
-            agl = _mix(position, 3)
-            if agl >= 0.0:
-                state.set_agl("relative", position.age_ms, agl, max(5.0, 0.1 * agl))
+        if position is not None and (agl := position.mixed("relative_alt_m")) >= 0.0:
+            state.set_agl("relative", position.age_ms, agl, max(5.0, 0.1 * agl))
 
 
 class _Assembly:
@@ -409,29 +396,17 @@ class _Assembly:
         return VehicleState(self.time_ns, age_ms=ages, sources=tuple(ages), **self.fields)
 
 
-def _quaternion(row: Row) -> Quaternion:
-    return (row[0], row[1], row[2], row[3])
-
-
-def _slerp(at: Bracket) -> Quaternion:
-    return slerp(_quaternion(at.before), _quaternion(at.after), at.fraction)
-
-
-def _body(at: Bracket) -> Quaternion:
+def _body(at: Bracket[AttitudeSample]) -> Quaternion:
     """``q_ned_body`` by its rates at both ends where they are known; by slerp past an end."""
-    if not _has_rates(at) or not 0.0 <= at.fraction <= 1.0:
-        return _slerp(at)
-    ends = (_quaternion(at.before), _quaternion(at.after))
-    before, after = (_vector(row[4:7]) for row in (at.before, at.after))
-    return curve(*ends, before, after, at.gap_s, at.fraction)
+    ends = at.before.q_ned_body, at.after.q_ned_body
+    rates = at.before.rates_rad_s, at.after.rates_rad_s
+    if rates[0] is None or rates[1] is None or not 0.0 <= at.fraction <= 1.0:
+        return slerp(*ends, at.fraction)
+    return curve(*ends, rates[0], rates[1], at.gap_s, at.fraction)
 
 
-def _has_rates(at: Bracket) -> bool:
-    return math.isfinite(at.before[4] + at.after[4])
-
-
-def _vector(row: Row) -> Vector:
-    return (row[0], row[1], row[2])
+def _has_rates(at: Bracket[AttitudeSample]) -> bool:
+    return at.before.rates_rad_s is not None and at.after.rates_rad_s is not None
 
 
 def _apart(a: Quaternion, b: Quaternion) -> float:
@@ -439,27 +414,21 @@ def _apart(a: Quaternion, b: Quaternion) -> float:
     return 1.0 - abs(sum(p * q for p, q in zip(a, b, strict=True)))
 
 
-def _mix(at: Bracket, k: int) -> float:
-    return at.before[k] + (at.after[k] - at.before[k]) * at.fraction
-
-
-def _position_at(at: Bracket) -> tuple[float, float, float, object]:
-    """(lat, lon, alt, v_ned or None) by a cubic Hermite curve when both ends have a velocity."""
-    per_lon = M_PER_DEG * max(1e-6, math.cos(math.radians(at.before[0])))
-    d_lon = (at.after[1] - at.before[1] + 180.0) % 360.0 - 180.0
-    step = (
-        (at.after[0] - at.before[0]) * M_PER_DEG,
-        d_lon * per_lon,
-        -(at.after[2] - at.before[2]),
-    )
-    v0, v1 = at.before[4:7], at.after[4:7]
+def _position_at(at: Bracket[PositionSample]) -> tuple[float, float, float, object]:
+    """(lat, lon, alt or NaN, v_ned or None) by a cubic Hermite curve when both ends have a
+    velocity."""
+    a, b = at.before, at.after
+    per_lon = M_PER_DEG * max(1e-6, math.cos(math.radians(a.lat_deg)))
+    d_lon = (b.lon_deg - a.lon_deg + 180.0) % 360.0 - 180.0
+    alts = [math.nan if one.alt_amsl_m is None else one.alt_amsl_m for one in (a, b)]
+    step = ((b.lat_deg - a.lat_deg) * M_PER_DEG, d_lon * per_lon, alts[0] - alts[1])
+    v0, v1 = a.v_ned_m_s or UNKNOWN, b.v_ned_m_s or UNKNOWN
     u, h = at.fraction, at.gap_s
     ned = [_way(step[k], v0[k] * h, v1[k] * h, u) for k in range(3)]
-    lat = at.before[0] + ned[0] / M_PER_DEG
-    lon = (at.before[1] + ned[1] / per_lon + 180.0) % 360.0 - 180.0
-    known = all(map(math.isfinite, (*v0, *v1)))
-    velocity = np.array([_mix(at, k) for k in (4, 5, 6)]) if known else None
-    return lat, lon, at.before[2] - ned[2], velocity
+    lat = a.lat_deg + ned[0] / M_PER_DEG
+    lon = (a.lon_deg + ned[1] / per_lon + 180.0) % 360.0 - 180.0
+    velocity = np.array(v0) + (np.array(v1) - np.array(v0)) * u
+    return lat, lon, alts[0] - ned[2], velocity if np.isfinite(velocity).all() else None
 
 
 def _way(step: float, m0: float, m1: float, u: float) -> float:
@@ -472,12 +441,12 @@ def _way(step: float, m0: float, m1: float, u: float) -> float:
     return hermite(step, m0, m1, u)
 
 
-def _receiver_above(accuracy: Bracket | None, positions: Track) -> ReceiverAltitude | None:
+def _receiver_above(
+    accuracy: Bracket[AccuracySample] | None, positions: Track[PositionSample]
+) -> ReceiverAltitude | None:
     """The fix nearest in time, compared with the autopilot's altitude then; None without either."""
-    if accuracy is None:
+    at = None if accuracy is None else positions.around(accuracy.nearer_ns)
+    if accuracy is None or at is None or accuracy.nearer.alt_amsl_m is None:
         return None
-    at = positions.around(accuracy.nearer_ns)
-    if at is None:
-        return None
-    above = accuracy.nearer[3] - _mix(at, 2)
+    above = accuracy.nearer.alt_amsl_m - at.mixed("alt_amsl_m")
     return ReceiverAltitude(accuracy.nearer_ns, above) if math.isfinite(above) else None

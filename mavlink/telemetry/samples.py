@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -130,20 +132,20 @@ class VehicleState:
     sources: tuple[str, ...] = ()  # of attitude, gimbal, gnss, rangefinder, terrain, relative
 
 
-Row = tuple[float, ...]
+S = TypeVar("S")
 
 EXTRAPOLATE_NS = 20_000_000
 MAX_GAP_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Bracket:
-    """The samples before and after a time; the same row twice at the end of a track."""
+class Bracket(Generic[S]):
+    """The samples before and after a time; the same one twice at the end of a track."""
 
     before_ns: int
     after_ns: int
-    before: Row
-    after: Row
+    before: S
+    after: S
     time_ns: int
 
     @property
@@ -153,7 +155,7 @@ class Bracket:
         return (self.time_ns - self.before_ns) / span if span else 0.0
 
     @property
-    def nearer(self) -> Row:
+    def nearer(self) -> S:
         """The sample nearer to the instant."""
         return self.before if self.fraction < 0.5 else self.after
 
@@ -166,6 +168,13 @@ class Bracket:
     def gap_s(self) -> float:
         """Seconds between the two samples."""
         return (self.after_ns - self.before_ns) * 1e-9
+
+    def mixed(self, name: str) -> float:
+        """An attribute interpolated linearly; NaN where a sample does not have it."""
+        before, after = getattr(self.before, name), getattr(self.after, name)
+        if before is None or after is None:
+            return math.nan
+        return float(before + (after - before) * self.fraction)
 
     @property
     def age_ms(self) -> float:
@@ -181,12 +190,12 @@ class Bracket:
         return 0.5 * abs(before * after)
 
 
-class Track:
-    """Rows of floats sorted by time. Not thread-safe by itself."""
+class Track(Generic[S]):
+    """Samples sorted by time. Not thread-safe by itself."""
 
     def __init__(self) -> None:
         self._times: list[int] = []
-        self._rows: list[Row] = []
+        self._samples: list[S] = []
 
     def __len__(self) -> int:
         return len(self._times)
@@ -202,45 +211,45 @@ class Track:
         return self._times[-1] if self._times else None
 
     @property
-    def last_row(self) -> Row | None:
+    def last(self) -> S | None:
         """The newest sample."""
-        return self._rows[-1] if self._rows else None
+        return self._samples[-1] if self._samples else None
 
-    def items(self) -> list[tuple[int, Row]]:
+    def items(self) -> list[tuple[int, S]]:
         """All samples, oldest first."""
-        return list(zip(self._times, self._rows, strict=True))
+        return list(zip(self._times, self._samples, strict=True))
 
-    def add(self, time_ns: int, row: Row) -> None:
+    def add(self, time_ns: int, sample: S) -> None:
         """Insert in order of time; replaces a sample of the same time."""
         if not self._times or time_ns > self._times[-1]:
             self._times.append(time_ns)
-            self._rows.append(row)
+            self._samples.append(sample)
             return
         i = bisect_left(self._times, time_ns)
         if self._times[i] == time_ns:
-            self._rows[i] = row
+            self._samples[i] = sample
         else:
             self._times.insert(i, time_ns)
-            self._rows.insert(i, row)
+            self._samples.insert(i, sample)
 
     def clear(self) -> None:
         """Discard everything."""
         self._times.clear()
-        self._rows.clear()
+        self._samples.clear()
 
     def forget_before(self, time_ns: int) -> None:
         """Drop older samples, in batches so that the cost per sample stays constant."""
         i = bisect_left(self._times, time_ns)
         if i > 64 and 2 * i > len(self._times):
             del self._times[:i]
-            del self._rows[:i]
+            del self._samples[:i]
 
     def around(
         self,
         time_ns: int,
         max_gap_ns: int = MAX_GAP_NS,
         extrapolate_ns: int = EXTRAPOLATE_NS,
-    ) -> Bracket | None:
+    ) -> Bracket[S] | None:
         """The samples around a time, or None without samples near enough.
 
         Inside the track the two neighbours must be at most ``max_gap_ns`` apart, unless one of
@@ -255,8 +264,8 @@ class Track:
             return self._inside(i, time_ns, max_gap_ns, extrapolate_ns)
         return self._past_end(bool(i), time_ns, max_gap_ns, extrapolate_ns)
 
-    def _past_end(self, late: bool, time_ns: int, max_gap: int, near: int) -> Bracket | None:
-        times, rows = self._times, self._rows
+    def _past_end(self, late: bool, time_ns: int, max_gap: int, near: int) -> Bracket[S] | None:
+        times, samples = self._times, self._samples
         k = len(times) - 1 if late else 0
         beyond = abs(time_ns - times[k])
         if beyond > near:
@@ -267,15 +276,15 @@ class Track:
         while 0 <= j < len(times) and abs(times[j] - times[k]) < beyond:
             j += step
         if beyond == 0 or not 0 <= j < len(times) or abs(times[j] - times[k]) > max_gap:
-            return Bracket(times[k], times[k], rows[k], rows[k], time_ns)
+            return Bracket(times[k], times[k], samples[k], samples[k], time_ns)
         a, b = (j, k) if late else (k, j)
-        return Bracket(times[a], times[b], rows[a], rows[b], time_ns)
+        return Bracket(times[a], times[b], samples[a], samples[b], time_ns)
 
-    def _inside(self, i: int, time_ns: int, max_gap: int, near: int) -> Bracket | None:
+    def _inside(self, i: int, time_ns: int, max_gap: int, near: int) -> Bracket[S] | None:
         before, after = self._times[i - 1], self._times[i]
         if after - before <= max_gap:
-            return Bracket(before, after, self._rows[i - 1], self._rows[i], time_ns)
+            return Bracket(before, after, self._samples[i - 1], self._samples[i], time_ns)
         k = i - 1 if time_ns - before <= after - time_ns else i
         if abs(time_ns - self._times[k]) > near:
             return None
-        return Bracket(self._times[k], self._times[k], self._rows[k], self._rows[k], time_ns)
+        return Bracket(self._times[k], self._times[k], self._samples[k], self._samples[k], time_ns)
