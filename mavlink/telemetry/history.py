@@ -105,7 +105,8 @@ class VehicleHistory:
     def covers(self, time_ns: int) -> bool:
         """True when no active stream can still add data about ``time_ns``."""
         with self._lock:
-            newest = [t.last_ns for t in (self._attitude, self._position, *self._gimbals.values())]
+            tracks: list[Track[Any]] = [self._attitude, self._position, *self._gimbals.values()]
+            newest = [track.last_ns for track in tracks]
         flowing = [t for t in newest if t is not None and t > time_ns - MAX_GAP_NS]
         return all(t >= time_ns for t in flowing)
 
@@ -118,7 +119,8 @@ class VehicleHistory:
         """Seconds between the attitudes of the camera's head about a time, or of the body; 0 where
         none are near."""
         with self._lock:
-            tracks = [*(self._gimbals[key] for key in self._gimbal_order()), self._attitude]
+            heads = [self._gimbals[key] for key in self._gimbal_order()]
+            tracks: list[Track[Any]] = [*heads, self._attitude]
             around = [at for track in tracks if (at := track.around(time_ns)) is not None]
         return around[0].gap_s if around else 0.0
 
