@@ -288,7 +288,7 @@ def test_a_recording_found_by_itself_that_does_not_fit_is_left(
     (job, *_), reported = jobs(tmp_path), list[str]()
     assert mesh_tile(job, noting(reported)) is not None
     assert any("after all" in text for text in reported)
-    with pytest.raises(InputError, match="its video cannot be used"):
+    with pytest.raises(InputError, match="contains no camera model"):
         mesh_tile(replace(job, options=ExportOptions(video=video)), noting(reported))
 
 

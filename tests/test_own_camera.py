@@ -28,12 +28,12 @@ from service.flight.scan import ScanInputs, create_store
 from service.flight.telemetry_check import TelemetryCheck
 from service.offline.refine.own_camera import (
     FILE,
-    camera_of,
     found_camera,
     images_at,
     sightings,
     write,
 )
+from service.scans.track import camera_of
 from service.stream.store import ScanStore
 
 SIZE = (480, 270)

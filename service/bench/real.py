@@ -263,7 +263,7 @@ def targets(flight: Flight) -> Iterator[tuple[str, float, str]]:
     with ScanStore.open(flight.scan / "scan.db") as store, Revisions(store) as revisions:
         states = [s for seq in store.seqs() if (s := revisions.keyframe_state(seq)) is not None]
         start = store.header.started_unix_ns
-        scan = ScanImages(states, revisions.frames(), store.header.camera, revisions.keyframe, None)
+        scan = ScanImages(states, revisions.frames(), store.header, revisions.keyframe, None)
         times = {image.name: image.time_ns for image in open_camera(flight.source)}
         placed = {_tick(frame.time_unix_ns - start) for frame in scan.frames}
         surveyed = _surveyed(flight.data / "gcp_list_1600px.txt", times, placed, start)

@@ -1,4 +1,4 @@
-"""Georeference and trajectory of a stored scan, also as tables."""
+"""Georeference, camera and trajectory of a stored scan, also as tables."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import io
 import math
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from recon import se3
+from recon.types import Camera
+from service.cameras.camera_file import shutter_of
+from service.errors import InputError
 from service.georeference import LocalFrame
 from service.stream.records import PoseRecord, ScanHeader
 
@@ -34,6 +39,18 @@ def local_frame(header: ScanHeader) -> LocalFrame | None:
     if lat is None or lon is None:
         return None
     return LocalFrame(lat, lon, alt or 0.0)
+
+
+def camera_of(header: ScanHeader) -> Camera:
+    """The camera that a scan was flown with. Raises InputError when the header names none."""
+    c = header.camera
+    try:
+        K = np.array(c["K"], np.float64).reshape(3, 3)
+        distortion = np.array(c["distortion"], np.float64).reshape(5)
+        shutter = shutter_of(c.get("readout_ms", 0), c.get("readout_direction", "down"))
+        return Camera(K, distortion, (int(c["width"]), int(c["height"])), shutter)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"scan {header.scan_id} contains no camera model") from error
 
 
 def latest(poses: Iterator[PoseRecord]) -> list[PoseRecord]:

@@ -20,6 +20,7 @@ from service.errors import InputError, SkyreliefError
 from service.offline.exports.view import ExportOptions
 from service.progress import Progress
 from service.scans.folder import SUMMARY
+from service.scans.track import camera_of
 from service.stream.records import ScanHeader
 
 MAX_BYTES = 1_500_000_000
@@ -65,7 +66,7 @@ def recording_of(folder: Path, header: ScanHeader) -> Recording:
     if found is None:
         return Recording(None, f"{stored}: {named} is not there; give the flight's --video")
     try:
-        camera, source = _camera(header), open_camera(str(found))
+        camera, source = camera_of(header), open_camera(str(found))
         size_px = source.size_px
         source.close()
     except SkyreliefError as error:
@@ -109,7 +110,7 @@ def _opened(header: ScanHeader, video: Path) -> CameraSource:
     """The open video; InputError when it is missing or its images have another size."""
     if not video.exists():
         raise InputError(f"{video}: no such file or folder; give the flight's video")
-    camera, source = _camera(header), open_camera(str(video))
+    camera, source = camera_of(header), open_camera(str(video))
     if source.size_px != camera.size_px:
         source.close()
         raise InputError(
@@ -132,7 +133,7 @@ def video_images(
     the scan's start. Keyframes without a frame keep their stored image. Raises InputError
     when the video is of another size, or none of its frames is a keyframe.
     """
-    camera, source = _camera(header), _opened(header, video)
+    camera, source = camera_of(header), _opened(header, video)
     start = header.started_unix_ns if epoch_ns is None else epoch_ns
     undistort = Undistorter(camera)
     shrink = min(1.0, (MAX_BYTES / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
@@ -171,18 +172,3 @@ def _view(bgra: U8, camera: Camera, T_world_camera: np.ndarray, shrink: float) -
     small = np.asarray(cv2.resize(bgra, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
     K = scaled_K(camera.K, w / camera.size_px[0], h / camera.size_px[1])
     return TextureView(small, K, T_world_camera)
-
-
-def _camera(header: ScanHeader) -> Camera:
-    """The camera model written in the scan's header."""
-    try:
-        document = header.camera
-        return Camera(
-            np.array(document["K"], np.float64).reshape(3, 3),
-            np.array(document["distortion"], np.float64).reshape(5),
-            (int(document["width"]), int(document["height"])),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"scan {header.scan_id} contains no camera model; its video cannot be used"
-        ) from error

@@ -9,6 +9,7 @@ process that is killed has written what it logged.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,18 +36,7 @@ def export_mcap(store: ScanStore, out_path: Path) -> int:
     Raises OutsideError without the ``foxglove-sdk`` package, InputError when the file cannot
     be written.
     """
-    with needing("an MCAP"):
-        import foxglove
-        from foxglove.mcap import MCAPWriteOptions
-    context = foxglove.Context()
-    options = MCAPWriteOptions(chunk_size=CHUNK_BYTES)
-    try:
-        writer = foxglove.open_mcap(
-            out_path, allow_overwrite=True, context=context, writer_options=options
-        )
-    except (OSError, RuntimeError) as error:
-        raise InputError(f"{out_path} cannot be written: {error}") from error
-    with writer:
+    with mcap_file(out_path) as context:
         recording = _Recording(context)
         recording.log_header(store)
         for item in _in_order(store):
@@ -56,6 +46,24 @@ def export_mcap(store: ScanStore, out_path: Path) -> int:
                 recording.log_keyframe(item)
         recording.log_summary(store)
     return recording.messages
+
+
+@contextmanager
+def mcap_file(path: Path, profile: str = "") -> Iterator[Any]:
+    """A Foxglove context whose channels are written to an MCAP; errors as of export_mcap."""
+    with needing("an MCAP"):
+        import foxglove
+        from foxglove.mcap import MCAPWriteOptions
+    context = foxglove.Context()
+    options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, profile=profile)
+    try:
+        writer = foxglove.open_mcap(
+            path, allow_overwrite=True, context=context, writer_options=options
+        )
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"{path} cannot be written: {error}") from error
+    with writer:
+        yield context
 
 
 def _in_order(store: ScanStore) -> Iterator[PoseRecord | Keyframe]:

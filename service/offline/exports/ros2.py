@@ -22,8 +22,7 @@ import numpy as np
 
 from recon import se3
 from recon.types import F64, Keyframe
-from service.errors import InputError
-from service.offline.exports.recording import CHUNK_BYTES, JPEG_QUALITY, POINT, known_points
+from service.offline.exports.recording import JPEG_QUALITY, POINT, known_points, mcap_file
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
 from service.scans.writing import writing
@@ -153,29 +152,17 @@ _Item = tuple[int, int, Keyframe | PoseRecord]
 
 def write_ros2(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """The scan's main piece as an MCAP of ROS 2 messages, in order of time."""
-    import foxglove
-    from foxglove.mcap import MCAPWriteOptions
-
     _types()
-    context = foxglove.Context()
-    options_of_file = MCAPWriteOptions(chunk_size=CHUNK_BYTES, profile="ros2")
-    with writing(out) as part:
-        try:
-            writer = foxglove.open_mcap(
-                part, allow_overwrite=True, context=context, writer_options=options_of_file
-            )
-        except (OSError, RuntimeError) as error:
-            raise InputError(f"{out} cannot be written: {error}") from error
-        with writer:
-            channels = Ros2Channels(context)
-            keyframes: Iterator[_Item] = ((k.time_ns, 0, k) for k in main_keyframes(scan.store))
-            poses: Iterator[_Item] = ((p.time_unix_ns, 1, p) for p in scan.poses)
-            placed_ns = None  # the last keyframe, which has its own transform
-            for time_ns, _, item in heapq.merge(keyframes, poses, key=lambda entry: entry[:2]):
-                if isinstance(item, Keyframe):
-                    channels.log_keyframe(item)
-                    placed_ns = time_ns
-                    continue
-                if time_ns != placed_ns:
-                    channels.log_transform(item.T_world_camera, time_ns)
-                channels.log_fix(item)
+    with writing(out) as part, mcap_file(part, "ros2") as context:
+        channels = Ros2Channels(context)
+        keyframes: Iterator[_Item] = ((k.time_ns, 0, k) for k in main_keyframes(scan.store))
+        poses: Iterator[_Item] = ((p.time_unix_ns, 1, p) for p in scan.poses)
+        placed_ns = None  # the last keyframe, which has its own transform
+        for time_ns, _, item in heapq.merge(keyframes, poses, key=lambda entry: entry[:2]):
+            if isinstance(item, Keyframe):
+                channels.log_keyframe(item)
+                placed_ns = time_ns
+                continue
+            if time_ns != placed_ns:
+                channels.log_transform(item.T_world_camera, time_ns)
+            channels.log_fix(item)

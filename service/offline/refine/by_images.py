@@ -45,6 +45,7 @@ from service.offline.refine import own_camera
 from service.offline.refine.control_points import MARK_PX, Candidate
 from service.offline.refine.revisions import KeyframeState, moved_frames
 from service.offline.refine.survey_file import SurveyPoint
+from service.scans.track import camera_of
 from service.stream.records import PoseRecord, ScanHeader
 
 FREE = SelfCalibrationConfig()
@@ -75,13 +76,13 @@ class ImageNetwork:
     sigma_focal: float
     doubt: str  # why the camera is held; empty when it is found
 
-    def figures(self, given_focal_px: float) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """Figures of the network."""
         return {
             "sightings": len(self.seen.view),
             "places": len(np.unique(self.seen.landmark)),
             "views": len(self.poses),
-            "focal_px": [round(given_focal_px, 2), round(float(self.camera.K[0, 0]), 2)],
+            "focal_px": [round(float(c.K[0, 0]), 2) for c in (self.given, self.camera)],
             "centre_px": [round(float(v), 1) for v in self.camera.K[:2, 2]],
             "distortion": [round(float(v), 5) for v in self.camera.distortion],
         }
@@ -118,7 +119,7 @@ def network_of(
 
     Raises InputError when ``video`` is not the scan's.
     """
-    given = own_camera.camera_of(header)
+    given = camera_of(header)
     times = [s.time_ns for s in states] + [f.time_unix_ns for f in marked]
     poses = np.array([s.T_world_camera for s in states] + [f.T_world_camera for f in marked])
     images = own_camera.images_at(video, header.started_unix_ns, times)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +18,8 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.refine.revisions import KeyframeState
 from service.offline.refine.survey_file import Sighting, SurveyPoint
-from service.stream.records import PoseRecord
+from service.scans.track import camera_of
+from service.stream.records import PoseRecord, ScanHeader
 
 MARK_PX = 1.5
 """How well a point is marked in an image, 1 sigma, with what remains of lens and pose."""
@@ -90,7 +90,7 @@ class ScanImages:
 
     states: Sequence[KeyframeState]
     frames: Sequence[PoseRecord]
-    camera: dict[str, Any]
+    header: ScanHeader
     keyframe: Callable[[KeyframeState], Keyframe | None]
     frame: LocalFrame | None
 
@@ -126,20 +126,15 @@ def candidates_of(survey: Sequence[SurveyPoint], scan: ScanImages, path: str) ->
 def _in_image(seen: Sighting, number: int, scan: ScanImages, where: str) -> Mark:
     """A mark from pixels of the camera's own, distorted image."""
     assert seen.uv_px is not None
-    camera = scan.camera
-    if not {"K", "width", "height"} <= set(camera):
-        raise InputError(f"{where}: the scan does not record its camera; give x,y,z instead")
-    u, v = seen.uv_px
-    if not (-0.5 <= u <= camera["width"] - 0.5 and -0.5 <= v <= camera["height"] - 0.5):
+    camera, (u, v) = camera_of(scan.header), seen.uv_px
+    width, height = camera.size_px
+    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
         raise InputError(
-            f"{where}: pixel {u:g}, {v:g} is outside the camera's image of "
-            f"{camera['width']}x{camera['height']}"
+            f"{where}: pixel {u:g}, {v:g} is outside the camera's image of {width}x{height}"
         )
-    K = np.array(camera["K"], np.float64).reshape(3, 3)
-    distortion = np.array(camera.get("distortion") or [0.0] * 5, np.float64)
-    flat = cv2.undistortPoints(np.array([[[u, v]]]), K, distortion)[0, 0]
+    flat = cv2.undistortPoints(np.array([[[u, v]]]), camera.K, camera.distortion)[0, 0]
     ray = np.array([flat[0], flat[1], 1.0])
-    sigma = MARK_PX / float(K[0, 0])
+    sigma = MARK_PX / float(camera.K[0, 0])
     index, T = _image(seen, scan, where)
     if not np.array_equal(T, np.eye(4)):
         return Mark(number, index, ray, sigma, T_key_camera=T)
@@ -205,7 +200,7 @@ def _in_map(seen: Sighting, number: int, scan: ScanImages, where: str) -> list[M
         surface = _surface_at(scan.keyframe(state), p / p[2])
         if surface is None or abs(surface[0] - p[2]) > 4.0 * surface[1] + 0.01 * p[2]:
             continue
-        sigma = 0.5 / float(np.array(scan.camera["K"]).ravel()[0]) if "K" in scan.camera else 1e-3
+        sigma = 0.5 / float(scan.header.camera["K"][0]) if "K" in scan.header.camera else 1e-3
         found.append(Mark(number, index, p / p[2], sigma, float(p[2]), surface[1]))
     if not found:
         raise InputError(

@@ -42,11 +42,10 @@ from recon.calibration.tracks import (
 from recon.camera_model import Undistorter, project, rays
 from recon.tracking import matching
 from recon.types import F64, U8, Camera
-from service.cameras.camera_file import save_camera, shutter_of
+from service.cameras.camera_file import save_camera
 from service.cameras.images import open_images
 from service.cameras.video import open_file
 from service.errors import InputError
-from service.stream.records import ScanHeader
 
 FILE = "camera.refined.yaml"
 WITHIN_S = 0.02
@@ -77,15 +76,6 @@ GROSS_PX = 15.0
 
 MIN_SHARE = 0.5
 """Share of the keyframes whose images the video must hold."""
-
-
-def camera_of(header: ScanHeader) -> Camera:
-    """The camera that a scan was flown with."""
-    c = header.camera
-    K = np.array(c["K"], np.float64).reshape(3, 3)
-    size = int(c["width"]), int(c["height"])
-    shutter = shutter_of(c.get("readout_ms", 0), c.get("readout_direction", "down"))
-    return Camera(K, np.array(c["distortion"], np.float64), size, shutter)
 
 
 def images_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[int, U8]:

@@ -64,7 +64,7 @@ from service.offline.refine.stored_loops import StoredLoops, loose
 from service.offline.refine.survey_file import SurveyPoint, at_times, read_survey
 from service.progress import Progress
 from service.scans.folder import write_deliverables
-from service.scans.track import local_frame
+from service.scans.track import camera_of, local_frame
 from service.scans.trust import BY_SURVEY
 from service.stream.records import (
     Repose,
@@ -224,7 +224,7 @@ class _Refinement:
         if self.options.video is not None:
             with self.progress.part("matching the images again", MATCHING):
                 self._match_again(self.options.video, survey)
-        images = ScanImages(self.states, self.frames, self.header.camera, self.keyframe, self.frame)
+        images = ScanImages(self.states, self.frames, self.header, self.keyframe, self.frame)
         candidates = candidates_of(survey, images, str(self.options.gcp))
         if self.images is not None:
             for one in candidates:
@@ -250,7 +250,7 @@ class _Refinement:
             places_m = track.poses[:, :3, 3]
         figures = figures_of(seqs, track, found, candidates, verified, self._ahead_m(), places_m)
         if self.images is not None:
-            figures["images"] = self.images.figures(self.header.camera["K"][0])
+            figures["images"] = self.images.figures()
             fixed = np.asarray(np.isfinite(fixes_of(track)[0]).all(axis=1))
             figures["apart"] = stretches_untied(seqs, self.images.seen, fixed)
         alone = self._left_out(track, candidates)
@@ -267,7 +267,7 @@ class _Refinement:
         self, video: Path, config: SelfCalibrationConfig = own_camera.START
     ) -> tuple[SelfCalibrated, Camera]:
         """The camera by the flight's own images, and the one that it was flown with."""
-        track, given = self._track(), own_camera.camera_of(self.header)
+        track, given = self._track(), camera_of(self.header)
         times = [s.time_ns for s in self.states]
         images = own_camera.images_at(video, self.header.started_unix_ns, times)
         ahead = track.poses[:, :3, 2] * self._ahead_m()
