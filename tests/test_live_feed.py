@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from service.ground.live import LiveFeed, StoreIndex
+from service.ground.live import LiveFeed
 from service.scans.track import latest
 from service.stream import radio_messages, store
 from service.stream.records import PoseRecord, Repose, ScanHeader, pack_pose
@@ -29,10 +29,8 @@ def scan(tmp_path: Path, house: HouseFlight) -> Iterator[ScanStore]:
 
 @pytest.fixture
 def feed(scan: ScanStore) -> Iterator[LiveFeed]:
-    index, reader = StoreIndex(scan.path), ScanStore.open(scan.path)
-    yield LiveFeed(reader, index)
-    index.close()
-    reader.close()
+    with ScanStore.open(scan.path) as reader:
+        yield LiveFeed(reader)
 
 
 def texts(feed: LiveFeed) -> list[dict[str, Any]]:
@@ -98,9 +96,7 @@ def test_text_in_place_of_numbers_is_left_out(scan: ScanStore, feed: LiveFeed) -
     chunk = "INSERT INTO chunks VALUES (?, ?, 1, 0, 0, 0, x'00')"
     radio = "INSERT INTO radio VALUES ('tile', 'z', 0, x'00')"
     scan._db.write([(chunk, (1, "x")), (chunk, ("y", 0)), (radio, ())])
-    index = StoreIndex(scan.path)
-    assert index.layers() == dict.fromkeys(range(5), 1)
-    index.close()
+    assert scan.states() == dict.fromkeys(range(5), (1, -1))
     assert [m["type"] for m in texts(feed)] == []
 
 
@@ -114,8 +110,8 @@ def test_poses_of_the_datalink_replace_those_of_the_radio(
 ) -> None:
     header = ScanHeader("test-1", "drone-1", house.start_ns)
     with ScanStore.create(tmp_path / "scan.db", header) as scan:
-        index, reader = StoreIndex(scan.path), ScanStore.open(scan.path)
-        feed = LiveFeed(reader, index)
+        reader = ScanStore.open(scan.path)
+        feed = LiveFeed(reader)
         for seq in range(3):
             heard(scan, seq, house.record(seq, 5.0 * seq))
             assert track(feed) == ([5.0 * k for k in range(seq + 1)], 5.0 * seq)
@@ -123,5 +119,4 @@ def test_poses_of_the_datalink_replace_those_of_the_radio(
         assert [p.T_world_camera[0, 3] for p in later] == [5.0, 10.0]
         scan.put_pose(4, pack_pose(house.record(1, 5.25)))
         assert track(feed) == ([5.25], 5.25)
-        index.close()
         reader.close()

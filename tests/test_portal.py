@@ -20,7 +20,7 @@ from portal_client import ONE, TOKEN, Client, FakeOperator, client, flown_store,
 from recon import se3
 from service.errors import InputError, OutsideError
 from service.ground.library import Library
-from service.ground.live import SIGMA_STEP_M, LiveFeed, StoreIndex
+from service.ground.live import SIGMA_STEP_M, LiveFeed
 from service.ground.portal import Portal, PortalConfig, open_portal
 from service.ground.scan_files import DARK
 from service.ground.scan_files import _closed as closed_image
@@ -399,7 +399,7 @@ def test_a_live_view_of_nothing_is_closed(client: Client) -> None:
 
 def test_the_feed_sends_each_thing_once(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as scan:
-        feed = LiveFeed(scan, StoreIndex(scan.path))
+        feed = LiveFeed(scan)
         first = [m for m in feed.news() if isinstance(m, bytes)]
         assert len(first) == 5
         assert list(feed.news()) == []
@@ -421,7 +421,7 @@ def test_a_finer_layer_replaces_the_coarse_one(tmp_path: Path, house: HouseFligh
     one = house.keyframe(0, 0.0)
     coarse, fine = encode(one, one.time_ns)
     with ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)) as scan:
-        feed = LiveFeed(scan, StoreIndex(scan.path))
+        feed = LiveFeed(scan)
         scan.add_chunk(coarse)
         heads = [unpack(m)[0] for m in feed.news() if isinstance(m, bytes)]
         scan.add_chunk(fine)

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import InputError, OutsideError
-from service.ground.live import StoreIndex
 from service.ground.storage import is_regular
 from service.listener import is_loopback, parse_address
 from service.offline.exports.ros2 import Ros2Channels
@@ -81,13 +80,12 @@ class LiveScan:
 
     def __init__(self, context: Any, folder: Path) -> None:
         self._store = ScanStore.open(folder / "scan.db")
-        self._index = StoreIndex(self._store.path)
+        self._version = (-1, -1)
         self._channels = Ros2Channels(context, self._store.header.drone)
         self.forget()
 
     def close(self) -> None:
-        """Close the files."""
-        self._index.close()
+        """Close the file."""
         self._store.close()
 
     def forget(self) -> None:
@@ -98,15 +96,16 @@ class LiveScan:
     def refresh(self) -> None:
         """Publish poses that are new, and keyframes that are new, finer or moved; AT_ONCE of
         these at most."""
-        if not (self._index.changed() or self._has_more):
+        before, self._version = self._version, self._store.version()
+        if before == self._version and not self._has_more:
             return
         for pose in self._store.poses(self._last_ns + 1):
             self._last_ns = pose.time_unix_ns
             self._channels.log_transform(pose.T_world_camera, pose.time_unix_ns)
             self._channels.log_fix(pose)
-        published, revisions = 0, self._index.revisions()
-        for seq, layer in self._index.layers().items():
-            published += self._publish(seq, layer, revisions.get(seq, -1))
+        published = 0
+        for seq, (layer, revision) in self._store.states().items():
+            published += self._publish(seq, layer, revision)
             self._has_more = published == AT_ONCE
             if self._has_more:
                 return

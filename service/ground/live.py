@@ -42,8 +42,7 @@ from recon.mapping.cloud_fusion import cloud_of
 from recon.types import F64, DepthMap, Keyframe
 from service.errors import SkyreliefError
 from service.ground.shown_site import SiteNews
-from service.stream.database import Database
-from service.stream.ranges import RangeSet, is_number
+from service.stream.ranges import RangeSet
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
@@ -94,43 +93,6 @@ def columns(T: F64) -> list[float]:
     return [round(float(v), 9) for v in np.asarray(T).T.ravel()]
 
 
-class StoreIndex:
-    """Contents of a store's file, also when another process writes it. Use from one thread.
-
-    Raises OutsideError when the file cannot be read.
-    """
-
-    RADIO = -1
-    """The layer number of keyframes that came by the narrow radio only."""
-
-    def __init__(self, path: Path) -> None:
-        self._db = Database(path, read_only=True)
-        self._version = -1
-
-    def close(self) -> None:
-        """Close the file."""
-        self._db.close()
-
-    def changed(self) -> bool:
-        """True at the first call, and when the file changed since the last one."""
-        version = int(self._db.all("PRAGMA data_version")[0][0])
-        news = version != self._version
-        self._version = version
-        return news
-
-    def layers(self) -> dict[int, int]:
-        """Keyframe number to its finest stored layer."""
-        radio = "SELECT number, -1 FROM radio WHERE kind = 'tile'"
-        chunks = f"SELECT seq, layer FROM chunks WHERE {is_number('layer')}"
-        sql = f"SELECT seq, MAX(layer) FROM ({chunks} UNION {radio}) WHERE {is_number('seq')}"
-        return dict(self._db.all(f"{sql} GROUP BY seq ORDER BY seq"))
-
-    def revisions(self) -> dict[int, int]:
-        """Keyframe number to the revision of its newest re-pose; without one it is left out."""
-        sql = f"SELECT seq, MAX(revision) FROM reposes WHERE {is_number('revision')} GROUP BY seq"
-        return dict(self._db.all(sql))
-
-
 @dataclass(slots=True, eq=False)
 class FlightPath:
     """The flight path of a growing scan; a pose is read once."""
@@ -174,7 +136,6 @@ class LiveFeed:
     """
 
     store: ScanStore
-    index: StoreIndex
     max_points: int | None = None  # of one chunk
     heard_unix_s: float = 0.0  # when the store grew, as far as this feed knows; else its last pose
     _sent: dict[int, int] = field(default_factory=dict)  # keyframe to the layer sent
@@ -182,6 +143,7 @@ class LiveFeed:
     _revision: dict[int, int] = field(default_factory=dict)
     _track: FlightPath = field(init=False)
     _finished: bool | None = None
+    _version: tuple[int, int] = (-1, -1)
     _more: bool = True  # the last call left something for the next
 
     def __post_init__(self) -> None:
@@ -190,21 +152,22 @@ class LiveFeed:
 
     def news(self, max_chunks: int = 20) -> Iterator[str | bytes]:
         """Messages for what has changed; at most ``max_chunks`` keyframes at a time."""
-        changed = self.index.changed()
+        before, self._version = self._version, self.store.version()
+        changed = before != self._version
         if not (changed or self._more):
             return
         if self._finished is not None and changed:
             self.heard_unix_s = time.time()
-        finest = self.index.layers()
-        due = [seq for seq, layer in finest.items() if layer > self._sent.get(seq, -2)]
+        states = self.store.states()
+        due = [seq for seq, (layer, _) in states.items() if layer > self._sent.get(seq, -2)]
         self._more = len(due) > max_chunks
         for seq in due[:max_chunks]:
-            self._sent[seq] = finest[seq]
+            self._sent[seq] = states[seq][0]
             keyframe = self.store.keyframe(seq)
             if keyframe is not None:
                 self._note_repose(seq)
-                yield chunk_message(keyframe, finest[seq], self.max_points)
-        yield from self._corrections()
+                yield chunk_message(keyframe, states[seq][0], self.max_points)
+        yield from self._corrections(states)
         if self._track.grown():
             if not self.heard_unix_s and self._track.last is not None:
                 self.heard_unix_s = self._track.last.time_unix_ns / 1e9
@@ -212,16 +175,16 @@ class LiveFeed:
         state = self.store.finished
         if state != self._finished and not self._more:
             self._finished = state
-            yield json.dumps({"type": "state", "finished": state, "keyframes": len(finest)})
+            yield json.dumps({"type": "state", "finished": state, "keyframes": len(states)})
 
     def _note_repose(self, seq: int) -> None:
         repose = self.store.repose(seq)
         self._revision[seq] = -1 if repose is None else repose.revision
         self._scale[seq] = 1.0 if repose is None else repose.scale
 
-    def _corrections(self) -> Iterator[str]:
+    def _corrections(self, states: dict[int, tuple[int, int]]) -> Iterator[str]:
         """Re-poses newer than the pose that a chunk was sent with."""
-        for seq, revision in self.index.revisions().items():
+        for seq, (_, revision) in states.items():
             had = self._revision.get(seq, revision)
             repose = self.store.repose(seq) if revision > had else None
             if repose is None or repose.revision <= had:
@@ -292,12 +255,11 @@ async def serve_live(
     socket: WebSocket, folder: Path, progress: Callable[[], list[dict[str, Any]]]
 ) -> None:
     """Send what is new in the scan of ``folder`` over an accepted socket; close it at the end."""
-    store = index = None
+    store = None
     reason = ""
     try:
         store = await run_in_threadpool(ScanStore.open, folder / "scan.db")
-        index = StoreIndex(store.path)
-        feed = LiveFeed(store, index, _max_points(socket))
+        feed = LiveFeed(store, _max_points(socket))
         gone = asyncio.create_task(_until_gone(socket))
         site, said_at = SiteNews(folder), -LINK_S
         while not gone.done():
@@ -316,9 +278,8 @@ async def serve_live(
         if isinstance(error, SkyreliefError):
             reason = str(error).replace(f"{folder}/", "")
     finally:
-        for opened in (index, store):
-            if opened is not None:
-                await run_in_threadpool(opened.close)
+        if store is not None:
+            await run_in_threadpool(store.close)
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             await socket.close(reason=reason.encode()[:MAX_REASON_BYTES].decode(errors="ignore"))
 

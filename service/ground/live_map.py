@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import time
-from array import array
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -25,7 +24,6 @@ from service.georeference import LocalFrame
 from service.scans.main_piece import main_seqs
 from service.scans.open_scans import OpenScans
 from service.scans.track import local_frame
-from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore
 
 SIDE, MARGIN = 256, 8
@@ -41,6 +39,9 @@ READ_S = 2.0
 
 Tile = tuple[int, int, int]
 """Zoom, column from west, row from north."""
+
+State = tuple[int, int]
+"""Of a keyframe, as :meth:`ScanStore.states` gives it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +72,7 @@ def pixel_m(zoom: int, lat_deg: float) -> float:
 class _Drawn:
     """One tile, and the state of each keyframe that is in it."""
 
-    states: dict[int, int] = field(default_factory=dict)
+    states: dict[int, State] = field(default_factory=dict)
     sigma: F32 = field(default_factory=lambda: np.full(WIDE * WIDE, np.inf, np.float32))
     height: F32 = field(default_factory=lambda: np.full(WIDE * WIDE, np.nan, np.float32))
     rgb: U8 = field(default_factory=lambda: np.zeros((WIDE * WIDE, 3), np.uint8))
@@ -98,38 +99,30 @@ class LiveMap:
         self._store, self._frame = store, frame
         self.zoom: int | None = None  # the finest that is drawn; finer tiles are enlarged
         self.version = 0  # counts the keyframes that came or changed
-        self._seqs, self._states = array("q"), array("q")
-        self._boxes = np.zeros((0, 4))
+        self._states: dict[int, State] = {}  # of the keyframes that were read
+        self._boxes: dict[int, F64] = {}
         self._tiles: OrderedDict[Tile, _Drawn] = OrderedDict()
         self._points = lru_cache(maxsize=64)(self._points_of)
 
     @property
     def bounds(self) -> tuple[float, float, float, float] | None:
         """(west, north, east, south) in the square of Web Mercator; None without surface."""
-        if not len(self._boxes) or not np.isfinite(self._boxes).any():
+        boxes = np.array(list(self._boxes.values())).reshape(-1, 4)
+        if not np.isfinite(boxes).any():
             return None
-        west, north = np.nanmin(self._boxes[:, :2], axis=0).tolist()
-        east, south = np.nanmax(self._boxes[:, 2:], axis=0).tolist()
+        west, north = np.nanmin(boxes[:, :2], axis=0).tolist()
+        east, south = np.nanmax(boxes[:, 2:], axis=0).tolist()
         return west, north, east, south
 
     def refresh(self) -> None:
         """Take note of keyframes that are new, finer or moved, for READ_S at most."""
         until = time.monotonic() + READ_S
-        fine = self._store.numbers().get("k1", RangeSet())
-        known = dict(zip(self._seqs, range(len(self._seqs)), strict=True))
+        states = self._store.states()
         for seq in main_seqs(self._store):
-            repose = self._store.repose(seq)
-            state = 2 * (0 if repose is None else repose.revision + 1) + (seq in fine)
-            at = known.get(seq)
-            if at is not None and self._states[at] == state:
+            state = states.get(seq, (-1, -1))
+            if self._states.get(seq) == state:
                 continue
-            box = self._box(seq, state)
-            if at is None:
-                self._seqs.append(seq)
-                self._states.append(state)
-                self._boxes = np.vstack([self._boxes, box])
-            else:
-                self._states[at], self._boxes[at] = state, box
+            self._boxes[seq], self._states[seq] = self._box(seq, state), state
             self.version += 1
             if time.monotonic() > until:
                 return
@@ -155,15 +148,14 @@ class LiveMap:
         closed = fill_holes(raster, HOLE_PX)
         return Cells(closed.height_m, closed.rgb)
 
-    def _within(self, tile: Tile) -> list[tuple[int, int]]:
+    def _within(self, tile: Tile) -> list[tuple[int, State]]:
         """Keyframes whose points may lie in a tile or its margin, with their states."""
         west, north = _corner(tile)
         side = WIDE / SIDE / (1 << tile[0])
-        if not len(self._boxes):
-            return []
-        b = self._boxes
+        seqs, b = list(self._boxes), np.array(list(self._boxes.values())).reshape(-1, 4)
         hit = (b[:, 0] < west + side) & (b[:, 2] > west) & (b[:, 1] < north + side)
-        return [(self._seqs[i], self._states[i]) for i in np.flatnonzero(hit & (b[:, 3] > north))]
+        inside = np.flatnonzero(hit & (b[:, 3] > north))
+        return [(seqs[i], self._states[seqs[i]]) for i in inside]
 
     def _draw(self, points: _Points, tile: Tile, drawn: _Drawn) -> None:
         """Put those points into a tile whose sigma is smaller than that of the point it shows."""
@@ -179,14 +171,14 @@ class LiveMap:
         drawn.height[new] = points.height_m[which[new]]
         drawn.rgb[new] = points.rgb[which[new]]
 
-    def _box(self, seq: int, state: int) -> F64:
+    def _box(self, seq: int, state: State) -> F64:
         """(4,) bounds of a keyframe's points; NaN without any."""
         place = self._points(seq, state).place
         if not len(place):
             return np.full(4, np.nan)
         return np.concatenate([place.min(axis=0), place.max(axis=0)])
 
-    def _points_of(self, seq: int, state: int) -> _Points:
+    def _points_of(self, seq: int, state: State) -> _Points:
         """The points of a keyframe in its ``state``."""
         keyframe = self._store.keyframe(seq)
         if keyframe is None:

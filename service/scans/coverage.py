@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,7 +31,6 @@ from service.scans.main_piece import Stretch, main_seqs, stretches_apart
 from service.scans.open_scans import OpenScans
 from service.scans.track import local_frame
 from service.scans.writing import writing
-from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore
 from service.workers import PROCESS, Worker
 
@@ -164,10 +162,7 @@ class LiveCoverage:
         """Start from nothing, without the keyframes of these stretches."""
         self._apart = apart
         self._map: CoverageMap | None = None
-        self._seqs = array("q")  # processed keyframes, in order; and for each:
-        self._fine = array("b")  # whether its fine layer was available
-        self._revisions = array("q")  # revision of its pose
-        self._reposes = RangeSet()  # re-poses in force at that time
+        self._states: dict[int, tuple[int, int]] = {}  # of the keyframes that are in it
 
     def refresh(self) -> Coverage | None:
         """The layer of the store's current content; None while it contains no surface."""
@@ -178,22 +173,12 @@ class LiveCoverage:
         apart = stretches_apart(self._store)
         if apart != self._apart:  # known once the scan is finished, or refined
             self._begin(apart)
-        numbers = self._store.numbers()
-        fine, reposes = (numbers.get(kind, RangeSet()) for kind in ("k1", "repose"))
-        is_moved = reposes != self._reposes
-        self._reposes = reposes
-        for i, seq in enumerate(main_seqs(self._store)):
-            if i == len(self._seqs) or self._seqs[i] != seq:
-                self._seqs.insert(i, seq)
-                self._fine.insert(i, seq in fine)
-                self._revisions.insert(i, self._revision(seq))
-                self._put(seq, finer=False)
-                continue
-            revision = self._revision(seq) if is_moved else self._revisions[i]
-            finer = (seq in fine) != self._fine[i]
-            if finer or revision != self._revisions[i]:
-                self._fine[i], self._revisions[i] = seq in fine, revision
-                self._put(seq, finer)
+        states = self._store.states()
+        for seq in main_seqs(self._store):
+            before, now = self._states.get(seq), states.get(seq, (-1, -1))
+            if before != now:
+                self._states[seq] = now
+                self._put(seq, finer=before is not None and before[0] != now[0])
         if self._map is None:
             return None
         self._map.refill(self._depths(self._map.stale()))
@@ -203,10 +188,6 @@ class LiveCoverage:
         places = self._map.places()
         limits = Limits(MIN_VIEWS, MAX_SIGMAS * float(np.median(layer.sigma_m[layer.known])))
         return Coverage(layer, local_frame(self._store.header), places, limits)
-
-    def _revision(self, seq: int) -> int:
-        repose = self._store.repose(seq)
-        return 0 if repose is None else repose.revision
 
     def _put(self, seq: int, finer: bool) -> None:
         keyframe = self._store.keyframe(seq)

@@ -262,6 +262,11 @@ class Database:
         except sqlite3.Error as error:
             raise OutsideError(f"cannot read {self.path} ({error}); check the disk") from error
 
+    def version(self) -> tuple[int, int]:
+        """Differs from an earlier one when this connection or another has written since."""
+        row = self.one("PRAGMA data_version")
+        return 0 if row is None else int(row[0]), self._connection.total_changes
+
     def write(self, statements: list[Statement]) -> int:
         """Run statements in one transaction; returns the number of changed rows.
 

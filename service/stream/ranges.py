@@ -205,18 +205,13 @@ class Inventory:
         self._numbers: dict[str, RangeSet] = {}
         self._reposes = RangeSet()
         self._database = database
-        self._version = self._written()
+        self._version = database.version()[0]
         self._load(database)
-
-    def _written(self) -> int:
-        """Changes when another connection has written the file."""
-        row = self._database.one("PRAGMA data_version")
-        return 0 if row is None else int(row[0])
 
     def follow(self) -> bool:
         """Take in what other connections have written, if anything; listeners are not called."""
         with self._lock:
-            before, self._version = self._version, self._written()
+            before, self._version = self._version, self._database.version()[0]
             if self._version == before:
                 return False
             self._numbers.clear()

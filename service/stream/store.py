@@ -282,6 +282,21 @@ class ScanStore:
         stored = {row[0] for row in self._db.all(sql)}
         return sorted(stored | self._radio.seqs())
 
+    def states(self) -> dict[int, tuple[int, int]]:
+        """Each keyframe's finest stored layer, -1 for tiles of the narrow radio alone, and the
+        revision of its newest re-pose, -1 without one."""
+        radio = "SELECT number, -1 FROM radio WHERE kind = 'tile'"
+        chunks = f"SELECT seq, layer FROM chunks WHERE {_IS_LAYER}"
+        finest = f"SELECT seq, MAX(layer) FROM ({chunks} UNION {radio}) WHERE {is_number('seq')}"
+        layers = self._db.all(f"{finest} GROUP BY seq ORDER BY seq")
+        newest = f"SELECT seq, MAX(revision) FROM reposes WHERE {is_number('revision')}"
+        revisions = dict(self._db.all(f"{newest} GROUP BY seq"))
+        return {seq: (layer, revisions.get(seq, -1)) for seq, layer in layers}
+
+    def version(self) -> tuple[int, int]:
+        """Differs from an earlier one when the file was written since, also by others."""
+        return self._db.version()
+
     # Poses and re-poses
 
     def add_pose(self, pose: PoseRecord) -> int:
