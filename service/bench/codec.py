@@ -9,12 +9,14 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from recon.types import F32, U8, Bool, Keyframe
+from recon.mapping.cloud_fusion import cloud_of
+from recon.types import F32, U8, Keyframe
 from service.bench import BenchOptions, BenchResult
 from service.bench.keyframes import make_keyframe, strip
 from service.stream import codec
@@ -24,58 +26,56 @@ REPEATS = 30
 FRAMES = 3
 
 
-@dataclass(frozen=True, slots=True)
-class CodecFigures:
-    """A codec's result on a keyframe; NaN where a figure does not apply."""
+class CodecFigures(NamedTuple):
+    """A codec's result on the keyframes; infinite or zero where nothing is lost."""
 
-    name: str
     bits_per_point: float
     encode_ms: float
     rms_at_60_m_m: float
     psnr_db: float
 
 
-def measure() -> list[CodecFigures]:
+Coded = tuple[Callable[[], bytes], int, float, float]
+"""Encodes a keyframe; its points, the depth's error at 60 m, and the colour's PSNR."""
+
+
+def measure() -> dict[str, CodecFigures]:
     """Our codec first, then every peer that is installed."""
     frames = [make_keyframe(k, SIZE_PX, seed=1 + k) for k in range(FRAMES)]
-    rows = [_average([_ours(frame) for frame in frames])]
-    for peer in (_jpeg_ls, _draco, _laz, _raw):
-        try:
-            rows.append(_average([peer(frame) for frame in frames]))
-        except ImportError:
-            continue
-    return rows
+    found = {}
+    for name, codec_of in CODECS.items():
+        with contextlib.suppress(ImportError):
+            found[name] = _figures([codec_of(frame) for frame in frames])
+    return found
+
+
+def _figures(coded: list[Coded]) -> CodecFigures:
+    with _one_core():
+        encode_ms = [_median_ms(encode) for encode, *_ in coded]
+    bits = [8 * len(encode()) / points for encode, points, *_ in coded]
+    rms, psnr = np.array([lost for _, _, *lost in coded]).T
+    return CodecFigures(
+        float(np.mean(bits)), float(np.median(encode_ms)), float(np.sqrt(np.mean(rms**2))),
+        float(np.mean(psnr)),
+    )  # fmt: skip
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
     """Bits per point against every peer, encoding time, error, masking and coarse share."""
-    ours, *peers = measure()
-    results = [
-        BenchResult(
-            "codec",
-            "size with colour",
-            ours.bits_per_point,
-            "bits per point",
-            peer=peer.name,
-            peer_value=peer.bits_per_point,
-            note=f"error at 60 m {ours.rms_at_60_m_m * 100:.2f} cm against "
-            f"{peer.rms_at_60_m_m * 100:.2f} cm",
-        )
-        for peer in peers
-    ]
-    results += [
-        BenchResult(
-            "codec",
-            "encode 320x180, both layers, one core",
-            ours.encode_ms,
-            "ms",
-            peer=peer.name,
-            peer_value=peer.encode_ms,
-        )
-        for peer in peers
-    ]
+    figures = measure()
+    ours = figures.pop("skyrelief")
+    results = []
+    for name, peer in figures.items():
+        error = f"{ours.rms_at_60_m_m * 100:.2f} cm against {peer.rms_at_60_m_m * 100:.2f} cm"
+        results += [
+            BenchResult("codec", "size with colour", ours.bits_per_point, "bits per point", 0.0,
+                        name, peer.bits_per_point, note=f"error at 60 m {error}"),
+            BenchResult("codec", "encode 320x180, both layers, one core", ours.encode_ms, "ms", 0.0,
+                        name, peer.encode_ms),
+        ]  # fmt: skip
     saved, bits = masking()
-    results += [
+    return [
+        *results,
         BenchResult("codec", "depth error at 60 m", ours.rms_at_60_m_m * 100, "cm rms"),
         BenchResult("codec", "colour", ours.psnr_db, "dB PSNR"),
         BenchResult("codec", "sent of a keyframe at 80 % overlap", 100 * (1 - saved), "%"),
@@ -85,7 +85,6 @@ def run(options: BenchOptions) -> list[BenchResult]:
         BenchResult("codec", "coarse layer of their bytes", 100 * coarse_share(), "%"),
         BenchResult("codec", "coarse layer of a whole keyframe", 100 * coarse_share(False), "%"),
     ]
-    return results
 
 
 def masking() -> tuple[float, float]:
@@ -125,16 +124,6 @@ def _size(frame: Keyframe) -> int:
     return sum(map(len, codec.encode(frame, 0)))
 
 
-def _average(rows: list[CodecFigures]) -> CodecFigures:
-    return CodecFigures(
-        rows[0].name,
-        float(np.mean([r.bits_per_point for r in rows])),
-        float(np.median([r.encode_ms for r in rows])),
-        float(np.sqrt(np.mean([r.rms_at_60_m_m**2 for r in rows]))),
-        float(np.mean([r.psnr_db for r in rows])),
-    )
-
-
 def _median_ms(work: Callable[[], object]) -> float:
     """Milliseconds of one core: processor time of this thread, so a busy machine counts less."""
     work()
@@ -167,53 +156,39 @@ def _psnr(a: U8, frame: Keyframe) -> float:
     return float(10 * np.log10(255**2 / np.mean((a.astype(float) - frame.bgr) ** 2)))
 
 
-def _ours(frame: Keyframe) -> CodecFigures:
-    with _one_core():
-        encode_ms = _median_ms(lambda: codec.encode(frame, 0))
-    layers = codec.encode(frame, 0)
-    back = codec.decode(layers)
+def _ours(frame: Keyframe) -> Coded:
+    back = codec.decode(codec.encode(frame, 0))
     assert back is not None
-    bits = sum(map(len, layers)) * 8 / frame.fresh.sum()
     rms = _rms_at_60(frame, back.depth.depth_m)
-    return CodecFigures("skyrelief", float(bits), encode_ms, rms, _psnr(back.bgr, frame))
+    points = int(frame.fresh.sum())
+    return lambda: b"".join(codec.encode(frame, 0)), points, rms, _psnr(back.bgr, frame)
 
 
-def _jpeg_ls(frame: Keyframe) -> CodecFigures:
+def _jpeg_ls(frame: Keyframe) -> Coded:
     """12-bit inverse depth between nearest and farthest in JPEG-LS, and JPEG quality 80."""
     import imagecodecs
 
     inverse = 1.0 / frame.depth.depth_m.astype(np.float64)
     low, step = inverse.min(), (inverse.max() - inverse.min()) / 4095
 
-    def encode() -> tuple[bytes, bytes]:
+    def coded() -> tuple[bytes, bytes]:
         codes = np.rint((1.0 / frame.depth.depth_m - low) / step).astype(np.uint16)
         colour = cv2.imencode(".jpg", frame.bgr, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
         return bytes(imagecodecs.jpegls_encode(codes)), colour.tobytes()
 
-    depth, colour = encode()
+    depth, colour = coded()
     codes = imagecodecs.jpegls_decode(depth)
     image = cv2.imdecode(np.frombuffer(colour, np.uint8), cv2.IMREAD_COLOR)
-    bits = (len(depth) + len(colour)) * 8 / codes.size
     rms = _rms_at_60(frame, (1.0 / (low + step * codes)).astype(np.float32))
-    return CodecFigures(
-        "JPEG-LS 12 bit + JPEG 80",
-        bits,
-        _median_ms(encode),
-        rms,
-        _psnr(np.asarray(image, np.uint8), frame),
-    )
+    return lambda: b"".join(coded()), codes.size, rms, _psnr(np.asarray(image, np.uint8), frame)
 
 
 def _points(frame: Keyframe) -> tuple[F32, U8]:
-    known: Bool = frame.fresh
-    v, u = np.nonzero(known)
-    z = frame.depth.depth_m[v, u]
-    K = frame.depth.K
-    xyz = np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=1)
-    return xyz.astype(np.float32), np.ascontiguousarray(frame.bgr[v, u, ::-1])
+    cloud = cloud_of(replace(frame.depth, T_world_camera=np.eye(4)), frame.bgr, frame.fresh)
+    return cloud.xyz_m.astype(np.float32), np.ascontiguousarray(cloud.rgb)
 
 
-def _draco(frame: Keyframe) -> CodecFigures:
+def _draco(frame: Keyframe) -> Coded:
     """Draco at 14 bits, where its error of position is about ours."""
     import DracoPy  # type: ignore[import-not-found, unused-ignore]
 
@@ -222,15 +197,11 @@ def _draco(frame: Keyframe) -> CodecFigures:
     def encode() -> bytes:
         return bytes(DracoPy.encode(xyz, colors=rgb, quantization_bits=14, compression_level=7))
 
-    began = time.thread_time()
-    data = encode()
-    encode_ms = (time.thread_time() - began) * 1e3
     extent = float((xyz.max(axis=0) - xyz.min(axis=0)).max())
-    rms = extent / (1 << 14) / 12**0.5
-    return CodecFigures("Draco 14 bit", len(data) * 8 / len(xyz), encode_ms, rms, float("inf"))
+    return encode, len(xyz), extent / (1 << 14) / 12**0.5, np.inf
 
 
-def _laz(frame: Keyframe) -> CodecFigures:
+def _laz(frame: Keyframe) -> Coded:
     """LAZ, point format 7, 1 cm."""
     import io
 
@@ -247,18 +218,19 @@ def _laz(frame: Keyframe) -> CodecFigures:
         las.write(out, do_compress=True, laz_backend=laspy.LazBackend.Lazrs)
         return out.getvalue()
 
-    data = encode()
-    return CodecFigures(
-        "LAZ 1 cm", len(data) * 8 / len(xyz), _median_ms(encode), 0.01 / 12**0.5, float("inf")
-    )
+    return encode, len(xyz), 0.01 / 12**0.5, np.inf
 
 
-def _raw(frame: Keyframe) -> CodecFigures:
+def _raw(frame: Keyframe) -> Coded:
     """Three floats and three bytes."""
     xyz, rgb = _points(frame)
+    return lambda: xyz.tobytes() + rgb.tobytes(), len(xyz), 0.0, np.inf
 
-    def encode() -> bytes:
-        return xyz.tobytes() + rgb.tobytes()
 
-    bits = len(encode()) * 8 / len(xyz)
-    return CodecFigures("raw float32", bits, _median_ms(encode), 0.0, float("inf"))
+CODECS: dict[str, Callable[[Keyframe], Coded]] = {
+    "skyrelief": _ours,
+    "JPEG-LS 12 bit + JPEG 80": _jpeg_ls,
+    "Draco 14 bit": _draco,
+    "LAZ 1 cm": _laz,
+    "raw float32": _raw,
+}
