@@ -27,7 +27,7 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.sim.recording import SimulationOptions, prepare
 from service.sim.render import Look, Renderer
-from service.sim.truth import Truth, heights_below, read_surface, short
+from service.sim.truth import Truth, heights_below, read_surface, reading
 
 log = logging.getLogger(__name__)
 
@@ -170,7 +170,7 @@ def _mesh(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
     """Distances of the mesh to the true surface, evenly by area, and of the truth to the mesh."""
     import trimesh
 
-    try:
+    with reading(path):
         extras = _glb_extras(path)
         mesh: Any = trimesh.load(str(path), force="mesh", process=False)
         x, up, south = np.asarray(mesh.vertices, np.float64).T
@@ -180,8 +180,6 @@ def _mesh(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
         own = None if origin is None else LocalFrame(*(float(v) for v in origin))
         placed = local if own is None else truth.frame.to_enu(own.to_geodetic(local))
         triangle_grid.build(placed, faces)
-    except (ValueError, TypeError, KeyError, AttributeError, struct.error) as error:
-        raise InputError(f"{path}: not a mesh of ours ({short(error)})") from error
     out: dict[str, Any] = {"vertices": len(local), "faces": len(faces), "placed": own is not None}
     for name, fit in fits.items():
         grid = triangle_grid.build(fit.points(placed), faces)
@@ -216,7 +214,7 @@ def _cloud(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
     """Distances of the points to the true surface, placed by the file's own coordinate system."""
     import laspy
 
-    try:
+    with reading(path, laspy.errors.LaspyException):
         with laspy.open(str(path)) as reader:
             crs = reader.header.parse_crs()
         if path.name.endswith(".copc.laz"):  # by its octree, as a viewer would
@@ -225,8 +223,6 @@ def _cloud(path: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
         else:
             las = laspy.read(str(path))
         points = np.column_stack([las.x, las.y, las.z]).astype(np.float64)
-    except (laspy.errors.LaspyException, RuntimeError, ValueError, OSError) as error:
-        raise InputError(f"{path}: cannot be read ({short(error)})") from error
     out: dict[str, Any] = {"epsg": None if crs is None else crs.to_epsg(), "points": len(points)}
     step = max(1, -(-len(points) // MAX_POINTS))
     places = _enu(crs, points[::step], truth.frame)
@@ -243,14 +239,11 @@ class _Raster:
         """Raises InputError for a file that is not a north-up GeoTIFF."""
         import rasterio
 
-        try:
-            with rasterio.open(path) as image:
-                self.bands = image.read()
-                self.nodata = image.nodata
-                self._to_map = image.transform
-                self._crs = image.crs
-        except (rasterio.errors.RasterioError, OSError) as error:
-            raise InputError(f"{path}: cannot be read ({short(error)})") from error
+        with reading(path, rasterio.errors.RasterioError), rasterio.open(path) as image:
+            self.bands = image.read()
+            self.nodata = image.nodata
+            self._to_map = image.transform
+            self._crs = image.crs
         self._frame = frame
         self.cell_m = float(self._to_map.a)
         if not self.cell_m > 0.0 or self._to_map.b or self._to_map.d:
@@ -323,10 +316,8 @@ def view_from_above(
     Raises InputError where it does not, or where its ground was made of photographs, which
     the truth does not hold.
     """
-    try:
+    with reading(truth / "params.json"):
         options = options_of(json.loads((truth / "params.json").read_text())["options"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{truth / 'params.json'}: does not say how to make the site") from error
     if options.photos is not None:
         raise InputError(f"{truth}: the ground was made of photographs, which are not kept there")
     simulation = prepare(options)

@@ -25,8 +25,8 @@ from service.sim.truth import (
     json_object,
     read_truth,
     read_tum,
+    reading,
     seen_surface,
-    short,
 )
 
 log = logging.getLogger(__name__)
@@ -223,10 +223,8 @@ def read_scan(folder: Path, frame: LocalFrame) -> ScanResult:
     origin, epsg = summary.get("origin"), summary.get("epsg")
     if not origin or not epsg:
         return ScanResult(points, sigma, times, poses, False)
-    try:
+    with reading(folder / "scan.json"):
         own = LocalFrame(origin["lat_deg"], origin["lon_deg"], origin["alt_amsl_m"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"scan {folder}: origin in scan.json ({short(error)})") from error
     if own.epsg != epsg:
         raise InputError(f"scan {folder}: EPSG {epsg} in scan.json is not that of its origin")
     enu = frame.to_enu(own.to_geodetic(own.from_utm(points)))
@@ -250,13 +248,9 @@ def _read_cloud(path: Path) -> tuple[F64, F32 | None]:
     """(points (N, 3), sigma_m (N,) or None) of a LAZ file."""
     import laspy
 
-    try:
+    with reading(path, laspy.errors.LaspyException):
         las = laspy.read(str(path))
         points = np.asarray(las.xyz, np.float64)
-    except FileNotFoundError:
-        raise InputError(f"cloud {path}: no such file; was the scan finished?") from None
-    except (laspy.errors.LaspyException, RuntimeError, ValueError, OSError) as error:
-        raise InputError(f"cloud {path}: cannot be read ({short(error)})") from error
     names = set(las.point_format.extra_dimension_names)
     sigma = np.asarray(las["sigma_m"], np.float32) if "sigma_m" in names else None
     return points, sigma

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,16 +58,14 @@ def read_truth(folder: Path) -> Truth:
     params = json_object(folder / "params.json")
     vertices, triangles = read_surface(folder / "surface.ply")
     times, poses = read_tum(folder / "trajectory.tum")
-    try:
+    with reading(folder):
         frame = LocalFrame(origin["lat_deg"], origin["lon_deg"], origin["alt_amsl_m"])
         K = np.array(params["K"], np.float64).reshape(3, 3)
         width, height = (int(v) for v in params["size_px"])
         agl = float(params["median_agl_m"])
         surface = triangle_grid.build(vertices, triangles)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"truth {folder}: unusable ({short(error)})") from error
-    if len(times) < 2:
-        raise InputError(f"truth {folder}: trajectory.tum has fewer than two poses")
+        if len(times) < 2:
+            raise ValueError("trajectory.tum has fewer than two poses")
     return Truth(folder, frame, surface, times, poses, K, (width, height), agl)
 
 
@@ -93,9 +94,8 @@ def seen_surface(truth: Truth) -> SeenSurface:
 
 def read_tum(path: Path) -> tuple[F64, F64]:
     """(times (N,) unix s, poses (N, 4, 4)) of a TUM trajectory, in order of time."""
-    text = _text(path)
-    rows = [r.split() for r in text.splitlines() if r.strip() and not r.startswith("#")]
-    try:
+    with reading(path):
+        rows = [r.split() for r in path.read_text().splitlines() if r and not r.startswith("#")]
         table = np.array([[float(v) for v in row] for row in rows]).reshape(len(rows), 8)
         if not np.isfinite(table).all():
             raise ValueError("numbers that are not finite")
@@ -104,34 +104,30 @@ def read_tum(path: Path) -> tuple[F64, F64]:
         for k, row in enumerate(table):
             poses[k, :3, :3] = se3.rotation_from_quaternion(row[[7, 4, 5, 6]])
         poses[:, :3, 3] = table[:, 1:4]
-    except ValueError as error:
-        raise InputError(f"trajectory {path}: not a TUM file ({short(error)})") from error
     return table[:, 0], poses
 
 
 def json_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file; InputError, in one line, for anything else."""
+    """The JSON object in a file."""
+    with reading(path):
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+
+
+UNFIT = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError, struct.error)
+
+
+@contextmanager
+def reading(path: Path, *faults: type[Exception]) -> Iterator[None]:
+    """Turn what a file that is not as it should be raises into an InputError in one line."""
+    unfit: tuple[type[Exception], ...] = (*UNFIT, *faults)
     try:
-        value = json.loads(_text(path))
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON ({short(error)})") from error
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: not a JSON object")
-    return value
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({short(error)})") from error
-
-
-def short(error: Exception) -> str:
-    """The start of an error's text, in one line."""
-    return " ".join(str(error).split())[:120]
+        yield
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except unfit as error:
+        raise InputError(
+            f"{path}: cannot be read ({' '.join(str(error).split())[:120]})"
+        ) from error
 
 
 FACE = np.dtype([("n", "u1"), ("v", "<i4", 3)])
@@ -170,22 +166,15 @@ def read_surface(path: Path) -> tuple[F64, I32]:
 
     Coordinates may be float or double. InputError, in one line, for anything else.
     """
-    try:
+    with reading(path):
         data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"surface {path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"surface {path}: cannot be read ({error.strerror})") from error
-    head = HEADER.match(data)
-    if head is None:
-        raise InputError(f"surface {path}: not a PLY file of simulate")
-    real, n, m = np.dtype("<f4" if head[2] == b"float" else "<f8"), int(head[1]), int(head[3])
-    try:
+        head = HEADER.match(data)
+        if head is None:
+            raise ValueError("not a PLY file of simulate")
+        real, n, m = np.dtype("<f4" if head[2] == b"float" else "<f8"), int(head[1]), int(head[3])
         vertices = np.frombuffer(data, real, 3 * n, head.end()).reshape(n, 3).astype(np.float64)
         faces = np.frombuffer(data, FACE, m, head.end() + vertices.size * real.itemsize)
-    except ValueError as error:
-        raise InputError(f"surface {path}: {error}; expected the PLY of simulate") from error
-    triangles = np.ascontiguousarray(faces["v"], np.int32)
-    if m and (not (faces["n"] == 3).all() or triangles.min() < 0 or triangles.max() >= n):
-        raise InputError(f"surface {path}: not a mesh of triangles over its own vertices")
+        triangles = np.ascontiguousarray(faces["v"], np.int32)
+        if m and (not (faces["n"] == 3).all() or triangles.min() < 0 or triangles.max() >= n):
+            raise ValueError("not a mesh of triangles over its own vertices")
     return vertices, triangles
