@@ -64,6 +64,9 @@ class Limits:
 class DroneReceiver:
     """Receives the scans of one drone, with :meth:`run` on a worker."""
 
+    worker: Worker
+    """Set by the owner that starts it."""
+
     def __init__(self, drone: str, station: Receiver) -> None:
         self.drone = drone
         self.inbox = Inbox()

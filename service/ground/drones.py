@@ -7,12 +7,11 @@ import resource
 import threading
 import time
 from collections import OrderedDict
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from service.ground.drone import DRONE_TIMEOUT_S, DroneReceiver
 from service.ground.received import ReceivedScan
-from service.workers import Worker, Workers
+from service.workers import Workers
 
 if TYPE_CHECKING:
     from service.ground.receiver import Receiver
@@ -33,21 +32,13 @@ REFUSAL_S = 60.0
 """Interval between two warnings about a drone that is not received."""
 
 
-@dataclass(slots=True, eq=False)
-class _Member:
-    """A drone and its worker."""
-
-    drone: DroneReceiver
-    worker: Worker
-
-
 class Drones:
     """The table of drones. Safe between threads, but for :meth:`retire` and :meth:`close`."""
 
     def __init__(self, station: Receiver, workers: Workers) -> None:
         self._station, self._workers = station, workers
         self._lock = threading.Lock()
-        self._members: dict[str, _Member] = {}
+        self._drones: dict[str, DroneReceiver] = {}  # those that have a worker
         self._resting: OrderedDict[str, DroneReceiver] = OrderedDict()
         self._refused_at = -1e9
         self._is_wanted = False  # a drone was refused since the last turn
@@ -56,10 +47,10 @@ class Drones:
     def get(self, name: str) -> DroneReceiver | None:
         """A drone, its worker started if need be; None when there are too many."""
         with self._lock:
-            member = self._members.get(name)
-            if member is not None:
-                return member.drone
-            if len(self._members) >= MAX_DRONES and not self._make_way():
+            found = self._drones.get(name)
+            if found is not None:
+                return found
+            if len(self._drones) >= MAX_DRONES and not self._make_way():
                 self._is_wanted = True
                 if time.monotonic() - self._refused_at > REFUSAL_S:
                     self._refused_at = time.monotonic()
@@ -67,26 +58,25 @@ class Drones:
                 return None
             drone = self._resting.pop(name, None) or DroneReceiver(name, self._station)
             drone.heard_at = time.monotonic()
-            worker = self._workers.start(f"drone {name}", drone.run)
-            self._members[name] = _Member(drone, worker)
+            drone.worker = self._workers.start(f"drone {name}", drone.run)
+            self._drones[name] = drone
             return drone
 
     def present(self, name: str) -> DroneReceiver | None:
         """A drone that has a worker."""
-        member = self._members.get(name)
-        return None if member is None else member.drone
+        return self._drones.get(name)
 
     @property
     def all(self) -> list[DroneReceiver]:
         """Those that have a worker."""
         with self._lock:
-            return [member.drone for member in self._members.values()]
+            return list(self._drones.values())
 
     @property
     def entries(self) -> list[dict[str, Any]]:
         """One entry per scan."""
         with self._lock:
-            drones = [*(member.drone for member in self._members.values()), *self._resting.values()]
+            drones = [*self._drones.values(), *self._resting.values()]
         return [entry for drone in drones for entry in drone.entries]
 
     @property
@@ -99,7 +89,7 @@ class Drones:
         """Scans that one drone may have open now."""
         soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         room = soft // DESCRIPTOR_SHARE // DESCRIPTORS_PER_SCAN
-        return max(2, min(MAX_OPEN_SCANS, room // max(1, len(self._members))))
+        return max(2, min(MAX_OPEN_SCANS, room // max(1, len(self._drones))))
 
     def retire(self, now: float) -> None:
         """End the workers of drones that are silent and have nothing open, or that failed.
@@ -108,58 +98,57 @@ class Drones:
         """
         with self._lock:
             gone = {
-                name: member
-                for name, member in self._members.items()
-                if member.worker.is_done
-                or (not member.drone.scans and now - member.drone.heard_at > DRONE_TIMEOUT_S)
+                name: drone
+                for name, drone in self._drones.items()
+                if drone.worker.is_done
+                or (not drone.scans and now - drone.heard_at > DRONE_TIMEOUT_S)
             }
-            if self._is_wanted and len(self._members) - len(gone) >= MAX_DRONES:
+            if self._is_wanted and len(self._drones) - len(gone) >= MAX_DRONES:
                 gone |= self._min_silent(now)
             self._is_wanted = False
             for name in gone:
-                del self._members[name]
-        for name, member in gone.items():
-            member.worker.join()
-            member.drone.close_all()
+                del self._drones[name]
+        for name, drone in gone.items():
+            drone.worker.join()
+            drone.close_all()
             with self._lock:
                 self._resting.pop(name, None)
-                if member.drone.is_known and not member.worker.has_failed:
-                    self._resting[name] = member.drone
+                if drone.is_known and not drone.worker.has_failed:
+                    self._resting[name] = drone
                 else:
-                    self._dropped += member.drone.dropped + member.drone.inbox.dropped
+                    self._dropped += drone.dropped + drone.inbox.dropped
                 while len(self._resting) > MAX_RESTING:
                     self._resting.popitem(last=False)
 
     def close(self) -> list[ReceivedScan]:
         """End all workers; the scans that are open."""
-        for member in self._members.values():
-            member.worker.stop.set()
-        for member in self._members.values():
-            member.worker.join()
-        return [scan for member in self._members.values() for scan in member.drone.scans]
+        for drone in self._drones.values():
+            drone.worker.stop.set()
+        for drone in self._drones.values():
+            drone.worker.join()
+        return [scan for drone in self._drones.values() for scan in drone.scans]
 
-    def _min_silent(self, now: float) -> dict[str, _Member]:
+    def _min_silent(self, now: float) -> dict[str, DroneReceiver]:
         """The silent drone that brought least, the one heard longest ago of several; or none."""
         silent = [
             (
-                sum(e["received_bytes"] + e["radio_messages"] for e in member.drone.entries),
-                member.drone.heard_at,
+                sum(e["received_bytes"] + e["radio_messages"] for e in drone.entries),
+                drone.heard_at,
                 name,
             )
-            for name, member in self._members.items()
-            if now - member.drone.heard_at > DRONE_TIMEOUT_S
-            and not any(scan.is_writing for scan in member.drone.scans)
+            for name, drone in self._drones.items()
+            if now - drone.heard_at > DRONE_TIMEOUT_S
+            and not any(scan.is_writing for scan in drone.scans)
         ]
-        return {name: self._members[name] for *_, name in sorted(silent)[:1]}
+        return {name: self._drones[name] for *_, name in sorted(silent)[:1]}
 
     def _make_way(self) -> bool:
         """End the worker of a drone that never had a scan and is silent; False for none."""
         now = time.monotonic()
-        for name, member in self._members.items():
-            drone = member.drone
+        for name, drone in self._drones.items():
             if not drone.is_known and now - drone.heard_at > STRANGER_S:
-                member.worker.stop.set()
+                drone.worker.stop.set()
                 self._dropped += drone.dropped + drone.inbox.dropped
-                del self._members[name]
+                del self._drones[name]
                 return True
         return False
