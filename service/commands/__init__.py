@@ -1,5 +1,6 @@
 """The subcommands, and the options that several of them take."""
 
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
+from service.errors import InputError
 from service.progress import Progress
 
 Overrides = Annotated[
@@ -57,6 +59,14 @@ def with_options(
         return run
 
     return wrap
+
+
+def parse_size(text: str, option: str) -> tuple[int, int]:
+    """(W, H) of ``WxH``; InputError, which names the option, for anything else."""
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.strip())
+    if found is None:
+        raise InputError(f"{option} {text!r}: give WIDTHxHEIGHT, such as 320x180")
+    return int(found[1]), int(found[2])
 
 
 def stop_by_signals() -> Event:

@@ -181,11 +181,8 @@ def inspect(
             raise InputError(f"{scan_dir}: no keyframe {seq}; there are {seqs[0]} to {seqs[-1]}")
     image, complete = stages(scan_dir, scan.store.header.scan_id, found)
     path = out or scan_dir / f"keyframe_{seq:06d}.png"
-    ok, data = cv2.imencode(".png", image)
-    if not ok:
-        raise InputError(f"{path}: OpenCV cannot write PNG on this machine")
     with writing(path) as part:
-        part.write_bytes(data.tobytes())
+        part.write_bytes(cv2.imencode(".png", image)[1].tobytes())
     known = np.isfinite(found.depth.depth_m)
     figures = {
         "keyframe": seq,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import showing, with_options
+from service.commands import parse_size, showing, with_options
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class SimulateOptions:
             look=Look(noise=self.image_noise, water_m=self.water_m),
             faults=self._faults(),
             seed=self.seed,
-            size_px=_size(self.size),
+            size_px=parse_size(self.size, "--size"),
             fps=self.fps,
             focal_share=self.focal,
             distortion=recording.DISTORTION if self.distortion else (0.0,) * 5,
@@ -229,14 +229,6 @@ def _pair(text: str, option: str) -> tuple[float, float]:
     except ValueError:
         pass
     raise InputError(f"{option} {text!r}: expected two numbers with a colon, such as 10:2.5")
-
-
-def _size(text: str) -> tuple[int, int]:
-    """(W, H) of ``WxH``."""
-    found = re.match(r"^(\d+)x(\d+)$", text.strip())
-    if found is None:
-        raise InputError(f"--size {text!r}: expected width x height, such as 1280x720")
-    return int(found[1]), int(found[2])
 
 
 def _frames(progress: Progress, done: int, total: int) -> None:

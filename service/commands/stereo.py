@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.commands import AsJson
+from service.commands import AsJson, parse_size
 from service.compute.rectified_pair import matching_config, read_gray
 from service.errors import InputError, OutsideError
 
@@ -49,8 +49,7 @@ def stereo(
             f"{left} is {_size(gray_left)} but {right} is {_size(gray_right)}: "
             "a rectified pair has one size"
         )
-    if not 2 <= labels <= 1024:
-        raise InputError(f"--labels {labels}: give 2 to 1024")
+    _check_labels(labels)
     config = matching_config(iterations, min_disparity, checked)
     check_output(out, ".npy")
     if image is not None:
@@ -103,6 +102,11 @@ def write(out: Path, image: Path | None, px: F32, labels: int, min_disparity: in
         raise OutsideError(f"{out}: cannot be written: {error.strerror}") from error
 
 
+def _check_labels(labels: int) -> None:
+    if not 2 <= labels <= 1024:
+        raise InputError(f"--labels {labels}: give 2 to 1024")
+
+
 def _size(image: U8) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"
 
@@ -123,10 +127,9 @@ def export_model(
     confidence (h, w) float32, taps (h, w, 3) and guide (H, W, 3) uint8 to fine_px,
     fine_confidence (H, W).
     """
-    shape = parse_size(size)
-    fine = parse_size(guide) if guide else None
-    if not 2 <= labels <= 1024:
-        raise InputError(f"--labels {labels}: give 2 to 1024")
+    shape = _shape(size, "--size")
+    fine = _shape(guide, "--guide") if guide else None
+    _check_labels(labels)
     if out.suffix != ".onnx" or not out.parent.is_dir():
         raise InputError(f"{out}: give a name that ends in .onnx, in a folder that exists")
     try:
@@ -150,11 +153,9 @@ def export_model(
     print(f"{out}: {len(model) / 1e6:.1f} MB")
 
 
-def parse_size(text: str) -> tuple[int, int]:
-    """(height, width) of ``WIDTHxHEIGHT``; InputError for anything else."""
-    width, cross, height = text.partition("x")
-    if not (cross and width.isdecimal() and height.isdecimal()):
-        raise InputError(f"size {text!r}: give WIDTHxHEIGHT, such as 320x180")
-    if not (8 <= int(width) <= 8192 and 8 <= int(height) <= 8192):
-        raise InputError(f"size {text!r}: sides are 8 to 8192")
-    return int(height), int(width)
+def _shape(text: str, option: str) -> tuple[int, int]:
+    """(height, width) of ``WIDTHxHEIGHT``."""
+    width, height = parse_size(text, option)
+    if not (8 <= width <= 8192 and 8 <= height <= 8192):
+        raise InputError(f"{option} {text!r}: sides are 8 to 8192")
+    return height, width

@@ -399,10 +399,7 @@ def _preview(
         track = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
         zero = summary["origin"]["alt_amsl_m"] if summary["origin"] else 0.0
         image = draw_preview(raster, track, lines, height_of_zero_m=zero)
-    ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])
-    if not ok:
-        raise OutsideError("preview.jpg: OpenCV cannot write JPEG on this machine")
-    return data.tobytes()
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 
 def _key_figures(summary: dict[str, Any]) -> list[str]:

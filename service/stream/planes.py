@@ -188,10 +188,7 @@ def encode_colour(planes: Planes, quality: int) -> bytes:
     if not planes.known.all():
         image = plane_kernels.calm(image, np.ascontiguousarray(planes.known), MCU_PX)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    ok, data = cv2.imencode(".jpg", image, options)
-    if not ok:
-        raise ValueError(f"JPEG refused an image of shape {image.shape}")
-    return data.tobytes()
+    return cv2.imencode(".jpg", image, options)[1].tobytes()
 
 
 def decode_colour(data: bytes, w: int, h: int) -> U8 | None:

@@ -72,9 +72,7 @@ def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
     if not path.is_file():
         write_ortho(scan, path, options)
     image, (west, south, east, north) = _in_degrees(path)
-    ok, data = cv2.imencode(".png", image)
-    if not ok:
-        raise InputError("OpenCV cannot write PNG on this machine")
+    _, data = cv2.imencode(".png", image)
     name = scan.store.header.scan_id
     kml = (
         '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">'

@@ -166,12 +166,11 @@ class _Recording:
         stamp = _stamp(time_ns)
         frame_id = f"keyframe-{keyframe.seq}"
         self._write(self._points, _points(keyframe, stamp), time_ns)
-        ok, jpeg = cv2.imencode(".jpg", keyframe.bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        if ok:
-            image = messages.CompressedImage(
-                timestamp=stamp, frame_id=frame_id, data=jpeg.tobytes(), format="jpeg"
-            )
-            self._write(self._image, image, time_ns)
+        _, jpeg = cv2.imencode(".jpg", keyframe.bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        image = messages.CompressedImage(
+            timestamp=stamp, frame_id=frame_id, data=jpeg.tobytes(), format="jpeg"
+        )
+        self._write(self._image, image, time_ns)
         h, w = keyframe.depth.depth_m.shape
         K = [float(v) for v in keyframe.depth.K.ravel()]
         camera = messages.CameraCalibration(

@@ -111,9 +111,8 @@ class Ros2Channels:
             self._points, time_ns, header, 1, points.size, fields, False, POINT.itemsize, size,
             data, True,
         )  # fmt: skip
-        ok, jpeg = cv2.imencode(".jpg", keyframe.bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        if ok:
-            _log(self._image, time_ns, header, "jpeg", jpeg.ravel())
+        _, jpeg = cv2.imencode(".jpg", keyframe.bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        _log(self._image, time_ns, header, "jpeg", jpeg.ravel())
         K = np.ascontiguousarray(depth.K, np.float64)
         P = np.hstack([K, np.zeros((3, 1))])
         whole = _new("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
