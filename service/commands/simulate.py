@@ -6,10 +6,10 @@ import json
 import re
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -19,10 +19,11 @@ from service.errors import InputError
 if TYPE_CHECKING:
     from service.progress import Progress
     from service.sim import recording
-    from service.sim.flight import FlightPlan, SensorNoise
+    from service.sim.flight import SensorNoise
     from service.sim.telemetry import TelemetryOptions
 
 VIDEO_TO = "udp://127.0.0.1:5600?pkt_size=1316"
+Made = TypeVar("Made")
 PAIR = re.compile(r"^(-?[0-9.]+):(-?[0-9.]+)$")
 
 
@@ -107,42 +108,30 @@ class SimulateOptions:
         """Raises ValueError for an impossible flight, InputError for unreadable text."""
         from service.cameras.camera_file import shutter_of
         from service.sim import recording
+        from service.sim.flight import FlightPlan
         from service.sim.render import Look
 
-        return recording.SimulationOptions(
-            plan=self._plan(),
+        return self._as(
+            recording.SimulationOptions,
+            plan=self._as(FlightPlan, centred=self.site_m is not None),
             noise=self._noise(),
             telemetry=self._telemetry(),
             look=Look(noise=self.image_noise, water_m=self.water_m),
             faults=self._faults(),
-            seed=self.seed,
             size_px=parse_size(self.size, "--size"),
-            fps=self.fps,
             focal_share=self.focal,
             distortion=recording.DISTORTION if self.distortion else (0.0,) * 5,
-            relief_m=self.relief_m,
-            density=self.density,
-            photos=self.photos,
-            depth_frames=self.depth_frames,
-            crf=self.crf,
             with_telemetry=self.telemetry,
             with_video=self.video,
             shutter=shutter_of(self.readout_ms, self.readout_direction),
             exposure_s=1e-3 * self.shutter_ms,
-            flight_seed=self.flight_seed,
-            site_m=self.site_m,
-            changes=self.changes,
-            date=self.date,
         )
 
-    def _plan(self) -> FlightPlan:
-        from service.sim.flight import FlightPlan
-
-        return FlightPlan(
-            self.pattern, self.duration_s, self.height_m, self.speed_m_s, self.heading_deg,
-            self.camera_pitch_deg, self.legs, self.spacing_m, self.wobble_deg, self.sway_m,
-            self.climb_m, self.swing_deg, centred=self.site_m is not None,
-        )  # fmt: skip
+    def _as(self, kind: type[Made], **others: Any) -> Made:
+        """A record of ``kind``: ``others``, and the options that have the names of its fields."""
+        names = {field.name for field in fields(kind)} - others.keys()  # type: ignore[arg-type]
+        same = {name: getattr(self, name) for name in names if hasattr(self, name)}
+        return kind(**same, **others)
 
     def _noise(self) -> SensorNoise:
         from service.sim.flight import SensorNoise
@@ -158,14 +147,12 @@ class SimulateOptions:
     def _telemetry(self) -> TelemetryOptions:
         from service.sim.telemetry import TelemetryOptions
 
-        return TelemetryOptions(
-            gimbal_frame=self.gimbal_frame,
-            rangefinder=self.rangefinder,
+        return self._as(
+            TelemetryOptions,
             gap_s=_pair(self.telemetry_gap, "--telemetry-gap") if self.telemetry_gap else None,
             lead_s=self.log_lead_s,
             boresight_deg=_pair(self.boresight_deg, "--boresight-deg"),
             accuracy=self.gnss_accuracy,
-            home_above_m=self.home_above_m,
         )
 
     def _faults(self) -> recording.Faults:
