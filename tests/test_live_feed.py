@@ -95,7 +95,7 @@ def test_text_in_place_of_numbers_is_left_out(scan: ScanStore, feed: LiveFeed) -
     texts(feed)
     chunk = "INSERT INTO chunks VALUES (?, ?, 1, 0, 0, 0, x'00')"
     radio = "INSERT INTO radio VALUES ('tile', 'z', 0, x'00')"
-    scan._db.write([(chunk, (1, "x")), (chunk, ("y", 0)), (radio, ())])
+    scan.database.write([(chunk, (1, "x")), (chunk, ("y", 0)), (radio, ())])
     assert scan.states() == dict.fromkeys(range(5), (1, -1))
     assert [m["type"] for m in texts(feed)] == []
 

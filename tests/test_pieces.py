@@ -204,7 +204,7 @@ def test_coverage_begins_again_where_a_piece_leaves(tmp_path: Path, house: House
 
 
 def set_refinement(store: ScanStore, figures: dict[str, Any]) -> None:
-    store._db.set("refinement", json.dumps({"figures": figures}))
+    store.database.set("refinement", json.dumps({"figures": figures}))
 
 
 def test_a_refinement_that_ties_brings_back(tmp_path: Path, house: HouseFlight) -> None:

@@ -472,7 +472,8 @@ def test_when_half_contradict_the_rest_nothing_is_changed(flight: Flight) -> Non
             row["lat"] += 10.0 / 111_200
     with pytest.raises(InputError, match="contradicts"):
         refine(flight.scan, RefineOptions(write_csv(flight.folder / "p.csv", rows)))
-    with Revisions(ScanStore.open(flight.scan / "scan.db")) as revisions:
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        revisions = Revisions(store)
         assert revisions._note == {}
 
 

@@ -290,9 +290,9 @@ def test_a_full_disk_at_the_ground_loses_nothing(
 def test_a_full_disk_onboard_is_said_and_leaves_the_store_sound(tmp_path: Path) -> None:
     with ScanStore.create(tmp_path / "a.db", ScanHeader("s", "d", 1)) as store:
         store.add_keyframe(0, LAYERS[0])
-        pages = store._db.one("PRAGMA page_count")
+        pages = store.database.one("PRAGMA page_count")
         assert pages is not None
-        store._db.one(f"PRAGMA max_page_count = {int(pages[0])}")
+        store.database.one(f"PRAGMA max_page_count = {int(pages[0])}")
         with pytest.raises(OutsideError, match="free some space"):
             for seq in range(1, 12):
                 store.add_keyframe(seq, LAYERS[seq])

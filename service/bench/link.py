@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -229,12 +229,9 @@ def fly_plain(trial: Trial) -> Outcome:
     plain.insert_json5("transport/shared_memory/enabled", "false")
     drone = zenoh.open(plain)
     made: dict[tuple[str, int], float] = {}
-    patterns = [make_keyframe(k, SIZE_PX, strip(SIZE_PX, 20 + k), seed=1 + k) for k in range(4)]
     pose = pack_pose(PoseRecord(0, np.eye(4), np.eye(6)))
     began, cpu = time.monotonic(), time.process_time()
-    for seq in range(round(trial.flight_s * trial.keyframes_hz)):
-        time.sleep(max(0.0, began + seq / trial.keyframes_hz - time.monotonic()))
-        layers = codec.encode(replace(patterns[seq % 4], seq=seq), time.time_ns())
+    for seq, layers in _keyframes(trial, began):
         now = time.monotonic()
         for kind, data in (("pose", pose), ("k0", layers[0]), ("k1", layers[1])):
             made[kind, seq] = now
@@ -287,12 +284,17 @@ def _switch_on(trial: Trial, folder: Path, number: int, ground_port: int) -> _Dr
     return _Drone(store, DatalinkSender(store, config), emulator)
 
 
-def _produce(trial: Trial, drones: Sequence[_Drone], began: float) -> None:
-    """Keyframes with 80 % overlap and a pose each, at the trial's rate."""
+def _keyframes(trial: Trial, began: float) -> Iterator[tuple[int, Sequence[bytes]]]:
+    """Number and coded layers of keyframes with 80 % overlap, at the trial's rate."""
     patterns = [make_keyframe(k, SIZE_PX, strip(SIZE_PX, 20 + k), seed=1 + k) for k in range(4)]
     for seq in range(round(trial.flight_s * trial.keyframes_hz)):
         time.sleep(max(0.0, began + seq / trial.keyframes_hz - time.monotonic()))
-        layers = codec.encode(replace(patterns[seq % 4], seq=seq), time.time_ns())
+        yield seq, codec.encode(replace(patterns[seq % 4], seq=seq), time.time_ns())
+
+
+def _produce(trial: Trial, drones: Sequence[_Drone], began: float) -> None:
+    """Store the keyframes, and a pose each."""
+    for seq, layers in _keyframes(trial, began):
         for drone in drones:
             now = time.monotonic()
             drone.made["k0", seq] = drone.made["k1", seq] = now

@@ -260,7 +260,8 @@ def _off_plane(xyz: F64) -> tuple[float, float]:
 
 def targets(flight: Flight) -> Iterator[tuple[str, float, str]]:
     """Distances between surveyed targets, scaled by their median, and their horizontal rms."""
-    with ScanStore.open(flight.scan / "scan.db") as store, Revisions(store) as revisions:
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        revisions = Revisions(store)
         states = [s for seq in store.seqs() if (s := revisions.keyframe_state(seq)) is not None]
         start = store.header.started_unix_ns
         scan = ScanImages(states, revisions.frames(), store.header, revisions.keyframe, None)

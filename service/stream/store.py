@@ -77,16 +77,16 @@ class ScanStore:
         self.path = path
         self.quota_bytes = quota_bytes
         self.refused = 0
-        self._db = Database(path, read_only)
-        self._lock = self._db.lock
+        self.database = Database(path, read_only)
+        self._lock = self.database.lock
         if header is not None:
-            self._db.set("schema", str(SCHEMA_VERSION))
-            self._db.set("header", header.to_json().decode())
+            self.database.set("schema", str(SCHEMA_VERSION))
+            self.database.set("header", header.to_json().decode())
         self._header = self._read_header()
-        total = self._db.one("SELECT TOTAL(LENGTH(data)) FROM chunks")
+        total = self.database.one("SELECT TOTAL(LENGTH(data)) FROM chunks")
         self.chunk_bytes = int(total[0]) if total else 0
-        self._inventory = Inventory(self._db)
-        self._radio = RadioStore(self._db)
+        self._inventory = Inventory(self.database)
+        self._radio = RadioStore(self.database)
         self._held: dict[tuple[int, int], Keyframe] = {}  # by number and layer
         self._held_room: int | None = None  # bytes; None: nothing is held
         self._decoding = Lock()
@@ -126,7 +126,7 @@ class ScanStore:
 
     def close(self) -> None:
         """Merge the write-ahead log into the file and close it."""
-        self._db.close()
+        self.database.close()
 
     def __enter__(self) -> ScanStore:
         return self
@@ -136,7 +136,7 @@ class ScanStore:
 
     def uses(self, thread: int) -> int:
         """Number of reads and writes by a thread (``Thread.ident``) so far."""
-        return self._db.uses[thread]
+        return self.database.uses[thread]
 
     # Header and summary
 
@@ -157,20 +157,20 @@ class ScanStore:
     @property
     def summary(self) -> dict[str, Any] | None:
         """The argument of :meth:`finish`; None for a scan in progress."""
-        text = self._db.get("summary")
+        text = self.database.get("summary")
         return None if text is None else summary_from_json(text.encode()) or {}
 
     @property
     def refinement(self) -> dict[str, Any] | None:
         """The figures of the refinement in force, or None."""
-        note = json_object(self._db.get("refinement"))
+        note = json_object(self.database.get("refinement"))
         figures = note.get("figures")
         return figures if isinstance(figures, dict) and not figures.get("undone") else None
 
     @property
     def finished(self) -> bool:
         """True once the drone closed the scan."""
-        return self._db.get("summary") is not None
+        return self.database.get("summary") is not None
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Close the scan with its ``summary`` of plain values; non-finite numbers become null.
@@ -217,7 +217,7 @@ class ScanStore:
             for head, data in layers
             if head.seq not in self._inventory.of(f"k{head.layer}")
         ]
-        self._db.write([(sql, _chunk_row(head, data)) for head, data in fresh])
+        self.database.write([(sql, _chunk_row(head, data)) for head, data in fresh])
         for head, data in fresh:
             self.chunk_bytes += len(data)
             self._inventory.note(f"k{head.layer}", head.seq)
@@ -226,7 +226,7 @@ class ScanStore:
     def chunk(self, seq: int, number: int) -> bytes | None:
         """The coded layer ``number`` of keyframe ``seq``."""
         sql = f"SELECT data FROM chunks WHERE seq = ? AND layer = ? AND {_NOT_TOO_LARGE}"
-        row = self._db.one(sql, (seq, number))
+        row = self.database.one(sql, (seq, number))
         return None if row is None else blob(row[0])
 
     def keyframe(self, seq: int) -> Keyframe | None:
@@ -235,7 +235,7 @@ class ScanStore:
         Without a layer, the tiles of the narrow radio are used.
         """
         sql = f"SELECT layer FROM chunks WHERE seq = ? AND {_IS_LAYER} ORDER BY layer DESC"
-        for (number,) in self._db.all(sql, (seq,)):
+        for (number,) in self.database.all(sql, (seq,)):
             decoded = self._decoded(seq, number)
             if decoded is not None and decoded.seq == seq:
                 break
@@ -279,7 +279,7 @@ class ScanStore:
         if self._only is not None:
             return sorted(self._only)
         sql = f"SELECT DISTINCT seq FROM chunks WHERE {is_number('seq')}"
-        stored = {row[0] for row in self._db.all(sql)}
+        stored = {row[0] for row in self.database.all(sql)}
         return sorted(stored | self._radio.seqs())
 
     def states(self) -> dict[int, tuple[int, int]]:
@@ -288,14 +288,14 @@ class ScanStore:
         radio = "SELECT number, -1 FROM radio WHERE kind = 'tile'"
         chunks = f"SELECT seq, layer FROM chunks WHERE {_IS_LAYER}"
         finest = f"SELECT seq, MAX(layer) FROM ({chunks} UNION {radio}) WHERE {is_number('seq')}"
-        layers = self._db.all(f"{finest} GROUP BY seq ORDER BY seq")
+        layers = self.database.all(f"{finest} GROUP BY seq ORDER BY seq")
         newest = f"SELECT seq, MAX(revision) FROM reposes WHERE {is_number('revision')}"
-        revisions = dict(self._db.all(f"{newest} GROUP BY seq"))
+        revisions = dict(self.database.all(f"{newest} GROUP BY seq"))
         return {seq: (layer, revisions.get(seq, -1)) for seq, layer in layers}
 
     def version(self) -> tuple[int, int]:
         """Differs from an earlier one when the file was written since, also by others."""
-        return self._db.version()
+        return self.database.version()
 
     # Poses and re-poses
 
@@ -312,8 +312,8 @@ class ScanStore:
         packed = [(p.time_unix_ns, pack_pose(p)) for p in poses]
         packed = [row for row in packed if unpack_pose(row[1]) is not None]
         with self._lock:
-            first = self._next_id("poses")
-            self._db.write([(sql, (first + i, *row)) for i, row in enumerate(packed)])
+            first = self.next_id("poses")
+            self.database.write([(sql, (first + i, *row)) for i, row in enumerate(packed)])
             for i in range(len(packed)):
                 self._inventory.note("pose", first + i)
             return first
@@ -327,14 +327,14 @@ class ScanStore:
             if number in self._inventory.of("pose"):
                 return False
             row = (number, pose.time_unix_ns, data)
-            self._db.write([("INSERT INTO poses VALUES (?, ?, ?)", row)])
+            self.database.write([("INSERT INTO poses VALUES (?, ?, ?)", row)])
             self._inventory.note("pose", number)
             return True
 
     def poses(self, since_unix_ns: int = -(1 << 63)) -> Iterator[PoseRecord]:
         """All poses since then in order of time; of several at one time only the newest."""
         newest = "SELECT MAX(id) FROM poses WHERE time_unix_ns >= ? GROUP BY time_unix_ns"
-        for (data,) in self._db.all(
+        for (data,) in self.database.all(
             f"SELECT data FROM poses WHERE id IN ({newest}) ORDER BY time_unix_ns", (since_unix_ns,)
         ):
             pose = unpack_pose(blob(data))
@@ -350,7 +350,7 @@ class ScanStore:
         """
         sql = "SELECT id, data FROM poses WHERE id BETWEEN ? AND ?"
         for gap in (RangeSet([(0, MAX_NUMBER)]) - known).pairs():
-            for number, data in self._db.all(sql, gap):
+            for number, data in self.database.all(sql, gap):
                 known.add(number)
                 pose = unpack_pose(blob(data))
                 if pose is not None:
@@ -360,9 +360,9 @@ class ScanStore:
         """Store several re-poses in one transaction, under the next numbers."""
         sql = "INSERT INTO reposes VALUES (?, ?, ?, ?)"
         with self._lock:
-            first = self._next_id("reposes")
+            first = self.next_id("reposes")
             rows = [(first + i, r.seq, r.revision, pack_repose(r)) for i, r in enumerate(reposes)]
-            self._db.write([(sql, row) for row in rows])
+            self.database.write([(sql, row) for row in rows])
             for number, seq, revision, _ in rows:
                 self._inventory.note_repose(number, seq, revision)
 
@@ -375,14 +375,14 @@ class ScanStore:
             if self._inventory.has_repose(number):
                 return False
             row = (number, repose.seq, repose.revision, data)
-            self._db.write([("INSERT INTO reposes VALUES (?, ?, ?, ?)", row)])
+            self.database.write([("INSERT INTO reposes VALUES (?, ?, ?, ?)", row)])
             self._inventory.note_repose(number, repose.seq, repose.revision)
             return True
 
     def repose(self, seq: int) -> Repose | None:
         """The newest re-pose of keyframe ``seq``."""
         sql = "SELECT data FROM reposes WHERE seq = ? ORDER BY revision DESC, id DESC LIMIT 1"
-        row = self._db.one(sql, (seq,))
+        row = self.database.one(sql, (seq,))
         return None if row is None else unpack_repose(blob(row[0]))
 
     def add_radio(self, kind: str, number: int, part: int, data: bytes) -> bool:
@@ -398,13 +398,13 @@ class ScanStore:
         Header and summary are numbered by the CRC-32 of their JSON, so that changes are visible.
         """
         if kind in ("header", "summary"):
-            text = self._db.get(kind)
+            text = self.database.get(kind)
             data = b"" if text is None else text.encode()
             return data if zlib.crc32(data) == number else None
         if kind.startswith("k"):
             return self.chunk(number, int(kind[1:]))
         table = {"pose": "poses", "repose": "reposes"}[kind]
-        row = self._db.one(f"SELECT data FROM {table} WHERE id = ?", (number,))
+        row = self.database.one(f"SELECT data FROM {table} WHERE id = ?", (number,))
         return None if row is None else blob(row[0])
 
     def put_record(self, kind: str, number: int, data: bytes) -> bool:
@@ -453,7 +453,7 @@ class ScanStore:
 
     def _set_whole(self, kind: str, data: bytes, header: ScanHeader) -> None:
         with self._lock:
-            self._db.set(kind, data.decode())
+            self.database.set(kind, data.decode())
             self._header = header
             self._inventory.note_whole(kind, data)
 
@@ -463,12 +463,12 @@ class ScanStore:
         rows = [(peer, kind, json.dumps(ranges.pairs())) for kind, ranges in numbers.items()]
         newest = "SELECT peer FROM held GROUP BY peer ORDER BY MAX(rowid) DESC LIMIT ?"
         forget = (f"DELETE FROM held WHERE peer NOT IN ({newest})", (MAX_HELD_PEERS,))
-        self._db.write([*((sql, row) for row in rows), forget])
+        self.database.write([*((sql, row) for row in rows), forget])
 
     def held(self) -> dict[str, dict[str, RangeSet]]:
         """Peer to its reported items."""
         out: dict[str, dict[str, RangeSet]] = {}
-        for peer, kind, text in self._db.all("SELECT peer, kind, ranges FROM held"):
+        for peer, kind, text in self.database.all("SELECT peer, kind, ranges FROM held"):
             ranges = ranges_from_pairs(json_value(text))
             if ranges is not None:
                 out.setdefault(str(peer), {})[str(kind)] = ranges
@@ -480,8 +480,8 @@ class ScanStore:
         return self.quota_bytes is None or self.chunk_bytes + size <= self.quota_bytes
 
     def _read_header(self) -> ScanHeader:
-        text = self._db.get("header")
-        schema = self._db.get("schema")
+        text = self.database.get("header")
+        schema = self.database.get("schema")
         if text is None or schema is None or not (schema.isdecimal() and len(schema) < 9):
             raise InputError(f"{self.path} contains no scan header; it is not a scan database")
         if int(schema) > SCHEMA_VERSION:
@@ -491,8 +491,9 @@ class ScanStore:
             raise InputError(f"{self.path}: the scan's header is not valid ({header})")
         return header
 
-    def _next_id(self, table: str) -> int:
-        row = self._db.one(f"SELECT MAX(id) FROM {table} WHERE {is_number('id')}")
+    def next_id(self, table: str) -> int:
+        """The number of the next row of a table."""
+        row = self.database.one(f"SELECT MAX(id) FROM {table} WHERE {is_number('id')}")
         return 1 if row is None or row[0] is None else int(row[0]) + 1
 
 

@@ -110,17 +110,16 @@ def refine(
     keyframes, and for bad control points.
     """
     target = _open_target(folder, options.out)
-    with ScanStore.open(target / "scan.db") as store, Revisions(store) as revisions:
-        progress = progress or Progress()
-        job = _Refinement(folder, store, revisions, options, progress)
-        figures = job.run()
+    with ScanStore.open(target / "scan.db") as store:
+        figures = _Refinement(folder, store, options, progress).run()
     return _deliver(target, figures)
 
 
 def undo(folder: Path) -> dict[str, Any]:
     """Bring back the unrefined state, as a further revision, and write the deliverables again."""
     target = _open_target(folder, None)
-    with ScanStore.open(target / "scan.db") as store, Revisions(store) as revisions:
+    with ScanStore.open(target / "scan.db") as store:
+        revisions = Revisions(store)
         if not revisions.refined:
             raise InputError(f"{folder} was never refined; there is nothing to undo")
         states = [s for seq in store.seqs() if (s := revisions.keyframe_state(seq)) is not None]
@@ -138,8 +137,8 @@ def intrinsics(
     does not determine the camera.
     """
     _open_target(folder, None)
-    with ScanStore.open(folder / "scan.db") as store, Revisions(store) as revisions:
-        job = _Refinement(folder, store, revisions, RefineOptions(telemetry=telemetry))
+    with ScanStore.open(folder / "scan.db") as store:
+        job = _Refinement(folder, store, RefineOptions(telemetry=telemetry))
         try:
             found, given = job.own_camera(video)
         except InputError as error:
@@ -153,8 +152,8 @@ def lens(folder: Path, images: Path, config: SelfCalibrationConfig) -> Camera:
     Raises InputError, in one line, where they do not determine it.
     """
     _open_target(folder, None)
-    with ScanStore.open(folder / "scan.db") as store, Revisions(store) as revisions:
-        job = _Refinement(folder, store, revisions, RefineOptions())
+    with ScanStore.open(folder / "scan.db") as store:
+        job = _Refinement(folder, store, RefineOptions())
         return job.own_camera(images, config)[0].camera
 
 
@@ -200,12 +199,11 @@ class _Refinement:
         self,
         folder: Path,
         store: ScanStore,
-        revisions: Revisions,
         options: RefineOptions,
         progress: Progress | None = None,
     ) -> None:
         self.folder, self.store, self.options = folder, store, options
-        self.revisions = revisions
+        self.revisions = revisions = Revisions(store)
         self.progress = progress or Progress()
         self.header = revisions.header
         self.frame = local_frame(self.header)

@@ -23,7 +23,7 @@ from service.cameras.rig import attitude_of
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.stream import codec
-from service.stream.database import Database, Statement, blob, json_object
+from service.stream.database import Statement, blob, json_object
 from service.stream.records import (
     PoseRecord,
     Repose,
@@ -67,23 +67,12 @@ class Revisions:
 
     def __init__(self, store: ScanStore) -> None:
         self._store = store
-        self._db = Database(store.path)
+        self._db = store.database
         self._note: dict[str, Any] = json_object(self._db.get(META))
         try:
             msgspec.convert(self._note, _Note)
         except msgspec.ValidationError as error:
-            self._db.close()
             raise InputError(f"{store.path}: its refinement record is invalid ({error})") from error
-
-    def close(self) -> None:
-        """Give the connection back."""
-        self._db.close()
-
-    def __enter__(self) -> Revisions:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def refined(self) -> bool:
@@ -100,20 +89,19 @@ class Revisions:
     def keyframe_state(self, seq: int) -> KeyframeState | None:
         """The unrefined state of a keyframe; None when nothing of it can be read."""
         data = self._store.chunk(seq, 0) or self._store.chunk(seq, 1)
-        keyframe = None if data is not None else self._store.keyframe(seq)
-        head = None if data is None else codec.unpack(data)
         base = self._base(seq)
-        if head is not None:
-            time_ns, T, covariance = (
-                head[0].time_unix_ns,
-                head[0].T_world_camera,
-                head[0].covariance,
-            )
-        elif keyframe is not None:
+        if data is None:
+            keyframe = self._store.keyframe(seq)
+            if keyframe is None:
+                return None
             time_ns, T = keyframe.time_ns, keyframe.depth.T_world_camera
             covariance = keyframe.pose.covariance
         else:
-            return None
+            unpacked = codec.unpack(data)
+            if unpacked is None:
+                return None
+            head, _ = unpacked
+            time_ns, T, covariance = head.time_unix_ns, head.T_world_camera, head.covariance
         if base is not None:
             return KeyframeState(seq, time_ns, base.T_world_camera, base.covariance, base.scale)
         return KeyframeState(seq, time_ns, T, covariance, 1.0)
@@ -175,12 +163,12 @@ class Revisions:
         revision = REFINED + int(note.get("revision", 0))
         note["revision"] = int(note.get("revision", 0)) + 1
         out: list[Statement] = []
-        first = self._next("reposes")
+        first = self._store.next_id("reposes")
         for n, r in enumerate(reposes):
             new = Repose(r.seq, revision, r.T_world_camera, r.scale, r.covariance)
             sql = "INSERT INTO reposes VALUES (?, ?, ?, ?)"
             out.append((sql, (first + n, r.seq, revision, pack_repose(new))))
-        first = self._next("poses")
+        first = self._store.next_id("poses")
         for n, p in enumerate(poses):
             sql = "INSERT INTO poses VALUES (?, ?, ?)"
             out.append((sql, (first + n, p.time_unix_ns, pack_pose(p))))
@@ -205,10 +193,6 @@ class Revisions:
         )
         row = self._db.one(sql, (seq, REFINED))
         return None if row is None else unpack_repose(blob(row[0]))
-
-    def _next(self, table: str) -> int:
-        row = self._db.one(f"SELECT MAX(id) FROM {table}")
-        return 1 if row is None or row[0] is None else int(row[0]) + 1
 
 
 def copy_store(source: Path, target: Path) -> None:
