@@ -56,7 +56,7 @@ def is_apart(seq: int, apart: Iterable[Stretch]) -> bool:
 
 @dataclass(frozen=True)
 class Piece:
-    """A stretch that is not tied to the rest, as a store of its own."""
+    """Some keyframes of a store, such as a stretch that is not tied to the rest, as a store."""
 
     whole: Keyframes
     own: list[int]

@@ -35,10 +35,11 @@ from service.offline.geopackage import points, polygons, write_layers
 from service.offline.site.alignment import AlignedSite, align_site
 from service.offline.site.change_page import draw_outlines, drawn, page, place_in, shape_of
 from service.offline.site.files import write_files
-from service.offline.site.gather import Member, Part
+from service.offline.site.gather import Member
 from service.offline.tiles import TILE_POINTS, Tile, grown, run_tiles
 from service.progress import Progress
 from service.scans.fused_cloud import fused_cloud, placed
+from service.scans.main_piece import Piece
 from service.scans.track import local_frame
 from service.scans.writing import writing
 from service.stream import codec
@@ -302,8 +303,13 @@ def surfaces(
     sigmas, and the size of their voxels; None without points."""
     box = job.tile.wide
     clouds = [
-        fused_cloud(Part(view.store, seqs), voxel, view.progress, box)
-        for seqs, voxel in zip(job.parts, job.voxels_m, strict=True)
+        fused_cloud(
+            Piece(view.store, [seq for seq in view.store.seqs() if first <= seq <= last]),
+            voxel,
+            view.progress,
+            box,
+        )
+        for (first, last), voxel in zip(job.parts, job.voxels_m, strict=True)
     ]
     if not all(len(fused.cloud) for fused in clouds):
         return None

@@ -13,13 +13,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from recon import se3
 from recon.posegraph.site_alignment import Similarity
-from recon.types import F64, Keyframe
+from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.site import DRONE
@@ -57,23 +56,6 @@ class Member:
     def seqs(self) -> range:
         """Its keyframes' numbers in the site's store."""
         return range(self.first, self.last + 1)
-
-
-class Part:
-    """Keyframes ``first`` to ``last`` of a site, such as those of one member, read as a store's."""
-
-    def __init__(self, store: ScanStore, seqs: tuple[int, int]) -> None:
-        self._store, self._ends = store, seqs
-        self.summary: dict[str, Any] | None = None
-        self.refinement: dict[str, Any] | None = None
-
-    def seqs(self) -> list[int]:
-        """Those that the site has."""
-        return [seq for seq in self._store.seqs() if self._ends[0] <= seq <= self._ends[1]]
-
-    def keyframe(self, seq: int) -> Keyframe | None:
-        """One of them, where the site has it."""
-        return self._store.keyframe(seq)
 
 
 def gather(
