@@ -26,10 +26,10 @@ from service.scans.coverage import (
     IMAGE,
     CoverageWriter,
     LiveCoverage,
-    LiveCoverages,
     coverage_of,
 )
 from service.scans.folder import write_deliverables
+from service.scans.open_scans import OpenScans
 from service.stream.codec import encode
 from service.stream.records import Repose
 
@@ -334,10 +334,10 @@ def test_few_layers_are_kept_and_rarely_made_again(tmp_path: Path, house: HouseF
     folders = [tmp_path / str(n) for n in range(3)]
     for folder in folders:
         house.flown(folder).close()
-    kept = LiveCoverages(min_age_s=1000.0, max_scans=2)
-    first = kept.of(folders[0])
-    assert kept.of(folders[0]) is first
+    kept = OpenScans(LiveCoverage, min_age_s=1000.0, max_scans=2)
+    first = kept.view(folders[0])
+    assert kept.view(folders[0]) is first
     for folder in folders[1:]:
-        kept.of(folder)
-    assert kept.of(folders[0]) is not first
+        kept.view(folder)
+    assert kept.view(folders[0]) is not first
     kept.close()

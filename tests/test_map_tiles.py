@@ -18,9 +18,9 @@ from pyproj import Transformer
 from recon.types import F64, U8
 from service.georeference import LocalFrame
 from service.ground import live_map
-from service.ground.live_map import LiveMap, LiveMaps, degrees, mercator, on_map, pixel_m
+from service.ground.live_map import LiveMap, degrees, mercator, on_map, pixel_m
 from service.ground.map_tiles import contour_mask, interval_m
-from service.scans.coverage import LiveCoverages
+from service.scans.open_scans import OpenScans
 from service.stream.codec import encode
 from service.stream.records import Repose
 from service.stream.store import ScanStore
@@ -65,7 +65,7 @@ def tile(client: Client, layer: str, z: int, x: int, y: int) -> U8:
 @pytest.fixture(autouse=True)
 def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
     """The map is looked at again with every request."""
-    monkeypatch.setattr(LiveMaps.__init__, "__defaults__", (0.0, 3))
+    monkeypatch.setattr("service.ground.state.MAP_AGE_S", 0.0)
 
 
 @pytest.mark.parametrize("zoom", [ZOOM - 3, ZOOM, ZOOM + 3])
@@ -109,7 +109,7 @@ def test_the_version_of_a_layer_is_that_of_its_tiles(
     store: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else a page that saw the version of now would keep the tile of before."""
-    monkeypatch.setattr(LiveCoverages.__init__, "__defaults__", (1000.0, 4))
+    monkeypatch.setattr("service.ground.state.COVERAGE_AGE_S", 1000.0)
     with serving(store) as client:
 
         def versions() -> tuple[str, str]:
@@ -263,14 +263,14 @@ def test_a_map_gets_the_fine_layer_that_the_receiver_stores_later(
     tmp_path: Path, house: HouseFlight
 ) -> None:
     folder = tmp_path / "scan"
-    maps = LiveMaps(min_age_s=0.0)
+    maps = OpenScans(LiveMap, min_age_s=0.0, max_scans=3)
     with house.flown(folder) as receiver:
         one = house.keyframe(9, 30.0)
         coarse, fine = encode(one, one.time_ns)
         receiver.add_chunk(coarse)
-        assert maps.of(folder).version == 6
+        assert maps.view(folder).version == 6
         receiver.add_chunk(fine)
-        assert maps.of(folder).version == 7
+        assert maps.view(folder).version == 7
     maps.close()
 
 

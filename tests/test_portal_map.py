@@ -16,10 +16,9 @@ from test_basemap import TILES, mbtiles
 from test_portal_access import PHONE
 
 from service.georeference import LocalFrame
-from service.ground.live_map import LiveMaps
+from service.ground import state
 from service.ground.portal import Portal, PortalConfig
 from service.offline.refine.refly import WAYPOINT
-from service.scans.coverage import LiveCoverages
 from service.stream.codec import encode
 from service.stream.store import ScanStore
 
@@ -151,9 +150,9 @@ def test_a_keyframe_is_on_the_map_after_its_next_round(
     browser: Browser, scans: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     """The page asks every 2 s, the server looks at the store at most 2 s before: 4 s in all."""
-    for maps in (LiveMaps, LiveCoverages):
-        assert maps.__init__.__defaults__[0] <= 2.0  # type: ignore[index]
-        monkeypatch.setattr(maps.__init__, "__defaults__", (0.0, 3))
+    for age in ("MAP_AGE_S", "COVERAGE_AGE_S"):
+        assert getattr(state, age) <= 2.0
+        monkeypatch.setattr(state, age, 0.0)
     portal = Portal(PortalConfig(scans, port=0, token=TOKEN))
     portal.start()
     page = browser.other()
@@ -184,7 +183,7 @@ ENDS = """[...document.querySelectorAll('.refly polyline')].flatMap(l =>
 def test_a_flight_over_weak_places_is_planned_while_the_scan_grows(
     browser: Browser, scans: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(LiveCoverages.__init__, "__defaults__", (0.0, 3))
+    monkeypatch.setattr(state, "COVERAGE_AGE_S", 0.0)
     (scans / "drone-1/test-1/scan.json").unlink()  # it is in flight
     portal = Portal(PortalConfig(scans, port=0, token=TOKEN))
     portal.start()

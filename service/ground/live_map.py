@@ -11,7 +11,6 @@ import time
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from recon.types import F32, F64, U8, Array, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.scans.main_piece import main_seqs
-from service.scans.open_scans import OpenScans
 from service.scans.track import local_frame
 from service.stream.store import ScanStore
 
@@ -221,17 +219,3 @@ def on_map(frame: LocalFrame, enu_m: F64) -> F64:
     middle, zero = box.mean(axis=0), known.mean(axis=0)
     A: Array = np.linalg.lstsq(box - middle, known - zero, rcond=None)[0]
     return np.asarray((enu_m - middle) @ A + zero)
-
-
-class LiveMaps(OpenScans[LiveMap]):
-    """Maps of the scans viewed last."""
-
-    def __init__(self, min_age_s: float = 1.0, max_scans: int = 3) -> None:
-        super().__init__(LiveMap, min_age_s, max_scans)
-
-    def of(self, folder: Path) -> LiveMap:
-        """The map of the scan in ``folder``, at most ``min_age_s`` old. Hold :attr:`lock`.
-
-        Raises InputError when the folder contains no scan, or one without a georeference.
-        """
-        return self.view(folder)

@@ -103,10 +103,10 @@ def tile_image(state: PortalState, folder: Path, layer: str, tile: Tile) -> U8:
     if raster is not None:
         return _drawn(layer, _from_raster(raster, layer, tile), pixel_m(tile[0], _latitude(tile)))
     if layer == "coverage":
-        found = state.coverages.of(folder)
+        found = state.coverages.view(folder).found
         return _clear() if found is None else coverage_image(found, tile)
     with state.maps.lock:
-        live = state.maps.of(folder)
+        live = state.maps.view(folder)
         up = max(0, tile[0] - (tile[0] if live.zoom is None else live.zoom))
         parent = tile[0] - up, tile[1] >> up, tile[2] >> up
         cells = live.cells(parent)
@@ -251,9 +251,9 @@ def _tile_json(request: Request) -> Response:
     """A layer of a scan as TileJSON 3.0; ``version`` changes with the map."""
     state, folder, layer = _asked(request)
     with state.maps.lock:
-        live = state.maps.of(folder)
+        live = state.maps.view(folder)
         bounds, version = _bounds(live), live.version
-    if layer == "coverage" and (found := state.coverages.of(folder)) is not None:
+    if layer == "coverage" and (found := state.coverages.view(folder).found) is not None:
         version = zlib.crc32(found.image().tobytes())
     raster = newer_raster(folder, layer)
     document = {
@@ -312,7 +312,7 @@ def _wmts(request: Request) -> Response:
     """All layers of a scan as WMTS 1.0.0 capabilities, whose tiles are the XYZ ones."""
     state, folder = state_of(request), state_of(request).library.folder(*names_of(request))
     with state.maps.lock:
-        bounds = dict(zip(BOUNDS, _bounds(state.maps.of(folder)), strict=True))
+        bounds = dict(zip(BOUNDS, _bounds(state.maps.view(folder)), strict=True))
     tiles = escape(f"{request.base_url}tiles/{folder.parent.name}/{folder.name}")
     layers = "".join(WMTS_LAYER.format(name=name, tiles=tiles, **bounds) for name in LAYERS)
     corner = {"left": -0.5 * EQUATOR_M, "top": 0.5 * EQUATOR_M, "side": SIDE}
@@ -330,7 +330,7 @@ def _kml(request: Request) -> Response:
     """A layer as overlays for Google Earth and TAK, each fetched again every few seconds."""
     state, folder, layer = _asked(request)
     with state.maps.lock:
-        found = state.maps.of(folder).bounds
+        found = state.maps.view(folder).bounds
     if found is None:
         raise InputError("no surface yet")
     west, north, east, south = found

@@ -200,7 +200,7 @@ def _closed(bgr: U8, known: Bool) -> U8:
 def _coverage(request: Request) -> Response:
     """The coverage layer as it is now, also of a scan that still grows."""
     state = state_of(request)
-    found = state.coverages.of(state.library.folder(*names_of(request)))
+    found = state.coverages.view(state.library.folder(*names_of(request))).found
     if found is None:
         raise InputError("no surface yet")
     if request.scope["path"].endswith(".png"):
@@ -215,7 +215,7 @@ def _refly(request: Request) -> Response:
     if kind not in ("geojson", "plan", "waypoints"):
         raise InputError("there is refly.geojson, refly.plan and refly.waypoints")
     folder = state.library.folder(*names_of(request))
-    found = state.coverages.of(folder)
+    found = state.coverages.view(folder).found
     if found is None or found.frame is None:
         raise InputError("no surface yet" if found is None else "the scan has no georeference")
     with ScanStore.open(folder / "scan.db", read_only=True) as store:

@@ -17,18 +17,22 @@ from service.errors import InputError, SkyreliefError
 from service.ground.basemap import Basemap
 from service.ground.drone import Limits
 from service.ground.library import Library
-from service.ground.live_map import LiveMaps
+from service.ground.live_map import LiveMap
 from service.ground.vehicle import Vehicle
 from service.offline.exports import EXPORTERS
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.progress import CancelledError, Progress
-from service.scans.coverage import LiveCoverages
+from service.scans.coverage import LiveCoverage
+from service.scans.open_scans import OpenScans
 from service.workers import Worker, Workers, guarded
 
 log = logging.getLogger(__name__)
 
 MAX_WAITING_JOBS = 20
 KEPT = 100
+MAP_AGE_S, COVERAGE_AGE_S = 1.0, 2.0
+"""Age at which the live map and the coverage layer of a scan are made anew."""
+
 SHOWN_S = 60.0
 """A job that has ended is listed for so long."""
 
@@ -211,8 +215,12 @@ class PortalState:
     vehicle: Vehicle | None
     basemap: Basemap | None = None
     limits: Limits = field(default_factory=Limits)  # of the disk
-    coverages: LiveCoverages = field(default_factory=LiveCoverages)
-    maps: LiveMaps = field(default_factory=LiveMaps)
+    coverages: OpenScans[LiveCoverage] = field(
+        default_factory=lambda: OpenScans(LiveCoverage, COVERAGE_AGE_S, max_scans=4)
+    )
+    maps: OpenScans[LiveMap] = field(
+        default_factory=lambda: OpenScans(LiveMap, MAP_AGE_S, max_scans=3)
+    )
     live_views: int = 0
     views_without_token: int = 0  # of these
     started: float = field(default_factory=time.monotonic)

@@ -28,7 +28,6 @@ from recon.surface.coverage import (
 from recon.types import U8, Array, DepthMap
 from service.georeference import LocalFrame
 from service.scans.main_piece import Stretch, main_seqs, stretches_apart
-from service.scans.open_scans import OpenScans
 from service.scans.track import local_frame
 from service.scans.writing import writing
 from service.stream.store import ScanStore
@@ -254,18 +253,3 @@ class CoverageWriter:
         found = self._live.refresh()
         if found is not None:
             _write(self._folder, found)
-
-
-class LiveCoverages(OpenScans[LiveCoverage]):
-    """Coverage of the scans viewed last."""
-
-    def __init__(self, min_age_s: float = 2.0, max_scans: int = 4) -> None:
-        super().__init__(LiveCoverage, min_age_s, max_scans)
-
-    def of(self, folder: Path) -> Coverage | None:
-        """The layer of the scan in ``folder``; None while it contains no surface.
-
-        Raises InputError when the folder contains no scan.
-        """
-        with self.lock:
-            return self.view(folder).found
