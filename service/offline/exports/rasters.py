@@ -379,24 +379,17 @@ def _in_utm(bands: Array, grid: Grid, frame: LocalFrame) -> tuple[Grid, Array]:
     corners = np.array([[west, north, 0.0], [east, north, 0.0], [east, south, 0.0],
                         [west, south, 0.0]])  # fmt: skip
     utm = frame.to_utm(corners)[:, :2]
-    cell = grid.cell_m
-    low = np.floor(utm.min(axis=0) / cell).astype(np.int64)
-    high = np.ceil(utm.max(axis=0) / cell).astype(np.int64)
-    shape = (int(high[1] - low[1]), int(high[0] - low[0]))
-    out = Grid(float(low[0] * cell), float(high[1] * cell), cell, shape)
+    out = over((*utm.min(axis=0).tolist(), *utm.max(axis=0).tolist()), grid.cell_m)
     # Pixel of the old grid as an affine function of the pixel of the new one.
     A = cv2.getAffineTransform(
         out.pixels(utm[:3]).astype(np.float32), grid.pixels(corners[:3, :2]).astype(np.float32)
     )
-    layers = [
-        cv2.warpAffine(
-            np.ascontiguousarray(band),
-            A,
-            shape[::-1],
-            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=float("nan"),
-        )
-        for band in bands
-    ]
-    return out, np.stack(layers)
+    turned = cv2.warpAffine(
+        np.ascontiguousarray(bands.transpose(1, 2, 0)),
+        A,
+        out.shape[::-1],
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=[math.nan] * len(bands),
+    )
+    return out, turned.transpose(2, 0, 1)
