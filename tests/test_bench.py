@@ -35,16 +35,16 @@ def test_compare_times_both_in_turn() -> None:
         calls.append("theirs")
         time.sleep(0.001)
 
-    result = compare("x", "y", ours, BenchOptions(rounds=3, warm_up=1), "sleep", theirs)
+    result = compare("y", ours, BenchOptions(rounds=3, warm_up=1), "sleep", theirs)
     assert calls == ["ours", "theirs"] * 4
     assert result.value >= 4
     assert result.ratio is not None
     assert result.ratio > 1
-    assert compare("x", "y", ours, BenchOptions(rounds=1, warm_up=0)).ratio is None
+    assert compare("y", ours, BenchOptions(rounds=1, warm_up=0)).ratio is None
 
 
 def test_table_and_record_hold_every_figure() -> None:
-    results = [BenchResult("a", "b", 2.0, "ms", 0.1, "peer", 4.0), BenchResult("c", "d", 7.0, "Hz")]
+    results = [BenchResult("b", 2.0, "ms", 0.1, "peer", 4.0), BenchResult("d", 7.0, "Hz")]
     lines = table(results).splitlines()
     assert len(lines) == 3
     assert "0.50" in lines[1]
@@ -59,7 +59,7 @@ def test_command_prints_and_keeps(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def run(options: BenchOptions) -> list[BenchResult]:
-        return [BenchResult("stereo", "figure", float(options.rounds), "ms")]
+        return [BenchResult("figure", float(options.rounds), "ms")]
 
     monkeypatch.setattr("service.bench.stereo.run", run)
     words = ["skyrelief", "bench", "stereo", "--rounds", "7", "--keep", str(tmp_path), "--json"]
@@ -71,6 +71,7 @@ def test_command_prints_and_keeps(
     (kept,) = tmp_path.glob("*-stereo.json")
     assert json.loads(kept.read_text()) == printed
     assert printed["results"][0]["value"] == 7
+    assert printed["results"][0]["name"] == "stereo"
     monkeypatch.setattr(sys, "argv", ["skyrelief", "bench", "nothing"])
     with pytest.raises(SystemExit) as stop:
         main()

@@ -12,7 +12,7 @@ import statistics
 import subprocess
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
@@ -55,7 +55,6 @@ class BenchOptions:
 class BenchResult:
     """One figure, and the peer's in the same run; less is better unless the unit is per second."""
 
-    name: str
     what: str
     value: float
     unit: str
@@ -64,6 +63,7 @@ class BenchResult:
     peer_value: float | None = None
     peer_spread: float = 0.0
     note: str = ""
+    name: str = ""  # empty: that of the benchmark in the table
 
     @property
     def ratio(self) -> float | None:
@@ -77,7 +77,6 @@ class BenchResult:
 
 
 def compare(
-    name: str,
     what: str,
     ours: Callable[[], object],
     options: BenchOptions,
@@ -97,11 +96,9 @@ def compare(
                 times.append(1e3 * seconds)
     value, spread = statistics.median(taken[0]), _spread(taken[0])
     if theirs is None:
-        return BenchResult(name, what, value, "ms", spread, note=note)
-    return BenchResult(
-        name, what, value, "ms", spread,
-        peer, statistics.median(taken[1]), _spread(taken[1]), note,
-    )  # fmt: skip
+        return BenchResult(what, value, "ms", spread, note=note)
+    theirs_ms = statistics.median(taken[1])
+    return BenchResult(what, value, "ms", spread, peer, theirs_ms, _spread(taken[1]), note)
 
 
 def run_benchmarks(names: list[str], options: BenchOptions) -> list[BenchResult]:
@@ -109,7 +106,8 @@ def run_benchmarks(names: list[str], options: BenchOptions) -> list[BenchResult]
     results: list[BenchResult] = []
     for name in names:
         module, _, function = BENCHMARKS[name].partition(":")
-        results += getattr(import_module(module), function)(options)
+        found = getattr(import_module(module), function)(options)
+        results += [replace(result, name=result.name or name) for result in found]
     return results
 
 

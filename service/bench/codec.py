@@ -68,22 +68,22 @@ def run(options: BenchOptions) -> list[BenchResult]:
     for name, peer in figures.items():
         error = f"{ours.rms_at_60_m_m * 100:.2f} cm against {peer.rms_at_60_m_m * 100:.2f} cm"
         results += [
-            BenchResult("codec", "size with colour", ours.bits_per_point, "bits per point", 0.0,
+            BenchResult("size with colour", ours.bits_per_point, "bits per point", 0.0,
                         name, peer.bits_per_point, note=f"error at 60 m {error}"),
-            BenchResult("codec", "encode 320x180, both layers, one core", ours.encode_ms, "ms", 0.0,
+            BenchResult("encode 320x180, both layers, one core", ours.encode_ms, "ms", 0.0,
                         name, peer.encode_ms),
         ]  # fmt: skip
     saved, bits = masking()
     return [
         *results,
-        BenchResult("codec", "depth error at 60 m", ours.rms_at_60_m_m * 100, "cm rms"),
-        BenchResult("codec", "colour", ours.psnr_db, "dB PSNR"),
-        BenchResult("codec", "sent of a keyframe at 80 % overlap", 100 * (1 - saved), "%"),
-        BenchResult("codec", "size of such keyframes", bits, "bits per point"),
-        BenchResult("codec", "encode one of them", strip_ms(), "ms"),
-        BenchResult("codec", "decode a whole keyframe", decode_ms(), "ms"),
-        BenchResult("codec", "coarse layer of their bytes", 100 * coarse_share(), "%"),
-        BenchResult("codec", "coarse layer of a whole keyframe", 100 * coarse_share(False), "%"),
+        BenchResult("depth error at 60 m", ours.rms_at_60_m_m * 100, "cm rms"),
+        BenchResult("colour", ours.psnr_db, "dB PSNR"),
+        BenchResult("sent of a keyframe at 80 % overlap", 100 * (1 - saved), "%"),
+        BenchResult("size of such keyframes", bits, "bits per point"),
+        BenchResult("encode one of them", strip_ms(), "ms"),
+        BenchResult("decode a whole keyframe", decode_ms(), "ms"),
+        BenchResult("coarse layer of their bytes", 100 * coarse_share(), "%"),
+        BenchResult("coarse layer of a whole keyframe", 100 * coarse_share(False), "%"),
     ]
 
 

@@ -40,7 +40,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
         except (ImportError, RuntimeError) as error:
             first = str(error).splitlines()[0]
             nothing = float("nan")
-            results.append(BenchResult("gpu", name, nothing, "ms", note=f"cannot run: {first}"))
+            results.append(BenchResult(name, nothing, "ms", note=f"cannot run: {first}"))
     return results
 
 
@@ -75,10 +75,10 @@ def onnx_results(compiled: Backend, options: BenchOptions) -> list[BenchResult]:
 
 def against_floor(stage: Stage, floor: Floor, options: BenchOptions) -> BenchResult:
     """The stage on the device compared with its floor."""
-    found = compare("gpu", stage.what, finished(stage.device, stage.work), options)
+    found = compare(stage.what, finished(stage.device, stage.work), options)
     least = floor.ms(stage.moved_bytes, stage.operations)
     return BenchResult(
-        "gpu", stage.what, found.value, "ms", found.spread, "floor of the device", least,
+        stage.what, found.value, "ms", found.spread, "floor of the device", least,
         note=f"{stage.moved_bytes / 1e6:.3g} MB, {stage.operations / 1e6:.3g} Mop; {stage.note}",
     )  # fmt: skip
 
@@ -107,7 +107,7 @@ def calls(
     )  # fmt: skip
     return [
         compare(
-            "gpu", f"{what}, with uploads", partial(call, backend), options, "cpu backend",
+            f"{what}, with uploads", partial(call, backend), options, "cpu backend",
             partial(call, compiled), note,
         )
         for what, call in own
@@ -200,20 +200,18 @@ def measure_floor(device: str, options: BenchOptions) -> tuple[Floor, list[Bench
     b = torch.empty_like(a)
     name = device_name(device)
     copy = compare(
-        "gpu", f"copy of {COPY_MB[device]} MiB", finished(device, lambda: target.copy_(source)),
+        f"copy of {COPY_MB[device]} MiB", finished(device, lambda: target.copy_(source)),
         options, note=name,
     )  # fmt: skip
     product = compare(
-        "gpu", f"matrix product of {n}", finished(device, lambda: torch.matmul(a, a, out=b)),
+        f"matrix product of {n}", finished(device, lambda: torch.matmul(a, a, out=b)),
         options, note=name,
     )  # fmt: skip
     moved = 2.0 * source.numel() * 4
     floor = Floor(moved / copy.value * 1e3, 2.0 * n**3 / product.value * 1e3)
     rates = [
-        BenchResult("gpu", "bandwidth of the device", floor.bytes_per_s / 1e9, "GB/s", note=name),
-        BenchResult(
-            "gpu", "float32 rate of the device", floor.operations_per_s / 1e9, "Gop/s", note=name
-        ),
+        BenchResult("bandwidth of the device", floor.bytes_per_s / 1e9, "GB/s", note=name),
+        BenchResult("float32 rate of the device", floor.operations_per_s / 1e9, "Gop/s", note=name),
     ]
     return floor, [copy, product, *rates]
 

@@ -65,12 +65,12 @@ def run(options: BenchOptions) -> list[BenchResult]:
                 f"{KEYFRAMES} keyframes; looked every ms; goal 50 ms"),
         _result("loop, until the whole map is corrected, longest", max(flown.corrected),
                 f"{len(flown.corrected)} loops taken, up to {flown.most} moved; goal 1 s"),
-        BenchResult("graph", "rms place of all keyframes", worst_m, "m", note="GNSS of 1 m"),
+        BenchResult("rms place of all keyframes", worst_m, "m", note="GNSS of 1 m"),
     ]  # fmt: skip
 
 
 def _result(what: str, value: float, note: str) -> BenchResult:
-    return BenchResult("graph", what, value, "ms", note=note)
+    return BenchResult(what, value, "ms", note=note)
 
 
 class _Flown:

@@ -107,7 +107,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
 
 def _report_radio(outcome: radio.RadioOutcome) -> list[BenchResult]:
     return [
-        BenchResult("link 57600 baud", what, value, unit)
+        BenchResult(what, value, unit, name="link 57600 baud")
         for what, value, unit in (
             ("of the radio, by the coarse map", 100 * outcome.share, "%"),
             ("of the radio, with our heartbeats and answers", 100 * outcome.all_share, "%"),
@@ -157,10 +157,10 @@ def _report(name: str, outcome: Outcome, peer: dict[str, float]) -> list[BenchRe
         ]
     return [
         BenchResult(
-            name,
             what,
             value,
             unit,
+            name=name,
             peer="plain Zenoh put" if what in peer else "",
             peer_value=peer.get(what),
         )

@@ -42,7 +42,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
     results = []
     for peer, other in peers().items():
         theirs = partial(other, source, target, guess)
-        results.append(compare("icp", what, ours, options, peer, theirs))
+        results.append(compare(what, ours, options, peer, theirs))
     for blur_px, words in ((0.0, "error, noise of each pixel"), (2.0, "error, noise of patches")):
         results += errors(words, blur_px, config)
     return results
@@ -173,7 +173,7 @@ def errors(what: str, blur_px: float, config: IcpConfig) -> list[BenchResult]:
             off.setdefault(name, []).append(100 * float(np.linalg.norm(miss)))
     ours = float(np.mean(off.pop("")))
     return [
-        BenchResult("icp", what, ours, "cm", 0.0, name, float(np.mean(values)))
+        BenchResult(what, ours, "cm", 0.0, name, float(np.mean(values)))
         for name, values in off.items()
     ]
 
@@ -228,7 +228,6 @@ def _map(depths: list[DepthMap], clouds: list[PointCloud], options: BenchOptions
         return np.isin(keys, held, kind="sort")
 
     return compare(
-        "map",
         "fresh + insert, 57,600 points",
         ours,
         options,
@@ -252,7 +251,7 @@ def _growth() -> BenchResult:
         voxel_map.insert(depth, voxel_map.fresh(depth))
     flown_m2 = (5.0 * LONG_FLIGHT + 80.0) * 45.0
     megabytes = voxel_map.nbytes / 1e6
-    return BenchResult("map", "memory", megabytes / flown_m2 * 1e4, "MB per hectare flown")
+    return BenchResult("memory", megabytes / flown_m2 * 1e4, "MB per hectare flown")
 
 
 def _fusion(
@@ -265,13 +264,12 @@ def _fusion(
     try:
         import open3d as o3d
     except ImportError:  # not installed, or a library of the system is missing
-        fusion = compare("map", name, lambda: fuse(clouds, 0.25), fewer)
+        fusion = compare(name, lambda: fuse(clouds, 0.25), fewer)
     else:
         xyz = np.concatenate([c.xyz_m for c in clouds]).astype(np.float64)
         points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
         points.colors = o3d.utility.Vector3dVector(np.full_like(xyz, 0.5))
         fusion = compare(
-            "map",
             name,
             lambda: fuse(clouds, 0.25),
             fewer,
@@ -279,5 +277,5 @@ def _fusion(
             lambda: points.voxel_down_sample(0.25),
             "the peer has no sigma, views or outlier test",
         )
-    seen = compare("map", "free-space test of it", lambda: seen_through(fused, depths), fewer)
+    seen = compare("free-space test of it", lambda: seen_through(fused, depths), fewer)
     return [fusion, seen]

@@ -40,20 +40,20 @@ def run(options: BenchOptions) -> list[BenchResult]:
     worst, usual = heartbeat_jitter()
     peer = "pymavlink"
     return [
-        BenchResult("mavlink", "parse", ours, "msg/s", 0.0, peer, theirs, 0.0, "aim 43000"),
+        BenchResult("parse", ours, "msg/s", 0.0, peer, theirs, 0.0, "aim 43000"),
         BenchResult(
-            "mavlink", f"link at {RATE_HZ} msg/s", cost, "% of a core", 0.0, peer, peer_cost, 0.0,
+            f"link at {RATE_HZ} msg/s", cost, "% of a core", 0.0, peer, peer_cost, 0.0,
             "aim 5",
         ),
         BenchResult(
-            "mavlink", "receive to stamp", delay, "ms", slow - delay, peer, peer_delay, 0.0, "aim 1"
+            "receive to stamp", delay, "ms", slow - delay, peer, peer_delay, 0.0, "aim 1"
         ),
-        BenchResult("mavlink", "first heartbeat", first_heartbeat(False), "s", note="aim 1"),
+        BenchResult("first heartbeat", first_heartbeat(False), "s", note="aim 1"),
         BenchResult(
-            "mavlink", "first heartbeat, all cores busy", first_heartbeat(True), "s", note="aim 1"
+            "first heartbeat, all cores busy", first_heartbeat(True), "s", note="aim 1"
         ),
         BenchResult(
-            "mavlink", "heartbeat jitter, all cores busy", worst, "ms",
+            "heartbeat jitter, all cores busy", worst, "ms",
             note=f"worst; median {usual:.0f}; aim 200",
         ),
     ]  # fmt: skip

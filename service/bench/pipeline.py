@@ -44,13 +44,13 @@ def run(options: BenchOptions) -> list[BenchResult]:
             note = f"{ours.fps:.1f} frames/s, {ours.rss_mib:.0f} MiB"
             results.append(
                 BenchResult(
-                    "pipeline", f"whole path, {words}", ours.clouds, "clouds/s",
+                    f"whole path, {words}", ours.clouds, "clouds/s",
                     peer="with OpenCV SGBM", peer_value=theirs.clouds, note=note,
                 )
             )  # fmt: skip
             results += [
                 BenchResult(
-                    "pipeline", f"a call of {stage} in it", ms, "ms",
+                    f"a call of {stage} in it", ms, "ms",
                     peer="with OpenCV SGBM", peer_value=theirs.stage_ms.get(stage),
                 )
                 for stage, ms in ours.stage_ms.items()
@@ -183,11 +183,11 @@ def run_memory(options: BenchOptions) -> list[BenchResult]:
     early, late = watch.tenth(0), watch.tenth(9)
     return [
         BenchResult(
-            "memory", "resident at the end of the flight", late[0], "MiB",
+            "resident at the end of the flight", late[0], "MiB",
             peer="after a tenth of it", peer_value=early[0], note=note,
         ),
         BenchResult(
-            "memory", "a frame in the last tenth", late[1], "ms",
+            "a frame in the last tenth", late[1], "ms",
             peer="in the second tenth", peer_value=watch.tenth(1)[1],
         ),
     ]  # fmt: skip

@@ -165,7 +165,7 @@ def _result(what: str, times_ms: list[float]) -> BenchResult:
     tenths = statistics.quantiles(times_ms, n=10) if len(times_ms) > 1 else [0.0, 0.0]
     note = f"{NOTE}; worst {max(times_ms):.0f} ms"
     middle = statistics.median(times_ms)
-    return BenchResult("portal", what, middle, "ms", tenths[-1] - tenths[0], note=note)
+    return BenchResult(what, middle, "ms", tenths[-1] - tenths[0], note=note)
 
 
 def _header(scan: str) -> ScanHeader:

@@ -85,7 +85,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
             flight = _replayed(one, options, Path(folder))
             for check in (_placed, seams, *one.checks):
                 for what, value, unit in check(flight):
-                    results.append(BenchResult("real", f"{one.name}: {what}", value, unit))
+                    results.append(BenchResult(f"{one.name}: {what}", value, unit))
     return results
 
 

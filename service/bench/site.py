@@ -90,7 +90,7 @@ def _simulated(folder: Path, options: BenchOptions) -> list[BenchResult]:
     off = seam_of(folder / "change", [folder / "one-0", later], places).site_m
     results = _seam_results(seams, truths[0].agl_m)
     results.append(
-        BenchResult("site", "flights without change that show none", 100.0 * unchanged / seeds, "%",
+        BenchResult("flights without change that show none", 100.0 * unchanged / seeds, "%",
                     note=f"{seeds} pairs; goal 95 %")
     )  # fmt: skip
     return results + change_results(change, folder / "one", folder / "change" / "change.tif", off)
@@ -193,11 +193,11 @@ def _seam_results(seams: Sequence[Seam], height_m: float) -> list[BenchResult]:
     site = float(np.sqrt(np.mean([np.sum(s.site_m**2) for s in seams])))
     many = f"{len(seams)} pairs of flights, GNSS wanders by 1 m"
     return [
-        BenchResult("site", "seam, median", float(np.median(after)), "m", peer="by fixes",
+        BenchResult("seam, median", float(np.median(after)), "m", peer="by fixes",
                     peer_value=before, note=many),
-        BenchResult("site", "seam over the height, median", 100.0 * float(np.median(after))
+        BenchResult("seam over the height, median", 100.0 * float(np.median(after))
                     / height_m, "%", note="goal 0.1 %"),
-        BenchResult("site", "bias of the site, rms", site, "m", peer="one flight",
+        BenchResult("bias of the site, rms", site, "m", peer="one flight",
                     peer_value=alone, note="goal 0.75 of one flight's"),
     ]  # fmt: skip
 
@@ -237,9 +237,9 @@ def change_results(
     share = 100.0 * len(found) / max(len(seen), 1)
     error = 100.0 * abs(measured / true - 1.0) if true else float("nan")
     return [
-        BenchResult("site", "boxes found", share, "%", note=f"of {len(seen)}; goal 95 %"),
-        BenchResult("site", "false objects", wrong / hectares, "/ha", note="goal 1"),
-        BenchResult("site", "volume of the boxes found, error", error, "%",
+        BenchResult("boxes found", share, "%", note=f"of {len(seen)}; goal 95 %"),
+        BenchResult("false objects", wrong / hectares, "/ha", note="goal 1"),
+        BenchResult("volume of the boxes found, error", error, "%",
                     note=f"{true:.0f} m3; goal 2 %"),
     ]  # fmt: skip
 
@@ -285,8 +285,8 @@ def real_results(out: Path) -> list[BenchResult]:
     seam = float(np.median(np.abs(height.compressed())))
     usual = float(np.median(sigma.compressed()))
     return [
-        BenchResult("site", "real, even and odd images: seam", seam, "m", peer="sigma",
+        BenchResult("real, even and odd images: seam", seam, "m", peer="sigma",
                     peer_value=usual, note="goal: at most sigma"),
-        BenchResult("site", "real, even and odd images: objects", float(len(change["objects"])), "",
+        BenchResult("real, even and odd images: objects", float(len(change["objects"])), "",
                     note="goal 0"),
     ]  # fmt: skip

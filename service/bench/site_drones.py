@@ -195,10 +195,10 @@ def _live_results(live: Live, apart_m: float, drones: Sequence[Drone]) -> list[B
     note = f"{len(live.together_s)} of {len(pairs)} pairs, {path_m:.0f} m of path; goal 5 s"
     busy = f"{live.busy_s:.0f} s in all, of a flight of {len(drones[0].poses) * KEYFRAME_S:.0f} s"
     return [
-        BenchResult("site", "four drones: shown together, after the first overlap", max(late_s),
+        BenchResult("four drones: shown together, after the first overlap", max(late_s),
                     "s", note=note),
-        BenchResult("site", "four drones: longest turn", live.longest_s, "s", note=busy),
-        BenchResult("site", "four drones: shown apart at the end", apart_m, "m", peer="by fixes",
+        BenchResult("four drones: longest turn", live.longest_s, "s", note=busy),
+        BenchResult("four drones: shown apart at the end", apart_m, "m", peer="by fixes",
                     peer_value=had),
     ]  # fmt: skip
 
@@ -225,9 +225,9 @@ def _site_results(
     pairs, tied = document["pairs"], len({scan["placed"] for scan in document["scans"]}) == 1
     ties = sum(p["ties"] for p in pairs)
     return [
-        BenchResult("site", "four drones: site too small by", 100.0 * (1.0 - wide), "%",
+        BenchResult("four drones: site too small by", 100.0 * (1.0 - wide), "%",
                     note=f"scales {min(scales):.3f} to {max(scales):.3f}"),
-        BenchResult("site", "four drones: middles apart in the site",
+        BenchResult("four drones: middles apart in the site",
                     float(np.ptp(means, axis=0).max()), "m",
                     note=f"{'one site' if tied else 'not one site'}, {len(pairs)} pairs, "
                     f"{ties} ties"),

@@ -137,7 +137,7 @@ def _write(
 
 def noisy(
     seq: int, time_ns: int, image: U8, depth: F32, K: F64, pose: Pose, rng: np.random.Generator
-) -> list[bytes]:  # fmt: skip
+) -> list[bytes]:
     """The coded keyframe of a view: its true depth (h, w) with noise of SIGMA_M."""
     one = DepthMap(
         (depth + rng.normal(size=depth.shape) * SIGMA_M).astype(np.float32),
@@ -161,8 +161,8 @@ def _results(
     low, usual, high = np.quantile(alone.tile_s, [0.1, 0.5, 0.9])
     what = f"{kind}: processor time of a tile, median"
     out = [
-        BenchResult("site", f"{kind}: peak memory", alone.peak_mib, "MiB", note=scans),
-        BenchResult("site", what, float(usual), "s", float(high - low), note=scans),
+        BenchResult(f"{kind}: peak memory", alone.peak_mib, "MiB", note=scans),
+        BenchResult(what, float(usual), "s", float(high - low), note=scans),
     ]
     for workers in WORKERS if kind == KINDS[0] else ():
         out += _on_workers(kind, site, parts, workers)
@@ -186,7 +186,7 @@ def _on_workers(kind: str, site: Path, parts: Any, workers: int) -> list[BenchRe
         done = _in_a_process(kind, site, parts, cluster.scheduler_address)
         peak = max(client.run(peak_mib).values())
     return [
-        BenchResult("site", f"{kind}: with {workers} worker(s), elapsed", done.elapsed_s, "s",
+        BenchResult(f"{kind}: with {workers} worker(s), elapsed", done.elapsed_s, "s",
                     note=f"largest worker {peak:.0f} MiB"),
     ]  # fmt: skip
 
@@ -268,7 +268,7 @@ def _height_error(path: Path, dates: list[Simulation], scans: int) -> BenchResul
             errors.append((enu[here, 2] - one)[np.abs(one - two) < 0.01])
     every = np.abs(np.concatenate(errors))
     return BenchResult(
-        "site", "dsm: error of height, median", float(np.median(every)), "m",
+        "dsm: error of height, median", float(np.median(every)), "m",
         note=f"{scans} scans; 90 %: {np.quantile(every, 0.9):.3f} m",
     )  # fmt: skip
 
@@ -276,4 +276,4 @@ def _height_error(path: Path, dates: list[Simulation], scans: int) -> BenchResul
 def _changes_found(path: Path, scans: int) -> BenchResult:
     placed = CHANGES * (scans // 2)
     count = json.loads(path.read_text(encoding="utf-8"))
-    return BenchResult("site", "change: objects", float(count), "", note=f"{placed} boxes placed")
+    return BenchResult("change: objects", float(count), "", note=f"{placed} boxes placed")

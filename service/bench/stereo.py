@@ -48,7 +48,6 @@ def run(options: BenchOptions) -> list[BenchResult]:
         config = BeliefPropagationConfig(iterations=ITERATIONS)
         results.append(
             compare(
-                "stereo",
                 f"{width}x{height}, {labels} labels, {ITERATIONS} iterations",
                 partial(backend.belief_propagation, left, right, labels, config),
                 options,
@@ -67,7 +66,6 @@ def run(options: BenchOptions) -> list[BenchResult]:
         for limit in (1.0, 0.5):
             results.append(
                 BenchResult(
-                    "stereo",
                     f"{pair.name}, bad-{limit}, not occluded",
                     100 * bad_share(ours, pair, limit),
                     "%",
@@ -196,7 +194,6 @@ def run_upsampling(options: BenchOptions) -> list[BenchResult]:
         what = f"{COARSE[1]}x{COARSE[0]} to {width}x{height}"
         results.append(
             compare(
-                "upsample",
                 f"{what}, exact",
                 partial(backend.upsample, coarse, guide, UpsamplingConfig()),
                 options,

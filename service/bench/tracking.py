@@ -33,18 +33,18 @@ def run(options: BenchOptions) -> list[BenchResult]:
     points = corners.uv_px[:, None]
     timed = [
         compare(
-            "matching", "corners, 1280x720, 30x30 grid", partial(harris_grid, a, config), options,
+            "corners, 1280x720, 30x30 grid", partial(harris_grid, a, config), options,
             "OpenCV goodFeaturesToTrack",
             partial(cv2.goodFeaturesToTrack, a, 900, 0.001, 15, useHarrisDetector=True, k=0.04),
         ),
         compare(
-            "matching", f"match {len(corners)} corners, radius {RADIUS_PX:.0f} px",
+            f"match {len(corners)} corners, radius {RADIUS_PX:.0f} px",
             partial(matched, a, b, corners, config), options,
             "OpenCV PyrLK both ways", partial(tracked, a, b, points),
             note="pyramids included",
         ),
         compare(
-            "matching", "common view without a prior", partial(shared, a, b), options
+            "common view without a prior", partial(shared, a, b), options
         ),
     ]  # fmt: skip
     return timed + accuracy(a, b, corners, config)
@@ -111,9 +111,9 @@ def accuracy(a: U8, b: U8, corners: Corners, config: MatchingConfig) -> list[Ben
         shares.append(100 * float(good.sum() / visible.sum()))
     peer = "OpenCV PyrLK both ways"
     return [
-        BenchResult("matching", "error of a coordinate", rms[0], "px", 0.0, peer, rms[1]),
+        BenchResult("error of a coordinate", rms[0], "px", 0.0, peer, rms[1]),
         BenchResult(
-            "matching", "found within 1 px, of the visible", shares[0], "%", 0.0, peer, shares[1],
+            "found within 1 px, of the visible", shares[0], "%", 0.0, peer, shares[1],
             note="more is better",
         ),
     ]  # fmt: skip
@@ -128,7 +128,7 @@ def run_pose(options: BenchOptions) -> list[BenchResult]:
     prior = se3.exp(np.array([0.002, -0.003, 0.004, 0.2, -0.3, 0.1])) @ T
     return [
         compare(
-            "pose", "900 points, 15 % wrong", partial(pnp.solve, points, uv, K, None, prior),
+            "900 points, 15 % wrong", partial(pnp.solve, points, uv, K, None, prior),
             options, "OpenCV RANSAC EPnP + LM", partial(by_opencv, points, uv),
             note="ours with covariance",
         ),
@@ -174,7 +174,7 @@ def position_error() -> BenchResult:
         theirs.append(se3.inverse(by_opencv(points, uv))[:3, 3] - truth)
     mean = [100 * float(np.linalg.norm(e, axis=1).mean()) for e in (ours, theirs)]
     return BenchResult(
-        "pose", "place of the camera, mean of 20", mean[0], "cm", 0.0, "OpenCV RANSAC EPnP + LM",
+        "place of the camera, mean of 20", mean[0], "cm", 0.0, "OpenCV RANSAC EPnP + LM",
         mean[1], note=f"{len(ours)} of 20 solved",
     )  # fmt: skip
 
@@ -196,4 +196,4 @@ def frame(options: BenchOptions) -> BenchResult:
 
     what = f"matching + pose of a {SIZE[1]}x{SIZE[0]} frame"
     note = f"shift {np.linalg.norm(SHIFT_PX):.0f} px; goal 10 ms"
-    return compare("pose", what, one, options, note=note)
+    return compare(what, one, options, note=note)
