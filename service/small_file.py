@@ -5,8 +5,13 @@ from __future__ import annotations
 import os
 import stat
 from pathlib import Path
+from typing import TypeVar
+
+import msgspec
 
 from service.errors import InputError
+
+T = TypeVar("T")
 
 
 def read_small(path: Path, max_bytes: int, what: str) -> bytes:
@@ -29,3 +34,15 @@ def read_small(path: Path, max_bytes: int, what: str) -> bytes:
     if len(data) > max_bytes:
         raise InputError(f"{path} is larger than {max_bytes} bytes; is it a {what}?")
     return data
+
+
+def read_json(path: Path, kind: type[T], max_bytes: int, what: str) -> T:
+    """The ``kind`` that the regular file at ``path`` holds as JSON.
+
+    Raises InputError as :func:`read_small`, and for any other content.
+    """
+    data = read_small(path, max_bytes, what)
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path.name} cannot be read as {what}: {error}"[:300]) from error

@@ -301,7 +301,7 @@ def read_labels(folder: Path) -> Labels:
     try:
         found = labels_in(folder / LABELS)
         return Labels(_title(found.title), _tags(found.tags), found.edition)
-    except UNREADABLE:
+    except InputError:
         return Labels()
 
 

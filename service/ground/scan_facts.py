@@ -1,7 +1,7 @@
 """Facts about a scan for the library, read from files that may come from a stranger.
 
-Strict JSON into typed records with bounds: anything else raises ValueError or RecursionError here,
-so that no NaN and no broken text reaches the list.
+Strict JSON into typed records with bounds: anything else raises InputError here, so that no NaN and
+no broken text reaches the list.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import msgspec
 
 from service.errors import InputError
 from service.ground.storage import is_regular
-from service.small_file import read_small
+from service.small_file import read_json
 from service.stream.store import ScanStore
 
 MAX_JSON_BYTES = 4_000_000
@@ -109,31 +109,27 @@ class Labels(msgspec.Struct, frozen=True):
 
 
 def labels_in(path: Path) -> Labels:
-    """The labels in ``path``; InputError, ValueError, RecursionError or OSError for unfit ones."""
-    return msgspec.json.decode(_small(path), type=Labels)
+    """The labels in ``path``; InputError for unfit ones."""
+    return _decoded(path, Labels)
 
 
 def facts_of(source: Path | ScanStore) -> dict[str, Any]:
     """A scan's entry in the list, from its ``scan.json`` or its open store.
 
-    Raises InputError, ValueError, RecursionError or OSError for what cannot be read.
+    Raises InputError for a file that cannot be read, ValueError for an unfit store.
     """
-    return (_decoded(source, Facts) if isinstance(source, Path) else _from_store(source)).shown()
+    return (_of_summary(source, Facts) if isinstance(source, Path) else _from_store(source)).shown()
 
 
 def ground_in(path: Path) -> Ground:
-    """When and where a scan was flown, from its ``scan.json``; errors as of :func:`facts_of`."""
-    return _decoded(path, Ground)
+    """When and where a scan was flown, from its ``scan.json``; InputError if it cannot be read."""
+    return _of_summary(path, Ground)
 
 
-def _decoded(path: Path, kind: type[T]) -> T:
-    data = _small(path)
-    try:
-        if msgspec.json.decode(data, type=_Schema).schema != SCHEMA:
-            raise InputError(f"{path.name} was written by another version; update skyrelief")
-        return msgspec.json.decode(data, type=kind)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path.name} cannot be read: {error}") from error
+def _of_summary(path: Path, kind: type[T]) -> T:
+    if _decoded(path, _Schema).schema != SCHEMA:
+        raise InputError(f"{path.name} was written by another version; update skyrelief")
+    return _decoded(path, kind)
 
 
 def _from_store(store: ScanStore) -> Facts:
@@ -156,8 +152,8 @@ def _from_store(store: ScanStore) -> Facts:
     )
 
 
-def _small(path: Path) -> bytes:
-    """The content of a small file. Raises InputError when it is not small, or a link."""
+def _decoded(path: Path, kind: type[T]) -> T:
+    """The content of a small file. Raises InputError when it is another, or a link."""
     if not is_regular(path):
         raise InputError(f"{path.name} is not a regular file")
-    return read_small(path, MAX_JSON_BYTES, "file of a scan")
+    return read_json(path, kind, MAX_JSON_BYTES, "file of a scan")

@@ -17,7 +17,7 @@ from service.ground.storage import is_regular
 from service.offline.site import SAME_VISIT_S
 from service.offline.site.live import Placed
 from service.scans.writing import writing
-from service.small_file import read_small
+from service.small_file import read_json
 
 FILE = ".live-site.json"
 MAX_BYTES = 200_000
@@ -81,8 +81,8 @@ class SiteNews:
         if not is_regular(self._path):
             return []
         try:
-            return msgspec.json.decode(read_small(self._path, MAX_BYTES, "file"), type=list[Shown])
-        except (InputError, OSError, ValueError, RecursionError):
+            return read_json(self._path, list[Shown], MAX_BYTES, "scans in flight")
+        except InputError:
             return []
 
 

@@ -26,7 +26,7 @@ from service.ground.storage import DiskShare, is_regular
 from service.offline.site import DRONE, SAME_VISIT_S, SITE
 from service.offline.site.start import Start
 from service.progress import Progress
-from service.small_file import read_small
+from service.small_file import read_json
 from service.workers import Worker, guarded, run_to_end
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,6 @@ ALIGN_S = 7200.0
 """One alignment may take so long."""
 
 MAX_SITE_BYTES = 4_000_000
-UNREADABLE = (InputError, OSError, ValueError, RecursionError)
 
 
 class Sites:
@@ -115,7 +114,7 @@ def companions(store: Path, folder: Path) -> list[Path]:
     """The finished scans of the same visit that share ground with the one in ``folder``."""
     try:
         own = ground_in(folder / "scan.json")
-    except UNREADABLE:
+    except InputError:
         return []
     others = ((path, ground) for path, ground in _grounds(store) if path != folder)
     return [
@@ -133,7 +132,7 @@ def references(
     members = {member for folders in sites.values() for member in folders}
     grounds = [(ground, path) for path, ground in _grounds(store)]
     for path in sites:
-        with contextlib.suppress(*UNREADABLE):
+        with contextlib.suppress(InputError):
             grounds.append((ground_in(path / "scan.json"), path))
     grounds = [(g, path) for g, path in grounds if path.resolve() not in held | members]
     own = Ground(Times(started_unix_s), True)
@@ -183,8 +182,8 @@ class _Site(msgspec.Struct):
 def _sites(store: Path) -> Iterator[tuple[Path, set[Path]]]:
     """The folders of the sites, each with those of its scans."""
     for path in sorted((store / DRONE).glob(f"*/{SITE}")):
-        with contextlib.suppress(*UNREADABLE):
-            site = msgspec.json.decode(read_small(path, MAX_SITE_BYTES, "site"), type=_Site)
+        with contextlib.suppress(InputError):
+            site = read_json(path, _Site, MAX_SITE_BYTES, "site")
             yield path.parent, {Path(scan.folder) for scan in site.scans}
 
 
@@ -193,7 +192,7 @@ def _grounds(store: Path) -> Iterator[tuple[Path, Ground]]:
         drone = path.parent.parent.name
         if drone == DRONE or drone.startswith(".") or not is_regular(path.parent / "scan.db"):
             continue
-        with contextlib.suppress(*UNREADABLE):
+        with contextlib.suppress(InputError):
             yield path.parent, ground_in(path)
 
 

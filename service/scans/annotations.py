@@ -9,7 +9,7 @@ import msgspec
 
 from service.errors import InputError
 from service.scans.writing import writing
-from service.small_file import read_small
+from service.small_file import read_json
 
 ANNOTATIONS = "annotations.geojson"
 MAX_ANNOTATIONS = 200
@@ -65,10 +65,7 @@ def read_annotations(folder: Path) -> Annotations:
     path = folder / ANNOTATIONS
     if not path.exists():
         return Annotations()
-    try:
-        return msgspec.json.decode(read_small(path, MAX_BYTES, "GeoJSON"), type=Annotations)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{ANNOTATIONS} cannot be read: {error}"[:300]) from error
+    return read_json(path, Annotations, MAX_BYTES, "GeoJSON")
 
 
 def add_annotation(folder: Path, spot: Spot, text: str, by: str, unix_s: float) -> Annotation:

@@ -14,7 +14,7 @@ from recon.posegraph.site_alignment import Similarity
 from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.small_file import read_small
+from service.small_file import read_json
 
 MIN_PAIRS, MAX_PAIRS, MAX_BYTES = 3, 100, 100_000
 MAX_MISS = 0.1
@@ -81,14 +81,12 @@ class Start:
 
 def read_start(path: Path) -> Start:
     """The points in a JSON file. Raises InputError for anything else."""
-    return start_of(read_small(path, MAX_BYTES, "list of points"), str(path))
+    return Start(read_json(path, list[Pair], MAX_BYTES, "list of points"))
 
 
-def start_of(data: bytes | list[Any], name: str) -> Start:
-    """The points in JSON, or in what was read from it; ``name`` is for the error."""
+def start_of(rows: list[Any], name: str) -> Start:
+    """The points in what was read from JSON; ``name`` is for the error."""
     try:
-        if isinstance(data, bytes):
-            return Start(msgspec.json.decode(data, type=list[Pair]))
-        return Start(msgspec.convert(data, list[Pair]))
-    except (ValueError, RecursionError) as error:
+        return Start(msgspec.convert(rows, list[Pair]))
+    except msgspec.ValidationError as error:
         raise InputError(f"{name} is no list of points: {error}"[:300]) from error
