@@ -106,7 +106,6 @@ class DatalinkSender:
         self._connected = False
         self._heard_at: float | None = None  # on the session that is open
         self._opening_s = FIRST_PATIENCE_S / PATIENCE  # what the last session took to open
-        self._queries: dict[int, Any] = {}
         self._workers = Workers()
         self._thread: Worker | None = None
         self._owned: list[ScanStore] = []
@@ -252,8 +251,9 @@ class DatalinkSender:
 
     def _close_session(self, session: zenoh.Session, pumps: list[Worker]) -> None:
         """Close it on a separate thread: over a dead link that takes long."""
-        self._queries.clear()
         self._asks.clear()
+        with self._lock:
+            self._outbox.forget_requests()
         closed = threading.Event()
 
         def wait() -> None:
@@ -315,10 +315,8 @@ class DatalinkSender:
             self._events.popleft()(now)
         while self._asks:
             query, scan_id, kind, numbers, ask = self._asks.popleft()
-            token = id(query)
-            self._queries[token] = query
-            for ended in self._outbox.ask(scan_id, kind, numbers, ask, token, now):
-                self._end(int(str(ended)))
+            for ended in self._outbox.ask(scan_id, kind, numbers, ask, query, now):
+                ended.drop()
             if self._outbox.serves(ask.peer):
                 self._heard_at = now
         if self._is_looked_for:
@@ -346,18 +344,12 @@ class DatalinkSender:
                     express=message.lane < 2,
                 )
                 return
-            query = self._queries.get(int(str(message.token)))
-            if query is not None and message.payload:
-                query.reply(key, message.payload)
+            if message.payload:
+                message.token.reply(key, message.payload)
         except zenoh.ZError as error:
             log.debug("datalink dropped %s: %s", key, error)
         if message.last:
-            self._end(int(str(message.token)))
-
-    def _end(self, token: int) -> None:
-        query = self._queries.pop(token, None)
-        if query is not None:
-            query.drop()
+            message.token.drop()
 
     # The threads that take what comes
 

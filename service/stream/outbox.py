@@ -8,9 +8,9 @@ do not fit wait in the store until a ground station requests them.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from typing import Any
 
 from service.stream.budget import RateEstimate, TokenBucket, wire_bytes
 from service.stream.messages import (
@@ -43,7 +43,7 @@ class Outgoing:
     topic: str  # "head", or "item/<kind>/<numbers>"
     payload: bytes
     lane: int = 0
-    token: Hashable | None = None  # the request that it answers; None for a live message
+    token: Any = None  # the request that it answers; None for a live message
     last: bool = False  # it completes that request
 
 
@@ -122,7 +122,7 @@ class Request:
     kind: str
     topic: str
     left: deque[int]
-    token: Hashable
+    token: Any  # whatever the link knows it by
 
 
 class AskedLane:
@@ -132,7 +132,7 @@ class AskedLane:
         self._turn: deque[Request] = deque()
         self._messages: deque[Outgoing] = deque()
 
-    def push(self, request: Request) -> Hashable | None:
+    def push(self, request: Request) -> Any:
         """Queue a request; returns the token of the request it replaces, if any."""
         replaced = None
         for old in list(self._turn):
@@ -154,14 +154,9 @@ class AskedLane:
             elif self._messages:
                 self._messages[-1] = replace(self._messages[-1], last=True)
             else:
+                name = request.store.header.name
                 self._messages.append(
-                    Outgoing(
-                        request.store.header.name,
-                        request.topic,
-                        b"",
-                        token=request.token,
-                        last=True,
-                    )
+                    Outgoing(name, request.topic, b"", token=request.token, last=True)
                 )
         return self._messages[0] if self._messages else None
 
@@ -313,10 +308,14 @@ class Outbox:
         for estimate in self._estimates.values():
             estimate.restart()
         self._clear_live()
-        self._asked = {ASKED: AskedLane(), BACKFILL: AskedLane()}
+        self.forget_requests()
         self._head = None
         for feed in self._feeds.values():
             feed.head_due = now
+
+    def forget_requests(self) -> None:
+        """Let go of all requests, and of their tokens."""
+        self._asked = {ASKED: AskedLane(), BACKFILL: AskedLane()}
 
     def set_rate(self, rate_bytes_s: float, now: float) -> None:
         """Change the maximum rate; congestion may lower it."""
@@ -334,8 +333,8 @@ class Outbox:
         self.bucket.set_rate(max(rates, default=self._configured), now)
 
     def ask(
-        self, scan_id: str, kind: str, numbers: RangeSet, ask: Ask, token: Hashable, now: float
-    ) -> list[Hashable]:
+        self, scan_id: str, kind: str, numbers: RangeSet, ask: Ask, token: Any, now: float
+    ) -> list[Any]:
         """A ground station requests items; returns the tokens of requests that this ends.
 
         A request replaces the station's previous one in its lane.
