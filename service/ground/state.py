@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 MAX_WAITING_JOBS = 20
 KEPT = 100
 MAP_AGE_S, COVERAGE_AGE_S = 1.0, 2.0
-"""Age at which the live map and the coverage layer of a scan are made anew."""
+"""Age at which the live map and the coverage layer of a scan are made again."""
 
 SHOWN_S = 60.0
 """A job that has ended is listed for so long."""

@@ -314,7 +314,7 @@ class Outbox:
             feed.head_due = now
 
     def forget_requests(self) -> None:
-        """Let go of all requests, and of their tokens."""
+        """Drop all requests, and their tokens."""
         self._asked = {ASKED: AskedLane(), BACKFILL: AskedLane()}
 
     def set_rate(self, rate_bytes_s: float, now: float) -> None:
