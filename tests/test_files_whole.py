@@ -7,7 +7,7 @@ import sys
 import threading
 from pathlib import Path
 
-from service.scans.writing import writing
+from service.scans.writing import writing, writing_folder
 
 
 def test_two_writers_of_one_file_do_not_mix(tmp_path: Path) -> None:
@@ -44,6 +44,22 @@ def test_what_a_killed_process_left_goes_with_the_next_attempt(tmp_path: Path) -
     with writing(path) as part:
         part.write_text("whole")
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_folder_that_a_killed_process_left_goes_with_the_next_attempt(tmp_path: Path) -> None:
+    path = tmp_path / "tiles"
+    killed = (
+        "import os, sys, pathlib; from service.scans.writing import writing_folder\n"
+        "with writing_folder(pathlib.Path(sys.argv[1])) as part:\n"
+        "    (part / 'one').touch(); os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", killed, str(path)], check=False)
+    assert len(list(tmp_path.iterdir())) == 1
+    for name in ("first", "second"):
+        with writing_folder(path) as part:
+            (part / name).touch()
+    assert [p.name for p in tmp_path.iterdir()] == ["tiles"]
+    assert [p.name for p in path.iterdir()] == ["second"]
 
 
 def test_files_that_only_look_like_ours_stay(tmp_path: Path) -> None:

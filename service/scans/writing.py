@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 import re
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -20,25 +21,47 @@ def writing(path: Path) -> Iterator[Path]:
 
     A disk failure becomes an OutsideError.
     """
+    with _beside(path) as part:
+        yield part
+        with open(part, "rb+") as written:
+            os.fsync(written.fileno())
+        os.replace(part, path)
+
+
+@contextmanager
+def writing_folder(path: Path) -> Iterator[Path]:
+    """An empty folder next to ``path``, renamed onto it on success. An existing folder is replaced
+    only then.
+
+    A disk failure becomes an OutsideError.
+    """
+    with _beside(path) as part:
+        part.mkdir()
+        yield part
+        if path.is_dir():
+            shutil.rmtree(path)
+        os.replace(part, path)
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """The temporary path, after those of processes that are gone were removed."""
     part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _remove_abandoned(path)
         yield part
-        with open(part, "rb+") as written:
-            os.fsync(written.fileno())
-        os.replace(part, path)
     except OSError as error:
         raise OutsideError(
             f"cannot write {path} ({error.strerror or error}); check the disk and its rights"
         ) from error
     finally:
         with suppress(OSError):  # a disk that cannot be written cannot be cleaned either
-            part.unlink(missing_ok=True)
+            _remove(part)
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Remove the temporary files for ``path`` of processes that ended by a kill or a power cut."""
+    """Remove what processes that ended by a kill or a power cut left for ``path``."""
     for part in path.parent.glob(f".{glob.escape(path.name)}.*-*.part"):
         writer = re.fullmatch(r"([0-9]{1,9})-[0-9]+\.part", part.name[len(path.name) + 2 :])
         if writer is None:
@@ -46,6 +69,14 @@ def _remove_abandoned(path: Path) -> None:
         try:
             os.kill(int(writer[1]), 0)
         except ProcessLookupError:
-            part.unlink(missing_ok=True)
+            _remove(part)
         except PermissionError:
             pass  # another user's, alive
+
+
+def _remove(part: Path) -> None:
+    """Remove a file, or a folder with all it holds, if it is there."""
+    if part.is_dir() and not part.is_symlink():
+        shutil.rmtree(part)
+    else:
+        part.unlink(missing_ok=True)

@@ -17,7 +17,6 @@ import numpy as np
 from recon.mapping.cloud_fusion import without
 from recon.types import F64, I64, U8, Array, PointCloud
 from service.georeference import map_crs
-from service.offline.exports.flight import writing_folder
 from service.offline.exports.rasters import GROUND_MARGIN_M
 from service.offline.exports.surface import bare_ground, surface_model
 from service.offline.exports.view import ExportOptions, ScanView, in_parts
@@ -29,7 +28,7 @@ from service.scans.fused_cloud import (
     point_record,
     write_laz,
 )
-from service.scans.writing import writing
+from service.scans.writing import writing, writing_folder
 
 if TYPE_CHECKING:
     import copclib

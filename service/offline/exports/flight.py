@@ -4,11 +4,6 @@ from __future__ import annotations
 
 import datetime as dt
 import json
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
@@ -18,11 +13,10 @@ import numpy as np
 
 from recon import se3
 from recon.types import F64, Keyframe
-from service.errors import OutsideError
 from service.georeference import LocalFrame
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
-from service.scans.writing import writing
+from service.scans.writing import writing, writing_folder
 
 
 def _geodetic(scan: ScanView, frame: LocalFrame) -> F64:
@@ -138,25 +132,3 @@ def _image_lines(one: Keyframe, camera: int) -> str:
     q = se3.quaternion_from_rotation(T[:3, :3])
     numbers = " ".join(f"{v:.9f}" for v in (*q, *T[:3, 3]))
     return f"{one.seq + 1} {numbers} {camera} {_name(one)}\n\n"
-
-
-@contextmanager
-def writing_folder(path: Path) -> Iterator[Path]:
-    """An empty folder next to ``path``, renamed onto it on success. An existing folder is replaced
-    only then. A failure of the disk becomes an OutsideError.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-        try:
-            yield part
-            if path.is_dir():
-                shutil.rmtree(path)
-            os.chmod(part, 0o755)
-            os.replace(part, path)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
-    except OSError as error:
-        raise OutsideError(
-            f"cannot write {path} ({error.strerror or error}); check the disk and its rights"
-        ) from error

@@ -15,13 +15,12 @@ from recon.surface.meshing import Mesh
 from recon.types import F64, U8
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
-from service.offline.exports.flight import writing_folder
 from service.offline.exports.images import check_video, recording_of
 from service.offline.exports.mesh_tiles import MARGIN_VOXELS, TileJob, TilePart, mesh_tile
 from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.tiles import footprints, run_tiles, tiles_over
 from service.packages import needing
-from service.scans.writing import writing
+from service.scans.writing import writing, writing_folder
 
 METHODS = ("auto", "height", "poisson")
 LARGEST_ATLAS_PX = 8192
