@@ -118,7 +118,8 @@ def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None
     chain: Any = Chain(Trajectory(), before(0), Counter(), Stopwatch())
     key = Refined(3, 0, some_pose())
     frame, anchor = Anchorage(7, key, some_pose()), Anchorage(5, key, some_pose())
-    assert chain.place(frame).sources == ("vision",)  # nothing is reconstructed yet
+    image = SimpleNamespace(prior=PosePrior())
+    assert chain.follow(image, frame).sources == ("vision",)  # nothing is reconstructed yet
     view = SimpleNamespace(
         seq=5, segment=0, time_ns=0, prior=PosePrior(), points=np.zeros((0, 3)), anchor=anchor,
         view=SimpleNamespace(T_odom_camera=anchor.T_odom_camera),

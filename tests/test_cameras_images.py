@@ -181,6 +181,49 @@ def test_dji_xmp_gives_attitude_height_and_accuracy(tmp_path: Path) -> None:
     assert tag.sigma_h_m == 0.015
 
 
+def test_gimbal_angles_that_are_all_zero_are_unknown(tmp_path: Path) -> None:
+    """A DJI Mini 2 that another program flew: the image looks down, the nose to the south."""
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:RelativeAltitude="+110.80" '
+        'drone-dji:GimbalRollDegree="+0.00" drone-dji:GimbalYawDegree="+0.00" '
+        'drone-dji:GimbalPitchDegree="+0.00" drone-dji:FlightYawDegree="+176.50"/></x:xmpmeta>'
+    )
+    path = tmp_path / "DJI_0001.jpg"
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
+    tag = read_tags(path).geotag
+    assert tag is not None and tag.relative_alt_m == 110.8
+    assert tag.ypr_deg is None
+
+
+@pytest.mark.parametrize(
+    ("ypr_deg", "nose_deg", "is_known"),
+    [
+        ((34.2, -90, 0), 90.1, False),  # a Mavic 2's thermal camera; the track agrees with the nose
+        ((-171, -90, 0), 176.5, True),
+        ((-90, -90, 180), 90.1, True),  # the same direction by other angles
+        ((88, -20, 0), 90.1, True),
+        ((88, 20, 0), 90.1, True),
+        ((0, -45, 0), 90.1, False),
+    ],
+)
+def test_headings_that_the_aircraft_contradicts_are_unknown(
+    tmp_path: Path, ypr_deg: tuple[float, float, float], nose_deg: float, is_known: bool
+) -> None:
+    """But for one image out of three, taken in a turn."""
+    for i in range(3):
+        angles = dict(zip(("GimbalYaw", "GimbalPitch", "GimbalRoll"), ypr_deg, strict=True))
+        named = {**angles, "FlightYaw": (nose_deg + 60.0 * (i == 1) + 180.0) % 360.0 - 180.0}
+        values = " ".join(f'drone-dji:{name}Degree="{deg:+.2f}"' for name, deg in named.items())
+        xmp = f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description {values}/></x:xmpmeta>'
+        gps = gps_tags(23, 113, 133, (12, 0, i))
+        write_still(tmp_path / f"{i}.jpg", f"2024:06:01 14:00:0{i}", "25", gps=gps, xmp=xmp)
+    source = open_camera(str(tmp_path))
+    tags = [frame.geotag for frame in source]
+    assert [tag and tag.ypr_deg for tag in tags] == [ypr_deg] * 3
+    assert [tag and tag.is_yaw_known for tag in tags] == [is_known] * 3
+    assert any("off the aircraft's nose" in warning for warning in source.warnings) != is_known
+
+
 @pytest.mark.parametrize(
     ("pitch_roll_deg", "looks_at_ned"),
     [((0, 0), (0, 0, 1)), ((10, 0), (0, 0.1736, 0.9848)), ((0, 10), (0.1736, 0, 0.9848))],

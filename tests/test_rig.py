@@ -114,7 +114,8 @@ def test_a_image_tag_serves_when_there_is_no_telemetry() -> None:
     flat = rig().prior(None, replace(tag, alt_amsl_m=None))  # no altitude: nothing to measure
     assert flat.sigma_position_m is not None and flat.sigma_position_m[2] > 500.0
     assert flat.is_sigma_claimed
-    assert not prior.is_view_assumed
+    assert not prior.is_view_assumed and prior.sigma_yaw_rad < 0.1
+    assert rig().prior(None, replace(tag, is_yaw_known=False)).sigma_yaw_rad > 1.0
     assert rig().prior(None, replace(tag, ypr_deg=None)).is_view_assumed
     _, top, view = up_and_right(prior.R_world_camera)
     np.testing.assert_allclose(view, [0, 0, -1], atol=1e-9)

@@ -38,6 +38,7 @@ class Tags:
     name_unix_ns: int | None = None  # UTC in the file name
     sub_second: bool = False  # local_ns is finer than a second
     geotag: GeoTag | None = None
+    pan_deg: float | None = None  # heading of the image less the aircraft's, which are both stated
     lens: Lens | None = None
     turned_deg: int = 0  # clockwise rotation that viewers apply to the stored pixels
 
@@ -74,6 +75,7 @@ def _read_tags(path: Path) -> Tags:
         exif = image.getexif()
         photo, gps = dict(exif.get_ifd(0x8769)), dict(exif.get_ifd(0x8825))
     xmp = _xmp(path)
+    geotag = _geotag(gps, xmp)
     text = str(photo.get(36867) or photo.get(36868) or exif.get(306) or "")
     sub = str(photo.get(37521) or photo.get(37522) or photo.get(37520) or "").strip("\0 ")
     return Tags(
@@ -83,7 +85,8 @@ def _read_tags(path: Path) -> Tags:
         gps_unix_ns=_gps_unix_ns(gps),
         name_unix_ns=name_unix_ns(path.name),
         sub_second=sub.isdigit(),
-        geotag=_geotag(gps, xmp),
+        geotag=geotag,
+        pan_deg=_pan_deg(geotag, xmp),
         lens=lens_of(photo, xmp, size_px),
         turned_deg=TURNED_DEG.get(exif.get(274), 0),
     )
@@ -168,12 +171,25 @@ def _plausible(sigma_m: float | None) -> float | None:
 
 
 def _gimbal_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:
+    """The gimbal's angles; None where all are exactly 0: the camera did not know them."""
     yaw = _xmp_number(xmp, "GimbalYawDegree")
     pitch = _xmp_number(xmp, "GimbalPitchDegree")
     roll = _xmp_number(xmp, "GimbalRollDegree")
     if yaw is None or pitch is None:
         return _pix4d_ypr_deg(xmp)
-    return yaw, pitch, roll or 0.0
+    angles = (yaw, pitch, roll or 0.0)
+    return angles if any(angles) else None
+
+
+def _pan_deg(geotag: GeoTag | None, xmp: dict[str, str]) -> float | None:
+    """Heading of the image, whose upper side is ahead, less the aircraft's."""
+    nose_deg = _xmp_number(xmp, "FlightYawDegree")
+    if nose_deg is None or geotag is None or geotag.ypr_deg is None:
+        return None
+    yaw, pitch, roll = map(math.radians, geotag.ypr_deg)
+    head = rotation_from_rpy(roll, pitch, yaw)
+    north, east, _ = head[:, 0] - head[:, 2]  # ahead where it looks level, up where it looks down
+    return math.remainder(math.degrees(math.atan2(east, north)) - nose_deg, 360.0)
 
 
 def _pix4d_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:

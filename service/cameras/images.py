@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
@@ -26,6 +27,10 @@ SECOND_NS = 1_000_000_000
 ZOOM = 0.03
 """Relative tolerance of the focal lengths of one camera."""
 
+MAX_PAN_DEG = 30.0
+"""Gimbals follow the nose: where images head further off it than that, their heading is wrong, as
+that of a gimbal without a compass, which drifts; or turned on purpose, and the track shows it."""
+
 ROLLED_DEG = 45.0
 ZONE_NS = 900 * SECOND_NS  # time zones are multiples of a quarter of an hour
 
@@ -39,7 +44,7 @@ class ImagesSource:
         self.is_live = False
         self.start_monotonic_ns: int | None = None
         self.warnings: list[str] = []
-        tagged = self._same_lens(self._same_size(self._read(folder)))
+        tagged = self._headings(self._same_lens(self._same_size(self._read(folder))))
         times, self.epoch_unix_ns = self._times(tagged, interval_s)
         order = sorted(range(len(tagged)), key=lambda i: (times[i], i))
         self._stills = [(*tagged[i], times[i]) for i in order]
@@ -124,6 +129,20 @@ class ImagesSource:
                 "others; skipped"
             )
         return kept
+
+    def _headings(self, tagged: list[tuple[Path, Tags]]) -> list[tuple[Path, Tags]]:
+        """The stills without headings that the aircraft's own contradict."""
+        pans = [abs(tags.pan_deg) for _, tags in tagged if tags.pan_deg is not None]
+        if not pans or median(pans) <= MAX_PAN_DEG:
+            return tagged
+        self._warn(
+            f"the images head {median(pans):.0f} degrees off the aircraft's nose: their headings "
+            "are not used"
+        )
+        return [
+            (path, replace(tags, geotag=tags.geotag and replace(tags.geotag, is_yaw_known=False)))
+            for path, tags in tagged
+        ]
 
     def _turn(self, tagged: list[tuple[Path, Tags]]) -> int:
         """Rotation in degrees clockwise for all stills, by their tags.

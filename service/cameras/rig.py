@@ -165,7 +165,7 @@ class Rig:
         if tag is not None and tag.ypr_deg is not None and self._fusion.attitude:
             yaw, pitch, roll = (math.radians(a) for a in tag.ypr_deg)
             R = R_ENU_NED @ rotation_from_rpy(roll, pitch, yaw) @ R_GIMBAL_CAMERA
-            return R, math.radians(1.5), math.radians(5.0)
+            return R, math.radians(1.5), math.radians(5.0) if tag.is_yaw_known else NO_YAW_RAD
         return R_ENU_NED @ self._R_body_camera, ASSUMED_TILT_RAD, NO_YAW_RAD
 
     def _fix(self, state: VehicleState | None, tag: GeoTag | None) -> Fix | None:

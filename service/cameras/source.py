@@ -27,6 +27,7 @@ class GeoTag:
     sigma_v_m: float | None = None  # of the altitude; None: not stated
     ypr_deg: tuple[float, float, float] | None = None
     """Yaw from true north, pitch, roll of the gimbal head (FRD in NED); pitch -90 looks down."""
+    is_yaw_known: bool = True  # False: the aircraft's own headings contradict it
     relative_alt_m: float | None = None  # above the take-off point
 
 

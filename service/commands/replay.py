@@ -329,10 +329,10 @@ def _epoch(
         epoch_ns = source.epoch_unix_ns
     elif log is not None:
         epoch_ns = round(log.first_ns / 1e6) * 10**6  # autopilots count whole milliseconds
-        notes.append("the video does not say when it began: taken as the start of the log")
+        notes.append("the recording does not say when it began: taken as the start of the log")
     else:
         epoch_ns = time.time_ns()
-        notes.append("the video does not say when it began: taken as the time of the replay")
+        notes.append("the recording does not say when it began: taken as the time of the replay")
     if log is not None and not log.first_ns - 600e9 < epoch_ns < log.last_ns:
         raise InputError(
             f"the telemetry covers {_utc(log.first_ns)} to {_utc(log.last_ns)}, the video begins "

@@ -69,6 +69,7 @@ class Chain:
         self.loops: LoopSearch | None = None
         self.levelled = 0  # keyframes without an attitude whose ground is taken as level
         self._carriers, self._is_settled = Carriers(), is_settled
+        self._unplaced: dict[int, F64] = {}  # (6, 6) of frames, by segment, that no view carries
         self._rejected, self._stopwatch = rejected, stopwatch
         self._pieces = Pieces()
         self._T_map = np.eye(4)  # of the last keyframe
@@ -173,6 +174,8 @@ class Chain:
 
     def follow(self, image: UndistortedFrame, anchor: Anchorage) -> Placed:
         """A tracked frame in the world."""
+        first = unplaced(anchor.T_odom_camera[:3, 3], image.prior)
+        self._unplaced.setdefault(anchor.key.segment, first)
         placed = self.place(anchor)
         self._seen = image.prior, placed, anchor.key.segment
         return placed
@@ -182,7 +185,7 @@ class Chain:
         T_odom_camera = anchor.T_odom_camera
         carrier = self._carriers.of(anchor)
         if carrier is None:
-            unsure = se3.about(-T_odom_camera[:3, 3], np.eye(6))
+            unsure = self._unplaced[anchor.key.segment]
             return Placed(anchor.key.seq, T_odom_camera, 1.0, unsure, ("vision",))
         # In flight no other view than the newest carries a new frame.
         known = self._newest or self.trajectory.place(carrier.seq)
@@ -208,6 +211,14 @@ class Chain:
         tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
         covariance = se3.about(-T[:3, 3], np.diag(np.square([tilt, tilt, yaw, *sigma])))
         return Placed(image.seq, T, 1.0, covariance, ("attitude", "gnss", "dead reckoning"))
+
+
+def unplaced(place_m: F64, prior: PosePrior) -> F64:
+    """(6, 6) covariance of poses in the odometry's own frame, of a segment whose first published
+    one is at ``place_m`` (3,): heading and scale are not known, so it grows with the way."""
+    fix, sigma = prior.position_m, prior.sigma_position_m
+    spread = np.ones(3) if fix is None or sigma is None else np.hypot(sigma, place_m - fix)
+    return se3.about(-place_m, np.diag([1.0, 1.0, 1.0, *np.square(spread)]))
 
 
 class Pieces:

@@ -26,8 +26,8 @@ MIN_PLACED_SHARE = 0.5
 
 
 REFUSED_SHARE, WRONG_SHARE = 0.2, 0.5
-"""Of the measured positions, that contradict the track. Above the first, positions are less certain
-than sigma says; above the second, either may be wrong."""
+"""Of the measured positions or attitudes, that contradict the track. Above the first, positions are
+less certain than sigma says; above the second, either may be wrong."""
 
 BY_SURVEY = "control points"
 """``georeference`` of a scan that control points have placed."""
@@ -70,7 +70,10 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     frames, tracked = _number(run, "frames"), _number(run, "frames_tracked")
     if frames and tracked is not None and tracked < MIN_PLACED_SHARE * (frames - 1):
         doubts.append(f"vision placed only {tracked:.0f} of {frames:.0f} frames")
-    refused, measured = _refused_positions(run)
+    tilted, attitudes = _refused(run, "attitude", "tilt off")
+    if tilted > WRONG_SHARE * attitudes:
+        doubts.append(f"{tilted:.0f} of {attitudes:.0f} attitudes contradict the images")
+    refused, measured = _refused(run, "position", "position off")
     contradicted = f"{refused:.0f} of {measured:.0f} positions contradict the track"
     if refused > WRONG_SHARE * measured:
         doubts.append(contradicted)
@@ -102,13 +105,13 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     return _said(Trust.GEOREFERENCED, limits)
 
 
-def _refused_positions(run: Mapping[str, Any]) -> tuple[float, float]:
-    """Number of measured positions that the pose graph left out, and of all."""
+def _refused(run: Mapping[str, Any], kind: str, why: str) -> tuple[float, float]:
+    """Number of readings of a kind that the pose graph left out, and of all."""
     graph = run.get("graph")
     graph = graph if isinstance(graph, Mapping) else {}
     residuals = graph.get("residuals")
-    used = residuals.get("position") if isinstance(residuals, Mapping) else None
-    refused = _number(graph.get("left_out"), "position off") or 0.0
+    used = residuals.get(kind) if isinstance(residuals, Mapping) else None
+    refused = _number(graph.get("left_out"), why) or 0.0
     return refused, refused + (_number(used, "count") or 0.0)
 
 
