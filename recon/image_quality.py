@@ -31,14 +31,12 @@ def stretch(gray: U8, seen: Bool | None = None) -> U8:
     One gain for the whole image, so that places are not moved; an image with contrast enough comes
     back as it is. Only pixels in ``seen`` (H, W) count.
     """
-    sample = gray[::4, ::4] if seen is None else gray[::4, ::4][seen[::4, ::4]]
-    if sample.size == 0:
-        return gray
-    spread = float(sample.std())
+    mask = None if seen is None else seen[::4, ::4].astype(np.uint8)
+    mean, spread = (float(v[0, 0]) for v in cv2.meanStdDev(gray[::4, ::4], mask=mask))
     if spread >= WANTED_SPREAD:
         return gray
     gain = min(WANTED_SPREAD / max(spread, 1e-3), MAX_GAIN)
-    levels = (np.arange(256) - float(sample.mean())) * gain + 128.0
+    levels = (np.arange(256) - mean) * gain + 128.0
     table = np.clip(np.rint(levels), 0, 255).astype(np.uint8)
     return np.asarray(cv2.LUT(gray, table), np.uint8)
 
@@ -52,7 +50,9 @@ def sharpness(gray: U8) -> float:
     """
     half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     eighth = cv2.resize(half, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-    fine, coarse = (float(np.abs(cv2.Laplacian(p, cv2.CV_16S)).mean()) for p in (half, eighth))
+    fine, coarse = (
+        cv2.norm(cv2.Laplacian(p, cv2.CV_16S), cv2.NORM_L1) / p.size for p in (half, eighth)
+    )
     return fine / coarse if coarse > 0 else float("nan")
 
 

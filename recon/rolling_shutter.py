@@ -274,12 +274,12 @@ class RowTrack:
     ) -> tuple[F64, F64]:
         """(6,) rate and change by the frames ``near``, and what one more would do to the rate."""
         from_odom = se3.inverse(frame.T_camera_odom)
-        twists = np.array([se3.log(f.T_camera_odom @ from_odom) for f in self._frames])
-        rate, change = _polynomial(times[near], twists[near], degree)
         rest = np.setdiff1d(np.flatnonzero(times), near)
+        more = np.append(near, rest[np.abs(times[rest]).argsort(kind="stable")[:1]])
+        twists = np.array([se3.log(self._frames[n].T_camera_odom @ from_odom) for n in more])
+        rate, change = _polynomial(times[near], twists[: near.size], degree)
         if rest.size:
-            more = np.append(near, rest[np.abs(times[rest]).argmin()])
-            frame.off = _polynomial(times[more], twists[more], degree + 1)[0] - rate
+            frame.off = _polynomial(times[more], twists, degree + 1)[0] - rate
         return rate, change
 
     def _covariance(self, off: F64 | None) -> F64:

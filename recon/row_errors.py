@@ -68,7 +68,7 @@ def _shifts(rows: Rows, points: F64, ray: F64, inverse_depth: F64) -> F64:
 def _by_twist(ray: F64, inverse_depth: F64) -> F64:
     """(N, 2, 6) by which rays (N, 3) with z = 1 shift with a twist, rotation first."""
     moved = np.zeros((len(ray), 3, 6))
-    moved[:, :, :3] = -np.array([se3.hat(one) for one in ray])
+    moved[:, :, :3] = -se3.hat(ray)
     moved[:, [0, 1, 2], [3, 4, 5]] = inverse_depth[:, None]
     return np.asarray(moved[:, :2] - ray[:, :2, None] * moved[:, 2:])
 

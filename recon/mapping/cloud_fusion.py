@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from numba import njit
 
-from recon.bands import at_once
+from recon.bands import at_once, in_bands
 from recon.mapping.voxel_map import find_slot, rehash, voxel_key
 from recon.types import F32, F64, I32, I64, U8, Bool, DepthMap, PointCloud
 
@@ -63,7 +63,11 @@ def fuse_strips(
     rows = zip(strips, borders[:-1], borders[1:], strict=True)
     keys, clouds = zip(*at_once(*(partial(fused, *row) for row in rows)), strict=True)
     whole = joined(clouds)
-    lone = _lone_contradicted(np.concatenate(keys), whole.xyz_m, whole.sigma_m, whole.views)
+    lone = np.zeros(len(whole), np.bool_)
+    in_bands(
+        _lone_contradicted, len(lone), np.concatenate(keys), whole.xyz_m, whole.sigma_m,
+        whole.views, lone,
+    )  # fmt: skip
     return whole if not lone.any() else without(whole, lone)
 
 
@@ -241,15 +245,16 @@ def _accumulate(
 
 
 @njit(cache=True, nogil=True)
-def _lone_contradicted(keys: I64, xyz: F32, sigma: F32, views: U8) -> Bool:
-    """(N,) lone single-view points with better, more often seen surface above or below.
+def _lone_contradicted(
+    begin: int, end: int, keys: I64, xyz: F32, sigma: F32, views: U8, out: Bool
+) -> None:
+    """Mark lone single-view points with better, more often seen surface above or below.
 
     ``keys`` are sorted, so a column of voxels is one run of rows.
     """
     n = keys.shape[0]
-    out = np.zeros(n, np.bool_)
     low = (1 << 21) - 1
-    for p in range(n):
+    for p in range(begin, end):
         if views[p] > 1:
             continue
         neighbours = -1  # the point itself
@@ -267,7 +272,6 @@ def _lone_contradicted(keys: I64, xyz: F32, sigma: F32, views: U8) -> Bool:
                         contradicted |= apart > 3.0 * (sigma[p] + sigma[q])
                     q += 1
         out[p] = contradicted and neighbours < LONE_NEIGHBOURS
-    return out
 
 
 def cloud_of(

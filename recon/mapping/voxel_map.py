@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from recon import se3
+from recon.bands import in_bands
 from recon.camera_model import rays
 from recon.types import F32, F64, I32, I64, Bool, DepthMap
 
@@ -140,18 +141,12 @@ class VoxelMap:
     def fresh(self, depth: DepthMap) -> Bool:
         """(h, w) pixels whose surface is new, or clearly better than what is held."""
         c = self.config
-        return np.asarray(
-            _fresh(
-                self._keys,
-                self._ids,
-                self._sigma,
-                *_arrays(depth),
-                1.0 / c.voxel_m,
-                c.better_ratio,
-                c.reach_sigma,
-                c.largest_reach_voxels,
-            )
-        )
+        out = np.zeros(depth.depth_m.shape, np.bool_)
+        in_bands(
+            _fresh, len(out), self._keys, self._ids, self._sigma, *_arrays(depth),
+            1.0 / c.voxel_m, c.better_ratio, c.reach_sigma, c.largest_reach_voxels, out,
+        )  # fmt: skip
+        return out
 
     def insert(self, depth: DepthMap, mask: Bool | None = None) -> int:
         """Remember the surface of ``depth``, where ``mask`` if given; how many voxels are new."""
@@ -282,13 +277,12 @@ def _put(
 
 @njit(cache=True, nogil=True, fastmath=False)
 def _fresh(
-    keys: I64, ids: I32, held: F32, depth: F32, sigma: F32, K: F64, T: F64, inverse: float,
-    better: float, reach_sigma: float, largest_reach: int,
-) -> Bool:  # fmt: skip
+    begin: int, end: int, keys: I64, ids: I32, held: F32, depth: F32, sigma: F32, K: F64, T: F64,
+    inverse: float, better: float, reach_sigma: float, largest_reach: int, out: Bool,
+) -> None:  # fmt: skip
     """See VoxelMap.fresh; the ray is sampled every voxel, nearest samples first."""
-    h, w = depth.shape
-    out = np.zeros((h, w), np.bool_)
-    for v in range(h):
+    w = depth.shape[1]
+    for v in range(begin, end):
         b = (v - K[1, 2]) / K[1, 1]
         for u in range(w):
             z, s = depth[v, u], sigma[v, u]
@@ -316,7 +310,6 @@ def _fresh(
                     known = True
                     break
             out[v, u] = not known
-    return out
 
 
 @njit(cache=True, nogil=True)

@@ -347,9 +347,9 @@ def _by_tile(cells: I64, wanted: set[Tile]) -> Iterator[tuple[Tile, I64]]:
     if not wanted:
         return
     tile = cells // TILE
-    order = np.lexsort((tile[:, 1], tile[:, 0]))  # stable
-    ordered = tile[order]
-    starts = np.flatnonzero(np.any(np.diff(ordered, axis=0) != 0, axis=1)) + 1
+    number = (tile[:, 0] << 32) + tile[:, 1]
+    order = np.argsort(number, kind="stable")
+    starts = np.flatnonzero(np.diff(number[order])) + 1
     for points in np.split(order, starts):
         key = (int(tile[points[0], 0]), int(tile[points[0], 1]))
         if key in wanted:

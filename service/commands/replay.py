@@ -346,20 +346,14 @@ def _utc(time_ns: int) -> str:
 
 
 def _flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:
-    """The bar of a scan, whose figures only a terminal shows; returns memory at each keyframe."""
+    """The bar of a scan, whose figures only a terminal shows."""
     from service.cameras.source import Counted
-    from service.memory import give_back
 
     images = source.images if isinstance(source, Counted) else 0
     say = progress.counting(images) if images else progress
-    keyframes = 0
 
     def show(scan: Scan) -> None:
-        nonlocal keyframes
         r = scan.recorder
-        if r.keyframes > keyframes:
-            keyframes = r.keyframes
-            give_back()
         if sys.stderr.isatty():
             say(f"{r.frames} images, {r.distance_m:.0f} m flown, {r.keyframes} keyframes")
 

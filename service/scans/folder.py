@@ -114,8 +114,8 @@ def write_deliverables(
     give_back()
     files.write_pieces()
     progress("writing the files")
-    summary = files.summary(extra)
-    at_once(partial(files.draw, summary), files.write_cloud)
+    _, summary = at_once(files.write_cloud, partial(files.draw, extra))
+    assert summary is not None
     failures = files.failures
     summary["failed"], summary["files_due"] = failures.why, failures.of_the_disk is not None
     with writing(folder / SUMMARY) as part:
@@ -138,6 +138,7 @@ class _Files:
         self._left_out = in_words(store)
         self._fused = NOTHING
         self._raster: Raster | None = None
+        self._cell_m: float | None = None
         self._coverage: Coverage | None = None
         self._pieces: list[str] = []
 
@@ -148,16 +149,13 @@ class _Files:
             part.write_text(csv_table(self._poses), encoding="utf-8")
 
     def fuse(self, progress: Progress) -> None:
-        """Make the cloud and its surface."""
-        cell_m = None
+        """Make the cloud."""
         with self.failures.noted(CLOUD):
             if self._tiled is None:
                 self._fused = fused_cloud(self._store, self._voxel_m, progress)
             else:
-                cell_m = preview_cell_m(self._tiled.bounds, self._tiled.voxel_m)
-                self._fused = self._written(self._tiled, cell_m)
-        with self.failures.noted(PREVIEW):
-            self._raster = surface(self._fused, cell_m)
+                self._cell_m = preview_cell_m(self._tiled.bounds, self._tiled.voxel_m)
+                self._fused = self._written(self._tiled, self._cell_m)
 
     def _written(self, tiled: TiledCloud, cell_m: float) -> FusedCloud:
         """Write the cloud tile by tile; of its points those that the preview shows."""
@@ -219,9 +217,11 @@ class _Files:
                 started = self._store.header.started_unix_ns
                 write_laz(part, [(self._fused.cloud, None, None)], self._frame, started)
 
-    def draw(self, summary: dict[str, Any]) -> None:
-        """Write the preview and the report."""
-        preview = b""
+    def draw(self, extra: dict[str, Any]) -> dict[str, Any]:
+        """Write the preview and the report; returns the content of scan.json."""
+        with self.failures.noted(PREVIEW):
+            self._raster = surface(self._fused, self._cell_m)
+        summary, preview = self.summary(extra), b""
         poses = main_poses(self._poses, stretches_apart(self._store))
         with self.failures.noted(PREVIEW):
             preview = _preview(self._raster, poses, summary, self._left_out)
@@ -232,6 +232,7 @@ class _Files:
             cloud, coverage = self._fused.cloud, self._coverage
             page = report_html(summary, poses, cloud, self._raster, preview, coverage, shown)
             part.write_text(page, encoding="utf-8")
+        return summary
 
 
 class Failures:

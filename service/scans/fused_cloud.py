@@ -7,7 +7,7 @@ the keyframe that knows it best.
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, pairwise
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from recon.bands import threads
+from recon.bands import at_once, threads
 from recon.mapping.cloud_fusion import cloud_of, fuse_strips, without
 from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
@@ -102,8 +102,7 @@ def fused_cloud(
         held.clear()
     if len(cloud):
         with progress.part("removing points that other images see through"):
-            seqs = spread([e.seq for e in extents])
-            keyframes = progress.over(map(store.keyframe, seqs), len(extents))
+            keyframes = progress.over(_decoded(store, extents), len(extents))
             cloud = without(cloud, seen_through(cloud, (k.depth for k in keyframes if k)))
     return FusedCloud(cloud, size, sample, len(extents), points, notes)
 
@@ -125,6 +124,13 @@ def _extents(
             if room >= 0:
                 held[keyframe.seq] = cloud
     return out, held
+
+
+def _decoded(store: Keyframes, extents: Sequence[_Extent]) -> Iterator[Keyframe | None]:
+    """The keyframes, spread over the flight, decoded by all cores."""
+    calls = [partial(store.keyframe, seq) for seq in spread([e.seq for e in extents])]
+    for at in range(0, len(calls), threads()):
+        yield from at_once(*calls[at : at + threads()])
 
 
 def _points(keyframe: Keyframe, box: Box) -> PointCloud:
