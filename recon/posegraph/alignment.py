@@ -20,6 +20,8 @@ from recon.posegraph.level_ground import ASSUMED_TILT_RAD
 from recon.posegraph.sensor_noise import (
     MIN_READINGS,
     MIN_WANDER,
+    PRECISE_M,
+    PRECISE_TAU_S,
     SURE_OF_WANDER,
     Noise,
     drift_noise,
@@ -88,6 +90,12 @@ UNKNOWNS = 11
 
 ROUNDS = 4
 """Times that the noise of altitudes and the tilt by them are found in turn."""
+
+STEP_SHARE = 0.002
+"""Share of its length by which a motion of vision errs."""
+
+AXES = (slice(0, 2), slice(2, 3))
+"""Those of a position that err alike: horizontal and vertical."""
 
 TINY = 1e-6
 """Sigma of what no reading has."""
@@ -256,34 +264,45 @@ def height_ratios(anchors: Sequence[Anchor]) -> tuple[list[tuple[float, float]],
     return [h for h, off in zip(exact, apart, strict=True) if off <= limit], EXACT_HEIGHTS
 
 
+def _together(times_s: F64 | Sequence[float], wander_s: float) -> float:
+    """Factor on the sigmas of readings at (n,) times whose errors wander with a time constant."""
+    if len(times_s) == 0:
+        return 1.0
+    independent = 1.0 + float(np.ptp(times_s)) / (2.0 * max(wander_s, 1e-3))
+    return float(np.sqrt(max(1.0, len(times_s) / independent)))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingNoise:
     """How fixes and velocities err along one flight, 1 sigma per axis."""
 
     horizontal: Noise | None = None  # of a fix, m; None: as it claims
     vertical: Noise | None = None
+    apart: tuple[Noise, Noise] | None = None  # the same off vision's track, which drifts as well
     reach_m: F64 | None = None  # (3,) how far fixes may wander
     tilt: Noise | None = None  # of an assumed view about its mount, rad
     walk_m_per_sqrt_s: float = 0.1  # of the integrated velocity
     rate_m_s: float = 0.05  # constant part of the velocity's error
 
-    def of_fixes(self, claimed: F64, times_s: F64) -> tuple[F64, F64]:
-        """(m, 3) sigma with which each fix weighs, and (m, 3) by which an outlier is known."""
-        weighing, single = WANDER_SHARE * claimed, WANDER_SHARE * claimed
-        span_s = float(np.ptp(times_s)) if len(times_s) else 0.0
-        for noise, axes in ((self.horizontal, slice(0, 2)), (self.vertical, slice(2, 3))):
-            if noise is not None:
-                weighing[:, axes] = max(noise.of_each(len(claimed), span_s), MIN_FIX_M)
-                single[:, axes] = max(noise.total, MIN_FIX_M)
-        return weighing, single
+    def of_fixes(self, claimed: F64, fix_s: float) -> tuple[F64, tuple[Noise, Noise]]:
+        """(m, 3) sigma of a fix alone, and how such errors, in units of it, go along the track:
+        horizontal and vertical."""
+        if self.apart is not None:
+            across, along = (replace(n, white=max(n.white, MIN_FIX_M)) for n in self.apart)
+            single = np.full_like(claimed, [across.total, across.total, along.total])
+            return single, (across.over(across.total), along.over(along.total))
+        is_precise = len(claimed) > 0 and float(np.median(claimed[:, 0])) < PRECISE_M
+        tau_s = PRECISE_TAU_S if is_precise else fix_s
+        common = (WANDER_SHARE**-2 - 1.0) ** 0.5 if fix_s > 0 else 0.0
+        usual = Noise(1.0, common, max(tau_s, 1.0))
+        return WANDER_SHARE * claimed, (usual, usual)
 
     def of_tilts(self, claimed: F64, times_s: F64, attitude_s: float) -> F64:
         """(n, 2) sigma with which assumed views weigh, of (n, 2) claimed ones at (n,) times."""
+        if self.tilt is None:
+            return np.asarray(claimed * _together(times_s, attitude_s))
         span_s = float(np.ptp(times_s)) if len(times_s) else 0.0
-        if self.tilt is not None:
-            return np.full_like(claimed, self.tilt.of_each(len(claimed), span_s))
-        independent = 1.0 + span_s / (2.0 * max(attitude_s, 1e-3))
-        return np.asarray(claimed * np.sqrt(max(1.0, len(claimed) / independent)))
+        return np.full_like(claimed, self.tilt.of_each(len(claimed), span_s))
 
     def of_mean(self, claimed: F64, times_s: F64, fix_s: float) -> tuple[F64, F64]:
         """(3,) sigma of the mean error of fixes with (m, 3) claimed sigmas at (m,) times, and what
@@ -324,13 +343,16 @@ class _Readings:
     """The anchors' readings as arrays, by kind; rows of one reading form a group."""
 
     def __init__(
-        self, anchors: Sequence[Anchor], noise: ReadingNoise | None = None, attitude_s: float = 40.0
+        self,
+        anchors: Sequence[Anchor],
+        noise: ReadingNoise | None = None,
+        wander_s: tuple[float, float] = (60.0, 40.0),
     ) -> None:
         turned = [a for a in anchors if a.prior.R_world_camera is not None]
         fixed = [a for a in anchors if _has_fix(a.prior)]
         moved = [(a, b) for a, b in pairwise(anchors) if _are_on_one_run(a.prior, b.prior)]
         heights, independent = height_ratios(anchors)
-        noise = noise or ReadingNoise()
+        noise, (fix_s, attitude_s) = noise or ReadingNoise(), wander_s
         self.R_odom = _stack([a.T_odom_camera[:3, :3] for a in turned], (3, 3))
         self.R_prior = _stack([a.prior.R_world_camera for a in turned], (3, 3))
         self.is_assumed = np.array([a.prior.is_view_assumed for a in turned], bool)
@@ -339,6 +361,9 @@ class _Readings:
         )
         self.heading_known = self.sigma_turn[:, 2] < KNOWN_YAW_RAD
         self.tilt_s = _stack([a.time_s for a in turned if a.prior.is_view_assumed], ())
+        self.sigma_turn[~self.is_assumed] *= _together(
+            [a.time_s for a in turned if not a.prior.is_view_assumed], attitude_s
+        )
         self.sigma_turn[self.is_assumed, :2] = noise.of_tilts(
             self.sigma_turn[self.is_assumed, :2], self.tilt_s, attitude_s
         )
@@ -347,7 +372,7 @@ class _Readings:
         self.claimed = _stack([a.prior.sigma_position_m for a in fixed], (3,))
         self.fix_s = _stack([a.time_s for a in fixed], ())
         self.is_height_claimed = all(a.prior.is_sigma_claimed for a in fixed)  # so without any
-        self.sigma_fix, self.sigma_single = noise.of_fixes(self.claimed, self.fix_s)
+        self.sigma_fix, self.wander = noise.of_fixes(self.claimed, fix_s)
         self.step = _stack([b.place - a.place for a, b in moved], (3,))
         self.way = _stack([_way(a.prior, b.prior) for a, b in moved], (3,))
         self.way_s = _stack([_seconds(a.prior, b.prior) for a, b in moved], ())
@@ -357,10 +382,6 @@ class _Readings:
         self.log_ratio = _stack([h[0] for h in heights], ())
         thinned = min(1.0, (independent / max(len(heights), 1)) ** 0.5)
         self.sigma_log = _stack([h[1] for h in heights], ()) / thinned
-        one = np.ones(len(turned)), np.ones(len(moved)), np.ones(len(heights) + 1)
-        outlying = np.mean(self.sigma_fix / self.sigma_single, axis=1)
-        self.outlying = np.concatenate([one[0], outlying, one[1], one[2]])
-        """(groups,) what a group's whitened residual is multiplied by to find an outlier."""
         three, single = len(turned) + len(fixed) + len(moved), len(heights)
         counts = np.array([3] * three + [1] * single + [4], int)
         self.group = np.repeat(np.arange(len(counts)), counts)
@@ -372,6 +393,8 @@ class _Readings:
             [known.ravel(), 1.0 / self.sigma_fix.ravel(), way, 1.0 / self.sigma_log,
              1.0 / self._sigma_common(turned)]
         )  # fmt: skip
+        self.of_fixes = slice(len(turned), len(turned) + len(fixed))
+        """Groups of the fixes."""
         self._turned, self._fixed = 3 * len(turned), 3 * len(fixed)
         self._scaled = slice(self._turned, 3 * three)
         self._J = np.zeros((len(self.group), UNKNOWNS))  # where it is constant
@@ -423,6 +446,32 @@ class _Readings:
         r = np.concatenate([turn.ravel(), fix.ravel(), way.ravel(), height, common])
         return r * self._whitening, J * self._whitening[:, None]
 
+    def weighted(self, rows: F64, weight: F64) -> F64:
+        """Whitened rows (M, k) times the inverse of their errors' covariance.
+
+        ``weight`` (groups,) is 1, less for an outlier: to a fix it adds variance, as those next to
+        it share its wander.
+        """
+        out = rows * weight[self.group][:, None]
+        if self._fixed == 0:
+            return out
+        of = slice(self._turned, self._turned + self._fixed)
+        fixes = rows[of].reshape(-1, 3, rows.shape[1])
+        extra = 1.0 / np.maximum(weight[self.of_fixes], TINY**2) - 1.0
+        parts = [
+            noise.weighted(self.fix_s, extra, fixes[:, axes].reshape(len(fixes), -1))
+            for noise, axes in zip(self.wander, AXES, strict=True)
+        ]
+        out[of] = np.concatenate(parts, axis=1).reshape(-1, rows.shape[1])
+        return out
+
+    def excess(self, r: F64, kept: F64) -> float:
+        """Variance factor of the fixes: 1 where their residuals (M,) are as their noise says."""
+        of = slice(self._turned, self._turned + self._fixed)
+        weighted = self.weighted(r[:, None], kept)[:, 0]
+        free = 3.0 * float(np.sum(kept[self.of_fixes])) - 7.0
+        return float(r[of] @ weighted[of]) / max(free, 1.0)
+
     def placed(self, at: _State) -> F64:
         """(m, 3) m from the fixes, without their drift, to where the similarity has them."""
         placed = np.exp(at.log_scale) * self.x @ at.R.T + at.t
@@ -470,17 +519,18 @@ def fit(
     usable = [a for a in anchors if a.prior.R_world_camera is not None or _has_fix(a.prior)]
     if not usable:
         return None
-    readings = _Readings(usable, attitude_s=attitude_s)
+    wander_s = (fix_s, attitude_s)
+    readings = _Readings(usable, wander_s=wander_s)
     if _velocities_contradict(readings):
         usable = [replace(a, prior=replace(a.prior, travel=None)) for a in usable]
-        readings = _Readings(usable, attitude_s=attitude_s)
+        readings = _Readings(usable, wander_s=wander_s)
     found = [_solve(readings, start, iterations) for start in _starts(usable, readings)]
     best = min(found, key=lambda f: f.cost)
-    noise = _measured(usable, best.at, (fix_s, attitude_s), iterations, slow_share)
-    readings = _Readings(usable, noise, attitude_s)
+    noise = _measured(usable, best.at, wander_s, iterations, slow_share)
+    readings = _Readings(usable, noise, wander_s)
     best = _solve(readings, best.at, iterations)
-    inflation = max(1.0, 0.2 * len(usable)) if noise.horizontal is None else 1.0
-    covariance = np.asarray(np.linalg.inv(best.H)[:7, :7] * inflation, np.float64)
+    covariance = np.asarray(np.linalg.inv(best.H)[:7, :7] * max(best.excess, 1.0), np.float64)
+    covariance[6, 6] += STEP_SHARE**2 / max(len(usable) - 1, 1)
     mean = counted = None
     if len(readings.fix):
         covariance[3:6, 3:6] += np.diag(np.mean(np.square(readings.claimed), axis=0))
@@ -513,13 +563,13 @@ def _measured(
     ]
     fixed = [replace(a, prior=replace(a.prior, travel=None)) for a in level]
     moved = [replace(a, prior=replace(a.prior, position_m=None)) for a in level]
-    out, fixes = ReadingNoise(), _Readings(fixed, None, wander_s[1])
+    out, fixes = ReadingNoise(), _Readings(fixed, None, wander_s)
     # Altitudes that weigh too little leave a lean, which looks like a wander of theirs.
     for _ in range(1 if fixes.is_height_claimed else ROUNDS):
         at = _solve(fixes, start, iterations).at
         out = _of_fixes(fixes, at, wander_s, slow_share)
-        fixes = _Readings(fixed, out, wander_s[1])
-    ways = _Readings(moved, None, wander_s[1])
+        fixes = _Readings(fixed, out, wander_s)
+    ways = _Readings(moved, None, wander_s)
     if len(ways.way) >= MIN_READINGS:
         drift = ways.moved(_solve(ways, start, iterations).at)
         found = drift_noise(np.cumsum(ways.way_s), np.cumsum(drift, axis=0))
@@ -547,9 +597,10 @@ def _of_fixes(
     if tilt is not None:
         tilt = tilt.bounded(ASSUMED_TILT_RAD, attitude_s, MIN_WANDER * ASSUMED_TILT_RAD)
     apart, is_claimed = fixes.placed(at), fixes.is_height_claimed
+    flat_off, high_off = (wander_noise(fixes.fix_s, apart[:, k], fix_s, 1.0) for k in AXES)
     across = wander_noise(fixes.fix_s, apart[:, :2], fix_s)
     along = wander_noise(fixes.fix_s, apart[:, 2:], fix_s, SURE_OF_WANDER if is_claimed else 1.0)
-    if across is None or along is None:
+    if across is None or along is None or flat_off is None or high_off is None:
         return ReadingNoise(tilt=tilt)
     claimed = np.median(fixes.claimed, axis=0)
     flat, high = float(claimed[:2].mean()), float(claimed[2])
@@ -559,6 +610,7 @@ def _of_fixes(
     return ReadingNoise(
         horizontal=across.bounded(most, fix_s, MIN_WANDER * most),
         vertical=along.bounded(high, fix_s, MIN_WANDER * drift),
+        apart=(flat_off.feared(most, fix_s), high_off.feared(drift, fix_s)),
         reach_m=np.array([reach, reach, along.reach(high, least)]),
         tilt=tilt,
     )
@@ -631,27 +683,29 @@ class _Solution:
     at: _State
     H: F64
     cost: float
+    excess: float  # squared residuals of the fixes over what their noise explains
 
 
 def _solve(readings: _Readings, at: _State, iterations: int) -> _Solution:
     """Gauss-Newton with Huber's weights."""
-    group, kept = readings.group, np.ones(len(readings.outlying))
-    H, cost, ridge = np.eye(UNKNOWNS), np.inf, np.diag([1e-6] * 6 + [1e-4] + [0.0] * 4)
+    group, kept = readings.group, np.ones(int(readings.group[-1]) + 1)
+    H, cost = np.eye(UNKNOWNS), np.inf
+    ridge = np.diag([1e-6] * 6 + [1e-4] + [0.0] * 4)
     for i in range(iterations + 10):
         r, J = readings.linearised(at)
         norms = np.sqrt(np.bincount(group, weights=r**2, minlength=len(kept)))
-        weight = (kept * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9)))[group]
+        weight = kept * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9))
         cost = float(np.sum(np.where(norms < HUBER, 0.5 * norms**2, HUBER * (norms - HUBER / 2))))
-        JW = (J * weight[:, None]).T
-        H = JW @ J + ridge
-        step = np.linalg.solve(H, -JW @ r)
+        W = readings.weighted(np.column_stack([J, r]), weight)
+        H, g = J.T @ W[:, :-1] + ridge, J.T @ W[:, -1]
+        step = np.linalg.solve(H, -g)
         step[:3] = np.clip(step[:3], -0.5, 0.5)
         step[6:10] = np.clip(step[6:10], -0.5, 0.5)
         at = at.moved(step)
         stands = np.abs(step).max() < 1e-7 or i >= iterations - 1
-        if stands and not (kept.all() and _leave_out(readings, norms * readings.outlying, kept)):
+        if stands and not (kept.all() and _leave_out(readings, norms, kept)):
             break
-    return _Solution(at, H, cost)
+    return _Solution(at, H, cost, readings.excess(r, kept))
 
 
 def _leave_out(readings: _Readings, norms: F64, kept: F64) -> bool:
