@@ -74,7 +74,8 @@ def test_one_strip_does_not_show_whether_it_leans() -> None:
     flown = stills(1, 8.0)
     found = fit(flown.anchors)
     assert found is not None and found.sigma_lean_rad is not None
-    assert 4.0 < flown.lean_deg(found) < 2.0 * np.degrees(found.sigma_lean_rad)
+    assert flown.lean_deg(found) < 2.0 * np.degrees(found.sigma_lean_rad)
+    assert np.degrees(found.sigma_lean_rad) > 3.0
 
 
 def settled(flown: Stills) -> Trajectory:

@@ -79,6 +79,9 @@ HUBER = 2.5
 WILD = 12.5
 """Fixes and attitudes beyond this are left out once the fit stands, if fewer than half are."""
 
+ODD = 5.0
+"""The same of a fix against those next to it."""
+
 KNOWN_YAW_RAD, NO_YAW_RAD = 1.0, 3.0
 """Sigma below which a heading counts as known, and one of a heading that is not."""
 
@@ -396,12 +399,12 @@ class _Readings:
         self.of_fixes = slice(len(turned), len(turned) + len(fixed))
         """Groups of the fixes."""
         self._turned, self._fixed = 3 * len(turned), 3 * len(fixed)
+        self._rows = slice(self._turned, self._turned + self._fixed)  # of the fixes
         self._scaled = slice(self._turned, 3 * three)
         self._J = np.zeros((len(self.group), UNKNOWNS))  # where it is constant
         self._J[: self._turned, :3] = np.tile(np.eye(3), (len(turned), 1))
-        rows = slice(self._turned, self._turned + self._fixed)
-        self._J[rows, 3:6] = np.tile(np.eye(3), (len(fixed), 1))
-        self._J[rows, 10] = np.outer(self.along, [0.0, 0.0, 1.0]).ravel()
+        self._J[self._rows, 3:6] = np.tile(np.eye(3), (len(fixed), 1))
+        self._J[self._rows, 10] = np.outer(self.along, [0.0, 0.0, 1.0]).ravel()
         self._J[3 * three : -4, 6] = 1.0
         self._J[-4:, 7:] = np.eye(4)
 
@@ -446,31 +449,43 @@ class _Readings:
         r = np.concatenate([turn.ravel(), fix.ravel(), way.ravel(), height, common])
         return r * self._whitening, J * self._whitening[:, None]
 
-    def weighted(self, rows: F64, weight: F64) -> F64:
-        """Whitened rows (M, k) times the inverse of their errors' covariance.
+    def information(self, extra: F64) -> list[F64]:
+        """(m, m) inverse covariances of whitened fixes, horizontal and vertical, each with an
+        ``extra`` (2, m) variance of its own."""
+        return [n.information(self.fix_s, e) for n, e in zip(self.wander, extra, strict=True)]
 
-        ``weight`` (groups,) is 1, less for an outlier: to a fix it adds variance, as those next to
-        it share its wander.
-        """
+    def alone(self, r: F64, known: Sequence[F64], extra: F64) -> F64:
+        """(m,) whitened residual of each fix against what all others say of its error."""
+        fixes, square = r[self._rows].reshape(-1, 3), np.zeros(len(self.fix))
+        for axes, P, own in zip(AXES, known, extra, strict=True):
+            variance = 1.0 / np.diag(P)
+            left = (P @ fixes[:, axes]) * variance[:, None]
+            square += np.sum(left**2, axis=1) / (variance - own)
+        return np.sqrt(square)
+
+    def doubted(self, known: Sequence[F64], extra: F64, weight: F64) -> F64:
+        """(2, m) variance that gives fixes the weight (groups,): their neighbours keep theirs."""
+        alone = np.array([1.0 / np.diag(P) for P in known]) - extra
+        return np.asarray(alone * (1.0 / np.maximum(weight[self.of_fixes], TINY) - 1.0))
+
+    def weighted(self, rows: F64, weight: F64, known: Sequence[F64]) -> F64:
+        """Whitened rows (M, k) times the inverse of their errors' covariance; ``weight`` (groups,)
+        is of all but fixes, whose inverse is ``known``."""
         out = rows * weight[self.group][:, None]
-        if self._fixed == 0:
-            return out
-        of = slice(self._turned, self._turned + self._fixed)
-        fixes = rows[of].reshape(-1, 3, rows.shape[1])
-        extra = 1.0 / np.maximum(weight[self.of_fixes], TINY**2) - 1.0
+        fixes = rows[self._rows].reshape(len(self.fix), 3, rows.shape[1])
         parts = [
-            noise.weighted(self.fix_s, extra, fixes[:, axes].reshape(len(fixes), -1))
-            for noise, axes in zip(self.wander, AXES, strict=True)
+            np.einsum("ij,jak->iak", P, fixes[:, axes]) for axes, P in zip(AXES, known, strict=True)
         ]
-        out[of] = np.concatenate(parts, axis=1).reshape(-1, rows.shape[1])
+        out[self._rows] = np.concatenate(parts, axis=1).reshape(-1, rows.shape[1])
         return out
 
     def excess(self, r: F64, kept: F64) -> float:
         """Variance factor of the fixes: 1 where their residuals (M,) are as their noise says."""
-        of = slice(self._turned, self._turned + self._fixed)
-        weighted = self.weighted(r[:, None], kept)[:, 0]
+        none = np.zeros((2, len(self.fix)))
+        known = self.information(self.doubted(self.information(none), none, kept))
         free = 3.0 * float(np.sum(kept[self.of_fixes])) - 7.0
-        return float(r[of] @ weighted[of]) / max(free, 1.0)
+        weighted = self.weighted(r[:, None], kept, known)[:, 0]
+        return float(r[self._rows] @ weighted[self._rows]) / max(free, 1.0)
 
     def placed(self, at: _State) -> F64:
         """(m, 3) m from the fixes, without their drift, to where the similarity has them."""
@@ -606,11 +621,16 @@ def _of_fixes(
     flat, high = float(claimed[:2].mean()), float(claimed[2])
     least = 1.0 if is_claimed else MIN_WANDER
     reach = across.reach(flat, min(least, slow_share))
+    span_s = float(np.ptp(fixes.fix_s))
     most, drift = across.reach(flat, slow_share), high if is_claimed else abs(at.drift)
+    vertical = along.bounded(high, fix_s, MIN_WANDER * drift)
     return ReadingNoise(
         horizontal=across.bounded(most, fix_s, MIN_WANDER * most),
-        vertical=along.bounded(high, fix_s, MIN_WANDER * drift),
-        apart=(flat_off.feared(most, fix_s), high_off.feared(drift, fix_s)),
+        vertical=vertical,
+        apart=(
+            flat_off.drifting(most, fix_s, span_s),
+            high_off.drifting(high, fix_s, span_s) if is_claimed else vertical,
+        ),
         reach_m=np.array([reach, reach, along.reach(high, least)]),
         tilt=tilt,
     )
@@ -689,14 +709,18 @@ class _Solution:
 def _solve(readings: _Readings, at: _State, iterations: int) -> _Solution:
     """Gauss-Newton with Huber's weights."""
     group, kept = readings.group, np.ones(int(readings.group[-1]) + 1)
-    H, cost = np.eye(UNKNOWNS), np.inf
+    H, cost, extra = np.eye(UNKNOWNS), np.inf, np.zeros((2, len(readings.fix)))
     ridge = np.diag([1e-6] * 6 + [1e-4] + [0.0] * 4)
     for i in range(iterations + 10):
         r, J = readings.linearised(at)
         norms = np.sqrt(np.bincount(group, weights=r**2, minlength=len(kept)))
-        weight = kept * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9))
         cost = float(np.sum(np.where(norms < HUBER, 0.5 * norms**2, HUBER * (norms - HUBER / 2))))
-        W = readings.weighted(np.column_stack([J, r]), weight)
+        known = readings.information(extra)
+        alone, fixes = readings.alone(r, known, extra), norms[readings.of_fixes]
+        np.maximum(fixes, alone * np.where(alone > ODD, WILD / ODD, 1.0), out=fixes)
+        weight = kept * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9))
+        W = readings.weighted(np.column_stack([J, r]), weight, known)
+        extra = readings.doubted(known, extra, weight)
         H, g = J.T @ W[:, :-1] + ridge, J.T @ W[:, -1]
         step = np.linalg.solve(H, -g)
         step[:3] = np.clip(step[:3], -0.5, 0.5)

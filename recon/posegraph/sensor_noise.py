@@ -59,31 +59,39 @@ class Noise:
     white: float
     wander: float
     tau_s: float
+    steady: float = 0.0  # drift from the middle of the readings to either end
 
     @property
     def total(self) -> float:
         """Of one reading."""
         return float(np.hypot(self.white, self.wander))
 
-    def weighted(self, times_s: F64, extra: F64, columns: F64) -> F64:
-        """``columns`` (N, k) times the inverse of the covariance of readings at (N,) times.
+    def information(self, times_s: F64, extra: F64) -> F64:
+        """(N, N) inverse of the covariance of readings at (N,) times.
 
         ``extra`` (N,) is each reading's own variance besides the white one, which is not 0. The
         inverse of a Gauss-Markov covariance K is tridiagonal, and with D of the readings' own
         variances (D + K)^-1 = D^-1 - D^-1 (K^-1 + D^-1)^-1 D^-1 (Woodbury).
         """
-        own = (self.white**2 + extra)[:, None]
-        if len(times_s) < 2 or self.wander == 0.0:
-            return np.asarray(columns / (own + self.wander**2))
-        keep = np.exp(-np.diff(times_s) / self.tau_s)
-        fresh = 1.0 / (self.wander**2 * np.maximum(1.0 - keep**2, MIN_FRESH))
-        inner = np.zeros((2, len(own)))
-        inner[0, 1:] = -keep * fresh
-        inner[1] = 1.0 / own[:, 0]
-        inner[1, 0] += self.wander**-2
-        inner[1, 1:] += fresh
-        inner[1, :-1] += keep**2 * fresh
-        return np.asarray((columns - solveh_banded(inner, columns / own)) / own)
+        own = self.white**2 + extra
+        if len(own) < 2 or self.wander == 0.0:
+            P = np.diag(1.0 / (own + self.wander**2))
+        else:
+            keep = np.exp(-np.diff(times_s) / self.tau_s)
+            fresh = 1.0 / (self.wander**2 * np.maximum(1.0 - keep**2, MIN_FRESH))
+            inner = np.zeros((2, len(own)))
+            inner[0, 1:] = -keep * fresh
+            inner[1] = 1.0 / own
+            inner[1, 0] += self.wander**-2
+            inner[1, 1:] += fresh
+            inner[1, :-1] += keep**2 * fresh
+            D = np.diag(1.0 / own)
+            P = D - solveh_banded(inner, D) / own[:, None]
+        if self.steady == 0.0:
+            return np.asarray(P)
+        ends = 2.0 * (times_s - times_s[0]) / max(float(np.ptp(times_s)), 1e-9) - 1.0
+        drift = P @ ends
+        return np.asarray(P - np.outer(drift, drift) / (self.steady**-2 + ends @ drift))
 
     def bounded(self, claimed: float, usual_tau_s: float, least: float) -> Noise:
         """The same with a wander between ``least`` and what the sensor claims.
@@ -97,20 +105,26 @@ class Noise:
         tau_s = PRECISE_TAU_S if claimed < PRECISE_M else usual_tau_s
         return replace(self, wander=min(max(self.wander, least), claimed), tau_s=tau_s)
 
-    def feared(self, claimed: float, usual_tau_s: float) -> Noise:
-        """The same with a wander that may be as far as :meth:`reach` says, if it is not further.
+    def drifting(self, claimed: float, tau_s: float, span_s: float) -> Noise:
+        """The same with the steady drift that a wander as far as :meth:`reach` says may have.
 
-        A steady drift changes little over the lags that a flight shows.
+        Over a track without turns it looks like another scale, so no residual shows it. The wander
+        is at most as ``claimed``.
         """
-        wander = self.reach(claimed, MIN_WANDER)
-        if self.wander >= wander or usual_tau_s <= 0:
+        if tau_s <= 0:
             return self
-        tau_s = PRECISE_TAU_S if claimed < PRECISE_M else usual_tau_s
-        return replace(self, wander=wander, tau_s=tau_s)
+        wander = min(self.wander, claimed)
+        spans = span_s / (PRECISE_TAU_S if claimed < PRECISE_M else tau_s)
+        # Variance of the slope of a Gauss-Markov error: spans / 5 if short, 2 / spans if long.
+        slope = 3.0 * spans / (5.0 + 0.5 * spans**2)
+        far = max(self.reach(claimed, MIN_WANDER) ** 2 - wander**2, 0.0)
+        return replace(self, wander=wander, steady=float(np.sqrt(far * slope)))
 
     def over(self, unit: float) -> Noise:
         """The same in another unit."""
-        return replace(self, white=self.white / unit, wander=self.wander / unit)
+        return replace(
+            self, white=self.white / unit, wander=self.wander / unit, steady=self.steady / unit
+        )
 
     def of_each(self, count: int, span_s: float) -> float:
         """The sigma of each of ``count`` readings over ``span_s``, as if all were independent.
