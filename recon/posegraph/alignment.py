@@ -130,6 +130,22 @@ class Common:
         return replace(prior, R_world_camera=R, position_m=position)
 
 
+@dataclass(frozen=True, slots=True)
+class Heights:
+    """What fixes of one receiver say of heights against each other, whatever they all err by."""
+
+    sigma_m: float  # of the mean height
+    time_s: float
+    rate_m_s: float  # of their drift, 0 where they state their accuracy
+    sigma_rate_m_s: float
+
+    def sigma_to(self, main: Heights) -> float:
+        """Sigma in m of the mean height against that of the main segment, which shows the drift."""
+        passed_s = abs(self.time_s - main.time_s)
+        drift_m = passed_s * float(np.hypot(main.rate_m_s, main.sigma_rate_m_s))
+        return float(np.sqrt(self.sigma_m**2 + main.sigma_m**2 + drift_m**2))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
     """``x_world = scale * R @ x_odom + t``; covariance of (rotation, translation, log scale)."""
@@ -143,6 +159,7 @@ class Similarity:
     sigma_fixes: F64 | None = None  # (3,) m of the mean error of all fixes, where they wander
     sigma_counted: F64 | None = None  # (3,) m that the readings in the graph count for it
     common: Common = field(default_factory=lambda: Common())
+    heights: Heights | None = None  # where the noise of fixes is known
     lean: F64 | None = None  # (6, 6) of a left perturbation that tilts all; None: level is known
 
     @property
@@ -284,6 +301,7 @@ class ReadingNoise:
     apart: tuple[Noise, Noise] | None = None  # the same off vision's track, which drifts as well
     reach_m: F64 | None = None  # (3,) how far fixes may wander
     tilt: Noise | None = None  # of an assumed view about its mount, rad
+    claimed: F64 | None = None  # (3,) m as the fixes claim it
     walk_m_per_sqrt_s: float = 0.1  # of the integrated velocity
     rate_m_s: float = 0.05  # constant part of the velocity's error
 
@@ -299,6 +317,17 @@ class ReadingNoise:
         common = (WANDER_SHARE**-2 - 1.0) ** 0.5 if fix_s > 0 else 0.0
         usual = Noise(1.0, common, max(tau_s, 1.0))
         return WANDER_SHARE * claimed, (usual, usual)
+
+    def or_else(self, usual: ReadingNoise | None, claimed: F64) -> ReadingNoise:
+        """The same with the ``usual`` noise of fixes that claim as much, (m, 3), if their own is
+        not known."""
+        if self.horizontal is not None or usual is None or usual.claimed is None:
+            return self
+        if not len(claimed) or np.any(np.abs(np.log(np.median(claimed, 0) / usual.claimed)) > 0.5):
+            return self
+        tilt = self.tilt or usual.tilt
+        walk, rate = self.walk_m_per_sqrt_s, self.rate_m_s
+        return replace(usual, tilt=tilt, walk_m_per_sqrt_s=walk, rate_m_s=rate)
 
     def of_tilts(self, claimed: F64, times_s: F64, attitude_s: float) -> F64:
         """(n, 2) sigma with which assumed views weigh, of (n, 2) claimed ones at (n,) times."""
@@ -429,6 +458,13 @@ class _Readings:
         """(m,) times of the fixes, -1 to 1."""
         return self.spanned.along(self.fix_s)
 
+    def rate(self, at: _State, H: F64) -> tuple[float, float]:
+        """m/s by which altitudes drift, and its sigma."""
+        if self.is_height_claimed:
+            return 0.0, 0.0
+        sigma_m = float(np.sqrt(np.linalg.inv(H)[10, 10]))
+        return at.drift / self.spanned.half_s, sigma_m / self.spanned.half_s
+
     def common(self, at: _State) -> Common:
         """What the readings have in common."""
         return replace(self.spanned, mount_rad=at.mount, drift_m=at.drift)
@@ -520,6 +556,7 @@ def fit(
     attitude_s: float = 40.0,
     iterations: int = 30,
     slow_share: float = 1.0,
+    usual: ReadingNoise | None = None,
 ) -> Similarity | None:
     """The similarity that brings the anchors onto their priors, or None without any prior.
 
@@ -529,7 +566,8 @@ def fit(
     An assumed view is off by one angle in all images, and altitudes of no stated accuracy drift:
     both are fitted too. Attitudes of one flight err together, so the covariance is inflated by
     their number. The receiver's error that all fixes share goes into the position's covariance.
-    ``slow_share`` is the part of its variance that may wander.
+    ``slow_share`` is the part of its variance that may wander. Too few fixes to be measured err as
+    the ``usual`` ones of the flight.
     """
     usable = [a for a in anchors if a.prior.R_world_camera is not None or _has_fix(a.prior)]
     if not usable:
@@ -542,9 +580,16 @@ def fit(
     found = [_solve(readings, start, iterations) for start in _starts(usable, readings)]
     best = min(found, key=lambda f: f.cost)
     noise = _measured(usable, best.at, wander_s, iterations, slow_share)
+    noise = noise.or_else(usual, readings.claimed)
     readings = _Readings(usable, noise, wander_s)
     best = _solve(readings, best.at, iterations)
     covariance = np.asarray(np.linalg.inv(best.H)[:7, :7] * max(best.excess, 1.0), np.float64)
+    heights = None
+    if len(readings.fix) and noise.horizontal is not None:
+        centre = np.exp(best.at.log_scale) * best.at.R @ readings.x.mean(axis=0) + best.at.t
+        about = se3.about(centre, covariance[:6, :6])
+        heights = Heights(float(np.sqrt(about[5, 5])), float(readings.fix_s.mean()),
+                          *readings.rate(best.at, best.H))  # fmt: skip
     covariance[6, 6] += STEP_SHARE**2 / max(len(usable) - 1, 1)
     mean = counted = None
     if len(readings.fix):
@@ -554,7 +599,7 @@ def fit(
     at = best.at
     similarity = Similarity(
         float(np.exp(at.log_scale)), at.R, at.t, covariance, _sources(readings), noise, mean,
-        counted, readings.common(at),
+        counted, readings.common(at), heights=heights,
     )  # fmt: skip
     if not readings.is_assumed.all() or not len(readings.fix):
         return similarity
@@ -633,6 +678,7 @@ def _of_fixes(
         ),
         reach_m=np.array([reach, reach, along.reach(high, least)]),
         tilt=tilt,
+        claimed=claimed,
     )
 
 

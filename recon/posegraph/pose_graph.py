@@ -185,6 +185,10 @@ class PoseGraph:
         """Constant errors of the sensors, as known for the newest segment."""
         return self._segments.constants(self._newest().segment) if self._nodes else Constants()
 
+    def sigma_height_m(self, segment: int) -> float | None:
+        """Sigma of a segment's height against the largest one by fixes; None where unknown."""
+        return self._segments.sigma_height_m(segment)
+
     def is_tied(self, segment: int) -> bool:
         """True when fixes or a loop locate the segment."""
         return self._segments.is_tied(segment)

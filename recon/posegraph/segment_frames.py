@@ -100,6 +100,20 @@ class SegmentFrames:
         frame = self._frames.get(segment)
         return None if frame is None else frame.noise
 
+    def _usual_noise(self) -> ReadingNoise | None:
+        """That of the fixes of the largest segment which shows it."""
+        known = [s for s, f in self._frames.items() if f.noise and f.noise.horizontal]
+        largest = max(known, key=self._seen.__getitem__, default=None)
+        return None if largest is None else self.noise(largest)
+
+    def sigma_height_m(self, segment: int) -> float | None:
+        """Sigma of a segment's height against the largest one of known heights; None without."""
+        known = {s: f.heights for s, f in self._frames.items() if f.heights is not None}
+        if segment not in known:
+            return None
+        main = max(known, key=self._seen.__getitem__)
+        return 0.0 if segment == main else known[segment].sigma_to(known[main])
+
     def rests_on_fixes(self, segment: int) -> bool:
         """True when positions place the segment."""
         frame = self._frames.get(segment)
@@ -145,7 +159,8 @@ class SegmentFrames:
         self._fitted[segment] = seen
         fresh = self._newest_constants()
         anchors = self._anchors(segment, fresh)
-        found = alignment.fit(anchors, *self._wander_s, slow_share=fresh.datum.slow_share)
+        found = alignment.fit(anchors, *self._wander_s, slow_share=fresh.datum.slow_share,
+                              usual=self._usual_noise())  # fmt: skip
         if found is None:
             return False
         if "gnss" not in found.sources and nodes[0].key > 0:
