@@ -160,6 +160,7 @@ class Similarity:
     sigma_counted: F64 | None = None  # (3,) m that the readings in the graph count for it
     common: Common = field(default_factory=lambda: Common())
     heights: Heights | None = None  # where the noise of fixes is known
+    bend_rad: float = 0.0  # sigma of a part of the track against its mean, as vision's turns add up
     lean: F64 | None = None  # (6, 6) of a left perturbation that tilts all; None: level is known
 
     @property
@@ -169,10 +170,10 @@ class Similarity:
 
     @property
     def sigma_lean_rad(self) -> float | None:
-        """1-sigma uncertainty of what is level, about the axis where it is largest."""
+        """1-sigma uncertainty of what is level somewhere, about the axis where it is largest."""
         if self.lean is None:
             return None
-        return float(np.sqrt(np.linalg.eigvalsh(self.lean[:2, :2])[-1]))
+        return float(np.sqrt(np.linalg.eigvalsh(self.lean[:2, :2])[-1] + self.bend_rad**2))
 
     def place(self, x_odom: F64) -> F64:
         """(3,) m of a place (3,) in the odometry."""
@@ -458,12 +459,16 @@ class _Readings:
         """(m,) times of the fixes, -1 to 1."""
         return self.spanned.along(self.fix_s)
 
-    def rate(self, at: _State, H: F64) -> tuple[float, float]:
-        """m/s by which altitudes drift, and its sigma."""
+    def heights(self, at: _State, H: F64, covariance: F64) -> Heights:
+        """What the fixes say of the mean height; ``covariance`` (7, 7) is that of the fit."""
+        east, north, up = np.exp(at.log_scale) * at.R @ self.x.mean(axis=0)
+        of_mean = np.array([north, -east, 0.0, 0.0, 0.0, 1.0, up])
+        sigma_m, time_s = float(np.sqrt(of_mean @ covariance @ of_mean)), float(self.fix_s.mean())
         if self.is_height_claimed:
-            return 0.0, 0.0
-        sigma_m = float(np.sqrt(np.linalg.inv(H)[10, 10]))
-        return at.drift / self.spanned.half_s, sigma_m / self.spanned.half_s
+            return Heights(sigma_m, time_s, 0.0, 0.0)
+        sigma_drift_m = float(np.sqrt(np.linalg.inv(H)[10, 10]))
+        half_s = self.spanned.half_s
+        return Heights(sigma_m, time_s, at.drift / half_s, sigma_drift_m / half_s)
 
     def common(self, at: _State) -> Common:
         """What the readings have in common."""
@@ -586,10 +591,7 @@ def fit(
     covariance = np.asarray(np.linalg.inv(best.H)[:7, :7] * max(best.excess, 1.0), np.float64)
     heights = None
     if len(readings.fix) and noise.horizontal is not None:
-        centre = np.exp(best.at.log_scale) * best.at.R @ readings.x.mean(axis=0) + best.at.t
-        about = se3.about(centre, covariance[:6, :6])
-        heights = Heights(float(np.sqrt(about[5, 5])), float(readings.fix_s.mean()),
-                          *readings.rate(best.at, best.H))  # fmt: skip
+        heights = readings.heights(best.at, best.H, covariance)
     covariance[6, 6] += STEP_SHARE**2 / max(len(usable) - 1, 1)
     mean = counted = None
     if len(readings.fix):

@@ -163,6 +163,7 @@ class SegmentFrames:
                               usual=self._usual_noise())  # fmt: skip
         if found is None:
             return False
+        found = replace(found, bend_rad=_bend_rad(nodes))
         if "gnss" not in found.sources and nodes[0].key > 0:
             found = _kept_in_place(found, nodes[0], pose(nodes[0].key))
         if found.sigma_fixes is not None:
@@ -210,6 +211,14 @@ class SegmentFrames:
             Anchor(n.T_odom_camera, known.applied(n.prior), n.height, n.lean, n.time_ns * 1e-9)
             for n in self.nodes[segment]
         ]
+
+
+def _bend_rad(nodes: list[Node]) -> float:
+    """Sigma of the turn of a segment's part against its mean, about each axis.
+
+    A random walk of variance v from end to end has v / 6 about its mean.
+    """
+    return float(np.sqrt(sum(np.trace(n.covariance[:3, :3]) for n in nodes[1:]) / 18.0))
 
 
 def _differ(before: Similarity, found: Similarity, nodes: list[Node]) -> bool:
