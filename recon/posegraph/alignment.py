@@ -132,7 +132,7 @@ class Common:
 
 @dataclass(frozen=True, slots=True)
 class Heights:
-    """What fixes of one receiver say of heights against each other, whatever they all err by."""
+    """What fixes of one receiver tell about heights against each other."""
 
     sigma_m: float  # of the mean height
     time_s: float
@@ -460,7 +460,7 @@ class _Readings:
         return self.spanned.along(self.fix_s)
 
     def heights(self, at: _State, H: F64, covariance: F64) -> Heights:
-        """What the fixes say of the mean height; ``covariance`` (7, 7) is that of the fit."""
+        """What the fixes tell about the mean height; ``covariance`` (7, 7) is that of the fit."""
         east, north, up = np.exp(at.log_scale) * at.R @ self.x.mean(axis=0)
         of_mean = np.array([north, -east, 0.0, 0.0, 0.0, 1.0, up])
         sigma_m, time_s = float(np.sqrt(of_mean @ covariance @ of_mean)), float(self.fix_s.mean())
@@ -496,7 +496,7 @@ class _Readings:
         return [n.information(self.fix_s, e) for n, e in zip(self.wander, extra, strict=True)]
 
     def alone(self, r: F64, known: Sequence[F64], extra: F64) -> F64:
-        """(m,) whitened residual of each fix against what all others say of its error."""
+        """(m,) whitened residual of each fix against what all others tell about its error."""
         fixes, square = r[self._rows].reshape(-1, 3), np.zeros(len(self.fix))
         for axes, P, own in zip(AXES, known, extra, strict=True):
             variance = 1.0 / np.diag(P)
