@@ -10,7 +10,8 @@ import pytest
 
 from recon import se3
 from recon.camera_model import rays
-from recon.posegraph.alignment import Anchor, fit, height_above, height_below, scales
+from recon.posegraph.alignment import fit, scales
+from recon.posegraph.anchors import Anchor, height_above, height_below
 from recon.types import F32, F64, DepthMap, PosePrior, Travel
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.posegraph.alignment import Anchor, Similarity, fit
+from recon.posegraph.alignment import Similarity, fit
+from recon.posegraph.anchors import Anchor
 from recon.posegraph.level_ground import ASSUMED_TILT_RAD
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior

@@ -13,7 +13,8 @@ from scipy.optimize import nnls
 from scipy.stats import chi2
 
 from recon import se3
-from recon.posegraph.alignment import Anchor, fit, scales
+from recon.posegraph.alignment import fit, scales
+from recon.posegraph.anchors import Anchor
 from recon.posegraph.between_keyframes import Odometer
 from recon.posegraph.sensor_noise import (
     CHI_SQUARED_MEDIANS,

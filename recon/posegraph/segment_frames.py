@@ -10,7 +10,9 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph import alignment
-from recon.posegraph.alignment import Anchor, ReadingNoise, Scale, Similarity
+from recon.posegraph.alignment import Scale, Similarity
+from recon.posegraph.alignment_readings import ReadingNoise
+from recon.posegraph.anchors import Anchor
 from recon.posegraph.between_keyframes import at_camera
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_offsets import Constants, Offsets, constants, offsets

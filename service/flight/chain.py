@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from recon import se3
-from recon.posegraph.alignment import height_above, height_below
+from recon.posegraph.anchors import height_above, height_below
 from recon.posegraph.between_keyframes import carried
 from recon.posegraph.level_ground import levelled
 from recon.posegraph.pose_graph import PoseGraph
