@@ -10,7 +10,8 @@ import pytest
 
 from recon import se3
 from recon.camera_model import rays
-from recon.posegraph.alignment import Anchor, fit, height_above, height_below, scales
+from recon.posegraph.alignment import fit, scales
+from recon.posegraph.anchors import Anchor, height_above, height_below
 from recon.types import F32, F64, DepthMap, PosePrior, Travel
 
 
@@ -29,7 +30,7 @@ def anchors(
     """Noisy priors of a track that the odometry sees turned, shrunk and moved."""
     rng = np.random.default_rng(seed)
     out = []
-    for T in track():
+    for i, T in enumerate(track()):
         odom = se3.compose(R.T @ T[:3, :3], R.T @ (T[:3, 3] - t) / scale)
         noise = np.r_[rng.normal(0, 0.01, 2), rng.normal(yaw_bias, 0.05)]
         prior = PosePrior(
@@ -41,7 +42,7 @@ def anchors(
             60.0 + rng.normal(0, 2.0),
             3.0,
         )
-        out.append(Anchor(odom, prior, 60.0 / scale))
+        out.append(Anchor(odom, prior, 60.0 / scale, time_s=float(i)))
     return out
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.posegraph.alignment import Anchor, fit
+from recon.posegraph.alignment import fit
+from recon.posegraph.anchors import Anchor
 from recon.posegraph.between_keyframes import FixAverage
 from recon.posegraph.sensor_offsets import altitude_datum
 from recon.types import PosePrior

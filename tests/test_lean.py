@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.posegraph.alignment import Anchor, Similarity, fit
+from recon.posegraph.alignment import Similarity, fit
+from recon.posegraph.anchors import Anchor
 from recon.posegraph.level_ground import ASSUMED_TILT_RAD
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
@@ -74,16 +75,19 @@ def test_one_strip_does_not_show_whether_it_leans() -> None:
     flown = stills(1, 8.0)
     found = fit(flown.anchors)
     assert found is not None and found.sigma_lean_rad is not None
-    assert 4.0 < flown.lean_deg(found) < 2.0 * np.degrees(found.sigma_lean_rad)
+    assert flown.lean_deg(found) < 2.0 * np.degrees(found.sigma_lean_rad)
+    assert np.degrees(found.sigma_lean_rad) > 3.0
 
 
-def settled(flown: Stills) -> Trajectory:
-    """The track of the stills by its pose graph."""
-    trajectory = Trajectory()
+def settled(flown: Stills, broken_at: int = 10**6, turn_rad: float = 1e-4) -> Trajectory:
+    """The track of the stills by its pose graph, whose steps turn by ``turn_rad`` too much; a new
+    segment begins at ``broken_at``."""
+    trajectory, start = Trajectory(), np.eye(4)
     for k, anchor in enumerate(flown.anchors):
+        start = se3.inverse(anchor.T_odom_camera) if k == broken_at else start
         trajectory.add(
-            k, 0, anchor.T_odom_camera, anchor.prior, None, round(anchor.time_s * 1e9),
-            np.diag([1e-4**2] * 3 + [0.01**2] * 3),
+            k, int(k >= broken_at), start @ anchor.T_odom_camera, anchor.prior, None,
+            round(anchor.time_s * 1e9), np.diag([turn_rad**2] * 3 + [0.01**2] * 3),
         )  # fmt: skip
     trajectory.moved(final=True)
     return trajectory
@@ -116,3 +120,30 @@ def test_the_drift_of_altitudes_does_not_bend_the_track() -> None:
     trajectory = settled(flown)
     z = [trajectory.place(k).T_world_camera[2, 3] for k in range(len(flown.anchors))]
     assert np.std(z) < 3.0
+
+
+@pytest.mark.parametrize("broken_at", [12, 66])
+def test_a_short_segment_has_the_noise_and_the_height_of_its_flight(broken_at: int) -> None:
+    """Altitudes state no accuracy, and ten stills show none: 50 m are typical."""
+    flown = stills(4, 4.0, turns=True)
+    trajectory = settled(flown, broken_at)
+    sigma_m = [trajectory.graph.sigma_height_m(segment) for segment in (0, 1)]
+    assert all(sigma is not None and sigma < 5.0 for sigma in sigma_m)
+    z = np.array([trajectory.place(k).T_world_camera[2, 3] for k in range(len(flown.anchors))])
+    assert abs(np.mean(z[:broken_at]) - np.mean(z[broken_at:])) < 2.0
+
+
+def test_altitudes_that_drift_lay_no_segment_on_another() -> None:
+    trajectory = settled(stills(4, 4.0, turns=True, drift_m=50.0), 38)
+    sigma_m = [trajectory.graph.sigma_height_m(segment) for segment in (0, 1)]
+    assert max(sigma or 0.0 for sigma in sigma_m) > 20.0
+
+
+def test_what_is_level_is_as_unsure_as_vision_bends() -> None:
+    flown = stills(4, 0.0)
+    straight, bent = (settled(flown, turn_rad=turn).similarity(0) for turn in (1e-6, 1e-3))
+    assert straight is not None and straight.sigma_lean_rad is not None
+    assert bent is not None and bent.sigma_lean_rad is not None
+    bend_rad = np.sqrt(bent.sigma_lean_rad**2 - straight.sigma_lean_rad**2)
+    walks = np.cumsum(np.random.default_rng(1).normal(0, 1e-3, (500, len(flown.anchors))), axis=1)
+    assert bend_rad == pytest.approx(np.sqrt(np.mean(np.var(walks, axis=1))), rel=0.1)

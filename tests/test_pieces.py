@@ -46,11 +46,15 @@ class Ties:
     loops: list[Edge] = field(default_factory=list)
     fixed: tuple[int, ...] = ()
     tied: tuple[int, ...] = ()
-    sigma_height_m: float = 1.0
+    sigma_m: float = 1.0  # of the height, whatever it is against
+    against_m: float | None = None  # of one segment's against another's
+
+    def sigma_height_m(self, segment: int) -> float | None:
+        return self.against_m
 
     def similarity(self, segment: int) -> Similarity | None:
         sources = ("gnss",) if segment in self.fixed else ("altitude",)
-        covariance = np.diag([1.0] * 5 + [self.sigma_height_m**2, 1.0])
+        covariance = np.diag([1.0] * 5 + [self.sigma_m**2, 1.0])
         return Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
 
     def is_tied(self, segment: int) -> bool:
@@ -88,11 +92,13 @@ def test_fixes_without_a_height_do_not_lay_one_stretch_on_another() -> None:
     """A camera's receiver errs by tens of metres in height: two layers of one ground."""
     every = (0, 1, 2, 3)
     high = replace(PLACED, sigma_position_m=np.array([5.0, 5.0, 50.0]))
-    coarse = Ties(fixed=every, tied=every, sigma_height_m=50.0)
+    coarse = Ties(fixed=every, tied=every, sigma_m=50.0)
     assert apart(coarse, prior=high) == [(0, 2), (20, 22), (30, 32)]
+    assert apart(replace(coarse, against_m=20.0), prior=high) == [(0, 2), (20, 22), (30, 32)]
+    assert apart(replace(coarse, against_m=2.0), prior=high) == []
     tied = replace(coarse, loops=[Edge(2, 11, True)])
     assert apart(tied, prior=high) == [(20, 22), (30, 32)]
-    assert apart(Ties(fixed=every, tied=every, sigma_height_m=5.0)) == []
+    assert apart(Ties(fixed=every, tied=every, sigma_m=5.0)) == []
 
 
 def test_a_forgotten_loop_still_ties() -> None:

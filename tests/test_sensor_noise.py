@@ -13,7 +13,8 @@ from scipy.optimize import nnls
 from scipy.stats import chi2
 
 from recon import se3
-from recon.posegraph.alignment import Anchor, fit, scales
+from recon.posegraph.alignment import fit, scales
+from recon.posegraph.anchors import Anchor
 from recon.posegraph.between_keyframes import Odometer
 from recon.posegraph.sensor_noise import (
     CHI_SQUARED_MEDIANS,
@@ -53,6 +54,43 @@ def test_white_noise_and_wander_are_separated(white: float, wander: float, tau_s
         found.append((noise.white, noise.wander, noise.of_each(300, 600.0)))
     each = Noise(white, wander, tau_s).of_each(300, 600.0)
     assert np.median(found, axis=0) == pytest.approx([white, wander, each], rel=0.2, abs=0.15)
+
+
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_weights_of_wandering_readings_agree_with_the_dense_inverse(count: int) -> None:
+    rng = np.random.default_rng(count)
+    times, extra = np.sort(rng.uniform(0, 90, count)), rng.exponential(size=count)
+    apart = np.abs(times[:, None] - times)
+    dense = 1.2**2 * np.exp(-apart / 30.0) + np.diag(0.4**2 + extra)
+    found = Noise(0.4, 1.2, 30.0).information(times, extra)
+    np.testing.assert_allclose(found, np.linalg.inv(dense), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("step_s", "legs", "most"), [(1.2, 1, 0.013), (0.6, 1, 0.012), (1.2, 3, 0.007)]
+)
+def test_sigma_of_the_scale_covers_fixes_that_wander(step_s: float, legs: int, most: float) -> None:
+    """Legs of 12 s at 6 m/s, where a wander of 1 m in 60 s stretches each by 1 %."""
+    error, sigma = np.array([wandering(step_s, legs, seed) for seed in range(20)]).T
+    assert np.sqrt(np.mean(error**2)) < most
+    assert 0.6 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
+
+
+def wandering(step_s: float, legs: int, seed: int) -> tuple[float, float]:
+    """Log of the scale that fixes of a flight to and fro give, which is 1, and its sigma."""
+    rng, times = np.random.default_rng(seed), seconds(int(12 * legs / step_s) + 1, step_s)
+    back = np.abs((times / 12.0 + 1.0) % 2.0 - 1.0)
+    at = np.column_stack([72.0 * back, 2.0 * times, 60.0 + 0.3 * np.sin(times)])
+    error = np.column_stack([gauss_markov(rng, times, sigma, 60.0) for sigma in (1.0, 1.5)])
+    fixes = at + error[:, :3] + 0.05 * rng.normal(size=at.shape)
+    claimed = np.array([1.0, 1.0, 1.5])
+    some = [
+        Anchor(se3.compose(NADIR, p), PosePrior(NADIR, 0.02, 0.1, fix, claimed), None, 0.0, t)
+        for p, fix, t in zip(at, fixes, times, strict=True)
+    ]
+    found = fit(some)
+    assert found is not None
+    return float(np.log(found.scale)), found.sigma_scale
 
 
 def test_outliers_do_not_count_as_noise() -> None:

@@ -89,7 +89,7 @@ class PoseGraph:
             covariance: (6, 6) of the motion since the last keyframe, a left perturbation in
                 the last camera's frame, in units of the odometry.
             prior: telemetry at this moment; parts may be missing.
-            height: above ground as :func:`recon.posegraph.alignment.height_above` gives it.
+            height: above ground as :func:`recon.posegraph.anchors.height_above` gives it.
         """
         above, lean = height if height is not None else (None, 0.0)
         node = Node(
@@ -184,6 +184,10 @@ class PoseGraph:
     def constants(self) -> Constants:
         """Constant errors of the sensors, as known for the newest segment."""
         return self._segments.constants(self._newest().segment) if self._nodes else Constants()
+
+    def sigma_height_m(self, segment: int) -> float | None:
+        """Sigma of a segment's height against the largest one by fixes; None where unknown."""
+        return self._segments.sigma_height_m(segment)
 
     def is_tied(self, segment: int) -> bool:
         """True when fixes or a loop locate the segment."""

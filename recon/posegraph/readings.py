@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from recon import se3
-from recon.posegraph.alignment import MIN_FIX_M, Anchor, ReadingNoise, height_ratio
+from recon.posegraph.alignment_readings import MIN_FIX_M, ReadingNoise
+from recon.posegraph.anchors import Anchor, height_ratio
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.sensor_noise import PRECISE_M
 from recon.posegraph.smoother import NO_SCALE, Smoother

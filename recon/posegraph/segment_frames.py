@@ -10,7 +10,9 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph import alignment
-from recon.posegraph.alignment import Anchor, ReadingNoise, Scale, Similarity
+from recon.posegraph.alignment import Scale, Similarity
+from recon.posegraph.alignment_readings import ReadingNoise
+from recon.posegraph.anchors import Anchor
 from recon.posegraph.between_keyframes import at_camera
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_offsets import Constants, Offsets, constants, offsets
@@ -100,6 +102,20 @@ class SegmentFrames:
         frame = self._frames.get(segment)
         return None if frame is None else frame.noise
 
+    def _usual_noise(self) -> ReadingNoise | None:
+        """That of the fixes of the largest segment which shows it."""
+        known = [s for s, f in self._frames.items() if f.noise and f.noise.horizontal]
+        largest = max(known, key=self._seen.__getitem__, default=None)
+        return None if largest is None else self.noise(largest)
+
+    def sigma_height_m(self, segment: int) -> float | None:
+        """Sigma of a segment's height against the largest one of known heights; None without."""
+        known = {s: f.heights for s, f in self._frames.items() if f.heights is not None}
+        if segment not in known:
+            return None
+        main = max(known, key=self._seen.__getitem__)
+        return 0.0 if segment == main else known[segment].sigma_to(known[main])
+
     def rests_on_fixes(self, segment: int) -> bool:
         """True when positions place the segment."""
         frame = self._frames.get(segment)
@@ -145,9 +161,11 @@ class SegmentFrames:
         self._fitted[segment] = seen
         fresh = self._newest_constants()
         anchors = self._anchors(segment, fresh)
-        found = alignment.fit(anchors, *self._wander_s, slow_share=fresh.datum.slow_share)
+        found = alignment.fit(anchors, *self._wander_s, slow_share=fresh.datum.slow_share,
+                              usual=self._usual_noise())  # fmt: skip
         if found is None:
             return False
+        found = replace(found, bend_rad=_bend_rad(nodes))
         if "gnss" not in found.sources and nodes[0].key > 0:
             found = _kept_in_place(found, nodes[0], pose(nodes[0].key))
         if found.sigma_fixes is not None:
@@ -195,6 +213,14 @@ class SegmentFrames:
             Anchor(n.T_odom_camera, known.applied(n.prior), n.height, n.lean, n.time_ns * 1e-9)
             for n in self.nodes[segment]
         ]
+
+
+def _bend_rad(nodes: list[Node]) -> float:
+    """Sigma of the turn of a segment's part against its mean, about each axis.
+
+    A random walk of variance v from end to end has v / 6 about its mean.
+    """
+    return float(np.sqrt(sum(np.trace(n.covariance[:3, :3]) for n in nodes[1:]) / 18.0))
 
 
 def _differ(before: Similarity, found: Similarity, nodes: list[Node]) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solveh_banded
 
 from recon.types import F64
 
@@ -47,6 +48,10 @@ MAX_PAIRED = 400
 """Readings that are compared with each other; of more, every n-th."""
 
 
+MIN_FRESH = 1e-9
+"""Share of a wander's variance that is new in each reading, at least: two at one time."""
+
+
 @dataclass(frozen=True, slots=True)
 class Noise:
     """Errors of one kind of reading, 1 sigma per axis, in the readings' unit."""
@@ -54,11 +59,39 @@ class Noise:
     white: float
     wander: float
     tau_s: float
+    steady: float = 0.0  # drift from the middle of the readings to either end
 
     @property
     def total(self) -> float:
         """Of one reading."""
         return float(np.hypot(self.white, self.wander))
+
+    def information(self, times_s: F64, extra: F64) -> F64:
+        """(N, N) inverse of the covariance of readings at (N,) times.
+
+        ``extra`` (N,) is each reading's own variance besides the white one, which is not 0. The
+        inverse of a Gauss-Markov covariance K is tridiagonal, and with D of the readings' own
+        variances (D + K)^-1 = D^-1 - D^-1 (K^-1 + D^-1)^-1 D^-1 (Woodbury).
+        """
+        own = self.white**2 + extra
+        if len(own) < 2 or self.wander == 0.0:
+            P = np.diag(1.0 / (own + self.wander**2))
+        else:
+            keep = np.exp(-np.diff(times_s) / self.tau_s)
+            fresh = 1.0 / (self.wander**2 * np.maximum(1.0 - keep**2, MIN_FRESH))
+            inner = np.zeros((2, len(own)))
+            inner[0, 1:] = -keep * fresh
+            inner[1] = 1.0 / own
+            inner[1, 0] += self.wander**-2
+            inner[1, 1:] += fresh
+            inner[1, :-1] += keep**2 * fresh
+            D = np.diag(1.0 / own)
+            P = D - solveh_banded(inner, D) / own[:, None]
+        if self.steady == 0.0:
+            return np.asarray(P)
+        ends = 2.0 * (times_s - times_s[0]) / max(float(np.ptp(times_s)), 1e-9) - 1.0
+        drift = P @ ends
+        return np.asarray(P - np.outer(drift, drift) / (self.steady**-2 + ends @ drift))
 
     def bounded(self, claimed: float, usual_tau_s: float, least: float) -> Noise:
         """The same with a wander between ``least`` and what the sensor claims.
@@ -71,6 +104,27 @@ class Noise:
             return self
         tau_s = PRECISE_TAU_S if claimed < PRECISE_M else usual_tau_s
         return replace(self, wander=min(max(self.wander, least), claimed), tau_s=tau_s)
+
+    def drifting(self, claimed: float, tau_s: float, span_s: float) -> Noise:
+        """The same with the steady drift that a wander as far as :meth:`reach` says may have.
+
+        Over a track without turns it looks like another scale, so no residual shows it. The wander
+        is at most as ``claimed``.
+        """
+        if tau_s <= 0:
+            return self
+        wander = min(self.wander, claimed)
+        spans = span_s / (PRECISE_TAU_S if claimed < PRECISE_M else tau_s)
+        # Variance of the slope of a Gauss-Markov error: spans / 5 if short, 2 / spans if long.
+        slope = 3.0 * spans / (5.0 + 0.5 * spans**2)
+        far = max(self.reach(claimed, MIN_WANDER) ** 2 - wander**2, 0.0)
+        return replace(self, wander=wander, steady=float(np.sqrt(far * slope)))
+
+    def over(self, unit: float) -> Noise:
+        """The same in another unit."""
+        return replace(
+            self, white=self.white / unit, wander=self.wander / unit, steady=self.steady / unit
+        )
 
     def of_each(self, count: int, span_s: float) -> float:
         """The sigma of each of ``count`` readings over ``span_s``, as if all were independent.
@@ -113,17 +167,24 @@ def wander_noise(
     if len(lag) < 3:
         return None
     weight = np.sqrt(lag[-1] / lag) / np.maximum(change, 1e-12 + 0.01 * change.max())
-    found = []
-    taus = [tau for tau in TAUS_S if tau <= lag[-1] / TAUS_SEEN]
-    for tau_s in [*taus, usual_tau_s] if usual_tau_s > 0 else []:
-        columns = np.column_stack([np.full(len(lag), 2.0), 2.0 * (1.0 - np.exp(-lag / tau_s))])
-        parts, error = nonnegative(columns * weight[:, None], change * weight)
-        found.append((error, tau_s, parts))
-    white, flat_error = nonnegative(2.0 * weight[:, None], change * weight)
-    error, tau_s, parts = min(found, key=lambda one: one[0], default=(np.inf, 1.0, white))
-    if flat_error < sure * error:
-        return Noise(float(np.sqrt(white[0])), 0.0, max(usual_tau_s, 1.0))
-    return Noise(float(np.sqrt(parts[0])), float(np.sqrt(parts[1])), tau_s)
+
+    def fitted(*columns: F64) -> tuple[F64, float]:
+        A = np.column_stack(columns) * weight[:, None]
+        parts = np.linalg.lstsq(A, change * weight, rcond=None)[0]
+        return parts, float(np.linalg.norm(A @ parts - change * weight))
+
+    two = np.full(len(lag), 2.0)
+    (white,), least = fitted(two)
+    best = Noise(float(np.sqrt(white)), 0.0, max(usual_tau_s, 1.0))
+    shorter = [tau for tau in TAUS_S if tau <= lag[-1] / TAUS_SEEN]
+    for tau_s in [usual_tau_s, *shorter] if usual_tau_s > 0 else []:
+        parts, error = fitted(two, 2.0 * (1.0 - np.exp(-lag / tau_s)))
+        if parts[1] > 0.0 and sure * error <= least:
+            # Means and filtered positions change less over short lags: as if white^2 < 0.
+            own, common = np.sqrt(np.maximum(parts, 0.0))
+            best, least = Noise(float(own), float(common), tau_s), error
+            sure = max(sure, SURE_OF_WANDER)
+    return best
 
 
 def drift_noise(times_s: F64, residuals: F64) -> tuple[float, float] | None:

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from recon import se3
-from recon.posegraph.alignment import EXACT_HEIGHTS, Anchor, Similarity, height_ratios
+from recon.posegraph.alignment import Similarity
+from recon.posegraph.anchors import EXACT_HEIGHTS, Anchor, height_ratios
 from recon.types import F64, PosePrior
 
 SIGMA_RAD = np.radians(2.0)

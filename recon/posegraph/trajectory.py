@@ -145,7 +145,7 @@ class Trajectory:
     ) -> None:
         """Append a keyframe to its segment.
 
-        ``height`` comes from :func:`recon.posegraph.alignment.height_above`, in odometry units, and
+        ``height`` comes from :func:`recon.posegraph.anchors.height_above`, in odometry units, and
         ``covariance`` is of the step from the keyframe before, as in
         :meth:`recon.posegraph.pose_graph.PoseGraph.add_keyframe`.
         """

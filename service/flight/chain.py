@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from recon import se3
-from recon.posegraph.alignment import height_above, height_below
+from recon.posegraph.anchors import height_above, height_below
 from recon.posegraph.between_keyframes import carried
 from recon.posegraph.level_ground import levelled
 from recon.posegraph.pose_graph import PoseGraph
@@ -29,8 +29,9 @@ FARTHEST_M = 1e6
 
 HEADING_KNOWN_RAD = 1.0
 
-HEIGHT_KNOWN_M = 20.0
-"""Sigma of a fix's height below which it lays two stretches of one flight on each other."""
+HEIGHT_KNOWN_M, HEIGHTS_AGREE_M = 20.0, 5.0
+"""Sigma of a fix's height below which it lays two stretches of one flight on each other, and of one
+stretch's height against the other's."""
 
 
 class KeyframeStep(NamedTuple):
@@ -257,7 +258,8 @@ class Pieces:
                 _join(piece, a, b)
                 looped |= {a, b}
         heights = {s: sigma for s in piece if (sigma := _sigma_height_m(graph, s)) is not None}
-        loose = {s for s, sigma in heights.items() if sigma > HEIGHT_KNOWN_M}
+        unsure = {s for s, sigma in heights.items() if sigma > HEIGHT_KNOWN_M}
+        loose = {s for s in unsure if not _agrees(graph, s)}
         fixed = [s for s in self._segments if s in self._placed or s in heights.keys() - loose]
         for segment in fixed[1:]:
             _join(piece, fixed[0], segment)
@@ -288,6 +290,13 @@ def _sigma_height_m(graph: PoseGraph, segment: int) -> float | None:
     if found is None or "gnss" not in found.sources:
         return None
     return float(np.sqrt(found.covariance[5, 5]))
+
+
+def _agrees(graph: PoseGraph, segment: int) -> bool:
+    """True when the height is known against the largest segment's: what all fixes of a flight err
+    by lays none on another."""
+    sigma_m = graph.sigma_height_m(segment)
+    return sigma_m is not None and sigma_m < HEIGHTS_AGREE_M
 
 
 def _join(piece: dict[int, int], a: int, b: int) -> None:

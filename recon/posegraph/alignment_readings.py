@@ -1,0 +1,374 @@
+"""The readings that place a segment, as rows of one least-squares problem, and how they err.
+
+Errors of fixes next to each other are not independent: fixes weigh by the inverse of their
+covariance (:mod:`recon.posegraph.sensor_noise`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from recon import se3
+from recon.posegraph.anchors import UNMEASURED_HEIGHTS, Anchor, height_ratios
+from recon.posegraph.sensor_noise import PRECISE_M, PRECISE_TAU_S, Noise
+from recon.types import F64, PosePrior
+
+WANDER_SHARE = 0.4
+"""Share of a fix's sigma that differs between fixes of one flight; the rest is common to all."""
+
+GUESSED_SHARE = 0.5
+"""Relative sigma of a height that is assumed: it holds a scale that nothing else gives."""
+
+KNOWN_YAW_RAD, NO_YAW_RAD = 1.0, 3.0
+"""Sigma below which a heading counts as known, and one of a heading that is not."""
+
+MIN_FIX_M = 0.005
+"""Sigma that no fix is better than."""
+
+UNKNOWNS = 11
+"""Rotation, shift and log scale; an assumed view's mount and the drift of altitudes."""
+
+AXES = (slice(0, 2), slice(2, 3))
+"""Those of a position that err alike: horizontal and vertical."""
+
+TINY = 1e-6
+"""Sigma of what no reading has."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Common:
+    """Errors that readings of one kind have in common, where nothing states their accuracy."""
+
+    mount_rad: F64 = field(default_factory=lambda: np.zeros(3))  # turns an assumed view
+    drift_m: float = 0.0  # by which altitudes are too high at the end, and too low at the start
+    middle_s: float = 0.0
+    half_s: float = 1.0
+
+    def along(self, time_s: float | F64) -> F64:
+        """Times as -1 at the start of the readings to 1 at their end, and no further."""
+        return np.asarray(np.clip((time_s - self.middle_s) / self.half_s, -1.0, 1.0))
+
+    def applied(self, prior: PosePrior, time_s: float) -> PosePrior:
+        """The prior without them."""
+        R, position = prior.R_world_camera, prior.position_m
+        if R is not None and prior.is_view_assumed:
+            R = R @ se3.so3_exp(self.mount_rad)
+        if position is not None:
+            position = position - np.array([0.0, 0.0, self.drift_m * float(self.along(time_s))])
+        return replace(prior, R_world_camera=R, position_m=position)
+
+
+@dataclass(frozen=True, slots=True)
+class Heights:
+    """What fixes of one receiver tell about heights against each other."""
+
+    sigma_m: float  # of the mean height
+    time_s: float
+    rate_m_s: float  # of their drift, 0 where they state their accuracy
+    sigma_rate_m_s: float
+
+    def sigma_to(self, main: Heights) -> float:
+        """Sigma in m of the mean height against that of the main segment, which shows the drift."""
+        passed_s = abs(self.time_s - main.time_s)
+        drift_m = passed_s * float(np.hypot(main.rate_m_s, main.sigma_rate_m_s))
+        return float(np.sqrt(self.sigma_m**2 + main.sigma_m**2 + drift_m**2))
+
+
+def _together(times_s: F64 | Sequence[float], wander_s: float) -> float:
+    """Factor on the sigmas of readings at (n,) times whose errors wander with a time constant."""
+    if len(times_s) == 0:
+        return 1.0
+    independent = 1.0 + float(np.ptp(times_s)) / (2.0 * max(wander_s, 1e-3))
+    return float(np.sqrt(max(1.0, len(times_s) / independent)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadingNoise:
+    """How fixes and velocities err along one flight, 1 sigma per axis."""
+
+    horizontal: Noise | None = None  # of a fix, m; None: as it claims
+    vertical: Noise | None = None
+    apart: tuple[Noise, Noise] | None = None  # the same off vision's track, which drifts as well
+    reach_m: F64 | None = None  # (3,) how far fixes may wander
+    tilt: Noise | None = None  # of an assumed view about its mount, rad
+    claimed: F64 | None = None  # (3,) m as the fixes claim it
+    walk_m_per_sqrt_s: float = 0.1  # of the integrated velocity
+    rate_m_s: float = 0.05  # constant part of the velocity's error
+
+    def of_fixes(self, claimed: F64, fix_s: float) -> tuple[F64, tuple[Noise, Noise]]:
+        """(m, 3) sigma of a fix alone, and how such errors, in units of it, go along the track:
+        horizontal and vertical."""
+        if self.apart is not None:
+            across, along = (replace(n, white=max(n.white, MIN_FIX_M)) for n in self.apart)
+            single = np.full_like(claimed, [across.total, across.total, along.total])
+            return single, (across.over(across.total), along.over(along.total))
+        is_precise = len(claimed) > 0 and float(np.median(claimed[:, 0])) < PRECISE_M
+        tau_s = PRECISE_TAU_S if is_precise else fix_s
+        common = (WANDER_SHARE**-2 - 1.0) ** 0.5 if fix_s > 0 else 0.0
+        usual = Noise(1.0, common, max(tau_s, 1.0))
+        return WANDER_SHARE * claimed, (usual, usual)
+
+    def or_else(self, usual: ReadingNoise | None, claimed: F64) -> ReadingNoise:
+        """The same with the ``usual`` noise of fixes that claim as much, (m, 3), if their own is
+        not known."""
+        if self.horizontal is not None or usual is None or usual.claimed is None:
+            return self
+        if not len(claimed) or np.any(np.abs(np.log(np.median(claimed, 0) / usual.claimed)) > 0.5):
+            return self
+        tilt = self.tilt or usual.tilt
+        walk, rate = self.walk_m_per_sqrt_s, self.rate_m_s
+        return replace(usual, tilt=tilt, walk_m_per_sqrt_s=walk, rate_m_s=rate)
+
+    def of_tilts(self, claimed: F64, times_s: F64, attitude_s: float) -> F64:
+        """(n, 2) sigma with which assumed views weigh, of (n, 2) claimed ones at (n,) times."""
+        if self.tilt is None:
+            return np.asarray(claimed * _together(times_s, attitude_s))
+        span_s = float(np.ptp(times_s)) if len(times_s) else 0.0
+        return np.full_like(claimed, self.tilt.of_each(len(claimed), span_s))
+
+    def of_mean(self, claimed: F64, times_s: F64, fix_s: float) -> tuple[F64, F64]:
+        """(3,) sigma of the mean error of fixes with (m, 3) claimed sigmas at (m,) times, and what
+        the readings in a graph count for it."""
+        usual, span_s = np.median(claimed, axis=0), float(np.ptp(times_s))
+        if self.horizontal is None or self.vertical is None or self.reach_m is None:
+            return usual, usual / np.sqrt(1.0 + span_s / (2.0 * fix_s))
+        known = (self.horizontal, self.horizontal, self.vertical)
+        mean = [one.of_mean(float(m), span_s) for one, m in zip(known, self.reach_m, strict=True)]
+        counted = [one.of_each(len(claimed), span_s) / len(claimed) ** 0.5 for one in known]
+        return np.array(mean), np.array(counted)
+
+    def of_travels(self, seconds: F64, span_s: float) -> F64:
+        """(k,) sigma of ways of so many seconds each; over all of them the rate adds up."""
+        variance = self.walk_m_per_sqrt_s**2 + self.rate_m_s**2 * span_s
+        return np.asarray(np.sqrt(variance * np.maximum(seconds, 1e-3)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """A similarity, and the errors that readings have in common."""
+
+    R: F64
+    t: F64
+    log_scale: float
+    mount: F64 = field(default_factory=lambda: np.zeros(3))
+    drift: float = 0.0
+
+    def moved(self, step: F64) -> State:
+        """The state after a step (UNKNOWNS,)."""
+        return State(
+            se3.so3_exp(step[:3]) @ self.R, self.t + step[3:6], self.log_scale + float(step[6]),
+            self.mount + step[7:10], self.drift + float(step[10]),
+        )  # fmt: skip
+
+
+class AlignmentReadings:
+    """The anchors' readings as arrays, by kind; rows of one reading form a group."""
+
+    def __init__(
+        self,
+        anchors: Sequence[Anchor],
+        noise: ReadingNoise | None = None,
+        wander_s: tuple[float, float] = (60.0, 40.0),
+    ) -> None:
+        turned = [a for a in anchors if a.prior.R_world_camera is not None]
+        fixed = [a for a in anchors if has_fix(a.prior)]
+        moved = [(a, b) for a, b in pairwise(anchors) if _are_on_one_run(a.prior, b.prior)]
+        heights, independent = height_ratios(anchors)
+        noise, (fix_s, attitude_s) = noise or ReadingNoise(), wander_s
+        self.R_odom = _stack([a.T_odom_camera[:3, :3] for a in turned], (3, 3))
+        self.R_prior = _stack([a.prior.R_world_camera for a in turned], (3, 3))
+        self.is_assumed = np.array([a.prior.is_view_assumed for a in turned], bool)
+        self.sigma_turn = _stack(
+            [[a.prior.sigma_tilt_rad] * 2 + [a.prior.sigma_yaw_rad] for a in turned], (3,)
+        )
+        self.heading_known = self.sigma_turn[:, 2] < KNOWN_YAW_RAD
+        self.tilt_s = _stack([a.time_s for a in turned if a.prior.is_view_assumed], ())
+        self.sigma_turn[~self.is_assumed] *= _together(
+            [a.time_s for a in turned if not a.prior.is_view_assumed], attitude_s
+        )
+        self.sigma_turn[self.is_assumed, :2] = noise.of_tilts(
+            self.sigma_turn[self.is_assumed, :2], self.tilt_s, attitude_s
+        )
+        self.x = _stack([a.place_of_fix for a in fixed], (3,))
+        self.fix = _stack([a.prior.position_m for a in fixed], (3,))
+        self.claimed = _stack([a.prior.sigma_position_m for a in fixed], (3,))
+        self.fix_s = _stack([a.time_s for a in fixed], ())
+        self.is_height_claimed = all(a.prior.is_sigma_claimed for a in fixed)  # so without any
+        self.sigma_fix, self.wander = noise.of_fixes(self.claimed, fix_s)
+        self.step = _stack([b.place - a.place for a, b in moved], (3,))
+        self.way = _stack([_way(a.prior, b.prior) for a, b in moved], (3,))
+        self.way_s = _stack([_seconds(a.prior, b.prior) for a, b in moved], ())
+        self.sigma_way = noise.of_travels(self.way_s, float(np.sum(self.way_s)))
+        self.has_measured_heights = bool(heights) and independent > UNMEASURED_HEIGHTS
+        self.has_heights = any(sigma < GUESSED_SHARE for _, sigma in heights)
+        self.log_ratio = _stack([h[0] for h in heights], ())
+        thinned = min(1.0, (independent / max(len(heights), 1)) ** 0.5)
+        self.sigma_log = _stack([h[1] for h in heights], ()) / thinned
+        three, single = len(turned) + len(fixed) + len(moved), len(heights)
+        counts = np.array([3] * three + [1] * single + [4], int)
+        self.group = np.repeat(np.arange(len(counts)), counts)
+        """(M,) the group of each row."""
+        known = 1.0 / self.sigma_turn
+        known[~self.heading_known, 2] = 0.0
+        way = np.repeat(1.0 / self.sigma_way, 3)
+        self._whitening = np.concatenate(
+            [known.ravel(), 1.0 / self.sigma_fix.ravel(), way, 1.0 / self.sigma_log,
+             1.0 / self._sigma_common(turned)]
+        )  # fmt: skip
+        self.of_fixes = slice(len(turned), len(turned) + len(fixed))
+        """Groups of the fixes."""
+        self._turned, self._fixed = 3 * len(turned), 3 * len(fixed)
+        self._rows = slice(self._turned, self._turned + self._fixed)  # of the fixes
+        self._scaled = slice(self._turned, 3 * three)
+        self._J = np.zeros((len(self.group), UNKNOWNS))  # where it is constant
+        self._J[: self._turned, :3] = np.tile(np.eye(3), (len(turned), 1))
+        self._J[self._rows, 3:6] = np.tile(np.eye(3), (len(fixed), 1))
+        self._J[self._rows, 10] = np.outer(self.along, [0.0, 0.0, 1.0]).ravel()
+        self._J[3 * three : -4, 6] = 1.0
+        self._J[-4:, 7:] = np.eye(4)
+
+    def _sigma_common(self, turned: Sequence[Anchor]) -> F64:
+        """(4,) of the assumed mount and of the altitudes' drift; next to none where there is
+        neither."""
+        tilts = [a.prior.sigma_tilt_rad for a in turned if a.prior.is_view_assumed]
+        mount = float(np.median(tilts)) if tilts else TINY
+        drift = TINY if self.is_height_claimed else float(np.median(self.claimed[:, 2]))
+        return np.array([mount] * 3 + [drift])
+
+    @cached_property
+    def spanned(self) -> Common:
+        """The times of the fixes."""
+        if len(self.fix_s) == 0:
+            return Common()
+        first, last = float(self.fix_s[0]), float(self.fix_s[-1])
+        return Common(middle_s=0.5 * (first + last), half_s=max(0.5 * (last - first), 1e-3))
+
+    @property
+    def along(self) -> F64:
+        """(m,) times of the fixes, -1 to 1."""
+        return self.spanned.along(self.fix_s)
+
+    def heights(self, at: State, H: F64, covariance: F64) -> Heights:
+        """What the fixes tell about the mean height; ``covariance`` (7, 7) is that of the fit."""
+        east, north, up = np.exp(at.log_scale) * at.R @ self.x.mean(axis=0)
+        of_mean = np.array([north, -east, 0.0, 0.0, 0.0, 1.0, up])
+        sigma_m, time_s = float(np.sqrt(of_mean @ covariance @ of_mean)), float(self.fix_s.mean())
+        if self.is_height_claimed:
+            return Heights(sigma_m, time_s, 0.0, 0.0)
+        sigma_drift_m = float(np.sqrt(np.linalg.inv(H)[10, 10]))
+        half_s = self.spanned.half_s
+        return Heights(sigma_m, time_s, at.drift / half_s, sigma_drift_m / half_s)
+
+    def common(self, at: State) -> Common:
+        """What the readings have in common."""
+        return replace(self.spanned, mount_rad=at.mount, drift_m=at.drift)
+
+    def linearised(self, at: State) -> tuple[F64, F64]:
+        """Whitened residuals (M,) and Jacobian (M, UNKNOWNS)."""
+        fix, way = self.placed(at), self.moved(at)
+        turn, of_mount = self.turned(at)
+        J = self._J.copy()
+        drifted = np.outer(self.along * at.drift, [0.0, 0.0, 1.0])
+        y = np.concatenate([fix + self.fix - drifted - at.t, way + self.way])
+        of = J[self._scaled].reshape(-1, 3, UNKNOWNS)
+        of[:, 0, 1], of[:, 1, 2], of[:, 2, 0] = y[:, 2], y[:, 0], y[:, 1]
+        of[:, 0, 2], of[:, 1, 0], of[:, 2, 1] = -y[:, 1], -y[:, 2], -y[:, 0]
+        of[:, :, 6] = y
+        J[: self._turned, 7:10] = of_mount.reshape(-1, 3)
+        height, common = at.log_scale - self.log_ratio, np.r_[at.mount, at.drift]
+        r = np.concatenate([turn.ravel(), fix.ravel(), way.ravel(), height, common])
+        return r * self._whitening, J * self._whitening[:, None]
+
+    def information(self, extra: F64) -> list[F64]:
+        """(m, m) inverse covariances of whitened fixes, horizontal and vertical, each with an
+        ``extra`` (2, m) variance of its own."""
+        return [n.information(self.fix_s, e) for n, e in zip(self.wander, extra, strict=True)]
+
+    def alone(self, r: F64, known: Sequence[F64], extra: F64) -> F64:
+        """(m,) whitened residual of each fix against what all others tell about its error."""
+        fixes, square = r[self._rows].reshape(-1, 3), np.zeros(len(self.fix))
+        for axes, P, own in zip(AXES, known, extra, strict=True):
+            variance = 1.0 / np.diag(P)
+            left = (P @ fixes[:, axes]) * variance[:, None]
+            square += np.sum(left**2, axis=1) / (variance - own)
+        return np.sqrt(square)
+
+    def doubted(self, known: Sequence[F64], extra: F64, weight: F64) -> F64:
+        """(2, m) variance that gives fixes the weight (groups,): their neighbours keep theirs."""
+        alone = np.array([1.0 / np.diag(P) for P in known]) - extra
+        return np.asarray(alone * (1.0 / np.maximum(weight[self.of_fixes], TINY) - 1.0))
+
+    def weighted(self, rows: F64, weight: F64, known: Sequence[F64]) -> F64:
+        """Whitened rows (M, k) times the inverse of their errors' covariance; ``weight`` (groups,)
+        is of all but fixes, whose inverse is ``known``."""
+        out = rows * weight[self.group][:, None]
+        fixes = rows[self._rows].reshape(len(self.fix), 3, rows.shape[1])
+        parts = [
+            np.einsum("ij,jak->iak", P, fixes[:, axes]) for axes, P in zip(AXES, known, strict=True)
+        ]
+        out[self._rows] = np.concatenate(parts, axis=1).reshape(-1, rows.shape[1])
+        return out
+
+    def excess(self, r: F64, kept: F64) -> float:
+        """Variance factor of the fixes: 1 where their residuals (M,) are as their noise says."""
+        none = np.zeros((2, len(self.fix)))
+        known = self.information(self.doubted(self.information(none), none, kept))
+        free = 3.0 * float(np.sum(kept[self.of_fixes])) - 7.0
+        weighted = self.weighted(r[:, None], kept, known)[:, 0]
+        return float(r[self._rows] @ weighted[self._rows]) / max(free, 1.0)
+
+    def placed(self, at: State) -> F64:
+        """(m, 3) m from the fixes, without their drift, to where the similarity has them."""
+        placed = np.exp(at.log_scale) * self.x @ at.R.T + at.t
+        return np.asarray(placed + np.outer(self.along * at.drift, [0.0, 0.0, 1.0]) - self.fix)
+
+    def moved(self, at: State) -> F64:
+        """(k, 3) m from ways by velocity to those by vision."""
+        return np.asarray(np.exp(at.log_scale) * self.step @ at.R.T - self.way)
+
+    def turned(self, at: State) -> tuple[F64, F64]:
+        """(n, 3) rotations from the attitudes; of one whose heading is unknown, the tilt alone.
+
+        And (n, 3, 3) how they change with the mount.
+        """
+        n = len(self.R_odom)
+        if n == 0:
+            return np.zeros((0, 3)), np.zeros((0, 3, 3))
+        seen, R_prior = at.R @ self.R_odom, self.R_prior.copy()
+        R_prior[self.is_assumed] = R_prior[self.is_assumed] @ se3.so3_exp(at.mount)
+        turn = se3.each_so3_log(seen @ R_prior.transpose(0, 2, 1))
+        up = np.einsum("nij,nj->ni", seen, R_prior[:, 2])  # where the prior's up points now
+        tilt = np.column_stack([-up[:, 1], up[:, 0], np.zeros(n)])
+        of_up = (seen @ se3.hat(R_prior[:, 2])) * self.is_assumed[:, None, None]
+        of_mount = np.stack([-of_up[:, 1], of_up[:, 0], np.zeros((n, 3))], axis=1)
+        return np.where(self.heading_known[:, None], turn, tilt), of_mount
+
+
+def has_fix(prior: PosePrior) -> bool:
+    return prior.position_m is not None and prior.sigma_position_m is not None
+
+
+def _are_on_one_run(a: PosePrior, b: PosePrior) -> bool:
+    """True when velocity was integrated from one to the other without a gap."""
+    return a.travel is not None and b.travel is not None and a.travel.run == b.travel.run
+
+
+def _way(a: PosePrior, b: PosePrior) -> F64:
+    """(3,) m flown by velocity between two priors of one run."""
+    assert a.travel is not None and b.travel is not None
+    return b.travel.metres - a.travel.metres
+
+
+def _seconds(a: PosePrior, b: PosePrior) -> float:
+    """Seconds between two priors of one run."""
+    assert a.travel is not None and b.travel is not None
+    return b.travel.seconds - a.travel.seconds
+
+
+def _stack(rows: Sequence[object], shape: tuple[int, ...]) -> F64:
+    return np.asarray(rows, np.float64).reshape(len(rows), *shape)

@@ -1,0 +1,122 @@
+"""Keyframes of the odometry with their telemetry, and the heights above ground that they give."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.types import F64, DepthMap, PosePrior
+
+INDEPENDENT_HEIGHTS = 4.0
+"""Heights of one flight count as so many: they share the ground's relief."""
+
+UNMEASURED_HEIGHTS = 1.0
+"""Heights above the take-off point, or assumed ones, count as so many: they share one offset."""
+
+EXACT_HEIGHTS = 16.0
+"""The same where the ground exactly below was measured: relief has no part in it."""
+
+LEANING_SHARE = 2.0
+"""Sigma of a height, as a share of it, per unit of (1 - cosine) off the vertical."""
+
+MIN_EXACT = 4
+"""Heights exactly below from which on no others count."""
+
+MIN_SPREAD = 0.005
+"""Share of a height by which readings of one flight may always differ."""
+
+EDGE_SHARE = 0.03
+"""Depths about the point below that differ by more than this share belong to an edge."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchor:
+    """A keyframe of the odometry with its telemetry."""
+
+    T_odom_camera: F64  # (4, 4)
+    prior: PosePrior
+    height: float | None  # of the camera above ground that it sees, in odometry units
+    lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is; 0 is below
+    time_s: float = 0.0
+
+    @property
+    def place(self) -> F64:
+        """(3,) of the camera, in the odometry."""
+        return np.asarray(self.T_odom_camera[:3, 3])
+
+    @property
+    def place_of_fix(self) -> F64:
+        """(3,) where the prior's position was, in the odometry."""
+        offset, T = self.prior.fix_offset, self.T_odom_camera
+        return T[:3, 3] if offset is None else T[:3, :3] @ offset + T[:3, 3]
+
+
+def height_above(points: F64, up: F64) -> tuple[float, float] | None:
+    """Height above the ground nearest below, and the deviation of that ground from the vertical.
+
+    Args:
+        points: (N, 3) ground in the camera's frame.
+        up: (3,) unit vector upwards in that frame.
+
+    The height is the median over the sixth of the points that lie most nearly below; the
+    second number is 1 - cosine of their angle from the vertical. None under 12 points.
+    """
+    if len(points) < 12:
+        return None
+    drop = -(points @ up)
+    cosine = drop / np.linalg.norm(points, axis=1)
+    below = np.argsort(-cosine)[: max(12, len(points) // 6)]
+    height = float(np.median(drop[below]))
+    return (height, 1.0 - float(np.median(cosine[below]))) if height > 0 else None
+
+
+def height_below(depth: DepthMap, up: F64) -> float | None:
+    """Height above the ground exactly below, in the depth map's unit; None where it is not seen.
+
+    ``up`` (3,) is the unit vector upwards in the camera's frame. Edges and holes do not count.
+    """
+    down = -up
+    if down[2] < 0.2:
+        return None
+    h, w = depth.depth_m.shape
+    u = round(float(depth.K[0, 0] * down[0] / down[2] + depth.K[0, 2]))
+    v = round(float(depth.K[1, 1] * down[1] / down[2] + depth.K[1, 2]))
+    if not (2 <= u < w - 2 and 2 <= v < h - 2):
+        return None
+    window = depth.depth_m[v - 2 : v + 3, u - 2 : u + 3]
+    known = window[np.isfinite(window)]
+    if len(known) < 15 or float(np.ptp(known)) > EDGE_SHARE * float(np.median(known)):
+        return None
+    return float(np.median(known)) / float(down[2])
+
+
+def height_ratio(anchor: Anchor) -> tuple[float, float] | None:
+    """Log of height by telemetry over height by vision, and its sigma; None without both."""
+    agl, height = anchor.prior.agl_m, anchor.height
+    if agl is None or height is None or not height > 0:
+        return None
+    # The height is measured straight below; ground seen elsewhere may lie otherwise.
+    sigma = anchor.prior.sigma_agl_m / agl + LEANING_SHARE * anchor.lean
+    return float(np.log(agl / height)), sigma
+
+
+def height_ratios(anchors: Sequence[Anchor]) -> tuple[list[tuple[float, float]], float]:
+    """:func:`height_ratio` of the anchors that have one, and as how many independent ones they
+    count.
+
+    Measured heights stand in for all others, and heights of the ground exactly below for those.
+    """
+    known = [(h, a) for a in anchors if (h := height_ratio(a)) is not None]
+    measured = [(h, a) for h, a in known if a.prior.is_agl_measured]
+    if not measured:
+        return [h for h, _ in known], UNMEASURED_HEIGHTS
+    exact = [h for h, a in measured if a.lean == 0.0]
+    if len(exact) < MIN_EXACT:
+        return [h for h, _ in measured], INDEPENDENT_HEIGHTS
+    # A rangefinder meets a tree where the image sees through it: single ones are far off.
+    ratio = np.array([h[0] for h in exact])
+    apart = np.abs(ratio - np.median(ratio))
+    limit = max(3.0 * 1.48 * float(np.median(apart)), MIN_SPREAD)
+    return [h for h, off in zip(exact, apart, strict=True) if off <= limit], EXACT_HEIGHTS
