@@ -298,6 +298,7 @@ def _solve(readings: AlignmentReadings, at: State, iterations: int) -> _Solution
     """Gauss-Newton with Huber's weights."""
     group, kept = readings.group, np.ones(int(readings.group[-1]) + 1)
     H, cost, extra = np.eye(UNKNOWNS), np.inf, np.zeros((2, len(readings.fix)))
+    weight = kept
     ridge = np.diag([1e-6] * 6 + [1e-4] + [0.0] * 4)
     for i in range(iterations + 10):
         r, J = readings.linearised(at)
@@ -317,7 +318,19 @@ def _solve(readings: AlignmentReadings, at: State, iterations: int) -> _Solution
         stands = np.abs(step).max() < 1e-7 or i >= iterations - 1
         if stands and not (kept.all() and _leave_out(readings, norms, kept)):
             break
-    return _Solution(at, H, cost, readings.excess(r, kept))
+    return _Solution(_centred(readings, at, weight), H, cost, readings.excess(r, kept))
+
+
+def _centred(readings: AlignmentReadings, at: State, weight: F64) -> State:
+    """The state whose track lies in the mean of the fixes, so that their mean error is its shift.
+
+    What is best for the slope of a wander rests on the first and last of them. ``weight``
+    (groups,) is less for outliers.
+    """
+    if not len(readings.fix):
+        return at
+    each = weight[readings.of_fixes, None] / readings.sigma_fix**2
+    return replace(at, t=at.t - np.average(readings.placed(at), axis=0, weights=each))
 
 
 def _leave_out(readings: AlignmentReadings, norms: F64, kept: F64) -> bool:

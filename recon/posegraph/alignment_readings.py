@@ -18,7 +18,7 @@ from recon.posegraph.anchors import UNMEASURED_HEIGHTS, Anchor, height_ratios
 from recon.posegraph.sensor_noise import PRECISE_M, PRECISE_TAU_S, Noise
 from recon.types import F64, PosePrior
 
-WANDER_SHARE = 0.4
+WANDER_SHARE = 0.6
 """Share of a fix's sigma that differs between fixes of one flight; the rest is common to all."""
 
 GUESSED_SHARE = 0.5
