@@ -65,7 +65,7 @@ def parse_size(text: str, option: str) -> tuple[int, int]:
     """(W, H) of ``WxH``; InputError, which names the option, for anything else."""
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.strip())
     if found is None:
-        raise InputError(f"{option} {text!r}: give WIDTHxHEIGHT, such as 320x180")
+        raise InputError(f"{option} {text!r}: give WIDTHxHEIGHT, such as 1280x720")
     return int(found[1]), int(found[2])
 
 
