@@ -32,15 +32,20 @@ def test_two_writers_of_one_file_do_not_mix(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["dsm.tif"]
 
 
-def test_what_a_killed_process_left_goes_with_the_next_attempt(tmp_path: Path) -> None:
-    path = tmp_path / "cloud[1].laz"
+def _killed(writer: str, makes: str, path: Path) -> None:
+    """A process that is killed while it writes ``path`` with ``writer``, and leaves one name."""
     killed = (
-        "import os, sys, pathlib; from service.scans.writing import writing\n"
-        "with writing(pathlib.Path(sys.argv[1])) as part:\n"
-        "    part.write_text('half'); os.kill(os.getpid(), 9)"
+        f"import os, sys, pathlib; from service.scans.writing import {writer}\n"
+        f"with {writer}(pathlib.Path(sys.argv[1])) as part:\n"
+        f"    {makes}; os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-c", killed, str(path)], check=False)
-    assert len(list(tmp_path.iterdir())) == 1
+    assert len(list(path.parent.iterdir())) == 1
+
+
+def test_what_a_killed_process_left_goes_with_the_next_attempt(tmp_path: Path) -> None:
+    path = tmp_path / "cloud[1].laz"
+    _killed("writing", "part.write_text('half')", path)
     with writing(path) as part:
         part.write_text("whole")
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
@@ -48,13 +53,7 @@ def test_what_a_killed_process_left_goes_with_the_next_attempt(tmp_path: Path) -
 
 def test_a_folder_that_a_killed_process_left_goes_with_the_next_attempt(tmp_path: Path) -> None:
     path = tmp_path / "tiles"
-    killed = (
-        "import os, sys, pathlib; from service.scans.writing import writing_folder\n"
-        "with writing_folder(pathlib.Path(sys.argv[1])) as part:\n"
-        "    (part / 'one').touch(); os.kill(os.getpid(), 9)"
-    )
-    subprocess.run([sys.executable, "-c", killed, str(path)], check=False)
-    assert len(list(tmp_path.iterdir())) == 1
+    _killed("writing_folder", "(part / 'one').touch()", path)
     for name in ("first", "second"):
         with writing_folder(path) as part:
             (part / name).touch()
