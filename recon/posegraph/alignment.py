@@ -134,8 +134,8 @@ def fit(
     constants with which a receiver and assumed views wander. How fixes and velocities err is
     measured by their residuals against the track of a first fit and weighs them in a second one.
     An assumed view is off by one angle in all images, and altitudes of no stated accuracy drift:
-    both are fitted too. Attitudes of one flight err together, so the covariance is inflated by
-    their number. The receiver's error that all fixes share goes into the position's covariance.
+    both are fitted too. Where fixes differ by more than their noise, the covariance grows by as
+    much. The receiver's error that all fixes share goes into the position's covariance.
     ``slow_share`` is the part of its variance that may wander. Too few fixes to be measured err as
     the ``usual`` ones of the flight.
     """
@@ -153,7 +153,8 @@ def fit(
     noise = noise.or_else(usual, readings.claimed)
     readings = AlignmentReadings(usable, noise, wander_s)
     best = _solve(readings, best.at, iterations)
-    covariance = np.asarray(np.linalg.inv(best.H)[:7, :7] * max(best.excess, 1.0), np.float64)
+    excess = readings.excess(best.residuals, best.kept)
+    covariance = np.asarray(np.linalg.inv(best.H)[:7, :7] * max(excess, 1.0), np.float64)
     heights = None
     if len(readings.fix) and noise.horizontal is not None:
         heights = readings.heights(best.at, best.H, covariance)
@@ -291,7 +292,8 @@ class _Solution:
     at: State
     H: F64
     cost: float
-    excess: float  # squared residuals of the fixes over what their noise explains
+    residuals: F64  # (M,) whitened, of the readings
+    kept: F64  # (groups,) 0 for what is left out
 
 
 def _solve(readings: AlignmentReadings, at: State, iterations: int) -> _Solution:
@@ -318,7 +320,7 @@ def _solve(readings: AlignmentReadings, at: State, iterations: int) -> _Solution
         stands = np.abs(step).max() < 1e-7 or i >= iterations - 1
         if stands and not (kept.all() and _leave_out(readings, norms, kept)):
             break
-    return _Solution(_centred(readings, at, weight), H, cost, readings.excess(r, kept))
+    return _Solution(_centred(readings, at, weight), H, cost, r, kept)
 
 
 def _centred(readings: AlignmentReadings, at: State, weight: F64) -> State:

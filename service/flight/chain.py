@@ -175,10 +175,11 @@ class Chain:
 
     def follow(self, image: UndistortedFrame, anchor: Anchorage) -> Placed:
         """A tracked frame in the world."""
-        first = unplaced(anchor.T_odom_camera[:3, 3], image.prior)
-        self._unplaced.setdefault(anchor.key.segment, first)
+        segment = anchor.key.segment
+        if segment not in self._unplaced:
+            self._unplaced[segment] = unplaced(anchor.T_odom_camera[:3, 3], image.prior)
         placed = self.place(anchor)
-        self._seen = image.prior, placed, anchor.key.segment
+        self._seen = image.prior, placed, segment
         return placed
 
     def place(self, anchor: Anchorage) -> Placed:
