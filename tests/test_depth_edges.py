@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
+from recon.stereo import depth_edges
 from recon.stereo.depth_edges import drop_edges
 from recon.types import F64, U8, Bool, DepthMap
 
@@ -108,3 +110,17 @@ def test_what_is_dropped_has_no_sigma_and_no_views() -> None:
     np.testing.assert_array_equal(known[40:], found.views[40:] > 0)
     nothing = DepthMap(np.full(SHAPE, np.nan, np.float32), depth.sigma_m, depth.views, K, np.eye(4))
     assert drop_edges(nothing, GRAY) is nothing
+
+
+@pytest.mark.parametrize("radius", [depth_edges.FLAT_RADIUS, depth_edges.PLANE_RADIUS])
+def test_a_row_at_once_finds_the_windows_of_its_pixels(radius: int) -> None:
+    """At the rims too, where windows lie outside."""
+    rng = np.random.default_rng(3)
+    x = rng.normal(0.0, 0.1, (9, 14)).astype(np.float32)
+    x[:, 6:] += 1.0
+    windows = depth_edges._windows(x, radius, radius == depth_edges.PLANE_RADIUS)
+    for v in range(len(x)):
+        least, expected = np.full(14, np.inf, np.float32), x[v].astype(np.float64)
+        depth_edges._steadiest(windows, radius, v, least, expected)
+        alone = [depth_edges._surface(windows, radius, u, v, x[v, u], 0.0)[1] for u in range(14)]
+        assert np.allclose(expected, alone, atol=1e-6)
