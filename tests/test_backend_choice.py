@@ -194,10 +194,18 @@ def test_a_learned_model_that_does_not_fit_is_refused(
         open_backend(ComputeConfig(backend=backend, model=model, stereo_width=width), image)
 
 
+@pytest.mark.parametrize(
+    ("failure", "said"),
+    [
+        (RuntimeError("Failed to find C compiler"), "Failed to find C compiler"),
+        (AttributeError("at 3:1:\n    area\n'int' object has no attribute 'to'"), "no attribute"),
+    ],
+)
 def test_plain_torch_computes_where_triton_compiles_nothing(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """No C compiler: said once, and nothing fails."""
+    failure: Exception, said: str, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    """No C compiler, or a kernel that this Triton refuses: said once, and nothing fails."""
     pytest.importorskip("torch")
     from recon.backends import torch_plan
 
@@ -206,11 +214,11 @@ def test_plain_torch_computes_where_triton_compiles_nothing(
 
         @staticmethod
         def contrast(*given: object) -> None:
-            raise RuntimeError("Failed to find C compiler")
+            raise failure
 
     monkeypatch.setattr(torch_plan, "HAS_TRITON", True)
     monkeypatch.setitem(sys.modules, "recon.backends.triton_dense", Kernels)
     monkeypatch.setattr(recon.backends, "triton_dense", Kernels, raising=False)
     backend_choice.try_kernels("cpu")
     assert not torch_plan.HAS_TRITON
-    assert "Failed to find C compiler" in caplog.text
+    assert said in caplog.text

@@ -195,6 +195,8 @@ from recon.backends import triton_dense as dense, triton_icp as icp
 def compiled(kernel, words, warps=4, **constants):
     kinds = iter(words.split())
     names = {n: "constexpr" if n in constants else next(kinds) for n in kernel.arg_names}
+    for p in kernel.params:  # an integer of 1 or a multiple of 16 would be compiled in
+        assert names[p.name] != "i32" or p.do_not_specialize, (kernel.__name__, p.name)
     source = ASTSource(fn=kernel, signature=names, constexprs=constants)
     found = triton.compile(
         source, target=GPUTarget("cuda", 87, 32), options={"num_warps": warps}
@@ -213,7 +215,7 @@ compiled(
     dense._select, "*i16 *i16 *i16 *i64 *fp32 *fp32 i32 i32 i32 fp32 fp32 fp32 fp32",
     radius=3, LABELS=16, CELLS=32,
 )
-compiled(dense._contrast, "*u8 *fp64 i32 i32 i32", PIXELS=128)
+compiled(dense._contrast, "*u8 *fp64 " + sizes, radius=3, PIXELS=128)
 compiled(dense._project, "*fp32 *fp32 *i64 *i32 *i1 i32 i32 i32 fp32", PIXELS=128)
 compiled(dense._compare, "*fp32 *fp32 *i64 *i32 *i1 i32 i32 i32 fp32", PIXELS=128)
 compiled(dense._unseen, "*fp32 *fp32 *u8 *u8 *i64 *fp32 *fp32 " + sizes, PIXELS=128)

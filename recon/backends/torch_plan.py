@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from threading import Lock
 from typing import Any
@@ -99,7 +100,7 @@ class Plan:
         """Record the kernels once; capture needs them loaded, so some rounds run before it."""
         stream: Any = torch.cuda.Stream()  # type: ignore[no-untyped-call]
         stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
+        with torch.cuda.stream(stream), compiling():
             for _ in range(2):
                 self._module(*self._inputs)
         torch.cuda.current_stream().wait_stream(stream)
@@ -108,6 +109,18 @@ class Plan:
             self._outputs = self._module(*self._inputs)
         self._replay = graph.replay
         log.debug("captured a CUDA graph for %s", [shape for shape, _ in self._parts])
+
+
+@contextmanager
+def compiling() -> Iterator[None]:
+    """RuntimeError, with the cause, where Triton cannot compile or load a kernel."""
+    try:
+        yield
+    except Exception as error:  # its own classes, those of its compilers, and the code's
+        if isinstance(error, RuntimeError):
+            raise
+        cause = (str(error).splitlines() or [""])[-1]
+        raise RuntimeError(f"a kernel cannot run: {type(error).__name__} {cause}") from error
 
 
 def part(array: Array, shape: tuple[int, ...] | None = None) -> Part:

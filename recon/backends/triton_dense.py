@@ -106,7 +106,10 @@ def _ones(word):
     return (word + (word >> 8) + (word >> 16) + (word >> 24)) & 63
 
 
-@triton.jit(do_not_specialize=["height", "width", "first"])
+@triton.jit(
+    do_not_specialize=["height", "width", "first", "max_bits", "bit_weight", "max_gray",
+                       "gray_weight", "unseen", "top"],
+)  # fmt: skip
 def _cost(
     left, right, words, true, cost, data, height, width, first, max_bits, bit_weight, max_gray,
     gray_weight, unseen, top, LABELS: tl.constexpr, CELLS: tl.constexpr,
@@ -169,7 +172,7 @@ def _edge(here, there, fall, floor, full):
     return _whole(tl.maximum(1.0 - step * fall, floor) * full).to(tl.int32)
 
 
-@triton.jit(do_not_specialize=["height", "width"])
+@triton.jit(do_not_specialize=["height", "width", "full"])
 def _edges(image, true, edges, height, width, fall, floor, full, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     here = at < height * width
@@ -207,7 +210,7 @@ def _halved(n, level):
     return n
 
 
-@triton.jit(do_not_specialize=["height", "width", "level"])
+@triton.jit(do_not_specialize=["height", "width", "level", "top"])
 def _coarser(
     data, edges, true, small, fewer, height, width, level, top, LABELS: tl.constexpr,
     CELLS: tl.constexpr,
@@ -305,7 +308,7 @@ def _envelope(rest, weight, unit, truncation, full, label):
     return tl.minimum(best, ((weight * truncation) // full)[:, None]).to(tl.int16)
 
 
-@triton.jit(do_not_specialize=["colour", "height", "width"])
+@triton.jit(do_not_specialize=["colour", "height", "width", "unit", "truncation", "full"])
 def _sweep(
     data, messages, edges, colour, height, width, unit, truncation, full, LABELS: tl.constexpr,
     CELLS: tl.constexpr,
@@ -433,7 +436,7 @@ def contrast(image: Tensor, radius: int) -> Tensor:
 
 
 @triton.jit(do_not_specialize=["height", "width"])
-def _contrast(image, out, height, width, radius, PIXELS: tl.constexpr):
+def _contrast(image, out, height, width, radius: tl.constexpr, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     here = at < height * width
     v, u = at // width, at % width
@@ -446,7 +449,7 @@ def _contrast(image, out, height, width, radius, PIXELS: tl.constexpr):
             gray = tl.load(image + y + x, mask=here, other=0).to(tl.int32)
             total += gray
             squares += gray * gray
-    area = ((2 * radius + 1) * (2 * radius + 1)).to(tl.float64)
+    area = (2 * radius + 1) * (2 * radius + 1)
     mean = total.to(tl.float64) / area
     spread = tl.maximum(squares.to(tl.float64) / area - mean * mean, 0.0)
     tl.store(out + at, tl.sqrt(spread), mask=here)
@@ -577,7 +580,7 @@ def _extremes(own, level, at, index, inside, height, width, step, unknown):
     return least, most
 
 
-@triton.jit(do_not_specialize=["height", "width"])
+@triton.jit(do_not_specialize=["height", "width", "step", "unknown"])
 def _wander(own, level, out, height, width, step, unknown, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     inside = at < height * width
@@ -586,7 +589,7 @@ def _wander(own, level, out, height, width, step, unknown, PIXELS: tl.constexpr)
     tl.store(out + at, least, mask=inside)
 
 
-@triton.jit(do_not_specialize=["height", "width"])
+@triton.jit(do_not_specialize=["height", "width", "step", "unknown", "many"])
 def _measure(own, level, count, height, width, step, unknown, many, PIXELS: tl.constexpr):
     """Add up the pixels of each index; one that is not a whole surface counts as ``many``."""
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)

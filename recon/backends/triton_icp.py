@@ -87,7 +87,7 @@ def surface_elements(depth: Tensor, sigma: Tensor, intrinsics: Tensor, edge_shar
     return out
 
 
-@triton.jit(do_not_specialize=["height", "width"])
+@triton.jit(do_not_specialize=["height", "width", "min_pixels"])
 def _surface(
     depth, sigma, K, out, height, width, edge_share, min_pixels, reach: tl.constexpr,
     PIXELS: tl.constexpr,
@@ -304,7 +304,7 @@ def _inverse(A, r, c):
     return X
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["least", "rounds"])
 def _advance(
     H, common, g, partners, centre, lever, T, state, share, weak_slope, shared, least,
     rounds,

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import MISSING, fields
 from importlib.util import find_spec
 from pathlib import Path
-from subprocess import SubprocessError
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
@@ -203,8 +202,9 @@ def try_kernels(device: str) -> None:
     try:
         from recon.backends import triton_dense
 
-        triton_dense.contrast(torch.zeros((8, 8), dtype=torch.uint8, device=device), 1)
-    except (ImportError, OSError, RuntimeError, SubprocessError) as error:
+        with torch_plan.compiling():
+            triton_dense.contrast(torch.zeros((8, 8), dtype=torch.uint8, device=device), 1)
+    except (ImportError, RuntimeError) as error:
         torch_plan.HAS_TRITON = False
         log.warning("Triton compiles no kernels here (%s): plain torch is slower", error)
 
