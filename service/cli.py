@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import logging
+import os
 import signal
 import sys
 import threading
@@ -138,6 +139,8 @@ def _end_by_signals() -> None:
 def main() -> None:
     """Run the command line; exit codes: 0 done, 2 usage or input, 3 environment, 1 internal."""
     _end_by_signals()
+    # Our matrices are small: OpenBLAS's threads would spin, on all cores, and compute nothing.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     threading.excepthook = lambda hook: _print_fault(
         hook.exc_type, hook.exc_value or hook.exc_type(), hook.exc_traceback
     )

@@ -98,6 +98,21 @@ def test_no_command_imports_heavy_packages() -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_matrices_keep_to_one_thread() -> None:
+    """On 16 cores OpenBLAS's threads took two thirds of a replay's processor time."""
+    script = (
+        "import sys\nsys.argv[1:] = ['config', 'default']\nfrom service.cli import main\ntry:\n"
+        "    main()\nexcept SystemExit:\n    pass\nimport numpy as np\n"
+        "a = np.ones((900, 900))\na @ a\n"
+        "print('threads', len(__import__('os').listdir('/proc/self/task')))\n"
+    )
+    free = {name: value for name, value in os.environ.items() if "NUM_THREADS" not in name}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=free, capture_output=True, text=True, check=True
+    )
+    assert "threads 1" in done.stdout.splitlines()[-1]
+
+
 def test_overview_imports_no_command() -> None:
     code = (
         "import sys\n"
