@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 
 from recon import se3
+from recon.backends.cpu import CpuBackend
 from recon.stereo.reprojection import LABEL_SIGMA_PX, PairDepth, carry, reproject
+from recon.stereo.virtual_stereo import View
 from recon.types import F64, DisparityMap, StereoPair
+from service.compute.backend_choice import FallbackBackend
+from service.flight.stages import Carry, Grid
+from service.progress import Stopwatch
 
 K = np.array([[190.0, 0, 159.5], [0, 190.0, 89.5], [0, 0, 1]])
 BASELINE_M = 4.0
@@ -126,6 +134,20 @@ def test_a_pairs_depth_is_carried_to_the_other_view(move_m: tuple[float, float, 
     error = np.abs(found.depth_m[known] / truth[known] - 1.0)
     assert np.median(error) < 1e-4 and np.mean(error > 0.002) < 0.02
     np.testing.assert_allclose(found.sigma_m[known], 0.002 * found.depth_m[known], rtol=0.02)
+
+
+def test_a_pair_is_matched_once_on_a_backend_that_gives_its_depth() -> None:
+    """ONNX Runtime's too, behind the fallback; not on a device that keeps the depth of pairs."""
+    gray, T = np.zeros((180, 320), np.uint8), np.eye(4)
+    here, there = (View(None, gray, K, T, seq=seq) for seq in (1, 0))
+    again: Any = SimpleNamespace(view=here, partners=(there,))
+    depth = np.full((180, 320), 60.0, np.float32)
+    for keeps_pairs, found in ((False, [0]), (True, [])):
+        own = CpuBackend()
+        own.name, own.keeps_pairs = "onnx", keeps_pairs
+        stage = Carry(FallbackBackend(own), Stopwatch())
+        stage.keep(0, {1: PairDepth(depth, 0.01 * depth)})
+        assert [*stage(again, Grid(K, (320, 180), T))] == found
 
 
 def test_the_nearer_surface_hides_what_is_behind_it() -> None:

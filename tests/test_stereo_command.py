@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.backends.cpu import CpuBackend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.types import U8, DepthMap, DisparityMap, Registration
+from recon.types import U8, DisparityMap
 from service.bench.stereo import (
     bad_share,
     semi_global_disparity,
@@ -116,7 +117,7 @@ def test_blank_pair_gives_an_unknown_map(tmp_path: Path, monkeypatch: pytest.Mon
     assert np.isnan(np.load(out)).all()
 
 
-class Broken:
+class Broken(CpuBackend):
     """A backend whose device is lost."""
 
     name, device = "torch", "cuda"
@@ -128,10 +129,6 @@ class Broken:
         raise RuntimeError("CUDA out of memory\nmore lines")
 
     def upsample(self, *given: object) -> DisparityMap:
-        """Fails too."""
-        raise RuntimeError("CUDA out of memory")
-
-    def register(self, source: DepthMap, *given: object) -> Registration:
         """Fails too."""
         raise RuntimeError("CUDA out of memory")
 

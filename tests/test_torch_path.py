@@ -237,21 +237,17 @@ def test_the_whole_path_equals_the_stages(device: str, guide: int) -> None:
     assert len(path._plans) == 2
 
 
-def test_what_the_path_does_not_do_is_said(device: str) -> None:
-    """No pair, filled occlusions."""
+def test_the_path_needs_a_pair(device: str) -> None:
     from recon.backends.torch_depth import DensePath
 
     with pytest.raises(ValueError, match="no stereo pair"):
         path = DensePath(device, BeliefPropagationConfig(), UpsamplingConfig(), ALL)
         path.depth([], K, SIZE, np.eye(4))
-    filling = BeliefPropagationConfig(fill_occluded=True)
-    with pytest.raises(ValueError, match="does not fill"):
-        DensePath(device, filling, UpsamplingConfig(), ALL)
 
 
 def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -> None:
     """The same depth through the fallback; stage by stage once the device failed."""
-    from recon.backends import DenseStages, PathBackend, load_backend
+    from recon.backends import DenseStages
     from recon.backends.torch_backend import TorchBackend
     from service.compute.backend_choice import FallbackBackend
 
@@ -259,12 +255,10 @@ def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -
     pair = stereo_pair(54, 96, 16, 1)
     own = TorchBackend(device)
     backend = FallbackBackend(own)
-    assert isinstance(backend, PathBackend)
+    assert backend.keeps_pairs
     found = backend.fused_depth([pair], K, SIZE, np.eye(4), stages)
     assert found is not None
     close(found.depth_m, by_stages([pair], stages.matching).depth_m, 1e-3, 0.99)
-    filling = replace(stages, matching=BeliefPropagationConfig(fill_occluded=True))
-    assert backend.fused_depth([pair], K, SIZE, np.eye(4), filling) is None
 
     def lost(*given: object) -> None:
         raise RuntimeError("CUDA error: device lost")
@@ -273,7 +267,7 @@ def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -
     assert backend.fused_depth([pair], K, SIZE, np.eye(4), stages) is None
     assert backend.failure == "CUDA error: device lost"
     assert backend.name == "cpu"
-    assert not isinstance(load_backend("cpu"), PathBackend)
+    assert not backend.keeps_pairs
 
 
 @pytest.mark.parametrize(("truncation", "exact"), [(1.0, True), (2.5, False)])

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol
 
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import FusionConfig
@@ -19,6 +19,15 @@ from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPai
 
 if TYPE_CHECKING:
     from recon.mapping.registration import IcpConfig
+
+
+@dataclass(frozen=True, slots=True)
+class DenseStages:
+    """The parameters of the stages from a rectified pair to fused depth."""
+
+    matching: BeliefPropagationConfig
+    upsampling: UpsamplingConfig
+    fusion: FusionConfig
 
 
 class Backend(Protocol):
@@ -32,6 +41,11 @@ class Backend(Protocol):
     @property
     def device(self) -> str:
         """Where it computes, such as "cpu" or "cuda"."""
+        ...
+
+    @property
+    def keeps_pairs(self) -> bool:
+        """True where :meth:`fused_depth` works, without giving the depth of single pairs."""
         ...
 
     def belief_propagation(
@@ -50,20 +64,6 @@ class Backend(Protocol):
         """Projective point-to-plane ICP from the given start."""
         ...
 
-
-@dataclass(frozen=True, slots=True)
-class DenseStages:
-    """The parameters of the stages from a rectified pair to fused depth."""
-
-    matching: BeliefPropagationConfig
-    upsampling: UpsamplingConfig
-    fusion: FusionConfig
-
-
-@runtime_checkable
-class PathBackend(Protocol):
-    """A backend that keeps the stages between images and fused depth on its device."""
-
     def fused_depth(
         self,
         pairs: Sequence[StereoPair],
@@ -72,7 +72,8 @@ class PathBackend(Protocol):
         T_world_camera: F64,
         stages: DenseStages,
     ) -> DepthMap | None:
-        """Depth of a keyframe on its grid ``size_px`` (w, h); None: do it stage by stage."""
+        """Depth of a keyframe on its grid ``size_px`` (w, h), all stages on the device; None: do it
+        stage by stage. ``stages.matching.fill_occluded`` is not for it."""
         ...
 
 

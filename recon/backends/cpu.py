@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.upsampling import UpsamplingConfig, upsample
-from recon.types import F64, U8, DepthMap, DisparityMap, Registration
+from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 
 if TYPE_CHECKING:
+    from recon.backends import DenseStages
     from recon.mapping.registration import IcpConfig
 
 
@@ -19,6 +21,7 @@ class CpuBackend:
 
     name = "cpu"
     device = "cpu"
+    keeps_pairs = False
 
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
@@ -37,6 +40,16 @@ class CpuBackend:
         from recon.mapping.registration import register_projective
 
         return register_projective(source, target, T_target_source, config)
+
+    def fused_depth(
+        self,
+        pairs: Sequence[StereoPair],
+        K: F64,
+        size_px: tuple[int, int],
+        T_world_camera: F64,
+        stages: DenseStages,
+    ) -> None:
+        """Nothing is gained here: None."""
 
 
 def warm_up() -> None:

@@ -35,6 +35,7 @@ class TorchBackend:
     """
 
     name = "torch"
+    keeps_pairs = True
 
     def __init__(self, device: str | None = None) -> None:
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -93,11 +94,8 @@ class TorchBackend:
         size_px: tuple[int, int],
         T_world_camera: F64,
         stages: DenseStages,
-    ) -> DepthMap | None:
-        """Depth of a keyframe without leaving the device; None for settings that it does not
-        support."""
-        if stages.matching.fill_occluded:
-            return None
+    ) -> DepthMap:
+        """Depth of a keyframe without leaving the device."""
         if self._path is None or self._path[0] != stages:
             path = DensePath(self.device, stages.matching, stages.upsampling, stages.fusion)
             self._path = stages, path

@@ -28,10 +28,7 @@ KEPT_PLANS = 8
 
 
 class DensePath:
-    """``device`` is "cuda" or "cpu"; one path serves one thread at a time.
-
-    ``matching.fill_occluded`` must be off, else ValueError.
-    """
+    """``device`` is "cuda" or "cpu"; one path serves one thread at a time."""
 
     def __init__(
         self,
@@ -40,8 +37,6 @@ class DensePath:
         upsampling: UpsamplingConfig,
         fusion: FusionConfig,
     ) -> None:
-        if matching.fill_occluded:
-            raise ValueError("the path on the device does not fill occlusions")
         self.device = device
         self.matching = matching
         self.upsampling = upsampling

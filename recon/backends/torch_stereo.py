@@ -297,12 +297,7 @@ UNKNOWN = -2048 * SPECKLE_STEP
 def drop_unreliable(
     left: Tensor, px: Tensor, confidence: Tensor, true: Tensor, config: BeliefPropagationConfig
 ) -> tuple[Tensor, Tensor]:
-    """Labels (h, w), NaN where they are unreliable, and their confidence.
-
-    Raises ValueError for ``fill_occluded``, which belongs to still pairs.
-    """
-    if config.fill_occluded:
-        raise ValueError("fill_occluded is not done on the device")
+    """Labels (h, w), NaN where they are unreliable, and their confidence."""
     if config.min_contrast > 0:
         confidence = torch.where(_contrast(left) < config.min_contrast, 0.0, confidence)
     gone = confidence <= 0

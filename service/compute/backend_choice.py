@@ -19,13 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 import numpy as np
 
-from recon.backends import (
-    BACKENDS,
-    Backend,
-    DenseStages,
-    PathBackend,
-    load_backend,
-)
+from recon.backends import BACKENDS, Backend, DenseStages, load_backend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
@@ -67,6 +61,11 @@ class FallbackBackend:
         """Device of the backend in use."""
         return self._backend.device
 
+    @property
+    def keeps_pairs(self) -> bool:
+        """See :class:`recon.backends.Backend`."""
+        return self._backend.keeps_pairs
+
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
     ) -> DisparityMap:
@@ -91,14 +90,8 @@ class FallbackBackend:
         T_world_camera: F64,
         stages: DenseStages,
     ) -> DepthMap | None:
-        """See :class:`recon.backends.PathBackend`; None also after the fallback."""
-        return self._run(
-            lambda b: (
-                b.fused_depth(pairs, K, size_px, T_world_camera, stages)
-                if isinstance(b, PathBackend)
-                else None
-            )
-        )
+        """See :class:`recon.backends.Backend`."""
+        return self._run(lambda b: b.fused_depth(pairs, K, size_px, T_world_camera, stages))
 
     def fail(self, error: Exception) -> None:
         """Use the CPU from now on, because of this error."""

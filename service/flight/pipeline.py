@@ -74,7 +74,7 @@ class Pipeline:
         depths = s.carry(view, grid)  # by images that are matched already
         pairs = s.rectify(view, depths)  # virtual stereo pairs, section 2.1
         if pairs:
-            depth = s.whole_path([*pairs.values()], grid)  # Eq. 1-3 at once, where a device can
+            depth = s.whole_path(pairs.values(), grid)  # Eq. 1-3 at once, where a device can
         if depth is None and (pairs or depths):
             for partner, pair in pairs.items():
                 disparity = s.match(pair)  # belief propagation, Eq. 1

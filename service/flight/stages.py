@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.backends import Backend, DenseStages, PathBackend
+from recon.backends import Backend, DenseStages
 from recon.bands import limit_threads
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
@@ -224,7 +224,7 @@ class Carry:
     """
 
     def __init__(self, backend: Backend, stopwatch: Stopwatch) -> None:
-        self._is_kept, self._stopwatch = not isinstance(backend, PathBackend), stopwatch
+        self._backend, self._stopwatch = backend, stopwatch
         self._kept: dict[tuple[int, int], PairDepth] = {}  # by view and partner
 
     def __call__(self, candidate: StereoCandidate, grid: Grid) -> dict[int, PairDepth]:
@@ -240,7 +240,7 @@ class Carry:
 
     def keep(self, seq: int, depths: Mapping[int, PairDepth]) -> None:
         """Remember a view's depth by partners that are views later; what is past is dropped."""
-        if not self._is_kept:
+        if self._backend.keeps_pairs:
             return
         later = {(seq, partner): depth for partner, depth in depths.items() if partner > seq}
         self._kept = {key: depth for key, depth in self._kept.items() if key[1] > seq} | later
@@ -258,6 +258,16 @@ class PairStages:
     ) -> None:
         self._backend, self._config = backend, config
         self._debug, self._stopwatch = debug, stopwatch
+
+    def whole_path(self, pairs: Collection[RectifiedPair], grid: Grid) -> DepthMap | None:
+        """Eq. 1 to 3 without leaving the device; None where the stages must do it."""
+        plain = [pair for pair in pairs if isinstance(pair, StereoPair)]  # as devices know them
+        if not self._backend.keeps_pairs or len(plain) < len(pairs) or self._debug is not None:
+            return None
+        with self._stopwatch("dense path"):
+            return self._backend.fused_depth(
+                plain, grid.K, grid.size_px, grid.T_odom_camera, self._config
+            )
 
     def match(self, pair: RectifiedPair) -> DisparityMap:
         """Labels of the left view by belief propagation, Eq. 1."""
@@ -293,27 +303,6 @@ class PairStages:
     def _keep(self, **arrays: Array) -> None:
         if self._debug is not None:
             self._debug |= arrays
-
-
-WholePath = Callable[[Sequence[RectifiedPair], Grid], DepthMap | None]
-
-
-def whole_path(backend: Backend, config: DenseStages, stopwatch: Stopwatch) -> WholePath:
-    """Eq. 1 to 3 without leaving the device; gives None where the stages must do it."""
-
-    def on_device(pairs: Sequence[RectifiedPair], grid: Grid) -> DepthMap | None:
-        assert isinstance(backend, PathBackend)
-        plain = [pair for pair in pairs if isinstance(pair, StereoPair)]
-        if len(plain) < len(pairs):
-            return None  # no device knows polar pairs
-        with stopwatch("dense path"):
-            return backend.fused_depth(plain, grid.K, grid.size_px, grid.T_odom_camera, config)
-
-    return on_device if isinstance(backend, PathBackend) else by_stages
-
-
-def by_stages(pairs: Sequence[RectifiedPair], grid: Grid) -> None:
-    """No device does the whole path."""
 
 
 class Plausible:
@@ -405,7 +394,7 @@ class Stages:
     views: StereoViews
     carry: Carry
     rectify: Rectify
-    whole_path: WholePath
+    whole_path: Callable[[Collection[RectifiedPair], Grid], DepthMap | None]
     match: Callable[[RectifiedPair], DisparityMap]
     upsample: Callable[[DisparityMap, RectifiedPair], DisparityMap]
     reproject: Callable[[DisparityMap, RectifiedPair, Grid], PairDepth]
@@ -474,7 +463,7 @@ def build_stages(
         views=views,
         carry=Carry(backend, stopwatch),
         rectify=Rectify(stereo, rejected, debug, stopwatch),
-        whole_path=whole_path(backend, dense, stopwatch) if debug is None else by_stages,
+        whole_path=pair.whole_path,
         match=pair.match,
         upsample=pair.upsample,
         reproject=pair.reproject,
