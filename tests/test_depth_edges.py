@@ -119,8 +119,16 @@ def test_a_row_at_once_finds_the_windows_of_its_pixels(radius: int) -> None:
     x = rng.normal(0.0, 0.1, (9, 14)).astype(np.float32)
     x[:, 6:] += 1.0
     windows = depth_edges._windows(x, radius, radius == depth_edges.PLANE_RADIUS)
-    for v in range(len(x)):
-        least, expected = np.full(14, np.inf, np.float32), x[v].astype(np.float64)
-        depth_edges._steadiest(windows, radius, v, least, expected)
-        alone = [depth_edges._surface(windows, radius, u, v, x[v, u], 0.0)[1] for u in range(14)]
-        assert np.allclose(expected, alone, atol=1e-6)
+    shifts = [radius * k for k in (-1, 0, 1)]
+    for v in range(9):
+        least, expected, place = np.empty((3, 14), np.float32)
+        depth_edges._steadiest(windows, radius, v, least, expected, place)
+        for u in range(14):
+            around = [(v - dv, u - du) for dv in shifts for du in shifts]
+            inside = [(i, j) for i, j in around if 0 <= i < 9 and 0 <= j < 14]
+            i, j = min(inside, key=lambda at: windows[3][at])
+            mean, across, down, variance = (one[i, j] for one in windows)
+            value = mean + across * (u - j) + down * (v - i)
+            plane = depth_edges._plane(windows, radius, place[u], u, v)
+            assert least[u] == variance
+            assert np.allclose([expected[u], *plane], [value, value, across, down], atol=1e-6)

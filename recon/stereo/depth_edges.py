@@ -8,7 +8,6 @@ contour matches. Either makes an object wider than it is.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -70,13 +69,13 @@ def drop_edges(depth: DepthMap, bgr: U8) -> DepthMap:
     nearness = np.where(known, nearness, around)
     noise = np.where(known, middle * depth.sigma_m / (z * z), np.float32(0.0))
     windows = _windows(nearness, FLAT_RADIUS, False), _windows(nearness, PLANE_RADIUS, True)
-    mixed = known.copy()
-    in_bands(_keep_mixtures, len(mixed), nearness, noise, *windows, mixed)
+    mixed, places = known.copy(), np.empty((2, *known.shape), np.float32)
+    in_bands(_find_surfaces, len(mixed), nearness, noise, *windows, places, mixed)
     closed = cv2.morphologyEx(mixed.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((CLOSED_PX,) * 2))
     kept = known & (closed == 0)
     farthest = cv2.erode(np.where(kept, nearness, np.inf), np.ones((2 * PLANE_RADIUS + 1,) * 2))
     spilt = kept & (nearness - farthest > STEP_SIGMAS * noise)
-    in_bands(_keep_spills, len(spilt), nearness, noise, kept, bgr, *windows, spilt)
+    in_bands(_keep_spills, len(spilt), nearness, noise, kept, bgr, *windows, places, spilt)
     kept &= ~spilt
     if kept.sum() == known.sum():
         return depth
@@ -105,81 +104,77 @@ def _windows(x: F32, radius: int, is_slanted: bool) -> Windows:
 
 
 @njit(cache=True, nogil=True)
-def _keep_mixtures(
-    begin: int, end: int, x: F32, noise: F32, flat: Windows, slanted: Windows, mixed: Bool
-) -> None:  # pragma: no cover - compiled
-    """Set ``mixed`` to False where the pixel lies on a surface."""
+def _find_surfaces(
+    begin: int, end: int, x: F32, noise: F32, flat: Windows, slanted: Windows, places: F32,
+    mixed: Bool,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Fill ``places`` (2, h, w) with those of the steadiest flat and slanted window of a pixel,
+    -1 where it does not lie on the slanted one; set ``mixed`` to False where it lies on one."""
     width = x.shape[1]
-    least, expected = np.empty(width, np.float32), np.empty(width)
+    least, expected = np.empty(width, np.float32), np.empty(width, np.float32)
     for v in range(begin, end):
-        for windows, radius in ((flat, FLAT_RADIUS), (slanted, PLANE_RADIUS)):
-            least[:], expected[:] = np.inf, x[v]
-            _steadiest(windows, radius, v, least, expected)
+        for n, windows, radius in ((0, flat, FLAT_RADIUS), (1, slanted, PLANE_RADIUS)):
+            place = places[n, v]
+            _steadiest(windows, radius, v, least, expected, place)
             for u in range(width):
                 off = abs(x[v, u] - expected[u]) - noise[v, u]
-                mixed[v, u] &= off > np.sqrt(max(least[u], np.float32(0)))
+                is_off = off > np.sqrt(max(least[u], np.float32(0)))
+                mixed[v, u] &= is_off
+                place[u] = np.float32(-1) if is_off and n == 1 else place[u]
 
 
 @njit(cache=True, nogil=True)
 def _steadiest(
-    windows: Windows, radius: int, v: int, least: F32, expected: F64
+    windows: Windows, radius: int, v: int, least: F32, expected: F32, place: F32
 ) -> None:  # pragma: no cover - compiled
-    """As :func:`_surface` of a row: (w,) variances of the windows and values at the pixels.
+    """The steadiest of the windows that contain each pixel of a row: (w,) variance, value at the
+    pixel, and place of that window, 0 to 8.
 
     One place of the window after the other, so that vector registers take the pixels.
     """
     height, width = windows[0].shape
-    for dv in (-radius, 0, radius):
+    least[:] = np.inf
+    for n in range(9):
+        dv, du = radius * (n // 3 - 1), radius * (n % 3 - 1)
         if not 0 <= v - dv < height:
             continue
-        mean, across, down, variance = (
-            windows[0][v - dv], windows[1][v - dv], windows[2][v - dv], windows[3][v - dv]
-        )  # fmt: skip
-        for du in (-radius, 0, radius):
-            first, count = max(du, 0), width - abs(du)
-            low, value = least[first : first + count], expected[first : first + count]
-            start = first - du
-            m, a = mean[start : start + count], across[start : start + count]
-            d, s = down[start : start + count], variance[start : start + count]
-            for i in range(count):
-                is_less = s[i] < low[i]
-                value[i] = m[i] + a[i] * du + d[i] * dv if is_less else value[i]
-                low[i] = s[i] if is_less else low[i]
+        first, count = max(du, 0), width - abs(du)
+        low, value = least[first : first + count], expected[first : first + count]
+        best, start, row = place[first : first + count], first - du, v - dv
+        m, a = windows[0][row, start : start + count], windows[1][row, start : start + count]
+        d, s = windows[2][row, start : start + count], windows[3][row, start : start + count]
+        right, below, number = np.float32(du), np.float32(dv), np.float32(n)
+        for i in range(count):
+            is_less = s[i] < low[i]
+            value[i] = m[i] + a[i] * right + d[i] * below if is_less else value[i]
+            best[i] = number if is_less else best[i]
+            low[i] = s[i] if is_less else low[i]
 
 
 @njit(cache=True, nogil=True)
-def _surface(
-    windows: Windows, radius: int, u: int, v: int, here: float, noise: float
-) -> Any:  # pragma: no cover - compiled
-    """The steadiest of the windows that contain a pixel: whether it lies on it, its value at the
-    pixel, and its slopes along columns and along rows."""
-    mean, across, down, variance = windows
-    least, row, col, expected = np.inf, v, u, here
-    for dv in (-radius, 0, radius):
-        for du in (-radius, 0, radius):
-            i, j = u - du, v - dv
-            if 0 <= i < mean.shape[1] and 0 <= j < mean.shape[0] and variance[j, i] < least:
-                least, row, col = variance[j, i], j, i
-                expected = mean[j, i] + across[j, i] * du + down[j, i] * dv
-    is_on = abs(here - expected) <= np.sqrt(max(least, 0.0)) + noise
-    return is_on, expected, across[row, col], down[row, col]
+def _plane(
+    windows: Windows, radius: int, place: float, u: int, v: int
+) -> tuple[float, float, float]:  # pragma: no cover - compiled
+    """Value at a pixel and slopes along columns and rows of the window at a place."""
+    mean, across, down, _ = windows
+    dv, du = radius * (int(place) // 3 - 1), radius * (int(place) % 3 - 1)
+    a, d = across[v - dv, u - du], down[v - dv, u - du]
+    return mean[v - dv, u - du] + a * du + d * dv, a, d
 
 
 @njit(cache=True, nogil=True)
 def _keep_spills(
     begin: int, end: int, x: F32, noise: F32, kept: Bool, bgr: U8, flat: Windows,
-    slanted: Windows, spilt: Bool,
+    slanted: Windows, places: F32, spilt: Bool,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
     """Set ``spilt`` to False where a pixel's colour is that of its own surface."""
     for v in range(begin, end):
         for u in range(x.shape[1]):
             if spilt[v, u]:
-                here, s = x[v, u], noise[v, u]
-                is_on, expected, across, down = _surface(slanted, PLANE_RADIUS, u, v, here, s)
-                if not is_on:
-                    is_on, expected, across, down = _surface(flat, FLAT_RADIUS, u, v, here, s)
-                plane = (expected, across, down)
-                spilt[v, u] = _is_spilt(u, v, plane, s, x, noise, kept, bgr)
+                plane = _plane(flat, FLAT_RADIUS, places[0, v, u], u, v)
+                if places[1, v, u] >= 0:
+                    plane = _plane(slanted, PLANE_RADIUS, places[1, v, u], u, v)
+                spilt[v, u] = _is_spilt(u, v, plane, noise[v, u], x, noise, kept, bgr)
 
 
 @njit(cache=True, nogil=True)
