@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import resource
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,13 +22,9 @@ from service.progress import Stopwatch
 RNG = np.random.default_rng(4)
 
 
-@dataclass
-class Refined:
+def refined(seq: int, segment: int, T_odom_camera: F64) -> Any:
     """A keyframe of the odometry that is still adjusted."""
-
-    seq: int
-    segment: int
-    T_odom_camera: F64
+    return SimpleNamespace(seq=seq, segment=segment, T_odom_camera=T_odom_camera)
 
 
 def some_pose() -> F64:
@@ -51,7 +46,7 @@ def published(seq: int, key: Key, agl_m: float | None = 41.5) -> PublishedFrame:
 
 
 def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
-    keys = [Refined(n, n // 20, some_pose()) for n in range(0, 40, 10)]
+    keys = [refined(n, n // 20, some_pose()) for n in range(0, 40, 10)]
     frames = [published(seq, keys[seq // 10], None if seq == 3 else 41.5) for seq in range(40)]
     kept = PublishedFrames(tmp_path)
     for frame in frames:
@@ -74,7 +69,7 @@ def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
 def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> None:
     kept = PublishedFrames(tmp_path)
     for seq in range(500):
-        key = Refined(seq, 0, some_pose())
+        key = refined(seq, 0, some_pose())
         kept.add(published(seq, key), before(seq - 9))
         kept.add(PublishedFrame(10**18 + seq, None, np.zeros(3), 0.0, None, False), before(seq - 9))
     assert len(kept._fresh) <= 22
@@ -89,14 +84,14 @@ def test_a_full_disk_is_the_outside_worlds_fault(tmp_path: Path) -> None:
     try:
         with pytest.raises(OutsideError):
             for seq in range(1000):
-                kept.add(published(seq, Refined(seq, 0, some_pose())), before(seq))
+                kept.add(published(seq, refined(seq, 0, some_pose())), before(seq))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     kept.close()
 
 
 def test_carriers_keep_their_places_when_they_settle() -> None:
-    keys = [Refined(n, n // 50, some_pose()) for n in range(0, 100, 10)]
+    keys = [refined(n, n // 50, some_pose()) for n in range(0, 100, 10)]
     carriers = Carriers()
     for key in keys:
         carriers.add(Anchorage(key.seq, key, some_pose()))
@@ -109,14 +104,14 @@ def test_carriers_keep_their_places_when_they_settle() -> None:
         assert old is not None
         assert new.seq == old.seq == frame.seq // 10 * 10
         assert np.array_equal(new.T_odom_camera, old.T_odom_camera)
-        assert isinstance(new.key, Refined) == (new.seq >= 70)
-    assert carriers.of(Anchorage(0, Refined(0, 7, np.eye(4)), np.eye(4))) is None
+        assert isinstance(new.key, SimpleNamespace) == (new.seq >= 70)
+    assert carriers.of(Anchorage(0, refined(0, 7, np.eye(4)), np.eye(4))) is None
 
 
 def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None:
     """The graph is at work then on another thread: nothing asks it, nothing waits for it."""
     chain: Any = Chain(Trajectory(), before(0), Counter(), Stopwatch())
-    key = Refined(3, 0, some_pose())
+    key = refined(3, 0, some_pose())
     frame, anchor = Anchorage(7, key, some_pose()), Anchorage(5, key, some_pose())
     image = SimpleNamespace(prior=PosePrior())
     assert chain.follow(image, frame).sources == ("vision",)  # nothing is reconstructed yet

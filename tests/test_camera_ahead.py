@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,7 +83,8 @@ def test_a_frame_that_tracking_skips_is_not_looked_at(
     )  # fmt: skip
     with create_store(inputs) as store:
         scan = Scan(inputs, store)
-        frame = CameraFrame(Unseen(), 0, 0, None, "frame 0")
+        unseen: Any = Unseen()
+        frame = CameraFrame(unseen, 0, 0, None, "frame 0")
         with pytest.raises(AssertionError, match="looked at"):
             scan.feed(frame)
         skipped = Step(Tracked(Tracking.SKIPPED, 0))

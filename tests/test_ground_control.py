@@ -7,7 +7,8 @@ import pytest
 
 from recon import se3
 from recon.posegraph import ground_control
-from recon.posegraph.ground_control import Closure, Mark, Point, Track, adjust, map_position
+from recon.posegraph.ground_control import Mark, Point, Track, adjust, map_position
+from recon.posegraph.records import Loop
 from recon.posegraph.smoother import State
 from recon.types import F64, PosePrior
 
@@ -138,11 +139,11 @@ def test_loops_straighten_a_track_and_false_ones_are_left_out() -> None:
     before[20:] = moved(before[20:], np.array([0.6, 0.4, -0.5]), np.zeros(3))
     spread = np.diag([1e-3**2] * 3 + [0.03**2] * 3)
     pairs = [(2, 37), (8, 31), (14, 25)]
-    loops = [Closure(a, b, se3.inverse(truth[a]) @ truth[b], spread) for a, b in pairs]
+    loops = [Loop(a, b, se3.inverse(truth[a]) @ truth[b], spread) for a, b in pairs]
     wrong = se3.inverse(truth[5]) @ truth[34]
     wrong[:3, 3] += [15.0, 0.0, 0.0]
     times: F64 = np.r_[np.arange(20.0), 40.0 + np.arange(20.0)]  # vision was lost between the legs
-    still = Track(before, times, loose(40), (), [*loops, Closure(5, 34, wrong, spread)])
+    still = Track(before, times, loose(40), (), [*loops, Loop(5, 34, wrong, spread)])
     found = adjust(still)
     assert found.loops_refused == (3,)
     assert len(ground_control.supported(still.loops, still.poses)) == 3

@@ -10,8 +10,9 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays
-from recon.posegraph.ground_control import Closure, Track, adjust, supported
+from recon.posegraph.ground_control import Track, adjust, supported
 from recon.posegraph.loop_closure import LoopView
+from recon.posegraph.records import Loop
 from recon.posegraph.submap_loops import SubmapLoopConfig, filled, verify_surfaces
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.offline.refine.stored_loops import StoredLoops, steps_m
@@ -138,7 +139,7 @@ def test_a_repeated_texture_is_no_loop_at_the_wrong_place() -> None:
         guess = se3.inverse(poses[a]) @ slip @ poses[b]
         found = verify_surfaces(one, two, guess)
         if found is not None:
-            loops.append(Closure(a, b, found.T_a_b, found.covariance))
+            loops.append(Loop(a, b, found.T_a_b, found.covariance))
     truth: F64 = np.array(poses)
     spread = np.array([np.diag([0.01**2] * 3 + [0.3**2] * 3)] * 10)
     track = Track(truth, np.linspace(0.0, 45.0, 10), spread, (), supported(loops, truth))

@@ -16,7 +16,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.ledger import Rows
-from recon.posegraph.records import loops_agree
+from recon.posegraph.records import Loop, loops_agree
 from recon.posegraph.smoother import (
     NO_SCALE,
     Linear,
@@ -83,17 +83,6 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Closure:
-    """A motion seen between two keyframes that are far apart in time."""
-
-    a: int  # which, of the list of keyframes
-    b: int
-    T_a_b: F64  # (4, 4) m
-    covariance: F64  # (6, 6) left perturbation in a's frame
-    growth: float = 1.0  # of b's depths, to fit a's
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Track:
     """The keyframes as they are before."""
 
@@ -101,7 +90,7 @@ class Track:
     times_s: F64  # (N,)
     covariances: F64  # (N, 6, 6) left perturbation in the world; they err together
     priors: Sequence[PosePrior] = ()  # of each keyframe; without them the poses are the prior
-    loops: Sequence[Closure] = ()
+    loops: Sequence[Loop] = ()  # between places in the list, in metres
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,8 +127,8 @@ def adjust(
 
 
 def supported(
-    loops: Sequence[Closure], poses: F64 | Mapping[int, F64], window: int = 15
-) -> list[Closure]:
+    loops: Sequence[Loop], poses: F64 | Mapping[int, F64], window: int = 15
+) -> list[Loop]:
     """Those loops that another one confirms, whose ends lie within ``window`` keyframes.
 
     Both, joined by the track between their ends (trusted to 3 % of its length), must close on
@@ -155,7 +144,7 @@ def supported(
     return out
 
 
-def _agree(one: Closure, other: Closure, poses: F64 | Mapping[int, F64]) -> bool:
+def _agree(one: Loop, other: Loop, poses: F64 | Mapping[int, F64]) -> bool:
     T_a_a = se3.inverse(poses[one.a]) @ poses[other.a]
     T_b_b = se3.inverse(poses[other.b]) @ poses[one.b]
     return loops_agree(one, other, T_a_a, T_b_b, CHI2_LIMIT)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -60,14 +59,15 @@ class Node:
 class Loop:
     """A motion seen between two keyframes that are far apart in time.
 
-    Lengths are in units of the odometry at ``a``, so that a better scale moves them too.
+    Lengths of a pose graph's loops are in units of the odometry at ``a``, so that a better scale
+    moves them too; those between finished keyframes are in metres.
     """
 
     a: int  # number of the earlier keyframe
     b: int
     T_a_b: F64  # (4, 4)
     covariance: F64  # (6, 6) left perturbation in a's frame
-    ratio: float  # units of a's odometry in one of b's
+    ratio: float = 1.0  # units of a's odometry in one of b's; in metres: b's depths grow by it
 
     @property
     def ends(self) -> tuple[int, int]:
@@ -82,21 +82,7 @@ class Loop:
         return replace(self, T_a_b=T, covariance=self.covariance * np.outer(units, units))
 
 
-class SeenMotion(Protocol):
-    """A motion between two keyframes, whoever found it."""
-
-    @property
-    def T_a_b(self) -> F64:
-        """(4, 4)"""
-        ...
-
-    @property
-    def covariance(self) -> F64:
-        """(6, 6) left perturbation in a's frame."""
-        ...
-
-
-def loops_agree(one: SeenMotion, other: SeenMotion, T_a_a: F64, T_b_b: F64, limit: float) -> bool:
+def loops_agree(one: Loop, other: Loop, T_a_a: F64, T_b_b: F64, limit: float) -> bool:
     """True when two loops, joined by the track between their ends, close on themselves.
 
     ``T_a_a`` takes the other's first camera to the one's, ``T_b_b`` the one's second to the

@@ -7,13 +7,16 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from threading import Event, Lock
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
 from recon.types import U8
 from service.background import Channel
 from service.workers import PROCESS, Worker
+
+if TYPE_CHECKING:
+    from service.cameras.video import Decoded
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,24 +34,11 @@ class GeoTag:
     relative_alt_m: float | None = None  # above the take-off point
 
 
-class Unconverted(Protocol):
-    """An image that is made when it is asked for: of a video only some are looked at."""
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(H, W, 3)."""
-        ...
-
-    def __call__(self) -> U8:
-        """(H, W, 3) BGR."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFrame:
     """One image of a source."""
 
-    pixels: U8 | Unconverted  # (H, W, 3) BGR
+    pixels: U8 | Decoded  # (H, W, 3) BGR; of a video only some are converted
     time_ns: int  # presentation time, ns since the start of the stream
     seq: int  # 0, 1, 2 … of the delivered images
     geotag: GeoTag | None

@@ -13,31 +13,12 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
+from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.types import F64
 from service.errors import OutsideError
-
-
-class Key(Protocol):
-    """A keyframe of the odometry, as far as frames refer to it."""
-
-    @property
-    def seq(self) -> int:
-        """Number of its frame."""
-        ...
-
-    @property
-    def segment(self) -> int:
-        """Number of the segment."""
-        ...
-
-    @property
-    def T_odom_camera(self) -> F64:
-        """(4, 4) as refined by now."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +28,10 @@ class SettledKey:
     seq: int
     segment: int
     T_odom_camera: F64  # (4, 4)
+
+
+Key = OdometryKeyframe | SettledKey
+"""A keyframe of the odometry, as far as frames refer to it; the first is still refined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

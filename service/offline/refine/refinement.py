@@ -22,7 +22,6 @@ from recon.posegraph.ground_control import (
     FIX_S,
     Adjusted,
     BatchConfig,
-    Closure,
     Mark,
     Point,
     Track,
@@ -30,6 +29,7 @@ from recon.posegraph.ground_control import (
     map_position,
     supported,
 )
+from recon.posegraph.records import Loop
 from recon.posegraph.sensor_offsets import constants
 from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import F64, Camera, Keyframe, PosePrior
@@ -321,7 +321,7 @@ class _Refinement:
 
     def _with_loops(self, track: Track) -> tuple[Track, int]:
         """The track with its loops, and how many of them were verified."""
-        flown, closures = self._flown_loops(), self._closures(track)
+        flown, closures = self._flown_loops(), self._seen_loops(track)
         kept = [c for c in supported([*flown, *closures], track.poses) if c not in flown]
         return replace(track, loops=[*flown, *kept]), len(flown) + len(closures)
 
@@ -409,7 +409,7 @@ class _Refinement:
 
     # ---- loops -------------------------------------------------------------------------------
 
-    def _flown_loops(self) -> list[Closure]:
+    def _flown_loops(self) -> list[Loop]:
         """The loops that the flight accepted, with whole images at hand."""
         graph = (self.store.summary or {}).get("graph") or {}
         at = {s.seq: k for k, s in enumerate(self.states)}
@@ -420,10 +420,10 @@ class _Refinement:
                 T = grown(T, self.grown)
                 units = np.array([1.0] * 3 + [self.grown] * 3)
                 spread = unpack_covariance(upper) * np.outer(units, units)
-                out.append(Closure(at[a], at[b], T, loose(T, spread)))
+                out.append(Loop(at[a], at[b], T, loose(T, spread)))
         return out
 
-    def _closures(self, track: Track) -> list[Closure]:
+    def _seen_loops(self, track: Track) -> list[Loop]:
         """All pairs of keyframes far apart in time that see the same place, verified."""
 
         def at(k: int) -> Keyframe | None:

@@ -16,8 +16,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from recon import se3
-from recon.posegraph.ground_control import Closure, Track
+from recon.posegraph.ground_control import Track
 from recon.posegraph.loop_closure import LoopConfig, LoopView, candidates, ground_seen
+from recon.posegraph.records import Loop
 from recon.posegraph.submap_loops import SubmapLoopConfig, filled, verify_surfaces
 from recon.types import F64, Keyframe
 from service.progress import Progress
@@ -82,14 +83,14 @@ def likely(view: LoopView, b: int, poses: Mapping[int, F64], config: SubmapLoopC
 def verified(
     a: int, b: int, views: tuple[LoopView | None, LoopView | None], guess: F64,
     config: SubmapLoopConfig,
-) -> Closure | None:  # fmt: skip
+) -> Loop | None:  # fmt: skip
     """The loop between the keyframes ``a`` and ``b``, by what they see."""
     if views[0] is None or views[1] is None:
         return None
     found = verify_surfaces(views[0], views[1], guess, config)
     if found is None:
         return None
-    return Closure(a, b, found.T_a_b, loose(found.T_a_b, found.covariance), found.growth)
+    return Loop(a, b, found.T_a_b, loose(found.T_a_b, found.covariance), found.growth)
 
 
 class StoredLoops:
@@ -111,10 +112,10 @@ class StoredLoops:
         pauses = np.diff(track.times_s, prepend=track.times_s[0])
         self._views = FilledViews(keyframe, np.cumsum(pauses > BREAK_S).tolist())
 
-    def find(self, progress: Progress | None = None) -> list[Closure]:
+    def find(self, progress: Progress | None = None) -> list[Loop]:
         """All pairs far apart in time that see the same place, verified."""
         tree = cKDTree(self._track.poses[:, :2, 3])
-        out: list[Closure] = []
+        out: list[Loop] = []
         later = range(self._config.min_gap, len(self._track.poses))
         for b in (progress or Progress()).over(later, len(later)):
             for earlier in self._near(b, tree):
@@ -143,7 +144,7 @@ class StoredLoops:
         poses = {a: self._track.poses[a] for a in (*earlier, b)}
         return likely(view, b, poses, self._config)
 
-    def _verified(self, a: int, b: int) -> Closure | None:
+    def _verified(self, a: int, b: int) -> Loop | None:
         reach = self._reach(a, b)
         views = self._views.view(a, reach), self._views.view(b, reach)
         guess = se3.inverse(self._track.poses[a]) @ self._track.poses[b]
@@ -161,12 +162,12 @@ def reach_m(one: Keyframe) -> float:
     return 2.0 * float(np.nanmedian(one.depth.depth_m))
 
 
-def weighted(loops: Sequence[Closure]) -> list[Closure]:
+def weighted(loops: Sequence[Loop]) -> list[Loop]:
     """The loops, less sure where several rest on the same surfaces."""
     return [replace(one, covariance=_alike(one, loops) * one.covariance) for one in loops]
 
 
-def _alike(one: Closure, loops: Sequence[Closure]) -> int:
+def _alike(one: Loop, loops: Sequence[Loop]) -> int:
     """Loops that rest on the same filled surfaces as ``one``, itself included: they err alike."""
     return sum(abs(one.a - x.a) <= NEIGHBOURS and abs(one.b - x.b) <= NEIGHBOURS for x in loops)
 
@@ -178,7 +179,7 @@ def loose(T_a_b: F64, covariance: F64) -> F64:
     return out
 
 
-def steps_m(loops: Sequence[Closure], poses: F64, scales: F64, ahead_m: float) -> F64:
+def steps_m(loops: Sequence[Loop], poses: F64, scales: F64, ahead_m: float) -> F64:
     """(n,) metres between where the two ends of a loop have the same ground.
 
     The ground is taken ``ahead_m`` before the later camera; the loop's own length grows with

@@ -19,12 +19,12 @@ from recon import se3
 from recon.camera_model import rays
 from recon.posegraph.ground_control import (
     BatchConfig,
-    Closure,
     Track,
     adjust,
     placed_by_points,
     supported,
 )
+from recon.posegraph.records import Loop
 from recon.posegraph.site_alignment import ScanPrior, SiteAlignment, Tie, align, alike
 from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import F64, Keyframe
@@ -194,7 +194,7 @@ def _aligned(
             assert one is not None
             ends = scans[loop.a], scans[loop.b]
             if members[ends[0]].start is None and members[ends[1]].start is None:
-                loop = replace(loop, growth=1.0)  # noise: their scales are known better
+                loop = replace(loop, ratio=1.0)  # noise: their scales are known better
             ties.append(tie(loop, ends, track.poses[loop.a], track.poses[loop.b], corners(one)))
             kept.append(loop)
     own = [np.array(scans) == k for k in range(len(members))]
@@ -210,7 +210,7 @@ def _aligned(
 
 
 def _bent(
-    track: Track, scans: Sequence[int], found: SiteAlignment, loops: Sequence[Closure],
+    track: Track, scans: Sequence[int], found: SiteAlignment, loops: Sequence[Loop],
     ties: Sequence[Tie],
 ) -> tuple[F64, F64]:  # fmt: skip
     """Poses and covariances after the motions of the scans, adjusted to the ties.
@@ -265,13 +265,13 @@ def corners(one: Keyframe) -> F64:
     return rays(one.depth.K, CORNERS * [w, h]) * float(np.nanmedian(one.depth.depth_m))
 
 
-def tie(loop: Closure, scans: tuple[int, int], T_a: F64, T_b: F64, here: F64) -> Tie:
+def tie(loop: Loop, scans: tuple[int, int], T_a: F64, T_b: F64, here: F64) -> Tie:
     """The places ``here`` (N, 3) in the loop's second camera, as it has them in both scans.
 
     ``T_a`` and ``T_b`` are the (4, 4) poses of the loop's cameras in the site.
     """
     there = se3.transform(loop.T_a_b, here)
-    there += (loop.growth - 1.0) * (there - there.mean(axis=0))
+    there += (loop.ratio - 1.0) * (there - there.mean(axis=0))
     J = np.concatenate([-se3.hat(there), np.tile(np.eye(3), (len(there), 1, 1))], axis=2)
     spread = T_a[:3, :3] @ (J @ loop.covariance @ J.transpose(0, 2, 1)) @ T_a[:3, :3].T
     count = len(there) * 3 / 6.0  # a motion has six numbers, four places twelve

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from recon import se3
-from recon.posegraph.ground_control import Closure, supported
+from recon.posegraph.ground_control import supported
+from recon.posegraph.records import Loop
 from recon.posegraph.site_alignment import ScanPrior, Similarity, align, alike
 from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import F64, Keyframe
@@ -175,7 +176,7 @@ class LiveSite:
 
     def __init__(self) -> None:
         self.scans: dict[Path, FollowedScan] = {}
-        self._loops: dict[tuple[int, int], tuple[Closure, F64]] = {}  # with places of b's ground
+        self._loops: dict[tuple[int, int], tuple[Loop, F64]] = {}  # with places of b's ground
         self._count = 0
         self._changed = False
 
@@ -235,10 +236,10 @@ class LiveSite:
             guess = T_a_b if second[0] is one else se3.inverse(T_a_b)
             loop, there = verified(*ends, views, guess, CONFIG), second[0].views.at(second[1])
             if loop is not None and there is not None:
-                self._keep(replace(loop, growth=1.0), corners(there))
+                self._keep(replace(loop, ratio=1.0), corners(there))
                 found += 1
 
-    def _keep(self, loop: Closure, here: F64) -> None:
+    def _keep(self, loop: Loop, here: F64) -> None:
         """Keep a loop; of one pair of scans only the newest."""
         if not (np.isfinite(loop.covariance).all() and np.isfinite(here).all()):
             return
