@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from recon.types import Keyframe
 from service.scans.track import latest
@@ -18,26 +18,25 @@ MIN_PIECE = 3
 """Keyframes from which on an unconnected stretch has a cloud of its own."""
 
 
-class Keyframes(Protocol):
-    """A store, or part of one."""
+@dataclass(frozen=True)
+class Piece:
+    """Some keyframes of a store, such as a stretch that is not tied to the rest, as a store."""
 
-    @property
-    def summary(self) -> dict[str, Any] | None:
-        """The scan's."""
-        ...
-
-    @property
-    def refinement(self) -> dict[str, Any] | None:
-        """The figures of the refinement in force, or None."""
-        ...
+    whole: ScanStore
+    own: list[int]
+    summary: dict[str, Any] | None = None
+    refinement: dict[str, Any] | None = None
 
     def seqs(self) -> list[int]:
         """Numbers of its keyframes."""
-        ...
+        return self.own
 
     def keyframe(self, seq: int) -> Keyframe | None:
         """One of them."""
-        ...
+        return self.whole.keyframe(seq)
+
+
+Keyframes = ScanStore | Piece
 
 
 def stretches_apart(store: Keyframes) -> list[Stretch]:
@@ -54,25 +53,7 @@ def is_apart(seq: int, apart: Iterable[Stretch]) -> bool:
     return any(first <= seq <= last for first, last in apart)
 
 
-@dataclass(frozen=True)
-class Piece:
-    """Some keyframes of a store, such as a stretch that is not tied to the rest, as a store."""
-
-    whole: Keyframes
-    own: list[int]
-    summary: dict[str, Any] | None = None
-    refinement: dict[str, Any] | None = None
-
-    def seqs(self) -> list[int]:
-        """Numbers of its keyframes."""
-        return self.own
-
-    def keyframe(self, seq: int) -> Keyframe | None:
-        """One of them."""
-        return self.whole.keyframe(seq)
-
-
-def pieces_apart(store: Keyframes) -> list[Piece]:
+def pieces_apart(store: ScanStore) -> list[Piece]:
     """The unconnected stretches of at least MIN_PIECE keyframes; none counts twice."""
     apart, own = stretches_apart(store), dict[int, list[int]]()
     for seq in store.seqs():
