@@ -28,6 +28,7 @@ from recon.mapping.registration import (
     IcpConfig,
     arrays_of,
     conclude,
+    no_overlap,
 )
 from recon.types import F64, Array, DepthMap, Registration
 
@@ -112,9 +113,11 @@ def _concluded(rows: F64, start: F64, config: IcpConfig) -> Registration:
     )
     if not np.isfinite(rows[: ends[-1]]).all():  # a start from which nothing can be computed
         partners = np.zeros(1)
+    if partners[0] < MIN_PARTNERS:
+        return no_overlap(start, int(done[0]))
     equations = Equations(
         H.reshape(6, 6), common.reshape(6, 6), g, sums, float(scale[0]), centre, float(lever[0]),
-        _area(lags.reshape(2, 3, AREA_LAGS)), int(partners[0]),
+        lambda: _area(lags.reshape(2, 3, AREA_LAGS)),
     )  # fmt: skip
     return conclude(equations, T.reshape(4, 4), start, int(available[0]), int(done[0]), config)
 

@@ -7,6 +7,7 @@ of the pixel it projects to, so no tree is searched.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,40 +97,40 @@ class Equations:
     scale: float  # robust standard deviation of the residuals in sigmas
     centre: F64  # (3,) m, target frame
     lever_m: float
-    area: float | None = None  # neighbours whose residuals err together, when known
-    partners: int = MIN_PARTNERS
+    area: Callable[[], float]  # neighbours whose residuals err together; takes long
 
 
 @dataclass(slots=True, eq=False)
 class _Problem:
     """The weighted normal equations of one iteration, rotating about the points' centre."""
 
-    size: F32  # (hs, ws) residuals in sigmas, see recon.mapping.icp_kernels.residuals
-    scale: float  # robust standard deviation of the residuals in sigmas
-    centre: F64  # (3,) m, target frame
+    equations: Equations
     unit: F64  # (6,) turns a twist in metres at the rms lever into rad and m
-    sums: F64  # (4,), see recon.mapping.icp_kernels.normal_equations
     values: F64  # (6,) information along the principal directions
     vectors: F64  # (6, 6) columns, scaled by ``unit``
     shared: F64  # (6,) the part of the information that both surfaces agree on
     gradient: F64  # (6,) along the principal directions
     strong: Bool  # (6,) directions that the surface determines
-    area: float | None = None  # neighbours that err together; None: asked of ``size``
+
+    def moved_m(self, T: F64) -> float:
+        """By which ``T`` (4, 4) moves the points' centre."""
+        centre = self.equations.centre
+        return float(np.linalg.norm(T[:3, :3] @ centre + T[:3, 3] - centre))
 
     def step(self) -> F64:
         """(4, 4) left correction in the target frame; weak directions stay put."""
         part = np.where(self.strong, self.gradient / np.maximum(self.values, 1e-30), 0.0)
         twist = self.unit * (-self.vectors @ part)
-        R = se3.so3_exp(twist[:3])
-        return se3.compose(R, self.centre - R @ self.centre + twist[3:])
+        R, centre = se3.so3_exp(twist[:3]), self.equations.centre
+        return se3.compose(R, centre - R @ centre + twist[3:])
 
     def settled(self, step: F64, share: float) -> bool:
         """True when ``step`` moves the points by less than ``share`` of its own sigma."""
-        move = float(np.linalg.norm(step[:3, :3] @ self.centre + step[:3, 3] - self.centre))
         turn = float(np.linalg.norm(se3.so3_log(step[:3, :3]))) / float(self.unit[0])
-        variance = float(self.sums[1]) / max(float(self.sums[0]), 1.0)
+        sums = self.equations.sums
+        variance = float(sums[1]) / max(float(sums[0]), 1.0)
         sigma = np.sqrt(variance / max(float(self.values[self.strong].min(initial=1e30)), 1e-30))
-        return max(move, turn) < max(share * float(sigma), 1e-7)
+        return max(self.moved_m(step), turn) < max(share * float(sigma), 1e-7)
 
 
 def _problem(
@@ -158,11 +159,14 @@ def _weighed(
     H, common, g, sums = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(4)
     limit = scale * (config.tukey_sigmas if tukey else config.huber_sigmas)
     icp_kernels.normal_equations(size, rows, centre, limit, tukey, H, common, g, sums)
-    equations = Equations(H, common, g, sums, scale, centre, lever_m)
-    return _along_directions(equations, size, config)
+
+    def area() -> float:
+        return float(icp_kernels.correlated_area(size, AREA_SIGMAS * scale, AREA_LAGS))
+
+    return _along_directions(Equations(H, common, g, sums, scale, centre, lever_m, area), config)
 
 
-def _along_directions(equations: Equations, size: F32, config: IcpConfig) -> _Problem:
+def _along_directions(equations: Equations, config: IcpConfig) -> _Problem:
     """The problem in its principal directions."""
     H, common, g, lever_m = equations.H, equations.common, equations.g, equations.lever_m
     unit = np.array([1 / lever_m] * 3 + [1.0] * 3)
@@ -172,10 +176,7 @@ def _along_directions(equations: Equations, size: F32, config: IcpConfig) -> _Pr
     # all normals. Noise tilts the normals too, but not those of both surfaces alike.
     enough = config.weak_slope**2 * max(float(values[-1]), 1e-30)
     strong = (shared > enough) & (shared > 0.35 * values)
-    return _Problem(
-        size, equations.scale, equations.centre, unit, equations.sums, values, vectors, shared,
-        vectors.T @ (unit * g), strong, equations.area,
-    )  # fmt: skip
+    return _Problem(equations, unit, values, vectors, shared, vectors.T @ (unit * g), strong)
 
 
 def conclude(
@@ -183,15 +184,10 @@ def conclude(
 ) -> Registration:
     """The registration after a last step from ``T`` (4, 4), for a search made elsewhere.
 
-    ``available`` counts the source's surface elements. Fewer than 50 partners: rejected.
+    ``available`` counts the source's surface elements.
     """
-    if equations.partners < MIN_PARTNERS:
-        return _no_overlap(T_start, iterations)
-    problem = _along_directions(equations, np.zeros((0, 0), np.float32), config)
-    depth = float(problem.centre[2])
-    limits = config.max_rms_share * depth, config.max_step_share * depth
-    moved = problem.step() @ T
-    return _judged(problem, moved, T_start, available, limits, iterations + 1, config)
+    problem = _along_directions(equations, config)
+    return _judged(problem, problem.step() @ T, T_start, available, iterations + 1, config)
 
 
 def register_projective(
@@ -224,7 +220,7 @@ def register_surfaces(
         for _ in range(limit):
             problem = _problem(source, target, T, stride, level == last, config)
             if problem is None:
-                return _no_overlap(T_target_source, done)
+                return no_overlap(T_target_source, done)
             step = problem.step()
             T = step @ T
             done += 1
@@ -232,33 +228,30 @@ def register_surfaces(
                 break
     assert problem is not None
     grid = source.elements[stride // 2 :: stride, stride // 2 :: stride, 4]
-    available = int(np.count_nonzero(grid))
-    depth = float(problem.centre[2])
-    limits = config.max_rms_share * depth, config.max_step_share * depth
-    return _judged(problem, T, T_target_source, available, limits, done, config)
+    return _judged(problem, T, T_target_source, int(np.count_nonzero(grid)), done, config)
 
 
-def _no_overlap(T: F64, iterations: int) -> Registration:
+def no_overlap(T: F64, iterations: int) -> Registration:
+    """The registration that fewer than :data:`MIN_PARTNERS` partners give: rejected."""
     return Registration(
         np.array(T, np.float64), np.eye(6) * 1e6, Verdict.REJECTED, float("nan"), 0.0, iterations
     )
 
 
 def _judged(
-    problem: _Problem, T: F64, T_start: F64, available: int, limits_m: tuple[float, float],
-    iterations: int, config: IcpConfig,
-) -> Registration:  # fmt: skip
-    """The registration with its verdict; ``limits_m`` are of the rms and of the correction."""
+    problem: _Problem, T: F64, T_start: F64, available: int, iterations: int, config: IcpConfig
+) -> Registration:
+    """The registration with its verdict."""
     covariance = _covariance(problem, config)
-    rms = float(np.sqrt(problem.sums[3] / max(problem.sums[0], 1e-9)))
-    share = float(problem.sums[2]) / max(available, 1)
+    sums, depth = problem.equations.sums, float(problem.equations.centre[2])
+    rms = float(np.sqrt(sums[3] / max(sums[0], 1e-9)))
+    share = float(sums[2]) / max(available, 1)
     change = T @ se3.inverse(T_start)
-    step = float(np.linalg.norm(change[:3, :3] @ problem.centre + change[:3, 3] - problem.centre))
     turn = float(np.linalg.norm(se3.so3_log(change[:3, :3])))
     implausible = (
         share < config.min_inlier_share
-        or rms > limits_m[0]
-        or step > limits_m[1]
+        or rms > config.max_rms_share * depth
+        or problem.moved_m(change) > config.max_step_share * depth
         or turn > config.max_turn_rad
         or not problem.strong.any()
     )
@@ -269,18 +262,14 @@ def _judged(
 
 def _covariance(problem: _Problem, config: IcpConfig) -> F64:
     """(6, 6) covariance of a left perturbation."""
-    weights, squares = float(problem.sums[0]), float(problem.sums[1])
+    weights, squares = (float(s) for s in problem.equations.sums[:2])
     # Residuals of neighbours err together, so they count as fewer than they are.
-    area = problem.area
-    if area is None:
-        area = float(
-            icp_kernels.correlated_area(problem.size, AREA_SIGMAS * problem.scale, AREA_LAGS)
-        )
+    area = problem.equations.area()
     variance = max(squares / max(weights - 6.0, 1.0), 1e-6) * area * _UNSEEN_VARIANCE
     # Information from noise in the normals is none: only the shared part moves the estimate.
     information = np.maximum(problem.shared, 1e-30) ** 2 / np.maximum(problem.values, 1e-30)
     spread = np.where(problem.strong, variance / information, config.unknown_sigma_m**2)
     # The rotation was about the centre; a left perturbation turns about the origin.
-    move = se3.adjoint(se3.compose(np.eye(3), problem.centre))
+    move = se3.adjoint(se3.compose(np.eye(3), problem.equations.centre))
     directions = move @ (problem.unit[:, None] * problem.vectors)
     return np.asarray((directions * spread) @ directions.T)
