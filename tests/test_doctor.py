@@ -27,6 +27,16 @@ def findings(*overrides: str, listen_s: float = 0.1) -> dict[str, tuple[str, str
     return {f.what: (f.verdict, f.text) for f in found}
 
 
+def test_links_are_closed_where_it_is_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mavlink.component.vehicle.VehicleLink.report", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        findings(f"mavlink.links=udpin:127.0.0.1:{free_port()}")
+    assert not [t.name for t in threading.enumerate() if t.name.startswith("mavlink")]
+
+
 def test_everything_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
     ended = threading.Event()

@@ -6,6 +6,7 @@ import contextlib
 import math
 import socket
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,8 @@ from mavlink.component.vehicle import VehicleConfig
 from mavlink.telemetry.logs import load_telemetry
 from mavlink.wire.dialect import dialect
 from mavlink.wire.link import LinkSpec, parse_link
-from mavlink.wire.tlog import Recorder
+from mavlink.wire.ports import PORTS, READ_S
+from mavlink.wire.tlog import Recorder, packets
 
 S = 1_000_000_000
 
@@ -69,7 +71,6 @@ def test_a_fault_in_the_service_does_not_cost_the_link(caplog: pytest.LogCapture
         ("tcp:host:5760", LinkSpec("tcp", "host", 5760)),
         ("serial:/dev/ttyTHS1:921600", LinkSpec("serial", "/dev/ttyTHS1", 921600)),
         ("serial:/dev/ttyACM0", LinkSpec("serial", "/dev/ttyACM0", 57600)),
-        ("tlog:/data/a:b.tlog", LinkSpec("tlog", "/data/a:b.tlog", 0)),
         ("/dev/ttyACM0,115200", LinkSpec("serial", "/dev/ttyACM0", 115200)),
     ],
 )
@@ -100,11 +101,43 @@ def test_the_last_word_is_said() -> None:
         assert b"Service stops" in heard
 
 
-def test_a_recorded_flight_comes_in_as_if_it_flew_now(tmp_path: Path) -> None:
+class LogPort:
+    """A recorded .tlog as a serial line: replayed at its pace; sent data is discarded."""
+
+    is_quick = True
+
+    def __init__(self, spec: LinkSpec) -> None:
+        self._file = open(spec.place, "rb")  # noqa: SIM115 - closed by close()
+        self._packets = packets(self._file, Counter())
+        self._next = next(self._packets)
+        self._ahead_ns = time.monotonic_ns() - self._next[0]
+
+    def read(self) -> bytes:
+        """The next packet when it is due."""
+        wait_s = (self._next[0] + self._ahead_ns - time.monotonic_ns()) * 1e-9
+        time.sleep(min(max(wait_s, 0.0), READ_S))
+        if wait_s > READ_S:
+            return b""
+        data = self._next[1].data
+        self._next = next(self._packets)
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Discard."""
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def test_a_recorded_flight_comes_in_as_if_it_flew_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(PORTS, "serial", LogPort)
     turn = Path(__file__).parent / "data" / "mavlink" / "arducopter_turn.tlog"
     recorded = load_telemetry(turn).history
     began = (recorded.first_ns or 0) + 2 * S
-    with RehearsalVehicle(f"tlog:{turn}") as daemon:
+    with RehearsalVehicle(f"serial:{turn}") as daemon:
         history = daemon.link.history
         until(lambda: (history.last_ns or 0) - (history.first_ns or 0) > 3 * S)
         start = history.first_ns
@@ -115,7 +148,7 @@ def test_a_recorded_flight_comes_in_as_if_it_flew_now(tmp_path: Path) -> None:
     assert live.alt_agl_m == pytest.approx(kept.alt_agl_m, abs=0.1)
     assert live.q_ned_body_wxyz is not None and kept.q_ned_body_wxyz is not None
     assert abs(float(live.q_ned_body_wxyz @ kept.q_ned_body_wxyz)) > 0.9999
-    with RehearsalVehicle(f"tlog:{tmp_path / 'none.tlog'}") as daemon:
+    with RehearsalVehicle(f"serial:{tmp_path / 'none.tlog'}") as daemon:
         until(lambda: "No such file" in daemon.link.report().links[0].last_error)
 
 

@@ -1,9 +1,8 @@
-"""Ports: serial, UDP, TCP and recorded logs; the only I/O of this package.
+"""Ports: serial, UDP and TCP; the only I/O of this package.
 
 A link is written as in pymavlink:
 ``serial:/dev/serial/by-id/NAME:921600``, ``udpin:0.0.0.0:14550`` (also ``udp:``),
-``udpout:192.168.1.2:14550``, ``tcp:HOST:PORT``, ``tcpin:0.0.0.0:5760``; and for tests
-``tlog:PATH``, a recorded log replayed at its original pace.
+``udpout:192.168.1.2:14550``, ``tcp:HOST:PORT``, ``tcpin:0.0.0.0:5760``.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import contextlib
 import select
 import socket
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -22,7 +20,6 @@ LONGEST = 65536
 PEER_NS = 60_000_000_000  # a UDP peer not heard for longer is forgotten
 MAX_PEERS = 8
 BAUD = 57600
-KINDS = ("serial", "udp", "udpin", "udpout", "tcp", "tcpin", "tlog")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +33,7 @@ class LinkSpec:
     @property
     def name(self) -> str:
         """The address as it is written."""
-        number = f":{self.number}" if self.number else ""
-        return f"{self.kind}:{self.place}{number}"
+        return f"{self.kind}:{self.place}:{self.number}"
 
 
 def parse_link(text: str) -> LinkSpec:
@@ -45,18 +41,17 @@ def parse_link(text: str) -> LinkSpec:
     if text.startswith("/dev/"):
         text = "serial:" + text.replace(",", ":")
     kind, _, rest = text.partition(":")
-    if kind == "tlog" and rest:
-        return LinkSpec(kind, rest, 0)
+    kind = "udpin" if kind == "udp" else kind
     place, _, number = rest.rpartition(":")
-    if kind not in KINDS:
-        raise ValueError(f"link {text!r}: use one of {', '.join(KINDS)}, as udpin:0.0.0.0:14550")
+    if kind not in PORTS:
+        raise ValueError(f"link {text!r}: use one of {', '.join(PORTS)}, as udpin:0.0.0.0:14550")
     if kind == "serial" and not number.isdigit():
         place, number = rest, str(BAUD)
     if not place or not number.isdigit() or not int(number):
         raise ValueError(f"link {text!r}: needs a place and a number, as {kind}:PLACE:NUMBER")
     if kind != "serial" and int(number) > 65535:
         raise ValueError(f"link {text!r}: no such port")
-    return LinkSpec("udpin" if kind == "udp" else kind, place, int(number))
+    return LinkSpec(kind, place, int(number))
 
 
 class Port(Protocol):
@@ -231,47 +226,11 @@ class TcpServerPort:
         self._server.close()
 
 
-class LogPort:
-    """A recorded .tlog, replayed at its pace; sent data is discarded."""
-
-    is_quick = True
-
-    def __init__(self, spec: LinkSpec) -> None:
-        from mavlink.wire.tlog import packets
-
-        self._file = open(spec.place, "rb")  # noqa: SIM115 - closed by close()
-        self._packets = packets(self._file, Counter())
-        self._next = next(self._packets, None)
-        self._ahead_ns = 0 if self._next is None else time.monotonic_ns() - self._next[0]
-
-    def read(self) -> bytes:
-        """The next packet when it is due."""
-        if self._next is None:
-            time.sleep(READ_S)
-            return b""
-        wait_s = (self._next[0] + self._ahead_ns - time.monotonic_ns()) * 1e-9
-        if wait_s > 0.0:
-            time.sleep(min(wait_s, READ_S))
-        if wait_s > READ_S:
-            return b""
-        data = self._next[1].data
-        self._next = next(self._packets, None)
-        return data
-
-    def write(self, data: bytes) -> None:
-        """Discard."""
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
 PORTS: dict[str, Callable[[LinkSpec], Port]] = {
     "serial": SerialPort,
     "udpin": UdpPort,
     "udpout": UdpPort,
     "tcp": TcpPort,
     "tcpin": TcpServerPort,
-    "tlog": LogPort,
 }
 """Kind of link to its port. A new kind is one class and one line."""

@@ -387,12 +387,14 @@ def _by_listening(config: Config, listen_s: float) -> Iterator[Finding]:
         yield Finding("mavlink", BAD, str(error))
         return
     vehicle.start()
-    end_s = time.monotonic() + listen_s
-    while time.monotonic() < end_s:
-        vehicle.set_health(Health.STANDBY)
-        time.sleep(CONFIRM_S)
-    found = vehicle.report()
-    vehicle.stop()
+    try:
+        end_s = time.monotonic() + listen_s
+        while time.monotonic() < end_s:
+            vehicle.set_health(Health.STANDBY)
+            time.sleep(CONFIRM_S)
+        found = vehicle.report()
+    finally:
+        vehicle.stop()
     for link in found.links:
         if link.packets:
             heard = (f"system {s}: {n / listen_s:.0f}/s" for s, n in sorted(link.packets.items()))
