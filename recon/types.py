@@ -95,6 +95,7 @@ class PosePrior:
     above_ns: int = 0  # time of the newest of them
     is_at_rest: bool = False  # the vehicle stands on the ground: its position repeats rightly
     is_agl_measured: bool = True  # False: above the take-off point, or assumed
+    is_agl_assumed: bool = False
     velocity_m_s: F64 | None = None  # (3,) ENU, of the vehicle
     travel: Travel | None = None  # the velocity integrated up to this moment
     turn_rad_s: F64 | None = None  # (3,) angular velocity of the camera, in its own frame

@@ -135,7 +135,7 @@ def test_without_anything_the_prior_says_how_little_it_knows() -> None:
     prior = some.prior(None, None)
     assert prior.position_m is None and prior.agl_m == ASSUMED_AGL_M
     assert prior.sigma_yaw_rad > 1.0 and prior.sigma_tilt_rad > 0.05
-    assert not some.height_known(None, None)
+    assert some.prior(None, None).is_agl_assumed
 
 
 def test_each_part_of_the_telemetry_can_be_switched_off() -> None:
@@ -153,7 +153,8 @@ def test_each_part_of_the_telemetry_can_be_switched_off() -> None:
 def test_a_tags_height_can_be_switched_off() -> None:
     tag = GeoTag(30.0, -98.0, 300.0, ypr_deg=(90.0, -90.0, 0.0), relative_alt_m=80.0)
     without = rig(fusion=FusionConfig(altitude=False))
-    assert without.prior(None, tag).agl_m == ASSUMED_AGL_M and not without.height_known(None, tag)
+    assert without.prior(None, tag).agl_m == ASSUMED_AGL_M
+    assert without.prior(None, tag).is_agl_assumed
 
 
 def test_attitude_of_a_pose_is_that_of_the_head() -> None:
@@ -181,9 +182,9 @@ def test_a_height_above_the_take_off_point_is_not_measured() -> None:
 
 def test_a_height_set_by_the_operator_is_known_whatever_it_is() -> None:
     fifty = Rig(CameraConfig(), ScanConfig(assumed_agl_m=50.0), FusionConfig())
-    assert fifty.height_known(None, None)
+    assert not fifty.prior(None, None).is_agl_assumed
     assert fifty.prior(None, None).is_agl_measured
-    assert not rig().height_known(None, None)
+    assert rig().prior(None, None).is_agl_assumed
 
 
 def test_the_turn_of_the_camera_is_in_its_own_frame() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import Enum
 
 import numpy as np
 
@@ -45,14 +44,6 @@ RATE_RAD_S, CHANGE_RAD_S2 = 0.02, 1.0
 
 NO_YAW_RAD = 3.0
 """Sigma of an unknown heading."""
-
-
-class HeightSource(Enum):
-    """Origin of a height above ground."""
-
-    MEASURED = "measured"  # by rangefinder, terrain model, or the operator
-    ABOVE_HOME = "above home"  # the site may lie higher or lower than the take-off point
-    ASSUMED = "assumed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,13 +95,15 @@ class Rig:
         R, tilt, yaw = self._rotation(state, tag)
         fix = self._fix(state, tag)
         position, sigma = self._position(fix)
-        agl, sigma_agl, source = self._agl(state, tag)
         lever = self._lever(state)
+        height = self._agl(state, tag, float(lever[2]))
+        agl, sigma_agl, is_measured = height or (ASSUMED_AGL_M, 0.5 * ASSUMED_AGL_M, False)
         position = None if position is None else position + lever
         prior = PosePrior(
             R, tilt, yaw, position, sigma, agl, sigma_agl,
             is_at_rest=state is not None and _is_at_rest(state),
-            is_agl_measured=source is HeightSource.MEASURED,
+            is_agl_measured=is_measured,
+            is_agl_assumed=height is None,
             is_sigma_claimed=fix is None or fix.is_claimed,
             is_view_assumed=tilt >= ASSUMED_TILT_RAD,
         )  # fmt: skip
@@ -207,27 +200,23 @@ class Rig:
         return enu, np.maximum(sigma, MIN_SIGMA_M)
 
     def _agl(
-        self, state: VehicleState | None, tag: GeoTag | None
-    ) -> tuple[float, float, HeightSource]:
-        """Height above ground, its sigma in metres, and its origin."""
+        self, state: VehicleState | None, tag: GeoTag | None, lever_m: float
+    ) -> tuple[float, float, bool] | None:
+        """Height above ground and its sigma, m, and whether it is measured or given, not above the
+        take-off point, which may lie elsewhere. The camera is ``lever_m`` above the vehicle."""
         if self._scan.assumed_agl_m is not None:
             agl = self._scan.assumed_agl_m
-            return agl, 0.1 * agl, HeightSource.MEASURED
+            return agl, 0.1 * agl, True
         if state is not None and state.alt_agl_m is not None and state.alt_agl_m > 1.0:
             if self._fusion.altitude:
                 agl = state.alt_agl_m
                 spread = max(state.sigma_agl_m or 3.0, 0.03 * agl)
-                raised = agl + float(self._lever(state)[2])
                 if "relative" not in state.sources:
-                    return raised, spread, HeightSource.MEASURED
-                return raised, max(spread, ABOVE_HOME_SHARE * agl), HeightSource.ABOVE_HOME
+                    return agl + lever_m, spread, True
+                return agl + lever_m, max(spread, ABOVE_HOME_SHARE * agl), False
         elif tag is not None and self._fusion.altitude and (agl := tag.relative_alt_m or 0.0) > 1.0:
-            return agl, ABOVE_HOME_SHARE * agl + 2.0, HeightSource.ABOVE_HOME
-        return ASSUMED_AGL_M, 0.5 * ASSUMED_AGL_M, HeightSource.ASSUMED
-
-    def height_known(self, state: VehicleState | None, tag: GeoTag | None) -> bool:
-        """False when the scan's scale depends on :data:`ASSUMED_AGL_M`."""
-        return self._agl(state, tag)[2] is not HeightSource.ASSUMED
+            return agl, ABOVE_HOME_SHARE * agl + 2.0, False
+        return None
 
 
 def _is_at_rest(state: VehicleState) -> bool:

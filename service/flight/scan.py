@@ -165,8 +165,8 @@ class Scan:
         self.tagged += state is not None
         if self.tags is not None:
             self.tags.write(exposed_ns + inputs.unix_offset_ns, state)
-        self.heights += self.rig.height_known(state, frame.geotag)
         prior = self.rig.prior(state, frame.geotag)
+        self.heights += not prior.is_agl_assumed
         self.attitudes += not prior.is_view_assumed
         prior = self._odometer.take(exposed_ns, prior)
         if self.pipeline.stages.track.odometry.needs_turn(exposed_ns):
