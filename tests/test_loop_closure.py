@@ -90,7 +90,6 @@ def test_a_place_seen_again_is_found_from_any_side(yaw: float) -> None:
     miss = se3.transform(loop.T_a_b, below) - se3.transform(truth, below)
     assert np.linalg.norm(miss) < 0.08
     assert error @ np.linalg.solve(loop.covariance, error) < 30
-    assert loop.sources == ("epnp", "icp") and loop.matches > 60
 
 
 def oblique(x: float, y: float, yaw: float) -> F64:

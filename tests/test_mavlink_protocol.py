@@ -417,7 +417,7 @@ def test_values_that_do_not_fit_are_dropped_not_raised() -> None:
     assert packer.pack(1, Outgoing(191, bad), 0) is None
     station = Station()
     for report in (
-        KeyframeReport(10**20, 1e30, -1e30, float("nan"), float("inf"), None, False, "x" * 999),
+        KeyframeReport(10**20, 1e30, -1e30, float("nan"), float("inf"), None, False),
         KeyframeReport(-5, None, None, None, None, (1.0, 0.0, 0.0, 0.0)),
     ):
         station.companion.report(report)

@@ -37,7 +37,6 @@ class KeyframeReport:
     alt_agl_m: float | None = None
     q_ned_camera_wxyz: tuple[float, float, float, float] | None = None  # of the head, FRD
     ok: bool = True
-    url: str = ""
 
 
 class CameraComponent:
@@ -212,7 +211,7 @@ class CameraComponent:
             list(k.q_ned_camera_wxyz or (math.nan,) * 4),
             index & 0x7FFFFFFF,
             int(k.ok),
-            k.url.encode()[:204],
+            b"",  # no address of the image
         )
 
     _MAKERS = {  # noqa: RUF012

@@ -60,8 +60,6 @@ class LoopClosure:
 
     T_a_b: F64  # (4, 4) m
     covariance: F64  # (6, 6) left perturbation in a's camera frame
-    matches: int
-    sources: tuple[str, ...]  # of "epnp", "icp"
     growth: float = 1.0  # of b's depths, to fit a's
 
 
@@ -161,7 +159,7 @@ def verify(
         return None
     T_a_b = se3.inverse(solved.T_camera_points)
     A = se3.adjoint(T_a_b)
-    return _with_icp(a, b, T_a_b, A @ solved.covariance @ A.T, solved, config)
+    return _with_icp(a, b, T_a_b, A @ solved.covariance @ A.T, config)
 
 
 def _by_features(
@@ -240,15 +238,13 @@ def _pose(
 
 
 def _with_icp(
-    a: LoopView, b: LoopView, T_a_b: F64, covariance: F64, solved: pnp.PnpResult,
-    config: LoopConfig,
-) -> LoopClosure | None:  # fmt: skip
+    a: LoopView, b: LoopView, T_a_b: F64, covariance: F64, config: LoopConfig
+) -> LoopClosure | None:
     """The loop refined by ICP of the depth maps; None when they contradict it."""
     growth = _growth(a, b, T_a_b)
     if growth is None:
         return None
     b = replace(b, depth=_grown(b.depth, growth))
-    count = int(np.count_nonzero(solved.inliers))
     # Depths of one keyframe err together, which the pixels do not show.
     depth = float(np.nanmedian(a.depth.depth_m))
     sigma = float(np.nanmedian(a.depth.sigma_m))
@@ -262,7 +258,7 @@ def _with_icp(
         return None
     T, covariance = se3.average(T_a_b, covariance, aligned.T_target_source, aligned.covariance)
     covariance = covariance + np.diag([MIN_RAD**2] * 3 + [(MIN_SHARE * sigma) ** 2] * 3)
-    return LoopClosure(T, covariance, count, ("epnp", "icp"), growth)
+    return LoopClosure(T, covariance, growth)
 
 
 def _growth(a: LoopView, b: LoopView, T_a_b: F64) -> float | None:

@@ -50,14 +50,6 @@ class MatchingCostConfig:
     difference_truncation: int = 20  # gray levels
     unseen: float = 1.0  # of a label whose partner is outside the image, above the best one
 
-    @property
-    def ceiling(self) -> float:
-        """The largest possible cost, in labels of smoothness."""
-        return (
-            self.census_weight * self.census_truncation
-            + self.difference_weight * self.difference_truncation
-        )
-
 
 def matching_cost(
     left: U8,

@@ -45,8 +45,7 @@ CELL = 8
 class VirtualStereoConfig:
     """Parameters of pair selection and rectification."""
 
-    base_to_height: float = 0.1  # wanted baseline over distance
-    min_base_to_height: float = 0.03
+    min_base_to_height: float = 0.03  # baseline over distance
     max_base_to_height: float = 0.8
     min_overlap: float = 0.25  # share of the left view that the right one sees
     width_px: int = 320  # of the stereo views, along the image's width
