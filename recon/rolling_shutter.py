@@ -130,7 +130,7 @@ def _after(ray: F64, inverse_depth: F64, twist: F64) -> F64:
     return np.asarray(ray + step + 0.5 * np.cross(twist[:, :3], step))
 
 
-def _on_image(points: F64) -> F64:
+def on_image(points: F64) -> F64:
     """(N, 2) where points (N, 3) are at a depth of 1."""
     return np.asarray(points[:, :2] / points[:, 2:])
 
@@ -146,10 +146,10 @@ def depth_share(
     R, t = T_partner_view[:3, :3], T_partner_view[:3, 3]
     ray, inverse_depth = points / points[:, 2:], 1.0 / points[:, 2]
     there = ray @ R.T + t * inverse_depth[:, None]
-    parallax = _on_image(there) - _on_image(ray @ R.T)
+    parallax = on_image(there) - on_image(ray @ R.T)
     there /= there[:, 2:]
     here_off, there_off = (
-        _on_image(_after(at, inverse_depth, rows.reading(readout_s).twists(at))) - at[:, :2]
+        on_image(_after(at, inverse_depth, rows.reading(readout_s).twists(at))) - at[:, :2]
         for at, rows in ((ray, view), (there, partner))
     )
     wrong = there_off - here_off @ R[:2, :2].T

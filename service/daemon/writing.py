@@ -9,13 +9,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavlink.component.control import ACCEPTED, Answer, Result, Work
 from service.errors import OutsideError
-from service.workers import PROCESS, guarded
+from service.workers import PROCESS, Worker, guarded
 
 if TYPE_CHECKING:
     from service.stream.store import ScanStore
@@ -23,50 +24,17 @@ if TYPE_CHECKING:
 OTHERS = ("scan.db", "link.tlog")
 
 
-class Writing:
-    """Writes a finished scan's files, starting when it is created."""
+@dataclass(slots=True, eq=False)
+class _Writing:
+    """One scan's files that are being written."""
 
-    def __init__(self, folder: Path, store: ScanStore, left: Callable[[Writing], None]) -> None:
-        """The thread that waits for the end closes the ``store``; after :meth:`leave` none waits,
-        so the store is closed here and ``left`` is called.
-        """
-        self.name = folder.name
-        self.fault = ""  # why the files are not written; empty when they are
-        self.work: Work | None = None  # work that ends with the files
-        self._folder, self._store = folder, store
-        self._lock, self._done = threading.Lock(), threading.Event()
-        self._left, self._is_left = left, False
-        self._worker = PROCESS.start("files", lambda _: self._write())
-
-    def wait(self, seconds: float) -> bool:
-        """True when it has ended, successfully or not."""
-        return self._done.wait(seconds)
-
-    def leave(self, hand_over: Callable[[], Work | None]) -> bool:
-        """Stop waiting, and take over the work that ``hand_over`` returns. False, without any
-        effect, when the files are written already.
-        """
-        with self._lock:
-            if self._done.is_set():
-                return False
-            self.work = hand_over()
-            self._is_left = True
-            return True
-
-    def marks(self) -> tuple[Any, ...]:
-        """Values that change when it makes progress: uses of the store, bytes of files."""
-        return (self._store.uses(self._worker.thread_id), sizes(self._folder))
-
-    def _write(self) -> None:
-        from service.scans.folder import write_deliverables
-
-        write = partial(write_deliverables, self._folder, self._store, {})
-        self.fault = guarded(f"files of {self.name}", write)
-        with self._lock:
-            self._done.set()
-        if self._is_left:
-            self._store.close()
-            self._left(self)
+    folder: Path
+    store: ScanStore
+    worker: Worker | None = None
+    done: threading.Event = field(default_factory=threading.Event)  # successfully or not
+    fault: str = ""  # why the files are not written; empty when they are
+    is_left: bool = False  # no scan waits: the thread that writes does what is left to do
+    work: Work | None = None  # then ends with the files
 
 
 class Writings:
@@ -75,7 +43,8 @@ class Writings:
     def __init__(self, report: Callable[[str], None]) -> None:
         """``report`` gets messages for the operator about files that no scan waited for."""
         self._report = report
-        self._all: list[Writing] = []
+        self._all: list[_Writing] = []
+        self._lock = threading.Lock()  # between the end of writing and the end of waiting
 
     def __len__(self) -> int:
         return len(self._all)
@@ -83,16 +52,19 @@ class Writings:
     @property
     def names(self) -> set[str]:
         """Names of the scans."""
-        return {writing.name for writing in tuple(self._all)}
+        return {writing.folder.name for writing in tuple(self._all)}
 
     def marks(self) -> tuple[Any, ...]:
-        """Values that change when one of them makes progress."""
-        return tuple(writing.marks() for writing in tuple(self._all))
+        """Values that change when one of them makes progress: uses of the store, bytes of files."""
+        return tuple(
+            (one.worker and one.store.uses(one.worker.thread_id), sizes(one.folder))
+            for one in tuple(self._all)
+        )
 
     def wait(self, seconds: float) -> None:
         """Wait for the oldest, at most this long."""
         for writing in tuple(self._all)[:1]:
-            writing.wait(seconds)
+            writing.done.wait(seconds)
 
     def write(
         self, folder: Path, store: ScanStore, in_haste: Callable[[], bool],
@@ -104,25 +76,36 @@ class Writings:
         ``hand_over`` ends the sender, and the work that it returns is finished with the files.
         Raises OutsideError when they cannot be written.
         """
-        writing = Writing(folder, store, self._written)
+        writing = _Writing(folder, store)
         self._all.append(writing)
-        while not writing.wait(0.1):
-            if in_haste() and writing.leave(hand_over):
-                return
+        writing.worker = PROCESS.start("files", lambda _: self._write(writing))
+        while not writing.done.wait(0.1):
+            if in_haste():
+                with self._lock:
+                    if not writing.done.is_set():
+                        writing.work, writing.is_left = hand_over(), True
+                        return
         self._all.remove(writing)
         land()
         store.close()
         if writing.fault:
             raise OutsideError(writing.fault)
 
-    def _written(self, writing: Writing) -> None:
-        """Finish files that no scan waited for, or report that they failed."""
+    def _write(self, writing: _Writing) -> None:
+        from service.scans.folder import write_deliverables
+
+        name = writing.folder.name
+        write = partial(write_deliverables, writing.folder, writing.store, {})
+        writing.fault = guarded(f"files of {name}", write)
+        with self._lock:
+            writing.done.set()
+        if not writing.is_left:
+            return
+        writing.store.close()
         self._all.remove(writing)
         answer = ACCEPTED
         if writing.fault:
-            self._report(
-                f"Scan {writing.name} is stored, its files are not written: {writing.fault}"
-            )
+            self._report(f"Scan {name} is stored, its files are not written: {writing.fault}")
             answer = Answer(Result.FAILED, writing.fault)
         if writing.work is not None:
             writing.work.finish(answer)

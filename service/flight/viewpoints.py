@@ -16,7 +16,7 @@ import numpy as np
 from recon import se3
 from recon.camera_model import Undistorter
 from recon.posegraph.between_keyframes import FixAverage
-from recon.rolling_shutter import NEAR_S, FrameRows, depth_share
+from recon.rolling_shutter import NEAR_S, FrameRows, depth_share, on_image
 from recon.row_errors import turn_shares
 from recon.stereo.virtual_stereo import View
 from recon.tracking.keyframe_window import OdometryKeyframe, landmarks, step_covariance
@@ -472,12 +472,7 @@ class StereoViews:
         depth = np.median(se3.transform(se3.inverse(view.T_odom_camera), points)[:, 2])
         on_axis = se3.transform(view.T_odom_camera, np.array([[0.0, 0.0, depth]]))
         first, last = (
-            self._K[0, 0] * _on_image(se3.transform(se3.inverse(at.T_odom_camera), on_axis))
+            self._K[0, 0] * on_image(se3.transform(se3.inverse(at.T_odom_camera), on_axis))
             for _, at in (near[0], near[-1])
         )
         return np.asarray((last - first)[0] * exposure_s * 1e9 / (near[-1][0] - near[0][0]))
-
-
-def _on_image(points: F64) -> F64:
-    """(N, 2) where points (N, 3) are at a depth of 1."""
-    return np.asarray(points[:, :2] / points[:, 2:])
