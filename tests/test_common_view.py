@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import cv2
 import numpy as np
 import pytest
 from painted_ground import pose, still
 
 from recon.tracking import common_view
-from recon.tracking.common_view import FeatureCache, Features, Signatures, alike, features
+from recon.tracking.common_view import FeatureCache, Features, alike, features, signature
 from recon.types import F64, U8
 
 
@@ -43,10 +41,8 @@ def test_a_cache_forgets_what_was_not_asked_for_longest(monkeypatch: pytest.Monk
 
 
 def test_a_look_is_that_of_the_place_whatever_the_turn() -> None:
-    signatures = Signatures()
     here, turned, elsewhere = (
-        signatures.of(i, partial(still, T))
-        for i, T in enumerate((pose(0.0), pose(6.0, 130.0, seed=1), pose(80.0)))
+        signature(still(T)) for T in (pose(0.0), pose(6.0, 130.0, seed=1), pose(80.0))
     )
     assert alike(here, turned) > 20 > 8 > alike(here, elsewhere)
     assert here.dtype == np.uint8 and here.nbytes <= 200 * 128

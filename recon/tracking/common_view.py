@@ -8,7 +8,6 @@ places seen before. The search for Harris corners makes it exact.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -166,23 +165,10 @@ def alike(a: U8, b: U8) -> int:
     return len(rows)
 
 
-class Signatures:
-    """The strongest features of many images by number, in 26 kB each."""
-
-    def __init__(self) -> None:
-        self._of: dict[int, U8] = {}
-
-    def of(self, seq: int, gray: Callable[[], U8]) -> U8:
-        """(N, 128) descriptors of image ``seq``, which ``gray`` gives when it is first needed."""
-        if seq not in self._of:
-            strongest = features(gray(), SIGNATURE_WIDTH_PX).descriptors[:SIGNATURE]
-            steps = np.clip(np.rint(strongest * SIGNATURE_STEPS), 0, 255)
-            self._of[seq] = np.asarray(steps, np.uint8)
-        return self._of[seq]
-
-    def forget(self, seq: int) -> None:
-        """Drop an image."""
-        self._of.pop(seq, None)
+def signature(gray: U8) -> U8:
+    """(N, 128) descriptors of the strongest features of an image, in 26 kB."""
+    strongest = features(gray, SIGNATURE_WIDTH_PX).descriptors[:SIGNATURE]
+    return np.asarray(np.clip(np.rint(strongest * SIGNATURE_STEPS), 0, 255), np.uint8)
 
 
 class FeatureCache:

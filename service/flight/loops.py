@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from recon.posegraph.loop_closure import (
     verify,
 )
 from recon.posegraph.trajectory import Trajectory
-from recon.tracking.common_view import Signatures, alike
+from recon.tracking.common_view import alike, signature
 from recon.types import F64, U8, DepthMap
 
 WIDTH_PX = 640
@@ -45,7 +46,7 @@ MOVED = 0.25
 """Of the view's diagonal, from which on a loop tells something new."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Kept:
     """A keyframe packed for later."""
 
@@ -63,6 +64,11 @@ class _Kept:
     def gray(self) -> U8:
         """(H, W) image."""
         return np.asarray(cv2.imdecode(self.image, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+    @cached_property
+    def signature(self) -> U8:
+        """Its look."""
+        return signature(self.gray())
 
     def unpacked(self, scale: float) -> LoopView:
         """The view with its depth in metres."""
@@ -112,7 +118,6 @@ class LoopSearch:
         self._kept: dict[int, _Kept] = {}
         self._tied: _Kept | None = None  # the last end of a loop
         self._turn = 0
-        self._signatures = Signatures()
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -188,12 +193,11 @@ class LoopSearch:
         """
         if self.trajectory.graph.is_tied(new.segment):
             return []
-        here = self._signatures.of(new.seq, new.gray)
         self._turn += 1
         every = -(-len(seqs) // COMPARED)
         found = []
         for seq in seqs[self._turn % every :: every]:
-            count = alike(self._signatures.of(seq, self._kept[seq].gray), here)
+            count = alike(self._kept[seq].signature, new.signature)
             if count >= MIN_ALIKE:
                 found.append((count, seq))
         return [seq for _, seq in sorted(found, reverse=True)]
@@ -207,4 +211,3 @@ class LoopSearch:
         """Forget every second keyframe of the older half."""
         for seq in list(self._kept)[: len(self._kept) // 2 : 2]:
             del self._kept[seq]
-            self._signatures.forget(seq)
