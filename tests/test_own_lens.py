@@ -99,11 +99,19 @@ def test_a_lens_that_the_images_do_not_determine_is_reported(
     def refuse(*_: object) -> None:
         raise InputError("the camera found is too far from the model given")
 
-    monkeypatch.setattr("service.flight.scan.Scan.run", lambda *_, **__: None)
     monkeypatch.setattr("service.offline.refine.refinement.lens", refuse)
     figures, _ = replayed(f"images:{stills(tmp_path / 'stills', 6)}", tmp_path / "scan")
     assert "distortion" in figures["assumed"]
     assert any("the camera found is too far" in note for note in figures["warnings"])
+
+
+def test_images_that_place_no_camera_determine_no_lens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.flight.scan.Scan.run", lambda *_, **__: None)
+    figures, _ = replayed(f"images:{stills(tmp_path / 'stills', 6)}", tmp_path / "scan")
+    reason = "the images do not determine their lens: 0 keyframes are too few; 2 needed"
+    assert reason in figures["warnings"]
 
 
 def test_the_stills_about_the_middle(tmp_path: Path) -> None:

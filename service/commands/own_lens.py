@@ -112,6 +112,8 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> C
             scan.close()
         finally:
             store.close()
+        if scan.recorder.keyframes < 2:
+            return f"{scan.recorder.keyframes} keyframes are too few; 2 needed"
         try:
             return lens(folder, Path(parse_source(video)[1]), search)
         except InputError as error:
