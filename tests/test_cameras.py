@@ -184,6 +184,22 @@ def test_truncated_video_gives_what_decodes_and_says_so(tmp_path: Path) -> None:
     assert any("cut off" in w for w in source.warnings)
 
 
+def test_joined_recordings_follow_each_other(tmp_path: Path) -> None:
+    """The times of MPEG-TS parts written one behind the other begin again with each."""
+    part = tmp_path / "part.ts"
+    write_video(str(part), "mpegts")
+    path = tmp_path / "joined.ts"
+    path.write_bytes(3 * part.read_bytes())
+    source = open_camera(str(path))
+    times_ms = np.array([frame.time_ns // 1_000_000 for frame in source])
+    assert len(times_ms) == 3 * len(TIMES_MS)
+    assert np.all(np.diff(times_ms) > 0)
+    for first in (0, len(TIMES_MS), 2 * len(TIMES_MS)):
+        own = times_ms[first : first + len(TIMES_MS)] - times_ms[first]
+        np.testing.assert_allclose(own, TIMES_MS, atol=1)
+    assert sum("times begin again" in warning for warning in source.warnings) == 2
+
+
 def test_damaged_middle_costs_only_itself(tmp_path: Path) -> None:
     path = tmp_path / "v.mp4"
     write_video(str(path), "mp4", {"movflags": "faststart"}, codec="mjpeg")

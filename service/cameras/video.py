@@ -39,6 +39,9 @@ EARLIEST_UNIX_S = 946_684_800  # 2000-01-01: cameras without a clock write 1904 
 
 OPTIONS = ("format", "video_size", "pixel_format", "framerate")
 
+RESTART_NS = 1_000_000_000
+"""A time that goes back to this long after the start, at most, begins again: joined recordings."""
+
 HEAD_BYTES = 4096
 NS_PER_S = 1_000_000_000
 
@@ -83,6 +86,7 @@ class VideoSource:
         self._container = container
         self._damaged = 0
         self._unordered = 0
+        self._earlier_ns = 0  # time before the clock last began again
         self._open = True
         self._wanted_ns: list[int] | None = None  # all
         self._within_ns = self._late_ns = 0
@@ -195,10 +199,21 @@ class VideoSource:
     def _time_ns(self, frame: av.VideoFrame, last_ns: int) -> int:
         """Presentation time; an image without one follows the last one at the mean interval."""
         if frame.pts is None or frame.time_base is None:
-            step = 1e9 / self.fps if self.fps else 1e9 / 30.0
-            return last_ns + int(step) if last_ns >= 0 else 0
+            return self._following(last_ns)
         # Whole ticks first: floats of seconds lose nanoseconds after minutes.
-        return round((frame.pts * frame.time_base - self._start_s) * NS_PER_S)
+        clock_ns = round((frame.pts * frame.time_base - self._start_s) * NS_PER_S)
+        if clock_ns <= RESTART_NS < last_ns - self._earlier_ns - clock_ns:
+            self._warn(
+                f"times begin again at {last_ns / 1e9:.2f} s, as in joined recordings: "
+                "the rest follows on at once"
+            )
+            self._earlier_ns = self._following(last_ns) - clock_ns
+        return self._earlier_ns + clock_ns
+
+    def _following(self, last_ns: int) -> int:
+        """Time of the image after the one at ``last_ns``, at the mean interval."""
+        step = 1e9 / self.fps if self.fps else 1e9 / 30.0
+        return last_ns + int(step) if last_ns >= 0 else 0
 
     def _warn_losses(self, decoded: int) -> None:
         if self._damaged:
