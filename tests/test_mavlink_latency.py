@@ -50,9 +50,9 @@ def of_scipy_head(q: Quaternion, mount: Rotation) -> Rotation:
 
 
 def attitudes(
-    hz: float, strength: float = 1.0, noise_rad: float = 0.0
+    hz: float, strength: float = 1.0, noise_rad: float = 0.0, seed: int = 11
 ) -> list[tuple[int, Quaternion]]:
-    rng = np.random.default_rng(11)
+    rng = np.random.default_rng(seed)
     samples = []
     for k in range(round(45 * hz)):
         a, b, c = map(float, rng.normal(0.0, 0.5 * noise_rad, 3))
@@ -79,6 +79,15 @@ def test_a_gimbal_that_only_trembles_is_enough() -> None:
     found = watch_flight(0.07, 2e-4, 0.08, 30.0).estimate(attitudes(20.0, 0.08, 9e-4))
     assert found is not None
     assert abs(found.latency_ms - 70.0) < 3.0 * found.sigma_ms < 40.0
+
+
+def test_images_in_step_with_telemetry_do_not_draw_the_latency_between_its_samples() -> None:
+    ratios = []
+    for seed in range(6):
+        found = watch_flight(0.0, 2e-4, 0.08, 10.0).estimate(attitudes(20.0, 0.08, 1e-3, seed))
+        assert found is not None
+        ratios.append(found.latency_ms / found.sigma_ms)
+    assert np.sqrt(np.mean(np.square(ratios))) < 2.0
 
 
 def test_a_calm_flight_and_too_few_frames_say_nothing() -> None:

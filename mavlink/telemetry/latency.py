@@ -184,14 +184,17 @@ def _refine(seen: _Turns, track: Attitudes, lag_s: float) -> LatencyEstimate | N
     if not 0 < k < len(lags) - 1:
         return None
     before, at, after = fits[k - 1], fits[k], fits[k + 1]
-    bend = costs[k - 1] - 2.0 * costs[k] + costs[k + 1]
-    if before is None or at is None or after is None or not bend > 0.0:
+    if before is None or at is None or after is None or not np.isfinite(costs).all():
         return None
-    latency = float(lags[k] - 0.5 * FINE_S * (costs[k + 1] - costs[k - 1]) / bend)
+    bend, tilt, _ = np.polyfit(lags - lag_s, costs, 2)
+    latency = float(lag_s - 0.5 * tilt / bend) if bend > 0.0 else np.inf
+    if not abs(latency - lag_s) <= FINE_STEPS * FINE_S:
+        return None
     slope = (after.ours - before.ours) / (2.0 * FINE_S)
     known = before.known & at.known & after.known
-    sigma = _sigma(slope[known] @ weight, slope[known], at.rest[known], 2 * seen.overlap)
     count = float(known.sum())
+    pull = _pull(slope[known] @ weight, at.rest[known], 2 * seen.overlap)
+    sigma = pull / (count * bend)
     sigma *= count / max(count - FITTED * seen.overlap, 1.0)
     sigma_ms = float(np.hypot(1e3 * sigma, FLOOR_MS))
     if not sigma_ms <= MAX_SIGMA_MS:
@@ -207,15 +210,14 @@ def _cost(fit: _Fit | None, weight: F64) -> float:
     return float(np.einsum("ij,jk,ik->i", rest, weight, rest).mean())
 
 
-def _sigma(weighted: F64, slope: F64, rest: F64, lasting: int) -> float:
-    """1 sigma in s of a time found by least squares, for misfits correlated over some windows."""
-    information = float((weighted * slope).sum())
+def _pull(weighted: F64, rest: F64, lasting: int) -> float:
+    """1 sigma of half the slope of all misfits together, which are correlated over some windows."""
     pulls = (weighted * rest).sum(axis=1)
     variance = float((pulls**2).sum())
     total = variance
     for k in range(1, min(lasting, len(pulls) - 1) + 1):
         total += 2.0 * (1.0 - k / (lasting + 1)) * float((pulls[k:] * pulls[:-k]).sum())
-    return float(np.sqrt(max(total, variance))) / information if information > 0.0 else np.inf
+    return float(np.sqrt(max(total, variance)))
 
 
 F64 = npt.NDArray[np.float64]
@@ -228,6 +230,10 @@ and a camera swings at up to 1 Hz."""
 FINER = 4
 """Steps from one attitude to the next."""
 
+AVERAGED = 6
+"""Steps over which attitudes are averaged. Over one and a half spacings the noise of the mean is the
+same between two samples as on one, to 0.6 %; over one spacing it is 17 % less half-way."""
+
 
 class Attitudes:
     """Attitudes of a flight; gives the rotation between any two times."""
@@ -235,7 +241,7 @@ class Attitudes:
     def __init__(self, samples: Sequence[tuple[int, Quaternion]]) -> None:
         """``samples`` are (time in ns, ``q_ned_body``), oldest first; at least two.
 
-        Each pair of neighbours is averaged. Otherwise noise would be minimal half-way between two
+        They are averaged (``AVERAGED``). Otherwise noise would be minimal half-way between two
         samples, and would bias every comparison towards that point.
         """
         self.base_ns = samples[0][0]
@@ -247,7 +253,7 @@ class Attitudes:
         self._step_s = max(self.spacing_s / FINER, 1e-3)
         self._grid_s = np.arange(0.0, times_s[-1] + self._step_s, self._step_s)
         fine, known = _between(times_s, q, self._grid_s)
-        weights = np.concatenate([[0.5], np.ones(FINER - 1), [0.5]]) / FINER
+        weights = np.concatenate([[0.5], np.ones(AVERAGED - 1), [0.5]]) / AVERAGED
         self._q = np.stack([np.convolve(fine[:, k], weights, "same") for k in range(4)], axis=1)
         self._known: Bool = np.convolve(known, weights, "same") > 0.999
 
