@@ -231,8 +231,8 @@ FINER = 4
 """Steps from one attitude to the next."""
 
 AVERAGED = 6
-"""Steps over which attitudes are averaged. Over one and a half spacings the noise of the mean is the
-same between two samples as on one, to 0.6 %; over one spacing it is 17 % less half-way."""
+"""Steps over which attitudes are averaged: over one and a half spacings the noise of the mean is as
+large between two samples as on one, to 0.6 %. Over one spacing it is 17 % less half-way."""
 
 
 class Attitudes:
