@@ -110,7 +110,7 @@ def test_images_that_place_no_camera_determine_no_lens(
 ) -> None:
     monkeypatch.setattr("service.flight.scan.Scan.run", lambda *_, **__: None)
     figures, _ = replayed(f"images:{stills(tmp_path / 'stills', 6)}", tmp_path / "scan")
-    reason = "the images do not determine their lens: 0 keyframes are too few; 2 needed"
+    reason = "the images do not determine their lens: 0 keyframes are too few; 3 needed"
     assert reason in figures["warnings"]
 
 

@@ -21,7 +21,7 @@ from service.cameras.images import ImagesSource
 from service.cameras.lens import SIGMA_FOCAL, Lens, by_full_frame
 from service.config import change
 from service.errors import InputError
-from service.offline.refine.own_camera import bent, by_tags
+from service.offline.refine.own_camera import MIN_IMAGES, bent, by_tags
 
 if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
@@ -112,8 +112,8 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> C
             scan.close()
         finally:
             store.close()
-        if scan.recorder.keyframes < 2:
-            return f"{scan.recorder.keyframes} keyframes are too few; 2 needed"
+        if scan.recorder.keyframes < MIN_IMAGES:
+            return f"{scan.recorder.keyframes} keyframes are too few; {MIN_IMAGES} needed"
         try:
             return lens(folder, Path(parse_source(video)[1]), search)
         except InputError as error:

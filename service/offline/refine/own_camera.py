@@ -74,6 +74,9 @@ EXHAUSTIVE = 60
 GROSS_PX = 15.0
 """A sighting further from its landmark takes no part."""
 
+MIN_IMAGES = 3
+"""Fewer do not determine a camera."""
+
 MIN_SHARE = 0.5
 """Share of the keyframes whose images the video must hold."""
 
@@ -95,7 +98,7 @@ def images_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[
             k = int(np.argmin(apart))
             if apart[k] <= WITHIN_S * 1e9 and k not in found:
                 found[k] = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
-    if len(found) < max(3, MIN_SHARE * len(wanted)):
+    if len(found) < max(MIN_IMAGES, MIN_SHARE * len(wanted)):
         raise InputError(
             f"{video}: holds images of {len(found)} of {len(wanted)} keyframes; give the video "
             "that the scan was made of"
