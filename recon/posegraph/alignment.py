@@ -62,6 +62,9 @@ WILD = 12.5
 ODD = 5.0
 """The same of a fix against those next to it."""
 
+SETTLED = 1e-3
+"""A step of so many sigmas ends the fit: each is about half as long as the one before."""
+
 ROUNDS = 4
 """Times that the noise of altitudes and the tilt by them are found in turn."""
 
@@ -191,10 +194,10 @@ def _measured(
     ]
     fixed = [replace(a, prior=replace(a.prior, travel=None)) for a in level]
     moved = [replace(a, prior=replace(a.prior, position_m=None)) for a in level]
-    out, fixes = ReadingNoise(), AlignmentReadings(fixed, None, wander_s)
+    out, at, fixes = ReadingNoise(), start, AlignmentReadings(fixed, None, wander_s)
     # Altitudes that weigh too little leave a lean, which looks like a wander of theirs.
     for _ in range(1 if fixes.is_height_claimed else ROUNDS):
-        at = _solve(fixes, start, iterations).at
+        at = _solve(fixes, at, iterations).at
         out = _of_fixes(fixes, at, wander_s, slow_share)
         fixes = AlignmentReadings(fixed, out, wander_s)
     ways = AlignmentReadings(moved, None, wander_s)
@@ -317,7 +320,7 @@ def _solve(readings: AlignmentReadings, at: State, iterations: int) -> _Solution
         step[:3] = np.clip(step[:3], -0.5, 0.5)
         step[6:10] = np.clip(step[6:10], -0.5, 0.5)
         at = at.moved(step)
-        stands = np.abs(step).max() < 1e-7 or i >= iterations - 1
+        stands = step @ H @ step < SETTLED**2 or i >= iterations - 1
         if stands and not (kept.all() and _leave_out(readings, norms, kept)):
             break
     return _Solution(_centred(readings, at, weight), H, cost, r, kept)
