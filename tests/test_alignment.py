@@ -10,6 +10,7 @@ import pytest
 
 from recon import se3
 from recon.camera_model import rays
+from recon.posegraph import alignment
 from recon.posegraph.alignment import fit, scales
 from recon.posegraph.anchors import Anchor, height_above, height_below
 from recon.types import F32, F64, DepthMap, PosePrior, Travel
@@ -75,6 +76,25 @@ def test_one_wild_fix_does_not_move_the_map() -> None:
     assert a is not None and b is not None
     shift = a.pose(good[15].T_odom_camera)[:3, 3] - b.pose(good[15].T_odom_camera)[:3, 3]
     assert np.linalg.norm(shift) < 0.4
+
+
+@pytest.mark.parametrize("off_m", [0.0, 8.0])
+def test_a_fit_ends_within_a_hundredth_of_its_sigma(
+    monkeypatch: pytest.MonkeyPatch, off_m: float
+) -> None:
+    """Against a fit that goes on until rounding, also with fixes that lose weight."""
+    some = anchors(se3.so3_exp(np.array([0.05, -0.03, 1.2])), 2.0, np.ones(3), seed=6)
+    for i in range(0, 30, 5):
+        p = some[i].prior
+        assert p.position_m is not None
+        moved = replace(p, position_m=p.position_m + np.array([off_m, 0.0, 0.0]))
+        some[i] = replace(some[i], prior=moved)
+    soon = fit(some)
+    monkeypatch.setattr(alignment, "SETTLED", 1e-12)
+    late = fit(some, iterations=200)
+    assert soon is not None and late is not None
+    step = np.r_[se3.so3_log(soon.R @ late.R.T), soon.t - late.t, np.log(soon.scale / late.scale)]
+    assert 0.0 < step @ np.linalg.solve(late.covariance, step) < 0.01**2
 
 
 def test_heading_comes_from_the_track_when_no_compass_tells_it() -> None:
