@@ -71,7 +71,8 @@ def run(project: Path, core: bool = True, works: bool = True) -> subprocess.Comp
         [str(project / ".ci" / "run")],
         env={
             "PATH": str(tools), "PYTHON": sys.executable, "HOME": os.environ.get("HOME", "/"),
-            "PYTEST_ADDOPTS": "-p no:dash",
+            "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_ADDOPTS": "-p xdist.plugin",
+            "PYTEST_XDIST_AUTO_NUM_WORKERS": "1",
         },
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
