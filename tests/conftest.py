@@ -106,12 +106,13 @@ FIRST = (
     "test_refine", "test_own_camera", "test_doc_commands_run", "test_trial_service",
     "test_replay_backends", "test_trial_attack", "test_sim_recording", "test_trial_soak",
     "test_bad_images", "test_demo", "test_hostile_scans", "test_trial_load", "test_loop_closure",
-    "test_matching", "test_trial_closing", "test_graph_dropped", "test_triton_kernels",
+    "test_matching", "test_trial_closing", "test_graph_dropped", "test_triton_kernels", "test_site",
     "test_calibration",
     "test_ground_hostile", "test_trial_ground", "test_simulated", "test_intent",
     "test_bench_site", "test_ground_killed", "test_walls", "test_foxglove", "test_ground_receiver",
     "test_backends", "test_bench_gpu", "test_bench_real", "test_mavlink_flight",
     "test_mavlink_latency", "test_mavlink_ctl", "test_ground_live_site", "test_graph_thinning",
+    "test_mesh_tiles",
 )  # fmt: skip
 """The files that take longest. The first compiles the kernels that the trials' processes load, and
 the next two need none of them; files that wait lie between those that compute."""
