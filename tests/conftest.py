@@ -103,11 +103,11 @@ def house() -> HouseFlight:
 
 FIRST = (
     "test_replay", "test_pose_graph", "test_graph_hard_flights", "test_refine_images",
-    "test_refine", "test_own_camera", "test_doc_commands_run", "test_trial_service",
+    "test_own_lens", "test_doc_commands_run", "test_rolling_shutter", "test_trial_service",
+    "test_refine", "test_site", "test_stills", "test_own_camera", "test_triton_kernels",
     "test_replay_backends", "test_trial_attack", "test_sim_recording", "test_trial_soak",
     "test_bad_images", "test_demo", "test_hostile_scans", "test_trial_load", "test_loop_closure",
-    "test_matching", "test_trial_closing", "test_graph_dropped", "test_triton_kernels", "test_site",
-    "test_calibration",
+    "test_matching", "test_trial_closing", "test_graph_dropped", "test_calibration",
     "test_ground_hostile", "test_trial_ground", "test_simulated", "test_intent",
     "test_bench_site", "test_ground_killed", "test_walls", "test_foxglove", "test_ground_receiver",
     "test_backends", "test_bench_gpu", "test_bench_real", "test_mavlink_flight",
