@@ -23,6 +23,7 @@ from service.errors import InputError
 from service.stream.store import ScanStore
 
 BENT = 0.1
+SPARSE = ("--set", "compute.stereo_width=160", "--set", "compute.guide_width=320")
 EXIF_FOCAL = 29  # mm of a 35 mm camera: 402 px
 
 
@@ -64,7 +65,8 @@ def video(path: Path, count: int) -> Path:
 
 def replayed(source: str | Path, out: Path, *more: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """The figures of a replay, and the camera that it stored."""
-    answer = CliRunner().invoke(app, ["replay", str(source), "--out", str(out), "--json", *more])
+    command = ["replay", str(source), "--out", str(out), "--json", *SPARSE, *more]
+    answer = CliRunner().invoke(app, command)
     assert answer.exit_code == 0, answer.output
     with ScanStore.open(out / "scan.db") as store:
         return json.loads(answer.stdout.splitlines()[-1]), store.header.camera
