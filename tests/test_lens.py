@@ -121,7 +121,7 @@ def test_whole_millimetres_are_less_sure_the_shorter_the_lens(tmp_path: Path) ->
         assert lens is not None
         sigma[mm] = lens.sigma_focal
     assert sigma[12] == pytest.approx(np.hypot(SIGMA_FOCAL, 0.5 / 12 / np.sqrt(3.0)))
-    assert sigma[12] > 1.3 * sigma[24] > 1.4 * sigma[200] > 0.028
+    assert sigma[12] > 1.07 * sigma[24] > 1.09 * sigma[200] > 1.09 * SIGMA_FOCAL
 
 
 def test_the_makers_distortion_and_middle_are_read(tmp_path: Path) -> None:

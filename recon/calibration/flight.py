@@ -21,7 +21,6 @@ from recon.calibration.global_bundle import (
     RowMotion,
     Sightings,
     Solution,
-    dispersion,
     errors_px,
     solve,
 )
@@ -32,6 +31,17 @@ MIN_SIGHTINGS = 60
 
 MAX_STEP = 0.3
 """Of a parameter's sigma, that one more step would move it by."""
+
+LOOSE, PARTS = 0.2, 6
+"""Sigma of a focal length that the images alone shall find, and parts of the flight of which one is
+left out at a time."""
+
+MAX_SIGHTINGS = 12_000
+
+TOO_FAR = "the camera found is too far from the model given; calibrate with a chessboard"
+
+SIGMA_TURN_RAD = 0.01
+"""Of the rows, from the first to the last: within 50 ms, 12 degrees a second, or 10 m/s at 50 m."""
 
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of an error whose coordinates have sigma 1."""
@@ -46,7 +56,7 @@ class SelfCalibrationConfig:
     sigma_centre: float = 0.015  # of the centre, as a share of the width
     sigma_k: float = 0.1  # of k1 and of k2
     sigma_p: float = 0.005  # of p1 and of p2
-    max_sigma_focal: float = 0.003  # a less certain focal length is refused
+    max_sigma_focal: float = 0.01  # a less certain focal length is refused
     max_sigma_bend: float = np.inf  # likewise of k1, as the share of depth it bends at a corner
     max_sigmas: float = 3.0  # from the model given; a camera further off is refused
     pixel_sigma: float = 0.5
@@ -104,17 +114,20 @@ def self_calibrate(
             camera, camera, poses, landmarks, some, sigmas, known, held, config.huber_sigmas
         )
 
-    seen = within(camera, poses, landmarks, seen, np.inf)
+    seen = thinned(within(camera, poses, landmarks, seen, np.inf))
     before = errors_px(camera, poses, landmarks, seen)
     first = solve(problem(seen, config.pixel_sigma), config.iterations)
-    # Once more without wild sightings and with the pixels' own scatter, on which sigmas rest.
+    # Once more without wild sightings and with the pixels' own scatter.
     sigma = float(np.clip(np.median(first.errors_px) / RAYLEIGH_MEDIAN, 0.1, 2.0))
     seen = shared(seen, first.errors_px < config.gate_sigmas * sigma)
     last = problem(seen, sigma)
-    found = independent(last, solve(last, config.iterations), config.iterations)
+    images, wider = by_images_alone(last, config)
+    found = solve(last.widened(wider), config.iterations)
     sigmas = camera_sigmas(found.camera_covariance)
-    focal = focal_sigma(found.camera, sigmas)
+    focal = focal_sigma(found.camera, sigmas) * contradiction(images, camera, config)
     why_not = doubt(found.camera, camera, sigmas, config)
+    if not why_not and focal > config.max_sigma_focal:
+        why_not = TOO_FAR
     if not why_not and (np.abs(found.camera_step) > MAX_STEP * sigmas).any():
         why_not = "the adjustment of the images does not settle"
     return SelfCalibrated(
@@ -124,13 +137,65 @@ def self_calibrate(
     )  # fmt: skip
 
 
-def independent(problem: Problem, found: Solution, iterations: int = 40) -> Solution:
-    """``found`` again with sightings that weigh as much as independent ones would."""
+@dataclass(frozen=True, slots=True)
+class FocalLength:
+    """A focal length with its relative sigma."""
+
+    px: float
+    sigma: float
+
+
+def thinned(seen: Sightings) -> Sightings:
+    """Those of evenly chosen landmarks, :data:`MAX_SIGHTINGS` in all: patches of an image share
+    their errors, so that more tell nothing more."""
+    count = max(len(seen.view), MAX_SIGHTINGS)
+    return shared(seen, seen.landmark * MAX_SIGHTINGS % count < MAX_SIGHTINGS)
+
+
+def by_images_alone(problem: Problem, config: SelfCalibrationConfig) -> tuple[FocalLength, float]:
+    """The focal length without prior knowledge, and by how much sightings have to be widened.
+
+    Errors that neighbouring sightings and views share pull the focal length of a flight straight
+    down much further than the adjustment's covariance says. So its sigma is that of a jackknife,
+    and of what it changes by where the camera may have a rolling shutter.
+    """
+    loose = replace(config, sigma_focal=max(config.sigma_focal, LOOSE))
+    problem = replace(problem, camera_information=camera_information(problem.given, loose))
+    found = solve(problem, config.iterations)
     at = replace(problem, camera=found.camera, poses=found.poses, points=found.points)
-    wider = float(np.sqrt(dispersion(at)))
-    if not 1.0 < wider < np.inf:
-        return found
-    return solve(at.widened(wider), iterations)
+    turning = solve(replace(at, rows=free_rows(len(at.poses))), config.iterations)
+    focal, other = (float(s.camera.K[0, 0]) for s in (found, turning))
+    spread = np.hypot(jackknife(at, config.iterations), np.log(focal / other))
+    sigma = focal_sigma(found.camera, camera_sigmas(found.camera_covariance))
+    wider = max(float(spread) / sigma, 1.0)
+    return FocalLength(focal, wider * sigma), wider
+
+
+def free_rows(count: int) -> RowMotion:
+    """Of ``count`` views whose rolling shutter is unknown."""
+    still = np.zeros((count, 3))
+    return RowMotion(still, still, still, np.full(still.shape, SIGMA_TURN_RAD))
+
+
+def jackknife(problem: Problem, iterations: int = 40) -> float:
+    """Relative sigma of the focal length by leaving out one part of the flight after another.
+
+    ``problem`` holds the adjusted state. Tukey 1958, with :data:`PARTS` runs of views.
+    """
+    seen, focal = problem.seen, []
+    for part in np.array_split(np.unique(seen.view), PARTS):
+        rest = shared(seen, ~np.isin(seen.view, part))
+        sigmas = np.full(len(rest.view), problem.sigma_px[0])
+        found = solve(replace(problem, seen=rest, sigma_px=sigmas), iterations)
+        focal.append(np.log(found.camera.K[0, 0]))
+    return float(np.sqrt((PARTS - 1) * np.var(focal)))
+
+
+def contradiction(images: FocalLength, given: Camera, config: SelfCalibrationConfig) -> float:
+    """How much further than their sigmas the focal lengths by the images and as given are apart;
+    1 where they agree. Birge 1932, doi:10.1103/PhysRev.40.207."""
+    apart = abs(np.log(images.px / given.K[0, 0]))
+    return max(float(apart / np.hypot(images.sigma, config.sigma_focal)), 1.0)
 
 
 ROUNDS = ((8.0, 180.0), (1.0, 15.0))
@@ -249,7 +314,7 @@ def doubt(found: Camera, given: Camera, sigmas: F64, c: SelfCalibrationConfig) -
     bent = np.abs(found.distortion[:4] - given.distortion[:4])
     off = max(off, float((bent / [c.sigma_k, c.sigma_k, c.sigma_p, c.sigma_p]).max()))
     if off > c.max_sigmas:
-        return "the camera found is too far from the model given; calibrate with a chessboard"
+        return TOO_FAR
     return ""
 
 

@@ -28,9 +28,9 @@ MIN_FOCAL, MAX_FOCAL = 0.2, 20.0
 SAME_SHAPE = 0.005
 """Relative tolerance of aspect ratios: sizes are whole pixels."""
 
-SIGMA_FOCAL = 0.02
-"""Relative sigma of a focal length in tags: it is that of the lens's model, and rounded; two real
-cameras had 0.5 % less and 3.7 % more (docs/reports/accuracy.md)."""
+SIGMA_FOCAL = 0.05
+"""Relative sigma of a focal length in tags: it is that of the lens's model, rounded, and of images
+before the camera straightens and crops them (docs/reports/accuracy.md)."""
 
 CALIBRATED, FOCAL_ALONE = "the maker's calibration", "the maker's focal length"
 AGREEMENT = 0.1

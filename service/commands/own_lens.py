@@ -15,16 +15,16 @@ from tempfile import TemporaryDirectory
 from threading import Event
 from typing import TYPE_CHECKING
 
-from recon.calibration.flight import SelfCalibrationConfig
 from service.cameras import open_camera, parse_source
 from service.cameras.images import ImagesSource
-from service.cameras.lens import SIGMA_FOCAL, Lens, by_full_frame
+from service.cameras.lens import Lens, by_full_frame
 from service.config import change
 from service.errors import InputError
 from service.offline.refine.own_camera import MIN_IMAGES, bent, by_tags
 
 if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
+    from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
     from recon.types import Camera
     from service.cameras.source import CameraSource
     from service.flight.scan import Scan, ScanInputs
@@ -43,9 +43,6 @@ MAX_FRAMES = 5400
 ASSUMED = Lens(0.5 / math.tan(math.radians(35.0)), sigma_focal=0.2)
 """70 degrees across; cameras of drones have 60 to 86."""
 
-OPEN = bent(SelfCalibrationConfig(sigma_focal=ASSUMED.sigma_focal, max_sigma_focal=SIGMA_FOCAL))
-"""How such a lens is sought: one found counts if its focal length is as good as EXIF's."""
-
 COARSE = {"compute.stereo_width": 320, "compute.upsample": False, "fusion.loops": False}
 """Poses are all that is needed."""
 
@@ -57,7 +54,7 @@ class StartLens:
     camera: Camera
     note: str
     assumed: tuple[str, ...]  # of "lens", "distortion"
-    search: SelfCalibrationConfig  # how the images may change it
+    search: SelfCalibrationConfig  # how the images may change it, and the focal length's sigma
 
 
 def start_lens(source: CameraSource, telemetry: TelemetryLog | None) -> StartLens:
@@ -69,12 +66,12 @@ def start_lens(source: CameraSource, telemetry: TelemetryLog | None) -> StartLen
         if known:
             return StartLens(source.camera, _advice(note), (), search)
         return StartLens(source.camera, _advice(note), ("distortion",), bent(search))
-    lens, of, search = ASSUMED, "70 degrees", OPEN
+    lens, of = ASSUMED, "70 degrees"
     if telemetry is not None and telemetry.focal_35mm is not None:
         lens = by_full_frame(telemetry.focal_35mm, source.size_px)
         of = f"{telemetry.focal_35mm:.0f} mm (35 mm equivalent in the telemetry)"
-        search = bent(by_tags(lens.sigma_focal))
     note = f"a lens of {of} without distortion is assumed"
+    search = bent(by_tags(lens.sigma_focal))
     return StartLens(lens.camera(source.size_px), _advice(note), ("lens",), search)
 
 
@@ -82,7 +79,7 @@ def _advice(note: str) -> str:
     return f"no camera model given: {note}; make one with 'skyrelief calibrate' for true shapes"
 
 
-def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> Camera | str:
+def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> SelfCalibrated | str:
     """The camera by a reconstruction of some images, or why they do not determine it.
 
     ``inputs`` are those of the whole scan, with the lens to begin with; ``video`` is its camera

@@ -20,6 +20,7 @@ from service.progress import Progress
 
 if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
+    from recon.calibration.flight import SelfCalibrated
     from recon.types import Camera, Shutter
     from service.cameras.source import CameraSource
     from service.commands.own_lens import StartLens
@@ -205,7 +206,7 @@ def _with_lens(
     from service.commands.own_lens import own_lens
     from service.flight.scan import check_new
 
-    found: Camera | str = ""
+    found: SelfCalibrated | str = ""
     if find_lens and parse_source(video)[0] in ("file", "images"):
         check_new(inputs.folder)
         progress("finding the lens")
@@ -213,9 +214,13 @@ def _with_lens(
     if isinstance(found, str):
         refused = (f"the images do not determine their lens: {found}",) if found else ()
         notes = (start.note, *refused, *inputs.notes)
-        return replace(inputs, notes=notes, assumed=start.assumed)
-    note = f"no camera model given: found from the images themselves ({found.K[0, 0]:.0f} px)"
-    return replace(inputs, camera=found, notes=(note, *inputs.notes))
+        sigma = start.search.sigma_focal
+        return replace(inputs, notes=notes, assumed=start.assumed, sigma_focal=sigma)
+    focal = f"{found.camera.K[0, 0]:.0f} px, sigma {100.0 * found.sigma_focal:.1f} %"
+    note = f"no camera model given: found from the images themselves ({focal})"
+    return replace(
+        inputs, camera=found.camera, notes=(note, *inputs.notes), sigma_focal=found.sigma_focal
+    )
 
 
 def _fly(

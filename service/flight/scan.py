@@ -71,6 +71,7 @@ class ScanInputs:
     history: VehicleHistory | None = None
     notes: tuple[str, ...] = ()
     assumed: tuple[str, ...] = ()  # of "lens", "distortion"
+    sigma_focal: float = 0.0  # of the focal length, as a share; 0: a calibrated camera
     extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
     latency_ms: float | None = None  # the camera's as an earlier scan found it
     known: KnownTrack | None = None  # takes the odometry's place
@@ -128,6 +129,7 @@ class Scan:
                 live=live,
                 pages=pages,
                 assumed=inputs.assumed,
+                sigma_focal=inputs.sigma_focal,
                 known=inputs.known,
             )
         )
@@ -236,6 +238,7 @@ class Scan:
             "warnings": [*self.inputs.notes, *self.inputs.source.warnings, *self._doubts()],
         }
         extra["assumed"] = self._assumed()
+        extra["sigma_focal"] = round(self.inputs.sigma_focal, 4)
         extra["camera_readout"] = self._readout()
         extra["motion_blur"] = self.shutter.summary
         shutter = self.found_shutter()

@@ -418,6 +418,7 @@ def build_stages(
     live: bool = False,
     pages: Path | None = None,
     assumed: Collection[str] = (),
+    sigma_focal: float = 0.0,
     known: KnownTrack | None = None,
 ) -> Stages:
     """The stages that the configuration asks for. Raises ValueError for an unusable camera model.
@@ -455,6 +456,7 @@ def build_stages(
     surface = SurfaceMap(
         pages, compute.map_voxels, config.scan.resolution_m, stopwatch, float(camera.K[0, 0]),
         assumed,
+        sigma_focal,
     )  # fmt: skip
 
     return Stages(

@@ -32,6 +32,11 @@ ASSUMED_LENS_SHARE = 0.02
 """Sigma of depth over depth where a lens without distortion is assumed: lenses of action cameras
 bend surfaces by that much."""
 
+MIN_FOCAL_SHARE, MAX_FOCAL_SHARE = 0.02, 0.05
+"""Sigma of the focal length from which on sigma of depth holds it, and up to which. All points
+share that error: a small one would only hide how they err against each other, and one above a tenth
+would drop them all."""
+
 SIGMA_K1 = 0.02
 """Sigma of a lens's first radial coefficient where tags give its focal length alone: what is left
 in stills that drones straighten themselves."""
@@ -142,16 +147,19 @@ class SurfaceMap:
         stopwatch: Stopwatch,
         focal_px: float,
         assumed: Collection[str] = (),
+        sigma_focal: float = 0.0,
     ) -> None:
         """``pages``: see :class:`PagedMap`; None: forget the oldest when memory is full.
 
-        ``focal_px`` is of the recorded images. With "lens" or "distortion" among ``assumed``,
-        sigma covers the bending by it.
+        ``focal_px`` is of the recorded images, known to ``sigma_focal``, a share. With "lens" or
+        "distortion" among ``assumed``, sigma covers the bending by it.
         """
         self._pages, self._max_voxels, self._resolution_m = pages, max_voxels, resolution_m
         self._stopwatch = stopwatch
         self._focal_px = focal_px
         self._lens_share = ASSUMED_LENS_SHARE if "lens" in assumed else 0.0
+        if sigma_focal > MIN_FOCAL_SHARE:
+            self._lens_share = float(np.hypot(self._lens_share, min(sigma_focal, MAX_FOCAL_SHARE)))
         self._sigma_k1 = SIGMA_K1 if "distortion" in assumed else 0.0
         self._map: VoxelMap | PagedMap | None = None
         self._disagreement, self._segment = Disagreement(), -1
@@ -190,7 +198,8 @@ class SurfaceMap:
         h, w = depth.depth_m.shape
         K = depth.K
         x, y = (np.arange(w) - K[0, 2]) / K[0, 0], (np.arange(h) - K[1, 2]) / K[1, 1]
-        return np.asarray(2.0 * self._sigma_k1 * np.add.outer(y * y, x * x), np.float32)
+        bent = 2.0 * self._sigma_k1 * np.add.outer(y * y, x * x)
+        return np.asarray(np.hypot(bent, self._lens_share), np.float32)
 
     def _empty(self, depth: DepthMap) -> VoxelMap | PagedMap:
         """A map as fine as the first view."""

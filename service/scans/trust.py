@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from enum import Enum
 from typing import Any
@@ -20,6 +21,9 @@ MAX_SLOPE_DEG = 30.0
 MAX_LEAN_SIGMA_DEG = 2.0
 """Above this sigma of what is level, slopes are in doubt: cameras that look 15 degrees ahead make
 level ground lean by 10."""
+
+MIN_LENS_SIGMA, MAX_LENS_SIGMA = 0.01, 0.1
+"""Sigma of a focal length above which heights are in doubt, and above which the shape is."""
 
 MIN_PLACED_SHARE = 0.5
 """Share of the frames; below it vision was lost for most of the flight."""
@@ -49,8 +53,9 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     """The level as ``level`` and what limits it as ``reasons``, both for scan.json.
 
     Args:
-        run: figures of the scan's run: ``assumed``, ``scale``, ``lean_sigma_deg``, ``frames``,
-            ``frames_tracked``, ``graph``. Missing or malformed ones limit nothing.
+        run: figures of the scan's run: ``assumed``, ``sigma_focal``, ``scale``,
+            ``lean_sigma_deg``, ``frames``, ``frames_tracked``, ``graph``. Missing or malformed
+            ones limit nothing.
         georeference: of the scan's header; "none" without.
         slope_deg: of the plane through the cloud.
     """
@@ -59,8 +64,11 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     scale = run.get("scale")
     sigma = _number(scale, "sigma")
     doubts = []
+    focal = _number(run, "sigma_focal") or 0.0
     if "lens" in assumed:
         doubts.append("the lens is assumed: shapes bend; calibrate the camera")
+    elif focal > MAX_LENS_SIGMA:
+        doubts.append(_uncertain(focal))
     if "view" in assumed and slope_deg > MAX_SLOPE_DEG:
         doubts.append(
             f"the view direction is assumed, and the site slopes by {slope_deg:.0f} degrees"
@@ -92,6 +100,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         limits.append(
             "the lens's distortion is unknown: surfaces bend by a percent of the distance"
         )
+    if focal > MIN_LENS_SIGMA:
+        limits.append(_uncertain(focal))
     lean_deg = _number(run, "lean_sigma_deg")
     if lean_deg is not None and lean_deg > MAX_LEAN_SIGMA_DEG:
         limits.append(
@@ -103,6 +113,13 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     if ratio := _number(scale, "gnss_over_heights"):
         limits.append(scales_differ(ratio))
     return _said(Trust.GEOREFERENCED, limits)
+
+
+def _uncertain(sigma_focal: float) -> str:
+    return (
+        f"the focal length is uncertain by {sigma_focal:.0%}: heights err by as much of the "
+        "distance; calibrate the camera"
+    )
 
 
 def _refused(run: Mapping[str, Any], kind: str, why: str) -> tuple[float, float]:
@@ -125,9 +142,10 @@ def scales_differ(gnss_over_heights: float) -> str:
 
 
 def scale_sigma(run: Mapping[str, Any], georeference: str) -> float | None:
-    """Relative sigma of the scale as the flight measured it; None where nothing did, or where
-    control points gave a better one."""
-    return None if georeference == BY_SURVEY else _number(run.get("scale"), "sigma")
+    """Relative sigma of the scale as the flight measured it, and of the focal length, which scales
+    heights; None where nothing measured it, or where control points gave a better one."""
+    sigma = None if georeference == BY_SURVEY else _number(run.get("scale"), "sigma")
+    return None if sigma is None else math.hypot(sigma, _number(run, "sigma_focal") or 0.0)
 
 
 def _said(level: Trust, reasons: list[str]) -> dict[str, Any]:

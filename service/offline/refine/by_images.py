@@ -48,7 +48,7 @@ from service.offline.refine.survey_file import SurveyPoint
 from service.scans.track import camera_of
 from service.stream.records import PoseRecord, ScanHeader
 
-FREE = SelfCalibrationConfig()
+FREE = SelfCalibrationConfig(max_sigma_focal=0.003)
 HELD = replace(
     FREE, sigma_focal=1e-5, sigma_aspect=1e-5, sigma_centre=1e-6, sigma_k=1e-6, sigma_p=1e-7
 )

@@ -115,8 +115,8 @@ def times_of_stills(folder: Path, start_unix_ns: int) -> dict[str, float]:
 
 
 def by_tags(sigma_focal: float) -> SelfCalibrationConfig:
-    """A camera whose focal length is known to ``sigma_focal``, a share, and holds if left open."""
-    return replace(START, sigma_focal=sigma_focal, max_sigma_focal=2.0 * sigma_focal)
+    """A camera whose focal length is known to ``sigma_focal``, a share; images may better it."""
+    return replace(START, sigma_focal=sigma_focal, max_sigma_focal=sigma_focal)
 
 
 def bent(search: SelfCalibrationConfig) -> SelfCalibrationConfig:

@@ -146,7 +146,7 @@ def intrinsics(
     return own_camera.write(found, given, out or folder) | {"notes": job.notes}
 
 
-def lens(folder: Path, images: Path, config: SelfCalibrationConfig) -> Camera:
+def lens(folder: Path, images: Path, config: SelfCalibrationConfig) -> SelfCalibrated:
     """The camera by a scan's own images, a recording or a folder of stills.
 
     Raises InputError, in one line, where they do not determine it.
@@ -154,7 +154,7 @@ def lens(folder: Path, images: Path, config: SelfCalibrationConfig) -> Camera:
     _open_target(folder, None)
     with ScanStore.open(folder / "scan.db") as store:
         job = _Refinement(folder, store, RefineOptions())
-        return job.own_camera(images, config)[0].camera
+        return job.own_camera(images, config)[0]
 
 
 def _deliver(target: Path, figures: dict[str, Any]) -> dict[str, Any]:
