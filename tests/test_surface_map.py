@@ -105,12 +105,21 @@ def test_nonsense_limits_are_refused(tmp_path: Path) -> None:
         PagedMap(CONFIG, tmp_path, max_voxels=10)
 
 
-@pytest.mark.parametrize(("assumed", "share"), [((), 0.0), (("lens",), 0.02)])
-def test_an_assumed_lens_widens_what_is_stored_and_not_the_choice(
-    assumed: tuple[str, ...], share: float
+@pytest.mark.parametrize(
+    ("assumed", "sigma_focal", "share"),
+    [
+        ((), 0.0, 0.0),
+        ((), 0.01, 0.0),
+        ((), 0.04, 0.04),
+        (("lens",), 0.0, 0.02),
+        (("lens",), 0.2, np.hypot(0.02, 0.05)),
+    ],
+)
+def test_an_uncertain_lens_widens_what_is_stored_and_not_the_choice(
+    assumed: tuple[str, ...], sigma_focal: float, share: float
 ) -> None:
-    """2 % of the depth; a better view still counts as better."""
-    surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], assumed)
+    """By a share of the depth; a better view still counts as better."""
+    surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], assumed, sigma_focal)
     first, better = (view(0.0, sigma_m=sigma) for sigma in (0.2, 0.05))
     candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=KNOWN_ROWS))
     sigma, fresh = surface(candidate, first, first.T_world_camera)

@@ -121,8 +121,8 @@ def self_calibrate(
     sigma = float(np.clip(np.median(first.errors_px) / RAYLEIGH_MEDIAN, 0.1, 2.0))
     seen = shared(seen, first.errors_px < config.gate_sigmas * sigma)
     last = problem(seen, sigma)
-    images, wider = by_images_alone(last, config)
-    found = solve(last.widened(wider), config.iterations)
+    images, wider, at = by_images_alone(last, config)
+    found = solve(replace(at, camera_information=held).widened(wider), config.iterations)
     sigmas = camera_sigmas(found.camera_covariance)
     focal = focal_sigma(found.camera, sigmas) * contradiction(images, camera, config)
     why_not = doubt(found.camera, camera, sigmas, config)
@@ -152,8 +152,11 @@ def thinned(seen: Sightings) -> Sightings:
     return shared(seen, seen.landmark * MAX_SIGHTINGS % count < MAX_SIGHTINGS)
 
 
-def by_images_alone(problem: Problem, config: SelfCalibrationConfig) -> tuple[FocalLength, float]:
-    """The focal length without prior knowledge, and by how much sightings have to be widened.
+def by_images_alone(
+    problem: Problem, config: SelfCalibrationConfig
+) -> tuple[FocalLength, float, Problem]:
+    """The focal length without prior knowledge, by how much sightings have to be widened, and the
+    state adjusted to them.
 
     Errors that neighbouring sightings and views share pull the focal length of a flight straight
     down much further than the adjustment's covariance says. So its sigma is that of a jackknife,
@@ -168,7 +171,7 @@ def by_images_alone(problem: Problem, config: SelfCalibrationConfig) -> tuple[Fo
     spread = np.hypot(jackknife(at, config.iterations), np.log(focal / other))
     sigma = focal_sigma(found.camera, camera_sigmas(found.camera_covariance))
     wider = max(float(spread) / sigma, 1.0)
-    return FocalLength(focal, wider * sigma), wider
+    return FocalLength(focal, wider * sigma), wider, at
 
 
 def free_rows(count: int) -> RowMotion:
