@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.tracking import matching
 from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.localisation import Localiser, OdometryConfig, Search
 from recon.tracking.odometry import Odometry, Tracked, Tracking
-from recon.types import F64, U8, Camera, PosePrior, Shutter
+from recon.types import F64, U8, Bool, Camera, PosePrior, Shutter
 
 K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
 CAMERA = Camera(K, np.zeros(5), (480, 360))
@@ -275,6 +276,25 @@ def test_each_landmark_is_searched_once(ground: U8, monkeypatch: pytest.MonkeyPa
             assert a and not a & b
             assert len(a | b) <= 1.5 * OdometryConfig().tracked_landmarks
     assert pairs > 5
+
+
+def test_a_few_landmarks_show_where_the_others_are(
+    ground: U8, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at, searched = matching._Search.at, list[int]()
+
+    def counted(self: Any, level: int, uv_b: F64, active: Bool, reach: int) -> Any:
+        searched[-1] += int(active.sum())
+        return at(self, level, uv_b, active, reach)
+
+    monkeypatch.setattr(matching._Search, "at", counted)
+    odometry, rng, out = Odometry(CAMERA, OdometryConfig()), np.random.default_rng(2), []
+    for i, T in enumerate(poses(20)):
+        searched.append(0)
+        out.append(odometry.track(photograph(ground, T), i, i * 200_000_000, prior_of(T, rng)))
+    between = [n for n, one in zip(searched, out, strict=True) if one.state is Tracking.TRACKED]
+    assert len(between) > 8
+    assert max(between) < 300  # of 450, on up to five levels
 
 
 def test_motions_between_keyframes_are_as_good_as_claimed(ground: U8) -> None:

@@ -326,7 +326,10 @@ class Localiser:
             visible[rows[:: max(1, len(rows) // most)]] = True
             config = replace(config, max_return_px=np.inf)  # the pose refutes what is wrong
         index = np.flatnonzero(visible)
-        found = matching.match(
+        # While a readout is sought, what it does to each row must show.
+        is_led = most is not None and self._row_track.is_known >= self._row_track.is_rolling
+        find = matching.match_led if is_led else matching.match
+        found = find(
             key.pyramid, key.uv[index].astype(np.float32), new.pyramid,
             guess.uv[index].astype(np.float32), guess.radius_px,
             guess.warp[index].astype(np.float32), config,

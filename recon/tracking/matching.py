@@ -7,7 +7,7 @@ centres are at integers; level ``l`` of a pyramid holds the pixel (u, v) at (u, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -338,38 +338,24 @@ def match(
     homography. Not ok: nothing alike, a second place as good, no texture, a backward match
     that ends elsewhere, a patch outside the image. A change of brightness or contrast does
     no harm. On a coarse level, points without an answer of their own follow the trend of the
-    others. Points that are not finite are not ok.
+    others. Points that are not finite are not ok. With a ``radius_px`` of 0 predictions that are
+    good to a pixel are only refined.
     """
     config = config or MatchingConfig()
     a, predicted = checked_points(uv_a), checked_points(uv_b_predicted)
     forward_warp, inverse_warp = checked_warps(warp, len(a))
     forward = _Search(pyramid_a.levels, pyramid_b.levels, a, inverse_warp, config)
-    level, reach = start_level(radius_px, min(len(pyramid_a.levels), len(pyramid_b.levels)), config)
-
     everyone: Bool = np.abs(np.hstack([a, predicted])).max(axis=1, initial=0.0) < FAR
-    coarse = forward.at(level, predicted, everyone, reach)
-    uv = coarse.uv
-    # A coarse pixel blurs; the fine patches have the last word on likeness.
-    active = coarse.distinct(config.ambiguity) & (1.0 - coarse.score <= config.max_zssd)
-    back_a = _Search(pyramid_b.levels, pyramid_a.levels, uv, forward_warp, config)
-    doubtful = active & ~coarse.distinct(0.4 * config.ambiguity)
-    returned = back_a.at(level, a, doubtful, min(reach, 4)).uv
-    active &= np.abs(returned - a).max(axis=1, initial=0.0) <= 1.6 * 2**level
-    start = level
-    if level > 0:
-        stray_px = max(0.5 * radius_px, 4.0 * 2**level)
-        uv, active = _follow_others(a, uv, predicted, active, everyone, 2.0 * 2**level, stray_px)
-    while level > 1:
-        finer = max(level - 2, 1)
-        found = forward.at(finer, uv, active, 1 + level - finer)
-        uv, level = found.uv, finer
-        active = active & (found.score > 0)
+    uv, active, contrast = predicted, everyone, None
+    if radius_px > 0:
+        back = _Search(pyramid_b.levels, pyramid_a.levels, predicted, forward_warp, config)
+        uv, active, contrast = _coarse_to_fine(forward, back, predicted, everyone, radius_px)
     fine = forward.refined(uv, active)
     uv = fine.uv
     ok = active & (2.0 * (1.0 - fine.score) <= config.max_zssd)
     ok &= fine.contrast_b >= config.min_contrast
-    if start > 0:
-        ok &= ~_repeats(forward, uv, ok, coarse.contrast, fine.contrast_a)
+    if contrast is not None:
+        ok &= ~_repeats(forward, uv, ok, contrast, fine.contrast_a)
 
     if np.isfinite(config.max_return_px):
         back = _Search(pyramid_b.levels, pyramid_a.levels, uv, forward_warp, config)
@@ -379,6 +365,61 @@ def match(
     uv = np.where(ok[:, None], uv, predicted)
     zssd = np.where(score > patch_search.NO_SCORE, 2.0 * (1.0 - score), 4.0)
     return Matches(uv.astype(np.float32), zssd.astype(np.float32), ok)
+
+
+LEADERS = 48
+"""Points that show the error of all predictions."""
+
+STEADY_PX = 1.0
+"""Their errors differ by about this from an affine motion, at most."""
+
+
+def match_led(
+    pyramid_a: Pyramid, uv_a: F32, pyramid_b: Pyramid, uv_b_predicted: F32, radius_px: float,
+    warp: F32, config: MatchingConfig,
+) -> Matches:  # fmt: skip
+    """As :func:`match` for predictions whose errors are about an affine motion: those of known
+    points by a pose, or by one for all rows of a rolling shutter.
+
+    ``warp`` is (N, 2, 2). A few points are searched; by them the others are known to a pixel.
+    """
+    step, count = len(uv_a) // LEADERS, len(uv_a)
+    if step > 1:
+        led, good = np.zeros((count, 2)), np.zeros(count, np.bool_)
+        some = slice(None, None, step)
+        start = uv_b_predicted[some]
+        found = match(pyramid_a, uv_a[some], pyramid_b, start, radius_px, warp[some], config)
+        led[some], good[some] = found.uv_px - start, found.ok
+        trend = _consensus(uv_a.astype(np.float64), led, good, STEADY_PX)
+        if trend is not None:
+            return match(pyramid_a, uv_a, pyramid_b, uv_b_predicted + trend, 0.0, warp, config)
+    return match(pyramid_a, uv_a, pyramid_b, uv_b_predicted, radius_px, warp, config)
+
+
+def _coarse_to_fine(
+    forward: _Search, back: _Search, predicted: F64, everyone: Bool, radius_px: float
+) -> tuple[F64, Bool, F64 | None]:
+    """(N, 2) places in b to about a pixel, which (N,) take part, and the contrast (N,) on the level
+    where the search began; None where that is the finest."""
+    a, config = forward.uv_a, forward.config
+    level, reach = start_level(radius_px, min(len(forward.a), len(forward.b)), config)
+    coarse = forward.at(level, predicted, everyone, reach)
+    uv = coarse.uv
+    # A coarse pixel blurs; the fine patches have the last word on likeness.
+    active = coarse.distinct(config.ambiguity) & (1.0 - coarse.score <= config.max_zssd)
+    doubtful = active & ~coarse.distinct(0.4 * config.ambiguity)
+    returned = replace(back, uv_a=uv).at(level, a, doubtful, min(reach, 4)).uv
+    active &= np.abs(returned - a).max(axis=1, initial=0.0) <= 1.6 * 2**level
+    if level == 0:
+        return uv, active, None
+    stray_px = max(0.5 * radius_px, 4.0 * 2**level)
+    uv, active = _follow_others(a, uv, predicted, active, everyone, 2.0 * 2**level, stray_px)
+    while level > 1:
+        finer = max(level - 2, 1)
+        found = forward.at(finer, uv, active, 1 + level - finer)
+        uv, level = found.uv, finer
+        active = active & (found.score > 0)
+    return uv, active, coarse.contrast
 
 
 def _follow_others(
