@@ -318,23 +318,3 @@ def test_motions_between_keyframes_are_as_good_as_claimed(ground: U8) -> None:
         s[:3, 3] *= scale
         errors.append(se3.log(s @ se3.inverse(t)) / sigma)
     assert 0.3 < np.sqrt(np.mean(np.square(errors))) < 3.0
-
-
-@pytest.mark.parametrize(
-    ("tilts", "stands", "is_lost"), [(True, True, True), (True, False, False), (False, True, False)]
-)
-def test_a_track_that_leaves_attitude_and_position_is_lost(
-    ground: U8, tilts: bool, stands: bool, is_lost: bool
-) -> None:
-    """Images of a camera that tilts slowly and stands, with the telemetry of one that does not."""
-    track = poses(36, wobble=0.0)
-    seen = list(track)
-    for k in range(18, 36):
-        T = track[18 if stands else k].copy()
-        if tilts:
-            T[:3, :3] = T[:3, :3] @ se3.so3_exp(np.array([0.02 * (k - 18), 0.0, 0.0]))
-        seen[k] = T
-    images = {k: photograph(ground, seen[k]) for k in range(18, 36)}
-    _, found = fly(ground, track, True, images)
-    states = [one.state for one in found[18:]]
-    assert (Tracking.LOST in states) == is_lost

@@ -49,9 +49,6 @@ class OdometryConfig:
 RECALLED = 4
 """Newest keyframes that a frame is compared with by features."""
 
-STRAYED_RAD = 0.1
-"""Change of tilt within the window that contradicts the attitudes, if positions contradict, too."""
-
 CLEAR_SHARE = 0.6
 """Share of the corners searched: if so many are found, no other start is tried."""
 
@@ -148,9 +145,6 @@ class Localiser:
                 continue
             if not self._agrees(found.pose.T_camera_points, new.prior, key, start.by_features):
                 reason = "vision and attitude disagree"
-                continue
-            if not still and _has_strayed(found.pose.T_camera_points, new.prior, keyframes):
-                reason = "vision disagrees with attitude and position"
                 continue
             if best is None or found.explained > best.explained:
                 best = found
@@ -375,40 +369,13 @@ class Localiser:
         if turn is None:
             return True
         seen = T_camera_odom[:3, :3] @ key.T_odom_camera[:3, :3]
-        off = _tilt_off(seen, key.prior, prior)
         if not tilt_only:
             off = float(np.linalg.norm(se3.so3_log(seen @ turn.T)))
+        else:
+            assert key.prior.R_world_camera is not None and prior.R_world_camera is not None
+            cosine = (seen @ key.prior.R_world_camera[2]) @ prior.R_world_camera[2]
+            off = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         return off < self.config.max_tilt_error_rad
-
-
-def _has_strayed(
-    T_camera_odom: F64, prior: PosePrior, keyframes: Sequence[OdometryKeyframe]
-) -> bool:
-    """True when vision tilted and moved otherwise than telemetry since one of the keyframes.
-
-    One alone may be telemetry's fault: a gimbal that it does not report, a jump of GNSS.
-    """
-    if prior.position_m is None or prior.sigma_position_m is None:
-        return False
-    place, sigma_m = se3.inverse(T_camera_odom)[:3, 3], np.linalg.norm(prior.sigma_position_m)
-    for key in keyframes:
-        fix = key.prior.position_m
-        if fix is None or prediction.relative_rotation(key.prior, prior) is None:
-            continue
-        flown = prior.position_m - fix
-        away_m = np.linalg.norm(place - key.T_odom_camera[:3, 3] - flown)
-        if away_m > sigma_m + 0.5 * np.linalg.norm(flown):
-            R_new_key = (T_camera_odom @ key.T_odom_camera)[:3, :3]
-            if _tilt_off(R_new_key, key.prior, prior) > STRAYED_RAD:
-                return True
-    return False
-
-
-def _tilt_off(R_b_a: F64, a: PosePrior, b: PosePrior) -> float:
-    """Angle in rad between the vertical of ``b`` by its attitude, and by that of ``a`` turned."""
-    assert a.R_world_camera is not None and b.R_world_camera is not None
-    cosine = (R_b_a @ a.R_world_camera[2]) @ b.R_world_camera[2]
-    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 class FirstViews:
