@@ -12,7 +12,7 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays
-from recon.posegraph.site_alignment import Similarity
+from recon.posegraph.site_alignment import ScanSimilarity
 from recon.types import F64, Bool, DepthMap, Keyframe, Pose
 from service.georeference import LocalFrame
 from service.stream.codec import encode
@@ -55,9 +55,11 @@ class Errors:
     growth: float = 1.0
     bend_m: float = 0.0  # higher at both ends of the leg than in its middle
 
-    def as_similarity(self) -> Similarity:
+    def as_similarity(self) -> ScanSimilarity:
         """From the truth to where the scan has it, about 40 m below the cameras."""
-        return Similarity(se3.so3_exp(np.array(self.turn_rad)), np.array(self.shift_m), self.growth)
+        return ScanSimilarity(
+            se3.so3_exp(np.array(self.turn_rad)), np.array(self.shift_m), self.growth
+        )
 
 
 def leg(heading_rad: float, count: int = 6, step_m: float = 6.0) -> list[F64]:

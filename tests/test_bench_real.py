@@ -11,7 +11,7 @@ import pytest
 from recon.types import DepthMap
 from service.bench import BenchOptions, real
 from service.bench.keyframes import make_keyframe
-from service.bench.real import Flight, _apart, level_ground, run
+from service.bench.real import ReplayedSet, _apart, level_ground, run
 from service.errors import InputError
 
 STILLS = sorted((Path(__file__).parents[1] / "demo" / "caliterra" / "frames").glob("*.jpg"))
@@ -66,7 +66,9 @@ def test_tilts_between_keyframes_are_told_from_the_bend_of_each(
         T[:3, 3] = 0.0, 0.0, 80.0 + 2.0 * (n % 2)  # every second keyframe is 2 m too high
         maps.append(DepthMap(level, 0.1 * level, np.ones_like(level, np.uint8), K, T))
     monkeypatch.setattr(real, "_maps", lambda flight: maps)
-    figures = {what: value for what, value, _ in level_ground(Flight(tmp_path, "", tmp_path, {}))}
+    figures = {
+        what: value for what, value, _ in level_ground(ReplayedSet(tmp_path, "", tmp_path, {}))
+    }
     assert figures["flat ground, robust sigma about a plane"] == pytest.approx(1 / 0.6745, rel=0.01)
     assert figures["flat ground, keyframes about their own planes"] == pytest.approx(0.0, abs=1e-6)
     assert figures["flat ground, slope"] == pytest.approx(0.0, abs=1e-6)

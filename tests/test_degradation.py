@@ -16,20 +16,20 @@ from service.daemon.load_shedding import (
     Ladder,
     LadderConfig,
     Level,
+    MachineReadings,
     Move,
-    Readings,
     lowered,
     strain,
 )
 
-CALM = Readings(10, 0, 60, 0, 0.05, 55.0, False, 4000.0)
+CALM = MachineReadings(10, 0, 60, 0, 0.05, 55.0, False, 4000.0)
 LATE = replace(CALM, late_views=4)
 HOPELESS = replace(CALM, views=20, late_views=19)
 HOT = replace(CALM, temperature_c=95.0)
 
 
 def run(
-    ladder: Ladder, readings: Callable[[float], Readings], from_s: float, to_s: float
+    ladder: Ladder, readings: Callable[[float], MachineReadings], from_s: float, to_s: float
 ) -> list[tuple[float, Move]]:
     """Moves with their times, looked at every two seconds."""
     moves = []
@@ -77,7 +77,7 @@ def test_it_comes_back_when_the_strain_passes() -> None:
 def test_a_step_up_that_does_not_hold_is_tried_less_and_less_often() -> None:
     ladder = Ladder()
 
-    def only_without_full_rate(_: float) -> Readings:
+    def only_without_full_rate(_: float) -> MachineReadings:
         return LATE if ladder.level is Level.FULL else CALM
 
     moves = run(ladder, only_without_full_rate, 0.0, 2000.0)
@@ -111,10 +111,10 @@ def test_throttling_never_ends_the_reconstruction() -> None:
         (replace(CALM, age_s=2.0), "2.0 s late"),
         (replace(CALM, late_frames=50), "83 % of the images"),
         (replace(CALM, temperature_c=95.0, memory_free_mib=10.0), "memory"),
-        (Readings(), ""),
+        (MachineReadings(), ""),
     ],
 )
-def test_the_reason_is_reported(readings: Readings, word: str) -> None:
+def test_the_reason_is_reported(readings: MachineReadings, word: str) -> None:
     found = strain(readings, LadderConfig())
     assert (found.reason if found else "") == "" if not word else found and word in found.reason
 
@@ -122,7 +122,7 @@ def test_the_reason_is_reported(readings: Readings, word: str) -> None:
 @given(
     st.lists(
         st.builds(
-            Readings,
+            MachineReadings,
             st.integers(0, 20),
             st.integers(0, 20),
             st.integers(0, 100),
@@ -135,7 +135,9 @@ def test_the_reason_is_reported(readings: Readings, word: str) -> None:
         max_size=200,
     )
 )
-def test_any_readings_move_it_by_whole_steps_within_the_ladder(series: list[Readings]) -> None:
+def test_any_readings_move_it_by_whole_steps_within_the_ladder(
+    series: list[MachineReadings],
+) -> None:
     ladder = Ladder()
     for i, readings in enumerate(series):
         before = ladder.level

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.stereo.reprojection import FusionConfig, PairDepth, fuse
+from recon.stereo.reprojection import DepthFusionConfig, PairDepth, fuse
 from recon.types import F32
 
 K = np.array([[100.0, 0, 39.5], [0, 100.0, 29.5], [0, 0, 1]])
@@ -20,7 +20,7 @@ def test_sigma_is_honest_for_gaussian_readings() -> None:
     rng = np.random.default_rng(0)
     truth = np.full(SHAPE, 60.0, np.float32)
     pairs = [reading(rng, truth, s) for s in (0.2, 0.3, 0.4)]
-    fused = fuse(pairs, K, np.eye(4), FusionConfig())
+    fused = fuse(pairs, K, np.eye(4), DepthFusionConfig())
     within = np.abs(fused.depth_m - truth) <= fused.sigma_m
     assert 0.6 < within.mean() < 0.85
     assert np.median(fused.sigma_m) < 0.2
@@ -32,7 +32,7 @@ def test_the_majority_wins_over_one_wrong_reading() -> None:
     truth = np.full(SHAPE, 60.0, np.float32)
     wrong = reading(rng, truth - 12.0, 0.1)
     pairs = [reading(rng, truth, 0.3), wrong, reading(rng, truth, 0.3)]
-    fused = fuse(pairs, K, np.eye(4), FusionConfig())
+    fused = fuse(pairs, K, np.eye(4), DepthFusionConfig())
     # Where the two right ones miss each other by over 2.5 sigma (1 in 80) there is none.
     assert np.mean(np.abs(fused.depth_m - truth) < 2.0) > 0.97
     assert (fused.views <= 2).all()
@@ -44,7 +44,7 @@ def test_what_no_pair_knows_stays_unknown_and_single_views_are_marked() -> None:
     a, b = reading(rng, truth, 0.3), reading(rng, truth, 0.3)
     a.depth_m[:, :40] = np.nan
     b.depth_m[:20] = np.nan
-    fused = fuse([a, b], K, np.eye(4), FusionConfig())
+    fused = fuse([a, b], K, np.eye(4), DepthFusionConfig())
     assert np.isnan(fused.depth_m[:20, :40]).all() and (fused.views[:20, :40] == 0).all()
     assert (fused.views[:20, 40:] == 1).all()
     single, double = fused.sigma_m[:20, 40:], fused.sigma_m[20:, 40:]
@@ -57,7 +57,7 @@ def test_readings_that_contradict_each_other_are_dropped() -> None:
     a, b = reading(rng, truth, 0.3), reading(rng, truth, 0.3)
     b.depth_m[:, :10] += 12.0
     b.depth_m[:, 10:20] = a.depth_m[:, 10:20] + 2.0  # more than 2.5 sigma, less than 4 %
-    fused = fuse([a, b], K, np.eye(4), FusionConfig())
+    fused = fuse([a, b], K, np.eye(4), DepthFusionConfig())
     assert np.isnan(fused.depth_m[:, :10]).all() and np.isnan(fused.sigma_m[:, :10]).all()
     assert (fused.views[:, :10] == 0).all()
     assert np.isfinite(fused.depth_m[:, 10:]).mean() > 0.97
@@ -72,14 +72,14 @@ def test_pairs_that_mostly_contradict_each_other_give_nothing() -> None:
     for pair in pairs:
         pair.depth_m[:, :20] = 60.0
     pairs[0].depth_m[:5] = pairs[1].depth_m[:5] = np.nan
-    fused = fuse(pairs, K, np.eye(4), FusionConfig())
+    fused = fuse(pairs, K, np.eye(4), DepthFusionConfig())
     assert np.isnan(fused.depth_m).all() and np.isnan(fused.sigma_m).all()
     assert (fused.views == 0).all()
-    few = fuse(pairs[2:], K, np.eye(4), FusionConfig())
+    few = fuse(pairs[2:], K, np.eye(4), DepthFusionConfig())
     assert np.isfinite(few.depth_m).all()  # one pair alone contradicts none
 
 
 def test_useless_readings_are_left_out() -> None:
     far = PairDepth(np.full(SHAPE, 60.0, np.float32), np.full(SHAPE, 30.0, np.float32))
-    fused = fuse([far], K, np.eye(4), FusionConfig())
+    fused = fuse([far], K, np.eye(4), DepthFusionConfig())
     assert np.isnan(fused.depth_m).all()

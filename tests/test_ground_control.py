@@ -7,7 +7,7 @@ import pytest
 
 from recon import se3
 from recon.posegraph import ground_control
-from recon.posegraph.ground_control import Mark, Point, Track, adjust, map_position
+from recon.posegraph.ground_control import ControlPoint, KeyframeTrack, Mark, adjust, map_position
 from recon.posegraph.records import Loop
 from recon.posegraph.smoother import State
 from recon.types import F64, PosePrior
@@ -79,8 +79,8 @@ def rms(poses: F64, truth: F64) -> float:
 def test_five_control_points_bring_the_map_to_its_place(with_depth: bool) -> None:
     truth = true_poses()
     before = moved(drifted(truth), np.array([1.2, -0.8, 2.0]), np.array([0.004, -0.003, 0.01]))
-    track = Track(before, TIMES, loose(40))
-    points = [Point(P, SURVEY) for P in SPOTS]
+    track = KeyframeTrack(before, TIMES, loose(40))
+    points = [ControlPoint(P, SURVEY) for P in SPOTS]
     marks = marks_of(truth, SPOTS, with_depth=with_depth)
     found = adjust(track, points, marks)
     assert rms(before, truth) > 2.0
@@ -95,8 +95,8 @@ def test_five_control_points_bring_the_map_to_its_place(with_depth: bool) -> Non
 def test_a_wrong_scale_is_found() -> None:
     truth = true_poses()
     before = drifted(truth, scale=1 / 1.03)
-    track = Track(before, TIMES, loose(40))
-    points = [Point(P, SURVEY) for P in SPOTS]
+    track = KeyframeTrack(before, TIMES, loose(40))
+    points = [ControlPoint(P, SURVEY) for P in SPOTS]
     marks = marks_of(truth, SPOTS, depth_scale=1.03)
     found = adjust(track, points, marks)
     assert found.scales == pytest.approx(1.03, abs=0.004)
@@ -111,8 +111,8 @@ def test_covariances_cover_the_errors() -> None:
         shift = rng.normal(0, 1.5, 3)
         before = moved(drifted(truth, seed), shift, rng.normal(0, 0.01, 3))
         survey = SPOTS + rng.normal(size=SPOTS.shape) * SURVEY
-        points = [Point(P, SURVEY) for P in survey]
-        track = Track(before, TIMES, loose(40))
+        points = [ControlPoint(P, SURVEY) for P in survey]
+        track = KeyframeTrack(before, TIMES, loose(40))
         found = adjust(track, points, marks_of(truth, SPOTS, seed))
         for k in range(0, 40, 5):
             error = se3.log(truth[k] @ se3.inverse(found.poses[k]))
@@ -128,8 +128,8 @@ def test_marks_between_keyframes_count_alike() -> None:
     marks = []
     for m in marks_of(np.array([T @ nearby for T in truth]), SPOTS, with_depth=False):
         marks.append(Mark(m.point, m.keyframe, m.ray, m.sigma, None, 1.0, nearby))
-    found = adjust(Track(before, TIMES, loose(40)), [Point(P, SURVEY) for P in SPOTS],
-                   marks)  # fmt: skip
+    points = [ControlPoint(P, SURVEY) for P in SPOTS]
+    found = adjust(KeyframeTrack(before, TIMES, loose(40)), points, marks)
     assert rms(found.poses, truth) < 0.25
 
 
@@ -143,7 +143,7 @@ def test_loops_straighten_a_track_and_false_ones_are_left_out() -> None:
     wrong = se3.inverse(truth[5]) @ truth[34]
     wrong[:3, 3] += [15.0, 0.0, 0.0]
     times: F64 = np.r_[np.arange(20.0), 40.0 + np.arange(20.0)]  # vision was lost between the legs
-    still = Track(before, times, loose(40), (), [*loops, Loop(5, 34, wrong, spread)])
+    still = KeyframeTrack(before, times, loose(40), (), [*loops, Loop(5, 34, wrong, spread)])
     found = adjust(still)
     assert found.loops_refused == (3,)
     assert len(ground_control.supported(still.loops, still.poses)) == 3
@@ -163,7 +163,7 @@ def test_telemetry_places_a_track_and_a_wild_fix_does_not_move_it() -> None:
         PosePrior(T[:3, :3], 0.01, 0.03, T[:3, 3] + rng.normal(0, 0.2, 3), sigma) for T in truth
     ]
     priors[10] = PosePrior(None, position_m=truth[10][:3, 3] + 40.0, sigma_position_m=sigma)
-    found = adjust(Track(before, TIMES, loose(40), priors))
+    found = adjust(KeyframeTrack(before, TIMES, loose(40), priors))
     assert rms(found.poses, truth) < 0.4
     assert np.linalg.norm((found.poses[10] - truth[10])[:3, 3]) < 0.6
     worst = np.argmax(np.sum(found.residuals["position"] ** 2, axis=1))
@@ -213,4 +213,4 @@ def test_a_similarity_from_three_points_or_none() -> None:
 def test_wrong_shapes_are_refused() -> None:
     one = np.eye(4)[None]
     with pytest.raises(ValueError, match="two poses"):
-        adjust(Track(one, np.zeros(1), loose(1)))
+        adjust(KeyframeTrack(one, np.zeros(1), loose(1)))

@@ -23,7 +23,7 @@ from service.config import DatalinkConfig
 from service.ground import drone as drone_module
 from service.ground import drones as drones_module
 from service.ground import receiver as receiver_module
-from service.ground.drone import Limits
+from service.ground.drone import DroneLimits
 from service.ground.inbox import MAX_HEADS, MAX_ITEM_BYTES, MAX_ITEMS, Inbox
 from service.ground.intake import ScanIntake
 from service.ground.received import ReceivedScan
@@ -47,12 +47,12 @@ def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextlib.contextmanager
 def serving(
-    folder: Path, limits: Limits | None = None, refresh_s: float = 0.0
+    folder: Path, limits: DroneLimits | None = None, refresh_s: float = 0.0
 ) -> Iterator[tuple[Receiver, str]]:
     """A ground station and where it listens."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     session = SessionConfig(mode="router", listen=(endpoint,))
-    ground = Receiver(ReceiverConfig(folder, session, limits or Limits(), "base", refresh_s))
+    ground = Receiver(ReceiverConfig(folder, session, limits or DroneLimits(), "base", refresh_s))
     ground.start()
     try:
         yield ground, endpoint
@@ -234,7 +234,7 @@ def test_a_drone_over_its_share_of_the_disk_is_refused_and_another_is_not(
     (store / "greedy" / "earlier").mkdir(parents=True)
     with (store / "greedy" / "earlier" / "cloud.laz").open("wb") as file:
         file.truncate(2_000_000)
-    limits = Limits(None, 2_000_000 / total, 0)
+    limits = DroneLimits(None, 2_000_000 / total, 0)
     greedy = scan_of(tmp_path, "greedy")
     with serving(store, limits) as (ground, endpoint):
         config = DatalinkConfig(connect=(endpoint,), budget_kbit_s=50_000.0)

@@ -16,7 +16,7 @@ from recon.types import DepthMap, Keyframe, Pose
 from service.config import DatalinkConfig
 from service.errors import InputError, OutsideError
 from service.ground import receiver as receiver_module
-from service.ground.drone import Limits
+from service.ground.drone import DroneLimits
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream import codec
 from service.stream import link as link_module
@@ -303,7 +303,7 @@ def test_over_the_quota_the_ground_keeps_coarse_layers_and_says_so(tmp_path: Pat
     fly(onboard, 0, 6)
     onboard.finish({})
     session = SessionConfig(mode="router", listen=(endpoint,))
-    ground = Receiver(ReceiverConfig(tmp_path / "ground", session, Limits(120_000)))
+    ground = Receiver(ReceiverConfig(tmp_path / "ground", session, DroneLimits(120_000)))
     ground.start()
     link = DatalinkSender(onboard, fast(endpoint))
     try:

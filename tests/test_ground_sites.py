@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from site_scans import Errors, leg, write_scan
 
-from service.ground.drone import Limits
+from service.ground.drone import DroneLimits
 from service.ground.sites import Sites, companions, site_of
 from service.offline.site.alignment import align_site
 from service.scans.folder import write_deliverables
@@ -80,7 +80,7 @@ def test_a_site_is_found_again_by_any_member(tmp_path: Path) -> None:
 
 @pytest.fixture
 def working(tmp_path: Path) -> Iterator[tuple[Sites, Worker]]:
-    workers, sites = Workers(), Sites(tmp_path, Limits(reserve_bytes=0))
+    workers, sites = Workers(), Sites(tmp_path, DroneLimits(reserve_bytes=0))
     worker = workers.start("sites", sites.run)
     yield sites, worker
     assert worker.join(10.0)

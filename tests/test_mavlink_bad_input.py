@@ -22,7 +22,7 @@ from mavlink.telemetry.clock import computer_offset_ns
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from mavlink.wire.signing import timestamp_of
-from mavlink.wire.tlog import Recorder
+from mavlink.wire.tlog import TlogRecorder
 
 REPEATS = 20
 STATION = (255, 190)
@@ -219,7 +219,7 @@ def test_a_reboot_of_the_autopilot_in_mid_scan_is_reported_once(peer: Peer) -> N
 def test_steps_of_the_clock_tear_neither_the_log_nor_the_telemetry(
     peer: Peer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recorder, now = Recorder(), time.time_ns()
+    recorder, now = TlogRecorder(), time.time_ns()
     recorder.open(tmp_path / "link.tlog", computer_offset_ns())
     recorder.write(b"a" * 12, time.monotonic_ns())
     peer.works()

@@ -30,7 +30,7 @@ from mavlink.telemetry.samples import (
     PositionSample,
     RangeSample,
     TerrainSample,
-    Track,
+    TimeSeries,
 )
 
 MS = 1_000_000
@@ -97,7 +97,7 @@ def test_normalised_refuses_what_is_no_rotation() -> None:
 
 
 def test_track_sorts_replaces_and_forgets() -> None:
-    track = Track[tuple[float]]()
+    track = TimeSeries[tuple[float]]()
     for t in (30, 10, 20, 10):
         track.add(t * MS, (float(t),))
     assert [t for t, _ in track.items()] == [10 * MS, 20 * MS, 30 * MS]
@@ -108,7 +108,7 @@ def test_track_sorts_replaces_and_forgets() -> None:
 
 
 def test_track_extrapolates_twenty_milliseconds_and_no_more() -> None:
-    track = Track[tuple[float]]()
+    track = TimeSeries[tuple[float]]()
     track.add(0, (0.0,))
     track.add(100 * MS, (1.0,))
     at = track.around(120 * MS)
@@ -120,7 +120,7 @@ def test_track_extrapolates_twenty_milliseconds_and_no_more() -> None:
 
 
 def test_extrapolation_does_not_magnify_two_close_samples() -> None:
-    track = Track[tuple[float]]()
+    track = TimeSeries[tuple[float]]()
     for t in (0, 99 * MS, 100 * MS):
         track.add(t, (float(t),))
     at = track.around(115 * MS)
@@ -128,7 +128,7 @@ def test_extrapolation_does_not_magnify_two_close_samples() -> None:
 
 
 def test_track_leaves_gaps_of_over_a_second_open() -> None:
-    track = Track[tuple[float]]()
+    track = TimeSeries[tuple[float]]()
     track.add(0, (0.0,))
     track.add(1001 * MS, (1.0,))
     assert track.around(500 * MS) is None

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mavlink.component.status import Odometry, odometry_message
+from mavlink.component.status import BodyOdometry, odometry_message
 from mavlink.telemetry import latency, quaternion
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.latency import LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import AttitudeSample, GimbalFrame, GimbalSample
 from mavlink.wire.framing import Decoder, Framer
-from mavlink.wire.messages import Outgoing, Packer
+from mavlink.wire.messages import OutgoingMessage, Packer
 
 S = 1_000_000_000
 
@@ -175,8 +175,8 @@ def test_the_head_is_compared_when_there_is_a_gimbal() -> None:
 def test_odometry_goes_out_as_meant() -> None:
     covariance = [[float(10 * min(i, j) + max(i, j)) for j in range(6)] for i in range(6)]
     q = quaternion.from_rpy(0.1, 0.2, 0.3)
-    odometry = Odometry((1.0, 2.0, -3.0), q, (4.0, 0.5, -0.25), covariance, 258, 250)
-    data = Packer(0).pack(1, Outgoing(191, odometry_message(odometry, 5_000_000)), 0)
+    odometry = BodyOdometry((1.0, 2.0, -3.0), q, (4.0, 0.5, -0.25), covariance, 258, 250)
+    data = Packer(0).pack(1, OutgoingMessage(191, odometry_message(odometry, 5_000_000)), 0)
     assert data is not None
     (packet,) = Framer().feed(data)
     message = Decoder().message(packet)

@@ -22,7 +22,7 @@ from mavlink.telemetry.clock import BootClock, BootCounter, TimesyncFilter, fit_
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.wire.dialect import CRC_EXTRA, dialect, x25crc
 from mavlink.wire.framing import Framer
-from mavlink.wire.messages import Address, Outgoing, Packer
+from mavlink.wire.messages import Address, OutgoingMessage, Packer
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -40,13 +40,13 @@ class Station:
             CompanionConfig(), self.control, self.presence, self.history, self.now_ns
         )
         self.framer = Framer()
-        self.sent: list[Outgoing] = []
+        self.sent: list[OutgoingMessage] = []
 
     def feed(self, data: bytes, link: int = 0) -> None:
         for packet in self.framer.feed(data):
             self.companion.receive(link, packet, self.now_ns)
 
-    def wait(self, seconds: float) -> list[Outgoing]:
+    def wait(self, seconds: float) -> list[OutgoingMessage]:
         self.now_ns += round(seconds * S)
         self.companion.tick(self.now_ns)
         out = self.companion.take()
@@ -414,7 +414,7 @@ def test_rates_are_asked_for_and_asked_again_when_they_fade() -> None:
 def test_values_that_do_not_fit_are_dropped_not_raised() -> None:
     packer = Packer(0)
     bad = dialect.MAVLink_named_value_float_message(-5, b"x", 1e300)
-    assert packer.pack(1, Outgoing(191, bad), 0) is None
+    assert packer.pack(1, OutgoingMessage(191, bad), 0) is None
     station = Station()
     for report in (
         KeyframeReport(10**20, 1e30, -1e30, float("nan"), float("inf"), None, False),
@@ -423,7 +423,7 @@ def test_values_that_do_not_fit_are_dropped_not_raised() -> None:
         station.companion.report(report)
     for out in station.companion.take():
         packer.pack(1, out, 0)
-    assert packer.pack(1, Outgoing(191, beat()), 0) is not None
+    assert packer.pack(1, OutgoingMessage(191, beat()), 0) is not None
 
 
 def test_sequence_numbers_count_per_component() -> None:
@@ -431,7 +431,7 @@ def test_sequence_numbers_count_per_component() -> None:
     sequences: dict[int, list[int]] = {191: [], 100: []}
     for k in range(300):
         component = 191 if k % 3 else 100
-        data = packer.pack(1, Outgoing(component, beat()), 0)
+        data = packer.pack(1, OutgoingMessage(component, beat()), 0)
         assert data is not None
         sequences[component].append(data[4])
     for numbers in sequences.values():

@@ -11,7 +11,7 @@ from autopilot import beat, packed
 
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
-from mavlink.wire.messages import Outgoing, Packer
+from mavlink.wire.messages import OutgoingMessage, Packer
 from mavlink.wire.signing import Signing, read_key, timestamp_of
 
 S = 1_000_000_000
@@ -65,7 +65,7 @@ def test_our_signatures_satisfy_pymavlink_and_times_only_grow() -> None:
     ear.signing.secret_key = KEY
     stamps = []
     for unix_ns in (1_760_000_000 * S, 1_760_000_000 * S, 1_500_000_000 * S):  # steps back
-        data = packer.pack(1, Outgoing(191, beat()), unix_ns)
+        data = packer.pack(1, OutgoingMessage(191, beat()), unix_ns)
         assert data is not None
         (message,) = ear.parse_buffer(data)
         assert message.get_signed() and message.get_srcComponent() == 191

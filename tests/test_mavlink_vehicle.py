@@ -19,7 +19,7 @@ from mavlink.telemetry.logs import load_telemetry
 from mavlink.wire.dialect import dialect
 from mavlink.wire.link import LinkSpec, parse_link
 from mavlink.wire.ports import PORTS, READ_S
-from mavlink.wire.tlog import Recorder, packets
+from mavlink.wire.tlog import TlogRecorder, packets
 
 S = 1_000_000_000
 
@@ -156,7 +156,7 @@ def test_a_full_disk_ends_the_log_and_nothing_else(caplog: pytest.LogCaptureFixt
     full = Path("/dev/full")
     if not full.exists():
         pytest.skip("no /dev/full here")
-    recorder = Recorder()
+    recorder = TlogRecorder()
     recorder.open(full, 0)
     for k in range(3000):
         recorder.write(bytes(40), k)

@@ -27,7 +27,7 @@ from service.offline import tiles
 from service.offline.exports import images, model
 from service.offline.exports.mesh_tiles import TileJob, TilePart, mesh_tile
 from service.offline.exports.view import ExportOptions, ScanView, export
-from service.offline.tiles import Footprint, Tile, run_tiles, tile_boxes
+from service.offline.tiles import KeyframeFootprint, Tile, run_tiles, tile_boxes
 from service.progress import Progress
 from service.scans.fused_cloud import EVERYWHERE
 from service.stream.store import ScanStore
@@ -68,7 +68,8 @@ def same(a: list[TilePart], b: list[TilePart]) -> None:
 
 def test_boxes_cover_the_site_once_and_hold_no_more_than_asked() -> None:
     prints = [
-        Footprint(n, 1000, 0.2, (10.0 * n, 5.0 * n, 10.0 * n + 30, 5.0 * n + 20)) for n in range(20)
+        KeyframeFootprint(n, 1000, 0.2, (10.0 * n, 5.0 * n, 10.0 * n + 30, 5.0 * n + 20))
+        for n in range(20)
     ]
     assert tile_boxes(prints, 100_000) == [EVERYWHERE]
     boxes = tile_boxes(prints, 3000)

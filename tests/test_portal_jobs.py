@@ -17,7 +17,7 @@ from person import Browser
 from portal_client import NEEDS, ONE, TOKEN, Client, browser, flown_store
 
 from service.ground import state
-from service.ground.drone import Limits
+from service.ground.drone import DroneLimits
 from service.ground.portal import Portal, PortalConfig
 from service.ground.state import Job
 from service.stream.store import ScanStore
@@ -86,7 +86,7 @@ def test_an_alignment_by_points_is_refused_with_its_reason(portal: Portal, tmp_p
 def test_an_alignment_by_points_that_does_not_fit_the_disk_share_is_refused(
     tmp_path: Path, house: HouseFlight
 ) -> None:
-    store, limits = flown_store(tmp_path, house), Limits(drone_share=1e-9, reserve_bytes=0)
+    store, limits = flown_store(tmp_path, house), DroneLimits(drone_share=1e-9, reserve_bytes=0)
     place = {"scan": [0.0, 0.0, 0.0], "place": [8.5, 47.4, 400.0]}
     order = {"drone": "drone-1", "scan": "test-1", "points": 3 * [place]}
     with contextlib.closing(

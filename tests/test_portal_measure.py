@@ -16,7 +16,7 @@ from person import Browser
 from portal_client import NEEDS, TOKEN, browser, flown_store, listing
 from site_scans import FRAME, Errors, leg, write_scan
 
-from recon.posegraph.site_alignment import Similarity
+from recon.posegraph.site_alignment import ScanSimilarity
 from recon.types import F64, Keyframe
 from service.georeference import LocalFrame
 from service.ground.portal import Portal, PortalConfig
@@ -268,7 +268,7 @@ def test_a_scan_without_georeference_is_placed_by_clicks_in_two_scans(
     assert np.linalg.norm(found[:, :2] - SPOTS, axis=1).max() < 0.5
 
 
-def click_spots(ruler: Ruler, errors: Similarity, button: str | None) -> F64:
+def click_spots(ruler: Ruler, errors: ScanSimilarity, button: str | None) -> F64:
     """Click SPOTS in the scan on the page, which has them off by ``errors``; (3, 3) m of the place
     that the clicks picked."""
     page = ruler.page
@@ -288,6 +288,6 @@ def click_spots(ruler: Ruler, errors: Similarity, button: str | None) -> F64:
     return inverse(errors, np.array([ruler.pick(float(x), float(y)) for x, y in spots]))
 
 
-def inverse(errors: Similarity, points: F64) -> F64:
+def inverse(errors: ScanSimilarity, points: F64) -> F64:
     """(N, 3) true places of the points of a scan that is off by ``errors``."""
     return np.asarray((points - errors.t) @ errors.R / errors.growth)

@@ -15,7 +15,7 @@ from recon.stereo.reprojection import LABEL_SIGMA_PX, PairDepth, carry, reprojec
 from recon.stereo.virtual_stereo import View
 from recon.types import F64, DisparityMap, StereoPair
 from service.compute.backend_choice import FallbackBackend
-from service.flight.stages import Carry, Grid
+from service.flight.stages import Carry, ViewGrid
 from service.progress import Stopwatch
 
 K = np.array([[190.0, 0, 159.5], [0, 190.0, 89.5], [0, 0, 1]])
@@ -147,7 +147,7 @@ def test_a_pair_is_matched_once_on_a_backend_that_gives_its_depth() -> None:
         own.name, own.keeps_pairs = "onnx", keeps_pairs
         stage = Carry(FallbackBackend(own), Stopwatch())
         stage.keep(0, {1: PairDepth(depth, 0.01 * depth)})
-        assert [*stage(again, Grid(K, (320, 180), T))] == found
+        assert [*stage(again, ViewGrid(K, (320, 180), T))] == found
 
 
 def test_the_nearer_surface_hides_what_is_behind_it() -> None:

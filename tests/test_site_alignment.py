@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.posegraph.site_alignment import ScanPrior, Similarity, SiteAlignment, Tie, align, alike
+from recon.posegraph.site_alignment import (
+    ScanPrior,
+    ScanSimilarity,
+    SiteAlignment,
+    Tie,
+    align,
+    alike,
+)
 from recon.types import F64
 
 SIGMA = np.array([0.005] * 3 + [1.0, 1.0, 1.5, 0.005])
@@ -19,15 +26,15 @@ def priors(count: int) -> list[ScanPrior]:
     return [ScanPrior(CENTRE, SIGMA) for _ in range(count)]
 
 
-def drawn(rng: np.random.Generator) -> Similarity:
+def drawn(rng: np.random.Generator) -> ScanSimilarity:
     """How wrongly a scan is placed, by the sigmas of its prior."""
     x = rng.normal(size=7) * SIGMA
     R, growth = se3.so3_exp(x[:3]), float(np.exp(x[6]))
-    return Similarity(R, CENTRE + x[3:6] - growth * R @ CENTRE, growth)
+    return ScanSimilarity(R, CENTRE + x[3:6] - growth * R @ CENTRE, growth)
 
 
 def ties_between(
-    a: int, b: int, wrong: list[Similarity], rng: np.random.Generator, count: int = 8
+    a: int, b: int, wrong: list[ScanSimilarity], rng: np.random.Generator, count: int = 8
 ) -> list[Tie]:
     """Ties of places on the ground with noise of 3 cm."""
     out = []
@@ -39,7 +46,7 @@ def ties_between(
     return out
 
 
-def placed(move: Similarity, wrong: Similarity, places: F64) -> F64:
+def placed(move: ScanSimilarity, wrong: ScanSimilarity, places: F64) -> F64:
     return move.points(wrong.points(places)) - places
 
 

@@ -12,7 +12,7 @@ from recon import se3
 from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.offline.site.live import LiveSite, Placed
+from service.offline.site.live import LiveSite, PlacedScan
 from service.stream.records import Repose
 from service.stream.store import ScanStore
 
@@ -34,7 +34,7 @@ class Flight:
         self.flown += 1
 
 
-def turn(site: LiveSite, *folders: Path) -> dict[Path, Placed]:
+def turn(site: LiveSite, *folders: Path) -> dict[Path, PlacedScan]:
     for folder in folders:
         site.refresh(folder)
         while site.scans[folder].due:
@@ -42,7 +42,7 @@ def turn(site: LiveSite, *folders: Path) -> dict[Path, Placed]:
     return {one.folder: one for one in site.place() or []}
 
 
-def miss_m(placed: Placed, errors: Errors, spot: F64) -> F64:
+def miss_m(placed: PlacedScan, errors: Errors, spot: F64) -> F64:
     """(3,) between a place of the ground and where the scan is shown to have it, m."""
     return np.asarray(placed.move.points(errors.as_similarity().points(spot[None]))[0] - spot)
 
@@ -62,15 +62,15 @@ def coming() -> list[F64]:
 @pytest.fixture(scope="module")
 def aligned(
     tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[list[Placed | None], list[Placed | None]]:
+) -> tuple[list[PlacedScan | None], list[PlacedScan | None]]:
     """Where a scan in flight is shown after each of its keyframes, and the ground's."""
     folder = tmp_path_factory.mktemp("live")
     ground = write_scan(folder / "ground", NORTH, WRONG)
     flight, site = Flight(folder / "flying", coming(), OTHER), LiveSite()
     site.add(ground, compare=False)
     site.add(flight.folder)
-    shown: list[Placed | None] = []
-    on_ground: list[Placed | None] = []
+    shown: list[PlacedScan | None] = []
+    on_ground: list[PlacedScan | None] = []
     for _ in coming():
         flight.fly()
         found = turn(site, ground, flight.folder)
@@ -91,7 +91,7 @@ def first_overlap(poses: list[F64]) -> int:
 
 
 def test_a_scan_in_flight_is_aligned_two_keyframes_after_the_first_overlap(
-    aligned: tuple[list[Placed | None], list[Placed | None]],
+    aligned: tuple[list[PlacedScan | None], list[PlacedScan | None]],
 ) -> None:
     shown, _ = aligned
     first = first_overlap(coming())
@@ -101,7 +101,7 @@ def test_a_scan_in_flight_is_aligned_two_keyframes_after_the_first_overlap(
 
 
 def test_its_place_is_as_good_as_its_sigma_says(
-    aligned: tuple[list[Placed | None], list[Placed | None]],
+    aligned: tuple[list[PlacedScan | None], list[PlacedScan | None]],
 ) -> None:
     shown, on_ground = aligned
     before, after, ground = shown[0], shown[-1], on_ground[-1]
@@ -118,7 +118,7 @@ def test_a_scan_that_meets_no_other_stays_where_its_fixes_put_it(tmp_path: Path)
     flight, site = Flight(tmp_path / "winter", leg(np.pi / 2, 3), OTHER, ground=2), LiveSite()
     site.add(ground, compare=False)
     site.add(flight.folder)
-    shown: dict[Path, Placed] = {}
+    shown: dict[Path, PlacedScan] = {}
     for _ in range(3):
         flight.fly()
         shown |= turn(site, ground, flight.folder)

@@ -32,7 +32,7 @@ from service.stream import codec
 from service.stream.link import DatalinkSender
 from service.stream.radio_messages import (
     MAX_BYTES,
-    Tile,
+    RadioTile,
     pack_announce,
     pack_pose,
     pack_tile,
@@ -337,6 +337,6 @@ def test_through_the_vehicles_own_serial_port_heeding_its_radio(tmp_path: Path) 
 
 def test_tags_tell_scans_apart() -> None:
     assert tag_of("a", "b") != tag_of("b", "a")
-    assert isinstance(tiles_of(coarse(keyframe(0, 0.0)))[0], Tile)
+    assert isinstance(tiles_of(coarse(keyframe(0, 0.0)))[0], RadioTile)
     pose = unpack_record(b"")
     assert pose is None

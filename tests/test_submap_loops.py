@@ -10,7 +10,7 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays
-from recon.posegraph.ground_control import Track, adjust, supported
+from recon.posegraph.ground_control import KeyframeTrack, adjust, supported
 from recon.posegraph.loop_closure import LoopView
 from recon.posegraph.records import Loop
 from recon.posegraph.submap_loops import SubmapLoopConfig, filled, verify_surfaces
@@ -142,7 +142,7 @@ def test_a_repeated_texture_is_no_loop_at_the_wrong_place() -> None:
             loops.append(Loop(a, b, found.T_a_b, found.covariance))
     truth: F64 = np.array(poses)
     spread = np.array([np.diag([0.01**2] * 3 + [0.3**2] * 3)] * 10)
-    track = Track(truth, np.linspace(0.0, 45.0, 10), spread, (), supported(loops, truth))
+    track = KeyframeTrack(truth, np.linspace(0.0, 45.0, 10), spread, (), supported(loops, truth))
     held = adjust(track)
     assert np.abs(held.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.1
 
@@ -160,7 +160,7 @@ def test_stored_keyframes_alone_bring_two_oblique_legs_together() -> None:
         kept = DepthMap(d.depth_m, d.sigma_m, d.views, d.K, flown[k])
         stored.append(Keyframe(k, one.time_ns, kept, one.bgr, one.pose, one.fresh))
     spread = np.array([np.diag([0.01**2] * 3 + [1.0] * 3)] * 10)
-    track = Track(flown, np.arange(10) * 5.0 + 40.0 * (np.arange(10) >= 5), spread)
+    track = KeyframeTrack(flown, np.arange(10) * 5.0 + 40.0 * (np.arange(10) >= 5), spread)
     found = supported(StoredLoops(track, stored.__getitem__, LOOPS).find(), flown)
     assert len(found) >= 3
     for loop in found:
@@ -169,7 +169,7 @@ def test_stored_keyframes_alone_bring_two_oblique_legs_together() -> None:
         assert error @ np.linalg.solve(loop.covariance, error) < 22.5
     ones = np.ones(10)
     assert np.median(steps_m(found, flown, ones, 66.0)) > 0.6
-    after = adjust(Track(track.poses, track.times_s, spread, (), found))
+    after = adjust(KeyframeTrack(track.poses, track.times_s, spread, (), found))
     assert np.median(steps_m(found, after.poses, after.scales, 66.0)) < 0.2
     left = se3.inverse(after.poses[2]) @ after.poses[7]
     true = se3.inverse(truth[2]) @ truth[7]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from recon.types import F64, Array, Bool
-from service.offline.exports.surface import Surface, cell_places, surface_model
+from service.offline.exports.surface import SurfaceHeights, cell_places, surface_model
 from service.offline.exports.view import ScanView
 from service.stream.codec import encode
 from service.stream.records import ScanHeader
@@ -39,7 +39,7 @@ def flown(folder: Path, house: HouseFlight, change: Callable[[F64, Array], Array
 
 def model(
     folder: Path, house: HouseFlight, change: Callable[[F64, Array], Array], strict: bool = False
-) -> tuple[Surface, F64]:
+) -> tuple[SurfaceHeights, F64]:
     """The model of such a scan, and (rows, cols, 3) places of its cells."""
     with ScanView(flown(folder, house, change)) as scan:
         found = surface_model(scan, CELL_M, strict)

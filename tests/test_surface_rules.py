@@ -17,7 +17,7 @@ import pytest
 from recon.surface.raster import Grid, Raster, without_cells
 from recon.types import F32, F64, U8, Bool
 from service.offline.exports import surface
-from service.offline.exports.surface import Surface
+from service.offline.exports.surface import SurfaceHeights
 
 CELL_M = 0.25
 SIZE = 60
@@ -55,7 +55,7 @@ def modelled(
     missing: Bool,
     air: Air,
     is_whole: bool = True,
-) -> Surface:
+) -> SurfaceHeights:
     """The surface model of these heights (rows, cols) without the ``missing`` ones."""
     grid = Grid(0.0, 0.0, CELL_M, (SIZE, SIZE))
     rgb = np.full((SIZE, SIZE, 3), 90, np.uint8)

@@ -12,7 +12,7 @@ from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh, cut, height_mesh
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import BORDER_PX, lay_out, pack
-from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, consistent, look
+from recon.surface.texture_views import CANDIDATES, TextureView, TriangleViews, consistent, look
 from recon.surface.texturing import PENALTY, choose, face_neighbours, fading, levels, texture
 from recon.types import F64, U8, Array
 
@@ -140,9 +140,9 @@ def test_resolution_falls_with_distance_and_slant() -> None:
     np.testing.assert_allclose(found.px_per_m[row, :2], [200 / 14, 200 / 28], rtol=0.02)
 
 
-def rows(view: list[list[int]], px: list[list[float]]) -> Sightings:
+def rows(view: list[list[int]], px: list[list[float]]) -> TriangleViews:
     count = len(view)
-    out = Sightings(
+    out = TriangleViews(
         np.full((count, CANDIDATES), -1, np.int32),
         np.zeros((count, CANDIDATES), np.float32),
         np.zeros((count, CANDIDATES, 3), np.float32),
@@ -153,7 +153,7 @@ def rows(view: list[list[int]], px: list[list[float]]) -> Sightings:
     return out
 
 
-def energy(found: Sightings, neighbours: Array, slot: Array) -> float:
+def energy(found: TriangleViews, neighbours: Array, slot: Array) -> float:
     """The energy of :func:`choose`: data costs plus ``PENALTY`` per edge between views."""
     seen = slot >= 0
     rows = np.flatnonzero(seen)

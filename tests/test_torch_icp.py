@@ -11,7 +11,7 @@ import pytest
 
 from recon import se3
 from recon.mapping import icp_kernels
-from recon.mapping.registration import IcpConfig, Surface
+from recon.mapping.registration import DepthSurface, IcpConfig
 from recon.mapping.registration import register_projective as compiled
 from recon.types import F64, DepthMap, Registration
 
@@ -84,7 +84,7 @@ def test_surface_elements_are_the_compiled_ones(device: str, gaps: float) -> Non
 
     depth = seen(se3.compose(DOWN, np.array([0.0, 0.0, 40.0])), "hills", 3, gaps)
     depth.depth_m[40:60, 70:100] -= 6
-    want = Surface.build(depth, IcpConfig())
+    want = DepthSurface.build(depth, IcpConfig())
     z, sigma, intrinsics = (
         torch.from_numpy(np.ascontiguousarray(x)).to(device)
         for x in (depth.depth_m, depth.sigma_m, want.intrinsics)

@@ -17,7 +17,7 @@ import pytest
 
 from recon.stereo import belief_propagation as compiled
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import FusionConfig, PairDepth
+from recon.stereo.reprojection import DepthFusionConfig, PairDepth
 from recon.stereo.reprojection import fuse as compiled_fuse
 from recon.stereo.reprojection import reproject as compiled_reproject
 from recon.stereo.upsampling import UpsamplingConfig, guide_at_taps
@@ -29,7 +29,7 @@ torch = pytest.importorskip("torch")
 
 SIZE = (96, 54)
 K = np.array([[100.0, 0, 47.5], [0, 100.0, 26.5], [0, 0, 1]])
-ALL = FusionConfig()
+ALL = DepthFusionConfig()
 
 
 @pytest.fixture

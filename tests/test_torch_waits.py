@@ -16,7 +16,7 @@ import pytest
 
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import FusionConfig
+from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import U8, DepthMap, StereoPair
 
@@ -126,7 +126,7 @@ def test_a_keyframe_from_images_to_fused_depth(device: str, reads: list[int]) ->
     )  # fmt: skip
     stages = DenseStages(
         BeliefPropagationConfig(iterations=2, speckle_px=4), UpsamplingConfig(diameter_px=3),
-        FusionConfig(),
+        DepthFusionConfig(),
     )  # fmt: skip
     backend = TorchBackend(device)
     reads.clear()
@@ -175,7 +175,7 @@ def test_nothing_is_made_on_the_host_between_upload_and_result() -> None:
         return torch.empty(shape, dtype=kind, device="meta")
 
     matching = BeliefPropagationConfig(iterations=1, speckle_px=1)
-    path = DensePath("meta", matching, UpsamplingConfig(diameter_px=2), FusionConfig())
+    path = DensePath("meta", matching, UpsamplingConfig(diameter_px=2), DepthFusionConfig())
     pair = [empty(torch.uint8, 64, 96) for _ in range(4)]
     pair += [empty(torch.uint8, 128, 192, 3), empty(torch.int64, 5), empty(torch.float64, 15)]
     depth = [empty(torch.float32, 48, 60)] * 2 + [empty(torch.float64, 4)]

@@ -19,7 +19,7 @@ import pytest
 
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import FusionConfig
+from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import Array, DepthMap
 
@@ -157,7 +157,7 @@ def test_depth_and_fusion(both: Both) -> None:
         z[1:] *= apart
         z[2:] *= apart
         stack = tensors(z.astype(np.float32), sigma.astype(np.float32))
-        fused, _, views = both(lambda s=stack: fuse(s[0], s[1], FusionConfig()), 1e-6)  # type: ignore[misc]
+        fused, _, views = both(lambda s=stack: fuse(s[0], s[1], DepthFusionConfig()), 1e-6)  # type: ignore[misc]
         assert bool(torch.isfinite(fused).any()) is known
         assert bool((views > 1).any()) is known
 

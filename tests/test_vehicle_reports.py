@@ -13,7 +13,7 @@ from loopback import until
 from rehearsal import RehearsalVehicle
 from scipy.spatial.transform import Rotation
 
-from mavlink.component.status import Odometry
+from mavlink.component.status import BodyOdometry
 from mavlink.telemetry.samples import VehicleState
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
@@ -53,7 +53,7 @@ def state() -> VehicleState:
 
 
 def test_pose_velocity_and_covariance_are_the_bodys_in_ned() -> None:
-    sent: list[tuple[Odometry, int]] = []
+    sent: list[tuple[BodyOdometry, int]] = []
     report = OdometryReport(CameraConfig(), lambda o, t: sent.append((o, t)))
     for k in range(3):
         report.send(step_at((4.0 * k / 10, 1.0, 30.0)), state(), k * S // 10)
@@ -68,7 +68,7 @@ def test_pose_velocity_and_covariance_are_the_bodys_in_ned() -> None:
 
 
 def test_a_fixed_mount_needs_no_gimbal() -> None:
-    sent: list[Odometry] = []
+    sent: list[BodyOdometry] = []
     camera = CameraConfig(mount="fixed", mount_pitch_deg=-60.0, mount_yaw_deg=20.0)
     mount = Rotation.from_euler("ZYX", [20.0, -60.0, 0.0], degrees=True)
     report = OdometryReport(camera, lambda o, t: sent.append(o))
@@ -77,7 +77,7 @@ def test_a_fixed_mount_needs_no_gimbal() -> None:
 
 
 def test_resets_are_counted_and_lost_frames_left_out() -> None:
-    sent: list[Odometry] = []
+    sent: list[BodyOdometry] = []
     report = OdometryReport(CameraConfig(), lambda o, t: sent.append(o))
     way = [(k * 1.0, 0.0, 30.0) for k in range(6)]
     for k, place in enumerate(way):  # a fast vehicle: no step of it is a jump

@@ -21,7 +21,7 @@ from mavlink.telemetry.samples import OF_AUTOPILOT
 from mavlink.wire.dialect import dialect
 from mavlink.wire.first_beat import ONBOARD
 from mavlink.wire.framing import Packet
-from mavlink.wire.messages import Address, Outbox
+from mavlink.wire.messages import Address, SendQueue
 
 S = 1_000_000_000
 LOST_NS = 5 * S
@@ -34,7 +34,7 @@ class AutopilotLink:
         self,
         presence: Presence,
         history: VehicleHistory,
-        outbox: Outbox,
+        outbox: SendQueue,
         say: Callable[[int, str], None],
     ) -> None:
         self.link: int | None = None  # where the autopilot was heard last

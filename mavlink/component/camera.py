@@ -15,7 +15,7 @@ from mavlink.component.control import ACCEPTED, Answer, Handled, Result, ScanCon
 from mavlink.component.metadata import DEFINITION_URI, MODEL, VENDOR, VERSION
 from mavlink.wire.dialect import dialect
 from mavlink.wire.first_beat import CAMERA
-from mavlink.wire.messages import Address, Outbox, Streams
+from mavlink.wire.messages import Address, SendQueue, Streams
 
 S = 1_000_000_000
 CAPABILITIES = 1 | 2 | 8 | 16  # video, image, and each during the other
@@ -46,7 +46,7 @@ class CameraComponent:
         self,
         definition_version: int,
         control: ScanControl,
-        outbox: Outbox,
+        outbox: SendQueue,
         streams: Streams,
         boot_ms: Callable[[], int],
         now: Callable[[], int],

@@ -17,7 +17,7 @@ from typing import Any
 from mavlink.component.control import Answer, Handled, Result, Work
 from mavlink.component.status import INFO, WARNING
 from mavlink.wire.dialect import dialect
-from mavlink.wire.messages import Address, Outbox
+from mavlink.wire.messages import Address, SendQueue
 
 INT_UNSET = 0x7FFFFFFF
 PROGRESS_EVERY_NS = 500_000_000
@@ -104,7 +104,7 @@ class CommandDesk:
     def __init__(
         self,
         commands: Mapping[int, Command],
-        outbox: Outbox,
+        outbox: SendQueue,
         host: Any,
         say: Callable[[int, str], None],
         is_stop: Callable[[Call], bool],

@@ -36,7 +36,7 @@ from mavlink.telemetry.history import VehicleHistory
 from mavlink.wire.dialect import COMMAND_CANCEL, numbers_of
 from mavlink.wire.first_beat import CAMERA, ONBOARD
 from mavlink.wire.framing import Decoder, Packet
-from mavlink.wire.messages import Address, Outbox, Outgoing, Streams
+from mavlink.wire.messages import Address, OutgoingMessage, SendQueue, Streams
 
 S = 1_000_000_000
 MS = 1_000_000
@@ -91,7 +91,7 @@ class Companion:
         self._unix_us = unix_us
         self._listeners: dict[str, list[Callable[[Any], None]]] = {}
         self._start_ns = self._now_ns = now_ns
-        self._outbox = Outbox()
+        self._outbox = SendQueue()
         self._decoder = Decoder()
         self.autopilot = AutopilotLink(presence, history, self._outbox, self.say)
         self.streams = Streams(self._outbox)
@@ -203,7 +203,7 @@ class Companion:
 
     # Output.
 
-    def take(self) -> list[Outgoing]:
+    def take(self) -> list[OutgoingMessage]:
         """Messages to send now, in order."""
         return self._outbox.take()
 

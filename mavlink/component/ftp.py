@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mavlink.wire.dialect import dialect
-from mavlink.wire.messages import Address, Outbox
+from mavlink.wire.messages import Address, SendQueue
 
 HEAD = struct.Struct("<HBBBBBBI")
 ROOM = 239
@@ -45,7 +45,7 @@ def file_crc(data: bytes) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class FtpRequest:
     """One request of a client."""
 
     sequence: int
@@ -56,12 +56,12 @@ class Request:
     data: bytes
 
 
-def parse_request(payload: bytes) -> Request | None:
+def parse_request(payload: bytes) -> FtpRequest | None:
     """The request in a payload; None for any other payload."""
     if len(payload) < HEAD.size:
         return None
     sequence, session, opcode, size, _, _, _, offset = HEAD.unpack_from(payload)
-    return Request(sequence, session, opcode, size, offset, payload[HEAD.size :][:ROOM])
+    return FtpRequest(sequence, session, opcode, size, offset, payload[HEAD.size :][:ROOM])
 
 
 class FileServer:
@@ -85,7 +85,7 @@ class FileServer:
             self._last[source] = (request.sequence, answers)
         return answers
 
-    def serve(self, message: Any, link: int, outbox: Outbox) -> None:
+    def serve(self, message: Any, link: int, outbox: SendQueue) -> None:
         """Answer a FILE_TRANSFER_PROTOCOL message that is meant for one of our components."""
         source = Address(message.get_srcSystem(), message.get_srcComponent())
         for payload in self.answer(bytes(message.payload), source):
@@ -94,7 +94,7 @@ class FileServer:
             )
             outbox.put(message.target_component, reply, link)
 
-    def _serve(self, r: Request, source: Address) -> list[bytes]:
+    def _serve(self, r: FtpRequest, source: Address) -> list[bytes]:
         if r.size > ROOM:
             return [_nak(r, BAD_SIZE)]
         if r.opcode == RESET:
@@ -110,7 +110,7 @@ class FileServer:
             return [_nak(r, UNKNOWN)]
         return self._by_session(r, source)
 
-    def _list(self, r: Request) -> bytes:
+    def _list(self, r: FtpRequest) -> bytes:
         if _name(r).strip("/.") != "":
             return _nak(r, NOT_FOUND)
         entries = [f"F{n}\t{len(f)}\0".encode() for n, f in sorted(self._files.items())]
@@ -123,7 +123,7 @@ class FileServer:
             data += entry
         return _ack(r, data)
 
-    def _by_name(self, r: Request, source: Address) -> bytes:
+    def _by_name(self, r: FtpRequest, source: Address) -> bytes:
         file = self._files.get(_name(r).lstrip("/"))
         if file is None:
             return _nak(r, NOT_FOUND)
@@ -135,7 +135,7 @@ class FileServer:
         self._sessions[free] = (source, file)
         return _ack(r, len(file).to_bytes(4, "little"), session=free)
 
-    def _by_session(self, r: Request, source: Address) -> list[bytes]:
+    def _by_session(self, r: FtpRequest, source: Address) -> list[bytes]:
         owner, file = self._sessions.get(r.session, (None, b""))
         if owner != source:
             return [_nak(r, BAD_SESSION)]
@@ -154,13 +154,13 @@ class FileServer:
         ]
 
 
-def _name(r: Request) -> str:
+def _name(r: FtpRequest) -> str:
     path = r.data[: r.size].partition(b"\0")[0].decode("ascii", "replace")
     return SELECTOR.sub("", path)
 
 
 def _ack(
-    r: Request,
+    r: FtpRequest,
     data: bytes,
     step: int = 0,
     offset: int | None = None,
@@ -175,6 +175,6 @@ def _ack(
     return (head + data).ljust(PAYLOAD, b"\0")
 
 
-def _nak(r: Request, error: int) -> bytes:
+def _nak(r: FtpRequest, error: int) -> bytes:
     head = HEAD.pack((r.sequence + 1) & 0xFFFF, r.session, NAK, 1, r.opcode, 0, 0, r.offset)
     return (head + bytes((error,))).ljust(PAYLOAD, b"\0")

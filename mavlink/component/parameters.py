@@ -17,7 +17,7 @@ from mavlink.component.control import Answer, Result
 from mavlink.telemetry.gimbal import YAW_FRAMES
 from mavlink.wire.dialect import dialect
 from mavlink.wire.first_beat import CAMERA, ONBOARD
-from mavlink.wire.messages import Outbox
+from mavlink.wire.messages import SendQueue
 
 REAL32 = 9  # MAV_PARAM_TYPE
 EXTENDED_VALUE = 128  # bytes
@@ -75,7 +75,7 @@ class Parameters:
 
     def __init__(
         self,
-        outbox: Outbox,
+        outbox: SendQueue,
         on_change: Callable[[str, float], Answer],
         kept: Mapping[str, float] | None = None,
         table: Sequence[Parameter] = PARAMETERS,

@@ -15,7 +15,7 @@ from typing import Any
 
 from mavlink.wire.dialect import dialect
 from mavlink.wire.first_beat import CAMERA, NO_AUTOPILOT, ONBOARD, TYPES, is_autopilot
-from mavlink.wire.messages import Outgoing
+from mavlink.wire.messages import OutgoingMessage
 
 S = 1_000_000_000
 PERIOD_NS = S
@@ -137,7 +137,7 @@ class Presence:
             return Health.NOT_READY if is_waiting else self._health
         return Health.CRITICAL if silent < self.config.dead_s else None
 
-    def due(self, now_ns: int) -> list[Outgoing]:
+    def due(self, now_ns: int) -> list[OutgoingMessage]:
         """The heartbeats to send now; the first call returns them at once."""
         with self._lock:
             if now_ns < self._next_ns:
@@ -147,7 +147,7 @@ class Presence:
             state = self._state(now_ns)
             if state is None:
                 return []
-            return [Outgoing(c, self._heartbeat(c, state)) for c in (ONBOARD, CAMERA)]
+            return [OutgoingMessage(c, self._heartbeat(c, state)) for c in (ONBOARD, CAMERA)]
 
     def _heartbeat(self, component: int, state: Health) -> Any:
         kind = TYPES[component]

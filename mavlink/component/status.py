@@ -12,7 +12,7 @@ from mavlink.component.control import ScanStatus
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.wire.dialect import dialect
 from mavlink.wire.first_beat import ONBOARD
-from mavlink.wire.messages import Outbox
+from mavlink.wire.messages import SendQueue
 
 S = 1_000_000_000
 TEXT = 50  # bytes in one STATUSTEXT
@@ -28,7 +28,7 @@ EMERGENCY, ALERT, CRITICAL, ERROR, WARNING, NOTICE, INFO, DEBUG = range(8)
 class StatusTexts:
     """Texts to the operator: at most one a second, repetitions suppressed."""
 
-    def __init__(self, outbox: Outbox) -> None:
+    def __init__(self, outbox: SendQueue) -> None:
         self._outbox = outbox
         self._waiting: deque[tuple[int, str]] = deque(maxlen=20)
         self._said: dict[str, int] = {}
@@ -141,7 +141,7 @@ CELLS = 21  # upper triangle of 6 x 6
 
 
 @dataclass(frozen=True, slots=True)
-class Odometry:
+class BodyOdometry:
     """Pose and velocity of the body; unknown parts of the covariances are NaN."""
 
     position_ned_m: tuple[float, float, float]
@@ -152,7 +152,7 @@ class Odometry:
     quality_percent: int  # 0 to 100; 0 is unusable
 
 
-def odometry_message(odometry: Odometry, boot_time_us: int) -> Any:
+def odometry_message(odometry: BodyOdometry, boot_time_us: int) -> Any:
     """The ODOMETRY at a time of the autopilot's boot clock."""
     rows = odometry.pose_covariance
     upper = [float(rows[i][j]) for i in range(6) for j in range(i, 6)]

@@ -26,17 +26,17 @@ from mavlink.component.control import ScanControl
 from mavlink.component.link_watch import Trouble
 from mavlink.component.memory import Memory
 from mavlink.component.presence import Health, Presence, PresenceConfig
-from mavlink.component.status import ComputerLoad, Odometry, odometry_message
+from mavlink.component.status import BodyOdometry, ComputerLoad, odometry_message
 from mavlink.telemetry.clock import computer_offset_ns
 from mavlink.telemetry.decode import READERS
 from mavlink.telemetry.history import PATIENCE_S, HistoryConfig, VehicleHistory
 from mavlink.wire.dialect import dialect, numbers_of
 from mavlink.wire.first_beat import FirstBeats
 from mavlink.wire.framing import Packet
-from mavlink.wire.link import Inbox, Job, Link, parse_link
-from mavlink.wire.messages import LinkReport, Links, Outgoing
+from mavlink.wire.link import Job, Link, LinkInbox, parse_link
+from mavlink.wire.messages import LinkReport, Links, OutgoingMessage
 from mavlink.wire.signing import Signing, read_key
-from mavlink.wire.tlog import Recorder
+from mavlink.wire.tlog import TlogRecorder
 
 log = logging.getLogger(__name__)
 
@@ -94,7 +94,7 @@ class VehicleLink:
         links = None if first is None else first.hand_over()
         now_ns = time.monotonic_ns()
         self.history = VehicleHistory(config.history, PATIENCE_S)
-        self.recorder = Recorder()
+        self.recorder = TlogRecorder()
         self._memory = Memory(config.state_dir)
         self._signing = self._make_signing()
         self.presence = Presence(
@@ -113,7 +113,7 @@ class VehicleLink:
             self._memory.parameters,
             lambda: (time.monotonic_ns() + self.unix_offset_ns()) // 1000,
         )
-        self._inbox: Inbox[tuple[int, Packet, int]] = Inbox(BACKLOG)
+        self._inbox: LinkInbox[tuple[int, Packet, int]] = LinkInbox(BACKLOG)
         self._heard = set(HEARD)  # numbers of handled messages; others are ignored
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -177,7 +177,7 @@ class VehicleLink:
         self._heard |= numbers_of([name])
         self._inbox.put(lambda: self._companion.listen(name, listener))
 
-    def report_odometry(self, odometry: Odometry, time_ns: int) -> bool:
+    def report_odometry(self, odometry: BodyOdometry, time_ns: int) -> bool:
         """Send our estimate to the autopilot, stamped with its clock at our monotonic time.
 
         Returns False and sends nothing unless ``odometry`` is enabled and its clock is known.
@@ -300,7 +300,7 @@ class VehicleLink:
                 self._send(due)
             self._stop.wait(max(0.001, (self.presence.next_timer() - time.monotonic_ns()) / S))
 
-    def _send(self, messages: list[Outgoing]) -> None:
+    def _send(self, messages: list[OutgoingMessage]) -> None:
         if not messages:
             return
         now_ns = time.monotonic_ns()

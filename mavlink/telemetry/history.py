@@ -26,7 +26,7 @@ from mavlink.telemetry.samples import (
     ReceiverAltitude,
     Sample,
     TerrainSample,
-    Track,
+    TimeSeries,
     VehicleState,
 )
 
@@ -74,13 +74,13 @@ class VehicleHistory:
         self._lock = threading.Lock()
         self._news = threading.Condition()
         self._waiting = 0  # waiting readers
-        self._attitude: Track[AttitudeSample] = Track()
-        self._position: Track[PositionSample] = Track()
-        self._accuracy: Track[AccuracySample] = Track()
-        self._range: Track[RangeSample] = Track()
-        self._terrain: Track[TerrainSample] = Track()
-        self._gimbals: dict[tuple[int, int], Track[GimbalSample]] = {}  # by rank and component
-        self._tracks: dict[type[Sample], Track[Any]] = {
+        self._attitude: TimeSeries[AttitudeSample] = TimeSeries()
+        self._position: TimeSeries[PositionSample] = TimeSeries()
+        self._accuracy: TimeSeries[AccuracySample] = TimeSeries()
+        self._range: TimeSeries[RangeSample] = TimeSeries()
+        self._terrain: TimeSeries[TerrainSample] = TimeSeries()
+        self._gimbals: dict[tuple[int, int], TimeSeries[GimbalSample]] = {}  # by rank and component
+        self._tracks: dict[type[Sample], TimeSeries[Any]] = {
             AttitudeSample: self._attitude,
             PositionSample: self._position,
             AccuracySample: self._accuracy,
@@ -105,7 +105,11 @@ class VehicleHistory:
     def covers(self, time_ns: int) -> bool:
         """True when no active stream can still add data about ``time_ns``."""
         with self._lock:
-            tracks: list[Track[Any]] = [self._attitude, self._position, *self._gimbals.values()]
+            tracks: list[TimeSeries[Any]] = [
+                self._attitude,
+                self._position,
+                *self._gimbals.values(),
+            ]
             newest = [track.last_ns for track in tracks]
         flowing = [t for t in newest if t is not None and t > time_ns - MAX_GAP_NS]
         return all(t >= time_ns for t in flowing)
@@ -120,7 +124,7 @@ class VehicleHistory:
         none are near."""
         with self._lock:
             heads = [self._gimbals[key] for key in self._gimbal_order()]
-            tracks: list[Track[Any]] = [*heads, self._attitude]
+            tracks: list[TimeSeries[Any]] = [*heads, self._attitude]
             around = [at for track in tracks if (at := track.around(time_ns)) is not None]
         return around[0].gap_s if around else 0.0
 
@@ -209,9 +213,9 @@ class VehicleHistory:
             self._gimbals.clear()
             self._judged.clear()
 
-    def _track(self, sample: Sample) -> Track[Any]:
+    def _track(self, sample: Sample) -> TimeSeries[Any]:
         if isinstance(sample, GimbalSample):
-            return self._gimbals.setdefault((sample.rank, sample.component), Track())
+            return self._gimbals.setdefault((sample.rank, sample.component), TimeSeries())
         return self._tracks[type(sample)]
 
     def state_at(self, time_ns: int) -> VehicleState | None:
@@ -315,7 +319,7 @@ class VehicleHistory:
             self._judged[key] = (newest, better)
         return better or claimed
 
-    def _steadiest(self, track: Track[GimbalSample]) -> GimbalFrame | None:
+    def _steadiest(self, track: TimeSeries[GimbalSample]) -> GimbalFrame | None:
         """Uses a thinned track, because it runs repeatedly in flight."""
         sent: list[Quaternion] = []
         bodies: list[Quaternion] = []
@@ -444,7 +448,7 @@ def _way(step: float, m0: float, m1: float, u: float) -> float:
 
 
 def _receiver_above(
-    accuracy: Bracket[AccuracySample] | None, positions: Track[PositionSample]
+    accuracy: Bracket[AccuracySample] | None, positions: TimeSeries[PositionSample]
 ) -> ReceiverAltitude | None:
     """The fix nearest in time, compared with the autopilot's altitude then; None without either."""
     at = None if accuracy is None else positions.around(accuracy.nearer_ns)

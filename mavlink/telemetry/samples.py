@@ -190,7 +190,7 @@ class Bracket(Generic[S]):
         return 0.5 * abs(before * after)
 
 
-class Track(Generic[S]):
+class TimeSeries(Generic[S]):
     """Samples sorted by time. Not thread-safe by itself."""
 
     def __init__(self) -> None:

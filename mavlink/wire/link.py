@@ -1,6 +1,6 @@
 """Links: reopened whenever they fail, stamped at the read; sending never blocks.
 
-:class:`Inbox` passes received packets to the protocol's thread. Waking a thread costs more than
+:class:`LinkInbox` passes received packets to the protocol's thread. Waking a thread costs more than
 processing a telemetry message, so messages that need no quick answer are batched briefly. They
 keep their own stamps.
 """
@@ -155,7 +155,7 @@ Job = Callable[[], object]
 T = TypeVar("T")
 
 
-class Inbox(Generic[T]):
+class LinkInbox(Generic[T]):
     """A bounded queue from many threads to one, of jobs and of telemetry."""
 
     def __init__(self, limit: int) -> None:

@@ -27,7 +27,7 @@ class Address:
 
 
 @dataclass(frozen=True, slots=True)
-class Outgoing:
+class OutgoingMessage:
     """A message from one of our components, for one link or (None) for all."""
 
     component: int
@@ -35,17 +35,17 @@ class Outgoing:
     link: int | None = None
 
 
-class Outbox:
+class SendQueue:
     """Messages waiting to be packed; a full queue drops the oldest."""
 
     def __init__(self, limit: int = 2000) -> None:
-        self._waiting: deque[Outgoing] = deque(maxlen=limit)
+        self._waiting: deque[OutgoingMessage] = deque(maxlen=limit)
 
     def put(self, component: int, message: Any, link: int | None = None) -> None:
         """Queue a message of one of our components."""
-        self._waiting.append(Outgoing(component, message, link))
+        self._waiting.append(OutgoingMessage(component, message, link))
 
-    def take(self) -> list[Outgoing]:
+    def take(self) -> list[OutgoingMessage]:
         """Everything queued since the last call, in order."""
         taken = list(self._waiting)
         self._waiting.clear()
@@ -65,7 +65,7 @@ class Packer:
         self._lock = threading.Lock()
         self._encoders: dict[tuple[int, int], Any] = {}
 
-    def pack(self, system: int, outgoing: Outgoing, unix_ns: int) -> bytes | None:
+    def pack(self, system: int, outgoing: OutgoingMessage, unix_ns: int) -> bytes | None:
         """The packet; None when a value does not fit its field."""
         with self._lock:
             key = (system, outgoing.component)
@@ -103,7 +103,7 @@ class _Stream:
 class Streams:
     """A table of (component, message number), each with an interval and a sender."""
 
-    def __init__(self, outbox: Outbox) -> None:
+    def __init__(self, outbox: SendQueue) -> None:
         self._outbox = outbox
         self._streams: dict[tuple[int, int], _Stream] = {}
 
@@ -180,7 +180,7 @@ class Links:
         for packet in self._framers[index].feed(data):
             self._on_packet(index, packet, now_ns)
 
-    def send(self, system: int, messages: Sequence[Outgoing]) -> list[bytes]:
+    def send(self, system: int, messages: Sequence[OutgoingMessage]) -> list[bytes]:
         """Send each message on its links; returns the packets sent."""
         unix_ns, sent = time.time_ns(), []
         for outgoing in messages:

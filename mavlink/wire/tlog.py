@@ -65,7 +65,7 @@ def _stamp_stands(
     return packet_length(buffer, end + STAMP) != 0 and abs(following - usec) < STEP_USEC
 
 
-class Recorder:
+class TlogRecorder:
     """Writes a .tlog while one is open; thread-safe, and never raises on a full disk."""
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Protocol
 
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import FusionConfig
+from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 
@@ -27,7 +27,7 @@ class DenseStages:
 
     matching: BeliefPropagationConfig
     upsampling: UpsamplingConfig
-    fusion: FusionConfig
+    fusion: DepthFusionConfig
 
 
 class Backend(Protocol):

@@ -19,7 +19,7 @@ from recon.backends.room import kept, pyramid_levels, room
 from recon.backends.torch_plan import Plan, fused, part, read
 from recon.backends.torch_stereo import DenseStereo, drop_unreliable, drop_unseen
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import LABEL_SIGMA_PX, FusionConfig
+from recon.stereo.reprojection import LABEL_SIGMA_PX, DepthFusionConfig
 from recon.stereo.reprojection import MIN_CONFIDENCE as MIN_REPROJECTED
 from recon.stereo.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig
 from recon.types import F64, Array, DepthMap, StereoPair
@@ -35,7 +35,7 @@ class DensePath:
         device: str,
         matching: BeliefPropagationConfig,
         upsampling: UpsamplingConfig,
-        fusion: FusionConfig,
+        fusion: DepthFusionConfig,
     ) -> None:
         self.device = device
         self.matching = matching
@@ -280,7 +280,7 @@ def _label(
     return torch.where(within, label, math.nan), sure[centre].double()
 
 
-def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Tensor, Tensor]:
+def fuse(depth: Tensor, sigma: Tensor, config: DepthFusionConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Depth, sigma (h, w) float32 and number of views uint8 of pairs (P, h, w); no view: NaN.
 
     As :func:`recon.stereo.reprojection.fuse`: inverse depth of the largest group that agrees,

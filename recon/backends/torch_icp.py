@@ -259,7 +259,7 @@ def _about(centre: Tensor, twist: Tensor) -> Tensor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeviceSurface:
-    """As :class:`recon.mapping.registration.Surface`, on a device."""
+    """As :class:`recon.mapping.registration.DepthSurface`, on a device."""
 
     elements: Tensor  # (h, w, 6) float32
     intrinsics: Tensor  # (4,) float64 fx fy cx cy

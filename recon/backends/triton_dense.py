@@ -25,7 +25,7 @@ from recon.stereo.belief_propagation import (
 )
 from recon.stereo.matching_cost import CENSUS_RADIUS, COST_UNIT
 from recon.stereo.message_passing import FULL_WEIGHT
-from recon.stereo.reprojection import FusionConfig
+from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import RANGE_FLOOR, UpsamplingConfig
 
 PIXELS = 128
@@ -784,7 +784,7 @@ def _reproject(
     tl.store(sigma + at, tl.where(good, error, float("nan")).to(tl.float32), mask=here)
 
 
-def fuse(depth: Tensor, sigma: Tensor, config: FusionConfig) -> tuple[Tensor, Tensor, Tensor]:
+def fuse(depth: Tensor, sigma: Tensor, config: DepthFusionConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Depth and sigma (h, w) float32 and views uint8 of pairs (P, h, w)."""
     pairs, height, width = depth.shape
     plane, device = height * width, depth.device

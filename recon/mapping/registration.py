@@ -58,7 +58,7 @@ def arrays_of(depth: DepthMap) -> tuple[F32, F32, F64]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Surface:
+class DepthSurface:
     """A depth map with its surface elements, ready to be aligned many times."""
 
     elements: F32  # (h, w, 6), see recon.mapping.icp_kernels
@@ -67,7 +67,7 @@ class Surface:
     lever_m: float  # rms distance of the surface from its centre
 
     @staticmethod
-    def build(depth: DepthMap, config: IcpConfig) -> Surface:
+    def build(depth: DepthMap, config: IcpConfig) -> DepthSurface:
         """The surface of ``depth``; raises ValueError when its shapes disagree."""
         z, sigma, intrinsics = arrays_of(depth)
         h, w = z.shape
@@ -83,7 +83,7 @@ class Surface:
         points = some[:, None] * rays(depth.K, np.column_stack([4.0 * u, 4.0 * v]))
         centre = points.mean(axis=0) if len(points) else np.zeros(3)
         lever = np.sqrt(np.mean(np.sum((points - centre) ** 2, axis=1))) if len(points) else 1.0
-        return Surface(elements, intrinsics, centre, max(float(lever), 1e-6))
+        return DepthSurface(elements, intrinsics, centre, max(float(lever), 1e-6))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +134,7 @@ class _Problem:
 
 
 def _problem(
-    source: Surface, target: Surface, T: F64, stride: int, tukey: bool, config: IcpConfig
+    source: DepthSurface, target: DepthSurface, T: F64, stride: int, tukey: bool, config: IcpConfig
 ) -> _Problem | None:
     """The problem at ``T``, or None when fewer than 50 points find a partner."""
     h, w = source.elements.shape[:2]
@@ -202,12 +202,15 @@ def register_projective(
     """
     config = config or IcpConfig()
     return register_surfaces(
-        Surface.build(source, config), Surface.build(target, config), T_target_source, config
+        DepthSurface.build(source, config),
+        DepthSurface.build(target, config),
+        T_target_source,
+        config,
     )
 
 
 def register_surfaces(
-    source: Surface, target: Surface, T_target_source: F64, config: IcpConfig
+    source: DepthSurface, target: DepthSurface, T_target_source: F64, config: IcpConfig
 ) -> Registration:
     """As :func:`register_projective`, for surfaces that were built before."""
     T = np.array(T_target_source, dtype=np.float64)

@@ -19,10 +19,10 @@ from recon.posegraph.alignment_readings import (
     NO_YAW_RAD,
     UNKNOWNS,
     AlignmentReadings,
+    AlignmentState,
     Common,
     Heights,
     ReadingNoise,
-    State,
     has_fix,
 )
 from recon.posegraph.anchors import INDEPENDENT_HEIGHTS, Anchor
@@ -182,7 +182,7 @@ def fit(
 
 def _measured(
     anchors: Sequence[Anchor],
-    start: State,
+    start: AlignmentState,
     wander_s: tuple[float, float],
     iterations: int,
     slow_share: float,
@@ -211,7 +211,7 @@ def _measured(
 
 
 def _of_fixes(
-    fixes: AlignmentReadings, at: State, wander_s: tuple[float, float], slow_share: float
+    fixes: AlignmentReadings, at: AlignmentState, wander_s: tuple[float, float], slow_share: float
 ) -> ReadingNoise:
     """The noise of fixes and of assumed views, by their residuals to a track.
 
@@ -292,14 +292,14 @@ def scales(anchors: Sequence[Anchor], at: Similarity) -> tuple[Scale | None, Sca
 class _Solution:
     """The best state with its (UNKNOWNS, UNKNOWNS) information and its robust cost."""
 
-    at: State
+    at: AlignmentState
     H: F64
     cost: float
     residuals: F64  # (M,) whitened, of the readings
     kept: F64  # (groups,) 0 for what is left out
 
 
-def _solve(readings: AlignmentReadings, at: State, iterations: int) -> _Solution:
+def _solve(readings: AlignmentReadings, at: AlignmentState, iterations: int) -> _Solution:
     """Gauss-Newton with Huber's weights."""
     group, kept = readings.group, np.ones(int(readings.group[-1]) + 1)
     H, cost, extra = np.eye(UNKNOWNS), np.inf, np.zeros((2, len(readings.fix)))
@@ -326,7 +326,7 @@ def _solve(readings: AlignmentReadings, at: State, iterations: int) -> _Solution
     return _Solution(_centred(readings, at, weight), H, cost, r, kept)
 
 
-def _centred(readings: AlignmentReadings, at: State, weight: F64) -> State:
+def _centred(readings: AlignmentReadings, at: AlignmentState, weight: F64) -> AlignmentState:
     """The state whose track lies in the mean of the fixes, so that their mean error is its shift.
 
     What is best for the slope of a wander rests on the first and last of them. ``weight``
@@ -348,7 +348,7 @@ def _leave_out(readings: AlignmentReadings, norms: F64, kept: F64) -> bool:
     return not kept.all()
 
 
-def _starts(anchors: Sequence[Anchor], readings: AlignmentReadings) -> list[State]:
+def _starts(anchors: Sequence[Anchor], readings: AlignmentReadings) -> list[AlignmentState]:
     """To begin with: by the attitude, and by the track.
 
     The second matters when the compass is far off or there is none: then only the track of
@@ -360,15 +360,15 @@ def _starts(anchors: Sequence[Anchor], readings: AlignmentReadings) -> list[Stat
             R = a.prior.R_world_camera @ a.T_odom_camera[:3, :3].T
             break
     if not len(readings.fix):
-        return [State(R, -R @ anchors[0].T_odom_camera[:3, 3], 0.0)]
+        return [AlignmentState(R, -R @ anchors[0].T_odom_camera[:3, 3], 0.0)]
     x = readings.x @ R.T
-    starts = [State(R, np.asarray(np.median(readings.fix - x, axis=0)), 0.0)]
+    starts = [AlignmentState(R, np.asarray(np.median(readings.fix - x, axis=0)), 0.0)]
     if len(x) >= 4:
         weight = 1.0 / np.mean(readings.claimed**2, axis=1)
         scale, turn, _ = umeyama(x, readings.fix, weight)
         if scale > 0:
             shift = np.asarray(np.median(readings.fix - scale * x @ turn.T, axis=0))
-            starts.append(State(turn @ R, shift, float(np.log(scale))))
+            starts.append(AlignmentState(turn @ R, shift, float(np.log(scale))))
     return starts
 
 

@@ -149,7 +149,7 @@ class ReadingNoise:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class State:
+class AlignmentState:
     """A similarity, and the errors that readings have in common."""
 
     R: F64
@@ -158,9 +158,9 @@ class State:
     mount: F64 = field(default_factory=lambda: np.zeros(3))
     drift: float = 0.0
 
-    def moved(self, step: F64) -> State:
+    def moved(self, step: F64) -> AlignmentState:
         """The state after a step (UNKNOWNS,)."""
-        return State(
+        return AlignmentState(
             se3.so3_exp(step[:3]) @ self.R, self.t + step[3:6], self.log_scale + float(step[6]),
             self.mount + step[7:10], self.drift + float(step[10]),
         )  # fmt: skip
@@ -253,7 +253,7 @@ class AlignmentReadings:
         """(m,) times of the fixes, -1 to 1."""
         return self.spanned.along(self.fix_s)
 
-    def heights(self, at: State, H: F64, covariance: F64) -> Heights:
+    def heights(self, at: AlignmentState, H: F64, covariance: F64) -> Heights:
         """What the fixes tell about the mean height; ``covariance`` (7, 7) is that of the fit."""
         east, north, up = np.exp(at.log_scale) * at.R @ self.x.mean(axis=0)
         of_mean = np.array([north, -east, 0.0, 0.0, 0.0, 1.0, up])
@@ -264,11 +264,11 @@ class AlignmentReadings:
         half_s = self.spanned.half_s
         return Heights(sigma_m, time_s, at.drift / half_s, sigma_drift_m / half_s)
 
-    def common(self, at: State) -> Common:
+    def common(self, at: AlignmentState) -> Common:
         """What the readings have in common."""
         return replace(self.spanned, mount_rad=at.mount, drift_m=at.drift)
 
-    def linearised(self, at: State) -> tuple[F64, F64]:
+    def linearised(self, at: AlignmentState) -> tuple[F64, F64]:
         """Whitened residuals (M,) and Jacobian (M, UNKNOWNS)."""
         fix, way = self.placed(at), self.moved(at)
         turn, of_mount = self.turned(at)
@@ -322,16 +322,16 @@ class AlignmentReadings:
         weighted = self.weighted(r[:, None], kept, known)[:, 0]
         return float(r[self._rows] @ weighted[self._rows]) / max(free, 1.0)
 
-    def placed(self, at: State) -> F64:
+    def placed(self, at: AlignmentState) -> F64:
         """(m, 3) m from the fixes, without their drift, to where the similarity has them."""
         placed = np.exp(at.log_scale) * self.x @ at.R.T + at.t
         return np.asarray(placed + np.outer(self.along * at.drift, [0.0, 0.0, 1.0]) - self.fix)
 
-    def moved(self, at: State) -> F64:
+    def moved(self, at: AlignmentState) -> F64:
         """(k, 3) m from ways by velocity to those by vision."""
         return np.asarray(np.exp(at.log_scale) * self.step @ at.R.T - self.way)
 
-    def turned(self, at: State) -> tuple[F64, F64]:
+    def turned(self, at: AlignmentState) -> tuple[F64, F64]:
         """(n, 3) rotations from the attitudes; of one whose heading is unknown, the tilt alone.
 
         And (n, 3, 3) how they change with the mount.

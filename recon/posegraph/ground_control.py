@@ -75,7 +75,7 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Point:
+class ControlPoint:
     """A surveyed point in the world."""
 
     position_m: F64  # (3,)
@@ -83,7 +83,7 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track:
+class KeyframeTrack:
     """The keyframes as they are before."""
 
     poses: F64  # (N, 4, 4) T_world_camera
@@ -105,8 +105,8 @@ class Adjusted:
 
 
 def adjust(
-    track: Track,
-    points: Sequence[Point] = (),
+    track: KeyframeTrack,
+    points: Sequence[ControlPoint] = (),
     marks: Sequence[Mark] = (),
     config: BatchConfig | None = None,
 ) -> Adjusted:
@@ -252,8 +252,8 @@ class _Batch:
     """
 
     def __init__(
-        self, track: Track, loops: Sequence[int], points: Sequence[Point], marks: Sequence[Mark],
-        config: BatchConfig,
+        self, track: KeyframeTrack, loops: Sequence[int], points: Sequence[ControlPoint],
+        marks: Sequence[Mark], config: BatchConfig,
     ) -> None:  # fmt: skip
         self._track, self._config, self._smoother = track, config, Smoother()
         for T, spread in zip(track.poses, track.covariances, strict=True):
@@ -338,7 +338,7 @@ class _Batch:
                 place = prior.position_m
                 self._smoother.add_place("position", key, place, sigma, cauchy=2.0)
 
-    def _add_points(self, points: Sequence[Point], marks: Sequence[Mark]) -> None:
+    def _add_points(self, points: Sequence[ControlPoint], marks: Sequence[Mark]) -> None:
         """The world at key N, and the points that images see behind it."""
         world = len(self._track.poses)
         self._smoother.append_pose(np.eye(4), np.zeros((6, 6)))

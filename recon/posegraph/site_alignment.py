@@ -63,7 +63,7 @@ def alike(priors: Sequence[ScanPrior]) -> list[ScanPrior]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Similarity:
+class ScanSimilarity:
     """``p -> growth * R @ p + t``."""
 
     R: F64  # (3, 3)
@@ -83,7 +83,7 @@ class Similarity:
 class SiteAlignment:
     """Where all scans go, and how sure that is."""
 
-    moves: list[Similarity]
+    moves: list[ScanSimilarity]
     covariance: F64  # (7 S, 7 S) of the unknowns
     before_m: F64  # (T,) distance of the two ends of each tie
     after_m: F64  # (T,)
@@ -95,7 +95,7 @@ class SiteAlignment:
 def align(ties: Sequence[Tie], priors: Sequence[ScanPrior]) -> SiteAlignment:
     """The alignment of as many scans as there are ``priors``. A scan without ties stays."""
     n = len(priors)
-    moves = [Similarity(np.eye(3), np.zeros(3), 1.0) for _ in priors]
+    moves = [ScanSimilarity(np.eye(3), np.zeros(3), 1.0) for _ in priors]
     before = _errors(ties, moves)
     state = np.zeros((n, UNKNOWNS))
     for _ in range(STEPS):
@@ -154,12 +154,12 @@ def _moved(x: F64, step: F64) -> F64:
     return np.concatenate([turn, x[3:] + step[3:]])
 
 
-def _similarity(x: F64, prior: ScanPrior) -> Similarity:
+def _similarity(x: F64, prior: ScanPrior) -> ScanSimilarity:
     R, growth = se3.so3_exp(x[:3]), float(np.exp(x[6]))
-    return Similarity(R, prior.centre_m + x[3:6] - growth * R @ prior.centre_m, growth)
+    return ScanSimilarity(R, prior.centre_m + x[3:6] - growth * R @ prior.centre_m, growth)
 
 
-def _errors(ties: Sequence[Tie], moves: Sequence[Similarity]) -> list[F64]:
+def _errors(ties: Sequence[Tie], moves: Sequence[ScanSimilarity]) -> list[F64]:
     """(P, 3) of each tie, along the first scan's axes, which are those of its covariance: it does
     not fall because everything turns to where ties are less sure."""
     return [
@@ -168,7 +168,7 @@ def _errors(ties: Sequence[Tie], moves: Sequence[Similarity]) -> list[F64]:
     ]
 
 
-def _unit(tie: Tie, moves: Sequence[Similarity]) -> float:
+def _unit(tie: Tie, moves: Sequence[ScanSimilarity]) -> float:
     """Growth of both scans: in its units the error does not fall because everything shrinks."""
     return float(np.sqrt(moves[tie.a].growth * moves[tie.b].growth))
 

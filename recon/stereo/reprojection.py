@@ -192,7 +192,7 @@ def _close_gaps(
 
 
 @dataclass(frozen=True, slots=True)
-class FusionConfig:
+class DepthFusionConfig:
     """Parameters of the fusion of stereo pairs."""
 
     agree_sigmas: float = 2.5  # pairs agree within that many combined sigmas
@@ -201,7 +201,9 @@ class FusionConfig:
     min_sigma_share: float = 0.0005  # of the depth; no pair is better than this
 
 
-def fuse(pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: FusionConfig) -> DepthMap:
+def fuse(
+    pairs: Sequence[PairDepth], K: F64, T_world_camera: F64, config: DepthFusionConfig
+) -> DepthMap:
     """One depth map of all pairs: at each pixel the largest group that agrees, averaged.
 
     The mean is over inverse depth (whose error is nearly Gaussian) with weights 1/sigma^2;

@@ -20,7 +20,13 @@ from recon.image_quality import sharpness
 from recon.mapping.free_space import pixel_of
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import flat, sample
-from recon.surface.texture_views import CANDIDATES, Sightings, TextureView, drop_outliers, insert
+from recon.surface.texture_views import (
+    CANDIDATES,
+    TextureView,
+    TriangleViews,
+    drop_outliers,
+    insert,
+)
 from recon.surface.texturing import levels
 from recon.types import F32, F64, I32, I64, U8, Bool
 
@@ -90,12 +96,12 @@ def _sightings(
     views: Sequence[TextureView],
     images: tuple[F64, F64, U8, I64, I64],
     progress: Callable[[str], None],
-) -> Sightings:
+) -> TriangleViews:
     """The views of each cell, the best first: pixels per metre times the cosine to the vertical,
     less where an image is blurred; without those whose colour differs from most others."""
     raster = terrain.raster
     rows, cols = raster.grid.shape
-    out = Sightings(
+    out = TriangleViews(
         np.full((rows * cols, CANDIDATES), -1, np.int32),
         np.zeros((rows * cols, CANDIDATES), np.float32),
         np.zeros((rows * cols, CANDIDATES, 3), np.float32),

@@ -12,7 +12,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from recon.surface.meshing import Mesh
-from recon.surface.texture_views import Sightings, TextureView
+from recon.surface.texture_views import TextureView, TriangleViews
 from recon.types import F32, F64, I32, I64, U8, Bool
 
 BORDER_PX = 2
@@ -141,7 +141,7 @@ class Palette:
     rgb: U8  # (V, 3) where no view has colour
 
 
-def paint(mesh: Mesh, layout: Layout, found: Sightings, label: I32, palette: Palette) -> U8:
+def paint(mesh: Mesh, layout: Layout, found: TriangleViews, label: I32, palette: Palette) -> U8:
     """(h, w, 3) RGB atlas: each texel the mix of the views that fade there."""
     w, h = layout.size_px
     image = np.zeros((h, w, 3), np.uint8)

@@ -50,7 +50,7 @@ class TextureView:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
+class TriangleViews:
     """The views of each triangle, the finest first; view -1 fills up the rows."""
 
     view: I32  # (F, CANDIDATES)
@@ -60,7 +60,7 @@ class Sightings:
 
 def look(
     mesh: Mesh, views: Sequence[TextureView], progress: Callable[[float], None] = lambda _: None
-) -> Sightings:
+) -> TriangleViews:
     """The sightings of every triangle of ``mesh``.
 
     A view sees a triangle when no surface hides its corners and its middle, it faces the camera,
@@ -74,7 +74,7 @@ def look(
     tolerance = 0.3 * float(np.sqrt(2.0 * np.median(area))) if len(area) else 0.0
     middle = corners.mean(axis=1)
     count = len(mesh.faces)
-    out = Sightings(
+    out = TriangleViews(
         np.full((count, CANDIDATES), -1, np.int32),
         np.zeros((count, CANDIDATES), np.float32),
         np.zeros((count, CANDIDATES, 3), np.float32),
@@ -130,14 +130,14 @@ def _grid_rays(mesh: Mesh) -> Rays:
     return lambda eye, directions: np.nan_to_num(grid.cast(eye, directions)[0], nan=np.inf)
 
 
-def consistent(found: Sightings) -> Sightings:
+def consistent(found: TriangleViews) -> TriangleViews:
     """``found`` without the views whose colour differs from that of most others.
 
     Needs MIN_VOTES views of a triangle at least; the rest of its row moves up.
     """
     view, px, bgr = found.view.copy(), found.px_per_m.copy(), found.bgr.copy()
     in_bands(drop_outliers, len(view), view, px, bgr)
-    return Sightings(view, px, bgr)
+    return TriangleViews(view, px, bgr)
 
 
 @njit(cache=True, nogil=True)

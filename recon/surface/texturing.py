@@ -17,7 +17,7 @@ from scipy import sparse
 
 from recon.surface.meshing import Mesh
 from recon.surface.texture_atlas import Layout, Palette, lay_out, paint
-from recon.surface.texture_views import Sightings, TextureView, consistent, look
+from recon.surface.texture_views import TextureView, TriangleViews, consistent, look
 from recon.types import F32, F64, I32, U8
 
 LARGEST_ATLAS_PX = 8192
@@ -119,7 +119,7 @@ def face_neighbours(faces: I32) -> I32:
     return out.reshape(count, 3)
 
 
-def choose(found: Sightings, neighbours: I32) -> I32:
+def choose(found: TriangleViews, neighbours: I32) -> I32:
     """(F,) the slot of ``found`` chosen for each triangle; -1 where no view sees it."""
     best = np.maximum(found.px_per_m[:, :1], 1e-9)
     cost = np.where(found.view >= 0, 1.0 - found.px_per_m / best, np.float32(1e6))
@@ -217,7 +217,7 @@ FADE_RINGS = 4
 BLENDED_VIEWS = 3
 
 
-def levels(found: Sightings, views: int) -> F32:
+def levels(found: TriangleViews, views: int) -> F32:
     """(views, 3, 2) gain and offset per channel (BGR) that make views agree where they overlap.
 
     Least squares over triangles that two views see, ``g_a I_a + o_a = g_b I_b + o_b``, with
@@ -235,7 +235,7 @@ def levels(found: Sightings, views: int) -> F32:
     return out
 
 
-def _pairs(found: Sightings) -> tuple[I32, I32, F64, F64]:
+def _pairs(found: TriangleViews) -> tuple[I32, I32, F64, F64]:
     """Views a and b of one triangle and its colours in both: the finest with each other."""
     parts = []
     for k in range(1, found.view.shape[1]):

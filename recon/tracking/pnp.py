@@ -52,7 +52,7 @@ class PnpResult:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class PoseFit:
     """The lowest reprojection error, before anyone judges it."""
 
     T_camera_points: F64  # (4, 4) m
@@ -92,7 +92,9 @@ def solve(
     T = _best(_starts(local, pixels, K, k, prior, config), local, pixels, k, config)
     if T is None:
         return None
-    fit = Fit(T @ se3.inverse(shift), np.zeros(len(points), np.bool_), _errors(T, local, pixels, k))
+    fit = PoseFit(
+        T @ se3.inverse(shift), np.zeros(len(points), np.bool_), _errors(T, local, pixels, k)
+    )
     fit.inliers[finite] = fit.error <= config.threshold_px
     return _judge(fit, points, uv, k, prior_T_camera_points, config)
 
@@ -192,7 +194,7 @@ def _best(starts: list[F64], points: F64, uv: F64, k: F64, config: PnpConfig) ->
 
 
 def _judge(
-    fit: Fit, points: F64, uv: F64, k: F64, prior: F64 | None, config: PnpConfig
+    fit: PoseFit, points: F64, uv: F64, k: F64, prior: F64 | None, config: PnpConfig
 ) -> PnpResult | None:
     """The result with its covariance, or None when it cannot be trusted."""
     T, inliers = fit.T_camera_points, fit.inliers

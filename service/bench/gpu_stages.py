@@ -17,7 +17,7 @@ from recon.backends.torch_plan import Plan, part
 from recon.backends.torch_stereo import DenseStereo, drop_unreliable, drop_unseen
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import LABEL_SIGMA_PX, FusionConfig
+from recon.stereo.reprojection import LABEL_SIGMA_PX, DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import Array, StereoPair
 from service.bench.gpu import LABELS, SIZE, Stage, camera, ground, propagation_work
@@ -127,7 +127,7 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     )
     z, sigma = (t.cpu().numpy() for t in depth.run())
     fused = planned(
-        device, lambda a, b: fuse(a, b, FusionConfig()), np.stack([z] * PAIRS),
+        device, lambda a, b: fuse(a, b, DepthFusionConfig()), np.stack([z] * PAIRS),
         np.stack([sigma] * PAIRS),
     )  # fmt: skip
     taps, pixels = upsampling.diameter_px**2, w * h
@@ -147,7 +147,7 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
 def whole_path(device: str, pair: StereoPair) -> list[Stage]:
     """A cloud of one pair: inputs on the device, then images up and depth down, and four."""
     assert pair.guide is not None
-    path = DensePath(device, BeliefPropagationConfig(), UpsamplingConfig(), FusionConfig())
+    path = DensePath(device, BeliefPropagationConfig(), UpsamplingConfig(), DepthFusionConfig())
     H, W = pair.guide.shape[:2]
     K = camera((W, H))
     path.depth([pair], K, (W, H), np.eye(4))

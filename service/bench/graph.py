@@ -32,7 +32,7 @@ LOOP_SPREAD = np.diag([5e-4**2] * 3 + [0.03**2] * 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Flight:
+class _Course:
     truth: list[F64]  # T_world_camera
     odometry: list[F64]
     covariance: F64
@@ -42,7 +42,7 @@ class _Flight:
 def run(options: BenchOptions) -> list[BenchResult]:
     """Milliseconds per keyframe and per loop, and the longest that tracking had to wait."""
     del options  # one flight is one round
-    flight, flown = _flight(), _Flown()
+    flight, flown = _flight(), _TimedTrajectory()
     tracking = _Tracking(flown)
     with short_collections(), tracking:
         for i in range(KEYFRAMES):
@@ -73,7 +73,7 @@ def _result(what: str, value: float, note: str) -> BenchResult:
     return BenchResult(what, value, "ms", note=note)
 
 
-class _Flown:
+class _TimedTrajectory:
     """The trajectory as the reconstruction keeps it, and how long that took."""
 
     def __init__(self) -> None:
@@ -95,7 +95,7 @@ class _Flown:
 class _Tracking:
     """Places a frame by the newest keyframe every millisecond, on a separate thread."""
 
-    def __init__(self, flown: _Flown) -> None:
+    def __init__(self, flown: _TimedTrajectory) -> None:
         self.stops: list[float] = []  # ms more than the pause, until the frame was placed
         self._flown = flown
         self._end = threading.Event()
@@ -118,7 +118,7 @@ class _Tracking:
             self.stops.append(1e3 * (time.perf_counter() - begun) - 1.0)
 
 
-def _keyframe(flight: _Flight, i: int, flown: _Flown) -> None:
+def _keyframe(flight: _Course, i: int, flown: _TimedTrajectory) -> None:
     """One keyframe with all that a flight asks of the graph for it."""
     T, prior, trajectory = flight.odometry[i], flight.priors[i], flown.trajectory
     begun = time.perf_counter()
@@ -157,7 +157,7 @@ def legs(rng: np.random.Generator, count: int, leg_count: int, step_m: float) ->
     return truth
 
 
-def _flight() -> _Flight:
+def _flight() -> _Course:
     """Legs to and fro with wandering sensors and an odometry of another scale that drifts."""
     rng = np.random.default_rng(1)
     truth = legs(rng, KEYFRAMES, LEG, STEP_M)
@@ -177,7 +177,7 @@ def _flight() -> _Flight:
         for T, w in zip(truth, wander, strict=True)
     ]  # fmt: skip
     units = np.array([1.0] * 3 + [1.3] * 3)
-    return _Flight(truth, odometry, covariance / np.outer(units, units), priors)
+    return _Course(truth, odometry, covariance / np.outer(units, units), priors)
 
 
 def _wander(rng: np.random.Generator, sigma: F64) -> F64:

@@ -63,7 +63,7 @@ class Traffic:
         return most
 
 
-class _Pipe:
+class _Direction:
     """One direction of the link: serialised at the rate, delayed, lost, cut."""
 
     def __init__(self, model: LinkModel, started: float, seed: int) -> None:
@@ -120,8 +120,8 @@ class LinkEmulator:
         self._model = model
         self._ports = listen_port, target_port
         self.started = time.monotonic()
-        self._up = _Pipe(model, self.started, model.seed)
-        self._down = _Pipe(model, self.started, model.seed + 1)
+        self._up = _Direction(model, self.started, model.seed)
+        self._down = _Direction(model, self.started, model.seed + 1)
         self._loop = asyncio.new_event_loop()
         self._ready = threading.Event()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -182,7 +182,7 @@ class LinkEmulator:
         )
 
     async def _relay(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, pipe: _Pipe
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, pipe: _Direction
     ) -> None:
         """Carry one direction until its sender is done.
 

@@ -115,7 +115,7 @@ class _Radio:
 
 
 @dataclass(slots=True, eq=False)
-class _Flight:
+class _TileTimes:
     """When keyframes were made, and when the first and the last of their tiles arrived."""
 
     made: dict[int, float] = field(default_factory=dict)
@@ -139,7 +139,7 @@ def fly() -> RadioOutcome:
 
 
 def _fly(folder: Path) -> RadioOutcome:
-    radio, flight = _Radio(), _Flight()
+    radio, flight = _Radio(), _TileTimes()
     vehicle = VehicleLink(VehicleConfig(links=(radio.names[0],)), NoScans())
     vehicle.start()
     session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",))
@@ -180,7 +180,7 @@ class BareReceiver(Receiver):
         scan.unwritten, scan.is_writing, scan.is_written = False, False, True
 
 
-def _produce(store: ScanStore, flight: _Flight, at_s: float) -> None:
+def _produce(store: ScanStore, flight: _TileTimes, at_s: float) -> None:
     """The keyframes that are due, of the surface that each adds."""
     while len(flight.made) < min(KEYFRAMES, 1 + int(at_s / FLIGHT_S * KEYFRAMES)):
         seq = len(flight.made)
@@ -220,7 +220,7 @@ def _cells(frames: list[F64]) -> set[tuple[int, int]]:
 
 
 def _outcome(
-    onboard: ScanStore, ground: ScanStore, flight: _Flight, sent: dict[int, int]
+    onboard: ScanStore, ground: ScanStore, flight: _TileTimes, sent: dict[int, int]
 ) -> RadioOutcome:
     there, here = (
         [points_of(k.depth, k.depth.T_world_camera)[0] for k in store.keyframes()]

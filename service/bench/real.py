@@ -48,7 +48,7 @@ BOARD = ("--pattern", "9x6", "--square-m", "0.03")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Flight:
+class ReplayedSet:
     """A replayed set."""
 
     data: Path  # the set's folder
@@ -57,7 +57,7 @@ class Flight:
     summary: dict[str, Any]  # scan.json
 
 
-Check = Callable[[Flight], Iterator[tuple[str, float, str]]]
+Check = Callable[[ReplayedSet], Iterator[tuple[str, float, str]]]
 """Yields (figure, value, unit)."""
 
 
@@ -89,7 +89,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
     return results
 
 
-def _replayed(one: RealSet, options: BenchOptions, folder: Path) -> Flight:
+def _replayed(one: RealSet, options: BenchOptions, folder: Path) -> ReplayedSet:
     assert options.data is not None
     source = options.data / one.source
     words = ["replay", str(source), "--out", str(folder / "scan"), "--backend", options.backend]
@@ -102,7 +102,7 @@ def _replayed(one: RealSet, options: BenchOptions, folder: Path) -> Flight:
     _skyrelief(*words)
     data = options.data / one.source.split("/")[0]
     summary = json.loads((folder / "scan" / "scan.json").read_text(encoding="utf-8"))
-    return Flight(data, str(source), folder / "scan", summary)
+    return ReplayedSet(data, str(source), folder / "scan", summary)
 
 
 def _skyrelief(*words: str) -> None:
@@ -117,7 +117,7 @@ def _skyrelief(*words: str) -> None:
 # ---- figures without truth -------------------------------------------------------------------
 
 
-def _placed(flight: Flight) -> Iterator[tuple[str, float, str]]:
+def _placed(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
     run = flight.summary["run"]
     with ScanStore.open(flight.scan / "scan.db") as store:
         placed = sum("vision" in pose.sources for pose in latest(store.poses()))
@@ -128,7 +128,7 @@ def _placed(flight: Flight) -> Iterator[tuple[str, float, str]]:
     yield "points", flight.summary["counts"]["points"] / 1e6, "M"
 
 
-def seams(flight: Flight) -> Iterator[tuple[str, float, str]]:
+def seams(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
     """Distance between two visits of the same ground, in metres and in their claimed sigmas."""
     maps = _maps(flight)
     rng = np.random.default_rng(1)
@@ -150,7 +150,7 @@ def seams(flight: Flight) -> Iterator[tuple[str, float, str]]:
         yield "seams, robust rms over the claimed sigma", sigmas, ""
 
 
-def _maps(flight: Flight) -> list[DepthMap]:
+def _maps(flight: ReplayedSet) -> list[DepthMap]:
     """The depth images that the cloud is made of."""
     left_out = flight.summary["run"]["apart"]
     with ScanStore.open(flight.scan / "scan.db") as store:
@@ -191,7 +191,7 @@ def _points(depth: DepthMap, known: npt.NDArray[np.intp]) -> F64:
 # ---- figures with truth -----------------------------------------------------------------------
 
 
-def from_log(flight: Flight) -> Iterator[tuple[str, float, str]]:
+def from_log(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
     """Horizontal distance of the delivered track to the fixes that it was replayed with."""
     from mavlink.telemetry.logs import load_telemetry
 
@@ -203,7 +203,7 @@ def from_log(flight: Flight) -> Iterator[tuple[str, float, str]]:
     yield from _off_fixes(flight, {t: (s.lat_deg, s.lon_deg) for t, s in states if s is not None})
 
 
-def from_tags(flight: Flight) -> Iterator[tuple[str, float, str]]:
+def from_tags(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
     """Horizontal distance of the delivered track to the positions in the images' tags."""
     with ScanStore.open(flight.scan / "scan.db") as store:
         start_ns = store.header.started_unix_ns
@@ -214,7 +214,7 @@ def from_tags(flight: Flight) -> Iterator[tuple[str, float, str]]:
 
 
 def _off_fixes(
-    flight: Flight, fixes: Mapping[int, tuple[float | None, float | None]]
+    flight: ReplayedSet, fixes: Mapping[int, tuple[float | None, float | None]]
 ) -> Iterator[tuple[str, float, str]]:
     """The track against latitudes and longitudes by unix time in ns; None: no fix then."""
     with ScanStore.open(flight.scan / "scan.db") as store:
@@ -230,7 +230,7 @@ def _off_fixes(
         yield "track to fixes, horizontal rms", rms_m, "m"
 
 
-def level_ground(flight: Flight) -> Iterator[tuple[str, float, str]]:
+def level_ground(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
     """Robust distance of points on nearly flat ground from one plane, and each keyframe's own."""
     points = []
     for depth in _maps(flight):
@@ -258,7 +258,7 @@ def _off_plane(xyz: F64) -> tuple[float, float]:
     return float(np.median(np.abs(r))) / NORMAL_MEDIAN, slope
 
 
-def targets(flight: Flight) -> Iterator[tuple[str, float, str]]:
+def targets(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
     """Distances between surveyed targets, scaled by their median, and their horizontal rms."""
     with ScanStore.open(flight.scan / "scan.db") as store:
         revisions = Revisions(store)

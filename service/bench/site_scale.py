@@ -192,7 +192,7 @@ def _on_workers(kind: str, site: Path, parts: Any, workers: int) -> list[BenchRe
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class ProductCost:
     """What one product took."""
 
     peak_mib: float
@@ -200,13 +200,13 @@ class Measured:
     tile_s: list[float]  # processor time of each tile
 
 
-def _in_a_process(kind: str, site: Path, parts: Any, scheduler: str | None) -> Measured:
+def _in_a_process(kind: str, site: Path, parts: Any, scheduler: str | None) -> ProductCost:
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=spawn) as pool:
         return pool.submit(made, kind, site, parts, scheduler).result()
 
 
-def made(kind: str, site: Path, parts: Any, scheduler: str | None) -> Measured:
+def made(kind: str, site: Path, parts: Any, scheduler: str | None) -> ProductCost:
     """Make one product in this process, and measure it."""
     ticks: list[float] = []
     texts: list[str] = []
@@ -219,7 +219,7 @@ def made(kind: str, site: Path, parts: Any, scheduler: str | None) -> Measured:
     begun = time.monotonic()
     _make(kind, site, parts, scheduler, Progress(noted))
     ticks.append(time.process_time())
-    return Measured(peak_mib(), time.monotonic() - begun, np.diff(ticks).tolist())
+    return ProductCost(peak_mib(), time.monotonic() - begun, np.diff(ticks).tolist())
 
 
 def _make(kind: str, site: Path, parts: Any, scheduler: str | None, progress: Progress) -> None:

@@ -17,7 +17,7 @@ from service.errors import InputError, SkyreliefError
 from service.packages import needing
 
 if TYPE_CHECKING:
-    from service.ground.drone import Limits
+    from service.ground.drone import DroneLimits
     from service.ground.portal import Portal
     from service.ground.receiver import Receiver, ReceiverConfig
     from service.init_system import Notifier
@@ -139,9 +139,9 @@ class GroundOptions:
             fleet_rights=has_keys and bool(listen),
         )
 
-    def _limits(self) -> Limits:
+    def _limits(self) -> DroneLimits:
         """Limits of one drone."""
-        from service.ground.drone import Limits
+        from service.ground.drone import DroneLimits
 
         if not 0.0 < self.drone_share <= 100.0:
             raise InputError("--drone-share is a percentage: more than 0, at most 100")
@@ -149,7 +149,7 @@ class GroundOptions:
         if any(size is not None and not size >= 0 for size in sizes_mb):
             raise InputError("--quota-mb and --reserve-mb are 0 or more")
         quota, reserve = (None if size is None else int(size * 1e6) for size in sizes_mb)
-        return Limits(quota, self.drone_share / 100.0, reserve)
+        return DroneLimits(quota, self.drone_share / 100.0, reserve)
 
 
 @with_options(GroundOptions)

@@ -50,7 +50,7 @@ class Level(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Readings:
+class MachineReadings:
     """Measurements since the last check; None where the machine has none."""
 
     views: int = 0  # views due for reconstruction
@@ -117,7 +117,7 @@ class Ladder:
         self._went_up = False
         self._calm_s = self.config.calm_s
 
-    def update(self, readings: Readings, now_s: float) -> Move | None:
+    def update(self, readings: MachineReadings, now_s: float) -> Move | None:
         """The step to take at ``now_s`` of a monotonic clock, if any."""
         found = strain(readings, self.config)
         if found is not None:
@@ -159,7 +159,7 @@ class Ladder:
         return Move(self.level, "")
 
 
-def strain(readings: Readings, config: LadderConfig) -> Strain | None:
+def strain(readings: MachineReadings, config: LadderConfig) -> Strain | None:
     """The overload in ``readings``: memory before heat before lag; None without any."""
     memory, heat = readings.memory_free_mib, readings.temperature_c
     if memory is not None and memory < config.min_memory_mib:
@@ -173,7 +173,7 @@ def strain(readings: Readings, config: LadderConfig) -> Strain | None:
     return _lag(readings, config)
 
 
-def _lag(readings: Readings, config: LadderConfig) -> Strain | None:
+def _lag(readings: MachineReadings, config: LadderConfig) -> Strain | None:
     """The worst lag above its threshold, if any."""
     views, frames = late_shares(readings)
     found = (
@@ -188,7 +188,7 @@ def _lag(readings: Readings, config: LadderConfig) -> Strain | None:
     return Strain(reason, config.patience_s, lowest)
 
 
-def late_shares(readings: Readings) -> tuple[float, float]:
+def late_shares(readings: MachineReadings) -> tuple[float, float]:
     """Shares of late views and frames, 0 to 1."""
     return (
         readings.late_views / max(readings.views, 1),
@@ -196,7 +196,7 @@ def late_shares(readings: Readings) -> tuple[float, float]:
     )
 
 
-def is_calm(readings: Readings, config: LadderConfig) -> bool:
+def is_calm(readings: MachineReadings, config: LadderConfig) -> bool:
     """True when everything is well below its threshold: a step up may be tried."""
     views, frames = late_shares(readings)
     heat, memory = readings.temperature_c, readings.memory_free_mib
@@ -230,7 +230,7 @@ class LoadControl:
         self._ladder = Ladder(_ladder_config(scanning.config.compute))
         self._counted: tuple[str, int, int, int, int] = ("", 0, 0, 0, 0)
         self._reported_failure = ""
-        self.readings = Readings()
+        self.readings = MachineReadings()
 
     def look(self, machine: Machine, now_s: float | None = None) -> Move | None:
         """Measure, and take the resulting step."""
@@ -274,9 +274,9 @@ class LoadControl:
         if self._scanning.level is not level:
             self._scanning.set_level(level)
 
-    def _measure(self, machine: Machine, now_s: float) -> Readings:
+    def _measure(self, machine: Machine, now_s: float) -> MachineReadings:
         """Measure heat and memory; for a running scan also lag since the last check."""
-        fixed = Readings(
+        fixed = MachineReadings(
             temperature_c=machine.temperature_c,
             throttled=machine.throttled,
             memory_free_mib=machine.memory_left_mib,

@@ -23,7 +23,14 @@ from recon.posegraph.trajectory import Placed, Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
-from recon.stereo.reprojection import FusionConfig, PairDepth, carry, fuse, plausible, reproject
+from recon.stereo.reprojection import (
+    DepthFusionConfig,
+    PairDepth,
+    carry,
+    fuse,
+    plausible,
+    reproject,
+)
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.stereo.virtual_stereo import (
     PairRejection,
@@ -75,7 +82,7 @@ MAX_WAITING = 3
 """Views that wait for reconstruction."""
 
 
-class Grid(NamedTuple):
+class ViewGrid(NamedTuple):
     """Where a view's depth is: its pixels and its pose."""
 
     K: F64  # (3, 3) px
@@ -168,14 +175,14 @@ class Rectify:
         self._relief_m = (0.0, 0.0)
         self.pairs = 0
 
-    def grid(self, candidate: StereoCandidate) -> Grid:
+    def grid(self, candidate: StereoCandidate) -> ViewGrid:
         """The grid of the view's depth."""
         view, width = candidate.view, self._config.width_px
         H, W = view.gray.shape
         w, h = width, round(width * H / W)
-        return Grid(scaled_K(view.K, w / W, h / H), (w, h), view.T_odom_camera)
+        return ViewGrid(scaled_K(view.K, w / W, h / H), (w, h), view.T_odom_camera)
 
-    def colours(self, candidate: StereoCandidate, grid: Grid) -> U8:
+    def colours(self, candidate: StereoCandidate, grid: ViewGrid) -> U8:
         """(h, w, 3) BGR of the view on the grid."""
         bgr = at_middle_row(candidate.view, candidate.bgr)
         return np.asarray(cv2.resize(bgr, grid.size_px, interpolation=cv2.INTER_AREA), np.uint8)
@@ -227,7 +234,7 @@ class Carry:
         self._backend, self._stopwatch = backend, stopwatch
         self._kept: dict[tuple[int, int], PairDepth] = {}  # by view and partner
 
-    def __call__(self, candidate: StereoCandidate, grid: Grid) -> dict[int, PairDepth]:
+    def __call__(self, candidate: StereoCandidate, grid: ViewGrid) -> dict[int, PairDepth]:
         """Depth on the view's grid by the number of the partner."""
         view, found = candidate.view, dict[int, PairDepth]()
         for partner in candidate.partners:
@@ -259,7 +266,7 @@ class PairStages:
         self._backend, self._config = backend, config
         self._debug, self._stopwatch = debug, stopwatch
 
-    def whole_path(self, pairs: Collection[RectifiedPair], grid: Grid) -> DepthMap | None:
+    def whole_path(self, pairs: Collection[RectifiedPair], grid: ViewGrid) -> DepthMap | None:
         """Eq. 1 to 3 without leaving the device; None where the stages must do it."""
         plain = [pair for pair in pairs if isinstance(pair, StereoPair)]  # as devices know them
         if not self._backend.keeps_pairs or len(plain) < len(pairs) or self._debug is not None:
@@ -288,14 +295,14 @@ class PairStages:
         self._keep(upsampled=fine.px)
         return fine
 
-    def reproject(self, disparity: DisparityMap, pair: RectifiedPair, grid: Grid) -> PairDepth:
+    def reproject(self, disparity: DisparityMap, pair: RectifiedPair, grid: ViewGrid) -> PairDepth:
         """The pair's depth on the view's grid, Eq. 3."""
         with self._stopwatch("reproject"):
             if isinstance(pair, PolarPair):
                 return reproject_polar(disparity, pair, grid.K, grid.size_px)
             return reproject(disparity, pair, grid.K, grid.size_px)
 
-    def fuse(self, depths: Sequence[PairDepth], grid: Grid) -> DepthMap:
+    def fuse(self, depths: Sequence[PairDepth], grid: ViewGrid) -> DepthMap:
         """One depth map of all pairs, in units of the odometry."""
         with self._stopwatch("fuse"):
             return fuse(depths, grid.K, grid.T_odom_camera, self._config.fusion)
@@ -394,11 +401,11 @@ class Stages:
     views: StereoViews
     carry: Carry
     rectify: Rectify
-    whole_path: Callable[[Collection[RectifiedPair], Grid], DepthMap | None]
+    whole_path: Callable[[Collection[RectifiedPair], ViewGrid], DepthMap | None]
     match: Callable[[RectifiedPair], DisparityMap]
     upsample: Callable[[DisparityMap, RectifiedPair], DisparityMap]
-    reproject: Callable[[DisparityMap, RectifiedPair, Grid], PairDepth]
-    fuse: Callable[[Sequence[PairDepth], Grid], DepthMap]
+    reproject: Callable[[DisparityMap, RectifiedPair, ViewGrid], PairDepth]
+    fuse: Callable[[Sequence[PairDepth], ViewGrid], DepthMap]
     plausible: Plausible
     register: Register
     chain: Chain
@@ -449,7 +456,9 @@ def build_stages(
         labels=compute.labels,
     )
     dense = DenseStages(
-        BeliefPropagationConfig(iterations=compute.iterations), UpsamplingConfig(), FusionConfig()
+        BeliefPropagationConfig(iterations=compute.iterations),
+        UpsamplingConfig(),
+        DepthFusionConfig(),
     )
     pair = PairStages(backend, dense, debug, stopwatch)
     views = StereoViews(selection, odometry, undistort.camera, undistort.valid, refused)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mavlink.component.camera import KeyframeReport
-from mavlink.component.status import Odometry
+from mavlink.component.status import BodyOdometry
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
@@ -29,7 +29,7 @@ class OdometryReport:
     starts again and when a correction moves the estimate.
     """
 
-    def __init__(self, camera: CameraConfig, send: Callable[[Odometry, int], object]) -> None:
+    def __init__(self, camera: CameraConfig, send: Callable[[BodyOdometry, int], object]) -> None:
         """``send(odometry, time_ns)`` takes the result, at the frame's exposure."""
         self._send = send
         rpy = np.radians([camera.mount_roll_deg, camera.mount_pitch_deg, camera.mount_yaw_deg])
@@ -52,7 +52,7 @@ class OdometryReport:
         a, b, c = (float(v) for v in R_ned_body.T @ velocity)
         north, east, down = (float(v) for v in position)
         quality = round(100.0 * min(1.0, step.tracked.tracks / BEST_TRACKS))
-        odometry = Odometry(
+        odometry = BodyOdometry(
             (north, east, down),
             (w, x, y, z),
             (a, b, c),

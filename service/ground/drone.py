@@ -53,7 +53,7 @@ UNREADABLE_REST_S, MAX_UNREADABLE = 60.0, 64
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class DroneLimits:
     """Limits of one drone at the ground station."""
 
     scan_bytes: int | None = None  # of one scan's chunks; beyond it only coarse layers

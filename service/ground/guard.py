@@ -223,7 +223,7 @@ class _StalledError(Exception):
     """The other end has stopped reading."""
 
 
-class Limits:
+class RequestLimits:
     """The outermost ASGI layer: bounds every request and marks it as served at the listener."""
 
     def __init__(self, app: ASGIApp, listener: BoundedListener) -> None:

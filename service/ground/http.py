@@ -32,7 +32,7 @@ from starlette.websockets import WebSocket
 
 from service.errors import InputError, OutsideError
 from service.ground.basemap import open_basemap
-from service.ground.drone import Limits
+from service.ground.drone import DroneLimits
 from service.ground.guard import (
     CHANGING,
     UPLOAD,
@@ -53,7 +53,7 @@ from service.ground.state import KINDS, Jobs, PortalState, names_of, state_of
 from service.ground.upload import Upload, check_parts
 from service.ground.vehicle import BUTTONS, Vehicle
 from service.offline.exports.view import ExportOptions
-from service.offline.site.start import Pair, Start
+from service.offline.site.start import Pair, StartPoints
 from service.scans.annotations import Spot, as_json, read_annotations
 from service.workers import Workers
 
@@ -140,12 +140,12 @@ def portal_app(
     vehicle: Vehicle | None = None,
     jobs: Jobs | None = None,
     basemap: Path | None = None,
-    limits: Limits | None = None,
+    limits: DroneLimits | None = None,
 ) -> ASGIApp:
     """The portal as an ASGI application; ``local`` when only this machine can reach it."""
     jobs = jobs or Jobs(Workers())
     below = None if basemap is None else open_basemap(basemap)
-    limits = limits or Limits()
+    limits = limits or DroneLimits()
     state = PortalState(Library(store), jobs, progress or list, vehicle, below, limits)
     one = "/api/scans/{drone}/{scan}"
     routes: list[Any] = [
@@ -357,7 +357,7 @@ async def _align(request: Request) -> Response:
     note(request, "align", to=f"{order.drone}/{order.scan}", points=len(order.points))
     folder = state.library.folder(drone, scan)
     other = state.library.folder(order.drone, order.scan)
-    store, start = state.library.store, Start(order.points)
+    store, start = state.library.store, StartPoints(order.points)
     work = partial(align_by_points, store, state.limits, other, folder, start)
     return JSONResponse(state.jobs.start(folder, "align", work), 202)
 

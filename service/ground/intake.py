@@ -97,7 +97,7 @@ so that neither the round trip nor what is newer waits long."""
 
 
 @dataclass(slots=True)
-class Progress:
+class ReceptionState:
     """State of a scan's reception."""
 
     received_bytes: int = 0
@@ -123,7 +123,7 @@ class ScanIntake:
 
     def __init__(self, store: ScanStore, peer: str) -> None:
         self.store = store
-        self.progress = Progress()
+        self.progress = ReceptionState()
         self.head: Head | None = None
         self.head_at = -1e9
         self._peer = peer

@@ -15,7 +15,7 @@ from service.ground import drone
 from service.ground.guard import (
     MAX_BODY_BYTES,
     AuditLog,
-    Limits,
+    RequestLimits,
     Tokens,
     kept_token,
     parse_tokens,
@@ -52,7 +52,7 @@ class PortalConfig:
     tls_certificate: str = ""
     tls_key: str = ""
     basemap: Path | None = None  # an MBTiles or PMTiles file
-    limits: drone.Limits = field(default_factory=drone.Limits)  # of the disk
+    limits: drone.DroneLimits = field(default_factory=drone.DroneLimits)  # of the disk
 
     def __post_init__(self) -> None:
         """Raise InputError for an address open to others without a token."""
@@ -135,7 +135,7 @@ class Portal:
 
         return uvicorn.Server(
             uvicorn.Config(
-                Limits(self._app, listener),
+                RequestLimits(self._app, listener),
                 http="h11",
                 loop="asyncio",
                 backlog=BACKLOG,
@@ -213,7 +213,7 @@ def open_portal(
     vehicle: Vehicle | None = None,
     workers: Workers | None = None,
     basemap: Path | None = None,
-    limits: drone.Limits | None = None,
+    limits: drone.DroneLimits | None = None,
 ) -> Portal:
     """A started portal at ``HOST:PORT`` on the scans below ``store``.
 
@@ -226,7 +226,7 @@ def open_portal(
         if not path.is_file():
             raise InputError(f"portal certificate {path}: no such file")
     certificate, key = (str(path) for path in tls) if tls else ("", "")
-    limits = limits or drone.Limits()
+    limits = limits or drone.DroneLimits()
     config = PortalConfig(store, host, port, token, certificate, key, basemap, limits)
     portal = Portal(config, progress, vehicle, workers)
     portal.start()

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, SkyreliefError
-from service.ground.drone import Limits
+from service.ground.drone import DroneLimits
 from service.ground.drones import Drones
 from service.ground.inbox import CHANNEL, Inbox, Replies
 from service.ground.live_site import run as run_live_site
@@ -62,7 +62,7 @@ class ReceiverConfig:
 
     store: Path
     session: SessionConfig = field(default_factory=lambda: SessionConfig(mode="router"))
-    limits: Limits = field(default_factory=Limits)
+    limits: DroneLimits = field(default_factory=DroneLimits)
     name: str = ""  # of this station; empty: made once and kept in the store
     refresh_s: float = 0.0  # write deliverables of growing scans so often; 0: when complete
     sites: bool = False  # align finished scans that show the same ground

@@ -53,7 +53,7 @@ Corner = tuple[
 ]
 
 
-class Coverage(msgspec.Struct):
+class MeasuredExtent(msgspec.Struct):
     """The extent of what a scan measured."""
 
     corners_lat_lon: tuple[Corner, Corner, Corner, Corner]
@@ -64,7 +64,7 @@ class Ground(msgspec.Struct):
 
     times: Times
     finished: bool
-    coverage: Coverage | None = None
+    coverage: MeasuredExtent | None = None
 
     @property
     def box(self) -> tuple[Corner, Corner] | None:

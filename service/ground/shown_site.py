@@ -15,7 +15,7 @@ from service.errors import InputError
 from service.ground.scan_facts import UnixTime
 from service.ground.storage import is_regular
 from service.offline.site import SAME_VISIT_S
-from service.offline.site.live import Placed
+from service.offline.site.live import PlacedScan
 from service.scans.writing import writing
 from service.small_file import read_json
 
@@ -39,7 +39,7 @@ class Shown(msgspec.Struct):
     group: int  # scans that ties join have one number
 
 
-def write_shown(store: Path, placed: list[Placed]) -> None:
+def write_shown(store: Path, placed: list[PlacedScan]) -> None:
     """Replace the file in ``store``; OutsideError for the disk."""
     found = []
     for one in placed:

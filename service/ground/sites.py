@@ -20,11 +20,11 @@ import numpy as np
 
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.ground.drone import Limits
+from service.ground.drone import DroneLimits
 from service.ground.scan_facts import Corner, Ground, Times, ground_in
 from service.ground.storage import DiskShare, is_regular
 from service.offline.site import DRONE, SAME_VISIT_S, SITE
-from service.offline.site.start import Start
+from service.offline.site.start import StartPoints
 from service.progress import Progress
 from service.small_file import read_json
 from service.workers import Worker, guarded, run_to_end
@@ -49,7 +49,7 @@ MAX_SITE_BYTES = 4_000_000
 class Sites:
     """Aligns the scans put in, one after the other, on one thread."""
 
-    def __init__(self, store: Path, limits: Limits) -> None:
+    def __init__(self, store: Path, limits: DroneLimits) -> None:
         self._store, self._limits = store, limits
         self._waiting: queue.Queue[Path] = queue.Queue()
 
@@ -85,7 +85,7 @@ class Sites:
             log.info("%s: %d scans are aligned", site, len(members))
 
 
-def _check_room(store: Path, limits: Limits, members: Sequence[Path]) -> None:
+def _check_room(store: Path, limits: DroneLimits, members: Sequence[Path]) -> None:
     """Raise QuotaError when a site of these scans does not fit the sites' share of the disk."""
     sizes = (path.stat().st_size for m in members for path in m.glob("scan.db*"))
     share = DiskShare(store / DRONE, limits.drone_share, limits.reserve_bytes)
@@ -93,7 +93,12 @@ def _check_room(store: Path, limits: Limits, members: Sequence[Path]) -> None:
 
 
 def align_by_points(
-    store: Path, limits: Limits, other: Path, folder: Path, start: Start, progress: Progress
+    store: Path,
+    limits: DroneLimits,
+    other: Path,
+    folder: Path,
+    start: StartPoints,
+    progress: Progress,
 ) -> str:
     """Align the scan in ``folder``, which points place, with the scan or site ``other``.
 

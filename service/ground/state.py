@@ -15,7 +15,7 @@ from starlette.requests import HTTPConnection
 
 from service.errors import InputError, SkyreliefError
 from service.ground.basemap import Basemap
-from service.ground.drone import Limits
+from service.ground.drone import DroneLimits
 from service.ground.library import Library
 from service.ground.live_map import LiveMap
 from service.ground.vehicle import Vehicle
@@ -214,7 +214,7 @@ class PortalState:
     progress: Callable[[], list[dict[str, Any]]]  # one entry per scan being received
     vehicle: Vehicle | None
     basemap: Basemap | None = None
-    limits: Limits = field(default_factory=Limits)  # of the disk
+    limits: DroneLimits = field(default_factory=DroneLimits)  # of the disk
     coverages: OpenScans[LiveCoverage] = field(
         default_factory=lambda: OpenScans(LiveCoverage, COVERAGE_AGE_S, max_scans=4)
     )

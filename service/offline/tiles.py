@@ -36,7 +36,7 @@ POLL_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Footprint:
+class KeyframeFootprint:
     """Ground that one keyframe covers, and how finely."""
 
     seq: int
@@ -60,7 +60,7 @@ class Tiling:
     """Tiles that cover the ground once; ``prints`` are empty where one tile is everything."""
 
     tiles: tuple[Tile, ...]
-    prints: tuple[Footprint, ...] = ()
+    prints: tuple[KeyframeFootprint, ...] = ()
 
     @property
     def bounds(self) -> Box:
@@ -73,7 +73,7 @@ class Tiling:
         return float(np.median([p.sample_m for p in self.prints]))
 
 
-def footprints(store: Keyframes) -> list[Footprint]:
+def footprints(store: Keyframes) -> list[KeyframeFootprint]:
     """The ground covered by each keyframe with points."""
     out = []
     for k in main_keyframes(store):
@@ -82,7 +82,7 @@ def footprints(store: Keyframes) -> list[Footprint]:
         if sample is not None and len(xyz):
             (west, south), (east, north) = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
             box = (float(west), float(south), float(east), float(north))
-            out.append(Footprint(k.seq, len(xyz), sample, box))
+            out.append(KeyframeFootprint(k.seq, len(xyz), sample, box))
     return out
 
 
@@ -108,7 +108,7 @@ def tiling(
 
 
 def tiles_over(
-    folder: Path, prints: Sequence[Footprint], max_points: int, margin_m: float,
+    folder: Path, prints: Sequence[KeyframeFootprint], max_points: int, margin_m: float,
     frame: LocalFrame | None = None,
 ) -> list[Tile]:  # fmt: skip
     """As :func:`tiling`, over these footprints."""
@@ -126,7 +126,9 @@ def tiles_over(
     return out
 
 
-def _on_map(prints: Sequence[Footprint], frame: LocalFrame | None) -> list[Footprint]:
+def _on_map(
+    prints: Sequence[KeyframeFootprint], frame: LocalFrame | None
+) -> list[KeyframeFootprint]:
     if frame is None:
         return list(prints)
     return [replace(p, box=_corners_box(np.array(p.box), frame.to_utm)) for p in prints]
@@ -142,7 +144,7 @@ def _corners_box(box: F64, move: Callable[[F64], F64] | None) -> Box:
     return float(west), float(south), float(east), float(north)
 
 
-def _bounds(prints: Sequence[Footprint]) -> Box:
+def _bounds(prints: Sequence[KeyframeFootprint]) -> Box:
     boxes = np.array([p.box for p in prints])
     west, south = boxes[:, :2].min(axis=0)
     east, north = boxes[:, 2:].max(axis=0)
@@ -154,7 +156,7 @@ def grown(box: Box, by_m: float) -> Box:
     return box[0] - by_m, box[1] - by_m, box[2] + by_m, box[3] + by_m
 
 
-def tile_boxes(prints: Sequence[Footprint], max_points: int) -> list[Box]:
+def tile_boxes(prints: Sequence[KeyframeFootprint], max_points: int) -> list[Box]:
     """Boxes that cover the site, each with about ``max_points`` stored points at most.
 
     One box without borders when all points are fewer. Empty boxes are left out. Points are
@@ -185,7 +187,7 @@ def _grid(low: F64, high: F64, side: float) -> Iterator[Box]:
             yield float(west), float(south), float(east), float(north)
 
 
-def _points_in(prints: Sequence[Footprint], tile: Box) -> float:
+def _points_in(prints: Sequence[KeyframeFootprint], tile: Box) -> float:
     total = 0.0
     for p in prints:
         shares = [

@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 from service.stream.store import ScanStore
 
 
-class View(Protocol):
+class StoreView(Protocol):
     """Something derived from an open store."""
 
     def refresh(self) -> object:
@@ -21,7 +21,7 @@ class View(Protocol):
         ...
 
 
-V = TypeVar("V", bound=View)
+V = TypeVar("V", bound=StoreView)
 
 
 class OpenScans(Generic[V]):

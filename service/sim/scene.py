@@ -39,7 +39,7 @@ class Scene:
     """The place: its mesh with materials, and the tables that the colouring reads."""
 
     area: Area
-    terrain: Terrain
+    terrain: HeightField
     roads: tuple[Road, ...]
     blocks: F64  # (B, COLUMNS), see service.sim.shapes
     trees: F64  # (T, 8)
@@ -49,11 +49,11 @@ class Scene:
     owner: npt.NDArray[np.int32]  # (M,) row of the block or tree table, -1 ground
     grid: TriangleGrid
     seed: int
-    changes: tuple[Change, ...] = ()
+    changes: tuple[ChangedBox, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class ChangedBox:
     """A box that stands on the ground at one of two dates only."""
 
     outline_m: tuple[tuple[float, float], ...]  # corners, ENU
@@ -172,7 +172,7 @@ def _block(kind: float, x: float, y: float, heading: float, size: tuple[float, f
     return row
 
 
-def _stand(row: F64, ground: Terrain, eave_m: float, ridge_m: float) -> None:
+def _stand(row: F64, ground: HeightField, eave_m: float, ridge_m: float) -> None:
     """Set a block's heights: its floor on the highest ground below it, its walls into it."""
     corners = np.vstack([shapes.footprint(row), row[[shapes.X, shapes.Y]]])
     z = ground.height(corners[:, 0], corners[:, 1])
@@ -189,7 +189,7 @@ def _paint(row: F64, top: tuple[int, ...], wall: tuple[int, ...], rng: np.random
 
 def _houses(
     roads: tuple[Road, ...],
-    ground: Terrain,
+    ground: HeightField,
     free: _FreeGround,
     density: float,
     rng: np.random.Generator,
@@ -222,7 +222,9 @@ def _pick(colours: tuple[tuple[int, ...], ...], rng: np.random.Generator) -> tup
     return colours[int(rng.integers(len(colours)))]
 
 
-def _next_to(house: F64, ground: Terrain, free: _FreeGround, rng: np.random.Generator) -> list[F64]:
+def _next_to(
+    house: F64, ground: HeightField, free: _FreeGround, rng: np.random.Generator
+) -> list[F64]:
     """A chimney on the roof and perhaps a garage next to a house."""
     out = []
     heading = float(np.arctan2(house[shapes.SIN], house[shapes.COS]))
@@ -247,7 +249,7 @@ def _next_to(house: F64, ground: Terrain, free: _FreeGround, rng: np.random.Gene
 def _cars(
     area: Area,
     roads: tuple[Road, ...],
-    ground: Terrain,
+    ground: HeightField,
     density: float,
     rng: np.random.Generator,
 ) -> list[F64]:
@@ -274,13 +276,13 @@ def _cars(
 
 
 def _changes(
-    area: Area, ground: Terrain, free: _FreeGround, count: int, seed: int
-) -> tuple[list[F64], list[Change]]:
+    area: Area, ground: HeightField, free: _FreeGround, count: int, seed: int
+) -> tuple[list[F64], list[ChangedBox]]:
     """Boxes on free ground in the inner two thirds of the area, for one of two dates each."""
     rng = np.random.default_rng(seed + 77)
     middle = np.array([0.5 * (area.x0 + area.x1), 0.5 * (area.y0 + area.y1)])
     rows: list[F64] = []
-    found: list[Change] = []
+    found: list[ChangedBox] = []
     for _ in range(1000 * count):
         if len(rows) == count:
             break
@@ -298,12 +300,12 @@ def _changes(
         volume = float((row[shapes.EAVE] - level).mean() * size[0] * size[1])
         outline = tuple((float(a), float(b)) for a, b in shapes.footprint(row))
         rows.append(row)
-        found.append(Change(outline, height, volume, 1 if len(rows) <= count // 2 else 2))
+        found.append(ChangedBox(outline, height, volume, 1 if len(rows) <= count // 2 else 2))
     return rows, found
 
 
 def _trees(
-    area: Area, ground: Terrain, free: _FreeGround, density: float, rng: np.random.Generator
+    area: Area, ground: HeightField, free: _FreeGround, density: float, rng: np.random.Generator
 ) -> tuple[F64, F64, list[F64]]:
     """(tree table, heights, trunks as blocks): groves, single trees and bushes."""
     surface = area.size_m[0] * area.size_m[1]
@@ -330,7 +332,7 @@ def _trees(
     return table, np.array(heights), trunks
 
 
-def _add_ground(parts: MeshParts, ground: Terrain, blocks: F64) -> None:
+def _add_ground(parts: MeshParts, ground: HeightField, blocks: F64) -> None:
     """The terrain's triangles, left out where a block's floor covers them whole."""
     ny, nx = ground.z_m.shape
     x = ground.area.x0 + ground.step_m * np.arange(nx)
@@ -365,7 +367,7 @@ class Area:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Terrain:
+class HeightField:
     """Heights on a square grid; two triangles per square, split from south-west to north-east."""
 
     area: Area
@@ -386,15 +388,15 @@ class Terrain:
         return np.asarray(np.where(fu >= fv, lower, upper))
 
 
-def make_terrain(area: Area, relief_m: float, step_m: float, seed: int) -> Terrain:
+def make_terrain(area: Area, relief_m: float, step_m: float, seed: int) -> HeightField:
     """A terrain whose hills span about ``relief_m`` metres, with 0 m at the world's origin."""
     nx = int(np.ceil(area.size_m[0] / step_m)) + 1
     ny = int(np.ceil(area.size_m[1] / step_m)) + 1
     z = np.empty((ny, nx))
     in_bands(_heights, ny, z, area.x0, area.y0, step_m, relief_m, seed)
-    terrain = Terrain(area, step_m, z)
+    terrain = HeightField(area, step_m, z)
     zero = terrain.height(np.zeros(1), np.zeros(1))[0]
-    return Terrain(area, step_m, z - zero)
+    return HeightField(area, step_m, z - zero)
 
 
 @njit(cache=True, nogil=True)

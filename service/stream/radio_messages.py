@@ -44,7 +44,7 @@ _TILE = struct.Struct("<BIHIBBB3i4h3HHHBbb")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tile:
+class RadioTile:
     """A part of a keyframe, as sent over the narrow radio."""
 
     seq: int
@@ -161,7 +161,7 @@ def unpack_pose(data: bytes) -> tuple[int, int, PoseRecord] | None:
     return f[1], f[2], pose
 
 
-def pack_tile(tag: int, tile: Tile) -> bytes:
+def pack_tile(tag: int, tile: RadioTile) -> bytes:
     """A tile. Raises ValueError when it has no known cell or the grid is beyond 255 px."""
     known = np.isfinite(tile.depth_m)
     w, h = tile.grid_px
@@ -197,7 +197,7 @@ def pack_tile(tag: int, tile: Tile) -> bytes:
     return head + _ten_bits(codes.ravel() | luma.ravel() << 6)
 
 
-def unpack_tile(data: bytes) -> tuple[int, Tile] | None:
+def unpack_tile(data: bytes) -> tuple[int, RadioTile] | None:
     """Tag and tile; None for anything else."""
     size = _TILE.size + CELLS * CELLS * 10 // 8
     data = _extended(data, size)
@@ -219,7 +219,7 @@ def unpack_tile(data: bytes) -> tuple[int, Tile] | None:
     low, high = 1.0 / (far * _DEPTH_UNIT_M), 1.0 / (near * _DEPTH_UNIT_M)
     depth = 1.0 / (low + (codes - 1.0) * (high - low) / _LEVELS)
     K = np.array([[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]])
-    tile = Tile(
+    tile = RadioTile(
         seq=f[2],
         time_unix_ns=f[3] * 1_000_000_000,
         grid_px=(w, h),

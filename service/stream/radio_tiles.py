@@ -10,14 +10,14 @@ import numpy as np
 from recon.types import DepthMap, Keyframe, Pose
 from service.stream import planes
 from service.stream.database import Database, blob
-from service.stream.radio_messages import CELLS, Tile, unpack_pose, unpack_tile
+from service.stream.radio_messages import CELLS, RadioTile, unpack_pose, unpack_tile
 from service.stream.ranges import is_number
 from service.stream.records import PoseRecord
 
 GRID_WIDTH_PX = 40
 
 
-def tiles_of(coarse: Keyframe) -> list[Tile]:
+def tiles_of(coarse: Keyframe) -> list[RadioTile]:
     """The non-empty tiles of a keyframe's coarse layer, at most 40 px across."""
     depth = coarse.depth
     full = planes.planes_of(depth, coarse.bgr, coarse.fresh)
@@ -40,7 +40,7 @@ def tiles_of(coarse: Keyframe) -> list[Tile]:
         bgr[: known.shape[0], : known.shape[1]] = small.bgr[cut]
         sigma = small.sigma_m[cut][known & (small.sigma_m[cut] > 0)]
         out.append(
-            Tile(
+            RadioTile(
                 coarse.seq,
                 coarse.time_ns,
                 (w, h),
@@ -55,7 +55,7 @@ def tiles_of(coarse: Keyframe) -> list[Tile]:
     return out
 
 
-def keyframe_of(tiles: Sequence[Tile]) -> Keyframe | None:
+def keyframe_of(tiles: Sequence[RadioTile]) -> Keyframe | None:
     """The keyframe shown by the tiles of one grid; None without tiles.
 
     During a correction some tiles have the old pose and scale and some the new; only tiles of the

@@ -20,7 +20,7 @@ from service.errors import InputError
 from service.stream import codec
 from service.stream.budget import TokenBucket
 from service.stream.radio_messages import (
-    Tile,
+    RadioTile,
     pack_announce,
     pack_pose,
     pack_tile,
@@ -59,7 +59,7 @@ class TunnelConfig:
 
 @dataclass(slots=True, eq=False)
 class _Waiting:
-    tile: Tile
+    tile: RadioTile
     repeats: int = REPEATS
     payload: bytes = b""  # as last offered
 
@@ -72,7 +72,7 @@ class TunnelSender:
         self._store = store
         self._config = config
         self._announcement = pack_announce(store.header)
-        self._tiles: deque[Tile] = deque(maxlen=MAX_WAITING)  # all tiles of the scan
+        self._tiles: deque[RadioTile] = deque(maxlen=MAX_WAITING)  # all tiles of the scan
         self._moved: dict[int, Repose] = {}  # keyframe to the correction last sent
         self._tag = tag_of(store.header.drone, store.header.name)
         self._factor = 1.0
@@ -121,7 +121,7 @@ class TunnelSender:
         waiting = {id(entry.tile) for entry in self._fresh}
         self._fresh.extendleft(_Waiting(tile) for tile in tiles if id(tile) not in waiting)
 
-    def _pack(self, tile: Tile) -> bytes:
+    def _pack(self, tile: RadioTile) -> bytes:
         """The tile at its keyframe's newest pose."""
         repose = self._store.repose(tile.seq)
         if repose is not None:

@@ -22,7 +22,7 @@ WANTED = numbers_of(READERS)
 
 
 @dataclass(slots=True)
-class _Stream:
+class _Session:
     """Samples of one sender (system, component) in one boot session."""
 
     stamps: list[int] = field(default_factory=list)
@@ -53,10 +53,10 @@ Key = tuple[int, int, int]
 """System, component, boot session."""
 
 
-def _collect(path: Path, counts: Counter[str]) -> tuple[dict[Key, _Stream], set[tuple[int, int]]]:
+def _collect(path: Path, counts: Counter[str]) -> tuple[dict[Key, _Session], set[tuple[int, int]]]:
     """The samples by sender and session, and the (system, component) of autopilots."""
     decoder = Decoder()
-    streams: dict[Key, _Stream] = {}
+    streams: dict[Key, _Session] = {}
     counters: dict[tuple[int, int], BootCounter] = {}
     autopilots: set[tuple[int, int]] = set()
     with path.open("rb") as file:
@@ -78,14 +78,14 @@ def _collect(path: Path, counts: Counter[str]) -> tuple[dict[Key, _Stream], set[
             counts[message.get_type()] += 1
             counter = counters.setdefault(sender, BootCounter())
             boot = None if sample.boot_ms is None else counter.unwrap(sample.boot_ms)
-            stream = streams.setdefault((*sender, counter.session), _Stream())
+            stream = streams.setdefault((*sender, counter.session), _Session())
             stream.stamps.append(stamp_ns)
             stream.samples.append(sample)
             stream.boots.append(boot)
     return streams, autopilots
 
 
-def _vehicle(streams: dict[Key, _Stream], autopilots: set[int], warnings: list[str]) -> int | None:
+def _vehicle(streams: dict[Key, _Session], autopilots: set[int], warnings: list[str]) -> int | None:
     """The system whose telemetry is used: the autopilot with the most attitude samples."""
     says: Counter[int] = Counter()
     for (system, _, _), stream in streams.items():
@@ -103,8 +103,8 @@ def _vehicle(streams: dict[Key, _Stream], autopilots: set[int], warnings: list[s
 def _place(
     history: VehicleHistory,
     key: Key,
-    stream: _Stream,
-    streams: dict[Key, _Stream],
+    stream: _Session,
+    streams: dict[Key, _Session],
     speaks: bool,
     warnings: list[str],
 ) -> None:
@@ -123,7 +123,7 @@ def _place(
             history.add(sample, _time(fit, stamp, boot))
 
 
-def _fit(stream: _Stream) -> BootFit | None:
+def _fit(stream: _Session) -> BootFit | None:
     pairs = [(s, b) for s, b in zip(stream.stamps, stream.boots, strict=True) if b is not None]
     return fit_boot([s for s, _ in pairs], [b for _, b in pairs]) if pairs else None
 

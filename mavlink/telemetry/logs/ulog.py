@@ -74,7 +74,7 @@ def _topics(path: Path) -> tuple[dict[str, Columns], Counter[str], list[str]]:
             f"{path}: reading .ulg needs pyulog; pip install 'skyrelief[logs]'"
         ) from error
     try:
-        with _Bounded(path) as file:
+        with _LimitedFile(path) as file:
             log = ULog(file, list(TABLE))
     except (*BROKEN, ULogException) as error:
         raise ValueError(f"{path}: the .ulg log cannot be read ({error})") from error
@@ -84,7 +84,7 @@ def _topics(path: Path) -> tuple[dict[str, Columns], Counter[str], list[str]]:
     return topics, counts, [f"{dropouts} dropouts while logging"] if dropouts else []
 
 
-class _Bounded(io.BufferedReader):
+class _LimitedFile(io.BufferedReader):
     """A file with a limit on the bytes read.
 
     pyulog seeks back over a damaged message. Where the file is truncated within it, pyulog seeks

@@ -54,14 +54,14 @@ PROBE_M = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Surface:
+class SurfaceHeights:
     """Heights of the upper surface, and (rows, cols) those that are no certain measurements."""
 
     raster: Raster
     is_filled: Bool
 
 
-def surface_model(scan: ScanView, cell_m: float | None, strict: bool = False) -> Surface:
+def surface_model(scan: ScanView, cell_m: float | None, strict: bool = False) -> SurfaceHeights:
     """The surface where it is certain and the air above it was seen, its holes filled.
 
     ``strict`` leaves the holes unknown. :func:`recon.surface.raster.reliable` removes uncertain
@@ -80,12 +80,12 @@ def bare_ground(scan: ScanView, cell_m: float | None) -> BareGround:
     return scan.shared(("ground", cell_m), lambda: terrain(surface_model(scan, cell_m).raster))
 
 
-def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> Surface:
+def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> SurfaceHeights:
     measured = scan.raster(cell_m)
     sure = reliable(measured)
     certain = _open_to_the_sky(scan, measured, sure)
     if strict:
-        return Surface(certain, np.zeros(certain.grid.shape, np.bool_))
+        return SurfaceHeights(certain, np.zeros(certain.grid.shape, np.bool_))
     holes = ~certain.known & (outlined(certain.known) if scan.is_whole else True)
     held = _unrefuted(scan, measured, holes & inner_doubtful(measured, sure), ())
     level = sure.known & _at_lowest(measured, certain)
@@ -96,7 +96,7 @@ def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> Surfac
     right = _unrefuted(scan, raster, new & holes, FILLED_UP_M)
     below = right & (top_m - raster.height_m > STEP_M)
     right &= ~below | _unrefuted(scan, raster, below, NEAR_UP_M)
-    return Surface(without_cells(raster, new & ~right), right | held)
+    return SurfaceHeights(without_cells(raster, new & ~right), right | held)
 
 
 def _at_lowest(measured: Raster, certain: Raster) -> Bool:

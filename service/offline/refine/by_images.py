@@ -34,9 +34,9 @@ from recon.posegraph.ground_control import (
     ATTITUDE_S,
     FIX_S,
     Adjusted,
+    ControlPoint,
+    KeyframeTrack,
     Mark,
-    Point,
-    Track,
     map_position,
 )
 from recon.types import F64, Bool, Camera, Keyframe
@@ -211,8 +211,8 @@ def depth_scales(
 
 
 def adjusted(
-    images: ImageNetwork, track: Track, points: Sequence[Point], marks: Sequence[Mark],
-    states: Sequence[KeyframeState], surface: Surfaces,
+    images: ImageNetwork, track: KeyframeTrack, points: Sequence[ControlPoint],
+    marks: Sequence[Mark], states: Sequence[KeyframeState], surface: Surfaces,
 ) -> tuple[Adjusted, ImageNetwork]:  # fmt: skip
     """The adjustment with telemetry and surveyed points, and the network after it.
 
@@ -249,7 +249,7 @@ def _view_of(images: ImageNetwork, mark: Mark) -> int:
 
 
 def _known(
-    images: ImageNetwork, track: Track, points: Sequence[Point], used: set[int]
+    images: ImageNetwork, track: KeyframeTrack, points: Sequence[ControlPoint], used: set[int]
 ) -> Knowledge:
     """Priors from telemetry, or from the flight's last georeference, and from the survey."""
     n, first = len(track.poses), len(images.points)

@@ -22,9 +22,9 @@ from recon.posegraph.ground_control import (
     FIX_S,
     Adjusted,
     BatchConfig,
+    ControlPoint,
+    KeyframeTrack,
     Mark,
-    Point,
-    Track,
     adjust,
     map_position,
     supported,
@@ -180,7 +180,7 @@ def _open_target(folder: Path, out: Path | None) -> Path:
     return out
 
 
-def fixes_of(track: Track) -> tuple[F64, F64]:
+def fixes_of(track: KeyframeTrack) -> tuple[F64, F64]:
     """(N, 3) measured places, NaN where there is none, and their sigmas as of independent ones."""
     places = np.full((len(track.poses), 3), np.nan)
     sigma = np.ones((len(track.poses), 3))
@@ -319,7 +319,7 @@ class _Refinement:
             "flight's: to correct them, replay with --camera-model and that file"
         )
 
-    def _with_loops(self, track: Track) -> tuple[Track, int]:
+    def _with_loops(self, track: KeyframeTrack) -> tuple[KeyframeTrack, int]:
         """The track with its loops, and how many of them were verified."""
         flown, closures = self._flown_loops(), self._seen_loops(track)
         kept = [c for c in supported([*flown, *closures], track.poses) if c not in flown]
@@ -377,11 +377,11 @@ class _Refinement:
                 f"fit ({reasons}); nothing was changed"
             )
 
-    def _track(self) -> Track:
+    def _track(self) -> KeyframeTrack:
         times = np.array([s.time_ns * 1e-9 for s in self.states])
         poses = np.array([s.T_world_camera for s in self.states])
         spread = np.array([s.covariance for s in self.states])
-        return Track(poses, times - times[0], spread, self._priors())
+        return KeyframeTrack(poses, times - times[0], spread, self._priors())
 
     def _priors(self) -> list[PosePrior]:
         """The flight's telemetry at each keyframe; empty without a log."""
@@ -423,7 +423,7 @@ class _Refinement:
                 out.append(Loop(at[a], at[b], T, loose(T, spread)))
         return out
 
-    def _seen_loops(self, track: Track) -> list[Loop]:
+    def _seen_loops(self, track: KeyframeTrack) -> list[Loop]:
         """All pairs of keyframes far apart in time that see the same place, verified."""
 
         def at(k: int) -> Keyframe | None:
@@ -452,7 +452,7 @@ class _Refinement:
 
     # ---- adjustment --------------------------------------------------------------------------
 
-    def _adjusted(self, track: Track, candidates: Sequence[Candidate]) -> Adjusted:
+    def _adjusted(self, track: KeyframeTrack, candidates: Sequence[Candidate]) -> Adjusted:
         """The adjustment; control points that stay off are left out one by one, and named."""
         points = _points(candidates)
         most = int(MAX_REFUSALS * sum(not c.point.is_check for c in candidates))
@@ -480,7 +480,7 @@ class _Refinement:
             worst.why_not = f"stays {far:.2f} m off after the adjustment"
 
     def _solved(
-        self, track: Track, points: Sequence[Point], marks: Sequence[Mark],
+        self, track: KeyframeTrack, points: Sequence[ControlPoint], marks: Sequence[Mark],
         candidates: Sequence[Candidate],
     ) -> Adjusted:  # fmt: skip
         if self.images is None:
@@ -492,7 +492,7 @@ class _Refinement:
         return found
 
     def _left_out(
-        self, track: Track, candidates: Sequence[Candidate]
+        self, track: KeyframeTrack, candidates: Sequence[Candidate]
     ) -> dict[str, list[float | None] | None]:
         """How far each control point is off where the others alone put it, by name.
 
@@ -526,10 +526,11 @@ class _Refinement:
         ]
 
 
-def _points(candidates: Sequence[Candidate]) -> list[Point]:
+def _points(candidates: Sequence[Candidate]) -> list[ControlPoint]:
     """The surveyed points of ``candidates``, numbered alike."""
     return [
-        Point(np.zeros(3) if c.surveyed_m is None else c.surveyed_m, c.sigma_m) for c in candidates
+        ControlPoint(np.zeros(3) if c.surveyed_m is None else c.surveyed_m, c.sigma_m)
+        for c in candidates
     ]
 
 

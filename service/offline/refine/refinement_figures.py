@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.posegraph.ground_control import Adjusted, Track, map_position
+from recon.posegraph.ground_control import Adjusted, KeyframeTrack, map_position
 from recon.types import F64
 from service.offline.refine.control_points import Candidate
 from service.offline.refine.stored_loops import steps_m
@@ -15,7 +15,7 @@ from service.offline.refine.stored_loops import steps_m
 
 def figures_of(
     seqs: Sequence[int],
-    track: Track,
+    track: KeyframeTrack,
     found: Adjusted,
     candidates: Sequence[Candidate],
     verified: int,
@@ -55,7 +55,7 @@ def figures_of(
     }
 
 
-def _steps(track: Track, found: Adjusted, ahead_m: float) -> dict[str, Any] | None:
+def _steps(track: KeyframeTrack, found: Adjusted, ahead_m: float) -> dict[str, Any] | None:
     """How far apart the two ends of the used loops have the same ground; None without any."""
     used = [loop for k, loop in enumerate(track.loops) if k not in found.loops_refused]
     if not used:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from recon import se3
-from recon.posegraph.ground_control import Track
+from recon.posegraph.ground_control import KeyframeTrack
 from recon.posegraph.loop_closure import LoopConfig, LoopView, candidates, ground_seen
 from recon.posegraph.records import Loop
 from recon.posegraph.submap_loops import SubmapLoopConfig, filled, verify_surfaces
@@ -98,7 +98,7 @@ class StoredLoops:
 
     def __init__(
         self,
-        track: Track,
+        track: KeyframeTrack,
         keyframe: Callable[[int], Keyframe | None],
         config: SubmapLoopConfig,
         scans: Sequence[int] | None = None,

@@ -26,7 +26,7 @@ Finite = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Sigma = Annotated[float, Meta(gt=0.0, le=100.0)]
 
 
-class Row(msgspec.Struct, frozen=True):
+class SurveyRow(msgspec.Struct, frozen=True):
     """One row as it is written."""
 
     name: Annotated[str, Meta(min_length=1)]
@@ -133,7 +133,7 @@ def _said(p: SurveyPoint) -> tuple[str, float, float, float | None, float, float
     return p.name, p.lat_deg, p.lon_deg, p.alt_amsl_m, p.sigma_h_m, p.sigma_v_m, p.is_check
 
 
-def _rows(path: Path) -> Iterator[tuple[int, Row]]:
+def _rows(path: Path) -> Iterator[tuple[int, SurveyRow]]:
     """Line number and content of each row."""
     try:
         text = read_small(path, LARGEST_BYTES, "CSV of surveyed points").decode("utf-8-sig")
@@ -152,7 +152,7 @@ def _rows(path: Path) -> Iterator[tuple[int, Row]]:
                     "decimals take a point, not a comma"
                 )
             filled = {k: v for k, c in zip(header, cells, strict=False) if (v := c.strip())}
-            yield table.line_num, msgspec.convert(filled, Row, strict=False)
+            yield table.line_num, msgspec.convert(filled, SurveyRow, strict=False)
     except csv.Error as error:
         raise InputError(f"{path} line {table.line_num}: not CSV ({error})") from error
     except msgspec.ValidationError as error:
@@ -163,7 +163,7 @@ def _rows(path: Path) -> Iterator[tuple[int, Row]]:
 
 
 def _check_header(path: Path, header: list[str]) -> None:
-    known = Row.__struct_fields__
+    known = SurveyRow.__struct_fields__
     if len(set(header)) < len(header) or not {"name", "lat", "lon"} <= set(header) <= set(known):
         raise InputError(
             f"{path} line 1: columns {', '.join(header)[:200]!r}; name, lat and lon are needed, "
@@ -171,7 +171,7 @@ def _check_header(path: Path, header: list[str]) -> None:
         )
 
 
-def _point(line: int, row: Row) -> SurveyPoint:
+def _point(line: int, row: SurveyRow) -> SurveyPoint:
     """The point of one row, with its one sighting."""
     mark = Sighting(line, row.keyframe_seq, row.time, row.image)
     if row.u_px is not None and row.v_px is not None:

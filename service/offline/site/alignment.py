@@ -19,7 +19,7 @@ from recon import se3
 from recon.camera_model import rays
 from recon.posegraph.ground_control import (
     BatchConfig,
-    Track,
+    KeyframeTrack,
     adjust,
     placed_by_points,
     supported,
@@ -33,7 +33,7 @@ from service.offline.refine.stored_loops import BREAK_S, StoredLoops
 from service.offline.site import SITE
 from service.offline.site.gather import Member, gather
 from service.offline.site.start import SIGMA_SCALE as START_SCALE
-from service.offline.site.start import Start, start_of
+from service.offline.site.start import StartPoints, start_of
 from service.offline.tiles import TILE_POINTS
 from service.progress import Progress
 from service.scans.track import local_frame
@@ -75,7 +75,7 @@ class AlignedSite:
 
 def align_site(
     folders: Sequence[Path], out: Path, deliver: bool = True,
-    starts: Mapping[Path, Start] | None = None, progress: Progress | None = None,
+    starts: Mapping[Path, StartPoints] | None = None, progress: Progress | None = None,
     tile_points: int = TILE_POINTS, scheduler: str | None = None,
 ) -> AlignedSite:  # fmt: skip
     """Gather the scans into the folder ``out``, align them, and write the site's files.
@@ -117,7 +117,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _align(
-    folders: Sequence[Path], out: Path, starts: Mapping[Path, Start], progress: Progress
+    folders: Sequence[Path], out: Path, starts: Mapping[Path, StartPoints], progress: Progress
 ) -> AlignedSite:
     known = _known(out)
     earlier = [Path(s["folder"]) for s in known.get("scans", [])]
@@ -210,7 +210,7 @@ def _aligned(
 
 
 def _bent(
-    track: Track, scans: Sequence[int], found: SiteAlignment, loops: Sequence[Loop],
+    track: KeyframeTrack, scans: Sequence[int], found: SiteAlignment, loops: Sequence[Loop],
     ties: Sequence[Tie],
 ) -> tuple[F64, F64]:  # fmt: skip
     """Poses and covariances after the motions of the scans, adjusted to the ties.
@@ -231,7 +231,7 @@ def _bent(
     if not closures:
         return moved, track.covariances
     config = BatchConfig(sigma_scale=SAME_SCALE, sigma_scale_walk=SAME_SCALE)
-    whole = Track(moved, track.times_s, track.covariances, loops=closures)
+    whole = KeyframeTrack(moved, track.times_s, track.covariances, loops=closures)
     try:
         adjusted = adjust(whole, config=config)
     except RuntimeError as error:  # so the solver says that the system is ill-posed
@@ -239,7 +239,9 @@ def _bent(
     return adjusted.poses, adjusted.covariances
 
 
-def _joined(store: ScanStore, members: Sequence[Member]) -> tuple[Track, list[int], list[int]]:
+def _joined(
+    store: ScanStore, members: Sequence[Member]
+) -> tuple[KeyframeTrack, list[int], list[int]]:
     """All keyframes one scan after the other, their numbers in the store, and their scans."""
     poses, spread, seqs, scans = [], [], [], []
     times: list[float] = []
@@ -256,7 +258,7 @@ def _joined(store: ScanStore, members: Sequence[Member]) -> tuple[Track, list[in
             times.append(begun + (one.time_ns - first) * 1e-9)
             seqs.append(seq)
             scans.append(k)
-    return Track(np.array(poses), np.array(times), np.array(spread)), seqs, scans
+    return KeyframeTrack(np.array(poses), np.array(times), np.array(spread)), seqs, scans
 
 
 def corners(one: Keyframe) -> F64:

@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from recon import se3
-from recon.posegraph.site_alignment import Similarity
+from recon.posegraph.site_alignment import ScanSimilarity
 from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.site import DRONE
-from service.offline.site.start import Start
+from service.offline.site.start import StartPoints
 from service.scans.main_piece import main_seqs
 from service.scans.track import latest, local_frame
 from service.stream import codec
@@ -45,11 +45,11 @@ class Member:
     first: int  # its keyframes' numbers in the site's store
     last: int
     scale: float = 1.0  # of a scan that points place
-    start: Start | None = None
+    start: StartPoints | None = None
 
     def placed(self, T: F64) -> F64:
         """A (4, 4) pose of the scan in the site's frame."""
-        move = Similarity(self.T_site_scan[:3, :3], self.T_site_scan[:3, 3], self.scale)
+        move = ScanSimilarity(self.T_site_scan[:3, :3], self.T_site_scan[:3, 3], self.scale)
         return move.pose(T)
 
     @property
@@ -59,7 +59,7 @@ class Member:
 
 
 def gather(
-    folders: Sequence[Path], path: Path, name: str, starts: Mapping[Path, Start] | None = None
+    folders: Sequence[Path], path: Path, name: str, starts: Mapping[Path, StartPoints] | None = None
 ) -> tuple[list[Member], list[str]]:
     """Copy the keyframes of the scans in ``folders`` into a new store; its members, and notes.
 
@@ -97,7 +97,7 @@ def _opened(folder: Path) -> ScanStore:
 
 
 def _chosen(
-    folders: Sequence[Path], stores: Sequence[ScanStore], starts: Mapping[Path, Start]
+    folders: Sequence[Path], stores: Sequence[ScanStore], starts: Mapping[Path, StartPoints]
 ) -> tuple[list[tuple[Path, ScanStore]], list[str]]:
     """The scans that can be part of a site, and why others cannot."""
     chosen: list[tuple[Path, ScanStore]] = []
@@ -184,7 +184,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 def _copied(
     store: ScanStore, site: ScanStore, origin: LocalFrame, title: str, folder: Path, first: int,
-    starts: Mapping[Path, Start],
+    starts: Mapping[Path, StartPoints],
 ) -> Member:  # fmt: skip
     """Copy the layers of one scan's main piece under new numbers, from ``first`` on."""
     frame, spread = local_frame(store.header), None

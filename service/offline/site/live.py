@@ -17,7 +17,7 @@ import numpy as np
 from recon import se3
 from recon.posegraph.ground_control import supported
 from recon.posegraph.records import Loop
-from recon.posegraph.site_alignment import ScanPrior, Similarity, align, alike
+from recon.posegraph.site_alignment import ScanPrior, ScanSimilarity, align, alike
 from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import F64, Keyframe
 from service.errors import InputError, SkyreliefError
@@ -38,7 +38,7 @@ from service.stream import codec
 from service.stream.store import ScanStore
 
 CONFIG = SubmapLoopConfig(min_gap=1)
-UNMOVED = Similarity(np.eye(3), np.zeros(3), 1.0)
+UNMOVED = ScanSimilarity(np.eye(3), np.zeros(3), 1.0)
 STRIDE = 20_000
 """Between the first keyframes' numbers of two scans; a scan takes part with so many at most."""
 
@@ -50,13 +50,13 @@ HELD = 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed:
+class PlacedScan:
     """Where a scan is shown."""
 
     folder: Path
     started_unix_s: float
     T_site_scan: F64  # (4, 4) by the two origins alone
-    move: Similarity  # in the site
+    move: ScanSimilarity  # in the site
     sigma_m: F64  # (3,) east, north, up, of its middle
     ties: int
     group: int  # scans that ties join have one number
@@ -250,7 +250,7 @@ class LiveSite:
         self._loops[loop.a, loop.b] = loop, here
         self._changed = True
 
-    def place(self) -> list[Placed] | None:
+    def place(self) -> list[PlacedScan] | None:
         """Where the scans that have keyframes are shown; None while nothing has changed."""
         if not self._changed:
             return None
@@ -280,7 +280,7 @@ class LiveSite:
         for one, move in zip(scans, found.moves, strict=True):
             one.move = move
         return [
-            Placed(
+            PlacedScan(
                 one.folder, one.started_unix_s, one.T_site_scan, one.move, sigma[i], ends[i],
                 found.groups[i],
             )

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from recon.posegraph.ground_control import placed_by_points
-from recon.posegraph.site_alignment import Similarity
+from recon.posegraph.site_alignment import ScanSimilarity
 from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -44,12 +44,12 @@ class Pair(msgspec.Struct, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Start:
+class StartPoints:
     """Points that place one scan."""
 
     pairs: list[Pair]
 
-    def placing(self, site: LocalFrame) -> tuple[Similarity, F64]:
+    def placing(self, site: LocalFrame) -> tuple[ScanSimilarity, F64]:
         """From the scan's coordinates to the site's, and (6, 6) its left covariance there.
 
         Raises InputError for too few points, points in a line, and points that disagree.
@@ -68,7 +68,7 @@ class Start:
         found = placed_by_points(here, there)
         assert found is not None  # they span a plane
         scale, R, t = found
-        move = Similarity(R, t, scale)
+        move = ScanSimilarity(R, t, scale)
         extent = float(np.linalg.norm(there - there.mean(axis=0), axis=1).max())
         miss = float(np.sqrt(np.mean(np.sum((move.points(here) - there) ** 2, axis=1))))
         if scale <= 0.0 or miss > MAX_MISS * extent:
@@ -79,14 +79,14 @@ class Start:
         return move, np.diag(sigma**2)
 
 
-def read_start(path: Path) -> Start:
+def read_start(path: Path) -> StartPoints:
     """The points in a JSON file. Raises InputError for anything else."""
-    return Start(read_json(path, list[Pair], MAX_BYTES, "list of points"))
+    return StartPoints(read_json(path, list[Pair], MAX_BYTES, "list of points"))
 
 
-def start_of(rows: list[Any], name: str) -> Start:
+def start_of(rows: list[Any], name: str) -> StartPoints:
     """The points in what was read from JSON; ``name`` is for the error."""
     try:
-        return Start(msgspec.convert(rows, list[Pair]))
+        return StartPoints(msgspec.convert(rows, list[Pair]))
     except msgspec.ValidationError as error:
         raise InputError(f"{name} is no list of points: {error}"[:300]) from error
