@@ -566,6 +566,18 @@ def dataflash_flight(dated: bool) -> DataflashWriter:
     return writer
 
 
+def test_a_damaged_time_of_an_onboard_log_costs_its_message_only(tmp_path: Path) -> None:
+    path = tmp_path / "log.BIN"
+    path.write_bytes(dataflash_flight(True).data)
+    sound = load_telemetry(path)
+    writer = dataflash_flight(True)
+    writer.add("ATT", 1 << 63, 500, -1000, 9000, 3)
+    writer.add("POS", 1 << 60, 473000000, 85000000, 512.5, 62.5, 60.0, 0)
+    path.write_bytes(writer.data)
+    damaged = load_telemetry(path)
+    assert (damaged.first_ns, damaged.last_ns) == (sound.first_ns, sound.last_ns)
+
+
 @pytest.mark.parametrize("dated", [True, False])
 def test_an_ardupilot_onboard_log(tmp_path: Path, dated: bool) -> None:
     path = tmp_path / "log.BIN"
