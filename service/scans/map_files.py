@@ -17,7 +17,7 @@ ALONE = {
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
     "GDAL_PAM_ENABLED": "NO",
 }
-"""GDAL reads neither hosts nor files beside the one that is opened."""
+"""GDAL reads no hosts, and no other file than the one that is opened."""
 
 
 @contextmanager
