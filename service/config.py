@@ -412,8 +412,13 @@ def _in_words(error: msgspec.ValidationError) -> str:
     if text.startswith("Invalid enum value"):
         section, _, key_name = name.partition(".")
         hints = get_type_hints(get_type_hints(Config)[section])
-        text += f"; there are {', '.join(get_args(hints[key_name]))}"
+        text += f"; there are {', '.join(_words(hints[key_name]))}"
     return f"{name}: {text}"
+
+
+def _words(hint: Any) -> list[str]:
+    """The words that a key takes, also next to other types."""
+    return [w for one in get_args(hint) for w in ([one] if isinstance(one, str) else _words(one))]
 
 
 def _override(config: Config, override: str) -> Config:

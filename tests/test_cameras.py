@@ -200,6 +200,18 @@ def test_joined_recordings_follow_each_other(tmp_path: Path) -> None:
     assert sum("times begin again" in warning for warning in source.warnings) == 2
 
 
+def test_times_of_another_century_are_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sound = TIMES_MS
+    monkeypatch.setitem(globals(), "TIMES_MS", [*sound, sound[-1] + 10**13])
+    path = tmp_path / "far.mkv"
+    write_video(str(path), "matroska")
+    source = open_camera(str(path))
+    assert [round(frame.time_ns / 1e6) for frame in source] == list(sound)
+    assert any("1 images whose time does not follow" in warning for warning in source.warnings)
+
+
 def test_damaged_middle_costs_only_itself(tmp_path: Path) -> None:
     path = tmp_path / "v.mp4"
     write_video(str(path), "mp4", {"movflags": "faststart"}, codec="mjpeg")

@@ -118,6 +118,25 @@ def test_no_zone_keeps_relative_time_only(tmp_path: Path) -> None:
     assert any("time zone" in w for w in source.warnings)
 
 
+@pytest.mark.parametrize(
+    ("local", "gps"),
+    [
+        ("9000:01:01 12:00:01", None),
+        ("0001:01:01 12:00:01", None),
+        (None, {7: (1e18, 0.0, 0.0), 29: "2024:06:01"}),
+    ],
+)
+def test_a_time_that_no_clock_shows_is_none(
+    tmp_path: Path, local: str | None, gps: dict[int, Any] | None
+) -> None:
+    write_still(tmp_path / "0.jpg", "2024:06:01 12:00:00", offset="+00:00")
+    write_still(tmp_path / "1.jpg", local, offset="+00:00", gps=gps)
+    source = open_camera(str(tmp_path))
+    assert [f.time_ns for f in source] == [0, 10**9]
+    assert source.epoch_unix_ns == NOON_UTC_NS
+    assert any("1 of 2 images have no time" in w for w in source.warnings)
+
+
 def test_stills_of_one_second_are_spread_over_it(tmp_path: Path) -> None:
     for i in range(4):
         write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i // 2}", offset="+00:00")

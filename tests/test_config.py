@@ -119,6 +119,7 @@ def test_later_override_wins_over_earlier_and_file(tmp_path: Path) -> None:
         ("[scan]\nbaseline = -1\n", "scan.baseline"),
         ("[scan]\nbaseline = 'wide'\n", "scan.baseline 'wide' is not"),
         ("[scan]\nstart = 'now'\n", "there are on-command, on-boot, on-arm"),
+        ("[camera]\nreadout_ms = 'autp'\n", "'autp'; there are model, auto"),
         ("[scan]\nbase_to_height = nan\n", "base_to_height"),
         ("[datalink]\nconnect = ['192.168.1.2']\n", "not like tcp/HOST:7447"),
         ("[datalink]\nbudget_kbit_s = 0\n", "budget_kbit_s"),

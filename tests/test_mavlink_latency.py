@@ -159,6 +159,21 @@ def test_turns_are_in_the_axes_at_their_start() -> None:
         assert turned[k] == pytest.approx((first.inv() * second).as_rotvec(), abs=2e-3)
 
 
+def test_a_log_whose_clock_was_set_costs_no_memory_for_the_years_between() -> None:
+    early = attitudes(20.0)
+    years_ns = 5 * 365 * 86_400 * S
+    track = latency.Attitudes(early + [(t + years_ns, q) for t, q in early])
+    alone = latency.Attitudes(early)
+    start = np.array([1.013, 2.5, 30.0, 44.9, 50.0])
+    for offset_s in (0.0, years_ns / S):
+        turned, known = track.turns(offset_s + start, offset_s + start + 0.2)
+        wanted, there = alone.turns(start, start + 0.2)
+        assert known.tolist() == there.tolist() == [True, True, True, False, False]
+        assert turned[known] == pytest.approx(wanted[there], abs=1e-4)
+    _, known = track.turns(np.array([1e6]), np.array([1e6 + 0.2]))
+    assert not known.any()
+
+
 def test_the_head_is_compared_when_there_is_a_gimbal() -> None:
     history = VehicleHistory()
     for k in range(100):

@@ -6,6 +6,7 @@ import math
 import random
 import re
 import struct
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -454,6 +455,33 @@ def test_subtitles_give_the_focal_length(
     assert any("zooms between 24 and 48 mm" in warning for warning in log.warnings) == zooms
 
 
+@pytest.mark.parametrize("place", ["gb_yaw", "gb_pitch", "rel_alt", "abs_alt", "focal_len"])
+def test_subtitles_lose_no_more_than_a_number_that_is_none(tmp_path: Path, place: str) -> None:
+    good = (
+        "[latitude: 45.0] [longitude: 13.0] [rel_alt: 30.0 abs_alt: 269.1] "
+        "[gb_yaw: 1.0 gb_pitch: -90.0 gb_roll: 0.0] [focal_len: 24.0]"
+    )
+    texts = [good, re.sub(rf"{place}: \S+?(?=[ \]])", f"{place}: {'9' * 400}", good), good]
+    path = tmp_path / "flight.SRT"
+    path.write_text("".join(cue(n, text) for n, text in enumerate(texts)))
+    log = load_telemetry(path)
+    assert log.counts["positions"] == 3 and log.warnings == () and log.focal_35mm == 24.0
+    gimbals = len(log.history.heads())
+    assert gimbals == 2 if place.startswith("gb_") else gimbals == 3
+
+
+def test_subtitles_of_a_cue_without_end_take_no_memory(tmp_path: Path) -> None:
+    path = tmp_path / "flight.SRT"
+    found = "[latitude: 45.0] [longitude: 13.0] [rel_alt: 30.0]"
+    path.write_text(cue(0, found) + "a\n" * 1_000_000 + cue(1, found))
+    tracemalloc.start()
+    try:
+        assert load_telemetry(path).counts["positions"] == 2
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    finally:
+        tracemalloc.stop()
+
+
 @pytest.mark.parametrize("name", ["p4_rtk.SRT", "mavic_air2.srt", "matrice_300.srt"])
 def test_real_subtitles_are_read_whole(name: str) -> None:
     log = load_telemetry(shared(f"flight_logs/dji_srt/{name}"))
@@ -536,6 +564,18 @@ def dataflash_flight(dated: bool) -> DataflashWriter:
             writer.add("RFND", us, 0, 50.0, 4, 25)
         writer.add("TERR", us, 2, 58.0)
     return writer
+
+
+def test_a_damaged_time_of_an_onboard_log_costs_its_message_only(tmp_path: Path) -> None:
+    path = tmp_path / "log.BIN"
+    path.write_bytes(dataflash_flight(True).data)
+    sound = load_telemetry(path)
+    writer = dataflash_flight(True)
+    writer.add("ATT", 1 << 63, 500, -1000, 9000, 3)
+    writer.add("POS", 1 << 60, 473000000, 85000000, 512.5, 62.5, 60.0, 0)
+    path.write_bytes(writer.data)
+    damaged = load_telemetry(path)
+    assert (damaged.first_ns, damaged.last_ns) == (sound.first_ns, sound.last_ns)
 
 
 @pytest.mark.parametrize("dated", [True, False])

@@ -229,6 +229,11 @@ def bad_inputs(flight: Path, tmp: Path) -> dict[str, tuple[list[str | Path], str
             [video, "--camera-model", camera, "--telemetry", log, "--video-epoch", "1000000000"],
             "do not overlap",
         ),
+        "begin that is none": ([video, "--camera-model", camera, "--video-epoch", "nan"], "1970"),
+        "begin of another age": (
+            [video, "--camera-model", camera, "--video-epoch", "1e11"],
+            "2106",
+        ),
         "unwritable folder": (
             [video, "--camera-model", camera, "--out", tmp / "file" / "scan"],
             "file",
@@ -241,7 +246,8 @@ def bad_inputs(flight: Path, tmp: Path) -> dict[str, tuple[list[str | Path], str
 CASES = (
     "no such file", "empty file", "not a video", "model of another size",
     "negative focal length", "NaN in the model", "no such log", "log of another day",
-    "unwritable folder", "unknown key", "unknown backend",
+    "begin that is none", "begin of another age", "unwritable folder",
+    "unknown key", "unknown backend",
 )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -11,12 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from mavlink.telemetry.gimbal import GimbalConfig
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
+from mavlink.telemetry.latency import LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import AttitudeSample, GimbalFrame, GimbalSample
 from recon.frames import R_GIMBAL_CAMERA
 from recon.tracking.odometry import Tracked, Tracking
 from service.config import CameraConfig
-from service.flight.telemetry_check import TelemetryCheck
+from service.flight.telemetry_check import AHEAD_NS, TelemetryCheck
 
 S = 1_000_000_000
 LATE_S = 0.07
@@ -192,3 +194,20 @@ def test_skipped_frames_do_not_interrupt_the_turns_of_the_others() -> None:
     check.finish()
     assert check.latency is not None
     assert abs(check.latency.latency_ms - 1e3 * LATE_S) < 5.0
+
+
+@pytest.mark.parametrize("gimbal", ["none", "honest"])
+def test_the_rest_of_a_long_log_is_not_read_for_each_look(
+    gimbal: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen_ns = []
+
+    def estimate(_: LatencyWatch, attitudes: Sequence[tuple[int, Quaternion]]) -> None:
+        seen_ns.append(attitudes[-1][0])
+
+    monkeypatch.setattr(LatencyWatch, "estimate", estimate)
+    camera = CameraConfig(mount="fixed") if gimbal == "none" else CameraConfig()
+    check = TelemetryCheck(camera, history_of(gimbal, 1.0))
+    for second in range(1, 13):
+        check.add(second * S, Tracked(Tracking.LOST, 0, None))
+    assert seen_ns == [11 * S + AHEAD_NS]

@@ -128,11 +128,11 @@ class VehicleHistory:
             around = [at for track in tracks if (at := track.around(time_ns)) is not None]
         return around[0].gap_s if around else 0.0
 
-    def bodies(self, since_ns: int = 0) -> list[tuple[int, Quaternion]]:
+    def bodies(self, since_ns: int = 0, until_ns: float = math.inf) -> list[tuple[int, Quaternion]]:
         """The body's attitude at every sample, and between slow samples whose rates are known."""
         out = []
         with self._lock:
-            samples = [one for one in self._attitude.items() if one[0] >= since_ns]
+            samples = [one for one in self._attitude.items() if since_ns <= one[0] <= until_ns]
         for (t, one), (later, next_one) in zip(samples, samples[1:] + samples[-1:], strict=True):
             gap = Bracket(t, later, one, next_one, t)
             is_curve = later - t <= MAX_GAP_NS and _has_rates(gap)
@@ -158,11 +158,11 @@ class VehicleHistory:
         """Streams by rank, most informative first; at equal rank the gimbal before its relay."""
         return sorted(self._gimbals, key=lambda k: (k[0], k[1] not in GIMBAL_DEVICES, k[1]))
 
-    def heads(self, since_ns: int = 0) -> list[tuple[int, Quaternion]]:
+    def heads(self, since_ns: int = 0, until_ns: float = math.inf) -> list[tuple[int, Quaternion]]:
         """The camera head's attitude at every gimbal sample, or the body's without a gimbal."""
         with self._lock:
             tracks = self._gimbals.values()
-            times = {t for track in tracks for t, _ in track.items() if t >= since_ns}
+            times = {t for track in tracks for t, _ in track.items() if since_ns <= t <= until_ns}
         states = [(t, self._state_at(t)) for t in sorted(times)]
         found = [
             (t, (w, x, y, z))
@@ -170,7 +170,7 @@ class VehicleHistory:
             if s is not None and s.q_ned_gimbal_wxyz is not None
             for w, x, y, z in [s.q_ned_gimbal_wxyz.tolist()]
         ]
-        return found or self.bodies(since_ns)
+        return found or self.bodies(since_ns, until_ns)
 
     def __len__(self) -> int:
         return len(self._attitude) + len(self._position)

@@ -251,7 +251,7 @@ class Attitudes:
         q[1:] *= np.cumprod(flips)[:, None]  # same hemisphere, so that neighbours average
         self.spacing_s = float(np.median(np.diff(times_s)))
         self._step_s = max(self.spacing_s / FINER, 1e-3)
-        self._grid_s = np.arange(0.0, times_s[-1] + self._step_s, self._step_s)
+        self._grid_s = self._grid(times_s)
         fine, known = _between(times_s, q, self._grid_s)
         weights = np.concatenate([[0.5], np.ones(AVERAGED - 1), [0.5]]) / AVERAGED
         self._q = np.stack([np.convolve(fine[:, k], weights, "same") for k in range(4)], axis=1)
@@ -266,6 +266,16 @@ class Attitudes:
     def last_s(self) -> float:
         """Time of the newest sample."""
         return float(self._grid_s[-1])
+
+    def _grid(self, times_s: F64) -> F64:
+        """Times a step apart; of a gap only two, as where the clock of a log was set."""
+        gaps = np.flatnonzero(np.diff(times_s) > MAX_GAP_S)
+        first = np.floor(times_s[np.append(0, gaps + 1)] / self._step_s)
+        last = np.ceil(times_s[np.append(gaps, len(times_s) - 1)] / self._step_s)
+        last[:-1] += 2
+        runs = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
+        grid: F64 = self._step_s * np.unique(np.concatenate(runs))
+        return grid
 
     def turns(self, start_s: F64, end_s: F64) -> tuple[F64, Bool]:
         """((N, 3) rotation vectors in rad in the axes at the start, (N,) where known).

@@ -84,7 +84,7 @@ def _read_tags(path: Path) -> Tags:
         offset_ns=_offset_ns(str(photo.get(36881) or photo.get(36880) or "")),
         gps_unix_ns=_gps_unix_ns(gps),
         name_unix_ns=name_unix_ns(path.name),
-        sub_second=sub.isdigit(),
+        sub_second=sub.isdecimal(),
         geotag=geotag,
         pan_deg=_pan_deg(geotag, xmp),
         lens=lens_of(photo, xmp, size_px),
@@ -110,8 +110,8 @@ def _local_ns(text: str, sub: str) -> int | None:
         moment = datetime.strptime(text.strip("\0 ")[:19], "%Y:%m:%d %H:%M:%S")
     except ValueError:
         return None
-    fraction = round(float(f"0.{sub}") * 1_000_000_000) if sub.isdigit() else 0
-    return _unix_ns(moment.replace(tzinfo=timezone.utc)) + fraction
+    fraction = round(float(f"0.{sub}") * 1_000_000_000) if sub.isdecimal() else 0
+    return _unix_ns(moment.replace(tzinfo=timezone.utc)) + fraction if _is_known(moment) else None
 
 
 def _offset_ns(text: str) -> int | None:
@@ -128,10 +128,15 @@ def _gps_unix_ns(gps: dict[int, Any]) -> int | None:
         day = datetime.strptime(str(gps.get(29, "")).strip("\0 "), "%Y:%m:%d")
     except ValueError:
         return None
-    if clock is None:
+    seconds = math.inf if clock is None else clock[0] * 3600 + clock[1] * 60 + clock[2]
+    if not (_is_known(day) and 0 <= seconds <= 86_401):
         return None
-    seconds = clock[0] * 3600 + clock[1] * 60 + clock[2]
     return _unix_ns(day.replace(tzinfo=timezone.utc)) + round(seconds * 1_000_000_000)
+
+
+def _is_known(moment: datetime) -> bool:
+    """Whether a clock that was set, and time in ns as we store it, can show it."""
+    return 1970 <= moment.year < 2106
 
 
 def _geotag(gps: dict[int, Any], xmp: dict[str, str]) -> GeoTag | None:

@@ -42,6 +42,9 @@ OPTIONS = ("format", "video_size", "pixel_format", "framerate")
 RESTART_NS = 1_000_000_000
 """A time that goes back to this long after the start, at most, begins again: joined recordings."""
 
+LONGEST_NS = 366 * 86_400 * 1_000_000_000
+"""No recording is longer: a time beyond is damage."""
+
 HEAD_BYTES = 4096
 NS_PER_S = 1_000_000_000
 
@@ -128,7 +131,7 @@ class VideoSource:
         for frame in itertools.chain((first,), self._decoded):
             decoded += 1
             time_ns = self._time_ns(frame, last_ns)
-            if time_ns <= last_ns:
+            if not last_ns < time_ns < LONGEST_NS:
                 self._unordered += 1
                 continue
             size_px = (int(frame.width), int(frame.height))
@@ -219,7 +222,9 @@ class VideoSource:
         if self._damaged:
             self._warn(f"{self._damaged} damaged images were skipped")
         if self._unordered:
-            self._warn(f"{self._unordered} images with non-increasing time were skipped")
+            self._warn(
+                f"{self._unordered} images whose time does not follow the one before were skipped"
+            )
         if self.images > decoded:
             self._warn(
                 f"{decoded} of the {self.images} images in the index could be "

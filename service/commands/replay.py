@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -324,9 +325,10 @@ def _epoch(
 ) -> int:
     """Unix ns of the source's time 0: as given, the container's, the log's start, or now."""
     from service.errors import InputError
+    from service.stream.validity import MAX_TIME_NS, is_time
 
     if video_epoch is not None:
-        epoch_ns = round(video_epoch * 1e9)
+        epoch_ns = round(video_epoch * 1e9) if math.isfinite(video_epoch) else MAX_TIME_NS
     elif log is not None and log.clock != "unix":  # time 0 of the video, or of the autopilot
         epoch_ns = 0 if log.clock == "video" else log.first_ns
         notes.append(f"the log has no date: times count from the start of the {log.clock}")
@@ -338,6 +340,10 @@ def _epoch(
     else:
         epoch_ns = time.time_ns()
         notes.append("the recording does not say when it began: taken as the time of the replay")
+    if not is_time(epoch_ns):
+        raise InputError(
+            "the recording begins outside the years 1970 to 2106; give the right --video-epoch"
+        )
     if log is not None and not log.first_ns - 600e9 < epoch_ns < log.last_ns:
         raise InputError(
             f"the telemetry covers {_utc(log.first_ns)} to {_utc(log.last_ns)}, the video begins "

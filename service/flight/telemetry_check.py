@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 LOOK_NS = 10_000_000_000
 REACH_NS = 60_000_000_000  # how far back telemetry is compared with frames, at least
+AHEAD_NS = 2_000_000_000  # how far ahead of the newest frame; a recording's log goes on
 SLEW = 0.1  # of the time that passes, so that frames stay in order when the latency changes
 UNSEEN_S = 0.05  # sigma of a latency that the images have not shown yet
 WORTH_TELLING_MS, OFF_SIGMAS = 10.0, 5.0  # a latency that differs by less is not reported
@@ -129,10 +130,8 @@ class TelemetryCheck:
         since_ns, stills_ns = now_ns - REACH_NS, self._turns.since_ns(STILLS)
         if stills_ns is not None:
             since_ns = min(since_ns, stills_ns)
-        if self._fixed:
-            found = self._turns.estimate(history.bodies(since_ns))
-        else:
-            found = self._turns.estimate(history.heads(since_ns))
+        attitudes = history.bodies if self._fixed else history.heads
+        found = self._turns.estimate(attitudes(since_ns, now_ns + AHEAD_NS))
         self.latency = found or self.latency
         if found is not None:
             self._report_latency(found)

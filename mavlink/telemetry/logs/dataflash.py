@@ -30,6 +30,7 @@ from mavlink.telemetry.samples import (
     Sample,
     TerrainSample,
 )
+from mavlink.wire.tlog import LATEST_USEC
 
 HEADER = b"\xa3\x95"
 UNIX_FROM_S = 1e9
@@ -51,6 +52,8 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     first_s: float | None = None
     attitudes: list[tuple[AttitudeSample, float]] = []
     for message in _messages(path):
+        if not 0.0 <= message._timestamp < 1e-6 * LATEST_USEC:
+            continue  # damaged
         name = message.get_type()
         counts[name] += 1
         sample = reader.sample(name, message)

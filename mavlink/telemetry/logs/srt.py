@@ -30,14 +30,16 @@ from mavlink.telemetry.samples import (
     PositionSample,
 )
 
-NUMBER = r"(-?\d+(?:\.\d+)?)"
-CUE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
-FIELD = re.compile(r"\b(\w+)\s*:\s*(-?\d+(?:[.,]\d+)?)")
+NUMBER = r"(-?\d{1,9}(?:\.\d+)?)"
+CUE = re.compile(r"(\d{1,4}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+FIELD = re.compile(r"\b(\w+)\s*:\s*(-?\d{1,9}(?:[.,]\d+)?)(?!\d)")
 GPS = re.compile(rf"GPS\s*\(\s*{NUMBER}\s*,\s*{NUMBER}\s*,\s*{NUMBER}\s*(M?)", re.IGNORECASE)
-FOCAL = re.compile(r"\bfocal_len\s*:\s*([1-9]\d*)(?:[.,](\d+))?")
+FOCAL = re.compile(r"\bfocal_len\s*:\s*([1-9]\d{0,8})(?:[.,](\d+))?(?!\d)")
 HEIGHT = re.compile(rf"\bH\s+{NUMBER}\s*m\b")
 PRY = re.compile(rf"\b([FG])\.PRY\s*\(\s*{NUMBER}\W?\s*,\s*{NUMBER}\W?\s*,\s*{NUMBER}")
-LONGEST_LINE = 4096
+LONGEST_LINE, LONGEST_CUE = 4096, 64
+"""In letters and in lines; the rest of a cue is skipped."""
+
 SAME_FOCAL = 0.02
 """Relative tolerance of a focal length that does not zoom."""
 
@@ -56,7 +58,8 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
         while line := file.readline(LONGEST_LINE):
             cue = CUE.match(line.strip())
             if cue is None:
-                text.append(line)
+                if len(text) < LONGEST_CUE:
+                    text.append(line)
                 continue
             _cue(history, counts, focals, time_ns, " ".join(text))
             text.clear()

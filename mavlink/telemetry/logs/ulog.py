@@ -25,6 +25,7 @@ from mavlink.telemetry.samples import (
     Sample,
     TerrainSample,
 )
+from mavlink.wire.tlog import LATEST_USEC
 
 HEADER = b"ULog\x01\x12\x35"
 BROKEN = (
@@ -56,9 +57,9 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
         topics.pop("vehicle_local_position", None)
     for name, columns in topics.items():
         times = columns["timestamp"].astype(np.int64) + (offset_us or 0)
-        for i, time_us in enumerate(times):
+        for i in np.flatnonzero((times >= 0) & (times < LATEST_USEC)):  # others are damaged
             for sample in TABLE[name](columns, i):
-                history.add(sample, int(time_us) * 1000)
+                history.add(sample, int(times[i]) * 1000)
     return finish(path, history, counts, warnings, "boot" if offset_us is None else "unix")
 
 
