@@ -9,12 +9,14 @@ import pytest
 from recon import se3
 from recon.calibration.flight import (
     SelfCalibrationConfig,
+    camera_information,
     camera_sigmas,
     doubt,
+    loosely_placed,
     self_calibrate,
     shared,
 )
-from recon.calibration.global_bundle import Sightings
+from recon.calibration.global_bundle import Problem, Sightings, solve
 from recon.types import F64, Camera
 from service.offline.refine.own_camera import bent, by_tags
 
@@ -174,6 +176,19 @@ def test_straight_down_from_one_height_it_is_not_determined() -> None:
     assert "straight down from one height" in found.why_not
 
 
+def test_an_adjustment_ends_by_itself_where_height_and_focal_length_trade_places() -> None:
+    poses = _about_nadir()
+    points, seen = _seen(poses, TRUE)
+    seen.uv_px[::40] += np.random.default_rng(1).uniform(-20, 20, seen.uv_px[::40].shape)
+    start, near = _guess(points, poses)
+    loose = camera_information(WRONG, SelfCalibrationConfig(sigma_focal=0.2))
+    sigmas, known = np.full(len(seen.view), SIGMA_PX), loosely_placed(start, seen)
+    problem = Problem(WRONG, WRONG, start, near[: len(known.surveyed)], seen, sigmas, known, loose)
+    found, further = solve(problem, 20), solve(problem, 100)
+    np.testing.assert_array_equal(found.poses, further.poses)
+    assert (np.abs(found.camera_step) < 0.02 * np.sqrt(np.diag(found.camera_covariance))).all()
+
+
 def test_two_heights_known_to_centimetres_determine_it() -> None:
     poses = _nadir((60.0, 90.0))
     points, seen = _seen(poses, TRUE)
@@ -197,12 +212,13 @@ def test_a_camera_beyond_belief_and_wild_sightings() -> None:
     assert "chessboard" in self_calibrate(far, start, near, seen, fixes, sigma).why_not
 
 
-def test_an_adjustment_that_has_not_settled_is_refused() -> None:
+def test_an_adjustment_that_has_not_settled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     poses = _oblique_turn()
     points, seen = _seen(poses, TRUE)
     start, near = _guess(points, poses)
     fixes, sigma = poses[:, :3, 3], np.full((len(poses), 3), 0.3)
-    hasty = SelfCalibrationConfig(iterations=2)
+    hasty = SelfCalibrationConfig(iterations=1)
+    monkeypatch.setattr("recon.calibration.flight.MAX_STEP", 0.003)
     assert "settle" in self_calibrate(WRONG, start, near, seen, fixes, sigma, hasty).why_not
 
 

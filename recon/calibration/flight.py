@@ -108,19 +108,17 @@ def self_calibrate(
     )  # fmt: skip
     held = camera_information(camera, config)
 
-    def problem(some: Sightings, sigma_px: float) -> Problem:
-        sigmas = np.full(len(some.view), sigma_px)
-        return Problem(
-            camera, camera, poses, landmarks, some, sigmas, known, held, config.huber_sigmas
-        )
-
     seen = thinned(within(camera, poses, landmarks, seen, np.inf))
     before = errors_px(camera, poses, landmarks, seen)
-    first = solve(problem(seen, config.pixel_sigma), config.iterations)
+    problem = Problem(
+        camera, camera, poses, landmarks, seen, np.full(len(seen.view), config.pixel_sigma),
+        known, held, config.huber_sigmas,
+    )  # fmt: skip
+    first = solve(problem, config.iterations)
     # Once more without wild sightings and with the pixels' own scatter.
     sigma = float(np.clip(np.median(first.errors_px) / RAYLEIGH_MEDIAN, 0.1, 2.0))
     seen = shared(seen, first.errors_px < config.gate_sigmas * sigma)
-    last = problem(seen, sigma)
+    last = replace(adjusted(problem, first), seen=seen, sigma_px=np.full(len(seen.view), sigma))
     images, wider, at = by_images_alone(last, config)
     found = solve(replace(at, camera_information=held).widened(wider), config.iterations)
     sigmas = camera_sigmas(found.camera_covariance)
@@ -165,13 +163,18 @@ def by_images_alone(
     loose = replace(config, sigma_focal=max(config.sigma_focal, LOOSE))
     problem = replace(problem, camera_information=camera_information(problem.given, loose))
     found = solve(problem, config.iterations)
-    at = replace(problem, camera=found.camera, poses=found.poses, points=found.points)
+    at = adjusted(problem, found)
     turning = solve(replace(at, rows=free_rows(len(at.poses))), config.iterations)
     focal, other = (float(s.camera.K[0, 0]) for s in (found, turning))
     spread = np.hypot(jackknife(at, config.iterations), np.log(focal / other))
     sigma = focal_sigma(found.camera, camera_sigmas(found.camera_covariance))
     wider = max(float(spread) / sigma, 1.0)
     return FocalLength(focal, wider * sigma), wider, at
+
+
+def adjusted(problem: Problem, found: Solution) -> Problem:
+    """``problem`` with the solution to begin with."""
+    return replace(problem, camera=found.camera, poses=found.poses, points=found.points)
 
 
 def free_rows(count: int) -> RowMotion:

@@ -3,6 +3,9 @@
 Levenberg-Marquardt with the Schur complement on the points (Triggs et al., Bundle Adjustment - A
 Modern Synthesis, 2000, doi:10.1007/3-540-44480-7_21). The reduced system of the poses is sparse:
 two of them meet only where they see a common point. The camera is a dense border of eight columns.
+After each step every point goes on alone to where its sightings cost least: poses and camera then
+follow the curved valley in which a focal length and a height trade places (variable projection;
+Ruhe and Wedin, SIAM Review 22, 1980, doi:10.1137/1022057).
 Poses err by left perturbations of T_camera_world, rotation first. Under a rolling shutter each view
 has three unknowns more: its turn from the first row to the last.
 """
@@ -23,6 +26,15 @@ from recon.types import F64, I64, Camera
 
 CAMERA = 8
 """fx, fy, cx, cy, k1, k2, p1, p2; k3 stays."""
+
+DAMPING, MAX_DAMPING = 1e-6, 1e-5
+"""At the start, as a share of the diagonal, and where a short step still means the end."""
+
+SETTLED_SIGMAS = 0.01
+"""Length, over the sigmas of poses and camera together, of a step after which none follows."""
+
+POINT_STEPS = 2
+"""Of each point alone after a step of all."""
 
 MAX_COVARIANCES = 100
 """Number of poses whose covariance is computed; the others take that of the nearest one."""
@@ -273,6 +285,52 @@ def _reduce(
 
 
 @njit(cache=True, nogil=True)
+def _settle(
+    T: F64, pose: I64, X: F64, k: F64, k3: float, start: I64, uv: F64, sigma: F64, huber: float,
+    surveyed: F64, sure: F64,
+) -> None:  # fmt: skip
+    """Move each point of ``X`` (P, 3) by Gauss-Newton steps, as long as they lower its cost.
+
+    ``T`` are the poses numbered by ``pose`` (M,); ``sure`` (P, 3) is one over the sigma of
+    ``surveyed``, 0 where there is none.
+    """
+    at, Jc, Jp, Jk = np.zeros(7), np.zeros((2, 6)), np.zeros((2, 3)), np.zeros((2, CAMERA))
+    H, b, r, x = np.zeros((3, 3)), np.zeros(3), np.zeros(2), np.zeros(3)
+    for p in range(X.shape[0]):
+        x[:], before = X[p], np.inf
+        for _ in range(POINT_STEPS + 1):
+            cost = 0.0
+            for i in range(3):
+                off = sure[p, i] * (x[i] - surveyed[p, i])
+                cost += 0.5 * off * off
+                H[i], b[i] = 0.0, -sure[p, i] * off
+                H[i, i] = sure[p, i] ** 2
+            for m in range(start[p], start[p + 1]):
+                if not _pixel(T[pose[m]], x, k, k3, at):
+                    cost = np.inf
+                    break
+                _linearise(T[pose[m]], x, k, k3, at, Jc, Jp, Jk)
+                r[0], r[1] = uv[m, 0] - at[0], uv[m, 1] - at[1]
+                length = np.sqrt(r[0] * r[0] + r[1] * r[1]) / sigma[m]
+                w = min(1.0, huber / max(length, 1e-12)) / sigma[m] ** 2
+                cost += 0.5 * length**2 if length <= huber else huber * (length - 0.5 * huber)
+                for i in range(2):
+                    for a in range(3):
+                        b[a] += w * Jp[i, a] * r[i]
+                        for c in range(3):
+                            H[a, c] += w * Jp[i, a] * Jp[i, c]
+            if not cost < before:
+                break
+            X[p], before = x, cost
+            ridge = 1e-9 * (H[0, 0] + H[1, 1] + H[2, 2]) + 1e-12
+            for a in range(3):
+                H[a, a] += ridge
+            invert_3x3(H, H)
+            for a in range(3):
+                x[a] += H[a, 0] * b[0] + H[a, 1] * b[1] + H[a, 2] * b[2]
+
+
+@njit(cache=True, nogil=True)
 def _mark_pairs(view: I64, start: I64, met: npt.NDArray[np.bool_]) -> None:
     """Set ``met`` (N, N), upper half, for views that share a point."""
     for p in range(start.size - 1):
@@ -295,25 +353,25 @@ def errors_px(
 
 
 def solve(problem: Problem, iterations: int = 40, covariances: bool = False) -> Solution:
-    """Adjust until a step lowers the cost by less than a millionth.
+    """Adjust until a step is short against the sigmas of poses and camera.
 
-    Raises ValueError for a landmark seen twice in one view.
+    Points do not decide about the end: of a few seen wrongly, Huber's weights change for long,
+    and nothing else follows. Raises ValueError for a landmark seen twice in one view.
     """
     bundle = _Bundle(problem)
     state = bundle.start
-    cost, damping = bundle.cost(state), 1e-4
+    cost, damping, lowered = bundle.cost(state), DAMPING, True
     for _ in range(iterations):
-        new = bundle.stepped(state, damping)
+        new, sigmas = bundle.stepped(state, damping)
         new_cost = bundle.cost(new)
+        is_last = sigmas < SETTLED_SIGMAS and damping <= MAX_DAMPING
         if new_cost < cost:
-            gain, state, cost = (cost - new_cost) / cost, new, new_cost
-            damping = max(damping * 0.2, 1e-9)
-            if gain < 1e-6:
-                break
+            state, cost = new, new_cost
+            damping, lowered = damping * (0.1 if lowered else 1.0), True
         else:
-            damping *= 10.0
-            if damping > 1e6:
-                break
+            damping, lowered = 10.0 * damping, False
+        if is_last or damping > 1e6:
+            break
     return bundle.solution(state, covariances)
 
 
@@ -454,11 +512,22 @@ class _Bundle:
 
     # ---- steps ------------------------------------------------------------------------------
 
-    def stepped(self, s: _State, damping: float) -> _State:
-        """The state after one step."""
+    def stepped(self, s: _State, damping: float) -> tuple[_State, float]:
+        """The state after one step, and the step's length over the sigmas of poses and camera."""
         eq = self._equations(s, damping)
-        dk = np.asarray(np.linalg.solve(eq.Hk, eq.gk), np.float64)
-        return self._moved(s, eq, dk, eq.solved(eq.g), eq.bp)
+        dk, dc = np.asarray(np.linalg.solve(eq.Hk, eq.gk), np.float64), eq.solved(eq.g)
+        new = self._moved(s, eq, dk, dc, eq.bp)
+        return self._with_settled_points(new), float(np.sqrt(eq.gk @ dk + eq.g @ dc))
+
+    def _with_settled_points(self, s: _State) -> _State:
+        known, X = self._of.known, s.X.copy()
+        T, pose = self._of_sightings(s)
+        _settle(
+            T, pose, X, s.k, self._k3, self._start_of, self._uv, self._sigma,
+            self._of.huber_sigmas, np.nan_to_num(known.surveyed),
+            np.nan_to_num(1.0 / known.sigma_surveyed),
+        )  # fmt: skip
+        return replace(s, X=X)
 
     def _moved(self, s: _State, eq: _Equations, dk: F64, dc: F64, bp: F64) -> _State:
         """The state after the camera's step ``dk`` (8,); poses and points follow it.
