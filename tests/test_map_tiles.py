@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 from collections.abc import Iterator
@@ -177,6 +178,34 @@ def test_an_exported_orthophoto_is_shown_while_it_is_newer(client: Client, store
     later = (folder / "ortho.tif").stat().st_mtime + 10
     os.utime(folder / "scan.json", (later, later))  # the scan was refined
     assert np.abs(at(client, "ortho", ROOF)[:3].astype(int) - ROOF_BGR).max() < 12
+
+
+@pytest.mark.parametrize("kind", ["garbage", "another format", "one band", "large block"])
+def test_a_raster_that_is_no_map_is_refused_and_names_no_other_file(
+    client: Client, store: Path, tmp_path: Path, kind: str
+) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    path = store / "drone-1/test-1/ortho.tif"
+    world = rasterio.Affine(1e5, 0, -HALF_M, 0, -1e5, HALF_M)
+    profile = {"driver": "GTiff", "width": 64, "height": 64, "count": 4, "dtype": "uint8",
+               "crs": "EPSG:3857", "transform": world}  # fmt: skip
+    if kind == "garbage":
+        path.write_bytes(b"no raster" * 100)
+    elif kind == "another format":
+        secret = tmp_path / "secret.tif"
+        with rasterio.open(secret, "w", **profile) as image:
+            image.write(np.full((4, 64, 64), 200, np.uint8))
+        importlib.import_module("rasterio.shutil").copy(secret, path, driver="VRT")
+    elif kind == "one band":
+        with rasterio.open(path, "w", **profile | {"count": 1}):
+            pass
+    else:
+        wide = {"width": 1 << 14, "height": 1 << 14, "tiled": True, "sparse_ok": True,
+                "blockxsize": 1 << 13, "blockysize": 1 << 13, "compress": "deflate"}  # fmt: skip
+        with rasterio.open(path, "w", **profile | wide):
+            pass
+    status, text, _ = client.ask(f"{TILES}/ortho/0/0/0.png")
+    assert status == 400 and "ortho.tif" in str(text)
 
 
 def test_tilejson_and_kml_say_where_the_tiles_are(client: Client) -> None:

@@ -37,6 +37,7 @@ from service.ground.live_map import (
 from service.ground.state import PortalState, names_of, state_of
 from service.scans.coverage import Coverage
 from service.scans.folder import SUMMARY
+from service.scans.map_files import open_map
 
 RASTERS = {"ortho": "ortho.tif", "dsm": "dsm.tif", "contours": "dsm.tif"}
 """The layers that a finished scan may have as rasters."""
@@ -148,7 +149,6 @@ def newer_raster(folder: Path, layer: str) -> Path | None:
 
 def _from_raster(path: Path, layer: str, tile: Tile) -> Cells:
     """A tile and its margin, from a GeoTIFF."""
-    import rasterio
     from rasterio.enums import Resampling
     from rasterio.transform import from_origin
     from rasterio.vrt import WarpedVRT
@@ -163,15 +163,16 @@ def _from_raster(path: Path, layer: str, tile: Tile) -> Cells:
         "height": WIDE,
         "resampling": Resampling.bilinear,
     }
-    with rasterio.open(path) as image:
+    with open_map(path, 4 if layer == "ortho" else 1) as image:
         if image.crs is None:
             raise InputError("no map: the scan has no georeference")
         with WarpedVRT(image, **options) as warped:
             bands = warped.read()
+        unknown = image.nodata
     if layer == "ortho":
         height = np.where(bands[3] > 0, np.float32(0.0), np.float32(np.nan))
         return Cells(height, np.ascontiguousarray(bands[:3].transpose(1, 2, 0)))
-    height = np.where(bands[0] == image.nodata, np.float32(np.nan), bands[0])
+    height = np.where(bands[0] == unknown, np.float32(np.nan), bands[0])
     return Cells(height.astype(np.float32), np.zeros((WIDE, WIDE, 3), np.uint8))
 
 

@@ -22,6 +22,7 @@ from service.offline.exports.rasters import contours_of, write_ortho
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.geopackage import lines, points, write_layers
 from service.scans.annotations import read_annotations
+from service.scans.map_files import open_map
 from service.scans.writing import writing
 from service.version import software
 
@@ -87,13 +88,12 @@ def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 def _in_degrees(path: Path) -> tuple[Any, tuple[float, float, float, float]]:
     """(h, w, 4) BGRA of a raster in longitude and latitude, and its bounds in degrees."""
-    import rasterio
     from pyproj import Transformer
     from rasterio.enums import Resampling
     from rasterio.transform import array_bounds
     from rasterio.warp import calculate_default_transform
 
-    with rasterio.open(path) as image:
+    with open_map(path, 4) as image:
         to, w, h = calculate_default_transform(
             image.crs, "EPSG:4326", image.width, image.height, *image.bounds
         )
@@ -159,9 +159,7 @@ def write_stac(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 
 def _asset(path: Path, role: str) -> dict[str, Any]:
-    import rasterio
-
-    with rasterio.open(path) as image:
+    with open_map(path) as image:
         west, south, east, north = image.bounds
         return {
             "href": f"./{path.name}",
