@@ -118,10 +118,11 @@ class ImagesSource:
     def _same_lens(self, tagged: list[tuple[Path, Tags]]) -> list[tuple[Path, Tags]]:
         """Stills of the most frequent focal length: a camera model is for one zoom."""
         focal = [0.0 if tags.lens is None else tags.lens.focal for _, tags in tagged]
-        known = [f for f in focal if f]
+        known = Counter(f for f in focal if f)
         if not known:
             return tagged
-        usual = max(known, key=lambda f: sum(abs(f / other - 1) < ZOOM for other in known))
+        alike = {f: sum(known[g] for g in known if abs(f / g - 1) < ZOOM) for f in known}
+        usual = max(alike, key=alike.__getitem__)
         kept = [t for t, f in zip(tagged, focal, strict=True) if f and abs(f / usual - 1) < ZOOM]
         if len(kept) < len(tagged):
             self._warn(
