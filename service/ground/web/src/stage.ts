@@ -11,8 +11,8 @@ export const LIGHT = 0xffffff;
 const INPUTS = ["pointerdown", "click", "input", "change", "keydown", "wheel"];
 const MOVING_MS = 250;
 const LIVELY_MS = 500;
-const MARGIN = 0.94; // of the scene that is filled
-const OUTLINE_POINTS = 300;
+const MARGIN = 0.92; // of the scene that is filled
+const OUTLINE_POINTS = 1000;
 
 /** False when this browser cannot draw in 3D. */
 export function canDraw(): boolean {
@@ -128,7 +128,7 @@ export class Stage {
     this.touch();
   }
 
-  /** Looks at all points and the track from the south and above, as close as the time slider leaves room. */
+  /** Looks at all points from the south and above, as close as the time slider leaves room. */
   frame(): void {
     const points = this.outline();
     if (!points.length) return;
@@ -154,16 +154,16 @@ export class Stage {
     this.camera.updateProjectionMatrix();
   }
 
-  /** Some of the points of each keyframe, which are shuffled, and the track. */
+  /** Some of the points of each keyframe, which are shuffled. */
   private outline(): THREE.Vector3[] {
     const found: THREE.Vector3[] = [];
-    const take = (node: THREE.Object3D): void => {
-      if (!(node instanceof THREE.Points || node === this.track)) return;
-      const xyz = (node as THREE.Points).geometry.getAttribute("position") as THREE.BufferAttribute | undefined;
-      const end = Math.min(xyz?.count ?? 0, node === this.track ? Infinity : OUTLINE_POINTS);
-      for (let i = 0; i < end; i++) found.push(new THREE.Vector3().fromBufferAttribute(xyz!, i).applyMatrix4(node.matrixWorld));
-    };
-    for (const object of [...this.painter.again, this.track]) object.traverse(take);
+    for (const object of this.painter.again)
+      object.traverse((node) => {
+        if (!(node instanceof THREE.Points)) return;
+        const xyz = (node as THREE.Points).geometry.getAttribute("position");
+        for (let i = 0; i < Math.min(xyz.count, OUTLINE_POINTS); i++)
+          found.push(new THREE.Vector3().fromBufferAttribute(xyz, i).applyMatrix4(node.matrixWorld));
+      });
     return found;
   }
 
