@@ -178,7 +178,7 @@ def test_the_whole_site_fills_the_scene_above_the_time_slider(
     cols = np.flatnonzero(is_site.any(axis=0))
     height, width = is_site.shape
     assert bottom < height - (100 if width < 700 else 56)  # above the slider
-    assert 0 < cols[0] and cols[-1] < width - 1 and np.ptp(cols) > 0.84 * width
+    assert cols[0] > 0 and cols[-1] < width - 1 and np.ptp(cols) > 0.84 * width
 
 
 SLOW_CARD = """
