@@ -138,7 +138,7 @@ export class Stage {
     const right = new THREE.Vector3().crossVectors(this.camera.up, back).normalize();
     const up = new THREE.Vector3().crossVectors(back, right);
     const high = MARGIN * Math.tan(THREE.MathUtils.degToRad(this.camera.fov / 2));
-    const low = high * (1 - (2 * this.covered()) / this.host.clientHeight);
+    const low = high * Math.max(0.1, 1 - (2 * this.covered()) / (this.host.clientHeight || 1)); // a keyboard leaves little
     const wide = high * this.camera.aspect;
     // From (x, y, d) along right, up and back all are in sight if d is at least each of these, less or plus x or y.
     const least = (x: number, y: number): number => points.reduce((d, p) => Math.max(d, p.dot(back) + x * p.dot(right) + y * p.dot(up)), -Infinity);
