@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -62,6 +63,19 @@ def test_a_pose_and_a_repose_are_read_once(
     read.clear()
     assert [m["type"] for m in texts(feed)] == ["repose", "track"]
     assert read == {"unpack_pose": 2, "unpack_repose": 1}
+
+
+def test_a_scan_is_heard_when_it_grows_not_when_its_file_is_written(
+    scan: ScanStore, feed: LiveFeed, house: HouseFlight
+) -> None:
+    texts(feed)
+    at = feed.heard_unix_s
+    assert at == max(pose.time_unix_ns for pose in scan.poses()) / 1e9
+    scan.database.write([("CREATE TABLE IF NOT EXISTS other (x)", ())])
+    assert texts(feed) == [] and feed.heard_unix_s == at
+    scan.add_poses([house.record(5, 25.0)])
+    assert [m["type"] for m in texts(feed)] == ["track"]
+    assert time.time() - feed.heard_unix_s < 60.0
 
 
 def test_poses_that_arrive_out_of_order_make_the_same_track(

@@ -78,6 +78,16 @@ def test_on_a_telephone_nothing_is_out_of_reach(browser: Browser, base: str) -> 
     assert len(acts) >= 7 and max(acts) < card["right"]  # what lies outside is cut off
     assert browser.run("document.documentElement.scrollWidth") <= PHONE[0]
     show(browser, f"{base}/#/view/drone-1/test-1", PHONE)
+    tops = browser.run(
+        "(() => { const [name, state] = document.querySelectorAll('h1, header > .state');"
+        " name.textContent = '20261127T003118Z'; state.textContent = 'finished';"
+        " state.className = 'state finished';"
+        " for (const a of document.querySelectorAll('header > a'))"
+        " a.hidden = a.href.endsWith('change.html');"
+        " return [...document.querySelectorAll('header > :is(a, h1, .state)')]"
+        ".filter(e => e.checkVisibility()).map(e => e.getBoundingClientRect().top) })()"
+    )
+    assert len(tops) == 5 and max(tops) - min(tops) < 10  # all in one line
     browser.click("Measure")
     assert browser.run("document.documentElement.scrollWidth") <= PHONE[0]
     assert browser.run("document.documentElement.scrollHeight") <= PHONE[1]
@@ -101,6 +111,8 @@ def test_no_panel_lies_over_the_time_slider(browser: Browser, base: str) -> None
 def test_choosing_a_deliverable_by_keyboard_starts_nothing(browser: Browser, base: str) -> None:
     show(browser, base, (1440, 900))
     browser.wait("document.querySelectorAll('article').length === 1")
+    names = browser.run("[...document.querySelector('article select')].map(o => o.textContent)")
+    assert {"all maps", "surface model, GeoTIFF", "orthophoto, KMZ"} < set(names)
     browser.run(
         "(() => { const kinds = document.querySelector('article select'); kinds.focus();"
         " kinds.value = 'ply'; for (const name of ['input', 'change'])"

@@ -126,9 +126,9 @@ def test_the_datum_is_chosen_on_the_page(
     )
     browser.open(portal.url)
     browser.wait("document.querySelectorAll('article').length === 1")
-    for kind in ("gpkg", "glb"):
+    for kind, words in (("gpkg", "contours, GeoPackage"), ("glb", "mesh, glTF")):
         browser.run(choose.format(1, "EGM96 to ellipsoid"))
-        browser.run(choose.format(0, kind))
+        browser.run(choose.format(0, words))
         browser.click("Make")
         assert until(partial(has_made, kind))
         shown = not browser.run("document.querySelectorAll('article select')[1].hidden")

@@ -165,6 +165,22 @@ def test_ground_looks_like_ground_at_the_first_look(browser: Browser, portal: Po
     assert solid_share(drawn(browser)) < solid_share(plain) - 0.02
 
 
+@pytest.mark.parametrize("screen", [(1440, 900), (390, 844)])
+def test_the_whole_site_fills_the_scene_above_the_time_slider(
+    browser: Browser, portal: Portal, screen: tuple[int, int]
+) -> None:
+    browser.screen(*screen)
+    open_scan(browser, portal)
+    browser.click("Whole site")
+    is_site = drawn(browser).max(axis=2) > 60
+    browser.screen(1440, 900)
+    bottom = np.flatnonzero(is_site.any(axis=1))[-1]
+    cols = np.flatnonzero(is_site.any(axis=0))
+    height, width = is_site.shape
+    assert bottom < height - (100 if width < 700 else 56)  # above the slider
+    assert cols[0] > 0 and cols[-1] < width - 1 and np.ptp(cols) > 0.84 * width
+
+
 SLOW_CARD = """
 window.since = Infinity;
 const late = new WeakSet(), gl = WebGL2RenderingContext.prototype;

@@ -137,7 +137,7 @@ class LiveFeed:
 
     store: ScanStore
     max_points: int | None = None  # of one chunk
-    heard_unix_s: float = 0.0  # when the store grew, as far as this feed knows; else its last pose
+    heard_unix_s: float = 0.0  # when this feed saw the scan grow or change; else its last pose
     _sent: dict[int, int] = field(default_factory=dict)  # keyframe to the layer sent
     _scale: dict[int, float] = field(default_factory=dict)
     _revision: dict[int, int] = field(default_factory=dict)
@@ -153,11 +153,15 @@ class LiveFeed:
     def news(self, max_chunks: int = 20) -> Iterator[str | bytes]:
         """Messages for what has changed; at most ``max_chunks`` keyframes at a time."""
         before, self._version = self._version, self.store.version()
-        changed = before != self._version
-        if not (changed or self._more):
+        if before == self._version and not self._more:
             return
-        if self._finished is not None and changed:
-            self.heard_unix_s = time.time()
+        had_all = self._finished is not None  # of what was there when the feed began
+        for message in self._unsent(max_chunks):
+            if had_all:
+                self.heard_unix_s = time.time()
+            yield message
+
+    def _unsent(self, max_chunks: int) -> Iterator[str | bytes]:
         states = self.store.states()
         due = [seq for seq, (layer, _) in states.items() if layer > self._sent.get(seq, -2)]
         self._more = len(due) > max_chunks

@@ -13,6 +13,9 @@ export function el<K extends keyof HTMLElementTagNameMap>(
   return node;
 }
 
+/** The way back to the list; a phone shows its arrow only. */
+export const toScans = (): HTMLElement => el("a", { href: "#/", className: "back" }, "‹ ", el("span", { textContent: "Scans" }));
+
 /** Says what went wrong, for a few seconds. */
 export function notify(error: unknown): void {
   const text = error instanceof Error ? error.message : String(error);

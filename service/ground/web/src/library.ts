@@ -5,9 +5,16 @@ import { count, date, el, notify, size } from "./dom";
 import { jobList } from "./jobs";
 import { vehicleStrip } from "./vehicle";
 
-const KINDS = [
-  "all", "laz", "copc", "ply", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "kmz", "stac", "glb", "obj", "3dtiles", "3dtiles-mesh", "geojson", "kml",
-  "mcap", "ros2", "refine",
+/** What can be made, as the server and as people call it. */
+const KINDS: [string, string][] = [
+  ["all", "all maps"], ["laz", "cloud, LAZ"], ["copc", "cloud, COPC"],
+  ["ply", "cloud, PLY"], ["dsm", "surface model, GeoTIFF"], ["dtm", "bare ground, GeoTIFF"],
+  ["ortho", "orthophoto, GeoTIFF"], ["contours", "contours, GeoJSON"], ["gpkg", "contours, GeoPackage"],
+  ["dxf", "contours, DXF"], ["coverage", "coverage, GeoTIFF"], ["kmz", "orthophoto, KMZ"],
+  ["stac", "STAC item"], ["glb", "mesh, glTF"], ["obj", "mesh, OBJ"],
+  ["3dtiles", "points, 3D Tiles"], ["3dtiles-mesh", "mesh, 3D Tiles"], ["geojson", "track, GeoJSON"],
+  ["kml", "track, KML"], ["mcap", "recording, Foxglove"], ["ros2", "recording, ROS 2"],
+  ["refine", "refined scan"],
 ];
 
 /** Those whose heights can be converted. */
@@ -213,8 +220,8 @@ function card(s: api.Scan, again: () => void): HTMLElement {
       s.origin ? el("a", { href: api.mapAddress(s), textContent: "Map", className: "button" }) : null,
       el("button", { textContent: "Rename", onclick: () => rename(s, again) }),
       el("button", { textContent: "Tags", onclick: () => retag(s, again) }),
-      makeMenu(s, again),
       el("button", { textContent: "Delete", onclick: () => remove(s, again) }),
+      makeMenu(s, again),
     ),
   );
 }
@@ -261,7 +268,7 @@ function downloads(s: api.Scan): HTMLElement {
 
 /** A kind to choose and a button that makes it. */
 function makeMenu(s: api.Scan, again: () => void): HTMLElement {
-  const kinds = el("select", {}, ...KINDS.map((kind) => el("option", { value: kind, textContent: kind === "all" ? "all maps" : kind })));
+  const kinds = el("select", {}, ...KINDS.map(([value, textContent]) => el("option", { value, textContent })));
   kinds.setAttribute("aria-label", "deliverable");
   const heights = el("select", {}, ...HEIGHTS.map(([text], i) => el("option", { value: String(i), textContent: text })));
   heights.setAttribute("aria-label", "heights");

@@ -1,7 +1,7 @@
 // A scan on a flat map: layers as XYZ tiles over the operator's own basemap; grows while it flies.
 
 import * as api from "./api";
-import { el, notify, short, svg } from "./dom";
+import { el, notify, short, svg, toScans } from "./dom";
 import { coverageKeys } from "./keys";
 import * as units from "./units";
 
@@ -155,7 +155,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   const head = el(
     "header",
     {},
-    el("a", { href: "#/", textContent: "‹ Scans" }),
+    toScans(),
     el("h1", { textContent: scan.title }),
     state,
     el("a", { href: open, textContent: "3D" }),

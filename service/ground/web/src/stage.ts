@@ -11,6 +11,8 @@ export const LIGHT = 0xffffff;
 const INPUTS = ["pointerdown", "click", "input", "change", "keydown", "wheel"];
 const MOVING_MS = 250;
 const LIVELY_MS = 500;
+const MARGIN = 0.92; // of the scene that is filled
+const OUTLINE_POINTS = 1000;
 
 /** False when this browser cannot draw in 3D. */
 export function canDraw(): boolean {
@@ -126,38 +128,49 @@ export class Stage {
     this.touch();
   }
 
-  /** Looks at everything there is, from the south and above. */
+  /** Looks at all points from the south and above, as close as the time slider leaves room. */
   frame(): void {
-    const box = new THREE.Box3();
-    for (const object of this.painter.again) box.expandByObject(object);
-    if (box.isEmpty()) box.setFromObject(this.world);
-    if (box.isEmpty()) return;
-    const centre = box.getCenter(new THREE.Vector3());
+    const points = this.outline();
+    if (!points.length) return;
+    const box = new THREE.Box3().setFromPoints(points);
     const reach = Math.max(box.getSize(new THREE.Vector3()).length(), 1);
-    const back = new THREE.Vector3(0, -0.65, 0.76);
-    this.controls.target.copy(centre);
-    this.camera.position.copy(centre).addScaledVector(back, this.distance(box, centre, back));
+    const back = new THREE.Vector3(0, -0.65, 0.76).normalize();
+    const right = new THREE.Vector3().crossVectors(this.camera.up, back).normalize();
+    const up = new THREE.Vector3().crossVectors(back, right);
+    const high = MARGIN * Math.tan(THREE.MathUtils.degToRad(this.camera.fov / 2));
+    const low = high * Math.max(0.1, 1 - (2 * this.covered()) / (this.host.clientHeight || 1)); // a keyboard leaves little
+    const wide = high * this.camera.aspect;
+    // From (x, y, d) along right, up and back all are in sight if d is at least each of these, less or plus x or y.
+    const least = (x: number, y: number): number => points.reduce((d, p) => Math.max(d, p.dot(back) + x * p.dot(right) + y * p.dot(up)), -Infinity);
+    const [east, west, top, bottom] = [least(1 / wide, 0), least(-1 / wide, 0), least(0, 1 / high), least(0, -1 / low)];
+    const d = Math.max((east + west) / 2, (high * top + low * bottom) / (high + low), least(0, 0) + reach / 100);
+    const y = ((top - d) * high + (d - bottom) * low) / 2;
+    const axis = right.multiplyScalar((wide * (east - west)) / 2).addScaledVector(up, y);
+    const middle = box.getCenter(new THREE.Vector3()).dot(back);
+    this.controls.target.copy(axis).addScaledVector(back, middle);
+    this.camera.position.copy(axis).addScaledVector(back, d);
     this.camera.near = reach / 2000;
     this.camera.far = reach * 20;
     this.camera.updateProjectionMatrix();
   }
 
-  /** How far `back` from `centre` every corner of `box` is in sight. */
-  private distance(box: THREE.Box3, centre: THREE.Vector3, back: THREE.Vector3): number {
-    const right = new THREE.Vector3().crossVectors(this.camera.up, back).normalize();
-    const up = new THREE.Vector3().crossVectors(back, right);
-    const high = Math.tan(THREE.MathUtils.degToRad(this.camera.fov / 2));
-    let least = 1;
-    for (let k = 0; k < 8; k++) {
-      const corner = new THREE.Vector3(
-        k & 1 ? box.max.x : box.min.x,
-        k & 2 ? box.max.y : box.min.y,
-        k & 4 ? box.max.z : box.min.z,
-      ).sub(centre);
-      const aside = Math.abs(corner.dot(right)) / (high * this.camera.aspect);
-      least = Math.max(least, corner.dot(back) + Math.max(aside, Math.abs(corner.dot(up)) / high));
-    }
-    return 1.12 * least;
+  /** Some of the points of each keyframe, which are shuffled. */
+  private outline(): THREE.Vector3[] {
+    const found: THREE.Vector3[] = [];
+    for (const object of this.painter.again)
+      object.traverse((node) => {
+        if (!(node instanceof THREE.Points)) return;
+        const xyz = (node as THREE.Points).geometry.getAttribute("position");
+        for (let i = 0; i < Math.min(xyz.count, OUTLINE_POINTS); i++)
+          found.push(new THREE.Vector3().fromBufferAttribute(xyz, i).applyMatrix4(node.matrixWorld));
+      });
+    return found;
+  }
+
+  /** How much of the scene's lower end the time slider covers, pixels. */
+  private covered(): number {
+    const slider = this.host.querySelector<HTMLElement>(".time");
+    return slider?.offsetParent ? this.host.clientHeight - slider.offsetTop : 0;
   }
 
   fieldOfView(degrees: number): void {

@@ -3,7 +3,7 @@
 import { Matrix4 } from "three";
 import * as api from "./api";
 import { Cameras } from "./cameras";
-import { count, el, notify } from "./dom";
+import { count, el, notify, toScans } from "./dom";
 import { Images, takeView, timeSlider } from "./explore";
 import { jobList } from "./jobs";
 import { LinkState } from "./link";
@@ -35,7 +35,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const report = el("a", { href: api.file(id, "report.html"), textContent: "Report" });
   const map = el("a", { href: api.mapAddress(id), textContent: "Map", hidden: !scan.origin });
   const changes = el("a", { href: api.file(id, "change.html"), textContent: "Changes" });
-  const bar = el("header", {}, el("a", { href: "#/", textContent: "‹ Scans" }), title, link.element, vehicleStrip(), map, report, changes);
+  const bar = el("header", {}, toScans(), title, link.element, vehicleStrip(), map, report, changes);
   const host = el("main", { className: "stage" });
   const legend = el("div", { className: "panel legend", hidden: true });
   const coverage = el("div", { className: "panel coverage", hidden: true });
@@ -171,7 +171,7 @@ function rows(cloud: Cloud, { counts, quality }: api.Scan, finished: boolean, la
     facts.push(["Speed", units.speed(last.speed_m_s)]);
     if (last.agl_m !== null) facts.push(["Height", units.length(last.agl_m, 1)]);
     if (last.alt_amsl_m !== null) facts.push(["AMSL", units.length(last.alt_amsl_m, 1)]);
-    facts.push(["Camera", `${last.roll_deg}° ${last.pitch_deg}° ${last.yaw_deg}°`]);
+    facts.push(["Roll, pitch, yaw", `${last.roll_deg}° ${last.pitch_deg}° ${last.yaw_deg}°`]);
     facts.push(["Absolute σ", units.length(last.sigma_m)]);
     facts.push(["From", last.sources.join(", ")]);
     if (last.lat_deg !== null && last.lon_deg !== null)
