@@ -43,6 +43,9 @@ TOO_FAR = "the camera found is too far from the model given; calibrate with a ch
 SIGMA_TURN_RAD = 0.01
 """Of the rows, from the first to the last: within 50 ms, 12 degrees a second, or 10 m/s at 50 m."""
 
+TURNING_STEPS = 10
+"""Towards free turns of the rows: noise alone decides the rest of the way to a weak minimum."""
+
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of an error whose coordinates have sigma 1."""
 
@@ -164,7 +167,9 @@ def by_images_alone(
     problem = replace(problem, camera_information=camera_information(problem.given, loose))
     found = solve(problem, config.iterations)
     at = adjusted(problem, found)
-    turning = solve(replace(at, rows=free_rows(len(at.poses))), config.iterations)
+    turning = solve(
+        replace(at, rows=free_rows(len(at.poses))), min(TURNING_STEPS, config.iterations)
+    )
     focal, other = (float(s.camera.K[0, 0]) for s in (found, turning))
     spread = np.hypot(jackknife(at, config.iterations), np.log(focal / other))
     sigma = focal_sigma(found.camera, camera_sigmas(found.camera_covariance))
