@@ -88,6 +88,15 @@ def test_attitudes_that_contradict_the_images_put_it_in_doubt(refused: int, used
     assert trust_of(SURE | {"graph": graph}, "exif")["level"] == "georeferenced"
 
 
+@pytest.mark.parametrize(("refuted", "level"), [(1, "georeferenced"), (4, "doubtful")])
+def test_vision_that_two_sensors_contradict_limits_it(refuted: int, level: str) -> None:
+    graph = {"left_out": {"vision off": refuted}, "residuals": {"vision": {"count": 30}}}
+    found = trust_of(SURE | {"graph": graph}, "exif")
+    assert found["level"] == level
+    words = f"{refuted} of {30 + refuted} steps of vision contradict attitude and positions"
+    assert [text[: len(words)] for text in found["reasons"]] == [words]
+
+
 @pytest.mark.parametrize("angle", [0.0, 20.0, 80.0])
 def test_the_slope_of_a_site_is_found_in_spite_of_towers(angle: float) -> None:
     rng = np.random.default_rng(2)

@@ -69,6 +69,11 @@ class Noise:
         """Of one reading."""
         return float(np.hypot(self.white, self.wander))
 
+    def change(self, passed_s: float) -> float:
+        """Sigma of the change from one reading to the next after so many seconds."""
+        wandered = self.wander**2 * (1.0 - np.exp(-passed_s / self.tau_s))
+        return float(np.sqrt(2.0 * (self.white**2 + wandered)))
+
     def information(self, times_s: F64, extra: F64) -> F64:
         """(N, N) inverse of the covariance of readings at (N,) times.
 

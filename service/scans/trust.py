@@ -33,6 +33,10 @@ REFUSED_SHARE, WRONG_SHARE = 0.2, 0.5
 """Of the measured positions or attitudes, that contradict the track. Above the first, positions are
 less certain than sigma says; above the second, either may be wrong."""
 
+MAX_REFUTED_SHARE = 0.05
+"""Of the steps of the track; where vision is refuted more often, it errs elsewhere by as much as
+attitude and positions do not show."""
+
 BY_SURVEY = "control points"
 """``georeference`` of a scan that control points have placed."""
 
@@ -85,6 +89,10 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     contradicted = f"{refused:.0f} of {measured:.0f} positions contradict the track"
     if refused > WRONG_SHARE * measured:
         doubts.append(contradicted)
+    broken, steps = _refused(run, "vision", "vision off")
+    refuted = f"{broken:.0f} of {steps:.0f} steps of vision contradict attitude and positions"
+    if broken > MAX_REFUTED_SHARE * steps:
+        doubts.append(f"{refuted}: the images are too poor")
     if doubts:
         return _said(Trust.DOUBTFUL, doubts)
     if "height" in assumed:
@@ -108,6 +116,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
             f"the view direction is assumed: all may lean by {lean_deg:.0f} degrees; fly strips "
             "both ways, several side by side"
         )
+    if broken:
+        limits.append(f"{refuted}: what they show is left out")
     if refused > REFUSED_SHARE * measured:
         limits.append(f"{contradicted}: they are less certain than sigma says")
     if ratio := _number(scale, "gnss_over_heights"):
