@@ -91,7 +91,7 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     if refused > WRONG_SHARE * measured:
         doubts.append(contradicted)
     ratio = _number(scale, "gnss_over_heights")
-    if ratio and abs(math.log(ratio)) > MAX_LENS_SIGMA:
+    if ratio and max(ratio, 1.0 / ratio) > 1.0 + MAX_LENS_SIGMA:
         doubts.append(f"{scales_differ(ratio)}: the lens, positions or heights are wrong")
     broken, steps = _refused(run, "vision", "vision off")
     refuted = f"{broken:.0f} of {steps:.0f} steps of vision contradict attitude and positions"
