@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import nnls
 from scipy.stats import chi2
 
@@ -91,6 +92,21 @@ def wandering(step_s: float, legs: int, seed: int) -> tuple[float, float]:
     found = fit(some)
     assert found is not None
     return float(np.log(found.scale)), found.sigma_scale
+
+
+def test_a_filtered_wander_keeps_its_speed_where_readings_come_fast() -> None:
+    """A climb and a landing, with five keyframes a second: a filter hides the wander in such lags,
+    and those which are small by chance must not count most."""
+    found, true = [], 0.5 / np.sqrt(60.0)
+    for seed in range(40):
+        fine = seconds(600, 0.1)
+        errors = gauss_markov(np.random.default_rng(seed), fine, 0.5, 60.0)[:, :1]
+        at = np.r_[0:60:2, 60:540:10, 540:600:2]
+        noise = wander_noise(fine[at], gaussian_filter1d(errors, 5.0, axis=0)[at], 60.0)
+        assert noise is not None
+        found.append(noise.wander / np.sqrt(noise.tau_s) / true)
+    low, middle, high = np.percentile(found, [10, 50, 90])
+    assert low > 0.55 and 0.7 < middle < 1.1 and high < 1.3
 
 
 def test_outliers_do_not_count_as_noise() -> None:

@@ -110,9 +110,10 @@ def test_nonsense_limits_are_refused(tmp_path: Path) -> None:
     [
         ((), 0.0, 0.0),
         ((), 0.01, 0.0),
-        ((), 0.04, 0.04),
+        ((), 0.02001, 0.00063),
+        ((), 0.04, 0.034641),
         (("lens",), 0.0, 0.02),
-        (("lens",), 0.2, np.hypot(0.02, 0.05)),
+        (("lens",), 0.2, 0.05),
     ],
 )
 def test_an_uncertain_lens_widens_what_is_stored_and_not_the_choice(
@@ -123,7 +124,7 @@ def test_an_uncertain_lens_widens_what_is_stored_and_not_the_choice(
     first, better = (view(0.0, sigma_m=sigma) for sigma in (0.2, 0.05))
     candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=KNOWN_ROWS))
     sigma, fresh = surface(candidate, first, first.T_world_camera)
-    np.testing.assert_allclose(sigma, np.hypot(0.2, share * first.depth_m), rtol=1e-5)
+    np.testing.assert_allclose(sigma, np.hypot(0.2, share * first.depth_m), rtol=1e-4)
     assert fresh.all() and sigma.dtype == np.float32
     assert surface(candidate, better, better.T_world_camera)[1].all()
 

@@ -31,7 +31,8 @@ SURE: dict[str, Any] = {
         ({"sigma_focal": 0.008}, "gnss", "georeferenced", ""),
         ({"sigma_focal": 0.04}, "gnss", "georeferenced", "focal length is uncertain by 4%"),
         ({"sigma_focal": 0.2}, "gnss", "doubtful", "focal length is uncertain by 20%"),
-        ({"scale": {"gnss_over_heights": 0.8}}, "gnss", "georeferenced", "25 % smaller"),
+        ({"scale": {"gnss_over_heights": 0.95}}, "gnss", "georeferenced", "5 % smaller"),
+        ({"scale": {"gnss_over_heights": 0.8}}, "gnss", "doubtful", "25 % smaller"),
         ({"assumed": ["height", "view"]}, "none", "relative", "assumed height"),
         ({"frames_tracked": 40}, "gnss", "doubtful", "40 of 100"),
         ({"frames": 101, "frames_tracked": 50}, "gnss", "georeferenced", ""),
@@ -86,6 +87,15 @@ def test_attitudes_that_contradict_the_images_put_it_in_doubt(refused: int, used
     assert found["reasons"] == [f"{refused} of 35 attitudes contradict the images"]
     graph = {"left_out": {"tilt off": 17}, "residuals": {"attitude": {"count": 18}}}
     assert trust_of(SURE | {"graph": graph}, "exif")["level"] == "georeferenced"
+
+
+@pytest.mark.parametrize(("refuted", "level"), [(1, "georeferenced"), (4, "doubtful")])
+def test_vision_that_two_sensors_contradict_limits_it(refuted: int, level: str) -> None:
+    graph = {"left_out": {"vision off": refuted}, "residuals": {"vision": {"count": 30}}}
+    found = trust_of(SURE | {"graph": graph}, "exif")
+    assert found["level"] == level
+    words = f"{refuted} of {30 + refuted} steps of vision contradict attitude and positions"
+    assert [text[: len(words)] for text in found["reasons"]] == [words]
 
 
 @pytest.mark.parametrize("angle", [0.0, 20.0, 80.0])

@@ -10,12 +10,13 @@ from collections import Counter
 import numpy as np
 
 from recon import se3
+from recon.posegraph.alignment_readings import has_fix
 from recon.posegraph.between_keyframes import carried
 from recon.posegraph.readings import BLOCK
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.segment_frames import SegmentFrames
 from recon.posegraph.smoother import NO_SCALE, Smoother, left_covariance
-from recon.types import F64
+from recon.types import F64, PosePrior
 
 VELOCITY_S = 1.0
 FASTEST_M_S = 100.0
@@ -32,6 +33,18 @@ def _length_sigma(node: Node, last: Node) -> float:
     return float(np.sqrt(step @ node.covariance[3:, 3:] @ step)) / square if square > 0.0 else 0.0
 
 
+def _contradiction(a: PosePrior, b: PosePrior, motion: F64) -> tuple[float, F64]:
+    """rad by which vision's ``motion`` (4, 4) from a to b tilts against known attitudes, and (3,) m
+    by which it leaves the positions; none where one of both is not known."""
+    R_a, R_b, from_m, to_m = a.R_world_camera, b.R_world_camera, a.position_m, b.position_m
+    are_assumed = a.is_view_assumed or b.is_view_assumed
+    if R_a is None or R_b is None or are_assumed or not (has_fix(a) and has_fix(b)):
+        return 0.0, np.zeros(3)
+    assert from_m is not None and to_m is not None
+    up = R_a @ motion[:3, :3] @ R_b[2]  # where that of b points
+    return float(np.hypot(up[0], up[1])), np.abs(R_a @ motion[:3, 3] - (to_m - from_m))
+
+
 class Motions:
     """Adds the motions of one graph to its smoother, and keeps the scale of each keyframe."""
 
@@ -46,6 +59,7 @@ class Motions:
         self._config, self._smoother = config, smoother
         self._segments, self._counts = segments, counts
         self.scale_of: list[int] = []  # key of each keyframe's scale, or NO_SCALE
+        self.refuted: dict[int, int] = {}  # last keyframe after each refuted step's first
         self._blocks: dict[int, tuple[int, int, int]] = {}
         # by segment, its last scale, that scale's first node, and how many keyframes it stands for
 
@@ -65,14 +79,22 @@ class Motions:
         self._smoother.add_place("prior place", node.key, T[:3, 3], sigma[3:])
         return T, left_covariance(T, np.diag(sigma**2))
 
-    def add(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
-        """T_last_node in metres and its (6, 6) covariance, left, in last's frame; now a factor."""
-        if node.segment == last.segment:
+    def add(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64, bool]:
+        """T_last_node in metres, its (6, 6) covariance, left, in last's frame, and whether vision
+        gives it; now a factor."""
+        is_seen = node.segment == last.segment
+        if is_seen:
             motion, covariance = self._seen(node, last)
+            if self._is_refuted(node, last, motion, covariance):
+                self.refuted[last.seq] = node.seq
+                self._counts["vision off"] += 1
+                is_seen = False
         else:
+            self._counts["stretch without vision"] += 1
+        if not is_seen:
             motion, covariance = self._link(node, last, T_last)
-        self._connect(node, last, motion, covariance)
-        return motion, covariance
+        self._connect(node, last, motion, covariance, is_seen)
+        return motion, covariance, is_seen
 
     def scale_key(self, node: Node, jump: float = 0.0) -> int:
         """Key of the node's scale; made when missing.
@@ -94,12 +116,29 @@ class Motions:
         self.scale_of[node.key] = key
         return key
 
-    def _connect(self, node: Node, last: Node, motion: F64, covariance: F64) -> None:
+    def _is_refuted(self, node: Node, last: Node, motion: F64, covariance: F64) -> bool:
+        """True where both attitude and positions contradict vision's motion: two sensors do not
+        fail at once by chance, and images that smear do."""
+        noise = self._segments.noise(node.segment)
+        if noise is None or noise.horizontal is None or noise.vertical is None:
+            return False
+        a, b = self._segments.freed(last).prior, self._segments.freed(node).prior
+        tilt_rad, off_m = _contradiction(a, b, motion)
+        passed_s = (node.time_ns - last.time_ns) * 1e-9
+        known = (noise.horizontal, noise.horizontal, noise.vertical)
+        changed = np.square([one.change(passed_s) for one in known])
+        sigma_m = np.sqrt(changed + np.trace(covariance[3:, 3:]) / 3.0)
+        sigma_rad = float(np.sqrt(np.trace(covariance[:3, :3]) / 3.0 + b.sigma_tilt_rad**2))
+        gate = self._config.gate_sigmas
+        return tilt_rad > gate * sigma_rad and bool(np.any(off_m > gate * sigma_m))
+
+    def _connect(self, node: Node, last: Node, motion: F64, covariance: F64, is_seen: bool) -> None:
         """The motion between two keyframes; of an aligned segment, with its scale left open."""
-        kind, scale = "vision" if node.segment == last.segment else "link", NO_SCALE
-        if kind == "vision" and self._segments.known(node.segment) is not None:
+        kind, scale = "vision" if is_seen else "link", NO_SCALE
+        if node.segment == last.segment and self._segments.known(node.segment) is not None:
             jump = _length_sigma(node, last)
-            scale = self.scale_key(node, jump if jump > OPEN_LENGTH else 0.0)
+            key = self.scale_key(node, jump if jump > OPEN_LENGTH else 0.0)
+            scale = key if is_seen else NO_SCALE
         self._smoother.add_motion(kind, (last.key, node.key), motion, covariance, scale)
 
     def _seen(self, node: Node, last: Node) -> tuple[F64, F64]:
@@ -113,10 +152,10 @@ class Motions:
 
     def _link(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
         """Dead reckoning where vision was lost: telemetry's motion, else the last one's, wide."""
-        self._counts["stretch without vision"] += 1
         passed_s = (node.time_ns - last.time_ns) * 1e-9
         frame = self._segments.known(node.segment)
-        if frame is not None and self._segments.is_tied(node.segment):
+        is_new = node.segment != last.segment
+        if is_new and frame is not None and self._segments.is_tied(node.segment):
             T = frame.pose(node.T_odom_camera)
         elif node.over is not None:
             T = T_last @ node.over

@@ -165,6 +165,11 @@ class PoseGraph:
         """Numbers of the nodes, in order."""
         return list(self._nodes)
 
+    @property
+    def refuted(self) -> dict[int, int]:
+        """Steps of vision that attitude and positions contradict: the node after by that before."""
+        return self._motions.refuted
+
     def metric_loops(self) -> list[Loop]:
         """Accepted loops with lengths in metres, by the scale known now."""
         return [loop.scaled(self.scale(loop.a)) for loop in self._book.taken]
@@ -324,15 +329,15 @@ class PoseGraph:
         self._segments.keep(node)
 
     def _insert(self, node: Node, last: Node | None) -> None:
-        is_seen = last is None or last.segment == node.segment
-        self._sources.append({"vision" if is_seen else "dead reckoning"})
+        self._sources.append({"vision"})
         self._motions.scale_of.append(0)
         self._path.append(self._path[-1] if self._path else 0.0)
         if last is None:
             T, spread = self._motions.first(node)
         else:
             T_last, spread_last = self._smoother.state(last.key)
-            motion, covariance = self._motions.add(node, last, T_last)
+            motion, covariance, is_seen = self._motions.add(node, last, T_last)
+            self._sources[-1] = {"vision" if is_seen else "dead reckoning"}
             T = se3.project_to_so3(T_last @ motion)
             self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
             spread = spread_last + left_covariance(T_last, covariance)

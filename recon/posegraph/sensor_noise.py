@@ -51,6 +51,9 @@ MAX_PAIRED = 400
 MIN_FRESH = 1e-9
 """Share of a wander's variance that is new in each reading, at least: two at one time."""
 
+FLOOR_SHARE, ROUNDS = 0.05, 4
+"""Least share of a model's largest value that gives weight, and times that weights are renewed."""
+
 
 @dataclass(frozen=True, slots=True)
 class Noise:
@@ -65,6 +68,11 @@ class Noise:
     def total(self) -> float:
         """Of one reading."""
         return float(np.hypot(self.white, self.wander))
+
+    def change(self, passed_s: float) -> float:
+        """Sigma of the change from one reading to the next after so many seconds."""
+        wandered = self.wander**2 * (1.0 - np.exp(-passed_s / self.tau_s))
+        return float(np.sqrt(2.0 * (self.white**2 + wandered)))
 
     def information(self, times_s: F64, extra: F64) -> F64:
         """(N, N) inverse of the covariance of readings at (N,) times.
@@ -166,13 +174,7 @@ def wander_noise(
     lag, change = variogram(times_s, residuals)
     if len(lag) < 3:
         return None
-    weight = np.sqrt(lag[-1] / lag) / np.maximum(change, 1e-12 + 0.01 * change.max())
-
-    def fitted(*columns: F64) -> tuple[F64, float]:
-        A = np.column_stack(columns) * weight[:, None]
-        parts = np.linalg.lstsq(A, change * weight, rcond=None)[0]
-        return parts, float(np.linalg.norm(A @ parts - change * weight))
-
+    fitted = _Fitted(lag, change)
     two = np.full(len(lag), 2.0)
     (white,), least = fitted(two)
     best = Noise(float(np.sqrt(white)), 0.0, max(usual_tau_s, 1.0))
@@ -185,6 +187,28 @@ def wander_noise(
             best, least = Noise(float(own), float(common), tau_s), error
             sure = max(sure, SURE_OF_WANDER)
     return best
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    """Fits models to a variogram, by relative errors that grow with the root of the lag."""
+
+    lag: F64  # (L,) s
+    change: F64  # (L,)
+
+    def __call__(self, *columns: F64) -> tuple[F64, float]:
+        """Factors (C,) of ``columns`` (L,) that sum up best to the change, and the misfit.
+
+        Weights follow from the model (Cressie, Math. Geology 17, 1985): by the values themselves,
+        those that are small by chance would count most.
+        """
+        A, model = np.column_stack(columns), np.full(len(self.lag), self.change.mean())
+        for _ in range(ROUNDS):
+            weight = np.sqrt(self.lag[-1] / self.lag) / np.maximum(model, 1e-12)
+            parts = np.linalg.lstsq(A * weight[:, None], self.change * weight, rcond=None)[0]
+            model = A @ parts
+            np.maximum(model, FLOOR_SHARE * model.max(), out=model)
+        return parts, float(np.linalg.norm(weight * (A @ parts - self.change)))
 
 
 def drift_noise(times_s: F64, residuals: F64) -> tuple[float, float] | None:

@@ -386,4 +386,4 @@ def _report(summary: dict[str, Any], as_json: bool) -> None:
     )
     if summary["refusals"]:
         refused = (f"{why} ({n})" for why, n in summary["refusals"].items())
-        print(f"stereo pairs not used: {', '.join(refused)}")
+        print(f"frames, views and pairs not used: {', '.join(refused)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -171,6 +172,10 @@ class Chain:
         """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
         return self._pieces.apart(self.graph)
 
+    def refuted(self) -> list[tuple[int, int]]:
+        """Keyframes between which vision is wrong, so that their depth is, too."""
+        return list(self.graph.refuted.items())
+
     # ---- frames ------------------------------------------------------------------------
 
     def follow(self, image: UndistortedFrame, anchor: Anchorage) -> Placed:
@@ -191,7 +196,17 @@ class Chain:
             return Placed(anchor.key.seq, T_odom_camera, 1.0, unsure, ("vision",))
         # In flight no other view than the newest carries a new frame.
         known = self._newest or self.trajectory.place(carrier.seq)
-        return known.carry(se3.inverse(carrier.T_odom_camera) @ T_odom_camera)
+        moved = se3.inverse(carrier.T_odom_camera) @ T_odom_camera
+        placed = known.carry(moved)
+        after = self.graph.refuted.get(carrier.seq) if self._newest is None else None
+        return placed if after is None else self._doubted(placed, carrier.seq, after)
+
+    def _doubted(self, placed: Placed, before: int, after: int) -> Placed:
+        """A frame between two keyframes where vision is wrong: as unsure as its step is long."""
+        step_m = self.trajectory.step_between(before, after)[:3, 3]
+        spread = np.diag(np.r_[np.ones(3), np.full(3, float(step_m @ step_m))])
+        about = se3.about(-placed.T_world_camera[:3, 3], spread)
+        return replace(placed, covariance=placed.covariance + about)
 
     def by_telemetry(self, image: UndistortedFrame, tracked: Tracked) -> Placed | None:
         """A lost frame where telemetry alone says the camera is; None without attitude, heading

@@ -170,4 +170,4 @@ class Pipeline:
 
     def refusals(self) -> Counter[str]:
         """Frames, views and pairs not used, by reason."""
-        return self.stages.refused + self.stages.rejected
+        return self.stages.refused + self.stages.rejected + self.stages.track.waiting

@@ -94,7 +94,8 @@ class Recorder:
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Close the scan, which is flushed; return its summary."""
         summary = self.summary() | {"graph": graph_figures(self._chain.graph)}
-        summary["apart"] = [list(ends) for ends in self._chain.apart()]
+        left_out = [*self._chain.apart(), *self._chain.refuted()]
+        summary["apart"] = [list(ends) for ends in left_out]
         summary |= extra
         self.store.finish(summary)
         return summary

@@ -66,6 +66,11 @@ class GraphWatch:
             kind: f"{counts[kind]} {text}" for kind, text in LEFT_OUT.items()
             if counts[kind] >= LEAST
         }  # fmt: skip
+        if steps := counts["vision off"]:
+            out["vision"] = (
+                f"{steps} steps of the track contradict both attitude and positions and were left "
+                "out: are images smeared by compression?"
+            )
         ratio = gnss_over_heights(self._graph)
         if ratio is not None:
             out["scale"] = f"scale: {scales_differ(ratio)}; check both"

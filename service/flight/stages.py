@@ -42,7 +42,7 @@ from recon.stereo.virtual_stereo import (
 )
 from recon.tracking.known_track import AnyTrack, KnownTrack
 from recon.tracking.localisation import OdometryConfig
-from recon.tracking.odometry import Odometry, Tracked
+from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.types import (
     F32,
     F64,
@@ -134,6 +134,8 @@ class Track:
     ) -> None:
         self.odometry, self._selection = odometry, selection
         self._refused, self._stopwatch = refused, stopwatch
+        self.waiting = Counter[str]()
+        """Frames since the segment's first one that wait for its second view, by reason."""
 
     def can_skip(self, time_ns: int, prior: PosePrior) -> bool:
         """True for a frame so close to the last one that nothing needs its pose."""
@@ -145,8 +147,14 @@ class Track:
             tracked = self.odometry.track(
                 image.small, image.seq, image.time_ns, image.prior, image.mask, image.is_blurred
             )
-        if tracked.T_odom_camera is None:
+        if tracked.state is Tracking.WAITING:
+            self.waiting[tracked.reason] += 1
+        elif tracked.T_odom_camera is None:
             self._refused[tracked.reason] += 1
+        else:
+            if tracked.state is Tracking.STARTED:  # the segment before never began
+                self._refused.update(self.waiting)
+            self.waiting.clear()
         return tracked
 
     @property

@@ -32,10 +32,9 @@ ASSUMED_LENS_SHARE = 0.02
 """Sigma of depth over depth where a lens without distortion is assumed: lenses of action cameras
 bend surfaces by that much."""
 
-MIN_FOCAL_SHARE, MAX_FOCAL_SHARE = 0.02, 0.05
-"""Sigma of the focal length from which on sigma of depth holds it, and up to which. All points
-share that error: a small one would only hide how they err against each other, and one above a tenth
-would drop them all."""
+COMMON_FOCAL_SHARE, MAX_FOCAL_SHARE = 0.02, 0.05
+"""Sigma of the focal length that all points share, so that it would only hide how they err against
+each other, and up to which sigma of depth holds the rest: above a tenth would drop all points."""
 
 SIGMA_K1 = 0.02
 """Sigma of a lens's first radial coefficient where tags give its focal length alone: what is left
@@ -158,8 +157,8 @@ class SurfaceMap:
         self._stopwatch = stopwatch
         self._focal_px = focal_px
         self._lens_share = ASSUMED_LENS_SHARE if "lens" in assumed else 0.0
-        if sigma_focal > MIN_FOCAL_SHARE:
-            self._lens_share = float(np.hypot(self._lens_share, min(sigma_focal, MAX_FOCAL_SHARE)))
+        apart = max(min(sigma_focal, MAX_FOCAL_SHARE) ** 2 - COMMON_FOCAL_SHARE**2, 0.0)
+        self._lens_share = float(np.hypot(self._lens_share, np.sqrt(apart)))
         self._sigma_k1 = SIGMA_K1 if "distortion" in assumed else 0.0
         self._map: VoxelMap | PagedMap | None = None
         self._disagreement, self._segment = Disagreement(), -1

@@ -23,7 +23,8 @@ MAX_LEAN_SIGMA_DEG = 2.0
 level ground lean by 10."""
 
 MIN_LENS_SIGMA, MAX_LENS_SIGMA = 0.01, 0.1
-"""Sigma of a focal length above which heights are in doubt, and above which the shape is."""
+"""Sigma of a focal length above which heights are in doubt, and above which the shape is; so, too,
+where positions and heights give scales that differ by more, as after a zoom."""
 
 MIN_PLACED_SHARE = 0.5
 """Share of the frames; below it vision was lost for most of the flight."""
@@ -32,6 +33,10 @@ MIN_PLACED_SHARE = 0.5
 REFUSED_SHARE, WRONG_SHARE = 0.2, 0.5
 """Of the measured positions or attitudes, that contradict the track. Above the first, positions are
 less certain than sigma says; above the second, either may be wrong."""
+
+MAX_REFUTED_SHARE = 0.05
+"""Of the steps of the track; where vision is refuted more often, it errs elsewhere by as much as
+attitude and positions do not show."""
 
 BY_SURVEY = "control points"
 """``georeference`` of a scan that control points have placed."""
@@ -85,6 +90,13 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     contradicted = f"{refused:.0f} of {measured:.0f} positions contradict the track"
     if refused > WRONG_SHARE * measured:
         doubts.append(contradicted)
+    ratio = _number(scale, "gnss_over_heights")
+    if ratio and max(ratio, 1.0 / ratio) > 1.0 + MAX_LENS_SIGMA:
+        doubts.append(f"{scales_differ(ratio)}: the lens, positions or heights are wrong")
+    broken, steps = _refused(run, "vision", "vision off")
+    refuted = f"{broken:.0f} of {steps:.0f} steps of vision contradict attitude and positions"
+    if broken > MAX_REFUTED_SHARE * steps:
+        doubts.append(f"{refuted}: the images are too poor")
     if doubts:
         return _said(Trust.DOUBTFUL, doubts)
     if "height" in assumed:
@@ -108,9 +120,11 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
             f"the view direction is assumed: all may lean by {lean_deg:.0f} degrees; fly strips "
             "both ways, several side by side"
         )
+    if broken:
+        limits.append(f"{refuted}: what they show is left out")
     if refused > REFUSED_SHARE * measured:
         limits.append(f"{contradicted}: they are less certain than sigma says")
-    if ratio := _number(scale, "gnss_over_heights"):
+    if ratio:
         limits.append(scales_differ(ratio))
     return _said(Trust.GEOREFERENCED, limits)
 

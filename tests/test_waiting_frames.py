@@ -1,0 +1,40 @@
+"""Frames that wait for a segment's second view are unused only where it never comes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from recon.tracking.odometry import Tracked, Tracking
+from recon.types import F64
+from service.flight.stages import Track
+from service.progress import Stopwatch
+
+POSE = cast(F64, object())
+STARTED, WAITING = (Tracking.STARTED, POSE, ""), (Tracking.WAITING, None, "too little motion")
+KEYFRAME, LOST = (Tracking.KEYFRAME, POSE, ""), (Tracking.LOST, None, "too few matches")
+
+
+@pytest.mark.parametrize(
+    ("states", "unused"),
+    [
+        ([STARTED, WAITING, WAITING, KEYFRAME], {}),
+        ([STARTED, WAITING, WAITING], {"too little motion": 2}),
+        ([STARTED, WAITING, LOST, STARTED, KEYFRAME],
+         {"too little motion": 1, "too few matches": 1}),
+    ],
+)  # fmt: skip
+def test_waiting_counts_where_it_is_in_vain(states: list[Any], unused: dict[str, int]) -> None:
+    results = iter([Tracked(state, 0, T, reason=why) for state, T, why in states])
+    odometry: Any = SimpleNamespace(track=lambda *image: next(results))
+    image: Any = SimpleNamespace(
+        small=None, seq=0, time_ns=0, prior=None, mask=None, is_blurred=False
+    )
+    refused: Counter[str] = Counter()
+    track = Track(odometry, cast(Any, None), refused, Stopwatch())
+    for _ in states:
+        track(image)
+    assert refused + track.waiting == unused
