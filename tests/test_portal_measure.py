@@ -295,7 +295,7 @@ def click_spots(ruler: Ruler, errors: ScanSimilarity, button: str | None) -> F64
     return true
 
 
-def picked_there(ruler: Ruler, errors: Similarity, spots: F64) -> F64:
+def picked_there(ruler: Ruler, errors: ScanSimilarity, spots: F64) -> F64:
     """(N, 3) true places of what clicks at (N, 2) spots pick."""
     return inverse(errors, np.array([ruler.pick(float(x), float(y)) for x, y in spots]))
 
