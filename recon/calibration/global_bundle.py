@@ -218,6 +218,14 @@ def _eliminate(A: F64, B: F64, b: F64, H: F64, g: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _weighed(at: F64, uv: F64, sigma: float, huber: float, r: F64) -> tuple[float, float]:
+    """Length of the error over ``sigma``, and its weight by Huber; ``r`` (2,) becomes the error."""
+    r[0], r[1] = uv[0] - at[0], uv[1] - at[1]
+    length = np.sqrt(r[0] * r[0] + r[1] * r[1]) / sigma
+    return length, min(1.0, huber / max(length, 1e-12)) / sigma**2
+
+
+@njit(cache=True, nogil=True)
 def _reduce(
     T: F64, pose: I64, share: F64, X: F64, k: F64, k3: float, view: I64, start: I64, uv: F64,
     sigma: F64, huber: float, Hp: F64, bp: F64, damping: float, pair: I64, S: F64, g: F64, B: F64,
@@ -244,9 +252,7 @@ def _reduce(
             for i in range(2):
                 for a in range(6, n_view):  # the turn across the image, to first order
                     Jc[i, a] = share[m] * Jc[i, a - 6]
-            r[0], r[1] = uv[m, 0] - at[0], uv[m, 1] - at[1]
-            length = np.sqrt(r[0] * r[0] + r[1] * r[1]) / sigma[m]
-            w = min(1.0, huber / max(length, 1e-12)) / sigma[m] ** 2
+            _, w = _weighed(at, uv[m], sigma[m], huber, r)
             q = pair[v, v]
             for i in range(2):
                 for a in range(n_view):
@@ -310,9 +316,7 @@ def _settle(
                     cost = np.inf
                     break
                 _linearise(T[pose[m]], x, k, k3, at, Jc, Jp, Jk)
-                r[0], r[1] = uv[m, 0] - at[0], uv[m, 1] - at[1]
-                length = np.sqrt(r[0] * r[0] + r[1] * r[1]) / sigma[m]
-                w = min(1.0, huber / max(length, 1e-12)) / sigma[m] ** 2
+                length, w = _weighed(at, uv[m], sigma[m], huber, r)
                 cost += 0.5 * length**2 if length <= huber else huber * (length - 0.5 * huber)
                 for i in range(2):
                     for a in range(3):
@@ -448,6 +452,8 @@ class _Bundle:
         turns = np.zeros((len(T), 3)) if rows is None else rows.turns
         self.start = _State(T, np.array(problem.points, np.float64), _vector(problem.camera), turns)
         self._k3 = float(problem.camera.distortion[4])
+        self._surveyed = np.nan_to_num(problem.known.surveyed)
+        self._sure = np.nan_to_num(1.0 / problem.known.sigma_surveyed)
         met = np.eye(len(T), dtype=np.bool_)
         _mark_pairs(self._view, self._start_of, met)
         self._rows, self._columns = np.nonzero(met)
@@ -520,12 +526,11 @@ class _Bundle:
         return self._with_settled_points(new), float(np.sqrt(eq.gk @ dk + eq.g @ dc))
 
     def _with_settled_points(self, s: _State) -> _State:
-        known, X = self._of.known, s.X.copy()
+        X = s.X.copy()
         T, pose = self._of_sightings(s)
         _settle(
             T, pose, X, s.k, self._k3, self._start_of, self._uv, self._sigma,
-            self._of.huber_sigmas, np.nan_to_num(known.surveyed),
-            np.nan_to_num(1.0 / known.sigma_surveyed),
+            self._of.huber_sigmas, self._surveyed, self._sure,
         )  # fmt: skip
         return replace(s, X=X)
 
@@ -608,10 +613,9 @@ class _Bundle:
             for i in range(3):
                 S[own, 6 + i, 6 + i] += sigma[:, i] ** -2
             g[:, 6:] -= off / sigma
-        sure = np.nan_to_num(1.0 / known.sigma_surveyed)
         for i in range(3):
-            Hp[:, i, i] += sure[:, i] ** 2
-        bp -= sure * points
+            Hp[:, i, i] += self._sure[:, i] ** 2
+        bp -= self._sure * points
 
     def dispersion(self, s: _State) -> float:
         """See :func:`dispersion`."""
