@@ -144,6 +144,7 @@ def seams(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
         ratio.append(found[0] / found[1])
         if len(apart) == SEAM_PAIRS:
             break
+    yield "seams: pairs of visits that share ground", float(len(apart)), ""
     if apart:
         yield "seams, median", float(np.median(np.abs(np.concatenate(apart)))), "m"
         sigmas = float(np.median(np.abs(np.concatenate(ratio)))) / NORMAL_MEDIAN
