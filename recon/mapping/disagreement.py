@@ -30,8 +30,8 @@ MIN_COMMON = 60
 NEIGHBOURS_CORRELATION = (0.55, 0.28)
 """Correlation of the errors of an image and of the one before it, and the one before that.
 
-They share frames. Measured on simulated flights at three widths (docs/reports/accuracy.md); three
-images apart it is 0."""
+They share frames. Measured on simulated flights at three widths
+(docs/reports/simulated-flights.md); three images apart it is 0."""
 
 MAX_FACTOR = 30.0
 """A larger difference is other ground."""

@@ -35,7 +35,8 @@ from recon.types import (
 
 BLURRED, UNLIKE = 0.016, 0.012
 """Sigma of a label by blur along the rows, over its length, and by two blurs that differ, over
-the difference of their squares (1/px): measured on a textured plane (docs/reports/accuracy.md)."""
+the difference of their squares (1/px): measured on a textured plane
+(docs/reports/rolling-shutter.md)."""
 
 CELL = 8
 """Pixels between two places where the warp of a rolling shutter is computed."""

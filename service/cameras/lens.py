@@ -30,7 +30,7 @@ SAME_SHAPE = 0.005
 
 SIGMA_FOCAL = 0.05
 """Relative sigma of a focal length in tags: it is that of the lens's model, rounded, and of images
-before the camera straightens and crops them (docs/reports/accuracy.md)."""
+before the camera straightens and crops them (docs/reports/lens.md)."""
 
 CALIBRATED, FOCAL_ALONE = "the maker's calibration", "the maker's focal length"
 AGREEMENT = 0.1

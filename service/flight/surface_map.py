@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 RECORDED_SIGMA_PX = 0.11
 """Sigma of a match, in pixels of the recording: where stereo's pixels are as small, its labels are
-no better (docs/reports/accuracy.md)."""
+no better (docs/reports/simulated-flights.md)."""
 
 ASSUMED_LENS_SHARE = 0.02
 """Sigma of depth over depth where a lens without distortion is assumed: lenses of action cameras

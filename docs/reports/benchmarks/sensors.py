@@ -1,4 +1,4 @@
-"""The table of docs/reports/accuracy.md: one simulated flight under each subset of its sensors.
+"""The table of docs/reports/sensors.md: one simulated flight under each subset of its sensors.
 
     python docs/reports/benchmarks/sensors.py FLIGHT OUT [ROW ...]
 
