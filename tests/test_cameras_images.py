@@ -200,6 +200,36 @@ def test_dji_xmp_gives_attitude_height_and_accuracy(tmp_path: Path) -> None:
     assert tag.sigma_h_m == 0.015
 
 
+@pytest.mark.parametrize(
+    "block",
+    [
+        # Autel: DJI's names
+        '<rdf:Description drone:GimbalYawDegree="146.5" drone:GimbalPitchDegree="-78.4" '
+        'drone:GimbalRollDegree="-0.3"/>',
+        # Parrot Anafi, which also counts from straight down
+        '<rdf:Description Camera:Yaw="140" Camera:Pitch="11" Camera:Roll="1">'
+        "<drone-parrot:CameraRollDegree>-0.3</drone-parrot:CameraRollDegree>"
+        "<drone-parrot:CameraPitchDegree>-78.4</drone-parrot:CameraPitchDegree>"
+        "<drone-parrot:CameraYawDegree>146.5</drone-parrot:CameraYawDegree></rdf:Description>",
+        # Skydio, older and newer, with angles in other frames of reference
+        '<drone-skydio:CameraOrientationFLU drone-skydio:Roll="9" drone-skydio:Pitch="9" '
+        'drone-skydio:Yaw="9"/><drone-skydio:CameraOrientationNED drone-skydio:Roll="-0.3" '
+        'drone-skydio:Pitch="-78.4" drone-skydio:Yaw="146.5"/>',
+        '<drone-skydio:CameraOrientationNED rdf:parseType="Resource">'
+        "<drone-skydio:Roll>-0.3</drone-skydio:Roll><drone-skydio:Pitch>-78.4</drone-skydio:Pitch>"
+        "<drone-skydio:Yaw>146.5</drone-skydio:Yaw></drone-skydio:CameraOrientationNED>"
+        '<drone-skydio:CameraOrientationFLU rdf:parseType="Resource">'
+        "<drone-skydio:Yaw>9</drone-skydio:Yaw></drone-skydio:CameraOrientationFLU>",
+    ],
+)
+def test_other_makers_state_the_attitude_too(tmp_path: Path, block: str) -> None:
+    path = tmp_path / "0001.jpg"
+    xmp = f'<x:xmpmeta xmlns:x="adobe:ns:meta/">{block}</x:xmpmeta>'
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
+    tag = read_tags(path).geotag
+    assert tag is not None and tag.ypr_deg == (146.5, -78.4, -0.3)
+
+
 def test_gimbal_angles_that_are_all_zero_are_unknown(tmp_path: Path) -> None:
     """A DJI Mini 2 that another program flew: the image looks down, the nose to the south."""
     xmp = (

@@ -48,14 +48,22 @@ class Ties:
     tied: tuple[int, ...] = ()
     sigma_m: float = 1.0  # of the height, whatever it is against
     against_m: float | None = None  # of one segment's against another's
+    sigma_scale: dict[int, float] = field(default_factory=dict)  # where it is not 0.01
+    largest: int = 0
+    _found: dict[int, Similarity] = field(default_factory=dict)
 
     def sigma_height_m(self, segment: int) -> float | None:
         return self.against_m
 
     def similarity(self, segment: int) -> Similarity | None:
         sources = ("gnss",) if segment in self.fixed else ("altitude",)
-        covariance = np.diag([1.0] * 5 + [self.sigma_m**2, 1.0])
-        return Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
+        scale = self.sigma_scale.get(segment, 0.01)
+        covariance = np.diag([1.0] * 5 + [self.sigma_m**2, scale**2])
+        found = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
+        return self._found.setdefault(segment, found)
+
+    def largest_similarity(self) -> Similarity | None:
+        return self.similarity(self.largest)
 
     def is_tied(self, segment: int) -> bool:
         return segment in self.tied
@@ -99,6 +107,16 @@ def test_fixes_without_a_height_do_not_lay_one_stretch_on_another() -> None:
     tied = replace(coarse, loops=[Edge(2, 11, True)])
     assert apart(tied, prior=high) == [(20, 22), (30, 32)]
     assert apart(Ties(fixed=every, tied=every, sigma_m=5.0)) == []
+
+
+def test_fixes_that_leave_the_size_open_do_not_lay_one_stretch_on_another() -> None:
+    """Five steps of a phone within the error of its receiver: depths of any length."""
+    every = (0, 1, 2, 3)
+    ties = Ties(fixed=every, tied=every, sigma_scale={1: 0.7, 2: 0.1, 3: 0.3})
+    for prior in (NOWHERE, PLACED):
+        assert apart(ties, prior=prior) == [(10, 12), (30, 32)]
+        assert apart(replace(ties, largest=1, _found={}), prior=prior) == [(30, 32)]
+        assert apart(replace(ties, loops=[Edge(2, 11, True)]), prior=prior) == [(30, 32)]
 
 
 def test_a_forgotten_loop_still_ties() -> None:

@@ -136,10 +136,14 @@ def test_a_pose_written_again_replaces_the_first(tmp_path: Path, house: HouseFli
     with house.flown(tmp_path) as store:
         store.add_pose(house.record(2, 11.5))
         poses = latest(store.poses())
-        write_deliverables(tmp_path, store, {})
+        summary = write_deliverables(tmp_path, store, {})
     assert len(poses) == 5
     numbers = np.loadtxt(tmp_path / TUM)
     np.testing.assert_allclose(numbers[:, 1], [0.0, 5.0, 11.5, 15.0, 20.0])
+    with open(tmp_path / CSV, newline="") as file:
+        flown = [float(row["distance_m"]) for row in csv.DictReader(file)]
+    assert flown == [0.0, 5.0, 11.5, 15.0, 20.0]
+    assert summary["quality"]["distance_m"] == 20.0
 
 
 def test_a_reposed_keyframe_moves_its_points(tmp_path: Path, house: HouseFlight) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from recon import se3
 from recon.calibration.flight import (
+    SelfCalibrated,
     SelfCalibrationConfig,
     camera_information,
     camera_sigmas,
@@ -18,6 +19,7 @@ from recon.calibration.flight import (
 )
 from recon.calibration.global_bundle import Problem, Sightings, solve
 from recon.types import F64, Camera
+from service.commands.own_lens import still_assumed
 from service.offline.refine.own_camera import bent, by_tags
 
 SIZE = (1280, 720)
@@ -264,6 +266,25 @@ def test_an_open_distortion_that_the_flight_does_not_determine_is_refused() -> N
     assert not doubt(BARREL, WRONG, sigmas, search)
     sigmas[4:6] = 0.05
     assert "does not determine the distortion" in doubt(BARREL, WRONG, sigmas, search)
+
+
+def test_a_wide_lens_surer_than_an_unknown_one_is_taken_and_its_distortion_stays_unsure() -> None:
+    """A compact on a fixed wing, 72 degrees across: k1 to 0.014 bends a corner by 2.3 %."""
+    K = np.array([[2775.0, 0.0, 1999.5], [0.0, 2775.0, 1499.5], [0.0, 0.0, 1.0]])
+    wide, search = Camera(K, np.zeros(5), (4000, 3000)), bent(by_tags(0.05))
+
+    def refused(sigma_k1: float) -> bool:
+        sigmas = np.array([30.0, 30.0, 9.0, 9.0, sigma_k1, 0.02, 1e-3, 1e-3])
+        return bool(doubt(wide, wide, sigmas, search))
+
+    def unsure(sigma_k1: float) -> tuple[str, ...]:
+        k, none = (sigma_k1, 0.02), np.zeros((0, 4, 4))
+        return still_assumed(
+            SelfCalibrated(wide, 0.01, k, (1e-3, 1e-3), 1.0, 0.5, none[:, 0, 0], none, "")
+        )
+
+    assert [refused(s) for s in (0.01, 0.014, 0.03)] == [False, False, True]
+    assert [unsure(s) for s in (0.01, 0.014)] == [(), ("distortion",)]
 
 
 def test_landmarks_without_a_place_take_no_part() -> None:

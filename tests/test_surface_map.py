@@ -12,7 +12,8 @@ import pytest
 from recon import se3
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from recon.types import F64, DepthMap
-from service.flight.surface_map import MAX_OVER, SIGMA_K1, PagedMap, SurfaceMap
+from service.cameras.lens import SIGMA_K1
+from service.flight.surface_map import MAX_OVER, PagedMap, SurfaceMap
 from service.flight.viewpoints import KNOWN_ROWS, StereoCandidate
 from service.progress import Stopwatch
 

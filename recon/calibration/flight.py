@@ -61,6 +61,7 @@ class SelfCalibrationConfig:
     sigma_p: float = 0.005  # of p1 and of p2
     max_sigma_focal: float = 0.01  # a less certain focal length is refused
     max_sigma_bend: float = np.inf  # likewise of k1, as the share of depth it bends at a corner
+    covered_sigma_k1: float = 0.0  # of k1 that is accepted whatever it bends
     max_sigmas: float = 3.0  # from the model given; a camera further off is refused
     pixel_sigma: float = 0.5
     huber_sigmas: float = 1.5
@@ -312,12 +313,11 @@ def doubt(found: Camera, given: Camera, sigmas: F64, c: SelfCalibrationConfig) -
             f"{100 * c.max_sigma_focal:.1f} %): seen straight down from one height it looks "
             "like another height; fly two heights or an oblique turn"
         )
-    corner = 0.5 * float(np.hypot(*found.size_px)) / found.K[0, 0]
-    bend = 2.0 * float(sigmas[4]) * corner**2  # of a pair's disparity, on average over its ways
-    if bend > c.max_sigma_bend:
+    bend, covered = (corner_bend(found, k1) for k1 in (float(sigmas[4]), c.covered_sigma_k1))
+    if bend > max(c.max_sigma_bend, covered):
         return (
             f"the flight does not determine the distortion (to {100 * bend:.1f} % of depth at a "
-            f"corner, asked {100 * c.max_sigma_bend:.1f} %); let images overlap more"
+            f"corner, asked {100 * max(c.max_sigma_bend, covered):.1f} %); let images overlap more"
         )
     off = abs(found.K[0, 0] / given.K[0, 0] - 1.0) / c.sigma_focal
     shift = np.abs(found.K[:2, 2] - given.K[:2, 2]).max()
@@ -327,6 +327,13 @@ def doubt(found: Camera, given: Camera, sigmas: F64, c: SelfCalibrationConfig) -
     if off > c.max_sigmas:
         return TOO_FAR
     return ""
+
+
+def corner_bend(camera: Camera, sigma_k1: float) -> float:
+    """Sigma of depth over depth at a corner, by that of k1: of a pair's disparity, on average over
+    its ways."""
+    corner = 0.5 * float(np.hypot(*camera.size_px)) / float(camera.K[0, 0])
+    return 2.0 * sigma_k1 * corner**2
 
 
 def focal_sigma(found: Camera, sigmas: F64) -> float:

@@ -1,7 +1,8 @@
-"""Time and place of a still: EXIF, the XMP block of DJI or Pix4D, or its file name.
+"""Time and place of a still: EXIF, the XMP block of its maker or Pix4D, or its file name.
 
-EXIF 2.32 (CIPA DC-008-2019) sections 4.6.5 and 4.6.6; XMP names as DJI writes them, and those of
-http://pix4d.com/camera/1.0, which Parrot, senseFly and MicaSense write.
+EXIF 2.32 (CIPA DC-008-2019) sections 4.6.5 and 4.6.6; XMP names as DJI, Autel, Parrot and Skydio
+write them, and those of http://pix4d.com/camera/1.0, which older Autels, Parrot's Sequoia, senseFly
+and MicaSense write.
 """
 
 from __future__ import annotations
@@ -19,8 +20,17 @@ from service.cameras.lens import Lens, finite_number, finite_numbers, lens_of
 from service.cameras.source import GeoTag
 
 XMP_BYTES = 1 << 18  # DJI's block sits in the first 64 KiB
+PREFIXES = "(?:drone-dji|drone-parrot|drone|Camera)"
+"""Of XMP names. Autel's are those of DJI with the prefix drone."""
+
 DEFAULT_SIGMA_H_M, MAX_SIGMA_M = 5.0, 1000.0
 NAME_TIME = re.compile(r"(?<!\d)(20\d{6})[T_-]?(\d{6})[._]?(\d{1,6})?Z(?![A-Za-z0-9])")
+SKYDIO_ANGLES = re.compile(
+    "<drone-skydio:CameraOrientationNED([^>]*/>|.{0,999}?</drone-skydio:CameraOrientationNED>)",
+    re.DOTALL,
+)
+"""Other frames of reference have angles of the same names."""
+
 TURNED_DEG = {3: 180, 6: 90, 8: 270}
 """EXIF orientation to degrees clockwise; no camera writes the mirrored ones."""
 
@@ -177,9 +187,10 @@ def _plausible(sigma_m: float | None) -> float | None:
 
 def _gimbal_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:
     """The gimbal's angles; None where all are exactly 0: the camera did not know them."""
-    yaw = _xmp_number(xmp, "GimbalYawDegree")
-    pitch = _xmp_number(xmp, "GimbalPitchDegree")
-    roll = _xmp_number(xmp, "GimbalRollDegree")
+    yaw, pitch, roll = (
+        _xmp_number(xmp, f"Gimbal{name}Degree", f"Camera{name}Degree")
+        for name in ("Yaw", "Pitch", "Roll")
+    )
     if yaw is None or pitch is None:
         return _pix4d_ypr_deg(xmp)
     angles = (yaw, pitch, roll or 0.0)
@@ -188,7 +199,7 @@ def _gimbal_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:
 
 def _pan_deg(geotag: GeoTag | None, xmp: dict[str, str]) -> float | None:
     """Heading of the image, whose upper side is ahead, less the aircraft's."""
-    nose_deg = _xmp_number(xmp, "FlightYawDegree")
+    nose_deg = _xmp_number(xmp, "FlightYawDegree", "DroneYawDegree")
     if nose_deg is None or geotag is None or geotag.ypr_deg is None:
         return None
     yaw, pitch, roll = map(math.radians, geotag.ypr_deg)
@@ -209,12 +220,15 @@ def _pix4d_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:
 
 
 def _xmp(path: Path) -> dict[str, str]:
-    """DJI's and Pix4D's values in the XMP block, as attributes or as elements."""
+    """The values of makers and of Pix4D in the XMP block, as attributes or as elements."""
     with path.open("rb") as stream:
         head = stream.read(XMP_BYTES)
     text = head.decode("latin-1")
-    pairs = re.findall(r"(?:drone-dji|Camera):(\w+)=\"([^\"]*)\"", text)
-    pairs += re.findall(r"<(?:drone-dji|Camera):(\w+)>([^<]*)</", text)
+    pairs = re.findall(rf"{PREFIXES}:(\w+)=\"([^\"]*)\"", text)
+    pairs += re.findall(rf"<{PREFIXES}:(\w+)>([^<]*)</", text)
+    for block in SKYDIO_ANGLES.findall(text):
+        angles = re.findall(r"(?<!/)drone-skydio:(Yaw|Pitch|Roll)(?:=\"|>)([^\"<]*)", block)
+        pairs += [(f"Gimbal{name}Degree", value) for name, value in angles]
     # Lists: <Camera:PrincipalPoint><rdf:Seq><rdf:li>3.4,2.6</rdf:li>...
     for name, block in re.findall(r"<Camera:(\w+)>\s*<rdf:Seq>(.*?)</rdf:Seq>", text, re.DOTALL):
         pairs.append((name, ",".join(re.findall(r"<rdf:li>([^<]*)</rdf:li>", block))))

@@ -32,6 +32,10 @@ SIGMA_FOCAL = 0.05
 """Relative sigma of a focal length in tags: it is that of the lens's model, rounded, and of images
 before the camera straightens and crops them (docs/reports/lens.md)."""
 
+SIGMA_K1 = 0.02
+"""Sigma of a lens's first radial coefficient where tags give its focal length alone: what is left
+in stills that drones straighten themselves."""
+
 CALIBRATED, FOCAL_ALONE = "the maker's calibration", "the maker's focal length"
 AGREEMENT = 0.1
 """A focal length that differs more from the 35 mm equivalent belongs to another size of the image:

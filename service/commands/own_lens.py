@@ -20,7 +20,7 @@ from service.cameras.images import ImagesSource
 from service.cameras.lens import Lens, by_full_frame
 from service.config import change
 from service.errors import InputError
-from service.offline.refine.own_camera import MIN_IMAGES, bent, by_tags
+from service.offline.refine.own_camera import MAX_SIGMA_BEND, MIN_IMAGES, bent, by_tags
 
 if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
@@ -115,6 +115,15 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> S
             return lens(folder, Path(parse_source(video)[1]), search)
         except InputError as error:
             return str(error)
+
+
+def still_assumed(found: SelfCalibrated) -> tuple[str, ...]:
+    """What is as good as assumed of a lens that was found: its distortion, where depth at a corner
+    is bent by more than :data:`MAX_SIGMA_BEND`."""
+    from recon.calibration.flight import corner_bend
+
+    bend = corner_bend(found.camera, found.sigma_k[0])
+    return ("distortion",) if bend > MAX_SIGMA_BEND else ()
 
 
 def _is_enough(scan: Scan) -> bool:

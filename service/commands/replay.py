@@ -204,7 +204,7 @@ def _with_lens(
 ) -> ScanInputs:
     """The scan with the lens by its own images, where they determine it, else as it is."""
     from service.cameras import parse_source
-    from service.commands.own_lens import own_lens
+    from service.commands.own_lens import own_lens, still_assumed
     from service.flight.scan import check_new
 
     found: SelfCalibrated | str = ""
@@ -220,7 +220,11 @@ def _with_lens(
     focal = f"{found.camera.K[0, 0]:.0f} px, sigma {100.0 * found.sigma_focal:.1f} %"
     note = f"no camera model given: found from the images themselves ({focal})"
     return replace(
-        inputs, camera=found.camera, notes=(note, *inputs.notes), sigma_focal=found.sigma_focal
+        inputs,
+        camera=found.camera,
+        notes=(note, *inputs.notes),
+        assumed=still_assumed(found),
+        sigma_focal=found.sigma_focal,
     )
 
 

@@ -34,6 +34,10 @@ HEIGHT_KNOWN_M, HEIGHTS_AGREE_M = 20.0, 5.0
 """Sigma of a fix's height below which it lays two stretches of one flight on each other, and of one
 stretch's height against the other's."""
 
+SCALE_KNOWN = 0.2
+"""Sigma of a stretch's scale, by its fixes, below which they lay it on another: depths of unknown
+length are no surface beside others."""
+
 
 class KeyframeStep(NamedTuple):
     """The step of the camera from the keyframe before, in units of the odometry."""
@@ -275,8 +279,10 @@ class Pieces:
                 looped |= {a, b}
         heights = {s: sigma for s in piece if (sigma := _sigma_height_m(graph, s)) is not None}
         unsure = {s for s, sigma in heights.items() if sigma > HEIGHT_KNOWN_M}
-        loose = {s for s in unsure if not _agrees(graph, s)}
-        fixed = [s for s in self._segments if s in self._placed or s in heights.keys() - loose]
+        of_any_size = {s for s in heights if not _is_scaled(graph, s)}
+        loose = {s for s in unsure if not _agrees(graph, s)} | of_any_size
+        placed = self._placed - of_any_size
+        fixed = [s for s in self._segments if s in placed or s in heights.keys() - loose]
         for segment in fixed[1:]:
             _join(piece, fixed[0], segment)
         if fixed:
@@ -313,6 +319,13 @@ def _agrees(graph: PoseGraph, segment: int) -> bool:
     by lays none on another."""
     sigma_m = graph.sigma_height_m(segment)
     return sigma_m is not None and sigma_m < HEIGHTS_AGREE_M
+
+
+def _is_scaled(graph: PoseGraph, segment: int) -> bool:
+    """True for segments of a known scale, and for the largest, which the others are laid on."""
+    found = graph.similarity(segment)
+    assert found is not None
+    return found is graph.largest_similarity() or found.sigma_scale < SCALE_KNOWN
 
 
 def _join(piece: dict[int, int], a: int, b: int) -> None:

@@ -316,8 +316,8 @@ class Scan:
         if apart:
             out.append(
                 f"left out of the cloud: {len(apart)} of {self.pipeline.segments} "
-                "segments of the flight, which neither fixes of known height nor loops tie to the "
-                "rest; fly with more overlap, or with GNSS that states its vertical accuracy"
+                "segments of the flight, which neither loops nor fixes of known height and scale "
+                "tie to the rest; fly with more overlap, or with GNSS that states its accuracy"
             )
         if frames and self.recorder.keyframes == 0:
             top = self.pipeline.refusals().most_common(2)

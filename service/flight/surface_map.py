@@ -19,6 +19,7 @@ from recon.mapping.disagreement import Disagreement
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, Voxels, tile_of, tiles_under
 from recon.stereo.reprojection import LABEL_SIGMA_PX
 from recon.types import F32, F64, I64, Bool, DepthMap
+from service.cameras.lens import SIGMA_K1
 from service.flight.viewpoints import StereoCandidate
 from service.progress import Stopwatch
 
@@ -35,10 +36,6 @@ bend surfaces by that much."""
 COMMON_FOCAL_SHARE, MAX_FOCAL_SHARE = 0.02, 0.05
 """Sigma of the focal length that all points share, so that it would only hide how they err against
 each other, and up to which sigma of depth holds the rest: above a tenth would drop all points."""
-
-SIGMA_K1 = 0.02
-"""Sigma of a lens's first radial coefficient where tags give its focal length alone: what is left
-in stills that drones straighten themselves."""
 
 MAX_OVER = 4
 

@@ -50,7 +50,7 @@ from service.scans.main_piece import (
     stretches_apart,
 )
 from service.scans.report import report_html
-from service.scans.track import csv_table, latest, local_frame, tum_lines
+from service.scans.track import csv_table, flown_m, latest, local_frame, tum_lines
 from service.scans.trust import scale_sigma, slope_deg, trust_of
 from service.scans.writing import writing
 from service.stream.records import PoseRecord, ScanHeader
@@ -382,7 +382,7 @@ def _quality(
         "views_median": None if none else float(np.median(cloud.views)),
         "seen_once_share": None if none else round(float((cloud.views <= 1).mean()), 4),
         "area_m2": 0.0 if raster is None else round(raster.area_m2, 1),
-        "distance_m": round(poses[-1].distance_m, 2) if poses else 0.0,
+        "distance_m": round(float(flown_m(poses)[-1]), 2) if poses else 0.0,
         "position_sigma_median_m": (
             round(float(np.median([p.sigma_m for p in poses])), 4) if poses else None
         ),

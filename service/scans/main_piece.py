@@ -101,5 +101,5 @@ def in_words(store: Keyframes) -> str:
     count = sum(is_apart(seq, apart) for seq in store.seqs())
     return (
         f"left out: {count} of {len(store.seqs())} keyframes, "
-        "which fixes of known height, loops or sound tracking do not tie to the rest"
+        "which fixes of known height and scale, loops or sound tracking do not tie to the rest"
     )

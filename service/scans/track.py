@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from recon import se3
-from recon.types import Camera
+from recon.types import F64, Camera
 from service.cameras.camera_file import shutter_of
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -58,6 +58,12 @@ def latest(poses: Iterator[PoseRecord]) -> list[PoseRecord]:
     return sorted({p.time_unix_ns: p for p in poses}.values(), key=lambda p: p.time_unix_ns)
 
 
+def flown_m(poses: Sequence[PoseRecord]) -> F64:
+    """(N,) way along the poses as they are now; their own was summed before later corrections."""
+    places = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
+    return np.cumsum(np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=1))
+
+
 def tum_lines(poses: Sequence[PoseRecord]) -> str:
     """TUM lines: unix seconds, then T_world_camera as tx ty tz qx qy qz qw."""
     lines = []
@@ -78,7 +84,7 @@ def csv_table(poses: Sequence[PoseRecord]) -> str:
     out = io.StringIO()
     table = csv.writer(out, lineterminator="\n")
     table.writerow(CSV_COLUMNS)
-    for p in poses:
+    for p, distance_m in zip(poses, flown_m(poses), strict=True):
         angles = (p.roll_rad, p.pitch_rad, p.yaw_rad)
         table.writerow(
             [
@@ -89,7 +95,7 @@ def csv_table(poses: Sequence[PoseRecord]) -> str:
                 _cell(p.agl_m, 3),
                 *(_cell(math.degrees(a), 4) for a in angles),
                 _cell(p.speed_m_s, 3),
-                _cell(p.distance_m, 3),
+                _cell(distance_m, 3),
                 _cell(math.degrees(p.turn_rate_rad_s), 3),
                 "+".join(p.sources),
                 _cell(p.sigma_m, 4),

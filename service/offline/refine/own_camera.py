@@ -44,6 +44,7 @@ from recon.tracking import matching
 from recon.types import F64, U8, Camera
 from service.cameras.camera_file import save_camera
 from service.cameras.images import open_images
+from service.cameras.lens import SIGMA_K1
 from service.cameras.video import open_file
 from service.errors import InputError
 
@@ -66,7 +67,8 @@ SIGMA_K = 0.25
 """Of k1 and of k2 where nothing states them: wide lenses have a k1 of -0.5 to 0.2."""
 
 MAX_SIGMA_BEND = 0.02
-"""A lens found bends depth at a corner by no more: the scan's sigma does not cover it."""
+"""A lens found that bends depth at a corner by more is accepted only where its k1 is surer than one
+that nothing states, which the scan's sigma then covers."""
 
 EXHAUSTIVE = 60
 """Up to so many images, all pairs are compared, regardless of their poses."""
@@ -121,7 +123,9 @@ def by_tags(sigma_focal: float) -> SelfCalibrationConfig:
 
 def bent(search: SelfCalibrationConfig) -> SelfCalibrationConfig:
     """``search`` for a lens of which nothing states the distortion."""
-    return replace(search, sigma_k=SIGMA_K, max_sigma_bend=MAX_SIGMA_BEND)
+    return replace(
+        search, sigma_k=SIGMA_K, max_sigma_bend=MAX_SIGMA_BEND, covered_sigma_k1=SIGMA_K1
+    )
 
 
 def sightings(
