@@ -222,14 +222,16 @@ def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, s
     facts = browser.run("document.querySelector('article .facts').innerText")
     assert f"{points} points" in facts
     assert f"{quality['sigma_median_m']:.2f} m relative" in facts
-    assert f"{quality['position_sigma_median_m']:.2f} m absolute" in facts
+    across, up = (quality[f"position_sigma_{way}_median_m"] for way in "hv")
+    absolute = f"{across:.2f} m horizontal, {up:.2f} m vertical"
+    assert f"absolute {absolute}" in facts
     assert f"Trust\n{quality['trust']['level']}" in facts
     open_scan(browser, portal)
     browser.wait(f"document.querySelector('.figures').innerText.includes('{points}')")
     figures = browser.run("document.querySelector('.figures').innerText")
     assert f"Points\n{points}" in figures
-    for name in ("sigma_median_m", "position_sigma_median_m"):
-        assert f" \N{GREEK SMALL LETTER SIGMA}\n{quality[name]:.2f} m" in figures
+    for sigma in (f"{quality['sigma_median_m']:.2f} m", absolute):
+        assert f" \N{GREEK SMALL LETTER SIGMA}\n{sigma}" in figures
     assert "Scale \N{GREEK SMALL LETTER SIGMA}\n0.7 %" in figures
     assert "Speed" not in figures  # it has landed
     follow = "[...document.querySelectorAll('button')].find(b => b.textContent === 'Follow')"

@@ -75,6 +75,10 @@ def test_ellipses_are_those_of_sampled_poses() -> None:
     places = np.array([(se3.exp(x) @ T)[:3, 3] for x in samples[:6000]])
     found = PoseRecord(0, T, spread).position_covariance
     assert np.allclose(found, np.cov(places.T), rtol=0.15, atol=0.05 * np.trace(found))
+    across = np.linalg.norm((places - places.mean(axis=0))[:, :2], axis=1)
+    of_samples = np.sqrt(np.mean(across**2)), np.std(places[:, 2])
+    assert PoseRecord(0, T, spread).sigma_h_v_m == pytest.approx(of_samples, rel=0.1)
+    assert PoseRecord(0, np.eye(4), -np.eye(6)).sigma_h_v_m == (0.0, 0.0)  # of a hostile peer
 
 
 def test_residuals_loops_drift_and_points_are_reported() -> None:

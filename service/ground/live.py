@@ -221,7 +221,7 @@ def track_message(track: FlightPath) -> str:
             "roll_deg": round(math.degrees(last.roll_rad), 1),
             "pitch_deg": round(math.degrees(last.pitch_rad), 1),
             "yaw_deg": round(math.degrees(last.yaw_rad), 1),
-            "sigma_m": round(last.sigma_m, 2),
+            "sigma_h_v_m": [round(sigma_m, 2) for sigma_m in last.sigma_h_v_m],
             "sources": list(last.sources),
         }
     return json.dumps(message)

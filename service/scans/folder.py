@@ -383,10 +383,17 @@ def _quality(
         "seen_once_share": None if none else round(float((cloud.views <= 1).mean()), 4),
         "area_m2": 0.0 if raster is None else round(raster.area_m2, 1),
         "distance_m": round(float(flown_m(poses)[-1]), 2) if poses else 0.0,
-        "position_sigma_median_m": (
-            round(float(np.median([p.sigma_m for p in poses])), 4) if poses else None
-        ),
-    }
+    } | _position_sigmas(poses)
+
+
+def _position_sigmas(poses: Sequence[PoseRecord]) -> dict[str, float | None]:
+    """Medians of the sigma of the camera's position: of all three directions together, horizontal
+    and vertical. None without poses."""
+    names = ("position_sigma_median_m", "position_sigma_h_median_m", "position_sigma_v_median_m")
+    if not poses:
+        return dict.fromkeys(names)
+    medians = np.median([(p.sigma_m, *p.sigma_h_v_m) for p in poses], axis=0)
+    return dict(zip(names, medians.round(4).tolist(), strict=True))
 
 
 def _preview(

@@ -129,7 +129,8 @@ def _accuracy(summary: dict[str, Any], raster: Raster | None) -> list[tuple[str,
         ("sigma of the points, 90 %", "sigma_90_percent_m", "m"),
         ("stereo pairs per point, median", "views_median", ""),
         ("seen by one pair only", "seen_once_share", "of 1"),
-        ("sigma of the camera's position, median", "position_sigma_median_m", "m"),
+        ("sigma of the camera's position, horizontal", "position_sigma_h_median_m", "m"),
+        ("sigma of the camera's position, vertical", "position_sigma_v_median_m", "m"),
     ):
         if quality[key] is not None:
             rows.append((name, f"{quality[key]:.3g} {unit}"))

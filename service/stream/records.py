@@ -103,6 +103,12 @@ class PoseRecord:
         """(3, 3) m2 of the camera's position."""
         return se3.about(self.T_world_camera[:3, 3], self.covariance)[3:, 3:]
 
+    @property
+    def sigma_h_v_m(self) -> tuple[float, float]:
+        """Sigma of the camera's position: horizontal (both directions together) and vertical."""
+        east, north, up = np.diag(self.position_covariance).clip(0.0)  # a peer's may be negative
+        return math.sqrt(east + north), math.sqrt(up)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Repose:

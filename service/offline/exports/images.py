@@ -12,7 +12,7 @@ import numpy as np
 
 from recon.camera_model import Undistorter, scaled_K
 from recon.surface.texture_views import TextureView
-from recon.types import U8, Camera, Keyframe
+from recon.types import U8, Array, Camera, Keyframe
 from service.cameras import open_camera
 from service.cameras.source import CameraSource
 from service.cameras.video import VideoSource
@@ -32,13 +32,16 @@ SAME_TIME_NS = 5_000_000
 def stored_images(keyframes: Sequence[Keyframe]) -> list[TextureView]:
     """A view per keyframe from the store: where it holds depth, at the depth's resolution."""
     return [
-        TextureView(
-            np.dstack([k.bgr, np.where(k.fresh, 255, 0).astype(np.uint8)]),
-            k.depth.K,
-            k.depth.T_world_camera,
-        )
+        TextureView(_bgra(k.bgr, np.where(k.fresh, 255, 0)), k.depth.K, k.depth.T_world_camera)
         for k in keyframes
     ]
+
+
+def _bgra(bgr: U8, alpha: Array) -> U8:
+    """(h, w, 4) image; many times as fast as numpy.dstack."""
+    out = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2BGRA), np.uint8)
+    out[..., 3] = alpha
+    return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +151,7 @@ def video_images(
             time_ns = start + frame.time_ns
             nearest = int(np.abs(times - time_ns).argmin())
             if abs(int(times[nearest]) - time_ns) <= SAME_TIME_NS:
-                image = np.dstack([undistort.image(frame.image), undistort.valid])
+                image = _bgra(undistort.image(frame.image), undistort.valid)
                 pose = keyframes[nearest].depth.T_world_camera
                 found[nearest] = _view(image, camera, pose, shrink)
                 say("reading the images")
@@ -161,8 +164,7 @@ def video_images(
             f"{video}: no frame was taken at the time of a keyframe; give the --video-epoch "
             "that the scan was made with"
         )
-    rest = stored_images(keyframes)
-    return [found.get(n, rest[n]) for n in range(len(keyframes))]
+    return [found.get(n) or stored_images([k])[0] for n, k in enumerate(keyframes)]
 
 
 def _view(bgra: U8, camera: Camera, T_world_camera: np.ndarray, shrink: float) -> TextureView:

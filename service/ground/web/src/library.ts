@@ -3,6 +3,7 @@
 import * as api from "./api";
 import { count, date, el, notify, size } from "./dom";
 import { jobList } from "./jobs";
+import * as units from "./units";
 import { vehicleStrip } from "./vehicle";
 
 /** What can be made, as the server and as people call it. */
@@ -229,15 +230,15 @@ function card(s: api.Scan, again: () => void): HTMLElement {
 function facts(s: api.Scan): HTMLElement {
   const rows: [string, string][] = [["Drone", s.drone], ["Flown", date(s.started_unix_s)]];
   if (s.origin) rows.push(["Place", `${s.origin.lat_deg.toFixed(5)}, ${s.origin.lon_deg.toFixed(5)}`]);
-  const { area_m2, sigma_median_m, position_sigma_median_m, trust } = s.quality ?? {};
+  const { area_m2, sigma_median_m, position_sigma_h_median_m: across, position_sigma_v_median_m: up, trust } = s.quality ?? {};
   const size: string[] = [];
   if (s.counts?.points !== undefined) size.push(`${count(s.counts.points)} points`);
   else if (s.counts?.keyframes !== undefined) size.push(`${s.counts.keyframes} keyframes`);
   if (area_m2) size.push(`${count(area_m2)} m²`);
   if (size.length) rows.push(["Size", size.join(", ")]);
   const sigma: string[] = [];
-  if (sigma_median_m) sigma.push(`${sigma_median_m.toFixed(2)} m relative`);
-  if (s.origin && position_sigma_median_m) sigma.push(`${position_sigma_median_m.toFixed(2)} m absolute`);
+  if (sigma_median_m) sigma.push(`${units.length(sigma_median_m)} relative`);
+  if (s.origin && across && up) sigma.push(`absolute ${units.sigmas(across, up)}`);
   if (sigma.length) rows.push(["Sigma", sigma.join(", ")]);
   if (trust) rows.push(["Trust", [trust.level, ...trust.reasons].join("; ")]);
   return el(

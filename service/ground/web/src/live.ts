@@ -28,7 +28,7 @@ export interface LastPose {
   roll_deg: number;
   pitch_deg: number;
   yaw_deg: number;
-  sigma_m: number;
+  sigma_h_v_m: [number, number];
   sources: string[];
 }
 

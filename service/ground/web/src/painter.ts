@@ -23,6 +23,7 @@ const MOVING_MS = 70;
 const SLICE_MS = 90;
 const FIRST_POINTS = 100_000;
 const MIN_POINTS = 20_000;
+const MAX_SLICES = 64; // showing a slice takes its time however few the points
 const SHOWN_FROM = 0.5; // of the points; until then the last, thinned frame with large points stays
 const EFFECTS_TIMES = 3; // of the points drawn while moving, once the view stands still
 
@@ -134,7 +135,8 @@ export class Painter {
   private paced(work: Work, now: number): void {
     const ms = Math.max(now - work.since, 1);
     if (work.kind === "slice") {
-      this.slice = Math.max(MIN_POINTS, this.slice * Math.min(Math.max(SLICE_MS / ms, 0.25), 1.2));
+      const least = Math.max(MIN_POINTS, (this.gradual?.wanted ?? 0) / MAX_SLICES);
+      this.slice = Math.max(least, this.slice * Math.min(Math.max(SLICE_MS / ms, 0.25), 1.2));
       return;
     }
     this.frames_per_s = 1000 / ms;

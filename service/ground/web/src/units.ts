@@ -23,6 +23,9 @@ export function setImperial(on: boolean): void {
 export const length = (m: number, digits = 2): string =>
   imperial() ? `${(m / FOOT).toFixed(digits)} ft` : `${m.toFixed(digits)} m`;
 
+/** A sigma of the position: horizontal, vertical. */
+export const sigmas = (h_m: number, v_m: number): string => `${length(h_m)} horizontal, ${length(v_m)} vertical`;
+
 export const area = (m2: number): string =>
   imperial() ? `${(m2 / FOOT ** 2).toFixed(1)} ft²` : `${m2.toFixed(1)} m²`;
 

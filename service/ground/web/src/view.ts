@@ -164,7 +164,8 @@ function rows(cloud: Cloud, { counts, quality }: api.Scan, finished: boolean, la
     ["Keyframes", String(cloud.keyframes)],
   ];
   if (finished && quality?.sigma_median_m) facts.push(["Relative σ", units.length(quality.sigma_median_m)]);
-  if (finished && quality?.position_sigma_median_m) facts.push(["Absolute σ", units.length(quality.position_sigma_median_m)]);
+  const [across, up] = finished ? [quality?.position_sigma_h_median_m, quality?.position_sigma_v_median_m] : (last?.sigma_h_v_m ?? []);
+  if (across && up) facts.push(["Absolute σ", units.sigmas(across, up)]);
   if (finished && quality?.scale_sigma) facts.push(["Scale σ", units.share(quality.scale_sigma)]);
   if (last) facts.push(["Flown", units.length(last.distance_m, 0)]);
   if (last && !finished) {
@@ -172,7 +173,6 @@ function rows(cloud: Cloud, { counts, quality }: api.Scan, finished: boolean, la
     if (last.agl_m !== null) facts.push(["Height", units.length(last.agl_m, 1)]);
     if (last.alt_amsl_m !== null) facts.push(["AMSL", units.length(last.alt_amsl_m, 1)]);
     facts.push(["Roll, pitch, yaw", `${last.roll_deg}° ${last.pitch_deg}° ${last.yaw_deg}°`]);
-    facts.push(["Absolute σ", units.length(last.sigma_m)]);
     facts.push(["From", last.sources.join(", ")]);
     if (last.lat_deg !== null && last.lon_deg !== null)
       facts.push(["At", `${last.lat_deg.toFixed(6)}, ${last.lon_deg.toFixed(6)}`]);
