@@ -53,6 +53,18 @@ def test_labels_grow_with_the_panel() -> None:
     assert shares[1] > 0.7 * shares[0]
 
 
+@pytest.mark.parametrize("side", [300, 1400])
+def test_long_lines_are_broken_before_the_edge(side: int) -> None:
+    line = "doubtful: " + "; ".join(f"reason {n} of many" for n in range(20))
+    one, many = (
+        draw_preview(raster(side, side), np.zeros((0, 3)), text, largest_px=side)
+        for text in ([line[:8]], [line])
+    )
+    assert many.shape[0] > one.shape[0] + 20
+    assert many.shape[1] == one.shape[1]
+    assert (many[:, -MARGIN // 2 :] == BACKGROUND).all()
+
+
 def test_unknown_ground_is_left_blank_and_far_tracks_do_no_harm() -> None:
     one = raster(40, 40)
     one.height_m[:, 20:] = np.nan

@@ -26,6 +26,9 @@ TRACK = (40, 60, 235)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 MARGIN = 16
 LINE_PX = 24
+MIN_LINE_PX = 640
+"""Width of the text below an image that is narrower."""
+
 SIGN_PX = 500
 """Panels this large have labels of their usual size; on larger ones labels grow, as pages show a
 panel about this large."""
@@ -219,18 +222,30 @@ def _text(image: U8, text: str, at: tuple[int, int], size: float) -> None:
 
 
 def _with_lines(image: U8, lines: Sequence[str], growth: float = 1.0) -> U8:
-    """The image in a margin, wide enough for the lines of text below it, which grow as there is
-    room."""
-    widest = max((cv2.getTextSize(t, FONT, 0.5, 1)[0][0] for t in lines), default=0)
+    """The image in a margin, with the lines of text below it, broken where they are too long."""
     h, w = image.shape[:2]
-    grown = max(1.0, min(growth, w / max(widest, 1)))
-    line_px, thick = round(LINE_PX * grown), round(grown)
-    size = (h + 2 * MARGIN + line_px * len(lines) + 6, max(w, widest) + 2 * MARGIN, 3)
+    width = max(w, MIN_LINE_PX)
+    broken = [part for text in lines for part in _broken(text, width, growth)]
+    line_px, thick = round(LINE_PX * growth), round(growth)
+    size = (h + 2 * MARGIN + line_px * len(broken) + 6, width + 2 * MARGIN, 3)
     out = np.full(size, BACKGROUND, np.uint8)
     out[MARGIN : MARGIN + h, MARGIN : MARGIN + w] = image
-    for n, text in enumerate(lines):
-        at = (MARGIN, h + 2 * MARGIN + round(10 * grown) + line_px * n)
-        cv2.putText(out, text, at, FONT, 0.5 * grown, INK, thick, cv2.LINE_AA)
+    for n, text in enumerate(broken):
+        at = (MARGIN, h + 2 * MARGIN + round(10 * growth) + line_px * n)
+        cv2.putText(out, text, at, FONT, 0.5 * growth, INK, thick, cv2.LINE_AA)
+    return out
+
+
+def _broken(text: str, width_px: int, growth: float) -> list[str]:
+    """The text in lines of at most ``width_px``, if its words allow."""
+    out = [""]
+    for word in text.split():
+        longer = f"{out[-1]} {word}".lstrip()
+        wide = cv2.getTextSize(longer, FONT, 0.5 * growth, round(growth))[0][0]
+        if wide > width_px and out[-1]:
+            out.append(word)
+        else:
+            out[-1] = longer
     return out
 
 

@@ -415,7 +415,7 @@ def _key_figures(summary: dict[str, Any]) -> list[str]:
     counts, quality, origin = summary["counts"], summary["quality"], summary["origin"]
     place = "no georeference"
     if origin is not None:
-        place = f"{origin['lat_deg']:.6f}, {origin['lon_deg']:.6f}  EPSG:{summary['epsg']}"
+        place = f"{origin['lat_deg']:.6f}, {origin['lon_deg']:.6f}, EPSG:{summary['epsg']}"
     figures = [f"{counts['points']} points from {counts['keyframes']} keyframes"]
     if counts["points"]:
         figures += [
@@ -427,4 +427,4 @@ def _key_figures(summary: dict[str, Any]) -> list[str]:
     name = summary["id"].encode("ascii", "replace").decode()
     trust = quality["trust"]
     words = f"{trust['level']}: {'; '.join(trust['reasons'])}" if trust["reasons"] else ""
-    return [f"{name}   {place}", ",  ".join(figures), *([words] if words else [])]
+    return [f"{name}, {place}", ", ".join(figures), *([words] if words else [])]
