@@ -22,9 +22,9 @@ def test_a_few_real_stills_are_placed_and_measured(tmp_path: Path) -> None:
     frames.mkdir(parents=True)
     for still in STILLS[:5]:
         shutil.copy(still, frames)
-    figures = {
-        r.what.removeprefix("Caliterra: "): r.value for r in run(BenchOptions(data=tmp_path))
-    }
+    results = run(BenchOptions(data=tmp_path, keep=tmp_path / "kept"))
+    figures = {r.what.removeprefix("Caliterra: "): r.value for r in results}
+    assert (tmp_path / "kept" / "caliterra.jpg").stat().st_size > 10_000
     assert figures["frames placed by vision"] >= 80.0
     assert figures["unbroken stretches"] == 1
     assert figures["points"] > 0.05

@@ -49,6 +49,7 @@ class BenchOptions:
     device: str = ""  # of the benchmark gpu: "cuda", "cpu", or empty for what is there
     scans: int = 0  # of the benchmark site: that many instead of two
     data: Path | None = None  # folder with ground truth, for the benchmarks that score
+    keep: Path | None = None  # folder for the previews of real flights
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,8 @@ autopilot's. A flight that cannot be reconstructed has no figure but its trust.
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -83,6 +85,8 @@ def run(options: BenchOptions) -> list[BenchResult]:
     for one in there:
         with tempfile.TemporaryDirectory(prefix="skyrelief-real-") as folder:
             flight = _replayed(one, options, Path(folder))
+            if options.keep is not None:
+                _keep_preview(flight, options.keep, one.name)
             for check in (_placed, seams, *one.checks):
                 for what, value, unit in check(flight):
                     results.append(BenchResult(f"{one.name}: {what}", value, unit))
@@ -103,6 +107,16 @@ def _replayed(one: RealSet, options: BenchOptions, folder: Path) -> ReplayedSet:
     data = options.data / one.source.split("/")[0]
     summary = json.loads((folder / "scan" / "scan.json").read_text(encoding="utf-8"))
     return ReplayedSet(data, str(source), folder / "scan", summary)
+
+
+def _keep_preview(flight: ReplayedSet, folder: Path, name: str) -> None:
+    """Copy the scan's preview. Raises OutsideError when it cannot be written."""
+    to = folder / f"{'-'.join(re.findall('[a-z0-9]+', name.lower()))}.jpg"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copy(flight.scan / "preview.jpg", to)
+    except OSError as error:
+        raise OutsideError(f"{to}: cannot be written: {error.strerror}") from error
 
 
 def _skyrelief(*words: str) -> None:

@@ -19,7 +19,7 @@ def bench(
     device: Annotated[str, typer.Option(help="for 'gpu': cuda or cpu; default: auto")] = "",
     data: Annotated[Path | None, typer.Option(help="folder of sets to score on")] = None,
     scans: Annotated[int, typer.Option(min=0, help="site: tiles of a site of so many scans")] = 0,
-    keep: Annotated[Path | None, typer.Option(help="folder for a result file (JSON)")] = None,
+    keep: Annotated[Path | None, typer.Option(help="folder for result (JSON) and previews")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Print our figure, the peer's in the same run, and the ratio."""
@@ -32,7 +32,9 @@ def bench(
         raise InputError(f"{data}: no such folder")
     if device not in ("", "cuda", "cpu"):
         raise InputError(f"--device {device}: give cuda or cpu")
-    options = BenchOptions(rounds=rounds, backend=backend, device=device, scans=scans, data=data)
+    options = BenchOptions(
+        rounds=rounds, backend=backend, device=device, scans=scans, data=data, keep=keep
+    )
     slow = {"site"} if data is not None else {"site", "real"}
     chosen = names or [name for name in BENCHMARKS if name not in slow]
     results = run_benchmarks(chosen, options)
