@@ -26,6 +26,19 @@ def test_the_strongest_features_come_first() -> None:
     assert found[:200].mean() > found[-200:].mean() + 0.15
 
 
+@pytest.mark.parametrize("share", [1, 2])
+def test_features_stay_where_they_are_in_an_image_upside_down(share: int) -> None:
+    image = still(pose(0.0))
+    h, w = image.shape
+    here = features(image, w // share).uv_px
+    there = (w - 1, h - 1) - features(np.ascontiguousarray(image[::-1, ::-1]), w // share).uv_px
+    off = here[:, None] - there
+    nearest = off[np.arange(len(here)), np.linalg.norm(off, axis=2).argmin(axis=1)]
+    same = nearest[np.linalg.norm(nearest, axis=1) < 1.5]
+    assert len(same) > 0.5 * len(here)
+    assert np.abs(np.median(same, axis=0)).max() < 0.05 * share
+
+
 def test_a_cache_forgets_what_was_not_asked_for_longest(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
 
