@@ -163,7 +163,8 @@ class Recorder:
         if not {"altitude", "gnss"} & set(found.sources):
             is_known = found.sigma_scale < GUESSED_SHARE / 2
             by = "velocity" if is_known else "an assumed height"
-        out = {"from": by, "sigma": round(found.sigma_scale, 4)}
+        # Loops and vision that give another scale than the readings leave it as unsure as that.
+        out = {"from": by, "sigma": round(max(found.sigma_scale, abs(graph.largest_growth())), 4)}
         ratio = gnss_over_heights(graph)
         return out if ratio is None else out | {"gnss_over_heights": round(ratio, 3)}
 
