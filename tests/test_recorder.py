@@ -89,7 +89,12 @@ def test_the_scale_names_what_measured_it(sources: tuple[str, ...], sigma: float
     covariance = np.diag([0.0] * 6 + [sigma**2])
     found = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
     scales: list[Scale | None] = [None, None]
-    graph = SimpleNamespace(largest_similarity=lambda: found, largest_scales=lambda: scales)
+    growth = [-2.0 * sigma]
+    graph = SimpleNamespace(
+        largest_similarity=lambda: found,
+        largest_scales=lambda: scales,
+        largest_growth=lambda: growth[0],
+    )
     recorder = Recorder.__new__(Recorder)
     recorder._chain = cast(Any, SimpleNamespace(trajectory=SimpleNamespace(graph=graph)))
     assert recorder._scale() == {"from": by, "sigma": sigma}
@@ -97,3 +102,5 @@ def test_the_scale_names_what_measured_it(sources: tuple[str, ...], sigma: float
     assert recorder._scale()["gnss_over_heights"] == pytest.approx(1.2)
     scales[1] = Scale(1.0, 0.1)
     assert "gnss_over_heights" not in recorder._scale()
+    growth[0] = -0.1 - 3.0 * sigma
+    assert recorder._scale()["sigma"] == pytest.approx(0.1 + 3.0 * sigma)

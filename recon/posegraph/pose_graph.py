@@ -182,6 +182,14 @@ class PoseGraph:
         """That of the segment with the most keyframes; None before telemetry or a loop."""
         return self._segments.largest()
 
+    def largest_growth(self) -> float:
+        """Log of that segment's scale by all factors over its scale by its own readings."""
+        segment = self._segments.largest_segment()
+        if segment is None:
+            return 0.0
+        keys = [node.key for node in self._segments.nodes[segment]]
+        return float(np.median(self._smoother.logs()[self._motions.scale_of][keys]))
+
     def largest_scales(self) -> tuple[Scale | None, Scale | None]:
         """The same segment's scale by fixes alone and by heights alone."""
         return self._segments.largest_scales()

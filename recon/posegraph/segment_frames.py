@@ -62,11 +62,12 @@ class SegmentFrames:
         return self._frames.get(segment)
 
     def largest(self) -> Similarity | None:
-        """Of the segment with the most keyframes, of those that readings place where some do."""
-        segment = self._largest()
+        """That of :meth:`largest_segment`."""
+        segment = self.largest_segment()
         return None if segment is None else self._frames[segment]
 
-    def _largest(self) -> int | None:
+    def largest_segment(self) -> int | None:
+        """The one with the most keyframes, of those that readings place where some do."""
         size = {s: (bool(f.sources), self._seen[s]) for s, f in self._frames.items()}
         return max(size, key=size.__getitem__, default=None)
 
@@ -202,7 +203,7 @@ class SegmentFrames:
 
     def largest_scales(self) -> tuple[Scale | None, Scale | None]:
         """The largest segment's scale by fixes alone and by heights alone."""
-        segment = self._largest()
+        segment = self.largest_segment()
         if segment is None:
             return None, None
         anchors = self._anchors(segment, self.constants(segment))

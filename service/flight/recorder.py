@@ -20,7 +20,7 @@ from recon.types import F64, Keyframe
 from service.cameras.rig import Rig, attitude_of
 from service.flight.anchorage import PublishedFrame, PublishedFrames
 from service.flight.pipeline import Pipeline, Step
-from service.flight.reports import FOUND, gnss_over_heights, graph_figures
+from service.flight.reports import FOUND, gnss_over_heights, graph_figures, sigma_of_scale
 from service.scans.drawing import save_debug
 from service.scans.trust import FIRST_TELEMETRY
 from service.stream.codec import encode
@@ -163,7 +163,7 @@ class Recorder:
         if not {"altitude", "gnss"} & set(found.sources):
             is_known = found.sigma_scale < GUESSED_SHARE / 2
             by = "velocity" if is_known else "an assumed height"
-        out = {"from": by, "sigma": round(found.sigma_scale, 4)}
+        out = {"from": by, "sigma": round(sigma_of_scale(graph), 4)}
         ratio = gnss_over_heights(graph)
         return out if ratio is None else out | {"gnss_over_heights": round(ratio, 3)}
 

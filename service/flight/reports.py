@@ -83,6 +83,14 @@ class GraphWatch:
         return out
 
 
+def sigma_of_scale(graph: PoseGraph) -> float:
+    """Relative sigma of the largest segment's scale; loops and vision that contradict its readings
+    leave it as unsure as they are apart."""
+    found, growth = graph.largest_similarity(), abs(graph.largest_growth())
+    assert found is not None
+    return growth if growth > SIGMAS * found.sigma_scale else found.sigma_scale
+
+
 def gnss_over_heights(graph: PoseGraph) -> float | None:
     """The scale of the largest segment by fixes over that by heights, where the two disagree."""
     by_fixes, by_heights = graph.largest_scales()
