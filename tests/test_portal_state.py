@@ -71,6 +71,12 @@ def test_the_state_says_when_the_drone_was_heard(browser: Browser, scans: Path) 
         browser.wait(
             f"/receiving · last heard 0 s ago · [1-9][0-9]* kB.s · lag 0.4 s/.test({STATE})"
         )
+        assert "no keyframe" not in browser.run(STATE)
+        browser.run(
+            "{ const now = performance.now.bind(performance);"
+            " performance.now = () => now() + 6e4; }; 0"
+        )  # a minute later, and no chunk came
+        browser.wait(f"/receiving · .* · no keyframe for [67][0-9] s/.test({STATE})")
 
 
 def test_the_report_is_linked_when_the_scan_has_finished(

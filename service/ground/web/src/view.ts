@@ -123,6 +123,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
       stage.touch();
       cameras.put(chunk.seq, chunk.T);
       images.arrived(chunk.seq);
+      link.grew();
       time.refresh();
       empty.hidden = true;
       document.body.dataset["chunk"] = `${chunk.seq} ${Date.now()}`;
