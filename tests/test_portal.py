@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import struct
 import threading
@@ -18,7 +19,10 @@ from loopback import until
 from portal_client import ONE, TOKEN, Client, FakeOperator, client, flown_store, serving, store
 
 from recon import se3
+from recon.types import Keyframe
 from service.errors import InputError, OutsideError
+from service.ground import live
+from service.ground.http import PAGE
 from service.ground.library import Library
 from service.ground.live import SIGMA_STEP_M, LiveFeed
 from service.ground.portal import Portal, PortalConfig, open_portal
@@ -386,6 +390,35 @@ def test_the_live_view_grows_with_the_scan(client: Client, store: Path, house: H
         assert seen["chunk"]["seq"] == 5
         assert seen["repose"]["seq"] == 2 and seen["repose"]["scale"] == pytest.approx(1.5)
         np.testing.assert_allclose(seen["repose"]["T"][12:15], [60.0, 0.0, 40.0])
+
+
+def test_a_chunk_is_sent_before_the_next_one_is_made(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from websockets.sync.client import connect
+
+    arrived, real = threading.Event(), live.chunk_message
+
+    def slow(keyframe: Keyframe, *arguments: Any) -> bytes:
+        assert keyframe.seq == 0 or arrived.wait(20)
+        return real(keyframe, *arguments)
+
+    monkeypatch.setattr(live, "chunk_message", slow)
+    url = client.base.replace("http", "ws") + "/api/scans/drone-1/test-1/live?points=5000"
+    with connect(url) as socket:
+        while not isinstance(socket.recv(timeout=5), bytes):
+            pass
+        arrived.set()
+
+
+def test_the_list_and_the_page_are_compressed(client: Client) -> None:
+    files = sorted((PAGE / "assets").glob("index-*"))
+    for path in ["/api/scans", *(f"/assets/{file.name}" for file in files)]:
+        request = urllib.request.Request(client.base + path, headers={"Accept-Encoding": "gzip"})
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            small, is_zipped = answer.read(), answer.headers["content-encoding"] == "gzip"
+        with urllib.request.urlopen(client.base + path, timeout=10) as answer:
+            assert is_zipped and gzip.decompress(small) == answer.read()
 
 
 def test_a_live_view_of_nothing_is_closed(client: Client) -> None:

@@ -71,6 +71,12 @@ def test_the_state_says_when_the_drone_was_heard(browser: Browser, scans: Path) 
         browser.wait(
             f"/receiving · last heard 0 s ago · [1-9][0-9]* kB.s · lag 0.4 s/.test({STATE})"
         )
+        assert "no keyframe" not in browser.run(STATE)
+        browser.run(
+            "{ const now = performance.now.bind(performance);"
+            " performance.now = () => now() + 6e4; }; 0"
+        )  # a minute later, and no chunk came
+        browser.wait(f"/receiving · .* · no keyframe for [67][0-9] s/.test({STATE})")
 
 
 def test_the_report_is_linked_when_the_scan_has_finished(
@@ -143,6 +149,16 @@ def test_list_and_map_say_whether_a_scan_is_heard(browser: Browser, scans: Path)
         kind(browser, "receiving")
         browser.open(f"{base}/#/")
         browser.wait("document.querySelector('.badge:not(.silent)')?.textContent === 'growing'")
+
+
+def test_the_list_shows_the_newest_image_of_a_scan_without_files(
+    browser: Browser, scans: Path
+) -> None:
+    for name in ("scan.json", "preview.jpg"):
+        (scans / "drone-1/test-1" / name).unlink()
+    with page_of(browser, scans, []):
+        image = "document.querySelector('.thumbnail img')"
+        browser.wait(f"{image}.src.endsWith('/keyframes/4.jpg') && {image}.naturalWidth > 0")
 
 
 @pytest.mark.parametrize("page", ["", "map/drone-1/test-1"])

@@ -181,6 +181,34 @@ def test_the_whole_site_fills_the_scene_above_the_time_slider(
     assert cols[0] > 0 and cols[-1] < width - 1 and np.ptp(cols) > 0.84 * width
 
 
+def test_the_whole_site_stays_in_sight_beside_a_panel(browser: Browser, portal: Portal) -> None:
+    browser.screen(390, 1400)
+    open_scan(browser, portal)
+    browser.click("Whole site")
+    browser.click("Coverage")
+    browser.wait("document.querySelector('.coverage img').naturalHeight > 0")
+    shown = drawn(browser)
+    browser.click("Whole site")
+    again = drawn(browser)
+    browser.screen(1280, 800)
+    assert shown.shape == again.shape
+    assert np.abs(shown.astype(int) - again).mean() < 1.0
+
+
+@pytest.mark.parametrize("screen", [(1440, 900), (390, 844)])
+def test_a_long_name_leaves_the_view_its_width(
+    browser: Browser, portal: Portal, store: Path, screen: tuple[int, int]
+) -> None:
+    labels = store / "drone-1/test-1/library.json"
+    labels.write_text(json.dumps({"title": 200 * "W"}))
+    browser.screen(*screen)
+    open_scan(browser, portal)
+    labels.unlink()
+    wide = browser.run("document.documentElement.scrollWidth")
+    browser.screen(1280, 800)
+    assert wide == screen[0]
+
+
 SLOW_CARD = """
 window.since = Infinity;
 const late = new WeakSet(), gl = WebGL2RenderingContext.prototype;

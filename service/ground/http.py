@@ -17,6 +17,8 @@ import msgspec
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import (
     FileResponse,
@@ -60,6 +62,10 @@ from service.workers import Workers
 T = TypeVar("T")
 
 PAGE = Path(__file__).parent / "web" / "dist"
+COMPRESSED = [Middleware(GZipMiddleware, compresslevel=5)]
+"""For what a slow network is to carry and is no image: the page, and the list, asked for again and
+again."""
+
 MAX_LIVE_VIEWS = 16
 MAX_VIEWS_WITHOUT_TOKEN = 8
 ORDERS_HZ, ORDERS_AT_ONCE = 1.0, 10
@@ -150,7 +156,7 @@ def portal_app(
     one = "/api/scans/{drone}/{scan}"
     routes: list[Any] = [
         Route("/", _page),
-        Route("/api/scans", _scans),
+        Route("/api/scans", _scans, middleware=COMPRESSED),
         Route(one, _scan, methods=["GET"]),
         Route(one, _label, methods=["PATCH"]),
         Route(one, _delete, methods=["DELETE"]),
@@ -177,7 +183,8 @@ def portal_app(
     document = _description(routes)
     routes.append(Route("/api/openapi.json", lambda _: JSONResponse(document)))
     if PAGE.is_dir():
-        routes.append(Mount("/assets", StaticFiles(directory=PAGE / "assets", check_dir=False)))
+        files = StaticFiles(directory=PAGE / "assets", check_dir=False)
+        routes.append(Mount("/assets", files, middleware=COMPRESSED))
     app = Starlette(
         routes=routes,
         exception_handlers={InputError: _said, OutsideError: _said, HTTPException: _refused},

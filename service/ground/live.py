@@ -35,7 +35,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from starlette.concurrency import run_in_threadpool
+from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from recon.mapping.cloud_fusion import cloud_of
@@ -255,6 +255,32 @@ POLL_S = 0.25
 LINK_S = 1.0
 
 
+@dataclass(slots=True, eq=False)
+class _LinkNews:
+    """The state of a scan's reception, every LINK_S."""
+
+    folder: Path
+    progress: Callable[[], list[dict[str, Any]]]
+    _due: float = 0.0
+
+    def messages(self, heard_unix_s: float) -> Iterator[str]:
+        """One message when it is due."""
+        if time.monotonic() >= self._due:
+            self._due = time.monotonic() + LINK_S
+            yield link_message(_entry(self.folder, self.progress()), heard_unix_s)
+
+
+def _news(feed: LiveFeed, site: SiteNews, link: _LinkNews) -> Iterator[str | bytes]:
+    """What is new; the state of the link also between two chunks."""
+    for message in feed.news():
+        yield message
+        yield from link.messages(feed.heard_unix_s)
+    placed = site.message()
+    if placed is not None:
+        yield placed
+    yield from link.messages(feed.heard_unix_s)
+
+
 async def serve_live(
     socket: WebSocket, folder: Path, progress: Callable[[], list[dict[str, Any]]]
 ) -> None:
@@ -265,17 +291,10 @@ async def serve_live(
         store = await run_in_threadpool(ScanStore.open, folder / "scan.db")
         feed = LiveFeed(store, _max_points(socket))
         gone = asyncio.create_task(_until_gone(socket))
-        site, said_at = SiteNews(folder), -LINK_S
+        site, link = SiteNews(folder), _LinkNews(folder, progress)
         while not gone.done():
-            for message in await run_in_threadpool(lambda: list(feed.news())):
-                await _send(socket, message)
-            placed = await run_in_threadpool(site.message)
-            if placed is not None:
-                await socket.send_text(placed)
-            if time.monotonic() - said_at >= LINK_S:
-                said_at = time.monotonic()
-                entry = _entry(folder, progress())
-                await socket.send_text(link_message(entry, feed.heard_unix_s))
+            async for message in iterate_in_threadpool(_news(feed, site, link)):
+                await _send(socket, message)  # before the next one is made
             await asyncio.wait({gone}, timeout=POLL_S)
     except (SkyreliefError, WebSocketDisconnect, RuntimeError) as error:
         log.debug("live view of %s ended: %s", folder, error)

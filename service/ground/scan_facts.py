@@ -84,6 +84,7 @@ class Facts(msgspec.Struct):
     quality: Annotated[dict[str, Figure | TrustFacts | None], msgspec.Meta(max_length=100)]
     notes: Annotated[list[Note], msgspec.Meta(max_length=1000)]
     origin: Origin | None = None
+    newest: Count | None = None  # keyframe of a scan that has no files yet
     failed: Annotated[dict[str, Note], msgspec.Meta(max_length=100)] = {}
 
     def shown(self) -> dict[str, Any]:
@@ -133,7 +134,7 @@ def _of_summary(path: Path, kind: type[T]) -> T:
 
 
 def _from_store(store: ScanStore) -> Facts:
-    header = store.header
+    header, seqs = store.header, store.seqs()
     origin = {
         "lat_deg": header.origin_lat_deg,
         "lon_deg": header.origin_lon_deg,
@@ -143,7 +144,8 @@ def _from_store(store: ScanStore) -> Facts:
         {
             "times": {"started_unix_s": header.started_unix_ns / 1e9},
             "finished": store.finished,
-            "counts": {"keyframes": len(store.seqs())},
+            "counts": {"keyframes": len(seqs)},
+            "newest": max(seqs, default=None),
             "quality": {},
             "notes": list(header.notes),
             "origin": None if header.origin_lat_deg is None else origin,

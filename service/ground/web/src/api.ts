@@ -34,6 +34,7 @@ export interface Scan {
   finished: boolean;
   growing: boolean;
   trouble: string | null;
+  newest?: number | null;
   counts?: { keyframes?: number; points?: number };
   quality?: {
     area_m2?: number | null;
@@ -187,6 +188,9 @@ export async function upload(files: File[], progress: (share: number) => void): 
     request.send(new Blob(files));
   });
 }
+/** The image of a keyframe. */
+export const keyframe = (s: { drone: string; scan: string }, seq: number): string => `${place(s)}/keyframes/${seq}.jpg`;
+
 export const file = (s: { drone: string; scan: string }, name: string): string =>
   `${place(s)}/files/${encodeURIComponent(name)}`;
 

@@ -160,7 +160,7 @@ export class Images {
     const image = new Image();
     image.alt = `keyframe ${seq}, seen from the aircraft`;
     image.onload = () => this.show(seq, image);
-    image.src = `${api.scanAddress(this.site.id)}/keyframes/${seq}.jpg?v=${this.version}`;
+    image.src = `${api.keyframe(this.site.id, seq)}?v=${this.version}`;
   }
 
   private show(seq: number, image: HTMLImageElement): void {

@@ -198,9 +198,12 @@ function uploads(again: () => void): [(files: FileList | null) => void, HTMLElem
 
 function card(s: api.Scan, again: () => void): HTMLElement {
   const open = api.viewAddress(s);
+  const newest = s.newest ?? null;
   const image = s.preview
     ? el("img", { src: api.file(s, "preview.jpg"), alt: `preview of ${s.title}`, loading: "lazy" })
-    : el("div", { className: "blank", textContent: "no preview yet" });
+    : newest !== null
+      ? el("img", { src: api.keyframe(s, newest), alt: `newest image of ${s.title}`, loading: "lazy" })
+      : el("div", { className: "blank", textContent: "no preview yet" });
   return el(
     "article",
     {},

@@ -4,6 +4,7 @@ import { el, size } from "./dom";
 import type { Link } from "./live";
 
 const SILENT_S = 5;
+const STILL_S = 15; // without a keyframe: the drone hovers, or its computer does not keep up
 const WINDOW_MS = 5000;
 
 export class LinkState {
@@ -13,6 +14,7 @@ export class LinkState {
   cut = "connecting";
   private link: Link | null = null;
   private at = 0;
+  private grown = performance.now();
   private readonly received: { at: number; bytes: number }[] = [];
 
   constructor() {
@@ -25,6 +27,11 @@ export class LinkState {
     if (link.received_bytes === null) return;
     this.received.push({ at: this.at, bytes: link.received_bytes });
     while (this.at - this.received[0]!.at > WINDOW_MS) this.received.shift();
+  }
+
+  /** A keyframe has come. */
+  grew(): void {
+    this.grown = performance.now();
   }
 
   /** Shows the state as it is now. */
@@ -47,6 +54,8 @@ export class LinkState {
     const rate = this.rate();
     if (rate !== null) parts.push(`${size(rate)}/s`);
     if (link.lag_s !== null) parts.push(`lag ${link.lag_s.toFixed(1)} s`);
+    const still = (performance.now() - this.grown) / 1000;
+    if (!this.finished && still > STILL_S) parts.push(`no keyframe for ${ago(still)}`);
     const what = this.finished ? "finished, receiving the rest" : "receiving";
     return ["receiving", [what, ...parts, ...backlog].join(" · ")];
   }

@@ -156,7 +156,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     "header",
     {},
     toScans(),
-    el("h1", { textContent: scan.title }),
+    el("h1", { textContent: scan.title, title: scan.title }),
     state,
     el("a", { href: open, textContent: "3D" }),
     el("a", { href: `${at}/ortho.kml`, textContent: "KML" }),

@@ -44,6 +44,7 @@ export class Stage {
   private readonly watcher: ResizeObserver;
   private touched = performance.now();
   private moved = -1e9;
+  private framed = false; // the view is still that of frame()
   private readonly keys = new Set<string>();
   private last = performance.now();
 
@@ -52,7 +53,7 @@ export class Stage {
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(0, -120, 90);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
-    this.controls.addEventListener("start", () => (this.follow = false));
+    this.controls.addEventListener("start", () => (this.follow = this.framed = false));
     this.track.frustumCulled = false;
     this.world.add(this.track, this.model);
     this.scene.add(this.world, new THREE.AmbientLight(0xffffff, 2));
@@ -111,6 +112,7 @@ export class Stage {
   /** In follow mode the view goes along with the camera at T, which looks `reach` metres far. */
   goAlong(T: number[], reach: number): void {
     if (!this.follow) return;
+    this.framed = false;
     const eye = new THREE.Vector3().setFromMatrixPosition(new THREE.Matrix4().fromArray(T));
     const axis = new THREE.Vector3(T[8], T[9], T[10]);
     const looked = eye.clone().addScaledVector(axis, reach);
@@ -122,13 +124,14 @@ export class Stage {
 
   /** Turns about a place from now on; the view keeps its direction and distance. */
   lookAt(point: THREE.Vector3): void {
-    this.follow = false;
+    this.follow = this.framed = false;
     this.camera.position.add(point).sub(this.controls.target);
     this.controls.target.copy(point);
     this.touch();
   }
 
-  /** Looks at all points from the south and above, as close as the time slider leaves room. */
+  /** Looks at all points from the south and above, as close as the time slider leaves room, also
+   * after the scene changes its size. */
   frame(): void {
     const points = this.outline();
     if (!points.length) return;
@@ -152,6 +155,7 @@ export class Stage {
     this.camera.near = reach / 2000;
     this.camera.far = reach * 20;
     this.camera.updateProjectionMatrix();
+    this.framed = true;
   }
 
   /** Some of the points of each keyframe, which are shuffled. */
@@ -244,7 +248,7 @@ export class Stage {
     move.multiplyScalar(step);
     this.camera.position.add(move);
     this.controls.target.add(move);
-    this.follow = false;
+    this.follow = this.framed = false;
     return true;
   }
 
@@ -265,6 +269,7 @@ export class Stage {
     this.camera.updateProjectionMatrix();
     this.renderer.setSize(w, h);
     this.painter.effects?.resize(w, h);
+    if (this.framed) this.frame();
     this.touch();
   }
 }

@@ -50,7 +50,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const learn = (now: api.Scan): void => {
     known = now;
     link.finished ||= now.finished;
-    title.textContent = now.title;
+    title.textContent = title.title = now.title;
     for (const page of [report, changes]) page.hidden = !now.files.some((f) => page.href.endsWith(`/${f.name}`));
   };
   learn(scan);
@@ -123,6 +123,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
       stage.touch();
       cameras.put(chunk.seq, chunk.T);
       images.arrived(chunk.seq);
+      link.grew();
       time.refresh();
       empty.hidden = true;
       document.body.dataset["chunk"] = `${chunk.seq} ${Date.now()}`;
