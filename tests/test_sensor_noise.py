@@ -34,10 +34,12 @@ def seconds(count: int, step_s: float = 1.0) -> F64:
     return np.arange(count, dtype=np.float64) * step_s
 
 
-def gauss_markov(rng: np.random.Generator, times: F64, sigma: float, tau_s: float) -> F64:
-    """(N, 2) first-order Gauss-Markov errors."""
+def gauss_markov(
+    rng: np.random.Generator, times: F64, sigma: float, tau_s: float, axes: int = 2
+) -> F64:
+    """(N, axes) first-order Gauss-Markov errors."""
     keep = np.exp(-np.diff(times) / tau_s)
-    out = rng.normal(size=(len(times), 2)) * sigma
+    out = rng.normal(size=(len(times), axes)) * sigma
     for i, k in enumerate(keep, 1):
         out[i] = k * out[i - 1] + np.sqrt(1 - k * k) * out[i]
     return np.asarray(out)
@@ -153,9 +155,42 @@ def test_velocity_gives_the_scale_where_fixes_drift() -> None:
     drifting = fit(anchors(1.006, 2.0))
     alone = fit(anchors(1.006, 2.0, travel=False))
     assert drifting is not None and alone is not None
-    assert drifting.scale == pytest.approx(1.5, rel=0.002)
+    assert drifting.scale == pytest.approx(1.5, rel=0.003)
     assert alone.scale == pytest.approx(1.5 * 1.006, rel=0.002)
     assert abs(np.log(drifting.scale / 1.5)) < 2.0 * drifting.sigma_scale
+
+
+def legs_flown(seed: int, leg_s: float, count: int, rate_m_s: float, tau_s: float) -> list[Anchor]:
+    """A keyframe a second, 60 m up; fixes wander by 1 m (60 s), velocities by ``rate_m_s``."""
+    rng, times = np.random.default_rng(seed), seconds(count)
+    along = SPEED_M_S * np.abs((times + leg_s) % (2.0 * leg_s) - leg_s)
+    at = np.column_stack([along, times, np.full(count, 60.0)])
+    fixes = at + gauss_markov(rng, times, 1.0, 60.0, 3)
+    slow = np.cumsum(gauss_markov(rng, times, rate_m_s, tau_s, 3), axis=0)
+    ways = at + slow + np.cumsum(0.02 * rng.normal(size=(count, 3)), axis=0)
+    return [
+        Anchor(
+            se3.compose(NADIR, place / 1.5),
+            PosePrior(
+                NADIR, 0.01, 0.05, fix, np.ones(3), None,
+                travel=Travel(way, float(t), 1), is_agl_measured=False,
+            ),
+            None, 0.0, float(t),
+        )
+        for t, place, fix, way in zip(times, at, fixes, ways, strict=True)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("tau_s", [20.0, 1e4])
+@pytest.mark.parametrize(("leg_s", "count", "expected"), [(30.0, 30, 0.007), (10.0, 60, 0.0015)])
+def test_sigma_of_the_scale_covers_velocities_that_err_slowly(
+    tau_s: float, leg_s: float, count: int, expected: float
+) -> None:
+    """By 0.05 m/s: over turns the error cancels, along a leg it looks like another scale."""
+    found = [fit(legs_flown(seed, leg_s, count, 0.05, tau_s)) for seed in range(12)]
+    off = np.array([[np.log(f.scale / 1.5), f.sigma_scale] for f in found if f is not None])
+    error, over_sigma = np.sqrt(np.mean(np.square([off[:, 0], off[:, 0] / off[:, 1]]), axis=1))
+    assert error < expected and over_sigma < 1.9
 
 
 def test_fixes_of_a_precise_receiver_outweigh_velocity() -> None:

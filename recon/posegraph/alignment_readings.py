@@ -1,7 +1,7 @@
 """The readings that place a segment, as rows of one least-squares problem, and how they err.
 
-Errors of fixes next to each other are not independent: fixes weigh by the inverse of their
-covariance (:mod:`recon.posegraph.sensor_noise`).
+Errors of fixes next to each other are not independent, nor are those of velocities: both weigh by
+the inverse of their covariance (:mod:`recon.posegraph.sensor_noise`).
 """
 
 from __future__ import annotations
@@ -26,6 +26,12 @@ GUESSED_SHARE = 0.5
 
 KNOWN_YAW_RAD, NO_YAW_RAD = 1.0, 3.0
 """Sigma below which a heading counts as known, and one of a heading that is not."""
+
+USUAL_RATE_M_S, RATE_S = 0.05, 20.0
+"""Sigma of the slow part of a velocity's error, and its time constant."""
+
+MIN_WAY_S = 1e-3
+"""Time that no way by velocity is shorter than."""
 
 MIN_FIX_M = 0.005
 """Sigma that no fix is better than."""
@@ -98,7 +104,7 @@ class ReadingNoise:
     tilt: Noise | None = None  # of an assumed view about its mount, rad
     claimed: F64 | None = None  # (3,) m as the fixes claim it
     walk_m_per_sqrt_s: float = 0.1  # of the integrated velocity
-    rate_m_s: float = 0.05  # constant part of the velocity's error
+    rate_m_s: float = USUAL_RATE_M_S  # of the velocity, which errs so for RATE_S
 
     def of_fixes(self, claimed: F64, fix_s: float) -> tuple[F64, tuple[Noise, Noise]]:
         """(m, 3) sigma of a fix alone, and how such errors, in units of it, go along the track:
@@ -142,10 +148,9 @@ class ReadingNoise:
         counted = [one.of_each(len(claimed), span_s) / len(claimed) ** 0.5 for one in known]
         return np.array(mean), np.array(counted)
 
-    def of_travels(self, seconds: F64, span_s: float) -> F64:
-        """(k,) sigma of ways of so many seconds each; over all of them the rate adds up."""
-        variance = self.walk_m_per_sqrt_s**2 + self.rate_m_s**2 * span_s
-        return np.asarray(np.sqrt(variance * np.maximum(seconds, 1e-3)))
+    def of_travels(self, seconds: F64) -> F64:
+        """(k,) sigma of the mean velocity, m/s, over each of so many seconds."""
+        return np.asarray(np.hypot(self.walk_m_per_sqrt_s / np.sqrt(seconds), self.rate_m_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,8 +207,11 @@ class AlignmentReadings:
         self.sigma_fix, self.wander = noise.of_fixes(self.claimed, fix_s)
         self.step = _stack([b.place - a.place for a, b in moved], (3,))
         self.way = _stack([_way(a.prior, b.prior) for a, b in moved], (3,))
-        self.way_s = _stack([_seconds(a.prior, b.prior) for a, b in moved], ())
-        self.sigma_way = noise.of_travels(self.way_s, float(np.sum(self.way_s)))
+        way_s = _stack([_seconds(a.prior, b.prior) for a, b in moved], ())
+        self.way_s = np.maximum(way_s, MIN_WAY_S)
+        self.way_end_s = _stack([b.time_s for _, b in moved], ())
+        self.sigma_speed = noise.of_travels(self.way_s)
+        self._slow = Noise(0.0, noise.rate_m_s, RATE_S)
         self.has_measured_heights = bool(heights) and independent > UNMEASURED_HEIGHTS
         self.has_heights = any(sigma < GUESSED_SHARE for _, sigma in heights)
         self.log_ratio = _stack([h[0] for h in heights], ())
@@ -215,16 +223,19 @@ class AlignmentReadings:
         """(M,) the group of each row."""
         known = 1.0 / self.sigma_turn
         known[~self.heading_known, 2] = 0.0
-        way = np.repeat(1.0 / self.sigma_way, 3)
+        way = np.repeat(1.0 / (self.sigma_speed * self.way_s), 3)
         self._whitening = np.concatenate(
             [known.ravel(), 1.0 / self.sigma_fix.ravel(), way, 1.0 / self.sigma_log,
              1.0 / self._sigma_common(turned)]
         )  # fmt: skip
         self.of_fixes = slice(len(turned), len(turned) + len(fixed))
         """Groups of the fixes."""
+        self.of_ways = slice(self.of_fixes.stop, three)
+        """Groups of the ways."""
         self._turned, self._fixed = 3 * len(turned), 3 * len(fixed)
         self._rows = slice(self._turned, self._turned + self._fixed)  # of the fixes
         self._scaled = slice(self._turned, 3 * three)
+        self._moved = slice(self._rows.stop, 3 * three)  # of the ways
         self._J = np.zeros((len(self.group), UNKNOWNS))  # where it is constant
         self._J[: self._turned, :3] = np.tile(np.eye(3), (len(turned), 1))
         self._J[self._rows, 3:6] = np.tile(np.eye(3), (len(fixed), 1))
@@ -312,7 +323,16 @@ class AlignmentReadings:
             np.einsum("ij,jak->iak", P, fixes[:, axes]) for axes, P in zip(AXES, known, strict=True)
         ]
         out[self._rows] = np.concatenate(parts, axis=1).reshape(-1, rows.shape[1])
+        out[self._moved] = self._weighted_ways(rows[self._moved], weight[self.of_ways])
         return out
+
+    def _weighted_ways(self, rows: F64, weight: F64) -> F64:
+        """Whitened rows (3 k, c) times the inverse of their covariance: a velocity's slow error
+        adds up. An outlier of a ``weight`` (k,) below 1 gets a variance of its own."""
+        sigma = self.sigma_speed[:, None]
+        own = self.sigma_speed**2 / np.maximum(weight, TINY) - self._slow.wander**2
+        ways = sigma * rows.reshape(len(sigma), 3 * rows.shape[1])
+        return (sigma * self._slow.weighted(self.way_end_s, own, ways)).reshape(rows.shape)
 
     def excess(self, r: F64, kept: F64) -> float:
         """Variance factor of the fixes: 1 where their residuals (M,) are as their noise says."""

@@ -77,29 +77,34 @@ class Noise:
     def information(self, times_s: F64, extra: F64) -> F64:
         """(N, N) inverse of the covariance of readings at (N,) times.
 
-        ``extra`` (N,) is each reading's own variance besides the white one, which is not 0. The
-        inverse of a Gauss-Markov covariance K is tridiagonal, and with D of the readings' own
+        ``extra`` (N,) is each reading's own variance besides the white one, which is not 0.
+        """
+        P = self.weighted(times_s, extra, np.eye(len(extra)))
+        if self.steady == 0.0:
+            return P
+        ends = 2.0 * (times_s - times_s[0]) / max(float(np.ptp(times_s)), 1e-9) - 1.0
+        drift = P @ ends
+        return np.asarray(P - np.outer(drift, drift) / (self.steady**-2 + ends @ drift))
+
+    def weighted(self, times_s: F64, extra: F64, rows: F64) -> F64:
+        """The inverse of the covariance, without the steady drift, times ``rows`` (N, k).
+
+        The inverse of a Gauss-Markov covariance K is tridiagonal, and with D of the readings' own
         variances (D + K)^-1 = D^-1 - D^-1 (K^-1 + D^-1)^-1 D^-1 (Woodbury).
         """
         own = self.white**2 + extra
         if len(own) < 2 or self.wander == 0.0:
-            P = np.diag(1.0 / (own + self.wander**2))
-        else:
-            keep = np.exp(-np.diff(times_s) / self.tau_s)
-            fresh = 1.0 / (self.wander**2 * np.maximum(1.0 - keep**2, MIN_FRESH))
-            inner = np.zeros((2, len(own)))
-            inner[0, 1:] = -keep * fresh
-            inner[1] = 1.0 / own
-            inner[1, 0] += self.wander**-2
-            inner[1, 1:] += fresh
-            inner[1, :-1] += keep**2 * fresh
-            D = np.diag(1.0 / own)
-            P = D - solveh_banded(inner, D) / own[:, None]
-        if self.steady == 0.0:
-            return np.asarray(P)
-        ends = 2.0 * (times_s - times_s[0]) / max(float(np.ptp(times_s)), 1e-9) - 1.0
-        drift = P @ ends
-        return np.asarray(P - np.outer(drift, drift) / (self.steady**-2 + ends @ drift))
+            return np.asarray(rows / (own + self.wander**2)[:, None])
+        keep = np.exp(-np.diff(times_s) / self.tau_s)
+        fresh = 1.0 / (self.wander**2 * np.maximum(1.0 - keep**2, MIN_FRESH))
+        inner = np.zeros((2, len(own)))
+        inner[0, 1:] = -keep * fresh
+        inner[1] = 1.0 / own
+        inner[1, 0] += self.wander**-2
+        inner[1, 1:] += fresh
+        inner[1, :-1] += keep**2 * fresh
+        alone = rows / own[:, None]
+        return np.asarray(alone - solveh_banded(inner, alone) / own[:, None])
 
     def bounded(self, claimed: float, usual_tau_s: float, least: float) -> Noise:
         """The same with a wander between ``least`` and what the sensor claims.
