@@ -76,6 +76,7 @@ def test_a_command_that_is_killed_removes_its_temporary_files(
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(Path(service.cli.__file__).parents[1])},
         stdout=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),  # nohup ignores SIGHUP
     )
     assert process.stdout is not None
     with process.stdout:
