@@ -313,11 +313,12 @@ def doubt(found: Camera, given: Camera, sigmas: F64, c: SelfCalibrationConfig) -
             f"{100 * c.max_sigma_focal:.1f} %): seen straight down from one height it looks "
             "like another height; fly two heights or an oblique turn"
         )
-    bend, covered = (corner_bend(found, k1) for k1 in (float(sigmas[4]), c.covered_sigma_k1))
-    if bend > max(c.max_sigma_bend, covered):
+    bend = corner_bend(found, float(sigmas[4]))
+    asked = max(c.max_sigma_bend, corner_bend(found, c.covered_sigma_k1))
+    if bend > asked:
         return (
             f"the flight does not determine the distortion (to {100 * bend:.1f} % of depth at a "
-            f"corner, asked {100 * max(c.max_sigma_bend, covered):.1f} %); let images overlap more"
+            f"corner, asked {100 * asked:.1f} %); let images overlap more"
         )
     off = abs(found.K[0, 0] / given.K[0, 0] - 1.0) / c.sigma_focal
     shift = np.abs(found.K[:2, 2] - given.K[:2, 2]).max()

@@ -66,7 +66,7 @@ def draw_preview(
 
 def blank_preview(lines: Sequence[str]) -> U8:
     """The image of a scan without any surface: only its key figures."""
-    return _with_lines(np.full((120, 640, 3), BACKGROUND, np.uint8), lines)
+    return _with_lines(np.full((120, MIN_LINE_PX, 3), BACKGROUND, np.uint8), lines)
 
 
 def _relief(raster: Raster) -> F32:
