@@ -5,6 +5,8 @@ from __future__ import annotations
 import datetime as dt
 import json
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unittest.mock import Mock
@@ -226,6 +228,32 @@ def test_a_missing_package_is_reported_before_the_work(
     ):
         export(scan, "dsm", None, ExportOptions())
     assert steps == []
+
+
+def test_what_deliverables_share_is_made_once_and_holds_up_nothing_else(scan_dir: Path) -> None:
+    with ScanView(scan_dir) as scan, ThreadPoolExecutor(2) as pool:
+        began, may_end = threading.Event(), threading.Event()
+
+        def make() -> bool:
+            began.set()
+            return may_end.wait(30.0)
+
+        made = Mock(side_effect=make)
+        both = [pool.submit(scan.shared, "long", made) for _ in range(2)]
+        assert began.wait(30.0)
+        try:
+            assert scan.shared("short", lambda: may_end.is_set()) is False
+        finally:
+            may_end.set()
+        assert [one.result(30.0) for one in both] == [True, True]
+        made.assert_called_once()
+
+
+def test_what_could_not_be_made_is_tried_again(scan_dir: Path) -> None:
+    with ScanView(scan_dir) as scan:
+        with pytest.raises(InputError, match="disk"):
+            scan.shared("part", Mock(side_effect=InputError("the disk is full")))
+        assert scan.shared("part", lambda: 3) == 3
 
 
 def test_ortho_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:

@@ -10,7 +10,7 @@ from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -103,6 +103,21 @@ class ProductJob:
     options: ExportOptions
 
 
+class _Once(Generic[T]):
+    """A value that the first thread makes which asks; the others wait for it."""
+
+    def __init__(self) -> None:
+        self._making = threading.Lock()
+        self._made: list[T] = []
+
+    def get(self, make: Callable[[], T]) -> T:
+        """The value; what ``make`` raises is raised, and the next thread makes it."""
+        with self._making:
+            if not self._made:
+                self._made.append(make())
+            return self._made[0]
+
+
 class ScanView:
     """An open scan folder; close it, or use it in a ``with``."""
 
@@ -123,8 +138,8 @@ class ScanView:
         self.store = ScanStore.open(folder / "scan.db")
         self._voxel_m = voxel_m
         self.progress = progress or Progress()
-        self._shared: dict[Any, Any] = {}
-        self._lock = threading.RLock()
+        self._shared: dict[Any, _Once[Any]] = {}
+        self._lock = threading.Lock()
         self._datums: tuple[str, str] | None = None  # heights from the first to the second
         self._box = EVERYWHERE
         if tile is not None:
@@ -170,10 +185,8 @@ class ScanView:
     def shared(self, key: Any, make: Callable[[], T]) -> T:
         """What several deliverables are made from, made once; other threads wait for it."""
         with self._lock:
-            if (self._datums, key) not in self._shared:
-                self._shared[self._datums, key] = make()
-            found: T = self._shared[self._datums, key]
-            return found
+            one: _Once[T] = self._shared.setdefault((self._datums, key), _Once())
+        return one.get(make)
 
     @cached_property
     def frame(self) -> LocalFrame | None:
