@@ -19,6 +19,7 @@ from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.se3 import rotation_from_quaternion
 from recon.types import F64, Shutter
 from service.cameras.camera_file import load_camera
+from service.cameras.video import creation_unix_ns
 from service.cli import app
 from service.errors import InputError
 from service.sim.ground_texture import patchwork
@@ -218,6 +219,21 @@ def test_same_seed_same_files(exact: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(a[0].to_ndarray(), b[0].to_ndarray())
     with pytest.raises(InputError, match="already holds a flight"):
         simulate(tmp_path / "a")
+
+
+def test_each_flight_of_a_place_has_its_own_time(tmp_path: Path) -> None:
+    starts = set()
+    other, second = ("--flight-seed", "8"), ("--date", "2")
+    for n, words in enumerate(((), other, second, (*other, *second))):
+        folder = tmp_path / str(n)
+        simulate(folder, "--seed", "7", "--fps", "1", *words)
+        start = json.loads((folder / "truth" / "params.json").read_text())["video_epoch_unix_s"]
+        with av.open(str(folder / "flight.mp4")) as video:
+            assert creation_unix_ns(video, video.streams.video[0]) == start * 10**9
+        assert abs(packets(folder / "flight.tlog")[0]._timestamp - start) < 60.0
+        assert trajectory(folder)[0, 0] == start
+        starts.add(start)
+    assert len(starts) == 4
 
 
 def test_faults_on_purpose(tmp_path: Path) -> None:

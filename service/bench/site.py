@@ -26,7 +26,6 @@ from service.georeference import LocalFrame
 from service.scans.track import local_frame
 from service.sim.flight import FlightPlan, Sensors
 from service.sim.recording import (
-    EPOCH_UNIX_S,
     ORIGIN,
     Simulation,
     SimulationOptions,
@@ -104,11 +103,10 @@ def _replayed(
     sensors = Sensors(
         simulation.flight, simulation.options.noise, np.random.default_rng([seed, *name.encode()])
     )
-    stream = packets(
-        sensors, ORIGIN, EPOCH_UNIX_S, simulation.surface_range, simulation.options.telemetry
-    )
+    start = simulation.options.started_unix_s
+    stream = packets(sensors, ORIGIN, start, simulation.surface_range, simulation.options.telemetry)
     log = folder / f"{name}-{seed}.tlog"
-    write_tlog(log, EPOCH_UNIX_S, stream)
+    write_tlog(log, start, stream)
     skyrelief(
         "replay", str(folder / name / "flight.mp4"), "--telemetry", str(log), "--camera-model",
         str(folder / name / "camera.yaml"), "--out", str(out), "--backend", options.backend,

@@ -21,8 +21,8 @@ from typing import Any
 import av
 
 from mavlink.wire.tlog import packets
+from service.cameras.video import creation_unix_ns
 from service.errors import InputError, OutsideError
-from service.sim.recording import EPOCH_UNIX_S
 from service.sim.telemetry import BOOT_BEFORE_VIDEO_S
 
 log = logging.getLogger(__name__)
@@ -150,7 +150,9 @@ def _play_once(video: Path, tlog: Path, options: LiveOptions, player: MavlinkPla
         with av.open(str(video)) as source, av.open(url, "w", format="mpegts") as sink:
             stream = sink.add_stream_from_template(source.streams.video[0])
             end_s = (source.duration or 0) / av.time_base
-            telemetry = (e for e in _telemetry(tlog) if not options.loop or 0 <= e[0] <= end_s)
+            start_ns = creation_unix_ns(source, source.streams.video[0]) or 0
+            said = _telemetry(tlog, start_ns)
+            telemetry = (e for e in said if not options.loop or 0 <= e[0] <= end_s)
             events = heapq.merge(_packets(source), telemetry, key=lambda e: e[:2])
             start = None
             for due_s, kind, payload in events:
@@ -187,9 +189,9 @@ def _packets(source: Any) -> Iterator[tuple[float, int, Any]]:
             yield float(packet.dts * packet.time_base), CAMERA, packet
 
 
-def _telemetry(tlog: Path) -> Iterator[tuple[float, int, bytes]]:
+def _telemetry(tlog: Path, start_unix_ns: int) -> Iterator[tuple[float, int, bytes]]:
     """(seconds, TELEMETRY, packet) of the log; nothing when there is none."""
     if tlog.exists():
         with tlog.open("rb") as file:
             for unix_ns, packet in packets(file, Counter()):
-                yield unix_ns * 1e-9 - EPOCH_UNIX_S, TELEMETRY, packet.data
+                yield (unix_ns - start_unix_ns) * 1e-9, TELEMETRY, packet.data

@@ -33,6 +33,8 @@ from service.sim.truth import write_surface
 log = logging.getLogger(__name__)
 
 EPOCH_UNIX_S = 1_777_629_600  # 2026-05-01 10:00:00 UTC: containers keep whole seconds
+FLIGHT_S, FLIGHTS = 600, 10_000
+"""From the start of a flight to that of the next by its seed, and how many flights a date has."""
 ORIGIN = LocalFrame(47.3977, 8.5456, 488.0)
 DISTORTION = (-0.12, 0.03, 0.0, 0.0, 0.0)
 TERRAIN_STEPS = 6
@@ -122,6 +124,15 @@ class SimulationOptions:
     def own_seed(self) -> int:
         """The seed of the motion and the sensors."""
         return self.seed if self.flight_seed is None else self.flight_seed
+
+    @property
+    def started_unix_s(self) -> int:
+        """Time of the first frame; another one for each flight of a place, the second date later.
+
+        Two scans that begin at the same time and place count as one flight.
+        """
+        flight_s = FLIGHT_S * ((self.own_seed - self.seed) % FLIGHTS)
+        return EPOCH_UNIX_S + FLIGHT_S * FLIGHTS * (self.date - 1) + flight_s
 
     @property
     def frames(self) -> int:
@@ -262,10 +273,10 @@ def write(
         packet_count = 0
         if options.with_telemetry:
             stream = packets(
-                simulation.sensors(), ORIGIN, EPOCH_UNIX_S,
+                simulation.sensors(), ORIGIN, options.started_unix_s,
                 simulation.surface_range, options.telemetry,
             )  # fmt: skip
-            packet_count = write_tlog(folder / "flight.tlog", EPOCH_UNIX_S, stream)
+            packet_count = write_tlog(folder / "flight.tlog", options.started_unix_s, stream)
         _write_truth(simulation, truth)
         parameters = _parameters(simulation, packet_count)
         (truth / "params.json").write_text(json.dumps(parameters, indent=2) + "\n")
@@ -288,7 +299,11 @@ def _write_truth(simulation: Simulation, truth: Path) -> None:
         for t, T in zip(simulation.times_s, simulation.poses, strict=True):
             q = quaternion_from_rotation(T[:3, :3])
             row = [*T[:3, 3], q[1], q[2], q[3], q[0]]
-            out.write(f"{EPOCH_UNIX_S + t:.6f} " + " ".join(f"{v:.9f}" for v in row) + "\n")
+            out.write(
+                f"{simulation.options.started_unix_s + t:.6f} "
+                + " ".join(f"{v:.9f}" for v in row)
+                + "\n"
+            )
     count = min(simulation.options.depth_frames, len(simulation.times_s))
     for k in np.unique(np.linspace(0, len(simulation.times_s) - 1, count).astype(int)):
         np.savez_compressed(
@@ -296,7 +311,9 @@ def _write_truth(simulation: Simulation, truth: Path) -> None:
             depth_m=simulation.renderer.depth(simulation.poses[k], simulation.options.look.water_m),
             K=simulation.options.camera.K,
             T_world_camera=simulation.poses[k],
-            time_unix_ns=np.int64(round((EPOCH_UNIX_S + simulation.times_s[k]) * 1e9)),
+            time_unix_ns=np.int64(
+                round((simulation.options.started_unix_s + simulation.times_s[k]) * 1e9)
+            ),
         )
 
 
@@ -319,7 +336,7 @@ def _parameters(simulation: Simulation, packet_count: int) -> dict[str, Any]:
     values["photos"] = options.photos.name if options.photos else None
     return {
         "options": values,
-        "video_epoch_unix_s": EPOCH_UNIX_S,
+        "video_epoch_unix_s": options.started_unix_s,
         "frames": len(t),
         "packets": packet_count,
         "K": options.camera.K.tolist(),
@@ -336,7 +353,7 @@ def _write_video(
 ) -> None:
     """H.264 in MP4 with a constant frame rate and the time of the first frame."""
     options = simulation.options
-    created = datetime.fromtimestamp(EPOCH_UNIX_S, timezone.utc)
+    created = datetime.fromtimestamp(options.started_unix_s, timezone.utc)
     rate = Fraction(options.fps).limit_denominator(1001)
     with av.open(str(path), "w") as container:
         container.metadata["creation_time"] = created.strftime("%Y-%m-%dT%H:%M:%S.000000Z")
