@@ -319,7 +319,7 @@ def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
     closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel)[pad:-pad, pad:-pad] > 0
     holes = closed & ~known
     height, sigma, rgb = raster.height_m.copy(), raster.sigma_m.copy(), raster.rgb.copy()
-    _fill(np.argwhere(holes), known, largest_cells, height, sigma, rgb)
+    _fill(np.ascontiguousarray(np.argwhere(holes)), known, largest_cells, height, sigma, rgb)
     return Raster(raster.grid, height, sigma, rgb)
 
 

@@ -53,9 +53,8 @@ class TriangleGrid:
         ``origins`` is (N, 3) or (3,). Raises ValueError for other shapes.
         """
         directions = _rows(directions, "directions")
-        origins = np.ascontiguousarray(
-            np.broadcast_to(np.asarray(origins, np.float64), directions.shape)
-        )
+        origins = np.broadcast_to(origins, directions.shape)
+        origins = np.require(origins, np.float64, ("C", "W"))  # each layout would be compiled
         t = np.empty(len(directions))
         hit = np.empty(len(directions), np.int32)
         in_bands(_cast_all, len(directions), self.arrays(), origins, directions, t, hit)
