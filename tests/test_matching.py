@@ -339,5 +339,5 @@ def test_real_stills_obey_one_epipolar_geometry(first: str, second: str) -> None
 
 @pytest.mark.parametrize("warp", [None, np.eye(2), np.tile(np.eye(2), (5, 1, 1))])
 def test_warps_have_one_layout(warp: F64 | None) -> None:
-    """The kernels are compiled for each that they see: seconds, in flight."""
+    """The kernels are compiled for each that they see, which takes eight seconds."""
     assert all(rows.flags.c_contiguous for rows in checked_warps(warp, 5))
