@@ -23,9 +23,8 @@ demo: $(CORE)
 unexport PYTHONDONTWRITEBYTECODE
 
 # A worker a core and one more, as tests of services wait half of their time; JOBS=0: one after the
-# other, in one process. Threads of torch next to them would spin: five times the processor time.
+# other, in one process.
 JOBS ?= $(shell $(PYTHON) -c 'import os; print(1 + (os.cpu_count() or 1))')
-test: export OMP_NUM_THREADS ?= 1
 test: $(STAMP) $(PEERS)
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
 

@@ -16,6 +16,9 @@ from service.stream.codec import encode
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
 
+# Threads of torch beside other work spin: up to ten times the processor time.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 settings.register_profile("loaded machines", deadline=None)
 settings.load_profile("loaded machines")
 

@@ -15,7 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from recon.tracking.common_view import common_view, features
-from recon.tracking.matching import MatchingConfig, Pyramid, harris_grid, match
+from recon.tracking.matching import MatchingConfig, Pyramid, checked_warps, harris_grid, match
 from recon.types import F64, U8, Bool
 
 CALITERRA = Path(__file__).resolve().parents[2] / "shared" / "data" / "caliterra_nadir" / "frames"
@@ -335,3 +335,9 @@ def test_real_stills_obey_one_epipolar_geometry(first: str, second: str) -> None
     )
     # The lens bends lines, which is not taken out here: the rim fits less well.
     assert inliers.sum() > 400 and np.mean(inliers) > 0.85
+
+
+@pytest.mark.parametrize("warp", [None, np.eye(2), np.tile(np.eye(2), (5, 1, 1))])
+def test_warps_have_one_layout(warp: F64 | None) -> None:
+    """The kernels are compiled for each that they see, which takes eight seconds."""
+    assert all(rows.flags.c_contiguous for rows in checked_warps(warp, 5))

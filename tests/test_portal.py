@@ -25,7 +25,7 @@ from service.ground import live
 from service.ground.http import PAGE
 from service.ground.library import Library
 from service.ground.live import SIGMA_STEP_M, LiveFeed
-from service.ground.portal import Portal, PortalConfig, open_portal
+from service.ground.portal import Portal, PortalConfig, config_of
 from service.ground.scan_files import DARK
 from service.ground.scan_files import _closed as closed_image
 from service.ground.vehicle import Vehicle
@@ -572,13 +572,13 @@ def test_the_ground_command_serves_the_portal(store: Path, tmp_path: Path) -> No
 
 def test_unfit_tokens_and_certificates_are_said(store: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").write_text("\n")
-    for options in (
-        {"token_file": tmp_path / "none"},
-        {"token_file": tmp_path / "empty"},
-        {"tls": (tmp_path / "a.crt", tmp_path / "a.key")},
+    for token_file, tls in (
+        (tmp_path / "none", None),
+        (tmp_path / "empty", None),
+        (None, (tmp_path / "a.crt", tmp_path / "a.key")),
     ):
         with pytest.raises(InputError):
-            open_portal("127.0.0.1:0", store, **options)
+            config_of("127.0.0.1:0", store, token_file, tls)
 
 
 def test_orders_and_figures_of_the_vehicle(store: Path) -> None:

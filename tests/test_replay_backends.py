@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -22,7 +21,6 @@ def replayed(*arguments: str | Path) -> dict[str, Any]:
     done = subprocess.run(
         [sys.executable, "-m", "service.cli", "replay", *map(str, arguments), "--json"],
         capture_output=True, text=True, timeout=500, check=False,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     report: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])

@@ -50,11 +50,8 @@ def height_mesh(raster: Raster, largest_faces: int = 400_000) -> Mesh:
             np.column_stack([b[second], c[second], d[second]]),
         ]
     ).astype(np.int32)
-    rows, cols = np.nonzero(known)
-    grid = raster.grid
-    x = grid.west_m + (cols + 0.5) * grid.cell_m
-    y = grid.north_m - (rows + 0.5) * grid.cell_m
-    vertices = np.column_stack([x, y, raster.height_m[known].astype(np.float64)])
+    places = raster.grid.centres(*np.nonzero(known))
+    vertices = np.column_stack([places, raster.height_m[known].astype(np.float64)])
     vertices, faces = _without_lone_vertices(vertices, faces)
     if len(faces) > largest_faces:
         vertices, faces = _simplified(vertices, faces, largest_faces)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from recon.types import F32, F64, I64, U8, Bool, PointCloud
+from recon.types import F32, F64, I64, U8, Array, Bool, PointCloud
 
 TOP_SIGMAS = 4.0
 """Points this many of its sigmas below the highest point of a cell are its surface too."""
@@ -89,6 +89,11 @@ class Grid:
         col = (xy[:, 0] - self.west_m) / self.cell_m - 0.5
         row = (self.north_m - xy[:, 1]) / self.cell_m - 0.5
         return np.column_stack([col, row])
+
+    def centres(self, rows: Array, cols: Array) -> F64:
+        """(N, 2) metres east and north of the middles of cells (N,)."""
+        x, y = (np.asarray(at, np.float64) + 0.5 for at in (cols, rows))
+        return np.column_stack([self.west_m + x * self.cell_m, self.north_m - y * self.cell_m])
 
     def holds(self, xy_m: F64) -> Bool:
         """(N,) which of (N, 2) m lie on the grid; what is not finite does not."""
@@ -314,7 +319,7 @@ def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
     closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel)[pad:-pad, pad:-pad] > 0
     holes = closed & ~known
     height, sigma, rgb = raster.height_m.copy(), raster.sigma_m.copy(), raster.rgb.copy()
-    _fill(np.argwhere(holes), known, largest_cells, height, sigma, rgb)
+    _fill(np.ascontiguousarray(np.argwhere(holes)), known, largest_cells, height, sigma, rgb)
     return Raster(raster.grid, height, sigma, rgb)
 
 

@@ -53,12 +53,11 @@ class TriangleGrid:
         ``origins`` is (N, 3) or (3,). Raises ValueError for other shapes.
         """
         directions = _rows(directions, "directions")
-        origins = np.ascontiguousarray(
-            np.broadcast_to(np.asarray(origins, np.float64), directions.shape)
-        )
+        origins = np.broadcast_to(origins, directions.shape)
+        origins = np.require(origins, np.float64, ("C", "W"))  # each layout would be compiled
         t = np.empty(len(directions))
         hit = np.empty(len(directions), np.int32)
-        in_bands(_cast_all, len(directions), *self.arrays(), origins, directions, t, hit)
+        in_bands(_cast_all, len(directions), self.arrays(), origins, directions, t, hit)
         return t, hit
 
     def closest(self, points: F64, max_m: float) -> tuple[F64, F64, I32]:
@@ -71,11 +70,11 @@ class TriangleGrid:
         nearest = np.empty((len(points), 3))
         hit = np.empty(len(points), np.int32)
         found = distance, nearest, hit
-        in_bands(_closest_all, len(points), *self.arrays(), points, float(max_m), *found)
+        in_bands(_closest_all, len(points), self.arrays(), points, float(max_m), *found)
         return distance, nearest, hit
 
     def arrays(self) -> tuple[Any, ...]:
-        """The arguments that the compiled functions of this module begin with."""
+        """What the compiled functions of this module take as ``grid``."""
         return (
             self.corners, self.start, self.items, self.column_z, self.block_z, self.bounds,
             self.cell_m,
@@ -215,10 +214,9 @@ def _exit(x0, y0, size, i, j, ox, oy, ix, iy):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def first_hit(  # type: ignore[no-untyped-def]
-    corners, start, items, column_z, block_z, bounds, cell_m, ox, oy, oz, dx, dy, dz
-):
+def first_hit(grid, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """(t, triangle) of the first hit of one ray, or (inf, -1); for use in compiled loops."""
+    corners, start, items, column_z, block_z, bounds, cell_m = grid
     t, t_out = _clip(bounds, ox, oy, oz, dx, dy, dz)
     if t > t_out:
         return np.inf, -1
@@ -272,16 +270,10 @@ def first_hit(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cast_all(  # type: ignore[no-untyped-def]
-    begin, end, corners, start, items, column_z, block_z, bounds, cell_m, origins, directions, t,
-    hit,
-):  # fmt: skip
+def _cast_all(begin, end, grid, origins, directions, t, hit):  # type: ignore[no-untyped-def]
     for n in range(begin, end):
         o, d = origins[n], directions[n]
-        tn, m = first_hit(
-            corners, start, items, column_z, block_z, bounds, cell_m,
-            o[0], o[1], o[2], d[0], d[1], d[2],
-        )  # fmt: skip
+        tn, m = first_hit(grid, o[0], o[1], o[2], d[0], d[1], d[2])
         t[n] = tn if m >= 0 else np.nan
         hit[n] = m
 
@@ -333,9 +325,9 @@ def _column_distance2(column_z, bounds, cell_m, i, j, px, py, pz):  # type: igno
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _closest_all(  # type: ignore[no-untyped-def]
-    begin, end, corners, start, items, column_z, block_z, bounds, cell_m, points, max_m, distance,
-    nearest, hit,
-):  # fmt: skip
+    begin, end, grid, points, max_m, distance, nearest, hit
+):
+    corners, start, items, column_z, _, bounds, cell_m = grid
     ny, nx = column_z.shape[0], column_z.shape[1]
     for n in range(begin, end):
         px, py, pz = points[n, 0], points[n, 1], points[n, 2]

@@ -231,7 +231,7 @@ def checked_points(uv_px: npt.ArrayLike) -> F64:
 def checked_warps(warp: npt.ArrayLike | None, count: int) -> tuple[F64, F64]:
     """Forward and inverse warps as (N, 4) rows; a singular warp becomes the identity."""
     matrices = np.eye(2) if warp is None else np.asarray(warp, dtype=np.float64)
-    matrices = np.array(np.broadcast_to(matrices, (count, 2, 2)))
+    matrices = np.array(np.broadcast_to(matrices, (count, 2, 2)), order="C")
     determinant = matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]
     usable = np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(determinant) > 1e-3)
     matrices[~usable] = np.eye(2)

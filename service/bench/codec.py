@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -26,102 +26,70 @@ REPEATS = 30
 FRAMES = 3
 
 
-class CodecFigures(NamedTuple):
-    """A codec's result on the keyframes; infinite or zero where nothing is lost."""
+class Coded(NamedTuple):
+    """A codec on one keyframe; infinite or zero where nothing is lost."""
 
-    bits_per_point: float
-    encode_ms: float
+    encode: Callable[[], bytes]
+    points: int
     rms_at_60_m_m: float
     psnr_db: float
 
 
-Coded = tuple[Callable[[], bytes], int, float, float]
-"""Encodes a keyframe; its points, the depth's error at 60 m, and the colour's PSNR."""
-
-
-def measure() -> dict[str, CodecFigures]:
-    """Our codec first, then every peer that is installed."""
+def run(options: BenchOptions) -> list[BenchResult]:
+    """Bits per point against every peer, encoding time, error, masking and coarse share."""
     frames = [make_keyframe(k, SIZE_PX, seed=1 + k) for k in range(FRAMES)]
-    found = {}
+    figures = {}
     for name, codec_of in CODECS.items():
         with contextlib.suppress(ImportError):
-            found[name] = _figures([codec_of(frame) for frame in frames])
-    return found
-
-
-def _figures(coded: list[Coded]) -> CodecFigures:
+            figures[name] = _figures([codec_of(frame) for frame in frames])
+    bits, encode_ms, rms_cm, psnr = figures.pop("skyrelief")
+    results = []
+    for name, (peer_bits, peer_ms, peer_cm, _) in figures.items():
+        error = f"error at 60 m {rms_cm:.2f} cm against {peer_cm:.2f} cm"
+        results += [
+            BenchResult("size with colour", bits, "bits per point", 0.0, name, peer_bits,
+                        note=error),
+            BenchResult("encode 320x180, both layers, one core", encode_ms, "ms", 0.0, name,
+                        peer_ms),
+        ]  # fmt: skip
+    parts = [replace(f, fresh=strip(SIZE_PX, 20 + k)) for k, f in enumerate(frames)]
+    whole, new = ([codec.encode(frame, 0) for frame in some] for some in (frames, parts))
     with _one_core():
-        encode_ms = [_median_ms(encode) for encode, *_ in coded]
-    bits = [8 * len(encode()) / points for encode, points, *_ in coded]
-    rms, psnr = np.array([lost for _, _, *lost in coded]).T
-    return CodecFigures(
-        float(np.mean(bits)), float(np.median(encode_ms)), float(np.sqrt(np.mean(rms**2))),
+        strip_ms = _median_ms(lambda: codec.encode(parts[0], 0))
+        decode_ms = _median_ms(lambda: codec.decode(whole[0][-1:]))
+    points = sum(int(frame.fresh.sum()) for frame in parts)
+    return [
+        *results,
+        BenchResult("depth error at 60 m", rms_cm, "cm rms"),
+        BenchResult("colour", psnr, "dB PSNR"),
+        BenchResult("sent of a keyframe at 80 % overlap", 100 * _size(new) / _size(whole), "%"),
+        BenchResult("size of such keyframes", 8 * _size(new) / points, "bits per point"),
+        BenchResult("encode one of them", strip_ms, "ms"),
+        BenchResult("decode a whole keyframe", decode_ms, "ms"),
+        BenchResult("coarse layer of their bytes", 100 * _coarse_share(new), "%"),
+        BenchResult("coarse layer of a whole keyframe", 100 * _coarse_share(whole), "%"),
+    ]
+
+
+def _figures(coded: list[Coded]) -> tuple[float, float, float, float]:
+    """Bits per point, milliseconds to encode, centimetres at 60 m, dB PSNR."""
+    with _one_core():
+        encode_ms = [_median_ms(one.encode) for one in coded]
+    bits = [8 * len(one.encode()) / one.points for one in coded]
+    rms, psnr = np.array([one[2:] for one in coded]).T
+    return (
+        float(np.mean(bits)), float(np.median(encode_ms)), 100 * float(np.sqrt(np.mean(rms**2))),
         float(np.mean(psnr)),
     )  # fmt: skip
 
 
-def run(options: BenchOptions) -> list[BenchResult]:
-    """Bits per point against every peer, encoding time, error, masking and coarse share."""
-    figures = measure()
-    ours = figures.pop("skyrelief")
-    results = []
-    for name, peer in figures.items():
-        error = f"{ours.rms_at_60_m_m * 100:.2f} cm against {peer.rms_at_60_m_m * 100:.2f} cm"
-        results += [
-            BenchResult("size with colour", ours.bits_per_point, "bits per point", 0.0,
-                        name, peer.bits_per_point, note=f"error at 60 m {error}"),
-            BenchResult("encode 320x180, both layers, one core", ours.encode_ms, "ms", 0.0,
-                        name, peer.encode_ms),
-        ]  # fmt: skip
-    saved, bits = masking()
-    return [
-        *results,
-        BenchResult("depth error at 60 m", ours.rms_at_60_m_m * 100, "cm rms"),
-        BenchResult("colour", ours.psnr_db, "dB PSNR"),
-        BenchResult("sent of a keyframe at 80 % overlap", 100 * (1 - saved), "%"),
-        BenchResult("size of such keyframes", bits, "bits per point"),
-        BenchResult("encode one of them", strip_ms(), "ms"),
-        BenchResult("decode a whole keyframe", decode_ms(), "ms"),
-        BenchResult("coarse layer of their bytes", 100 * coarse_share(), "%"),
-        BenchResult("coarse layer of a whole keyframe", 100 * coarse_share(False), "%"),
-    ]
+def _size(frames: Sequence[Sequence[bytes]]) -> int:
+    return sum(len(layer) for layers in frames for layer in layers)
 
 
-def masking() -> tuple[float, float]:
-    """Share of the bytes saved by sending only new surface at 80 % overlap, and the bits per point
-    of such keyframes."""
-    whole = sum(_size(make_keyframe(k, SIZE_PX, seed=1 + k)) for k in range(FRAMES))
-    fresh = [strip(SIZE_PX, 20 + k) for k in range(FRAMES)]
-    frames = [make_keyframe(k, SIZE_PX, f, seed=1 + k) for k, f in enumerate(fresh)]
-    part = sum(map(_size, frames))
-    return 1 - part / whole, part * 8 / sum(int(f.sum()) for f in fresh)
-
-
-def strip_ms() -> float:
-    """Milliseconds to encode a keyframe at 80 % overlap, both layers, on one core."""
-    frame = make_keyframe(0, SIZE_PX, strip(SIZE_PX, 20), seed=1)
-    with _one_core():
-        return _median_ms(lambda: codec.encode(frame, 0))
-
-
-def decode_ms() -> float:
-    """Milliseconds to decode the fine layer of a whole keyframe, on one core."""
-    layers = codec.encode(make_keyframe(0, SIZE_PX, seed=1), 0)
-    with _one_core():
-        return _median_ms(lambda: codec.decode(layers[-1:]))
-
-
-def coarse_share(masked: bool = True) -> float:
-    """Share of the bytes that the coarse layer takes, at 80 % overlap or of whole keyframes."""
-    fresh = [strip(SIZE_PX, 20 + k) if masked else None for k in range(FRAMES)]
-    layers = [
-        codec.encode(make_keyframe(k, SIZE_PX, fresh[k], seed=1 + k), 0) for k in range(FRAMES)
-    ]
-    return sum(len(x[0]) for x in layers) / sum(len(x[0]) + len(x[1]) for x in layers)
-
-
-def _size(frame: Keyframe) -> int:
-    return sum(map(len, codec.encode(frame, 0)))
+def _coarse_share(frames: Sequence[Sequence[bytes]]) -> float:
+    """Share of the bytes that the coarse layer takes."""
+    return sum(len(layers[0]) for layers in frames) / _size(frames)
 
 
 def _median_ms(work: Callable[[], object]) -> float:
@@ -161,7 +129,7 @@ def _ours(frame: Keyframe) -> Coded:
     assert back is not None
     rms = _rms_at_60(frame, back.depth.depth_m)
     points = int(frame.fresh.sum())
-    return lambda: b"".join(codec.encode(frame, 0)), points, rms, _psnr(back.bgr, frame)
+    return Coded(lambda: b"".join(codec.encode(frame, 0)), points, rms, _psnr(back.bgr, frame))
 
 
 def _jpeg_ls(frame: Keyframe) -> Coded:
@@ -180,7 +148,8 @@ def _jpeg_ls(frame: Keyframe) -> Coded:
     codes = imagecodecs.jpegls_decode(depth)
     image = cv2.imdecode(np.frombuffer(colour, np.uint8), cv2.IMREAD_COLOR)
     rms = _rms_at_60(frame, (1.0 / (low + step * codes)).astype(np.float32))
-    return lambda: b"".join(coded()), codes.size, rms, _psnr(np.asarray(image, np.uint8), frame)
+    psnr = _psnr(np.asarray(image, np.uint8), frame)
+    return Coded(lambda: b"".join(coded()), codes.size, rms, psnr)
 
 
 def _points(frame: Keyframe) -> tuple[F32, U8]:
@@ -198,7 +167,7 @@ def _draco(frame: Keyframe) -> Coded:
         return bytes(DracoPy.encode(xyz, colors=rgb, quantization_bits=14, compression_level=7))
 
     extent = float((xyz.max(axis=0) - xyz.min(axis=0)).max())
-    return encode, len(xyz), extent / (1 << 14) / 12**0.5, np.inf
+    return Coded(encode, len(xyz), extent / (1 << 14) / 12**0.5, np.inf)
 
 
 def _laz(frame: Keyframe) -> Coded:
@@ -218,13 +187,13 @@ def _laz(frame: Keyframe) -> Coded:
         las.write(out, do_compress=True, laz_backend=laspy.LazBackend.Lazrs)
         return out.getvalue()
 
-    return encode, len(xyz), 0.01 / 12**0.5, np.inf
+    return Coded(encode, len(xyz), 0.01 / 12**0.5, np.inf)
 
 
 def _raw(frame: Keyframe) -> Coded:
     """Three floats and three bytes."""
     xyz, rgb = _points(frame)
-    return lambda: xyz.tobytes() + rgb.tobytes(), len(xyz), 0.0, np.inf
+    return Coded(lambda: xyz.tobytes() + rgb.tobytes(), len(xyz), 0.0, np.inf)
 
 
 CODECS: dict[str, Callable[[Keyframe], Coded]] = {

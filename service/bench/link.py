@@ -101,21 +101,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
     return [
         *_report("link", fly(RADIO), peer),
         *_report("link fleet of ten", fly(FLEET), {}),
-        *_report_radio(flown.result()),
-    ]
-
-
-def _report_radio(outcome: radio.RadioOutcome) -> list[BenchResult]:
-    return [
-        BenchResult(what, value, unit, name="link 57600 baud")
-        for what, value, unit in (
-            ("of the radio, by the coarse map", 100 * outcome.share, "%"),
-            ("of the radio, with our heartbeats and answers", 100 * outcome.all_share, "%"),
-            ("of the surface seen in 100 m that is at the ground", 100 * outcome.covered, "%"),
-            ("height of those points against the truth", outcome.height_rms_m, "m rms"),
-            ("first tile after the first keyframe", outcome.first_s, "s"),
-            ("last tile of a keyframe after it was made, median", outcome.latency_s, "s"),
-        )
+        *flown.result(),
     ]
 
 

@@ -28,6 +28,7 @@ from mavlink.wire.framing import Framer
 from recon import se3
 from recon.posegraph.submap_loops import points_of
 from recon.types import F64, DepthMap, Keyframe, Pose
+from service.bench import BenchResult
 from service.bench.link_emulator import free_port
 from service.config import DatalinkConfig
 from service.ground.received import ReceivedScan
@@ -49,19 +50,6 @@ FLIGHT_S, FLIGHT_M, KEYFRAMES = 20.0, 100.0, 13
 HEIGHT_M = 60.0
 FOCAL_PX, SIZE_PX = 260.0, (320, 180)
 CELL_M = 4.0
-
-
-@dataclass(frozen=True, slots=True)
-class RadioOutcome:
-    """State of the ground at the end of the flight."""
-
-    share: float  # of the radio, by our tunnel
-    all_share: float  # of the radio, by everything that our component sent
-    covered: float  # of the 4 m cells that the drone saw
-    height_rms_m: float  # of the points against the true ground
-    first_s: float  # from the first keyframe to the first of its tiles
-    latency_s: float  # median, from a keyframe to its last tile
-    poses: int
 
 
 class _Radio:
@@ -132,13 +120,13 @@ class _TileTimes:
             self.last[tile[1].seq] = time.monotonic()
 
 
-def fly() -> RadioOutcome:
-    """Fly over the radio alone."""
+def fly() -> list[BenchResult]:
+    """Fly over the radio alone; the state of the ground at the end."""
     with tempfile.TemporaryDirectory() as folder:
         return _fly(Path(folder))
 
 
-def _fly(folder: Path) -> RadioOutcome:
+def _fly(folder: Path) -> list[BenchResult]:
     radio, flight = _Radio(), _TileTimes()
     vehicle = VehicleLink(VehicleConfig(links=(radio.names[0],)), NoScans())
     vehicle.start()
@@ -221,7 +209,7 @@ def _cells(frames: list[F64]) -> set[tuple[int, int]]:
 
 def _outcome(
     onboard: ScanStore, ground: ScanStore, flight: _TileTimes, sent: dict[int, int]
-) -> RadioOutcome:
+) -> list[BenchResult]:
     there, here = (
         [points_of(k.depth, k.depth.T_world_camera)[0] for k in store.keyframes()]
         for store in (ground, onboard)
@@ -230,12 +218,17 @@ def _outcome(
     points = np.concatenate(there)
     error = points[:, 2] - _ground_m(points[:, 0], points[:, 1])
     whole = BYTES_S * FLIGHT_S
-    return RadioOutcome(
-        share=sent.get(TUNNEL, 0) / whole,
-        all_share=sum(sent.values()) / whole,
-        covered=len(_cells(there) & seen) / len(seen),
-        height_rms_m=float(np.sqrt(np.mean(error**2))),
-        first_s=min(flight.first.values()) - flight.made[0],
-        latency_s=float(np.median([at - flight.made[seq] for seq, at in flight.last.items()])),
-        poses=len(list(ground.poses())),
-    )
+    ours, covered = sum(sent.values()), len(_cells(there) & seen) / len(seen)
+    first_s = min(flight.first.values()) - flight.made[0]
+    last_s = [at - flight.made[seq] for seq, at in flight.last.items()]
+    return [
+        BenchResult(what, float(value), unit, name="link 57600 baud")
+        for what, value, unit in (
+            ("of the radio, by the coarse map", 100 * sent.get(TUNNEL, 0) / whole, "%"),
+            ("of the radio, with our heartbeats and answers", 100 * ours / whole, "%"),
+            ("of the surface seen in 100 m that is at the ground", 100 * covered, "%"),
+            ("height of those points against the truth", np.sqrt(np.mean(error**2)), "m rms"),
+            ("first tile after the first keyframe", first_s, "s"),
+            ("last tile of a keyframe after it was made, median", np.median(last_s), "s"),
+        )
+    ]

@@ -217,21 +217,16 @@ def _open_portal(
 ) -> Portal:
     """The portal, started; its address is printed."""
     with needing("the portal"):
-        from service.ground.portal import open_portal
+        from service.ground.portal import Portal, config_of
         from service.ground.vehicle import Vehicle
     endpoint = given.vehicle
     vehicle = None if endpoint is None else Vehicle(endpoint, workers=workers)
-    page = open_portal(
-        address,
-        given.store,
-        receiver.progress,
-        given.portal_token,
-        given.portal_tls,
-        vehicle,
-        workers,
-        given.basemap,
-        receiver.limits,
-    )
+    config = config_of(
+        address, given.store, given.portal_token, given.portal_tls, basemap=given.basemap,
+        limits=receiver.limits,
+    )  # fmt: skip
+    page = Portal(config, receiver.progress, vehicle, workers)
+    page.start()
     if vehicle is not None:
         vehicle.start()
     print(f"portal: {page.url}", file=sys.stderr, flush=True)

@@ -33,8 +33,6 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
 from service.errors import InputError, OutsideError
-from service.ground.basemap import open_basemap
-from service.ground.drone import DroneLimits
 from service.ground.guard import (
     CHANGING,
     UPLOAD,
@@ -46,18 +44,17 @@ from service.ground.guard import (
     is_length,
     note,
 )
-from service.ground.library import ConflictError, Library
+from service.ground.library import ConflictError
 from service.ground.live import serve_live
 from service.ground.map_tiles import map_routes
 from service.ground.scan_files import file_routes
 from service.ground.sites import align_by_points
-from service.ground.state import KINDS, Jobs, PortalState, names_of, state_of
+from service.ground.state import KINDS, PortalState, names_of, state_of
 from service.ground.upload import Upload, check_parts
-from service.ground.vehicle import BUTTONS, Vehicle
+from service.ground.vehicle import BUTTONS
 from service.offline.exports.view import ExportOptions
 from service.offline.site.start import Pair, StartPoints
 from service.scans.annotations import Spot, as_json, read_annotations
-from service.workers import Workers
 
 T = TypeVar("T")
 
@@ -137,22 +134,8 @@ class VehicleOrder(msgspec.Struct, forbid_unknown_fields=True):
     ) = None
 
 
-def portal_app(
-    store: Path,
-    tokens: Tokens,
-    local: bool,
-    audit: AuditLog,
-    progress: Callable[[], list[dict[str, Any]]] | None = None,
-    vehicle: Vehicle | None = None,
-    jobs: Jobs | None = None,
-    basemap: Path | None = None,
-    limits: DroneLimits | None = None,
-) -> ASGIApp:
+def portal_app(state: PortalState, tokens: Tokens, local: bool) -> ASGIApp:
     """The portal as an ASGI application; ``local`` when only this machine can reach it."""
-    jobs = jobs or Jobs(Workers())
-    below = None if basemap is None else open_basemap(basemap)
-    limits = limits or DroneLimits()
-    state = PortalState(Library(store), jobs, progress or list, vehicle, below, limits)
     one = "/api/scans/{drone}/{scan}"
     routes: list[Any] = [
         Route("/", _page),
@@ -191,7 +174,7 @@ def portal_app(
     )
     app.state.portal = state
     app.state.order_pace = Pace(ORDERS_HZ, ORDERS_AT_ONCE)
-    return Guard(app, tokens, local, audit)
+    return Guard(app, tokens, local, AuditLog(state.library.store))
 
 
 def _description(routes: list[Any]) -> dict[str, Any]:

@@ -12,9 +12,9 @@ from typing import Any
 
 from service.errors import InputError, OutsideError
 from service.ground import drone
+from service.ground.basemap import open_basemap
 from service.ground.guard import (
     MAX_BODY_BYTES,
-    AuditLog,
     RequestLimits,
     Tokens,
     kept_token,
@@ -22,7 +22,8 @@ from service.ground.guard import (
     read_tokens,
 )
 from service.ground.http import portal_app
-from service.ground.state import Jobs
+from service.ground.library import Library
+from service.ground.state import Jobs, PortalState
 from service.ground.vehicle import Vehicle
 from service.listener import (
     BoundedListener,
@@ -85,19 +86,12 @@ class Portal:
         self.config = config
         self._workers = workers or Workers()
         self._jobs = Jobs(self._workers)
+        below = None if config.basemap is None else open_basemap(config.basemap)
+        library = Library(config.store)
+        state = PortalState(library, self._jobs, progress or list, vehicle, below, config.limits)
         tokens = parse_tokens(config.token or secrets.token_urlsafe(24))
         self.token = next(iter(tokens.values()))
-        self._app = portal_app(
-            config.store,
-            Tokens(tokens),
-            is_loopback(config.host),
-            AuditLog(config.store),
-            progress,
-            vehicle,
-            self._jobs,
-            config.basemap,
-            config.limits,
-        )
+        self._app = portal_app(state, Tokens(tokens), is_loopback(config.host))
         self._vehicle = vehicle
         self._listener: BoundedListener | None = None
         self._port = config.port
@@ -204,18 +198,10 @@ def listener_limits() -> ListenerLimits:
     return ListenerLimits(total, min(default.per_address, total), default.wait_s)
 
 
-def open_portal(
-    address: str,
-    store: Path,
-    progress: Callable[[], list[dict[str, Any]]] | None = None,
-    token_file: Path | None = None,
-    tls: tuple[Path, Path] | None = None,
-    vehicle: Vehicle | None = None,
-    workers: Workers | None = None,
-    basemap: Path | None = None,
-    limits: drone.DroneLimits | None = None,
-) -> Portal:
-    """A started portal at ``HOST:PORT`` on the scans below ``store``.
+def config_of(
+    address: str, store: Path, token_file: Path | None, tls: tuple[Path, Path] | None, **rest: Any
+) -> PortalConfig:
+    """The configuration of a portal at ``HOST:PORT`` on the scans below ``store``.
 
     ``token_file`` holds the tokens; without it one is made and kept in the store. ``tls`` are
     certificate and key. Raises InputError or OutsideError, in one line.
@@ -226,8 +212,4 @@ def open_portal(
         if not path.is_file():
             raise InputError(f"portal certificate {path}: no such file")
     certificate, key = (str(path) for path in tls) if tls else ("", "")
-    limits = limits or drone.DroneLimits()
-    config = PortalConfig(store, host, port, token, certificate, key, basemap, limits)
-    portal = Portal(config, progress, vehicle, workers)
-    portal.start()
-    return portal
+    return PortalConfig(store, host, port, token, certificate, key, **rest)

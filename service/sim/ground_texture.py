@@ -130,7 +130,7 @@ def _light(scene: Scene, sun: F64) -> F32:
     z = scene.terrain.height(gx.ravel(), gy.ravel()).reshape(gx.shape)
     out = np.empty(gx.shape, np.float32)
     blocks = scene.blocks if len(scene.blocks) else np.zeros((1, shapes.COLUMNS))
-    in_bands(_shadow, len(gx), *scene.grid.arrays(), gx, gy, z, which, blocks, sun, out)
+    in_bands(_shadow, len(gx), scene.grid.arrays(), gx, gy, z, which, blocks, sun, out)
     return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.7), np.float32)
 
 
@@ -156,10 +156,7 @@ def _local(block, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _shadow(  # type: ignore[no-untyped-def]
-    begin, end, corners, start, items, column_z, block_z, bounds, cell_m, gx, gy, z, which,
-    blocks, sun, out,
-):  # fmt: skip
+def _shadow(begin, end, grid, gx, gy, z, which, blocks, sun, out):  # type: ignore[no-untyped-def]
     for j in range(begin, end):
         for i in range(gx.shape[1]):
             x, y, top = gx[j, i], gy[j, i], z[j, i]
@@ -174,10 +171,7 @@ def _shadow(  # type: ignore[no-untyped-def]
             for n in range(4):
                 ax = 0.02 * (hash01(i, j, 2 * n) - 0.5)
                 ay = 0.02 * (hash01(i, j, 2 * n + 1) - 0.5)
-                _, m = first_hit(
-                    corners, start, items, column_z, block_z, bounds, cell_m,
-                    x, y, top + 0.08, sun[0] + ax, sun[1] + ay, sun[2],
-                )  # fmt: skip
+                _, m = first_hit(grid, x, y, top + 0.08, sun[0] + ax, sun[1] + ay, sun[2])
                 lit += 0.25 if m < 0 else 0.0
             out[j, i] = lit
 

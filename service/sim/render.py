@@ -75,7 +75,6 @@ class Renderer:
         plain = Camera(camera.K, np.zeros(5), camera.size_px)
         self._straight = camera_rays(plain)
         self._normals = scene.grid.normals()
-        self._owner = scene.owner
         self._blocks = scene.blocks if len(scene.blocks) else np.zeros((1, shapes.COLUMNS))
         self._trees = scene.trees if len(scene.trees) else np.zeros((1, 8))
 
@@ -93,17 +92,15 @@ class Renderer:
         colour = np.empty((H, W, 3), np.float32)
         depth = np.empty((H, W))
         body = np.empty((H, W), np.int32)
-        tables = self._tables()
         sideways = self.camera.shutter.axis == 0
         poses = np.broadcast_to(T_world_camera, (W if sideways else H, 4, 4))
         R, c = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
         focal = float(0.5 * (self.camera.K[0, 0] + self.camera.K[1, 1]))
-        scene = (*self.scene.grid.arrays(), *tables, self.rays, R, c, sideways, focal)
-        in_bands(_render, H, *scene, colour, depth, body)
-        in_bands(_smooth_edges, H, *scene, colour, depth, body)
+        view = self.rays, R, c, sideways, focal
+        in_bands(_render, H, self._place(), *view, colour, depth, body)
+        in_bands(_smooth_edges, H, self._place(), *view, colour, depth, body)
         if look.water_m is not None:
-            seen = colour, depth, self.rays, R, c, sideways, focal
-            in_bands(flood, H, *seen, look.water_m, time_s)
+            in_bands(_flood, H, colour, depth, *view, look.water_m, time_s)
         return colour
 
     def develop(self, light: F32, index: int, look: Look) -> U8:
@@ -122,11 +119,12 @@ class Renderer:
             t[T_world_camera[2, 3] + t * directions[:, 2] < water_m] = np.nan
         return np.asarray(t.reshape(H, W), np.float32)
 
-    def _tables(self) -> tuple[object, ...]:
+    def _place(self) -> tuple[object, ...]:
+        """What the compiled functions take as ``place``."""
         p = self.texture
         return (
-            self._normals, self.scene.material, self._owner, self._blocks, self._trees,
-            p.bgr, p.levels, p.x0, p.y0, p.texel_m, p.sun,
+            self.scene.grid.arrays(), self._normals, self.scene.material, self.scene.owner,
+            self._blocks, self._trees, p.bgr, p.levels, p.x0, p.y0, p.texel_m, p.sun,
         )  # fmt: skip
 
 
@@ -150,18 +148,24 @@ def _texel(bgr, levels, level, x0, y0, texel_m, x, y):  # type: ignore[no-untype
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _seen(  # type: ignore[no-untyped-def]
-    corners, start, items, column_z, block_z, bounds, cell_m,
-    normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
-    c, dx, dy, dz, pixel,
-):  # fmt: skip
-    """(b, g, r, t, body) along one ray; ``pixel`` is the angle of a pixel in rad.
+def _turned(R, a, b):  # type: ignore[no-untyped-def]
+    """The direction (a, b, 1) of a camera, in the world."""
+    return (
+        R[0, 0] * a + R[0, 1] * b + R[0, 2],
+        R[1, 0] * a + R[1, 1] * b + R[1, 2],
+        R[2, 0] * a + R[2, 1] * b + R[2, 2],
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _seen(place, R, c, a, b, pixel):  # type: ignore[no-untyped-def]
+    """(b, g, r, t, body) along the ray (a, b, 1); ``pixel`` is the angle of a pixel in rad.
 
     ``t`` counts in lengths of the direction; body 0 is the ground, -1 the sky.
     """
-    t, m = first_hit(
-        corners, start, items, column_z, block_z, bounds, cell_m, c[0], c[1], c[2], dx, dy, dz
-    )
+    grid, normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun = place
+    dx, dy, dz = _turned(R, a, b)
+    t, m = first_hit(grid, c[0], c[1], c[2], dx, dy, dz)
     if m < 0:
         return SKY[0], SKY[1], SKY[2], np.inf, -1
     x, y, z = c[0] + t * dx, c[1] + t * dy, c[2] + t * dz
@@ -193,20 +197,12 @@ def _seen(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _render(  # type: ignore[no-untyped-def]
-    begin, end, corners, start, items, column_z, block_z, bounds, cell_m,
-    normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
-    rays, poses_R, poses_c, sideways, focal, colour, depth, body,
-):  # fmt: skip
+    begin, end, place, rays, poses_R, poses_c, sideways, focal, colour, depth, body
+):
     for v in range(begin, end):
         for u in range(rays.shape[1]):
             R, c = (poses_R[u], poses_c[u]) if sideways else (poses_R[v], poses_c[v])
-            a, b = rays[v, u, 0], rays[v, u, 1]
-            cb, cg, cr, t, m = _seen(
-                corners, start, items, column_z, block_z, bounds, cell_m,
-                normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun, c,
-                R[0, 0] * a + R[0, 1] * b + R[0, 2], R[1, 0] * a + R[1, 1] * b + R[1, 2],
-                R[2, 0] * a + R[2, 1] * b + R[2, 2], 1.0 / focal,
-            )  # fmt: skip
+            cb, cg, cr, t, m = _seen(place, R, c, rays[v, u, 0], rays[v, u, 1], 1.0 / focal)
             colour[v, u, 0], colour[v, u, 1], colour[v, u, 2] = cb, cg, cr
             depth[v, u], body[v, u] = t, m
 
@@ -226,10 +222,8 @@ def _is_edge(depth, body, u, v):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _smooth_edges(  # type: ignore[no-untyped-def]
-    begin, end, corners, start, items, column_z, block_z, bounds, cell_m,
-    normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
-    rays, poses_R, poses_c, sideways, focal, colour, depth, body,
-):  # fmt: skip
+    begin, end, place, rays, poses_R, poses_c, sideways, focal, colour, depth, body
+):
     """Average a rotated square of four rays wherever an outline crosses the pixel."""
     H, W = rays.shape[0], rays.shape[1]
     for v in range(begin, end):
@@ -242,18 +236,10 @@ def _smooth_edges(  # type: ignore[no-untyped-def]
             bx, by = sv * (rays[vn, u, 0] - rays[v, u, 0]), sv * (rays[vn, u, 1] - rays[v, u, 1])
             R, c = (poses_R[u], poses_c[u]) if sideways else (poses_R[v], poses_c[v])
             tb, tg, tr = 0.0, 0.0, 0.0
-            for n in range(4):
-                p = 0.375 if n == 0 else (-0.125 if n == 1 else (-0.375 if n == 2 else 0.125))
-                q = 0.125 if n == 0 else (0.375 if n == 1 else (-0.125 if n == 2 else -0.375))
+            for p, q in ((0.375, 0.125), (-0.125, 0.375), (-0.375, -0.125), (0.125, -0.375)):
                 a = rays[v, u, 0] + p * ax + q * bx
                 b = rays[v, u, 1] + p * ay + q * by
-                cb, cg, cr, _, _ = _seen(
-                    corners, start, items, column_z, block_z, bounds, cell_m,
-                    normals, material, owner, blocks, trees, bgr, levels, x0, y0, texel_m, sun,
-                    c,
-                    R[0, 0] * a + R[0, 1] * b + R[0, 2], R[1, 0] * a + R[1, 1] * b + R[1, 2],
-                    R[2, 0] * a + R[2, 1] * b + R[2, 2], 1.0 / focal,
-                )  # fmt: skip
+                cb, cg, cr, _, _ = _seen(place, R, c, a, b, 1.0 / focal)
                 tb, tg, tr = tb + cb, tg + cg, tr + cr
             colour[v, u, 0], colour[v, u, 1], colour[v, u, 2] = 0.25 * tb, 0.25 * tg, 0.25 * tr
 
@@ -282,7 +268,7 @@ CLOUDS_ABOVE_M, CLOUD_M, CLOUD_SPEED_M_S = 600.0, 500.0, 9.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def flood(
+def _flood(
     begin: int, end: int, colour: F32, depth: F64, rays: F64, poses_R: F64, poses_c: F64,
     sideways: bool, focal: float, level_m: float, time_s: float,
 ) -> None:  # fmt: skip
@@ -299,10 +285,7 @@ def flood(
     for v in range(begin, end):
         for u in range(rays.shape[1]):
             R, c = (poses_R[u], poses_c[u]) if sideways else (poses_R[v], poses_c[v])
-            a, b = rays[v, u, 0], rays[v, u, 1]
-            dx = R[0, 0] * a + R[0, 1] * b + R[0, 2]
-            dy = R[1, 0] * a + R[1, 1] * b + R[1, 2]
-            dz = R[2, 0] * a + R[2, 1] * b + R[2, 2]
+            dx, dy, dz = _turned(R, rays[v, u, 0], rays[v, u, 1])
             length = np.sqrt(dx * dx + dy * dy + dz * dz)
             t = (level_m - c[2]) / dz if dz < -1e-4 * length else np.inf
             bright = 0.0

@@ -159,10 +159,8 @@ def _dsm(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, float]:
 
 def _truth_heights(truth: Truth, grid: Grid) -> F64:
     """(rows, cols) height of the truth straight below the middle of each cell; NaN outside."""
-    rows, cols = np.indices(grid.shape)
-    x = grid.west_m + (cols.ravel() + 0.5) * grid.cell_m
-    y = grid.north_m - (rows.ravel() + 0.5) * grid.cell_m
-    return heights_below(truth.surface, np.column_stack([x, y])).reshape(grid.shape)
+    places = grid.centres(*np.indices(grid.shape).reshape(2, -1))
+    return heights_below(truth.surface, places).reshape(grid.shape)
 
 
 def _range_of_three(height: F64) -> F64:

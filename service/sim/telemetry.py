@@ -61,7 +61,11 @@ def packets(
     """(seconds since the first frame, MAVLink 2 packet) in the order of time."""
     from pymavlink.dialects.v20 import common as dialect  # type: ignore[import-untyped]
 
-    kinds = _kinds(sensors, origin, epoch_unix_s, ground_range, options, dialect)
+    drone = _Drone(sensors, origin, epoch_unix_s, ground_range, options, dialect)
+    kinds = [
+        drone.housekeeping(), drone.attitude(), drone.gimbal(), drone.position(),
+        drone.satellites(), *([drone.range()] if options.rangefinder else []),
+    ]  # fmt: skip
     senders = {
         1: dialect.MAVLink(None, srcSystem=1, srcComponent=1),
         GIMBAL_COMPONENT: dialect.MAVLink(None, srcSystem=1, srcComponent=GIMBAL_COMPONENT),
@@ -88,67 +92,113 @@ def write_tlog(path: Path, epoch_unix_s: float, stream: Iterator[tuple[float, by
     return count
 
 
-def _times(hz: float, duration_s: float) -> F64:
-    """From before the first frame until after the last."""
-    return np.asarray(np.arange(-LEAD_S, duration_s + LEAD_S, 1.0 / hz), np.float64)
-
-
 def _boot_ms(t: F64) -> npt.NDArray[np.int64]:
     return np.asarray(np.round((t + BOOT_BEFORE_VIDEO_S) * 1e3), np.int64)
 
 
-def _kinds(
-    sensors: Sensors,
-    origin: LocalFrame,
-    epoch_unix_s: float,
-    ground_range: RANGE_TO_GROUND,
-    options: TelemetryOptions,
-    dialect: Any,
-) -> list[Iterator[Timed]]:
-    """The messages kind by kind, each kind in the order of time."""
-    duration = sensors.flight.plan.duration_s
-    kinds = [
-        _housekeeping(origin, epoch_unix_s, duration, options, dialect),
-        _attitude(sensors, duration, dialect),
-        _gimbal(sensors, duration, options, dialect),
-        _position(sensors, origin, duration, options, dialect),
-        _satellites(sensors, origin, duration, options, dialect),
-    ]
-    if options.rangefinder:
-        kinds.append(_range(sensors, ground_range, duration, dialect))
-    return kinds
+@dataclass(frozen=True, slots=True, eq=False)
+class _Drone:
+    """The messages of a flight kind by kind, each kind in the order of time."""
 
+    sensors: Sensors
+    origin: LocalFrame
+    epoch_unix_s: float
+    ground_range: RANGE_TO_GROUND
+    options: TelemetryOptions
+    dialect: Any
 
-def _housekeeping(
-    origin: LocalFrame,
-    epoch_unix_s: float,
-    duration_s: float,
-    options: TelemetryOptions,
-    dialect: Any,
-) -> Iterator[Timed]:
-    """HEARTBEAT (armed, in a mission), SYSTEM_TIME and HOME_POSITION, once a second."""
-    lat, lon = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7)
-    level = [1.0, 0.0, 0.0, 0.0]
-    for t in _times(1.0, duration_s):
-        heartbeat = dialect.MAVLink_heartbeat_message(2, 3, 128 | 16 | 8 | 1, 3, 4, 3)
-        yield heartbeat, 1, float(t)
-        yield dialect.MAVLink_heartbeat_message(26, 8, 0, 0, 4, 3), GIMBAL_COMPONENT, float(t)
-        unix_us, boot_ms = round((epoch_unix_s + t) * 1e6), int(_boot_ms(np.array([t]))[0])
-        yield dialect.MAVLink_system_time_message(unix_us, boot_ms), 1, float(t) + 0.001
-        alt = round((origin.alt_amsl_m + options.home_above_m) * 1e3)
-        home = dialect.MAVLink_home_position_message(lat, lon, alt, 0, 0, 0, level, 0, 0, 0)
-        yield home, 1, float(t) + 0.002
+    def _times(self, hz: float) -> F64:
+        """From before the first frame until after the last."""
+        duration_s = self.sensors.flight.plan.duration_s
+        return np.asarray(np.arange(-LEAD_S, duration_s + LEAD_S, 1.0 / hz), np.float64)
 
+    def housekeeping(self) -> Iterator[Timed]:
+        """HEARTBEAT (armed, in a mission), SYSTEM_TIME and HOME_POSITION, once a second."""
+        lat, lon = round(self.origin.lat_deg * 1e7), round(self.origin.lon_deg * 1e7)
+        level = [1.0, 0.0, 0.0, 0.0]
+        for t in self._times(1.0):
+            heartbeat = self.dialect.MAVLink_heartbeat_message
+            yield heartbeat(2, 3, 128 | 16 | 8 | 1, 3, 4, 3), 1, float(t)
+            yield heartbeat(26, 8, 0, 0, 4, 3), GIMBAL_COMPONENT, float(t)
+            unix_us, boot_ms = round((self.epoch_unix_s + t) * 1e6), int(_boot_ms(np.array([t]))[0])
+            yield self.dialect.MAVLink_system_time_message(unix_us, boot_ms), 1, float(t) + 0.001
+            alt = round((self.origin.alt_amsl_m + self.options.home_above_m) * 1e3)
+            home = self.dialect.MAVLink_home_position_message
+            yield home(lat, lon, alt, 0, 0, 0, level, 0, 0, 0), 1, float(t) + 0.002
 
-def _attitude(sensors: Sensors, duration_s: float, dialect: Any) -> Iterator[Timed]:
-    """ATTITUDE at 50 Hz."""
-    t = _times(50.0, duration_s)
-    rpy = sensors.vehicle_rpy(t)
-    rates = _body_rates(sensors.flight.vehicle_rpy(t), t)
-    for k, boot in enumerate(_boot_ms(t)):
-        yaw = float((rpy[k, 2] + np.pi) % (2 * np.pi) - np.pi)
-        message = dialect.MAVLink_attitude_message(int(boot), rpy[k, 0], rpy[k, 1], yaw, *rates[k])
-        yield message, 1, float(t[k])
+    def attitude(self) -> Iterator[Timed]:
+        """ATTITUDE at 50 Hz."""
+        t = self._times(50.0)
+        rpy = self.sensors.vehicle_rpy(t)
+        rates = _body_rates(self.sensors.flight.vehicle_rpy(t), t)
+        for k, boot in enumerate(_boot_ms(t)):
+            yaw = float((rpy[k, 2] + np.pi) % (2 * np.pi) - np.pi)
+            attitude = self.dialect.MAVLink_attitude_message
+            yield attitude(int(boot), rpy[k, 0], rpy[k, 1], yaw, *rates[k]), 1, float(t[k])
+
+    def gimbal(self) -> Iterator[Timed]:
+        """GIMBAL_DEVICE_ATTITUDE_STATUS at 20 Hz, from the gimbal's own component."""
+        t = self._times(20.0) + 0.003
+        right, up = np.radians(self.options.boresight_deg)
+        off = R_GIMBAL_CAMERA @ so3_exp(-np.array([up, right, 0.0])) @ R_GIMBAL_CAMERA.T
+        R = self.sensors.R_ned_gimbal(t) @ off
+        flags = ROLL_LOCK | PITCH_LOCK | YAW_IN_EARTH_FRAME
+        if self.options.gimbal_frame == "vehicle":
+            flags = ROLL_LOCK | PITCH_LOCK | YAW_IN_VEHICLE_FRAME
+            for k, yaw in enumerate(self.sensors.vehicle_rpy(t)[:, 2]):
+                R[k] = rotation_from_rpy(0.0, 0.0, float(-yaw)) @ R[k]
+        for k, boot in enumerate(_boot_ms(t)):
+            q = [float(v) for v in quaternion_from_rotation(R[k])]
+            nan = float("nan")
+            message = self.dialect.MAVLink_gimbal_device_attitude_status_message(
+                0, 0, int(boot), flags, q, nan, nan, nan, 0, nan, nan, 0
+            )
+            yield message, GIMBAL_COMPONENT, float(t[k])
+
+    def position(self) -> Iterator[Timed]:
+        """GLOBAL_POSITION_INT at 10 Hz."""
+        t = self._times(10.0) + 0.001
+        at = self.sensors.estimate(t)
+        geodetic = self.origin.to_geodetic(at)
+        v = self.sensors.flight.velocity(t) + 0.05 * self.sensors.rng.normal(size=(len(t), 3))
+        yaw = np.degrees(self.sensors.vehicle_rpy(t)[:, 2]) % 360.0
+        for k, boot in enumerate(_boot_ms(t)):
+            lat, lon = round(geodetic[k, 0] * 1e7), round(geodetic[k, 1] * 1e7)
+            ned = round(v[k, 1] * 100), round(v[k, 0] * 100), round(-v[k, 2] * 100)
+            yield self.dialect.MAVLink_global_position_int_message(
+                int(boot), lat, lon, round(geodetic[k, 2] * 1e3),
+                round((at[k, 2] - self.options.home_above_m) * 1e3), *ned,
+                round(float(yaw[k]) * 100) % 36000,
+            ), 1, float(t[k])  # fmt: skip
+
+    def satellites(self) -> Iterator[Timed]:
+        """GPS_RAW_INT at 5 Hz."""
+        t = self._times(5.0) + 0.004
+        geodetic = self.origin.to_geodetic(self.sensors.gps(t))
+        v, noise = self.sensors.flight.velocity(t), self.sensors.noise
+        h_acc = round(1e3 * max(0.02, np.hypot(noise.gps_m, noise.gps_white_m)))
+        h_acc *= self.options.accuracy  # 0: unknown
+        for k, boot in enumerate(_boot_ms(t)):
+            course = round(float(np.degrees(np.arctan2(v[k, 0], v[k, 1]))) * 100) % 36000
+            speed = round(float(np.hypot(v[k, 0], v[k, 1])) * 100)
+            yield self.dialect.MAVLink_gps_raw_int_message(
+                int(boot) * 1000, 3, round(geodetic[k, 0] * 1e7), round(geodetic[k, 1] * 1e7),
+                round(geodetic[k, 2] * 1e3), 80, 120, speed, course, 14, 0, h_acc,
+                round(1.5 * h_acc), 300, 0,
+            ), 1, float(t[k])  # fmt: skip
+
+    def range(self) -> Iterator[Timed]:
+        """DISTANCE_SENSOR along the body's z axis at 10 Hz, up to 120 m."""
+        t = self._times(10.0) + 0.002
+        rpy = self.sensors.flight.vehicle_rpy(t)
+        down = np.array([R_ENU_NED @ rotation_from_rpy(*map(float, row))[:, 2] for row in rpy])
+        ways = self.ground_range(self.sensors.flight.position(t), down)
+        ways = ways + self.sensors.noise.range_m * self.sensors.rng.normal(size=len(t))
+        for k, boot in enumerate(_boot_ms(t)):
+            if 0.1 < ways[k] < 120.0:
+                cm = round(float(ways[k]) * 100)
+                distance = self.dialect.MAVLink_distance_sensor_message
+                yield distance(int(boot), 10, 12000, cm, 0, 1, 25, 0), 1, float(t[k])
 
 
 def _body_rates(rpy: F64, t: F64) -> F64:
@@ -163,86 +213,3 @@ def _body_rates(rpy: F64, t: F64) -> F64:
             -np.sin(roll) * d_pitch + down * d_yaw,
         ]
     )
-
-
-def _gimbal(
-    sensors: Sensors, duration_s: float, options: TelemetryOptions, dialect: Any
-) -> Iterator[Timed]:
-    """GIMBAL_DEVICE_ATTITUDE_STATUS at 20 Hz, from the gimbal's own component."""
-    t = _times(20.0, duration_s) + 0.003
-    right, up = np.radians(options.boresight_deg)
-    off = R_GIMBAL_CAMERA @ so3_exp(-np.array([up, right, 0.0])) @ R_GIMBAL_CAMERA.T
-    R = sensors.R_ned_gimbal(t) @ off
-    flags = ROLL_LOCK | PITCH_LOCK | YAW_IN_EARTH_FRAME
-    if options.gimbal_frame == "vehicle":
-        flags = ROLL_LOCK | PITCH_LOCK | YAW_IN_VEHICLE_FRAME
-        for k, yaw in enumerate(sensors.vehicle_rpy(t)[:, 2]):
-            R[k] = rotation_from_rpy(0.0, 0.0, float(-yaw)) @ R[k]
-    for k, boot in enumerate(_boot_ms(t)):
-        q = [float(v) for v in quaternion_from_rotation(R[k])]
-        nan = float("nan")
-        message = dialect.MAVLink_gimbal_device_attitude_status_message(
-            0, 0, int(boot), flags, q, nan, nan, nan, 0, nan, nan, 0
-        )
-        yield message, GIMBAL_COMPONENT, float(t[k])
-
-
-def _position(
-    sensors: Sensors,
-    origin: LocalFrame,
-    duration_s: float,
-    options: TelemetryOptions,
-    dialect: Any,
-) -> Iterator[Timed]:
-    """GLOBAL_POSITION_INT at 10 Hz."""
-    t = _times(10.0, duration_s) + 0.001
-    at = sensors.estimate(t)
-    geodetic = origin.to_geodetic(at)
-    v = sensors.flight.velocity(t) + 0.05 * sensors.rng.normal(size=(len(t), 3))
-    yaw = np.degrees(sensors.vehicle_rpy(t)[:, 2]) % 360.0
-    for k, boot in enumerate(_boot_ms(t)):
-        lat, lon = round(geodetic[k, 0] * 1e7), round(geodetic[k, 1] * 1e7)
-        ned = round(v[k, 1] * 100), round(v[k, 0] * 100), round(-v[k, 2] * 100)
-        yield dialect.MAVLink_global_position_int_message(
-            int(boot), lat, lon, round(geodetic[k, 2] * 1e3),
-            round((at[k, 2] - options.home_above_m) * 1e3), *ned,
-            round(float(yaw[k]) * 100) % 36000,
-        ), 1, float(t[k])  # fmt: skip
-
-
-def _satellites(
-    sensors: Sensors,
-    origin: LocalFrame,
-    duration_s: float,
-    options: TelemetryOptions,
-    dialect: Any,
-) -> Iterator[Timed]:
-    """GPS_RAW_INT at 5 Hz."""
-    t = _times(5.0, duration_s) + 0.004
-    geodetic = origin.to_geodetic(sensors.gps(t))
-    v = sensors.flight.velocity(t)
-    h_acc = round(1e3 * max(0.02, np.hypot(sensors.noise.gps_m, sensors.noise.gps_white_m)))
-    h_acc *= options.accuracy  # 0: unknown
-    for k, boot in enumerate(_boot_ms(t)):
-        course = round(float(np.degrees(np.arctan2(v[k, 0], v[k, 1]))) * 100) % 36000
-        yield dialect.MAVLink_gps_raw_int_message(
-            int(boot) * 1000, 3, round(geodetic[k, 0] * 1e7), round(geodetic[k, 1] * 1e7),
-            round(geodetic[k, 2] * 1e3), 80, 120, round(float(np.hypot(v[k, 0], v[k, 1])) * 100),
-            course, 14, 0, h_acc, round(1.5 * h_acc), 300, 0,
-        ), 1, float(t[k])  # fmt: skip
-
-
-def _range(
-    sensors: Sensors, ground_range: RANGE_TO_GROUND, duration_s: float, dialect: Any
-) -> Iterator[Timed]:
-    """DISTANCE_SENSOR along the body's z axis at 10 Hz, up to 120 m."""
-    t = _times(10.0, duration_s) + 0.002
-    rpy = sensors.flight.vehicle_rpy(t)
-    down = np.array([R_ENU_NED @ rotation_from_rpy(*map(float, row))[:, 2] for row in rpy])
-    ways = ground_range(sensors.flight.position(t), down)
-    ways = ways + sensors.noise.range_m * sensors.rng.normal(size=len(t))
-    for k, boot in enumerate(_boot_ms(t)):
-        if 0.1 < ways[k] < 120.0:
-            cm = round(float(ways[k]) * 100)
-            message = dialect.MAVLink_distance_sensor_message(int(boot), 10, 12000, cm, 0, 1, 25, 0)
-            yield message, 1, float(t[k])

@@ -328,9 +328,7 @@ def contour_lines(
             runs = (r for r in _inside_runs(loop[:, 0], inner) if len(r) >= SHORTEST_CONTOUR_CELLS)
             for run in chain(*(_stretches(r, mine[r[:, 1], r[:, 0]]) for r in runs)):
                 if len(run) > 1:
-                    x = raster.grid.west_m + (run[:, 0] + 0.5) * raster.grid.cell_m
-                    y = raster.grid.north_m - (run[:, 1] + 0.5) * raster.grid.cell_m
-                    yield n * step_m, np.column_stack([x, y])
+                    yield n * step_m, raster.grid.centres(run[:, 1], run[:, 0])
 
 
 def _inside_runs(loop: Array, inside: Array) -> list[Array]:

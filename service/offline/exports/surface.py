@@ -143,11 +143,7 @@ def _open_to_the_sky(scan: ScanView, measured: Raster, raster: Raster) -> Raster
 
 def _places(scan: ScanView, raster: Raster, cells: Bool) -> F64:
     """(N, 3) places of the middles of some of the cells in the scan's frame."""
-    rows, cols = np.nonzero(cells)
-    grid = raster.grid
-    x = grid.west_m + (cols + 0.5) * grid.cell_m
-    y = grid.north_m - (rows + 0.5) * grid.cell_m
-    places = np.column_stack([x, y, raster.height_m[cells]])
+    places = np.column_stack([raster.grid.centres(*np.nonzero(cells)), raster.height_m[cells]])
     return places if scan.frame is None else scan.frame.from_utm(places)
 
 

@@ -153,11 +153,9 @@ def weak_patches(weak: Bool, grid: Grid, swath: Swath) -> list[F64]:
     groups, member = cv2.connectedComponents(grown, connectivity=8)
     out = []
     for n in range(1, groups):
-        row, col = np.nonzero(kept & (member == n))
-        if len(row):
-            x = grid.west_m + (col + 0.5) * cell
-            y = grid.north_m - (row + 0.5) * cell
-            out.append(np.column_stack([x, y]))
+        cells_m = grid.centres(*np.nonzero(kept & (member == n)))
+        if len(cells_m):
+            out.append(cells_m)
     return out
 
 
