@@ -130,6 +130,23 @@ def test_the_motion_between_two_views_is_known_better_than_their_poses() -> None
     np.testing.assert_allclose(found.step_covariance(1, 2), found.covariance[2])  # 1 is fixed
 
 
+def test_pixels_that_move_together_are_in_the_covariance_of_a_motion() -> None:
+    """Normalised squared errors of the last motion have about the right mean (6) where blocks of
+    80 pixels of each image move together, as an encoder predicts them."""
+    squared = []
+    for seed in range(20):
+        T, X, cam, pt, uv = flight(seed, cameras=5, points=2000)
+        rng = np.random.default_rng(200 + seed)
+        shift, block = rng.normal(0, 0.1, (5, 16, 9, 2)), uv.astype(int) // 80
+        noisy = uv + shift[cam, block[:, 0], block[:, 1]] + rng.normal(0, 0.05, uv.shape)
+        free = np.arange(len(T)) >= 2
+        found = bundle.adjust(T, X, cam, pt, noisy, K, free, sigma_px=None)
+        before, last = found.T_camera_world[-2:]
+        error = se3.log((last @ se3.inverse(before)) @ se3.inverse(T[-1] @ se3.inverse(T[-2])))
+        squared.append(error @ np.linalg.solve(found.step_covariance(3, 4), error))
+    assert 3.5 < np.mean(squared) < 12.0
+
+
 def test_fixed_cameras_stay() -> None:
     T, X, cam, pt, uv = flight(4)
     free = np.array([False, False, True, False, True, True])

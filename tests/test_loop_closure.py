@@ -238,6 +238,17 @@ def test_two_verified_loops_close_the_map() -> None:
 DRIFT = 1.02
 
 
+def test_lengths_that_are_all_as_unsure_leave_the_scale_as_it_is() -> None:
+    """Steps of noisy images scatter by 1 %; keyframes after another share one scale."""
+    rng, graph = np.random.default_rng(5), PoseGraph()
+    covariance = np.diag([1e-4**2] * 3 + [0.05**2] * 3)
+    for i, T in lawnmower().items():
+        fix = T[:3, 3] + rng.normal(0.0, 1.0, 3)
+        prior = PosePrior(T[:3, :3], 0.02, 0.1, fix, np.full(3, 1.0))
+        graph.add_keyframe(i, i * 10**9, 0, T, covariance, prior)
+    assert len({graph.scale(i) for i in range(len(graph))}) <= 5
+
+
 def test_a_loop_joins_the_scales_of_its_ends() -> None:
     """In the turn vision takes a step of unsure length for 2 % longer and all after it for larger,
     which fixes of 3 m do not show; depths at two loops do."""

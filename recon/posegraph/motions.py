@@ -21,9 +21,10 @@ from recon.types import F64, PosePrior
 VELOCITY_S = 1.0
 FASTEST_M_S = 100.0
 
-OPEN_LENGTH = 0.005
-"""Relative sigma of the length of a step from which on vision's scale may have changed there, as
-where stills turn and have little in common."""
+OPEN_LENGTH, OPEN_SHARE = 0.005, 3.0
+"""Relative sigma of the length of a step, and that over the segment's usual one, from which on
+vision's scale may have changed there, as where stills turn and have little in common. Where all
+images are noisy, lengths scatter and the scale stays."""
 
 
 def _length_sigma(node: Node, last: Node) -> float:
@@ -62,6 +63,7 @@ class Motions:
         self.refuted: dict[int, int] = {}  # last keyframe after each refuted step's first
         self._blocks: dict[int, tuple[int, int, int]] = {}
         # by segment, its last scale, that scale's first node, and how many keyframes it stands for
+        self._lengths: dict[int, list[float]] = {}  # by segment, relative sigmas of its steps
 
     def first(self, node: Node) -> tuple[F64, F64]:
         """Pose and covariance of the first keyframe: loose where readings will follow.
@@ -116,6 +118,13 @@ class Motions:
         self.scale_of[node.key] = key
         return key
 
+    def _jump(self, node: Node, last: Node) -> float:
+        """Share by which vision's scale may have changed at a step."""
+        lengths = self._lengths.setdefault(node.segment, [])
+        lengths.append(_length_sigma(node, last))
+        usual = float(np.median(lengths))
+        return lengths[-1] if lengths[-1] > max(OPEN_LENGTH, OPEN_SHARE * usual) else 0.0
+
     def _is_refuted(self, node: Node, last: Node, motion: F64, covariance: F64) -> bool:
         """True where both attitude and positions contradict vision's motion: two sensors do not
         fail at once by chance, and images that smear do."""
@@ -136,8 +145,7 @@ class Motions:
         """The motion between two keyframes; of an aligned segment, with its scale left open."""
         kind, scale = "vision" if is_seen else "link", NO_SCALE
         if node.segment == last.segment and self._segments.known(node.segment) is not None:
-            jump = _length_sigma(node, last)
-            key = self.scale_key(node, jump if jump > OPEN_LENGTH else 0.0)
+            key = self.scale_key(node, self._jump(node, last))
             scale = key if is_seen else NO_SCALE
         self._smoother.add_motion(kind, (last.key, node.key), motion, covariance, scale)
 

@@ -7,6 +7,11 @@ a landmark seen from several keyframes ties their scale together.
 Minimises the Huber cost of the reprojection error over poses and points by
 Levenberg-Marquardt with the Schur complement on the points (Triggs et al., Bundle
 Adjustment - A Modern Synthesis, 2000, doi:10.1007/3-540-44480-7_21).
+
+Errors of neighbouring points are alike: an encoder moves blocks, and a track that drifts takes its
+later pixels along. So the noise follows from how cells of the image scatter, not single pixels
+(Liang and Zeger, Longitudinal data analysis using generalized linear models, 1986,
+doi:10.1093/biomet/73.1.13).
 """
 
 from __future__ import annotations
@@ -19,6 +24,10 @@ from numba import njit
 from recon import se3
 from recon.small_matrices import invert_3x3, solve_symmetric
 from recon.types import F64, I64, Bool
+
+CELL_ROWS = 4
+"""Cells whose errors count as independent: so many strips with as many cells each. Larger ones hold
+more of what an encoder moves together; fewer do not show how they scatter."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,8 +197,10 @@ def _normal_equations(
 @njit(cache=True, nogil=True)
 def _adjust(
     T: F64, X: F64, cam: I64, start: I64, uv: F64, k: F64, huber: float, slot: I64, n_free: int,
-    iterations: int,
-) -> tuple[F64, F64, F64, F64, bool]:  # fmt: skip
+    iterations: int, first: I64,
+) -> tuple[F64, F64, F64, F64, F64, bool]:  # fmt: skip
+    """Poses, points, lengths of the errors, by runs of points from ``first`` (R + 1,) on their
+    (R, 6F, 6F) reduced systems and (R, 6F) right sides, and whether the cost was lowered."""
     M, N = cam.size, X.shape[0]
     pt = np.empty(M, np.int64)
     for p in range(N):
@@ -243,8 +254,14 @@ def _adjust(
             if damping > 1e4:
                 break
     _cost(T, X, cam, pt, uv, k, huber, res)
-    _normal_equations(T, X, cam, start, uv, k, huber, slot, n_free, 0.0, S, g, Hpp_inv, bp, W)
-    return T, X, res, S, improved
+    runs, sides = np.zeros((first.size - 1, g.size, g.size)), np.zeros((first.size - 1, g.size))
+    for c in range(first.size - 1):
+        a, b = first[c], first[c + 1]
+        _normal_equations(
+            T, X[a:b], cam, start[a : b + 1], uv, k, huber, slot, n_free, 0.0, runs[c], sides[c],
+            Hpp_inv[a:b], bp[a:b], W,
+        )  # fmt: skip
+    return T, X, res, runs, sides, improved
 
 
 def adjust(
@@ -270,17 +287,22 @@ def adjust(
         K: (3, 3) intrinsics shared by the cameras.
         free: (C,) True for the cameras that may move.
         huber_px: error at which the quadratic cost turns linear.
-        sigma_px: pixel noise that the covariances are scaled with; None: as the residuals show.
+        sigma_px: pixel noise that the covariances are scaled with; None: as the residuals of
+            cells of the image show.
         iterations: most Levenberg-Marquardt steps.
     """
-    n_free = int(free.sum())
-    order = np.argsort(point_index, kind="stable")
-    start = np.searchsorted(point_index[order], np.arange(points_m.shape[0] + 1)).astype(np.int64)
+    n_free, N = int(free.sum()), len(points_m)
+    by_place = _by_place(T_camera_world[len(T_camera_world) // 2], points_m)
+    number = np.empty(N, np.int64)
+    number[by_place] = np.arange(N)
+    first = np.linspace(0, N, CELL_ROWS**2 + 1).astype(np.int64)
+    order = np.argsort(number[point_index], kind="stable")
+    start = np.searchsorted(number[point_index[order]], np.arange(N + 1)).astype(np.int64)
     slot = np.where(free, np.cumsum(free) - 1, -1).astype(np.int64)
     k = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-    T, X, residual, S, improved = _adjust(
+    T, moved, residual, cells, sides, improved = _adjust(
         np.ascontiguousarray(T_camera_world, dtype=np.float64),
-        np.ascontiguousarray(points_m, dtype=np.float64),
+        np.ascontiguousarray(points_m[by_place], dtype=np.float64),
         np.ascontiguousarray(camera_index[order], dtype=np.int64),
         start,
         np.ascontiguousarray(uv_px[order], dtype=np.float64),
@@ -289,25 +311,40 @@ def adjust(
         slot,
         n_free,
         iterations,
+        first,
     )
-    if sigma_px is None:
-        sigma_px = noise_px(residual, 3 * len(X) + 6 * n_free)
-    C, moving = len(T), np.flatnonzero(free)
+    inverse = np.linalg.pinv(cells.sum(axis=0), hermitian=True)
+    variance = noise(inverse, cells, sides) if sigma_px is None else sigma_px**2
+    C, where = len(T), np.flatnonzero(free)
     joint = np.zeros((C, C, 6, 6))
-    full = np.linalg.pinv(S, hermitian=True) * sigma_px**2
-    joint[np.ix_(moving, moving)] = full.reshape(n_free, 6, n_free, 6).swapaxes(1, 2)
+    full = variance * inverse
+    joint[np.ix_(where, where)] = full.reshape(n_free, 6, n_free, 6).swapaxes(1, 2)
     back = np.empty(len(uv_px))
     back[order] = residual
-    return BundleResult(T, X, back, joint, bool(improved))
+    points = np.empty_like(moved)
+    points[by_place] = moved
+    return BundleResult(T, points, back, joint, bool(improved))
 
 
-def noise_px(residual_px: F64, unknowns: int) -> float:
-    """Noise of one coordinate by the median length of (M,) residuals, of a fit of so many unknowns.
+def _by_place(T_camera_world: F64, points_m: F64) -> I64:
+    """(N,) order of points in which equal runs are cells of one view: strips, each cut across."""
+    seen = se3.transform(T_camera_world, points_m)
+    right = np.argsort(np.arctan2(seen[:, 0], seen[:, 2]))
+    strip = np.empty(len(points_m), np.int64)
+    strip[right] = np.arange(len(points_m)) * CELL_ROWS // len(points_m)
+    return np.asarray(np.lexsort((np.arctan2(seen[:, 1], seen[:, 2]), strip)))
 
-    Lengths of two normal coordinates are Rayleigh's; their median is 1.1774 sigma.
+
+def noise(inverse: F64, cells: F64, sides: F64) -> float:
+    """Variance in px^2 of pixels that would let the fit err as far as cells of the image show.
+
+    ``inverse`` (n, n) is that of the sum of ``cells`` (C, n, n), the cells' normal matrices;
+    ``sides`` (C, n) are their right sides at the minimum. The expectation of their squares lacks
+    what the fit takes up of each cell.
     """
-    free = max(2 * len(residual_px) - unknowns, 1)
-    return float(np.median(residual_px)) / 1.1774 * float(np.sqrt(2 * len(residual_px) / free))
+    leverage = inverse @ cells
+    squares = np.einsum("ci,ij,cj->", sides, inverse, sides)
+    return float(squares / (len(inverse) - np.einsum("cij,cji->", leverage, leverage)))
 
 
 def triangulate(T_a_world: F64, T_b_world: F64, K: F64, uv_a: F64, uv_b: F64) -> tuple[F64, F64]:
