@@ -211,6 +211,15 @@ def slerp(q0_wxyz: F64, q1_wxyz: F64, share: float) -> F64:
     return quaternion_from_rotation(R0 @ so3_exp(share * so3_log(R0.T @ R1)))
 
 
+def disagreement(T_a: F64, covariance_a: F64, T_b: F64, covariance_b: F64) -> float:
+    """Chi-square per degree of freedom of the difference of two estimates of one motion.
+
+    Both covariances are of left perturbations in the same frame.
+    """
+    difference = log(T_b @ inverse(T_a))
+    return float(difference @ np.linalg.solve(covariance_a + covariance_b, difference)) / 6.0
+
+
 def average(T_a: F64, covariance_a: F64, T_b: F64, covariance_b: F64) -> tuple[F64, F64]:
     """Weighted mean of two estimates of one motion, and its (6, 6) covariance.
 

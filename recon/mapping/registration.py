@@ -46,6 +46,7 @@ class IcpConfig:
     max_turn_rad: float = 0.1
     weak_slope: float = 0.02  # rms slope of the ground that a direction needs to be observed
     unknown_sigma_m: float = 10.0  # given to directions that are not observed
+    max_disagreement: float = 4.0  # chi-square per degree of freedom against the images' motion
 
 
 def arrays_of(depth: DepthMap) -> tuple[F32, F32, F64]:

@@ -35,7 +35,6 @@ class LoopConfig:
     min_overlap: float = 0.35  # of the later view in the earlier one
     search_share: float = 0.12  # of the image's width, about the predicted places
     min_matches: int = 40
-    max_disagreement: float = 4.0  # chi-square per degree of freedom between EPnP and ICP
     matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
     pnp: pnp.PnpConfig = field(default_factory=lambda: pnp.PnpConfig(min_inliers=30))
     icp: IcpConfig = field(default_factory=IcpConfig)
@@ -252,11 +251,10 @@ def _with_icp(
     aligned = register_projective(b.depth, a.depth, T_a_b, config.icp)
     if not aligned.converged:
         return None
-    difference = se3.log(aligned.T_target_source @ se3.inverse(T_a_b))
-    spread = covariance + aligned.covariance
-    if float(difference @ np.linalg.solve(spread, difference)) / 6.0 > config.max_disagreement:
+    both = T_a_b, covariance, aligned.T_target_source, aligned.covariance
+    if se3.disagreement(*both) > config.icp.max_disagreement:
         return None
-    T, covariance = se3.average(T_a_b, covariance, aligned.T_target_source, aligned.covariance)
+    T, covariance = se3.average(*both)
     covariance = covariance + np.diag([MIN_RAD**2] * 3 + [(MIN_SHARE * sigma) ** 2] * 3)
     return LoopClosure(T, covariance, growth)
 

@@ -352,7 +352,8 @@ class Register:
         self.verdicts: Counter[Verdict] = Counter()
 
     def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> KeyframeStep:
-        """The step from the keyframe before: vision's and ICP's, weighted by covariance."""
+        """The step from the keyframe before: vision's and ICP's, weighted by covariance; vision's
+        alone where ICP contradicts it."""
         covariance = view.covariance + np.diag([1e-4**2] * 3 + [0.005**2] * 3)
         before, self._before = self._before, (view.seq, depth)
         T_before = view.earlier.get(before[0]) if before is not None else None
@@ -366,9 +367,11 @@ class Register:
         with self._stopwatch("icp"):
             found = self._backend.register(depth, before[1], step, self._config)
         self.verdicts[found.verdict] += 1
-        if not found.converged:
+        both = step, covariance, found.T_target_source, found.covariance
+        is_refuted = se3.disagreement(*both) > self._config.max_disagreement
+        if not found.converged or is_refuted:
             return KeyframeStep(step, covariance)
-        return KeyframeStep(*se3.average(step, covariance, found.T_target_source, found.covariance))
+        return KeyframeStep(*se3.average(*both))
 
 
 class MakeKeyframe:

@@ -1,0 +1,40 @@
+"""The step between two keyframes by vision and by ICP of their depths."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.types import DepthMap, Registration, Verdict
+from service.flight.stages import Register
+from service.progress import Stopwatch
+
+DEPTH = cast(DepthMap, object())
+STEP = se3.compose(np.eye(3), np.array([4.0, 0.0, 0.0]))
+
+
+def step_with_icp(off_m: float) -> float:
+    """m by which a step leaves vision's, when ICP as sure as vision is off by ``off_m``."""
+    spread = np.diag([1e-3**2] * 3 + [0.02**2] * 3)
+    T = se3.compose(np.eye(3), np.array([4.0 + off_m, 0.0, 0.0]))
+    found = Registration(T, spread, Verdict.CONVERGED, 0.1, 0.9, 3)
+    register = Register(cast(Any, SimpleNamespace(register=lambda *_: found)), Stopwatch())
+    for seq, T_odom_camera in enumerate((np.eye(4), STEP)):
+        view = SimpleNamespace(
+            seq=seq,
+            covariance=spread,
+            earlier={0: np.eye(4)},
+            view=SimpleNamespace(T_odom_camera=T_odom_camera),
+        )
+        step = register(cast(Any, view), DEPTH)
+    assert step.T_before_camera is not None
+    return float(step.T_before_camera[0, 3] - STEP[0, 3])
+
+
+@pytest.mark.parametrize(("off_m", "taken_m"), [(0.03, 0.015), (0.5, 0.0)])
+def test_icp_that_contradicts_vision_does_not_move_the_step(off_m: float, taken_m: float) -> None:
+    assert step_with_icp(off_m) == pytest.approx(taken_m, abs=0.002)
