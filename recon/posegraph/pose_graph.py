@@ -383,12 +383,11 @@ class PoseGraph:
         return True
 
     def _add_loop_factor(self, loop: Loop) -> None:
-        a, b = self._nodes[loop.a].key, self._nodes[loop.b].key
-        metric = loop.scaled(self.scale(loop.a))
-        self._sources[b].add("loop")
-        # Not robust: two loops agreed, and a late one with a large misclosure would lose weight.
-        self._smoother.add_motion("loop", (a, b), metric.T_a_b, metric.covariance)
-        self._add_loop_scale(loop, a, b)
+        a, b = self._nodes[loop.a], self._nodes[loop.b]
+        metric = loop.scaled(self._segments.frame(a.segment).scale)
+        self._sources[b.key].add("loop")
+        self._motions.add_loop(a, b, metric.T_a_b, metric.covariance)
+        self._add_loop_scale(loop, a.key, b.key)
 
     def _add_loop_scale(self, loop: Loop, a: int, b: int) -> None:
         """The ratio of the depths at both ends, where each has a scale of its own."""
