@@ -555,6 +555,20 @@ def test_vision_and_loops_that_contradict_each_other_leave_the_scale_to_the_fixe
     assert umeyama(places, truth, np.ones(130))[0] == pytest.approx(1.0, abs=0.005)
 
 
+def test_a_stretch_whose_scale_no_fix_measures_is_as_high_as_the_flight() -> None:
+    """The height is assumed to be 50 m, and 180 m of 60 units; fixes of 60 m say little."""
+    f, graph = flight(66, scale=3.0, sigma_gnss_m=1.0), PoseGraph()
+    for i, (T, prior) in enumerate(zip(f.odom, f.priors, strict=True)):
+        prior = replace(prior, agl_m=50.0, sigma_agl_m=25.0, is_agl_measured=False)
+        if i >= 60:
+            prior = replace(prior, sigma_position_m=np.full(3, 60.0))
+        graph.add_keyframe(i, i * 10**9, int(i >= 60), T, f.covariance, prior, (60.0, 0.0))
+    graph.solve()
+    assert graph.scale(30) == pytest.approx(3.0, rel=0.02)
+    assert graph.scale(63) == pytest.approx(3.0, rel=0.3)
+    assert not graph.is_tied(1)
+
+
 def test_a_loop_that_vision_cannot_have_drifted_is_refused() -> None:
     f = circle()
     graph, _ = fly(f)

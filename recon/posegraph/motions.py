@@ -26,6 +26,10 @@ OPEN_LENGTH = 0.005
 where stills turn and have little in common."""
 
 
+UNKNOWN_SCALE = 1.0
+"""Sigma of the logarithm of a scale that no reading measures."""
+
+
 def _length_sigma(node: Node, last: Node) -> float:
     """Relative sigma of the length of vision's step to a node; 0 for none."""
     step = (se3.inverse(last.T_odom_camera) @ node.T_odom_camera)[:3, 3]
@@ -106,7 +110,8 @@ class Motions:
         if key == NO_SCALE or node.key - since >= BLOCK or jump:
             before, since = key, node.key
             log = float(self._smoother.logs()[before])
-            sigma = self._config.sigma_scale
+            known = self._segments.frame(node.segment).sigma_scale
+            sigma = float(np.clip(known, self._config.sigma_scale, UNKNOWN_SCALE))
             if before != NO_SCALE:
                 walk = self._config.sigma_scale_walk * np.sqrt(max(1.0, held / BLOCK))
                 sigma = float(np.hypot(walk, jump))

@@ -135,12 +135,13 @@ class PoseGraph:
 
     def solve(self) -> None:
         """Fit every segment's frame to all its telemetry again, and rebuild the graph."""
-        for segment, nodes in self._segments.nodes.items():
-            if self._segments.forget(segment) and nodes[0].key > 0:
-                self.rebuild()  # so that the segment's start is known
-                if any(self._tie(loop) for loop in self._book.into(segment)):
-                    continue
+        for segment in self._segments.nodes:
+            self._segments.forget(segment)
             self._segments.refit(segment, self._smoother.pose)
+            loops = self._book.into(segment)
+            if loops and not self._segments.is_tied(segment):
+                self.rebuild()  # so that the segments before are where they belong
+                any(self._tie(loop) for loop in loops)
         self.rebuild()
 
     # ---- what comes out ------------------------------------------------------------------------
@@ -203,7 +204,7 @@ class PoseGraph:
         return self._segments.sigma_height_m(segment)
 
     def is_tied(self, segment: int) -> bool:
-        """True when fixes or a loop locate the segment."""
+        """True when a loop places the segment, or fixes that measure its scale."""
         return self._segments.is_tied(segment)
 
     def node(self, seq: int) -> Node:
