@@ -149,6 +149,19 @@ def test_an_assumed_height_has_no_part_in_a_scale_that_is_measured(by: str) -> N
     assert "altitude" not in found.sources
 
 
+def test_an_assumed_height_does_not_pull_a_scale_that_fixes_know_to_a_quarter() -> None:
+    """A camera carried at 1.5 m, where 50 m are assumed."""
+    off = []
+    for seed in range(8):
+        some = []
+        for a in anchors(np.eye(3), 1.0, np.zeros(3), seed, gnss_m=20.0)[::3]:
+            some.append(replace(a, prior=assumed(a.prior), height=1.5))
+        found = fit(some)
+        assert found is not None and 0.1 < found.sigma_scale < 0.5
+        off.append(math.log(found.scale) / found.sigma_scale)
+    assert abs(np.mean(off)) < 1.0
+
+
 def test_an_assumed_height_is_no_source_of_the_scale() -> None:
     some = [
         Anchor(a.T_odom_camera, assumed(replace(a.prior, position_m=None)), 120.0)

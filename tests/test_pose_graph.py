@@ -535,6 +535,40 @@ def test_a_lost_stretch_is_tied_by_two_loops_in_scale_and_heading() -> None:
     assert graph.scale(20) == pytest.approx(0.5 * graph.scale(4), rel=0.03)
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_vision_and_loops_that_contradict_each_other_leave_the_scale_to_the_fixes(
+    seed: int,
+) -> None:
+    """All err by ten of their sigmas, so a smaller map would agree better in metres."""
+    f = flight(130, seed=seed, sigma_gnss_m=2.0, drift=0.01)
+    f.covariance = f.covariance / 10.0**2
+    graph, _ = fly(f, PoseGraphConfig())
+    rng = np.random.default_rng(seed)
+    spread = np.diag([1e-3**2] * 3 + [0.05**2] * 3)
+    for i in range(8):
+        error = se3.exp(10.0 * rng.multivariate_normal(np.zeros(6), spread))
+        T = error @ se3.inverse(f.truth[i]) @ f.truth[120 + i]
+        T[:3, 3] *= graph.scale(i) / 1.3  # it is seen in units of the odometry
+        graph.add_loop(i, 120 + i, T, spread)
+    graph.solve()
+    places, truth = graph.pose_array()[:, :3, 3], np.array(f.truth)[:, :3, 3]
+    assert umeyama(places, truth, np.ones(130))[0] == pytest.approx(1.0, abs=0.005)
+
+
+def test_a_stretch_whose_scale_no_fix_measures_is_as_high_as_the_flight() -> None:
+    """The height is assumed to be 50 m, and 180 m of 60 units; fixes of 60 m say little."""
+    f, graph = flight(66, scale=3.0, sigma_gnss_m=1.0), PoseGraph()
+    for i, (T, prior) in enumerate(zip(f.odom, f.priors, strict=True)):
+        prior = replace(prior, agl_m=50.0, sigma_agl_m=25.0, is_agl_measured=False)
+        if i >= 60:
+            prior = replace(prior, sigma_position_m=np.full(3, 60.0))
+        graph.add_keyframe(i, i * 10**9, int(i >= 60), T, f.covariance, prior, (60.0, 0.0))
+    graph.solve()
+    assert graph.scale(30) == pytest.approx(3.0, rel=0.02)
+    assert graph.scale(63) == pytest.approx(3.0, rel=0.3)
+    assert not graph.is_tied(1)
+
+
 def test_a_loop_that_vision_cannot_have_drifted_is_refused() -> None:
     f = circle()
     graph, _ = fly(f)
@@ -613,19 +647,20 @@ def test_the_gradient_is_the_costs_own(seed: int) -> None:
     smoother = Smoother()
     for one in T:
         smoother.append_pose(one, np.eye(6))
-    scale = smoother.append_scale(0.1)
+    scale, unit = smoother.append_scale(0.1), smoother.append_scale(-0.2)
     for a, b in ((0, 1), (1, 2), (0, 2)):
         error = se3.exp(rng.normal(size=6) * 1e-3)
         spread = np.diag(rng.uniform(0.5, 2.0, 6))
-        smoother.add_motion("vision", (a, b), error @ se3.inverse(T[a]) @ T[b], spread, scale)
+        motion = error @ se3.inverse(T[a]) @ T[b]
+        smoother.add_motion("vision", (a, b), motion, spread, scale, unit)
     smoother.add_motion("loop", (0, 2), se3.inverse(T[0]) @ T[2], np.eye(6))
     smoother.add_turn("attitude", 1, T[1][:3, :3], np.array([0.5, 1.0, 2.0]), 0.7)
     smoother.add_place("position", 2, T[2][:3, 3] + 0.3, np.array([0.5, np.inf, 2.0]), 0.2)
     smoother.add_scale("scale", (NO_SCALE, scale), 0.2, 0.5)
     R, t = np.array(T)[:, :3, :3], np.array(T)[:, :3, 3]
-    at, factors = State(R, t, np.array([0.0, 0.1])), list(smoother._factors.values())
+    at, factors = State(R, t, np.array([0.0, 0.1, -0.2])), list(smoother._factors.values())
     system = System.of(factors, at)
-    for i in [*range(18), 19]:  # 18 is the scale that is held
+    for i in [*range(18), 19, 20]:  # 18 is the scale that is held
         step = np.zeros(len(system.g))
         step[i] = 1e-4
         up, down = (System.of(factors, at.moved(s)) for s in (step, -step))

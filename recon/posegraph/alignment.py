@@ -27,7 +27,7 @@ from recon.posegraph.alignment_readings import (
     ReadingNoise,
     has_fix,
 )
-from recon.posegraph.anchors import INDEPENDENT_HEIGHTS, Anchor
+from recon.posegraph.anchors import GUESSED_SHARE, INDEPENDENT_HEIGHTS, Anchor
 from recon.posegraph.level_ground import ASSUMED_TILT_RAD
 from recon.posegraph.sensor_noise import (
     MIN_READINGS,
@@ -139,6 +139,7 @@ def fit(
     The anchors stand in the order of time; ``fix_s`` and ``attitude_s`` are the usual time
     constants with which a receiver and assumed views wander. How fixes and velocities err is
     measured by their residuals against the track of a first fit and weighs them in a second one.
+    An assumed height takes part only where nothing else measures the scale as well.
     An assumed view is off by one angle in all images, and altitudes of no stated accuracy drift:
     both are fitted too. Where fixes differ by more than their noise, the covariance grows by as
     much. The receiver's error that all fixes share goes into the position's covariance.
@@ -159,8 +160,15 @@ def fit(
     noise = noise.or_else(usual, readings.claimed)
     readings = AlignmentReadings(usable, noise, wander_s)
     best = _solve(readings, best.at, iterations)
-    excess = readings.excess(best.residuals, best.kept)
-    covariance = np.asarray(np.linalg.inv(best.H)[:7, :7] * max(excess, 1.0), np.float64)
+    covariance = _covariance(readings, best)
+    if readings.is_height_assumed:
+        others = AlignmentReadings([replace(a, height=None) for a in usable], noise, wander_s)
+        measured = _solve(others, best.at, iterations)
+        known = _covariance(others, measured)
+        if known[6, 6] < GUESSED_SHARE**2:  # the assumed height would pull the scale
+            readings, best, covariance = others, measured, known
+        else:
+            covariance[6, 6] = max(covariance[6, 6], GUESSED_SHARE**2)
     heights = None
     if len(readings.fix) and noise.horizontal is not None:
         heights = readings.heights(best.at, best.H, covariance)
@@ -181,6 +189,12 @@ def fit(
     lean[:2, :2] = covariance[:2, :2]
     centre = similarity.place(readings.x.mean(axis=0))
     return replace(similarity, lean=se3.about(-centre, lean))
+
+
+def _covariance(readings: AlignmentReadings, found: _Solution) -> F64:
+    """(7, 7) of a solution, larger where fixes differ by more than their noise."""
+    excess = readings.excess(found.residuals, found.kept)
+    return np.asarray(np.linalg.inv(found.H)[:7, :7] * max(excess, 1.0), np.float64)
 
 
 def _measured(

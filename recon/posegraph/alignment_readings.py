@@ -14,15 +14,12 @@ from itertools import pairwise
 import numpy as np
 
 from recon import se3
-from recon.posegraph.anchors import UNMEASURED_HEIGHTS, Anchor, height_ratios
+from recon.posegraph.anchors import GUESSED_SHARE, UNMEASURED_HEIGHTS, Anchor, height_ratios
 from recon.posegraph.sensor_noise import PRECISE_M, PRECISE_TAU_S, Noise
 from recon.types import F64, PosePrior
 
 WANDER_SHARE = 0.6
 """Share of a fix's sigma that differs between fixes of one flight; the rest is common to all."""
-
-GUESSED_SHARE = 0.5
-"""Relative sigma of a height that is assumed: it holds a scale that nothing else gives."""
 
 KNOWN_YAW_RAD, NO_YAW_RAD = 1.0, 3.0
 """Sigma below which a heading counts as known, and one of a heading that is not."""
@@ -214,6 +211,7 @@ class AlignmentReadings:
         self._slow = Noise(0.0, noise.rate_m_s, RATE_S)
         self.has_measured_heights = bool(heights) and independent > UNMEASURED_HEIGHTS
         self.has_heights = any(sigma < GUESSED_SHARE for _, sigma in heights)
+        self.is_height_assumed = bool(heights) and not self.has_heights
         self.log_ratio = _stack([h[0] for h in heights], ())
         thinned = min(1.0, (independent / max(len(heights), 1)) ** 0.5)
         self.sigma_log = _stack([h[1] for h in heights], ()) / thinned

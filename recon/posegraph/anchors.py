@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,9 @@ INDEPENDENT_HEIGHTS = 4.0
 
 UNMEASURED_HEIGHTS = 1.0
 """Heights above the take-off point, or assumed ones, count as so many: they share one offset."""
+
+GUESSED_SHARE = 0.5
+"""Relative sigma of a height that is assumed: it holds a scale that nothing else gives."""
 
 EXACT_HEIGHTS = 16.0
 """The same where the ground exactly below was measured: relief has no part in it."""
@@ -51,6 +54,14 @@ class Anchor:
         """(3,) where the prior's position was, in the odometry."""
         offset, T = self.prior.fix_offset, self.T_odom_camera
         return T[:3, 3] if offset is None else T[:3, :3] @ offset + T[:3, 3]
+
+
+def guessed_at(height_m: float | None, prior: PosePrior) -> PosePrior:
+    """The prior with another assumed height above ground; a known one stays."""
+    agl, sigma = prior.agl_m, prior.sigma_agl_m
+    if height_m is None or agl is None or prior.is_agl_measured or sigma < GUESSED_SHARE * agl:
+        return prior
+    return replace(prior, agl_m=height_m, sigma_agl_m=GUESSED_SHARE * height_m)
 
 
 def height_above(points: F64, up: F64) -> tuple[float, float] | None:

@@ -40,6 +40,9 @@ STEPS = 60
 HELD, HELD_PLACE, HELD_SIGMA = "held", "held place", 1e-5
 """Kinds of factors that hold what is not an unknown; rad and m."""
 
+UNIT = NO_SCALE + 1
+"""Key of the first stretch's scale, in whose unit all motions err."""
+
 MARK = np.dtype(
     [("key", int), ("point", int), ("scale", int), ("ray", float, (3,)), ("depth", float),
      ("R", float, (3, 3)), ("t", float, (3,)), ("weight", float, (3,))]
@@ -265,7 +268,7 @@ class _Batch:
         for k in loops:
             one = track.loops[k]
             self._smoother.add_motion(
-                "loop", (one.a, one.b), one.T_a_b, one.covariance, self._scale_key(one.a), 1.5
+                "loop", (one.a, one.b), one.T_a_b, one.covariance, self._scale_key(one.a), UNIT, 1.5
             )
         self._add_points(points, marks)
         self._smoother.update(now=True, steps=STEPS)
@@ -285,11 +288,11 @@ class _Batch:
     # ---- factors ---------------------------------------------------------------------------
 
     def _scale_key(self, key: int) -> int:
-        return NO_SCALE + 1 + key // self._config.stretch
+        return UNIT + key // self._config.stretch
 
     def _add_scales(self) -> None:
         sigma = self._config.sigma_scale
-        for key in range(NO_SCALE + 1, self._scale_key(len(self._track.poses) - 1) + 1):
+        for key in range(UNIT, self._scale_key(len(self._track.poses) - 1) + 1):
             self._smoother.append_scale(0.0)
             before = key - 1
             self._smoother.add_scale("scale", (before, key), 0.0, sigma)
@@ -310,7 +313,8 @@ class _Batch:
             turn, shift, kind = c.sigma_break_rad, c.sigma_break_m * pause / c.break_s, "link"
         right = np.diag([turn**2] * 3 + [shift**2] * 3)
         spread = left_covariance(motion, right)
-        self._smoother.add_motion(kind, (key - 1, key), motion, spread, self._scale_key(key - 1))
+        scale = self._scale_key(key - 1)
+        self._smoother.add_motion(kind, (key - 1, key), motion, spread, scale, UNIT)
 
     def _add_placing(self) -> None:
         """The poses' own covariances: they err together, so each counts one N-th."""

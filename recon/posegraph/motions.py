@@ -26,6 +26,9 @@ OPEN_LENGTH, OPEN_SHARE = 0.005, 3.0
 vision's scale may have changed there, as where stills turn and have little in common. Where all
 images are noisy, lengths scatter and the scale stays."""
 
+UNKNOWN_SCALE = 1.0
+"""Sigma of the logarithm of a scale that no reading measures."""
+
 
 def _length_sigma(node: Node, last: Node) -> float:
     """Relative sigma of the length of vision's step to a node; 0 for none."""
@@ -60,6 +63,7 @@ class Motions:
         self._config, self._smoother = config, smoother
         self._segments, self._counts = segments, counts
         self.scale_of: list[int] = []  # key of each keyframe's scale, or NO_SCALE
+        self._units: dict[int, int] = {}  # key of each segment's first scale
         self.refuted: dict[int, int] = {}  # last keyframe after each refuted step's first
         self._blocks: dict[int, tuple[int, int, int]] = {}
         # by segment, its last scale, that scale's first node, and how many keyframes it stands for
@@ -107,12 +111,14 @@ class Motions:
         if key == NO_SCALE or node.key - since >= BLOCK or jump:
             before, since = key, node.key
             log = float(self._smoother.logs()[before])
-            sigma = self._config.sigma_scale
+            known = self._segments.frame(node.segment).sigma_scale
+            sigma = float(np.clip(known, self._config.sigma_scale, UNKNOWN_SCALE))
             if before != NO_SCALE:
                 walk = self._config.sigma_scale_walk * np.sqrt(max(1.0, held / BLOCK))
                 sigma = float(np.hypot(walk, jump))
             key, held = self._smoother.append_scale(log), 0
             self._smoother.add_scale("scale", (before, key), 0.0, sigma)
+            self._units.setdefault(node.segment, key)
         if self.scale_of[node.key] != key:
             self._blocks[node.segment] = (key, since, held + node.weight)
         self.scale_of[node.key] = key
@@ -124,6 +130,13 @@ class Motions:
         lengths.append(_length_sigma(node, last))
         usual = float(np.median(lengths))
         return lengths[-1] if lengths[-1] > max(OPEN_LENGTH, OPEN_SHARE * usual) else 0.0
+
+    def add_loop(self, a: Node, b: Node, T_a_b: F64, covariance: F64) -> None:
+        """A motion (4, 4) seen between two nodes, in metres by a's frame, whose lengths grow with
+        a's scale; its covariance (6, 6) is of the left perturbation in a's frame."""
+        scale, unit = self.scale_of[a.key], self._units.get(a.segment, NO_SCALE)
+        # Not robust: two loops agreed, and a late one with a large misclosure would lose weight.
+        self._smoother.add_motion("loop", (a.key, b.key), T_a_b, covariance, scale, unit)
 
     def _is_refuted(self, node: Node, last: Node, motion: F64, covariance: F64) -> bool:
         """True where both attitude and positions contradict vision's motion: two sensors do not
@@ -143,11 +156,12 @@ class Motions:
 
     def _connect(self, node: Node, last: Node, motion: F64, covariance: F64, is_seen: bool) -> None:
         """The motion between two keyframes; of an aligned segment, with its scale left open."""
-        kind, scale = "vision" if is_seen else "link", NO_SCALE
+        kind, scale, unit = "vision" if is_seen else "link", NO_SCALE, NO_SCALE
         if node.segment == last.segment and self._segments.known(node.segment) is not None:
             key = self.scale_key(node, self._jump(node, last))
-            scale = key if is_seen else NO_SCALE
-        self._smoother.add_motion(kind, (last.key, node.key), motion, covariance, scale)
+            if is_seen:
+                scale, unit = key, self._units[node.segment]
+        self._smoother.add_motion(kind, (last.key, node.key), motion, covariance, scale, unit)
 
     def _seen(self, node: Node, last: Node) -> tuple[F64, F64]:
         """Vision's motion."""

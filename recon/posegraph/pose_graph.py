@@ -135,12 +135,13 @@ class PoseGraph:
 
     def solve(self) -> None:
         """Fit every segment's frame to all its telemetry again, and rebuild the graph."""
-        for segment, nodes in self._segments.nodes.items():
-            if self._segments.forget(segment) and nodes[0].key > 0:
-                self.rebuild()  # so that the segment's start is known
-                if any(self._tie(loop) for loop in self._book.into(segment)):
-                    continue
+        for segment in self._segments.nodes:
+            self._segments.forget(segment)
             self._segments.refit(segment, self._smoother.pose)
+            loops = self._book.into(segment)
+            if loops and not self._segments.is_tied(segment):
+                self.rebuild()  # so that the segments before are where they belong
+                any(self._tie(loop) for loop in loops)
         self.rebuild()
 
     # ---- what comes out ------------------------------------------------------------------------
@@ -203,7 +204,7 @@ class PoseGraph:
         return self._segments.sigma_height_m(segment)
 
     def is_tied(self, segment: int) -> bool:
-        """True when fixes or a loop locate the segment."""
+        """True when a loop places the segment, or fixes that measure its scale."""
         return self._segments.is_tied(segment)
 
     def node(self, seq: int) -> Node:
@@ -383,12 +384,11 @@ class PoseGraph:
         return True
 
     def _add_loop_factor(self, loop: Loop) -> None:
-        a, b = self._nodes[loop.a].key, self._nodes[loop.b].key
-        metric = loop.scaled(self.scale(loop.a))
-        self._sources[b].add("loop")
-        # Not robust: two loops agreed, and a late one with a large misclosure would lose weight.
-        self._smoother.add_motion("loop", (a, b), metric.T_a_b, metric.covariance)
-        self._add_loop_scale(loop, a, b)
+        a, b = self._nodes[loop.a], self._nodes[loop.b]
+        metric = loop.scaled(self._segments.frame(a.segment).scale)
+        self._sources[b.key].add("loop")
+        self._motions.add_loop(a, b, metric.T_a_b, metric.covariance)
+        self._add_loop_scale(loop, a.key, b.key)
 
     def _add_loop_scale(self, loop: Loop, a: int, b: int) -> None:
         """The ratio of the depths at both ends, where each has a scale of its own."""

@@ -12,7 +12,7 @@ from recon import se3
 from recon.posegraph import alignment
 from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.alignment_readings import ReadingNoise
-from recon.posegraph.anchors import Anchor
+from recon.posegraph.anchors import GUESSED_SHARE, Anchor, guessed_at
 from recon.posegraph.between_keyframes import at_camera
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_offsets import Constants, Offsets, constants, offsets
@@ -54,7 +54,7 @@ class SegmentFrames:
         for node in nodes:
             self.nodes.setdefault(node.segment, []).append(node)
         for segment in before.keys() - self.nodes.keys():
-            self._unplace(segment)
+            self.forget(segment)
             self._seen.pop(segment)
 
     def known(self, segment: int) -> Similarity | None:
@@ -123,8 +123,9 @@ class SegmentFrames:
         return frame is not None and "gnss" in frame.sources
 
     def is_tied(self, segment: int) -> bool:
-        """True when fixes or a loop locate the segment."""
-        return segment in self._tied or self.rests_on_fixes(segment)
+        """True when a loop places the segment, or fixes that measure its scale."""
+        is_scaled = self.frame(segment).sigma_scale < GUESSED_SHARE
+        return segment in self._tied or (is_scaled and self.rests_on_fixes(segment))
 
     def tie(self, segment: int, scale: float, R: F64, t: F64) -> None:
         """Place a segment by a loop, for good."""
@@ -139,12 +140,8 @@ class SegmentFrames:
         )
         self._tied.add(segment)
 
-    def forget(self, segment: int) -> bool:
-        """Count the segment as not placed; True when no fix can place it again."""
-        self._unplace(segment)
-        return all(n.prior.sigma_position_m is None for n in self.nodes[segment])
-
-    def _unplace(self, segment: int) -> None:
+    def forget(self, segment: int) -> None:
+        """Count the segment as not placed."""
         for known in (self._frames, self._offsets, self._fitted, self._constants):
             known.pop(segment, None)
         self._tied.discard(segment)
@@ -210,10 +207,22 @@ class SegmentFrames:
         return alignment.scales(anchors, self._frames[segment])
 
     def _anchors(self, segment: int, known: Constants) -> list[Anchor]:
+        height_m = self._usual_height_m()
         return [
-            Anchor(n.T_odom_camera, known.applied(n.prior), n.height, n.lean, n.time_ns * 1e-9)
+            Anchor(
+                n.T_odom_camera, guessed_at(height_m, known.applied(n.prior)), n.height, n.lean,
+                n.time_ns * 1e-9,
+            )
             for n in self.nodes[segment]
-        ]
+        ]  # fmt: skip
+
+    def _usual_height_m(self) -> float | None:
+        """Height above ground of the largest segment, if its scale is measured."""
+        segment = self.largest_segment()
+        if segment is None or self._frames[segment].sigma_scale >= GUESSED_SHARE:
+            return None
+        heights = [n.height for n in self.nodes[segment] if n.height is not None]
+        return self._frames[segment].scale * float(np.median(heights)) if heights else None
 
 
 def _bend_rad(nodes: list[Node]) -> float:

@@ -40,8 +40,8 @@ NO_SCALE = 0
 """Key of a scale that is held at 1."""
 
 MOTION = np.dtype(
-    [("a", int), ("b", int), ("scale", int), ("R", float, (3, 3)), ("t", float, (3,)),
-     ("weight", float, (6, 6))]
+    [("a", int), ("b", int), ("scale", int), ("unit", int), ("R", float, (3, 3)),
+     ("t", float, (3,)), ("weight", float, (6, 6))]
 )  # fmt: skip
 TURN = np.dtype([("key", int), ("R", float, (3, 3)), ("weight", float, (3,))])
 PLACE = np.dtype([("key", int), ("t", float, (3,)), ("weight", float, (3,))])
@@ -74,21 +74,30 @@ class Linear(NamedTuple):
 
 
 def _of_motions(rows: Rows, at: State) -> Linear:
-    """log of T_a_b over the motion, whose lengths grow with a scale; left in the frame of a."""
+    """log of T_a_b over the motion, whose lengths grow with a scale; left in the frame of a.
+
+    Lengths are compared in a unit that is a scale of the same track: in metres, motions that
+    contradict each other would agree better the smaller the map is.
+    """
     a, b, scale = rows["a"], rows["b"], rows["scale"]
     R_a_world = at.R[a].transpose(0, 2, 1)
     turned = at.R[b] @ rows["R"].transpose(0, 2, 1)
     expected = np.einsum("nij,nj->ni", turned, rows["t"] * np.exp(at.logs[scale])[:, None])
     apart = at.t[b] - at.t[a] - expected  # m, in the world
-    error = np.hstack([_log(R_a_world @ turned), np.einsum("nij,nj->ni", R_a_world, apart)])
-    J = np.zeros((len(rows), 6, 13))
-    J[:, :3, 0:3] = J[:, 3:, 3:6] = -R_a_world
-    J[:, :3, 6:9] = J[:, 3:, 9:12] = R_a_world
-    J[:, 3:, 0:3] = R_a_world @ se3.hat(apart)
-    J[:, 3:, 6:9] = R_a_world @ se3.hat(expected)
-    J[:, 3:, 12] = -np.einsum("nij,nj->ni", R_a_world, expected)
-    J[scale == NO_SCALE, :, 12] = 0.0
-    columns = np.hstack([columns_of(a, 0, 6), columns_of(b, 0, 6), scale_columns(at, scale)])
+    per_unit = np.exp(-at.logs[rows["unit"]])[:, None]
+    R_a_units = R_a_world * per_unit[:, :, None]
+    off = np.einsum("nij,nj->ni", R_a_units, apart)
+    error = np.hstack([_log(R_a_world @ turned), off])
+    J = np.zeros((len(rows), 6, 14))
+    J[:, :3, 0:3], J[:, 3:, 3:6] = -R_a_world, -R_a_units
+    J[:, :3, 6:9], J[:, 3:, 9:12] = R_a_world, R_a_units
+    J[:, 3:, 0:3] = R_a_units @ se3.hat(apart)
+    J[:, 3:, 6:9] = R_a_units @ se3.hat(expected)
+    J[:, 3:, 12] = -np.einsum("nij,nj->ni", R_a_units, expected)
+    J[:, 3:, 13] = -off
+    J[scale == NO_SCALE, :, 12] = J[rows["unit"] == NO_SCALE, :, 13] = 0.0
+    of_scales = [scale_columns(at, scale), scale_columns(at, rows["unit"])]
+    columns = np.hstack([columns_of(a, 0, 6), columns_of(b, 0, 6), *of_scales])
     error = np.einsum("nij,nj->ni", rows["weight"], error)
     return Linear(error, rows["weight"] @ J, columns)
 
@@ -240,12 +249,13 @@ class Smoother:
 
     def add_motion(
         self, kind: str, keys: tuple[int, int], T_a_b: F64, covariance: F64,
-        scale: int = NO_SCALE, huber: float = np.inf,
+        scale: int = NO_SCALE, unit: int = NO_SCALE, huber: float = np.inf,
     ) -> None:  # fmt: skip
-        """A motion (4, 4) between poses a and b, whose lengths grow with a scale; its covariance
-        (6, 6) is of the left perturbation in a's frame."""
+        """A motion (4, 4) between poses a and b, whose lengths grow with a ``scale``; its
+        covariance (6, 6) is of the left perturbation in a's frame, whose lengths grow with the
+        scale ``unit``."""
         weight = np.linalg.inv(np.linalg.cholesky(covariance))
-        row = (*keys, scale, T_a_b[:3, :3], T_a_b[:3, 3], weight)
+        row = (*keys, scale, unit, T_a_b[:3, :3], T_a_b[:3, 3], weight)
         self.add(_of_motions, MOTION, kind, row, huber)
 
     def add_turn(self, kind: str, key: int, R: F64, sigma: F64, huber: float = np.inf) -> None:

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from mavlink.telemetry.samples import VehicleState
-from recon.posegraph.alignment_readings import GUESSED_SHARE
+from recon.posegraph.anchors import GUESSED_SHARE
 from recon.posegraph.trajectory import Placed
 from recon.tracking.odometry import Tracking
 from recon.types import F64, Keyframe
