@@ -61,10 +61,10 @@ def packets(
     """(seconds since the first frame, MAVLink 2 packet) in the order of time."""
     from pymavlink.dialects.v20 import common as dialect  # type: ignore[import-untyped]
 
-    drone = _Drone(sensors, origin, epoch_unix_s, ground_range, options, dialect)
+    messages = _SimulatedMessages(sensors, origin, epoch_unix_s, ground_range, options, dialect)
     kinds = [
-        drone.housekeeping(), drone.attitude(), drone.gimbal(), drone.position(),
-        drone.satellites(), *([drone.range()] if options.rangefinder else []),
+        messages.housekeeping(), messages.attitude(), messages.gimbal(), messages.position(),
+        messages.satellites(), *([messages.range()] if options.rangefinder else []),
     ]  # fmt: skip
     senders = {
         1: dialect.MAVLink(None, srcSystem=1, srcComponent=1),
@@ -97,7 +97,7 @@ def _boot_ms(t: F64) -> npt.NDArray[np.int64]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Drone:
+class _SimulatedMessages:
     """The messages of a flight kind by kind, each kind in the order of time."""
 
     sensors: Sensors
