@@ -80,7 +80,8 @@ def landing(tmp_path: Path) -> Landing:
 def test_the_files_are_waited_for(slow: Slow, landing: Landing) -> None:
     waiting = threading.Thread(target=landing.write)
     waiting.start()
-    until(lambda: landing.writings.names == {"s"})
+    until(lambda: [uses for uses, _ in landing.writings.marks()] == [0])  # its thread is known
+    assert landing.writings.names == {"s"}
     before = landing.writings.marks()
     assert landing.writings.marks() == before
     assert not landing.asked
