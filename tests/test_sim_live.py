@@ -111,3 +111,16 @@ def test_wrong_addresses_are_refused(address: str, flight: Path) -> None:
 def test_empty_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no flight"):
         play(tmp_path, LiveOptions())
+
+
+def test_a_video_without_a_time_is_refused(flight: Path, tmp_path: Path) -> None:
+    """Its log could not be played at the right moment."""
+    out = tmp_path / "flight.mp4"
+    with av.open(str(flight / "flight.mp4")) as source, av.open(str(out), "w") as sink:
+        stream = sink.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                sink.mux(packet)
+    with pytest.raises(InputError, match="creation time"):
+        play(tmp_path, LiveOptions(video=str(tmp_path / "out.ts")))

@@ -150,7 +150,9 @@ def _play_once(video: Path, tlog: Path, options: LiveOptions, player: MavlinkPla
         with av.open(str(video)) as source, av.open(url, "w", format="mpegts") as sink:
             stream = sink.add_stream_from_template(source.streams.video[0])
             end_s = (source.duration or 0) / av.time_base
-            start_ns = creation_unix_ns(source, source.streams.video[0]) or 0
+            start_ns = creation_unix_ns(source, source.streams.video[0])
+            if start_ns is None:
+                raise InputError(f"{video} has no creation time; simulate the flight again")
             said = _telemetry(tlog, start_ns)
             telemetry = (e for e in said if not options.loop or 0 <= e[0] <= end_s)
             events = heapq.merge(_packets(source), telemetry, key=lambda e: e[:2])
