@@ -295,15 +295,12 @@ def _write_truth(simulation: Simulation, truth: Path) -> None:
     if simulation.scene.changes:
         boxes = [asdict(change) for change in simulation.scene.changes]
         (truth / "changes.json").write_text(json.dumps(boxes, indent=1) + "\n")
+    start_s = simulation.options.started_unix_s
     with (truth / "trajectory.tum").open("w") as out:
         for t, T in zip(simulation.times_s, simulation.poses, strict=True):
             q = quaternion_from_rotation(T[:3, :3])
             row = [*T[:3, 3], q[1], q[2], q[3], q[0]]
-            out.write(
-                f"{simulation.options.started_unix_s + t:.6f} "
-                + " ".join(f"{v:.9f}" for v in row)
-                + "\n"
-            )
+            out.write(f"{start_s + t:.6f} " + " ".join(f"{v:.9f}" for v in row) + "\n")
     count = min(simulation.options.depth_frames, len(simulation.times_s))
     for k in np.unique(np.linspace(0, len(simulation.times_s) - 1, count).astype(int)):
         np.savez_compressed(
@@ -311,9 +308,7 @@ def _write_truth(simulation: Simulation, truth: Path) -> None:
             depth_m=simulation.renderer.depth(simulation.poses[k], simulation.options.look.water_m),
             K=simulation.options.camera.K,
             T_world_camera=simulation.poses[k],
-            time_unix_ns=np.int64(
-                round((simulation.options.started_unix_s + simulation.times_s[k]) * 1e9)
-            ),
+            time_unix_ns=np.int64(round((start_s + simulation.times_s[k]) * 1e9)),
         )
 
 
