@@ -141,7 +141,9 @@ class PoseGraph:
             loops = self._book.into(segment)
             if loops and not self._segments.is_tied(segment):
                 self.rebuild()  # so that the segments before are where they belong
-                any(self._tie(loop) for loop in loops)
+                for loop in loops:
+                    if self._tie(loop):
+                        break
         self.rebuild()
 
     # ---- what comes out ------------------------------------------------------------------------
