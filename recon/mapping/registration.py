@@ -210,6 +210,17 @@ def register_projective(
     )
 
 
+def agreed_motion(
+    T: F64, covariance: F64, found: Registration, config: IcpConfig
+) -> tuple[F64, F64] | None:
+    """The images' motion (4, 4) with its covariance, averaged with a registration's; None where
+    that is rejected or contradicts the images."""
+    both = T, covariance, found.T_target_source, found.covariance
+    if not found.converged or se3.disagreement(*both) > config.max_disagreement:
+        return None
+    return se3.average(*both)
+
+
 def register_surfaces(
     source: DepthSurface, target: DepthSurface, T_target_source: F64, config: IcpConfig
 ) -> Registration:

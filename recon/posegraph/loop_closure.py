@@ -15,7 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import project, rays
-from recon.mapping.registration import IcpConfig, register_projective
+from recon.mapping.registration import IcpConfig, agreed_motion, register_projective
 from recon.tracking import matching, pnp
 from recon.tracking.common_view import FEATURE_SHARES, common_view, features
 from recon.types import F32, F64, U8, Bool, DepthMap
@@ -249,12 +249,10 @@ def _with_icp(
     sigma = float(np.nanmedian(a.depth.sigma_m))
     covariance = covariance + np.diag([(sigma / depth) ** 2 * 0.01] * 3 + [(0.3 * sigma) ** 2] * 3)
     aligned = register_projective(b.depth, a.depth, T_a_b, config.icp)
-    if not aligned.converged:
+    agreed = agreed_motion(T_a_b, covariance, aligned, config.icp)
+    if agreed is None:
         return None
-    both = T_a_b, covariance, aligned.T_target_source, aligned.covariance
-    if se3.disagreement(*both) > config.icp.max_disagreement:
-        return None
-    T, covariance = se3.average(*both)
+    T, covariance = agreed
     covariance = covariance + np.diag([MIN_RAD**2] * 3 + [(MIN_SHARE * sigma) ** 2] * 3)
     return LoopClosure(T, covariance, growth)
 

@@ -17,7 +17,7 @@ from recon.backends import Backend, DenseStages
 from recon.bands import limit_threads
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
-from recon.mapping.registration import IcpConfig
+from recon.mapping.registration import IcpConfig, agreed_motion
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.trajectory import Placed, Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
@@ -367,11 +367,8 @@ class Register:
         with self._stopwatch("icp"):
             found = self._backend.register(depth, before[1], step, self._config)
         self.verdicts[found.verdict] += 1
-        both = step, covariance, found.T_target_source, found.covariance
-        is_refuted = se3.disagreement(*both) > self._config.max_disagreement
-        if not found.converged or is_refuted:
-            return KeyframeStep(step, covariance)
-        return KeyframeStep(*se3.average(*both))
+        agreed = agreed_motion(step, covariance, found, self._config)
+        return KeyframeStep(*(agreed or (step, covariance)))
 
 
 class MakeKeyframe:
