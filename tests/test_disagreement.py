@@ -1,4 +1,4 @@
-"""Depth images of one ground against each other: sigmas that are right stay, others are widened."""
+"""Depth images of one ground against each other: sigmas that are right stay, others change."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import toeplitz
 
 from recon import se3
-from recon.mapping.disagreement import NEIGHBOURS_CORRELATION, Disagreement
+from recon.mapping.disagreement import MIN_FACTOR, NEIGHBOURS_CORRELATION, Disagreement
 from recon.types import F64, DepthMap
 
 SIZE = (160, 120)
@@ -44,7 +44,16 @@ def _independent(found: Disagreement, depth: DepthMap) -> float:
 def test_noise_as_the_sigmas_say_leaves_them() -> None:
     found = Disagreement()
     factors = [_independent(found, _seen(T, 0.1, k)) for k, T in enumerate(PLACES)]
-    assert max(factors) < 1.05 and min(factors) >= 1.0
+    assert factors[0] == 1.0 and factors == pytest.approx([1.0] * 4, abs=0.05)
+
+
+def test_images_clearer_than_stereo_states_have_smaller_sigmas_down_to_a_limit() -> None:
+    found = Disagreement()
+    factors = [_independent(found, _seen(T, 0.1, k, noise=0.85)) for k, T in enumerate(PLACES)]
+    assert factors[1:] == pytest.approx([0.85] * 3, rel=0.06)
+    same = Disagreement()
+    same.take(_seen(PLACES[0], 0.1, 0, noise=0.0))
+    assert _independent(same, _seen(PLACES[0], 0.1, 1, noise=0.0)) == MIN_FACTOR
 
 
 def test_noise_of_twice_the_sigma_is_reported() -> None:

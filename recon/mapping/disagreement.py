@@ -3,7 +3,8 @@
 Stereo knows its own noise. That a lens is not quite as its model says, or that the poses a depth
 image was made with were off, tilts and bows the whole image; only other images of the same ground
 show it. What they disagree by is the square root of the adjustment's variance factor (Mikhail and
-Ackermann, Observations and Least Squares, 1976), and sigmas are widened by it.
+Ackermann, Observations and Least Squares, 1976), and sigmas are multiplied by it: wider in
+compressed video, narrower in clear images.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ NEIGHBOURS_CORRELATION = (0.55, 0.28)
 They share frames. Measured on simulated flights at three widths
 (docs/reports/simulated-flights.md); three images apart it is 0."""
 
-MAX_FACTOR = 30.0
-"""A larger difference is other ground."""
+MIN_FACTOR, MAX_FACTOR = 0.75, 30.0
+"""Errors that all images share show in no difference; a larger difference is other ground."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,10 +58,10 @@ class Disagreement:
         self._earlier.clear()
 
     def take(self, depth: DepthMap) -> float:
-        """The factor, 1 or more, that the new image's sigmas fall short by; it is remembered.
+        """The factor that the new image's sigmas are to be multiplied by; it is remembered.
 
         1 where nothing earlier shows its ground. Sigmas of the image and of those before it
-        count as equally short: it is the root mean square over the earlier images of the robust
+        count as equally wrong: it is the root mean square over the earlier images of the robust
         normalised difference, less what their errors have in common. Points that one pair alone
         saw take part where there are too few others.
         """
@@ -75,7 +76,7 @@ class Disagreement:
         if not ratios:
             return 1.0
         factor = float(np.sqrt(np.mean(np.square(ratios))))
-        return float(np.clip(factor, 1.0, MAX_FACTOR))
+        return float(np.clip(factor, MIN_FACTOR, MAX_FACTOR))
 
     def _apart(self, depth: DepthMap, one: _Samples) -> float | None:
         """Robust normalised difference along z; None with too little in common."""

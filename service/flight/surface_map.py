@@ -163,8 +163,8 @@ class SurfaceMap:
     def __call__(
         self, view: StereoCandidate, depth: DepthMap, T_map_camera: F64
     ) -> tuple[F32, Bool]:
-        """((h, w) sigma widened by disagreement between views, an unknown readout and an assumed
-        lens, (h, w) surface that is new or better)."""
+        """((h, w) sigma, which holds disagreement of views, an unknown readout, an assumed lens;
+        (h, w) surface that is new or better)."""
         with self._stopwatch("map"):
             if view.segment != self._segment:
                 self._disagreement.forget()
@@ -174,8 +174,8 @@ class SurfaceMap:
             share = cv2.resize(view.rows_share, depth.depth_m.shape[::-1])
             sigma_m = np.hypot(depth.sigma_m * noise, share * depth.depth_m)
             in_map = replace(depth, sigma_m=sigma_m, T_world_camera=T_map_camera)
-            wider = np.float32(self._disagreement.take(in_map))
-            in_map = replace(in_map, sigma_m=in_map.sigma_m * wider)
+            factor = np.float32(self._disagreement.take(in_map))
+            in_map = replace(in_map, sigma_m=in_map.sigma_m * factor)
             known = self._map
             if known is None:
                 known = self._map = self._empty(depth)
