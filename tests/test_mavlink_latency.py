@@ -61,7 +61,7 @@ def attitudes(
     return samples
 
 
-@pytest.mark.parametrize("latency_s", [-0.08, 0.0, 0.07, 0.333])
+@pytest.mark.parametrize("latency_s", [-2.5, -0.08, 0.0, 0.07, 0.333])
 @pytest.mark.parametrize(
     ("camera_hz", "telemetry_hz"), [(15.0, 50.0), (30.0, 20.0), (25.0, 10.0), (15.0, 3.3)]
 )
@@ -72,6 +72,16 @@ def test_the_latency_is_found(latency_s: float, camera_hz: float, telemetry_hz: 
     assert found is not None and found.correlation > 0.9 and found.is_settled
     assert found.latency_ms == pytest.approx(1e3 * latency_s, abs=10.0)
     assert abs(found.latency_ms - 1e3 * latency_s) < 4.0 * found.sigma_ms
+
+
+def test_a_recording_is_found_anywhere_in_its_log() -> None:
+    recording = watch_flight(100.0, 5e-4, 1.0, 15.0, seconds=35.0)
+    assert recording.estimate(attitudes(20.0, noise_rad=1e-3)) is None
+    found = recording.anywhere(attitudes(20.0, noise_rad=1e-3))
+    assert found is not None and found.is_settled
+    assert found.latency_ms == pytest.approx(100e3, abs=10.0)
+    assert recording.anywhere(attitudes(20.0, 0.0, 1e-3)) is None
+    assert recording.anywhere([]) is None
 
 
 def test_a_gimbal_that_only_trembles_is_enough() -> None:

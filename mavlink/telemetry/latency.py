@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -28,8 +28,12 @@ MAX_SIGMA_MS = 40.0  # maximum sigma of an estimate that is reported
 RIVAL = 1.3  # a second solution, further away than RIVAL_APART_S, must fit worse by this factor
 RIVAL_APART_S = 0.15
 KEPT = 2000
-RANGE_S = (-0.2, 0.8)
-COARSE_S, FINE_S, FINE_STEPS = 0.02, 0.004, 8
+REACH_S = 5.0  # latencies that are sought, either way: a range without the true one holds aliases
+COARSE_S, FINE_S, FINE_STEPS = 0.04, 0.004, 8
+MIN_SHARE = 0.5  # of the most windows that telemetry covers at any latency
+NEAR_S = np.array([-0.5, 0.0, 0.5]) * COARSE_S
+FAR_WINDOW_S, FAR_STEP_S = 0.5, 0.05  # of the search over a whole log
+FAR_REACH_S = 600.0
 OUTLIER = 4.0  # times the median misfit
 
 
@@ -60,9 +64,13 @@ class _Turns:
     def __len__(self) -> int:
         return len(self.start_s)
 
-    def only(self, mask: Bool) -> _Turns:
+    def only(self, mask: Bool | slice) -> _Turns:
         """The subset selected by a mask."""
         return _Turns(self.start_s[mask], self.end_s[mask], self.rate[mask], self.overlap)
+
+    def apart(self) -> _Turns:
+        """Those that share no instant."""
+        return replace(self.only(slice(None, None, self.overlap)), overlap=1)
 
 
 class LatencyWatch:
@@ -90,32 +98,41 @@ class LatencyWatch:
         """The stamp of the oldest of the newest ``frames``; None without any."""
         return self._frames[-min(frames, len(self._frames))][1] if self._frames else None
 
-    def estimate(self, attitudes: Sequence[tuple[int, Quaternion]]) -> LatencyEstimate | None:
+    def estimate(
+        self, attitudes: Sequence[tuple[int, Quaternion]], about_s: float = 0.0
+    ) -> LatencyEstimate | None:
         """The latency by attitudes (time in ns, attitude) over the same time, oldest first.
 
-        None with too few frames, too little rotation, or no unambiguous solution.
+        It is sought within ``REACH_S`` of ``about_s``. None with too few frames, too little
+        rotation, or no unambiguous solution.
         """
         if len(attitudes) < MIN_WINDOWS or len(self._frames) < MIN_WINDOWS:
             return None
         track = Attitudes(attitudes)
-        low, high = RANGE_S
         seen = self._turns(track.base_ns, max(WINDOW_S, 2.0 * track.spacing_s))
-        inside = (seen.start_s - high > track.first_s) & (seen.end_s - low < track.last_s)
-        seen = seen.only(inside)
-        span_s = float((seen.end_s - seen.start_s).sum()) / seen.overlap
-        if len(seen) < MIN_WINDOWS * seen.overlap or span_s < MIN_SPAN_S:
+        steps = round(REACH_S / COARSE_S)
+        lags: F64 = about_s + COARSE_S * np.arange(-steps, steps + 1, dtype=np.float64)
+        coarse_s = _best_lag(seen.apart(), track, lags)
+        if coarse_s is None:
             return None
-        lags = np.arange(low, high + COARSE_S / 2, COARSE_S)
-        fits = [_fit(seen, track, float(lag)) for lag in lags]
-        misfits = np.array([np.inf if fit is None else fit.misfit for fit in fits])
-        k = int(np.argmin(misfits))
-        best = fits[k]
-        if best is None or not 0 < k < len(lags) - 1 or best.correlation < MIN_CORRELATION:
+        near = [(_fit(seen, track, lag_s), lag_s) for lag_s in coarse_s + NEAR_S]
+        best, lag_s = min(near, key=lambda fit: np.inf if fit[0] is None else fit[0].misfit)
+        if best is None or best.span_s(seen) < MIN_SPAN_S:
             return None
-        far = np.abs(lags - lags[k]) > RIVAL_APART_S
-        if (misfits[far] < RIVAL * best.misfit).any():
-            return None  # two latencies explain the images almost equally well
-        return _refine(seen.only(best.good), track, float(lags[k]))
+        return _refine(seen.only(best.good), track, float(lag_s))
+
+    def anywhere(self, attitudes: Sequence[tuple[int, Quaternion]]) -> LatencyEstimate | None:
+        """The latency by attitudes of a whole log; of a recording whose clock is minutes off."""
+        if len(attitudes) < MIN_WINDOWS or len(self._frames) < MIN_WINDOWS:
+            return None
+        track = Attitudes(attitudes)
+        seen = self._turns(track.base_ns, max(FAR_WINDOW_S, 2.0 * track.spacing_s)).apart()
+        if len(seen) < MIN_WINDOWS:
+            return None
+        low = max(float(seen.start_s[0]) - track.last_s, -FAR_REACH_S)
+        high = min(float(seen.end_s[-1]) - track.first_s, FAR_REACH_S)
+        lag_s = _best_lag(seen, track, np.arange(low, high, FAR_STEP_S, dtype=np.float64))
+        return None if lag_s is None else self.estimate(attitudes, lag_s)
 
     def _turns(self, base_ns: int, window_s: float) -> _Turns:
         """Rotations over ``window_s`` or a little more, four per window."""
@@ -141,8 +158,12 @@ class _Fit:
     ours: F64  # (N, 3) telemetry's rates in the camera's axes
     rest: F64  # (N, 3) the images' rates minus these
     known: Bool  # (N,) telemetry is available
-    misfit: float  # mean square of ``rest``
+    misfit: float  # share of the images' rotation that is not explained
     correlation: float
+
+    def span_s(self, seen: _Turns) -> float:
+        """Time that the windows cover together."""
+        return float((seen.end_s - seen.start_s)[self.known].sum()) / seen.overlap
 
     @property
     def good(self) -> Bool:
@@ -161,9 +182,25 @@ def _fit(seen: _Turns, track: Attitudes, lag_s: float) -> _Fit | None:
     ours = ours @ best_rotation(ours[known], seen.rate[known]).T
     rest = seen.rate - ours
     a, b = ours[known], seen.rate[known]
-    power = float(np.sqrt((a**2).sum() * (b**2).sum()))
+    of_images = max(float((b**2).sum()), 1e-30)
+    power = float(np.sqrt((a**2).sum() * of_images))
     correlation = float((a * b).sum()) / power if power > 0.0 else 0.0
-    return _Fit(ours, rest, known, float((rest[known] ** 2).sum(axis=1).mean()), correlation)
+    return _Fit(ours, rest, known, float((rest[known] ** 2).sum()) / of_images, correlation)
+
+
+def _best_lag(seen: _Turns, track: Attitudes, lags: F64) -> float | None:
+    """The latency of the least misfit, inside the range; None where another is as good."""
+    fits = [_fit(seen, track, float(lag)) for lag in lags]
+    counts = np.array([0 if fit is None else int(fit.known.sum()) for fit in fits])
+    misfits = np.array([np.inf if fit is None else fit.misfit for fit in fits])
+    misfits[counts < MIN_SHARE * counts.max(initial=0)] = np.inf
+    k = int(np.argmin(misfits)) if len(lags) else 0
+    best = fits[k] if len(lags) else None
+    if best is None or not 0 < k < len(lags) - 1 or best.correlation < MIN_CORRELATION:
+        return None
+    far = np.abs(lags - lags[k]) > RIVAL_APART_S
+    is_rivalled = bool((misfits[far] < RIVAL * best.misfit).any())
+    return None if is_rivalled else float(lags[k])
 
 
 def _refine(seen: _Turns, track: Attitudes, lag_s: float) -> LatencyEstimate | None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import closing, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
@@ -152,10 +151,10 @@ def _replay(
     as_json: bool,
     is_latency_given: bool,
 ) -> dict[str, Any]:
-    from recon.types import Shutter
     from service.cameras import open_camera, parse_source
     from service.commands.all_stills import all_stills
     from service.commands.own_lens import start_lens
+    from service.commands.video_time import start_of
     from service.compute.backend_choice import open_backend
     from service.flight.scan import ScanInputs
 
@@ -166,7 +165,7 @@ def _replay(
         start = start_lens(source, log)
         lens = start.camera
     lens, config = _with_stated_readout(lens, config, video, source, notes)
-    epoch_ns = _epoch(source, log, video_epoch, notes)
+    epoch_ns = start_of(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
     folder = out or Path(f"scan-{scan_id}")
     chosen = open_backend(config.compute, source.size_px)
@@ -183,19 +182,27 @@ def _replay(
         notes=tuple(notes),
         extra={"backend": chosen.name, "source": source.description},
     )
-    is_file = parse_source(video)[0] == "file"
+    unsure: set[str] = set()  # what the images may correct: then the scan begins again
+    if played is source and parse_source(video)[0] == "file":
+        is_clock_given = video_epoch is not None or is_latency_given
+        is_clock_sure = log is None or log.clock == "video" or is_clock_given
+        unsure = {"readout"} if is_clock_sure else {"readout", "clock"}
     with nullcontext(Progress()) if as_json else showing("replay") as progress:
         if start is not None:
             inputs = _with_lens(inputs, video, start, find_lens, progress)
         if played is source:
             inputs = all_stills(inputs, is_latency_given, progress)
         stop = stop_by_signals()
-        found = _fly(inputs, stop, progress, can_begin_again=played is source and is_file)
-        if isinstance(found, Shutter):
-            progress("beginning again with the readout that was found")
+        found = _fly(inputs, stop, progress, unsure)
+        corrected = inputs
+        while isinstance(found, _Correction):
+            progress(f"beginning again with the {found.of} that was found")
+            # A readout that was sought with another clock is sought once more.
+            unsure = {"readout"} if found.of == "clock" else unsure - {"readout"}
+            base = inputs if found.of == "clock" else corrected
             with closing(open_camera(video)) as again:
-                found = _fly(_with_readout(inputs, found, again), stop, progress)
-    assert isinstance(found, dict)
+                corrected = replace(base, source=again, **found.changed)
+                found = _fly(corrected, stop, progress, unsure)
     return found | {"scan_folder": str(folder)}
 
 
@@ -228,15 +235,20 @@ def _with_lens(
     )
 
 
-def _fly(
-    inputs: ScanInputs,
-    stop: Event,
-    progress: Progress,
-    can_begin_again: bool = False,
-) -> dict[str, Any] | Shutter:
-    """The scan's figures; or its shutter, once the images show a readout that was not known.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Correction:
+    """What the images of a scan correct, for a scan that is right from its start."""
 
-    The images before that are bent, so such a scan is discarded, unless it goes to the ground.
+    of: str  # "readout", "clock"
+    changed: dict[str, Any]  # of its inputs
+
+
+def _fly(
+    inputs: ScanInputs, stop: Event, progress: Progress, unsure: Collection[str]
+) -> dict[str, Any] | _Correction:
+    """The scan's figures; or once the images correct something ``unsure``, the correction.
+
+    What came before that is wrong, so such a scan is discarded, unless it goes to the ground.
     """
     from service.daemon.warm_up import has_kernels
     from service.flight.datalink import open_datalink
@@ -246,22 +258,22 @@ def _fly(
 
     store = create_store(inputs)
     link = open_datalink(store, inputs.config)
-    can_begin_again = can_begin_again and link is None
+    unsure = unsure if link is None else ()
     scan = Scan(inputs, store)
-    shutter = None
+    correction = None
     try:
         work = "tracking and reconstructing"
         if not has_kernels():
             work = f"compiling kernels, once, a minute or two; {work}"
         with progress.part(work, of_rest=0.9):
             show = _flown(inputs.source, progress)
-            if can_begin_again:
-                scan.run(stop, show, is_enough=Scan.found_shutter)
-                shutter = None if stop.is_set() else scan.found_shutter()
-            else:
-                scan.run(stop, show)
+            scan.run(stop, show, is_enough=lambda scan: _correction(scan, unsure))
+            if not stop.is_set():
+                if "clock" in unsure:
+                    scan.check.search_log()
+                correction = _correction(scan, unsure)
     finally:
-        if shutter is not None:
+        if correction is not None:
             scan.discard()
         else:
             summary = scan.close()
@@ -273,16 +285,26 @@ def _fly(
             give_back(collect=True)
             summary |= write_deliverables(inputs.folder, store, {}, progress=progress)
             store.close()
-    return shutter or summary
+    return correction or summary
 
 
-def _with_readout(inputs: ScanInputs, shutter: Shutter, source: CameraSource) -> ScanInputs:
-    """The scan from its start with the readout that its images show; the search goes on."""
+def _correction(scan: Scan, unsure: Collection[str]) -> _Correction | None:
+    """What the images of the scan show by now, of what is ``unsure``; None before they do."""
+    from service.commands.video_time import at_another_time
+
+    off_ms = scan.check.clock_off_ms() if "clock" in unsure else None
+    if off_ms is not None:
+        return _Correction("clock", at_another_time(scan.inputs, off_ms))
+    shutter = scan.found_shutter() if "readout" in unsure else None
+    return None if shutter is None else _Correction("readout", _with_readout(scan.inputs, shutter))
+
+
+def _with_readout(inputs: ScanInputs, shutter: Shutter) -> dict[str, Any]:
+    """Inputs of the scan with the readout that its images show; the search goes on."""
     from service.config import change
 
     camera = replace(inputs.camera, shutter=shutter)
-    config = change(inputs.config, "camera.readout_ms", "auto")
-    return replace(inputs, source=source, camera=camera, config=config)
+    return {"camera": camera, "config": change(inputs.config, "camera.readout_ms", "auto")}
 
 
 def _with_stated_readout(
@@ -322,42 +344,6 @@ def _fitted(camera: Camera, source: CameraSource, notes: list[str]) -> Camera:
         (w, h), (W, H) = camera.size_px, source.size_px
         notes.append(f"the camera model is for {w}x{h} images: scaled to {W}x{H}")
     return model
-
-
-def _epoch(
-    source: CameraSource, log: TelemetryLog | None, video_epoch: float | None, notes: list[str]
-) -> int:
-    """Unix ns of the source's time 0: as given, the container's, the log's start, or now."""
-    from service.errors import InputError
-    from service.stream.validity import MAX_TIME_NS, is_time
-
-    if video_epoch is not None:
-        epoch_ns = round(video_epoch * 1e9) if math.isfinite(video_epoch) else MAX_TIME_NS
-    elif log is not None and log.clock != "unix":  # time 0 of the video, or of the autopilot
-        epoch_ns = 0 if log.clock == "video" else log.first_ns
-        notes.append(f"the log has no date: times count from the start of the {log.clock}")
-    elif source.epoch_unix_ns is not None:
-        epoch_ns = source.epoch_unix_ns
-    elif log is not None:
-        epoch_ns = round(log.first_ns / 1e6) * 10**6  # autopilots count whole milliseconds
-        notes.append("the recording does not say when it began: taken as the start of the log")
-    else:
-        epoch_ns = time.time_ns()
-        notes.append("the recording does not say when it began: taken as the time of the replay")
-    if not is_time(epoch_ns):
-        raise InputError(
-            "the recording begins outside the years 1970 to 2106; give the right --video-epoch"
-        )
-    if log is not None and not log.first_ns - 600e9 < epoch_ns < log.last_ns:
-        raise InputError(
-            f"the telemetry covers {_utc(log.first_ns)} to {_utc(log.last_ns)}, the video begins "
-            f"at {_utc(epoch_ns)}: they do not overlap; give the right --video-epoch"
-        )
-    return epoch_ns
-
-
-def _utc(time_ns: int) -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(time_ns / 1e9))
 
 
 def _flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:

@@ -30,6 +30,7 @@ AHEAD_NS = 2_000_000_000  # how far ahead of the newest frame; a recording's log
 SLEW = 0.1  # of the time that passes, so that frames stay in order when the latency changes
 UNSEEN_S = 0.05  # sigma of a latency that the images have not shown yet
 WORTH_TELLING_MS, OFF_SIGMAS = 10.0, 5.0  # a latency that differs by less is not reported
+SURE_OF_CLOCK, MIN_CLOCK_OFF_MS = 0.95, 100.0  # of a recording: correlation; less is a latency
 STILLS = 60  # images that are compared, where they come more slowly than REACH_NS holds
 
 
@@ -121,17 +122,36 @@ class TelemetryCheck:
         if self._frames is not None:
             self._frames.add(first_ns, second_ns, q)
 
+    def clock_off_ms(self) -> float | None:
+        """By how much a recording's stamps are surely late, where it is no camera's latency.
+
+        None where they are not.
+        """
+        found = self.latency
+        if found is None or not found.is_settled or found.correlation < SURE_OF_CLOCK:
+            return None
+        off_ms = found.latency_ms - self._camera.latency_ms
+        return off_ms if abs(off_ms) > MIN_CLOCK_OFF_MS else None
+
+    def search_log(self) -> None:
+        """Look for a whole recording anywhere in its log, where no latency was found near by."""
+        if self._history is not None and self.latency is None:
+            self.latency = self._turns.anywhere(self._attitudes(self._history)())
+
     def finish(self) -> None:
         """Look once more, at the end of a scan."""
         if self._history is not None and self._seen_ns is not None:
             self._look(self._history, self._seen_ns)
 
+    def _attitudes(self, history: VehicleHistory) -> Callable[..., list[tuple[int, Quaternion]]]:
+        return history.bodies if self._fixed else history.heads
+
     def _look(self, history: VehicleHistory, now_ns: int) -> None:
         since_ns, stills_ns = now_ns - REACH_NS, self._turns.since_ns(STILLS)
         if stills_ns is not None:
             since_ns = min(since_ns, stills_ns)
-        attitudes = history.bodies if self._fixed else history.heads
-        found = self._turns.estimate(attitudes(since_ns, now_ns + AHEAD_NS))
+        attitudes = self._attitudes(history)(since_ns, now_ns + AHEAD_NS)
+        found = self._turns.estimate(attitudes)
         self.latency = found or self.latency
         if found is not None:
             self._report_latency(found)

@@ -1,0 +1,89 @@
+"""A video whose clock differs from the log's: the scan begins again at the time that fits."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import av
+import pytest
+from command_line import skyrelief
+
+from service.flight.scan import ScanInputs
+from service.progress import Progress
+from service.stream.store import ScanStore
+
+EPOCH_S = 1_777_629_600.0  # of the simulated video, 2026-05-01 10:00 UTC
+EARLY_S = 30.0  # of the time that the video states
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated flight of two legs; the video states a time that is too early."""
+    folder = tmp_path_factory.mktemp("sim") / "flight"
+    made = skyrelief(
+        "simulate", "--out", folder, "--size", "320x180", "--fps", "6", "--duration-s", "14",
+        "--height-m", "40", "--pattern", "legs", "--legs", "2", "--spacing-m", "8",
+        "--wobble-deg", "3",
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    with av.open(str(folder / "flight.mp4")) as right, av.open(folder / "early.mp4", "w") as early:
+        early.metadata["creation_time"] = "2026-05-01T11:59:30.000000Z"  # Swiss summer
+        stream = early.add_stream_from_template(right.streams.video[0])
+        for packet in right.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                early.mux(packet)
+    return folder
+
+
+def replayed(flight: Path, out: Path, *more: str) -> dict[str, Any]:
+    done = skyrelief(
+        "replay", flight / "early.mp4", "--telemetry", flight / "flight.tlog", "--camera-model",
+        flight / "camera.yaml", "--out", out, "--json", "--set", "compute.stereo_width=160", *more,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def test_a_video_goes_where_its_images_turn_with_the_log(flight: Path, tmp_path: Path) -> None:
+    found = replayed(flight, tmp_path / "scan")
+    (note,) = (text for text in found["warnings"] if "the time that it states" in text)
+    assert note.startswith(f"the video begins {EARLY_S:.2f} s after")
+    assert "the video's clock is +2 h off the log's: taken as local time" in found["warnings"]
+    assert found["quality"]["trust"]["level"] == "georeferenced"
+    assert abs(found["camera_latency"]["estimate_ms"]) < 20.0
+    with ScanStore.open(tmp_path / "scan" / "scan.db") as store:
+        assert store.header.started_unix_ns == pytest.approx(EPOCH_S * 1e9, abs=20e6)
+
+
+@pytest.mark.parametrize(
+    ("options", "unsure"),
+    [
+        ([], {"readout", "clock"}),
+        (["--video-epoch", str(EPOCH_S - 2.5)], {"readout"}),
+        (["--set", "camera.latency_ms=40"], {"readout"}),
+        (["--realtime"], set()),
+    ],
+)
+def test_a_time_that_the_operator_gives_stays(
+    flight: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    options: list[str],
+    unsure: set[str],
+) -> None:
+    asked = []
+
+    def fly(
+        inputs: ScanInputs, stop: Event, progress: Progress, unsure: set[str]
+    ) -> dict[str, Any]:
+        asked.append(set(unsure))
+        return {}
+
+    monkeypatch.setattr("service.commands.replay._fly", fly)
+    assert replayed(flight, tmp_path / "scan", *options).keys() == {"scan_folder"}
+    assert asked == [unsure]
