@@ -32,7 +32,7 @@ REACH_S = 5.0  # latencies that are sought, either way: a range without the true
 COARSE_S, FINE_S, FINE_STEPS = 0.04, 0.004, 8
 MIN_SHARE = 0.5  # of the most windows that telemetry covers at any latency
 NEAR_S = np.array([-0.5, 0.0, 0.5]) * COARSE_S
-FAR_WINDOW_S, FAR_STEP_S = 0.5, 0.05  # of the search over a whole log
+FAR_WINDOW_S, FAR_STEP_S = 1.0, 0.1  # of the search over a whole log
 FAR_REACH_S = 600.0
 OUTLIER = 4.0  # times the median misfit
 
