@@ -11,6 +11,9 @@ import av
 import pytest
 from command_line import skyrelief
 
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.logs import TelemetryLog
+from service.commands.video_time import HOUR_NS, local_zone_ns
 from service.flight.scan import ScanInputs
 from service.progress import Progress
 from service.stream.store import ScanStore
@@ -87,3 +90,27 @@ def test_a_time_that_the_operator_gives_stays(
     monkeypatch.setattr("service.commands.replay._fly", fly)
     assert replayed(flight, tmp_path / "scan", *options).keys() == {"scan_folder"}
     assert asked == [unsure]
+
+
+@pytest.mark.parametrize(
+    ("video_h", "minutes", "ahead_h"),
+    [
+        (12.1, 15.0, 0.0),  # in the log, which begins at 12:00
+        (14.1, 15.0, 2.0),
+        (17.6, 15.0, 5.5),  # India
+        (1.1, 15.0, -11.0),
+        (12.75, 15.0, 0.0),  # fits no zone
+        (14.1, 180.0, 0.0),  # in the log as it is
+        (16.1, 180.0, 0.0),  # fits several
+        (40.1, 15.0, 0.0),  # another day
+    ],
+)
+def test_local_time_is_taken_where_one_zone_fits(
+    video_h: float, minutes: float, ahead_h: float
+) -> None:
+    noon_ns = 12 * HOUR_NS
+    last_ns = noon_ns + round(minutes * 60e9)
+    log = TelemetryLog(VehicleHistory(), "unix", noon_ns, last_ns, (), {})
+    notes: list[str] = []
+    assert local_zone_ns(round(video_h * HOUR_NS), log, notes) == ahead_h * HOUR_NS
+    assert len(notes) == (ahead_h != 0)

@@ -27,7 +27,7 @@ def start_of(
         epoch_ns = 0 if log.clock == "video" else log.first_ns
         notes.append(f"the log has no date: times count from the start of the {log.clock}")
     elif source.epoch_unix_ns is not None:
-        epoch_ns = source.epoch_unix_ns - _zone_ns(source.epoch_unix_ns, log, notes)
+        epoch_ns = source.epoch_unix_ns - local_zone_ns(source.epoch_unix_ns, log, notes)
     elif log is not None:
         epoch_ns = round(log.first_ns / 1e6) * 10**6  # autopilots count whole milliseconds
         notes.append("the recording does not say when it began: taken as the start of the log")
@@ -51,7 +51,7 @@ def _covers(log: TelemetryLog, start_ns: int) -> bool:
     return log.first_ns - 600e9 < start_ns < log.last_ns
 
 
-def _zone_ns(start_ns: int, log: TelemetryLog | None, notes: list[str]) -> int:
+def local_zone_ns(start_ns: int, log: TelemetryLog | None, notes: list[str]) -> int:
     """The hours by which a camera's local time is ahead of the log's UTC; 0 where it is not.
 
     Cameras write their local time where the format asks for UTC.
