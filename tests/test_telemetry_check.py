@@ -93,6 +93,24 @@ def test_the_latency_is_shown_and_not_applied_unless_asked(gimbal: str) -> None:
     assert len(reported) == 1 and reported[0].endswith("by the images, 0 ms is set")
 
 
+@pytest.mark.parametrize(
+    ("set_ms", "strength", "off_ms"),
+    [
+        (-130.0, 1.0, 200.0),
+        (500.0, 1.0, -430.0),
+        (0.0, 1.0, None),
+        (-130.0, 0.0, None),
+    ],
+)
+def test_stamps_that_are_off_by_more_than_a_latency_show_a_clock(
+    set_ms: float, strength: float, off_ms: float | None
+) -> None:
+    check = TelemetryCheck(CameraConfig(latency_ms=set_ms), history_of("none", strength))
+    fly(check, strength)
+    found = check.clock_off_ms()
+    assert found == (None if off_ms is None else pytest.approx(off_ms, abs=10.0))
+
+
 def test_stills_show_a_latency_too() -> None:
     """A still every other second, turned to 0.4 degrees: enough to report, not to apply."""
     reported: list[str] = []

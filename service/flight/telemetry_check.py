@@ -30,7 +30,8 @@ AHEAD_NS = 2_000_000_000  # how far ahead of the newest frame; a recording's log
 SLEW = 0.1  # of the time that passes, so that frames stay in order when the latency changes
 UNSEEN_S = 0.05  # sigma of a latency that the images have not shown yet
 WORTH_TELLING_MS, OFF_SIGMAS = 10.0, 5.0  # a latency that differs by less is not reported
-SURE_OF_CLOCK, MIN_CLOCK_OFF_MS = 0.95, 100.0  # of a recording: correlation; less is a latency
+SURE_OF_CLOCK, MIN_CLOCK_OFF_MS = 0.9, 100.0  # of a recording: correlation; less is a latency
+CLOCK_OFF_SIGMAS = 10.0
 STILLS = 60  # images that are compared, where they come more slowly than REACH_NS holds
 
 
@@ -128,10 +129,11 @@ class TelemetryCheck:
         None where they are not.
         """
         found = self.latency
-        if found is None or not found.is_settled or found.correlation < SURE_OF_CLOCK:
+        if found is None or found.correlation < SURE_OF_CLOCK:
             return None
         off_ms = found.latency_ms - self._camera.latency_ms
-        return off_ms if abs(off_ms) > MIN_CLOCK_OFF_MS else None
+        is_off = abs(off_ms) > max(MIN_CLOCK_OFF_MS, CLOCK_OFF_SIGMAS * found.sigma_ms)
+        return off_ms if is_off else None
 
     def search_log(self) -> None:
         """Look for a whole recording anywhere in its log, where no latency was found near by."""
