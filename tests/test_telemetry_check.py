@@ -111,6 +111,14 @@ def test_stamps_that_are_off_by_more_than_a_latency_show_a_clock(
     assert found == (None if off_ms is None else pytest.approx(off_ms, abs=10.0))
 
 
+def test_a_clock_that_the_whole_log_does_not_confirm_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another turn of the flight may look like that of the images."""
+    check = TelemetryCheck(CameraConfig(latency_ms=-130.0), history_of("none", 1.0))
+    fly(check)
+    monkeypatch.setattr(LatencyWatch, "anywhere", lambda watch, attitudes: None)
+    assert check.clock_off_ms() is None and check.clock_off_ms(has_ended=True) is None
+
+
 def test_stills_show_a_latency_too() -> None:
     """A still every other second, turned to 0.4 degrees: enough to report, not to apply."""
     reported: list[str] = []

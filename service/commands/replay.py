@@ -269,9 +269,7 @@ def _fly(
             show = _flown(inputs.source, progress)
             scan.run(stop, show, is_enough=lambda scan: _correction(scan, unsure))
             if not stop.is_set():
-                if "clock" in unsure:
-                    scan.check.search_log()
-                correction = _correction(scan, unsure)
+                correction = _correction(scan, unsure, has_ended=True)
     finally:
         if correction is not None:
             scan.discard()
@@ -288,11 +286,11 @@ def _fly(
     return correction or summary
 
 
-def _correction(scan: Scan, unsure: Collection[str]) -> _Correction | None:
+def _correction(scan: Scan, unsure: Collection[str], has_ended: bool = False) -> _Correction | None:
     """What the images of the scan show by now, of what is ``unsure``; None before they do."""
     from service.commands.video_time import at_another_time
 
-    off_ms = scan.check.clock_off_ms() if "clock" in unsure else None
+    off_ms = scan.check.clock_off_ms(has_ended) if "clock" in unsure else None
     if off_ms is not None:
         return _Correction("clock", at_another_time(scan.inputs, off_ms))
     shutter = scan.found_shutter() if "readout" in unsure else None

@@ -53,6 +53,8 @@ class TelemetryCheck:
     ) -> None:
         """``earlier_ms``, found by an earlier scan, is taken with "auto" until there is news."""
         self.latency: LatencyEstimate | None = None
+        self._in_log: LatencyEstimate | None = None  # in the whole log, when _compared with it
+        self._compared: LatencyEstimate | None = None
         self.frame: FrameVerdict | None = None
         self.reported: dict[str, str] = {}  # by subject
         self._history, self._warn = history, warn
@@ -123,22 +125,27 @@ class TelemetryCheck:
         if self._frames is not None:
             self._frames.add(first_ns, second_ns, q)
 
-    def clock_off_ms(self) -> float | None:
-        """By how much a recording's stamps are surely late, where it is no camera's latency.
+    def clock_off_ms(self, has_ended: bool = False) -> float | None:
+        """By how much a recording's stamps are surely late, beyond a camera's latency; or None.
 
-        None where they are not.
+        A latency near by only gives rise to a search of the whole log, in which another turn may
+        look alike; so does the end of a recording that shows none.
         """
-        found = self.latency
-        if found is None or found.correlation < SURE_OF_CLOCK:
+        near = self.latency
+        is_due = has_ended if near is None else self._off_ms(near) is not None
+        if self._history is None or not is_due:
+            return None
+        if near is None or near is not self._compared:
+            self._compared = near
+            self._in_log = self._turns.anywhere(self._attitudes(self._history)())
+        return None if self._in_log is None else self._off_ms(self._in_log)
+
+    def _off_ms(self, found: LatencyEstimate) -> float | None:
+        if found.correlation < SURE_OF_CLOCK:
             return None
         off_ms = found.latency_ms - self._camera.latency_ms
         is_off = abs(off_ms) > max(MIN_CLOCK_OFF_MS, CLOCK_OFF_SIGMAS * found.sigma_ms)
         return off_ms if is_off else None
-
-    def search_log(self) -> None:
-        """Look for a whole recording anywhere in its log, where no latency was found near by."""
-        if self._history is not None and self.latency is None:
-            self.latency = self._turns.anywhere(self._attitudes(self._history)())
 
     def finish(self) -> None:
         """Look once more, at the end of a scan."""
