@@ -10,6 +10,7 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import FrameRows
 from recon.tracking import bundle, matching, two_view
+from recon.tracking.focal_watch import Sightings
 from recon.types import F64, I64, U8, Bool, PosePrior
 
 
@@ -144,7 +145,7 @@ def triangulate(
     ok[rows[error >= gate_px]] = False
 
 
-def adjust_window(window: list[OdometryKeyframe], K: F64) -> None:
+def adjust_window(window: list[OdometryKeyframe], K: F64) -> Sightings:
     """Bundle-adjust the keyframes; the two oldest of them hold the frame and scale."""
     fixed = 1 if len(window) == 2 else 2
     cam, pt, uv = [], [], []
@@ -160,23 +161,18 @@ def adjust_window(window: list[OdometryKeyframe], K: F64) -> None:
     ids, index = np.unique(point[use], return_inverse=True)
     base, table = _baseline(window), window[0].map
     free = np.arange(len(window)) >= fixed
-    result = bundle.adjust(
-        np.stack([k.T_camera_odom for k in window]),
-        table[ids],
-        np.concatenate(cam)[use],
-        index.astype(np.int64),
-        np.concatenate(uv)[use],
-        K,
-        free,
-        sigma_px=None,
-    )
+    T_camera_odom = np.stack([k.T_camera_odom for k in window])
+    camera, uv_px = np.concatenate(cam)[use], np.concatenate(uv)[use]
+    index = index.astype(np.int64)
+    result = bundle.adjust(T_camera_odom, table[ids], camera, index, uv_px, K, free, sigma_px=None)
     for c in np.flatnonzero(free):
         window[c].T_camera_odom = result.T_camera_world[c]
         window[c].covariance = result.step_covariance(c - 1, c)
     table[ids] = result.points_m
-    _drop_outliers(window, ids, index, np.concatenate(cam)[use], result.residual_px)
+    _drop_outliers(window, ids, index, camera, result.residual_px)
     if len(window) == 2:
         _restore_baseline(window, base)
+    return Sightings(result.T_camera_world, result.points_m, camera, index, uv_px)
 
 
 def step_covariance(keys: Sequence[OdometryKeyframe], T_camera_odom: F64) -> F64:

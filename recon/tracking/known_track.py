@@ -9,6 +9,7 @@ import numpy as np
 
 from recon import se3
 from recon.rolling_shutter import FrameRows, RowClock, Rows
+from recon.tracking.focal_watch import FocalWatch
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.matching import Pyramid
 from recon.tracking.motion_blur import ExposureWatch
@@ -56,7 +57,7 @@ class KnownTrack:
         that was given.
         """
         self.segment, self.keyframes = -1, list[OdometryKeyframe]()
-        self.exposure = ExposureWatch()
+        self.exposure, self.focal = ExposureWatch(), FocalWatch(lens.K)  # no window is adjusted
         self.readout = None
         if sigma_readout_s:
             found = ReadoutEstimate(lens.shutter.readout_s, sigma_readout_s, len(views))

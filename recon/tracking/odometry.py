@@ -20,6 +20,7 @@ from recon import se3
 from recon.rolling_shutter import NEAR_S, FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, two_view
 from recon.tracking.common_view import FeatureCache
+from recon.tracking.focal_watch import FocalWatch
 from recon.tracking.keyframe_window import (
     Landmarks,
     OdometryKeyframe,
@@ -102,6 +103,7 @@ class Odometry:
         self._row_track = RowTrack(lens or camera, seeks_readout)
         clock = self._row_track.clock
         self.readout = ReadoutSearch(clock, self.K) if seeks_readout and clock else None
+        self.focal, self._watched_seq = FocalWatch(self.K), -1
         self._unsettled: OdometryKeyframe | None = None  # its rows' motion will be known better
         self._early: list[tuple[FrameRows, F64, Bool]] = []  # frames, the first one's corners there
         self._localiser = Localiser(camera, self.config, features, self._row_track)
@@ -407,7 +409,11 @@ class Odometry:
         )
         self.keyframes.append(key_new)
         self._unsettled = key_new if new.moving.rows is not None else None
-        adjust_window(self.keyframes[-self.config.window - 2 :], self.K)
+        window = self.keyframes[-self.config.window - 2 :]
+        adjusted = adjust_window(window, self.K)
+        if len(window) > self.config.window and window[0].seq > self._watched_seq:
+            self._watched_seq = new.seq
+            self.focal.add(adjusted)
         self._depth = self.median_depth(key_new)
         self._forget()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import math
 import secrets
 import time
 from collections.abc import Callable, Iterator
@@ -40,6 +41,9 @@ log = logging.getLogger(__name__)
 
 TIME_STEP_NS = 100_000
 """Frame times are rounded to this; no camera's clock is finer."""
+
+MIN_FOCAL_OFF, FOCAL_OFF_SIGMAS = 0.01, 4.0
+"""A focal length by the images that differs by both is another one than the camera model's."""
 
 
 @contextmanager
@@ -238,7 +242,8 @@ class Scan:
             "warnings": [*self.inputs.notes, *self.inputs.source.warnings, *self._doubts()],
         }
         extra["assumed"] = self._assumed()
-        extra["sigma_focal"] = round(self.inputs.sigma_focal, 4)
+        extra["sigma_focal"] = round(max(self.inputs.sigma_focal, abs(self._focal_off())), 4)
+        extra["focal_by_images"] = self._focal_by_images()
         extra["camera_readout"] = self._readout()
         extra["motion_blur"] = self.shutter.summary
         shutter = self.found_shutter()
@@ -265,6 +270,26 @@ class Scan:
             return None
         camera = with_shutter(self.inputs.camera, self.inputs.config.camera)
         return camera.shutter.reading(found.readout_s)
+
+    def _focal_off(self) -> float:
+        """Share by which the images contradict the focal length; 0 where they do not."""
+        found = self.pipeline.stages.track.odometry.focal.estimate
+        if found is None:
+            return 0.0
+        sigma = math.hypot(found.sigma, self.inputs.sigma_focal)
+        is_off = abs(found.change) > max(MIN_FOCAL_OFF, FOCAL_OFF_SIGMAS * sigma)
+        return found.change if is_off else 0.0
+
+    def _focal_by_images(self) -> dict[str, Any] | None:
+        """The change of the focal length that the images ask for; None where they show none."""
+        found = self.pipeline.stages.track.odometry.focal.estimate
+        if found is None:
+            return None
+        return {
+            "change": round(found.change, 4),
+            "sigma": round(found.sigma, 4),
+            "windows": found.windows,
+        }
 
     def _readout(self) -> dict[str, Any] | None:
         """The readout by the images; None where it was not sought or does not show."""
@@ -305,6 +330,13 @@ class Scan:
             out.append(
                 f"the images show a readout of {1e3 * shutter.readout_s:.1f} ms, "
                 f"{shutter.direction}: set camera.readout_ms and camera.readout_direction"
+            )
+        off = self._focal_off()
+        if off:
+            out.append(
+                f"the images show a focal length that is {abs(off):.1%} "
+                f"{'longer' if off > 0 else 'shorter'} than the camera model's: calibrate the "
+                "camera as it records"
             )
         frames = self.recorder.frames
         if frames and "height" in self._assumed():

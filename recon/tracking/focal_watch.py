@@ -1,0 +1,136 @@
+"""Whether the images fit the focal length of their camera model.
+
+A wrong focal length leaves errors in the odometry's window that no pose or landmark takes up. What
+is left of the derivative by the focal length, once poses and landmarks have taken up their part,
+times these errors gives one Gauss-Newton step of it (Frisch and Waugh, doi:10.2307/1907330).
+Level ground straight below gives next to none, so that the sigma is large there. It follows from
+how cells of the image and windows scatter (Liang and Zeger, doi:10.1093/biomet/73.1.13), as
+errors of neighbouring landmarks are alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.types import F64, I64
+
+HUBER_PX = 1.0
+CELLS = 4
+"""Rows and columns of cells of the landmarks."""
+
+
+@dataclass(frozen=True, slots=True)
+class FocalEstimate:
+    """How much the images would change the focal length, in shares of it; from ``windows``."""
+
+    change: float
+    sigma: float
+    windows: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Where (M,) cameras saw (M,) of the points, in undistorted pixels."""
+
+    T_camera_world: F64  # (C, 4, 4)
+    points_m: F64  # (N, 3)
+    camera: I64  # (M,)
+    point: I64  # (M,)
+    uv_px: F64  # (M, 2)
+
+
+class FocalWatch:
+    """Collects adjusted windows that share no keyframe."""
+
+    def __init__(self, K: F64) -> None:
+        self._K = K
+        self._cells: list[F64] = []  # (CELLS**2, 2) information and score, of each window
+
+    def add(self, seen: Sightings) -> None:
+        """Add a window after its adjustment."""
+        self._cells.append(_evidence(seen, self._K))
+
+    @property
+    def estimate(self) -> FocalEstimate | None:
+        """By all windows; None where they show nothing."""
+        if not self._cells:
+            return None
+        cells = np.stack(self._cells)
+        information, score = cells.sum(axis=(0, 1))
+        if not information > 0.0:
+            return None
+        change, count = float(score / information), len(cells)
+        rest = cells[..., 1] - change * cells[..., 0]
+        squares = float(np.square(rest).sum())
+        if count > 1:
+            of_windows = float(np.square(rest.sum(axis=1)).sum()) * count / (count - 1)
+            squares = max(squares, of_windows)
+        return FocalEstimate(change, float(np.sqrt(squares) / information), count)
+
+
+def _evidence(seen: Sightings, K: F64) -> F64:
+    """(CELLS**2, 2) information and score of the logarithm of the focal length, by cells."""
+    cam, point = seen.camera, seen.point
+    C, N, f = len(seen.T_camera_world), len(seen.points_m), np.array([K[0, 0], K[1, 1]])
+    R, t = seen.T_camera_world[cam, :3, :3], seen.T_camera_world[cam, :3, 3]
+    P = np.einsum("mij,mj->mi", R, seen.points_m[point]) + t
+    iz = 1.0 / np.maximum(P[:, 2], 1e-6)
+    a, b = (P[:, :2] * iz[:, None]).T
+    by_focal = f * np.column_stack([a, b])
+    error = by_focal + K[:2, 2] - seen.uv_px
+    weight = np.minimum(1.0, HUBER_PX / np.maximum(np.linalg.norm(error, axis=1), 1e-9))
+    weight = np.sqrt(weight * (P[:, 2] > 1e-6))[:, None]
+    none = np.zeros_like(a)
+    u_row = np.column_stack([-a * b, 1.0 + a * a, -b, iz, none, -a * iz])
+    v_row = np.column_stack([-(1.0 + b * b), a * b, a, none, iz, -b * iz])
+    by_pose = np.stack([u_row, v_row], axis=1) * f[:, None] * weight[..., None]
+    by_point = np.einsum("mij,mjk->mik", by_pose[..., 3:], R)
+    left = _not_taken_up(by_focal * weight, by_pose, by_point, cam, point, C, N)
+    cell = _cells(np.column_stack([a, b]), point, N)
+    out = np.zeros((CELLS**2, 2))
+    np.add.at(out[:, 0], cell, np.sum(left**2, axis=1))
+    np.add.at(out[:, 1], cell, -np.sum(left * error * weight, axis=1))
+    return out
+
+
+def _not_taken_up(
+    values: F64, by_pose: F64, by_point: F64, cam: I64, point: I64, C: int, N: int
+) -> F64:
+    """What is left of ``values`` (M, 2) after the best change of poses and points.
+
+    ``by_pose`` (M, 2, 6) and ``by_point`` (M, 2, 3) are the derivatives.
+    """
+    H = np.zeros((N, 3, 3))
+    np.add.at(H, point, np.einsum("mki,mkj->mij", by_point, by_point))
+    ridge = 1e-9 * np.trace(H, axis1=1, axis2=2) + 1e-9  # far points have no depth
+    H_inv = np.linalg.inv(H + ridge[:, None, None] * np.eye(3))
+    W = np.zeros((C, N, 6, 3))
+    np.add.at(W, (cam, point), np.einsum("mki,mkj->mij", by_pose, by_point))
+    of_pose = np.zeros((C, 6, 6))
+    np.add.at(of_pose, cam, np.einsum("mki,mkj->mij", by_pose, by_pose))
+    S = np.zeros((C, 6, C, 6))
+    S[np.arange(C), :, np.arange(C)] = of_pose
+    wide = W.transpose(0, 2, 1, 3).reshape(6 * C, 3 * N)
+    eliminated = np.einsum("cnij,njk->cnik", W, H_inv).transpose(0, 2, 1, 3).reshape(6 * C, 3 * N)
+    of_points, of_poses = np.zeros((N, 3)), np.zeros((C, 6))
+    np.add.at(of_points, point, np.einsum("mki,mk->mi", by_point, values))
+    np.add.at(of_poses, cam, np.einsum("mki,mk->mi", by_pose, values))
+    reduced = S.reshape(6 * C, 6 * C) - eliminated @ wide.T
+    inverse = np.linalg.pinv(reduced, rcond=1e-9, hermitian=True)  # place, turn and scale are open
+    poses = inverse @ (of_poses.ravel() - eliminated @ of_points.ravel())
+    points = np.einsum("nij,nj->ni", H_inv, of_points - (wide.T @ poses).reshape(N, 3))
+    taken = np.einsum("mki,mi->mk", by_pose, poses.reshape(C, 6)[cam])
+    return np.asarray(values - taken - np.einsum("mki,mi->mk", by_point, points[point]))
+
+
+def _cells(at: F64, point: I64, N: int) -> I64:
+    """(M,) cell of each sighting by the mean place (M, 2) of its point in the images."""
+    mean = np.zeros((N, 2))
+    np.add.at(mean, point, at)
+    mean /= np.maximum(np.bincount(point, minlength=N), 1)[:, None]
+    low, high = mean.min(axis=0), mean.max(axis=0)
+    grid = np.minimum(CELLS * (mean - low) / np.maximum(high - low, 1e-9), CELLS - 1)
+    row = grid.astype(np.int64)
+    return np.asarray((CELLS * row[:, 1] + row[:, 0])[point])
