@@ -11,7 +11,7 @@ from command_line import skyrelief
 
 from recon import se3
 from recon.tracking import bundle
-from recon.tracking.focal_watch import FocalEstimate, FocalWatch, Sightings
+from recon.tracking.focal_watch import AdjustedWindow, FocalEstimate, FocalWatch
 from recon.types import F64
 
 K = np.array([[480.0, 0.0, 320.0], [0.0, 480.0, 180.0], [0.0, 0.0, 1.0]])
@@ -19,7 +19,7 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 VIEWS, NOISE_PX = 8, 0.2
 
 
-def window(pitch_deg: float, wobble_deg: float, longer: float, seed: int) -> Sightings:
+def window(pitch_deg: float, wobble_deg: float, longer: float, seed: int) -> AdjustedWindow:
     """Eight views 4 m apart over ground 40 m below, adjusted with a focal length ``longer``."""
     rng = np.random.default_rng(seed)
     turn = [se3.so3_exp(w) for w in np.radians(wobble_deg) * rng.normal(size=(VIEWS, 3))]
@@ -48,7 +48,7 @@ def window(pitch_deg: float, wobble_deg: float, longer: float, seed: int) -> Sig
     model[:2, 2] = K[:2, 2]
     poses = np.stack(T)
     done = bundle.adjust(poses, X[ids], camera, index, at, model, free, iterations=20)
-    return Sightings(done.T_camera_world, done.points_m, camera, index, at)
+    return AdjustedWindow(done.T_camera_world, done.points_m, camera, index, at)
 
 
 def estimate(pitch_deg: float, wobble_deg: float, longer: float, windows: int = 3) -> FocalEstimate:

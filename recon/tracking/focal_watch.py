@@ -31,8 +31,8 @@ class FocalEstimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
-    """Where (M,) cameras saw (M,) of the points, in undistorted pixels."""
+class AdjustedWindow:
+    """Poses and points, and where (M,) cameras saw (M,) of the points, in undistorted pixels."""
 
     T_camera_world: F64  # (C, 4, 4)
     points_m: F64  # (N, 3)
@@ -48,7 +48,7 @@ class FocalWatch:
         self._K = K
         self._cells: list[F64] = []  # (CELLS**2, 2) information and score, of each window
 
-    def add(self, seen: Sightings) -> None:
+    def add(self, seen: AdjustedWindow) -> None:
         """Add a window after its adjustment."""
         self._cells.append(_evidence(seen, self._K))
 
@@ -70,7 +70,7 @@ class FocalWatch:
         return FocalEstimate(change, float(np.sqrt(squares) / information), count)
 
 
-def _evidence(seen: Sightings, K: F64) -> F64:
+def _evidence(seen: AdjustedWindow, K: F64) -> F64:
     """(CELLS**2, 2) information and score of the logarithm of the focal length, by cells."""
     cam, point = seen.camera, seen.point
     C, N, f = len(seen.T_camera_world), len(seen.points_m), np.array([K[0, 0], K[1, 1]])

@@ -10,7 +10,7 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import FrameRows
 from recon.tracking import bundle, matching, two_view
-from recon.tracking.focal_watch import Sightings
+from recon.tracking.focal_watch import AdjustedWindow
 from recon.types import F64, I64, U8, Bool, PosePrior
 
 
@@ -145,7 +145,7 @@ def triangulate(
     ok[rows[error >= gate_px]] = False
 
 
-def adjust_window(window: list[OdometryKeyframe], K: F64) -> Sightings:
+def adjust_window(window: list[OdometryKeyframe], K: F64) -> AdjustedWindow:
     """Bundle-adjust the keyframes; the two oldest of them hold the frame and scale."""
     fixed = 1 if len(window) == 2 else 2
     cam, pt, uv = [], [], []
@@ -172,7 +172,7 @@ def adjust_window(window: list[OdometryKeyframe], K: F64) -> Sightings:
     _drop_outliers(window, ids, index, camera, result.residual_px)
     if len(window) == 2:
         _restore_baseline(window, base)
-    return Sightings(result.T_camera_world, result.points_m, camera, index, uv_px)
+    return AdjustedWindow(result.T_camera_world, result.points_m, camera, index, uv_px)
 
 
 def step_covariance(keys: Sequence[OdometryKeyframe], T_camera_odom: F64) -> F64:
