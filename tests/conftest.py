@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+# Threads of OpenBLAS and torch spin: up to fifty times the processor time. Read at their import.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -15,9 +18,6 @@ from recon.types import F64, Array, DepthMap, Keyframe, Pose
 from service.stream.codec import encode
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
-
-# Threads of torch beside other work spin: up to ten times the processor time.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 settings.register_profile("loaded machines", deadline=None)
 settings.load_profile("loaded machines")
