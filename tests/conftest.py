@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+# Threads of OpenBLAS and torch spin: up to fifty times the processor time. Read at their import.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -15,9 +18,6 @@ from recon.types import F64, Array, DepthMap, Keyframe, Pose
 from service.stream.codec import encode
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
-
-# Threads of torch beside other work spin: up to ten times the processor time.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 settings.register_profile("loaded machines", deadline=None)
 settings.load_profile("loaded machines")
@@ -105,21 +105,20 @@ def house() -> HouseFlight:
 
 
 FIRST = (
-    "test_replay", "test_pose_graph", "test_graph_hard_flights", "test_refine_images",
-    "test_own_lens", "test_doc_commands_run", "test_rolling_shutter", "test_trial_service",
-    "test_refine", "test_site", "test_stills", "test_own_camera", "test_triton_kernels",
-    "test_replay_backends", "test_stills_together", "test_sim_score", "test_trial_attack",
-    "test_sim_recording", "test_trial_soak", "test_odometry", "test_tiled_products",
-    "test_bad_images", "test_demo", "test_hostile_scans", "test_trial_load", "test_loop_closure",
-    "test_matching", "test_trial_closing", "test_graph_dropped", "test_calibration",
-    "test_ground_hostile", "test_trial_ground", "test_simulated", "test_intent",
-    "test_bench_site", "test_ground_killed", "test_walls", "test_foxglove", "test_ground_receiver",
+    "test_replay", "test_pose_graph", "test_graph_hard_flights", "test_graph_dropped",
+    "test_graph_thinning", "test_lean", "test_trial_service", "test_doc_commands_run",
+    "test_own_lens", "test_trial_attack", "test_refine", "test_refine_images", "test_sim_recording",
+    "test_stills_together", "test_replay_backends", "test_trial_soak", "test_bad_images",
+    "test_site", "test_sim_score", "test_triton_kernels", "test_trial_ground", "test_bench_site",
+    "test_stills", "test_pieces", "test_own_camera", "test_trial_load", "test_rolling_shutter",
+    "test_odometry", "test_loop_closure", "test_trial_closing", "test_tiled_products", "test_walls",
+    "test_demo", "test_hostile_scans", "test_matching", "test_calibration", "test_ground_hostile",
+    "test_simulated", "test_intent", "test_ground_killed", "test_foxglove", "test_ground_receiver",
     "test_backends", "test_bench_gpu", "test_bench_real", "test_mavlink_flight",
-    "test_mavlink_latency", "test_mavlink_ctl", "test_ground_live_site", "test_graph_thinning",
-    "test_mesh_tiles",
+    "test_mavlink_latency", "test_mavlink_ctl", "test_ground_live_site", "test_mesh_tiles",
 )  # fmt: skip
 """The files that take longest. The first compiles the kernels that the trials' processes load, and
-the next two need none of them; files that wait lie between those that compute."""
+the next five need none of them; files that wait lie between those that compute."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -223,7 +223,7 @@ def test_each_row_is_rendered_at_its_own_pose(direction: str) -> None:
     poses = np.array(
         [looking_down(3.0 + 20 * t, 1.0, 40.0, np.array([2 * t, t, 0])) for t in times]
     )
-    rolling = Renderer(place(), ground_texture.make(place(), 0.12), camera).frame(poses, 0, QUIET)
+    rolling = Renderer(place(), renderer().texture, camera).frame(poses, 0, QUIET)
     for k in (0, n // 3, n - 1):
         whole = renderer().frame(poses[k], 0, QUIET)
         ours, row = (rolling[:, k], whole[:, k]) if sideways else (rolling[k], whole[k])

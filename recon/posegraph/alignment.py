@@ -68,6 +68,9 @@ ODD = 5.0
 SETTLED = 1e-3
 """A step of so many sigmas ends the fit: each is about half as long as the one before."""
 
+SETTLED_START = 0.1
+"""The same for a fit that only starts another one, or whose residuals tell the noise."""
+
 ROUNDS = 4
 """Times that the noise of altitudes and the tilt by them are found in turn."""
 
@@ -154,16 +157,17 @@ def fit(
     if _velocities_contradict(readings):
         usable = [replace(a, prior=replace(a.prior, travel=None)) for a in usable]
         readings = AlignmentReadings(usable, wander_s=wander_s)
-    found = [_solve(readings, start, iterations) for start in _starts(usable, readings)]
+    starts = _starts(usable, readings)
+    found = [_solve(readings, start, iterations, SETTLED_START) for start in starts]
     best = min(found, key=lambda f: f.cost)
     noise = _measured(usable, best.at, wander_s, iterations, slow_share)
     noise = noise.or_else(usual, readings.claimed)
     readings = AlignmentReadings(usable, noise, wander_s)
-    best = _solve(readings, best.at, iterations)
+    best = _solve(readings, best.at, iterations, SETTLED)
     covariance = _covariance(readings, best)
     if readings.is_height_assumed:
         others = AlignmentReadings([replace(a, height=None) for a in usable], noise, wander_s)
-        measured = _solve(others, best.at, iterations)
+        measured = _solve(others, best.at, iterations, SETTLED)
         known = _covariance(others, measured)
         if known[6, 6] < GUESSED_SHARE**2:  # the assumed height would pull the scale
             readings, best, covariance = others, measured, known
@@ -214,12 +218,12 @@ def _measured(
     out, at, fixes = ReadingNoise(), start, AlignmentReadings(fixed, None, wander_s)
     # Altitudes that weigh too little leave a lean, which looks like a wander of theirs.
     for _ in range(1 if fixes.is_height_claimed else ROUNDS):
-        at = _solve(fixes, at, iterations).at
+        at = _solve(fixes, at, iterations, SETTLED_START).at
         out = _of_fixes(fixes, at, wander_s, slow_share)
         fixes = AlignmentReadings(fixed, out, wander_s)
     ways = AlignmentReadings(moved, None, wander_s)
     if len(ways.way) >= MIN_READINGS:
-        drift = ways.moved(_solve(ways, start, iterations).at)
+        drift = ways.moved(_solve(ways, start, iterations, SETTLED_START).at)
         found = drift_noise(np.cumsum(ways.way_s), np.cumsum(drift, axis=0))
         if found is not None:
             # A steady error along a leg looks like another scale: no residual shows it.
@@ -318,8 +322,10 @@ class _Solution:
     kept: F64  # (groups,) 0 for what is left out
 
 
-def _solve(readings: AlignmentReadings, at: AlignmentState, iterations: int) -> _Solution:
-    """Gauss-Newton with Huber's weights."""
+def _solve(
+    readings: AlignmentReadings, at: AlignmentState, iterations: int, settled: float
+) -> _Solution:
+    """Gauss-Newton with Huber's weights, until a step of ``settled`` sigmas."""
     group, kept = readings.group, np.ones(int(readings.group[-1]) + 1)
     H, cost, extra = np.eye(UNKNOWNS), np.inf, np.zeros((2, len(readings.fix)))
     weight = kept
@@ -339,7 +345,7 @@ def _solve(readings: AlignmentReadings, at: AlignmentState, iterations: int) -> 
         step[:3] = np.clip(step[:3], -0.5, 0.5)
         step[6:10] = np.clip(step[6:10], -0.5, 0.5)
         at = at.moved(step)
-        stands = step @ H @ step < SETTLED**2 or i >= iterations - 1
+        stands = step @ H @ step < settled**2 or i >= iterations - 1
         if stands and not (kept.all() and _leave_out(readings, norms, kept)):
             break
     return _Solution(_centred(readings, at, weight), H, cost, r, kept)

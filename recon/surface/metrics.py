@@ -218,13 +218,14 @@ def seen_from(
     z = np.where(local[:, 2] > 0.1, local[:, 2], np.nan)
     u = K[0, 0] * local[:, 0] / z + K[0, 2]
     v = K[1, 1] * local[:, 1] / z + K[1, 2]
-    away = eye - points
-    facing = np.einsum("ni,ni->n", away, normals) / np.linalg.norm(away, axis=1)
-    seen = (u >= 0) & (u <= W - 1) & (v >= 0) & (v <= H - 1) & (facing > STEEPEST_COSINE)
-    index = np.flatnonzero(seen)
-    t, _ = surface.cast(eye, points[index] - eye)
+    index = np.flatnonzero((u >= 0) & (u <= W - 1) & (v >= 0) & (v <= H - 1))
+    away = eye - points[index]
+    facing = np.einsum("ni,ni->n", away, normals[index]) / np.linalg.norm(away, axis=1)
+    index, away = index[facing > STEEPEST_COSINE], away[facing > STEEPEST_COSINE]
+    t, _ = surface.cast(eye, -away)
+    seen = np.zeros(len(points), np.bool_)
     seen[index] = ~(t < 1.0 - 1e-4)
-    return np.asarray(seen)
+    return seen
 
 
 def share_covered(samples: F64, points: F64, within_m: float) -> F64:
