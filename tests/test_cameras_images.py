@@ -109,11 +109,11 @@ def test_written_zone_wins_and_a_wrong_clock_is_corrected(tmp_path: Path) -> Non
     assert open_camera(str(wrong)).epoch_unix_ns == NOON_UTC_NS
 
 
-def test_no_zone_keeps_relative_time_only(tmp_path: Path) -> None:
+def test_without_a_zone_local_time_counts_as_utc(tmp_path: Path) -> None:
     for i in range(3):
         write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i}")
     source = open_camera(str(tmp_path))
-    assert source.epoch_unix_ns is None
+    assert source.epoch_unix_ns == NOON_UTC_NS
     assert [f.time_ns for f in source] == [0, 10**9, 2 * 10**9]
     assert any("time zone" in w for w in source.warnings)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ import pytest
 from recon import se3
 from recon.posegraph.alignment import Similarity, fit
 from recon.posegraph.anchors import Anchor
-from recon.posegraph.level_ground import ASSUMED_TILT_RAD
+from recon.posegraph.level_ground import ASSUMED_TILT_RAD, LEVEL_SIGMA_RAD
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 
@@ -77,6 +77,15 @@ def test_one_strip_does_not_show_whether_it_leans() -> None:
     assert found is not None and found.sigma_lean_rad is not None
     assert flown.lean_deg(found) < 2.0 * np.degrees(found.sigma_lean_rad)
     assert np.degrees(found.sigma_lean_rad) > 3.0
+
+
+def test_a_view_levelled_by_its_ground_does_not_show_what_is_level() -> None:
+    flown = stills(1, 8.0)
+    one = flown.anchors[5]
+    steep = replace(one.prior, sigma_tilt_rad=LEVEL_SIGMA_RAD, is_view_assumed=False)
+    found = fit([replace(a, prior=steep) if a is one else a for a in flown.anchors])
+    assert found is not None and found.sigma_lean_rad is not None
+    assert flown.lean_deg(found) < 2.0 * np.degrees(found.sigma_lean_rad)
 
 
 def settled(flown: Stills, broken_at: int = 10**6, turn_rad: float = 1e-4) -> Trajectory:

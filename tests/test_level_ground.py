@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +19,10 @@ from recon.posegraph.level_ground import (
     levelled,
     plane_normal,
 )
+from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
+from service.flight.chain import Chain
+from service.progress import Stopwatch
 
 
 def looking(pitch_deg: float, yaw_deg: float = 0.0) -> F64:
@@ -65,3 +71,17 @@ def test_ground_without_a_plane_levels_nothing() -> None:
     assert levelled(NADIR, ground_seen(looking(-40), relief_m=150.0)) is NADIR
     assert levelled(NADIR, ground_seen(looking(-40))[:20]) is NADIR
     assert plane_normal(np.zeros((100, 3))) is None
+
+
+@pytest.mark.parametrize(("steep", "is_levelled"), [(1, False), (2, False), (3, True), (10, True)])
+def test_a_few_steep_views_do_not_doubt_the_mount_of_all(steep: int, is_levelled: bool) -> None:
+    chain: Any = Chain(Trajectory(), lambda key: True, Counter(), Stopwatch())
+    for seq in range(10):
+        R, T = looking(-40 if seq < steep else -90), np.eye(4)
+        T[0, 3] = seq
+        view = SimpleNamespace(
+            seq=seq, segment=0, time_ns=seq, prior=NADIR, points=ground_seen(R),
+            view=SimpleNamespace(T_odom_camera=T),
+        )  # fmt: skip
+        chain.add(view, SimpleNamespace(T_before_camera=None, covariance=np.eye(6)), None)
+    assert chain.is_levelled == is_levelled

@@ -187,7 +187,8 @@ def fit(
         float(np.exp(at.log_scale)), at.R, at.t, covariance, _sources(readings), noise, mean,
         counted, readings.common(at), heights=heights,
     )  # fmt: skip
-    if not readings.is_assumed.all() or not len(readings.fix):
+    views = [a.prior for a in usable if a.prior.R_world_camera is not None]
+    if any(v.sigma_tilt_rad < ASSUMED_TILT_RAD for v in views) or not len(readings.fix):
         return similarity
     lean = np.zeros((6, 6))
     lean[:2, :2] = covariance[:2, :2]

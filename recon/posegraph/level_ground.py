@@ -19,6 +19,9 @@ MAX_SLOPE_RAD = math.radians(20.0)
 LEVEL_SIGMA_RAD = math.radians(10.0)
 """How far sites that are taken as level slope."""
 
+MAX_LEVELLED_SHARE = 0.2
+"""Of the views; fewer see a slope, or are placed badly, and the assumed mount levels the flight."""
+
 MIN_POINTS = 30
 
 MAX_THICKNESS = 0.2

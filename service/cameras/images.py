@@ -175,8 +175,8 @@ class ImagesSource:
             return _from_first(spread(known, tags)), min(known)
         local = [t.local_ns for t in tags if t.local_ns is not None]
         if interval_s is None and len(local) == len(tags):
-            self._warn("the images have no time zone; their absolute time is unknown")
-            return _from_first(spread(local, tags)), None
+            self._warn("the images state no time zone: their local time is taken as UTC")
+            return _from_first(spread(local, tags)), min(local)
         if interval_s is None:
             missing = sum(t.local_ns is None and t.name_unix_ns is None for t in tags)
             self._warn(

@@ -13,7 +13,7 @@ import numpy as np
 from recon import se3
 from recon.posegraph.anchors import height_above, height_below
 from recon.posegraph.between_keyframes import carried
-from recon.posegraph.level_ground import levelled
+from recon.posegraph.level_ground import MAX_LEVELLED_SHARE, levelled
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Placed, Trajectory
 from recon.tracking.odometry import Tracked, Tracking
@@ -73,7 +73,7 @@ class Chain:
         """``is_settled`` marks keyframes that the odometry no longer adjusts."""
         self.trajectory, self.watch = trajectory, GraphWatch(trajectory.graph)
         self.loops: LoopSearch | None = None
-        self.levelled = 0  # keyframes without an attitude whose ground is taken as level
+        self.views = self.levelled = 0  # keyframes, and those whose ground is taken as level
         self._carriers, self._is_settled = Carriers(), is_settled
         self._unplaced: dict[int, F64] = {}  # (6, 6) of frames, by segment, that no view carries
         self._rejected, self._stopwatch = rejected, stopwatch
@@ -90,6 +90,11 @@ class Chain:
     def graph(self) -> PoseGraph:
         """That places the keyframes."""
         return self.trajectory.graph
+
+    @property
+    def is_levelled(self) -> bool:
+        """True when what is level follows from the ground: too many views are off the mount."""
+        return self.levelled > MAX_LEVELLED_SHARE * self.views
 
     @property
     def held(self) -> dict[str, int]:
@@ -109,6 +114,7 @@ class Chain:
         below = height_below(depth, up) if depth is not None else None
         height = (below, 0.0) if below is not None else height_above(view.points, up)
         prior = levelled(view.prior, view.points)
+        self.views += 1
         self.levelled += prior is not view.prior
         self.trajectory.add(
             view.seq, view.segment, self._T_map, prior, height, view.time_ns, motion.covariance,

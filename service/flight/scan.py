@@ -309,7 +309,7 @@ class Scan:
         out = list(self.inputs.assumed)
         if self.attitudes == 0:
             out.append("view")
-        if self.pipeline.stages.chain.levelled:
+        if self.pipeline.stages.chain.is_levelled:
             out.append("level")
         if self.heights == 0 and self.rig.georeference == "none":
             out.append("height")
