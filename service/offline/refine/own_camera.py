@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 from recon import se3
+from recon.bands import at_once
 from recon.calibration.flight import (
     SelfCalibrated,
     SelfCalibrationConfig,
@@ -139,13 +140,15 @@ def sightings(
     ``ground_m`` up in the world. Images whose ground overlaps are compared, and of few
     images all that look alike. Raises InputError when nothing ties them together.
     """
-    features = {k: image_of(gray, camera) for k, gray in images.items()}
-    views = sorted(features)
+    views = sorted(images)
+    described = at_once(*(partial(image_of, images[k], camera) for k in views))
+    features = dict(zip(views, described, strict=True))
     overlap = _overlapping(views, camera, poses, ground_m)
     pairs = {(min(a, b), max(a, b)) for a, others in overlap.items() for b in others}
     if len(views) <= EXHAUSTIVE:
         some = [pair for pair in combinations(views, 2) if pair not in pairs]
-        pairs |= {(a, b) for a, b in some if are_alike(features[a], features[b])}
+        alike = at_once(*(partial(are_alike, features[a], features[b]) for a, b in some))
+        pairs.update(pair for pair, is_alike in zip(some, alike, strict=True) if is_alike)
     seen = joined(features, sorted(pairs), camera)
     if len(seen.view) == 0:
         raise InputError("no place was found again in another image; is this the video?")
