@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import combinations
 from pathlib import Path
@@ -129,12 +129,21 @@ def bent(search: SelfCalibrationConfig) -> SelfCalibrationConfig:
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TiedViews:
+    """Views tied by their images, adjusted to the features alone."""
+
+    camera: Camera
+    poses: F64  # (N, 4, 4) T_world_camera
+    points: F64  # (P, 3) world, m; NaN without a place
+    seen: Sightings
+
+
 def sightings(
     images: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float,
     config: SelfCalibrationConfig = START,
-) -> tuple[F64, Sightings, F64]:  # fmt: skip
-    """(P, 3) landmarks, NaN without a place, where they are seen in the distorted images, and
-    (N, 4, 4) poses that agree with them.
+) -> TiedViews:  # fmt: skip
+    """Landmarks, where they are seen in the distorted images, and poses that agree with them.
 
     ``images`` by view, with ``poses`` (N, 4, 4) of all views; the ground lies about
     ``ground_m`` up in the world. Images whose ground overlaps are compared, and of few
@@ -166,7 +175,7 @@ def sightings(
     overlap = _overlapping(views, own, poses, float(np.nanmedian(points[:, 2])))
     seen = extended(stack, camera, own, poses, points, found.seen, overlap)
     seen = within(own, poses, points, seen, GROSS_PX)
-    return points, seen, poses
+    return TiedViews(own, poses, points, seen)
 
 
 def _overlapping(
@@ -208,9 +217,11 @@ def found_camera(
     sigma_fixes: F64, config: SelfCalibrationConfig = START,
 ) -> SelfCalibrated:  # fmt: skip
     """The camera estimated from the flight; InputError, in one line, when it is not determined."""
-    landmarks, seen, poses = sightings(images, camera, poses, ground_m, config)
+    tied = sightings(images, camera, poses, ground_m, config)
     try:
-        found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes, config)
+        found = self_calibrate(
+            camera, tied.poses, tied.points, tied.seen, fixes, sigma_fixes, config
+        )
     except ValueError as error:
         raise InputError(str(error)) from error
     except (RuntimeError, np.linalg.LinAlgError) as error:  # an ill-posed problem
