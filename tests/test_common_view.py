@@ -8,7 +8,14 @@ import pytest
 from painted_ground import pose, still
 
 from recon.tracking import common_view
-from recon.tracking.common_view import FeatureCache, Features, alike, features, signature
+from recon.tracking.common_view import (
+    FeatureCache,
+    Features,
+    alike,
+    features,
+    mutual,
+    signature,
+)
 from recon.types import F64, U8
 
 
@@ -80,3 +87,20 @@ def test_stills_that_share_fine_detail_alone_are_compared_in_fine_detail() -> No
     view = cache.common_view(a, b, is_still=True)
     assert view is not None
     np.testing.assert_allclose(view.carry(np.array([[640.0, 360.0]])), [[540.0, 360.0]], atol=2.0)
+
+
+def test_mutual_matches_are_those_of_a_search_both_ways() -> None:
+    rng = np.random.default_rng(3)
+    a = np.abs(rng.normal(size=(60, 128)))
+    b = np.vstack([a[20:50], np.abs(rng.normal(size=(20, 128)))]) + 0.1 * rng.random((50, 128))
+    a[40] = a[30]  # equally good: the first counts
+    a, b = (one / np.linalg.norm(one, axis=1, keepdims=True) for one in (a, b))
+    apart = np.linalg.norm(a[:, None] - b, axis=2)
+    expected = []
+    for i, row in enumerate(apart):
+        j = int(row.argmin())
+        if row[j] < common_view.RATIO * np.delete(row, j).min() and apart[:, j].argmin() == i:
+            expected.append((i, j))
+    rows_a, rows_b = mutual(a.astype(np.float32), b.astype(np.float32))
+    assert 20 < len(expected) < 30
+    assert list(zip(rows_a, rows_b, strict=True)) == expected

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon import se3
+from recon import bands, se3
+from recon.calibration import flight
 from recon.calibration.flight import (
     SelfCalibrationConfig,
     camera_information,
@@ -169,6 +170,44 @@ def test_poses_that_are_metres_off_and_wild_sightings_do_no_harm() -> None:
     assert np.linalg.norm(s.poses[:, :3, 3] - T[:, :3, 3], axis=1).max() < 0.3
     assert found.sigma_px == pytest.approx(0.2, abs=0.06)
     assert len(found.seen.view) < len(uv) - 0.8 * len(wild)
+
+
+def test_poses_that_agree_with_the_images_are_adjusted_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    T, points, seen = scene(0.2)
+    uv = seen.uv_px.copy()
+    uv[::17] += 40.0
+    seen, known = replace(seen, uv_px=uv), known_by_survey(T, points)
+    held = camera_information(TRUE, FREE)
+    first = network(TRUE, off(T), seen, known, held)
+    solved: list[Problem] = []
+
+    def counted(problem: Problem, **options: bool) -> Solution:
+        solved.append(problem)
+        return solve(problem, **options)
+
+    monkeypatch.setattr(flight, "solve", counted)
+    s = first.solution
+    again = network(TRUE, s.poses, seen, known, held, near=s.camera)
+    assert len(solved) == 1 and solved[0].given is TRUE
+    assert again.sigma_px == pytest.approx(first.sigma_px, rel=0.1)
+    assert np.abs(again.solution.poses - s.poses).max() < 0.1  # a fifth of its sigma
+    assert again.solution.camera.K[0, 0] == pytest.approx(s.camera.K[0, 0], abs=1.0)
+    assert len(again.seen.view) < len(uv) - 0.8 * len(uv[::17])
+
+
+def test_any_number_of_cores_gives_the_same_result() -> None:
+    one, *others = (_with_threads(n) for n in (1, 2, 3))
+    assert all(np.array_equal(one.poses, other.poses) for other in others)
+
+
+def _with_threads(threads: int) -> Solution:
+    bands.limit_threads(threads)
+    try:
+        return adjusted(TRUE, FREE, noise_px=0.3)
+    finally:
+        bands.limit_threads(0)
 
 
 def test_a_landmark_whose_rays_cross_nowhere_has_no_place() -> None:

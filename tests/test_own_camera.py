@@ -113,7 +113,8 @@ def test_a_leg_flown_back_ties_its_images_to_those_of_the_first() -> None:
     back = [_pose(10.0, 36.0 - 9.0 * k, np.pi, 0.0) for k in range(5)]
     poses = np.array([*out, *back])
     images = {k: _image(T, k) for k, T in enumerate(poses)}
-    landmarks, seen, own = sightings(images, TRUE, poses, 0.0)
+    tied = sightings(images, TRUE, poses, 0.0)
+    landmarks, seen, own = tied.points, tied.seen, tied.poses
     of = [set(seen.landmark[seen.view == k]) for k in range(10)]
     assert len(of[0] & of[9]) > 20 and len(of[1] & of[7]) > 20
     shared = np.isin(seen.landmark, list(of[0] & of[9])) & (seen.view == 9)

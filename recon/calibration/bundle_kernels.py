@@ -38,10 +38,14 @@ def _pixel(P: F64, X: F64, k: F64, k3: float, out: F64) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def errors(T: F64, X: F64, k: F64, k3: float, pose: I64, point: I64, uv: F64, out: F64) -> None:
-    """``out`` (M, 2) receives the sightings less their prediction; infinite behind the camera."""
+def errors(
+    first: int, end: int, T: F64, X: F64, k: F64, k3: float, pose: I64, point: I64, uv: F64,
+    out: F64,
+) -> None:  # fmt: skip
+    """``out`` (M, 2) receives the sightings less their prediction, from ``first`` to before
+    ``end``; infinite behind the camera."""
     at = np.zeros(7)
-    for m in range(pose.size):
+    for m in range(first, end):
         if _pixel(T[pose[m]], X[point[m]], k, k3, at):
             out[m, 0], out[m, 1] = uv[m, 0] - at[0], uv[m, 1] - at[1]
         else:
@@ -106,21 +110,22 @@ def _weighed(at: F64, uv: F64, sigma: float, huber: float, r: F64) -> tuple[floa
 
 @njit(cache=True, nogil=True)
 def reduce_points(
-    T: F64, pose: I64, share: F64, X: F64, k: F64, k3: float, view: I64, start: I64, uv: F64,
-    sigma: F64, huber: float, Hp: F64, bp: F64, damping: float, pair: I64, S: F64, g: F64, B: F64,
-    Hk: F64, gk: F64, W: F64, Wk: F64,
+    first: int, end: int, T: F64, pose: I64, share: F64, X: F64, k: F64, k3: float, view: I64,
+    start: I64, uv: F64, sigma: F64, huber: float, Hp: F64, bp: F64, damping: float, pair: I64,
+    W: F64, Wk: F64, S: F64, g: F64, B: F64, Hk: F64, gk: F64,
 ) -> None:  # fmt: skip
-    """Eliminate the points.
+    """Eliminate the points from ``first`` to before ``end``.
 
     ``T`` are the poses numbered by ``pose`` (M,). ``Hp`` (P, 3, 3) and ``bp`` (P, 3) hold what is
     known of the points and receive the inverses and right-hand sides. A view has ``n`` unknowns:
     its pose, and with nine its turn. ``S`` (Q, n, n) are the blocks of the views numbered by
-    ``pair`` (N, N), the upper half only; ``B`` (N, n, 8) and ``Hk`` (8, 8) the border.
+    ``pair`` (N, N), the upper half only; ``B`` (N, n, 8) and ``Hk`` (8, 8) the border. From ``S``
+    on all are added to, so that points reduced at the same time need sums of their own.
     """
     n_view = g.shape[1]
     at, Jc, Jp, Jk = np.zeros(7), np.zeros((2, n_view)), np.zeros((2, 3)), np.zeros((2, 8))
     r, A, Ak = np.zeros(2), np.zeros((n_view, 3)), np.zeros((CAMERA, 3))
-    for p in range(X.shape[0]):
+    for p in range(first, end):
         for m in range(start[p], start[p + 1]):
             v = view[m]
             W[m] = 0.0
@@ -171,17 +176,18 @@ def reduce_points(
 
 @njit(cache=True, nogil=True)
 def settle_points(
-    T: F64, pose: I64, X: F64, k: F64, k3: float, start: I64, uv: F64, sigma: F64, huber: float,
-    surveyed: F64, sure: F64,
+    first: int, end: int, T: F64, pose: I64, X: F64, k: F64, k3: float, start: I64, uv: F64,
+    sigma: F64, huber: float, surveyed: F64, sure: F64,
 ) -> None:  # fmt: skip
-    """Move each point of ``X`` (P, 3) by Gauss-Newton steps, as long as they lower its cost.
+    """Move each point of ``X`` (P, 3), from ``first`` to before ``end``, by Gauss-Newton steps, as
+    long as they lower its cost.
 
     ``T`` are the poses numbered by ``pose`` (M,); ``sure`` (P, 3) is one over the sigma of
     ``surveyed``, 0 where there is none.
     """
     at, Jc, Jp, Jk = np.zeros(7), np.zeros((2, 6)), np.zeros((2, 3)), np.zeros((2, CAMERA))
     H, b, r, x = np.zeros((3, 3)), np.zeros(3), np.zeros(2), np.zeros(3)
-    for p in range(X.shape[0]):
+    for p in range(first, end):
         x[:], before = X[p], np.inf
         for _ in range(POINT_STEPS + 1):
             cost = 0.0

@@ -210,7 +210,7 @@ def contradiction(images: FocalLength, given: Camera, config: SelfCalibrationCon
     return max(float(apart / np.hypot(images.sigma, config.sigma_focal)), 1.0)
 
 
-ROUNDS = ((8.0, 180.0), (1.0, 15.0))
+ROUNDS: tuple[tuple[float, float], ...] = ((8.0, 180.0), (1.0, 15.0))
 """Sigma of a pixel, and the error beyond which it is left out, while poses are far off."""
 
 
@@ -226,7 +226,7 @@ class Network:
 def network(
     camera: Camera, poses: F64, seen: Sightings, known: Knowledge, held: F64,
     marks: Sightings | None = None, mark_px: float = 1.0, covariances: bool = False,
-    rows: RowMotion | None = None,
+    rows: RowMotion | None = None, near: Camera | None = None,
 ) -> Network:  # fmt: skip
     """Views adjusted to their sightings, from poses that may be far off.
 
@@ -236,14 +236,19 @@ def network(
         held: (8, 8) information of the camera given.
         marks: sightings of surveyed landmarks, which always take part with ``mark_px``.
         rows: of a rolling shutter, to begin with.
+        near: the camera to begin with, where ``poses`` and it agree with most sightings already.
 
     Raises ValueError where too few sightings agree.
     """
-    count, given, kept, solution = len(known.surveyed), camera, seen, None
+    count, given, kept, points = len(known.surveyed), camera, seen, known.surveyed
     marks = marks or Sightings(seen.view[:0], seen.landmark[:0], seen.uv_px[:0])
-    for sigma, gate in (*ROUNDS, (0.0, 0.0)):
-        if solution is not None and sigma == 0.0:
-            errors = errors_px(camera, poses, solution.points, kept, rows)
+    rounds = ROUNDS
+    if near is not None:
+        camera, rounds = near, ()
+        points = crossings(poses, camera, joint(seen, marks), count, rows)
+    for sigma, gate in (*rounds, (0.0, 0.0)):
+        if sigma == 0.0:
+            errors = errors_px(camera, poses, points, kept, rows)
             sigma = float(np.clip(np.median(errors) / RAYLEIGH_MEDIAN, 0.1, 2.0))
             gate = max(6.0 * sigma, 1.0)
         points = crossings(poses, camera, joint(seen, marks), count, rows)
@@ -259,8 +264,8 @@ def network(
             Problem(camera, given, poses, points, every, sigmas, known, held, rows=rows),
             covariances=covariances and gate < 15.0,
         )
-        poses, camera, rows = solution.poses, solution.camera, solution.rows
-    assert solution is not None
+        poses, points = solution.poses, solution.points
+        camera, rows = solution.camera, solution.rows
     return Network(solution, kept, sigma)
 
 

@@ -13,11 +13,13 @@ has three unknowns more: its turn from the first row to the last.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from recon import se3
+from recon.bands import at_once, in_bands
 from recon.calibration.bundle_kernels import (
     CAMERA,
     errors,
@@ -33,6 +35,10 @@ DAMPING, MAX_DAMPING = 1e-6, 1e-5
 
 SETTLED_SIGMAS = 0.01
 """Length, over the sigmas of poses and camera together, of a step after which none follows."""
+
+PARTS = 8
+"""Of the points, whose sums are made at the same time: the result is that of any number of cores.
+"""
 
 MAX_COVARIANCES = 100
 """Number of poses whose covariance is computed; the others take that of the nearest one."""
@@ -149,7 +155,8 @@ def errors_px(
         poses, pose = rows.by_row(camera, poses, seen), np.arange(len(seen.view))
     k, k3 = _vector(camera), float(camera.distortion[4])
     X = np.ascontiguousarray(points)
-    errors(se3.each_inverse(poses), X, k, k3, pose, seen.landmark, seen.uv_px, out)
+    T = se3.each_inverse(poses)
+    in_bands(errors, len(pose), T, X, k, k3, pose, seen.landmark, seen.uv_px, out)
     return np.asarray(np.hypot(out[:, 0], out[:, 1]))
 
 
@@ -270,7 +277,7 @@ class _Bundle:
     def _errors(self, s: _State) -> F64:
         out = np.zeros((len(self._view), 2))
         T, pose = self._of_sightings(s)
-        errors(T, s.X, s.k, self._k3, pose, self._point, self._uv, out)
+        in_bands(errors, len(out), T, s.X, s.k, self._k3, pose, self._point, self._uv, out)
         return out
 
     def _lengths(self, s: _State) -> F64:
@@ -325,8 +332,8 @@ class _Bundle:
     def _with_settled_points(self, s: _State) -> _State:
         X = s.X.copy()
         T, pose = self._of_sightings(s)
-        settle_points(
-            T, pose, X, s.k, self._k3, self._start_of, self._uv, self._sigma,
+        in_bands(
+            settle_points, len(X), T, pose, X, s.k, self._k3, self._start_of, self._uv, self._sigma,
             self._of.huber_sigmas, self._surveyed, self._sure,
         )  # fmt: skip
         return replace(s, X=X)
@@ -353,10 +360,19 @@ class _Bundle:
         self._add_known(s, S, g, Hp, bp)
         W, Wk = np.zeros((M, V, 3)), np.zeros((P, CAMERA, 3))
         T, pose = self._of_sightings(s)
-        reduce_points(
-            T, pose, self._share, s.X, s.k, self._k3, self._view, self._start_of, self._uv,
-            self._sigma, self._of.huber_sigmas, Hp, bp, damping, self._pair, S, g, B, Hk, gk, W, Wk,
-        )  # fmt: skip
+        sums = S, g, B, Hk, gk
+        parts = [np.zeros((PARTS, *one.shape)) for one in sums]
+        ends = np.searchsorted(self._start_of, M * np.arange(1, PARTS) // PARTS)
+        at_once(*(
+            partial(
+                reduce_points, first, end, T, pose, self._share, s.X, s.k, self._k3, self._view,
+                self._start_of, self._uv, self._sigma, self._of.huber_sigmas, Hp, bp, damping,
+                self._pair, W, Wk, *own,
+            )
+            for first, end, *own in zip([0, *ends], [*ends, P], *parts, strict=True)
+        ))  # fmt: skip
+        for whole, own in zip(sums, parts, strict=True):
+            whole += own.sum(axis=0)
         own = self._pair[np.arange(N), np.arange(N)]
         for i in range(V):
             S[own, i, i] += damping * np.abs(S[own, i, i]) + 1e-9

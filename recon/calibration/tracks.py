@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from recon import se3
+from recon.bands import at_once
 from recon.calibration.global_bundle import RowMotion, Sightings
 from recon.camera_model import project, rays
 from recon.tracking import robust_geometry
@@ -108,11 +110,13 @@ def joined(
     """The tracks through matched ``pairs``; one that meets a view twice is left out."""
     views = sorted(images)
     first = dict(zip(views, np.cumsum([0, *(len(images[k].place) for k in views)]), strict=False))
-    ends: list[npt.NDArray[np.int64]] = []
-    for a, b in pairs:
-        found = matches(images[a], images[b], camera)
-        if found is not None:
-            ends.append(np.column_stack([found[0] + first[a], found[1] + first[b]]))
+    pairs = list(pairs)
+    found = at_once(*(partial(matches, images[a], images[b], camera) for a, b in pairs))
+    ends: list[npt.NDArray[np.int64]] = [
+        np.column_stack([both[0] + first[a], both[1] + first[b]])
+        for (a, b), both in zip(pairs, found, strict=True)
+        if both is not None
+    ]
     return _tracks(np.concatenate(ends) if ends else np.zeros((0, 2), np.int64), images, first)
 
 

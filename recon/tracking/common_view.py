@@ -141,14 +141,16 @@ def mutual(a: F32, b: F32) -> tuple[np.ndarray, np.ndarray]:
     if min(len(a), len(b)) < MIN_MATCHES:
         return none, none
     likeness = a @ b.T
-    best, back = likeness.argmax(axis=1), likeness.argmax(axis=0)
+    best, highest = likeness.argmax(axis=1), likeness.max(axis=0)  # argmax of columns is slow
     rows = np.arange(len(a))
     top = likeness[rows, best]
     likeness[rows, best] = -1.0
     closest, next_one = (
         np.sqrt(np.maximum(2.0 - 2.0 * one, 0.0)) for one in (top, likeness.max(axis=1))
     )
-    good = (back[best] == rows) & (closest < RATIO * next_one)
+    good = np.flatnonzero((top == highest[best]) & (closest < RATIO * next_one))
+    _, first = np.unique(best[good], return_index=True)  # of rows that are equally good
+    good = good[np.sort(first)]
     return rows[good], best[good]
 
 

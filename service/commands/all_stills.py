@@ -148,9 +148,9 @@ def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHisto
     poses = np.array([_pose(prior) for prior in priors])
     ground_m = float(np.median(poses[:, 2, 3] - [prior.agl_m or 0.0 for prior in priors]))
     images = {k: still.gray for k, (still, _) in enumerate(known)}
-    _, seen, poses = sightings(images, camera, poses, ground_m)
+    views = sightings(images, camera, poses, ground_m)
     found = together(
-        camera, poses, seen, _knowledge(priors, int(seen.landmark.max()) + 1),
+        camera, views.poses, views.seen, _knowledge(priors, int(views.seen.landmark.max()) + 1),
         _turning(priors, history), seeks,
     )  # fmt: skip
     piece = pieces(found.seen, len(known))

@@ -124,10 +124,10 @@ def network_of(
     poses = np.array([s.T_world_camera for s in states] + [f.T_world_camera for f in marked])
     images = own_camera.images_at(video, header.started_unix_ns, times)
     ground_m = float(np.median((poses[:, :3, 3] + ahead_m * poses[:, :3, 2])[:, 2]))
-    _, seen, start = own_camera.sightings(images, given, poses, ground_m)
-    known = loosely_placed(poses, seen)
+    tied = own_camera.sightings(images, given, poses, ground_m)
+    known = loosely_placed(poses, tied.seen)
     held = camera_information(given, FREE)
-    found = network(given, start, seen, known, held)
+    found = network(given, tied.poses, tied.seen, known, held, near=tied.camera)
     s, pixel = found.solution, np.full(len(found.seen.view), found.sigma_px)
     settled = Problem(s.camera, given, s.poses, s.points, found.seen, pixel, known, held)
     sigmas = camera_sigmas(s.camera_covariance) * np.sqrt(max(dispersion(settled), 1.0))
@@ -135,7 +135,7 @@ def network_of(
     why = doubt(s.camera, given, sigmas, FREE)
     if why:
         held = camera_information(given, HELD)
-        found = network(given, start, seen, known, held)
+        found = network(given, tied.poses, tied.seen, known, held)
     s = found.solution
     return ImageNetwork(
         len(states), given, s.camera, held, s.poses, s.points, found.seen, focal, why
@@ -230,8 +230,9 @@ def adjusted(
         seen = Sightings(np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), at_px)
     try:
         found = network(
-            images.given, images.poses, images.seen, known, images.held, seen, MARK_PX, True
-        )
+            images.given, images.poses, images.seen, known, images.held, seen, MARK_PX, True,
+            near=images.camera,
+        )  # fmt: skip
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
         raise InputError(f"the images do not tie the scan together ({error})") from error
     s = found.solution

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 from recon import se3
+from recon.bands import at_once
 from recon.calibration.flight import (
     SelfCalibrated,
     SelfCalibrationConfig,
@@ -128,24 +129,35 @@ def bent(search: SelfCalibrationConfig) -> SelfCalibrationConfig:
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TiedViews:
+    """Views tied by their images, adjusted to the features alone."""
+
+    camera: Camera
+    poses: F64  # (N, 4, 4) T_world_camera
+    points: F64  # (P, 3) world, m; NaN without a place
+    seen: Sightings
+
+
 def sightings(
     images: Mapping[int, U8], camera: Camera, poses: F64, ground_m: float,
     config: SelfCalibrationConfig = START,
-) -> tuple[F64, Sightings, F64]:  # fmt: skip
-    """(P, 3) landmarks, NaN without a place, where they are seen in the distorted images, and
-    (N, 4, 4) poses that agree with them.
+) -> TiedViews:  # fmt: skip
+    """Landmarks, where they are seen in the distorted images, and poses that agree with them.
 
     ``images`` by view, with ``poses`` (N, 4, 4) of all views; the ground lies about
     ``ground_m`` up in the world. Images whose ground overlaps are compared, and of few
     images all that look alike. Raises InputError when nothing ties them together.
     """
-    features = {k: image_of(gray, camera) for k, gray in images.items()}
-    views = sorted(features)
+    views = sorted(images)
+    described = at_once(*(partial(image_of, images[k], camera) for k in views))
+    features = dict(zip(views, described, strict=True))
     overlap = _overlapping(views, camera, poses, ground_m)
     pairs = {(min(a, b), max(a, b)) for a, others in overlap.items() for b in others}
     if len(views) <= EXHAUSTIVE:
         some = [pair for pair in combinations(views, 2) if pair not in pairs]
-        pairs |= {(a, b) for a, b in some if are_alike(features[a], features[b])}
+        alike = at_once(*(partial(are_alike, features[a], features[b]) for a, b in some))
+        pairs.update(pair for pair, is_alike in zip(some, alike, strict=True) if is_alike)
     seen = joined(features, sorted(pairs), camera)
     if len(seen.view) == 0:
         raise InputError("no place was found again in another image; is this the video?")
@@ -163,7 +175,7 @@ def sightings(
     overlap = _overlapping(views, own, poses, float(np.nanmedian(points[:, 2])))
     seen = extended(stack, camera, own, poses, points, found.seen, overlap)
     seen = within(own, poses, points, seen, GROSS_PX)
-    return points, seen, poses
+    return TiedViews(own, poses, points, seen)
 
 
 def _overlapping(
@@ -205,9 +217,11 @@ def found_camera(
     sigma_fixes: F64, config: SelfCalibrationConfig = START,
 ) -> SelfCalibrated:  # fmt: skip
     """The camera estimated from the flight; InputError, in one line, when it is not determined."""
-    landmarks, seen, poses = sightings(images, camera, poses, ground_m, config)
+    tied = sightings(images, camera, poses, ground_m, config)
     try:
-        found = self_calibrate(camera, poses, landmarks, seen, fixes, sigma_fixes, config)
+        found = self_calibrate(
+            camera, tied.poses, tied.points, tied.seen, fixes, sigma_fixes, config
+        )
     except ValueError as error:
         raise InputError(str(error)) from error
     except (RuntimeError, np.linalg.LinAlgError) as error:  # an ill-posed problem
