@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -40,6 +41,29 @@ def test_above_the_horizon_one_pair_alone_says_nothing() -> None:
     np.testing.assert_array_equal(known[:, 30:].all(axis=1), np.arange(80) > horizon)
     np.testing.assert_array_equal(known, kept.views > 0)
     np.testing.assert_array_equal(known, np.isfinite(kept.sigma_m))
+
+
+def test_above_the_horizon_only_what_stands_on_the_ground_is_kept() -> None:
+    """Clouds 300 m away over the sea, and a tower at 50 m in front of both."""
+    horizon = 39.5 - 100.0 * np.tan(np.radians(10.0))
+    above = np.arange(80)[:, None] < horizon - 2.0
+    depth = np.where(above, 300.0, 120.0) * np.ones(SHAPE)
+    depth[10:, 80:95] = 50.0
+    depth[:, :20] = np.nan
+    views = np.where(np.isnan(depth), 0, 2).astype(np.uint8)
+    seen = replace(surface(views), depth_m=depth.astype(np.float32))
+    kept = plausible(seen, PosePrior(looking(-10.0), sigma_tilt_rad=0.0))
+    assert kept is not None
+    known = np.isfinite(kept.depth_m)
+    assert not known[:18, 20:78].any() and not known[:8, 80:95].any()
+    assert known[12:, 82:93].all() and known[26:, 20:].all()
+    np.testing.assert_array_equal(known, kept.views > 0)
+
+
+def test_of_an_image_that_shows_no_ground_two_pairs_decide() -> None:
+    up = surface(np.full(SHAPE, 2, np.uint8))
+    kept = plausible(up, PosePrior(looking(60.0), sigma_tilt_rad=0.0))
+    assert kept is not None and np.isfinite(kept.depth_m).all()
 
 
 def test_what_may_lie_below_the_horizon_is_kept() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numba import njit
 
@@ -308,25 +309,42 @@ def _fuse(
 
 TILT_SIGMAS = 2.0
 
+MAX_STEP_SHARE = 0.1
+"""Neighbouring pixels whose depths differ by more belong to two surfaces."""
+
 
 def plausible(depth: DepthMap, prior: PosePrior) -> DepthMap | None:
-    """``depth`` without surface that only one pair sees above the horizon; None with nothing left.
+    """``depth`` without false surface above the horizon; None with nothing left.
 
     Below the horizon a ray ends at the ground. Above it there may be nothing but sky, so a
-    surface there takes two pairs that agree.
+    surface there takes two pairs that agree, and stands on surface below: clouds do not.
     """
     if prior.R_world_camera is not None:
         sky = _above_horizon(depth, prior.R_world_camera[2], TILT_SIGMAS * prior.sigma_tilt_rad)
-        sky &= depth.views == 1
         if sky.any():
+            false = sky & ((depth.views == 1) | ~_reaching(depth.depth_m, ~sky))
             nothing = np.float32(np.nan)
             depth = replace(
                 depth,
-                depth_m=np.where(sky, nothing, depth.depth_m),
-                sigma_m=np.where(sky, nothing, depth.sigma_m),
-                views=np.where(sky, np.uint8(0), depth.views),
+                depth_m=np.where(false, nothing, depth.depth_m),
+                sigma_m=np.where(false, nothing, depth.sigma_m),
+                views=np.where(false, np.uint8(0), depth.views),
             )
     return depth if np.isfinite(depth.depth_m).any() else None
+
+
+def _reaching(depth_m: F32, ground: Bool) -> Bool:
+    """(h, w) pixels of surfaces that reach into ``ground``; all where the image shows none."""
+    if not ground.any():
+        return np.ones(depth_m.shape, np.bool_)
+    known = np.isfinite(depth_m)
+    away = np.log(np.where(known, depth_m, np.float32(1.0)))
+    square = np.ones((3, 3), np.uint8)
+    farthest = cv2.dilate(np.where(known, away, np.float32(-99.0)), square)
+    nearest = cv2.erode(np.where(known, away, np.float32(99.0)), square)
+    smooth = known & (farthest - nearest < MAX_STEP_SHARE)
+    _, surface = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
+    return np.isin(surface, surface[ground & smooth])
 
 
 def _above_horizon(depth: DepthMap, up: F64, margin_rad: float) -> Bool:
