@@ -56,7 +56,7 @@ def test_a_video_goes_where_its_images_turn_with_the_log(flight: Path, tmp_path:
     found = replayed(flight, tmp_path / "scan")
     (note,) = (text for text in found["warnings"] if "the time that it states" in text)
     assert note.startswith(f"the video begins {EARLY_S:.2f} s after")
-    assert "the video's clock is +2 h off the log's: taken as local time" in found["warnings"]
+    assert "the camera's clock is +2 h off the log's: taken as local time" in found["warnings"]
     assert found["quality"]["trust"]["level"] == "georeferenced"
     assert abs(found["camera_latency"]["estimate_ms"]) < 20.0
     with ScanStore.open(tmp_path / "scan" / "scan.db") as store:

@@ -47,6 +47,12 @@ def test_the_weakest_fact_sets_the_level(
     assert all(reason in text for text in found["reasons"])
 
 
+def test_a_doubtful_scan_names_the_source_of_its_scale_too() -> None:
+    found = trust_of(SURE | {"assumed": ["view", "level", "height"]}, "none")
+    assert found["level"] == "doubtful" and len(found["reasons"]) == 2
+    assert "taken as level" in found["reasons"][0] and "assumed height" in found["reasons"][1]
+
+
 def test_a_site_that_leans_was_not_seen_from_above() -> None:
     leaning = trust_of(SURE | {"assumed": ["view"]}, "gnss", 60.0)
     assert leaning["level"] == "doubtful" and "60 degrees" in leaning["reasons"][0]

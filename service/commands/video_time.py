@@ -63,7 +63,7 @@ def local_zone_ns(start_ns: int, log: TelemetryLog | None, notes: list[str]) -> 
         fitting = [zone for zone in zones if _covers(log, start_ns - zone)]
         if len(fitting) == 1:
             hours = fitting[0] / HOUR_NS
-            notes.append(f"the video's clock is {hours:+g} h off the log's: taken as local time")
+            notes.append(f"the camera's clock is {hours:+g} h off the log's: taken as local time")
             return fitting[0]
     return 0
 

@@ -97,14 +97,15 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     refuted = f"{broken:.0f} of {steps:.0f} steps of vision contradict attitude and positions"
     if broken > MAX_REFUTED_SHARE * steps:
         doubts.append(f"{refuted}: the images are too poor")
-    if doubts:
-        return _said(Trust.DOUBTFUL, doubts)
+    unsized = []
     if "height" in assumed:
-        return _said(Trust.RELATIVE, ["the scale comes from an assumed height above ground"])
-    if isinstance(scale, Mapping) and scale.get("from") == FIRST_TELEMETRY:
-        return _said(Trust.RELATIVE, ["too few keyframes in a row to measure the scale"])
-    if sigma is not None and sigma > MAX_SCALE_SIGMA:
-        return _said(Trust.RELATIVE, [f"the scale is uncertain by {sigma:.0%}"])
+        unsized.append("the scale comes from an assumed height above ground")
+    elif isinstance(scale, Mapping) and scale.get("from") == FIRST_TELEMETRY:
+        unsized.append("too few keyframes in a row to measure the scale")
+    elif sigma is not None and sigma > MAX_SCALE_SIGMA:
+        unsized.append(f"the scale is uncertain by {sigma:.0%}")
+    if doubts or unsized:
+        return _said(Trust.DOUBTFUL if doubts else Trust.RELATIVE, doubts + unsized)
     if georeference == "none":
         return _said(Trust.SCALED, ["no positions: the scan has its own origin and heading"])
     limits = []
