@@ -6,6 +6,7 @@ import io
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,13 @@ import pytest
 from recon.types import U8
 from service.cameras import CAMERAS, CameraFrame, CameraSource, open_camera, parse_source, video
 from service.cameras.container import open_container
-from service.cameras.video import PipeReader, VideoSource, index_at_end, parse_time_unix_ns
+from service.cameras.video import (
+    PipeReader,
+    VideoSource,
+    decoded_frames,
+    index_at_end,
+    parse_time_unix_ns,
+)
 from service.errors import InputError
 
 SIZE_PX = (160, 96)
@@ -120,7 +127,7 @@ def test_images_that_are_not_wanted_are_passed_over(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("container_format", ["mp4", "matroska"])
 def test_images_behind_the_last_wanted_one_are_not_decoded(
-    tmp_path: Path, container_format: str
+    tmp_path: Path, container_format: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "v"
     noise = np.random.default_rng(4).integers(0, 256, (60, 96, 128, 3), np.uint8)
@@ -133,6 +140,14 @@ def test_images_behind_the_last_wanted_one_are_not_decoded(
         out.mux(stream.encode(None))
     everything = {f.time_ns: f.image for f in open_camera(str(path))}
     wanted = [list(everything)[n] for n in (0, 13, 47)]
+    decoded: list[int | None] = []
+
+    def counted(*arguments: Any) -> Iterator[av.VideoFrame]:
+        for frame in decoded_frames(*arguments):
+            decoded.append(frame.pts)
+            yield frame
+
+    monkeypatch.setattr(video, "decoded_frames", counted)
     source = open_camera(str(path))
     assert isinstance(source, VideoSource)
     source.only_near(wanted, 5_000_000)
@@ -144,6 +159,7 @@ def test_images_behind_the_last_wanted_one_are_not_decoded(
         assert 30 <= source.passed <= 60 - 1 - 2 - 12
     else:
         assert not source.passed
+    assert len(decoded) <= 49
 
 
 def test_file_epoch_is_the_creation_time(tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +103,28 @@ def test_poses_at_once_are_those_one_by_one(tmp_path: Path) -> None:
         assert a.numbers() == b.numbers()
         for number in (1, 2, 3):
             assert a.record("pose", number) == b.record("pose", number)
+
+
+def test_held_keyframes_are_decoded_once_and_several_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both, decode, decoded = threading.Barrier(2, timeout=5.0), codec.decode, []
+
+    def counted(layers: Sequence[bytes]) -> Keyframe | None:
+        decoded.append(layers)
+        both.wait()
+        return decode(layers)
+
+    with ScanStore.create(tmp_path / "scan.db", HEADER) as store:
+        for k in range(2):
+            store.add_keyframe(k, codec.encode(keyframe(k), 0))
+        monkeypatch.setattr(codec, "decode", counted)
+        store.hold_decoded()
+        for _ in range(2):
+            with ThreadPoolExecutor(2) as threads:
+                found = list(threads.map(store.keyframe, range(2)))
+            assert [one.seq for one in found if one is not None] == [0, 1]
+    assert len(decoded) == 2
 
 
 def test_duplicates_and_order_do_not_matter(tmp_path: Path) -> None:

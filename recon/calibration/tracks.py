@@ -154,19 +154,26 @@ def sharpened(pyramid: Callable[[int], Pyramid], camera: Camera, seen: Sightings
     reference = middle[np.searchsorted(seen.landmark[middle], seen.landmark)]
     uv = flat.copy()
     pairs = np.column_stack([seen.view[reference], seen.view])
-    for a, b in np.unique(pairs, axis=0):
-        rows = np.flatnonzero((pairs == (a, b)).all(axis=1))
-        if a == b or len(rows) < MIN_SHARED:
-            continue
+    views, which = np.unique(pairs, axis=0, return_inverse=True)
+    order = np.argsort(which.ravel(), kind="stable")
+    rows_of = np.split(order, np.cumsum(np.bincount(which.ravel()))[:-1])
+
+    def sharpen(a: int, b: int, rows: I64) -> None:
         found = robust_geometry.homography(flat[reference[rows]], flat[rows], RELIEF_PX)
         if found is None:
-            continue
+            return
         turned = replace(by_homography(found[0], flat[reference[rows]], REACH_PX), uv=flat[rows])
         at = match(
-            pyramid(int(a)), flat[reference[rows]], pyramid(int(b)), turned.uv, REACH_PX,
-            turned.warp, MatchingConfig(),
+            pyramid(a), flat[reference[rows]], pyramid(b), turned.uv, REACH_PX, turned.warp,
+            MatchingConfig(),
         )  # fmt: skip
         uv[rows[at.ok]] = at.uv_px[at.ok]
+
+    at_once(*(
+        partial(sharpen, int(a), int(b), rows)
+        for (a, b), rows in zip(views, rows_of, strict=True)
+        if a != b and len(rows) >= MIN_SHARED
+    ))  # fmt: skip
     moved = (uv != flat).any(axis=1)
     at_px = seen.uv_px.copy()
     at_px[moved] = with_distortion(camera, uv[moved])
@@ -225,24 +232,26 @@ def extended(
     rows = _middles(seen)
     rows = rows[np.isfinite(points[seen.landmark[rows]]).all(axis=1)]
     known = {(int(v), int(p)) for v, p in zip(seen.view, seen.landmark, strict=True)}
-    more: list[tuple[int, int]] = []
-    places: list[F64] = []
-    for a, others in overlap.items():
+
+    def found_again(a: int, b: int) -> tuple[I64, I64, F64]:
+        """Views, landmarks and places that view ``b`` shows of those of view ``a``."""
         mine = rows[seen.view[rows] == a]
-        for b in others:
-            new = [r for r in mine if (b, int(seen.landmark[r])) not in known]
-            if len(new) < MIN_SHARED:
-                continue
-            spots = points[seen.landmark[new]]
-            predicted, warp = _on_level_ground(found, poses[a], poses[b], flat[new], spots)
-            shown = without_distortion(given, with_distortion(found, predicted))
-            at = match(pyramid(a), flat[new], pyramid(b), shown, REACH_PX, warp, MatchingConfig())
-            more += [(b, int(seen.landmark[new[i]])) for i in np.flatnonzero(at.ok)]
-            places.append(at.uv_px[at.ok].astype(np.float64))
+        new = np.array([r for r in mine if (b, int(seen.landmark[r])) not in known], np.int64)
+        if len(new) < MIN_SHARED:
+            return new[:0], new[:0], np.zeros((0, 2))
+        spots = points[seen.landmark[new]]
+        predicted, warp = _on_level_ground(found, poses[a], poses[b], flat[new], spots)
+        shown = without_distortion(given, with_distortion(found, predicted))
+        at = match(pyramid(a), flat[new], pyramid(b), shown, REACH_PX, warp, MatchingConfig())
+        again = seen.landmark[new[at.ok]]
+        return np.full_like(again, b), again, at.uv_px[at.ok].astype(np.float64)
+
+    pairs = [(a, b) for a, others in overlap.items() for b in others]
+    more = at_once(*(partial(found_again, a, b) for a, b in pairs))
     if not more:
         return seen
-    view, landmark = np.array(more, np.int64).T
-    at_px = with_distortion(given, np.concatenate(places))
+    view, landmark, places = (np.concatenate(parts) for parts in zip(*more, strict=True))
+    at_px = with_distortion(given, places)
     return Sightings(
         np.append(seen.view, view), np.append(seen.landmark, landmark),
         np.concatenate([seen.uv_px, at_px]),

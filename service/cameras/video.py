@@ -93,6 +93,7 @@ class VideoSource:
         self._open = True
         self._wanted_ns: list[int] | None = None  # all
         self._within_ns = self._late_ns = 0
+        self._end_ns = LONGEST_NS
         self.passed = 0  # coded images that were not decoded
         if not container.streams.video:
             self.close()
@@ -134,6 +135,8 @@ class VideoSource:
             if not last_ns < time_ns < LONGEST_NS:
                 self._unordered += 1
                 continue
+            if time_ns > self._end_ns:
+                break
             size_px = (int(frame.width), int(frame.height))
             if size_px != self._stored_px:
                 self._warn(
@@ -151,12 +154,13 @@ class VideoSource:
         self.close()
 
     def only_near(self, times_ns: Iterable[int], within_ns: int) -> None:
-        """Yield no other images than those near ``times_ns``.
+        """Yield no other images than those near ``times_ns``, at least one, and end with the last.
 
         Others are not converted. In a file with an index (mp4) they are not decoded either, unless
         one that is wanted follows before the next keyframe.
         """
         self._wanted_ns, self._within_ns = sorted(times_ns), within_ns
+        self._end_ns = self._wanted_ns[-1] + within_ns
 
     def _is_wanted(self, first_ns: int, last_ns: int) -> bool:
         """Whether one of the times wanted lies between two times, or near them."""

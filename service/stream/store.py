@@ -54,6 +54,9 @@ from service.stream.validity import summary_from_json
 
 _NOT_TOO_LARGE = f"LENGTH(data) <= {codec.MAX_LAYER_BYTES}"
 _IS_LAYER = f"typeof(layer) = 'integer' AND layer BETWEEN 0 AND {codec.MAX_LAYERS - 1}"
+HELD_BYTES = 500_000_000
+"""Decoded keyframes that are held, by default."""
+
 DECODED_BYTES = 13
 """A pixel of a keyframe: depth, sigma, views, colour, mask."""
 MAX_HELD_PEERS = 8
@@ -89,7 +92,8 @@ class ScanStore:
         self._radio = RadioStore(self.database)
         self._held: dict[tuple[int, int], Keyframe] = {}  # by number and layer
         self._held_room: int | None = None  # bytes; None: nothing is held
-        self._decoding = Lock()
+        self._holding = Lock()
+        self._decoding: dict[tuple[int, int], Lock] = {}
         self._only: frozenset[int] | None = None  # keyframes that a reader is restricted to
 
     @classmethod
@@ -244,7 +248,7 @@ class ScanStore:
         repose = self.repose(seq)
         return decoded if decoded is None or repose is None else repose.applied_to(decoded)
 
-    def hold_decoded(self, max_bytes: int) -> None:
+    def hold_decoded(self, max_bytes: int = HELD_BYTES) -> None:
         """Hold decoded layers in memory, for who reads all keyframes several times; they must not
         be written into."""
         self._held_room = max_bytes
@@ -253,14 +257,18 @@ class ScanStore:
         """A layer's keyframe, as it was sent."""
         if self._held_room is None:
             return codec.decode([self.chunk(seq, number) or b""])
-        with self._decoding:  # a second thread takes what the first has decoded
-            found = self._held.get((seq, number))
+        key = seq, number
+        with self._holding:
+            decoding = self._decoding.setdefault(key, Lock())
+        with decoding:  # a second thread takes what the first has decoded
+            found = self._held.get(key)
             if found is None:
                 found = codec.decode([self.chunk(seq, number) or b""])
                 size = 0 if found is None else DECODED_BYTES * found.fresh.size
-                if found is not None and size <= self._held_room:
-                    self._held_room -= size
-                    self._held[seq, number] = found
+                with self._holding:
+                    if found is not None and size <= self._held_room:
+                        self._held_room -= size
+                        self._held[key] = found
             return found
 
     def keyframes(self) -> Iterator[Keyframe]:

@@ -31,9 +31,6 @@ from service.vertical_datum import height_change, vertical_code
 
 T = TypeVar("T")
 
-HELD_BYTES = 500_000_000
-"""Decoded keyframes that are held, as several deliverables go over all of them."""
-
 OBLIQUE_SHARE = 0.25
 """Share of the keyframes looking sideways above which a scan counts as oblique."""
 
@@ -145,7 +142,7 @@ class ScanView:
         if tile is not None:
             self._box = tile.wide
             self.store.only(tile.seqs)
-        self.store.hold_decoded(HELD_BYTES)
+        self.store.hold_decoded()  # several deliverables go over all keyframes
 
     def __enter__(self) -> ScanView:
         return self

@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from recon import se3
+from recon.bands import at_once
 from recon.calibration.flight import (
     Network,
     SelfCalibrationConfig,
@@ -191,12 +193,12 @@ def depth_scales(
 ) -> F64:  # fmt: skip
     """(N,) what the depth of each keyframe is multiplied by to meet the places that it shows."""
     flat = rays(found.given.K, without_distortion(found.given, seen.uv_px))
-    out = np.full(len(states), np.nan)
-    for k, state in enumerate(states):
-        keyframe = surface(state)
+
+    def scale(k: int) -> float:
+        keyframe = surface(states[k])
         rows = np.flatnonzero(seen.view == k)
         if keyframe is None or len(rows) < MIN_DEPTHS:
-            continue
+            return np.nan
         depth = keyframe.depth
         h, w = depth.depth_m.shape
         u, v = np.rint(project(depth.K, flat[rows])).astype(int).T
@@ -204,8 +206,9 @@ def depth_scales(
         there = se3.transform(se3.inverse(poses[k]), points[seen.landmark[rows[inside]]])[:, 2]
         ratio = there / depth.depth_m[v[inside], u[inside]]
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
-        if len(ratio) >= MIN_DEPTHS:
-            out[k] = np.median(ratio)
+        return float(np.median(ratio)) if len(ratio) >= MIN_DEPTHS else np.nan
+
+    out = np.array(at_once(*(partial(scale, k) for k in range(len(states)))))
     usual = float(np.nanmedian(out)) if np.isfinite(out).any() else 1.0
     return np.where(np.isfinite(out), out, usual)
 

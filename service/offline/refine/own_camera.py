@@ -46,7 +46,7 @@ from recon.types import F64, U8, Camera
 from service.cameras.camera_file import save_camera
 from service.cameras.images import open_images
 from service.cameras.lens import SIGMA_K1
-from service.cameras.video import open_file
+from service.cameras.video import VideoSource, open_file
 from service.errors import InputError
 
 FILE = "camera.refined.yaml"
@@ -90,16 +90,19 @@ def images_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[
     ``video`` is a recording or a folder of stills.
     """
     wanted = np.array(times_ns, np.int64)
-    last_ns = wanted.max(initial=0) + WITHIN_S * 1e9
+    within_ns = round(WITHIN_S * 1e9)
+    last_ns = wanted.max(initial=0) + within_ns
     found: dict[int, U8] = {}
     opened = open_images if video.is_dir() else open_file
     with closing(opened(str(video), {})) as source:
+        if isinstance(source, VideoSource):
+            source.only_near((wanted - start_unix_ns).tolist(), within_ns)
         for frame in source:
             if start_unix_ns + frame.time_ns > last_ns:
                 break
             apart = np.abs(wanted - (start_unix_ns + frame.time_ns))
             k = int(np.argmin(apart))
-            if apart[k] <= WITHIN_S * 1e9 and k not in found:
+            if apart[k] <= within_ns and k not in found:
                 found[k] = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
     if len(found) < max(MIN_IMAGES, MIN_SHARE * len(wanted)):
         raise InputError(

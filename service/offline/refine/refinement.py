@@ -10,13 +10,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import lru_cache
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from recon import se3
+from recon.bands import at_once
 from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
 from recon.posegraph.ground_control import (
     FIX_S,
@@ -111,6 +112,7 @@ def refine(
     """
     target = _open_target(folder, options.out)
     with ScanStore.open(target / "scan.db") as store:
+        store.hold_decoded()
         figures = _Refinement(folder, store, options, progress).run()
     return _deliver(target, figures)
 
@@ -159,6 +161,7 @@ def lens(folder: Path, images: Path, config: SelfCalibrationConfig) -> SelfCalib
 
 def _deliver(target: Path, figures: dict[str, Any]) -> dict[str, Any]:
     with ScanStore.open(target / "scan.db") as store:
+        store.hold_decoded()
         write_deliverables(target, store, {})
     return figures | {"scan_folder": str(target)}
 
@@ -210,7 +213,7 @@ class _Refinement:
         states = (revisions.keyframe_state(seq) for seq in store.seqs())
         self.states = sorted((s for s in states if s is not None), key=lambda s: s.time_ns)
         self.frames = revisions.frames()
-        self.keyframe = lru_cache(maxsize=64)(revisions.keyframe)
+        self.keyframe = revisions.keyframe
         self.notes: list[str] = []
         self.grown = 1.0  # metres of the survey per metre of the flight's own scale
         self.images: ImageNetwork | None = None
@@ -436,7 +439,8 @@ class _Refinement:
 
     def _ahead_m(self) -> float:
         """Usual distance of the ground; 0 without any surface."""
-        some = [self.keyframe(s) for s in self.states[:: max(1, len(self.states) // 16)]]
+        few = self.states[:: max(1, len(self.states) // 16)]
+        some = at_once(*(partial(self.keyframe, s) for s in few))
         depths = [one.depth.depth_m for one in some if one is not None]
         known = [float(np.nanmedian(z)) for z in depths if np.isfinite(z).any()]
         return float(np.median(known)) if known else 0.0
