@@ -69,7 +69,7 @@ SETTLED = 1e-3
 """A step of so many sigmas ends the fit: each is about half as long as the one before."""
 
 SETTLED_START = 0.1
-"""The same for a fit that only starts another one, or whose residuals tell the noise."""
+"""The same for a fit that only starts another one, or whose residuals give the noise."""
 
 ROUNDS = 4
 """Times that the noise of altitudes and the tilt by them are found in turn."""
