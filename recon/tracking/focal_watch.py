@@ -1,9 +1,9 @@
 """Whether the images fit the focal length of their camera model.
 
-A wrong focal length leaves errors in the odometry's window that no pose or landmark takes up. What
-is left of the derivative by the focal length, once poses and landmarks have taken up their part,
+A wrong focal length leaves errors in the odometry's window that no pose or landmark takes up. The
+remainder of the derivative by the focal length, once poses and landmarks have taken up their part,
 times these errors gives one Gauss-Newton step of it (Frisch and Waugh, doi:10.2307/1907330).
-Level ground straight below gives next to none, so that the sigma is large there. It follows from
+Views that never turn give next to none, so that their sigma is large. It follows from
 how cells of the image and windows scatter (Liang and Zeger, doi:10.1093/biomet/73.1.13), as
 errors of neighbouring landmarks are alike.
 """
@@ -98,7 +98,7 @@ def _evidence(seen: AdjustedWindow, K: F64) -> F64:
 def _not_taken_up(
     values: F64, by_pose: F64, by_point: F64, cam: I64, point: I64, C: int, N: int
 ) -> F64:
-    """What is left of ``values`` (M, 2) after the best change of poses and points.
+    """The remainder of ``values`` (M, 2) after the best change of poses and points.
 
     ``by_pose`` (M, 2, 6) and ``by_point`` (M, 2, 3) are the derivatives.
     """
