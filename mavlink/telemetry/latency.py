@@ -98,28 +98,15 @@ class LatencyWatch:
         """The stamp of the oldest of the newest ``frames``; None without any."""
         return self._frames[-min(frames, len(self._frames))][1] if self._frames else None
 
-    def estimate(
-        self, attitudes: Sequence[tuple[int, Quaternion]], about_s: float = 0.0
-    ) -> LatencyEstimate | None:
+    def estimate(self, attitudes: Sequence[tuple[int, Quaternion]]) -> LatencyEstimate | None:
         """The latency by attitudes (time in ns, attitude) over the same time, oldest first.
 
-        It is sought within ``REACH_S`` of ``about_s``. None with too few frames, too little
-        rotation, or no unambiguous solution.
+        It is sought within ``REACH_S``. None with too few frames, too little rotation, or no
+        unambiguous solution.
         """
         if len(attitudes) < MIN_WINDOWS or len(self._frames) < MIN_WINDOWS:
             return None
-        track = Attitudes(attitudes)
-        seen = self._turns(track.base_ns, max(WINDOW_S, 2.0 * track.spacing_s))
-        steps = round(REACH_S / COARSE_S)
-        lags: F64 = about_s + COARSE_S * np.arange(-steps, steps + 1, dtype=np.float64)
-        coarse_s = _best_lag(seen.apart(), track, lags)
-        if coarse_s is None:
-            return None
-        near = [(_fit(seen, track, lag_s), lag_s) for lag_s in coarse_s + NEAR_S]
-        best, lag_s = min(near, key=lambda fit: np.inf if fit[0] is None else fit[0].misfit)
-        if best is None or best.span_s(seen) < MIN_SPAN_S:
-            return None
-        return _refine(seen.only(best.good), track, float(lag_s))
+        return self._about(Attitudes(attitudes), 0.0)
 
     def anywhere(self, attitudes: Sequence[tuple[int, Quaternion]]) -> LatencyEstimate | None:
         """The latency by attitudes of a whole log; of a recording whose clock is minutes off."""
@@ -132,7 +119,21 @@ class LatencyWatch:
         low = max(float(seen.start_s[0]) - track.last_s, -FAR_REACH_S)
         high = min(float(seen.end_s[-1]) - track.first_s, FAR_REACH_S)
         lag_s = _best_lag(seen, track, np.arange(low, high, FAR_STEP_S, dtype=np.float64))
-        return None if lag_s is None else self.estimate(attitudes, lag_s)
+        return None if lag_s is None else self._about(track, lag_s)
+
+    def _about(self, track: Attitudes, about_s: float) -> LatencyEstimate | None:
+        """The latency within ``REACH_S`` of ``about_s``."""
+        seen = self._turns(track.base_ns, max(WINDOW_S, 2.0 * track.spacing_s))
+        steps = round(REACH_S / COARSE_S)
+        lags: F64 = about_s + COARSE_S * np.arange(-steps, steps + 1, dtype=np.float64)
+        coarse_s = _best_lag(seen.apart(), track, lags)
+        if coarse_s is None:
+            return None
+        near = [(_fit(seen, track, lag_s), lag_s) for lag_s in coarse_s + NEAR_S]
+        best, lag_s = min(near, key=lambda fit: np.inf if fit[0] is None else fit[0].misfit)
+        if best is None or best.span_s(seen) < MIN_SPAN_S:
+            return None
+        return _refine(seen.only(best.good), track, float(lag_s))
 
     def _turns(self, base_ns: int, window_s: float) -> _Turns:
         """Rotations over ``window_s`` or a little more, four per window."""
