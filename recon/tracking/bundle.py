@@ -128,6 +128,16 @@ def linearise(P: F64, x: F64, uv: F64, k: F64, huber: float, Jc: F64, Jp: F64, r
 
 
 @njit(cache=True, nogil=True)
+def linearise_all(
+    T: F64, X: F64, cam: I64, point: I64, uv: F64, k: F64, huber: float, Jc: F64, Jp: F64, r: F64,
+    weight: F64,
+) -> None:  # fmt: skip
+    """:func:`linearise` of each observation, into its row of the last four."""
+    for m in range(cam.size):
+        weight[m] = linearise(T[cam[m]], X[point[m]], uv[m], k, huber, Jc[m], Jp[m], r[m])
+
+
+@njit(cache=True, nogil=True)
 def _normal_equations(
     T: F64, X: F64, cam: I64, start: I64, uv: F64, k: F64, huber: float, slot: I64, n_free: int,
     damping: float, S: F64, g: F64, Hpp_inv: F64, bp: F64, W: F64,

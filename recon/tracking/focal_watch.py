@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from recon.tracking.bundle import linearise_all
 from recon.types import F64, I64
 
 HUBER_PX = 1.0
@@ -72,26 +73,24 @@ class FocalWatch:
 
 def _evidence(seen: AdjustedWindow, K: F64) -> F64:
     """(CELLS**2, 2) information and score of the logarithm of the focal length, by cells."""
-    cam, point = seen.camera, seen.point
-    C, N, f = len(seen.T_camera_world), len(seen.points_m), np.array([K[0, 0], K[1, 1]])
-    R, t = seen.T_camera_world[cam, :3, :3], seen.T_camera_world[cam, :3, 3]
-    P = np.einsum("mij,mj->mi", R, seen.points_m[point]) + t
-    iz = 1.0 / np.maximum(P[:, 2], 1e-6)
-    a, b = (P[:, :2] * iz[:, None]).T
-    by_focal = f * np.column_stack([a, b])
-    error = by_focal + K[:2, 2] - seen.uv_px
-    weight = np.minimum(1.0, HUBER_PX / np.maximum(np.linalg.norm(error, axis=1), 1e-9))
-    weight = np.sqrt(weight * (P[:, 2] > 1e-6))[:, None]
-    none = np.zeros_like(a)
-    u_row = np.column_stack([-a * b, 1.0 + a * a, -b, iz, none, -a * iz])
-    v_row = np.column_stack([-(1.0 + b * b), a * b, a, none, iz, -b * iz])
-    by_pose = np.stack([u_row, v_row], axis=1) * f[:, None] * weight[..., None]
-    by_point = np.einsum("mij,mjk->mik", by_pose[..., 3:], R)
-    left = _not_taken_up(by_focal * weight, by_pose, by_point, cam, point, C, N)
-    cell = _cells(np.column_stack([a, b]), point, N)
+    cam, point, M = seen.camera, seen.point, len(seen.uv_px)
+    C, N = len(seen.T_camera_world), len(seen.points_m)
+    by_pose, by_point = np.zeros((M, 2, 6)), np.zeros((M, 2, 3))
+    error, weight = np.zeros((M, 2)), np.zeros(M)
+    linearise_all(
+        seen.T_camera_world, seen.points_m, cam, point, seen.uv_px,
+        np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), HUBER_PX, by_pose, by_point, error, weight,
+    )  # fmt: skip
+    by_focal = error + seen.uv_px - K[:2, 2]
+    root = np.sqrt(weight)
+    left = _not_taken_up(
+        by_focal * root[:, None], by_pose * root[:, None, None], by_point * root[:, None, None],
+        cam, point, C, N,
+    )  # fmt: skip
+    cell = _cells(by_focal, point, N)
     out = np.zeros((CELLS**2, 2))
     np.add.at(out[:, 0], cell, np.sum(left**2, axis=1))
-    np.add.at(out[:, 1], cell, -np.sum(left * error * weight, axis=1))
+    np.add.at(out[:, 1], cell, -np.sum(left * error * root[:, None], axis=1))
     return out
 
 
