@@ -20,6 +20,9 @@ T = TypeVar("T")
 
 GIVE_WAY_S = 1e-4
 
+BAND_CELLS = 1 << 20
+"""Cells of a cost volume that are worth a thread: half a millisecond of simple work."""
+
 _limit = 0  # threads that one call may use; 0: one per core
 
 
@@ -48,6 +51,11 @@ def give_way() -> None:
     Event().wait(GIVE_WAY_S)
 
 
+def shares(cells: int) -> int:
+    """How many threads are worth it for work on so many cells."""
+    return max(1, min(threads(), cells // BAND_CELLS))
+
+
 @cache
 def _pool() -> ThreadPoolExecutor:
     """The threads that all callers share; none is started before it is needed."""
@@ -66,15 +74,19 @@ def at_once(*calls: Callable[[], T]) -> list[T]:
     return results
 
 
-def in_bands(kernel: Callable[..., None], count: int, *arguments: Any) -> None:
+def in_bands(
+    kernel: Callable[..., None], count: int, *arguments: Any, cells: int | None = None
+) -> None:
     """Call ``kernel(first, end, *arguments)`` so that 0 to ``count`` is covered once.
+
+    Work on ``cells`` numbers in all is shared out only where that is worth it.
 
     The bands run at the same time, so none may write what another reads. A band that no thread has
     begun when the caller is done with its own is the caller's too: no caller waits for the work of
     others, and a band may share out rows itself. An exception of the kernel is raised after all
     bands have ended.
     """
-    bands = min(threads(), count)
+    bands = min(threads() if cells is None else shares(cells), count)
     if bands <= 1:
         kernel(0, count, *arguments)
         return

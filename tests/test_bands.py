@@ -61,6 +61,18 @@ def test_no_call_uses_more_threads_than_the_limit(four: None) -> None:
     assert bands.threads() == 4
 
 
+@pytest.mark.parametrize("cells, pieces", [(0, 1), (1.9, 1), (2.0, 2), (3.9, 3), (9.0, 4)])
+def test_each_thread_gets_work_that_is_worth_it(four: None, cells: float, pieces: int) -> None:
+    calls: list[tuple[int, int]] = []
+
+    def note(begin: int, end: int) -> None:
+        calls.append((begin, end))
+
+    bands.in_bands(note, 8, cells=int(cells * bands.BAND_CELLS))
+    assert len(calls) == pieces
+    assert sum(end - begin for begin, end in calls) == 8
+
+
 def test_a_caller_does_what_no_thread_has_begun(four: None) -> None:
     """A short call ends while a long one of another thread occupies all threads."""
     release, seen = threading.Event(), np.zeros(8, int)

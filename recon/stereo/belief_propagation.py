@@ -162,7 +162,7 @@ def select(
     confidence = np.empty((height, width), np.float32)
     in_bands(
         _select, height, data, messages, cost, min_disparity, 2 * truncation, float(min_evidence),
-        px, confidence,
+        px, confidence, cells=cost.size,
     )  # fmt: skip
     return px, confidence
 

@@ -74,7 +74,7 @@ def matching_cost(
         _cost_volume, height, left, right, census(left), census(right), min_disparity,
         round(config.census_weight * COST_UNIT), config.census_truncation,
         round(config.difference_weight * COST_UNIT), config.difference_truncation,
-        round(config.unseen * COST_UNIT), cost,
+        round(config.unseen * COST_UNIT), cost, cells=cost.size,
     )  # fmt: skip
     return cost
 
@@ -105,7 +105,7 @@ def census(image: U8) -> U32:
     """
     padded = np.pad(image, CENSUS_RADIUS, mode="edge")
     words = np.empty(image.shape, np.uint32)
-    in_bands(_census, len(image), padded, words)
+    in_bands(_census, len(image), padded, words, cells=image.size)
     return words
 
 

@@ -25,7 +25,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from recon.bands import in_bands, threads
+from recon.bands import in_bands, shares
 from recon.stereo.matching_cost import Workspace
 from recon.types import I16, U8
 
@@ -145,9 +145,6 @@ class _Block:
         return self.builder.select(self.builder.icmp_signed("<", a, b), a, b)
 
 
-BAND_ROWS = 80
-"""Rows that are worth a thread: waiting for it costs more than a smaller band."""
-
 FULL_WEIGHT = 256
 
 UP, DOWN, LEFT, RIGHT = 0, 1, 2, 3
@@ -237,13 +234,13 @@ def propagate(
     pyramid = [_space.take("data", (height, 2, labels, cells))]
     shape = (4, height + 2, 2, labels, cells)
     coarse = _Coarse(_space.take_bytes("messages", shape).reshape(-1))
-    _by_rows(_split, height, cost, truncation, pyramid[0])
+    in_bands(_split, height, cost, truncation, pyramid[0], cells=cost.size)
     weights = [smoothness.weights(image)]
     while len(pyramid) < levels and min(weights[-1].shape[1:]) >= 8:
         weights.append(_coarser_weights(weights[-1]))
         _, h, w = weights[-1].shape
         pyramid.append(coarse.take((h, 2, labels, cells_of(w)), np.int16))
-        _by_rows(_coarser, h, pyramid[-2], w, truncation, pyramid[-1])
+        in_bands(_coarser, h, pyramid[-2], w, truncation, pyramid[-1], cells=pyramid[-2].size)
     messages = np.zeros((4, 1, 2, labels, 1), np.uint8)
     for level in range(len(pyramid) - 1, -1, -1):
         data, weight = pyramid[level], weights[level]
@@ -254,7 +251,7 @@ def propagate(
             finer = coarse.take(shape, np.uint8)
         else:
             finer = _space.take_bytes("messages 1" if level else "messages", shape)
-        _by_rows(_start, h + 2, messages, w, finer)
+        in_bands(_start, h + 2, messages, w, finer, cells=data.size)
         messages = finer
         edges = _edges(weight, cells, smoothness.slope, truncation)
         _sweeps(data, messages, edges, w, iterations)
@@ -277,14 +274,6 @@ class _Coarse:
             return np.empty(shape, dtype)
         taken, self._memory = self._memory[:size], self._memory[size:]
         return taken.view(dtype).reshape(shape)
-
-
-def _by_rows(kernel: Any, rows: int, *args: Any) -> None:
-    """``kernel(begin, end, ...)`` of all rows, on several threads where there are many."""
-    if rows < 2 * BAND_ROWS:
-        kernel(0, rows, *args)
-    else:
-        in_bands(kernel, rows, *args)
 
 
 def cells_of(width: int) -> int:
@@ -472,7 +461,7 @@ def _sweep_gap(
 def _sweeps(data: I16, messages: U8, edges: Any, width: int, iterations: int) -> None:
     """All iterations of a level, in bands of rows; then what the bands left out between them."""
     height = data.shape[0]
-    bands = max(1, min(threads(), height // max(BAND_ROWS, 2 * iterations)))
+    bands = max(1, min(shares(data.size), height // (2 * iterations)))
 
     def sweep(begin: int, end: int) -> None:
         for band in range(begin, end):
