@@ -16,7 +16,7 @@ from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 from service.errors import OutsideError
 from service.flight.anchorage import Anchorage, Carriers, Key, PublishedFrame, PublishedFrames
-from service.flight.chain import Chain, KeyframeStep
+from service.flight.chain import Chain, KeyframeStep, Uncarried
 from service.progress import Stopwatch
 
 RNG = np.random.default_rng(4)
@@ -122,12 +122,14 @@ def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None
     assert chain.add(view, KeyframeStep(None, np.eye(6)), None) is None
     trajectory, known = chain.trajectory, chain.trajectory.place(5)
     chain.trajectory = None
-    assert chain.place(frame).seq == 3  # the view is not done
+    alone = Uncarried(np.zeros(3), np.ones(3))
+    assert chain.place(frame, alone).seq == 3  # the view is not done
     chain.reconstructed(view, None)
     step = se3.inverse(anchor.T_odom_camera) @ frame.T_odom_camera
     step[:3, 3] *= known.scale
-    found = chain.place(frame)
+    found = chain.place(frame, alone)
     np.testing.assert_allclose(found.T_world_camera, known.T_world_camera @ step, atol=1e-12)
     chain.trajectory = trajectory
     assert chain.corrections(final=True) == ()
-    np.testing.assert_allclose(chain.place(frame).T_world_camera, found.T_world_camera, atol=1e-9)
+    again = chain.place(frame, alone)
+    np.testing.assert_allclose(again.T_world_camera, found.T_world_camera, atol=1e-9)

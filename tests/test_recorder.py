@@ -15,6 +15,7 @@ from recon.posegraph.trajectory import Placed
 from recon.tracking.odometry import Tracked, Tracking
 from service.cameras.rig import Rig
 from service.flight.anchorage import Anchorage, SettledKey
+from service.flight.chain import Uncarried
 from service.flight.pipeline import Pipeline, Step
 from service.flight.recorder import REPLAYED, Recorder
 from service.stream.records import ScanHeader
@@ -34,9 +35,20 @@ def step(seq: int, sigma_m: float = 0.1) -> Step:
 
 
 def recorder_of(store: ScanStore, batch: int, sigma_m: float) -> Recorder:
-    """A recorder of frames that do not move, and whose sigma is ``sigma_m`` in the end."""
+    """A recorder of frames that do not move, and whose sigma is ``sigma_m`` in the end.
+
+    0: that of a frame as it was published.
+    """
     nothing = Step(Tracked(Tracking.LOST, 0))
-    chain = SimpleNamespace(place=lambda anchor: placed(anchor.seq, sigma_m))
+
+    def place(anchor: Anchorage, as_published: Uncarried) -> Placed:
+        assert (
+            np.linalg.norm(as_published.place_m - placed(anchor.seq, 1.0).T_world_camera[:3, 3])
+            == 0
+        )
+        return placed(anchor.seq, sigma_m or float(np.linalg.norm(as_published.sigma_m)))
+
+    chain = SimpleNamespace(place=place)
     track = SimpleNamespace(is_settled=lambda _key: False)
     stages = SimpleNamespace(chain=chain, track=track, debug=None)
     pipeline = SimpleNamespace(stages=stages, drain=lambda: nothing, finish=lambda: nothing)
@@ -74,6 +86,20 @@ def test_poses_published_before_the_scan_was_placed_get_their_sigma(tmp_path: Pa
         recorder.flush()
         found = [pose.sigma_m for pose in store.poses()]
         assert found == pytest.approx([0.02, 0.02, 0.021, 0.02], abs=1e-4)
+
+
+def test_frames_that_no_keyframe_carries_stay_as_published(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("stills", "drone", 0)) as store:
+        recorder = recorder_of(store, 1, sigma_m=0.0)
+        for seq in range(4):
+            recorder.write(step(seq, 5.0), 1_000_000 * seq, None)
+        corrected: list[int] = []
+        monkeypatch.setattr(store, "add_poses", lambda poses: corrected.append(len(poses)))
+        recorder.flush()
+        assert corrected == []
+        assert [pose.sigma_m for pose in store.poses()] == pytest.approx([5.0] * 4)
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,14 @@ class KeyframeStep(NamedTuple):
     covariance: F64  # (6, 6) left perturbation; of the pose itself where the chain begins
 
 
+class Uncarried(NamedTuple):
+    """Where a frame is as long as no keyframe carries it."""
+
+    place_m: F64  # (3,) in the world
+    sigma_m: F64  # (3,)
+    sources: tuple[str, ...] = ("vision",)
+
+
 class News(NamedTuple):
     """The graph's answer once a view is in it."""
 
@@ -75,7 +83,7 @@ class Chain:
         self.loops: LoopSearch | None = None
         self.views = self.levelled = 0  # keyframes, and those whose ground is taken as level
         self._carriers, self._is_settled = Carriers(), is_settled
-        self._unplaced: dict[int, F64] = {}  # (6, 6) of frames, by segment, that no view carries
+        self._known: dict[int, tuple[F64, Uncarried]] = {}  # by segment, its last frame with a fix
         self._rejected, self._stopwatch = rejected, stopwatch
         self._pieces = Pieces()
         self._T_map = np.eye(4)  # of the last keyframe
@@ -190,20 +198,33 @@ class Chain:
 
     def follow(self, image: UndistortedFrame, anchor: Anchorage) -> Placed:
         """A tracked frame in the world."""
-        segment = anchor.key.segment
-        if segment not in self._unplaced:
-            self._unplaced[segment] = unplaced(anchor.T_odom_camera[:3, 3], image.prior)
-        placed = self.place(anchor)
-        self._seen = image.prior, placed, segment
+        placed = self.place(anchor, self._uncarried(image.prior, anchor))
+        self._seen = image.prior, placed, anchor.key.segment
         return placed
 
-    def place(self, anchor: Anchorage) -> Placed:
-        """A frame in the world, carried by the chain's keyframe at or before it."""
+    def _uncarried(self, prior: PosePrior, anchor: Anchorage) -> Uncarried:
+        """A frame at its fix, or as far from the last one as the odometry has it.
+
+        Heading and scale of the odometry are not known: the sigma grows by the way.
+        """
+        at_m, fix, sigma = anchor.T_odom_camera[:3, 3], prior.position_m, prior.sigma_position_m
+        if fix is not None and sigma is not None:
+            self._known[anchor.key.segment] = at_m, Uncarried(fix, sigma, ("gnss",))
+        start = at_m, Uncarried(at_m, np.ones(3))
+        from_m, known = self._known.setdefault(anchor.key.segment, start)
+        way_m = at_m - from_m
+        sigma_m = np.hypot(known.sigma_m, np.linalg.norm(way_m))
+        return Uncarried(known.place_m + way_m, sigma_m, known.sources)
+
+    def place(self, anchor: Anchorage, uncarried: Uncarried) -> Placed:
+        """A frame in the world, carried by the chain's keyframe at or before it where it can."""
         T_odom_camera = anchor.T_odom_camera
         carrier = self._carriers.of(anchor)
         if carrier is None:
-            unsure = self._unplaced[anchor.key.segment]
-            return Placed(anchor.key.seq, T_odom_camera, 1.0, unsure, ("vision",))
+            place_m, sigma_m, sources = uncarried
+            T = se3.compose(T_odom_camera[:3, :3], place_m)
+            covariance = se3.about(-place_m, np.diag(np.r_[np.ones(3), np.square(sigma_m)]))
+            return Placed(anchor.key.seq, T, 1.0, covariance, sources)
         # In flight no other view than the newest carries a new frame.
         known = self._newest or self.trajectory.place(carrier.seq)
         moved = se3.inverse(carrier.T_odom_camera) @ T_odom_camera
@@ -238,14 +259,6 @@ class Chain:
         tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
         covariance = se3.about(-T[:3, 3], np.diag(np.square([tilt, tilt, yaw, *sigma])))
         return Placed(image.seq, T, 1.0, covariance, ("attitude", "gnss", "dead reckoning"))
-
-
-def unplaced(place_m: F64, prior: PosePrior) -> F64:
-    """(6, 6) covariance of poses in the odometry's own frame, of a segment whose first published
-    one is at ``place_m`` (3,): heading and scale are not known, so it grows with the way."""
-    fix, sigma = prior.position_m, prior.sigma_position_m
-    spread = np.ones(3) if fix is None or sigma is None else np.hypot(sigma, place_m - fix)
-    return se3.about(-place_m, np.diag([1.0, 1.0, 1.0, *np.square(spread)]))
 
 
 class Pieces:

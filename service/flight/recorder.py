@@ -19,6 +19,7 @@ from recon.tracking.odometry import Tracking
 from recon.types import F64, Keyframe
 from service.cameras.rig import Rig, attitude_of
 from service.flight.anchorage import PublishedFrame, PublishedFrames
+from service.flight.chain import Uncarried
 from service.flight.pipeline import Pipeline, Step
 from service.flight.reports import FOUND, gnss_over_heights, graph_figures, sigma_of_scale
 from service.scans.drawing import save_debug
@@ -118,7 +119,8 @@ class Recorder:
         """The poses that corrections have moved, or whose sigma they have changed."""
         for frame in self._frames.corrigible():
             assert frame.anchor is not None
-            record = self._record(frame, self._chain.place(frame.anchor))
+            as_published = Uncarried(frame.position_m, np.full(3, frame.sigma_m / 3**0.5))
+            record = self._record(frame, self._chain.place(frame.anchor, as_published))
             moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - frame.position_m)
             change = abs(record.sigma_m - frame.sigma_m)
             if moved_m > REPUBLISH_M or change > REPUBLISH_SHARE * record.sigma_m:
