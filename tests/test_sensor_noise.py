@@ -23,6 +23,7 @@ from recon.posegraph.sensor_noise import (
     drift_noise,
     nonnegative,
     wander_noise,
+    wander_s_of,
 )
 from recon.types import F64, PosePrior, Travel
 
@@ -43,6 +44,28 @@ def gauss_markov(
     for i, k in enumerate(keep, 1):
         out[i] = k * out[i - 1] + np.sqrt(1 - k * k) * out[i]
     return np.asarray(out)
+
+
+def test_a_sensor_errs_as_far_as_its_residuals_scatter() -> None:
+    """A gimbal is moved once, half-way: no variogram of short lags shows it."""
+    times = seconds(100)
+    moved = np.where(times < 50.0, -4.0, 4.0)[:, None] + np.zeros(2)
+    noise = Noise(0.5, 1.0, 10.0)
+    found = noise.scattered(moved)
+    assert found.wander**2 + found.white**2 == pytest.approx(16.0)
+    assert found.wander**2 / found.tau_s == pytest.approx(noise.wander**2 / noise.tau_s)
+    assert noise.scattered(0.1 * moved) == noise
+    assert Noise(0.5, 0.0, 10.0).scattered(moved).tau_s > 1e6  # nothing moves in a short time
+    # As unsure as one reading, in place of a mean of a hundred.
+    assert found.of_each(100, 99.0) / 100**0.5 == pytest.approx(found.wander, rel=0.25)
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "usual_s", "expected_s"),
+    [(0.02, 60.0, 10.0), (0.29, 60.0, 10.0), (0.3, 60.0, 60.0), (0.02, 0.0, 0.0), (5.0, 0.0, 0.0)],
+)
+def test_precise_receivers_wander_faster(sigma_m: float, usual_s: float, expected_s: float) -> None:
+    assert wander_s_of(sigma_m, usual_s) == expected_s
 
 
 @pytest.mark.parametrize(("white", "wander", "tau_s"), [(1.0, 0.0, 60.0), (0.1, 1.5, 5.0)])

@@ -36,6 +36,7 @@ from recon.posegraph.sensor_noise import (
     Noise,
     drift_noise,
     wander_noise,
+    wander_s_of,
 )
 from recon.types import F64
 
@@ -217,7 +218,11 @@ def _measured(
     fixed = [replace(a, prior=replace(a.prior, travel=None)) for a in level]
     moved = [replace(a, prior=replace(a.prior, position_m=None)) for a in level]
     out, at, fixes = ReadingNoise(), start, AlignmentReadings(fixed, None, wander_s)
-    # Altitudes that weigh too little leave a lean, which looks like a wander of theirs.
+    # Altitudes that weigh too little leave a lean, which looks like a wander of theirs. So they
+    # begin as if they were as good as places.
+    if not fixes.is_height_claimed and len(fixes.fix):
+        alike = Noise(float(np.median(fixes.claimed[:, :2])), 0.0, max(wander_s[0], 1.0))
+        fixes = AlignmentReadings(fixed, ReadingNoise(apart=(alike, alike)), wander_s)
     for _ in range(1 if fixes.is_height_claimed else ROUNDS):
         at = _solve(fixes, at, iterations, SETTLED_START).at
         out = _of_fixes(fixes, at, wander_s, slow_share)
@@ -250,7 +255,9 @@ def _of_fixes(
     tilts = fixes.turned(at)[0][fixes.is_assumed, :2]
     tilt = wander_noise(fixes.tilt_s, tilts, attitude_s, 1.0)
     if tilt is not None:
-        tilt = tilt.bounded(ASSUMED_TILT_RAD, attitude_s, MIN_WANDER * ASSUMED_TILT_RAD)
+        tilt = tilt.scattered(tilts).bounded(
+            ASSUMED_TILT_RAD, attitude_s, MIN_WANDER * ASSUMED_TILT_RAD
+        )
     apart, is_claimed = fixes.placed(at), fixes.is_height_claimed
     flat_off, high_off = (wander_noise(fixes.fix_s, apart[:, k], fix_s, 1.0) for k in AXES)
     across = wander_noise(fixes.fix_s, apart[:, :2], fix_s)
@@ -263,13 +270,14 @@ def _of_fixes(
     reach = across.reach(flat, min(least, slow_share))
     span_s = float(np.ptp(fixes.fix_s))
     most, drift = across.reach(flat, slow_share), high if is_claimed else abs(at.drift)
-    vertical = along.bounded(high, fix_s, MIN_WANDER * drift)
+    flat_s, high_s = wander_s_of(most, fix_s), wander_s_of(high, fix_s)
+    vertical = along.bounded(high, high_s, MIN_WANDER * drift)
     return ReadingNoise(
-        horizontal=across.bounded(most, fix_s, MIN_WANDER * most),
+        horizontal=across.bounded(most, flat_s, MIN_WANDER * most),
         vertical=vertical,
         apart=(
-            flat_off.drifting(most, fix_s, span_s),
-            high_off.drifting(high, fix_s, span_s) if is_claimed else vertical,
+            flat_off.drifting(most, flat_s, span_s),
+            high_off.drifting(high, high_s, span_s) if is_claimed else vertical,
         ),
         reach_m=np.array([reach, reach, along.reach(high, least)]),
         tilt=tilt,

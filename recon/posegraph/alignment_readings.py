@@ -15,7 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.anchors import GUESSED_SHARE, UNMEASURED_HEIGHTS, Anchor, height_ratios
-from recon.posegraph.sensor_noise import PRECISE_M, PRECISE_TAU_S, Noise
+from recon.posegraph.sensor_noise import Noise, wander_s_of
 from recon.types import F64, PosePrior
 
 WANDER_SHARE = 0.6
@@ -110,8 +110,7 @@ class ReadingNoise:
             across, along = (replace(n, white=max(n.white, MIN_FIX_M)) for n in self.apart)
             single = np.full_like(claimed, [across.total, across.total, along.total])
             return single, (across.over(across.total), along.over(along.total))
-        is_precise = len(claimed) > 0 and float(np.median(claimed[:, 0])) < PRECISE_M
-        tau_s = PRECISE_TAU_S if is_precise else fix_s
+        tau_s = wander_s_of(float(np.median(claimed[:, 0])), fix_s) if len(claimed) else fix_s
         common = (WANDER_SHARE**-2 - 1.0) ** 0.5 if fix_s > 0 else 0.0
         usual = Noise(1.0, common, max(tau_s, 1.0))
         return WANDER_SHARE * claimed, (usual, usual)

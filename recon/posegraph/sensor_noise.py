@@ -115,8 +115,20 @@ class Noise:
         """
         if least <= self.wander <= claimed or usual_tau_s <= 0:
             return self
-        tau_s = PRECISE_TAU_S if claimed < PRECISE_M else usual_tau_s
-        return replace(self, wander=min(max(self.wander, least), claimed), tau_s=tau_s)
+        return replace(self, wander=min(max(self.wander, least), claimed), tau_s=usual_tau_s)
+
+    def scattered(self, residuals: F64) -> Noise:
+        """The same with a wander as large as (N, axes) ``residuals`` scatter, at least.
+
+        A variogram looks no farther than a sixth of the span. What changes once on the way, as a
+        gimbal that the pilot moves, is in the scatter alone. The time constant grows with it, as
+        the variogram shows how fast a sensor wanders (wander^2 / tau).
+        """
+        seen = float(np.mean(np.square(residuals))) - self.white**2
+        if seen <= self.wander**2:
+            return self
+        tau_s = self.tau_s * seen / max(self.wander**2, MIN_FRESH * seen)
+        return replace(self, wander=float(np.sqrt(seen)), tau_s=tau_s)
 
     def drifting(self, claimed: float, tau_s: float, span_s: float) -> Noise:
         """The same with the steady drift that a wander as far as :meth:`reach` says may have.
@@ -127,7 +139,7 @@ class Noise:
         if tau_s <= 0:
             return self
         wander = min(self.wander, claimed)
-        spans = span_s / (PRECISE_TAU_S if claimed < PRECISE_M else tau_s)
+        spans = span_s / tau_s
         # Variance of the slope of a Gauss-Markov error: spans / 5 if short, 2 / spans if long.
         slope = 3.0 * spans / (5.0 + 0.5 * spans**2)
         far = max(self.reach(claimed, MIN_WANDER) ** 2 - wander**2, 0.0)
@@ -167,6 +179,11 @@ class Noise:
         variance stays in any case.
         """
         return float(sigma * np.sqrt(np.clip(self.wander / max(sigma, 1e-9), min_share, 1.0)))
+
+
+def wander_s_of(sigma_m: float, usual_s: float) -> float:
+    """The time constant of a receiver that claims ``sigma_m``; 0 where none wanders."""
+    return min(PRECISE_TAU_S, usual_s) if sigma_m < PRECISE_M else usual_s
 
 
 def wander_noise(
