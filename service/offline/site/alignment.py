@@ -29,6 +29,8 @@ from recon.posegraph.site_alignment import ScanPrior, SiteAlignment, Tie, align,
 from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import F64, Keyframe
 from service.errors import InputError
+from service.offline.exports.clouds import VOXELS_MARGIN_M, points_of
+from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.refine.stored_loops import BREAK_S, StoredLoops
 from service.offline.site import SITE
 from service.offline.site.gather import Member, gather
@@ -36,6 +38,8 @@ from service.offline.site.start import SIGMA_SCALE as START_SCALE
 from service.offline.site.start import StartPoints, start_of
 from service.offline.tiles import TILE_POINTS
 from service.progress import Progress
+from service.scans.folder import resolution_m, write_deliverables
+from service.scans.fused_cloud import TiledCloud
 from service.scans.track import local_frame
 from service.scans.writing import writing
 from service.stream.records import Repose
@@ -91,10 +95,31 @@ def align_site(
     with _locked(out):
         site = _align(folders, out, starts or {}, progress)
         if deliver:
-            from service.offline.site.files import write_files
-
             write_files(out, tile_points, scheduler, progress)
     return site
+
+
+def write_files(
+    folder: Path,
+    tile_points: int = TILE_POINTS,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Write the files of the site in ``folder``, the cloud of a large one in tiles.
+
+    Errors as of :func:`write_deliverables`.
+    """
+    with ScanStore.open(folder / "scan.db") as store, ScanView(folder, None, progress) as view:
+        options = ExportOptions(
+            voxel_m=resolution_m(store.header), tile_points=tile_points, scheduler=scheduler
+        )
+        cut, tiled = view.tiling(options, VOXELS_MARGIN_M), None
+        if len(cut.tiles) > 1:
+            tiled = TiledCloud(
+                points_of(view, options, is_classified=False), options.voxel_m or cut.sample_m,
+                cut.sample_m, len(cut.prints), sum(p.points for p in cut.prints), cut.bounds,
+            )  # fmt: skip
+        write_deliverables(folder, store, {}, tiled=tiled)
 
 
 @contextlib.contextmanager

@@ -32,9 +32,8 @@ from service.georeference import LocalFrame
 from service.offline.exports.rasters import NODATA_M, Layers, mosaic, over, put, window_in
 from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.geopackage import points, polygons, write_layers
-from service.offline.site.alignment import AlignedSite, align_site
+from service.offline.site.alignment import AlignedSite, align_site, write_files
 from service.offline.site.change_page import draw_outlines, drawn, page, place_in, shape_of
-from service.offline.site.files import write_files
 from service.offline.site.gather import Member
 from service.offline.tiles import TILE_POINTS, Tile, grown, run_tiles
 from service.progress import Progress
