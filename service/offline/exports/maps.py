@@ -18,11 +18,10 @@ from recon.types import F32, F64
 from service.errors import InputError, SkyreliefError
 from service.georeference import between_nodes
 from service.offline.exports import EXPORTERS
-from service.offline.exports.rasters import contours_of, write_ortho
+from service.offline.exports.rasters import contours_of, open_map, write_ortho
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.geopackage import lines, points, write_layers
 from service.scans.annotations import read_annotations
-from service.scans.map_files import open_map
 from service.scans.writing import writing
 from service.version import software
 
