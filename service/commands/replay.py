@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from recon.calibration.flight import SelfCalibrated
     from recon.types import Camera, Shutter
     from service.cameras.source import CameraSource
-    from service.commands.own_lens import StartLens
+    from service.commands.unstated import StartLens
     from service.config import Config
     from service.flight.scan import Scan, ScanInputs
 
@@ -153,8 +153,7 @@ def _replay(
 ) -> dict[str, Any]:
     from service.cameras import open_camera, parse_source
     from service.commands.all_stills import all_stills
-    from service.commands.own_lens import start_lens
-    from service.commands.video_time import start_of
+    from service.commands.unstated import start_lens, start_of
     from service.compute.backend_choice import open_backend
     from service.flight.scan import ScanInputs
 
@@ -211,7 +210,7 @@ def _with_lens(
 ) -> ScanInputs:
     """The scan with the lens by its own images, where they determine it, else as it is."""
     from service.cameras import parse_source
-    from service.commands.own_lens import own_lens, still_assumed
+    from service.commands.unstated import own_lens, still_assumed
     from service.flight.scan import check_new
 
     found: SelfCalibrated | str = ""
@@ -288,7 +287,7 @@ def _fly(
 
 def _correction(scan: Scan, unsure: Collection[str], has_ended: bool = False) -> _Correction | None:
     """What the images of the scan show by now, of what is ``unsure``; None before they do."""
-    from service.commands.video_time import at_another_time
+    from service.commands.unstated import at_another_time
 
     off_ms = scan.check.clock_off_ms(has_ended) if "clock" in unsure else None
     if off_ms is not None:
