@@ -28,8 +28,7 @@ from threading import Event
 from typing import IO, TYPE_CHECKING, Any
 
 from recon.types import U8
-from service.cameras import reject_options
-from service.cameras.container import open_container
+from service.cameras import open_container, reject_options
 from service.cameras.source import CameraFrame, CameraSource, Paced
 from service.cameras.video import decoded_frames, frame_bgr, video_stream
 from service.errors import InputError, OutsideError
