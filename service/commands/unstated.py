@@ -1,4 +1,4 @@
-"""What a recording does not state: its lens, and when it begins.
+"""What a recording leaves open: its lens, its readout, and when it begins.
 
 The lens is that of its tags, of its log, or of its own images. A lens that bends straight lines by
 a few percent turns every view of level ground a little and makes it a sixth too near: the images
@@ -17,20 +17,25 @@ from tempfile import TemporaryDirectory
 from threading import Event
 from typing import TYPE_CHECKING, Any
 
+from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig, corner_bend
+from recon.types import Camera, Shutter
 from service.cameras import open_camera, parse_source
+from service.cameras.camera_file import seeks_readout
+from service.cameras.dji_metadata import stated_shutter
 from service.cameras.images import ImagesSource
 from service.cameras.lens import Lens, by_full_frame
 from service.config import change
 from service.errors import InputError
+from service.flight.scan import Scan, ScanInputs, check_new, create_store
+from service.offline.refine import refinement
 from service.offline.refine.own_camera import MAX_SIGMA_BEND, MIN_IMAGES, bent, by_tags
 from service.stream.validity import MAX_TIME_NS, is_time
 
 if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
-    from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
-    from recon.types import Camera
     from service.cameras.source import CameraSource
-    from service.flight.scan import Scan, ScanInputs
+    from service.config import Config
+    from service.progress import Progress
 
 log = logging.getLogger(__name__)
 
@@ -84,15 +89,37 @@ def _advice(note: str) -> str:
     return f"no camera model given: {note}; make one with 'skyrelief calibrate' for true shapes"
 
 
+def with_own_lens(
+    inputs: ScanInputs, video: str, start: StartLens, find_lens: bool, progress: Progress
+) -> ScanInputs:
+    """The scan with the lens by its own images, where they determine it, else as it is."""
+    found: SelfCalibrated | str = ""
+    if find_lens and parse_source(video)[0] in ("file", "images"):
+        check_new(inputs.folder)
+        progress("finding the lens")
+        found = own_lens(inputs, video, start.search)
+    if isinstance(found, str):
+        refused = (f"the images do not determine their lens: {found}",) if found else ()
+        notes = (start.note, *refused, *inputs.notes)
+        sigma = start.search.sigma_focal
+        return replace(inputs, notes=notes, assumed=start.assumed, sigma_focal=sigma)
+    focal = f"{found.camera.K[0, 0]:.0f} px, sigma {100.0 * found.sigma_focal:.1f} %"
+    note = f"no camera model given: found from the images themselves ({focal})"
+    return replace(
+        inputs,
+        camera=found.camera,
+        notes=(note, *inputs.notes),
+        assumed=still_assumed(found),
+        sigma_focal=found.sigma_focal,
+    )
+
+
 def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> SelfCalibrated | str:
     """The camera by a reconstruction of some images, or why they do not determine it.
 
     ``inputs`` are those of the whole scan, with the lens to begin with; ``video`` is its camera
     source, a recording or a folder of stills.
     """
-    from service.flight.scan import Scan, create_store
-    from service.offline.refine.refinement import lens
-
     source, config = inputs.source, inputs.config
     if isinstance(source, ImagesSource):
         source = source.middle(VIEWS)
@@ -117,7 +144,7 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> S
         if scan.recorder.keyframes < MIN_IMAGES:
             return f"{scan.recorder.keyframes} keyframes are too few; {MIN_IMAGES} needed"
         try:
-            return lens(folder, Path(parse_source(video)[1]), search)
+            return refinement.lens(folder, Path(parse_source(video)[1]), search)
         except InputError as error:
             return str(error)
 
@@ -125,14 +152,37 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> S
 def still_assumed(found: SelfCalibrated) -> tuple[str, ...]:
     """What is as good as assumed of a lens that was found: its distortion, where depth at a corner
     is bent by more than :data:`MAX_SIGMA_BEND`."""
-    from recon.calibration.flight import corner_bend
-
     bend = corner_bend(found.camera, found.sigma_k[0])
     return ("distortion",) if bend > MAX_SIGMA_BEND else ()
 
 
 def _is_enough(scan: Scan) -> bool:
     return scan.recorder.keyframes >= VIEWS or scan.recorder.frames >= MAX_FRAMES
+
+
+def with_stated_readout(
+    camera: Camera, config: Config, video: str, source: CameraSource, notes: list[str]
+) -> tuple[Camera, Config]:
+    """Camera and configuration with the readout that the video states, where nothing else does.
+
+    The images refine it.
+    """
+    kind, path = parse_source(video)[:2]
+    is_open = seeks_readout(camera, config.camera) and config.camera.readout_ms != "auto"
+    if kind != "file" or not is_open or getattr(source, "turned_deg", 0) != 0:
+        return camera, config
+    shutter = stated_shutter(path)
+    if shutter is None:
+        return camera, config
+    readout_ms = 1e3 * shutter.readout_s
+    notes.append(f"the video states a readout of {readout_ms:.1f} ms, {shutter.direction}")
+    return replace(camera, shutter=shutter), change(config, "camera.readout_ms", "auto")
+
+
+def with_readout(inputs: ScanInputs, shutter: Shutter) -> dict[str, Any]:
+    """Inputs of the scan with the readout that its images show; the search goes on."""
+    camera = replace(inputs.camera, shutter=shutter)
+    return {"camera": camera, "config": change(inputs.config, "camera.readout_ms", "auto")}
 
 
 def start_of(
