@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -98,10 +98,8 @@ class ScanRun:
         try:
             source = self._open_camera()
             if source is not None:
-                try:
+                with closing(source):
                     self._scan(source)
-                finally:
-                    source.close()
         finally:
             self.is_closing = True
             self.scan = self.gate = self._store = None
