@@ -72,15 +72,13 @@ def replay(
     log = _load_telemetry(telemetry, chosen) if telemetry else _subtitles(video, chosen)
     source = open_camera(video)
     played = Paced(source) if realtime else source
-    try:
+    with closing(played):
         if not (realtime or chosen.compute.model or is_given(WIDTH, config, overrides)):
             chosen = denser(chosen, source)
         summary = _replay(
             video, source, played, camera, find_lens and not realtime, log, video_epoch, out,
             chosen, as_json, is_given(LATENCY, config, overrides),
         )  # fmt: skip
-    finally:
-        played.close()
     _report(summary, as_json)
 
 

@@ -153,8 +153,7 @@ def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None
     """The textured mesh of a tile; None when there is too little surface in it."""
     progress = progress or Progress()
     tile = job.tile
-    store = ScanStore.open(Path(tile.folder) / "scan.db")
-    try:
+    with ScanStore.open(Path(tile.folder) / "scan.db") as store:
         store.only(tile.seqs)
         keyframes = list(store.keyframes())
         with progress.part("fusing the cloud", 0.15):
@@ -169,8 +168,6 @@ def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None
             return None
         with progress.part(f"{len(mesh.faces)} triangles; reading images", 0.25):
             views = scan_images(keyframes, Path(tile.folder), store.header, job.options, progress)
-    finally:
-        store.close()
     with progress.part("texture"):
         done = texture(mesh, views, job.largest_texture_px, progress.counting(TEXTURE_STEPS))
     figures = {

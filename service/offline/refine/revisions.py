@@ -8,7 +8,9 @@ the unrefined state. Which pose rows belong to refinements is noted in the store
 from __future__ import annotations
 
 import json
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from recon import se3
 from recon.posegraph.ground_control import Adjusted
 from recon.types import F64, DepthMap, Keyframe
 from service.cameras.rig import attitude_of
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
 from service.stream import codec
 from service.stream.database import Statement, blob, json_object
@@ -200,18 +202,12 @@ def copy_store(source: Path, target: Path) -> None:
 
     Raises InputError when ``target`` exists, OutsideError when it cannot be written.
     """
-    import sqlite3
-
-    from service.errors import OutsideError
-
     if target.exists():
         raise InputError(f"{target} exists; choose another folder, nothing was changed")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with sqlite3.connect(source) as one, sqlite3.connect(target) as two:
+        with closing(sqlite3.connect(source)) as one, closing(sqlite3.connect(target)) as two:
             one.backup(two)
-        one.close()
-        two.close()
     except (OSError, sqlite3.Error) as error:
         target.unlink(missing_ok=True)
         raise OutsideError(f"cannot copy {source} to {target} ({error}); check the disk") from error
