@@ -2,7 +2,7 @@
 
 A learned model is an ONNX file and a TOML file next to it, which names the ONNX file
 (``model = "net.onnx"``, relative to itself) and sets the fields of
-:class:`recon.backends.learned_stereo.LearnedStereoConfig` that differ from their defaults.
+:class:`recon.backends.onnx_backend.LearnedStereoConfig` that differ from their defaults.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from service.errors import InputError, OutsideError
 from service.packages import loads
 
 if TYPE_CHECKING:
-    from recon.backends.learned_stereo import LearnedStereoBackend
+    from recon.backends.onnx_backend import LearnedStereoBackend
     from recon.mapping.registration import IcpConfig
 
 Result = TypeVar("Result")
@@ -287,7 +287,7 @@ def load_learned_model(declaration: Path) -> LearnedStereoBackend:
     do not fit, and OutsideError when ONNX Runtime is missing.
     """
     try:
-        from recon.backends.learned_stereo import LearnedStereoBackend, LearnedStereoConfig
+        from recon.backends.onnx_backend import LearnedStereoBackend, LearnedStereoConfig
     except ImportError as error:
         raise OutsideError(f"a learned model needs ONNX Runtime: {error}") from error
     try:
