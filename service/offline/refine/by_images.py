@@ -33,8 +33,6 @@ from recon.calibration.global_bundle import Knowledge, Problem, Sightings, dispe
 from recon.calibration.tracks import pieces, with_distortion, without_distortion
 from recon.camera_model import project, rays
 from recon.posegraph.ground_control import (
-    ATTITUDE_S,
-    FIX_S,
     Adjusted,
     ControlPoint,
     KeyframeTrack,
@@ -269,17 +267,9 @@ def _known(
             out.placing[k] = np.linalg.inv(n * A @ (spread + floor) @ A.T)
         return out
     out.placing[0] = first_held(track.poses)[0] * 1e-4
-    gap_s = max(float(np.median(np.diff(track.times_s))), 1e-3)
-    for k, prior in enumerate(track.priors):
-        if prior.position_m is not None and prior.sigma_position_m is not None:
-            out.fixes[k] = prior.position_m
-            sigma = np.maximum(prior.sigma_position_m, 0.005)
-            out.sigma_fixes[k] = sigma * np.sqrt(max(1.0, 2.0 * FIX_S / gap_s))
-        if prior.R_world_camera is not None:
-            yaw = prior.sigma_yaw_rad if prior.sigma_yaw_rad < 1.0 else 10.0
-            sigma = np.array([prior.sigma_tilt_rad, prior.sigma_tilt_rad, yaw])
-            out.attitudes[k] = prior.R_world_camera
-            out.sigma_attitudes[k] = sigma * np.sqrt(max(1.0, 2.0 * ATTITUDE_S / gap_s))
+    log = track.readings()
+    out.fixes[:n], out.sigma_fixes[:n] = log.fixes, log.sigma_fixes
+    out.attitudes[:n], out.sigma_attitudes[:n] = log.attitudes, log.sigma_attitudes
     return out
 
 

@@ -20,7 +20,6 @@ from recon import se3
 from recon.bands import at_once
 from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
 from recon.posegraph.ground_control import (
-    FIX_S,
     Adjusted,
     BatchConfig,
     ControlPoint,
@@ -33,7 +32,7 @@ from recon.posegraph.ground_control import (
 from recon.posegraph.records import Loop
 from recon.posegraph.sensor_offsets import constants
 from recon.posegraph.submap_loops import SubmapLoopConfig
-from recon.types import F64, Camera, Keyframe, PosePrior
+from recon.types import Camera, Keyframe, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cameras.rig import Rig
 from service.config import CameraConfig, FusionConfig, ScanConfig
@@ -183,18 +182,6 @@ def _open_target(folder: Path, out: Path | None) -> Path:
     return out
 
 
-def fixes_of(track: KeyframeTrack) -> tuple[F64, F64]:
-    """(N, 3) measured places, NaN where there is none, and their sigmas as of independent ones."""
-    places = np.full((len(track.poses), 3), np.nan)
-    sigma = np.ones((len(track.poses), 3))
-    gap_s = max(float(np.median(np.diff(track.times_s))), 1e-3)
-    for k, prior in enumerate(track.priors):
-        if prior.position_m is not None and prior.sigma_position_m is not None:
-            places[k] = prior.position_m
-            sigma[k] = prior.sigma_position_m * np.sqrt(max(1.0, 2.0 * FIX_S / gap_s))
-    return places, sigma
-
-
 class _Refinement:
     """One adjustment of one scan."""
 
@@ -252,7 +239,7 @@ class _Refinement:
         figures = figures_of(seqs, track, found, candidates, verified, self._ahead_m(), places_m)
         if self.images is not None:
             figures["images"] = self.images.figures()
-            fixed = np.asarray(np.isfinite(fixes_of(track)[0]).all(axis=1))
+            fixed = np.asarray(np.isfinite(track.readings().fixes).all(axis=1))
             figures["apart"] = stretches_untied(seqs, self.images.seen, fixed)
         alone = self._left_out(track, candidates)
         for point in figures["points"]:
@@ -273,8 +260,10 @@ class _Refinement:
         images = own_camera.images_at(video, self.header.started_unix_ns, times)
         ahead = track.poses[:, :3, 2] * self._ahead_m()
         ground_m = float(np.median(track.poses[:, 2, 3] + ahead[:, 2]))
-        fixes, sigma = fixes_of(track)
-        found = own_camera.found_camera(images, given, track.poses, ground_m, fixes, sigma, config)
+        log = track.readings()
+        found = own_camera.found_camera(
+            images, given, track.poses, ground_m, log.fixes, log.sigma_fixes, config
+        )
         return found, given
 
     # ---- what goes in ------------------------------------------------------------------------
