@@ -12,6 +12,7 @@ import typer
 from service.commands import AsJson, ScanDir, Scheduler, TilePoints, Voxel, showing
 from service.errors import InputError
 from service.offline.exports import EXPORTERS
+from service.packages import needing
 
 KINDS = "|".join(EXPORTERS)
 
@@ -73,7 +74,6 @@ def export(
     except ValueError as error:
         raise InputError(f"export: {error}") from error
     done: dict[str, Path] = {}
-    written: dict[str, str] = {}
     try:
         with showing("export") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
             write_kinds(scan, to, out, options, done)
@@ -121,7 +121,6 @@ def mesh(
     as_json: AsJson = False,
 ) -> None:
     """Mesh and texture a scan into one binary glTF file."""
-    from service.errors import InputError
     from service.offline.exports.model import MeshOptions, write_mesh
     from service.offline.exports.view import ExportOptions, ScanView
 
@@ -245,7 +244,6 @@ def site(
         print(json.dumps(figures) if as_json else "\n".join(_aligned_lines(out, figures)))
         return
     from service.offline.site.compare import compare
-    from service.packages import needing
 
     if len(scans) != 2:
         raise InputError(f"site compare takes two scans, before and after, not {len(scans)}")

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.commands import ConfigFile, Overrides, showing, stop_by_signals
+from service.errors import InputError
 from service.progress import Progress
 
 if TYPE_CHECKING:
@@ -106,7 +107,6 @@ def _load_telemetry(path: Path, config: Config) -> TelemetryLog:
     from mavlink.telemetry.gimbal import GimbalConfig
     from mavlink.telemetry.history import HistoryConfig
     from mavlink.telemetry.logs import load_telemetry
-    from service.errors import InputError
 
     gimbal = GimbalConfig(yaw_frame=config.mavlink.gimbal_yaw_frame)
     try:
@@ -118,7 +118,6 @@ def _load_telemetry(path: Path, config: Config) -> TelemetryLog:
 def _subtitles(video: str, config: Config) -> TelemetryLog | None:
     """The telemetry in the subtitles that DJI drones write next to a video, under its name."""
     from service.cameras import parse_source
-    from service.errors import InputError
 
     kind, name = parse_source(video)[:2]
     places = [Path(name).with_suffix(end) for end in (".SRT", ".srt")] if kind == "file" else []

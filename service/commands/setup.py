@@ -112,7 +112,6 @@ def keys(
     FOLDER/authority private: with it anyone can join the fleet. --revoke NAME removes the rights
     of a drone or viewer; revoking a ground station makes new keys for all others.
     """
-    from service.errors import InputError
     from service.stream import keys as fleet_keys
 
     members = {"drone": drone or [], "ground": ground or [], "viewer": viewer or []}

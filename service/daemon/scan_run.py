@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mavlink.component.status import WARNING
 from mavlink.telemetry.clock import agree, computer_offset_ns
-from service.config import Config
+from service.config import Config, change
 from service.daemon.intent import FIRST_RETRY_S, LAST_RETRY_S
 from service.errors import OutsideError
 
@@ -153,7 +153,6 @@ class ScanRun:
     def _inputs(self, source: CameraSource) -> tuple[ScanInputs, FrameGate]:
         """Inputs of the scan, with its camera behind a gate."""
         from service.cameras.camera_file import check_size, seeks_readout
-        from service.config import change
         from service.daemon.camera_memory import measured
         from service.daemon.frame_gate import FrameGate
         from service.flight.scan import ScanInputs
