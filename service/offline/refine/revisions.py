@@ -34,7 +34,6 @@ from service.stream.records import (
     pack_pose,
     pack_repose,
     unpack_pose,
-    unpack_repose,
 )
 from service.stream.store import ScanStore
 
@@ -91,7 +90,7 @@ class Revisions:
     def keyframe_state(self, seq: int) -> KeyframeState | None:
         """The unrefined state of a keyframe; None when nothing of it can be read."""
         data = self._store.chunk(seq, 0) or self._store.chunk(seq, 1)
-        base = self._base(seq)
+        base = self._store.repose(seq, below=REFINED)
         if data is None:
             keyframe = self._store.keyframe(seq)
             if keyframe is None:
@@ -187,14 +186,6 @@ class Revisions:
             and bool(np.abs(now.T_world_camera - wanted.T_world_camera).max() < 1e-4)
             and abs(now.scale / wanted.scale - 1.0) < 1e-6
         )
-
-    def _base(self, seq: int) -> Repose | None:
-        sql = (
-            "SELECT data FROM reposes WHERE seq = ? AND revision < ? "
-            "ORDER BY revision DESC, id DESC LIMIT 1"
-        )
-        row = self._db.one(sql, (seq, REFINED))
-        return None if row is None else unpack_repose(blob(row[0]))
 
 
 def copy_store(source: Path, target: Path) -> None:
