@@ -215,8 +215,8 @@ def test_a_similarity_from_three_points_or_none() -> None:
     b = 1.7 * a @ R.T + [100.0, 20.0, -4.0]
     found = ground_control.placed_by_points(a, b)
     assert found is not None
-    assert found[0] == pytest.approx(1.7) and np.allclose(found[1], R)
-    assert np.allclose(found[2], [100.0, 20.0, -4.0])
+    assert found.growth == pytest.approx(1.7) and np.allclose(found.R, R)
+    assert np.allclose(found.t, [100.0, 20.0, -4.0])
     line = np.arange(4.0)[:, None] * np.array([1.0, 2.0, 0.1])
     assert ground_control.placed_by_points(line, line) is None
     assert ground_control.placed_by_points(a[:2], b[:2]) is None

@@ -17,6 +17,7 @@ import numpy as np
 from recon import se3
 from recon.posegraph.ledger import Rows
 from recon.posegraph.records import Loop, loops_agree
+from recon.posegraph.site_alignment import ScanSimilarity
 from recon.posegraph.smoother import (
     NO_SCALE,
     Linear,
@@ -235,8 +236,8 @@ def consenting(surveyed_m: F64, mapped_m: F64, sigma_m: F64) -> Bool:
     return np.asarray(agree[best])
 
 
-def placed_by_points(mapped_m: F64, surveyed_m: F64) -> tuple[float, F64, F64] | None:
-    """Scale, (3, 3) rotation and (3,) shift from the map to the survey, (N, 3) each.
+def placed_by_points(mapped_m: F64, surveyed_m: F64) -> ScanSimilarity | None:
+    """From the map to the survey, (N, 3) each.
 
     Umeyama 1991, doi:10.1109/34.88573. None for fewer than three points or points in a line.
     """
@@ -248,7 +249,8 @@ def placed_by_points(mapped_m: F64, surveyed_m: F64) -> tuple[float, F64, F64] |
         return None
     R = se3.nearest_rotation(b.T @ a)
     scale = float(np.sum(b * (a @ R.T)) / np.sum(a**2))
-    return scale, R, np.asarray(surveyed_m.mean(axis=0) - scale * R @ mapped_m.mean(axis=0))
+    shift = np.asarray(surveyed_m.mean(axis=0) - scale * R @ mapped_m.mean(axis=0))
+    return ScanSimilarity(R, shift, scale)
 
 
 def of_marks(rows: Rows, at: State) -> Linear:

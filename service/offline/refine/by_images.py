@@ -39,6 +39,7 @@ from recon.posegraph.ground_control import (
     Mark,
     map_position,
 )
+from recon.posegraph.site_alignment import ScanSimilarity
 from recon.types import F64, Bool, Camera, Keyframe
 from service.errors import InputError
 from service.offline.refine import own_camera
@@ -179,10 +180,10 @@ def as_seen(
     return poses, moved
 
 
-def in_world(images: ImageNetwork, scale: float, R: F64, t: F64) -> ImageNetwork:
+def in_world(images: ImageNetwork, move: ScanSimilarity) -> ImageNetwork:
     """The network in the world that a similarity takes it to."""
-    poses = np.array([se3.compose(R @ T[:3, :3], scale * R @ T[:3, 3] + t) for T in images.poses])
-    return replace(images, poses=poses, points=scale * images.points @ R.T + t)
+    poses = np.array([move.pose(T) for T in images.poses])
+    return replace(images, poses=poses, points=move.points(images.points))
 
 
 def depth_scales(

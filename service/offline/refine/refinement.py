@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from recon import se3
 from recon.bands import at_once
 from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
 from recon.posegraph.ground_control import (
@@ -319,22 +318,21 @@ class _Refinement:
 
     def _place(self, candidates: Sequence[Candidate]) -> None:
         """Give a scan without a place, and without a sure scale, those of the survey."""
-        self.frame, scale, R, t = place_by_survey(candidates)
+        self.frame, move = place_by_survey(candidates)
         if not any(c.has_height for c in candidates if c.usable):
             self.notes.append("no control point has a height: heights count from the scan's own 0")
-        self.grown = scale
-        moved = []
-        for s in self.states:
-            T = s.T_world_camera
-            placed = se3.compose(R @ T[:3, :3], scale * R @ T[:3, 3] + t)
-            spread = np.diag([0.03**2] * 3 + [1.0] * 3)
-            moved.append(
-                replace(s, T_world_camera=placed, covariance=spread, scale=s.scale * scale)
+        self.grown = scale = move.growth
+        spread = np.diag([0.03**2] * 3 + [1.0] * 3)
+        self.states = [
+            replace(
+                s, T_world_camera=move.pose(s.T_world_camera), covariance=spread,
+                scale=s.scale * scale,
             )
-        self.states = moved
+            for s in self.states
+        ]  # fmt: skip
         for one in candidates:
             if one.before_m is not None:
-                one.before_m = np.asarray(scale * R @ one.before_m + t)
+                one.before_m = move.points(one.before_m)
                 one.sigma_before_m *= scale
             one.marks = [
                 replace(
@@ -345,13 +343,9 @@ class _Refinement:
                 )
                 for m in one.marks
             ]
-        self.frames = [
-            replace(f, T_world_camera=se3.compose(
-                R @ f.T_world_camera[:3, :3], scale * R @ f.T_world_camera[:3, 3] + t))
-            for f in self.frames
-        ]  # fmt: skip
+        self.frames = [replace(f, T_world_camera=move.pose(f.T_world_camera)) for f in self.frames]
         if self.images is not None:
-            self.images = in_world(self.images, scale, R, t)
+            self.images = in_world(self.images, move)
         f = self.frame
         self.header = replace(
             self.header, origin_lat_deg=f.lat_deg, origin_lon_deg=f.lon_deg,
@@ -450,7 +444,7 @@ class _Refinement:
         points = _points(candidates)
         most = int(MAX_REFUSALS * sum(not c.point.is_check for c in candidates))
         while True:
-            used = [c for c in candidates if c.usable and not c.point.is_check]
+            used = [c for c in candidates if c.is_control]
             marks = [m for c in used for m in c.marks]
             try:
                 found = self._solved(track, points, marks, candidates)
@@ -491,7 +485,7 @@ class _Refinement:
 
         Empty for fewer than four control points: three are needed without it.
         """
-        used = [c for c in candidates if c.usable and not c.point.is_check]
+        used = [c for c in candidates if c.is_control]
         if len(used) <= MIN_OTHERS:
             return {}
         points = _points(candidates)

@@ -250,7 +250,7 @@ def _bent(
             at_a, at_b = found.moves[tie.a].points(tie.at_a), found.moves[tie.b].points(tie.at_b)
             fit = placed_by_points(at_b, at_a)
             assert fit is not None  # four corners of a view
-            D = se3.compose(fit[1], at_a.mean(axis=0) - fit[1] @ at_b.mean(axis=0))
+            D = se3.compose(fit.R, at_a.mean(axis=0) - fit.R @ at_b.mean(axis=0))
             T = se3.inverse(moved[loop.a]) @ D @ moved[loop.b]
             closures.append(replace(loop, T_a_b=T))
     if not closures:
