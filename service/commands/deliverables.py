@@ -168,7 +168,7 @@ def inspect(
 
     from service.offline.exports.view import ScanView
     from service.scans.drawing import middle_keyframe, stages
-    from service.scans.writing import writing
+    from service.scans.writing import write_whole
 
     with ScanView(scan_dir) as scan:
         seqs = scan.store.seqs()
@@ -180,8 +180,7 @@ def inspect(
             raise InputError(f"{scan_dir}: no keyframe {seq}; there are {seqs[0]} to {seqs[-1]}")
     image, complete = stages(scan_dir, scan.store.header.scan_id, found)
     path = out or scan_dir / f"keyframe_{seq:06d}.png"
-    with writing(path) as part:
-        part.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    write_whole(path, cv2.imencode(".png", image)[1].tobytes())
     known = np.isfinite(found.depth.depth_m)
     figures = {
         "keyframe": seq,

@@ -186,11 +186,10 @@ def _flight(
 
 def _write_plan(path: Path, flight: Refly) -> None:
     from service.offline.refine.refly import plan_json, waypoints_text
-    from service.scans.writing import writing
+    from service.scans.writing import write_whole
 
     text = waypoints_text(flight) if path.suffix == ".waypoints" else plan_json(flight)
-    with writing(path) as part:
-        part.write_text(text, encoding="utf-8")
+    write_whole(path, text)
 
 
 def _plan_figures(path: Path, flight: Refly) -> dict[str, Any]:

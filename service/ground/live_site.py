@@ -28,7 +28,7 @@ from service.ground.sites import references
 from service.ground.storage import is_regular
 from service.offline.site import DRONE, SAME_VISIT_S
 from service.offline.site.live import LiveSite, PlacedScan
-from service.scans.writing import writing
+from service.scans.writing import write_whole
 from service.small_file import read_json
 from service.workers import Worker, guarded, run_process
 
@@ -156,8 +156,7 @@ def write_shown(store: Path, placed: list[PlacedScan]) -> None:
         sigma = (float(v) for v in np.minimum(one.sigma_m, 1e6))
         names = one.folder.parent.name, one.folder.name
         found.append(Shown(*names, one.started_unix_s, *matrices, (*sigma,), one.ties, one.group))  # type: ignore[arg-type]
-    with writing(store / FILE) as part:
-        part.write_bytes(msgspec.json.encode(found))
+    write_whole(store / FILE, msgspec.json.encode(found))
 
 
 class SiteNews:

@@ -30,7 +30,7 @@ from service.offline.tiles import grown
 from service.scans.coverage import coverage_of
 from service.scans.fused_cloud import EVERYWHERE, Box
 from service.scans.main_piece import main_keyframes, main_seqs
-from service.scans.writing import writing
+from service.scans.writing import write_whole, writing
 
 NODATA_M = -9999.0
 QUICKLY = {"level": 4, "overview_resampling": "AVERAGE"}
@@ -276,8 +276,7 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
                 },
             }
         )
-    with writing(out) as part:
-        part.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    write_whole(out, json.dumps({"type": "FeatureCollection", "features": features}))
 
 
 def contours_of(scan: ScanView, options: ExportOptions) -> list[tuple[float, F64]]:

@@ -41,7 +41,7 @@ from service.progress import Progress
 from service.scans.folder import resolution_m, write_deliverables
 from service.scans.fused_cloud import TiledCloud
 from service.scans.track import local_frame
-from service.scans.writing import writing
+from service.scans.writing import write_whole
 from service.stream.records import Repose
 from service.stream.store import ScanStore
 
@@ -168,8 +168,7 @@ def _align(
             store.add_reposes(_reposes(store, members, found, adjusted))
             document = _document(store, members, found, priors, ties, notes, known)
             store.update_header(notes=tuple(document["notes"]))
-        with writing(out / SITE) as part:
-            part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        write_whole(out / SITE, json.dumps(document, indent=1) + "\n")
         _remove(out / "scan.db")
         os.replace(fresh, out / "scan.db")
     finally:
