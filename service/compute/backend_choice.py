@@ -25,7 +25,7 @@ from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 from service.config import ComputeConfig
 from service.errors import InputError, OutsideError
-from service.packages import loads
+from service.packages import loads, needing
 
 if TYPE_CHECKING:
     from recon.backends.onnx_backend import LearnedStereoBackend
@@ -286,10 +286,8 @@ def load_learned_model(declaration: Path) -> LearnedStereoBackend:
     Raises InputError, with what was expected and what was found, when declaration and model
     do not fit, and OutsideError when ONNX Runtime is missing.
     """
-    try:
+    with needing("a learned model"):
         from recon.backends.onnx_backend import LearnedStereoBackend, LearnedStereoConfig
-    except ImportError as error:
-        raise OutsideError(f"a learned model needs ONNX Runtime: {error}") from error
     try:
         given = msgspec.toml.decode(declaration.read_bytes(), type=dict[str, Any])
         model = declaration.parent / str(given.pop("model", ""))
