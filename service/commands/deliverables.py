@@ -221,7 +221,7 @@ def site(
     ] = False,
     tile_points: TilePoints = 20_000_000,
     scheduler: Scheduler = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Join scans that overlap into one site, or measure what changed between two.
 

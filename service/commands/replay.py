@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import ConfigFile, Overrides, showing, stop_by_signals
+from service.commands import AsJson, ConfigFile, Overrides, showing, stop_by_signals
 from service.errors import InputError
 from service.progress import Progress
 
@@ -55,7 +55,7 @@ def replay(
     ] = True,
     config: ConfigFile = None,
     set_: Overrides = None,
-    as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Reconstruct a recording (video, folder of images or pipe) into a scan folder."""
     from service.memory import one_pool
