@@ -45,7 +45,7 @@ META_HEADER = "unrefined_header"
 
 
 class _Note(msgspec.Struct):
-    """The fields of the refinement's note that are read."""
+    """What the store notes of its refinements."""
 
     revision: int = 0
     pose_rows: list[tuple[int, int]] = []
@@ -69,16 +69,15 @@ class Revisions:
     def __init__(self, store: ScanStore) -> None:
         self._store = store
         self._db = store.database
-        self._note: dict[str, Any] = json_object(self._db.get(META))
         try:
-            msgspec.convert(self._note, _Note)
+            self._note = msgspec.convert(json_object(self._db.get(META)), _Note)
         except msgspec.ValidationError as error:
             raise InputError(f"{store.path}: its refinement record is invalid ({error})") from error
 
     @property
     def refined(self) -> bool:
         """True once a refinement was written, also when it was undone."""
-        return bool(self._note)
+        return bool(self._note.figures)
 
     @property
     def header(self) -> ScanHeader:
@@ -120,7 +119,7 @@ class Revisions:
 
     def frames(self) -> list[PoseRecord]:
         """All unrefined poses in order of time; of several for one time the newest."""
-        ranges = self._note.get("pose_rows", [])
+        ranges = self._note.pose_rows
         newest: dict[int, PoseRecord] = {}
         for number, data in self._db.all("SELECT id, data FROM poses ORDER BY id"):
             if any(a <= number <= b for a, b in ranges):
@@ -144,12 +143,12 @@ class Revisions:
         """
         changed = [r for r in reposes if not self._holds(r)]
         statements: list[Statement] = []
-        note = dict(self._note)
+        note = msgspec.structs.replace(self._note)
         if changed:
             statements += self._rows(reposes, poses, note)
-        note["figures"] = figures | {"revision": note.get("revision", 0)}
+        note.figures = figures | {"revision": note.revision}
         meta = "INSERT OR REPLACE INTO meta VALUES (?, ?)"
-        statements.append((meta, (META, json.dumps(note, sort_keys=True))))
+        statements.append((meta, (META, json.dumps(msgspec.structs.asdict(note), sort_keys=True))))
         if self._db.get(META_HEADER) is None:
             statements.append((meta, (META_HEADER, self._store.header.to_json().decode())))
         if header.to_json() != self._store.header.to_json():
@@ -159,10 +158,10 @@ class Revisions:
         return bool(changed)
 
     def _rows(
-        self, reposes: Sequence[Repose], poses: Sequence[PoseRecord], note: dict[str, Any]
+        self, reposes: Sequence[Repose], poses: Sequence[PoseRecord], note: _Note
     ) -> list[Statement]:
-        revision = REFINED + int(note.get("revision", 0))
-        note["revision"] = int(note.get("revision", 0)) + 1
+        revision = REFINED + note.revision
+        note.revision += 1
         out: list[Statement] = []
         first = self._store.next_id("reposes")
         for n, r in enumerate(reposes):
@@ -173,8 +172,8 @@ class Revisions:
         for n, p in enumerate(poses):
             sql = "INSERT INTO poses VALUES (?, ?, ?)"
             out.append((sql, (first + n, p.time_unix_ns, pack_pose(p))))
-        rows = [list(pair) for pair in note.get("pose_rows", [])]
-        note["pose_rows"] = [*rows, [first, first + len(poses) - 1]] if poses else rows
+        if poses:
+            note.pose_rows = [*note.pose_rows, (first, first + len(poses) - 1)]
         return out
 
     def _holds(self, wanted: Repose) -> bool:
