@@ -16,8 +16,15 @@ import numpy as np
 import pytest
 
 from recon.types import U8
-from service.cameras import CAMERAS, CameraFrame, CameraSource, open_camera, parse_source, video
-from service.cameras.container import open_container
+from service.cameras import (
+    CAMERAS,
+    CameraFrame,
+    CameraSource,
+    open_camera,
+    open_container,
+    parse_source,
+    video,
+)
 from service.cameras.video import (
     PipeReader,
     VideoSource,

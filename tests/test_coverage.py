@@ -20,6 +20,7 @@ from recon.types import F64, DepthMap
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.ground.portal import Portal, PortalConfig
+from service.ground.state import OpenScans
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.scans.coverage import (
     FIGURES,
@@ -29,7 +30,6 @@ from service.scans.coverage import (
     coverage_of,
 )
 from service.scans.folder import write_deliverables
-from service.scans.open_scans import OpenScans
 from service.stream.codec import encode
 from service.stream.records import Repose
 

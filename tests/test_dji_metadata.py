@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from recon.types import Camera, Shutter
 from service.cameras import open_camera
 from service.cameras.dji_metadata import shutter_of_sample, stated_shutter
-from service.commands.replay import _with_stated_readout
+from service.commands.unstated import with_stated_readout
 from service.config import Config, change
 
 
@@ -121,9 +121,9 @@ def test_replay_starts_with_the_readout_that_the_video_states(
     config = change(Config(), "camera.readout_ms", readout_ms)
     notes: list[str] = []
     with closing(open_camera(str(path))) as source:
-        found, then = _with_stated_readout(camera, config, str(path), source, notes)
+        found, then = with_stated_readout(camera, config, str(path), source, notes)
         own = replace(camera, shutter=Shutter(0.02))
-        kept, _ = _with_stated_readout(own, config, str(path), source, [])
+        kept, _ = with_stated_readout(own, config, str(path), source, [])
     assert kept is own, "the camera file has the last word"
     if is_taken:
         assert found.shutter.readout_s == pytest.approx(0.01648)

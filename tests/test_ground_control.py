@@ -170,6 +170,18 @@ def test_telemetry_places_a_track_and_a_wild_fix_does_not_move_it() -> None:
     assert worst == 10
 
 
+def test_readings_are_known_where_telemetry_is_and_count_as_independent_ones() -> None:
+    sigma = np.array([0.5, 0.5, 0.8])
+    priors = [PosePrior() for _ in range(40)]
+    priors[7] = PosePrior(DOWN, 0.01, 2.0, np.array([1.0, 2.0, 3.0]), sigma)
+    found = KeyframeTrack(true_poses(), TIMES, loose(40), priors).readings()
+    rows = (found.fixes, found.sigma_fixes, found.attitudes, found.sigma_attitudes)
+    assert all(np.flatnonzero(np.isfinite(r).reshape(40, -1).any(axis=1)) == [7] for r in rows)
+    assert found.sigma_fixes[7] == pytest.approx(sigma * np.sqrt(120.0))
+    turn = np.array([0.01, 0.01, 10.0])
+    assert found.sigma_attitudes[7] == pytest.approx(turn * np.sqrt(80.0))
+
+
 def test_the_derivatives_of_a_mark_are_those_of_differences() -> None:
     rng = np.random.default_rng(0)
     side = se3.exp(rng.normal(0, 0.2, 6))
@@ -203,8 +215,8 @@ def test_a_similarity_from_three_points_or_none() -> None:
     b = 1.7 * a @ R.T + [100.0, 20.0, -4.0]
     found = ground_control.placed_by_points(a, b)
     assert found is not None
-    assert found[0] == pytest.approx(1.7) and np.allclose(found[1], R)
-    assert np.allclose(found[2], [100.0, 20.0, -4.0])
+    assert found.growth == pytest.approx(1.7) and np.allclose(found.R, R)
+    assert np.allclose(found.t, [100.0, 20.0, -4.0])
     line = np.arange(4.0)[:, None] * np.array([1.0, 2.0, 0.1])
     assert ground_control.placed_by_points(line, line) is None
     assert ground_control.placed_by_points(a[:2], b[:2]) is None

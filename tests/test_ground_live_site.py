@@ -16,8 +16,7 @@ import pytest
 from site_scans import ELSEWHERE, FRAME, START_NS, Errors, header_of, layers, leg, write_scan
 
 from recon.types import F64
-from service.ground.live_site import MAX_SCANS, Follower, run
-from service.ground.shown_site import FILE, SiteNews
+from service.ground.live_site import FILE, MAX_SCANS, Follower, SiteNews, run
 from service.ground.sites import references
 from service.offline.site.alignment import align_site
 from service.offline.site.gather import between_frames

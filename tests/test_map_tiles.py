@@ -21,7 +21,7 @@ from service.georeference import LocalFrame
 from service.ground import live_map
 from service.ground.live_map import LiveMap, degrees, mercator, on_map, pixel_m
 from service.ground.map_tiles import contour_mask, interval_m
-from service.scans.open_scans import OpenScans
+from service.ground.state import OpenScans
 from service.stream.codec import encode
 from service.stream.records import Repose
 from service.stream.store import ScanStore

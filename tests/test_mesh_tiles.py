@@ -25,7 +25,7 @@ from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
 from service.offline import tiles
 from service.offline.exports import images, model
-from service.offline.exports.mesh_tiles import TileJob, TilePart, mesh_tile
+from service.offline.exports.model import TileJob, TilePart, mesh_tile
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.tiles import KeyframeFootprint, Tile, run_tiles, tile_boxes
 from service.progress import Progress

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from service.errors import InputError
-from service.scans.open_scans import OpenScans
+from service.ground.state import OpenScans
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 

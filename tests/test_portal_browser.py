@@ -19,9 +19,8 @@ from portal_client import NEEDS, TOKEN, VEHICLE_SHOWN, browser, flown_store, lis
 from rehearsal import RehearsalVehicle
 from site_scans import Box, Errors, leg, write_scan
 
-from service.ground.live_site import Follower
+from service.ground.live_site import FILE, Follower
 from service.ground.portal import Portal, PortalConfig
-from service.ground.shown_site import FILE
 from service.ground.vehicle import Vehicle
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.scans.folder import write_deliverables

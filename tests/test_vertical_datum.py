@@ -18,9 +18,8 @@ from typer.testing import CliRunner
 from recon.types import F64
 from service.cli import app
 from service.errors import InputError
-from service.georeference import LocalFrame
+from service.georeference import LocalFrame, height_change, vertical_code
 from service.offline.exports.view import ExportOptions, ScanView, export
-from service.vertical_datum import height_change, vertical_code
 
 if TYPE_CHECKING:
     from conftest import HouseFlight

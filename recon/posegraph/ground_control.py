@@ -17,6 +17,7 @@ import numpy as np
 from recon import se3
 from recon.posegraph.ledger import Rows
 from recon.posegraph.records import Loop, loops_agree
+from recon.posegraph.site_alignment import ScanSimilarity
 from recon.posegraph.smoother import (
     NO_SCALE,
     Linear,
@@ -86,6 +87,16 @@ class ControlPoint:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TrackReadings:
+    """Telemetry of N keyframes, with sigmas as of independent readings; NaN where there is none."""
+
+    fixes: F64  # (N, 3) m
+    sigma_fixes: F64  # (N, 3) m
+    attitudes: F64  # (N, 3, 3) R_world_camera
+    sigma_attitudes: F64  # (N, 3) rad about the axes of the world
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class KeyframeTrack:
     """The keyframes as they are before."""
 
@@ -94,6 +105,23 @@ class KeyframeTrack:
     covariances: F64  # (N, 6, 6) left perturbation in the world; they err together
     priors: Sequence[PosePrior] = ()  # of each keyframe; without them the poses are the prior
     loops: Sequence[Loop] = ()  # between places in the list, in metres
+
+    def readings(self) -> TrackReadings:
+        """Fixes and attitudes; their sigmas grow as errors wander (cf. factors.py)."""
+        shapes = (3,), (3,), (3, 3), (3,)
+        out = TrackReadings(*(np.full((len(self.poses), *shape), np.nan) for shape in shapes))
+        gap_s = max(float(np.median(np.diff(self.times_s))), 1e-3)
+        fixes, attitudes = np.sqrt(np.maximum(1.0, 2.0 * np.array([FIX_S, ATTITUDE_S]) / gap_s))
+        for k, prior in enumerate(self.priors):
+            if prior.position_m is not None and prior.sigma_position_m is not None:
+                out.fixes[k] = prior.position_m
+                out.sigma_fixes[k] = fixes * np.maximum(prior.sigma_position_m, 0.005)
+            if prior.R_world_camera is not None:
+                tilt = prior.sigma_tilt_rad
+                yaw = prior.sigma_yaw_rad if prior.sigma_yaw_rad < 1.0 else 10.0
+                out.attitudes[k] = prior.R_world_camera
+                out.sigma_attitudes[k] = attitudes * np.array([tilt, tilt, yaw])
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,8 +236,8 @@ def consenting(surveyed_m: F64, mapped_m: F64, sigma_m: F64) -> Bool:
     return np.asarray(agree[best])
 
 
-def placed_by_points(mapped_m: F64, surveyed_m: F64) -> tuple[float, F64, F64] | None:
-    """Scale, (3, 3) rotation and (3,) shift from the map to the survey, (N, 3) each.
+def placed_by_points(mapped_m: F64, surveyed_m: F64) -> ScanSimilarity | None:
+    """From the map to the survey, (N, 3) each.
 
     Umeyama 1991, doi:10.1109/34.88573. None for fewer than three points or points in a line.
     """
@@ -221,7 +249,8 @@ def placed_by_points(mapped_m: F64, surveyed_m: F64) -> tuple[float, F64, F64] |
         return None
     R = se3.nearest_rotation(b.T @ a)
     scale = float(np.sum(b * (a @ R.T)) / np.sum(a**2))
-    return scale, R, np.asarray(surveyed_m.mean(axis=0) - scale * R @ mapped_m.mean(axis=0))
+    shift = np.asarray(surveyed_m.mean(axis=0) - scale * R @ mapped_m.mean(axis=0))
+    return ScanSimilarity(R, shift, scale)
 
 
 def of_marks(rows: Rows, at: State) -> Linear:
@@ -326,20 +355,15 @@ class _Batch:
             self._smoother.add_motion("placing", (n, key), T, n * (spread + floor))
 
     def _add_telemetry(self) -> None:
-        """Attitude and fixes; sigmas grow as their errors wander slowly (cf. readings.py)."""
+        """Attitudes and fixes."""
         self._hold(0, self._track.poses[0], 2.0, 1e4)
-        gap_s = max(float(np.median(np.diff(self._track.times_s))), 1e-3)
-        for key, prior in enumerate(self._track.priors):
-            R = prior.R_world_camera
-            if R is not None:
-                yaw = prior.sigma_yaw_rad if prior.sigma_yaw_rad < 1.0 else 10.0
-                sigma = np.array([prior.sigma_tilt_rad, prior.sigma_tilt_rad, yaw])
-                sigma = sigma * np.sqrt(max(1.0, 2.0 * ATTITUDE_S / gap_s))
-                self._smoother.add_turn("attitude", key, R, sigma, 1.5)
-            if prior.position_m is not None and prior.sigma_position_m is not None:
-                sigma = np.maximum(prior.sigma_position_m, 0.005)
-                sigma = sigma * np.sqrt(max(1.0, 2.0 * FIX_S / gap_s))
-                place = prior.position_m
+        known = self._track.readings()
+        for key in range(len(self._track.poses)):
+            R, place = known.attitudes[key], known.fixes[key]
+            if np.isfinite(R).all():
+                self._smoother.add_turn("attitude", key, R, known.sigma_attitudes[key], 1.5)
+            if np.isfinite(place).all():
+                sigma = known.sigma_fixes[key]
                 self._smoother.add_place("position", key, place, sigma, cauchy=2.0)
 
     def _add_points(self, points: Sequence[ControlPoint], marks: Sequence[Mark]) -> None:

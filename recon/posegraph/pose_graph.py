@@ -17,9 +17,8 @@ import numpy as np
 
 from recon import bands, se3
 from recon.posegraph.alignment import Scale, Similarity
+from recon.posegraph.factors import Motions, Readings, is_frozen, sound
 from recon.posegraph.loop_book import Edge, LoopBook
-from recon.posegraph.motions import Motions
-from recon.posegraph.readings import Readings, is_frozen, sound
 from recon.posegraph.records import Loop, Node, PoseGraphConfig
 from recon.posegraph.segment_frames import SegmentFrames
 from recon.posegraph.sensor_offsets import Constants

@@ -179,7 +179,7 @@ def altitude_datum(
     An autopilot's altitude follows its barometer, whose zero is off by decimetres to metres. The
     receiver's own altitudes scatter more, but about another mean. The part of the receiver's
     claimed sigma that shows as scatter from fix to fix averages out; the rest wanders (first-order
-    Gauss-Markov, as in :mod:`recon.posegraph.readings`) and stays. The autopilot's altitude rests
+    Gauss-Markov, as in :mod:`recon.posegraph.factors`) and stays. The autopilot's altitude rests
     on the same receiver, so the receiver's mean is taken over only as far as it is the better one.
     Where the scatter could be all of the sigma, it is taken to be, but for what is seen to wander.
 

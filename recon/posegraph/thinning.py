@@ -4,7 +4,7 @@ A keyframe that stops being a node hands its motion to the next one: motions are
 so are their covariances (Barfoot, State Estimation for Robotics, 2017, section 7.3). Loops that
 ended at it end at the node before it, moved there by vision. Its fix goes into the mean of the
 next node's; other readings of it go. Readings are weighed by how many of them there are in the
-time flown (:mod:`recon.posegraph.readings`), so those that stay then weigh more.
+time flown (:mod:`recon.posegraph.factors`), so those that stay then weigh more.
 
 Where segments are so many and short that this finds too few, whole segments are dropped, those
 first that leave the smallest holes. Their keyframes stay where they were published; their

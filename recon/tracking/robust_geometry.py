@@ -25,6 +25,9 @@ Pixels are float32, which limits them; points may have wild outliers along the l
 MIN_RESOLUTION = 1e-12
 """Least extent of points as a share of their largest coordinate: less is rounding."""
 
+RELATIVE_POSE_PX = 1.0
+"""Distance from its epipolar line below which a match supports a relative pose."""
+
 _T = TypeVar("_T")
 
 
@@ -85,21 +88,23 @@ def consensus_pose(
     return None if found is None or not found[0] else _motion(found[1], found[2])
 
 
-def relative_pose(
-    uv_a: F64, uv_b: F64, K: F64, threshold_px: float = 1.0
-) -> tuple[F64, F64, int] | None:
+def _essential(uv_a: F64, uv_b: F64, K: F64, threshold_px: float) -> tuple[Array, Array] | None:
+    """The essential matrix of (N, 2) matched pixels, and (N, 1) which of them agree with it."""
+    if len(uv_a) < 6 or not span_a_plane(uv_a, uv_b):
+        return None
+    E, mask = attempt(
+        lambda: cv2.findEssentialMat(uv_a, uv_b, K, cv2.USAC_MAGSAC, 0.9999, threshold_px)
+    ) or (None, None)
+    return None if E is None or mask is None or E.shape != (3, 3) else (E, mask)
+
+
+def relative_pose(uv_a: F64, uv_b: F64, K: F64) -> tuple[F64, F64, int] | None:
     """(R_b_a, unit t of T_b_a, points in front of both cameras) of (N, 2) matched pixels.
 
     By the essential matrix. None also where no essential matrix explains the matches.
     """
-    if len(uv_a) < 6 or not span_a_plane(uv_a, uv_b):
-        return None
-    found = attempt(
-        lambda: cv2.findEssentialMat(
-            uv_a, uv_b, K, method=cv2.USAC_MAGSAC, prob=0.9999, threshold=threshold_px
-        )
-    )
-    if found is None or found[0] is None or found[0].shape != (3, 3):
+    found = _essential(uv_a, uv_b, K, RELATIVE_POSE_PX)
+    if found is None:
         return None
     E, mask = found
     split = attempt(lambda: cv2.recoverPose(E, uv_a, uv_b, K, mask=mask))
@@ -111,14 +116,8 @@ def relative_pose(
 
 def on_epipolar_lines(uv_a: F64, uv_b: F64, K: F64, threshold_px: float) -> Bool | None:
     """(N,) matches that agree with one essential matrix; None where there is none."""
-    if len(uv_a) < 6 or not span_a_plane(uv_a, uv_b):
-        return None
-    found = attempt(
-        lambda: cv2.findEssentialMat(uv_a, uv_b, K, cv2.USAC_MAGSAC, 0.9999, threshold_px)
-    )
-    if found is None or found[0] is None or found[0].shape != (3, 3):
-        return None
-    return np.asarray(found[1]).ravel().astype(bool)
+    found = _essential(uv_a, uv_b, K, threshold_px)
+    return None if found is None else np.asarray(found[1]).ravel().astype(bool)
 
 
 def homography(uv_a: F64, uv_b: F64, threshold_px: float) -> tuple[F64, Bool] | None:

@@ -26,7 +26,7 @@ from service.ground.receiver import ReceiverConfig
 from service.stream import codec
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, ScanHeader, pack_pose
-from service.stream.session import SessionConfig
+from service.stream.session import SessionConfig, zenoh_config
 from service.stream.store import ScanStore
 
 SIZE_PX = (320, 180)
@@ -192,8 +192,6 @@ def _fly(trial: Trial, folder: Path) -> Outcome:
 def fly_plain(trial: Trial) -> Outcome:
     """The same data put on Zenoh at once: no store, no budget, default settings."""
     import zenoh
-
-    from service.stream.session import zenoh_config
 
     ground_port, port = free_port(), free_port()
     came: dict[tuple[str, int], float] = {}

@@ -22,7 +22,7 @@ from recon.backends.cpu import CpuBackend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import F32, F64, U8, Camera, DisparityMap
 from service.bench import BenchOptions, BenchResult
-from service.flight.scan import Scan
+from service.flight.scan import Scan, ScanInputs, create_store
 
 SIZE = (1280, 720)
 K: F64 = np.array([[960.0, 0, 639.5], [0, 960.0, 359.5], [0, 0, 1.0]])
@@ -128,7 +128,6 @@ def _fly(
     """The summary of one scan, and its seconds."""
     from service.cameras import open_camera
     from service.config import load_config
-    from service.flight.scan import ScanInputs, create_store
 
     config = load_config(None, [*flags, "scan.assumed_agl_m=60"])
     source = open_camera(str(video))

@@ -24,8 +24,7 @@ from recon.camera_model import rays
 from recon.types import F64, Pose
 from service.bench import BenchResult
 from service.bench.site_scale import noisy
-from service.ground.live_site import Follower
-from service.ground.shown_site import FILE, Shown
+from service.ground.live_site import FILE, Follower, Shown
 from service.offline.site.alignment import align_site
 from service.sim.flight import FlightPlan, fly
 from service.sim.recording import EPOCH_UNIX_S, ORIGIN, Simulation, SimulationOptions, prepare

@@ -224,8 +224,8 @@ def made(kind: str, site: Path, parts: Any, scheduler: str | None) -> ProductCos
 
 def _make(kind: str, site: Path, parts: Any, scheduler: str | None, progress: Progress) -> None:
     from service.offline.exports.view import ExportOptions, ScanView, export
+    from service.offline.site.alignment import write_files
     from service.offline.site.compare import changes
-    from service.offline.site.files import write_files
 
     if kind == FILES:
         write_files(site, TILE_POINTS, scheduler, progress)

@@ -11,6 +11,7 @@ import difflib
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qsl
 
 from service.cameras.source import CameraFrame, CameraSource, GeoTag
@@ -77,3 +78,16 @@ def reject_options(source: str, options: Mapping[str, str], known: tuple[str, ..
         if key not in known:
             listing = ", ".join(known) if known else "none"
             raise InputError(f"{source}: no option '{key}'; available: {listing}")
+
+
+LENIENT_SINCE = 19
+"""The version of PyAV from which tags that are not UTF-8 are read without being asked for it."""
+
+
+def open_container(source: Any, **options: Any) -> Any:
+    """A recording or stream by ``av.open``; tags that are not UTF-8 raise nothing."""
+    import av
+
+    if int(av.__version__.partition(".")[0]) < LENIENT_SINCE:
+        options["metadata_errors"] = "replace"
+    return av.open(source, **options)

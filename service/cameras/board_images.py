@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -89,16 +90,13 @@ def _video(path: Path) -> Iterator[tuple[str, U8]]:
     """Images of a video, a few a second."""
     from service.cameras import open_camera
 
-    camera = open_camera(f"file:{path}")
     due_ns = 0
-    try:
+    with closing(open_camera(f"file:{path}")) as camera:
         for frame in camera:
             if frame.time_ns >= due_ns:
                 due_ns = frame.time_ns + round(VIDEO_STEP_S * 1e9)
                 gray = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
                 yield f"{path.name} at {frame.time_ns / 1e9:.2f} s", np.asarray(gray, np.uint8)
-    finally:
-        camera.close()
 
 
 def draw_coverage(calibration: Calibration, views: Sequence[BoardView]) -> U8:

@@ -8,14 +8,15 @@ and not read.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 import yaml
+from msgspec import Meta
 
 from recon.camera_model import check_camera
 from recon.types import DIRECTIONS, F64, Camera, Shutter
@@ -24,37 +25,51 @@ from service.errors import InputError, OutsideError
 from service.small_file import read_small
 
 MODEL = "plumb_bob"
-REQUIRED = (
-    "image_width",
-    "image_height",
-    "camera_matrix",
-    "distortion_model",
-    "distortion_coefficients",
-)
 LARGEST_FILE_BYTES = 1 << 20
 LONGEST_READOUT_MS = 200.0
+
+Pixels = Annotated[int, Meta(gt=0, le=100_000)]
+
+
+class _Matrix(msgspec.Struct):
+    data: Annotated[list[float], Meta(min_length=9, max_length=9)]
+
+
+class _Coefficients(msgspec.Struct):
+    data: Annotated[list[float], Meta(min_length=5, max_length=5)]
+
+
+class _CameraInfo(msgspec.Struct):
+    """The keys that are read; :func:`shutter_of` checks the last two."""
+
+    image_width: Pixels
+    image_height: Pixels
+    camera_matrix: _Matrix
+    distortion_model: str
+    distortion_coefficients: _Coefficients
+    readout_ms: Any = 0
+    readout_direction: Any = None
 
 
 def load_camera(path: str | Path) -> Camera:
     """The camera of a camera_info YAML file; InputError, in one line, when it is unusable."""
     path = Path(path)
     document = _read(path)
-    missing = [key for key in REQUIRED if key not in document]
-    if missing:
-        raise InputError(
-            f"camera model {path}: missing {', '.join(missing)}; expected ROS camera_info YAML"
-        )
-    if document["distortion_model"] != MODEL:
+    if document.get("distortion_model", MODEL) != MODEL:
         raise InputError(
             f"camera model {path}: distortion_model is {document['distortion_model']!r}, "
             f"only {MODEL!r} is supported; calibrate again with `skyrelief calibrate`"
         )
-    size = _size(path, document)
-    K = _numbers(path, document, "camera_matrix", 9).reshape(3, 3)
-    distortion = _numbers(path, document, "distortion_coefficients", 5)
     try:
-        readout_ms, direction = document.get("readout_ms", 0), document.get("readout_direction")
-        camera = Camera(K, distortion, size, shutter_of(readout_ms, direction or "down"))
+        info = msgspec.convert(document, _CameraInfo)
+    except msgspec.ValidationError as error:
+        raise InputError(f"camera model {path}: {error}; expected ROS camera_info YAML") from error
+    K = np.array(info.camera_matrix.data).reshape(3, 3)
+    distortion = np.array(info.distortion_coefficients.data)
+    size = info.image_width, info.image_height
+    try:
+        shutter = shutter_of(info.readout_ms, info.readout_direction or "down")
+        camera = Camera(K, distortion, size, shutter)
         _check_matrix(K)
         check_camera(camera)
     except ValueError as error:
@@ -157,35 +172,6 @@ def _one_line(error: Exception) -> str:
     if mark is not None:
         return f"line {mark.line + 1}: {getattr(error, 'problem', None) or 'syntax error'}"
     return " ".join(str(error).split())[:120]
-
-
-def _size(path: Path, document: Mapping[str, Any]) -> tuple[int, int]:
-    """(W, H) of the image, whole positive numbers."""
-    values = []
-    for key in ("image_width", "image_height"):
-        value = document[key]
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= 100_000:
-            raise InputError(f"camera model {path}: {key} must be a whole number of pixels")
-        values.append(value)
-    return values[0], values[1]
-
-
-def _numbers(path: Path, document: Mapping[str, Any], key: str, count: int) -> F64:
-    """(count,) finite numbers of ``key``'s ``data``."""
-    entry = document[key]
-    data = entry.get("data") if isinstance(entry, dict) else None
-    if not isinstance(data, Sequence) or isinstance(data, str):
-        raise InputError(f"camera model {path}: {key}.data is missing or not a list")
-    if len(data) != count:
-        raise InputError(
-            f"camera model {path}: {key}.data has {len(data)} numbers, expected {count}"
-        )
-    for value in data:
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise InputError(f"camera model {path}: {key}.data holds {value!r}, not a number")
-        if not math.isfinite(value):
-            raise InputError(f"camera model {path}: {key}.data holds {value}, not a finite number")
-    return np.array([float(value) for value in data])
 
 
 def _check_matrix(K: F64) -> None:

@@ -14,7 +14,7 @@ from itertools import islice
 import av
 
 from recon.types import Shutter
-from service.cameras.container import open_container
+from service.cameras import open_container
 
 HANDLER = "DJI meta"
 MAX_BYTES = 1 << 16

@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from recon.types import U8
-from service.cameras import reject_options
-from service.cameras.container import open_container
+from service.cameras import open_container, reject_options
 from service.cameras.source import CameraFrame
 from service.errors import InputError
 

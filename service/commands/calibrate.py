@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.commands import AsJson
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ def calibrate(
     out: Annotated[Path, typer.Option(help="Camera model to write (YAML).")],
     tangential: Annotated[bool, typer.Option(help="Fit p1 and p2 too.")] = False,
     name: Annotated[str, typer.Option(help="Name of the camera in the file.")] = "camera",
-    as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Estimate intrinsics and radial distortion from a chessboard, as ROS camera_info YAML.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.commands import AsJson
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def ctl(
     system: Annotated[int | None, typer.Option(help="the vehicle's system id")] = None,
     timeout: Annotated[float, typer.Option(help="seconds to wait for the vehicle")] = 10.0,
     seconds: Annotated[float, typer.Option(help="watch: how long; 0 until Ctrl-C")] = 0.0,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Start, stop, watch and steer a scan from the ground."""
     _check(action, metres, timeout)

@@ -12,6 +12,7 @@ import typer
 from service.commands import AsJson, ScanDir, Scheduler, TilePoints, Voxel, showing
 from service.errors import InputError
 from service.offline.exports import EXPORTERS
+from service.packages import needing
 
 KINDS = "|".join(EXPORTERS)
 
@@ -73,7 +74,6 @@ def export(
     except ValueError as error:
         raise InputError(f"export: {error}") from error
     done: dict[str, Path] = {}
-    written: dict[str, str] = {}
     try:
         with showing("export") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
             write_kinds(scan, to, out, options, done)
@@ -121,7 +121,6 @@ def mesh(
     as_json: AsJson = False,
 ) -> None:
     """Mesh and texture a scan into one binary glTF file."""
-    from service.errors import InputError
     from service.offline.exports.model import MeshOptions, write_mesh
     from service.offline.exports.view import ExportOptions, ScanView
 
@@ -169,7 +168,7 @@ def inspect(
 
     from service.offline.exports.view import ScanView
     from service.scans.drawing import middle_keyframe, stages
-    from service.scans.writing import writing
+    from service.scans.writing import write_whole
 
     with ScanView(scan_dir) as scan:
         seqs = scan.store.seqs()
@@ -181,8 +180,7 @@ def inspect(
             raise InputError(f"{scan_dir}: no keyframe {seq}; there are {seqs[0]} to {seqs[-1]}")
     image, complete = stages(scan_dir, scan.store.header.scan_id, found)
     path = out or scan_dir / f"keyframe_{seq:06d}.png"
-    with writing(path) as part:
-        part.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    write_whole(path, cv2.imencode(".png", image)[1].tobytes())
     known = np.isfinite(found.depth.depth_m)
     figures = {
         "keyframe": seq,
@@ -223,7 +221,7 @@ def site(
     ] = False,
     tile_points: TilePoints = 20_000_000,
     scheduler: Scheduler = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object at the end")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Join scans that overlap into one site, or measure what changed between two.
 
@@ -245,7 +243,6 @@ def site(
         print(json.dumps(figures) if as_json else "\n".join(_aligned_lines(out, figures)))
         return
     from service.offline.site.compare import compare
-    from service.packages import needing
 
     if len(scans) != 2:
         raise InputError(f"site compare takes two scans, before and after, not {len(scans)}")

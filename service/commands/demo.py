@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 import typer
 
+from service.commands import AsJson
 from service.errors import InputError, OutsideError
 
 FLIGHT = Path("demo") / "caliterra"
@@ -33,7 +34,7 @@ def demo(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="section.key=value for the replay")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Replay a small real flight while a ground station receives it over the datalink."""
     from service.bench.link_emulator import free_port

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import stop_by_signals, with_options
+from service.commands import AsJson, stop_by_signals, with_options
 from service.errors import InputError, SkyreliefError
 from service.packages import needing
 
@@ -106,7 +106,7 @@ class GroundOptions:
     idle_exit_s: Annotated[
         float | None, typer.Option(help="end after so many seconds without new data")
     ] = None
-    as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False
+    as_json: AsJson = False
 
     def receiver(self) -> ReceiverConfig:
         """The receiver's configuration; InputError for impossible options."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from service.commands import AsJson, ScanDir, showing
+from service.errors import InputError
 
 if TYPE_CHECKING:
     from service.offline.refine.refly import Refly
@@ -41,7 +43,6 @@ def refine(
     Keyframes keep their numbers; --undo restores the poses of the flight. The scan's files are
     written again.
     """
-    from service.errors import InputError
     from service.offline.refine.refinement import RefineOptions
     from service.offline.refine.refinement import intrinsics as run_intrinsics
     from service.offline.refine.refinement import refine as run
@@ -148,7 +149,6 @@ def refly(
     as_json: AsJson = False,
 ) -> None:
     """Plan a mission over gaps, places in too few images and places of large sigma."""
-    from service.errors import InputError
 
     path = out or scan_dir / "refly.plan"
     if path.suffix not in (".plan", ".waypoints"):
@@ -172,9 +172,6 @@ def _flight(
 ) -> Refly | None:
     """Lines over the cells that are weak by ``limits``, at the scan's height and speed; None
     without any."""
-    from dataclasses import replace
-
-    from service.errors import InputError
     from service.offline.exports.view import ScanView
     from service.offline.refine.refly import suggest_as_flown
     from service.scans.coverage import coverage_of
@@ -189,11 +186,10 @@ def _flight(
 
 def _write_plan(path: Path, flight: Refly) -> None:
     from service.offline.refine.refly import plan_json, waypoints_text
-    from service.scans.writing import writing
+    from service.scans.writing import write_whole
 
     text = waypoints_text(flight) if path.suffix == ".waypoints" else plan_json(flight)
-    with writing(path) as part:
-        part.write_text(text, encoding="utf-8")
+    write_whole(path, text)
 
 
 def _plan_figures(path: Path, flight: Refly) -> dict[str, Any]:

@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import ConfigFile, Overrides, showing, stop_by_signals
+from service.commands import AsJson, ConfigFile, Overrides, showing, stop_by_signals
+from service.errors import InputError
 from service.progress import Progress
 
 if TYPE_CHECKING:
     from mavlink.telemetry.logs import TelemetryLog
-    from recon.calibration.flight import SelfCalibrated
-    from recon.types import Camera, Shutter
+    from recon.types import Camera
     from service.cameras.source import CameraSource
-    from service.commands.own_lens import StartLens
     from service.config import Config
     from service.flight.scan import Scan, ScanInputs
 
@@ -56,7 +55,7 @@ def replay(
     ] = True,
     config: ConfigFile = None,
     set_: Overrides = None,
-    as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Reconstruct a recording (video, folder of images or pipe) into a scan folder."""
     from service.memory import one_pool
@@ -74,15 +73,13 @@ def replay(
     log = _load_telemetry(telemetry, chosen) if telemetry else _subtitles(video, chosen)
     source = open_camera(video)
     played = Paced(source) if realtime else source
-    try:
+    with closing(played):
         if not (realtime or chosen.compute.model or is_given(WIDTH, config, overrides)):
             chosen = denser(chosen, source)
         summary = _replay(
             video, source, played, camera, find_lens and not realtime, log, video_epoch, out,
             chosen, as_json, is_given(LATENCY, config, overrides),
         )  # fmt: skip
-    finally:
-        played.close()
     _report(summary, as_json)
 
 
@@ -110,7 +107,6 @@ def _load_telemetry(path: Path, config: Config) -> TelemetryLog:
     from mavlink.telemetry.gimbal import GimbalConfig
     from mavlink.telemetry.history import HistoryConfig
     from mavlink.telemetry.logs import load_telemetry
-    from service.errors import InputError
 
     gimbal = GimbalConfig(yaw_frame=config.mavlink.gimbal_yaw_frame)
     try:
@@ -122,7 +118,6 @@ def _load_telemetry(path: Path, config: Config) -> TelemetryLog:
 def _subtitles(video: str, config: Config) -> TelemetryLog | None:
     """The telemetry in the subtitles that DJI drones write next to a video, under its name."""
     from service.cameras import parse_source
-    from service.errors import InputError
 
     kind, name = parse_source(video)[:2]
     places = [Path(name).with_suffix(end) for end in (".SRT", ".srt")] if kind == "file" else []
@@ -153,8 +148,12 @@ def _replay(
 ) -> dict[str, Any]:
     from service.cameras import open_camera, parse_source
     from service.commands.all_stills import all_stills
-    from service.commands.own_lens import start_lens
-    from service.commands.video_time import start_of
+    from service.commands.unstated import (
+        start_lens,
+        start_of,
+        with_own_lens,
+        with_stated_readout,
+    )
     from service.compute.backend_choice import open_backend
     from service.flight.scan import ScanInputs
 
@@ -164,7 +163,7 @@ def _replay(
     else:
         start = start_lens(source, log)
         lens = start.camera
-    lens, config = _with_stated_readout(lens, config, video, source, notes)
+    lens, config = with_stated_readout(lens, config, video, source, notes)
     epoch_ns = start_of(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
     folder = out or Path(f"scan-{scan_id}")
@@ -189,7 +188,7 @@ def _replay(
         unsure = {"readout"} if is_clock_sure else {"readout", "clock"}
     with nullcontext(Progress()) if as_json else showing("replay") as progress:
         if start is not None:
-            inputs = _with_lens(inputs, video, start, find_lens, progress)
+            inputs = with_own_lens(inputs, video, start, find_lens, progress)
         if played is source:
             inputs = all_stills(inputs, is_latency_given, progress)
         stop = stop_by_signals()
@@ -204,35 +203,6 @@ def _replay(
                 corrected = replace(base, source=again, **found.changed)
                 found = _fly(corrected, stop, progress, unsure)
     return found | {"scan_folder": str(folder)}
-
-
-def _with_lens(
-    inputs: ScanInputs, video: str, start: StartLens, find_lens: bool, progress: Progress
-) -> ScanInputs:
-    """The scan with the lens by its own images, where they determine it, else as it is."""
-    from service.cameras import parse_source
-    from service.commands.own_lens import own_lens, still_assumed
-    from service.flight.scan import check_new
-
-    found: SelfCalibrated | str = ""
-    if find_lens and parse_source(video)[0] in ("file", "images"):
-        check_new(inputs.folder)
-        progress("finding the lens")
-        found = own_lens(inputs, video, start.search)
-    if isinstance(found, str):
-        refused = (f"the images do not determine their lens: {found}",) if found else ()
-        notes = (start.note, *refused, *inputs.notes)
-        sigma = start.search.sigma_focal
-        return replace(inputs, notes=notes, assumed=start.assumed, sigma_focal=sigma)
-    focal = f"{found.camera.K[0, 0]:.0f} px, sigma {100.0 * found.sigma_focal:.1f} %"
-    note = f"no camera model given: found from the images themselves ({focal})"
-    return replace(
-        inputs,
-        camera=found.camera,
-        notes=(note, *inputs.notes),
-        assumed=still_assumed(found),
-        sigma_focal=found.sigma_focal,
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -288,45 +258,13 @@ def _fly(
 
 def _correction(scan: Scan, unsure: Collection[str], has_ended: bool = False) -> _Correction | None:
     """What the images of the scan show by now, of what is ``unsure``; None before they do."""
-    from service.commands.video_time import at_another_time
+    from service.commands.unstated import at_another_time, with_readout
 
     off_ms = scan.check.clock_off_ms(has_ended) if "clock" in unsure else None
     if off_ms is not None:
         return _Correction("clock", at_another_time(scan.inputs, off_ms))
     shutter = scan.found_shutter() if "readout" in unsure else None
-    return None if shutter is None else _Correction("readout", _with_readout(scan.inputs, shutter))
-
-
-def _with_readout(inputs: ScanInputs, shutter: Shutter) -> dict[str, Any]:
-    """Inputs of the scan with the readout that its images show; the search goes on."""
-    from service.config import change
-
-    camera = replace(inputs.camera, shutter=shutter)
-    return {"camera": camera, "config": change(inputs.config, "camera.readout_ms", "auto")}
-
-
-def _with_stated_readout(
-    camera: Camera, config: Config, video: str, source: CameraSource, notes: list[str]
-) -> tuple[Camera, Config]:
-    """Camera and configuration with the readout that the video states, where nothing else does.
-
-    The images refine it.
-    """
-    from service.cameras import parse_source
-    from service.cameras.camera_file import seeks_readout
-    from service.cameras.dji_metadata import stated_shutter
-    from service.config import change
-
-    kind, path = parse_source(video)[:2]
-    is_open = seeks_readout(camera, config.camera) and config.camera.readout_ms != "auto"
-    if kind != "file" or not is_open or getattr(source, "turned_deg", 0) != 0:
-        return camera, config
-    shutter = stated_shutter(path)
-    if shutter is None:
-        return camera, config
-    readout_ms = 1e3 * shutter.readout_s
-    notes.append(f"the video states a readout of {readout_ms:.1f} ms, {shutter.direction}")
-    return replace(camera, shutter=shutter), change(config, "camera.readout_ms", "auto")
+    return None if shutter is None else _Correction("readout", with_readout(scan.inputs, shutter))
 
 
 def _fitted(camera: Camera, source: CameraSource, notes: list[str]) -> Camera:

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.commands import ConfigFile, Overrides
+from service.errors import InputError
 
 if TYPE_CHECKING:
     from mavlink.wire.first_beat import FirstBeats
     from service.config import Config
     from service.daemon.runtime import Daemon
     from service.daemon.simulated import SimulatedFlight
-    from service.errors import InputError
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +50,6 @@ def _configuration(path: Path | None, overrides: list[str]) -> tuple[Config, Inp
     fault where no init system would restart the service: a person reads it in a terminal.
     """
     from service.config import Config, load_config
-    from service.errors import InputError
 
     try:
         return load_config(path, overrides), None
@@ -100,7 +99,6 @@ def _reload(
     daemon: Daemon, flight: SimulatedFlight | None, path: Path | None, overrides: list[str]
 ) -> None:
     from service.config import load_config
-    from service.errors import InputError
 
     try:
         wanted = load_config(path, overrides)

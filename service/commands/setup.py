@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands import ConfigFile, Overrides, showing
+from service.commands import AsJson, ConfigFile, Overrides, showing
 from service.config import keys as configuration_keys
 from service.config import load_config
 from service.errors import InputError, OutsideError
@@ -23,7 +23,7 @@ def config(
     action: Annotated[str, typer.Argument(help="check, show or default")],
     file: Annotated[Path | None, typer.Argument(help="configuration file (TOML)")] = None,
     set_: Overrides = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Check a configuration file, show what is in force, or print the documented default.
 
@@ -75,7 +75,7 @@ def doctor(
     ] = None,
     set_: Overrides = None,
     listen_s: Annotated[float, typer.Option(help="seconds to listen on the MAVLink links")] = 3.0,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Report what works, what does not, and the remedy. Exit code 3 when something is bad."""
     from service.daemon.diagnosis import BAD, examine
@@ -104,7 +104,7 @@ def keys(
     ] = None,
     revoke: Annotated[str | None, typer.Option(help="member whose certificate is revoked")] = None,
     days: Annotated[int, typer.Option(help="validity of the certificates", min=1)] = 365,
-    as_json: Annotated[bool, typer.Option("--json", help="end with one JSON object")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Make keys for drones, ground stations and viewers; existing keys are kept.
 
@@ -112,7 +112,6 @@ def keys(
     FOLDER/authority private: with it anyone can join the fleet. --revoke NAME removes the rights
     of a drone or viewer; revoking a ground station makes new keys for all others.
     """
-    from service.errors import InputError
     from service.stream import keys as fleet_keys
 
     members = {"drone": drone or [], "ground": ground or [], "viewer": viewer or []}
@@ -146,7 +145,7 @@ def _say_revoked(member: str, paths: list[Path], as_json: bool) -> None:
 def warm_up(
     config: ConfigFile = None,
     set_: Overrides = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compile all kernels before the first flight, by a scan of synthetic ground.
 

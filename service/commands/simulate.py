@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from service.commands import parse_size, showing, with_options
+from service.commands import AsJson, parse_size, showing, with_options
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class SimulateOptions:
     mavlink_to: Annotated[str, typer.Option(help="Live: UDP host:port.")] = "127.0.0.1:14550"
     loop: Annotated[bool, typer.Option("--loop", help="Live: repeat the flight.")] = False
     until_stdin_ends: Annotated[bool, typer.Option("--until-stdin-ends", hidden=True)] = False
-    as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False
+    as_json: AsJson = False
 
     def simulation(self) -> recording.SimulationOptions:
         """Raises ValueError for an impossible flight, InputError for unreadable text."""
@@ -248,7 +248,7 @@ def score(
     deliverables: Annotated[
         bool, typer.Option("--deliverables", help="Measure the exported files in it as well.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Report as one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure accuracy, completeness and trajectory error of a scan of a simulated flight."""
     from service.sim import scoring

@@ -12,6 +12,7 @@ import typer
 from service.commands import AsJson, parse_size
 from service.compute.rectified_pair import matching_config, read_gray
 from service.errors import InputError, OutsideError
+from service.packages import needing
 
 if TYPE_CHECKING:
     from recon.backends import Backend
@@ -130,12 +131,9 @@ def export_model(
     shape = _shape(size, "--size")
     fine = _shape(guide, "--guide") if guide else None
     _check_labels(labels)
-    if out.suffix != ".onnx" or not out.parent.is_dir():
-        raise InputError(f"{out}: give a name that ends in .onnx, in a folder that exists")
-    try:
+    check_output(out, ".onnx")
+    with needing("an ONNX model"):
         from recon.backends.onnx_dense import stereo_model, upsampling_model
-    except ImportError as error:
-        raise OutsideError(f"export needs the onnx package: {error}") from error
     from recon.stereo.belief_propagation import BeliefPropagationConfig
     from recon.stereo.upsampling import UpsamplingConfig
 

@@ -2,7 +2,7 @@
 
 A learned model is an ONNX file and a TOML file next to it, which names the ONNX file
 (``model = "net.onnx"``, relative to itself) and sets the fields of
-:class:`recon.backends.learned_stereo.LearnedStereoConfig` that differ from their defaults.
+:class:`recon.backends.onnx_backend.LearnedStereoConfig` that differ from their defaults.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 from service.config import ComputeConfig
 from service.errors import InputError, OutsideError
-from service.packages import loads
+from service.packages import loads, needing
 
 if TYPE_CHECKING:
-    from recon.backends.learned_stereo import LearnedStereoBackend
+    from recon.backends.onnx_backend import LearnedStereoBackend
     from recon.mapping.registration import IcpConfig
 
 Result = TypeVar("Result")
@@ -286,10 +286,8 @@ def load_learned_model(declaration: Path) -> LearnedStereoBackend:
     Raises InputError, with what was expected and what was found, when declaration and model
     do not fit, and OutsideError when ONNX Runtime is missing.
     """
-    try:
-        from recon.backends.learned_stereo import LearnedStereoBackend, LearnedStereoConfig
-    except ImportError as error:
-        raise OutsideError(f"a learned model needs ONNX Runtime: {error}") from error
+    with needing("a learned model"):
+        from recon.backends.onnx_backend import LearnedStereoBackend, LearnedStereoConfig
     try:
         given = msgspec.toml.decode(declaration.read_bytes(), type=dict[str, Any])
         model = declaration.parent / str(given.pop("model", ""))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -176,8 +177,6 @@ class ControlActions:
 
 def _systemctl(verb: str) -> Answer:
     """Ask the init system to reboot or power off."""
-    import subprocess
-
     try:
         subprocess.run(["systemctl", verb], check=True, capture_output=True, timeout=10)
     except (OSError, subprocess.SubprocessError) as error:

@@ -7,6 +7,7 @@ import os
 import platform
 import re
 import shutil
+import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -298,8 +299,6 @@ def _certificate(config: Config) -> Iterator[Finding]:
 
 
 def _datalink(config: Config) -> Iterator[Finding]:
-    import socket
-
     if not (config.datalink.connect or config.datalink.listen):
         yield Finding("datalink", NOTE, "no endpoints: scans stay onboard")
     for endpoint in config.datalink.connect:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavlink.component.status import WARNING
 from mavlink.telemetry.clock import agree, computer_offset_ns
-from service.config import Config
+from service.config import Config, change
 from service.daemon.intent import FIRST_RETRY_S, LAST_RETRY_S
 from service.errors import OutsideError
 
@@ -98,10 +98,8 @@ class ScanRun:
         try:
             source = self._open_camera()
             if source is not None:
-                try:
+                with closing(source):
                     self._scan(source)
-                finally:
-                    source.close()
         finally:
             self.is_closing = True
             self.scan = self.gate = self._store = None
@@ -155,7 +153,6 @@ class ScanRun:
     def _inputs(self, source: CameraSource) -> tuple[ScanInputs, FrameGate]:
         """Inputs of the scan, with its camera behind a gate."""
         from service.cameras.camera_file import check_size, seeks_readout
-        from service.config import change
         from service.daemon.camera_memory import measured
         from service.daemon.frame_gate import FrameGate
         from service.flight.scan import ScanInputs

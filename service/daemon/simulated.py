@@ -11,15 +11,15 @@ import contextlib
 import dataclasses
 import logging
 import os
-import shutil
 import socket
 import sys
 from pathlib import Path
 
 from service.cameras import parse_source, reject_options
 from service.config import Config, ScanConfig
-from service.errors import InputError, OutsideError
+from service.errors import InputError
 from service.init_system import Notifier
+from service.scans.writing import writing_folder
 from service.workers import PROCESS, Worker, run_process
 
 log = logging.getLogger(__name__)
@@ -134,16 +134,8 @@ def _render(folder: Path, given: dict[str, str]) -> None:
             log.info("rendering the simulated flight: frame %d of %d", done, total)
             notifier.closing()  # extends systemd's timeout
 
-    part = folder.with_name(f"{folder.name}.part")
-    try:
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir(parents=True)
+    with writing_folder(folder) as part:
         recording.write(simulation, part, report)
-        part.rename(folder)
-    except OSError as error:
-        raise OutsideError(f"{folder} cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)  # frees the space on a full disk
 
 
 def _can_write(folder: Path) -> bool:

@@ -19,7 +19,9 @@ import numpy as np
 
 from service.cameras.source import CameraFrame
 from service.config import Config, change
+from service.errors import OutsideError
 from service.progress import Progress
+from service.scans.writing import write_whole
 from service.version import software
 
 log = logging.getLogger(__name__)
@@ -135,10 +137,9 @@ def _mark() -> None:
     if marker is None:
         return
     try:
-        marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.write_text(software(), encoding="utf-8")
-    except OSError as error:
-        log.warning("%s cannot be written: %s", marker, error.strerror)
+        write_whole(marker, software())
+    except OutsideError as error:
+        log.warning("%s", error)
 
 
 def _services_cache() -> str:

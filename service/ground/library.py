@@ -32,7 +32,7 @@ from service.ground.storage import (
 )
 from service.scans.annotations import Annotation, Spot, add_annotation, delete_annotation
 from service.scans.folder import PIECE, SUMMARY, write_deliverables
-from service.scans.writing import writing
+from service.scans.writing import write_whole
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
@@ -171,8 +171,7 @@ class Library:
                 old.tags if tags is None else _tags(tags),
                 old.edition + 1,
             )
-            with writing(folder / LABELS) as part:
-                part.write_bytes(msgspec.json.encode(new))
+            write_whole(folder / LABELS, msgspec.json.encode(new))
         return new
 
     def annotate(self, drone: str, scan: str, spot: Spot, text: str, by: str) -> Annotation:

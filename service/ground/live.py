@@ -41,7 +41,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from recon.mapping.cloud_fusion import cloud_of
 from recon.types import F64, DepthMap, Keyframe
 from service.errors import SkyreliefError
-from service.ground.shown_site import SiteNews
+from service.ground.live_site import SiteNews
 from service.stream.ranges import RangeSet
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore

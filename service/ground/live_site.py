@@ -7,23 +7,37 @@ takes where each scan is shown. Nothing is sent to an aircraft, and no scan is c
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import select
 import sys
 import time
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
-from service.errors import SkyreliefError
+import msgspec
+import numpy as np
+
+from recon import se3
+from recon.types import F64
+from service.errors import InputError, SkyreliefError
 from service.ground.foxglove import growing
-from service.ground.shown_site import FILE, write_shown
+from service.ground.scan_facts import UnixTime
 from service.ground.sites import references
-from service.offline.site import DRONE
-from service.offline.site.live import LiveSite
+from service.ground.storage import is_regular
+from service.offline.site import DRONE, SAME_VISIT_S
+from service.offline.site.live import LiveSite, PlacedScan
+from service.scans.writing import write_whole
+from service.small_file import read_json
 from service.workers import Worker, guarded, run_process
 
 log = logging.getLogger(__name__)
 
+FILE = ".live-site.json"
+"""Where the scans in flight are shown; below the receiver's folder."""
+
+MAX_BYTES = 200_000
 POLL_S = 0.25
 MAX_FLYING, MAX_SCANS = 16, 48
 """Scans in flight, and all that are followed."""
@@ -114,6 +128,87 @@ def serve(store: Path) -> None:
     write_shown(store, [])
     while not select.select([sys.stdin], [], [], 0.0 if is_busy else POLL_S)[0]:
         is_busy = follower.turn(time.time())
+
+
+Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+Matrix = Annotated[list[Number], msgspec.Meta(min_length=16, max_length=16)]
+
+
+class Shown(msgspec.Struct):
+    """One scan in the site."""
+
+    drone: str
+    scan: str
+    started_unix_s: UnixTime
+    T_site_scan: Matrix  # row by row, by the two origins alone
+    moved: Matrix  # row by row: in the site, with the scale
+    sigma_m: tuple[Number, Number, Number]  # east, north, up
+    ties: int
+    group: int  # scans that ties join have one number
+
+
+def write_shown(store: Path, placed: list[PlacedScan]) -> None:
+    """Replace the file in ``store``; OutsideError for the disk."""
+    found = []
+    for one in placed:
+        moved = se3.compose(one.move.growth * one.move.R, one.move.t)
+        matrices = (one.T_site_scan.ravel().tolist(), moved.ravel().tolist())
+        sigma = (float(v) for v in np.minimum(one.sigma_m, 1e6))
+        names = one.folder.parent.name, one.folder.name
+        found.append(Shown(*names, one.started_unix_s, *matrices, (*sigma,), one.ties, one.group))  # type: ignore[arg-type]
+    write_whole(store / FILE, msgspec.json.encode(found))
+
+
+class SiteNews:
+    """Gives where the scans tied to one scan are shown, in its own coordinates."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder.parent.parent / FILE
+        self._names = folder.parent.name, folder.name
+        self._seen = 0
+
+    def message(self) -> str | None:
+        """What the process wrote last, as JSON; None when it is known already.
+
+        ``T`` (16, column by column) takes a scan's coordinates, corrected, to this scan's.
+        """
+        try:
+            written = self._path.lstat().st_mtime_ns
+        except OSError:
+            written = 0
+        if written == self._seen:
+            return None
+        self._seen = written
+        scans = self._read()
+        own = next((one for one in scans if (one.drone, one.scan) == self._names), None)
+        near = [one for one in scans if own and _is_for(own, one)]
+        return json.dumps({"type": "site", "scans": [_entry(own, one) for one in near if own]})
+
+    def _read(self) -> list[Shown]:
+        if not is_regular(self._path):
+            return []
+        try:
+            return read_json(self._path, list[Shown], MAX_BYTES, "scans in flight")
+        except InputError:
+            return []
+
+
+def _is_for(own: Shown, one: Shown) -> bool:
+    """True for a scan tied to this one, and not of a later visit."""
+    return one.group == own.group and one.started_unix_s <= own.started_unix_s + SAME_VISIT_S
+
+
+def _entry(own: Shown, one: Shown) -> dict[str, object]:
+    T = se3.inverse(_matrix(own.T_site_scan)) @ _matrix(one.moved) @ _matrix(one.T_site_scan)
+    return {
+        "drone": one.drone, "scan": one.scan, "own": one is own,
+        "earlier": one.started_unix_s < own.started_unix_s - SAME_VISIT_S, "ties": one.ties,
+        "sigma_m": one.sigma_m, "T": [round(float(v), 9) for v in T.T.ravel()],
+    }  # fmt: skip
+
+
+def _matrix(numbers: list[float]) -> F64:
+    return np.array(numbers, np.float64).reshape(4, 4)
 
 
 if __name__ == "__main__":

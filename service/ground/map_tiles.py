@@ -35,9 +35,9 @@ from service.ground.live_map import (
     pixel_m,
 )
 from service.ground.state import PortalState, names_of, state_of
+from service.offline.exports.rasters import open_map
 from service.scans.coverage import Coverage
 from service.scans.folder import SUMMARY
-from service.scans.map_files import open_map
 
 RASTERS = {"ortho": "ortho.tif", "dsm": "dsm.tif", "contours": "dsm.tif"}
 """The layers that a finished scan may have as rasters."""

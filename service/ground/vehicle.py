@@ -7,14 +7,11 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from service.errors import InputError, OutsideError
-from service.ground.operator import order
+from service.ground.operator import Operator, order
 from service.workers import Worker, Workers
-
-if TYPE_CHECKING:
-    from service.ground.operator import Operator
 
 log = logging.getLogger(__name__)
 
@@ -134,8 +131,6 @@ class Vehicle:
 
 
 def _operator(endpoint: str) -> Operator:
-    from service.ground.operator import Operator
-
     return Operator(endpoint, None, SEARCH_S)
 
 

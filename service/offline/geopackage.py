@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 import struct
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,25 +72,21 @@ def write_layers(path: Path, epsg: int, layers: Sequence[Layer]) -> None:
     """Write the layers as one file."""
     from pyproj import CRS
 
-    with writing(path) as part:
-        db = sqlite3.connect(part)
-        try:
-            db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            db.execute(f"PRAGMA user_version = {VERSION}")
-            db.executescript(SCHEMA)
-            system = CRS.from_epsg(epsg)
-            known = [
-                ("Undefined Cartesian", -1, "NONE", -1, "undefined", None),
-                ("Undefined geographic", 0, "NONE", 0, "undefined", None),
-                ("WGS 84", 4326, "EPSG", 4326, CRS.from_epsg(4326).to_wkt("WKT1_GDAL"), None),
-                (system.name, epsg, "EPSG", epsg, system.to_wkt("WKT1_GDAL"), None),
-            ]
-            db.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)", known)
-            for layer in layers:
-                _put(db, epsg, layer)
-            db.commit()
-        finally:
-            db.close()
+    with writing(path) as part, closing(sqlite3.connect(part)) as db:
+        db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        db.execute(f"PRAGMA user_version = {VERSION}")
+        db.executescript(SCHEMA)
+        system = CRS.from_epsg(epsg)
+        known = [
+            ("Undefined Cartesian", -1, "NONE", -1, "undefined", None),
+            ("Undefined geographic", 0, "NONE", 0, "undefined", None),
+            ("WGS 84", 4326, "EPSG", 4326, CRS.from_epsg(4326).to_wkt("WKT1_GDAL"), None),
+            (system.name, epsg, "EPSG", epsg, system.to_wkt("WKT1_GDAL"), None),
+        ]
+        db.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)", known)
+        for layer in layers:
+            _put(db, epsg, layer)
+        db.commit()
 
 
 def _put(db: sqlite3.Connection, epsg: int, layer: Layer) -> None:

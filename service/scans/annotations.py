@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from service.errors import InputError
-from service.scans.writing import writing
+from service.scans.writing import write_whole
 from service.small_file import read_json
 
 ANNOTATIONS = "annotations.geojson"
@@ -109,8 +109,7 @@ def _text(text: str) -> str:
 
 
 def _write(folder: Path, known: Annotations) -> None:
-    with writing(folder / ANNOTATIONS) as part:
-        part.write_bytes(msgspec.json.encode(known))
+    write_whole(folder / ANNOTATIONS, msgspec.json.encode(known))
 
 
 def as_json(document: Annotation | Annotations) -> Any:

@@ -29,7 +29,7 @@ from recon.types import U8, Array, DepthMap
 from service.georeference import LocalFrame
 from service.scans.main_piece import Stretch, main_seqs, stretches_apart
 from service.scans.track import local_frame
-from service.scans.writing import writing
+from service.scans.writing import write_whole
 from service.stream.store import ScanStore
 from service.workers import PROCESS, Worker
 
@@ -223,10 +223,8 @@ def write_coverage_files(folder: Path, store: ScanStore) -> Coverage | None:
 
 
 def _write(folder: Path, found: Coverage) -> None:
-    with writing(folder / IMAGE) as part:
-        part.write_bytes(found.png_bytes())
-    with writing(folder / FIGURES) as part:
-        part.write_bytes(found.json_bytes())
+    write_whole(folder / IMAGE, found.png_bytes())
+    write_whole(folder / FIGURES, found.json_bytes())
 
 
 class CoverageWriter:

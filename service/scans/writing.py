@@ -28,6 +28,12 @@ def writing(path: Path) -> Iterator[Path]:
         os.replace(part, path)
 
 
+def write_whole(path: Path, data: bytes | str) -> None:
+    """Write a file of bytes or UTF-8 by :func:`writing`."""
+    with writing(path) as part:
+        part.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
 @contextmanager
 def writing_folder(path: Path) -> Iterator[Path]:
     """An empty folder next to ``path``, renamed onto it on success. An existing folder is replaced

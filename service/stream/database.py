@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -149,12 +150,9 @@ def _version(connection: sqlite3.Connection) -> int:
 @cache
 def _ours() -> dict[str, tuple[str, str, str]]:
     """Name to kind, table and SQL of everything that belongs in the file."""
-    connection = sqlite3.connect(":memory:")
-    try:
+    with closing(sqlite3.connect(":memory:")) as connection:
         connection.executescript(SCHEMA)
         rows = connection.execute("SELECT name, type, tbl_name, sql FROM sqlite_master").fetchall()
-    finally:
-        connection.close()
     return {name: (kind, table, _plain(text)) for name, kind, table, text in rows}
 
 
@@ -178,13 +176,10 @@ def as_error(path: Path, error: sqlite3.Error) -> InputError | OutsideError:
 def peek_meta(path: Path, key: str) -> str | None:
     """A text of the meta table, also while the file is open elsewhere; None without one."""
     try:
-        connection, _ = connect(path, read_only=True)
-        try:
+        with closing(connect(path, read_only=True)[0]) as connection:
             check_schema(connection, path)
             sql = "SELECT value FROM meta WHERE key = ?"
             row = connection.execute(sql, (key,)).fetchone()
-        finally:
-            connection.close()
     except (sqlite3.Error, OSError, InputError) as error:
         log.debug("%s: %s", path, error)
         return None
@@ -316,12 +311,9 @@ def is_sound(path: Path) -> bool:
     Raises InputError when its schema is not that of a scan.
     """
     try:
-        connection, _ = connect(path, read_only=not can_write(path))
-        try:
+        with closing(connect(path, read_only=not can_write(path))[0]) as connection:
             check_schema(connection, path)
             return bool(connection.execute("PRAGMA quick_check(1)").fetchone()[0] == "ok")
-        finally:
-            connection.close()
     except sqlite3.OperationalError:
         return True
     except sqlite3.DatabaseError:

@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.errors import InputError, OutsideError
+from service.errors import InputError
+from service.packages import needing
 from service.stream.naming import ROOT, check_name
 
 if TYPE_CHECKING:
@@ -168,10 +169,8 @@ def member_name(certificate: Path) -> str:
 
 
 def _read(certificate: Path) -> x509.Certificate:
-    try:
+    with needing("reading certificates"):
         from cryptography import x509
-    except ImportError as error:
-        raise OutsideError("reading certificates needs the package 'cryptography'") from error
     try:
         return x509.load_pem_x509_certificate(certificate.read_bytes())
     except (OSError, ValueError) as error:
@@ -189,9 +188,8 @@ def make_keys(
     for names in members.values():
         for name in names:
             check_name(name, "fleet member")
-    start = datetime.datetime.fromtimestamp(
-        now if now is not None else datetime.datetime.now().timestamp(), datetime.timezone.utc
-    )
+    utc = datetime.timezone.utc
+    start = datetime.datetime.now(utc) if now is None else datetime.datetime.fromtimestamp(now, utc)
     try:
         authority = _authority(folder / "authority", start)
         path = folder / FLEET
@@ -210,7 +208,7 @@ def make_keys(
     return made
 
 
-def revoke(folder: Path, member: str, days: int = 365, now: float | None = None) -> list[Path]:
+def revoke(folder: Path, member: str, days: int = 365) -> list[Path]:
     """Revoke the certificate of ``member`` (a name, or ``<role>.<name>``); returns files to copy.
 
     A drone or viewer loses its rights through the ``fleet.json`` of every ground station. For a
@@ -231,7 +229,7 @@ def revoke(folder: Path, member: str, days: int = 365, now: float | None = None)
         _write_fleet(folder, rest)
     except OSError as error:
         raise InputError(f"cannot write keys in {folder}: {error.strerror}") from error
-    return make_keys(folder, rest.members, days, now)
+    return make_keys(folder, rest.members, days)
 
 
 def _named(fleet: Fleet, member: str) -> tuple[str, str]:
@@ -270,14 +268,10 @@ def _write_fleet(folder: Path, fleet: Fleet) -> list[Path]:
 
 
 def _authority(folder: Path, start: datetime.datetime) -> Authority:
-    try:
+    with needing("an authority"):
         from cryptography import x509
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ec
-    except ImportError as error:
-        raise OutsideError(
-            "keys need the package 'cryptography'; install skyrelief with the extra 'ground'"
-        ) from error
     if (folder / KEY).exists():
         key = serialization.load_pem_private_key((folder / KEY).read_bytes(), None)
         if not isinstance(key, ec.EllipticCurvePrivateKey):

@@ -44,6 +44,7 @@ from service.stream.records import (
     PoseRecord,
     Repose,
     ScanHeader,
+    header_from_json,
     pack_pose,
     pack_repose,
     read_header,
@@ -387,10 +388,10 @@ class ScanStore:
             self._inventory.note_repose(number, repose.seq, repose.revision)
             return True
 
-    def repose(self, seq: int) -> Repose | None:
-        """The newest re-pose of keyframe ``seq``."""
-        sql = "SELECT data FROM reposes WHERE seq = ? ORDER BY revision DESC, id DESC LIMIT 1"
-        row = self.database.one(sql, (seq,))
+    def repose(self, seq: int, below: int = 1 << 32) -> Repose | None:
+        """The newest re-pose of keyframe ``seq``, of the revisions ``below`` a number."""
+        of = "SELECT data FROM reposes WHERE seq = ? AND revision < ?"
+        row = self.database.one(f"{of} ORDER BY revision DESC, id DESC LIMIT 1", (seq, below))
         return None if row is None else unpack_repose(blob(row[0]))
 
     def add_radio(self, kind: str, number: int, part: int, data: bytes) -> bool:
@@ -508,8 +509,7 @@ class ScanStore:
 def header_of(path: Path) -> ScanHeader | None:
     """The header of a store, also while it is open elsewhere; None when it cannot be read."""
     text = peek_meta(path, "header")
-    header = None if text is None else read_header(text.encode())
-    return header if isinstance(header, ScanHeader) else None
+    return None if text is None else header_from_json(text.encode())
 
 
 def _chunk_row(head: codec.LayerHead, data: bytes) -> tuple[Any, ...]:

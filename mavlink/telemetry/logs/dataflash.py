@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -77,17 +78,10 @@ def _messages(path: Path) -> Iterator[Any]:
         log = DFReader_binary(str(path))
     except Exception as error:  # DFReader raises this class itself
         raise ValueError(f"{path}: the .BIN log cannot be read ({error})") from error
-    try:
-        while True:
-            try:
-                message = log.recv_match(type=list(_Reader.TABLE))
-            except Exception:
-                return  # truncated here: keep what was read before
-            if message is None:
-                return
+    # Where the log is cut off, what was read before counts.
+    with closing(log), suppress(Exception):
+        while (message := log.recv_match(type=list(_Reader.TABLE))) is not None:
             yield message
-    finally:
-        log.close()
 
 
 class _Gyros:

@@ -16,7 +16,7 @@ from recon.types import F64, Keyframe
 from service.georeference import LocalFrame
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
-from service.scans.writing import writing, writing_folder
+from service.scans.writing import write_whole, writing_folder
 
 
 def _geodetic(scan: ScanView, frame: LocalFrame) -> F64:
@@ -26,7 +26,8 @@ def _geodetic(scan: ScanView, frame: LocalFrame) -> F64:
     return frame.to_geodetic(np.array([p.T_world_camera[:3, 3] for p in scan.poses]))
 
 
-def _iso(time_unix_ns: int) -> str:
+def iso_time(time_unix_ns: int) -> str:
+    """RFC 3339 to the millisecond."""
     when = dt.datetime.fromtimestamp(time_unix_ns / 1e9, dt.timezone.utc)
     return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
@@ -54,7 +55,7 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
                 "type": "Feature",
                 "properties": {
                     "keyframe": one.seq,
-                    "time": _iso(one.time_ns),
+                    "time": iso_time(one.time_ns),
                     "points": int(one.fresh.sum()),
                     "sigma_m": round(se3.sigma_at(place_m, one.pose.covariance), 4),
                 },
@@ -64,14 +65,13 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
                 },
             }
         )
-    with writing(out) as part:
-        part.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    write_whole(out, json.dumps({"type": "FeatureCollection", "features": features}))
 
 
 def write_kml(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """The track with its times; heights above mean sea level, as KML demands."""
     geodetic = _geodetic(scan, scan.flown_frame or scan.needs_place("a map of the flight"))
-    whens = "".join(f"<when>{_iso(p.time_unix_ns)}</when>" for p in scan.poses)
+    whens = "".join(f"<when>{iso_time(p.time_unix_ns)}</when>" for p in scan.poses)
     places = "".join(f"<gx:coord>{g[1]:.8f} {g[0]:.8f} {g[2]:.3f}</gx:coord>" for g in geodetic)
     name = escape(scan.store.header.scan_id)
     text = (
@@ -81,8 +81,7 @@ def write_kml(scan: ScanView, out: Path, options: ExportOptions) -> None:
         f"<altitudeMode>absolute</altitudeMode>{whens}{places}"
         "</gx:Track></Placemark></Document></kml>\n"
     )
-    with writing(out) as part:
-        part.write_text(text, encoding="utf-8")
+    write_whole(out, text)
 
 
 def write_colmap(scan: ScanView, out: Path, options: ExportOptions) -> None:

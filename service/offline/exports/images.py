@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -146,7 +147,7 @@ def video_images(
     if isinstance(source, VideoSource):
         source.only_near((times - start).tolist(), SAME_TIME_NS)
     say = (progress or Progress()).counting(len(times))
-    try:
+    with closing(source):
         for frame in source:
             time_ns = start + frame.time_ns
             nearest = int(np.abs(times - time_ns).argmin())
@@ -157,8 +158,6 @@ def video_images(
                 say("reading the images")
             if len(found) == len(times) or time_ns > times.max() + SAME_TIME_NS:
                 break
-    finally:
-        source.close()
     if not found:
         raise InputError(
             f"{video}: no frame was taken at the time of a keyframe; give the --video-epoch "

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import hashlib
 import json
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,12 @@ from recon.types import F32, F64
 from service.errors import InputError, SkyreliefError
 from service.georeference import between_nodes
 from service.offline.exports import EXPORTERS
-from service.offline.exports.rasters import contours_of, write_ortho
+from service.offline.exports.flight import iso_time
+from service.offline.exports.rasters import contours_of, open_map, write_ortho
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.geopackage import lines, points, write_layers
 from service.scans.annotations import read_annotations
-from service.scans.map_files import open_map
-from service.scans.writing import writing
+from service.scans.writing import write_whole, writing
 from service.version import software
 
 MAX_OVERLAY_PX = 4096
@@ -40,8 +39,7 @@ def write_contours_dxf(scan: ScanView, out: Path, options: ExportOptions) -> Non
             place = ["10", f"{x:.3f}", "20", f"{y:.3f}", "30", f"{height_m:.3f}"]
             rows += ["0", "VERTEX", "8", layer, *place, "70", "32"]
         rows += ["0", "SEQEND", "8", layer]
-    with writing(out) as part:
-        part.write_text("\n".join([*rows, "0", "ENDSEC", "0", "EOF", ""]), encoding="ascii")
+    write_whole(out, "\n".join([*rows, "0", "ENDSEC", "0", "EOF", ""]))
 
 
 def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -134,7 +132,8 @@ def write_stac(scan: ScanView, out: Path, options: ExportOptions) -> None:
     south, west = geodetic[:, :2].min(axis=0).tolist()
     north, east = geodetic[:, :2].max(axis=0).tolist()
     ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
-    start, end = _times(scan)
+    times = [p.time_unix_ns for p in scan.poses] or [scan.store.header.started_unix_ns]
+    start, end = iso_time(min(times)), iso_time(max(times))
     item = {
         "type": "Feature",
         "stac_version": "1.0.0",
@@ -154,8 +153,7 @@ def write_stac(scan: ScanView, out: Path, options: ExportOptions) -> None:
         "links": [],
         "assets": {Path(name).stem: asset for name, asset in found.items()},
     }
-    with writing(out) as part:
-        part.write_text(json.dumps(item, indent=1), encoding="utf-8")
+    write_whole(out, json.dumps(item, indent=1))
 
 
 def _asset(path: Path, role: str) -> dict[str, Any]:
@@ -171,14 +169,6 @@ def _asset(path: Path, role: str) -> dict[str, Any]:
                 [[west, south, 0.0], [west, north, 0.0], [east, south, 0.0], [east, north, 0.0]]
             ),
         }
-
-
-def _times(scan: ScanView) -> Iterator[str]:
-    """The first and the last time of the flight, as RFC 3339."""
-    times = [p.time_unix_ns for p in scan.poses] or [scan.store.header.started_unix_ns]
-    for time_ns in (min(times), max(times)):
-        when = dt.datetime.fromtimestamp(time_ns / 1e9, dt.timezone.utc)
-        yield when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 MAPS = ("laz", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "geojson", "kml",

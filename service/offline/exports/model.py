@@ -3,28 +3,41 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TextIO
 
 import cv2
 import numpy as np
 
-from recon.surface.meshing import Mesh
-from recon.types import F64, U8
+from recon.mapping.cloud_fusion import cloud_of
+from recon.surface.meshing import Mesh, cut, height_mesh, poisson_mesh
+from recon.surface.raster import fill_holes, grid_over, rasterise, smoothed
+from recon.surface.texturing import texture
+from recon.types import F64, U8, Keyframe, PointCloud
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
-from service.offline.exports.images import check_video, recording_of
-from service.offline.exports.mesh_tiles import MARGIN_VOXELS, TileJob, TilePart, mesh_tile
+from service.offline.exports.images import check_video, recording_of, scan_images
 from service.offline.exports.view import ExportOptions, ScanView
-from service.offline.tiles import footprints, run_tiles, tiles_over
+from service.offline.tiles import Tile, footprints, run_tiles, tiles_over
 from service.packages import needing
+from service.progress import Progress
+from service.scans.fused_cloud import fused_cloud
 from service.scans.writing import writing, writing_folder
+from service.stream.store import ScanStore
+
+log = logging.getLogger(__name__)
 
 METHODS = ("auto", "height", "poisson")
 LARGEST_ATLAS_PX = 8192
 TILED_ATLAS_PX = 4096
+MARGIN_VOXELS = 25
+"""About a tile's mesh, which is then cut exactly at the tile's borders."""
+
+TEXTURE_STEPS = 15
+"""Reports of :func:`recon.surface.texturing.texture`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +126,96 @@ def mesh_parts(
         "texture_px": [p.figures["texture_px"] for p in parts],
     }
     return parts, figures
+
+
+@dataclass(frozen=True, slots=True)
+class TileJob:
+    """One tile's mesh, in plain values; its box is in the scan's ENU metres."""
+
+    tile: Tile
+    voxel_m: float
+    method: str  # height or poisson
+    largest_faces: int
+    largest_texture_px: int
+    options: ExportOptions = field(default_factory=ExportOptions)  # where images come from
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TilePart:
+    """A tile's mesh and texture, and what it was made of."""
+
+    mesh: Mesh
+    image: U8
+    figures: dict[str, Any]
+
+
+def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None:
+    """The textured mesh of a tile; None when there is too little surface in it."""
+    progress = progress or Progress()
+    tile = job.tile
+    with ScanStore.open(Path(tile.folder) / "scan.db") as store:
+        store.only(tile.seqs)
+        keyframes = list(store.keyframes())
+        with progress.part("fusing the cloud", 0.15):
+            cloud = fused_cloud(store, job.voxel_m, progress, tile.wide).cloud
+        try:
+            with progress.part("surface", 0.3):
+                mesh = cut(_surface(job, cloud, keyframes, progress), tile.box)
+        except ValueError as error:
+            log.debug("tile %s: %s", tile.box, error)
+            return None
+        if not len(mesh.faces):
+            return None
+        with progress.part(f"{len(mesh.faces)} triangles; reading images", 0.25):
+            views = scan_images(keyframes, Path(tile.folder), store.header, job.options, progress)
+    with progress.part("texture"):
+        done = texture(mesh, views, job.largest_texture_px, progress.counting(TEXTURE_STEPS))
+    figures = {
+        "faces": len(done.mesh.faces),
+        "vertices": len(done.mesh.vertices_m),
+        "seen": round(done.seen_share, 4),
+        "views": done.views_used,
+        "charts": done.charts,
+        "texture_px": [done.image.shape[1], done.image.shape[0]],
+    }
+    return TilePart(done.mesh, done.image, figures)
+
+
+def _surface(
+    job: TileJob,
+    cloud: PointCloud,
+    keyframes: Sequence[Keyframe],
+    progress: Progress,
+) -> Mesh:
+    """The untextured mesh, with colours at its vertices."""
+    if job.method == "poisson":
+        progress("Poisson surface")
+        return poisson_mesh(cloud, _seen_from(cloud, keyframes), job.voxel_m, job.largest_faces)
+    if not len(cloud):
+        raise ValueError("no points")
+    progress("filling and smoothing the surface")
+    grid = grid_over(cloud.xyz_m[:, :2].astype(np.float64), job.voxel_m, margin_cells=1)
+    raster = fill_holes(rasterise(cloud, grid), largest_cells=8)
+    progress("triangles")
+    mesh = height_mesh(smoothed(raster), job.largest_faces)
+    rgb = raster.rgb[raster.grid.cells(mesh.vertices_m[:, :2])]
+    return Mesh(mesh.vertices_m, mesh.faces, None, rgb)
+
+
+def _seen_from(cloud: PointCloud, keyframes: Sequence[Keyframe]) -> F64:
+    """(N, 3) the camera that looked at each fused point: that of the nearest stored point."""
+    from scipy.spatial import cKDTree
+
+    places, cameras = [], []
+    for k in keyframes:
+        step = k.fresh.copy()
+        step[1::3] = step[2::3] = False
+        step[:, 1::3] = step[:, 2::3] = False
+        part = cloud_of(k.depth, k.bgr, step)
+        places.append(part.xyz_m)
+        cameras.append(np.tile(k.depth.T_world_camera[:3, 3], (len(part), 1)))
+    nearest = cKDTree(np.concatenate(places)).query(cloud.xyz_m, workers=-1)[1]
+    return np.asarray(np.concatenate(cameras)[nearest])
 
 
 def mesh_extras(scan: ScanView) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from service.offline.tiles import grown
 from service.scans.coverage import coverage_of
 from service.scans.fused_cloud import EVERYWHERE, Box
 from service.scans.main_piece import main_keyframes, main_seqs
-from service.scans.writing import writing
+from service.scans.writing import write_whole, writing
 
 NODATA_M = -9999.0
 QUICKLY = {"level": 4, "overview_resampling": "AVERAGE"}
@@ -276,8 +276,7 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
                 },
             }
         )
-    with writing(out) as part:
-        part.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    write_whole(out, json.dumps({"type": "FeatureCollection", "features": features}))
 
 
 def contours_of(scan: ScanView, options: ExportOptions) -> list[tuple[float, F64]]:
@@ -391,3 +390,31 @@ def _in_utm(bands: Array, grid: Grid, frame: LocalFrame) -> tuple[Grid, Array]:
         borderValue=[math.nan] * len(bands),
     )
     return out, turned.transpose(2, 0, 1)
+
+
+MAX_BLOCK_PX = 1 << 22
+"""Of a block that is decoded at once; exports have 512 by 512 pixels."""
+
+ALONE = {
+    "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".none",
+    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
+    "GDAL_PAM_ENABLED": "NO",
+}
+"""GDAL reads no hosts, and no other file than the one that is opened."""
+
+
+@contextmanager
+def open_map(path: Path, bands: int = 1) -> Iterator[Any]:
+    """The GeoTIFF at ``path``, which may come from anyone, with so many bands at least.
+
+    Raises InputError for any other file: other formats of GDAL name files and hosts to read.
+    """
+    import rasterio
+
+    try:
+        with rasterio.Env(**ALONE), rasterio.open(path, driver="GTiff") as image:
+            if image.count < bands or max(h * w for h, w in image.block_shapes) > MAX_BLOCK_PX:
+                raise InputError(f"{path.name} is not a map of a scan; make it again")
+            yield image
+    except (rasterio.errors.RasterioError, ValueError) as error:
+        raise InputError(f"{path.name} cannot be read as a GeoTIFF; make it again") from error

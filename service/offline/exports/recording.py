@@ -8,7 +8,8 @@ process that is killed has written what it logged.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import heapq
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ def export_mcap(store: ScanStore, out_path: Path) -> int:
     with mcap_file(out_path) as context:
         recording = _Recording(context)
         recording.log_header(store)
-        for item in _in_order(store):
+        for item in in_order(store.poses(), store.keyframes()):
             if isinstance(item, PoseRecord):
                 recording.log_pose(item)
             else:
@@ -66,16 +67,13 @@ def mcap_file(path: Path, profile: str = "") -> Iterator[Any]:
         yield context
 
 
-def _in_order(store: ScanStore) -> Iterator[PoseRecord | Keyframe]:
-    """Poses and keyframes by time; one keyframe is in memory at a time."""
-    poses = list(store.poses())
-    at = 0
-    for keyframe in store.keyframes():
-        while at < len(poses) and poses[at].time_unix_ns <= keyframe.time_ns:
-            yield poses[at]
-            at += 1
-        yield keyframe
-    yield from poses[at:]
+def in_order(*streams: Iterable[PoseRecord | Keyframe]) -> Iterator[PoseRecord | Keyframe]:
+    """All by time, of one time those of the first stream first; one of each is in memory."""
+    return heapq.merge(*streams, key=_time_ns)
+
+
+def _time_ns(item: PoseRecord | Keyframe) -> int:
+    return item.time_unix_ns if isinstance(item, PoseRecord) else item.time_ns
 
 
 class _Recording:

@@ -11,8 +11,6 @@ CompressedImage, ``camera_info`` CameraInfo (of the image, without distortion), 
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,13 @@ import numpy as np
 
 from recon import se3
 from recon.types import F64, Keyframe
-from service.offline.exports.recording import JPEG_QUALITY, POINT, known_points, mcap_file
+from service.offline.exports.recording import (
+    JPEG_QUALITY,
+    POINT,
+    in_order,
+    known_points,
+    mcap_file,
+)
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
 from service.scans.writing import writing
@@ -145,23 +149,17 @@ def _log(to: tuple[Any, str], time_ns: int, *parts: Any) -> None:
     channel.log(bytes(data), log_time=min(max(time_ns, 0), MAX_STAMP_NS))
 
 
-_Item = tuple[int, int, Keyframe | PoseRecord]
-"""Time, order at one time, content."""
-
-
 def write_ros2(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """The scan's main piece as an MCAP of ROS 2 messages, in order of time."""
     _types()
     with writing(out) as part, mcap_file(part, "ros2") as context:
         channels = Ros2Channels(context)
-        keyframes: Iterator[_Item] = ((k.time_ns, 0, k) for k in main_keyframes(scan.store))
-        poses: Iterator[_Item] = ((p.time_unix_ns, 1, p) for p in scan.poses)
         placed_ns = None  # the last keyframe, which has its own transform
-        for time_ns, _, item in heapq.merge(keyframes, poses, key=lambda entry: entry[:2]):
+        for item in in_order(main_keyframes(scan.store), scan.poses):
             if isinstance(item, Keyframe):
                 channels.log_keyframe(item)
-                placed_ns = time_ns
+                placed_ns = item.time_ns
                 continue
-            if time_ns != placed_ns:
-                channels.log_transform(item.T_world_camera, time_ns)
+            if item.time_unix_ns != placed_ns:
+                channels.log_transform(item.T_world_camera, item.time_unix_ns)
             channels.log_fix(item)

@@ -17,7 +17,7 @@ import numpy as np
 from recon.surface.raster import Grid, Raster, grid_over, rasterise_points, round_cell
 from recon.types import F64
 from service.errors import InputError
-from service.georeference import LocalFrame
+from service.georeference import LocalFrame, height_change, vertical_code
 from service.offline.exports import EXPORTERS
 from service.offline.tiles import TILE_POINTS, Tile, Tiling, run_tiles, tiling
 from service.packages import needing
@@ -27,7 +27,6 @@ from service.scans.main_piece import main_keyframes, main_track
 from service.scans.track import local_frame
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
-from service.vertical_datum import height_change, vertical_code
 
 T = TypeVar("T")
 

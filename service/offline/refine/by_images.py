@@ -33,14 +33,13 @@ from recon.calibration.global_bundle import Knowledge, Problem, Sightings, dispe
 from recon.calibration.tracks import pieces, with_distortion, without_distortion
 from recon.camera_model import project, rays
 from recon.posegraph.ground_control import (
-    ATTITUDE_S,
-    FIX_S,
     Adjusted,
     ControlPoint,
     KeyframeTrack,
     Mark,
     map_position,
 )
+from recon.posegraph.site_alignment import ScanSimilarity
 from recon.types import F64, Bool, Camera, Keyframe
 from service.errors import InputError
 from service.offline.refine import own_camera
@@ -181,10 +180,10 @@ def as_seen(
     return poses, moved
 
 
-def in_world(images: ImageNetwork, scale: float, R: F64, t: F64) -> ImageNetwork:
+def in_world(images: ImageNetwork, move: ScanSimilarity) -> ImageNetwork:
     """The network in the world that a similarity takes it to."""
-    poses = np.array([se3.compose(R @ T[:3, :3], scale * R @ T[:3, 3] + t) for T in images.poses])
-    return replace(images, poses=poses, points=scale * images.points @ R.T + t)
+    poses = np.array([move.pose(T) for T in images.poses])
+    return replace(images, poses=poses, points=move.points(images.points))
 
 
 def depth_scales(
@@ -269,17 +268,9 @@ def _known(
             out.placing[k] = np.linalg.inv(n * A @ (spread + floor) @ A.T)
         return out
     out.placing[0] = first_held(track.poses)[0] * 1e-4
-    gap_s = max(float(np.median(np.diff(track.times_s))), 1e-3)
-    for k, prior in enumerate(track.priors):
-        if prior.position_m is not None and prior.sigma_position_m is not None:
-            out.fixes[k] = prior.position_m
-            sigma = np.maximum(prior.sigma_position_m, 0.005)
-            out.sigma_fixes[k] = sigma * np.sqrt(max(1.0, 2.0 * FIX_S / gap_s))
-        if prior.R_world_camera is not None:
-            yaw = prior.sigma_yaw_rad if prior.sigma_yaw_rad < 1.0 else 10.0
-            sigma = np.array([prior.sigma_tilt_rad, prior.sigma_tilt_rad, yaw])
-            out.attitudes[k] = prior.R_world_camera
-            out.sigma_attitudes[k] = sigma * np.sqrt(max(1.0, 2.0 * ATTITUDE_S / gap_s))
+    log = track.readings()
+    out.fixes[:n], out.sigma_fixes[:n] = log.fixes, log.sigma_fixes
+    out.attitudes[:n], out.sigma_attitudes[:n] = log.attitudes, log.sigma_attitudes
     return out
 
 

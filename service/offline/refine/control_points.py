@@ -13,6 +13,7 @@ from recon import se3
 from recon.camera_model import project
 from recon.posegraph.alignment import umeyama
 from recon.posegraph.ground_control import Mark, consenting, map_position, placed_by_points
+from recon.posegraph.site_alignment import ScanSimilarity
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -58,6 +59,11 @@ class Candidate:
     def usable(self) -> bool:
         """True while no reason against it is known."""
         return not self.why_not
+
+    @property
+    def is_control(self) -> bool:
+        """True while the adjustment may use it; a check point takes no part."""
+        return self.usable and not self.point.is_check
 
     @property
     def has_height(self) -> bool:
@@ -223,7 +229,7 @@ def screen(candidates: Sequence[Candidate], frame: LocalFrame) -> None:
     for one in candidates:
         if one.usable and one.before_m is not None:
             one.why_not = _far(one, frame)
-    voters = [c for c in candidates if c.usable and not c.point.is_check]
+    voters = [c for c in candidates if c.is_control]
     if len(voters) < 2:
         return
     surveyed = np.array([c.surveyed_m for c in voters])
@@ -280,7 +286,7 @@ def _odd_one(voters: Sequence[Candidate]) -> tuple[Candidate, F64] | None:
         found = placed_by_points(mapped[others], surveyed[others])
         if found is None:
             return None
-        off = surveyed[k] - (found[0] * found[1] @ mapped[k] + found[2])
+        off = surveyed[k] - found.points(mapped[k])
         away = float(np.linalg.norm(mapped[k] - mapped[others].mean(axis=0)))
         sigma = one.tolerance_m(one.sigma_before_m)
         ratio = float(np.linalg.norm(off)) / (4.0 * sigma + 0.01 * away + 0.2)
@@ -291,10 +297,7 @@ def _odd_one(voters: Sequence[Candidate]) -> tuple[Candidate, F64] | None:
 
 def clustered(candidates: Sequence[Candidate], places_m: F64) -> str:
     """A warning when the control points span little of the track (N, 3); empty otherwise."""
-    points = [
-        c.surveyed_m for c in candidates
-        if c.usable and not c.point.is_check and c.surveyed_m is not None
-    ]  # fmt: skip
+    points = [c.surveyed_m for c in candidates if c.is_control and c.surveyed_m is not None]
     if not points:
         return ""
     about = places_m[:, :2] - places_m[:, :2].mean(axis=0)
@@ -340,16 +343,14 @@ def _metres(value: float) -> str:
     return f"{value / 1000:.0f} km" if value >= 10_000 else f"{value:.0f} m"
 
 
-def place_by_survey(
-    candidates: Sequence[Candidate],
-) -> tuple[LocalFrame, float, F64, F64]:
-    """Origin, scale, rotation and shift for a scan without a place, from three points or more.
+def place_by_survey(candidates: Sequence[Candidate]) -> tuple[LocalFrame, ScanSimilarity]:
+    """Origin of a scan without a place, and what moves it there, from three points or more.
 
     Points that the largest agreeing set contradicts are noted. Where a height is not known the
     map's vertical and its zero of heights hold. Raises InputError when there are too few, they
     lie in a line, or no three agree with the map.
     """
-    voters = [c for c in candidates if c.usable and not c.point.is_check]
+    voters = [c for c in candidates if c.is_control]
     if len(voters) < 3:
         raise InputError(
             f"the scan has no georeference and only {len(voters)} usable control points; three "
@@ -365,9 +366,9 @@ def place_by_survey(
     best, most = None, np.zeros(len(voters), np.bool_)
     for triple in list(combinations(range(len(voters)), 3))[:MAX_TRIPLES]:
         found = _placed(mapped[list(triple)], surveyed[list(triple)], level)
-        if found is None or not 1e-3 < found[0] < 1e3:
+        if found is None or not 1e-3 < found.growth < 1e3:
             continue
-        off = found[0] * mapped @ found[1].T + found[2] - surveyed
+        off = found.points(mapped) - surveyed
         away = np.linalg.norm(off[:, :2] if level else off, axis=1)
         fits = away < 0.02 * np.ptp(surveyed[:, :2], axis=0).max() + 0.3
         if best is None or fits.sum() > most.sum():
@@ -384,11 +385,11 @@ def place_by_survey(
     for one, fits in zip(voters, most, strict=True):
         if not fits:
             one.why_not = "contradicts the other points"
-    return frame, *best
+    return frame, best
 
 
-def _placed(mapped_m: F64, surveyed_m: F64, level: bool) -> tuple[float, F64, F64] | None:
-    """Scale, rotation and shift from map to survey, each (N, 3); None where they leave it open.
+def _placed(mapped_m: F64, surveyed_m: F64, level: bool) -> ScanSimilarity | None:
+    """From map to survey, each (N, 3); None where they leave it open.
 
     ``level``: not every height is known, so the map's own vertical holds, and its height of zero.
     """
@@ -398,4 +399,4 @@ def _placed(mapped_m: F64, surveyed_m: F64, level: bool) -> tuple[float, F64, F6
     if np.ptp(mapped_m[:, :2], axis=0).max() < 1e-6:
         return None
     scale, R, t = umeyama(mapped_m * flat, surveyed_m * flat, np.ones(len(mapped_m)))
-    return scale, R, t
+    return ScanSimilarity(R, t, scale)

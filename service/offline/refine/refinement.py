@@ -16,11 +16,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from recon import se3
 from recon.bands import at_once
 from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
 from recon.posegraph.ground_control import (
-    FIX_S,
     Adjusted,
     BatchConfig,
     ControlPoint,
@@ -33,7 +31,7 @@ from recon.posegraph.ground_control import (
 from recon.posegraph.records import Loop
 from recon.posegraph.sensor_offsets import constants
 from recon.posegraph.submap_loops import SubmapLoopConfig
-from recon.types import F64, Camera, Keyframe, PosePrior
+from recon.types import Camera, Keyframe, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cameras.rig import Rig
 from service.config import CameraConfig, FusionConfig, ScanConfig
@@ -183,18 +181,6 @@ def _open_target(folder: Path, out: Path | None) -> Path:
     return out
 
 
-def fixes_of(track: KeyframeTrack) -> tuple[F64, F64]:
-    """(N, 3) measured places, NaN where there is none, and their sigmas as of independent ones."""
-    places = np.full((len(track.poses), 3), np.nan)
-    sigma = np.ones((len(track.poses), 3))
-    gap_s = max(float(np.median(np.diff(track.times_s))), 1e-3)
-    for k, prior in enumerate(track.priors):
-        if prior.position_m is not None and prior.sigma_position_m is not None:
-            places[k] = prior.position_m
-            sigma[k] = prior.sigma_position_m * np.sqrt(max(1.0, 2.0 * FIX_S / gap_s))
-    return places, sigma
-
-
 class _Refinement:
     """One adjustment of one scan."""
 
@@ -252,7 +238,7 @@ class _Refinement:
         figures = figures_of(seqs, track, found, candidates, verified, self._ahead_m(), places_m)
         if self.images is not None:
             figures["images"] = self.images.figures()
-            fixed = np.asarray(np.isfinite(fixes_of(track)[0]).all(axis=1))
+            fixed = np.asarray(np.isfinite(track.readings().fixes).all(axis=1))
             figures["apart"] = stretches_untied(seqs, self.images.seen, fixed)
         alone = self._left_out(track, candidates)
         for point in figures["points"]:
@@ -273,8 +259,10 @@ class _Refinement:
         images = own_camera.images_at(video, self.header.started_unix_ns, times)
         ahead = track.poses[:, :3, 2] * self._ahead_m()
         ground_m = float(np.median(track.poses[:, 2, 3] + ahead[:, 2]))
-        fixes, sigma = fixes_of(track)
-        found = own_camera.found_camera(images, given, track.poses, ground_m, fixes, sigma, config)
+        log = track.readings()
+        found = own_camera.found_camera(
+            images, given, track.poses, ground_m, log.fixes, log.sigma_fixes, config
+        )
         return found, given
 
     # ---- what goes in ------------------------------------------------------------------------
@@ -330,22 +318,21 @@ class _Refinement:
 
     def _place(self, candidates: Sequence[Candidate]) -> None:
         """Give a scan without a place, and without a sure scale, those of the survey."""
-        self.frame, scale, R, t = place_by_survey(candidates)
+        self.frame, move = place_by_survey(candidates)
         if not any(c.has_height for c in candidates if c.usable):
             self.notes.append("no control point has a height: heights count from the scan's own 0")
-        self.grown = scale
-        moved = []
-        for s in self.states:
-            T = s.T_world_camera
-            placed = se3.compose(R @ T[:3, :3], scale * R @ T[:3, 3] + t)
-            spread = np.diag([0.03**2] * 3 + [1.0] * 3)
-            moved.append(
-                replace(s, T_world_camera=placed, covariance=spread, scale=s.scale * scale)
+        self.grown = scale = move.growth
+        spread = np.diag([0.03**2] * 3 + [1.0] * 3)
+        self.states = [
+            replace(
+                s, T_world_camera=move.pose(s.T_world_camera), covariance=spread,
+                scale=s.scale * scale,
             )
-        self.states = moved
+            for s in self.states
+        ]  # fmt: skip
         for one in candidates:
             if one.before_m is not None:
-                one.before_m = np.asarray(scale * R @ one.before_m + t)
+                one.before_m = move.points(one.before_m)
                 one.sigma_before_m *= scale
             one.marks = [
                 replace(
@@ -356,13 +343,9 @@ class _Refinement:
                 )
                 for m in one.marks
             ]
-        self.frames = [
-            replace(f, T_world_camera=se3.compose(
-                R @ f.T_world_camera[:3, :3], scale * R @ f.T_world_camera[:3, 3] + t))
-            for f in self.frames
-        ]  # fmt: skip
+        self.frames = [replace(f, T_world_camera=move.pose(f.T_world_camera)) for f in self.frames]
         if self.images is not None:
-            self.images = in_world(self.images, scale, R, t)
+            self.images = in_world(self.images, move)
         f = self.frame
         self.header = replace(
             self.header, origin_lat_deg=f.lat_deg, origin_lon_deg=f.lon_deg,
@@ -461,7 +444,7 @@ class _Refinement:
         points = _points(candidates)
         most = int(MAX_REFUSALS * sum(not c.point.is_check for c in candidates))
         while True:
-            used = [c for c in candidates if c.usable and not c.point.is_check]
+            used = [c for c in candidates if c.is_control]
             marks = [m for c in used for m in c.marks]
             try:
                 found = self._solved(track, points, marks, candidates)
@@ -502,7 +485,7 @@ class _Refinement:
 
         Empty for fewer than four control points: three are needed without it.
         """
-        used = [c for c in candidates if c.usable and not c.point.is_check]
+        used = [c for c in candidates if c.is_control]
         if len(used) <= MIN_OTHERS:
             return {}
         points = _points(candidates)

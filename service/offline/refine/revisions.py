@@ -8,7 +8,9 @@ the unrefined state. Which pose rows belong to refinements is noted in the store
 from __future__ import annotations
 
 import json
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from recon import se3
 from recon.posegraph.ground_control import Adjusted
 from recon.types import F64, DepthMap, Keyframe
 from service.cameras.rig import attitude_of
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
 from service.stream import codec
 from service.stream.database import Statement, blob, json_object
@@ -32,7 +34,6 @@ from service.stream.records import (
     pack_pose,
     pack_repose,
     unpack_pose,
-    unpack_repose,
 )
 from service.stream.store import ScanStore
 
@@ -44,7 +45,7 @@ META_HEADER = "unrefined_header"
 
 
 class _Note(msgspec.Struct):
-    """The fields of the refinement's note that are read."""
+    """What the store notes of its refinements."""
 
     revision: int = 0
     pose_rows: list[tuple[int, int]] = []
@@ -68,16 +69,15 @@ class Revisions:
     def __init__(self, store: ScanStore) -> None:
         self._store = store
         self._db = store.database
-        self._note: dict[str, Any] = json_object(self._db.get(META))
         try:
-            msgspec.convert(self._note, _Note)
+            self._note = msgspec.convert(json_object(self._db.get(META)), _Note)
         except msgspec.ValidationError as error:
             raise InputError(f"{store.path}: its refinement record is invalid ({error})") from error
 
     @property
     def refined(self) -> bool:
         """True once a refinement was written, also when it was undone."""
-        return bool(self._note)
+        return bool(self._note.figures)
 
     @property
     def header(self) -> ScanHeader:
@@ -89,7 +89,7 @@ class Revisions:
     def keyframe_state(self, seq: int) -> KeyframeState | None:
         """The unrefined state of a keyframe; None when nothing of it can be read."""
         data = self._store.chunk(seq, 0) or self._store.chunk(seq, 1)
-        base = self._base(seq)
+        base = self._store.repose(seq, below=REFINED)
         if data is None:
             keyframe = self._store.keyframe(seq)
             if keyframe is None:
@@ -119,7 +119,7 @@ class Revisions:
 
     def frames(self) -> list[PoseRecord]:
         """All unrefined poses in order of time; of several for one time the newest."""
-        ranges = self._note.get("pose_rows", [])
+        ranges = self._note.pose_rows
         newest: dict[int, PoseRecord] = {}
         for number, data in self._db.all("SELECT id, data FROM poses ORDER BY id"):
             if any(a <= number <= b for a, b in ranges):
@@ -143,12 +143,12 @@ class Revisions:
         """
         changed = [r for r in reposes if not self._holds(r)]
         statements: list[Statement] = []
-        note = dict(self._note)
+        note = msgspec.structs.replace(self._note)
         if changed:
             statements += self._rows(reposes, poses, note)
-        note["figures"] = figures | {"revision": note.get("revision", 0)}
+        note.figures = figures | {"revision": note.revision}
         meta = "INSERT OR REPLACE INTO meta VALUES (?, ?)"
-        statements.append((meta, (META, json.dumps(note, sort_keys=True))))
+        statements.append((meta, (META, json.dumps(msgspec.structs.asdict(note), sort_keys=True))))
         if self._db.get(META_HEADER) is None:
             statements.append((meta, (META_HEADER, self._store.header.to_json().decode())))
         if header.to_json() != self._store.header.to_json():
@@ -158,10 +158,10 @@ class Revisions:
         return bool(changed)
 
     def _rows(
-        self, reposes: Sequence[Repose], poses: Sequence[PoseRecord], note: dict[str, Any]
+        self, reposes: Sequence[Repose], poses: Sequence[PoseRecord], note: _Note
     ) -> list[Statement]:
-        revision = REFINED + int(note.get("revision", 0))
-        note["revision"] = int(note.get("revision", 0)) + 1
+        revision = REFINED + note.revision
+        note.revision += 1
         out: list[Statement] = []
         first = self._store.next_id("reposes")
         for n, r in enumerate(reposes):
@@ -172,8 +172,8 @@ class Revisions:
         for n, p in enumerate(poses):
             sql = "INSERT INTO poses VALUES (?, ?, ?)"
             out.append((sql, (first + n, p.time_unix_ns, pack_pose(p))))
-        rows = [list(pair) for pair in note.get("pose_rows", [])]
-        note["pose_rows"] = [*rows, [first, first + len(poses) - 1]] if poses else rows
+        if poses:
+            note.pose_rows = [*note.pose_rows, (first, first + len(poses) - 1)]
         return out
 
     def _holds(self, wanted: Repose) -> bool:
@@ -186,32 +186,18 @@ class Revisions:
             and abs(now.scale / wanted.scale - 1.0) < 1e-6
         )
 
-    def _base(self, seq: int) -> Repose | None:
-        sql = (
-            "SELECT data FROM reposes WHERE seq = ? AND revision < ? "
-            "ORDER BY revision DESC, id DESC LIMIT 1"
-        )
-        row = self._db.one(sql, (seq, REFINED))
-        return None if row is None else unpack_repose(blob(row[0]))
-
 
 def copy_store(source: Path, target: Path) -> None:
     """A sound copy of a store that may be open elsewhere.
 
     Raises InputError when ``target`` exists, OutsideError when it cannot be written.
     """
-    import sqlite3
-
-    from service.errors import OutsideError
-
     if target.exists():
         raise InputError(f"{target} exists; choose another folder, nothing was changed")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with sqlite3.connect(source) as one, sqlite3.connect(target) as two:
+        with closing(sqlite3.connect(source)) as one, closing(sqlite3.connect(target)) as two:
             one.backup(two)
-        one.close()
-        two.close()
     except (OSError, sqlite3.Error) as error:
         target.unlink(missing_ok=True)
         raise OutsideError(f"cannot copy {source} to {target} ({error}); check the disk") from error

@@ -29,6 +29,8 @@ from recon.posegraph.site_alignment import ScanPrior, SiteAlignment, Tie, align,
 from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import F64, Keyframe
 from service.errors import InputError
+from service.offline.exports.clouds import VOXELS_MARGIN_M, points_of
+from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.refine.stored_loops import BREAK_S, StoredLoops
 from service.offline.site import SITE
 from service.offline.site.gather import Member, gather
@@ -36,8 +38,10 @@ from service.offline.site.start import SIGMA_SCALE as START_SCALE
 from service.offline.site.start import StartPoints, start_of
 from service.offline.tiles import TILE_POINTS
 from service.progress import Progress
+from service.scans.folder import resolution_m, write_deliverables
+from service.scans.fused_cloud import TiledCloud
 from service.scans.track import local_frame
-from service.scans.writing import writing
+from service.scans.writing import write_whole
 from service.stream.records import Repose
 from service.stream.store import ScanStore
 
@@ -91,10 +95,31 @@ def align_site(
     with _locked(out):
         site = _align(folders, out, starts or {}, progress)
         if deliver:
-            from service.offline.site.files import write_files
-
             write_files(out, tile_points, scheduler, progress)
     return site
+
+
+def write_files(
+    folder: Path,
+    tile_points: int = TILE_POINTS,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Write the files of the site in ``folder``, the cloud of a large one in tiles.
+
+    Errors as of :func:`write_deliverables`.
+    """
+    with ScanStore.open(folder / "scan.db") as store, ScanView(folder, None, progress) as view:
+        options = ExportOptions(
+            voxel_m=resolution_m(store.header), tile_points=tile_points, scheduler=scheduler
+        )
+        cut, tiled = view.tiling(options, VOXELS_MARGIN_M), None
+        if len(cut.tiles) > 1:
+            tiled = TiledCloud(
+                points_of(view, options, is_classified=False), options.voxel_m or cut.sample_m,
+                cut.sample_m, len(cut.prints), sum(p.points for p in cut.prints), cut.bounds,
+            )  # fmt: skip
+        write_deliverables(folder, store, {}, tiled=tiled)
 
 
 @contextlib.contextmanager
@@ -143,8 +168,7 @@ def _align(
             store.add_reposes(_reposes(store, members, found, adjusted))
             document = _document(store, members, found, priors, ties, notes, known)
             store.update_header(notes=tuple(document["notes"]))
-        with writing(out / SITE) as part:
-            part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        write_whole(out / SITE, json.dumps(document, indent=1) + "\n")
         _remove(out / "scan.db")
         os.replace(fresh, out / "scan.db")
     finally:
@@ -225,7 +249,7 @@ def _bent(
             at_a, at_b = found.moves[tie.a].points(tie.at_a), found.moves[tie.b].points(tie.at_b)
             fit = placed_by_points(at_b, at_a)
             assert fit is not None  # four corners of a view
-            D = se3.compose(fit[1], at_a.mean(axis=0) - fit[1] @ at_b.mean(axis=0))
+            D = se3.compose(fit.R, at_a.mean(axis=0) - fit.R @ at_b.mean(axis=0))
             T = se3.inverse(moved[loop.a]) @ D @ moved[loop.b]
             closures.append(replace(loop, T_a_b=T))
     if not closures:

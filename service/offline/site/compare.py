@@ -32,16 +32,15 @@ from service.georeference import LocalFrame
 from service.offline.exports.rasters import NODATA_M, Layers, mosaic, over, put, window_in
 from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.geopackage import points, polygons, write_layers
-from service.offline.site.alignment import AlignedSite, align_site
+from service.offline.site.alignment import AlignedSite, align_site, write_files
 from service.offline.site.change_page import draw_outlines, drawn, page, place_in, shape_of
-from service.offline.site.files import write_files
 from service.offline.site.gather import Member
 from service.offline.tiles import TILE_POINTS, Tile, grown, run_tiles
 from service.progress import Progress
 from service.scans.fused_cloud import fused_cloud, placed
 from service.scans.main_piece import Piece
 from service.scans.track import local_frame
-from service.scans.writing import writing
+from service.scans.writing import write_whole
 from service.stream import codec
 from service.stream.database import Database
 from service.stream.store import ScanStore
@@ -120,10 +119,8 @@ def compare(
             raise InputError(f"{before} and {after} share no ground")
         document = _document(site, found, one, two)
         _write_polygons(view, out / CHANGE_GPKG, found)
-        with writing(out / CHANGE_PAGE) as part:
-            part.write_text(page(document, found.images), encoding="utf-8")
-        with writing(out / CHANGE_JSON) as part:
-            part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        write_whole(out / CHANGE_PAGE, page(document, found.images))
+        write_whole(out / CHANGE_JSON, json.dumps(document, indent=1) + "\n")
     hide_changed(out / "scan.db", site.members[one], out / CHANGE_TIF)
     with ScanStore.open(out / "scan.db") as store:
         store.update_header(notes=(*store.header.notes, document["in_words"]))

@@ -231,8 +231,8 @@ def _copy_poses(
     if any(after[0] <= before[1] for before, after in pairwise(ends)):
         return
     for track, k in tracks:
-        for pose in track:
-            site.add_pose(placed_pose(pose, members[k].placed(pose.T_world_camera), origin))
+        placed = (placed_pose(p, members[k].placed(p.T_world_camera), origin) for p in track)
+        site.add_poses(list(placed))
 
 
 def placed_pose(pose: PoseRecord, T: F64, origin: LocalFrame) -> PoseRecord:

@@ -65,13 +65,11 @@ class StartPoints:
             size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
             if not size[1] > LINE * size[0]:
                 raise InputError(f"the points {which} lie in a line; choose a triangle")
-        found = placed_by_points(here, there)
-        assert found is not None  # they span a plane
-        scale, R, t = found
-        move = ScanSimilarity(R, t, scale)
+        move = placed_by_points(here, there)
+        assert move is not None  # they span a plane
         extent = float(np.linalg.norm(there - there.mean(axis=0), axis=1).max())
         miss = float(np.sqrt(np.mean(np.sum((move.points(here) - there) ** 2, axis=1))))
-        if scale <= 0.0 or miss > MAX_MISS * extent:
+        if move.growth <= 0.0 or miss > MAX_MISS * extent:
             raise InputError(
                 f"the points contradict each other by {miss:.1f} m; check their order and places"
             )

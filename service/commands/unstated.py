@@ -1,0 +1,250 @@
+"""What a recording leaves open: its lens, its readout, and when it begins.
+
+The lens is that of its tags, of its log, or of its own images. A lens that bends straight lines by
+a few percent turns every view of level ground a little and makes it a sixth too near: the images
+can be explained that way too, until the distortion is free.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event
+from typing import TYPE_CHECKING, Any
+
+from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig, corner_bend
+from recon.types import Camera, Shutter
+from service.cameras import open_camera, parse_source
+from service.cameras.camera_file import seeks_readout
+from service.cameras.dji_metadata import stated_shutter
+from service.cameras.images import ImagesSource
+from service.cameras.lens import Lens, by_full_frame
+from service.config import change
+from service.errors import InputError
+from service.flight.scan import Scan, ScanInputs, check_new, create_store
+from service.offline.refine import refinement
+from service.offline.refine.own_camera import MAX_SIGMA_BEND, MIN_IMAGES, bent, by_tags
+from service.stream.validity import MAX_TIME_NS, is_time
+
+if TYPE_CHECKING:
+    from mavlink.telemetry.logs import TelemetryLog
+    from service.cameras.source import CameraSource
+    from service.config import Config
+    from service.progress import Progress
+
+log = logging.getLogger(__name__)
+
+VIEWS = 25
+"""Number of stills about the middle of a flight, or of a video's first keyframes, that are used."""
+
+MIN_STILLS = 6
+"""Fewer stills do not determine a lens."""
+
+MAX_FRAMES = 5400
+"""Of a video, in which its first keyframes are sought."""
+
+ASSUMED = Lens(0.5 / math.tan(math.radians(35.0)), sigma_focal=0.2)
+"""70 degrees across; cameras of drones have 60 to 86."""
+
+COARSE = {"compute.stereo_width": 320, "compute.upsample": False, "fusion.loops": False}
+"""Poses are all that is needed."""
+
+HOUR_NS = 3_600_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartLens:
+    """What is known about the lens before its images are looked at."""
+
+    camera: Camera
+    note: str
+    assumed: tuple[str, ...]  # of "lens", "distortion"
+    search: SelfCalibrationConfig  # how the images may change it, and the focal length's sigma
+
+
+def start_lens(source: CameraSource, telemetry: TelemetryLog | None) -> StartLens:
+    """The lens by the images' tags, the log's focal length, or 70 degrees."""
+    if isinstance(source, ImagesSource) and source.lens is not None and source.camera is not None:
+        f, side, known = source.lens.focal, max(source.size_px), source.lens.is_calibrated
+        note = f"taken from {source.lens.source} ({f * side:.0f} px)"
+        search = by_tags(source.lens.sigma_focal)
+        if known:
+            return StartLens(source.camera, _advice(note), (), search)
+        return StartLens(source.camera, _advice(note), ("distortion",), bent(search))
+    lens, of = ASSUMED, "70 degrees"
+    if telemetry is not None and telemetry.focal_35mm is not None:
+        lens = by_full_frame(telemetry.focal_35mm, source.size_px)
+        of = f"{telemetry.focal_35mm:.0f} mm (35 mm equivalent in the telemetry)"
+    note = f"a lens of {of} without distortion is assumed"
+    search = bent(by_tags(lens.sigma_focal))
+    return StartLens(lens.camera(source.size_px), _advice(note), ("lens",), search)
+
+
+def _advice(note: str) -> str:
+    return f"no camera model given: {note}; make one with 'skyrelief calibrate' for true shapes"
+
+
+def with_own_lens(
+    inputs: ScanInputs, video: str, start: StartLens, find_lens: bool, progress: Progress
+) -> ScanInputs:
+    """The scan with the lens by its own images, where they determine it, else as it is."""
+    found: SelfCalibrated | str = ""
+    if find_lens and parse_source(video)[0] in ("file", "images"):
+        check_new(inputs.folder)
+        progress("finding the lens")
+        found = own_lens(inputs, video, start.search)
+    if isinstance(found, str):
+        refused = (f"the images do not determine their lens: {found}",) if found else ()
+        notes = (start.note, *refused, *inputs.notes)
+        sigma = start.search.sigma_focal
+        return replace(inputs, notes=notes, assumed=start.assumed, sigma_focal=sigma)
+    focal = f"{found.camera.K[0, 0]:.0f} px, sigma {100.0 * found.sigma_focal:.1f} %"
+    note = f"no camera model given: found from the images themselves ({focal})"
+    return replace(
+        inputs,
+        camera=found.camera,
+        notes=(note, *inputs.notes),
+        assumed=still_assumed(found),
+        sigma_focal=found.sigma_focal,
+    )
+
+
+def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> SelfCalibrated | str:
+    """The camera by a reconstruction of some images, or why they do not determine it.
+
+    ``inputs`` are those of the whole scan, with the lens to begin with; ``video`` is its camera
+    source, a recording or a folder of stills.
+    """
+    source, config = inputs.source, inputs.config
+    if isinstance(source, ImagesSource):
+        source = source.middle(VIEWS)
+        if source.images < MIN_STILLS:
+            return f"{source.images} stills are too few; {MIN_STILLS} needed"
+    else:
+        source = open_camera(video)
+    for key, value in COARSE.items():
+        config = change(config, key, str(value).lower())
+    with closing(source), TemporaryDirectory(prefix="skyrelief-lens-") as temporary:
+        folder = Path(temporary) / "scan"
+        inputs = replace(
+            inputs, source=source, config=config, folder=folder, scan_id="lens", warn=log.info
+        )
+        store = create_store(inputs)
+        try:
+            scan = Scan(inputs, store)
+            scan.run(Event(), is_enough=_is_enough)
+            scan.close()
+        finally:
+            store.close()
+        if scan.recorder.keyframes < MIN_IMAGES:
+            return f"{scan.recorder.keyframes} keyframes are too few; {MIN_IMAGES} needed"
+        try:
+            return refinement.lens(folder, Path(parse_source(video)[1]), search)
+        except InputError as error:
+            return str(error)
+
+
+def still_assumed(found: SelfCalibrated) -> tuple[str, ...]:
+    """What is as good as assumed of a lens that was found: its distortion, where depth at a corner
+    is bent by more than :data:`MAX_SIGMA_BEND`."""
+    bend = corner_bend(found.camera, found.sigma_k[0])
+    return ("distortion",) if bend > MAX_SIGMA_BEND else ()
+
+
+def _is_enough(scan: Scan) -> bool:
+    return scan.recorder.keyframes >= VIEWS or scan.recorder.frames >= MAX_FRAMES
+
+
+def with_stated_readout(
+    camera: Camera, config: Config, video: str, source: CameraSource, notes: list[str]
+) -> tuple[Camera, Config]:
+    """Camera and configuration with the readout that the video states, where nothing else does.
+
+    The images refine it.
+    """
+    kind, path = parse_source(video)[:2]
+    is_open = seeks_readout(camera, config.camera) and config.camera.readout_ms != "auto"
+    if kind != "file" or not is_open or getattr(source, "turned_deg", 0) != 0:
+        return camera, config
+    shutter = stated_shutter(path)
+    if shutter is None:
+        return camera, config
+    readout_ms = 1e3 * shutter.readout_s
+    notes.append(f"the video states a readout of {readout_ms:.1f} ms, {shutter.direction}")
+    return replace(camera, shutter=shutter), change(config, "camera.readout_ms", "auto")
+
+
+def with_readout(inputs: ScanInputs, shutter: Shutter) -> dict[str, Any]:
+    """Inputs of the scan with the readout that its images show; the search goes on."""
+    camera = replace(inputs.camera, shutter=shutter)
+    return {"camera": camera, "config": change(inputs.config, "camera.readout_ms", "auto")}
+
+
+def start_of(
+    source: CameraSource, log: TelemetryLog | None, video_epoch: float | None, notes: list[str]
+) -> int:
+    """Unix ns of the source's time 0: as given, the container's, the log's start, or now."""
+    if video_epoch is not None:
+        epoch_ns = round(video_epoch * 1e9) if math.isfinite(video_epoch) else MAX_TIME_NS
+    elif log is not None and log.clock != "unix":  # time 0 of the video, or of the autopilot
+        epoch_ns = 0 if log.clock == "video" else log.first_ns
+        notes.append(f"the log has no date: times count from the start of the {log.clock}")
+    elif source.epoch_unix_ns is not None:
+        epoch_ns = source.epoch_unix_ns - local_zone_ns(source.epoch_unix_ns, log, notes)
+    elif log is not None:
+        epoch_ns = round(log.first_ns / 1e6) * 10**6  # autopilots count whole milliseconds
+        notes.append("the recording does not say when it began: taken as the start of the log")
+    else:
+        epoch_ns = time.time_ns()
+        notes.append("the recording does not say when it began: taken as the time of the replay")
+    if not is_time(epoch_ns):
+        raise InputError(
+            "the recording begins outside the years 1970 to 2106; give the right --video-epoch"
+        )
+    if log is not None and not _covers(log, epoch_ns):
+        raise InputError(
+            f"the telemetry covers {_utc(log.first_ns)} to {_utc(log.last_ns)}, the video begins "
+            f"at {_utc(epoch_ns)}: they do not overlap; give the right --video-epoch"
+        )
+    return epoch_ns
+
+
+def _covers(log: TelemetryLog, start_ns: int) -> bool:
+    """True when a video that starts then can be in the log."""
+    return log.first_ns - 600e9 < start_ns < log.last_ns
+
+
+def local_zone_ns(start_ns: int, log: TelemetryLog | None, notes: list[str]) -> int:
+    """The hours by which a camera's local time is ahead of the log's UTC; 0 where it is not.
+
+    Cameras write their local time where the format asks for UTC.
+    """
+    if log is None or _covers(log, start_ns):
+        return 0
+    for step_ns in (HOUR_NS, HOUR_NS // 2):  # some zones are half an hour off
+        zones = range(-12 * HOUR_NS, 14 * HOUR_NS + 1, step_ns)
+        fitting = [zone for zone in zones if _covers(log, start_ns - zone)]
+        if len(fitting) == 1:
+            hours = fitting[0] / HOUR_NS
+            notes.append(f"the camera's clock is {hours:+g} h off the log's: taken as local time")
+            return fitting[0]
+    return 0
+
+
+def _utc(time_ns: int) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(time_ns / 1e9))
+
+
+def at_another_time(inputs: ScanInputs, off_ms: float) -> dict[str, Any]:
+    """Inputs of the scan of a video whose stamps are late by ``off_ms``."""
+    word = "before" if off_ms > 0 else "after"
+    note = (
+        f"the video begins {1e-3 * abs(off_ms):.2f} s {word} the time that it states, as its "
+        "images turn with the log: applied"
+    )
+    return {"epoch_ns": inputs.epoch_ns - round(1e6 * off_ms), "notes": (*inputs.notes, note)}
