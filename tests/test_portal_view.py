@@ -226,20 +226,64 @@ gl.clientWaitSync = function (sync, ...a) {
 """A graphics card that ends no work given to it after ``since``, until that is infinite again."""
 
 
+COUNTED = """
+window.frames_given = 0;
+const counted = WebGL2RenderingContext.prototype.fenceSync;
+WebGL2RenderingContext.prototype.fenceSync = function (...a) {
+  window.frames_given++;
+  return counted.apply(this, a);
+};
+"""
+FRAMES_LATER = """(async () => {
+  for (let k = 0; k < 5; k++) await new Promise(r => requestAnimationFrame(r));
+})()"""
+
+
 def test_what_changes_while_the_graphics_card_is_busy_is_drawn(
     browser: Browser, portal: Portal
 ) -> None:
     browser.screen(1280, 800)
     open_scan(browser, portal)
+    setting(browser, "Full detail", "field.click()")  # a frame holds all points, none follows it
+    drawn(browser)
     browser.run(SLOW_CARD + ";0")
-    browser.run("dispatchEvent(new Event('input')); since = performance.now() + 510; 0")
-    browser.run("new Promise(r => setTimeout(r, 900))")  # the last frame is being drawn
+    browser.run("since = performance.now(); dispatchEvent(new Event('input')); 0")
+    browser.run(FRAMES_LATER)  # a frame is being drawn
     browser.screen(1000, 700)  # clears the canvas
-    browser.run("new Promise(r => setTimeout(r, 900))")
+    browser.run(FRAMES_LATER)
     browser.run("since = Infinity; 0")
     corner = drawn(browser)[2, 2]
     browser.screen(1280, 800)
     assert corner.tolist() == [0x20, 0x1B, 0x17]  # the background, not black
+
+
+def test_the_view_follows_a_drag_that_lasts(browser: Browser, portal: Portal) -> None:
+    open_scan(browser, portal)
+    browser.click("Whole site")
+    before = drawn(browser)
+    browser.page.mouse.move(600, 400)
+    browser.page.mouse.down()
+    browser.run("new Promise(r => setTimeout(r, 700))")  # the scene rests
+    browser.page.mouse.move(700, 420)
+    turned = drawn(browser)
+    browser.page.mouse.up()
+    assert difference(before, turned) > 0.1
+
+
+def test_a_click_that_measures_does_not_draw_the_scene_again(
+    browser: Browser, portal: Portal
+) -> None:
+    open_scan(browser, portal)
+    browser.click("Measure")
+    drawn(browser)
+    browser.run(COUNTED + ";0")
+    browser.mouse(640, 430)
+    browser.wait("document.querySelectorAll('.overlay circle').length === 1")
+    browser.run(FRAMES_LATER)
+    assert browser.run("frames_given") == 0
+    browser.click("Cameras")
+    drawn(browser)
+    assert browser.run("frames_given") > 0
 
 
 def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, store: Path) -> None:

@@ -41,6 +41,8 @@ export class Painter {
   frames_per_s = 0;
   /** Share of the points that the frame shows so far. */
   shown = 0;
+  /** The frame shows what is no more: it is drawn again, at the next tick or when the graphics card is done. */
+  stale = true;
   gradual: Gradual | null = null;
   readonly dome = new Dome();
   /** Objects drawn with every slice; all others are in the first frame only. */
@@ -59,26 +61,30 @@ export class Painter {
 
   /** True when the frame is whole and nothing is being drawn. */
   get still(): boolean {
-    return this.settled && this.shown >= 1 && !this.work;
+    return this.settled && this.shown >= 1 && !this.work && !this.stale;
   }
 
   /**
-   * One tick: a new frame while something changes, then slices over it until all is drawn.
+   * One tick: a new frame when something changed; once the scene rests, the whole frame unless
+   * it is that already, slice by slice.
    * Nothing is given to the graphics card before it has done what it was given.
    */
-  tick(now: number, lively: boolean, before: readonly (() => void)[]): void {
+  tick(now: number, resting: boolean, before: readonly (() => void)[]): void {
     const presenting = this.renderer.xr.isPresenting;
-    if (lively) this.settled = false; // also while the graphics card is busy
     if (!presenting && this.work && !this.done(this.work, now)) return;
     if (presenting && this.work) this.paced(this.work, now);
     this.work = null;
-    if (!lively && this.settled) {
-      if (this.shown < 1) this.addSlice(now);
-      return;
-    }
-    this.settled = !lively;
+    if (this.stale) {
+      this.stale = false;
+      this.frame(now, false, before);
+    } else if (resting && !this.settled) this.frame(now, true, before);
+    else if (resting && this.shown < 1) this.addSlice(now);
+  }
+
+  private frame(now: number, still: boolean, before: readonly (() => void)[]): void {
     for (const call of before) call();
-    this.whole(!lively);
+    this.whole(still);
+    this.settled = still || this.shown >= 1;
     this.give("whole", now);
   }
 

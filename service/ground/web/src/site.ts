@@ -53,7 +53,11 @@ export class SiteView {
         this.cloud.add(chunk);
         this.stage.touch();
       },
-      (item) => item.type === "repose" && this.cloud.repose(item.seq + k * STRIDE, item.T, item.scale),
+      (item) => {
+        if (item.type !== "repose") return;
+        this.cloud.repose(item.seq + k * STRIDE, item.T, item.scale);
+        this.stage.touch();
+      },
       () => undefined,
     );
   }

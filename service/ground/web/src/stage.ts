@@ -8,9 +8,10 @@ import { type Gradual, Painter } from "./painter";
 
 export const BACKGROUND = 0x171b20;
 export const LIGHT = 0xffffff;
-const INPUTS = ["pointerdown", "click", "input", "change", "keydown", "wheel"];
-const MOVING_MS = 250;
-const LIVELY_MS = 500;
+const INPUTS = ["click", "input", "change"];
+// Until then a part of many points is drawn: after a movement, after other news.
+const MOVED_MS = 250;
+const NEWS_MS = 500;
 const MARGIN = 0.92; // of the scene that is filled
 const OUTLINE_POINTS = 1000;
 
@@ -42,8 +43,7 @@ export class Stage {
     new THREE.LineBasicMaterial({ color: 0xff6b4a }),
   );
   private readonly watcher: ResizeObserver;
-  private touched = performance.now();
-  private moved = -1e9;
+  private rests = 0; // from this time on
   private framed = false; // the view is still that of frame()
   private readonly keys = new Set<string>();
   private last = performance.now();
@@ -53,7 +53,11 @@ export class Stage {
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(0, -120, 90);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
-    this.controls.addEventListener("start", () => (this.follow = this.framed = false));
+    this.controls.addEventListener("start", () => {
+      if (this.follow) this.touch();
+      this.follow = this.framed = false;
+    });
+    this.controls.addEventListener("change", () => this.changed(MOVED_MS));
     this.track.frustumCulled = false;
     this.world.add(this.track, this.model);
     this.scene.add(this.world, new THREE.AmbientLight(0xffffff, 2));
@@ -66,7 +70,7 @@ export class Stage {
     this.resize();
     addEventListener("keydown", this.press);
     addEventListener("keyup", this.release);
-    for (const name of INPUTS) addEventListener(name, this.touch);
+    for (const name of INPUTS) addEventListener(name, this.input);
     this.renderer.setAnimationLoop(() => this.draw());
   }
 
@@ -88,7 +92,7 @@ export class Stage {
   close(): void {
     removeEventListener("keydown", this.press);
     removeEventListener("keyup", this.release);
-    for (const name of INPUTS) removeEventListener(name, this.touch);
+    for (const name of INPUTS) removeEventListener(name, this.input);
     this.renderer.setAnimationLoop(null);
     this.watcher.disconnect();
     this.controls.dispose();
@@ -214,23 +218,26 @@ export class Stage {
     this.world.matrixWorldNeedsUpdate = true;
   }
 
-  /** Something changed that is to be seen: frames are drawn again for a moment. */
-  readonly touch = (): void => {
+  /** Something changed that is to be seen: the next tick draws a frame. */
+  readonly touch = (): void => this.changed(NEWS_MS);
+
+  private changed(busy_ms: number): void {
     document.body.dataset["still"] = "no";
-    this.touched = performance.now();
-  };
+    this.painter.stale = true;
+    this.rests = Math.max(this.rests, performance.now() + busy_ms);
+  }
 
   /** One tick. Nothing is drawn once all is drawn and nothing changes. */
   private draw(): void {
     const now = performance.now();
     const presenting = this.renderer.xr.isPresenting;
     if (!presenting) {
-      const flying = this.fly((now - this.last) / 1000);
-      if (this.controls.update() || flying) this.moved = now;
+      if (this.fly((now - this.last) / 1000)) this.changed(MOVED_MS);
+      this.controls.update();
     }
     this.last = now;
-    const moving = presenting || now - this.moved < MOVING_MS;
-    this.painter.tick(now, moving || now - this.touched < LIVELY_MS, this.before);
+    if (presenting) this.painter.stale = true;
+    this.painter.tick(now, now >= this.rests, this.before);
     const still = this.painter.still ? "yes" : "no";
     if (document.body.dataset["still"] !== still) document.body.dataset["still"] = still;
   }
@@ -260,6 +267,11 @@ export class Stage {
 
   private readonly release = (event: KeyboardEvent): void => {
     this.keys.delete(event.key.toLowerCase());
+  };
+
+  /** Any control may change what is seen; what a click on the scene changes, its own listeners say. */
+  private readonly input = (event: Event): void => {
+    if (event.target !== this.renderer.domElement) this.touch();
   };
 
   private resize(): void {

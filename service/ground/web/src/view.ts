@@ -139,7 +139,9 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     link.draw();
     if (cameras.refresh()) stage.touch();
     if (cloud.refresh()) stage.touch();
-    figures.replaceChildren(...rows(cloud, known, link.finished, last, others.words));
+    const now = rows(cloud, known, link.finished, last, others.words);
+    const text = (nodes: Iterable<Element>): string => [...nodes].map((node) => node.textContent).join();
+    if (text(now) !== text(figures.children)) figures.replaceChildren(...now); // or the page is laid out again
     document.body.dataset["points"] = String(cloud.total);
     document.body.dataset["drawn"] = String(cloud.drawn);
     document.body.dataset["fps"] = stage.painter.frames_per_s.toFixed(1);
