@@ -52,18 +52,25 @@ LIKE = (
 
 
 @pytest.fixture
-def page(browser: Browser, tmp_path: Path, house: HouseFlight) -> Iterator[Browser]:
+def base(browser: Browser, tmp_path: Path, house: HouseFlight) -> Iterator[str]:
+    """The address of a portal with the scan drone-1/test-1, which no page shows yet."""
     portal = Portal(PortalConfig(flown_store(tmp_path, house), port=0, token=TOKEN))
     portal.start()
     browser.screen(1280, 800)
     browser.open("about:blank")
-    browser.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/test-1")
+    yield portal.url.split("/?")[0] + "/"
+    browser.run("localStorage.clear()")
+    portal.close()
+
+
+@pytest.fixture
+def page(browser: Browser, base: str) -> Browser:
+    """The scan, whole and at rest."""
+    browser.open(f"{base}#/view/drone-1/test-1")
     browser.wait("document.body.dataset.points > 71000")  # all five keyframes
     browser.click("Whole site")
     settle(browser)
-    yield browser
-    browser.run("localStorage.clear()")
-    portal.close()
+    return browser
 
 
 def settle(page: Browser) -> None:
@@ -175,28 +182,29 @@ def test_a_link_opens_the_same_view(page: Browser) -> None:
 
 
 @pytest.mark.parametrize("broken", ["1,2,3", "1,2,3,4,5,x", "", "NaN,0,0,0,0,0"])
-def test_a_link_with_a_broken_view_shows_the_whole_site(page: Browser, broken: str) -> None:
-    base = page.run("location.href").split("#")[0]
-    page.open("about:blank")
-    page.open(f"{base}#/view/drone-1/test-1/{broken}")
-    page.wait("document.body.dataset.points > 71000")
-    settle(page)
-    assert page.run(COLOURED) > 0.05
+def test_a_link_with_a_broken_view_shows_the_whole_site(
+    browser: Browser, base: str, broken: str
+) -> None:
+    browser.open(f"{base}#/view/drone-1/test-1/{broken}")
+    browser.wait("document.body.dataset.points > 71000")
+    settle(browser)
+    assert browser.run(COLOURED) > 0.05
 
 
-def test_a_click_on_a_camera_shows_its_image(page: Browser, house: HouseFlight) -> None:
-    base = page.run("location.href").split("#")[0]
-    page.open("about:blank")
-    page.open(f"{base}#/view/drone-1/test-1/10,-130,70,10,0,20")
-    page.wait("document.body.dataset.image === '4'")
-    settle(page)
-    page.mouse(*projected(page, view(page), house.pose(5.0)[:3, 3]))  # where the second was taken
-    page.wait("document.body.dataset.image === '1'")
+def test_a_click_on_a_camera_shows_its_image(
+    browser: Browser, base: str, house: HouseFlight
+) -> None:
+    browser.open(f"{base}#/view/drone-1/test-1/10,-130,70,10,0,20")
+    browser.wait("document.body.dataset.image === '4'")
+    settle(browser)
+    second = house.pose(5.0)[:3, 3]  # where the second was taken
+    browser.mouse(*projected(browser, view(browser), second))
+    browser.wait("document.body.dataset.image === '1'")
     caption = "document.querySelector('.latest figcaption').textContent"
-    assert page.run(caption).startswith("keyframe 1")
-    assert page.run("document.querySelector('.latest img').naturalWidth") > 0
-    page.click("Latest")
-    page.wait("document.body.dataset.image === '4'")
+    assert browser.run(caption).startswith("keyframe 1")
+    assert browser.run("document.querySelector('.latest img').naturalWidth") > 0
+    browser.click("Latest")
+    browser.wait("document.body.dataset.image === '4'")
 
 
 def projected(page: Browser, where: F64, point: F64) -> tuple[float, float]:
@@ -226,14 +234,15 @@ def test_lengths_in_feet_when_chosen(page: Browser) -> None:
     assert float(feet[1]) * 0.3048 == pytest.approx(float(metres[1]), abs=0.1)
 
 
-def test_the_list_follows_a_dark_desktop(page: Browser) -> None:
+def test_the_list_follows_a_dark_desktop(browser: Browser, base: str) -> None:
     background = "getComputedStyle(document.documentElement).backgroundColor"
-    page.open(page.run("location.href").split("#")[0] + "#/")
-    light = page.wait(background)
+    browser.open(f"{base}#/")
+    browser.wait("document.querySelectorAll('article').length === 1")
+    light = browser.run(background)
     dark = [{"name": "prefers-color-scheme", "value": "dark"}]
-    page.call("Emulation.setEmulatedMedia", features=dark)
+    browser.call("Emulation.setEmulatedMedia", features=dark)
     try:
-        shown = [int(v) for v in re.findall(r"\d+", page.run(background))]
+        shown = [int(v) for v in re.findall(r"\d+", browser.run(background))]
         assert max(shown) < 60 < min(int(v) for v in re.findall(r"\d+", light))
     finally:
-        page.call("Emulation.setEmulatedMedia", features=[])
+        browser.call("Emulation.setEmulatedMedia", features=[])
