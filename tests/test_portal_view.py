@@ -165,6 +165,19 @@ def test_ground_looks_like_ground_at_the_first_look(browser: Browser, portal: Po
     assert solid_share(drawn(browser)) < solid_share(plain) - 0.02
 
 
+def test_a_scene_at_rest_asks_for_no_frames(browser: Browser, portal: Portal) -> None:
+    open_scan(browser, portal)
+    drawn(browser)
+    count = "window.requestAnimationFrame = f => (asked++, ask.call(window, f));"
+    browser.run(f"window.asked = 0; window.ask = requestAnimationFrame; {count} 0")
+    browser.run("new Promise(r => setTimeout(r, 400))")  # beyond the next turn of the figures
+    assert browser.run("asked") == 0
+    before = drawn(browser)
+    browser.page.keyboard.press("d", delay=200)  # flies
+    assert difference(before, drawn(browser)) > 0.01
+    assert browser.run("asked") > 0
+
+
 @pytest.mark.parametrize("screen", [(1440, 900), (390, 844)])
 def test_the_whole_site_fills_the_scene_above_the_time_slider(
     browser: Browser, portal: Portal, screen: tuple[int, int]

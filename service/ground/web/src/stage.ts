@@ -44,6 +44,8 @@ export class Stage {
   );
   private readonly watcher: ResizeObserver;
   private rests = 0; // from this time on
+  private ticking = false;
+  private closed = false; // what is still loading may come later
   private framed = false; // the view is still that of frame()
   private readonly keys = new Set<string>();
   private last = performance.now();
@@ -71,7 +73,6 @@ export class Stage {
     addEventListener("keydown", this.press);
     addEventListener("keyup", this.release);
     for (const name of INPUTS) addEventListener(name, this.input);
-    this.renderer.setAnimationLoop(() => this.draw());
   }
 
   add(object: THREE.Object3D): void {
@@ -93,7 +94,8 @@ export class Stage {
     removeEventListener("keydown", this.press);
     removeEventListener("keyup", this.release);
     for (const name of INPUTS) removeEventListener(name, this.input);
-    this.renderer.setAnimationLoop(null);
+    this.tick(false);
+    this.closed = true;
     this.watcher.disconnect();
     this.controls.dispose();
     this.painter.dome.close();
@@ -199,8 +201,8 @@ export class Stage {
   async vr(): Promise<HTMLElement | null> {
     const offered = await navigator.xr?.isSessionSupported("immersive-vr").catch(() => false);
     if (!offered) return null;
-    this.renderer.xr.addEventListener("sessionstart", () => this.layAtFeet());
-    this.renderer.xr.addEventListener("sessionend", () => this.world.matrix.identity());
+    this.renderer.xr.addEventListener("sessionstart", () => (this.layAtFeet(), this.touch()));
+    this.renderer.xr.addEventListener("sessionend", () => (this.world.matrix.identity(), this.touch()));
     return VRButton.createButton(this.renderer);
   }
 
@@ -225,9 +227,18 @@ export class Stage {
     document.body.dataset["still"] = "no";
     this.painter.stale = true;
     this.rests = Math.max(this.rests, performance.now() + busy_ms);
+    this.tick(true);
   }
 
-  /** One tick. Nothing is drawn once all is drawn and nothing changes. */
+  /** Ticks at the pace of the screen, or of the headset, or not at all. */
+  private tick(on: boolean): void {
+    if (on === this.ticking || this.closed) return;
+    this.ticking = on;
+    this.last = performance.now();
+    this.renderer.setAnimationLoop(on ? () => this.draw() : null);
+  }
+
+  /** One tick; the last one when all is drawn and nothing changes. */
   private draw(): void {
     const now = performance.now();
     const presenting = this.renderer.xr.isPresenting;
@@ -240,6 +251,7 @@ export class Stage {
     this.painter.tick(now, now >= this.rests, this.before);
     const still = this.painter.still ? "yes" : "no";
     if (document.body.dataset["still"] !== still) document.body.dataset["still"] = still;
+    if (this.painter.still && !presenting) this.tick(false);
   }
 
   /** W A S D fly over the ground, R and F up and down; faster the farther one looks. */
@@ -262,7 +274,10 @@ export class Stage {
   private readonly press = (event: KeyboardEvent): void => {
     const typing = event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement;
     const key = event.key.toLowerCase();
-    if (!typing && !event.ctrlKey && !event.metaKey && "wasdrf".includes(key)) this.keys.add(key);
+    if (!typing && !event.ctrlKey && !event.metaKey && "wasdrf".includes(key)) {
+      this.keys.add(key);
+      this.changed(MOVED_MS);
+    }
   };
 
   private readonly release = (event: KeyboardEvent): void => {
