@@ -1,11 +1,11 @@
 """Whether the images fit the focal length of their camera model.
 
 A wrong focal length leaves errors in the odometry's window that no pose or landmark takes up. The
-remainder of the derivative by the focal length, once poses and landmarks have taken up their part,
-times these errors gives one Gauss-Newton step of it (Frisch and Waugh, doi:10.2307/1907330).
-Views that never turn give next to none, so that their sigma is large. It follows from
-how cells of the image and windows scatter (Liang and Zeger, doi:10.1093/biomet/73.1.13), as
-errors of neighbouring landmarks are alike.
+remainder of the derivative by the focal length, once poses, landmarks and radial distortion have
+taken up their part, times these errors gives one Gauss-Newton step of it (Frisch and Waugh,
+doi:10.2307/1907330). Views that never turn give next to none, so that their sigma is large. It
+follows from how cells of the image and windows scatter (Liang and Zeger,
+doi:10.1093/biomet/73.1.13), as errors of neighbouring landmarks are alike.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class FocalWatch:
 
     def __init__(self, K: F64) -> None:
         self._K = K
-        self._cells: list[F64] = []  # (CELLS**2, 2) information and score, of each window
+        self._cells: list[F64] = []  # (CELLS**2, 2, 3) information and score, of each window
 
     def add(self, seen: AdjustedWindow) -> None:
         """Add a window after its adjustment."""
@@ -59,20 +59,24 @@ class FocalWatch:
         if not self._cells:
             return None
         cells = np.stack(self._cells)
-        information, score = cells.sum(axis=(0, 1))
-        if not information > 0.0:
+        information, score = cells[..., :2], cells[..., 2]
+        try:
+            covariance = np.linalg.inv(information.sum(axis=(0, 1)))
+        except np.linalg.LinAlgError:
             return None
-        change, count = float(score / information), len(cells)
-        rest = cells[..., 1] - change * cells[..., 0]
+        step, count = covariance @ score.sum(axis=(0, 1)), len(cells)
+        # Of each cell, by how much the change of the focal length would differ without it.
+        rest = (score - information @ step) @ covariance[0]
         squares = float(np.square(rest).sum())
         if count > 1:
             of_windows = float(np.square(rest.sum(axis=1)).sum()) * count / (count - 1)
             squares = max(squares, of_windows)
-        return FocalEstimate(change, float(np.sqrt(squares) / information), count)
+        return FocalEstimate(float(step[0]), float(np.sqrt(squares)), count)
 
 
 def _evidence(seen: AdjustedWindow, K: F64) -> F64:
-    """(CELLS**2, 2) information and score of the logarithm of the focal length, by cells."""
+    """(CELLS**2, 2, 3) information and score by cells: of the logarithm of the focal length, and of
+    radial distortion in shares at the largest radius."""
     cam, point, M = seen.camera, seen.point, len(seen.uv_px)
     C, N = len(seen.T_camera_world), len(seen.points_m)
     by_pose, by_point = np.zeros((M, 2, 6)), np.zeros((M, 2, 3))
@@ -82,22 +86,23 @@ def _evidence(seen: AdjustedWindow, K: F64) -> F64:
         np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), HUBER_PX, by_pose, by_point, error, weight,
     )  # fmt: skip
     by_focal = error + seen.uv_px - K[:2, 2]
-    root = np.sqrt(weight)
+    square = np.sum(by_focal**2, axis=1, keepdims=True)
+    by_lens = np.stack([by_focal, by_focal * square / max(float(square.max()), 1e-9)], axis=-1)
+    root = np.sqrt(weight)[:, None]
     left = _not_taken_up(
-        by_focal * root[:, None], by_pose * root[:, None, None], by_point * root[:, None, None],
+        by_lens * root[..., None], by_pose * root[..., None], by_point * root[..., None],
         cam, point, C, N,
     )  # fmt: skip
-    cell = _cells(by_focal, point, N)
-    out = np.zeros((CELLS**2, 2))
-    np.add.at(out[:, 0], cell, np.sum(left**2, axis=1))
-    np.add.at(out[:, 1], cell, -np.sum(left * error * root[:, None], axis=1))
+    seen_by = np.concatenate([left, -(error * root)[..., None]], axis=-1)
+    out = np.zeros((CELLS**2, 2, 3))
+    np.add.at(out, _cells(by_focal, point, N), np.einsum("mki,mkj->mij", left, seen_by))
     return out
 
 
 def _not_taken_up(
     values: F64, by_pose: F64, by_point: F64, cam: I64, point: I64, C: int, N: int
 ) -> F64:
-    """The remainder of ``values`` (M, 2) after the best change of poses and points.
+    """The remainder of ``values`` (M, 2, V) after the best change of poses and points.
 
     ``by_pose`` (M, 2, 6) and ``by_point`` (M, 2, 3) are the derivatives.
     """
@@ -113,15 +118,17 @@ def _not_taken_up(
     S[np.arange(C), :, np.arange(C)] = of_pose
     wide = W.transpose(0, 2, 1, 3).reshape(6 * C, 3 * N)
     eliminated = np.einsum("cnij,njk->cnik", W, H_inv).transpose(0, 2, 1, 3).reshape(6 * C, 3 * N)
-    of_points, of_poses = np.zeros((N, 3)), np.zeros((C, 6))
-    np.add.at(of_points, point, np.einsum("mki,mk->mi", by_point, values))
-    np.add.at(of_poses, cam, np.einsum("mki,mk->mi", by_pose, values))
+    V = values.shape[2]
+    of_points, of_poses = np.zeros((N, 3, V)), np.zeros((C, 6, V))
+    np.add.at(of_points, point, np.einsum("mki,mkv->miv", by_point, values))
+    np.add.at(of_poses, cam, np.einsum("mki,mkv->miv", by_pose, values))
     reduced = S.reshape(6 * C, 6 * C) - eliminated @ wide.T
     inverse = np.linalg.pinv(reduced, rcond=1e-9, hermitian=True)  # place, turn and scale are open
-    poses = inverse @ (of_poses.ravel() - eliminated @ of_points.ravel())
-    points = np.einsum("nij,nj->ni", H_inv, of_points - (wide.T @ poses).reshape(N, 3))
-    taken = np.einsum("mki,mi->mk", by_pose, poses.reshape(C, 6)[cam])
-    return np.asarray(values - taken - np.einsum("mki,mi->mk", by_point, points[point]))
+    rows_of_points, rows_of_poses = of_points.reshape(3 * N, V), of_poses.reshape(6 * C, V)
+    poses = inverse @ (rows_of_poses - eliminated @ rows_of_points)
+    points = H_inv @ (rows_of_points - wide.T @ poses).reshape(N, 3, V)
+    taken = by_pose @ poses.reshape(C, 6, V)[cam]
+    return np.asarray(values - taken - by_point @ points[point])
 
 
 def _cells(at: F64, point: I64, N: int) -> I64:
