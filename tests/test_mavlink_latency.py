@@ -106,10 +106,36 @@ def test_a_turn_that_looks_like_another_places_no_recording(first_s: float) -> N
         watch.add(round(t * S), round((t + 0.1) * S), seen)
     for start_s, is_found in ((first_s, False), (88.0, True)):
         times = start_s + np.arange(350) / 10
-        log = [(round((t - 60.0) * S), legs(float(t))) for t in times]
+        log = [(round((t - 100.0) * S), legs(float(t))) for t in times]
         found = watch.anywhere(log)
         assert (found is not None) == is_found
-        assert found is None or found.latency_ms == pytest.approx(60e3, abs=20.0)
+        assert found is None or found.latency_ms == pytest.approx(100e3, abs=20.0)
+
+
+@pytest.mark.parametrize(("late_s", "is_found"), [(3.0, True), (30.0, False)])
+def test_a_turn_alone_shows_a_clock_that_is_off_by_seconds_but_no_minute(
+    late_s: float, is_found: bool
+) -> None:
+    """A gimbal holds the head still between turns."""
+    rng = np.random.default_rng(6)
+
+    def head(t: float) -> Quaternion:
+        return quaternion.from_rpy(0.0, 0.0, 1.5 / (1.0 + math.exp(-3.0 * (t - 60.0))))
+
+    watch = LatencyWatch()
+    for k in range(300):
+        t = 45.0 + 0.1 * k
+        step = quaternion.multiply(quaternion.conjugate(head(t)), head(t + 0.1))
+        a, b, c = map(float, rng.normal(0.0, 1e-4, 3))
+        first_ns, second_ns = (round((x + late_s) * S) for x in (t, t + 0.1))
+        watch.add(first_ns, second_ns, quaternion.multiply(step, (1.0, a, b, c)))
+    log = []
+    for k in range(1200):
+        a, b, c = map(float, rng.normal(0.0, 5e-4, 3))
+        log.append((k * S // 10, quaternion.multiply(head(0.1 * k), (1.0, a, b, c))))
+    found = watch.anywhere(log)
+    assert (found is not None) == is_found
+    assert found is None or found.latency_ms == pytest.approx(1e3 * late_s, abs=20.0)
 
 
 def test_a_gimbal_that_only_trembles_is_enough() -> None:

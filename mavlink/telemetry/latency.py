@@ -120,8 +120,10 @@ class LatencyWatch:
         high = min(float(seen.end_s[-1]) - track.first_s, FAR_REACH_S)
         lag_s = _best_lag(seen, track, np.arange(low, high, FAR_STEP_S, dtype=np.float64))
         found = None if lag_s is None else self._about(track, lag_s)
-        fit = None if found is None else _fit(seen, track, 1e-3 * found.latency_ms)
+        if found is None or abs(found.latency_ms) <= 1e3 * REACH_S:
+            return found
         # The turn at the end of a leg looks like the next one: what is between must agree as well.
+        fit = _fit(seen, track, 1e-3 * found.latency_ms)
         return None if fit is None or fit.agreement(seen) < MIN_CORRELATION else found
 
     def _about(self, track: Attitudes, about_s: float) -> LatencyEstimate | None:
