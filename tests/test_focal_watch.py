@@ -103,6 +103,24 @@ def test_one_window_has_a_sigma_of_its_own() -> None:
     assert abs(found.change) < 3.5 * found.sigma < 0.02
 
 
+@pytest.mark.parametrize("broken", ["empty", "pixel", "point", "pose"])
+def test_a_window_without_finite_sightings_shows_nothing(broken: str) -> None:
+    """The adjustment survives such a window, and so does the flight."""
+    seen = window(-60.0, 3.0, 1.0, 0)
+    if broken == "empty":
+        no = seen.camera[:0]
+        seen = AdjustedWindow(seen.T_camera_world, seen.points_m[:0], no, no, seen.uv_px[:0])
+    elif broken == "pixel":
+        seen.uv_px[5] = np.nan
+    elif broken == "point":
+        seen.points_m[3] = np.inf
+    else:
+        seen.T_camera_world[4] = np.nan
+    watch = FocalWatch(K)
+    watch.add(seen)
+    assert watch.estimate is None
+
+
 def test_without_a_window_there_is_no_estimate() -> None:
     assert FocalWatch(K).estimate is None
 

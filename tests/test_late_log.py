@@ -100,6 +100,7 @@ def test_a_time_that_the_operator_gives_stays(
         (17.6, 15.0, 5.5),  # India
         (1.1, 15.0, -11.0),
         (12.75, 15.0, 0.0),  # fits no zone
+        (13.6, 15.0, 0.0),  # another flight: there is no zone of +1.5 h
         (14.1, 180.0, 0.0),  # in the log as it is
         (16.1, 180.0, 0.0),  # fits several
         (40.1, 15.0, 0.0),  # another day

@@ -84,6 +84,60 @@ def test_a_recording_is_found_anywhere_in_its_log() -> None:
     assert recording.anywhere([]) is None
 
 
+def legs(t: float) -> Quaternion:
+    """Legs of 25 s with a half turn after each, left and right in turn, in calm air."""
+    n, rest = divmod(t, 29.0)
+    share = 0.5 - 0.5 * math.cos(math.pi * min(max(rest - 25.0, 0.0) / 4.0, 1.0))
+    yaw = math.pi * (share if n % 2 == 0 else 1.0 - share)
+    air = 0.003 * math.sin(1.3 * t + 0.01 * t * t), 0.003 * math.sin(0.9 * t + 0.02 * t * t)
+    return quaternion.from_rpy(*air, yaw)
+
+
+@pytest.mark.parametrize("first_s", [150.0, 20.0])
+def test_a_turn_that_looks_like_another_places_no_recording(first_s: float) -> None:
+    """The recording is of 90 to 120 s; the log, of 35 s, holds a turn of the same kind or it."""
+    rng = np.random.default_rng(5)
+    watch = LatencyWatch()
+    for k in range(300):
+        t = 90.0 + 0.1 * k
+        step = quaternion.multiply(quaternion.conjugate(legs(t)), legs(t + 0.1))
+        a, b, c = map(float, rng.normal(0.0, 1e-4, 3))
+        seen = quaternion.multiply(step, (1.0, a, b, c))
+        watch.add(round(t * S), round((t + 0.1) * S), seen)
+    for start_s, is_found in ((first_s, False), (88.0, True)):
+        times = start_s + np.arange(350) / 10
+        log = [(round((t - 100.0) * S), legs(float(t))) for t in times]
+        found = watch.anywhere(log)
+        assert (found is not None) == is_found
+        assert found is None or found.latency_ms == pytest.approx(100e3, abs=20.0)
+
+
+@pytest.mark.parametrize(("late_s", "is_found"), [(3.0, True), (30.0, False)])
+def test_a_turn_alone_shows_a_clock_that_is_off_by_seconds_but_no_minute(
+    late_s: float, is_found: bool
+) -> None:
+    """A gimbal holds the head still between turns."""
+    rng = np.random.default_rng(6)
+
+    def head(t: float) -> Quaternion:
+        return quaternion.from_rpy(0.0, 0.0, 1.5 / (1.0 + math.exp(-3.0 * (t - 60.0))))
+
+    watch = LatencyWatch()
+    for k in range(300):
+        t = 45.0 + 0.1 * k
+        step = quaternion.multiply(quaternion.conjugate(head(t)), head(t + 0.1))
+        a, b, c = map(float, rng.normal(0.0, 1e-4, 3))
+        first_ns, second_ns = (round((x + late_s) * S) for x in (t, t + 0.1))
+        watch.add(first_ns, second_ns, quaternion.multiply(step, (1.0, a, b, c)))
+    log = []
+    for k in range(1200):
+        a, b, c = map(float, rng.normal(0.0, 5e-4, 3))
+        log.append((k * S // 10, quaternion.multiply(head(0.1 * k), (1.0, a, b, c))))
+    found = watch.anywhere(log)
+    assert (found is not None) == is_found
+    assert found is None or found.latency_ms == pytest.approx(1e3 * late_s, abs=20.0)
+
+
 def test_a_gimbal_that_only_trembles_is_enough() -> None:
     # Half a degree of unsteadiness, seen and measured with errors a tenth of that.
     found = watch_flight(0.07, 2e-4, 0.08, 30.0).estimate(attitudes(20.0, 0.08, 9e-4))

@@ -66,6 +66,21 @@ def test_of_an_image_that_shows_no_ground_two_pairs_decide() -> None:
     assert kept is not None and np.isfinite(kept.depth_m).all()
 
 
+def test_a_facade_stays_where_only_a_strip_without_depth_lies_below_the_horizon() -> None:
+    """The camera looks 16 degrees up: the horizon lies 11 rows above the lower edge, where the
+    other images of the pairs end."""
+    facade = surface(np.full(SHAPE, 2, np.uint8))
+    facade.depth_m[65:], facade.views[65:] = np.nan, 0
+    kept = plausible(facade, PosePrior(looking(16.0), sigma_tilt_rad=0.0))
+    assert kept is not None and np.isfinite(kept.depth_m[:65]).all()
+
+
+def test_clouds_over_a_sea_without_depth_are_dropped() -> None:
+    clouds = surface(np.full(SHAPE, 2, np.uint8))
+    clouds.depth_m[20:], clouds.views[20:] = np.nan, 0
+    assert plausible(clouds, PosePrior(looking(0.0), sigma_tilt_rad=0.0)) is None
+
+
 def test_what_may_lie_below_the_horizon_is_kept() -> None:
     alone = surface(np.ones(SHAPE, np.uint8))
     unsure = PosePrior(looking(-10.0), sigma_tilt_rad=np.radians(6.1))

@@ -119,6 +119,17 @@ def test_a_clock_that_the_whole_log_does_not_confirm_stays(monkeypatch: pytest.M
     assert check.clock_off_ms() is None and check.clock_off_ms(has_ended=True) is None
 
 
+def test_a_search_that_found_nothing_is_repeated_with_all_frames(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    check = TelemetryCheck(CameraConfig(latency_ms=-130.0), history_of("none", 1.0))
+    fly(check)
+    with monkeypatch.context() as early:
+        early.setattr(LatencyWatch, "anywhere", lambda watch, attitudes: None)
+        assert check.clock_off_ms() is None
+    assert check.clock_off_ms(has_ended=True) == pytest.approx(200.0, abs=10.0)
+
+
 def test_stills_show_a_latency_too() -> None:
     """A still every other second, turned to 0.4 degrees: enough to report, not to apply."""
     reported: list[str] = []

@@ -119,7 +119,12 @@ class LatencyWatch:
         low = max(float(seen.start_s[0]) - track.last_s, -FAR_REACH_S)
         high = min(float(seen.end_s[-1]) - track.first_s, FAR_REACH_S)
         lag_s = _best_lag(seen, track, np.arange(low, high, FAR_STEP_S, dtype=np.float64))
-        return None if lag_s is None else self._about(track, lag_s)
+        found = None if lag_s is None else self._about(track, lag_s)
+        if found is None or abs(found.latency_ms) <= 1e3 * REACH_S:
+            return found
+        # The turn at the end of a leg looks like the next one: what is between must agree as well.
+        fit = _fit(seen, track, 1e-3 * found.latency_ms)
+        return None if fit is None or fit.agreement(seen) < MIN_CORRELATION else found
 
     def _about(self, track: Attitudes, about_s: float) -> LatencyEstimate | None:
         """The latency within ``REACH_S`` of ``about_s``."""
@@ -165,6 +170,12 @@ class _Fit:
     def span_s(self, seen: _Turns) -> float:
         """Time that the windows cover together."""
         return float((seen.end_s - seen.start_s)[self.known].sum()) / seen.overlap
+
+    def agreement(self, seen: _Turns) -> float:
+        """Mean cosine between the rates of images and telemetry: all windows count alike."""
+        ours, rate = self.ours[self.known], seen.rate[self.known]
+        sizes = np.linalg.norm(ours, axis=1) * np.linalg.norm(rate, axis=1)
+        return float(((ours * rate).sum(axis=1) / np.maximum(sizes, 1e-30)).mean())
 
     @property
     def good(self) -> Bool:

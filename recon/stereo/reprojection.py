@@ -312,6 +312,10 @@ TILT_SIGMAS = 2.0
 MAX_STEP_SHARE = 0.1
 """Neighbouring pixels whose depths differ by more belong to two surfaces."""
 
+STRIP_SHARE = 0.2
+"""Of the image below the horizon; less of it without any depth shows no ground: the pairs' other
+images may end above it, as those of a camera that looks up a facade."""
+
 
 def plausible(depth: DepthMap, prior: PosePrior) -> DepthMap | None:
     """``depth`` without false surface above the horizon; None with nothing left.
@@ -335,9 +339,9 @@ def plausible(depth: DepthMap, prior: PosePrior) -> DepthMap | None:
 
 def _reaching(depth_m: F32, ground: Bool) -> Bool:
     """(h, w) pixels of surfaces that reach into ``ground``; all where the image shows none."""
-    if not ground.any():
-        return np.ones(depth_m.shape, np.bool_)
     known = np.isfinite(depth_m)
+    if ground.mean() < STRIP_SHARE and not (ground & known).any():
+        return np.ones(depth_m.shape, np.bool_)
     away = np.log(np.where(known, depth_m, np.float32(1.0)))
     square = np.ones((3, 3), np.uint8)
     farthest = cv2.dilate(np.where(known, away, np.float32(-99.0)), square)

@@ -50,8 +50,10 @@ class FocalWatch:
         self._cells: list[F64] = []  # (CELLS**2, 2, 3) information and score, of each window
 
     def add(self, seen: AdjustedWindow) -> None:
-        """Add a window after its adjustment."""
-        self._cells.append(_evidence(seen, self._K))
+        """Add a window after its adjustment; one without finite sightings says nothing."""
+        every = seen.T_camera_world, seen.points_m, seen.uv_px
+        if len(seen.uv_px) and all(np.isfinite(one).all() for one in every):
+            self._cells.append(_evidence(seen, self._K))
 
     @property
     def estimate(self) -> FocalEstimate | None:

@@ -55,6 +55,9 @@ COARSE = {"compute.stereo_width": 320, "compute.upsample": False, "fusion.loops"
 """Poses are all that is needed."""
 
 HOUR_NS = 3_600_000_000_000
+HOURS = tuple(range(-12, 15))
+HALF_HOURS = -9.5, -3.5, -2.5, 3.5, 4.5, 5.5, 6.5, 9.5, 10.5
+"""The zones that there are; with others nearly each flight of the day would fit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,13 +229,12 @@ def local_zone_ns(start_ns: int, log: TelemetryLog | None, notes: list[str]) -> 
     """
     if log is None or _covers(log, start_ns):
         return 0
-    for step_ns in (HOUR_NS, HOUR_NS // 2):  # some zones are half an hour off
-        zones = range(-12 * HOUR_NS, 14 * HOUR_NS + 1, step_ns)
-        fitting = [zone for zone in zones if _covers(log, start_ns - zone)]
+    for zones in (HOURS, (*HOURS, *HALF_HOURS)):
+        fitting = [h for h in zones if _covers(log, start_ns - round(h * HOUR_NS))]
         if len(fitting) == 1:
-            hours = fitting[0] / HOUR_NS
+            (hours,) = fitting
             notes.append(f"the camera's clock is {hours:+g} h off the log's: taken as local time")
-            return fitting[0]
+            return round(hours * HOUR_NS)
     return 0
 
 

@@ -135,7 +135,7 @@ class TelemetryCheck:
         is_due = has_ended if near is None else self._off_ms(near) is not None
         if self._history is None or not is_due:
             return None
-        if near is None or near is not self._compared:
+        if near is not self._compared or (has_ended and self._in_log is None):
             self._compared = near
             self._in_log = self._turns.anywhere(self._attitudes(self._history)())
         return None if self._in_log is None else self._off_ms(self._in_log)
