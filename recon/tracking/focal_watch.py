@@ -78,7 +78,7 @@ class FocalWatch:
 
 def _evidence(seen: AdjustedWindow, K: F64) -> F64:
     """(CELLS**2, 2, 3) information and score by cells: of the logarithm of the focal length, and of
-    radial distortion in shares at the largest radius."""
+    radial distortion in shares at the image's corner."""
     cam, point, M = seen.camera, seen.point, len(seen.uv_px)
     C, N = len(seen.T_camera_world), len(seen.points_m)
     by_pose, by_point = np.zeros((M, 2, 6)), np.zeros((M, 2, 3))
@@ -89,7 +89,8 @@ def _evidence(seen: AdjustedWindow, K: F64) -> F64:
     )  # fmt: skip
     by_focal = error + seen.uv_px - K[:2, 2]
     square = np.sum(by_focal**2, axis=1, keepdims=True)
-    by_lens = np.stack([by_focal, by_focal * square / max(float(square.max()), 1e-9)], axis=-1)
+    corner = float(K[0, 2] ** 2 + K[1, 2] ** 2)  # one unit in all windows, as their sums share it
+    by_lens = np.stack([by_focal, by_focal * square / corner], axis=-1)
     root = np.sqrt(weight)[:, None]
     left = _not_taken_up(
         by_lens * root[..., None], by_pose * root[..., None], by_point * root[..., None],
