@@ -27,7 +27,6 @@ from service.cameras.lens import Lens, by_full_frame
 from service.config import change
 from service.errors import InputError
 from service.flight.scan import Scan, ScanInputs, check_new, create_store
-from service.offline.refine import refinement
 from service.offline.refine.own_camera import MAX_SIGMA_BEND, MIN_IMAGES, bent, by_tags
 from service.stream.validity import MAX_TIME_NS, is_time
 
@@ -123,6 +122,8 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> S
     ``inputs`` are those of the whole scan, with the lens to begin with; ``video`` is its camera
     source, a recording or a folder of stills.
     """
+    from service.offline.refine.refinement import lens
+
     source, config = inputs.source, inputs.config
     if isinstance(source, ImagesSource):
         source = source.middle(VIEWS)
@@ -147,7 +148,7 @@ def own_lens(inputs: ScanInputs, video: str, search: SelfCalibrationConfig) -> S
         if scan.recorder.keyframes < MIN_IMAGES:
             return f"{scan.recorder.keyframes} keyframes are too few; {MIN_IMAGES} needed"
         try:
-            return refinement.lens(folder, Path(parse_source(video)[1]), search)
+            return lens(folder, Path(parse_source(video)[1]), search)
         except InputError as error:
             return str(error)
 
