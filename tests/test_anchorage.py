@@ -133,3 +133,26 @@ def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None
     assert chain.corrections(final=True) == ()
     again = chain.place(frame, alone)
     np.testing.assert_allclose(again.T_world_camera, found.T_world_camera, atol=1e-9)
+
+
+def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> None:
+    """Its keyframe carries them by a scale and a heading that nobody knows."""
+    chain: Any = Chain(Trajectory(), before(0), Counter(), Stopwatch())
+    key, fix = refined(3, 0, np.eye(4)), np.array([20.0, -10.0, 50.0])
+    prior = PosePrior(position_m=fix, sigma_position_m=np.full(3, 5.0))
+    view = SimpleNamespace(
+        seq=5, segment=0, time_ns=0, prior=prior, points=np.zeros((0, 3)),
+        anchor=Anchorage(5, key, some_pose()), view=SimpleNamespace(T_odom_camera=some_pose()),
+    )  # fmt: skip
+    chain.add(view, KeyframeStep(None, np.eye(6)), None)
+    chain.reconstructed(view, None)
+    frame = Anchorage(7, key, some_pose())
+    in_flight = chain.follow(SimpleNamespace(prior=prior), frame)
+    chain.corrections(final=True)
+    again = chain.place(frame, Uncarried(fix, np.full(3, 5.0)))
+    for placed in (in_flight, again):
+        np.testing.assert_allclose(placed.T_world_camera[:3, 3], fix)
+        assert placed.sigma_m == pytest.approx(5.0 * 3**0.5)
+    chain.trajectory.similarity = lambda segment: object()
+    carried = chain.place(frame, Uncarried(fix, np.full(3, 5.0)))
+    assert np.linalg.norm(carried.T_world_camera[:3, 3] - fix) > 1.0

@@ -184,8 +184,8 @@ class Trajectory:
         pose = self.graph.pose(seq)
         frame = self.graph.similarity(self.graph.node(seq).segment)
         T, covariance = pose.T_world_camera, pose.covariance
-        if frame is None:
-            covariance = se3.about(-T[:3, 3], np.eye(6))
+        if frame is None:  # its scale and heading are not known
+            covariance = covariance + se3.about(-T[:3, 3], np.eye(6))
         elif frame.sigma_fixes is not None and frame.sigma_counted is not None:
             own = np.diag(se3.about(T[:3, 3], covariance))[3:]
             bent = np.maximum(own - frame.sigma_counted**2, 0.0)

@@ -216,11 +216,24 @@ class Chain:
         sigma_m = np.hypot(known.sigma_m, np.linalg.norm(way_m))
         return Uncarried(known.place_m + way_m, sigma_m, known.sources)
 
+    def _has_fix(self, segment: int) -> bool:
+        return segment in self._known and "gnss" in self._known[segment][1].sources
+
+    def _is_aligned(self, segment: int) -> bool:
+        """True when the segment has a frame in the world; in flight, of the newest one."""
+        if self._newest is not None:
+            return segment == self._aligned
+        return self.trajectory.similarity(segment) is not None
+
     def place(self, anchor: Anchorage, uncarried: Uncarried) -> Placed:
-        """A frame in the world, carried by the chain's keyframe at or before it where it can."""
-        T_odom_camera = anchor.T_odom_camera
+        """A frame in the world, carried by the chain's keyframe at or before it where it can.
+
+        A segment too short to be aligned has no scale and no heading: its frames stay at their
+        fixes.
+        """
+        T_odom_camera, segment = anchor.T_odom_camera, anchor.key.segment
         carrier = self._carriers.of(anchor)
-        if carrier is None:
+        if carrier is None or (self._has_fix(segment) and not self._is_aligned(segment)):
             place_m, sigma_m, sources = uncarried
             T = se3.compose(T_odom_camera[:3, :3], place_m)
             covariance = se3.about(-place_m, np.diag(np.r_[np.ones(3), np.square(sigma_m)]))
