@@ -1,4 +1,4 @@
-"""Features of images: the strongest first, remembered for a while, compared by their look."""
+"""Features of images: the largest first, remembered for a while, compared by their look."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def noisy(image: U8, seed: int) -> U8:
     return np.asarray(np.clip(image + noise, 0, 255), np.uint8)
 
 
-def test_the_strongest_features_come_first() -> None:
-    """They survive noise better than the last ones."""
+def test_the_largest_features_come_first() -> None:
+    """They survive noise better than the smallest ones."""
     image = still(pose(0.0))
     one, other = (features(noisy(image, seed)) for seed in (1, 2))
     apart_px = np.linalg.norm(one.uv_px[:, None] - other.uv_px, axis=2).min(axis=1)
@@ -68,25 +68,41 @@ def test_a_look_is_that_of_the_place_whatever_the_turn() -> None:
     assert here.dtype == np.uint8 and here.nbytes <= 200 * 128
 
 
-def test_stills_that_share_fine_detail_alone_are_compared_in_fine_detail() -> None:
-    """Treetops: leaves look alike from two places, their masses do not."""
+def textured(shared_px: float, own_px: float, own: float) -> list[U8]:
+    """Two images 100 px apart: structure of one size is shared, that of another is each's own."""
     rng = np.random.default_rng(3)
 
-    def texture(size_px: float, shape: tuple[int, int] = (720, 1280)) -> F64:
-        noise = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), size_px)
+    def texture(size_px: float, width: int = 1280) -> F64:
+        noise = cv2.GaussianBlur(rng.normal(size=(720, width)), (0, 0), size_px)
         return np.asarray(noise / noise.std(), np.float64)
 
-    leaves = texture(1.8, (720, 1380))
-    images = [
-        np.asarray(np.clip(120 + 35 * seen + 30 * texture(8.0), 0, 255), np.uint8)
-        for seen in (leaves[:, :1280], leaves[:, 100:])
+    shared = texture(shared_px, 1380)
+    return [
+        np.asarray(np.clip(120 + 35 * seen + own * texture(own_px), 0, 255), np.uint8)
+        for seen in (shared[:, :1280], shared[:, 100:])
     ]
-    a, b = enumerate(images)
+
+
+def test_stills_that_share_fine_detail_alone_are_compared_in_fine_detail() -> None:
+    a, b = enumerate(textured(shared_px=1.8, own_px=8.0, own=20.0))
     cache = FeatureCache()
     assert cache.common_view(a, b, is_still=False) is None
     view = cache.common_view(a, b, is_still=True)
     assert view is not None
     np.testing.assert_allclose(view.carry(np.array([[640.0, 360.0]])), [[540.0, 360.0]], atol=2.0)
+
+
+def test_masses_tie_images_whose_leaves_differ() -> None:
+    a, b = textured(shared_px=16.0, own_px=2.0, own=30.0)
+    largest, strongest = (
+        common_view.common_view(*(features(image, are_strongest=one) for image in (a, b)))
+        for one in (False, True)
+    )
+    assert largest is not None
+    np.testing.assert_allclose(
+        largest.carry(np.array([[640.0, 360.0]])), [[540.0, 360.0]], atol=2.0
+    )
+    assert strongest is None or len(largest) > 3 * len(strongest)
 
 
 def test_mutual_matches_are_those_of_a_search_both_ways() -> None:

@@ -53,7 +53,7 @@ class Image:
 
 def image_of(gray: U8, camera: Camera) -> Image:
     """The features of a distorted ``gray`` (H, W)."""
-    found = features(gray, WIDTH_PX, FEATURES)
+    found = features(gray, WIDTH_PX, FEATURES, are_strongest=True)
     _, first, which = np.unique(
         np.round(found.uv_px, 1), axis=0, return_index=True, return_inverse=True
     )

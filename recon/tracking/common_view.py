@@ -53,7 +53,7 @@ KEPT = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """Distinct places of one image with their descriptors, the strongest first."""
+    """Distinct places of one image with their descriptors, the largest first."""
 
     uv_px: F64  # (N, 2) of the full image
     descriptors: F32  # (N, 128) unit length
@@ -98,22 +98,30 @@ class CommonView:
         return replace(by_plane, uv=self.carry(uv_px))
 
 
-def features(gray: U8, width_px: int = WIDTH_PX, most: int = MOST) -> Features:
-    """The ``most`` strongest features of ``gray`` (H, W) uint8, looked for at ``width_px``; none
-    where it shows nothing."""
+def features(
+    gray: U8, width_px: int = WIDTH_PX, most: int = MOST, are_strongest: bool = False
+) -> Features:
+    """The ``most`` largest features of ``gray`` (H, W) uint8, looked for at ``width_px``; none
+    where it shows nothing.
+
+    Large ones are found again from elsewhere, where the strongest are leaves and glints.
+    ``are_strongest``: those of the highest contrast instead, as their places are more exact.
+    """
     H, W = gray.shape
     size = (min(width_px, W), max(16, round(min(width_px, W) * H / W)))
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     level = cv2.createCLAHE(4.0, (8, 8)).apply(small)
     # Without the precise upscale all places are a quarter of a pixel too far right and down.
-    sift = cv2.SIFT.create(most, contrastThreshold=0.01, enable_precise_upscale=True)
-    found, descriptors = sift.detectAndCompute(level, None)
+    sift = cv2.SIFT.create(0, contrastThreshold=0.01, enable_precise_upscale=True)
+    found = sorted(
+        sift.detect(level, None), key=lambda p: -(p.response if are_strongest else p.size)
+    )[:most]
+    found, descriptors = sift.compute(level, found)
     if descriptors is None or len(found) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), W)
-    order = np.argsort([-point.response for point in found], kind="stable")[:most]
-    uv = np.array([found[i].pt for i in order], np.float64)
-    total = np.maximum(descriptors[order].sum(1, keepdims=True), 1e-9)
-    root = np.sqrt(descriptors[order] / total)
+    uv = np.array([point.pt for point in found], np.float64)
+    total = np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
+    root = np.sqrt(descriptors / total)
     scale = np.array([W / size[0], H / size[1]])
     return Features((uv + 0.5) * scale - 0.5, np.asarray(root, np.float32), W)
 
@@ -170,9 +178,9 @@ def alike(a: U8, b: U8) -> int:
 
 
 def signature(gray: U8) -> U8:
-    """(N, 128) descriptors of the strongest features of an image, in 26 kB."""
-    strongest = features(gray, SIGNATURE_WIDTH_PX).descriptors[:SIGNATURE]
-    return np.asarray(np.clip(np.rint(strongest * SIGNATURE_STEPS), 0, 255), np.uint8)
+    """(N, 128) descriptors of the largest features of an image, in 26 kB."""
+    largest = features(gray, SIGNATURE_WIDTH_PX).descriptors[:SIGNATURE]
+    return np.asarray(np.clip(np.rint(largest * SIGNATURE_STEPS), 0, 255), np.uint8)
 
 
 class FeatureCache:
