@@ -113,10 +113,10 @@ def features(
     level = cv2.createCLAHE(4.0, (8, 8)).apply(small)
     # Without the precise upscale all places are a quarter of a pixel too far right and down.
     sift = cv2.SIFT.create(0, contrastThreshold=0.01, enable_precise_upscale=True)
-    found = sorted(
+    places = sorted(
         sift.detect(level, None), key=lambda p: -(p.response if are_strongest else p.size)
-    )[:most]
-    found, descriptors = sift.compute(level, found)
+    )
+    found, descriptors = sift.compute(level, places[:most])
     if descriptors is None or len(found) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), W)
     uv = np.array([point.pt for point in found], np.float64)
