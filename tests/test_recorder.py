@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -76,6 +77,20 @@ def test_poses_of_a_recording_share_transactions(
         recorder.flush()
         assert [pose.time_unix_ns for pose in store.poses()] == [1_000_000 * n for n in range(20)]
         assert len(written) == transactions and sum(written) == 20
+
+
+def test_a_still_that_the_next_one_places_is_no_longer_lost(tmp_path: Path) -> None:
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("stills", "drone", 0)) as store:
+        recorder = recorder_of(store, 1, sigma_m=0.1)
+        recorder.write(Step(Tracked(Tracking.LOST, 0)), 1_000_000, 30.0)
+        assert recorder.states == {Tracking.LOST: 1}
+        recorder.write(replace(step(2), late=step(1)), 2_000_000, 31.0)
+        recorder.flush()
+        assert [(p.time_unix_ns, p.agl_m) for p in store.poses()] == [
+            (1_000_000, 30.0),
+            (2_000_000, 31.0),
+        ]
+        assert recorder.frames == 2 and +recorder.states == {Tracking.TRACKED: 2}
 
 
 def test_poses_published_before_the_scan_was_placed_get_their_sigma(tmp_path: Path) -> None:

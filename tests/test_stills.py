@@ -12,10 +12,14 @@ import painted_ground
 import pytest
 from painted_ground import CAMERA, DOWN, FOOTPRINT_M, HEIGHT_M, SIZE, pose, still
 
+from recon.backends import load_backend
 from recon.camera_model import scaled
 from recon.tracking.localisation import Localiser, Located, Start
-from recon.tracking.odometry import Odometry, Tracked
-from recon.types import F64, U8, PosePrior
+from recon.tracking.odometry import Odometry, Tracked, Tracking
+from recon.types import F64, U8, Frame, PosePrior
+from service.config import load_config
+from service.flight.pipeline import Pipeline
+from service.flight.stages import build_stages
 
 PLACED = ("started", "tracked", "keyframe")
 OFF = 0.1
@@ -120,6 +124,35 @@ def test_stills_of_other_places_are_not_joined() -> None:
     assert found[3].state == "lost"
     assert [f.state for f in found[4:]] == ["keyframe"] * 2
     assert {f.segment for f in found[4:]} == {1}
+    first = found[4].before  # the segment begins with the still that was lost when it came
+    assert first is not None and first.state == "started" and first.segment == 1
+    assert first.T_odom_camera is not None and found[4].T_odom_camera is not None
+    assert np.linalg.norm((first.T_odom_camera - found[4].T_odom_camera)[:3, 3]) > 1.0
+    assert [f.before for f in found if f is not found[4]] == [None] * 5
+
+
+def test_the_first_still_of_a_segment_is_placed_and_reconstructed() -> None:
+    """It is lost when it comes, as nothing before shows its ground; the next one proves it."""
+    track = [pose(0.3 * FOOTPRINT_M * i - 100.0, seed=i) for i in range(3)]
+    track += [pose(0.3 * FOOTPRINT_M * i + 10.0, seed=5 + i) for i in range(3)]
+    config = load_config(None, ["compute.upsample=false", "compute.stereo_width=240"])
+    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
+    steps = []
+    for i, T in enumerate(track):
+        prior = PosePrior(
+            DOWN, 0.1, 0.1, T[:3, 3], np.full(3, 0.5), agl_m=HEIGHT_M, sigma_agl_m=2.0
+        )
+        image = np.repeat(still(T)[..., None], 3, axis=2)
+        steps.append(pipeline.step(Frame(image, i * 2_000_000_000, i, prior)))
+    last = pipeline.finish()
+    assert [n for n, step in enumerate(steps) if step.late is not None] == [4]
+    late = steps[4].late
+    assert steps[3].tracked.state is Tracking.LOST and late is not None and late.is_view
+    assert late.anchor is not None and late.anchor.seq == 3 and late.placed is not None
+    np.testing.assert_allclose(late.placed.T_world_camera[:3, 3], track[3][:3, 3], atol=2.0)
+    keyframes = [k.seq for step in [*steps, last] for k in step.keyframes]
+    assert keyframes == list(range(6))
+    assert pipeline.refusals().total() == 0
 
 
 def test_corners_without_a_landmark_do_not_choose_the_pose(monkeypatch: pytest.MonkeyPatch) -> None:

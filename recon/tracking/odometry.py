@@ -11,7 +11,7 @@ heading and position are corrected afterwards by :mod:`recon.posegraph.alignment
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -72,6 +72,7 @@ class Tracked:
     tracks: int = 0
     reason: str = ""
     moving: FrameRows | None = None  # its rows' motion, better once its neighbours are known
+    before: Tracked | None = None  # the still before, lost when it came: a segment begins with it
 
 
 class Odometry:
@@ -191,8 +192,10 @@ class Odometry:
         self._lost += 1
         if self._still and self._missed_still is not None and self._lost >= 2:
             first, self._missed_still = self._missed_still, None
-            if self._start(first).state is Tracking.STARTED:
-                return self._second_view(new)
+            started = self._start(first)
+            if started.state is Tracking.STARTED:
+                second = self._second_view(new)
+                return second if second.state is Tracking.LOST else replace(second, before=started)
         elif not self._still and self._lost >= self.config.lost_after:
             self._start(new)
         self._missed_still = new if self._still else None

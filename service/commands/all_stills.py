@@ -97,7 +97,7 @@ def _tracked(
     stages = build_stages(inputs.camera, inputs.config, inputs.backend)
     rig = Rig(inputs.config.camera, inputs.config.scan, inputs.config.fusion)
     check = TelemetryCheck(inputs.config.camera, history, log.info)
-    out = []
+    out = list[Still]()
     for frame in source:
         time_ns = inputs.epoch_ns + frame.time_ns
         state = history.state_at(check.exposed_ns(time_ns))
@@ -106,6 +106,8 @@ def _tracked(
         tracked = stages.track(image)
         check.add(time_ns, tracked)
         is_tracked = tracked.T_odom_camera is not None
+        if tracked.before is not None:
+            out[-1] = replace(out[-1], is_tracked=True)
         out.append(Still(frame.seq, _small(frame), frame.time_ns, is_tracked))
     check.finish()
     return out, check.latency

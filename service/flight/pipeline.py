@@ -17,7 +17,7 @@ from recon.types import Frame, Keyframe, PosePrior
 from service.config import ComputeConfig, ScanConfig
 from service.flight.anchorage import Anchorage
 from service.flight.stages import Stages
-from service.flight.viewpoints import StereoCandidate
+from service.flight.viewpoints import StereoCandidate, UndistortedFrame
 from service.stream.records import Repose
 
 
@@ -31,6 +31,7 @@ class Step:
     anchor: Anchorage | None = None  # gives the frame's place again, as it is known later
     keyframes: tuple[Keyframe, ...] = ()  # finished depth images, oldest first
     moved: tuple[Repose, ...] = ()  # keyframes published before whose pose is better now
+    late: Step | None = None  # the frame before, which was lost until this one came
 
 
 class Pipeline:
@@ -39,6 +40,7 @@ class Pipeline:
     def __init__(self, stages: Stages) -> None:
         self.stages = stages
         self._background = stages.in_background(self.reconstruct)
+        self._lost: UndistortedFrame | None = None  # the last frame, where it has no pose
 
     # ---- the figure --------------------------------------------------------------------
 
@@ -57,6 +59,7 @@ class Pipeline:
         s = self.stages
         image = s.undistort(frame)  # section 2.1
         tracked = s.track(image)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
+        late = self._late(image, tracked)
         anchor, is_view = s.views.take(image, tracked)  # virtual stereo camera, section 2.3
         if anchor is None:
             return Step(tracked, s.chain.by_telemetry(image, tracked))
@@ -65,7 +68,17 @@ class Pipeline:
         keyframes = self._finished()
         moved = s.chain.corrections() if keyframes else ()
         placed = s.chain.follow(image, anchor)
-        return Step(tracked, placed, is_view, anchor, keyframes, moved)
+        return Step(tracked, placed, is_view, anchor, keyframes, moved, late)
+
+    def _late(self, image: UndistortedFrame, tracked: Tracked) -> Step | None:
+        """The step of the frame before, which begins the segment of this one."""
+        before, self._lost = self._lost, image if tracked.state is Tracking.LOST else None
+        if before is None or tracked.before is None:
+            return None
+        anchor, is_view = self.stages.views.take(before, tracked.before)
+        assert anchor is not None
+        placed = self.stages.chain.follow(before, anchor)
+        return Step(tracked.before, placed, is_view, anchor)
 
     def reconstruct(self, view: StereoCandidate) -> Keyframe | None:
         """One view: its depth from all its partners, its pose, and its new surface."""

@@ -63,13 +63,21 @@ class Recorder:
         self._frames = PublishedFrames(store.path.parent)
         self._last: tuple[int, F64] | None = None  # unix ns and T_world_camera of the last pose
         self._origin_written = False
+        self._before: tuple[int, float | None] = 0, None  # time and height of the frame before
 
     def write(self, step: Step, time_ns: int, agl_m: float | None) -> None:
         """One step of the pipeline; raises OutsideError when the disk is full."""
+        if step.late is not None:
+            self.states[Tracking.LOST] -= 1
+            self._write_pose(step.late, *self._before)
+        self._before = time_ns, agl_m
         self.frames += 1
-        self.states[step.tracked.state] += 1
         self._write_origin()
         self._write_keyframes(step)
+        self._write_pose(step, time_ns, agl_m)
+
+    def _write_pose(self, step: Step, time_ns: int, agl_m: float | None) -> None:
+        self.states[step.tracked.state] += 1
         placed = step.placed
         if placed is None:
             return

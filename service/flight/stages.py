@@ -134,6 +134,7 @@ class Track:
     ) -> None:
         self.odometry, self._selection = odometry, selection
         self._refused, self._stopwatch = refused, stopwatch
+        self._lost = ""  # why the last lost frame has no pose
         self.waiting = Counter[str]()
         """Frames since the segment's first one that wait for its second view, by reason."""
 
@@ -147,10 +148,13 @@ class Track:
             tracked = self.odometry.track(
                 image.small, image.seq, image.time_ns, image.prior, image.mask, image.is_blurred
             )
+        if tracked.before is not None:
+            self._refused -= Counter([self._lost])
         if tracked.state is Tracking.WAITING:
             self.waiting[tracked.reason] += 1
         elif tracked.T_odom_camera is None:
             self._refused[tracked.reason] += 1
+            self._lost = tracked.reason
         else:
             if tracked.state is Tracking.STARTED:  # the segment before never began
                 self._refused.update(self.waiting)

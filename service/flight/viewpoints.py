@@ -348,7 +348,7 @@ class StereoViews:
             self._segment = tracked.segment
         if tracked.T_odom_camera is None:
             return None, False
-        key = self._odometry.keyframes[-1]
+        key = next(key for key in reversed(self._odometry.keyframes) if key.seq <= image.seq)
         anchor = Anchorage(image.seq, key, se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera)
         frame = Viewpoint(
             image.seq, image.time_ns, image.prior, image.colour, image.gray, key, anchor,
