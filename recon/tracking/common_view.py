@@ -198,9 +198,11 @@ class FeatureCache:
         Stills are compared in finer detail where they need it: they are few and far apart.
         """
         view = common_view(self.of(*a), self.of(*b))
-        if view is None and is_still:
-            view = common_view(*(self.of(*image, FINE_WIDTH_PX, FINE_MOST) for image in (a, b)))
-        return view
+        return self.fine_view(a, b) if view is None and is_still else view
+
+    def fine_view(self, a: tuple[int, U8], b: tuple[int, U8]) -> CommonView | None:
+        """The same in fine detail."""
+        return common_view(*(self.of(*image, FINE_WIDTH_PX, FINE_MOST) for image in (a, b)))
 
     def of(self, seq: int, gray: U8, width_px: int = WIDTH_PX, most: int = MOST) -> Features:
         """Features of image ``seq``, which is ``gray`` (H, W)."""

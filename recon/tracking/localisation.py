@@ -176,10 +176,28 @@ class Localiser:
                     guess.uv.astype(np.float32), guess.radius_px, guess.warp.astype(np.float32),
                     self.config.matching,
                 )  # fmt: skip
-                bridge = self._two_views(new, key, found.uv_px.astype(np.float64), found.ok)
+                uv, ok = found.uv_px.astype(np.float64), found.ok
+                bridge = self._two_views(new, key, uv, ok)
                 if bridge is not None:
                     return bridge
+            corners = key.uv, key.landmark
+            bridge = self._two_views(new, key, *self.with_features(new, key, uv, ok))
+            if bridge is not None:
+                return bridge
+            key.uv, key.landmark = corners
         return None
+
+    def with_features(
+        self, new: TrackingFrame, key: OdometryKeyframe, uv: F64, ok: Bool
+    ) -> tuple[F64, Bool]:
+        """Where (N, 2) a keyframe's corners are found, and which (N,), once the features that both
+        images share are among them: treetops have few corners that look alike from two places."""
+        view = self._features.fine_view((key.seq, key.pyramid.levels[0]), (new.seq, new.gray))
+        if view is None:
+            return uv, ok
+        key.uv = np.vstack([key.uv, view.uv_a])
+        key.landmark = np.concatenate([key.landmark, np.full(len(view), -1, np.int64)])
+        return np.vstack([uv, view.uv_b]), np.concatenate([ok, np.ones(len(view), np.bool_)])
 
     def _two_views(
         self, new: TrackingFrame, key: OdometryKeyframe, uv: F64, ok: Bool

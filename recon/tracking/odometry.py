@@ -249,6 +249,8 @@ class Odometry:
         first = self.keyframes[0]
         R_b_a = prediction.relative_rotation(first.prior, new.prior)
         uv, ok = self._first_views.match(new, first, R_b_a, self._still)
+        if self._still and ok.sum() < 2 * self.config.min_tracks:
+            uv, ok = self._localiser.with_features(new, first, uv, ok)
         if ok.sum() < 2 * self.config.min_tracks:
             return self._missed(new, "too few matches with the first frame")
         self._lost = 0
