@@ -72,7 +72,7 @@ class Tracked:
     tracks: int = 0
     reason: str = ""
     moving: FrameRows | None = None  # its rows' motion, better once its neighbours are known
-    before: Tracked | None = None  # the still before, lost when it came: a segment begins with it
+    before: Tracked | None = None  # the still before, lost when it came, now a segment's first
 
 
 class Odometry:
@@ -195,7 +195,9 @@ class Odometry:
             started = self._start(first)
             if started.state is Tracking.STARTED:
                 second = self._second_view(new)
-                return second if second.state is Tracking.LOST else replace(second, before=started)
+                if second.state is Tracking.KEYFRAME:
+                    return replace(second, before=replace(started, state=Tracking.KEYFRAME))
+                return second
         elif not self._still and self._lost >= self.config.lost_after:
             self._start(new)
         self._missed_still = new if self._still else None
