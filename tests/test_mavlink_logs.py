@@ -505,7 +505,7 @@ DATAFLASH = {
     "ATT": ("QhhHH", "TimeUS,Roll,Pitch,Yaw,AEKF", "Qcccc"),
     "POS": ("QiifffB", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt,X", "QLLfffB"),
     "XKF1": ("QBfff", "TimeUS,C,VN,VE,VD", "QBfff"),
-    "GPS": ("QBBIHBfi", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat", "QBBIHBfL"),
+    "GPS": ("QBBIHBfiB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,U", "QBBIHBfLB"),
     "GPA": ("QBff", "TimeUS,I,HAcc,VAcc", "QBff"),
     "RFND": ("QBfBB", "TimeUS,Instance,Dist,Stat,Orient", "QBfBB"),
     "TERR": ("QBf", "TimeUS,Status,CHeight", "QBf"),
@@ -554,7 +554,7 @@ def dataflash_flight(dated: bool) -> DataflashWriter:
         us = 30_000_000 + k * 50_000
         if k % 4 == 0:
             gms = 100_000_000 + k * 50 if dated else 0
-            writer.add("GPS", us, 0, 3, gms, 2200 if dated else 0, 12, 0.8, 473000000)
+            writer.add("GPS", us, 0, 3, gms, 2200 if dated else 0, 12, 0.8, 473000000, 1)
             writer.add("GPA", us, 0, 0.7, 1.1)
         writer.add("XKF1", us, 0, 3.0, 1.0, -0.5)
         writer.add("ATT", us, 500, -1000, 9000, 3)
@@ -606,6 +606,21 @@ def test_an_ardupilot_onboard_log(tmp_path: Path, dated: bool) -> None:
     assert late is not None and late.sources[-1] == "rangefinder"
     path.write_bytes(dataflash_flight(dated).data[:-700])
     assert load_telemetry(path).counts["ATT"] > 190
+
+
+def test_a_second_receiver_without_a_fix_takes_no_position(tmp_path: Path) -> None:
+    writer = dataflash_flight(True)
+    for k in range(100):
+        us = 30_000_000 + k * 100_000
+        writer.add("GPS", us, 1, 1, 0, 0, 0, 99.9, 0, 0)
+        writer.add("GPA", us, 1, 500.0, 500.0)
+    path = tmp_path / "log.BIN"
+    path.write_bytes(writer.data)
+    log = load_telemetry(path)
+    for k in range(1, 10):
+        state = log.history.state_at(log.first_ns + k * 970_000_000)
+        assert state is not None and state.lat_deg == pytest.approx(47.3)
+        assert state.sigma_h_m == pytest.approx(0.7, rel=0.01)
 
 
 @pytest.mark.parametrize("has_rate", [True, False], ids=["RATE", "IMU"])

@@ -125,6 +125,7 @@ class _Reader:
     def __init__(self) -> None:
         self.gyros = _Gyros()
         self._velocity: tuple[float, tuple[float, float, float]] | None = None
+        self._receiver = 0  # the one in use
         self._fix = True
         self._fix_alt_m: float | None = None
 
@@ -159,11 +160,16 @@ class _Reader:
         return PositionSample(None, m.Lat, m.Lng, m.Alt, relative, velocity)
 
     def _gps(self, m: Any) -> Sample | None:
+        if not getattr(m, "U", True):
+            return None
+        self._receiver = getattr(m, "I", 0)
         self._fix = m.Status >= 3
         self._fix_alt_m = getattr(m, "Alt", None) if self._fix else None
         return None if self._fix else AccuracySample(None, False, 1e3, 1e3)
 
     def _gps_accuracy(self, m: Any) -> Sample | None:
+        if getattr(m, "I", 0) != self._receiver:
+            return None
         return AccuracySample(None, self._fix, m.HAcc, m.VAcc, self._fix_alt_m)
 
     def _range(self, m: Any) -> Sample | None:
