@@ -326,6 +326,22 @@ def test_odd_ones_are_left_out_and_reported(tmp_path: Path) -> None:
     assert len(list(source)) == 2 and source.warnings == reported  # once each
 
 
+def test_of_the_cameras_of_one_drone_that_in_colour_counts(tmp_path: Path) -> None:
+    """Beside each image a thermal one, or two of a spectral camera; and what a Mac adds."""
+    for i in range(3):
+        at = f"2024:06:01 12:00:0{i}"
+        write_still(tmp_path / f"DJI_{i}_T.jpg", at, size_px=(64, 51))
+        write_still(tmp_path / f"DJI_{i}_MS_G.jpg", at, size_px=(60, 45))
+        write_still(tmp_path / f"DJI_{i}_MS_R.jpg", at, size_px=(60, 45))
+        write_still(tmp_path / f"DJI_{i}_V.jpg", at, size_px=(80, 60))
+        (tmp_path / f"._DJI_{i}_V.jpg").write_bytes(b"\0\5\x16\7")
+    write_still(tmp_path / "panorama.jpg", "2024:06:01 12:00:09", size_px=(192, 96))
+    source = open_camera(str(tmp_path))
+    assert [f.name for f in source] == [f"DJI_{i}_V.jpg" for i in range(3)]
+    assert source.warnings[0] == "10 images are not 80x60 like the others; skipped"
+    assert not any("readable" in warning for warning in source.warnings)
+
+
 def test_a_still_is_not_skipped_for_want_of_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

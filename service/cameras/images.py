@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -26,6 +27,9 @@ SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 SECOND_NS = 1_000_000_000
 ZOOM = 0.03
 """Relative tolerance of the focal lengths of one camera."""
+
+AS_OFTEN = 0.9
+"""Of two cameras of one drone, one misses some images at times."""
 
 MAX_PAN_DEG = 30.0
 """Gimbals follow the nose: where images head further off it than that, their heading is wrong, as
@@ -90,7 +94,11 @@ class ImagesSource:
 
     def _read(self, folder: Path) -> list[tuple[Path, Tags]]:
         paths = sorted(
-            (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()),
+            (
+                p
+                for p in folder.iterdir()
+                if p.suffix.lower() in SUFFIXES and p.name[0] != "." and p.is_file()
+            ),
             key=natural_key,
         )
         tagged = []
@@ -105,8 +113,17 @@ class ImagesSource:
         return tagged
 
     def _same_size(self, tagged: list[tuple[Path, Tags]]) -> list[tuple[Path, Tags]]:
-        """Stills of the most frequent size: a camera model is for one size."""
-        size_px, _ = Counter(tags.size_px for _, tags in tagged).most_common(1)[0]
+        """Stills of the size taken at most moments: a camera model is for one size.
+
+        Of sizes taken about as often it is the largest: a drone takes thermal or spectral images
+        with those in colour.
+        """
+        moments: dict[tuple[int, int], set[object]] = {}
+        for path, tags in tagged:
+            moment = tags.local_ns or tags.gps_unix_ns or path
+            moments.setdefault(tags.size_px, set()).add(moment)
+        usual = AS_OFTEN * max(map(len, moments.values()))
+        size_px = max((s for s, m in moments.items() if len(m) >= usual), key=math.prod)
         kept = [(path, tags) for path, tags in tagged if tags.size_px == size_px]
         if len(kept) < len(tagged):
             self._warn(
