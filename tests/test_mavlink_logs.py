@@ -414,8 +414,10 @@ def test_subtitles_of_several_drones(
 
 
 def cue(number: int, text: str) -> str:
-    start, end = number * 40, number * 40 + 40
-    return f"{number + 1}\n00:00:00,{start:03d} --> 00:00:00,{end:03d}\n{text}\n\n"
+    start, end = (
+        f"00:00:{ms // 1000:02d},{ms % 1000:03d}" for ms in (number * 40, number * 40 + 40)
+    )
+    return f"{number + 1}\n{start} --> {end}\n{text}\n\n"
 
 
 def test_subtitles_of_a_drone_without_a_position_give_its_height(tmp_path: Path) -> None:
@@ -431,6 +433,19 @@ def test_subtitles_of_a_drone_without_a_position_give_its_height(tmp_path: Path)
         assert state.alt_agl_m == pytest.approx(30.0)
     state = log.history.state_at(150_000_000)
     assert state is not None and state.lat_deg == pytest.approx(45.0)
+
+
+def test_subtitles_of_joined_recordings_follow_on(tmp_path: Path) -> None:
+    places = [f"[latitude: 45.0] [longitude: 13.0] [rel_alt: {n + 1}.0]" for n in range(60)]
+    files = ["".join(cue(n, text) for n, text in enumerate(part)) for part in (places, places[30:])]
+    path = tmp_path / "flight.SRT"
+    path.write_text("".join(files))
+    log = load_telemetry(path)
+    assert log.warnings == ("times begin again 1 time(s): joined, the rest follows on",)
+    assert log.last_ns == 89 * 40_000_000
+    for time_ns, height_m in ((0, 1.0), (59 * 40_000_000, 60.0), (60 * 40_000_000, 31.0)):
+        state = log.history.state_at(time_ns)
+        assert state is not None and state.alt_agl_m == pytest.approx(height_m)
 
 
 @pytest.mark.parametrize(

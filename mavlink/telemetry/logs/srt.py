@@ -40,6 +40,9 @@ PRY = re.compile(rf"\b([FG])\.PRY\s*\(\s*{NUMBER}\W?\s*,\s*{NUMBER}\W?\s*,\s*{NU
 LONGEST_LINE, LONGEST_CUE = 4096, 64
 """In letters and in lines; the rest of a cue is skipped."""
 
+RESTART_NS = 1_000_000_000
+"""A time that goes back to this long after the start, at most, begins again: joined files."""
+
 SAME_FOCAL = 0.02
 """Relative tolerance of a focal length that does not zoom."""
 
@@ -52,6 +55,7 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     history = VehicleHistory(config)
     counts: Counter[str] = Counter()
     time_ns: int | None = None
+    earlier_ns = step_ns = 0  # of the recordings before; between the last two cues
     text: list[str] = []
     focals: list[float] = []
     with path.open(encoding="utf-8", errors="replace") as file:
@@ -66,11 +70,21 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
             hours, minutes, seconds, fraction = cue.groups()
             ms = int(fraction.ljust(3, "0"))
             whole = int(hours) * 3600 + int(minutes) * 60 + int(seconds)
-            time_ns = (whole * 1000 + ms) * 1_000_000
+            cue_ns = (whole * 1000 + ms) * 1_000_000
+            last_ns, time_ns = time_ns, earlier_ns + cue_ns
+            if last_ns is not None and cue_ns <= RESTART_NS < last_ns - time_ns:
+                counts["joined"] += 1
+                time_ns = last_ns + step_ns
+                earlier_ns = time_ns - cue_ns
+            step_ns = time_ns - (last_ns or 0)
     _cue(history, counts, focals, time_ns, " ".join(text))
     if not counts["cues"]:
         raise ValueError(f"{path}: not a subtitle file; no cue was found")
     warnings = [f"{counts['unreadable']} cues without a position"] if counts["unreadable"] else []
+    if counts["joined"]:
+        warnings.append(
+            f"times begin again {counts['joined']} time(s): joined, the rest follows on"
+        )
     if focals and max(focals) > (1.0 + SAME_FOCAL) * min(focals):
         warnings.append(
             f"the lens zooms between {min(focals):.0f} and {max(focals):.0f} mm (35 mm equivalent):"
