@@ -53,7 +53,9 @@ def angle(a: Quaternion | F64, b: Quaternion | F64) -> float:
     return float((scipy_of(a).inv() * scipy_of(b)).magnitude())
 
 
-def position(lat: float, lon: float, alt: float, v: tuple[float, float, float]) -> PositionSample:
+def position(
+    lat: float, lon: float, alt: float, v: tuple[float, float, float] | None
+) -> PositionSample:
     return PositionSample(None, lat, lon, alt, alt - 500.0, v)
 
 
@@ -260,6 +262,19 @@ def test_position_follows_a_curve_exactly_and_crosses_the_date_line() -> None:
         assert state.alt_amsl_m == pytest.approx(alt, abs=0.01)
         assert state.v_ned_m_s is not None
         assert state.v_ned_m_s[1] == pytest.approx(5.0 + acceleration * float(t), abs=1e-6)
+
+
+def test_positions_once_a_second_hold_at_every_time() -> None:
+    """They never come exactly on time."""
+    history = VehicleHistory()
+    for k in range(5):
+        history.add(position(50.0 + 1e-5 * 1.05 * k, 8.0, 600.0, None), T0 + k * 1050 * MS)
+    for t in range(0, 4200, 100):
+        state = history.state_at(T0 + t * MS)
+        assert state is not None and state.lat_deg == pytest.approx(50.0 + 1e-8 * t, abs=1e-10)
+        assert state.alt_agl_m is not None and state.sigma_h_m is not None
+    history.add(position(50.0, 8.0, 600.0, None), T0 + 7300 * MS)
+    assert history.state_at(T0 + 5 * S) is None  # 3.1 s without any
 
 
 def test_position_is_straight_when_velocity_contradicts_the_way() -> None:

@@ -31,7 +31,7 @@ from mavlink.telemetry.samples import (
 )
 
 M_PER_DEG = 111_319.49  # along a meridian, and along the equator
-ACCURACY_GAP_NS = 3_000_000_000
+POSITION_GAP_NS = ACCURACY_GAP_NS = 3_000_000_000  # the way between bends by a metre at most
 GIMBAL_DEVICES = (154, 171, 172, 173, 174, 175)
 JUDGE_EVERY_NS = 10_000_000_000  # between two checks of a gimbal's reference frame
 JUDGE_LAG_NS = 3_000_000_000
@@ -225,8 +225,8 @@ class VehicleHistory:
         known; position by a cubic through positions and velocities.
         Nothing is extrapolated by more than 20 ms past the last sample. Sigmas grow with the
         square of the distance to the samples on both sides; a part whose samples are more than
-        one second apart is left out. The height above ground comes from the first available of
-        rangefinder, terrain, height above home.
+        one second apart (positions: three) is left out. The height above ground comes from the
+        first available of rangefinder, terrain, height above home.
         """
         if self._patience_s:
             self._await(time_ns)
@@ -336,7 +336,7 @@ class VehicleHistory:
         return steadiest_frame(sent, bodies, max(1, round(JUDGE_LAG_NS / spacing_ns)))
 
     def _add_position(self, state: _Assembly) -> Bracket[PositionSample] | None:
-        at = self._position.around(state.time_ns)
+        at = self._position.around(state.time_ns, POSITION_GAP_NS)
         if at is None:
             return None
         accuracy = self._accuracy.around(state.time_ns, ACCURACY_GAP_NS, ACCURACY_GAP_NS)
