@@ -25,14 +25,16 @@ PLACED = ("started", "tracked", "keyframe")
 OFF = 0.1
 
 
-def flown(images: list[U8], sigma_yaw_rad: float = 3.0) -> list[Tracked]:
+def flown(
+    images: list[U8], sigma_yaw_rad: float = 3.0, step_ns: int = 2_000_000_000
+) -> list[Tracked]:
     """The odometry over stills two seconds apart, each said to look down, its top to the north.
 
     By default only the nominal mount is known, and no heading.
     """
     odometry = Odometry(CAMERA)
     prior = PosePrior(DOWN, 0.1, sigma_yaw_rad, agl_m=HEIGHT_M)
-    return [odometry.track(image, i, i * 2_000_000_000, prior) for i, image in enumerate(images)]
+    return [odometry.track(image, i, i * step_ns, prior) for i, image in enumerate(images)]
 
 
 def off_m(track: list[F64], found: list[Tracked]) -> float:
@@ -62,6 +64,13 @@ def test_stills_at_60_percent_overlap_are_one_piece(yaw_deg: float) -> None:
     step = 0.4 * FOOTPRINT_M * (1.0 if yaw_deg == 0.0 else 0.75)
     track = [pose(step * (i - 4), yaw_deg * i, seed=i) for i in range(9)]
     assert_one_piece(track, flown([still(T) for T in track]), 0.02)
+
+
+def test_a_time_lapse_is_one_piece() -> None:
+    """Video of a tenth of a second a frame that jumps and turns as stills do."""
+    track = [pose(0.3 * FOOTPRINT_M * (i - 2), 60.0 * (i % 3), seed=i) for i in range(5)]
+    found = flown([still(T) for T in track], step_ns=100_000_000)
+    assert_one_piece(track, found, 0.02)
 
 
 def test_headings_that_are_wrong_do_not_part_the_flight() -> None:

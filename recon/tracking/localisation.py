@@ -243,6 +243,8 @@ class Localiser:
             yield from self._by_features(new, keyframes, still)
         if not still or turn is None:
             yield Start(key, by_motion, self.config.wide_search_share)
+        if not (still or lost):
+            yield from self._by_features(new, keyframes, still)
 
     def _by_features(
         self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], is_still: bool
