@@ -17,6 +17,8 @@ from recon.frames import rotation_from_rpy
 from service.cameras import open_camera
 from service.cameras.exif import name_unix_ns, read_tags
 from service.cameras.images import natural_key
+from service.cameras.rig import Rig
+from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.errors import InputError
 
 DEMO = Path(__file__).resolve().parents[1] / "demo" / "caliterra" / "frames"
@@ -307,6 +309,23 @@ def test_useless_gps_is_no_position(tmp_path: Path) -> None:
         path = tmp_path / f"{name}.jpg"
         write_still(path, gps=gps)
         assert read_tags(path).geotag is None, name
+
+
+def test_a_camera_without_a_fix_still_knows_its_attitude_and_height(tmp_path: Path) -> None:
+    """Under a bridge, or before the receiver has found its satellites."""
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:RelativeAltitude="+12.50" '
+        'drone-dji:GimbalRollDegree="+0.00" drone-dji:GimbalYawDegree="+90.00" '
+        'drone-dji:GimbalPitchDegree="-45.00"/></x:xmpmeta>'
+    )
+    path = tmp_path / "DJI_0001.jpg"
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(0, 0, 0, (12, 0, 0)), xmp=xmp)
+    tag = read_tags(path).geotag
+    assert tag is not None and (tag.lat_deg, tag.lon_deg) == (None, None)
+    prior = Rig(CameraConfig(), ScanConfig(), FusionConfig()).prior(None, tag)
+    assert prior.R_world_camera is not None and not prior.is_view_assumed
+    np.testing.assert_allclose(prior.R_world_camera[:, 2], [0.5**0.5, 0, -(0.5**0.5)], atol=1e-9)
+    assert prior.position_m is None and prior.agl_m == 12.5
 
 
 def test_odd_ones_are_left_out_and_reported(tmp_path: Path) -> None:

@@ -157,8 +157,11 @@ def _geotag(gps: dict[int, Any], xmp: dict[str, str]) -> GeoTag | None:
             _xmp_number(xmp, "GpsLatitude"),
             _xmp_number(xmp, "GpsLongitude", "GpsLongtitude"),
         )
+    ypr_deg, relative_m = _gimbal_ypr_deg(xmp), _xmp_number(xmp, "RelativeAltitude")
     if lat is None or lon is None or abs(lat) > 90 or abs(lon) > 180 or (lat == 0 and lon == 0):
-        return None
+        if ypr_deg is None and relative_m is None:
+            return None
+        lat = lon = None
     altitude = finite_number(gps.get(6))
     if altitude is not None and gps.get(5) in (1, b"\x01"):
         altitude = -altitude
@@ -170,8 +173,8 @@ def _geotag(gps: dict[int, Any], xmp: dict[str, str]) -> GeoTag | None:
         alt_amsl_m=altitude if altitude is not None else _xmp_number(xmp, "AbsoluteAltitude"),
         sigma_h_m=stated or DEFAULT_SIGMA_H_M,
         sigma_v_m=_sigma(xmp, "RtkStdHgt", "GPSZAccuracy"),
-        ypr_deg=_gimbal_ypr_deg(xmp),
-        relative_alt_m=_xmp_number(xmp, "RelativeAltitude"),
+        ypr_deg=ypr_deg,
+        relative_alt_m=relative_m,
     )
 
 

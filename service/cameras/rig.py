@@ -174,7 +174,9 @@ class Rig:
                 state.sigma_v_m or 4.0,
                 state.is_claimed or state.alt_amsl_m is None,
             )
-        if state is None and tag is not None and self.georeference != "gnss":
+        if state is not None or tag is None or self.georeference == "gnss":
+            return None
+        if tag.lat_deg is not None and tag.lon_deg is not None:
             self.georeference = "exif"
             usual_m = TAG_HEIGHT_M if tag.relative_alt_m is None else BAROMETER_M
             sigma_v = tag.sigma_v_m or usual_m

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class GeoTag:
-    """Position of an image, as written by the camera (EXIF, XMP)."""
+    """Place and attitude of an image, as written by the camera (EXIF, XMP)."""
 
-    lat_deg: float
-    lon_deg: float
+    lat_deg: float | None  # None like lon_deg: the camera had no fix
+    lon_deg: float | None
     alt_amsl_m: float | None = None  # as written; consumer cameras drift by tens of metres
     sigma_h_m: float = 5.0  # 1 sigma, horizontal; the default for tags without accuracy
     sigma_v_m: float | None = None  # of the altitude; None: not stated
