@@ -328,6 +328,20 @@ def test_a_camera_without_a_fix_still_knows_its_attitude_and_height(tmp_path: Pa
     assert prior.position_m is None and prior.agl_m == 12.5
 
 
+def test_a_position_of_another_day_is_not_used(tmp_path: Path) -> None:
+    """The receiver's last place, 20 km off, in the first two; a second site half an hour later."""
+    lats = [45.18, 45.18, *(45.0 + 1e-4 * i for i in range(4)), 45.4, 45.4]
+    for i, lat in enumerate(lats):
+        local = f"2024:06:01 12:{30 * (i > 5):02d}:{2 * i:02d}"
+        write_still(
+            tmp_path / f"{i}.jpg", local, offset="+00:00", gps=gps_tags(lat, 8, 90, (12, 0, i))
+        )
+    source = open_camera(str(tmp_path))
+    tags = [frame.geotag for frame in source]
+    assert [tag is not None and tag.lat_deg is not None for tag in tags] == [False] * 2 + [True] * 6
+    assert source.warnings == ["2 positions are far off all others: not used"]
+
+
 def test_odd_ones_are_left_out_and_reported(tmp_path: Path) -> None:
     for i in range(3):
         write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i}", offset="+00:00")

@@ -35,6 +35,12 @@ MAX_PAN_DEG = 30.0
 """Gimbals follow the nose: where images head further off it than that, their heading is wrong, as
 that of a gimbal without a compass, which drifts; or turned on purpose, and the track shows it."""
 
+NEAR_M, FASTEST_M_S = 1000.0, 100.0
+"""Errors of fixes that the track corrects; and no aircraft that maps is faster."""
+
+ONE_FLIGHT_S, MAX_COMPARED = 600.0, 400
+"""Images of one flight are so close in time; so many at most are compared with each."""
+
 ROLLED_DEG = 45.0
 ZONE_NS = 900 * SECOND_NS  # time zones are multiples of a quarter of an hour
 
@@ -50,6 +56,7 @@ class ImagesSource:
         self.warnings: list[str] = []
         tagged = self._headings(self._same_lens(self._same_size(self._read(folder))))
         times, self.epoch_unix_ns = self._times(tagged, interval_s)
+        tagged = self._places(tagged, times)
         order = sorted(range(len(tagged)), key=lambda i: (times[i], i))
         self._stills = [(*tagged[i], times[i]) for i in order]
         stored = tagged[0][1].size_px
@@ -160,6 +167,40 @@ class ImagesSource:
         return [
             (path, replace(tags, geotag=tags.geotag and replace(tags.geotag, is_yaw_known=False)))
             for path, tags in tagged
+        ]
+
+    def _places(
+        self, tagged: list[tuple[Path, Tags]], times_ns: list[int]
+    ) -> list[tuple[Path, Tags]]:
+        """The stills without positions from which no aircraft reaches most of its flight in time.
+
+        A receiver that has just been switched on may say where it was last.
+        """
+        from service.georeference import LocalFrame
+
+        fixes = {
+            i: (tags.geotag.lat_deg, tags.geotag.lon_deg, 0.0)
+            for i, (_, tags) in enumerate(tagged)
+            if tags.geotag is not None and tags.geotag.lat_deg is not None
+        }
+        if not fixes:
+            return tagged
+        places = np.array(list(fixes.values()), np.float64)
+        enu_m, at_s = LocalFrame(*places[0]).to_enu(places), 1e-9 * np.array(times_ns)[list(fixes)]
+        few = slice(None, None, len(fixes) // MAX_COMPARED + 1)
+        apart_m = np.linalg.norm(enu_m[:, None] - enu_m[few], axis=2)
+        apart_s = np.abs(at_s[:, None] - at_s[few])
+        is_near = apart_s < ONE_FLIGHT_S
+        is_far = is_near & (apart_m > NEAR_M + FASTEST_M_S * apart_s)
+        most = np.count_nonzero(is_near, axis=1) / 2
+        wild = {i for i, far in zip(fixes, is_far.sum(axis=1) > most, strict=True) if far}
+        if wild:
+            self._warn(f"{len(wild)} positions are far off all others: not used")
+        return [
+            (path, replace(tags, geotag=replace(tags.geotag, lat_deg=None, lon_deg=None)))
+            if i in wild and tags.geotag is not None
+            else (path, tags)
+            for i, (path, tags) in enumerate(tagged)
         ]
 
     def _turn(self, tagged: list[tuple[Path, Tags]]) -> int:
