@@ -372,6 +372,11 @@ SRT = {
         "1\n00:00:00,000 --> 00:00:01,000\nHOME(-58.85,-34.23) 2017.8.5 14:11:51\n"
         "GPS(-58.8500,-34.2300,16) Hb:85.8 Hs:1.9\nISO:100 TV:60 EV: 0 IR:F2.8\n\n"
     ),
+    "autel": (
+        "1\n00:00:00,000 --> 00:00:01,000\nHOME(W: 58.800000, S: 34.200000) 2022-05-01 15:01:58\n"
+        "GPS(W: 58.850000, S: 34.230000, 085.80m)\nISO:100 SHUTTER:30 EV:0.0 F-NUM:2.8\n"
+        "F.PRY (2.7°, -7.0°, 110.1°), G.PRY (-24.4°, 0.0°, 110.4°)\n\n"
+    ),
 }
 
 
@@ -401,13 +406,13 @@ def test_subtitles_of_several_drones(
     state = log.history.state_at(0)
     assert state is not None
     assert state.lat_deg == pytest.approx(-34.23) and state.lon_deg == pytest.approx(-58.85)
-    assert state.alt_agl_m == pytest.approx(85.8)
+    assert state.alt_agl_m == (None if layout == "autel" else pytest.approx(85.8))
     assert state.alt_amsl_m == (pytest.approx(210.5) if layout == "mavic" else None)
-    if layout in ("phantom", "mavic"):
+    if layout in ("phantom", "mavic", "autel"):
         assert state.q_ned_gimbal_wxyz is not None
         q = quaternion.from_rpy(0.0, math.radians(-24.4), math.radians(110.4))
         assert angle(state.q_ned_gimbal_wxyz, q) < 1e-6
-    if layout == "phantom":
+    if layout in ("phantom", "autel"):
         assert state.q_ned_body_wxyz is not None
         q = quaternion.from_rpy(*map(math.radians, (-7.0, 2.7, 110.1)))
         assert angle(state.q_ned_body_wxyz, q) < 1e-6

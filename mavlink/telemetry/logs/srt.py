@@ -1,11 +1,13 @@
-"""DJI subtitle telemetry (.SRT): one cue per video frame or per second.
+"""Subtitle telemetry (.SRT) of DJI and Autel: one cue per video frame or per second.
 
 The times are the video's own presentation times: the dates in these files are local time of
 an unknown zone. Several layouts are read: ``[latitude: ..] [longitude: ..] [rel_alt: ..
 abs_alt: ..]`` with optional ``[gb_yaw: .. gb_pitch: .. gb_roll: ..]``; ``GPS (lon, lat, n)``
-with ``H`` and ``F.PRY``, ``G.PRY``; ``GPS(lat,lon,..M) BAROMETER:``; ``GPS(lon,lat,n) Hb:``. A
-drone without a position writes zeros and still ``rel_alt``. ``focal_len`` is the 35 mm equivalent:
-in mm with decimals, in tenths of a millimetre without. Decimals of named fields may follow a comma.
+with ``H`` and ``F.PRY``, ``G.PRY``; ``GPS(lat,lon,..M) BAROMETER:``; ``GPS(lon,lat,n) Hb:``;
+Autel's ``GPS(E: lon, N: lat, ..m)``, whose height is not used, as nothing says above what it is.
+A drone without a position writes zeros and still ``rel_alt``. ``focal_len`` is the 35 mm
+equivalent: in mm with decimals, in tenths of a millimetre without. Decimals of named fields may
+follow a comma.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ NUMBER = r"(-?\d{1,9}(?:\.\d+)?)"
 CUE = re.compile(r"(\d{1,4}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 FIELD = re.compile(r"\b(\w+)\s*:\s*(-?\d{1,9}(?:[.,]\d+)?)(?!\d)")
 GPS = re.compile(rf"GPS\s*\(\s*{NUMBER}\s*,\s*{NUMBER}\s*,\s*{NUMBER}\s*(M?)", re.IGNORECASE)
+AUTEL = re.compile(r"GPS\s*\(\s*([EW])\s*:\s*(\d+[.,]\d+)\s*,\s*([NS])\s*:\s*(\d+[.,]\d+)")
 FOCAL = re.compile(r"\bfocal_len\s*:\s*([1-9]\d{0,8})(?:[.,](\d+))?(?!\d)")
 HEIGHT = re.compile(rf"\bH\s+{NUMBER}\s*m\b")
 PRY = re.compile(rf"\b([FG])\.PRY\s*\(\s*{NUMBER}\W?\s*,\s*{NUMBER}\W?\s*,\s*{NUMBER}")
@@ -108,7 +111,7 @@ def _cue(
     if (focal := FOCAL.search(text)) is not None:
         whole, decimals = focal.groups()
         focals.append(float(f"{whole}.{decimals}") if decimals else float(whole) / 10.0)
-    fields = {name.lower(): float(v.replace(",", ".")) for name, v in FIELD.findall(text)}
+    fields = {name.lower(): _decimal(v) for name, v in FIELD.findall(text)}
     place = _place(text, fields)
     if place is None:
         counts["unreadable"] += 1
@@ -119,6 +122,10 @@ def _cue(
         history.add(place[0], time_ns)
         history.add(place[1], time_ns)
     _attitudes(history, text, fields, time_ns)
+
+
+def _decimal(text: str) -> float:
+    return float(text.replace(",", "."))
 
 
 def _place(text: str, fields: dict[str, float]) -> tuple[PositionSample, AccuracySample] | None:
@@ -136,6 +143,9 @@ def _place(text: str, fields: dict[str, float]) -> tuple[PositionSample, Accurac
         coarse_m = 0.3 * M_PER_DEG * 10.0 ** -len(first.partition(".")[2])
         height = HEIGHT.search(text)
         relative = relative if height is None else float(height.group(1))
+    if (autel := AUTEL.search(text)) is not None:
+        letters, (lon, lat) = autel.group(1, 3), (_decimal(n) for n in autel.group(2, 4))
+        lon, lat = (-v if at in "WS" else v for at, v in zip(letters, (lon, lat), strict=True))
     if lat is None or lon is None or not plausible_place(lat, lon):
         return None
     position = PositionSample(None, lat, lon, fields.get("abs_alt"), relative, None)
