@@ -161,6 +161,29 @@ def test_a_recording_begins_again_once_its_readout_is_found(
 
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
+@pytest.mark.parametrize(("name", "coded"), [("DJI_0001.MP4", "mov_text"), ("flight.mkv", "srt")])
+def test_subtitles_in_a_video_are_its_telemetry(
+    flight: Path, tmp_path: Path, name: str, coded: str
+) -> None:
+    place = "[latitude: 47.1] [longitude: 8.5] [rel_alt: {}.0 abs_alt: 450.0]"
+    cue = "{0}\n00:00:0{0},000 --> 00:00:0{0},900\n{1}\n\n"
+    text = tmp_path / "text.srt"
+    text.write_text("".join(cue.format(k, place.format(40 + k)) for k in range(3)))
+    video = tmp_path / name
+    subprocess.run(
+        ["ffmpeg", "-loglevel", "error", "-i", str(flight / "flight.mp4"), "-i", str(text),
+         "-map", "0:v", "-map", "1:s", "-c:v", "copy", "-c:s", coded, str(video)],
+        check=True, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    found = _subtitles(str(video), load_config(None, []))
+    assert found is not None and found.counts["positions"] == 3
+    assert found.warnings == ("telemetry from the video's own subtitles",)
+    for k in range(3):
+        state = found.history.state_at(k * 10**9)
+        assert state is not None and state.alt_agl_m == pytest.approx(40.0 + k)
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 def test_a_pipe_gives_the_same_cloud_as_the_file(
     flight: Path, scan: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:

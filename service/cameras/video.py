@@ -289,6 +289,29 @@ def decoded_frames(
             return
 
 
+def subtitles(path: Path) -> Iterator[tuple[int, str]]:
+    """(ns since the video's start, text) of the cues in a video's own subtitles, if it has any."""
+    import av.error
+
+    try:
+        with open_container(str(path)) as container:
+            stream = next(iter(container.streams.subtitles), None)
+            if stream is None or not container.streams.video:
+                return
+            video = container.streams.video[0]
+            start_s = (video.start_time or 0) * (video.time_base or Fraction(0))
+            for other in container.streams:
+                if other is not stream and hasattr(other, "discard"):  # since PyAV 18
+                    other.discard = type(other.discard).all  # most of the file is not read
+            head = 2 if stream.codec_context.name == "mov_text" else 0  # the number of bytes
+            for packet in container.demux(stream):
+                text = bytes(packet)[head:].decode("utf-8", "replace")
+                if packet.pts is not None and packet.time_base is not None and text:
+                    yield round((packet.pts * packet.time_base - start_s) * NS_PER_S), text
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        log.debug("%s: its subtitles end: %s", path, error)
+
+
 def creation_unix_ns(container: Any, stream: Any) -> int | None:
     """UTC of the start from the container's (else the stream's) creation time; None without."""
     for metadata in (container.metadata, stream.metadata):

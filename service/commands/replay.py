@@ -20,6 +20,7 @@ from service.errors import InputError
 from service.progress import Progress
 
 if TYPE_CHECKING:
+    from mavlink.telemetry.history import HistoryConfig
     from mavlink.telemetry.logs import TelemetryLog
     from recon.types import Camera
     from service.cameras.source import CameraSource
@@ -103,34 +104,46 @@ def _load_model(path: Path | None, config: Config) -> Camera | None:
     return None if chosen is None else load_camera(chosen)
 
 
-def _load_telemetry(path: Path, config: Config) -> TelemetryLog:
+def _history_config(config: Config) -> HistoryConfig:
     from mavlink.telemetry.gimbal import GimbalConfig
     from mavlink.telemetry.history import HistoryConfig
+
+    return HistoryConfig(gimbal=GimbalConfig(yaw_frame=config.mavlink.gimbal_yaw_frame))
+
+
+def _load_telemetry(path: Path, config: Config) -> TelemetryLog:
     from mavlink.telemetry.logs import load_telemetry
 
-    gimbal = GimbalConfig(yaw_frame=config.mavlink.gimbal_yaw_frame)
     try:
-        return load_telemetry(path, HistoryConfig(gimbal=gimbal))
+        return load_telemetry(path, _history_config(config))
     except ValueError as error:
         raise InputError(str(error)) from error
 
 
 def _subtitles(video: str, config: Config) -> TelemetryLog | None:
-    """The telemetry in the subtitles that DJI drones write next to a video, under its name."""
+    """The telemetry in the subtitles of a video: next to it, under its name, or in it."""
+    from mavlink.telemetry.logs.srt import of_cues
     from service.cameras import parse_source
+    from service.cameras.video import subtitles
 
     kind, name = parse_source(video)[:2]
-    places = [Path(name).with_suffix(end) for end in (".SRT", ".srt")] if kind == "file" else []
-    path = next((place for place in places if place.is_file()), None)
-    if path is None:
+    if kind != "file":
         return None
+    places = [Path(name).with_suffix(end) for end in (".SRT", ".srt")]
+    path = next((place for place in places if place.is_file()), None)
     try:
-        found = _load_telemetry(path, config)
-    except InputError as error:
+        if path is not None:
+            found, where = _load_telemetry(path, config), f"{path.name}, next to the video"
+        else:
+            cues = list(subtitles(Path(name)))
+            if not cues:
+                return None
+            found = of_cues(Path(name), cues, _history_config(config))
+            where = "the video's own subtitles"
+    except (InputError, ValueError) as error:
         logging.getLogger(__name__).warning("no telemetry: %s", error)
         return None
-    note = f"telemetry from {path.name}, next to the video"
-    return replace(found, warnings=(note, *found.warnings))
+    return replace(found, warnings=(f"telemetry from {where}", *found.warnings))
 
 
 def _replay(

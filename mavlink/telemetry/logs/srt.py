@@ -15,9 +15,11 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
+from typing import TextIO
 
 from mavlink.telemetry.decode import plausible_place
 from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
@@ -54,33 +56,46 @@ CAMERA = 100  # component id for the head's attitude
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:
-    """The history in a DJI subtitle file; its clock is ``video``."""
+    """The history in a subtitle file; its clock is ``video``."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return of_cues(path, _cues(file), config)
+
+
+def _cues(file: TextIO) -> Iterator[tuple[int, str]]:
+    """(time in ns, text) of the cues in a file."""
+    time_ns: int | None = None
+    text: list[str] = []
+    while line := file.readline(LONGEST_LINE):
+        cue = CUE.match(line.strip())
+        if cue is None:
+            if len(text) < LONGEST_CUE:
+                text.append(line)
+            continue
+        if time_ns is not None:
+            yield time_ns, " ".join(text)
+        text.clear()
+        hours, minutes, seconds, fraction = cue.groups()
+        ms = int(fraction.ljust(3, "0"))
+        whole = int(hours) * 3600 + int(minutes) * 60 + int(seconds)
+        time_ns = (whole * 1000 + ms) * 1_000_000
+    if time_ns is not None:
+        yield time_ns, " ".join(text)
+
+
+def of_cues(path: Path, cues: Iterable[tuple[int, str]], config: HistoryConfig) -> TelemetryLog:
+    """The history in the cues (time in ns, text) of ``path``; ValueError where they give none."""
     history = VehicleHistory(config)
     counts: Counter[str] = Counter()
-    time_ns: int | None = None
-    earlier_ns = step_ns = 0  # of the recordings before; between the last two cues
-    text: list[str] = []
     focals: list[float] = []
-    with path.open(encoding="utf-8", errors="replace") as file:
-        while line := file.readline(LONGEST_LINE):
-            cue = CUE.match(line.strip())
-            if cue is None:
-                if len(text) < LONGEST_CUE:
-                    text.append(line)
-                continue
-            _cue(history, counts, focals, time_ns, " ".join(text))
-            text.clear()
-            hours, minutes, seconds, fraction = cue.groups()
-            ms = int(fraction.ljust(3, "0"))
-            whole = int(hours) * 3600 + int(minutes) * 60 + int(seconds)
-            cue_ns = (whole * 1000 + ms) * 1_000_000
-            last_ns, time_ns = time_ns, earlier_ns + cue_ns
-            if last_ns is not None and cue_ns <= RESTART_NS < last_ns - time_ns:
-                counts["joined"] += 1
-                time_ns = last_ns + step_ns
-                earlier_ns = time_ns - cue_ns
-            step_ns = time_ns - (last_ns or 0)
-    _cue(history, counts, focals, time_ns, " ".join(text))
+    last_ns = earlier_ns = step_ns = 0  # earlier: of the recordings before
+    for cue_ns, text in cues:
+        time_ns = earlier_ns + cue_ns
+        if cue_ns <= RESTART_NS < last_ns - time_ns:
+            counts["joined"] += 1
+            time_ns = last_ns + step_ns
+            earlier_ns = time_ns - cue_ns
+        last_ns, step_ns = time_ns, time_ns - last_ns
+        _cue(history, counts, focals, time_ns, text)
     if not counts["cues"]:
         raise ValueError(f"{path}: not a subtitle file; no cue was found")
     warnings = [f"{counts['unreadable']} cues without a position"] if counts["unreadable"] else []
@@ -101,12 +116,10 @@ def _cue(
     history: VehicleHistory,
     counts: Counter[str],
     focals: list[float],
-    time_ns: int | None,
+    time_ns: int,
     text: str,
 ) -> None:
     """Add what one cue says to the history, its counts and its focal lengths in mm."""
-    if time_ns is None:
-        return
     counts["cues"] += 1
     if (focal := FOCAL.search(text)) is not None:
         whole, decimals = focal.groups()
