@@ -139,9 +139,10 @@ def test_a_time_that_no_clock_shows_is_none(
     assert any("1 of 2 images have no time" in w for w in source.warnings)
 
 
-def test_stills_of_one_second_are_spread_over_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sub", [None, "00"])
+def test_stills_of_one_second_are_spread_over_it(tmp_path: Path, sub: str | None) -> None:
     for i in range(4):
-        write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i // 2}", offset="+00:00")
+        write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i // 2}", sub, offset="+00:00")
     assert [f.time_ns for f in open_camera(str(tmp_path))] == [0, 5 * 10**8, 10**9, 15 * 10**8]
 
 

@@ -301,12 +301,16 @@ def utc_ns(tags: Tags, offset_ns: int | None) -> int | None:
 
 
 def spread(times_ns: list[int], tags: list[Tags]) -> list[int]:
-    """The same times, with stills within one whole second spread evenly over that second."""
+    """The same times, with stills within one whole second spread evenly over that second.
+
+    Some cameras state no more than whole seconds as fractions, too.
+    """
     same = Counter(times_ns)
+    is_finer = any(tag.sub_second and (tag.local_ns or 0) % SECOND_NS for tag in tags)
     taken: Counter[int] = Counter()
     out = []
     for time_ns, tag in zip(times_ns, tags, strict=True):
-        step = 1 if tag.sub_second else SECOND_NS // same[time_ns]
+        step = 1 if is_finer and tag.sub_second else SECOND_NS // same[time_ns]
         out.append(time_ns + taken[time_ns] * step)
         taken[time_ns] += 1
     return out
