@@ -358,6 +358,10 @@ SRT = {
         " -34.2, -57.98m), D 698.70m, H 85.80m, F.PRY (2.7°, -7.0°, 110.1°), G.PRY (-24.4°, 0.0°,"
         " 110.4°)\n\n"
     ),
+    "phantom with a base station": (
+        "1\n00:00:00,000 --> 00:00:01,000\nF/6.3, SS 60, ISO 100, EV 0, RTK (-58.85, -34.23, 28),"
+        " HOME (-58.8, -34.2, 103.55m), D 75.36m, H 85.80m, G.PRY (-40.0°, 0.0°, 28.2°)\n\n"
+    ),
     "mavic": (
         '1\n00:00:00,000 --> 00:00:00,033\n<font size="36">SrtCnt : 1, DiffTime : 33ms\n'
         "2022-05-01 15:01:58,531,716\n[iso : 100] [latitude: -34.23] [longitude: -58.85]"
@@ -462,6 +466,10 @@ def test_subtitles_of_joined_recordings_follow_on(tmp_path: Path) -> None:
         (("162.00",) * 3, 162.0, False),
         (("240", "240", "480"), 24.0, True),
         (("0", "0", "0"), None, False),
+        (("240] [dzoom_ratio: 10000, delta:0",) * 3, 24.0, False),
+        (("240] [dzoom_ratio: 20000, delta:0",) * 3, 48.0, False),
+        (("24.00] [dzoom_ratio: 1.00", "24.00] [dzoom_ratio: 2.00") * 2, 36.0, True),
+        (("24.00] [dzoom_ratio: 999999999",) * 3, 24.0, False),
     ],
 )
 def test_subtitles_give_the_focal_length(

@@ -2,12 +2,12 @@
 
 The times are the video's own presentation times: the dates in these files are local time of
 an unknown zone. Several layouts are read: ``[latitude: ..] [longitude: ..] [rel_alt: ..
-abs_alt: ..]`` with optional ``[gb_yaw: .. gb_pitch: .. gb_roll: ..]``; ``GPS (lon, lat, n)``
-with ``H`` and ``F.PRY``, ``G.PRY``; ``GPS(lat,lon,..M) BAROMETER:``; ``GPS(lon,lat,n) Hb:``;
-Autel's ``GPS(E: lon, N: lat, ..m)``, whose height is not used, as nothing says above what it is.
-A drone without a position writes zeros and still ``rel_alt``. ``focal_len`` is the 35 mm
-equivalent: in mm with decimals, in tenths of a millimetre without. Decimals of named fields may
-follow a comma.
+abs_alt: ..]`` with optional ``[gb_yaw: .. gb_pitch: .. gb_roll: ..]``; ``GPS (lon, lat, n)`` or
+``RTK (lon, lat, n)`` with ``H`` and ``F.PRY``, ``G.PRY``; ``GPS(lat,lon,..M) BAROMETER:``;
+``GPS(lon,lat,n) Hb:``; Autel's ``GPS(E: lon, N: lat, ..m)``, whose height is not used, as nothing
+says above what it is. A drone without a position writes zeros and still ``rel_alt``. ``focal_len``
+is the 35 mm equivalent: in mm with decimals, in tenths of a millimetre without; ``dzoom_ratio`` is
+a crop besides, 1.00 or 10000 for none. Decimals of named fields may follow a comma.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ from mavlink.telemetry.samples import (
 NUMBER = r"(-?\d{1,9}(?:\.\d+)?)"
 CUE = re.compile(r"(\d{1,4}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 FIELD = re.compile(r"\b(\w+)\s*:\s*(-?\d{1,9}(?:[.,]\d+)?)(?!\d)")
-GPS = re.compile(rf"GPS\s*\(\s*{NUMBER}\s*,\s*{NUMBER}\s*,\s*{NUMBER}\s*(M?)", re.IGNORECASE)
+GPS = re.compile(
+    rf"(?:GPS|RTK)\s*\(\s*{NUMBER}\s*,\s*{NUMBER}\s*,\s*{NUMBER}\s*(M?)", re.IGNORECASE
+)
 AUTEL = re.compile(r"GPS\s*\(\s*([EW])\s*:\s*(\d+[.,]\d+)\s*,\s*([NS])\s*:\s*(\d+[.,]\d+)")
 FOCAL = re.compile(r"\bfocal_len\s*:\s*([1-9]\d{0,8})(?:[.,](\d+))?(?!\d)")
 HEIGHT = re.compile(rf"\bH\s+{NUMBER}\s*m\b")
@@ -47,6 +49,9 @@ LONGEST_LINE, LONGEST_CUE = 4096, 64
 
 RESTART_NS = 1_000_000_000
 """A time that goes back to this long after the start, at most, begins again: joined files."""
+
+UNIT_CROP, MAX_CROP = 1e4, 1e2
+"""What some drones write where nothing is cropped; and no drone crops so far."""
 
 SAME_FOCAL = 0.02
 """Relative tolerance of a focal length that does not zoom."""
@@ -121,10 +126,13 @@ def _cue(
 ) -> None:
     """Add what one cue says to the history, its counts and its focal lengths in mm."""
     counts["cues"] += 1
+    fields = {name.lower(): _decimal(v) for name, v in FIELD.findall(text)}
     if (focal := FOCAL.search(text)) is not None:
         whole, decimals = focal.groups()
-        focals.append(float(f"{whole}.{decimals}") if decimals else float(whole) / 10.0)
-    fields = {name.lower(): _decimal(v) for name, v in FIELD.findall(text)}
+        crop = fields.get("dzoom_ratio", 1.0)
+        crop = crop if crop < MAX_CROP else crop / UNIT_CROP
+        crop = crop if 1.0 <= crop < MAX_CROP else 1.0
+        focals.append(crop * (float(f"{whole}.{decimals}") if decimals else float(whole) / 10.0))
     place = _place(text, fields)
     if place is None:
         counts["unreadable"] += 1
