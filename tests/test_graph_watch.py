@@ -49,6 +49,21 @@ def test_scales_that_disagree_are_reported_once(agl_m: float, word: str) -> None
     assert watch.sentences() == heard
 
 
+def test_an_assumed_view_that_is_wrong_is_no_attitude() -> None:
+    """Each fifth of the images looks ahead, which nothing states."""
+    priors = [prior(T) for T in track(40)]
+    ahead = se3.so3_exp(np.array([0.8, 0.0, 0.0]))
+    for i, one in enumerate(priors):
+        R = one.R_world_camera
+        assert R is not None
+        R = R @ ahead if i % 5 == 0 else R
+        priors[i] = replace(
+            one, R_world_camera=R, sigma_tilt_rad=0.105, sigma_yaw_rad=3.0, is_view_assumed=True
+        )
+    _, watch = warnings_of(priors)
+    assert [text[2:25] for text in watch.sentences()] == ["images do not look as a"]
+
+
 def test_a_jump_of_the_receiver_is_reported() -> None:
     priors = [prior(T) for T in track(40)]
     for i in range(20, 28):

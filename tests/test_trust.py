@@ -83,14 +83,19 @@ def test_positions_that_contradict_the_track_limit_it(
     assert [reason] == [text[: len(reason)] for text in found["reasons"] or [""]]
 
 
+@pytest.mark.parametrize(
+    ("why", "views"), [("tilt off", "attitudes"), ("view off", "assumed view directions")]
+)
 @pytest.mark.parametrize(("refused", "used"), [(35, 0), (20, 15)])
-def test_attitudes_that_contradict_the_images_put_it_in_doubt(refused: int, used: int) -> None:
+def test_attitudes_that_contradict_the_images_put_it_in_doubt(
+    refused: int, used: int, why: str, views: str
+) -> None:
     """Such a scan of level ground stood on edge."""
     residuals = {"attitude": {"count": used}} if used else {}
-    graph = {"left_out": {"tilt off": refused}, "residuals": residuals}
+    graph = {"left_out": {why: refused}, "residuals": residuals}
     found = trust_of(SURE | {"graph": graph}, "exif")
     assert found["level"] == "doubtful"
-    assert found["reasons"] == [f"{refused} of 35 attitudes contradict the images"]
+    assert found["reasons"] == [f"{refused} of 35 {views} contradict the images"]
     graph = {"left_out": {"tilt off": 17}, "residuals": {"attitude": {"count": 18}}}
     assert trust_of(SURE | {"graph": graph}, "exif")["level"] == "georeferenced"
 

@@ -118,7 +118,7 @@ class Readings:
             self._counts["heading off"] += 1
             turn, sigma[2] = _turn(T[:3, :3], prior.R_world_camera, False), np.pi
         if np.any(np.abs(turn[:2]) > allowed[:2]):
-            self._counts["tilt off"] += 1
+            self._counts["view off" if prior.is_view_assumed else "tilt off"] += 1
             return False
         R = se3.so3_exp(turn) @ T[:3, :3]
         sigma = sigma * self._inflated(self._config.attitude_s)

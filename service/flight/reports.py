@@ -34,6 +34,7 @@ LEFT_OUT = {
     "position frozen": "positions only repeated the one before: is GNSS frozen?",
     "heading off": "headings contradict the track and were left out: check the compass",
     "tilt off": "attitudes contradict the images and were left out: check the gimbal's frame",
+    "view off": "images do not look as assumed without attitude: set camera.mount_pitch_deg",
     "altitude off": "altitudes stepped and were left out: check the barometer",
 }
 

@@ -83,9 +83,10 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     frames, tracked = _number(run, "frames"), _number(run, "frames_tracked")
     if frames and tracked is not None and tracked < MIN_PLACED_SHARE * (frames - 1):
         doubts.append(f"vision placed only {tracked:.0f} of {frames:.0f} frames")
-    tilted, attitudes = _refused(run, "attitude", "tilt off")
-    if tilted > WRONG_SHARE * attitudes:
-        doubts.append(f"{tilted:.0f} of {attitudes:.0f} attitudes contradict the images")
+    for why, views in (("tilt off", "attitudes"), ("view off", "assumed view directions")):
+        tilted, attitudes = _refused(run, "attitude", why)
+        if tilted > WRONG_SHARE * attitudes:
+            doubts.append(f"{tilted:.0f} of {attitudes:.0f} {views} contradict the images")
     refused, measured = _refused(run, "position", "position off")
     contradicted = f"{refused:.0f} of {measured:.0f} positions contradict the track"
     if refused > WRONG_SHARE * measured:
