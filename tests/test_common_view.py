@@ -105,6 +105,15 @@ def test_masses_tie_images_whose_leaves_differ() -> None:
     assert strongest is None or len(largest) > 3 * len(strongest)
 
 
+def test_a_place_is_carried_as_far_off_the_plane_as_the_matches_next_to_it() -> None:
+    """A roof 5 px off the ground's homography, seen by three of six matches."""
+    uv_a = np.array([[100.0, 100], [104, 100], [100, 104], [600, 400], [604, 400], [600, 404]])
+    off = np.array([[5.0, 0.0]] * 3 + [[0.0, 0.0]] * 3)
+    view = common_view.CommonView(np.eye(3), uv_a, uv_a + off, 640)
+    carried = view.carry(np.array([[101.0, 101.0], [601.0, 401.0], [350.0, 250.0]]))
+    np.testing.assert_allclose(carried, [[106.0, 101.0], [601.0, 401.0], [350.0, 250.0]])
+
+
 def test_mutual_matches_are_those_of_a_search_both_ways() -> None:
     rng = np.random.default_rng(3)
     a = np.abs(rng.normal(size=(60, 128)))
