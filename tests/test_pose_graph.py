@@ -22,7 +22,7 @@ from recon.types import F64, Pose, PosePrior
 STEP_M = 6.0
 # The noise of these flights is white, unlike real sensors', and their scale does not drift.
 WHITE = PoseGraphConfig(
-    fix_s=0.0, precise_fix_s=0.0, attitude_s=0.0, altitude_s=0.0, sigma_step=1e-4,
+    fix_s=0.0, attitude_s=0.0, altitude_s=0.0, sigma_step=1e-4,
     sigma_scale_walk=1e-4,
 )  # fmt: skip
 

@@ -21,7 +21,7 @@ from recon.posegraph.anchors import Anchor, height_ratio
 from recon.posegraph.between_keyframes import carried
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.segment_frames import SegmentFrames
-from recon.posegraph.sensor_noise import PRECISE_M
+from recon.posegraph.sensor_noise import wander_s_of
 from recon.posegraph.smoother import NO_SCALE, Smoother, left_covariance
 from recon.types import F64, PosePrior
 
@@ -143,9 +143,7 @@ class Readings:
             each = [one.of_each(self._keyframes, self._span_s) for one in known]
             sigma = np.maximum(each, MIN_FIX_M)
         else:
-            precise = float(sigma[0]) < PRECISE_M
-            seconds = self._config.precise_fix_s if precise else self._config.fix_s
-            sigma = sigma * self._inflated(seconds)
+            sigma = sigma * self._inflated(wander_s_of(float(sigma[0]), self._config.fix_s))
         self._smoother.add_place(
             "position", node.key, prior.position_m, sigma, self._config.huber_sigmas
         )

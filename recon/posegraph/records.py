@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon import se3
-from recon.posegraph.sensor_noise import PRECISE_TAU_S
 from recon.types import F64, PosePrior
 
 
@@ -20,7 +19,6 @@ class PoseGraphConfig:
     sigma_step: float = 0.002  # of one vision motion, as a share of its length
     min_anchors: int = 3  # keyframes of a segment before telemetry places it
     fix_s: float = 60.0  # a receiver's error wanders with this time constant
-    precise_fix_s: float = PRECISE_TAU_S  # and that of an RTK fix, under 0.3 m, with this one
     attitude_s: float = 40.0  # an attitude's
     altitude_s: float = 120.0  # a barometer's
     altitude_slack_m: float = 3.0  # beyond its gate, until the barometer counts as stepped
