@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import pty
+import termios
 import tty
 from pathlib import Path
 
+import pytest
 from loopback import until
 from rehearsal import RehearsalVehicle
 
@@ -52,4 +54,21 @@ def test_a_serial_line_is_spoken_to_first_and_survives_the_plug(tmp_path: Path) 
         until(lambda: daemon.control.asked == ["start_scan"])
         framer = Framer()
         until(lambda: 77 in heard(line, framer))
+    os.close(line)
+
+
+def test_a_line_that_is_unplugged_while_it_opens_is_opened_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flush, faults = termios.tcflush, [termios.error(5, "Input/output error")]
+
+    def flaky(descriptor: int, queue: int) -> None:
+        if faults:
+            raise faults.pop()
+        flush(descriptor, queue)
+
+    monkeypatch.setattr(termios, "tcflush", flaky)
+    line = plug(tmp_path / "autopilot")
+    with RehearsalVehicle(f"serial:{tmp_path / 'autopilot'}:57600"):
+        until(lambda: heard(line, Framer()))
     os.close(line)

@@ -18,7 +18,7 @@ from mavlink.component.vehicle import VehicleConfig
 from mavlink.telemetry.logs import load_telemetry
 from mavlink.wire.dialect import dialect
 from mavlink.wire.link import LinkSpec, parse_link
-from mavlink.wire.ports import PORTS, READ_S
+from mavlink.wire.ports import MAX_PEERS, PORTS, READ_S, TcpServerPort, UdpPort
 from mavlink.wire.tlog import TlogRecorder, packets
 
 S = 1_000_000_000
@@ -84,6 +84,32 @@ def test_links_are_named_as_pymavlink_does(text: str, spec: LinkSpec) -> None:
 def test_senseless_links_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="link"):
         VehicleConfig(links=(text,))
+
+
+def test_the_newest_peers_of_a_port_are_answered() -> None:
+    at = LinkSpec("udpin", "127.0.0.1", free_port())
+    with contextlib.closing(UdpPort(at)) as port, contextlib.ExitStack() as stack:
+        peers = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(MAX_PEERS + 2)]
+        for peer in map(stack.enter_context, peers):
+            peer.sendto(b"x", (at.place, at.number))
+            assert port.read() == b"x"
+            port.write(b"y")
+            peer.settimeout(10.0)
+            assert peer.recv(16) == b"y"
+
+
+def test_a_client_that_is_dropped_while_others_are_read_ends_nothing() -> None:
+    at = LinkSpec("tcpin", "127.0.0.1", free_port(socket.SOCK_STREAM))
+    with (
+        contextlib.closing(TcpServerPort(at)) as port,
+        socket.create_connection((at.place, at.number)) as client,
+    ):
+        until(lambda: port.read() or port._clients)
+        gone = socket.socket()
+        gone.close()  # as the writing thread closes one
+        port._clients.append(gone)
+        client.sendall(b"x")
+        assert until(port.read) == b"x"
 
 
 def test_the_last_word_is_said() -> None:

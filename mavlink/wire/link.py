@@ -117,7 +117,7 @@ class Link:
                     now_ns = time.monotonic_ns()
                     self.received_bytes += len(data)
                     self.on_data(data, now_ns)
-        except OSError as error:
+        except (OSError, ValueError) as error:
             self._complain(error)
         finally:
             with self._wake:

@@ -10,8 +10,9 @@ from __future__ import annotations
 import contextlib
 import select
 import socket
+import termios
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -77,9 +78,12 @@ class SerialPort:
     def __init__(self, spec: LinkSpec) -> None:
         import serial
 
-        self._line = serial.Serial(
-            spec.place, spec.number, timeout=READ_S, write_timeout=1.0, exclusive=True
-        )
+        try:
+            self._line = serial.Serial(
+                spec.place, spec.number, timeout=READ_S, write_timeout=1.0, exclusive=True
+            )
+        except termios.error as error:  # unplugged meanwhile; no OSError
+            raise OSError(*error.args) from error
 
     def read(self) -> bytes:
         """Received data."""
@@ -129,8 +133,10 @@ class UdpPort:
             length, peer = self._socket.recvfrom_into(self._buffer)
         except (TimeoutError, ConnectionRefusedError):
             return b""
-        if peer in self._peers or len(self._peers) < MAX_PEERS:
-            self._peers[peer] = time.monotonic_ns()
+        if peer not in self._peers and len(self._peers) >= MAX_PEERS:
+            last_heard = list(self._peers.items())  # the writing thread drops some
+            self._peers.pop(min(last_heard, key=lambda entry: entry[1])[0], None)
+        self._peers[peer] = time.monotonic_ns()
         return bytes(self._buffer[:length])
 
     def write(self, data: bytes) -> None:
@@ -159,7 +165,7 @@ class TcpPort:
 
     def read(self) -> bytes:
         """Received data."""
-        if not select.select([self._socket], [], [], READ_S)[0]:
+        if not _ready([self._socket]):
             return b""
         data = self._socket.recv(LONGEST)
         if not data:
@@ -186,9 +192,8 @@ class TcpServerPort:
 
     def read(self) -> bytes:
         """Received data of any client."""
-        ready = select.select([self._server, *self._clients], [], [], READ_S)[0]
         data = b""
-        for source in ready:
+        for source in _ready([self._server, *self._clients]):
             if source is self._server:
                 client, _ = self._server.accept()
                 client.settimeout(1.0)
@@ -224,6 +229,18 @@ class TcpServerPort:
         for client in list(self._clients):
             self._drop(client)
         self._server.close()
+
+
+def _ready(sockets: Sequence[socket.socket]) -> list[socket.socket]:
+    """Those with something to read within ``READ_S``.
+
+    Another thread may close one meanwhile, and unlike ``select`` its number may be any.
+    """
+    numbered = {n: one for one in sockets if (n := one.fileno()) >= 0}
+    poll = select.poll()
+    for number in numbered:
+        poll.register(number, select.POLLIN)
+    return [numbered[number] for number, _ in poll.poll(1e3 * READ_S)]
 
 
 PORTS: dict[str, Callable[[LinkSpec], Port]] = {
