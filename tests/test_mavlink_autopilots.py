@@ -32,6 +32,12 @@ def test_a_device_that_calls_itself_a_vehicle_is_not_the_autopilot(component: in
     assert net.presence.autopilot == (1, 1) and net.presence.is_armed
 
 
+def test_everybody_is_no_vehicle() -> None:
+    net = Net()
+    net.beat((0, 1), QUADROTOR, GENERIC)
+    assert net.presence.autopilot is None and net.presence.system == 1
+
+
 def test_a_generic_autopilot_is_one() -> None:
     net = Net()
     net.beat((4, 1), QUADROTOR, GENERIC, armed=True)

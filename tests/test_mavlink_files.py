@@ -154,13 +154,22 @@ def test_lost_answers_are_given_again_and_sessions_belong_to_their_owner() -> No
     assert again == session
     ((code, *_),) = other.ask(READ, session=session, size=10)
     assert code == NAK
-    for _ in range(20):
-        other.ask(OPEN, b"a.bin")
-    assert other.ask(OPEN, b"a.bin")[0][0] == NAK  # no session left
     assert other.ask(RESET)[0][0] == ACK
-    assert other.ask(OPEN, b"a.bin")[0][0] == ACK
     ((code, *_),) = client.ask(READ, session=session, size=10)
     assert code == ACK
+
+
+def test_sessions_that_nobody_closes_make_way() -> None:
+    server = FileServer({"a.bin": CONTENT})
+    client, other = Client(server), Client(server, Address(254, 1))
+    session, _ = client.open(b"a.bin")
+    for _ in range(20):  # its link breaks each time
+        other.open(b"a.bin")
+    assert client.ask(READ, session=session, size=10)[0][0] == ACK
+    for number in range(20):
+        session, _ = Client(server, Address(1, number)).open(b"a.bin")
+    assert client.ask(READ, session=session, size=10)[0][0] == NAK
+    assert client.open(b"a.bin")[1] == len(CONTENT)
 
 
 def test_any_request_is_survived() -> None:

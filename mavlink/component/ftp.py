@@ -22,7 +22,7 @@ PAYLOAD = 251
 TERMINATE, RESET, LIST, OPEN, READ = 1, 2, 3, 4, 5
 CRC32, BURST = 14, 15
 ACK, NAK = 128, 129
-BAD_SIZE, BAD_SESSION, NO_SESSIONS, END, UNKNOWN, PROTECTED, NOT_FOUND = 3, 4, 5, 6, 7, 9, 10
+BAD_SIZE, BAD_SESSION, END, UNKNOWN, PROTECTED, NOT_FOUND = 3, 4, 6, 7, 9, 10
 WRITING = frozenset({6, 7, 8, 9, 10, 11, 12, 13})
 MAX_SESSIONS = 8
 MAX_CLIENTS = 16
@@ -65,7 +65,10 @@ def parse_request(payload: bytes) -> FtpRequest | None:
 
 
 class FileServer:
-    """Serves files by name; every answer is a full payload."""
+    """Serves files by name; every answer is a full payload.
+
+    Where all sessions are open, a new one takes the place of the oldest of its client, or of all.
+    """
 
     def __init__(self, files: Mapping[str, bytes]) -> None:
         self._files = dict(files)
@@ -129,9 +132,10 @@ class FileServer:
             return _nak(r, NOT_FOUND)
         if r.opcode == CRC32:
             return _ack(r, file_crc(file).to_bytes(4, "little"))
-        free = next((n for n in range(MAX_SESSIONS) if n not in self._sessions), None)
-        if free is None:
-            return _nak(r, NO_SESSIONS)
+        if len(self._sessions) >= MAX_SESSIONS:  # clients that lost their link close none
+            own = [n for n, session in self._sessions.items() if session[0] == source]
+            del self._sessions[(own or list(self._sessions))[0]]
+        free = next(n for n in range(MAX_SESSIONS) if n not in self._sessions)
         self._sessions[free] = (source, file)
         return _ack(r, len(file).to_bytes(4, "little"), session=free)
 

@@ -160,7 +160,7 @@ class Presence:
     def hear(self, message: Any, now_ns: int) -> None:
         """Process a heartbeat of any sender."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
-        if is_autopilot(component, message):
+        if system and is_autopilot(component, message):  # system 0 is everybody
             armed = bool(message.base_mode & ARMED)
             self.autopilots.hear(system, component, armed, now_ns, message.autopilot)
         elif system == self.system and component in TYPES:
