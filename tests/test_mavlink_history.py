@@ -29,6 +29,7 @@ from mavlink.telemetry.samples import (
     GimbalSample,
     PositionSample,
     RangeSample,
+    Sample,
     TerrainSample,
     TimeSeries,
 )
@@ -329,6 +330,19 @@ def test_height_above_ground_comes_from_the_best_source_there_is() -> None:
     ):
         assert agl(k)[0] == source
         assert agl(k)[1] == pytest.approx(height)
+
+
+@pytest.mark.parametrize("absurd", [RangeSample(None, 3e38), TerrainSample(None, 1e20, 5.0)])
+def test_heights_that_nothing_flies_at_are_left_out(absurd: Sample) -> None:
+    history = VehicleHistory()
+    history.add(AttitudeSample(None, quaternion.from_rpy(0.0, 0.0, 1.0)), T0)
+    history.add(absurd, T0)
+    history.add(PositionSample(None, 50.0, 8.0, 480.0, 2.1e6, None), T0)
+    state = history.state_at(T0)
+    assert state is not None and state.alt_agl_m is None
+    history.add(PositionSample(None, 50.0, 8.0, 480.0, 80.0, None), T0)
+    state = history.state_at(T0)
+    assert state is not None and state.alt_agl_m == 80.0
 
 
 def test_height_below_home_is_left_out() -> None:

@@ -57,6 +57,8 @@ WITH_RATES = 0.5
 BETWEEN_NS = 100_000_000
 """A rotation that is compared with images is wanted at least so often."""
 
+MAX_AGL_M = 1e5  # senders fill in any float; the datalink takes no higher pose
+
 UNKNOWN = (math.nan, math.nan, math.nan)
 
 
@@ -367,16 +369,21 @@ class VehicleHistory:
         self, state: _Assembly, q_body: Quaternion | None, position: Bracket[PositionSample] | None
     ) -> None:
         at = self._range.around(state.time_ns)
-        if at is not None and q_body is not None and down_component(q_body) > 0.5:
-            agl = at.mixed("distance_m") * down_component(q_body)
+        down = 0.0 if q_body is None else down_component(q_body)
+        if at is not None and down > 0.5 and _is_height(agl := at.mixed("distance_m") * down):
             state.set_agl("rangefinder", at.age_ms, agl, 0.1 + 0.02 * agl)
             return
         terrain = self._terrain.around(state.time_ns)
-        if terrain is not None and (agl := terrain.mixed("agl_m")) >= 0.0:
+        if terrain is not None and _is_height(agl := terrain.mixed("agl_m")):
             state.set_agl("terrain", terrain.age_ms, agl, terrain.before.sigma_m)
             return
-        if position is not None and (agl := position.mixed("relative_alt_m")) >= 0.0:
+        if position is not None and _is_height(agl := position.mixed("relative_alt_m")):
             state.set_agl("relative", position.age_ms, agl, max(5.0, 0.1 * agl))
+
+
+def _is_height(agl_m: float) -> bool:
+    """True for a height above ground that an aircraft may have; False for NaN."""
+    return 0.0 <= agl_m <= MAX_AGL_M
 
 
 class _Assembly:
