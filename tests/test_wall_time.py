@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
+from pathlib import Path
 
 import pytest
 from loopback import free_port, until
@@ -11,7 +12,7 @@ from rehearsal import RehearsalVehicle
 
 from mavlink.telemetry.clock import DIFFER_NS, WallTime, computer_offset_ns
 from mavlink.wire.dialect import dialect
-from service.daemon.scan_run import disagreement, set_since
+from service.daemon.scan_run import disagreement, new_folder, set_since
 
 S = 1_000_000_000
 MONTH_NS = 30 * 86_400 * S
@@ -41,6 +42,15 @@ def test_what_is_said_of_clocks_that_differ(ahead_ns: int, word: str) -> None:
     assert text.endswith(f"30 days {word}")
     (text,) = set_since(own_ns + 90 * S, own_ns)
     assert text.endswith("90 s ahead")
+
+
+def test_a_clock_that_stands_still_stops_no_scan(tmp_path: Path) -> None:
+    names = []
+    for _ in range(3):
+        folder = new_folder(tmp_path, 1_795_737_599.5)
+        folder.mkdir()
+        names.append(folder.name)
+    assert names == ["20261126T235959Z", "20261127T000000Z", "20261127T000001Z"]
 
 
 def test_only_our_own_autopilot_sets_the_time(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 log = logging.getLogger(__name__)
 
 FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0
-"""Waits between attempts at a scan; names of scans are whole seconds."""
+"""Waits between attempts at a scan."""
 
 MARK = ".scanning"
 BOOT = Path("/proc/sys/kernel/random/boot_id")

@@ -167,8 +167,8 @@ class ScanRun:
         check_size(camera, source.size_px, source.description)
         zero_ns, offset_ns = _zero_ns(source), vehicle.unix_offset_ns()
         unix_s = 1e-9 * (time.monotonic_ns() + offset_ns)
-        scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(unix_s))
-        folder = Path(host.config.scan.folder) / scan_id
+        folder = new_folder(Path(host.config.scan.folder), unix_s)
+        scan_id = folder.name
         host.made.add(scan_id)
         gate = FrameGate(
             source, folder / LATER, zero_ns + offset_ns, self.alive, host.intent.paused
@@ -221,6 +221,16 @@ class ScanRun:
         scan = self.scan
         if scan is not None:
             report_keyframe(self._host.vehicle, scan, keyframe)
+
+
+def new_folder(scans: Path, unix_s: float) -> Path:
+    """The folder of a scan that starts now; a name that is taken, as by a clock that stands still
+    or was set back, is followed by the next second's."""
+    while True:
+        folder = scans / time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(unix_s))
+        if not folder.exists():
+            return folder
+        unix_s += 1.0
 
 
 def _zero_ns(source: CameraSource) -> int:
