@@ -16,7 +16,7 @@ import pytest
 
 from recon import se3
 from recon.types import DepthMap, Keyframe, Pose
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 from service.stream import codec
 from service.stream.ranges import RangeSet
 from service.stream.records import PoseRecord, Repose, ScanHeader
@@ -218,6 +218,16 @@ def test_wrong_files_are_refused_in_one_line(tmp_path: Path) -> None:
     ScanStore.create(tmp_path / "a.db", HEADER).close()
     with pytest.raises(InputError, match="exists"):
         ScanStore.create(tmp_path / "a.db", HEADER)
+
+
+def test_a_store_that_is_deleted_takes_no_more(tmp_path: Path) -> None:
+    with ScanStore.create(tmp_path / "a.db", HEADER) as store:
+        store.add_pose(pose(0))
+        for path in tmp_path.iterdir():
+            path.unlink()
+        with pytest.raises(OutsideError, match="deleted"):
+            store.add_pose(pose(1))
+        assert len(list(store.poses())) == 1
 
 
 def test_a_damaged_file_gives_back_what_can_be_read(tmp_path: Path) -> None:

@@ -270,6 +270,8 @@ class Database:
         with self.lock:
             self._deadline.start()
             before = self._connection.total_changes
+            if not os.path.exists(self.path):  # SQLite goes on with a file that has no name
+                raise OutsideError(f"cannot write {self.path}: it was deleted")
             try:
                 with self._connection:
                     for sql, values in statements:
