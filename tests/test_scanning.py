@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import gc
+import os
 import threading
 import time
 from pathlib import Path
@@ -163,6 +165,31 @@ def test_only_a_scan_that_was_not_ended_goes_on(
     by_itself = next_life("on-boot")
     by_itself._resume()
     assert not by_itself.scanning.is_running
+
+
+def test_a_disk_that_goes_away_leaves_the_commands(
+    daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stat = os.stat
+
+    def away(path: Any, *more: Any, **options: Any) -> os.stat_result:
+        if str(path).startswith(str(tmp_path)):
+            raise OSError(errno.ENOTCONN, "Transport endpoint is not connected", str(path))
+        return stat(path, *more, **options)
+
+    scanning = daemon.scanning
+    source: Any = SimpleNamespace(
+        size_px=(1600, 1200), description="", start_monotonic_ns=0, close=lambda: None, warnings=[]
+    )
+    monkeypatch.setattr(ScanRun, "_open_camera", lambda _: source)
+    scanning.camera, scanning._backend = load_camera(MODEL), CpuBackend()
+    monkeypatch.setattr(os, "stat", away)
+    assert daemon.actions.status().storage_total_mib > 0
+    scanning.start()
+    until(lambda: scanning.fault and not scanning.is_running)
+    assert "internal" not in scanning.fault
+    assert daemon.snapshot()["state"]
+    scanning.stop()
 
 
 def test_a_scan_is_started_once(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:

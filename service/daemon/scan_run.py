@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from contextlib import ExitStack, closing
@@ -228,7 +229,7 @@ def new_folder(scans: Path, unix_s: float) -> Path:
     or was set back, is followed by the next second's."""
     while True:
         folder = scans / time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(unix_s))
-        if not folder.exists():
+        if not os.path.exists(folder):
             return folder
         unix_s += 1.0
 

@@ -309,7 +309,7 @@ class Scanning:
         try:
             run.carry_out()
             self.fulfilled(run)
-        except SkyreliefError as error:
+        except (SkyreliefError, OSError) as error:
             fault = str(error)
         except Exception as error:
             log.exception("the scan ended with an internal fault")

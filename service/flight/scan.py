@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import math
+import os
 import secrets
 import time
 from collections.abc import Callable, Iterator
@@ -87,7 +88,7 @@ class ScanInputs:
 def check_new(folder: Path) -> Path:
     """The database of a scan to be made in ``folder``; InputError when it holds one already."""
     path = folder / "scan.db"
-    if path.exists():
+    if os.path.exists(path):
         raise InputError(f"{folder} already holds a scan; give another --out, nothing was changed")
     return path
 

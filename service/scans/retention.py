@@ -72,8 +72,8 @@ def make_room(folder: Path, keep_free_mib: float, keep: Container[str] = ()) -> 
 
 
 def existing(folder: Path) -> Path:
-    """The folder, or the nearest of its parents that exists."""
-    while not folder.exists() and folder != folder.parent:
+    """The folder, or the nearest of its parents that can be found."""
+    while not os.path.exists(folder) and folder != folder.parent:
         folder = folder.parent
     return folder
 

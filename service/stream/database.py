@@ -271,7 +271,7 @@ class Database:
             self._deadline.start()
             before = self._connection.total_changes
             if not os.path.exists(self.path):  # SQLite goes on with a file that has no name
-                raise OutsideError(f"cannot write {self.path}: it was deleted")
+                raise OutsideError(f"cannot write {self.path} (the file is gone); check the disk")
             try:
                 with self._connection:
                     for sql, values in statements:

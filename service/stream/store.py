@@ -9,6 +9,7 @@ name missing items.
 from __future__ import annotations
 
 import json
+import os
 import time
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -103,7 +104,7 @@ class ScanStore:
     ) -> ScanStore:
         """A new store; raises InputError when ``path`` exists or cannot be created."""
         path = Path(path)
-        if path.exists():
+        if os.path.exists(path):
             raise InputError(f"{path} exists; open it or choose another folder")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
