@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from recon.types import DepthMap, Keyframe, Pose
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 from service.ground import storage
 from service.ground.library import Library
 from service.ground.storage import take_in
@@ -125,6 +125,21 @@ def test_links_and_devices_on_a_card_are_not_followed(tmp_path: Path, card: Path
         (odd / name / "scan.db").symlink_to(target)
     with pytest.raises(InputError, match="contains no scan"):
         take_in(tmp_path / "ground", odd)
+
+
+def test_a_damaged_scan_leaves_the_others_and_no_card_fills_the_disk(
+    tmp_path: Path, card: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (card / "scan-0").mkdir()
+    (card / "scan-0" / "scan.db").write_bytes(b"no database")
+    (card / "scan-2").symlink_to(tmp_path)
+    monkeypatch.setattr(storage, "_deliver", lambda *_: None)
+    (tmp_path / "link").symlink_to(card)  # the operator's own
+    assert [path.name for path in take_in(tmp_path / "ground", tmp_path / "link")] == ["scan-1"]
+    nearly_full = shutil.disk_usage(tmp_path)._replace(free=10)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: nearly_full)
+    with pytest.raises(OutsideError, match="has room for"):
+        take_in(tmp_path / "ground", card)
 
 
 def test_the_library_imports_two_runs_of_one_time_and_no_run_twice(tmp_path: Path) -> None:

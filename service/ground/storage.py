@@ -228,21 +228,30 @@ def take_in(store: Path, folder: Path) -> list[Path]:
     """The scan folders under ``store`` that now hold what those in ``folder`` hold.
 
     ``folder`` is a scan folder or a folder of them, such as a card's; nothing is written there.
-    Items received before by radio or network are kept and completed. Raises InputError when there
-    is not a scan, OutsideError when the disk is full.
+    Items received before by radio or network are kept and completed. A damaged scan is left out
+    where there are others. Raises InputError when there is not a scan, OutsideError when the disk
+    is full.
     """
-    paths = [folder / STORE_FILES[0], *sorted(folder.glob(f"*/{STORE_FILES[0]}"))]
-    paths = [path for path in paths if is_regular(path)]
+    given = Path(os.path.realpath(folder))  # the operator's own link is followed
+    paths = [given / STORE_FILES[0], *sorted(given.glob(f"*/{STORE_FILES[0]}"))]
+    paths = [path for path in paths if is_regular(path) and not path.parent.is_symlink()]
     if not paths:
         raise InputError(f"{folder} contains no scan; it should hold scan.db, or folders that do")
-    return [_take(store, path.parent) for path in paths]
+    taken, faults = [], []
+    for path in paths:
+        try:
+            taken.append(_take(store, path.parent))
+        except InputError as error:
+            log.error("%s is not taken: %s", path.parent, error)
+            faults.append(error)
+    if not taken:
+        raise faults[0]
+    return taken
 
 
 def _take(store: Path, folder: Path) -> Path:
     with workplace(store) as place:
-        for name in STORE_FILES:
-            if is_regular(folder / name):
-                shutil.copyfile(folder / name, place / name, follow_symlinks=False)
+        copy_files(folder, place, STORE_FILES)
         with ScanStore.open(place / STORE_FILES[0]) as source:
             header = source.header
             drone, scan = check_name(header.drone, "drone"), check_name(header.name, "scan")
