@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -276,6 +277,24 @@ def test_poses_stop_at_the_reserve_and_go_on_when_there_is_room(
             assert link.drain(20.0)
             assert until(lambda: ground.progress()[0]["held"].get("pose") == 1)
             assert ground.progress()[0]["trouble"] is None
+        finally:
+            link.close()
+            onboard.close()
+
+
+def test_a_scan_that_is_deleted_while_it_comes_in_is_received_anew(tmp_path: Path) -> None:
+    onboard = ScanStore.create(tmp_path / "a.db", ScanHeader("scan-1", "red", 1))
+    place = tmp_path / "ground" / "red" / "scan-1"
+    with serving(tmp_path / "ground") as (ground, endpoint):
+        link = DatalinkSender(onboard, DatalinkConfig(connect=(endpoint,), budget_kbit_s=50_000.0))
+        try:
+            onboard.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
+            until(lambda: any("pose" in entry["held"] for entry in ground.progress()))
+            shutil.rmtree(place)
+            onboard.add_pose(PoseRecord(2, np.eye(4), np.eye(6)))
+            assert until(lambda: place.exists() and link.drain(0.1))
+            with ScanStore.open(place / "scan.db", read_only=True) as received:
+                assert [pose.time_unix_ns for pose in received.poses()] == [1, 2]
         finally:
             link.close()
             onboard.close()

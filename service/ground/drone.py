@@ -7,6 +7,7 @@ in use, and has a folder only once its valid header has arrived.
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections import OrderedDict
 from collections.abc import Callable
@@ -153,10 +154,21 @@ class DroneReceiver:
             self._rest(scan, str(error), now)
 
     def _rest(self, scan: ReceivedScan, trouble: str, now: float) -> None:
-        """Pause a scan that cannot be written; missing items are requested later."""
+        """Pause a scan that cannot be written; missing items are requested later.
+
+        One whose database was deleted is forgotten: the drone's next head begins it again.
+        """
         if trouble != scan.trouble:
             log.error("%s; trying again every %.0f s", trouble, FULL_DISK_REST_S)
         scan.trouble, scan.rest_until = trouble, now + FULL_DISK_REST_S
+        if self._scans.get(scan.name) is scan and not scan.is_writing:
+            try:
+                os.stat(scan.intake.store.path)
+            except FileNotFoundError:
+                del self._scans[scan.name]
+                scan.intake.store.close()
+            except OSError as error:
+                log.debug("%s", error)
 
     def add_radio(
         self, header: ScanHeader, kind: str, number: int, part: int, data: bytes, now: float
