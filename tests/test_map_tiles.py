@@ -180,7 +180,10 @@ def test_an_exported_orthophoto_is_shown_while_it_is_newer(client: Client, store
     assert np.abs(at(client, "ortho", ROOF)[:3].astype(int) - ROOF_BGR).max() < 12
 
 
-@pytest.mark.parametrize("kind", ["garbage", "another format", "one band", "large block"])
+KINDS = ["garbage", "another format", "one band", "large block", "flat pixels", "other planet"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_raster_that_is_no_map_is_refused_and_names_no_other_file(
     client: Client, store: Path, tmp_path: Path, kind: str
 ) -> None:
@@ -198,6 +201,12 @@ def test_a_raster_that_is_no_map_is_refused_and_names_no_other_file(
         importlib.import_module("rasterio.shutil").copy(secret, path, driver="VRT")
     elif kind == "one band":
         with rasterio.open(path, "w", **profile | {"count": 1}):
+            pass
+    elif kind == "flat pixels":
+        with rasterio.open(path, "w", **profile | {"transform": rasterio.Affine(*(1, 0, 0) * 2)}):
+            pass
+    elif kind == "other planet":
+        with rasterio.open(path, "w", **profile | {"crs": 'LOCAL_CS["x",UNIT["metre",1]]'}):
             pass
     else:
         wide = {"width": 1 << 14, "height": 1 << 14, "tiled": True, "sparse_ok": True,
@@ -257,6 +266,7 @@ def test_wmts_shows_the_house_to_gdal(client: Client) -> None:
         f"{TILES}/ortho/18/-1/0.png",
         f"{TILES}/ortho/2/4/0.png",
         f"{TILES}/ortho/99/0/0.png",
+        f"{TILES}/ortho/0/{'9' * 5000}/0.png",
         f"{TILES}/secret/1/0/0.png",
         f"{TILES}/secret.json",
         "/tiles/drone-1/none/ortho/1/0/0.png",

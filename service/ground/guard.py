@@ -209,6 +209,8 @@ def _short(value: Any) -> Any:
     return str(value)[:MAX_TEXT]
 
 
+MAX_PATH = 1000
+"""Letters of an address before its query; the longest of ours has some 300."""
 MAX_BODY_BYTES = 65_536
 BODY_S = 10.0
 """A request's whole body must arrive within this time."""
@@ -365,6 +367,8 @@ class Guard:
             return 401, "a change needs the token: open the address that skyrelief printed"
         if not self._local and who is None and not opening:
             return 401, "the token is needed: open the address that skyrelief printed"
+        if len(connection.scope["path"]) > MAX_PATH:
+            return 414, "the address is too long"
         length = headers.get("content-length", "0")
         most = MAX_UPLOAD_BYTES if connection.scope["path"] == UPLOAD else MAX_BODY_BYTES
         if is_length(length) and int(length) <= most:

@@ -410,11 +410,12 @@ def open_map(path: Path, bands: int = 1) -> Iterator[Any]:
     Raises InputError for any other file: other formats of GDAL name files and hosts to read.
     """
     import rasterio
+    from rasterio._err import CPLE_BaseError  # of GDAL itself; no RasterioError
 
     try:
         with rasterio.Env(**ALONE), rasterio.open(path, driver="GTiff") as image:
             if image.count < bands or max(h * w for h, w in image.block_shapes) > MAX_BLOCK_PX:
                 raise InputError(f"{path.name} is not a map of a scan; make it again")
             yield image
-    except (rasterio.errors.RasterioError, ValueError) as error:
+    except (rasterio.errors.RasterioError, CPLE_BaseError, ValueError) as error:
         raise InputError(f"{path.name} cannot be read as a GeoTIFF; make it again") from error
