@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import socket
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from service.stream.records import PoseRecord, ScanHeader
 from service.stream.reports import delivered, open_undelivered
 from service.stream.session import SessionConfig
 from service.stream.store import ScanStore
+from service.workers import running
 
 pytest.importorskip("zenoh")
 
@@ -33,6 +36,21 @@ def make_scan(scans: Path, name: str, finished: bool = True, held: bool = False)
             store.finish({"points": 1})
         if held:
             store.set_held("base", store.numbers())
+
+
+@pytest.mark.parametrize("drone", ["red", "r" * 60])
+def test_a_datalink_that_cannot_be_used_stops_no_scan(tmp_path: Path, drone: str) -> None:
+    """Its certificates are not there; the names are too long for the radio."""
+    said: list[str] = []
+    vehicle: Any = SimpleNamespace(statustext=lambda text, _: said.append(text), listen=print)
+    connect = ("tls/10.0.0.1:7447",) if drone == "red" else ("tcp/127.0.0.1:1",)
+    config = dataclasses.replace(Config().datalink, connect=connect, radio="mavlink")
+    header = ScanHeader("one", drone, 1, run_id="0" * 32)
+    with ScanStore.create(tmp_path / "scan.db", header) as store:
+        link = DaemonLink()
+        link.take_off(store, dataclasses.replace(Config(), datalink=config), vehicle)
+        assert link.flying is None and said[0].startswith("Scan is only stored: ")
+        assert not [w for w in running() if w["name"].startswith(("datalink", "radio"))]
 
 
 def test_only_what_was_not_delivered_is_offered(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mavlink.component.status import WARNING
 from service.config import Config
 from service.errors import SkyreliefError
 from service.workers import PROCESS
@@ -81,13 +82,20 @@ class DaemonLink:
         self._radio: VehicleRadio | None = None
 
     def take_off(self, store: ScanStore, config: Config, vehicle: VehicleLink) -> None:
-        """Send a scan, in place of the backlog, to the ground stations that are configured."""
+        """Send a scan, in place of the backlog, to the ground stations that are configured.
+
+        Where that cannot be done, the operator is warned, and the scan is only stored.
+        """
         self.rest()
         if config.datalink.radio == OWN_LINKS and self._radio is None:
             from service.radio import VehicleRadio
 
             self._radio = VehicleRadio(vehicle)
-        self.flying = open_datalink(store, config, self._radio)
+        try:
+            self.flying = open_datalink(store, config, self._radio)
+        except SkyreliefError as error:
+            log.error("the scan is only stored: %s", error)
+            vehicle.statustext(f"Scan is only stored: {error}", WARNING)
 
     def land(self, config: Config, in_haste: bool = False) -> None:
         """End the scan's sender. The backlog sends the rest. By radio alone there is no backlog:

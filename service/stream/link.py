@@ -109,17 +109,17 @@ class DatalinkSender:
         self._workers = Workers()
         self._thread: Worker | None = None
         self._owned: list[ScanStore] = []
-        if store is not None:
-            self.add(store)
-        if config.connect or config.listen:
-            self._thread = self._workers.start("datalink", self._run)
-        atexit.register(self.close)  # Zenoh aborts a process that ends around an open session
         self._radio = None
         if store is not None and radio is not None:
             tunnel = TunnelConfig(config.radio_baud / 10, config.radio_share)
             self._radio = RadioSender(
                 store, tunnel, radio, lambda: not self._listened(), self._workers
             )
+        if store is not None:
+            self.add(store)
+        if config.connect or config.listen:
+            self._thread = self._workers.start("datalink", self._run)
+        atexit.register(self.close)  # Zenoh aborts a process that ends around an open session
 
     def _listened(self) -> bool:
         with self._lock:
