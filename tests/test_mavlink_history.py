@@ -524,6 +524,31 @@ def test_a_live_history_does_not_wait_in_vain() -> None:
     assert history.state_at(now) is not None  # a stream that has dried up
 
 
+def test_a_slow_relay_of_the_gimbal_is_not_waited_for() -> None:
+    history = VehicleHistory(patience_s=1000.0)  # would stand still for ever if it waited
+    now = time.monotonic_ns()
+    history.add(AttitudeSample(None, IDENTITY), now)
+    history.add(GimbalSample(None, IDENTITY, GimbalFrame.EARTH, 154, 0), now)
+    history.add(GimbalSample(None, IDENTITY, GimbalFrame.EARTH, 1, 1), now - 500 * MS)
+    state = history.state_at(now - 10 * MS)
+    assert state is not None and state.q_ned_gimbal_wxyz is not None
+
+
+def test_a_live_history_waits_once_for_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    history, waits = VehicleHistory(patience_s=0.03), list[float]()
+    monkeypatch.setattr(history._news, "wait", lambda left_s: waits.append(left_s))
+    now = time.monotonic_ns()
+    history.add(AttitudeSample(None, IDENTITY), now - 500 * MS)
+    history.state_at(now)
+    assert waits
+    waits.clear()
+    for apart_ms in (-20, 0, 20):  # the camera's turn about the exposure
+        history.state_at(now + apart_ms * MS)
+    assert not waits
+    history.state_at(now + 25 * MS)
+    assert waits
+
+
 def test_a_live_history_forgets() -> None:
     history = VehicleHistory(HistoryConfig(keep_s=2.0))
     for k in range(2000):

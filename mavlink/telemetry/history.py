@@ -13,6 +13,7 @@ import numpy as np
 from mavlink.telemetry.gimbal import GimbalConfig, steadiest_frame, to_earth
 from mavlink.telemetry.quaternion import Quaternion, curve, down_component, hermite, slerp
 from mavlink.telemetry.samples import (
+    EXTRAPOLATE_NS,
     MAX_GAP_NS,
     RECEIVER_SIGMA_H_M,
     RECEIVER_SIGMA_V_M,
@@ -76,6 +77,7 @@ class VehicleHistory:
         self._lock = threading.Lock()
         self._news = threading.Condition()
         self._waiting = 0  # waiting readers
+        self._given_up_ns = 0  # up to here nothing is waited for again
         self._attitude: TimeSeries[AttitudeSample] = TimeSeries()
         self._position: TimeSeries[PositionSample] = TimeSeries()
         self._accuracy: TimeSeries[AccuracySample] = TimeSeries()
@@ -105,16 +107,18 @@ class VehicleHistory:
         return max(times, default=None)
 
     def covers(self, time_ns: int) -> bool:
-        """True when no active stream can still add data about ``time_ns``."""
+        """True when no active stream can still add data about ``time_ns``.
+
+        Of several streams of gimbals the first counts, which is the one that is used.
+        """
         with self._lock:
-            tracks: list[TimeSeries[Any]] = [
-                self._attitude,
-                self._position,
-                *self._gimbals.values(),
-            ]
-            newest = [track.last_ns for track in tracks]
-        flowing = [t for t in newest if t is not None and t > time_ns - MAX_GAP_NS]
-        return all(t >= time_ns for t in flowing)
+            gimbals = [self._gimbals[key].last_ns for key in self._gimbal_order()]
+            others = [self._attitude.last_ns, self._position.last_ns]
+        heads, bodies = (
+            [t for t in newest if t is not None and t > time_ns - MAX_GAP_NS]
+            for newest in (gimbals, others)
+        )
+        return all(t >= time_ns for t in (*heads[:1], *bodies))
 
     def attitudes(self) -> list[tuple[AttitudeSample, int]]:
         """Every attitude with its time in ns, oldest first."""
@@ -238,7 +242,7 @@ class VehicleHistory:
         """Wait until every active stream has passed ``time_ns``, or until patience ends."""
         now_s = time.monotonic()
         end_s = now_s + self._patience_s
-        if time_ns * 1e-9 >= end_s:
+        if time_ns * 1e-9 >= end_s or time_ns <= self._given_up_ns:
             return  # samples further ahead cannot arrive in time
         with self._news:
             self._waiting += 1  # before checking, so that no new sample is missed
@@ -246,6 +250,8 @@ class VehicleHistory:
                 self._news.wait(end_s - now_s)
                 now_s = time.monotonic()
             self._waiting -= 1
+        if now_s >= end_s:  # once for a frame, not for each moment about its exposure
+            self._given_up_ns = time_ns + EXTRAPOLATE_NS
 
     def _state_at(self, time_ns: int) -> VehicleState | None:
         with self._lock:
