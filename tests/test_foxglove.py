@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from test_ros2 import DOWN, START_NS, camera_at, in_map, keyframe, matrix, nanos
 from recon import se3
 from service.config import DatalinkConfig
 from service.errors import InputError, OutsideError
+from service.ground import foxglove
 from service.ground.foxglove import FoxgloveServer
 from service.stream import codec
 from service.stream.link import DatalinkSender
@@ -218,6 +220,26 @@ def test_hostile_clients_stop_neither_the_receiver_nor_the_server(flight: Flight
         until(lambda: len(flight.seqs()) == 40, 60.0, lambda: len(flight.seqs()))
     with viewer(flight.port) as good:
         good.until_heard("/red/camera/points", 20)
+
+
+def test_a_viewer_that_asks_again_and_again_holds_up_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[int] = []
+    channels = SimpleNamespace(
+        log_keyframe=lambda one: seen.append(one.seq), log_transform=print, log_fix=print
+    )
+    monkeypatch.setattr(foxglove, "Ros2Channels", lambda *_: channels)
+    path = tmp_path / "scan.db"
+    with ScanStore.create(path, ScanHeader("s", "red", START_NS)) as store:
+        for seq in range(3 * foxglove.AT_ONCE):
+            store.add_keyframe(seq, codec.encode(keyframe(seq, camera_at(5.0)), START_NS))
+    with contextlib.closing(foxglove.LiveScan(None, tmp_path)) as scan:
+        for _ in range(8):
+            scan.again()
+            scan.refresh()
+    assert seen[: 3 * foxglove.AT_ONCE] == list(range(3 * foxglove.AT_ONCE))
+    assert seen[3 * foxglove.AT_ONCE] == 0  # then for the one that asked
 
 
 def test_addresses_that_cannot_be(tmp_path: Path) -> None:

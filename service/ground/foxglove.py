@@ -82,20 +82,26 @@ class LiveScan:
         self._store = ScanStore.open(folder / "scan.db")
         self._version = (-1, -1)
         self._channels = Ros2Channels(context, self._store.header.drone)
-        self.forget()
+        self._forget()
 
     def close(self) -> None:
         """Close the file."""
         self._store.close()
 
-    def forget(self) -> None:
-        """Publish all of it once more."""
+    def again(self) -> None:
+        """Publish all of it once more, after what is under way: whoever asks often holds up no
+        other."""
+        self._is_asked = True
+
+    def _forget(self) -> None:
         self._sent: dict[int, tuple[int, float, int]] = {}  # layer, scale, revision
-        self._last_ns, self._has_more = -1, True
+        self._last_ns, self._has_more, self._is_asked = -1, True, False
 
     def refresh(self) -> None:
         """Publish poses that are new, and keyframes that are new, finer or moved; AT_ONCE of
         these at most."""
+        if self._is_asked and not self._has_more:
+            self._forget()
         before, self._version = self._version, self._store.version()
         if before == self._version and not self._has_more:
             return
@@ -186,7 +192,7 @@ def serve(store: Path, host: str, port: int) -> None:
             scans.pop(folder).close()
         if again:
             for scan in scans.values():
-                scan.forget()
+                scan.again()
         for folder in folders:
             guarded(f"{folder} for Foxglove", partial(follow, folder))
         with contextlib.suppress(OSError):
