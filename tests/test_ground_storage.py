@@ -142,6 +142,16 @@ def test_a_damaged_scan_leaves_the_others_and_no_card_fills_the_disk(
         take_in(tmp_path / "ground", card)
 
 
+def test_the_list_reads_no_growing_scan_as_a_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ScanStore.create(tmp_path / "red" / "scan-1" / "scan.db", HEADER) as store:
+        store.add_keyframe(3, codec.encode(keyframe(3), 3))
+        monkeypatch.setattr("service.stream.store.is_sound", lambda _: pytest.fail("all of it"))
+        (entry,) = Library(tmp_path).scans()
+    assert entry["trouble"] is None and entry["counts"]["keyframes"] == 1
+
+
 def test_the_library_imports_two_runs_of_one_time_and_no_run_twice(tmp_path: Path) -> None:
     library = Library(tmp_path / "ground")
     cards = []

@@ -308,7 +308,7 @@ def _facts(folder: Path) -> dict[str, Any]:
     """From scan.json when it is there, else from the store's header."""
     if (folder / SUMMARY).exists():
         return facts_of(folder / SUMMARY)
-    with ScanStore.open(folder / "scan.db") as store:
+    with ScanStore.peek(folder / "scan.db") as store:
         return facts_of(store)
 
 

@@ -132,7 +132,7 @@ def _image(request: Request) -> Response:
     if not SEQ.fullmatch(request.path_params["seq"]):
         raise InputError("no such keyframe")
     seq = int(request.path_params["seq"])
-    with ScanStore.open(folder / "scan.db") as store:
+    with ScanStore.peek(folder / "scan.db") as store:
         keyframe = store.keyframe(seq)
         if keyframe is None:
             raise InputError("no such keyframe")
@@ -218,7 +218,7 @@ def _refly(request: Request) -> Response:
     found = state.coverages.view(folder).found
     if found is None or found.frame is None:
         raise InputError("no surface yet" if found is None else "the scan has no georeference")
-    with ScanStore.open(folder / "scan.db", read_only=True) as store:
+    with ScanStore.peek(folder / "scan.db") as store:
         flight = suggest_as_flown(found, main_track(store))
     if kind == "geojson":
         return Response(geojson(flight, found.frame), media_type="application/geo+json")

@@ -130,6 +130,14 @@ class ScanStore:
             rescue(path)
         return cls(path, None, quota_bytes, read_only)
 
+    @classmethod
+    def peek(cls, path: Path) -> ScanStore:
+        """An existing store, read without looking for damage, which reads the whole file.
+
+        Raises InputError when it contains no scan, OutsideError when it cannot be read.
+        """
+        return cls(path, None, None, read_only=True)
+
     def close(self) -> None:
         """Merge the write-ahead log into the file and close it."""
         self.database.close()
