@@ -696,6 +696,12 @@ def test_a_flood_of_answers_neither_grows_nor_silences_the_rest(ends: Ends) -> N
     ends.companion.say(2, "camera gone")
     ends.pass_time(2.0)
     assert "camera gone" in ends.texts()
+    for k in range(1000, 1100):
+        ends.companion.say(4, f"answer {k}", is_answer=True)
+        if k == 1050:
+            ends.companion.say(2, "disk full")
+    ends.pass_time(2.0)
+    assert "disk full" in ends.texts()
 
 
 def test_a_long_text_comes_in_chunks(ends: Ends) -> None:

@@ -18,6 +18,7 @@ S = 1_000_000_000
 TEXT = 50  # bytes in one STATUSTEXT
 LONGEST = 200
 AGAIN_NS = 30 * S  # a repeated text is suppressed within this time
+MAX_WAITING = 20  # news, and answers
 MAX_SAID = 100  # texts that are remembered; answers use at most half of it
 SPACING_NS = S
 BURST = 3  # texts that may be sent at once after a pause
@@ -26,11 +27,15 @@ EMERGENCY, ALERT, CRITICAL, ERROR, WARNING, NOTICE, INFO, DEBUG = range(8)
 
 
 class StatusTexts:
-    """Texts to the operator: at most one a second, repetitions suppressed."""
+    """Texts to the operator: at most one a second, repetitions suppressed.
+
+    News come before answers, of which anybody may cause any number.
+    """
 
     def __init__(self, outbox: SendQueue) -> None:
         self._outbox = outbox
-        self._waiting: deque[tuple[int, str]] = deque(maxlen=20)
+        self._news: deque[tuple[int, str]] = deque(maxlen=MAX_WAITING)
+        self._answers: deque[tuple[int, str]] = deque(maxlen=MAX_WAITING)
         self._said: dict[str, int] = {}
         self._credit_ns = BURST * SPACING_NS
         self._last_ns: int | None = None
@@ -39,13 +44,14 @@ class StatusTexts:
     def say(self, severity: int, text: str, now_ns: int, is_answer: bool = False) -> None:
         """Queue a text. It is dropped when it was sent within 30 s, unless it answers a command."""
         self._said = {t: at for t, at in self._said.items() if now_ns - at < AGAIN_NS}
-        if not text or (severity, text) in self._waiting:
+        waiting = self._answers if is_answer else self._news
+        if not text or (severity, text) in waiting:
             return
         if not is_answer and (text in self._said or len(self._said) >= MAX_SAID):
             return
         if len(self._said) < MAX_SAID // (2 if is_answer else 1):
             self._said[text] = now_ns
-        self._waiting.append((severity, text))
+        waiting.append((severity, text))
         self.tick(now_ns)
 
     def tick(self, now_ns: int) -> None:
@@ -53,9 +59,9 @@ class StatusTexts:
         passed = 0 if self._last_ns is None else max(0, now_ns - self._last_ns)
         self._last_ns = now_ns
         self._credit_ns = min(BURST * SPACING_NS, self._credit_ns + passed)
-        while self._waiting and self._credit_ns >= SPACING_NS:
+        while (waiting := self._news or self._answers) and self._credit_ns >= SPACING_NS:
             self._credit_ns -= SPACING_NS
-            self._send(*self._waiting.popleft())
+            self._send(*waiting.popleft())
 
     def _send(self, severity: int, text: str) -> None:
         raw = text.encode("ascii", "replace")[:LONGEST]
