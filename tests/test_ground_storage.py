@@ -17,6 +17,7 @@ from service.ground import storage
 from service.ground.library import Library
 from service.ground.storage import take_in
 from service.stream import codec
+from service.stream.naming import NAME, station_name
 from service.stream.radio_messages import pack_announce, pack_tile, tag_of, unpack_announce
 from service.stream.radio_tiles import tiles_of
 from service.stream.records import PoseRecord, Repose, ScanHeader
@@ -140,6 +141,13 @@ def test_a_damaged_scan_leaves_the_others_and_no_card_fills_the_disk(
     monkeypatch.setattr(shutil, "disk_usage", lambda _: nearly_full)
     with pytest.raises(OutsideError, match="has room for"):
         take_in(tmp_path / "ground", card)
+
+
+def test_a_station_whose_name_is_damaged_takes_another(tmp_path: Path) -> None:
+    for torn in (b"\x83\xff\x00", b""):
+        (tmp_path / "station.txt").write_bytes(torn)
+        name = station_name(tmp_path)
+        assert NAME.fullmatch(name) and station_name(tmp_path) == name
 
 
 def test_the_list_reads_no_growing_scan_as_a_whole(

@@ -53,7 +53,7 @@ def station_name(store: Path) -> str:
     """The name of the ground station with this store, created once and kept in it."""
     path = store / "station.txt"
     if path.exists():
-        name = path.read_text(encoding="utf-8").strip()
+        name = path.read_text(encoding="utf-8", errors="replace").strip()
         if NAME.fullmatch(name):
             return name
     host = "".join(c if c.isalnum() else "-" for c in socket.gethostname())[:40].strip("-")
