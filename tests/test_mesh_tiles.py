@@ -272,6 +272,9 @@ def test_the_recording_that_a_scan_names_is_found(
     assert name(str(video)).path == video
     for unfit in (None, 7, ["x"]):
         assert "does not name" in name(unfit).words
+    assert "is not there" in name("x" * 5000).words
+    (folder / "scan.json").write_text("[" * 100_000)
+    assert "does not name" in images.recording_of(folder, header).words
     monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house, (640, 360)))
     assert name("flight.mp4").path is None and "another recording" in name("flight.mp4").words
     bare = replace(header, camera={})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -63,10 +64,10 @@ def recording_of(folder: Path, header: ScanHeader) -> Recording:
     try:
         named = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["run"]["source"]
         path = Path(named)
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return Recording(None, f"{stored}: the scan does not name a recording; give --video")
     places = [path, folder / path, folder.parent / path]
-    found = next((p for p in places if p.is_file() or p.is_dir()), None)
+    found = next((p for p in places if os.path.isfile(p) or os.path.isdir(p)), None)
     if found is None:
         return Recording(None, f"{stored}: {named} is not there; give the flight's --video")
     try:
