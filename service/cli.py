@@ -11,13 +11,13 @@ import threading
 import traceback
 from importlib import import_module
 from types import TracebackType
-from typing import Any
+from typing import Any, NoReturn
 
 import typer
 import typer.core
 import typer.main
 
-from service.errors import InputError, SkyreliefError
+from service.errors import InputError, OutsideError, SkyreliefError
 from service.init_system import log_handler
 from service.packages import needing
 from service.redaction import without_credentials
@@ -148,10 +148,19 @@ def main() -> None:
         with needing("this command"):
             app(standalone_mode=True)
     except SkyreliefError as error:
-        print(f"skyrelief: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        _end(error)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        place = str(error.filename)[:200]
+        _end(OutsideError(f"{place}: {error.strerror}; check the path and its rights"))
     finally:
         sys.excepthook = _print_fault  # replaces typer's
+
+
+def _end(error: SkyreliefError) -> NoReturn:
+    print(f"skyrelief: {error}", file=sys.stderr)
+    sys.exit(error.exit_code)
 
 
 def _print_fault(

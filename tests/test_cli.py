@@ -222,6 +222,18 @@ def test_exit_codes(
     assert capsys.readouterr().err == f"skyrelief: {error}\n"
 
 
+def test_a_path_that_may_not_be_looked_at_is_refused_in_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = "x" * 5000  # as a folder without rights, which root would see
+    monkeypatch.setattr(sys, "argv", ["skyrelief", "export", name, "--to", "laz"])
+    with pytest.raises(SystemExit) as caught:
+        service.cli.main()
+    said = capsys.readouterr().err
+    assert caught.value.code == 3 and said.count("\n") == 1
+    assert said.startswith("skyrelief: xxx") and "File name too long" in said
+
+
 def test_config_command(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     printed = run_cli("config", "default")
