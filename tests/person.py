@@ -37,13 +37,16 @@ class Page(bench.Page):
         """Press and release a key that writes nothing, such as Escape."""
         self.page.keyboard.press(name)
 
-    def screen(self, width: int, height: int, mobile: bool = False) -> None:
-        """Show pages on a screen of this size, in CSS pixels."""
+    def screen(
+        self, width: int, height: int, mobile: bool = False, pixel_ratio: float = 0.0
+    ) -> None:
+        """Show pages on a screen of this size, in CSS pixels; ``pixel_ratio`` of the screen's own
+        lie along each, with 0 as many as the browser has."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width,
             height=height,
-            deviceScaleFactor=1,
+            deviceScaleFactor=pixel_ratio,
             mobile=mobile,
         )
         if not mobile:

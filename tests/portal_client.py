@@ -154,6 +154,6 @@ def client(store: Path) -> Iterator[Client]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """One Chromium for all tests of a file."""
+    """One Chromium for all tests of a file. It draws in software, so its pixels are coarse."""
     with sync_playwright() as driver:
-        yield Browser(driver)
+        yield Browser(driver, "--force-device-scale-factor=0.5")

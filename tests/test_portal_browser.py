@@ -263,6 +263,7 @@ def test_what_is_new_since_the_last_visit_has_its_colours(browser: Browser, tmp_
     while follower.turn(time.time()):
         pass
     with listing(browser, tmp_path, 2) as base:
+        browser.screen(1280, 800, pixel_ratio=1.0)  # pixels are counted
         browser.open(f"{base}/#/view/b/june")
         browser.wait(f"Number(document.body.dataset.points) > {samples(now)}")
         drawn = browser.wait("Number(document.body.dataset.drawn)")

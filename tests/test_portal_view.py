@@ -152,6 +152,7 @@ def solid_share(image: U8) -> float:
 
 
 def test_ground_looks_like_ground_at_the_first_look(browser: Browser, portal: Portal) -> None:
+    browser.screen(1280, 800, pixel_ratio=1.0)  # points, and the shade beside them, are fine
     open_scan(browser, portal)
     browser.click("Whole site")
     browser.click("Cameras")
@@ -163,6 +164,7 @@ def test_ground_looks_like_ground_at_the_first_look(browser: Browser, portal: Po
     assert 150 < (darker > 60).sum() < 0.02 * darker.size  # along the steps of the house alone
     setting(browser, "Point size", "field.value = 0.3;" + CHANGED)
     assert solid_share(drawn(browser)) < solid_share(plain) - 0.02
+    browser.screen(1280, 800)
 
 
 def test_a_scene_at_rest_asks_for_no_frames(browser: Browser, portal: Portal) -> None:
