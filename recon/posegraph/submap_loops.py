@@ -13,13 +13,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 
 from recon import se3
 from recon.camera_model import project, rays
 from recon.posegraph.loop_closure import LoopClosure, LoopView, landmarks, warps
 from recon.tracking import matching
-from recon.types import F32, F64, Bool, DepthMap, Keyframe
+from recon.types import F32, F64, I64, Bool, DepthMap, Keyframe
 
 MIN_RAD, MIN_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma."""
@@ -155,19 +156,20 @@ def filled(own: Keyframe, others: Sequence[Keyframe]) -> Keyframe:
     """
     at = own.depth
     h, w = at.depth_m.shape
+    known = np.isfinite(at.depth_m)
+    wanted = cv2.dilate(np.asarray(~known, np.uint8), np.ones((3, 3))) > 0  # holes and their edges
     T_own_world = se3.inverse(at.T_world_camera)
     layers = np.full((h, w, 5), np.nan, np.float32)  # depth, sigma, colour
-    rows = [_rows(one, T_own_world @ one.depth.T_world_camera) for one in others]
+    rows = [
+        _rows(one, T_own_world @ one.depth.T_world_camera, at.K, wanted)
+        for one in others
+        if wanted.any()
+    ]
     if rows:
-        points, values = (np.concatenate(part) for part in zip(*rows, strict=True))
-        uv = np.rint(project(at.K, points))
-        inside = (uv >= 0).all(axis=1) & (uv <= [w - 1, h - 1]).all(axis=1)
-        points, values, uv = points[inside], values[inside], uv[inside].astype(np.int64)
-        order = np.argsort(-points[:, 2])  # the nearest is written last
-        layers[uv[order, 1], uv[order, 0]] = values[order]
-        layers[..., 0][uv[order, 1], uv[order, 0]] = points[order, 2]
+        v, u, depth_m, values = (np.concatenate(part) for part in zip(*rows, strict=True))
+        order = np.argsort(-depth_m, kind="stable")  # the nearest is written last
+        layers[v[order], u[order]] = values[order]
         layers = _closed(layers)
-    known = np.isfinite(at.depth_m)
     layers[known, 0], layers[known, 1] = at.depth_m[known], at.sigma_m[known]
     layers[known, 2:] = own.bgr[known]
     views = np.where(np.isfinite(layers[..., 0]), np.maximum(at.views, 2), 0).astype(np.uint8)
@@ -176,11 +178,17 @@ def filled(own: Keyframe, others: Sequence[Keyframe]) -> Keyframe:
     return replace(own, depth=depth, bgr=np.ascontiguousarray(bgr))
 
 
-def _rows(one: Keyframe, T: F64) -> tuple[F64, F32]:
-    """(N, 3) points after ``T`` (4, 4) and (N, 5) their depth, sigma and colour."""
-    v, u = np.nonzero(np.isfinite(one.depth.depth_m))
+def _rows(one: Keyframe, T: F64, K: F64, wanted: Bool) -> tuple[I64, I64, F64, F32]:
+    """(N,) rows and columns of points after ``T`` (4, 4), of those ``wanted`` (h, w), with (N,)
+    depths and (N, 5) depth, sigma and colour."""
     points, sigma = points_of(one.depth, T)
-    return points, np.column_stack([points[:, 2], sigma, one.bgr[v, u]]).astype(np.float32)
+    uv = np.rint(project(K, points))
+    inside = np.asarray(((uv >= 0) & (uv < wanted.shape[::-1])).all(axis=1))
+    u, v = uv[inside].astype(np.int64).T
+    inside[inside] = seen = wanted[v, u]
+    depth_m, colour = points[inside, 2], one.bgr[np.isfinite(one.depth.depth_m)][inside]
+    values = np.column_stack([depth_m, sigma[inside], colour])
+    return v[seen], u[seen], depth_m, values.astype(np.float32)
 
 
 def points_of(depth: DepthMap, T: F64) -> tuple[F64, F64]:
