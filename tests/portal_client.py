@@ -156,4 +156,4 @@ def client(store: Path) -> Iterator[Client]:
 def browser() -> Iterator[Browser]:
     """One Chromium for all tests of a file. It draws in software, so its pixels are coarse."""
     with sync_playwright() as driver:
-        yield Browser(driver, "--force-device-scale-factor=0.5")
+        yield Browser(driver, "--force-device-scale-factor=0.5", "--disable-gpu-rasterization")
