@@ -152,7 +152,7 @@ def solid_share(image: U8) -> float:
 
 
 def test_ground_looks_like_ground_at_the_first_look(browser: Browser, portal: Portal) -> None:
-    browser.screen(1280, 800, pixel_ratio=1.0)  # points, and the shade beside them, are fine
+    browser.screen(1280, 800, pixel_ratio=1.0)  # points and their shade are small
     open_scan(browser, portal)
     browser.click("Whole site")
     browser.click("Cameras")
