@@ -54,7 +54,10 @@ def view(T: F64, seed: int = 0, ground: int = 1, sigma_m: float = 0.08) -> LoopV
     t = np.full(len(directions), T[2, 3])
     for _ in range(12):  # gentle hills: the fixed point converges
         p = T[:3, 3] + directions * t[:, None]
-        t += (p[:, 2] - height(p[:, 0], p[:, 1])) / -directions[:, 2]
+        off = (p[:, 2] - height(p[:, 0], p[:, 1])) / -directions[:, 2]
+        t += off
+        if np.abs(off).max() < 1e-4:
+            break
     p = (T[:3, 3] + directions * t[:, None]).reshape(SIZE[1], SIZE[0], 3)
     places = (p[..., :2] / METRES_PER_TEXEL + 800).astype(np.float32)
     colour = cv2.remap(
