@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.scans.trust import slope_deg, trust_of
+from service.scans.trust import TWO_ONLY, slope_deg, trust_of
 
 SURE: dict[str, Any] = {
     "assumed": [],
@@ -36,6 +36,8 @@ SURE: dict[str, Any] = {
         ({"assumed": ["height", "view"]}, "none", "relative", "assumed height"),
         ({"frames_tracked": 40}, "gnss", "doubtful", "40 of 100"),
         ({"frames": 101, "frames_tracked": 50}, "gnss", "georeferenced", ""),
+        ({"frames_tracked": 60, "drops": {TWO_ONLY: 20}}, "gnss", "doubtful", "40 of 100"),
+        ({"frames_tracked": 60, "drops": {TWO_ONLY: 8}}, "gnss", "georeferenced", ""),
     ],
 )
 def test_the_weakest_fact_sets_the_level(

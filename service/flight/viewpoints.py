@@ -26,6 +26,7 @@ from recon.tracking.prediction import inverse_depth_plane
 from recon.types import F32, F64, U8, Camera, PosePrior
 from service.config import ScanConfig, parse_baseline
 from service.flight.anchorage import Anchorage
+from service.scans.trust import TWO_ONLY
 
 KEPT = 6
 MIN_FRAMES_PER_STEP = 6.0
@@ -378,7 +379,7 @@ class StereoViews:
         while self._waiting and (everything or self._is_ready(self._waiting[0][0])):
             view, prior = self._waiting.popleft()
             if not self.selection.confirmed(view):
-                self._refused["seen by two views only"] += 1
+                self._refused[TWO_ONLY] += 1
             elif view.is_blurred:
                 self._refused["blurred"] += 1
             else:

@@ -29,6 +29,8 @@ where positions and heights give scales that differ by more, as after a zoom."""
 MIN_PLACED_SHARE = 0.5
 """Share of the frames; below it vision was lost for most of the flight."""
 
+TWO_ONLY = "seen by two views only"
+"""Reason for which views of a stretch of two are dropped."""
 
 REFUSED_SHARE, WRONG_SHARE = 0.2, 0.5
 """Of the measured positions or attitudes, that contradict the track. Above the first, positions are
@@ -59,8 +61,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
 
     Args:
         run: figures of the scan's run: ``assumed``, ``sigma_focal``, ``scale``,
-            ``lean_sigma_deg``, ``frames``, ``frames_tracked``, ``graph``. Missing or malformed
-            ones limit nothing.
+            ``lean_sigma_deg``, ``frames``, ``frames_tracked``, ``drops``, ``graph``. Missing or
+            malformed ones limit nothing.
         georeference: of the scan's header; "none" without.
         slope_deg: of the plane through the cloud.
     """
@@ -81,8 +83,9 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     if "level" in assumed:
         doubts.append("no attitude, and not seen from straight above: the ground is taken as level")
     frames, tracked = _number(run, "frames"), _number(run, "frames_tracked")
-    if frames and tracked is not None and tracked < MIN_PLACED_SHARE * (frames - 1):
-        doubts.append(f"vision placed only {tracked:.0f} of {frames:.0f} frames")
+    in_pairs = _number(run.get("drops"), TWO_ONLY) or 0.0  # frames that nothing confirms
+    if frames and tracked is not None and tracked - in_pairs < MIN_PLACED_SHARE * (frames - 1):
+        doubts.append(f"vision placed only {tracked - in_pairs:.0f} of {frames:.0f} frames")
     for why, views in (("tilt off", "attitudes"), ("view off", "assumed view directions")):
         tilted, attitudes = _refused(run, "attitude", why)
         if tilted > WRONG_SHARE * attitudes:
