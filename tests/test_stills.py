@@ -118,6 +118,20 @@ def test_stills_whose_corners_differ_are_tied_by_their_features(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Treetops: each still has leaves of its own on the masses that it shares."""
+    with_features, counts = Localiser.with_features, []
+
+    def twice(self: Localiser, new: Any, key: Any, uv: F64, ok: Any) -> Any:
+        found = with_features(self, new, key, uv, ok)
+        assert found is not None
+        before, count = key.uv, len(uv)
+        again = with_features(self, new, key, *found)
+        assert again is not None
+        np.testing.assert_array_equal(key.uv, before)  # a place that is there is not added again
+        np.testing.assert_array_equal(again[1], found[1])
+        counts.append(len(before) - count)
+        return again
+
+    monkeypatch.setattr(Localiser, "with_features", twice)
     camera = larger(960, monkeypatch)
     odometry, prior = Odometry(camera), PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
     track, found = [pose(0.3 * FOOTPRINT_M * (i - 2), seed=i) for i in range(4)], []
@@ -127,6 +141,19 @@ def test_stills_whose_corners_differ_are_tied_by_their_features(
         image = np.clip(still(T) + 20.0 * leaves / leaves.std(), 0, 255).astype(np.uint8)
         found.append(odometry.track(image, i, i * 2_000_000_000, prior))
     assert_one_piece(track, found, 0.005)
+    assert min(counts) > 80
+
+
+def test_frames_that_wait_are_placed_though_features_follow_the_corners_since() -> None:
+    odometry, prior = Odometry(CAMERA), PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
+    odometry.track(still(pose(0.0)), 0, 0, prior)
+    first = odometry.keyframes[0]
+    seen = np.zeros(len(first.uv), np.bool_)
+    odometry._early = [(first.moving, first.uv, seen)]
+    first.uv = np.vstack([first.uv, first.uv[:5] + 0.5])
+    first.landmark = np.concatenate([first.landmark, np.full(5, -1, np.int64)])
+    odometry._place_early(first)
+    assert odometry._early == []
 
 
 def test_rows_of_a_field_are_not_taken_for_one_another(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -181,7 +181,8 @@ class Localiser:
                 if bridge is not None:
                     return bridge
             corners = key.uv, key.landmark
-            bridge = self._two_views(new, key, *self.with_features(new, key, uv, ok))
+            tied = self.with_features(new, key, uv, ok)
+            bridge = None if tied is None else self._two_views(new, key, *tied)
             if bridge is not None:
                 return bridge
             key.uv, key.landmark = corners
@@ -189,15 +190,24 @@ class Localiser:
 
     def with_features(
         self, new: TrackingFrame, key: OdometryKeyframe, uv: F64, ok: Bool
-    ) -> tuple[F64, Bool]:
+    ) -> tuple[F64, Bool] | None:
         """Where (N, 2) a keyframe's corners are found, and which (N,), once the features that both
-        images share are among them: treetops have few corners that look alike from two places."""
+        images share are among them; None where they share none.
+
+        Treetops have few corners that look alike from two places. Features follow the corners that
+        are there, each place once however often it is found.
+        """
         view = self._features.fine_view((key.seq, key.pyramid.levels[0]), (new.seq, new.gray))
         if view is None:
-            return uv, ok
-        key.uv = np.vstack([key.uv, view.uv_a])
-        key.landmark = np.concatenate([key.landmark, np.full(len(view), -1, np.int64)])
-        return np.vstack([uv, view.uv_b]), np.concatenate([ok, np.ones(len(view), np.bool_)])
+            return None
+        row_of = {tuple(place): row for row, place in enumerate(key.uv.tolist())}
+        rows = np.array([row_of.get(tuple(place), -1) for place in view.uv_a.tolist()])
+        fresh, uv, ok = rows < 0, uv.copy(), ok.copy()
+        uv[rows[~fresh]], ok[rows[~fresh]] = view.uv_b[~fresh], True
+        count = int(np.count_nonzero(fresh))
+        key.uv = np.vstack([key.uv, view.uv_a[fresh]])
+        key.landmark = np.concatenate([key.landmark, np.full(count, -1, np.int64)])
+        return np.vstack([uv, view.uv_b[fresh]]), np.concatenate([ok, np.ones(count, np.bool_)])
 
     def _two_views(
         self, new: TrackingFrame, key: OdometryKeyframe, uv: F64, ok: Bool

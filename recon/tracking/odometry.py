@@ -252,7 +252,7 @@ class Odometry:
         R_b_a = prediction.relative_rotation(first.prior, new.prior)
         uv, ok = self._first_views.match(new, first, R_b_a, self._still)
         if self._still and ok.sum() < 2 * self.config.min_tracks:
-            uv, ok = self._localiser.with_features(new, first, uv, ok)
+            uv, ok = self._localiser.with_features(new, first, uv, ok) or (uv, ok)
         if ok.sum() < 2 * self.config.min_tracks:
             return self._missed(new, "too few matches with the first frame")
         self._lost = 0
@@ -318,7 +318,7 @@ class Odometry:
     def _place_early(self, first: OdometryKeyframe) -> None:
         """Poses of the frames after the first; they say how its rows moved."""
         for moving, uv, ok in self._early:
-            rows = np.flatnonzero(ok & first.map.known(first.landmark))
+            rows = np.flatnonzero(ok & first.map.known(first.landmark[: len(ok)]))
             points = first.map[first.landmark[rows]]
             depth = se3.transform(first.T_camera_odom, points)[:, 2]
             at = moving.at_middle(self.K, uv[rows], 1.0 / depth)
