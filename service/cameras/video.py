@@ -289,6 +289,10 @@ def decoded_frames(
             return
 
 
+LONGEST_CUE = 8192
+"""Bytes of a cue that are read; drones write a few hundred."""
+
+
 def subtitles(path: Path) -> Iterator[tuple[int, str]]:
     """(ns since the video's start, text) of the cues in a video's own subtitles, if it has any."""
     import av.error
@@ -305,7 +309,7 @@ def subtitles(path: Path) -> Iterator[tuple[int, str]]:
                     other.discard = type(other.discard).all  # most of the file is not read
             head = 2 if stream.codec_context.name == "mov_text" else 0  # the number of bytes
             for packet in container.demux(stream):
-                text = bytes(packet)[head:].decode("utf-8", "replace")
+                text = bytes(packet)[head:LONGEST_CUE].decode("utf-8", "replace")
                 if packet.pts is not None and packet.time_base is not None and text:
                     yield round((packet.pts * packet.time_base - start_s) * NS_PER_S), text
     except (av.error.FFmpegError, OSError, ValueError) as error:

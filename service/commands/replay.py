@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Collection
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
@@ -135,10 +136,11 @@ def _subtitles(video: str, config: Config) -> TelemetryLog | None:
         if path is not None:
             found, where = _load_telemetry(path, config), f"{path.name}, next to the video"
         else:
-            cues = list(subtitles(Path(name)))
-            if not cues:
+            cues = subtitles(Path(name))
+            first = next(cues, None)
+            if first is None:
                 return None
-            found = of_cues(Path(name), cues, _history_config(config))
+            found = of_cues(Path(name), chain((first,), cues), _history_config(config))
             where = "the video's own subtitles"
     except (InputError, ValueError) as error:
         logging.getLogger(__name__).warning("no telemetry: %s", error)
