@@ -524,6 +524,19 @@ def test_a_live_history_does_not_wait_in_vain() -> None:
     assert history.state_at(now) is not None  # a stream that has dried up
 
 
+def test_a_position_that_is_due_later_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    history, waits = VehicleHistory(patience_s=0.3), list[float]()
+    monkeypatch.setattr(history._news, "wait", lambda left_s: waits.append(left_s))
+    now = time.monotonic_ns()
+    history.add(AttitudeSample(None, IDENTITY), now)
+    for late_ms in (1400, 400):  # once a second
+        history.add(position(50.0, 8.0, 580.0, (0.0, 0.0, 0.0)), now - late_ms * MS)
+    assert history.state_at(now) is not None and not waits  # the next one is due in 0.6 s
+    history.add(position(50.0, 8.0, 580.0, (0.0, 0.0, 0.0)), now - 50 * MS)
+    history.state_at(now)
+    assert waits  # in 0.3 s
+
+
 def test_a_slow_relay_of_the_gimbal_is_not_waited_for() -> None:
     history = VehicleHistory(patience_s=1000.0)  # would stand still for ever if it waited
     now = time.monotonic_ns()

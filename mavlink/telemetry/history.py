@@ -106,19 +106,20 @@ class VehicleHistory:
         times = [t.last_ns for t in (self._attitude, self._position) if t.last_ns is not None]
         return max(times, default=None)
 
-    def covers(self, time_ns: int) -> bool:
+    def covers(self, time_ns: int, until_ns: float = math.inf) -> bool:
         """True when no active stream can still add data about ``time_ns``.
 
-        Of several streams of gimbals the first counts, which is the one that is used.
+        A stream whose next sample is due after ``until_ns`` cannot. Of several streams of gimbals
+        the first counts, which is the one that is used.
         """
         with self._lock:
-            gimbals = [self._gimbals[key].last_ns for key in self._gimbal_order()]
-            others = [self._attitude.last_ns, self._position.last_ns]
-        heads, bodies = (
-            [t for t in newest if t is not None and t > time_ns - MAX_GAP_NS]
-            for newest in (gimbals, others)
-        )
-        return all(t >= time_ns for t in (*heads[:1], *bodies))
+            gimbals: list[TimeSeries[Any]] = [self._gimbals[key] for key in self._gimbal_order()]
+            heads, bodies = (
+                [t for t in tracks if (t.last_ns or -math.inf) > time_ns - MAX_GAP_NS]
+                for tracks in (gimbals, (self._attitude, self._position))
+            )
+            awaited = (*heads[:1], *bodies)
+            return all((t.last_ns or 0) >= time_ns or t.due_ns > until_ns for t in awaited)
 
     def attitudes(self) -> list[tuple[AttitudeSample, int]]:
         """Every attitude with its time in ns, oldest first."""
@@ -246,7 +247,7 @@ class VehicleHistory:
             return  # samples further ahead cannot arrive in time
         with self._news:
             self._waiting += 1  # before checking, so that no new sample is missed
-            while not self.covers(time_ns) and now_s < end_s:
+            while not self.covers(time_ns, end_s * 1e9) and now_s < end_s:
                 self._news.wait(end_s - now_s)
                 now_s = time.monotonic()
             self._waiting -= 1

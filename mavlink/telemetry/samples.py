@@ -211,6 +211,13 @@ class TimeSeries(Generic[S]):
         return self._times[-1] if self._times else None
 
     @property
+    def due_ns(self) -> int:
+        """Time of the next sample, as far from the newest as the one before; 0 without samples."""
+        if len(self._times) < 2:
+            return self.last_ns or 0
+        return 2 * self._times[-1] - self._times[-2]
+
+    @property
     def last(self) -> S | None:
         """The newest sample."""
         return self._samples[-1] if self._samples else None
