@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.posegraph.alignment import Similarity
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 from service.errors import OutsideError
@@ -153,6 +154,7 @@ def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> N
     for placed in (in_flight, again):
         np.testing.assert_allclose(placed.T_world_camera[:3, 3], fix)
         assert placed.sigma_m == pytest.approx(5.0 * 3**0.5)
-    chain.trajectory.similarity = lambda segment: object()
+    known = Similarity(1.0, np.eye(3), np.zeros(3), np.eye(7))
+    chain.graph.segments.known = lambda segment: known
     carried = chain.place(frame, Uncarried(fix, np.full(3, 5.0)))
     assert np.linalg.norm(carried.T_world_camera[:3, 3] - fix) > 1.0

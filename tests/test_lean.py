@@ -130,7 +130,7 @@ def test_poses_say_that_all_may_lean() -> None:
         for k in (0, len(flown.anchors) // 2)
         if (placed := trajectory.place(k))
     ]
-    found = trajectory.similarity(0)
+    found = trajectory.graph.segments.known(0)
     assert found is not None and found.sigma_lean_rad is not None
     min_m = 0.5 * STRIP_M * found.sigma_lean_rad
     assert np.hypot(min_m, sigma_m[1]) == pytest.approx(sigma_m[0], rel=0.25)
@@ -156,7 +156,7 @@ def test_a_short_segment_has_the_noise_and_the_height_of_its_flight(broken_at: i
     """Altitudes state no accuracy, and ten stills show none: 50 m are typical."""
     flown = stills(4, 4.0, turns=True)
     trajectory = settled(flown, broken_at)
-    sigma_m = [trajectory.graph.sigma_height_m(segment) for segment in (0, 1)]
+    sigma_m = [trajectory.graph.segments.sigma_height_m(segment) for segment in (0, 1)]
     assert all(sigma is not None and sigma < 5.0 for sigma in sigma_m)
     z = np.array([trajectory.place(k).T_world_camera[2, 3] for k in range(len(flown.anchors))])
     assert abs(np.mean(z[:broken_at]) - np.mean(z[broken_at:])) < 2.0
@@ -164,13 +164,15 @@ def test_a_short_segment_has_the_noise_and_the_height_of_its_flight(broken_at: i
 
 def test_altitudes_that_drift_lay_no_segment_on_another() -> None:
     trajectory = settled(stills(4, 4.0, turns=True, drift_m=50.0), 38)
-    sigma_m = [trajectory.graph.sigma_height_m(segment) for segment in (0, 1)]
+    sigma_m = [trajectory.graph.segments.sigma_height_m(segment) for segment in (0, 1)]
     assert max(sigma or 0.0 for sigma in sigma_m) > 20.0
 
 
 def test_what_is_level_is_as_unsure_as_vision_bends() -> None:
     flown = stills(4, 0.0)
-    straight, bent = (settled(flown, turn_rad=turn).similarity(0) for turn in (1e-6, 1e-3))
+    straight, bent = (
+        settled(flown, turn_rad=turn).graph.segments.known(0) for turn in (1e-6, 1e-3)
+    )
     assert straight is not None and straight.sigma_lean_rad is not None
     assert bent is not None and bent.sigma_lean_rad is not None
     bend_rad = np.sqrt(bent.sigma_lean_rad**2 - straight.sigma_lean_rad**2)

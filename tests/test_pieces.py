@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from recon.calibration.global_bundle import Sightings
 from recon.calibration.tracks import MIN_COMMON
 from recon.posegraph.alignment import Similarity
-from recon.posegraph.loop_book import Edge
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.records import Loop
 from recon.types import F64, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cli import app
@@ -41,32 +41,45 @@ PLACED = PosePrior(np.eye(3), 0.02, 0.1, np.zeros(3), np.ones(3))
 
 @dataclass
 class Ties:
-    """A graph as far as pieces ask it."""
+    """A graph, its loops and its segments, as far as pieces ask them."""
 
-    loops: list[Edge] = field(default_factory=list)
+    taken: list[Loop] = field(default_factory=list)
+    pending: list[Loop] = field(default_factory=list)
     fixed: tuple[int, ...] = ()
     tied: tuple[int, ...] = ()
     sigma_m: float = 1.0  # of the height, whatever it is against
     against_m: float | None = None  # of one segment's against another's
     sigma_scale: dict[int, float] = field(default_factory=dict)  # where it is not 0.01
-    largest: int = 0
+    main: int = 0  # the largest
     _found: dict[int, Similarity] = field(default_factory=dict)
+
+    @property
+    def loops(self) -> Ties:
+        return self
+
+    @property
+    def segments(self) -> Ties:
+        return self
 
     def sigma_height_m(self, segment: int) -> float | None:
         return self.against_m
 
-    def similarity(self, segment: int) -> Similarity | None:
+    def known(self, segment: int) -> Similarity | None:
         sources = ("gnss",) if segment in self.fixed else ("altitude",)
         scale = self.sigma_scale.get(segment, 0.01)
         covariance = np.diag([1.0] * 5 + [self.sigma_m**2, scale**2])
         found = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
         return self._found.setdefault(segment, found)
 
-    def largest_similarity(self) -> Similarity | None:
-        return self.similarity(self.largest)
+    def largest(self) -> Similarity | None:
+        return self.known(self.main)
 
     def is_tied(self, segment: int) -> bool:
         return segment in self.tied
+
+
+def loop(a: int, b: int) -> Loop:
+    return Loop(a, b, np.eye(4), np.eye(6))
 
 
 def apart(
@@ -85,14 +98,13 @@ def test_without_ties_the_largest_stays() -> None:
 
 
 def test_loops_make_pieces_and_a_waiting_loop_does_not() -> None:
-    loops = [Edge(2, 30, True), Edge(11, 21, False)]
-    assert apart(Ties(loops)) == [(0, 2), (20, 22), (30, 32)]
-    assert apart(Ties([Edge(2, 21, True), Edge(22, 30, True)])) == [(10, 12)]
+    assert apart(Ties([loop(2, 30)], [loop(11, 21)])) == [(0, 2), (20, 22), (30, 32)]
+    assert apart(Ties([loop(2, 21), loop(22, 30)])) == [(10, 12)]
 
 
 def test_what_fixes_place_stays_whatever_its_size() -> None:
     assert apart(Ties(fixed=(3,))) == [(0, 2), (10, 12), (20, 22)]
-    assert apart(Ties([Edge(12, 22, True)], fixed=(0, 2))) == [(30, 32)]
+    assert apart(Ties([loop(12, 22)], fixed=(0, 2))) == [(30, 32)]
     assert apart(Ties(), prior=PLACED) == []
 
 
@@ -104,7 +116,7 @@ def test_fixes_without_a_height_do_not_lay_one_stretch_on_another() -> None:
     assert apart(coarse, prior=high) == [(0, 2), (20, 22), (30, 32)]
     assert apart(replace(coarse, against_m=20.0), prior=high) == [(0, 2), (20, 22), (30, 32)]
     assert apart(replace(coarse, against_m=2.0), prior=high) == []
-    tied = replace(coarse, loops=[Edge(2, 11, True)])
+    tied = replace(coarse, taken=[loop(2, 11)])
     assert apart(tied, prior=high) == [(20, 22), (30, 32)]
     assert apart(Ties(fixed=every, tied=every, sigma_m=5.0)) == []
 
@@ -115,8 +127,8 @@ def test_fixes_that_leave_the_size_open_do_not_lay_one_stretch_on_another() -> N
     ties = Ties(fixed=every, tied=every, sigma_scale={1: 0.7, 2: 0.1, 3: 0.3})
     for prior in (NOWHERE, PLACED):
         assert apart(ties, prior=prior) == [(10, 12), (30, 32)]
-        assert apart(replace(ties, largest=1, _found={}), prior=prior) == [(30, 32)]
-        assert apart(replace(ties, loops=[Edge(2, 11, True)]), prior=prior) == [(30, 32)]
+        assert apart(replace(ties, main=1, _found={}), prior=prior) == [(30, 32)]
+        assert apart(replace(ties, taken=[loop(2, 11)]), prior=prior) == [(30, 32)]
 
 
 def test_a_forgotten_loop_still_ties() -> None:

@@ -127,7 +127,7 @@ def test_accepted_loops_come_back_with_motion_and_covariance() -> None:
         """A graph of known records."""
 
         entered = 2
-        loops: tuple[Any, ...] = ()
+        loops = PoseGraph().loops
         counts: dict[str, int] = {"loop waits": 1}  # noqa: RUF012
 
         def __len__(self) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,15 +20,6 @@ CHI2_LIMIT = 22.5
 
 MAX_PENDING = 50
 """Loops that wait for one that agrees; older ones are forgotten."""
-
-
-@dataclass(frozen=True, slots=True)
-class Edge:
-    """A loop as reports show it."""
-
-    a: int  # number of the earlier keyframe
-    b: int
-    accepted: bool  # False: none that agrees was found
 
 
 class LoopBook:
@@ -63,11 +53,6 @@ class LoopBook:
         stay."""
         self.taken = moved_loops(self.taken, marginalised, dropped, most)
         self.pending = moved_loops(self.pending, marginalised, dropped, most)
-
-    def edges(self) -> list[Edge]:
-        """All loops that were offered and not refused."""
-        found = [Edge(loop.a, loop.b, True) for loop in self.taken]
-        return found + [Edge(loop.a, loop.b, False) for loop in self.pending]
 
     def into(self, segment: int) -> list[Loop]:
         """Accepted loops from an earlier segment into this one."""

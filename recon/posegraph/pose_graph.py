@@ -16,9 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from recon import bands, se3
-from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.factors import Motions, Readings, is_frozen, sound
-from recon.posegraph.loop_book import Edge, LoopBook
+from recon.posegraph.loop_book import LoopBook
 from recon.posegraph.records import Loop, Node, PoseGraphConfig
 from recon.posegraph.segment_frames import SegmentFrames
 from recon.posegraph.sensor_offsets import Constants
@@ -33,7 +32,7 @@ from recon.posegraph.smoother import (
 from recon.posegraph.thinning import GONE_SHARE, thin
 from recon.types import F64, Pose, PosePrior
 
-__all__ = ["Edge", "PoseGraph", "PoseGraphConfig"]
+__all__ = ["PoseGraph", "PoseGraphConfig"]
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +45,8 @@ GIVE_WAY_EVERY = 4
 class PoseGraph:
     """Keyframe poses in the world, corrected as evidence comes in.
 
-    Poses, motions and covariances use this package's conventions (left perturbations).
+    ``segments`` holds each segment's similarity to the world, ``loops`` those offered. Poses,
+    motions and covariances use this package's conventions (left perturbations).
     """
 
     def __init__(self, config: PoseGraphConfig | None = None) -> None:
@@ -57,10 +57,10 @@ class PoseGraph:
         self._thin_at = self.config.max_nodes
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
-        self._segments = SegmentFrames(
+        self.segments = SegmentFrames(
             self.config.min_anchors, self.config.fix_s, self.config.attitude_s
         )
-        self._book = LoopBook(self.config, self)
+        self.loops = LoopBook(self.config, self)
         self._built = 0
         self._start()
 
@@ -97,7 +97,7 @@ class PoseGraph:
         )  # fmt: skip
         last = self._newest() if self._nodes else None
         self._keep(node)
-        is_refitted = self._segments.refit(segment, self._smoother.pose)
+        is_refitted = self.segments.refit(segment, self._smoother.pose)
         if len(self) >= self._thin_at:
             self._thin()
         elif is_refitted:
@@ -121,7 +121,7 @@ class PoseGraph:
         scale = self.scale(a)
         ratio = growth * self.scale(b) / scale
         loop = Loop(a, b, T_a_b, covariance, ratio).scaled(1.0 / scale)
-        fresh = self._book.offer(loop)
+        fresh = self.loops.offer(loop)
         if not fresh:
             return False
         if self._tie(loop):
@@ -134,11 +134,11 @@ class PoseGraph:
 
     def solve(self) -> None:
         """Fit every segment's frame to all its telemetry again, and rebuild the graph."""
-        for segment in self._segments.nodes:
-            self._segments.forget(segment)
-            self._segments.refit(segment, self._smoother.pose)
-            loops = self._book.into(segment)
-            if loops and not self._segments.is_tied(segment):
+        for segment in self.segments.nodes:
+            self.segments.forget(segment)
+            self.segments.refit(segment, self._smoother.pose)
+            loops = self.loops.into(segment)
+            if loops and not self.segments.is_tied(segment):
                 self.rebuild()  # so that the segments before are where they belong
                 for loop in loops:
                     if self._tie(loop):
@@ -148,19 +148,9 @@ class PoseGraph:
     # ---- what comes out ------------------------------------------------------------------------
 
     @property
-    def aligned(self) -> bool:
-        """True when the newest segment's frame is the world's, by fixes."""
-        return bool(self._nodes) and self._segments.rests_on_fixes(self._newest().segment)
-
-    @property
     def counts(self) -> Counter[str]:
         """Readings and loops left out, by reason."""
-        return self._kept_counts + self._book.counts + self._left_out
-
-    @property
-    def loops(self) -> list[Edge]:
-        """All loops that were offered."""
-        return self._book.edges()
+        return self._kept_counts + self.loops.counts + self._left_out
 
     @property
     def seqs(self) -> list[int]:
@@ -174,39 +164,19 @@ class PoseGraph:
 
     def metric_loops(self) -> list[Loop]:
         """Accepted loops with lengths in metres, by the scale known now."""
-        return [loop.scaled(self.scale(loop.a)) for loop in self._book.taken]
-
-    def similarity(self, segment: int) -> Similarity | None:
-        """The motion from a segment's odometry to the world; None before telemetry or a loop."""
-        return self._segments.known(segment)
-
-    def largest_similarity(self) -> Similarity | None:
-        """That of the segment with the most keyframes; None before telemetry or a loop."""
-        return self._segments.largest()
+        return [loop.scaled(self.scale(loop.a)) for loop in self.loops.taken]
 
     def largest_growth(self) -> float:
-        """Log of that segment's scale by all factors over its scale by its own readings."""
-        segment = self._segments.largest_segment()
+        """Log of the largest segment's scale by all factors over its scale by its own readings."""
+        segment = self.segments.largest_segment()
         if segment is None:
             return 0.0
-        keys = [node.key for node in self._segments.nodes[segment]]
+        keys = [node.key for node in self.segments.nodes[segment]]
         return float(np.median(self._smoother.logs()[self._motions.scale_of][keys]))
-
-    def largest_scales(self) -> tuple[Scale | None, Scale | None]:
-        """The same segment's scale by fixes alone and by heights alone."""
-        return self._segments.largest_scales()
 
     def constants(self) -> Constants:
         """Constant errors of the sensors, as known for the newest segment."""
-        return self._segments.constants(self._newest().segment) if self._nodes else Constants()
-
-    def sigma_height_m(self, segment: int) -> float | None:
-        """Sigma of a segment's height against the largest one by fixes; None where unknown."""
-        return self._segments.sigma_height_m(segment)
-
-    def is_tied(self, segment: int) -> bool:
-        """True when a loop places the segment, or fixes that measure its scale."""
-        return self._segments.is_tied(segment)
+        return self.segments.constants(self._newest().segment) if self._nodes else Constants()
 
     def node(self, seq: int) -> Node:
         """The record of keyframe ``seq``. Raises KeyError for an unknown one."""
@@ -236,18 +206,14 @@ class PoseGraph:
         """Metres per unit of the odometry at keyframe ``seq``."""
         node = self._nodes[seq]
         log = self._smoother.logs()[self._motions.scale_of[node.key]]
-        return self._segments.frame(node.segment).scale * float(np.exp(log))
-
-    def poses(self) -> dict[int, F64]:
-        """(4, 4) T_world_camera of every node."""
-        return dict(zip(self._nodes, self._smoother.poses(), strict=True))
+        return self.segments.frame(node.segment).scale * float(np.exp(log))
 
     @property
     def version(self) -> int:
         """A number that changes whenever published poses may have changed."""
         return self._built * 1_000_000 + self._smoother.updates
 
-    def pose_array(self) -> F64:
+    def poses(self) -> F64:
         """(N, 4, 4) T_world_camera in the order of the keyframes."""
         return self._smoother.poses()
 
@@ -259,8 +225,8 @@ class PoseGraph:
     def scales(self) -> F64:
         """(N,) metres per unit of the odometry, in the order of the keyframes."""
         frames = [
-            np.full(len(nodes), self._segments.frame(segment).scale)
-            for segment, nodes in self._segments.nodes.items()
+            np.full(len(nodes), self.segments.frame(segment).scale)
+            for segment, nodes in self.segments.nodes.items()
         ]
         logs = self._smoother.logs()[self._motions.scale_of]
         return np.asarray(np.concatenate(frames) * np.exp(logs))
@@ -282,9 +248,9 @@ class PoseGraph:
         span_s = (times[-1] - times[0]) * 1e-9 if times else 0.0
         self._readings = Readings(
             self.config, self._smoother, self._left_out, len(times), span_s,
-            self._segments.altitude_offset(),
+            self.segments.altitude_offset(),
         )  # fmt: skip
-        self._motions = Motions(self.config, self._smoother, self._segments, self._left_out)
+        self._motions = Motions(self.config, self._smoother, self.segments, self._left_out)
         self._sources: list[set[str]] = []
         self._path: list[float] = []  # m flown up to each keyframe
 
@@ -297,7 +263,7 @@ class PoseGraph:
                 bands.give_way()
             self._insert(node, last)
             last = node
-        for loop in self._book.taken:
+        for loop in self.loops.taken:
             self._add_loop_factor(loop)
         self._solve(now=True, steps=MANY_STEPS)
 
@@ -317,8 +283,8 @@ class PoseGraph:
         nodes = done.nodes
         self._kept_counts["keyframe dropped"] += len(done.dropped)
         self._nodes = {node.seq: node for node in nodes}
-        self._segments.thin(nodes)
-        self._book.thin(done.marginalised, done.dropped, len(nodes))
+        self.segments.thin(nodes)
+        self.loops.thin(done.marginalised, done.dropped, len(nodes))
         self._thin_at = max(self.config.max_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
         self.generation += 1
         self.rebuild()
@@ -330,13 +296,13 @@ class PoseGraph:
             for node, used in zip(self._nodes.values(), self._sources, strict=False)
             if node.prior.sigma_position_m is not None
             and "gnss" not in used
-            and self._segments.rests_on_fixes(node.segment)
+            and self.segments.rests_on_fixes(node.segment)
         }
 
     def _keep(self, node: Node) -> None:
         self.entered += 1
         self._nodes[node.seq] = node
-        self._segments.keep(node)
+        self.segments.keep(node)
 
     def _insert(self, node: Node, last: Node | None) -> None:
         self._sources.append({"vision"})
@@ -352,10 +318,10 @@ class PoseGraph:
             self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
             spread = spread_last + left_covariance(T_last, covariance)
         self._smoother.append_pose(T, spread)
-        frame = self._segments.known(node.segment)
+        frame = self.segments.known(node.segment)
         drift_m = None if frame is None else self.config.frame_drift * self._path[node.key]
-        node = self._segments.freed(node)
-        noise = self._segments.noise(node.segment)
+        node = self.segments.freed(node)
+        noise = self.segments.noise(node.segment)
         used = self._readings.add(node, T, spread, drift_m, noise)
         if frame is not None and self._readings.height(
             node, self._motions.scale_key(node), frame.scale
@@ -375,18 +341,18 @@ class PoseGraph:
     def _tie(self, loop: Loop) -> bool:
         """True when a loop between segments now places the later one, which no fix does."""
         a, b = self._nodes[loop.a], self._nodes[loop.b]
-        if not self._book.enters(loop, b.segment) or self._segments.is_tied(b.segment):
+        if not self.loops.enters(loop, b.segment) or self.segments.is_tied(b.segment):
             return False
         scale = self.scale(loop.a)
         T = self._smoother.pose(a.key) @ loop.scaled(scale).T_a_b
         R = T[:3, :3] @ b.T_odom_camera[:3, :3].T
         scale *= loop.ratio
-        self._segments.tie(b.segment, scale, R, T[:3, 3] - scale * R @ b.T_odom_camera[:3, 3])
+        self.segments.tie(b.segment, scale, R, T[:3, 3] - scale * R @ b.T_odom_camera[:3, 3])
         return True
 
     def _add_loop_factor(self, loop: Loop) -> None:
         a, b = self._nodes[loop.a], self._nodes[loop.b]
-        metric = loop.scaled(self._segments.frame(a.segment).scale)
+        metric = loop.scaled(self.segments.frame(a.segment).scale)
         self._sources[b.key].add("loop")
         self._motions.add_loop(a, b, metric.T_a_b, metric.covariance)
         self._add_loop_scale(loop, a.key, b.key)
@@ -396,7 +362,7 @@ class PoseGraph:
         keys = self._motions.scale_of[a], self._motions.scale_of[b]
         if keys[0] == keys[1] or NO_SCALE in keys:
             return
-        frames = [self._segments.frame(self._nodes[seq].segment).scale for seq in loop.ends]
+        frames = [self.segments.frame(self._nodes[seq].segment).scale for seq in loop.ends]
         log = float(np.log(loop.ratio * frames[0] / frames[1]))
         self._smoother.add_scale(
             "loop scale", keys, log, self.config.sigma_loop_scale, self.config.huber_sigmas

@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from recon import se3
-from recon.posegraph.alignment import Similarity
 from recon.posegraph.interpolated import (
     KEYFRAME,
     Spans,
@@ -162,11 +161,6 @@ class Trajectory:
         row = bisect_left(self._seqs, seq)
         return row < len(self._seqs) and self._seqs[row] == seq
 
-    def similarity(self, segment: int) -> Similarity | None:
-        """The segment's similarity to the world; None while it is placed by its first telemetry
-        only."""
-        return self.graph.similarity(segment)
-
     def map_pose(self, seq: int) -> F64:
         """(4, 4) T_map_camera of a keyframe in its segment's chain."""
         if seq in self.graph:
@@ -182,7 +176,7 @@ class Trajectory:
             node = self.place(ends[0])
             return replace(node, seq=seq, T_world_camera=T[0], scale=float(scales[0]))
         pose = self.graph.pose(seq)
-        frame = self.graph.similarity(self.graph.node(seq).segment)
+        frame = self.graph.segments.known(self.graph.node(seq).segment)
         T, covariance = pose.T_world_camera, pose.covariance
         if frame is None:  # its scale and heading are not known
             covariance = covariance + se3.about(-T[:3, 3], np.eye(6))
@@ -199,7 +193,7 @@ class Trajectory:
 
     def places(self, seqs: Sequence[int]) -> F64:
         """(N, 4, 4) T_world_camera of keyframes."""
-        nodes, graph = self.graph.pose_array(), self.graph
+        nodes, graph = self.graph.poses(), self.graph
         found = [
             nodes[graph.node(seq).key] if seq in graph else self.place(seq).T_world_camera
             for seq in seqs
@@ -254,7 +248,7 @@ class Trajectory:
             return []
         published.checked = self.graph.version
         keys = published.keys
-        T, scales = self.graph.pose_array()[keys], self.graph.scales()[keys]
+        T, scales = self.graph.poses()[keys], self.graph.scales()[keys]
         least = np.maximum(REPOSE_M, REPOSE_SIGMAS * published.sigma)
         change, claimed = published.change(T, scales), published.sigma
         if final:

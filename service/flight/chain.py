@@ -15,6 +15,7 @@ from recon.posegraph.anchors import height_above, height_below
 from recon.posegraph.between_keyframes import carried
 from recon.posegraph.level_ground import MAX_LEVELLED_SHARE, levelled
 from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.segment_frames import SegmentFrames
 from recon.posegraph.trajectory import Placed, Trajectory
 from recon.tracking.odometry import Tracked, Tracking
 from recon.types import F64, DepthMap, Keyframe, PosePrior
@@ -137,7 +138,7 @@ class Chain:
         elif depth is not None:
             self._rejected["placed impossibly far away"] += 1
         self._news[view.seq] = News(
-            placed, self.trajectory.similarity(view.segment) is not None,
+            placed, self.graph.segments.known(view.segment) is not None,
             self._moved() if depth is not None else (), self.watch.look(),
         )  # fmt: skip
         return placed if depth is not None and is_near else None
@@ -223,7 +224,7 @@ class Chain:
         """True when the segment has a frame in the world; in flight, of the newest one."""
         if self._newest is not None:
             return segment == self._aligned
-        return self.trajectory.similarity(segment) is not None
+        return self.graph.segments.known(segment) is not None
 
     def place(self, anchor: Anchorage, uncarried: Uncarried) -> Placed:
         """A frame in the world, carried by the chain's keyframe at or before it where it can.
@@ -302,17 +303,17 @@ class Pieces:
 
         The main piece is the one that fixes place; without fixes, that with most points.
         """
-        piece = {segment: segment for segment in self._segments}
+        piece, frames = {segment: segment for segment in self._segments}, graph.segments
         looped: set[int | None] = set()
-        for edge in graph.loops:
-            a, b = (self._segment_of(seq) for seq in (edge.a, edge.b))
-            if edge.accepted and a is not None and b is not None:
+        for loop in graph.loops.taken:
+            a, b = (self._segment_of(seq) for seq in loop.ends)
+            if a is not None and b is not None:
                 _join(piece, a, b)
                 looped |= {a, b}
-        heights = {s: sigma for s in piece if (sigma := _sigma_height_m(graph, s)) is not None}
+        heights = {s: sigma for s in piece if (sigma := _sigma_height_m(frames, s)) is not None}
         unsure = {s for s, sigma in heights.items() if sigma > HEIGHT_KNOWN_M}
-        of_any_size = {s for s in heights if not _is_scaled(graph, s)}
-        loose = {s for s in unsure if not _agrees(graph, s)} | of_any_size
+        of_any_size = {s for s in heights if not _is_scaled(frames, s)}
+        loose = {s for s in unsure if not _agrees(frames, s)} | of_any_size
         placed = self._placed - of_any_size
         fixed = [s for s in self._segments if s in placed or s in heights.keys() - loose]
         for segment in fixed[1:]:
@@ -330,7 +331,7 @@ class Pieces:
             for segment, first, last in ends
             # A long flight forgets loops, and not which segments they tied.
             if piece[segment] != main
-            and (segment in looped or segment in loose or not graph.is_tied(segment))
+            and (segment in looped or segment in loose or not frames.is_tied(segment))
         ]
 
     def _segment_of(self, seq: int) -> int | None:
@@ -338,26 +339,26 @@ class Pieces:
         return self._segments[at] if at >= 0 else None
 
 
-def _sigma_height_m(graph: PoseGraph, segment: int) -> float | None:
+def _sigma_height_m(frames: SegmentFrames, segment: int) -> float | None:
     """Sigma of the height at which fixes place a segment; None where they do not."""
-    found = graph.similarity(segment)
+    found = frames.known(segment)
     if found is None or "gnss" not in found.sources:
         return None
     return float(np.sqrt(found.covariance[5, 5]))
 
 
-def _agrees(graph: PoseGraph, segment: int) -> bool:
+def _agrees(frames: SegmentFrames, segment: int) -> bool:
     """True when the height is known against the largest segment's: what all fixes of a flight err
     by lays none on another."""
-    sigma_m = graph.sigma_height_m(segment)
+    sigma_m = frames.sigma_height_m(segment)
     return sigma_m is not None and sigma_m < HEIGHTS_AGREE_M
 
 
-def _is_scaled(graph: PoseGraph, segment: int) -> bool:
+def _is_scaled(frames: SegmentFrames, segment: int) -> bool:
     """True for segments of a known scale, and for the largest, which the others are laid on."""
-    found = graph.similarity(segment)
+    found = frames.known(segment)
     assert found is not None
-    return found is graph.largest_similarity() or found.sigma_scale < SCALE_KNOWN
+    return found is frames.largest() or found.sigma_scale < SCALE_KNOWN
 
 
 def _join(piece: dict[int, int], a: int, b: int) -> None:

@@ -166,7 +166,7 @@ class Recorder:
         """Source of the metric scale, its relative sigma, and what contradicts it: of the largest
         segment."""
         graph = self._chain.trajectory.graph
-        found = graph.largest_similarity()
+        found = graph.segments.largest()
         if found is None:
             return {"from": FIRST_TELEMETRY, "sigma": None}
         by = ", ".join(found.sources)
@@ -179,7 +179,7 @@ class Recorder:
 
     def _lean_sigma_deg(self) -> float | None:
         """Sigma of what is level, of the largest segment; None where attitudes show it."""
-        found = self._chain.trajectory.graph.largest_similarity()
+        found = self._chain.trajectory.graph.segments.largest()
         sigma = None if found is None else found.sigma_lean_rad
         return None if sigma is None else round(math.degrees(sigma), 2)
 

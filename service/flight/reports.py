@@ -87,14 +87,14 @@ class GraphWatch:
 def sigma_of_scale(graph: PoseGraph) -> float:
     """Relative sigma of the largest segment's scale; loops and vision that contradict its readings
     leave it as unsure as they are apart."""
-    found, growth = graph.largest_similarity(), abs(graph.largest_growth())
+    found, growth = graph.segments.largest(), abs(graph.largest_growth())
     assert found is not None
     return growth if growth > SIGMAS * found.sigma_scale else found.sigma_scale
 
 
 def gnss_over_heights(graph: PoseGraph) -> float | None:
     """The scale of the largest segment by fixes over that by heights, where the two disagree."""
-    by_fixes, by_heights = graph.largest_scales()
+    by_fixes, by_heights = graph.segments.largest_scales()
     if by_fixes is None or by_heights is None:
         return None
     ratio = by_fixes.metres / by_heights.metres
@@ -124,7 +124,11 @@ def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
         return None
     accepted = graph.metric_loops()
     step = max(1, -(-len(accepted) // MAX_LOOPS))
-    edges = graph.loops
+    pairs = [
+        [*loop.ends, taken]
+        for loops, taken in ((graph.loops.taken, True), (graph.loops.pending, False))
+        for loop in loops
+    ]
     return {
         "keyframes": graph.entered,
         "nodes": len(graph),
@@ -137,9 +141,9 @@ def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
             if rows.size
         },
         "loops": {
-            "used": sum(edge.accepted for edge in edges),
-            "waiting": sum(not edge.accepted for edge in edges),
-            "pairs": [[edge.a, edge.b, edge.accepted] for edge in edges][-2 * MAX_LOOPS :],
+            "used": len(graph.loops.taken),
+            "waiting": len(graph.loops.pending),
+            "pairs": pairs[-2 * MAX_LOOPS :],
             "motions": [
                 [
                     loop.a,
