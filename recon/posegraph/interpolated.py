@@ -24,6 +24,7 @@ KEYFRAME = np.dtype(
         ("odom", np.float64, (3, 4)),  # T_odom_camera in the segment's chain
         ("height", np.float64),  # above the ground that it sees, in odometry units
         ("pose", np.float64, (3, 4)),  # T_world_camera as last published
+        ("sigma_m", np.float64),  # of the place, as last published as a node
         ("scale", np.float64),  # metres per odometry unit as last published
         ("first_scale", np.float64),  # and as published first
     ]
@@ -94,18 +95,10 @@ def whole(parts: F64) -> F64:
 
 def moved_m(rows: Rows, T: F64, scales: F64) -> F64:
     """(N,) metres by which keyframes as published, or their ground, are off where they are now."""
-    return change(whole(rows["pose"]), rows["scale"], rows["height"], T, scales)
-
-
-def change(old: F64, old_scales: F64, heights: F64, T: F64, scales: F64) -> F64:
-    """(N,) metres from the poses and scales ``old`` to the new ones, at the camera or its ground.
-
-    ``heights`` are in units of the odometry.
-    """
-    reach = scales * heights
-    shift = np.linalg.norm(T[:, :3, 3] - old[:, :3, 3], axis=1)
+    old, reach = rows["pose"], scales * rows["height"]
+    shift = np.linalg.norm(T[:, :3, 3] - old[:, :, 3], axis=1)
     # Of a rotation by an angle a, the Frobenius norm of its difference is sqrt(8) sin(a/2).
-    apart = np.linalg.norm(T[:, :3, :3] - old[:, :3, :3], axis=(1, 2))
+    apart = np.linalg.norm(T[:, :3, :3] - old[:, :, :3], axis=(1, 2))
     turn = 2.0 * np.arcsin(np.clip(apart / np.sqrt(8.0), 0.0, 1.0)) * reach
-    growth = np.abs(scales / old_scales - 1.0) * reach
+    growth = np.abs(scales / rows["scale"] - 1.0) * reach
     return np.asarray(shift + turn + growth)

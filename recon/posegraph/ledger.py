@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.types import I64
+
 Rows = npt.NDArray[Any]
 """(N,) of a structured type whose first field is ``seq``."""
 
@@ -31,6 +33,10 @@ class Ledger:
     def read(self, first: int, end: int) -> Rows:
         """A copy of the rows from ``first`` up to ``end``."""
         return np.array(self._rows[first : min(end, self._count)])
+
+    def pick(self, places: I64) -> Rows:
+        """A copy of the rows at these places (N,)."""
+        return self._rows[places]
 
     def amend(self, first: int, rows: Rows) -> None:
         """Write over rows from ``first`` on."""

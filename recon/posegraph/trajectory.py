@@ -13,13 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from recon import se3
 from recon.posegraph.interpolated import (
     KEYFRAME,
     Spans,
-    change,
     interpolated,
     moved_m,
     whole,
@@ -63,58 +61,6 @@ class Placed:
         return replace(self, T_world_camera=self.T_world_camera @ moved)
 
 
-class _Published:
-    """Nodes as they were last published, as columns that grow."""
-
-    def __init__(self) -> None:
-        self.placed: list[Placed] = []
-        self.checked = -1  # version of the graph that they were compared with
-        self._row: dict[int, int] = {}
-        self._columns = np.zeros((64, 20))  # pose, scale, sigma, height, key
-
-    def __len__(self) -> int:
-        return len(self.placed)
-
-    def put(self, placed: Placed, key: int, height: float) -> None:
-        """Take a node's newest published pose; ``height`` in odometry units."""
-        row = self._row.setdefault(placed.seq, len(self.placed))
-        if row == len(self.placed):
-            self.placed.append(placed)
-        if row == len(self._columns):
-            self._columns = np.concatenate([self._columns, np.zeros_like(self._columns)])
-        self.placed[row] = placed
-        self._columns[row, :16] = placed.T_world_camera.ravel()
-        self._columns[row, 16:] = placed.scale, placed.sigma_m, height, key
-
-    def of(self, seq: int) -> Placed | None:
-        """A node as it was published; None before it was."""
-        row = self._row.get(seq)
-        return None if row is None else self.placed[row]
-
-    def thin(self, keys: dict[int, int]) -> None:
-        """Keep those that have a key in the graph."""
-        before, heights = self.placed, self._columns[: len(self), 18].copy()
-        self.placed, self._row = [], {}
-        for placed, height in zip(before, heights, strict=True):
-            if placed.seq in keys:
-                self.put(placed, keys[placed.seq], float(height))
-
-    @property
-    def keys(self) -> npt.NDArray[np.int64]:
-        """(N,) keys in the graph."""
-        return self._columns[: len(self), 19].astype(np.int64)
-
-    @property
-    def sigma(self) -> F64:
-        """(N,) m of the place."""
-        return self._columns[: len(self), 17]
-
-    def change(self, T: F64, scales: F64) -> F64:
-        """(N,) metres by which the keyframes or their ground are off, given where they are now."""
-        rows = self._columns[: len(self)]
-        return change(rows[:, :16].reshape(-1, 4, 4), rows[:, 16], rows[:, 18], T, scales)
-
-
 class Trajectory:
     """Keyframe poses of one scan, segment by segment.
 
@@ -126,7 +72,8 @@ class Trajectory:
         """``graph`` places the keyframes; a :class:`PoseGraph` when left out."""
         self.graph = PoseGraph() if graph is None else graph
         self._ledger = Ledger(KEYFRAME)
-        self._published = _Published()
+        self._published: dict[int, Placed] = {}  # nodes as they were last published, in order
+        self._checked = -1  # version of the graph that they were compared with
         self._seqs = array("q")  # numbers of all keyframes, as in the ledger
         self._nodes: list[int] = []  # their numbers, in order
         self._generation = 0  # of the graph
@@ -214,10 +161,10 @@ class Trajectory:
         segment."""
         if a not in self.graph:
             before, after = self._neighbours(a)
-            if not self._same_segment(before, after):
+            node, rows = self.graph.node(after), self._row(after) - self._row(before)
+            if node.segment != self.graph.node(before).segment:
                 return False  # no node carries it
             T = self.step_between(before, a)
-            node, rows = self.graph.node(after), self._row(after) - self._row(before)
             units = np.array([1.0] * 3 + [self.graph.scale(before)] * 3)
             step = node.covariance * np.outer(units, units) * (rows / node.weight)
             A = se3.adjoint(T)
@@ -243,27 +190,29 @@ class Trajectory:
         return nodes + self._moved_interpolated(final)
 
     def _moved_nodes(self, final: bool) -> list[Placed]:
-        published = self._published
-        if not len(published) or (published.checked == self.graph.version and not final):
+        if not self._published or (self._checked == self.graph.version and not final):
             return []
-        published.checked = self.graph.version
-        keys = published.keys
+        self._checked = self.graph.version
+        before, seqs = list(self._published.values()), list(self._published)
+        rows = self._ledger.pick(np.searchsorted(self._seqs, seqs))
+        keys = np.searchsorted(self._nodes, seqs)
         T, scales = self.graph.poses()[keys], self.graph.scales()[keys]
-        least = np.maximum(REPOSE_M, REPOSE_SIGMAS * published.sigma)
-        change, claimed = published.change(T, scales), published.sigma
+        change, claimed = moved_m(rows, T, scales), rows["sigma_m"]
         if final:
-            now = [self.place(p.seq) for p in published.placed]
+            now = [self.place(p.seq) for p in before]
             sigma = np.array([p.sigma_m for p in now])
             stale = (change > 1e-6) | (np.abs(sigma - claimed) > SIGMA_SHARE * claimed)
             return [now[i] for i in np.flatnonzero(stale)]
-        rows = np.flatnonzero(change > least)
+        moved = np.flatnonzero(change > np.maximum(REPOSE_M, REPOSE_SIGMAS * claimed))
+        self._owe([before[i].seq for i in moved])
         # In flight with the sigmas published before: newer readings have only made them smaller.
-        before = [published.placed[i] for i in rows]
-        self._owe([p.seq for p in before])
         return [
-            Placed(p.seq, T[i], float(scales[i]), p.covariance, self.graph.sources(p.seq))
-            for i, p in zip(rows, before, strict=True)
-        ]
+            replace(
+                before[i], T_world_camera=T[i], scale=float(scales[i]),
+                sources=self.graph.sources(before[i].seq),
+            )
+            for i in moved
+        ]  # fmt: skip
 
     def _owe(self, seqs: Sequence[int]) -> None:
         """Look at the keyframes on both sides of these nodes soon."""
@@ -301,7 +250,7 @@ class Trajectory:
         rows, number, span = rows[published], number[published], span[published]
         T, scales = interpolated(rows, number, span, self._spans(spans))
         known = [
-            self.place(before) if final else self._published.of(before) or self.place(before)
+            self.place(before) if final else self._published.get(before) or self.place(before)
             for before, _ in spans
         ]
         sigma = np.array([one.sigma_m for one in known])[span]
@@ -318,11 +267,11 @@ class Trajectory:
 
         Returns how often it had been published before, and its scale over the first published.
         """
-        if placed.seq in self.graph:
-            node = self.graph.node(placed.seq)
-            self._published.put(placed, node.key, node.height or 1.0)
         row = self._row(placed.seq)
         rows = self._read(row)
+        if placed.seq in self.graph:
+            self._published[placed.seq] = placed
+            rows["sigma_m"] = placed.sigma_m
         rows["published"] += 1
         rows["pose"], rows["scale"] = placed.T_world_camera[:3], placed.scale
         if rows["published"][0] == 1:
@@ -338,11 +287,8 @@ class Trajectory:
             return
         self._generation = self.graph.generation
         self._nodes = list(self.graph.seqs)
-        self._published.thin({seq: key for key, seq in enumerate(self._nodes)})
+        self._published = {seq: p for seq, p in self._published.items() if seq in self.graph}
         self._pending = deque(seq for seq in self._pending if seq in self.graph)
-
-    def _same_segment(self, a: int, b: int) -> bool:
-        return self.graph.node(a).segment == self.graph.node(b).segment
 
     def _neighbours(self, seq: int) -> tuple[int, int]:
         """The nodes before and after a keyframe that is none."""
