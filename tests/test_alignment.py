@@ -92,7 +92,8 @@ def test_a_fit_ends_within_a_hundredth_of_its_sigma(
     soon = fit(some)
     for name in ("SETTLED", "SETTLED_START"):
         monkeypatch.setattr(alignment, name, 1e-12)
-    late = fit(some, iterations=200)
+    monkeypatch.setattr(alignment, "ITERATIONS", 200)
+    late = fit(some)
     assert soon is not None and late is not None
     step = np.r_[se3.so3_log(soon.R @ late.R.T), soon.t - late.t, np.log(soon.scale / late.scale)]
     assert 0.0 < step @ np.linalg.solve(late.covariance, step) < 0.01**2

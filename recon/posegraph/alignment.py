@@ -72,6 +72,9 @@ SETTLED = 1e-3
 SETTLED_START = 0.1
 """The same for a fit that only starts another one, or whose residuals give the noise."""
 
+ITERATIONS = 30
+"""Steps of a fit before it must stand; ten more may follow without what is wild."""
+
 ROUNDS = 4
 """Times that the noise of altitudes and the tilt by them are found in turn."""
 
@@ -134,7 +137,6 @@ def fit(
     anchors: Sequence[Anchor],
     fix_s: float = 60.0,
     attitude_s: float = 40.0,
-    iterations: int = 30,
     slow_share: float = 1.0,
     usual: ReadingNoise | None = None,
 ) -> Similarity | None:
@@ -159,16 +161,16 @@ def fit(
         usable = [replace(a, prior=replace(a.prior, travel=None)) for a in usable]
         readings = AlignmentReadings(usable, wander_s=wander_s)
     starts = _starts(usable, readings)
-    found = [_solve(readings, start, iterations, SETTLED_START) for start in starts]
+    found = [_solve(readings, start, SETTLED_START) for start in starts]
     best = min(found, key=lambda f: f.cost)
-    noise = _measured(usable, best.at, wander_s, iterations, slow_share)
+    noise = _measured(usable, best.at, wander_s, slow_share)
     noise = noise.or_else(usual, readings.claimed)
     readings = AlignmentReadings(usable, noise, wander_s)
-    best = _solve(readings, best.at, iterations, SETTLED)
+    best = _solve(readings, best.at, SETTLED)
     covariance = _covariance(readings, best)
     if readings.is_height_assumed:
         others = AlignmentReadings([replace(a, height=None) for a in usable], noise, wander_s)
-        measured = _solve(others, best.at, iterations, SETTLED)
+        measured = _solve(others, best.at, SETTLED)
         known = _covariance(others, measured)
         if known[6, 6] < GUESSED_SHARE**2:  # the assumed height would pull the scale
             readings, best, covariance = others, measured, known
@@ -207,7 +209,6 @@ def _measured(
     anchors: Sequence[Anchor],
     start: AlignmentState,
     wander_s: tuple[float, float],
-    iterations: int,
     slow_share: float,
 ) -> ReadingNoise:
     """The noise of fixes and of velocities, each by its residuals to the track as it alone, with
@@ -224,12 +225,12 @@ def _measured(
         alike = Noise(float(np.median(fixes.claimed[:, :2])), 0.0, max(wander_s[0], 1.0))
         fixes = AlignmentReadings(fixed, ReadingNoise(apart=(alike, alike)), wander_s)
     for _ in range(1 if fixes.is_height_claimed else ROUNDS):
-        at = _solve(fixes, at, iterations, SETTLED_START).at
+        at = _solve(fixes, at, SETTLED_START).at
         out = _of_fixes(fixes, at, wander_s, slow_share)
         fixes = AlignmentReadings(fixed, out, wander_s)
     ways = AlignmentReadings(moved, None, wander_s)
     if len(ways.way) >= MIN_READINGS:
-        drift = ways.moved(_solve(ways, start, iterations, SETTLED_START).at)
+        drift = ways.moved(_solve(ways, start, SETTLED_START).at)
         found = drift_noise(np.cumsum(ways.way_s), np.cumsum(drift, axis=0))
         if found is not None:
             # A steady error along a leg looks like another scale: no residual shows it.
@@ -331,15 +332,13 @@ class _Solution:
     kept: F64  # (groups,) 0 for what is left out
 
 
-def _solve(
-    readings: AlignmentReadings, at: AlignmentState, iterations: int, settled: float
-) -> _Solution:
+def _solve(readings: AlignmentReadings, at: AlignmentState, settled: float) -> _Solution:
     """Gauss-Newton with Huber's weights, until a step of ``settled`` sigmas."""
     group, kept = readings.group, np.ones(int(readings.group[-1]) + 1)
     H, cost, extra = np.eye(UNKNOWNS), np.inf, np.zeros((2, len(readings.fix)))
     weight = kept
     ridge = np.diag([1e-6] * 6 + [1e-4] + [0.0] * 4)
-    for i in range(iterations + 10):
+    for i in range(ITERATIONS + 10):
         r, J = readings.linearised(at)
         norms = np.sqrt(np.bincount(group, weights=r**2, minlength=len(kept)))
         cost = float(np.sum(np.where(norms < HUBER, 0.5 * norms**2, HUBER * (norms - HUBER / 2))))
@@ -354,7 +353,7 @@ def _solve(
         step[:3] = np.clip(step[:3], -0.5, 0.5)
         step[6:10] = np.clip(step[6:10], -0.5, 0.5)
         at = at.moved(step)
-        stands = step @ H @ step < settled**2 or i >= iterations - 1
+        stands = step @ H @ step < settled**2 or i >= ITERATIONS - 1
         if stands and not (kept.all() and _leave_out(readings, norms, kept)):
             break
     return _Solution(_centred(readings, at, weight), H, cost, r, kept)

@@ -57,12 +57,12 @@ class Readings:
         config: PoseGraphConfig,
         smoother: Smoother,
         counts: Counter[str],
-        keyframes: int = 1,
-        span_s: float = 0.0,
-        altitude_offset_m: float | None = None,
+        keyframes: int,
+        span_s: float,
+        altitude_offset_m: float | None,
     ) -> None:
         """``keyframes`` are known so far over ``span_s``; ``altitude_offset_m`` is altitude less
-        world z, by default that of the first reading."""
+        world z; None: that of the first reading."""
         self._config, self._smoother, self._counts = config, smoother, counts
         self._huber = config.huber_sigmas
         self._keyframes, self._span_s = max(keyframes, 1), max(span_s, 1.0)
@@ -99,9 +99,7 @@ class Readings:
             return False
         sigma = ratio[1] * float(np.sqrt(BLOCK * self._config.blocks_per_height))
         measured = ratio[0] - float(np.log(scale))
-        self._smoother.add_scale(
-            "height", (NO_SCALE, scale_key), measured, sigma, self._config.huber_sigmas
-        )
+        self._smoother.add_scale("height", (NO_SCALE, scale_key), measured, sigma, self._huber)
         return True
 
     def _attitude(self, node: Node, T: F64, spread: F64, is_placed: bool) -> bool:
@@ -144,9 +142,7 @@ class Readings:
             sigma = np.maximum(each, MIN_FIX_M)
         else:
             sigma = sigma * self._inflated(wander_s_of(float(sigma[0]), self._config.fix_s))
-        self._smoother.add_place(
-            "position", node.key, prior.position_m, sigma, self._config.huber_sigmas
-        )
+        self._smoother.add_place("position", node.key, prior.position_m, sigma, self._huber)
         return True
 
     def _altitude(self, node: Node, T: F64) -> bool:

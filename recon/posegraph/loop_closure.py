@@ -39,10 +39,6 @@ class LoopConfig:
     pnp: pnp.PnpConfig = field(default_factory=lambda: pnp.PnpConfig(min_inliers=30))
     icp: IcpConfig = field(default_factory=IcpConfig)
 
-    def without_gap(self) -> LoopConfig:
-        """The same for keyframes that are known not to be neighbours."""
-        return replace(self, min_gap=1)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopView:
@@ -105,29 +101,27 @@ def plane_normal(points: F64) -> F64:
 
 
 def candidates(
-    poses: Mapping[int, F64], newest: int, K: F64, size_px: tuple[int, int], ground: F64,
-    config: LoopConfig | None = None,
-) -> list[tuple[int, float]]:  # fmt: skip
-    """Earlier keyframes that see what ``newest`` sees, with the share of its view, best first.
+    poses: Mapping[int, F64], K: F64, size_px: tuple[int, int], ground: F64, min_overlap: float
+) -> list[tuple[int, float]]:
+    """Keyframes that see at least ``min_overlap`` of what the last one sees, with the share of its
+    view, best first.
 
-    ``poses`` are T_world_camera (4, 4) by keyframe number; ``ground`` (N, 3) is what the newest
+    ``poses`` are T_world_camera (4, 4) by keyframe number; ``ground`` (N, 3) is what the last one
     sees, in its camera's frame (:func:`ground_seen`).
     """
-    config = config or LoopConfig()
     W, H = size_px
     if not len(ground):
         return []
+    *earlier, newest = poses
     ground = se3.transform(poses[newest], ground)
-    order = list(poses)
-    position = order.index(newest)
     found = []
-    for seq in order[: max(position - config.min_gap + 1, 0)]:
+    for seq in earlier:
         there = se3.transform(se3.inverse(poses[seq]), ground)
         seen = project(K, there)
         inside = (seen >= 0).all(axis=1) & (seen <= [W - 1, H - 1]).all(axis=1)
         inside &= there[:, 2] > 0
         share = float(np.mean(inside))
-        if share >= config.min_overlap:
+        if share >= min_overlap:
             found.append((seq, share))
     here = poses[newest][:3, 3]
     return sorted(

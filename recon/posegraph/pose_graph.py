@@ -57,9 +57,7 @@ class PoseGraph:
         self._thin_at = self.config.max_nodes
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
-        self.segments = SegmentFrames(
-            self.config.min_anchors, self.config.fix_s, self.config.attitude_s
-        )
+        self.segments = SegmentFrames(self.config)
         self.loops = LoopBook(self.config, self)
         self._built = 0
         self._start()
@@ -96,7 +94,9 @@ class PoseGraph:
             np.array(covariance, np.float64), self._fresh(sound(prior)), above, lean,
         )  # fmt: skip
         last = self._newest() if self._nodes else None
-        self._keep(node)
+        self.entered += 1
+        self._nodes[node.seq] = node
+        self.segments.keep(node)
         is_refitted = self.segments.refit(segment, self._smoother.pose)
         if len(self) >= self._thin_at:
             self._thin()
@@ -298,11 +298,6 @@ class PoseGraph:
             and "gnss" not in used
             and self.segments.rests_on_fixes(node.segment)
         }
-
-    def _keep(self, node: Node) -> None:
-        self.entered += 1
-        self._nodes[node.seq] = node
-        self.segments.keep(node)
 
     def _insert(self, node: Node, last: Node | None) -> None:
         self._sources.append({"vision"})

@@ -14,7 +14,7 @@ from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.anchors import GUESSED_SHARE, Anchor, guessed_at
 from recon.posegraph.between_keyframes import at_camera
-from recon.posegraph.records import Node
+from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.sensor_offsets import Constants, Offsets, constants, offsets
 from recon.types import F64, PosePrior
 
@@ -29,13 +29,9 @@ SETTLED = 100
 class SegmentFrames:
     """Keyframes by segment, and each segment's similarity once telemetry or a loop gives it."""
 
-    def __init__(self, min_anchors: int, fix_s: float = 60.0, attitude_s: float = 40.0) -> None:
-        """``min_anchors`` keyframes must be there before telemetry places a segment.
-
-        Fixes and attitudes wander with the time constants ``fix_s`` and ``attitude_s``.
-        """
+    def __init__(self, config: PoseGraphConfig) -> None:
         self.nodes: dict[int, list[Node]] = {}
-        self._least, self._wander_s = min_anchors, (fix_s, attitude_s)
+        self._least, self._wander_s = config.min_anchors, (config.fix_s, config.attitude_s)
         self._constants: dict[int, Constants] = {}  # that the frame was fitted with
         self._frames: dict[int, Similarity] = {}
         self._offsets: dict[int, Offsets] = {}

@@ -18,12 +18,16 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import project, rays
-from recon.posegraph.loop_closure import LoopClosure, LoopView, landmarks, warps
+from recon.posegraph.loop_closure import (
+    MIN_RAD,
+    MIN_SHARE,
+    LoopClosure,
+    LoopView,
+    landmarks,
+    warps,
+)
 from recon.tracking import matching
 from recon.types import F32, F64, I64, Bool, DepthMap, Keyframe
-
-MIN_RAD, MIN_SHARE = 2e-4, 0.1
-"""A loop's sigmas are no less than this, and than this share of its depths' sigma."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,7 +11,6 @@ import numpy.typing as npt
 
 from recon.camera_model import scaled_K
 from recon.posegraph.loop_closure import (
-    LoopClosure,
     LoopConfig,
     LoopView,
     candidates,
@@ -112,7 +110,6 @@ class LoopSearch:
         is forgotten.
         """
         self._max_views = max_views
-        self.counts: Counter[str] = Counter()  # "tried", "verified", "taken"
         self.trajectory = trajectory
         self._config = config or LoopConfig()
         self._kept: dict[int, _Kept] = {}
@@ -139,11 +136,12 @@ class LoopSearch:
     def _search(self, new: _Kept) -> None:
         view = new.unpacked(self.trajectory.scale(new.seq))
         for seq in self._likely(new, view):
-            self.counts["tried"] += 1
             guess = self.trajectory.step_between(seq, new.seq)
             known = self._kept[seq].unpacked(self.trajectory.scale(seq))
             found = verify(known, view, guess, self._config)
-            if found is not None and self._add(seq, new, found):
+            if found is not None and self.trajectory.add_loop(
+                seq, new.seq, found.T_a_b, found.covariance, found.growth
+            ):
                 self._tied = new
                 return
 
@@ -156,13 +154,6 @@ class LoopSearch:
         step = self.trajectory.map_pose(new.seq) - self.trajectory.map_pose(tied.seq)
         moved = float(np.linalg.norm(step[:3, 3] + distance * step[:3, 2]))
         return moved < MOVED * distance * float(np.hypot(*new.size_px)) / float(new.K[0, 0])
-
-    def _add(self, seq: int, new: _Kept, found: LoopClosure) -> bool:
-        """True when the graph accepts the loop."""
-        self.counts["verified"] += 1
-        taken = self.trajectory.add_loop(seq, new.seq, found.T_a_b, found.covariance, found.growth)
-        self.counts["taken"] += taken
-        return taken
 
     def _likely(self, new: _Kept, view: LoopView) -> list[int]:
         """Earlier keyframes worth a verification, the best first."""
@@ -180,10 +171,11 @@ class LoopSearch:
         apart = np.linalg.norm(ahead - (here[:3, 3] + depth_m * here[:3, 2]), axis=1)
         some = {seqs[i]: there[i] for i in np.argsort(apart)[:8] if apart[i] < reach}
         some[new.seq] = here
-        config = self._config.without_gap()
-        ground = ground_seen(view.depth)
-        found = [s for s, _ in candidates(some, new.seq, new.K, new.size_px, ground, config)]
-        return list(dict.fromkeys(self._by_look(new, seqs) + found))[:TRIES]
+        found = candidates(
+            some, new.K, new.size_px, ground_seen(view.depth), self._config.min_overlap
+        )
+        by_place = [seq for seq, _ in found]
+        return list(dict.fromkeys(self._by_look(new, seqs) + by_place))[:TRIES]
 
     def _by_look(self, new: _Kept, seqs: list[int]) -> list[int]:
         """Earlier keyframes that look like this one, the most similar first; some of them at a

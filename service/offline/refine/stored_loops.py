@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from recon import se3
 from recon.posegraph.ground_control import KeyframeTrack
-from recon.posegraph.loop_closure import LoopConfig, LoopView, candidates, ground_seen
+from recon.posegraph.loop_closure import LoopView, candidates, ground_seen
 from recon.posegraph.records import Loop
 from recon.posegraph.submap_loops import SubmapLoopConfig, filled, verify_surfaces
 from recon.types import F64, Keyframe
@@ -71,12 +71,11 @@ class FilledViews:
         return LoopView(gray, whole.depth.K, whole.depth)
 
 
-def likely(view: LoopView, b: int, poses: Mapping[int, F64], config: SubmapLoopConfig) -> list[int]:
-    """Numbers of the ``poses`` that see what ``view``, of the last of them, ``b``, sees, best
-    first; few are worth a look."""
-    h, w = view.depth.depth_m.shape
-    options = LoopConfig(min_gap=1, min_overlap=config.min_overlap)
-    found = candidates(poses, b, view.K, (w, h), ground_seen(view.depth), options)
+def likely(view: LoopView, poses: Mapping[int, F64], config: SubmapLoopConfig) -> list[int]:
+    """Numbers of the ``poses`` that see what ``view``, of the last of them, sees, best first; few
+    are worth a look."""
+    size_px = view.depth.depth_m.shape[::-1]
+    found = candidates(poses, view.K, size_px, ground_seen(view.depth), config.min_overlap)
     return [a for a, _ in found[:TRIES]]
 
 
@@ -142,7 +141,7 @@ class StoredLoops:
         if view is None:
             return []
         poses = {a: self._track.poses[a] for a in (*earlier, b)}
-        return likely(view, b, poses, self._config)
+        return likely(view, poses, self._config)
 
     def _verified(self, a: int, b: int) -> Loop | None:
         reach = self._reach(a, b)

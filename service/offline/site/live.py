@@ -226,7 +226,7 @@ class LiveSite:
         view, found = one.views.view(k), 0
         if view is None:
             return
-        for a in likely(view, STRIDE, poses, CONFIG):
+        for a in likely(view, poses, CONFIG):
             first, second = sorted(((other, a), (one, k)), key=lambda end: end[0].number)
             ends = first[0].key(first[1]), second[0].key(second[1])
             if ends in self._loops or found == LOOPS_PER_KEYFRAME:
