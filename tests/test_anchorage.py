@@ -111,7 +111,7 @@ def test_carriers_keep_their_places_when_they_settle() -> None:
 
 def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None:
     """The graph is at work then on another thread: nothing asks it, nothing waits for it."""
-    chain: Any = Chain(Trajectory(), before(0), Counter(), Stopwatch())
+    chain: Any = Chain(Trajectory(), None, before(0), Counter(), Stopwatch())
     key = refined(3, 0, some_pose())
     frame, anchor = Anchorage(7, key, some_pose()), Anchorage(5, key, some_pose())
     image = SimpleNamespace(prior=PosePrior())
@@ -138,7 +138,7 @@ def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None
 
 def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> None:
     """Its keyframe carries them by a scale and a heading that nothing shows."""
-    chain: Any = Chain(Trajectory(), before(0), Counter(), Stopwatch())
+    chain: Any = Chain(Trajectory(), None, before(0), Counter(), Stopwatch())
     key, fix = refined(3, 0, np.eye(4)), np.array([20.0, -10.0, 50.0])
     prior = PosePrior(position_m=fix, sigma_position_m=np.full(3, 5.0))
     view = SimpleNamespace(

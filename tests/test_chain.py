@@ -23,7 +23,7 @@ def anchor(seq: int, north_m: float) -> Anchorage:
 
 
 def following() -> Any:
-    chain = Chain(Trajectory(), lambda key: True, Counter(), Stopwatch())
+    chain = Chain(Trajectory(), None, lambda key: True, Counter(), Stopwatch())
 
     def follow(seq: int, north_m: float, fix: F64 | None = None) -> Placed:
         sigma = None if fix is None else np.full(3, 5.0)

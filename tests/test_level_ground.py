@@ -75,7 +75,7 @@ def test_ground_without_a_plane_levels_nothing() -> None:
 
 @pytest.mark.parametrize(("steep", "is_levelled"), [(1, False), (2, False), (3, True), (10, True)])
 def test_a_few_steep_views_do_not_doubt_the_mount_of_all(steep: int, is_levelled: bool) -> None:
-    chain: Any = Chain(Trajectory(), lambda key: True, Counter(), Stopwatch())
+    chain: Any = Chain(Trajectory(), None, lambda key: True, Counter(), Stopwatch())
     for seq in range(10):
         R, T = looking(-40 if seq < steep else -90), np.eye(4)
         T[0, 3] = seq

@@ -183,6 +183,7 @@ def test_stills_of_other_places_are_not_joined() -> None:
     assert {f.segment for f in found[4:]} == {1}
     first = found[4].before  # the segment begins with the still that was lost when it came
     assert first is not None and first.state == "keyframe" and first.segment == 1
+    assert first.reason == found[3].reason
     assert first.T_odom_camera is not None and found[4].T_odom_camera is not None
     assert np.linalg.norm((first.T_odom_camera - found[4].T_odom_camera)[:3, 3]) > 1.0
     assert [f.before for f in found if f is not found[4]] == [None] * 5

@@ -72,7 +72,7 @@ class Tracked:
     tracks: int = 0
     reason: str = ""
     moving: FrameRows | None = None  # its rows' motion, better once its neighbours are known
-    before: Tracked | None = None  # the still before, lost when it came, now a segment's first
+    before: Tracked | None = None  # the still before, now a segment's first, and why it was lost
 
 
 class Odometry:
@@ -97,7 +97,7 @@ class Odometry:
         self.segment = -1
         self._metric = False  # the current segment has landmarks
         self._lost = 0
-        self._missed_still: TrackingFrame | None = None  # the last frame, when it has no pose
+        self._missed_still: tuple[TrackingFrame, str] | None = None  # the last frame, and why
         self._motion: Motion | None = None
         features = FeatureCache()
         self.exposure = ExposureWatch()
@@ -191,16 +191,17 @@ class Odometry:
         """Count a frame without a pose; after too many, or two stills, begin a new segment."""
         self._lost += 1
         if self._still and self._missed_still is not None and self._lost >= 2:
-            first, self._missed_still = self._missed_still, None
+            (first, why), self._missed_still = self._missed_still, None
             started = self._start(first)
             if started.state is Tracking.STARTED:
                 second = self._second_view(new)
                 if second.state is Tracking.KEYFRAME:
-                    return replace(second, before=replace(started, state=Tracking.KEYFRAME))
+                    before = replace(started, state=Tracking.KEYFRAME, reason=why)
+                    return replace(second, before=before)
                 return second
         elif not self._still and self._lost >= self.config.lost_after:
             self._start(new)
-        self._missed_still = new if self._still else None
+        self._missed_still = (new, reason) if self._still else None
         return Tracked(Tracking.LOST, self.segment, reason=reason)
 
     def _start(self, new: TrackingFrame) -> Tracked:

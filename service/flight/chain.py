@@ -75,13 +75,14 @@ class Chain:
     def __init__(
         self,
         trajectory: Trajectory,
+        loops: LoopSearch | None,
         is_settled: Callable[[Key], bool],
         rejected: Counter[str],
         stopwatch: Stopwatch,
     ) -> None:
         """``is_settled`` marks keyframes that the odometry no longer adjusts."""
         self.trajectory, self.watch = trajectory, GraphWatch(trajectory.graph)
-        self.loops: LoopSearch | None = None
+        self._loops = loops
         self.views = self.levelled = 0  # keyframes, and those whose ground is taken as level
         self._carriers, self._is_settled = Carriers(), is_settled
         self._known: dict[int, tuple[F64, Uncarried]] = {}  # by segment, its last frame with a fix
@@ -108,7 +109,7 @@ class Chain:
     @property
     def held(self) -> dict[str, int]:
         """Views that are remembered for loops, and keyframes in the graph."""
-        views = 0 if self.loops is None else len(self.loops)
+        views = 0 if self._loops is None else len(self._loops)
         return {"loop_views": views, "graph_keyframes": len(self.graph)}
 
     # ---- keyframes ---------------------------------------------------------------------
@@ -128,9 +129,9 @@ class Chain:
         self.trajectory.add(
             view.seq, view.segment, self._T_map, prior, height, view.time_ns, motion.covariance,
         )  # fmt: skip
-        if depth is not None and self.loops is not None:
+        if depth is not None and self._loops is not None:
             with self._stopwatch("loops"):
-                self.loops.look(view.seq, view.segment, view.view.gray, view.view.K, depth)
+                self._loops.look(view.seq, view.segment, view.view.gray, view.view.K, depth)
         placed = self.trajectory.place(view.seq)
         is_near = bool(np.abs(placed.T_world_camera[:3, 3]).max() < FARTHEST_M)
         if depth is not None and is_near:

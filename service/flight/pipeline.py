@@ -87,14 +87,14 @@ class Pipeline:
         depths = s.carry(view, grid)  # by images that are matched already
         pairs = s.rectify(view, depths)  # virtual stereo pairs, section 2.1
         if pairs:
-            depth = s.whole_path(pairs.values(), grid)  # Eq. 1-3 at once, where a device can
+            depth = s.stereo.whole_path(pairs.values(), grid)  # Eq. 1-3 at once, where a device can
         if depth is None and (pairs or depths):
             for partner, pair in pairs.items():
-                disparity = s.match(pair)  # belief propagation, Eq. 1
-                disparity = s.upsample(disparity, pair)  # joint bilateral upsampling, Eq. 2
-                depths[partner] = s.reproject(disparity, pair, grid)  # Eq. 3
+                disparity = s.stereo.match(pair)  # belief propagation, Eq. 1
+                disparity = s.stereo.upsample(disparity, pair)  # joint bilateral, Eq. 2
+                depths[partner] = s.stereo.reproject(disparity, pair, grid)  # Eq. 3
             s.carry.keep(view.seq, depths)
-            depth = s.fuse([*depths.values()], grid)
+            depth = s.stereo.fuse([*depths.values()], grid)
         bgr = s.rectify.colours(view, grid)
         depth = s.plausible(view, depth, bgr)  # nothing that cannot be
         s.rectify.learn(depth)  # how far the relief of the next pairs may reach

@@ -110,7 +110,8 @@ class Undistort:
         """Raises ValueError when the image is not of the camera model's size."""
         with self._stopwatch("undistort"):
             image = _resized(frame.image, self.camera.size_px)
-            gray = self._undistorter.image(_gray(image))
+            gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+            gray = self._undistorter.image(gray)
             small, size = gray, self.tracking_camera.size_px
             if size != self.camera.size_px:
                 small = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -134,7 +135,6 @@ class Track:
     ) -> None:
         self.odometry, self._selection = odometry, selection
         self._refused, self._stopwatch = refused, stopwatch
-        self._lost = ""  # why the last lost frame has no pose
         self.waiting = Counter[str]()
         """Frames since the segment's first one that wait for its second view, by reason."""
 
@@ -149,12 +149,11 @@ class Track:
                 image.small, image.seq, image.time_ns, image.prior, image.mask, image.is_blurred
             )
         if tracked.before is not None:
-            self._refused -= Counter([self._lost])
+            self._refused -= Counter([tracked.before.reason])
         if tracked.state is Tracking.WAITING:
             self.waiting[tracked.reason] += 1
         elif tracked.T_odom_camera is None:
             self._refused[tracked.reason] += 1
-            self._lost = tracked.reason
         else:
             if tracked.state is Tracking.STARTED:  # the segment before never began
                 self._refused.update(self.waiting)
@@ -413,11 +412,7 @@ class Stages:
     views: StereoViews
     carry: Carry
     rectify: Rectify
-    whole_path: Callable[[Collection[RectifiedPair], ViewGrid], DepthMap | None]
-    match: Callable[[RectifiedPair], DisparityMap]
-    upsample: Callable[[DisparityMap, RectifiedPair], DisparityMap]
-    reproject: Callable[[DisparityMap, RectifiedPair, ViewGrid], PairDepth]
-    fuse: Callable[[Sequence[PairDepth], ViewGrid], DepthMap]
+    stereo: PairStages
     plausible: Plausible
     register: Register
     chain: Chain
@@ -472,8 +467,11 @@ def build_stages(
         UpsamplingConfig(),
         DepthFusionConfig(),
     )
-    pair = PairStages(backend, dense, debug, stopwatch)
     views = StereoViews(selection, odometry, undistort.camera, undistort.valid, refused)
+    graph = PoseGraph(PoseGraphConfig(max_nodes=config.fusion.graph_keyframes))
+    trajectory, loops = Trajectory(graph=graph), None
+    if config.fusion.loops:
+        loops = LoopSearch(trajectory, max_views=config.fusion.loop_views)
     surface = SurfaceMap(
         pages, compute.map_voxels, config.scan.resolution_m, stopwatch, float(camera.K[0, 0]),
         assumed,
@@ -486,14 +484,10 @@ def build_stages(
         views=views,
         carry=Carry(backend, stopwatch),
         rectify=Rectify(stereo, rejected, debug, stopwatch),
-        whole_path=pair.whole_path,
-        match=pair.match,
-        upsample=pair.upsample,
-        reproject=pair.reproject,
-        fuse=pair.fuse,
+        stereo=PairStages(backend, dense, debug, stopwatch),
         plausible=Plausible(rejected),
         register=Register(backend, stopwatch),
-        chain=_chain(config, track.is_settled, rejected, stopwatch),
+        chain=Chain(trajectory, loops, track.is_settled, rejected, stopwatch),
         map=surface,
         keyframe=MakeKeyframe(debug),
         in_background=partial(DenseWorker, row, bound=MAX_WAITING, live=live),
@@ -502,23 +496,6 @@ def build_stages(
         rejected=rejected,
         debug=debug,
     )
-
-
-def _chain(
-    config: Config, is_settled: Callable[[Key], bool], rejected: Counter[str], stopwatch: Stopwatch
-) -> Chain:
-    """The pose graph and all that depends on it."""
-    graph = PoseGraph(PoseGraphConfig(max_nodes=config.fusion.graph_keyframes))
-    trajectory = Trajectory(graph=graph)
-    chain = Chain(trajectory, is_settled, rejected, stopwatch)
-    if config.fusion.loops:
-        chain.loops = LoopSearch(trajectory, max_views=config.fusion.loop_views)
-    return chain
-
-
-def _gray(image: U8) -> U8:
-    """(H, W) of (H, W, 3)."""
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 def _resized(image: U8, size_px: tuple[int, int]) -> U8:
