@@ -15,7 +15,7 @@ from loopback import free_port
 from pymavlink import mavutil, mavwp  # type: ignore[import-untyped]
 from typer.testing import CliRunner
 
-from recon.surface.coverage import CoverageMap, Footprint
+from recon.surface.coverage import PLACE, CoverageMap
 from recon.types import F64, DepthMap
 from service.cli import app
 from service.errors import InputError
@@ -167,10 +167,11 @@ def test_what_cannot_be_planned_says_why() -> None:
     with pytest.raises(InputError, match="height above ground"):
         suggest(covered(two_lines()), 5.0, None, relative=True)
     with pytest.raises(InputError, match="single keyframe"):
-        refly.flown_swath([Footprint(np.zeros((4, 2)), np.zeros(2), np.zeros(3))], FRAME, 1.0, 1.0)
-    standing = Footprint(np.eye(4, 2), np.zeros(2), np.zeros(3))
+        refly.flown_swath(np.zeros(1, PLACE), FRAME, 1.0, 1.0)
+    standing = np.zeros(3, PLACE)
+    standing["corners_m"] = np.eye(4, 2)
     with pytest.raises(InputError, match="never moved"):
-        refly.flown_swath([standing] * 3, FRAME, 1.0, 1.0)
+        refly.flown_swath(standing, FRAME, 1.0, 1.0)
 
 
 def wanted(flight: Refly) -> list[tuple[int, int, float, float, float]]:

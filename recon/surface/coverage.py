@@ -54,12 +54,6 @@ class _Cells:
     weight: F32 = field(default_factory=lambda: np.zeros((TILE, TILE), np.float32))
     seen_s: F32 = field(default_factory=lambda: np.full((TILE, TILE), -np.inf, np.float32))
 
-    def forget_surface(self) -> None:
-        self.sigma.fill(np.inf)
-        self.weight.fill(0.0)
-        self.height.fill(0.0)
-        self.seen_s.fill(-np.inf)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoverageGrid:
@@ -155,24 +149,21 @@ class CoverageMap:
         A keyframe that moved leaves stale tiles; :meth:`refill` recomputes them. So does one with
         ``finer`` depth than before. One without any depth is skipped.
         """
-        place = footprint(depth)
-        if place is None:
+        row = footprint(depth)
+        if row is None:
             return
         if self._first_ns is None:
             self._first_ns = time_ns
         at = self._row(seq)
         before = None if at is None else self._ledger.read(at, at + 1)[0]
         if before is not None:
-            shift_m = np.abs(footprint_of(before).corners_m - place.corners_m).max()
+            shift_m = np.abs(before["corners_m"] - row["corners_m"][0]).max()
             if not finer and shift_m < 0.25 * self.cell_m:
                 return  # too little to change any cell
-            self._count(footprint_of(before), -1)
+            self._count(before["corners_m"], -1)
             self._stale |= self._within(before)
-        self._count(place, +1)
-        row = np.zeros(1, PLACE)
+        self._count(row["corners_m"][0], +1)
         row["seq"], row["seen_s"] = seq, (time_ns - self._first_ns) * 1e-9
-        row["corners_m"], row["centre_m"] = place.corners_m, place.centre_m
-        row["camera_m"] = place.camera_m
         if at is None:
             touched = self._add_surface(row[0], depth, None)
         else:
@@ -219,7 +210,7 @@ class CoverageMap:
         """Sum up the surface of the stale tiles again, from the keyframes of :meth:`stale`."""
         for key in self._stale:
             if key in self._tiles:
-                self._tiles[key].forget_surface()
+                self._tiles[key] = _Cells(self._tiles[key].views)
         for seq, depth in depths:
             at = self._row(seq)
             if at is not None:
@@ -259,9 +250,9 @@ class CoverageMap:
 
     # ---- footprints ------------------------------------------------------------------------
 
-    def _count(self, place: Footprint, change: int) -> None:
-        """Add ``change`` to the views of all cells whose centre the footprint covers."""
-        corners = place.corners_m / self.cell_m - 0.5  # whole numbers at cell centres
+    def _count(self, corners_m: F64, change: int) -> None:
+        """Add ``change`` to the views of all cells whose centre the footprint (4, 2) covers."""
+        corners = corners_m / self.cell_m - 0.5  # whole numbers at cell centres
         low = np.floor(corners.min(axis=0)).astype(int)
         size = np.ceil(corners.max(axis=0)).astype(int) - low + 1
         if size.max() > LONGEST_CELLS or size[0] * size[1] > MAX_CELLS:
@@ -429,8 +420,8 @@ PLACE = np.dtype(
     [
         ("seq", np.int64),
         ("seen_s", np.float64),  # from the first keyframe
-        ("corners_m", np.float64, (4, 2)),  # as Footprint has them
-        ("centre_m", np.float64, (2,)),
+        ("corners_m", np.float64, (4, 2)),  # east and north, around the image
+        ("centre_m", np.float64, (2,)),  # where the middle of the image looks
         ("camera_m", np.float64, (3,)),
         ("low", np.int64, (2,)),  # first and last of the tiles with surface of it
         ("high", np.int64, (2,)),
@@ -439,17 +430,9 @@ PLACE = np.dtype(
 """A row of the ledger: what is kept of a keyframe."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Footprint:
-    """Ground that a keyframe's image covers, taken as level at its median height."""
-
-    corners_m: F64  # (4, 2) east and north, around the image
-    centre_m: F64  # (2,) where the middle of the image looks
-    camera_m: F64  # (3,)
-
-
-def footprint(depth: DepthMap) -> Footprint | None:
-    """Where a keyframe's image meets level ground; None without any depth."""
+def footprint(depth: DepthMap) -> Rows | None:
+    """A row of :data:`PLACE` with the camera and the ground that its image covers, taken as level
+    at its median height; None without any depth."""
     known = np.isfinite(depth.depth_m)
     if not known.any():
         return None
@@ -464,9 +447,6 @@ def footprint(depth: DepthMap) -> Footprint | None:
         reach = np.where(ways[:, 2] < 0, -max(drop_m, 0.0) / ways[:, 2], np.inf)
     reach = np.minimum(reach, FARTHEST * middle_m)
     ground = T[:2, 3] + reach[:, None] * ways[:, :2]
-    return Footprint(ground[:4], ground[4], T[:3, 3].copy())
-
-
-def footprint_of(place: np.void) -> Footprint:
-    """The footprint in a row of :data:`PLACE`."""
-    return Footprint(place["corners_m"], place["centre_m"], place["camera_m"])
+    row = np.zeros(1, PLACE)
+    row["corners_m"], row["centre_m"], row["camera_m"] = ground[:4], ground[4], T[:3, 3]
+    return row

@@ -18,13 +18,7 @@ import cv2
 import numpy as np
 
 from recon.posegraph.ledger import Rows
-from recon.surface.coverage import (
-    CoverageGrid,
-    CoverageMap,
-    Footprint,
-    footprint_of,
-    usual_cell_m,
-)
+from recon.surface.coverage import CoverageGrid, CoverageMap, usual_cell_m
 from recon.types import U8, Array, DepthMap
 from service.georeference import LocalFrame
 from service.scans.main_piece import Stretch, main_seqs, stretches_apart
@@ -71,11 +65,6 @@ class Coverage:
     frame: LocalFrame | None
     places: Rows  # rows of PLACE per keyframe, in order of their number
     limits: Limits
-
-    @cached_property
-    def footprints(self) -> tuple[Footprint, ...]:
-        """Footprints of the keyframes, in order of their number."""
-        return tuple(footprint_of(place) for place in self.places)
 
     @cached_property
     def weak(self) -> Array:

@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.surface.coverage import Footprint
+from recon.posegraph.ledger import Rows
 from recon.surface.raster import Grid
 from recon.types import F64, Array, Bool
 from service.errors import InputError
@@ -92,26 +92,22 @@ class Refly:
         return sum(line.length_m for line in self.lines) + ways
 
 
-def flown_swath(
-    places: Sequence[Footprint], frame: LocalFrame, speed_m_s: float, height_m: float | None
-) -> Swath:
+def flown_swath(places: Rows, frame: LocalFrame, speed_m_s: float, height_m: float | None) -> Swath:
     """Camera and flight by the keyframes' images. Raises InputError for one alone."""
     if len(places) < 2:
         raise InputError("the scan holds a single keyframe: there is no flown line to plan from")
-    cameras = np.array([p.camera_m for p in places])
+    cameras = places["camera_m"]
     steps = np.gradient(cameras[:, :2], axis=0)
     length = np.linalg.norm(steps, axis=1)
     if length.max() < 0.1:
         raise InputError("the camera never moved in this scan: there is no flown line to plan from")
     ways = steps / np.maximum(length, 1e-6)[:, None]
-    edges = np.array([[p.corners_m[1] - p.corners_m[0], p.corners_m[2] - p.corners_m[1]]
-                      for p in places])  # fmt: skip
+    edges = np.diff(places["corners_m"][:, :3], axis=1)
     sizes = np.linalg.norm(edges, axis=2)
     cosine = np.abs(np.einsum("nec,nc->ne", edges, ways)) / np.maximum(sizes, 1e-6)
     along = np.argmax(cosine, axis=1)
     rows = np.arange(len(places))
-    middles = np.array([p.centre_m for p in places])
-    ahead = np.sum((middles - cameras[:, :2]) * ways, axis=1)
+    ahead = np.sum((places["centre_m"] - cameras[:, :2]) * ways, axis=1)
     moving = length > 0.3 * np.median(length)
     return Swath(
         across_m=float(np.median(sizes[rows, 1 - along])),
@@ -257,7 +253,7 @@ def suggest(
         raise InputError("the scan has no georeference; a mission needs one (fly with GNSS)")
     if relative and height_m is None:
         raise InputError("the scan has no height above ground; omit --relative")
-    swath = flown_swath(coverage.footprints, frame, speed_m_s, height_m)
+    swath = flown_swath(coverage.places, frame, speed_m_s, height_m)
     patches = weak_patches(coverage.weak, coverage.layer.grid, swath)
     if not patches:
         return None
@@ -268,7 +264,7 @@ def suggest(
             f"{count} lines would be needed, more than {MAX_LINES}; raise --sigma-m, lower "
             "--views or fly the whole area again"
         )
-    begin = coverage.footprints[-1].camera_m[:2]
+    begin = coverage.places["camera_m"][-1, :2]
     lines = [_behind(line, swath) for line in in_order(groups, begin)]
     home = _first_place(coverage, frame, height_m)
     items = _items(lines, frame, swath, relative, photos)
@@ -288,7 +284,7 @@ def _first_place(
     coverage: Coverage, frame: LocalFrame, height_m: float | None
 ) -> tuple[float, float, float]:
     """The ground below the first keyframe."""
-    camera = coverage.footprints[0].camera_m
+    camera = coverage.places["camera_m"][0]
     lat, lon, alt = frame.to_geodetic(camera[None])[0]
     return float(lat), float(lon), float(alt) - (height_m or 0.0)
 
