@@ -12,7 +12,7 @@ from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh, cut, height_mesh
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import BORDER_PX, lay_out, pack
-from recon.surface.texture_views import CANDIDATES, TextureView, TriangleViews, consistent, look
+from recon.surface.texture_views import TextureView, TriangleViews, consistent, look
 from recon.surface.texturing import PENALTY, choose, face_neighbours, fading, levels, texture
 from recon.types import F64, U8, Array
 
@@ -142,11 +142,7 @@ def test_resolution_falls_with_distance_and_slant() -> None:
 
 def rows(view: list[list[int]], px: list[list[float]]) -> TriangleViews:
     count = len(view)
-    out = TriangleViews(
-        np.full((count, CANDIDATES), -1, np.int32),
-        np.zeros((count, CANDIDATES), np.float32),
-        np.zeros((count, CANDIDATES, 3), np.float32),
-    )
+    out = TriangleViews.none(count)
     for n in range(count):
         out.view[n, : len(view[n])] = view[n]
         out.px_per_m[n, : len(px[n])] = px[n]

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from scipy import ndimage
 from scipy.spatial import Delaunay
 
 from recon.surface.raster import Raster
-from recon.types import F32, Bool
-
-I64 = npt.NDArray[np.int64]
+from recon.types import F32, I64, Bool
 
 LARGEST_OBJECT_M = 36.0
 """Width of the widest building that is removed."""

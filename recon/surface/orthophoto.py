@@ -19,14 +19,8 @@ from recon.bands import in_bands
 from recon.image_quality import sharpness
 from recon.mapping.free_space import pixel_of
 from recon.surface.raster import Grid, Raster
-from recon.surface.texture_atlas import flat, sample
-from recon.surface.texture_views import (
-    CANDIDATES,
-    TextureView,
-    TriangleViews,
-    drop_outliers,
-    insert,
-)
+from recon.surface.texture_atlas import cameras, flat, sample
+from recon.surface.texture_views import TextureView, TriangleViews, drop_outliers, insert
 from recon.surface.texturing import levels
 from recon.types import F32, F64, I32, I64, U8, Bool
 
@@ -64,7 +58,7 @@ def orthophoto(
     Cells that no view shows take the colour of the surface model. ``progress`` is called STEPS
     times.
     """
-    lens, images = _cameras(views), flat(views)
+    lens, images = cameras(views), flat(views)
     found = _sightings(terrain, views, (*lens, *images), progress)
     progress("painting the orthophoto")
     label = found.view[:, 0].reshape(terrain.raster.grid.shape)
@@ -84,13 +78,6 @@ def orthophoto(
     return rgb, known
 
 
-def _cameras(views: Sequence[TextureView]) -> tuple[F64, F64]:
-    """(V, 3, 3) intrinsics and (V, 3, 4) world to camera."""
-    K = np.array([v.K for v in views], np.float64).reshape(-1, 3, 3)
-    T = np.array([np.linalg.inv(v.T_world_camera)[:3] for v in views]).reshape(-1, 3, 4)
-    return K, T
-
-
 def _sightings(
     terrain: Terrain,
     views: Sequence[TextureView],
@@ -101,11 +88,7 @@ def _sightings(
     less where an image is blurred; without those whose colour differs from most others."""
     raster = terrain.raster
     rows, cols = raster.grid.shape
-    out = TriangleViews(
-        np.full((rows * cols, CANDIDATES), -1, np.int32),
-        np.zeros((rows * cols, CANDIDATES), np.float32),
-        np.zeros((rows * cols, CANDIDATES, 3), np.float32),
-    )
+    out = TriangleViews.none(rows * cols)
     eyes = np.column_stack([raster.grid.pixels(terrain.eyes_m[:, :2]), terrain.eyes_m[:, 2]])
     centres = np.array([v.T_world_camera[:3, 3] for v in views]).reshape(-1, 3)
     highest = float(np.nanmax(raster.height_m, initial=-np.inf))

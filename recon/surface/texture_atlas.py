@@ -11,8 +11,9 @@ from numba import njit
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from recon.mapping.free_space import pixel_of
 from recon.surface.meshing import Mesh
-from recon.surface.texture_views import TextureView, TriangleViews
+from recon.surface.texture_views import TextureView, TriangleViews, doubled_area
 from recon.types import F32, F64, I32, I64, U8, Bool
 
 BORDER_PX = 2
@@ -69,8 +70,7 @@ def _scale_for(uv: F64) -> float:
     """1, or up to MAX_SCALE where a middling triangle would cover fewer than four texels."""
     if not len(uv):
         return 1.0
-    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    area = 0.5 * float(np.median(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])))
+    area = 0.5 * float(np.median(doubled_area(uv)))
     return float(np.clip(np.sqrt(4.0 / max(area, 1e-9)), 1.0, MAX_SCALE))
 
 
@@ -148,16 +148,19 @@ def paint(mesh: Mesh, layout: Layout, found: TriangleViews, label: I32, palette:
     done = np.zeros((h, w), np.bool_)
     views = palette.views
     pixels, start, sides = flat(views)
-    empty = np.zeros((0, 3, 3))
     _paint(
         np.ascontiguousarray(mesh.vertices_m, np.float64), mesh.faces, layout.uv_px, label,
         found.view, palette.fade_view, palette.fade_share, palette.rgb, pixels, start, sides,
-        np.array([v.K for v in views]) if views else empty,
-        np.array([np.linalg.inv(v.T_world_camera)[:3] for v in views]) if views
-        else np.zeros((0, 3, 4)),
-        palette.levels, image, done,
+        *cameras(views), palette.levels, image, done,
     )  # fmt: skip
     return _bordered(image, done)
+
+
+def cameras(views: Sequence[TextureView]) -> tuple[F64, F64]:
+    """(V, 3, 3) intrinsics and (V, 3, 4) world to camera."""
+    K = np.array([v.K for v in views], np.float64).reshape(-1, 3, 3)
+    T = np.array([np.linalg.inv(v.T_world_camera)[:3] for v in views]).reshape(-1, 3, 4)
+    return K, T
 
 
 def flat(views: Sequence[TextureView]) -> tuple[U8, I64, I64]:
@@ -224,12 +227,7 @@ def _mix(
             visible |= seen[k] == v
         if not visible:
             continue
-        cz = T[v, 2, 0] * x + T[v, 2, 1] * y + T[v, 2, 2] * z + T[v, 2, 3]
-        if cz <= 1e-6:
-            continue
-        cx = T[v, 0, 0] * x + T[v, 0, 1] * y + T[v, 0, 2] * z + T[v, 0, 3]
-        cy = T[v, 1, 0] * x + T[v, 1, 1] * y + T[v, 1, 2] * z + T[v, 1, 3]
-        px, py = K[v, 0, 0] * cx / cz + K[v, 0, 2], K[v, 1, 1] * cy / cz + K[v, 1, 2]
+        px, py, _ = pixel_of(K[v], T[v], x, y, z)
         alpha = sample(pixels, start[v], sides[v, 0], sides[v, 1], px, py, colour)
         weight = shares[n] * alpha
         total += weight

@@ -57,6 +57,15 @@ class TriangleViews:
     px_per_m: F32  # (F, CANDIDATES) geometric mean resolution on the triangle
     bgr: F32  # (F, CANDIDATES, 3) mean colour of corners and middle
 
+    @staticmethod
+    def none(count: int) -> TriangleViews:
+        """So many triangles that no view sees."""
+        return TriangleViews(
+            np.full((count, CANDIDATES), -1, np.int32),
+            np.zeros((count, CANDIDATES), np.float32),
+            np.zeros((count, CANDIDATES, 3), np.float32),
+        )
+
 
 def look(
     mesh: Mesh, views: Sequence[TextureView], progress: Callable[[float], None] = lambda _: None
@@ -73,12 +82,7 @@ def look(
     area = 0.5 * np.linalg.norm(normal, axis=1)
     tolerance = 0.3 * float(np.sqrt(2.0 * np.median(area))) if len(area) else 0.0
     middle = corners.mean(axis=1)
-    count = len(mesh.faces)
-    out = TriangleViews(
-        np.full((count, CANDIDATES), -1, np.int32),
-        np.zeros((count, CANDIDATES), np.float32),
-        np.zeros((count, CANDIDATES, 3), np.float32),
-    )
+    out = TriangleViews.none(len(mesh.faces))
     for number, view in enumerate(views):
         progress(number / len(views))
         px = _projected(view, vertices)
@@ -90,7 +94,7 @@ def look(
         faces = faces[facing > MIN_COSINE * 2.0 * area[faces] * np.linalg.norm(towards, axis=1)]
         faces = faces[_free(reach, view, middle[faces], tolerance)]
         middle_px = _projected(view, middle[faces])
-        resolution = np.sqrt(_doubled_area(px[mesh.faces[faces]]) / (2.0 * area[faces]))
+        resolution = np.sqrt(doubled_area(px[mesh.faces[faces]]) / (2.0 * area[faces]))
         places = np.concatenate([px[mesh.faces[faces]], middle_px[:, None]], axis=1)
         colour, seen = _mean_colour(view.bgra, places)
         good = seen & np.isfinite(resolution)
@@ -204,7 +208,7 @@ def _free(reach: Rays, view: TextureView, xyz: F64, tolerance_m: float) -> Bool:
     return np.asarray(hit > distance - tolerance_m - 1e-4 * distance)
 
 
-def _doubled_area(px: F64) -> F64:
+def doubled_area(px: F64) -> F64:
     """(N,) twice the area of (N, 3, 2) triangles."""
     a, b = px[:, 1] - px[:, 0], px[:, 2] - px[:, 0]
     return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
