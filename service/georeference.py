@@ -229,15 +229,9 @@ class HeightChange:
 
         Raises InputError where the grid ends.
         """
-        from pyproj.enums import TransformDirection
-
-        way = TransformDirection.INVERSE if undo else TransformDirection.FORWARD
         lat, lon, height = geodetic.T
-        # PROJ takes arrays of one element for numbers.
-        *_, changed = self.transformer.transform(
-            lon.tolist(), lat.tolist(), height.tolist(), direction=way
-        )
-        out = np.column_stack([lat, lon, np.asarray(changed, np.float64)])
+        changed = _apply(self.transformer, lon, lat, height, inverse=undo)[:, 2]
+        out = np.column_stack([lat, lon, changed])
         if not np.isfinite(out[np.isfinite(height), 2]).all():
             raise InputError(f"{self.words}: PROJ's grid does not cover all of the scan")
         return out

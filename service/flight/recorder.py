@@ -23,6 +23,7 @@ from service.flight.chain import Uncarried
 from service.flight.pipeline import Pipeline, Step
 from service.flight.reports import FOUND, gnss_over_heights, graph_figures, sigma_of_scale
 from service.scans.drawing import save_debug
+from service.scans.track import cell, seconds_text
 from service.scans.trust import FIRST_TELEMETRY
 from service.stream.codec import encode
 from service.stream.records import PoseRecord
@@ -321,18 +322,10 @@ def _line(time_unix_ns: int, state: VehicleState) -> str:
         state.sigma_v_m,
         state.sigma_agl_m,
     )
-    seconds = f"{time_unix_ns // 10**9}.{time_unix_ns % 10**9:09}"
-    cells = [seconds, " ".join(state.sources), *map(_ms, ages), *map(_cell, sigmas)]
+    cells = [seconds_text(time_unix_ns), " ".join(state.sources)]
+    cells += [cell(one, 1) for one in ages] + [cell(one, 3) for one in sigmas]
     return ",".join(cells) + "\n"
 
 
 def _degrees(value: float | None) -> float | None:
     return None if value is None else math.degrees(value)
-
-
-def _ms(value: float | None) -> str:
-    return "" if value is None else f"{value:.1f}"
-
-
-def _cell(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"

@@ -331,10 +331,10 @@ def stages(folder: Path, scan_id: str, keyframe: Keyframe) -> tuple[U8, bool]:
 def debug_panels(arrays: dict[str, Array]) -> list[Panel]:
     """The stages in the order of the paper's figure; stages that were not saved are left out."""
     out = []
-    for name, title in (("raw_left", "raw, left"), ("raw_right", "raw, right")):
-        if name in arrays:
-            out.append(Panel(title, _bgr(arrays[name])))
-    for name, title in (("rect_left", "rectified, left"), ("rect_right", "rectified, right")):
+    for name, title in (
+        ("raw_left", "raw, left"), ("raw_right", "raw, right"),
+        ("rect_left", "rectified, left"), ("rect_right", "rectified, right"),
+    ):  # fmt: skip
         if name in arrays:
             out.append(Panel(title, _bgr(arrays[name])))
     if "rect_left" in arrays and "rect_right" in arrays:

@@ -25,7 +25,6 @@ from recon.mapping.cloud_fusion import joined
 from recon.surface.raster import Raster, grid_over, rasterise
 from recon.types import PointCloud
 from service.errors import OutsideError, SkyreliefError
-from service.georeference import LocalFrame
 from service.memory import give_back
 from service.progress import Progress
 from service.redaction import public_configuration, redacted
@@ -90,7 +89,6 @@ def write_deliverables(
     folder: Path,
     store: ScanStore,
     extra: dict[str, Any],
-    voxel_m: float | None = None,
     tiled: TiledCloud | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -99,15 +97,13 @@ def write_deliverables(
     Args:
         extra: more figures of the run, added under ``run`` in scan.json; empty where the files
         shall be identical at both ends.
-        voxel_m: size of the fused voxels; by default ``scan.resolution_m`` of the scan's own
-            configuration, else the ground sample distance.
         tiled: the cloud, where it is too large for memory.
 
     A file that cannot be made is listed under ``failed``, with the reason, and logged; the others
     are written. Raises OutsideError, at the end, when the folder cannot be written.
     """
     progress = progress or Progress()
-    files = _Files(folder, store, voxel_m, tiled)
+    files = _Files(folder, store, tiled)
     files.write_trajectory()
     with progress.part("reading the keyframes", 0.7):
         at_once(partial(files.fuse, progress), files.cover)
@@ -128,11 +124,9 @@ def write_deliverables(
 class _Files:
     """The parts of a scan's files, while they are made."""
 
-    def __init__(
-        self, folder: Path, store: ScanStore, voxel_m: float | None, tiled: TiledCloud | None
-    ) -> None:
+    def __init__(self, folder: Path, store: ScanStore, tiled: TiledCloud | None) -> None:
         self._folder, self._store, self._tiled = folder, store, tiled
-        self._voxel_m = voxel_m or resolution_m(store.header)
+        self._voxel_m = resolution_m(store.header)
         self.failures = Failures(folder)
         self._frame, self._poses = local_frame(store.header), latest(store.poses())
         self._left_out = in_words(store)
@@ -199,17 +193,56 @@ class _Files:
 
     def summary(self, extra: dict[str, Any]) -> dict[str, Any]:
         """The content of scan.json."""
-        store = self._store
-        run = (store.summary or {}) | extra
-        out = _summary(
-            store.header, self._frame, self._poses, self._fused, self._raster, run, store.finished
-        )
-        out["notes"] += [self._left_out] if self._left_out else []
+        store, frame, fused = self._store, self._frame, self._fused
+        header, run = store.header, (store.summary or {}) | extra
+        notes, origin = [*header.notes, *fused.notes], None
+        if frame is None:
+            notes.append(NO_GEOREFERENCE)
+        else:
+            origin = {
+                "lat_deg": frame.lat_deg,
+                "lon_deg": frame.lon_deg,
+                "alt_amsl_m": frame.alt_amsl_m,
+            }
+        if self._left_out:
+            notes.append(self._left_out)
         if self._pieces:
-            out["notes"].append(PIECES.format(", ".join(self._pieces)))
-        out["coverage"] = None if self._coverage is None else self._coverage.figures()
-        out["refinement"] = store.refinement
-        return out
+            notes.append(PIECES.format(", ".join(self._pieces)))
+        times = [p.time_unix_ns / 1e9 for p in self._poses]
+        return {
+            "schema": 1,
+            "id": header.scan_id,
+            "run_id": header.run_id,
+            "drone": header.drone,
+            "times": {
+                "started_unix_s": header.started_unix_ns / 1e9,
+                "first_pose_unix_s": times[0] if times else None,
+                "last_pose_unix_s": times[-1] if times else None,
+            },
+            "finished": store.finished,
+            "origin": origin,
+            "epsg": None if frame is None else frame.epsg,
+            "heights": "metres above mean sea level" if frame else "metres above the scan's origin",
+            "georeference": header.georeference,
+            "camera": header.camera,
+            "configuration": public_configuration(header.configuration),
+            "software": header.software,
+            "counts": {
+                "keyframes": fused.keyframes,
+                "points": len(fused.cloud) if fused.points_out is None else fused.points_out,
+                "points_before_fusion": fused.points_in,
+                "poses": len(self._poses),
+            },
+            "quality": _quality(fused, self._raster, self._poses)
+            | {
+                "scale_sigma": scale_sigma(run, header.georeference),
+                "trust": trust_of(run, header.georeference, slope_deg(fused.cloud.xyz_m)),
+            },
+            "notes": notes,
+            "coverage": None if self._coverage is None else self._coverage.figures(),
+            "refinement": store.refinement,
+            "run": redacted(run),
+        }
 
     def write_cloud(self) -> None:
         if self._fused is not NOTHING and self._tiled is None:
@@ -309,61 +342,6 @@ def preview_cell_m(bounds: Box, voxel_m: float) -> float:
     while ((east - west) / voxel_m + 2.0) * ((north - south) / voxel_m + 2.0) > PREVIEW_CELLS:
         voxel_m *= 2.0
     return voxel_m
-
-
-def _summary(
-    header: ScanHeader,
-    frame: LocalFrame | None,
-    poses: Sequence[PoseRecord],
-    fused: FusedCloud,
-    raster: Raster | None,
-    extra: dict[str, Any],
-    finished: bool,
-) -> dict[str, Any]:
-    """The content of scan.json."""
-    notes = list(header.notes) + list(fused.notes)
-    if frame is None:
-        notes.append(NO_GEOREFERENCE)
-    times = [p.time_unix_ns / 1e9 for p in poses]
-    origin = None
-    if frame is not None:
-        origin = {
-            "lat_deg": frame.lat_deg,
-            "lon_deg": frame.lon_deg,
-            "alt_amsl_m": frame.alt_amsl_m,
-        }
-    return {
-        "schema": 1,
-        "id": header.scan_id,
-        "run_id": header.run_id,
-        "drone": header.drone,
-        "times": {
-            "started_unix_s": header.started_unix_ns / 1e9,
-            "first_pose_unix_s": times[0] if times else None,
-            "last_pose_unix_s": times[-1] if times else None,
-        },
-        "finished": finished,
-        "origin": origin,
-        "epsg": None if frame is None else frame.epsg,
-        "heights": "metres above mean sea level" if frame else "metres above the scan's origin",
-        "georeference": header.georeference,
-        "camera": header.camera,
-        "configuration": public_configuration(header.configuration),
-        "software": header.software,
-        "counts": {
-            "keyframes": fused.keyframes,
-            "points": len(fused.cloud) if fused.points_out is None else fused.points_out,
-            "points_before_fusion": fused.points_in,
-            "poses": len(poses),
-        },
-        "quality": _quality(fused, raster, poses)
-        | {
-            "scale_sigma": scale_sigma(extra, header.georeference),
-            "trust": trust_of(extra, header.georeference, slope_deg(fused.cloud.xyz_m)),
-        },
-        "notes": notes,
-        "run": redacted(extra),
-    }
 
 
 def _quality(

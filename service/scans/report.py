@@ -261,10 +261,6 @@ def _counted(title: str, values: Any) -> str:
     return f"<h3>{escape(title)}</h3>" + _table([(str(k), str(v)) for k, v in values.items()])
 
 
-def _table(rows: Sequence[tuple[str, str]]) -> str:
-    return rows_table((), rows)
-
-
 def _figure(data: bytes, kind: str, caption: str) -> str:
     code = base64.b64encode(data).decode("ascii")
     image = f'<img alt="" src="data:{kind};base64,{code}">'
@@ -307,14 +303,14 @@ def consistency(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[st
         out += ["<h2>Consistency</h2>", residuals]
     drift = _drift(summary, poses)
     if drift:
-        out += ["<h3>Drift</h3>", rows_table((), drift)]
+        out += ["<h3>Drift</h3>", _table(drift)]
     out += _loops(summary, flown, refined)
     if refined.get("points"):
         out += ["<h3>Surveyed points</h3>", _survey(refined)]
     return out
 
 
-def rows_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def _table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
     """A table, its text escaped; empty without rows."""
     if not rows:
         return ""
@@ -343,7 +339,7 @@ def _residuals(flown: dict[str, Any], refined: dict[str, Any]) -> str:
         "<p>1 agrees with sigma. Values of telemetry are smaller: its sigmas are enlarged, "
         "because its errors drift slowly and are correlated.</p>"
     )
-    return rows_table(header if refined else header[:2], rows) + note
+    return _table(rows, header if refined else header[:2]) + note
 
 
 def _drift(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[str, str]]:
@@ -381,7 +377,7 @@ def _loops(summary: dict[str, Any], flown: dict[str, Any], refined: dict[str, An
     if used:
         more = f" and {len(used) - 40} more" if len(used) > 40 else ""
         rows.append(("between keyframes", ", ".join(used[:40]) + more))
-    return ["<h3>Loops</h3>", rows_table((), rows)]
+    return ["<h3>Loops</h3>", _table(rows)]
 
 
 def _survey(refined: dict[str, Any]) -> str:
@@ -396,7 +392,7 @@ def _survey(refined: dict[str, Any]) -> str:
             sums = [_rms(s[f"rms_h_{w}_m"], s[f"rms_v_{w}_m"]) for w in ("before", "after")]
             rows.append([f"rms of {s['count']}", role, "", *sums, "horizontal, vertical"])
     header = ("point", "role", "marks", "map minus survey before: east, north, up, m", "after", "")
-    return rows_table(header, rows)
+    return _table(rows, header)
 
 
 def _offset(values: Sequence[float | None] | None) -> str:

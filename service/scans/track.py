@@ -70,11 +70,13 @@ def tum_lines(poses: Sequence[PoseRecord]) -> str:
     for pose in poses:
         w, x, y, z = se3.quaternion_from_rotation(pose.T_world_camera[:3, :3])
         numbers = " ".join(f"{v:.6f}" for v in pose.T_world_camera[:3, 3])
-        lines.append(f"{_seconds(pose.time_unix_ns)} {numbers} {x:.9f} {y:.9f} {z:.9f} {w:.9f}\n")
+        lines.append(
+            f"{seconds_text(pose.time_unix_ns)} {numbers} {x:.9f} {y:.9f} {z:.9f} {w:.9f}\n"
+        )
     return "".join(lines)
 
 
-def _seconds(time_unix_ns: int) -> str:
+def seconds_text(time_unix_ns: int) -> str:
     """Seconds with nine decimals, exactly."""
     return f"{time_unix_ns // 10**9}.{time_unix_ns % 10**9:09d}"
 
@@ -88,21 +90,21 @@ def csv_table(poses: Sequence[PoseRecord]) -> str:
         angles = (p.roll_rad, p.pitch_rad, p.yaw_rad)
         table.writerow(
             [
-                _seconds(p.time_unix_ns),
-                _cell(p.lat_deg, 9),
-                _cell(p.lon_deg, 9),
-                _cell(p.alt_amsl_m, 3),
-                _cell(p.agl_m, 3),
-                *(_cell(math.degrees(a), 4) for a in angles),
-                _cell(p.speed_m_s, 3),
-                _cell(distance_m, 3),
-                _cell(math.degrees(p.turn_rate_rad_s), 3),
+                seconds_text(p.time_unix_ns),
+                cell(p.lat_deg, 9),
+                cell(p.lon_deg, 9),
+                cell(p.alt_amsl_m, 3),
+                cell(p.agl_m, 3),
+                *(cell(math.degrees(a), 4) for a in angles),
+                cell(p.speed_m_s, 3),
+                cell(distance_m, 3),
+                cell(math.degrees(p.turn_rate_rad_s), 3),
                 "+".join(p.sources),
-                _cell(p.sigma_m, 4),
+                cell(p.sigma_m, 4),
             ]
         )
     return out.getvalue()
 
 
-def _cell(value: float | None, decimals: int) -> str:
+def cell(value: float | None, decimals: int) -> str:
     return "" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
