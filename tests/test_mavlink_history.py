@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from mavlink.telemetry import quaternion
 from mavlink.telemetry.gimbal import (
     FrameWatch,
-    GimbalConfig,
     frame_of_flags,
     judge_frame,
     steadiest_frame,
@@ -396,9 +395,9 @@ def sway(k: int) -> Quaternion:
     return quaternion.from_rpy(0.1 * math.sin(0.03 * k), 0.08 * math.cos(0.02 * k), 0.5)
 
 
-def gimbal_history(frame: GimbalFrame, config: GimbalConfig) -> VehicleHistory:
+def gimbal_history(frame: GimbalFrame, yaw_frame: str = "auto") -> VehicleHistory:
     """A head at 60 degrees down by a mount that really keeps the horizon, sent in a frame."""
-    history = VehicleHistory(HistoryConfig(gimbal=config))
+    history = VehicleHistory(HistoryConfig(yaw_frame=yaw_frame))
     head = quaternion.from_rpy(0.0, -1.0, 0.5)
     for k in range(400):
         body = sway(k)
@@ -415,7 +414,7 @@ def gimbal_history(frame: GimbalFrame, config: GimbalConfig) -> VehicleHistory:
 
 @pytest.mark.parametrize("frame", [GimbalFrame.EARTH, GimbalFrame.VEHICLE, GimbalFrame.BODY])
 def test_auto_sees_through_a_wrong_claim(frame: GimbalFrame) -> None:
-    history = gimbal_history(frame, GimbalConfig())
+    history = gimbal_history(frame)
     for k in (50, 155, 333):
         state = history.state_at(T0 + k * 100 * MS + 40 * MS)
         assert state is not None and state.q_ned_gimbal_wxyz is not None
@@ -424,7 +423,7 @@ def test_auto_sees_through_a_wrong_claim(frame: GimbalFrame) -> None:
 
 
 def test_configuration_overrides_every_claim() -> None:
-    history = gimbal_history(GimbalFrame.BODY, GimbalConfig(yaw_frame="vehicle"))
+    history = gimbal_history(GimbalFrame.BODY, "vehicle")
     state = history.state_at(T0 + 5 * S)
     assert state is not None and state.q_ned_gimbal_wxyz is not None
     wrong = to_earth(
@@ -434,7 +433,7 @@ def test_configuration_overrides_every_claim() -> None:
     )
     assert angle(state.q_ned_gimbal_wxyz, wrong) < 1e-6
     with pytest.raises(ValueError, match="yaw_frame"):
-        GimbalConfig(yaw_frame="north")
+        HistoryConfig(yaw_frame="north")
 
 
 def test_too_little_sway_decides_nothing() -> None:
@@ -483,7 +482,7 @@ def test_the_images_decide_between_frames() -> None:
     assert set(verdict.refuted) == {GimbalFrame.EARTH, GimbalFrame.VEHICLE}
     history.trust_images(GimbalFrame.EARTH)
     assert history.gimbal_frame() is GimbalFrame.EARTH
-    history.set_gimbal(GimbalConfig(yaw_frame="servo"))
+    history.set_yaw_frame("servo")
     assert history.gimbal_frame() is GimbalFrame.SERVO  # the configuration stands
 
 

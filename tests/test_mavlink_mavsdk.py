@@ -161,7 +161,7 @@ def test_mavsdk_downloads_the_definition_and_sets_settings(
         frames = [option.option_description for option in known["SR_YAW_FRAME"].options]
         assert frames == ["auto", "vehicle", "earth", "body", "servo"]
         camera.set_setting(100, Setting("SR_YAW_FRAME", "", Option("3", ""), False))
-        assert daemon.link.history.config.gimbal.yaw_frame == "body"
+        assert daemon.link.history.config.yaw_frame == "body"
         camera.set_setting(100, Setting("SR_BASELINE_M", "", Option("2.5", ""), True))
         assert daemon.link.parameter("SR_BASELINE_M") == 2.5
 

@@ -440,13 +440,13 @@ def test_sequence_numbers_count_per_component() -> None:
 
 def test_the_gimbals_frame_is_tuned_in_flight() -> None:
     station = Station()
-    assert station.history.config.gimbal.yaw_frame == "auto"
+    assert station.history.config.yaw_frame == "auto"
     message = dialect.MAVLink_param_set_message(1, 191, b"SR_YAW_FRAME", 3.0, 9)
     station.feed(packed(message, (255, 190)))
-    assert station.history.config.gimbal.yaw_frame == "body"
+    assert station.history.config.yaw_frame == "body"
     refused = dialect.MAVLink_param_set_message(1, 191, b"SR_YAW_FRAME", 17.0, 9)
     station.feed(packed(refused, (255, 190)))
-    assert station.history.config.gimbal.yaw_frame == "body"
+    assert station.history.config.yaw_frame == "body"
 
 
 def test_kept_parameters_are_reported_to_the_service_and_dropped_when_it_refuses() -> None:
@@ -457,7 +457,7 @@ def test_kept_parameters_are_reported_to_the_service_and_dropped_when_it_refuses
     presence = Presence(PresenceConfig(), 1, 0)
     companion = Companion(CompanionConfig(), control, presence, history, 0, kept)
     companion.announce_kept()
-    assert history.config.gimbal.yaw_frame == "earth"
+    assert history.config.yaw_frame == "earth"
     assert "SR_BASELINE_M=2.5" in control.asked
     values = companion.parameters.values()
     assert values["SR_BASELINE_M"] == 2.5 and values["SR_LINK_KBIT_S"] == 1000.0

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mavlink.telemetry.gimbal import GimbalConfig
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
 from mavlink.telemetry.latency import LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
@@ -35,12 +34,12 @@ def quaternion_of(R: Rotation) -> Quaternion:
     return (w, x, y, z)
 
 
-def history_of(gimbal: str, strength: float, config: GimbalConfig | None = None) -> VehicleHistory:
+def history_of(gimbal: str, strength: float, yaw_frame: str = "auto") -> VehicleHistory:
     """Telemetry of a camera fixed at 60 degrees below the nose.
 
     The gimbal is "none", "honest" (earth), or "wrong": body-relative, but claims the earth.
     """
-    history = VehicleHistory(HistoryConfig(gimbal=config or GimbalConfig()))
+    history = VehicleHistory(HistoryConfig(yaw_frame=yaw_frame))
     mount = Rotation.from_euler("Y", -math.pi / 3)
     for k in range(45 * 25):
         t = k / 25
@@ -204,7 +203,7 @@ def test_a_gimbal_that_claims_the_wrong_frame_is_corrected_and_reported_once() -
 
 def test_a_frame_that_was_configured_stands_against_the_images() -> None:
     reported: list[str] = []
-    history = history_of("wrong", 1.0, GimbalConfig(yaw_frame="earth"))
+    history = history_of("wrong", 1.0, "earth")
     fly(TelemetryCheck(CameraConfig(), history, reported.append))
     assert history.gimbal_frame() is GimbalFrame.EARTH
     (text,) = [text for text in reported if "Gimbal" in text]

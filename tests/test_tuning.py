@@ -196,6 +196,6 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         operator.set("SR_CAM_LATENCY", 70.0)
         assert scan.check.exposed_ns(3 * 10**9) == 3 * 10**9 - 70_000_000
         operator.set("SR_YAW_FRAME", 2.0)
-        assert operator.daemon.vehicle.history.config.gimbal.yaw_frame == "earth"
+        assert operator.daemon.vehicle.history.config.yaw_frame == "earth"
         scanning._run = scanning.link.flying = None
         scan.pipeline.finish()

@@ -29,7 +29,7 @@ def test_every_key_reaches_the_link(tmp_path: Path) -> None:
     vehicle = vehicle_config(config)
     assert vehicle.links == ("udpin:127.0.0.1:14550", "tcp:10.0.0.1:5760")
     assert vehicle.presence.system == 7 and vehicle.odometry
-    assert vehicle.history.gimbal.yaw_frame == "servo"
+    assert vehicle.history.yaw_frame == "servo"
     assert vehicle.signing_key == key and vehicle.state_dir == tmp_path
 
 

@@ -7,7 +7,7 @@ No sockets and no clocks: ``receive(link, packet, now_ns)``, ``tick(now_ns)`` an
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from mavlink.component import status as texts
@@ -198,8 +198,7 @@ class Companion:
                 self.parameters.forget(name)
 
     def _set_yaw_frame(self, value: float) -> None:
-        gimbal = replace(self.history.config.gimbal, yaw_frame=YAW_FRAMES[round(value)])
-        self.history.set_gimbal(gimbal)
+        self.history.set_yaw_frame(YAW_FRAMES[round(value)])
 
     # Output.
 

@@ -41,19 +41,6 @@ TILTED_RAD = math.radians(1.0)
 YAW_FRAMES = ("auto", "vehicle", "earth", "body", "servo")
 
 
-@dataclass(frozen=True, slots=True)
-class GimbalConfig:
-    """Options for reading gimbal messages."""
-
-    yaw_frame: str = "auto"  # auto: as the flags declare, unless telemetry refutes them
-
-    def __post_init__(self) -> None:
-        if self.yaw_frame not in YAW_FRAMES:
-            raise ValueError(
-                f"gimbal yaw_frame is {self.yaw_frame!r}; use one of {', '.join(YAW_FRAMES)}"
-            )
-
-
 def frame_of_flags(flags: int) -> GimbalFrame:
     """The quaternion's reference, by the flags of GIMBAL_DEVICE_ATTITUDE_STATUS."""
     if flags & YAW_IN_EARTH_FRAME:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import threading
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from mavlink.telemetry.gimbal import GimbalConfig, steadiest_frame, to_earth
+from mavlink.telemetry.gimbal import YAW_FRAMES, steadiest_frame, to_earth
 from mavlink.telemetry.quaternion import Quaternion, curve, down_component, hermite, slerp
 from mavlink.telemetry.samples import (
     EXTRAPOLATE_NS,
@@ -42,10 +42,16 @@ PATIENCE_S = 0.3  # live: a little more than the 3.5 Hz of a slow telemetry radi
 
 @dataclass(frozen=True, slots=True)
 class HistoryConfig:
-    """How long samples are kept, and their sigmas."""
+    """How long samples are kept, and how gimbal messages are read."""
 
     keep_s: float = math.inf
-    gimbal: GimbalConfig = field(default_factory=GimbalConfig)
+    yaw_frame: str = "auto"  # auto: as a gimbal's flags declare, unless telemetry refutes them
+
+    def __post_init__(self) -> None:
+        if self.yaw_frame not in YAW_FRAMES:
+            raise ValueError(
+                f"gimbal yaw_frame is {self.yaw_frame!r}; use one of {', '.join(YAW_FRAMES)}"
+            )
 
 
 SIGMA_TILT_RAD, SIGMA_YAW_RAD, SIGMA_GIMBAL_RAD = 0.01, 0.05, 0.01
@@ -193,10 +199,10 @@ class VehicleHistory:
             with self._news:
                 self._news.notify_all()
 
-    def set_gimbal(self, gimbal: GimbalConfig) -> None:
+    def set_yaw_frame(self, frame: str) -> None:
         """Change how gimbal messages are read, including those already stored."""
         with self._lock:
-            self.config = replace(self.config, gimbal=gimbal)
+            self.config = replace(self.config, yaw_frame=frame)
 
     def gimbal_frame(self) -> GimbalFrame | None:
         """The reference frame in use for the gimbal; None without a gimbal."""
@@ -313,7 +319,7 @@ class VehicleHistory:
 
         By configuration, else by the images, else as declared unless telemetry refutes it.
         """
-        chosen = self.config.gimbal.yaw_frame
+        chosen = self.config.yaw_frame
         if chosen != "auto":
             return GimbalFrame(chosen)
         if self._seen is not None:

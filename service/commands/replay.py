@@ -106,10 +106,9 @@ def _load_model(path: Path | None, config: Config) -> Camera | None:
 
 
 def _history_config(config: Config) -> HistoryConfig:
-    from mavlink.telemetry.gimbal import GimbalConfig
     from mavlink.telemetry.history import HistoryConfig
 
-    return HistoryConfig(gimbal=GimbalConfig(yaw_frame=config.mavlink.gimbal_yaw_frame))
+    return HistoryConfig(yaw_frame=config.mavlink.gimbal_yaw_frame)
 
 
 def _load_telemetry(path: Path, config: Config) -> TelemetryLog:

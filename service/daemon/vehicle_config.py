@@ -13,7 +13,7 @@ from mavlink.component.link_watch import WatchConfig
 from mavlink.component.parameters import YAW_FRAME
 from mavlink.component.presence import PresenceConfig
 from mavlink.component.vehicle import VehicleConfig
-from mavlink.telemetry.gimbal import YAW_FRAMES, GimbalConfig
+from mavlink.telemetry.gimbal import YAW_FRAMES
 from mavlink.telemetry.history import HistoryConfig
 from mavlink.wire.signing import read_key
 from service.config import Config, change
@@ -34,9 +34,7 @@ def vehicle_config(config: Config) -> VehicleConfig:
             links=mavlink.links,
             presence=PresenceConfig(system=mavlink.system_id or None),
             companion=CompanionConfig(parameters=parameters_of(config), watch=watch_config(config)),
-            history=HistoryConfig(
-                keep_s=KEEP_S, gimbal=GimbalConfig(yaw_frame=mavlink.gimbal_yaw_frame)
-            ),
+            history=HistoryConfig(KEEP_S, mavlink.gimbal_yaw_frame),
             signing_key=key,
             odometry=mavlink.odometry,
             state_dir=Path(mavlink.memory or config.scan.folder),

@@ -183,7 +183,7 @@ class TelemetryCheck:
         if verdict is None or not verdict.decided or used not in verdict.refuted:
             return
         seen = f"Gimbal angles refer to {_WORDS[verdict.frame]} by the images"
-        if history.config.gimbal.yaw_frame == "auto":
+        if history.config.yaw_frame == "auto":
             history.trust_images(verdict.frame)
             self._once("frame", f"{seen}: applied")
         else:
