@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -63,7 +64,7 @@ def state(i: int) -> VehicleState:
 
 def fly(images: list[U8]) -> tuple[list[Keyframe], Counter[str], Pipeline]:
     config = load_config(None, ["scan.assumed_agl_m=60", "compute.upsample=false"])
-    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
+    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages")))
     rig = Rig(config.camera, config.scan, config.fusion)
     keyframes: list[Keyframe] = []
     for i, image in enumerate(images):
@@ -157,7 +158,7 @@ def test_telemetry_goes_on_where_vision_was_lost() -> None:
     images = [photograph(ground, i) for i in range(80)]
     images += [over_exposed(images[0])] * 16
     config = load_config(None, ["compute.upsample=false"])
-    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
+    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages")))
     rig = Rig(config.camera, config.scan, config.fusion)
     metre_east = 1.0 / (111_319.49 * np.cos(np.radians(47.0)))
     seen: list[tuple[int, F64]] = []
@@ -183,7 +184,7 @@ def test_no_kernel_takes_more_threads_than_the_configuration_gives() -> None:
     try:
         for given, want in ((1, 1), (0, bands.cores())):
             config = load_config(None, [f"compute.threads={given}"])
-            build_stages(CAMERA, config, load_backend("cpu"))
+            build_stages(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages"))
             assert bands.threads() == want
     finally:
         bands.limit_threads(0)

@@ -6,6 +6,7 @@ The flight is exact: 40 m above a level, textured plane under a plain sky.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -105,7 +106,7 @@ def keyframes(rectified: list[tuple[int, int]]) -> Iterator[list[Keyframe]]:
 def fly() -> list[Keyframe]:
     levels = ground()
     config = load_config(None, ["compute.upsample=false", "camera.readout_ms=0"])
-    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
+    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages")))
     out: list[Keyframe] = []
     for i in range(FRAMES):
         T = pose(i)

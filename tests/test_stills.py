@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -194,7 +195,7 @@ def test_the_first_still_of_a_segment_is_placed_and_reconstructed() -> None:
     track = [pose(0.3 * FOOTPRINT_M * i - 100.0, seed=i) for i in range(3)]
     track += [pose(0.3 * FOOTPRINT_M * i + 10.0, seed=5 + i) for i in range(3)]
     config = load_config(None, ["compute.upsample=false", "compute.stereo_width=240"])
-    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu")))
+    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages")))
     steps = []
     for i, T in enumerate(track):
         prior = PosePrior(

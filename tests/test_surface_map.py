@@ -21,6 +21,7 @@ from service.progress import Stopwatch
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
 NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 CONFIG = VoxelMapConfig(voxel_m=0.5)
+NO_PAGES = Path("/dev/null/pages")
 
 
 def view(east_m: float, north_m: float = 0.0, sigma_m: float = 0.2) -> DepthMap:
@@ -122,7 +123,7 @@ def test_an_uncertain_lens_widens_what_is_stored_and_not_the_choice(
     assumed: tuple[str, ...], sigma_focal: float, share: float
 ) -> None:
     """By a share of the depth; a better view still counts as better."""
-    surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], assumed, sigma_focal)
+    surface = SurfaceMap(NO_PAGES, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], assumed, sigma_focal)
     first, better = (view(0.0, sigma_m=sigma) for sigma in (0.2, 0.05))
     candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=KNOWN_ROWS))
     sigma, fresh = surface(candidate, first, first.T_world_camera)
@@ -133,7 +134,7 @@ def test_an_uncertain_lens_widens_what_is_stored_and_not_the_choice(
 
 def test_an_unknown_distortion_widens_the_sigma_towards_the_corners() -> None:
     """By the change of disparity that k1 of one sigma makes, on average over both axes."""
-    surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], ("distortion",))
+    surface = SurfaceMap(NO_PAGES, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], ("distortion",))
     seen = view(0.0, sigma_m=0.2)
     candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=KNOWN_ROWS))
     sigma, _ = surface(candidate, seen, seen.T_world_camera)
@@ -151,7 +152,7 @@ def test_an_unknown_distortion_widens_the_sigma_towards_the_corners() -> None:
 
 
 def test_an_unknown_readout_widens_the_sigma_and_gives_way_to_what_is_seen_later() -> None:
-    surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0])
+    surface = SurfaceMap(NO_PAGES, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0])
     seen = view(0.0, sigma_m=0.05)
     unsure, sure = (
         cast(
@@ -169,7 +170,7 @@ def test_an_unknown_readout_widens_the_sigma_and_gives_way_to_what_is_seen_later
 
 @pytest.mark.parametrize(("reduced", "expected"), [(1.0, 0.11 / 0.075), (1.2, 0.11 / 0.09), (2, 1)])
 def test_images_that_are_not_reduced_are_noisier(reduced: float, expected: float) -> None:
-    surface = SurfaceMap(None, 1_000_000, 0.0, Stopwatch(), reduced * K[0, 0])
+    surface = SurfaceMap(NO_PAGES, 1_000_000, 0.0, Stopwatch(), reduced * K[0, 0])
     seen = view(0.0)
     candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=KNOWN_ROWS))
     sigma, _ = surface(candidate, seen, seen.T_world_camera)

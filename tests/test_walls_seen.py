@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -56,7 +58,9 @@ def flown(site: Simulation, down_deg: float) -> F64:
     down = np.radians(down_deg)
     ahead = -np.cos(down) * out - np.sin(down) * np.array([0.0, 0.0, 1.0])
     config = load_config(None, ["compute.upsample=false", "camera.readout_ms=0"])
-    pipeline = Pipeline(build_stages(site.options.camera, config, load_backend("cpu")))
+    pipeline = Pipeline(
+        build_stages(site.options.camera, config, load_backend("cpu"), Path("/dev/null/pages"))
+    )
     keyframes: list[Keyframe] = []
     for i in range(FRAMES):
         place = wall.mean(axis=0) + STEP_M * (i - FRAMES / 2) * along

@@ -33,6 +33,7 @@ from service.flight.scan import ScanInputs, check_new
 from service.flight.stages import build_stages
 from service.flight.telemetry_check import TelemetryCheck, differs
 from service.offline.refine.own_camera import sightings
+from service.scans.retention import PAGES
 
 log = logging.getLogger(__name__)
 
@@ -94,7 +95,7 @@ def _tracked(
     inputs: ScanInputs, source: ImagesSource, history: VehicleHistory
 ) -> tuple[list[Still], LatencyEstimate | None]:
     """The stills by the odometry, and how long before its stamp each was exposed."""
-    stages = build_stages(inputs.camera, inputs.config, inputs.backend)
+    stages = build_stages(inputs.camera, inputs.config, inputs.backend, inputs.folder / PAGES)
     rig = Rig(inputs.config.camera, inputs.config.scan, inputs.config.fusion)
     check = TelemetryCheck(inputs.config.camera, history, log.info)
     out = list[Still]()

@@ -429,16 +429,16 @@ def build_stages(
     camera: Camera,
     config: Config,
     backend: Backend,
+    pages: Path,
     live: bool = False,
-    pages: Path | None = None,
     assumed: Collection[str] = (),
     sigma_focal: float = 0.0,
     known: KnownTrack | None = None,
 ) -> Stages:
     """The stages that the configuration asks for. Raises ValueError for an unusable camera model.
 
-    ``live`` drops old work when reconstruction cannot keep up. ``pages`` is a folder for the oldest
-    parts of the map; without it they are dropped. An ``assumed`` lens widens sigmas. A ``known``
+    ``pages`` is a folder, made when it is needed, for the oldest parts of the map. ``live`` drops
+    old work when reconstruction cannot keep up. An ``assumed`` lens widens sigmas. A ``known``
     track takes the odometry's place.
     """
     compute, stopwatch = config.compute, Stopwatch()

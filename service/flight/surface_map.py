@@ -137,7 +137,7 @@ class SurfaceMap:
 
     def __init__(
         self,
-        pages: Path | None,
+        pages: Path,
         max_voxels: int,
         resolution_m: float,
         stopwatch: Stopwatch,
@@ -145,7 +145,7 @@ class SurfaceMap:
         assumed: Collection[str] = (),
         sigma_focal: float = 0.0,
     ) -> None:
-        """``pages``: see :class:`PagedMap`; None: forget the oldest when memory is full.
+        """``pages`` is the folder of :class:`PagedMap`.
 
         ``focal_px`` is of the recorded images, known to ``sigma_focal``, a share. With "lens" or
         "distortion" among ``assumed``, sigma covers the bending by it.
@@ -157,7 +157,7 @@ class SurfaceMap:
         apart = max(min(sigma_focal, MAX_FOCAL_SHARE) ** 2 - COMMON_FOCAL_SHARE**2, 0.0)
         self._lens_share = float(np.hypot(self._lens_share, np.sqrt(apart)))
         self._sigma_k1 = SIGMA_K1 if "distortion" in assumed else 0.0
-        self._map: VoxelMap | PagedMap | None = None
+        self._map: PagedMap | None = None
         self._disagreement, self._segment = Disagreement(), -1
 
     def __call__(
@@ -197,23 +197,22 @@ class SurfaceMap:
         bent = 2.0 * self._sigma_k1 * np.add.outer(y * y, x * x)
         return np.asarray(np.hypot(bent, self._lens_share), np.float32)
 
-    def _empty(self, depth: DepthMap) -> VoxelMap | PagedMap:
+    def _empty(self, depth: DepthMap) -> PagedMap:
         """A map as fine as the first view."""
         ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
         fine = VoxelMapConfig(voxel_m=max(2.0 * ground_m, self._resolution_m, 1e-3))
-        if self._pages is None:
-            return VoxelMap(fine)
         return PagedMap(fine, self._pages, self._max_voxels)
 
     @property
     def held(self) -> dict[str, int]:
         """Voxels in memory and tiles on disk."""
         known = self._map
-        tiles = known.tiles_on_disk if isinstance(known, PagedMap) else 0
-        return {"map_voxels": 0 if known is None else len(known), "map_tiles_on_disk": tiles}
+        if known is None:
+            return {"map_voxels": 0, "map_tiles_on_disk": 0}
+        return {"map_voxels": len(known), "map_tiles_on_disk": known.tiles_on_disk}
 
     def clear(self) -> None:
         """Reset the map: all surface counts as unseen."""
         known, self._map = self._map, None
-        if isinstance(known, PagedMap):
+        if known is not None:
             known.close()
