@@ -48,20 +48,13 @@ def each_so3_exp(w: F64) -> F64:
 
 def each_so3_log(R: F64) -> F64:
     """(N, 3) rotation vectors in rad, of length at most pi, of the (N, 3, 3) rotations ``R``."""
-    diagonal = np.diagonal(R, axis1=1, axis2=2)
-    trace = diagonal.sum(axis=1)
-    square = np.empty((len(R), 4, 4))  # 4 q q^T of the quaternion q: any column is q, scaled
-    square[:, 0, 0] = 1.0 + trace
-    square[:, 1:, 1:] = R + R.swapaxes(1, 2)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        square[:, i + 1, i + 1] = 1.0 + 2.0 * diagonal[:, i] - trace
-        square[:, 0, i + 1] = square[:, i + 1, 0] = R[:, k, j] - R[:, j, k]
-    longest = np.argmax(np.diagonal(square, axis1=1, axis2=2), axis=1)
-    q = square[np.arange(len(R)), longest]
-    q *= np.where(q[:, :1] < 0, -1.0, 1.0) / np.linalg.norm(q, axis=1, keepdims=True)
-    half = np.arctan2(np.linalg.norm(q[:, 1:], axis=1), q[:, 0])
-    return np.asarray(2.0 / np.sinc(half / np.pi)[:, None] * q[:, 1:])
+    axis = 0.5 * (R - R.transpose(0, 2, 1))[:, [2, 0, 1], [1, 2, 0]]
+    sine, cosine = np.linalg.norm(axis, axis=1), 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0)
+    grown = np.where(sine > 1e-9, np.arctan2(sine, cosine) / np.maximum(sine, 1e-9), 1.0)
+    out = axis * grown[:, None]
+    for i in np.flatnonzero((sine < 1e-3) & (cosine < 0.0)):  # half a turn hides its axis
+        out[i] = so3_log(R[i])
+    return np.asarray(out)
 
 
 def _left_jacobian(w: F64) -> F64:

@@ -87,7 +87,7 @@ def _of_motions(rows: Rows, at: State) -> Linear:
     per_unit = np.exp(-at.logs[rows["unit"]])[:, None]
     R_a_units = R_a_world * per_unit[:, :, None]
     off = np.einsum("nij,nj->ni", R_a_units, apart)
-    error = np.hstack([_log(R_a_world @ turned), off])
+    error = np.hstack([se3.each_so3_log(R_a_world @ turned), off])
     J = np.zeros((len(rows), 6, 14))
     J[:, :3, 0:3], J[:, 3:, 3:6] = -R_a_world, -R_a_units
     J[:, :3, 6:9], J[:, 3:, 9:12] = R_a_world, R_a_units
@@ -104,7 +104,7 @@ def _of_motions(rows: Rows, at: State) -> Linear:
 
 def _of_turns(rows: Rows, at: State) -> Linear:
     """Rotation from the measured one, in world axes."""
-    error = _log(at.R[rows["key"]] @ rows["R"].transpose(0, 2, 1)) * rows["weight"]
+    error = se3.each_so3_log(at.R[rows["key"]] @ rows["R"].transpose(0, 2, 1)) * rows["weight"]
     return Linear(error, np.eye(3) * rows["weight"][:, :, None], columns_of(rows["key"], 0, 3))
 
 
@@ -119,17 +119,6 @@ def _of_scales(rows: Rows, at: State) -> Linear:
     error = (at.logs[rows["b"]] - at.logs[rows["a"]] - rows["log"])[:, None] * weight
     J = np.stack([np.where(rows["a"][:, None] == NO_SCALE, 0.0, -weight), weight], axis=2)
     return Linear(error, J, np.hstack([scale_columns(at, rows["a"]), scale_columns(at, rows["b"])]))
-
-
-def _log(R: F64) -> F64:
-    """(N, 3) rotation vectors of (N, 3, 3)."""
-    axis = 0.5 * (R - R.transpose(0, 2, 1))[:, [2, 0, 1], [1, 2, 0]]
-    sine, cosine = np.linalg.norm(axis, axis=1), 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0)
-    grown = np.where(sine > 1e-9, np.arctan2(sine, cosine) / np.maximum(sine, 1e-9), 1.0)
-    out = axis * grown[:, None]
-    for i in np.flatnonzero((sine < 1e-6) & (cosine < 0.0)):  # half a turn hides its axis
-        out[i] = se3.so3_log(R[i])
-    return np.asarray(out)
 
 
 def columns_of(keys: I64, first: int, end: int) -> I64:
