@@ -430,8 +430,8 @@ def _body(
 
     At the rim of what both flights saw, where few views reach, nothing is a change: the ground
     around it must be known, but for strips that it may hide itself. The rim that stereo smears
-    belongs to the volume. Sigma also holds
-    one cell all along the outline, as matching windows make what stands wider.
+    belongs to the volume. Sigma also holds one cell all along the outline, as matching windows make
+    what stands wider.
     """
     rim = config.edge_cells
     rows, cols = np.nonzero(labels == label)

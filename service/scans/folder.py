@@ -51,7 +51,7 @@ from service.scans.main_piece import (
 from service.scans.report import report_html
 from service.scans.track import csv_table, flown_m, latest, local_frame, tum_lines
 from service.scans.trust import scale_sigma, slope_deg, trust_of
-from service.scans.writing import writing
+from service.scans.writing import write_whole, writing
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
 
@@ -114,8 +114,7 @@ def write_deliverables(
     assert summary is not None
     failures = files.failures
     summary["failed"], summary["files_due"] = failures.why, failures.of_the_disk is not None
-    with writing(folder / SUMMARY) as part:
-        part.write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    write_whole(folder / SUMMARY, json.dumps(summary, indent=2, sort_keys=True) + "\n")
     if failures.of_the_disk is not None:
         raise failures.of_the_disk
     return summary
@@ -137,10 +136,10 @@ class _Files:
         self._pieces: list[str] = []
 
     def write_trajectory(self) -> None:
-        with self.failures.noted(TUM), writing(self._folder / TUM) as part:
-            part.write_text(tum_lines(self._poses), encoding="ascii")
-        with self.failures.noted(CSV), writing(self._folder / CSV) as part:
-            part.write_text(csv_table(self._poses), encoding="utf-8")
+        with self.failures.noted(TUM):
+            write_whole(self._folder / TUM, tum_lines(self._poses))
+        with self.failures.noted(CSV):
+            write_whole(self._folder / CSV, csv_table(self._poses))
 
     def fuse(self, progress: Progress) -> None:
         """Make the cloud."""
@@ -258,13 +257,12 @@ class _Files:
         poses = main_poses(self._poses, stretches_apart(self._store))
         with self.failures.noted(PREVIEW):
             preview = _preview(self._raster, poses, summary, self._left_out)
-            with writing(self._folder / PREVIEW) as part:
-                part.write_bytes(preview)
-        with self.failures.noted(REPORT), writing(self._folder / REPORT) as part:
+            write_whole(self._folder / PREVIEW, preview)
+        with self.failures.noted(REPORT):
             shown = _stages(self._folder, self._store)
             cloud, coverage = self._fused.cloud, self._coverage
             page = report_html(summary, poses, cloud, self._raster, preview, coverage, shown)
-            part.write_text(page, encoding="utf-8")
+            write_whole(self._folder / REPORT, page)
         return summary
 
 
