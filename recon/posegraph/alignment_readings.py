@@ -178,7 +178,7 @@ class AlignmentReadings:
     ) -> None:
         turned = [a for a in anchors if a.prior.R_world_camera is not None]
         fixed = [a for a in anchors if has_fix(a.prior)]
-        moved = [(a, b) for a, b in pairwise(anchors) if _are_on_one_run(a.prior, b.prior)]
+        moved = [(a, b, w) for a, b in pairwise(anchors) if (w := _way(a.prior, b.prior))]
         heights, independent = height_ratios(anchors)
         noise, (fix_s, attitude_s) = noise or ReadingNoise(), wander_s
         self.R_odom = _stack([a.T_odom_camera[:3, :3] for a in turned], (3, 3))
@@ -201,11 +201,10 @@ class AlignmentReadings:
         self.fix_s = _stack([a.time_s for a in fixed], ())
         self.is_height_claimed = all(a.prior.is_sigma_claimed for a in fixed)  # so without any
         self.sigma_fix, self.wander = noise.of_fixes(self.claimed, fix_s)
-        self.step = _stack([b.place - a.place for a, b in moved], (3,))
-        self.way = _stack([_way(a.prior, b.prior) for a, b in moved], (3,))
-        way_s = _stack([_seconds(a.prior, b.prior) for a, b in moved], ())
-        self.way_s = np.maximum(way_s, MIN_WAY_S)
-        self.way_end_s = _stack([b.time_s for _, b in moved], ())
+        self.step = _stack([b.place - a.place for a, b, _ in moved], (3,))
+        self.way = _stack([metres for *_, (metres, _) in moved], (3,))
+        self.way_s = np.maximum(_stack([s for *_, (_, s) in moved], ()), MIN_WAY_S)
+        self.way_end_s = _stack([b.time_s for _, b, _ in moved], ())
         self.sigma_speed = noise.of_travels(self.way_s)
         self._slow = Noise(0.0, noise.rate_m_s, RATE_S)
         self.has_measured_heights = bool(heights) and independent > UNMEASURED_HEIGHTS
@@ -370,21 +369,13 @@ def has_fix(prior: PosePrior) -> bool:
     return prior.position_m is not None and prior.sigma_position_m is not None
 
 
-def _are_on_one_run(a: PosePrior, b: PosePrior) -> bool:
-    """True when velocity was integrated from one to the other without a gap."""
-    return a.travel is not None and b.travel is not None and a.travel.run == b.travel.run
-
-
-def _way(a: PosePrior, b: PosePrior) -> F64:
-    """(3,) m flown by velocity between two priors of one run."""
-    assert a.travel is not None and b.travel is not None
-    return b.travel.metres - a.travel.metres
-
-
-def _seconds(a: PosePrior, b: PosePrior) -> float:
-    """Seconds between two priors of one run."""
-    assert a.travel is not None and b.travel is not None
-    return b.travel.seconds - a.travel.seconds
+def _way(a: PosePrior, b: PosePrior) -> tuple[F64, float] | None:
+    """(3,) m flown by velocity between two priors, and the seconds; None where it was not
+    integrated from one to the other without a gap."""
+    one, two = a.travel, b.travel
+    if one is None or two is None or one.run != two.run:
+        return None
+    return two.metres - one.metres, two.seconds - one.seconds
 
 
 def _stack(rows: Sequence[object], shape: tuple[int, ...]) -> F64:
