@@ -280,19 +280,15 @@ class Pieces:
     """The segments of one scan with their keyframes, and which telemetry places in the world."""
 
     def __init__(self) -> None:
-        self._starts: list[int] = []  # numbers of the segments' first keyframes
-        self._segments: list[int] = []
-        self._last: list[int] = []
+        self._stretches: list[list[int]] = []  # each segment with its first and last keyframe
         self._points: Counter[int] = Counter()  # by segment
         self._placed: set[int] = set()  # by a fix and a heading of their own
 
     def add(self, seq: int, segment: int, points: int, prior: PosePrior) -> None:
         """Take the next keyframe with surface."""
-        if not self._segments or self._segments[-1] != segment:
-            self._starts.append(seq)
-            self._segments.append(segment)
-            self._last.append(seq)
-        self._last[-1] = seq
+        if not self._stretches or self._stretches[-1][0] != segment:
+            self._stretches.append([segment, seq, seq])
+        self._stretches[-1][2] = seq
         self._points[segment] += points
         sigma = prior.sigma_position_m
         is_known = sigma is not None and sigma[2] < HEIGHT_KNOWN_M
@@ -304,7 +300,7 @@ class Pieces:
 
         The main piece is the one that fixes place; without fixes, that with most points.
         """
-        piece, frames = {segment: segment for segment in self._segments}, graph.segments
+        piece, frames = {segment: segment for segment, _, _ in self._stretches}, graph.segments
         looped: set[int | None] = set()
         for loop in graph.loops.taken:
             a, b = (self._segment_of(seq) for seq in loop.ends)
@@ -316,7 +312,7 @@ class Pieces:
         of_any_size = {s for s in heights if not _is_scaled(frames, s)}
         loose = {s for s in unsure if not _agrees(frames, s)} | of_any_size
         placed = self._placed - of_any_size
-        fixed = [s for s in self._segments if s in placed or s in heights.keys() - loose]
+        fixed = [s for s in piece if s in placed or s in heights.keys() - loose]
         for segment in fixed[1:]:
             _join(piece, fixed[0], segment)
         if fixed:
@@ -326,18 +322,17 @@ class Pieces:
             for segment, points in self._points.items():
                 sizes[piece[segment]] += points
             main = sizes.most_common(1)[0][0] if sizes else -1
-        ends = zip(self._segments, self._starts, self._last, strict=True)
         return [
             (first, last)
-            for segment, first, last in ends
+            for segment, first, last in self._stretches
             # A long flight forgets loops, and not which segments they tied.
             if piece[segment] != main
             and (segment in looped or segment in loose or not frames.is_tied(segment))
         ]
 
     def _segment_of(self, seq: int) -> int | None:
-        at = bisect_right(self._starts, seq) - 1
-        return self._segments[at] if at >= 0 else None
+        at = bisect_right(self._stretches, seq, key=lambda one: one[1]) - 1
+        return self._stretches[at][0] if at >= 0 else None
 
 
 def _sigma_height_m(frames: SegmentFrames, segment: int) -> float | None:
