@@ -135,8 +135,7 @@ class CoverageMap:
 
     def places(self) -> Rows:
         """Rows of :data:`PLACE` of all keyframes, in order of their number."""
-        rows = self._ledger.read(0, len(self._ledger))
-        return np.asarray(rows[np.frombuffer(self._rows, np.int64)])
+        return self._ledger.pick(np.array(self._rows))
 
     @property
     def tiles(self) -> int:
