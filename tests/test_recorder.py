@@ -134,7 +134,7 @@ def test_the_scale_names_what_measured_it(sources: tuple[str, ...], sigma: float
     segments = SimpleNamespace(largest=lambda: found, largest_scales=lambda: scales)
     graph = SimpleNamespace(segments=segments, largest_growth=lambda: growth[0])
     recorder = Recorder.__new__(Recorder)
-    recorder._chain = cast(Any, SimpleNamespace(trajectory=SimpleNamespace(graph=graph)))
+    recorder._chain = cast(Any, SimpleNamespace(graph=graph))
     assert recorder._scale() == {"from": by, "sigma": sigma}
     scales[:] = Scale(1.2, 0.01), Scale(1.0, 0.03)
     assert recorder._scale()["gnss_over_heights"] == pytest.approx(1.2)

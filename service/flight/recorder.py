@@ -166,7 +166,7 @@ class Recorder:
     def _scale(self) -> dict[str, Any]:
         """Source of the metric scale, its relative sigma, and what contradicts it: of the largest
         segment."""
-        graph = self._chain.trajectory.graph
+        graph = self._chain.graph
         found = graph.segments.largest()
         if found is None:
             return {"from": FIRST_TELEMETRY, "sigma": None}
@@ -180,7 +180,7 @@ class Recorder:
 
     def _lean_sigma_deg(self) -> float | None:
         """Sigma of what is level, of the largest segment; None where attitudes show it."""
-        found = self._chain.trajectory.graph.segments.largest()
+        found = self._chain.graph.segments.largest()
         sigma = None if found is None else found.sigma_lean_rad
         return None if sigma is None else round(math.degrees(sigma), 2)
 
