@@ -97,7 +97,7 @@ class Similarity:
     noise: ReadingNoise | None = None  # as measured by the fit; None without one
     sigma_fixes: F64 | None = None  # (3,) m of the mean error of all fixes, where they wander
     sigma_counted: F64 | None = None  # (3,) m that the readings in the graph count for it
-    common: Common = field(default_factory=lambda: Common())
+    common: Common = field(default_factory=Common)
     heights: Heights | None = None  # where the noise of fixes is known
     bend_rad: float = 0.0  # sigma of a part of the track against its mean, as vision's turns add up
     lean: F64 | None = None  # (6, 6) of a left perturbation that tilts all; None: level is known
