@@ -59,12 +59,6 @@ class RowClock:
         self._scale = sign * camera.K[axis, axis] / camera.size_px[axis]
         self._offset = float(row_shares(camera, camera.K[axis, 2]))
 
-    def reading(self, readout_s: float) -> RowClock:
-        """The same rows, read in another time."""
-        out = copy(self)
-        out.readout_s = readout_s
-        return out
-
     def seconds(self, ray: F64) -> F64:
         """(N,) seconds from the middle row of undistorted rays (N, 3) with z = 1."""
         x, y = ray[:, 0], ray[:, 1]
@@ -97,7 +91,9 @@ class Rows:
 
     def reading(self, readout_s: float) -> Rows:
         """The same motion, with the rows read in another time."""
-        return replace(self, clock=self.clock.reading(readout_s))
+        clock = copy(self.clock)
+        clock.readout_s = readout_s
+        return replace(self, clock=clock)
 
     def twists(self, ray: F64) -> F64:
         """(N, 6) motion from the middle row to the rows that expose the rays (N, 3)."""
@@ -177,9 +173,13 @@ class FrameRows:
         """True where frames to come still change what a rolling shutter does to this one."""
         return self.rows is not None and bool(self.rows.clock.readout_s) and not self.is_settled
 
-    def at_middle(self, K: F64, uv: F64, inverse_depth: F64) -> F64:
-        """(N, 2) where the frame's pixels (N, 2) would be at the middle row's time."""
-        return uv if self.rows is None else self.rows.at_middle(K, uv, inverse_depth)
+    def at_middle(self, K: F64, uv: F64, inverse_depth: F64, readout_s: float | None = None) -> F64:
+        """(N, 2) where the frame's pixels (N, 2) would be at the middle row's time; with another
+        readout than the known one if ``readout_s`` is given."""
+        if self.rows is None:
+            return uv
+        rows = self.rows if readout_s is None else self.rows.reading(readout_s)
+        return rows.at_middle(K, uv, inverse_depth)
 
 
 class RowTrack:
@@ -188,26 +188,22 @@ class RowTrack:
     def __init__(self, camera: Camera, is_sought: bool = False) -> None:
         """``camera`` is the one with distortion, at any size of its images.
 
-        ``is_sought``: its readout may yet be found.
+        ``is_sought``: its readout may yet be found. The ``clock`` of all frames is None for a
+        global shutter.
         """
-        self._clock = RowClock(camera) if camera.shutter.readout_s or is_sought else None
+        self.clock = RowClock(camera) if camera.shutter.readout_s or is_sought else None
         self._frames: deque[FrameRows] = deque(maxlen=32)
         self._offs: deque[F64] = deque(maxlen=8)  # of settled frames
 
     @property
-    def clock(self) -> RowClock | None:
-        """Of all frames; None for a global shutter."""
-        return self._clock
-
-    @property
     def is_rolling(self) -> bool:
         """False for a global shutter."""
-        return self._clock is not None
+        return self.clock is not None
 
     @property
     def is_known(self) -> bool:
         """True for a rolling shutter whose readout is known or found."""
-        return self._clock is not None and self._clock.readout_s != 0.0
+        return self.clock is not None and self.clock.readout_s != 0.0
 
     def needs_telemetry(self, time_ns: int) -> bool:
         """True where too few frames are near ``time_ns`` to show the turn within a readout."""
@@ -216,7 +212,7 @@ class RowTrack:
 
     def stop(self) -> None:
         """The shutter is global: frames to come need no motion of their rows."""
-        self._clock = None
+        self.clock = None
         self._frames.clear()
 
     def begin(self) -> None:
@@ -237,7 +233,7 @@ class RowTrack:
 
     def add(self, frame: FrameRows, T_camera_odom: F64) -> None:
         """Keep the frame with its final pose; it gives the motion of those before it."""
-        if self._clock is None:
+        if self.clock is None:
             return
         self.place(frame, T_camera_odom)
         self._frames.append(frame)
@@ -249,7 +245,7 @@ class RowTrack:
 
     def _refresh(self, frame: FrameRows) -> None:
         """Fit the motion of its rows to its neighbours and to telemetry."""
-        if self._clock is None:
+        if self.clock is None:
             return
         times = np.array([(f.time_ns - frame.time_ns) * 1e-9 for f in self._frames])
         before, later = np.flatnonzero(times < 0), np.flatnonzero(times > 0)
@@ -261,12 +257,12 @@ class RowTrack:
         frame.is_settled = since_s >= NEAR_S or (after >= 2 and since_s >= STEADY_S)
         frame.is_measured = near.size >= 2
         if near.size < (1 if frame.prior.turn_rad_s is None else 2):
-            frame.rows = _by_telemetry(frame, self._clock)
+            frame.rows = _by_telemetry(frame, self.clock)
             return
         degree = min(near.size, 2 + min(after, near.size - after, 2))
         rate, change = self._by_neighbours(frame, times, near, degree)
         frame.rows = _with_telemetry(
-            frame.prior, Rows(self._clock, rate, change, self._covariance(frame.off))
+            frame.prior, Rows(self.clock, rate, change, self._covariance(frame.off))
         )
 
     def _by_neighbours(

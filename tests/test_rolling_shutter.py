@@ -348,8 +348,8 @@ def test_a_known_readout_gives_way_to_sharp_images_alone(
 ) -> None:
     clock = RowClock(replace(PLAIN, shutter=Shutter(0.03)))
 
-    def cost(window: object, tried: RowClock, K: F64) -> tuple[float, int]:
-        return 100.0 + sharpness * (1e3 * (tried.readout_s - 0.012)) ** 2, 400
+    def cost(window: object, tried_s: float, K: F64) -> tuple[float, int]:
+        return 100.0 + sharpness * (1e3 * (tried_s - 0.012)) ** 2, 400
 
     monkeypatch.setattr(readout_search, "_cost", cost)
     search = ReadoutSearch(clock, PLAIN.K)

@@ -33,7 +33,7 @@ from service.flight.viewpoints import (
 def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Viewpoint:
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
     key = OdometryKeyframe(
-        seq, seq, segment, se3.inverse(T), np.eye(6), PosePrior(), Pyramid(()),
+        seq, segment, se3.inverse(T), np.eye(6), PosePrior(), Pyramid(()),
         np.zeros((0, 2)), np.zeros(0, np.int64), Landmarks(), FrameRows(seq, PosePrior(), T),
     )  # fmt: skip
     image = np.zeros((32, 32, 3), np.uint8)

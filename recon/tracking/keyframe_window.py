@@ -74,7 +74,6 @@ class OdometryKeyframe:
     """A keyframe inside the odometry; its pose is refined while it is in the window."""
 
     seq: int
-    time_ns: int
     segment: int
     T_camera_odom: F64  # (4, 4)
     covariance: F64  # (6, 6) of the motion from the keyframe before, left of T_camera_before
@@ -88,6 +87,11 @@ class OdometryKeyframe:
     @property
     def T_odom_camera(self) -> F64:
         return se3.inverse(self.T_camera_odom)
+
+    def known_points(self) -> tuple[Bool, F64]:
+        """(N,) which corners have a landmark, and (M, 3) those in its camera, in odometry units."""
+        known = self.map.known(self.landmark)
+        return known, se3.transform(self.T_camera_odom, self.map[self.landmark[known]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,12 +108,16 @@ class TrackingFrame:
     blurred: bool
 
 
-def landmarks(key: OdometryKeyframe) -> tuple[F64, F64]:
-    """(N, 3) points in the keyframe's camera and (N,) their depths, in odometry units."""
-    points = key.map[key.landmark[key.map.known(key.landmark)]]
-    P = se3.transform(key.T_camera_odom, points)
-    P = P[P[:, 2] > 0]
-    return P, P[:, 2]
+def landmarks(key: OdometryKeyframe) -> F64:
+    """(N, 3) points in front of the keyframe's camera, in odometry units."""
+    _, P = key.known_points()
+    return P[P[:, 2] > 0]
+
+
+def median_depth(key: OdometryKeyframe) -> float:
+    """Median depth of the keyframe's landmarks, in odometry units; NaN without any."""
+    depth = landmarks(key)[:, 2]
+    return float(np.median(depth)) if depth.size else float("nan")
 
 
 def triangulate(
@@ -131,8 +139,7 @@ def triangulate(
     rows = np.flatnonzero(ok & (key.landmark < 0))
     if rows.size == 0:
         return
-    _, depths = landmarks(key)
-    far = np.full(rows.size, 1.0 / np.median(depths) if depths.size else 0.0)
+    far = np.full(rows.size, np.nan_to_num(1.0 / median_depth(key)))
     uv_a, uv_b = key.moving.at_middle(K, key.uv[rows], far), moving.at_middle(K, uv[rows], far)
     points, angle = bundle.triangulate(key.T_camera_odom, T_camera_odom, K, uv_a, uv_b)
     error = np.maximum(
@@ -145,25 +152,34 @@ def triangulate(
     ok[rows[error >= gate_px]] = False
 
 
+def observations(
+    window: list[OdometryKeyframe], K: F64, views: int, readout_s: float | None = None
+) -> tuple[I64, I64, I64, F64]:
+    """(N,) landmarks that so many ``views`` or more show, and of each of M sightings: which of
+    them, in which keyframe, and at which pixel (M, 2) at the middle row's time.
+
+    ``readout_s`` is that of the rows; None: as known.
+    """
+    cam, pt, uv = [], [], []
+    for c, key in enumerate(window):
+        known, P = key.known_points()
+        cam.append(np.full(len(P), c, np.int64))
+        pt.append(key.landmark[known])
+        uv.append(key.moving.at_middle(K, key.uv[known], 1.0 / P[:, 2], readout_s))
+    point = np.concatenate(pt)
+    _, index, counts = np.unique(point, return_inverse=True, return_counts=True)
+    use = counts[index] >= views
+    ids, index = np.unique(point[use], return_inverse=True)
+    return ids, index.astype(np.int64), np.concatenate(cam)[use], np.concatenate(uv)[use]
+
+
 def adjust_window(window: list[OdometryKeyframe], K: F64) -> AdjustedWindow:
     """Bundle-adjust the keyframes; the two oldest of them hold the frame and scale."""
     fixed = 1 if len(window) == 2 else 2
-    cam, pt, uv = [], [], []
-    for c, key in enumerate(window):
-        rows = np.flatnonzero(key.map.known(key.landmark))
-        cam.append(np.full(rows.size, c, np.int64))
-        pt.append(key.landmark[rows])
-        depth = se3.transform(key.T_camera_odom, key.map[key.landmark[rows]])[:, 2]
-        uv.append(key.moving.at_middle(K, key.uv[rows], 1.0 / depth))
-    point = np.concatenate(pt)
-    ids, index, counts = np.unique(point, return_inverse=True, return_counts=True)
-    use = counts[index] >= 2
-    ids, index = np.unique(point[use], return_inverse=True)
+    ids, index, camera, uv_px = observations(window, K, 2)
     base, table = _baseline(window), window[0].map
     free = np.arange(len(window)) >= fixed
     T_camera_odom = np.stack([k.T_camera_odom for k in window])
-    camera, uv_px = np.concatenate(cam)[use], np.concatenate(uv)[use]
-    index = index.astype(np.int64)
     result = bundle.adjust(T_camera_odom, table[ids], camera, index, uv_px, K, free, sigma_px=None)
     for c in np.flatnonzero(free):
         window[c].T_camera_odom = result.T_camera_world[c]

@@ -93,7 +93,7 @@ class KnownTrack:
             rows = Rows(self._clock, view.rate, np.zeros(6), spread)
         moving = FrameRows(time_ns, prior, T_camera_odom, rows, is_measured=True)
         key = OdometryKeyframe(
-            seq, time_ns, 0, T_camera_odom, view.covariance, prior, Pyramid.build(gray, 1),
+            seq, 0, T_camera_odom, view.covariance, prior, Pyramid.build(gray, 1),
             np.zeros((len(view.landmark), 2)), view.landmark, self._map, moving,
         )  # fmt: skip
         self.keyframes = [*self.keyframes[1 - KEPT :], key]

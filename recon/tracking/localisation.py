@@ -17,7 +17,7 @@ from recon import se3
 from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
 from recon.tracking.common_view import FEATURE_SHARES, CommonView, FeatureCache
-from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame, landmarks
+from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame, median_depth
 from recon.tracking.prediction import Motion
 from recon.types import F64, I64, Bool, Camera, PosePrior
 
@@ -104,7 +104,8 @@ class Search:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bridge:
-    """A frame's pose by what it and one keyframe see, and its scale by that keyframe's depths."""
+    """A frame's pose by what it and one keyframe see; its scale is known otherwise, as by that
+    keyframe's depths."""
 
     key: OdometryKeyframe
     T_camera_odom: F64  # (4, 4)
@@ -171,12 +172,7 @@ class Localiser:
         for key, view in self._views(new, keyframes, is_still=True):
             for share in FEATURE_SHARES:
                 guess = view.predict(key.uv, share * self.camera.size_px[0])
-                found = matching.match(
-                    key.pyramid, key.uv.astype(np.float32), new.pyramid,
-                    guess.uv.astype(np.float32), guess.radius_px, guess.warp.astype(np.float32),
-                    self.config.matching,
-                )  # fmt: skip
-                uv, ok = found.uv_px.astype(np.float64), found.ok
+                uv, ok = _find(key, new, guess, self.config.matching)
                 bridge = self._two_views(new, key, uv, ok)
                 if bridge is not None:
                     return bridge
@@ -218,8 +214,7 @@ class Localiser:
         turn = prediction.relative_rotation(key.prior, new.prior)
         largest = np.pi if turn is None else self.config.max_tilt_error_rad
         up, K = key.T_camera_odom[:3, 2], self.camera.K
-        depths = landmarks(key)[1]
-        far = np.full(int(ok.sum()), 1.0 / np.median(depths) if depths.size else 0.0)
+        far = np.full(int(ok.sum()), np.nan_to_num(1.0 / median_depth(key)))
         uv_a, uv_b = key.moving.at_middle(K, key.uv[ok], far), new.moving.at_middle(K, uv[ok], far)
         seen = two_view.solve(uv_a, uv_b, K, turn, largest, up)
         if seen is None and turn is not None:  # tags are often wrong
@@ -408,19 +403,26 @@ class Localiser:
         return off < self.config.max_tilt_error_rad
 
 
+def _find(
+    key: OdometryKeyframe, new: TrackingFrame, guess: prediction.Prediction,
+    config: matching.MatchingConfig,
+) -> tuple[F64, Bool]:  # fmt: skip
+    """Where (N, 2) a keyframe's corners are in a frame, and which (N,) are found."""
+    found = matching.match(
+        key.pyramid, key.uv.astype(np.float32), new.pyramid, guess.uv.astype(np.float32),
+        guess.radius_px, guess.warp.astype(np.float32), config,
+    )  # fmt: skip
+    return found.uv_px.astype(np.float64), found.ok
+
+
 class FirstViews:
     """Matches the first frame's corners by what is likely: as in the frame before, by
     telemetry, by the features that both images share."""
 
-    def __init__(
-        self,
-        camera: Camera,
-        config: matching.MatchingConfig,
-        radius_px: float,
-        features: FeatureCache,
-    ) -> None:
-        """``radius_px`` is searched where motion or telemetry predicts the corners."""
-        self._K, self._config, self._radius_px = camera.K, config, radius_px
+    def __init__(self, camera: Camera, config: OdometryConfig, features: FeatureCache) -> None:
+        """The wide radius is searched where motion or telemetry predicts the corners."""
+        self._K, self._config = camera.K, config.matching
+        self._radius_px = config.wide_search_share * camera.size_px[0]
         self._near_px = [share * camera.size_px[0] for share in FEATURE_SHARES]
         self._features = features
         self._drift = np.eye(3)  # from the first frame's pixels to the last one's
@@ -436,21 +438,15 @@ class FirstViews:
 
         ``R_b_a`` (3, 3) is the turn by telemetry; ``still`` images are far apart in time.
         """
-        best: tuple[F64, Bool] | None = None
+        uv, ok = first.uv, np.zeros(len(first.uv), np.bool_)
         for guess in self._guesses(new, first, R_b_a, still):
-            found = matching.match(
-                first.pyramid, first.uv.astype(np.float32), new.pyramid,
-                guess.uv.astype(np.float32), guess.radius_px, guess.warp.astype(np.float32),
-                self._config,
-            )  # fmt: skip
-            if best is None or found.ok.sum() > best[1].sum():
-                best = (found.uv_px.astype(np.float64), found.ok)
-            if best[1].sum() > 0.5 * len(first.uv):
-                self._drift = prediction.common_affine(first.uv[best[1]], best[0][best[1]])
+            found = _find(first, new, guess, self._config)
+            if found[1].sum() > ok.sum():
+                uv, ok = found
+            if ok.sum() > 0.5 * len(first.uv):
+                self._drift = prediction.common_affine(first.uv[ok], uv[ok])
                 break
-        if best is None:
-            return first.uv, np.zeros(len(first.uv), np.bool_)
-        return best
+        return uv, ok
 
     def _guesses(
         self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64 | None, still: bool

@@ -264,9 +264,9 @@ class _Refined:
     contrast_b: F64  # (N,) and where it was found
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Search:
-    """One direction of matching: the state of every point on its way down the pyramid."""
+    """One direction of matching: patches about the points of image a, looked for in image b."""
 
     a: tuple[U8, ...]
     b: tuple[U8, ...]

@@ -90,8 +90,7 @@ class ExposureWatch:
     def shown_s(self) -> float:
         """The exposure where it smears the images; 0 where they are as sharp as others."""
         exposure_s = self.exposure_s
-        is_shown = exposure_s is not None and self._typical > SHOWN_PX
-        return exposure_s if exposure_s is not None and is_shown else 0.0
+        return exposure_s if exposure_s is not None and self._typical > SHOWN_PX else 0.0
 
     @property
     def _typical(self) -> float:

@@ -26,7 +26,7 @@ from recon.tracking.keyframe_window import (
     OdometryKeyframe,
     TrackingFrame,
     adjust_window,
-    landmarks,
+    median_depth,
     triangulate,
 )
 from recon.tracking.localisation import Bridge, FirstViews, Localiser, Located, OdometryConfig
@@ -95,7 +95,6 @@ class Odometry:
         self.config = config or OdometryConfig()
         self.keyframes: list[OdometryKeyframe] = []  # of the current segment
         self.segment = -1
-        self._metric = False  # the current segment has landmarks
         self._lost = 0
         self._missed_still: tuple[TrackingFrame, str] | None = None  # the last frame, and why
         self._motion: Motion | None = None
@@ -108,12 +107,7 @@ class Odometry:
         self._unsettled: OdometryKeyframe | None = None  # its rows' motion will be known better
         self._early: list[tuple[FrameRows, F64, Bool]] = []  # frames, the first one's corners there
         self._localiser = Localiser(camera, self.config, features, self._row_track)
-        self._first_views = FirstViews(
-            camera,
-            self.config.matching,
-            self.config.wide_search_share * camera.size_px[0],
-            features,
-        )
+        self._first_views = FirstViews(camera, self.config, features)
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
         self._depth = float("nan")  # median of the last keyframe's landmarks
 
@@ -124,9 +118,9 @@ class Odometry:
 
         ``frames_per_step`` is how many frames at least are followed from keyframe to keyframe.
         """
-        if not self._metric or self._lost or self._motion is None:
+        if not self._is_metric or self._lost:
             return False
-        moved, turned, gap_s = self._motion.shift(time_ns, prior, self._depth)
+        moved, turned, gap_s = self._moving.shift(time_ns, prior, self._depth)
         max_gap_s = SOUGHT_GAP_S if self._row_track.is_rolling else MAX_GAP_S
         max_gap_s = ROLLING_GAP_S if self._row_track.is_known else max_gap_s
         step = max(moved / self.config.base_to_height, turned / MAX_TURN_RAD)
@@ -159,7 +153,7 @@ class Odometry:
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
             return self._start(new)
-        if not self._metric:
+        if not self._is_metric:
             return self._second_view(new)
         found = self._localiser.locate(
             new, self.keyframes, self._moving, self._still, lost=self._lost > 0
@@ -171,10 +165,15 @@ class Odometry:
 
     def _expected(self, time_ns: int, prior: PosePrior) -> F64:
         """(4, 4) T_camera_odom of a new frame, as far as it can be foreseen."""
-        if self._motion is not None and self.keyframes:
+        if self._motion is not None:
             return se3.inverse(self._motion.ahead(time_ns, prior)[0])
         R = prior.R_world_camera
         return np.eye(4) if R is None else se3.compose(R.T, np.zeros(3))
+
+    @property
+    def _is_metric(self) -> bool:
+        """True where the current segment has landmarks: from its second keyframe on."""
+        return len(self.keyframes) > 1
 
     @property
     def _still(self) -> bool:
@@ -210,35 +209,29 @@ class Odometry:
         if len(uv) < 2 * self.config.min_tracks:
             return Tracked(Tracking.LOST, self.segment, reason="too little texture")
         self.segment += 1
-        self._metric, self._lost = False, 0
+        self._lost = 0
         self._first_views.begin()
         self._row_track.begin()
         self._unsettled, self._early = None, []
-        R = (
-            new.prior.R_world_camera
-            if new.prior.R_world_camera is not None
-            else np.diag([1.0, -1, -1])
+        R, t = new.prior.R_world_camera, new.prior.position_m
+        T_odom_camera = se3.compose(
+            np.diag([1.0, -1, -1]) if R is None else R, np.zeros(3) if t is None else t
         )
-        t = new.prior.position_m if new.prior.position_m is not None else np.zeros(3)
-        T_odom_camera = se3.compose(R, t)
-        self.keyframes = [
-            OdometryKeyframe(
-                new.seq,
-                new.time_ns,
-                self.segment,
-                se3.inverse(T_odom_camera),
-                np.zeros((6, 6)),
-                new.prior,
-                new.pyramid,
-                uv,
-                np.full(len(uv), -1, np.int64),
-                Landmarks(),
-                new.moving,
-            )
-        ]
-        self._row_track.add(new.moving, se3.inverse(T_odom_camera))
+        T_camera_odom = se3.inverse(T_odom_camera)
+        unknown = np.full(len(uv), -1, np.int64)
+        self.keyframes = [self._keyframe(new, T_camera_odom, uv, unknown, Landmarks())]
+        self._row_track.add(new.moving, T_camera_odom)
         self._motion = Motion(new.time_ns, T_odom_camera, new.prior)
         return Tracked(Tracking.STARTED, self.segment, T_odom_camera, moving=new.moving)
+
+    def _keyframe(
+        self, new: TrackingFrame, T_camera_odom: F64, uv: F64, landmark: I64, table: Landmarks
+    ) -> OdometryKeyframe:
+        """The frame as a keyframe with corners ``uv`` (N, 2)."""
+        return OdometryKeyframe(
+            new.seq, self.segment, T_camera_odom, np.zeros((6, 6)), new.prior, new.pyramid, uv,
+            landmark, table, new.moving,
+        )  # fmt: skip
 
     def _corners(self, new: TrackingFrame) -> F64:
         """(N, 2) Harris corners of the frame, Eq. 4-5."""
@@ -275,14 +268,7 @@ class Odometry:
         scale = self._first_landmarks(view, matched[view.inliers], new.prior)
         self._place_early(first)
         second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
-        T_camera_odom = second @ first.T_camera_odom
-        self._metric = True
-        self._add_keyframe(new, T_camera_odom, [(first, uv, ok)])
-        T_odom_camera = self.keyframes[-1].T_odom_camera
-        self._moving.update(new.time_ns, T_odom_camera, new.prior)
-        return Tracked(
-            Tracking.KEYFRAME, self.segment, T_odom_camera, int(ok.sum()), moving=new.moving
-        )
+        return self._cross(new, Bridge(first, second @ first.T_camera_odom, uv, ok))
 
     def _is_no_turn(self, uv_a: F64, uv_b: F64) -> bool:
         """True where no turn of the camera explains matched pixels (N, 2).
@@ -335,7 +321,7 @@ class Odometry:
         key = found.key
         T_camera_odom = found.pose.T_camera_points
         moved = T_camera_odom @ key.T_odom_camera
-        depth = self._depth if key is self.keyframes[-1] else self.median_depth(key)
+        depth = self._depth if key is self.keyframes[-1] else median_depth(key)
         base = float(np.linalg.norm(moved[:3, 3])) / max(depth, 1e-6)
         tracks = int(found.ok.sum())
         turned = float(np.linalg.norm(se3.so3_log(moved[:3, :3])))
@@ -358,11 +344,8 @@ class Odometry:
         self._add_keyframe(
             new, found.pose.T_camera_points, [(other.key, other.uv, other.ok) for other in seen]
         )
-        last, tracks = self.keyframes[-1], int(found.ok.sum())
-        self._moving.correct(last.T_odom_camera)
-        return Tracked(
-            Tracking.KEYFRAME, self.segment, last.T_odom_camera, tracks, moving=new.moving
-        )
+        self._moving.correct(self.keyframes[-1].T_odom_camera)
+        return self._as_keyframe(new, found.ok)
 
     def _px_s(self, T_odom_camera: F64, depth: float) -> F64:
         """(2,) motion of the image since the frame before; zero for stills, which are far apart."""
@@ -375,12 +358,13 @@ class Odometry:
         """Make a keyframe of a frame that two views alone place."""
         self._lost = 0
         self._add_keyframe(new, bridge.T_camera_odom, [(bridge.key, bridge.uv, bridge.ok)])
-        last = self.keyframes[-1]
-        self._moving.update(new.time_ns, last.T_odom_camera, new.prior)
-        tracks = int(bridge.ok.sum())
-        return Tracked(
-            Tracking.KEYFRAME, self.segment, last.T_odom_camera, tracks, moving=new.moving
-        )
+        self._moving.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
+        return self._as_keyframe(new, bridge.ok)
+
+    def _as_keyframe(self, new: TrackingFrame, ok: Bool) -> Tracked:
+        """The newest keyframe's outcome, by the corners that are ``ok``."""
+        T, tracks = self.keyframes[-1].T_odom_camera, int(ok.sum())
+        return Tracked(Tracking.KEYFRAME, self.segment, T, tracks, moving=new.moving)
 
     def _add_keyframe(
         self, new: TrackingFrame, T_camera_odom: F64, seen: list[tuple[OdometryKeyframe, F64, Bool]]
@@ -402,19 +386,9 @@ class Odometry:
         fresh = prediction.fresh_corners(
             self._corners(new), kept, self.camera.size_px, self.config.matching.grid
         )
-        key_new = OdometryKeyframe(
-            new.seq,
-            new.time_ns,
-            self.segment,
-            T_camera_odom,
-            np.zeros((6, 6)),
-            new.prior,
-            new.pyramid,
-            np.vstack([kept, fresh]),
-            np.concatenate([landmark, np.full(len(fresh), -1, np.int64)]),
-            seen[0][0].map,
-            new.moving,
-        )
+        uv = np.vstack([kept, fresh])
+        landmark = np.concatenate([landmark, np.full(len(fresh), -1, np.int64)])
+        key_new = self._keyframe(new, T_camera_odom, uv, landmark, seen[0][0].map)
         self.keyframes.append(key_new)
         self._unsettled = key_new if new.moving.rows is not None else None
         window = self.keyframes[-self.config.window - 2 :]
@@ -422,23 +396,20 @@ class Odometry:
         if len(window) > self.config.window and window[0].seq > self._watched_seq:
             self._watched_seq = new.seq
             self.focal.add(adjusted)
-        self._depth = self.median_depth(key_new)
+        self._depth = median_depth(key_new)
         self._forget()
 
     def _settle(self) -> None:
-        """Adjust the window again once frames after its last keyframe say how its rows moved."""
+        """Adjust the window again once frames after its last keyframe say how its rows moved, and
+        look for the readout, until it is known that there is none."""
         if self._unsettled is not None and self._unsettled.moving.is_settled:
             adjust_window(self.keyframes, self.K)
             self._unsettled = None
-            if self.readout is not None and self._row_track.is_rolling:
-                self._seek(self.readout)
-
-    def _seek(self, readout: ReadoutSearch) -> None:
-        """Look for the readout, until it is known that there is none."""
-        if readout.look(self.keyframes):
-            adjust_window(self.keyframes, self.K)
-        if readout.estimate is not None and readout.estimate.is_none:
-            self._row_track.stop()
+            search = self.readout if self._row_track.is_rolling else None
+            if search is not None and search.look(self.keyframes):
+                adjust_window(self.keyframes, self.K)
+            if search is not None and search.estimate is not None and search.estimate.is_none:
+                self._row_track.stop()
 
     def _forget(self) -> None:
         """Drop images and corners that left the window, and landmarks out of sight."""
@@ -450,8 +421,3 @@ class Odometry:
         seen = np.concatenate([k.landmark for k in window])
         if (seen >= 0).any():
             window[0].map.forget_before(int(seen[seen >= 0].min()))
-
-    def median_depth(self, key: OdometryKeyframe) -> float:
-        """Median depth of the keyframe's landmarks, in odometry units; NaN without any."""
-        _, depth = landmarks(key)
-        return float(np.median(depth)) if depth.size else float("nan")

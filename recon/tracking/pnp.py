@@ -51,15 +51,6 @@ class PnpResult:
         return float(np.mean(self.inliers))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseFit:
-    """The lowest reprojection error, before anyone judges it."""
-
-    T_camera_points: F64  # (4, 4) m
-    inliers: Bool  # (N,)
-    error: F64  # (M,) px, of the points that are finite
-
-
 STEPS = 10
 """Maximum number of Gauss-Newton steps."""
 
@@ -92,11 +83,9 @@ def solve(
     T = _best(_starts(local, pixels, K, k, prior, config), local, pixels, k, config)
     if T is None:
         return None
-    fit = PoseFit(
-        T @ se3.inverse(shift), np.zeros(len(points), np.bool_), _errors(T, local, pixels, k)
-    )
-    fit.inliers[finite] = fit.error <= config.threshold_px
-    return _judge(fit, points, uv, k, prior_T_camera_points, config)
+    error = np.full(len(points), np.inf)
+    error[finite] = _errors(T, local, pixels, k)
+    return _judge(T @ se3.inverse(shift), error, points, uv, k, prior_T_camera_points, config)
 
 
 def _starts(
@@ -194,10 +183,10 @@ def _best(starts: list[F64], points: F64, uv: F64, k: F64, config: PnpConfig) ->
 
 
 def _judge(
-    fit: PoseFit, points: F64, uv: F64, k: F64, prior: F64 | None, config: PnpConfig
+    T: F64, error: F64, points: F64, uv: F64, k: F64, prior: F64 | None, config: PnpConfig
 ) -> PnpResult | None:
-    """The result with its covariance, or None when it cannot be trusted."""
-    T, inliers = fit.T_camera_points, fit.inliers
+    """The result with its covariance, or None when it cannot be trusted; ``error`` (N,) px."""
+    inliers = error <= config.threshold_px
     count = int(np.count_nonzero(inliers))
     share = count / len(points)
     if count < config.min_inliers or share < config.min_inlier_share:
@@ -206,7 +195,7 @@ def _judge(
         turn = float(np.linalg.norm(se3.so3_log(T[:3, :3] @ prior[:3, :3].T)))
         if turn > config.max_prior_rotation_rad:
             return None
-    error = fit.error[fit.error <= config.threshold_px]
+    error = error[inliers]
     variance = max(float(error @ error) / (2 * count - 6), config.floor_px**2)
     H, _ = _normal_equations(T, points, uv, k, inliers)
     covariance = _inverse(H)

@@ -80,8 +80,7 @@ def on_landmarks(
     """Where the keyframe's corners fall for a start pose; corners without a landmark
     are taken to lie on the plane through the landmarks."""
     T_new_key = T_camera_odom @ key.T_odom_camera
-    known = key.map.known(key.landmark)
-    P_key = se3.transform(key.T_camera_odom, key.map[key.landmark[known]])
+    known, P_key = key.known_points()
     plane = inverse_depth_plane(P_key)
     H = K @ (T_new_key[:3, :3] + np.outer(T_new_key[:3, 3], plane)) @ np.linalg.inv(K)
     uv = cv2.perspectiveTransform(key.uv[:, None], H)[:, 0].astype(np.float64)
@@ -99,8 +98,7 @@ def landmark_depths(key: OdometryKeyframe, K: F64, rows: I64) -> F64 | None:
     With too few landmarks among them all depths are those of the plane through the others;
     None where that does not reach.
     """
-    known = key.map.known(key.landmark)
-    P = se3.transform(key.T_camera_odom, key.map[key.landmark[known]])
+    known, P = key.known_points()
     z = np.full(len(key.uv), np.nan)
     z[known] = P[:, 2]
     if np.isfinite(z[rows]).sum() >= MIN_MEASURED:

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon import se3
-from recon.rolling_shutter import RowClock, Rows
+from recon.rolling_shutter import RowClock
 from recon.tracking import bundle
-from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.tracking.keyframe_window import OdometryKeyframe, observations
 from recon.types import F64
 
 KEYFRAMES, FIRST_KEYFRAMES = 5, 3
@@ -121,7 +120,7 @@ class ReadoutSearch:
     def _take(self, window: list[OdometryKeyframe]) -> None:
         now = self._clock.readout_s
         tried = now + STEP_S * np.arange(-1.0, 2.0) if self._is_sure else COARSE_S
-        costs = [_cost(window, self._clock.reading(readout_s), self._K) for readout_s in tried]
+        costs = [_cost(window, float(readout_s), self._K) for readout_s in tried]
         k = int(np.clip(np.argmin([cost for cost, _ in costs]), 1, len(tried) - 2))
         (below, _), (here, redundancy), (above, _) = costs[k - 1 : k + 2]
         spacing = tried[1] - tried[0]
@@ -147,30 +146,11 @@ class ReadoutSearch:
             self._clock.readout_s = float(np.clip(mean, -MAX_READOUT_S, MAX_READOUT_S))
 
 
-def _cost(window: list[OdometryKeyframe], clock: RowClock, K: F64) -> tuple[float, int]:
-    """Huber cost, px^2, of the adjusted window, and its redundancy."""
-    view, landmark, uv = [], [], []
-    for c, key in enumerate(window):
-        assert key.moving.rows is not None
-        at = np.flatnonzero(key.map.known(key.landmark))
-        depth = se3.transform(key.T_camera_odom, key.map[key.landmark[at]])[:, 2]
-        rows = Rows(clock, key.moving.rows.rate, key.moving.rows.change)
-        view.append(np.full(at.size, c, np.int64))
-        landmark.append(key.landmark[at])
-        uv.append(rows.at_middle(K, key.uv[at], 1.0 / depth))
-    point = np.concatenate(landmark)
-    _, index, counts = np.unique(point, return_inverse=True, return_counts=True)
-    use = counts[index] >= 3  # two views give way to any readout
-    ids, index = np.unique(point[use], return_inverse=True)
-    found = bundle.adjust(
-        np.stack([key.T_camera_odom for key in window]),
-        window[0].map[ids],
-        np.concatenate(view)[use],
-        index.astype(np.int64),
-        np.concatenate(uv)[use],
-        K,
-        np.arange(len(window)) > 0,
-    )
+def _cost(window: list[OdometryKeyframe], readout_s: float, K: F64) -> tuple[float, int]:
+    """Huber cost, px^2, of the window adjusted with a readout, and its redundancy."""
+    ids, index, camera, uv = observations(window, K, 3, readout_s)  # two give way to any readout
+    T_camera_odom, free = np.stack([k.T_camera_odom for k in window]), np.arange(len(window)) > 0
+    found = bundle.adjust(T_camera_odom, window[0].map[ids], camera, index, uv, K, free)
     error = np.minimum(found.residual_px, 1e3)
     cost = np.where(error < HUBER_PX, error**2, 2.0 * HUBER_PX * error - HUBER_PX**2)
     return float(cost.sum()), 2 * len(error) - 3 * len(ids) - 6 * (len(window) - 1)

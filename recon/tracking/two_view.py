@@ -30,7 +30,7 @@ class TwoView:
     parallax_rad: float  # median over the inliers
 
 
-def translation_direction(rays_a: F64, rays_b: F64, R_b_a: F64, rounds: int = 10) -> F64:
+def translation_direction(rays_a: F64, rays_b: F64, R_b_a: F64) -> F64:
     """(3,) unit translation t of ``x_b ~ R x_a + t / depth`` for a known rotation.
 
     Every match says that t lies in the plane of its two rays; the least-squares normal is
@@ -39,7 +39,7 @@ def translation_direction(rays_a: F64, rays_b: F64, R_b_a: F64, rounds: int = 10
     normals = np.cross(rays_b, rays_a @ R_b_a.T)
     weights = np.ones(len(normals))
     t = np.zeros(3)
-    for _ in range(rounds):
+    for _ in range(10):
         _, vectors = np.linalg.eigh((normals * weights[:, None]).T @ normals)
         t = vectors[:, 0]
         error = np.abs(normals @ t)
@@ -67,7 +67,7 @@ def _candidates(
     return out
 
 
-def _refine(R: F64, t: F64, uv_a: F64, uv_b: F64, K: F64, max_error_px: float) -> TwoView | None:
+def _refine(R: F64, t: F64, uv_a: F64, uv_b: F64, K: F64) -> TwoView | None:
     """Bundle-adjusted candidate with the baseline set back to one, or None."""
     T_b_a = se3.compose(R, t)
     for _ in range(2):
@@ -95,7 +95,7 @@ def _refine(R: F64, t: F64, uv_a: F64, uv_b: F64, K: F64, max_error_px: float) -
     error = np.maximum(
         reprojection_error(np.eye(4), points, K, uv_a), reprojection_error(T_b_a, points, K, uv_b)
     )
-    inliers = (error < max_error_px) & (angle > 2e-3)
+    inliers = (error < MAX_ERROR_PX) & (angle > 2e-3)
     if inliers.sum() < 20:
         return None
     points[~inliers] = np.nan
@@ -137,7 +137,6 @@ def solve(
     R_b_a: F64 | None,
     max_turn_rad: float,
     up_a: F64,
-    max_error_px: float = MAX_ERROR_PX,
 ) -> TwoView | None:
     """The relative pose of two frames and their points, or None when it is not certain.
 
@@ -156,7 +155,7 @@ def solve(
     rays_b = np.hstack([uv_b, one]) @ K_inv.T
     found: list[tuple[TwoView, float]] = []
     for R, t in _candidates(uv_a, uv_b, rays_a, rays_b, K, R_b_a):
-        view = _refine(R, t, uv_a, uv_b, K, max_error_px)
+        view = _refine(R, t, uv_a, uv_b, K)
         if view is None:
             continue
         if R_b_a is not None:

@@ -19,7 +19,12 @@ from recon.posegraph.between_keyframes import FixAverage
 from recon.rolling_shutter import NEAR_S, FrameRows, depth_share, on_image
 from recon.row_errors import turn_shares
 from recon.stereo.virtual_stereo import View
-from recon.tracking.keyframe_window import OdometryKeyframe, landmarks, step_covariance
+from recon.tracking.keyframe_window import (
+    OdometryKeyframe,
+    landmarks,
+    median_depth,
+    step_covariance,
+)
 from recon.tracking.known_track import AnyTrack
 from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.prediction import inverse_depth_plane
@@ -289,7 +294,7 @@ class Viewpoints:
 
     def _wide(self, view: Viewpoint, others: list[Viewpoint]) -> list[Viewpoint]:
         """Partners of all baselines that stereo can bridge; the nearest where there are none."""
-        widest = WIDEST * float(np.median(landmarks(view.key)[1]))
+        widest = WIDEST * median_depth(view.key)
         good = [v for v in others if _apart(v, view) <= widest]
         return _evenly(good, KNOWN_PARTNERS * self._partners) or others[: self._partners]
 
@@ -394,7 +399,7 @@ class StereoViews:
         return self.selection.ready(view) and not (shows and len(self._waiting) < HELD)
 
     def _candidate(self, view: Viewpoint, prior: PosePrior) -> StereoCandidate:
-        points, _ = landmarks(view.key)
+        points = landmarks(view.key)
         points = se3.transform(se3.inverse(view.anchor.T_key_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         assert view.colour is not None
