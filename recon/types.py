@@ -213,11 +213,10 @@ class Keyframe:
 class PointCloud:
     """Points with colour and uncertainty."""
 
-    xyz_m: F32  # (N, 3)
+    xyz_m: F32  # (N, 3) world
     rgb: U8  # (N, 3)
     sigma_m: F32  # (N,)
     views: U8  # (N,)
-    frame: str = "world"
     time_ns: I64 | None = None  # (N,) unix time of the image that knows each point best
 
     def __len__(self) -> int:

@@ -80,7 +80,7 @@ def _descent(config: IcpConfig) -> Callable[..., tuple[Tensor, ...]]:
         size = last.residual.view(seen.shape)
         near = (last.found.view(seen.shape) > 0) & (size.abs() < AREA_SIGMAS * last.scale)
         numbers = [
-            last.H, last.common, last.g, last.sums, last.scale, last.centre, a.lever_m,
+            last.H, last.common, last.g, last.sums, last.centre, a.lever_m,
             last.partners * state[0], seen.known.sum(), state[2], T,
             correlation_sums(torch.where(near, size, 0.0), near, AREA_LAGS),
         ]  # fmt: skip
@@ -107,16 +107,14 @@ def descend(
 
 def _concluded(rows: F64, start: F64, config: IcpConfig) -> Registration:
     """The registration from the numbers read from the device."""
-    ends = np.cumsum([36, 36, 6, 4, 1, 3, 1, 1, 1, 1, 16])
-    H, common, g, sums, scale, centre, lever, partners, available, done, T, lags = np.split(
-        rows, ends
-    )
+    ends = np.cumsum([36, 36, 6, 4, 3, 1, 1, 1, 1, 16])
+    H, common, g, sums, centre, lever, partners, available, done, T, lags = np.split(rows, ends)
     if not np.isfinite(rows[: ends[-1]]).all():  # a start from which nothing can be computed
         partners = np.zeros(1)
     if partners[0] < MIN_PARTNERS:
         return no_overlap(start, int(done[0]))
     equations = Equations(
-        H.reshape(6, 6), common.reshape(6, 6), g, sums, float(scale[0]), centre, float(lever[0]),
+        H.reshape(6, 6), common.reshape(6, 6), g, sums, centre, float(lever[0]),
         lambda: _area(lags.reshape(2, 3, AREA_LAGS)),
     )  # fmt: skip
     return conclude(equations, T.reshape(4, 4), start, int(available[0]), int(done[0]), config)

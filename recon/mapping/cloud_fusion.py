@@ -96,8 +96,7 @@ def without(cloud: PointCloud, mask: Bool) -> PointCloud:
     keep = np.flatnonzero(~mask)  # rows are gathered several times faster than masked
     return PointCloud(
         cloud.xyz_m.take(keep, 0), cloud.rgb.take(keep, 0), cloud.sigma_m.take(keep),
-        cloud.views.take(keep), cloud.frame,
-        None if cloud.time_ns is None else cloud.time_ns.take(keep),
+        cloud.views.take(keep), None if cloud.time_ns is None else cloud.time_ns.take(keep),
     )  # fmt: skip
 
 
@@ -108,30 +107,22 @@ class _Sums:
         self.keys: I64 = np.full(1 << 16, -1, np.int64)
         self.ids: I32 = np.zeros(1 << 16, np.int32)
         self.count = 0
-        self._grow(1 << 15)
-
-    def _grow(self, rows: int) -> None:
-        old = self.count
-        names = (("xyzw", 4, np.float64), ("rgb", 3, np.float32), ("info", 3, np.float64))
-        for name, width, dtype in names:
-            new = np.zeros((rows, width), dtype)
-            if old:
-                new[:old] = getattr(self, name)[:old]
-            setattr(self, name, new)
-        tags = np.zeros((rows, 4), np.int32)
-        if old:
-            tags[:old] = self.tags[:old]
-        self.tags = tags
-
-    xyzw: F64  # sum of w x, w y, w z, w over points
-    rgb: F32  # sum of w colour
-    info: F64  # sum over clouds of the best w; best w of the last cloud; best w of all
-    tags: I32  # last cloud; sum over clouds of the most views; most in the last; cloud of best w
+        rows = 1 << 15
+        # Sums of w x, w y, w z, w over points; of w colour.
+        self.xyzw, self.rgb = np.zeros((rows, 4)), np.zeros((rows, 3), np.float32)
+        # Sum over clouds of the best w; best w of the last cloud; best w of all.
+        self.info = np.zeros((rows, 3))
+        # Last cloud; sum over clouds of the most views; most in the last; cloud of best w.
+        self.tags = np.zeros((rows, 4), np.int32)
 
     def add(self, cloud: PointCloud, number: int, voxel_m: float, low: float, high: float) -> None:
         """Add one cloud's points whose voxel's x index lies in [low, high)."""
         while len(self.tags) < self.count + len(cloud):
-            self._grow(2 * len(self.tags))
+            for name in ("xyzw", "rgb", "info", "tags"):
+                held = getattr(self, name)
+                grown = np.zeros((2 * len(held), held.shape[1]), held.dtype)
+                grown[: len(held)] = held
+                setattr(self, name, grown)
         slots = len(self.keys)
         while slots < 2 * (self.count + len(cloud)):
             slots *= 2

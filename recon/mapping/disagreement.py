@@ -15,15 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
-from recon.camera_model import project, rays
-from recon.types import F32, F64, Bool, DepthMap
+from recon.camera_model import project
+from recon.mapping.voxel_map import sampled
+from recon.types import F32, Bool, DepthMap
 
 NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a normal variable of unit sigma."""
 
 
-IMAGES, ROWS = 32, 24
-"""Number of images that are kept, and rows of samples of each."""
+IMAGES = 32
+"""Number of images that are kept."""
 
 MIN_COMMON = 60
 """Minimum number of samples that two images share."""
@@ -71,8 +72,7 @@ class Disagreement:
             for one, rho in zip(reversed(self._earlier), common, strict=False)
         ]
         ratios = [ratio / differing for ratio, differing in found if ratio is not None]
-        samples = _samples(depth)
-        self._earlier.append(samples)
+        self._earlier.append(_samples(depth))
         if not ratios:
             return 1.0
         factor = float(np.sqrt(np.mean(np.square(ratios))))
@@ -83,12 +83,8 @@ class Disagreement:
         h, w = depth.depth_m.shape
         here = se3.transform(se3.inverse(depth.T_world_camera), one.points.astype(np.float64))
         ahead = here[:, 2] > 1e-3
-        if np.count_nonzero(ahead) < MIN_COMMON:
-            return None
         uv = np.rint(project(depth.K, here[ahead]))
         inside = (uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] < w) & (uv[:, 1] < h)
-        if np.count_nonzero(inside) < MIN_COMMON:
-            return None
         u, v = uv[inside].astype(np.int64).T
         z = depth.depth_m[v, u]
         known = np.isfinite(z)
@@ -103,11 +99,6 @@ class Disagreement:
 
 def _samples(depth: DepthMap) -> _Samples:
     """The surface at every so many pixels."""
-    step = max(1, depth.depth_m.shape[0] // ROWS)
-    z, sigma = depth.depth_m[::step, ::step], depth.sigma_m[::step, ::step]
-    v, u = np.nonzero(np.isfinite(z))
-    uv = np.column_stack([u, v]).astype(np.float64) * step
-    camera: F64 = rays(depth.K, uv) * z[v, u, None].astype(np.float64)
-    world = se3.transform(depth.T_world_camera, camera)
-    is_sure = depth.views[::step, ::step][v, u] >= 2
-    return _Samples(world.astype(np.float32), np.asarray(sigma[v, u], np.float32), is_sure)
+    at, world = sampled(depth)
+    sigma_m = np.asarray(depth.sigma_m[at], np.float32)
+    return _Samples(world.astype(np.float32), sigma_m, depth.views[at] >= 2)

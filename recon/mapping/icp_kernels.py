@@ -98,7 +98,7 @@ def surface_elements(
     """
     h, w = depth.shape
     for chunk in range(begin, end):
-        column, fits, fit = np.empty((3, w)), np.empty((4, w)), np.empty(4)
+        column, fits = np.empty((3, w)), np.empty((4, w))
         for v in range(chunk * CHUNK, min((chunk + 1) * CHUNK, h)):
             _full_fits(inverse, v, column, fits)
             for u in range(w):
@@ -107,10 +107,8 @@ def surface_elements(
                 z = depth[v, u]
                 if not (z > 0 and sigma[v, u] > 0):
                     continue
-                if np.isnan(fits[0, u]):
-                    if not _gappy_fit(inverse, v, u, fit):
-                        continue
-                    fits[0, u], fits[1, u], fits[2, u], fits[3, u] = fit[0], fit[1], fit[2], fit[3]
+                if np.isnan(fits[0, u]) and not _gappy_fit(inverse, v, u, fits[:, u]):
+                    continue
                 rms = np.sqrt(max(fits[3, u], 0.0)) * z * z
                 if rms > edge * z and rms > 3 * sigma[v, u]:
                     continue

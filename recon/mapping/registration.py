@@ -60,7 +60,7 @@ def arrays_of(depth: DepthMap) -> tuple[F32, F32, F64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthSurface:
-    """A depth map with its surface elements, ready to be aligned many times."""
+    """A depth map with its surface elements."""
 
     elements: F32  # (h, w, 6), see recon.mapping.icp_kernels
     intrinsics: F64  # (4,) fx fy cx cy
@@ -95,7 +95,6 @@ class Equations:
     common: F64  # (6, 6)
     g: F64  # (6,)
     sums: F64  # (4,)
-    scale: float  # robust standard deviation of the residuals in sigmas
     centre: F64  # (3,) m, target frame
     lever_m: float
     area: Callable[[], float]  # neighbours whose residuals err together; takes long
@@ -137,7 +136,7 @@ class _Problem:
 def _problem(
     source: DepthSurface, target: DepthSurface, T: F64, stride: int, tukey: bool, config: IcpConfig
 ) -> _Problem | None:
-    """The problem at ``T``, or None when fewer than 50 points find a partner."""
+    """The problem at ``T``, or None when fewer than :data:`MIN_PARTNERS` points find a partner."""
     h, w = source.elements.shape[:2]
     shape = (h - stride // 2 - 1) // stride + 1, (w - stride // 2 - 1) // stride + 1
     size, rows = np.empty(shape, np.float32), np.empty((*shape, 10), np.float32)
@@ -145,26 +144,21 @@ def _problem(
         source.elements, source.intrinsics, target.elements, target.intrinsics,
         T, stride, config.gate_share, size, rows,
     )  # fmt: skip
-    return _weighed(size, rows, T[:3, :3] @ source.centre + T[:3, 3], source.lever_m, tukey, config)
-
-
-def _weighed(
-    size: F32, rows: F32, centre: F64, lever_m: float, tukey: bool, config: IcpConfig
-) -> _Problem | None:
-    """The problem of partners that were found, or None when they are fewer than 50."""
     matched = size[size < icp_kernels.UNMATCHED]
     if len(matched) < MIN_PARTNERS:
         return None
     every = max(len(matched) // 2000, 1)
     scale = max(float(np.median(np.abs(matched[::every]))) / 0.6745, 1e-3)
     H, common, g, sums = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(4)
+    centre = T[:3, :3] @ source.centre + T[:3, 3]
     limit = scale * (config.tukey_sigmas if tukey else config.huber_sigmas)
     icp_kernels.normal_equations(size, rows, centre, limit, tukey, H, common, g, sums)
 
     def area() -> float:
         return float(icp_kernels.correlated_area(size, AREA_SIGMAS * scale, AREA_LAGS))
 
-    return _along_directions(Equations(H, common, g, sums, scale, centre, lever_m, area), config)
+    equations = Equations(H, common, g, sums, centre, source.lever_m, area)
+    return _along_directions(equations, config)
 
 
 def _along_directions(equations: Equations, config: IcpConfig) -> _Problem:
@@ -202,12 +196,26 @@ def register_projective(
     little overlap, residuals too large, or a correction too large to be plausible.
     """
     config = config or IcpConfig()
-    return register_surfaces(
-        DepthSurface.build(source, config),
-        DepthSurface.build(target, config),
-        T_target_source,
-        config,
-    )
+    a, b = DepthSurface.build(source, config), DepthSurface.build(target, config)
+    T = np.array(T_target_source, dtype=np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise ValueError("T_target_source must be (4, 4) finite numbers")
+    problem: _Problem | None = None
+    done = 0
+    last = len(config.strides) - 1
+    for level, (stride, limit) in enumerate(zip(config.strides, config.iterations, strict=True)):
+        for _ in range(limit):
+            problem = _problem(a, b, T, stride, level == last, config)
+            if problem is None:
+                return no_overlap(T_target_source, done)
+            step = problem.step()
+            T = step @ T
+            done += 1
+            if problem.settled(step, 0.3 if level == last else 1.0):
+                break
+    assert problem is not None
+    grid = a.elements[stride // 2 :: stride, stride // 2 :: stride, 4]
+    return _judged(problem, T, T_target_source, int(np.count_nonzero(grid)), done, config)
 
 
 def agreed_motion(
@@ -219,31 +227,6 @@ def agreed_motion(
     if not found.converged or se3.disagreement(*both) > config.max_disagreement:
         return None
     return se3.average(*both)
-
-
-def register_surfaces(
-    source: DepthSurface, target: DepthSurface, T_target_source: F64, config: IcpConfig
-) -> Registration:
-    """As :func:`register_projective`, for surfaces that were built before."""
-    T = np.array(T_target_source, dtype=np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise ValueError("T_target_source must be (4, 4) finite numbers")
-    problem: _Problem | None = None
-    done = 0
-    last = len(config.strides) - 1
-    for level, (stride, limit) in enumerate(zip(config.strides, config.iterations, strict=True)):
-        for _ in range(limit):
-            problem = _problem(source, target, T, stride, level == last, config)
-            if problem is None:
-                return no_overlap(T_target_source, done)
-            step = problem.step()
-            T = step @ T
-            done += 1
-            if problem.settled(step, 0.3 if level == last else 1.0):
-                break
-    assert problem is not None
-    grid = source.elements[stride // 2 :: stride, stride // 2 :: stride, 4]
-    return _judged(problem, T, T_target_source, int(np.count_nonzero(grid)), done, config)
 
 
 def no_overlap(T: F64, iterations: int) -> Registration:

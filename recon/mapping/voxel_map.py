@@ -21,6 +21,8 @@ from recon.types import F32, F64, I32, I64, Bool, DepthMap
 EMPTY = np.int64(-1)
 TILE_BITS = 7
 """Pages hold square columns of 2**7 voxels on a side."""
+SAMPLED_ROWS = 24
+"""Of a depth map, where some of its surface stands for all."""
 _OFFSET = 1 << 20
 LARGEST_INDEX = _OFFSET - 1
 """Voxel indices reach this far from the origin on each axis; points beyond are left out."""
@@ -97,17 +99,22 @@ def tile_of(keys: I64) -> I64:
     return np.asarray(((i >> TILE_BITS) << 21) | (j >> TILE_BITS))
 
 
+def sampled(depth: DepthMap) -> tuple[tuple[I64, I64], F64]:
+    """Rows and columns of known pixels on a coarse grid of ``depth``, and the (N, 3) places that
+    they show, m, world."""
+    step = max(1, depth.depth_m.shape[0] // SAMPLED_ROWS)
+    v, u = np.nonzero(np.isfinite(depth.depth_m[::step, ::step]))
+    v, u = step * v, step * u
+    z = depth.depth_m[v, u, None].astype(np.float64)
+    uv = np.column_stack([u, v]).astype(np.float64)
+    return (v, u), se3.transform(depth.T_world_camera, rays(depth.K, uv) * z)
+
+
 def tiles_under(depth: DepthMap, voxel_m: float, margin_m: float) -> I64:
     """(T,) tiles that the surface of ``depth`` lies in, and those ``margin_m`` around it."""
-    h, w = depth.depth_m.shape
-    step = max(1, h // 24)
-    v, u = np.mgrid[0:h:step, 0:w:step]
-    z = depth.depth_m[::step, ::step].ravel().astype(np.float64)
-    known = np.isfinite(z)
-    if not known.any():
+    _, points = sampled(depth)
+    if not len(points):
         return np.zeros(0, np.int64)
-    uv = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)[known]
-    points = se3.transform(depth.T_world_camera, rays(depth.K, uv) * z[known, None])
     low, high = points[:, :2].min(axis=0) - margin_m, points[:, :2].max(axis=0) + margin_m
     reach = LARGEST_INDEX - 1
     first = (np.floor(low / voxel_m).clip(-reach, reach).astype(np.int64) + _OFFSET) >> TILE_BITS
@@ -127,7 +134,7 @@ class VoxelMap:
         self.config = config or VoxelMapConfig()
         self._turn = 0
         self._count: int = 0
-        self._clear(1 << 16)
+        self._clear()
 
     def __len__(self) -> int:
         """Number of voxels that hold surface."""
@@ -152,6 +159,8 @@ class VoxelMap:
         """Remember the surface of ``depth``, where ``mask`` if given; how many voxels are new."""
         mask_ = np.ones(depth.depth_m.shape, np.bool_) if mask is None else mask
         self._turn += 1
+        if self._count > self.config.largest_voxels:
+            self._forget_half()
         self._make_room(int(np.count_nonzero(mask_)))
         before = self._count
         self._count = int(
@@ -169,17 +178,16 @@ class VoxelMap:
         )
         return self._count - before
 
-    def _clear(self, slots: int) -> None:
-        self._keys: I64 = np.full(slots, -1, np.int64)
+    def _clear(self) -> None:
+        slots = 1 << 16
+        self._keys: I64 = np.full(slots, EMPTY, np.int64)
         self._ids: I32 = np.zeros(slots, np.int32)
         self._sigma: F32 = np.zeros(slots // 2, np.float32)
         self._seen: I32 = np.zeros(slots // 2, np.int32)
         self._count = 0
 
-    def _make_room(self, more: int, forget: bool = True) -> None:
-        """Room for ``more`` voxels at a load of one half; forgets the oldest at the limit."""
-        if forget and self._count > self.config.largest_voxels:
-            self._forget_half()
+    def _make_room(self, more: int) -> None:
+        """Room for ``more`` voxels at a load of one half."""
         need = self._count + more
         slots = len(self._keys)
         while slots < 2 * need:
@@ -199,7 +207,7 @@ class VoxelMap:
 
     def put(self, voxels: Voxels) -> None:
         """Add voxels taken before; where one is held already the smaller sigma stays."""
-        self._make_room(len(voxels.keys), forget=False)
+        self._make_room(len(voxels.keys))
         self._count = int(
             _put(
                 self._keys, self._ids, self._sigma, self._seen, self._count, voxels.keys,
@@ -228,13 +236,9 @@ class VoxelMap:
         return Voxels(self._keys[at], self._sigma[ids], self._seen[ids])
 
     def _refill(self, voxels: Voxels) -> None:
-        count, slots = len(voxels.keys), 1 << 16
-        while slots < 4 * count:
-            slots *= 2
-        self._clear(slots)
-        self._count = count
-        self._sigma[:count], self._seen[:count] = voxels.sigma_m, voxels.seen
-        _place(self._keys, self._ids, voxels.keys)
+        self._clear()
+        self._make_room(2 * len(voxels.keys))
+        self.put(voxels)
 
 
 def _arrays(depth: DepthMap) -> tuple[F32, F32, F64, F64]:
@@ -245,15 +249,6 @@ def _arrays(depth: DepthMap) -> tuple[F32, F32, F64, F64]:
         np.ascontiguousarray(depth.K, np.float64),
         np.ascontiguousarray(depth.T_world_camera, np.float64),
     )
-
-
-@njit(cache=True, nogil=True)
-def _place(keys: I64, ids: I32, new: I64) -> None:
-    """Write ``new`` keys with ids 0, 1, 2 ... into an empty table."""
-    for n in range(new.shape[0]):
-        s = find_slot(keys, new[n])
-        keys[s] = new[n]
-        ids[s] = n
 
 
 @njit(cache=True, nogil=True)
