@@ -14,7 +14,6 @@ from recon.calibration.flight import (
     SelfCalibrationConfig,
     camera_information,
     first_held,
-    joint,
     network,
 )
 from recon.calibration.global_bundle import (
@@ -23,6 +22,7 @@ from recon.calibration.global_bundle import (
     Sightings,
     Solution,
     errors_px,
+    joint,
     solve,
 )
 from recon.calibration.tracks import crossings, with_distortion, without_distortion

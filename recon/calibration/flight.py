@@ -22,6 +22,7 @@ from recon.calibration.global_bundle import (
     Sightings,
     Solution,
     errors_px,
+    joint,
     solve,
 )
 from recon.calibration.tracks import crossings
@@ -275,14 +276,6 @@ def within(
 ) -> Sightings:  # fmt: skip
     """Sightings of known points that are off by less than ``gate_px``, two of each at least."""
     return shared(seen, errors_px(camera, poses, points, seen, rows) < gate_px)
-
-
-def joint(a: Sightings, b: Sightings) -> Sightings:
-    """The sightings of both sets."""
-    return Sightings(
-        np.append(a.view, b.view), np.append(a.landmark, b.landmark),
-        np.concatenate([a.uv_px, b.uv_px]),
-    )  # fmt: skip
 
 
 def loosely_placed(poses: F64, seen: Sightings) -> Knowledge:

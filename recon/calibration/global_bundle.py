@@ -53,6 +53,14 @@ class Sightings:
     uv_px: F64  # (M, 2)
 
 
+def joint(a: Sightings, b: Sightings) -> Sightings:
+    """The sightings of both sets."""
+    return Sightings(
+        np.append(a.view, b.view), np.append(a.landmark, b.landmark),
+        np.concatenate([a.uv_px, b.uv_px]),
+    )  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Knowledge:
     """Prior knowledge about N poses and P points, besides their pixels; NaN where there is none."""
@@ -192,7 +200,23 @@ def dispersion(problem: Problem) -> float:
     doi:10.1214/aos/1176346391) with views as clusters.
     """
     bundle = _Bundle(problem)
-    return bundle.dispersion(bundle.start)
+    s = bundle.start
+    eq, before = bundle._equations(s, 0.0), bundle._errors(s)
+    step = 0.1 * np.sqrt(np.abs(np.diag(np.linalg.inv(eq.Hk))))
+    still, none = np.zeros(eq.g.shape), np.zeros(eq.bp.shape)
+    moved = [bundle._errors(bundle._moved(s, eq, d, still, none)) for d in np.diag(step)]
+    D = np.stack([(before - after) / h for after, h in zip(moved, step, strict=True)], axis=2)
+    lengths = np.hypot(*before.T) / bundle._sigma
+    ok = np.isfinite(D).all(axis=(1, 2)) & np.isfinite(lengths)
+    huber = problem.huber_sigmas
+    w = np.minimum(1.0, huber / np.maximum(lengths[ok], 1e-12)) / bundle._sigma[ok] ** 2
+    score, known = np.zeros((len(s.T), CAMERA)), np.zeros((len(s.T), CAMERA, CAMERA))
+    np.add.at(score, bundle._view[ok], np.einsum("mik,m,mi->mk", D[ok], w, before[ok]))
+    np.add.at(known, bundle._view[ok], np.einsum("mik,m,mil->mkl", D[ok], w, D[ok]))
+    share = np.linalg.solve(known.sum(axis=0), known)  # of each view in what all know
+    fitted = np.einsum("nij,nji->", share, share)
+    spread = np.trace(np.linalg.solve(known.sum(axis=0), score.T @ score))
+    return float(spread / max(CAMERA - fitted, 1.0))
 
 
 def step_covariances(problem: Problem) -> F64:
@@ -201,13 +225,20 @@ def step_covariances(problem: Problem) -> F64:
     ``problem`` holds the adjusted state. Zero for the first pose.
     """
     bundle = _Bundle(problem)
-    return bundle.step_covariances(bundle.start)
+    T, V = bundle.start.T, bundle._unknowns
+    eq, out = bundle._equations(bundle.start, 0.0), np.zeros((len(T), 6, 6))
+    for n in range(1, len(T)):
+        both = _joint(eq, np.r_[V * (n - 1) : V * (n - 1) + 6, V * n : V * n + 6])
+        J = np.hstack([-se3.adjoint(T[n] @ se3.inverse(T[n - 1])), np.eye(6)])
+        out[n] = J @ both @ J.T
+    return np.asarray(0.5 * (out + out.transpose(0, 2, 1)))
 
 
 def turn_covariances(problem: Problem) -> F64:
     """(N, 3, 3) of the turns of the rows, in rad^2; ``problem`` holds the adjusted state."""
     bundle = _Bundle(problem)
-    return bundle.turn_covariances(bundle.start)
+    eq, V = bundle._equations(bundle.start, 0.0), bundle._unknowns
+    return np.array([_joint(eq, np.r_[V * n + 6 : V * n + 9]) for n in range(len(bundle.start.T))])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,7 +254,6 @@ class _Equations:
     """The reduced system of N views with V unknowns each, factored, with its border."""
 
     solved: Any  # solves for columns (V N, n)
-    B: F64  # (V N, 8)
     Hk: F64  # (8, 8), reduced by the points and the views
     g: F64  # (V N,)
     gk: F64  # (8,)
@@ -380,7 +410,7 @@ class _Bundle:
         solved, border = self._factored(S, N), B.reshape(V * N, CAMERA)
         Z = solved(border)
         reduced, right = Hk - border.T @ Z, gk - Z.T @ g.ravel()
-        return _Equations(solved, border, reduced, g.ravel(), right, Z, Hp, bp, W, Wk)
+        return _Equations(solved, reduced, g.ravel(), right, Z, Hp, bp, W, Wk)
 
     def _factored(self, S: F64, N: int) -> Any:
         """Solves with the symmetric matrix of the blocks ``S``."""
@@ -429,39 +459,6 @@ class _Bundle:
         for i in range(3):
             Hp[:, i, i] += self._sure[:, i] ** 2
         bp -= self._sure * points
-
-    def dispersion(self, s: _State) -> float:
-        """See :func:`dispersion`."""
-        eq, before = self._equations(s, 0.0), self._errors(s)
-        step = 0.1 * np.sqrt(np.abs(np.diag(np.linalg.inv(eq.Hk))))
-        still, none = np.zeros(eq.g.shape), np.zeros(eq.bp.shape)
-        moved = [self._errors(self._moved(s, eq, d, still, none)) for d in np.diag(step)]
-        D = np.stack([(before - after) / h for after, h in zip(moved, step, strict=True)], axis=2)
-        lengths = np.hypot(*before.T) / self._sigma
-        ok = np.isfinite(D).all(axis=(1, 2)) & np.isfinite(lengths)
-        huber = self._of.huber_sigmas
-        w = np.minimum(1.0, huber / np.maximum(lengths[ok], 1e-12)) / self._sigma[ok] ** 2
-        score, known = np.zeros((len(s.T), CAMERA)), np.zeros((len(s.T), CAMERA, CAMERA))
-        np.add.at(score, self._view[ok], np.einsum("mik,m,mi->mk", D[ok], w, before[ok]))
-        np.add.at(known, self._view[ok], np.einsum("mik,m,mil->mkl", D[ok], w, D[ok]))
-        share = np.linalg.solve(known.sum(axis=0), known)  # of each view in what all know
-        fitted = np.einsum("nij,nji->", share, share)
-        spread = np.trace(np.linalg.solve(known.sum(axis=0), score.T @ score))
-        return float(spread / max(CAMERA - fitted, 1.0))
-
-    def step_covariances(self, s: _State) -> F64:
-        """See :func:`step_covariances`."""
-        eq, V, out = self._equations(s, 0.0), self._unknowns, np.zeros((len(s.T), 6, 6))
-        for n in range(1, len(s.T)):
-            both = _joint(eq, np.r_[V * (n - 1) : V * (n - 1) + 6, V * n : V * n + 6])
-            J = np.hstack([-se3.adjoint(s.T[n] @ se3.inverse(s.T[n - 1])), np.eye(6)])
-            out[n] = J @ both @ J.T
-        return np.asarray(0.5 * (out + out.transpose(0, 2, 1)))
-
-    def turn_covariances(self, s: _State) -> F64:
-        """See :func:`turn_covariances`."""
-        eq, V = self._equations(s, 0.0), self._unknowns
-        return np.array([_joint(eq, np.r_[V * n + 6 : V * n + 9]) for n in range(len(s.T))])
 
     # ---- result -----------------------------------------------------------------------------
 

@@ -12,15 +12,14 @@ from functools import partial
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from recon import se3
 from recon.bands import at_once
-from recon.calibration.global_bundle import RowMotion, Sightings
+from recon.calibration.global_bundle import RowMotion, Sightings, joint
 from recon.camera_model import project, rays
 from recon.tracking import robust_geometry
 from recon.tracking.common_view import Features, features, mutual
-from recon.tracking.matching import MatchingConfig, Pyramid, match
+from recon.tracking.matching import Pyramid, match
 from recon.tracking.prediction import by_homography
 from recon.types import F64, I64, U8, Camera
 
@@ -108,35 +107,25 @@ def joined(
     images: Mapping[int, Image], pairs: Iterable[tuple[int, int]], camera: Camera
 ) -> Sightings:
     """The tracks through matched ``pairs``; one that meets a view twice is left out."""
-    views = sorted(images)
-    first = dict(zip(views, np.cumsum([0, *(len(images[k].place) for k in views)]), strict=False))
-    pairs = list(pairs)
-    found = at_once(*(partial(matches, images[a], images[b], camera) for a, b in pairs))
-    ends: list[npt.NDArray[np.int64]] = [
-        np.column_stack([both[0] + first[a], both[1] + first[b]])
-        for (a, b), both in zip(pairs, found, strict=True)
-        if both is not None
-    ]
-    return _tracks(np.concatenate(ends) if ends else np.zeros((0, 2), np.int64), images, first)
-
-
-def _tracks(edges: I64, images: Mapping[int, Image], first: Mapping[int, int]) -> Sightings:
-    """Connected features with one sighting a view at most."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     views = sorted(images)
-    total = sum(len(images[k].place) for k in views)
+    *starts, total = np.cumsum([0, *(len(images[k].place) for k in views)])
+    first, pairs = dict(zip(views, starts, strict=True)), list(pairs)
+    found = at_once(*(partial(matches, images[a], images[b], camera) for a, b in pairs))
+    ends = [
+        np.column_stack([both[0] + first[a], both[1] + first[b]])
+        for (a, b), both in zip(pairs, found, strict=True)
+        if both is not None
+    ]
+    edges = np.concatenate([np.zeros((0, 2), np.int64), *ends])
     graph = coo_matrix((np.ones(len(edges), np.bool_), (edges[:, 0], edges[:, 1])), (total, total))
-    label = connected_components(graph, directed=False)[1]
     used = np.unique(edges)
-    label = label[used]
-    starts = np.array([first[k] for k in views])
+    label = connected_components(graph, directed=False)[1][used]
     order = np.searchsorted(starts, used, side="right") - 1
-    _, often = np.unique(np.column_stack([label, order]), axis=0, return_counts=True)
-    pairs = np.unique(np.column_stack([label, order]), axis=0)
-    twice = np.unique(pairs[often > 1, 0])
-    kept = ~np.isin(label, twice)
+    met, often = np.unique(np.column_stack([label, order]), axis=0, return_counts=True)
+    kept = ~np.isin(label, met[often > 1, 0])
     _, landmark = np.unique(label[kept], return_inverse=True)
     all_uv = np.concatenate([images[k].features.uv_px for k in views])
     return Sightings(
@@ -159,14 +148,12 @@ def sharpened(pyramid: Callable[[int], Pyramid], camera: Camera, seen: Sightings
     rows_of = np.split(order, np.cumsum(np.bincount(which.ravel()))[:-1])
 
     def sharpen(a: int, b: int, rows: I64) -> None:
-        found = robust_geometry.homography(flat[reference[rows]], flat[rows], RELIEF_PX)
+        here = flat[reference[rows]]
+        found = robust_geometry.homography(here, flat[rows], RELIEF_PX)
         if found is None:
             return
-        turned = replace(by_homography(found[0], flat[reference[rows]], REACH_PX), uv=flat[rows])
-        at = match(
-            pyramid(a), flat[reference[rows]], pyramid(b), turned.uv, REACH_PX, turned.warp,
-            MatchingConfig(),
-        )  # fmt: skip
+        warp = by_homography(found[0], here, REACH_PX).warp
+        at = match(pyramid(a), here, pyramid(b), flat[rows], REACH_PX, warp)
         uv[rows[at.ok]] = at.uv_px[at.ok]
 
     at_once(*(
@@ -242,7 +229,7 @@ def extended(
         spots = points[seen.landmark[new]]
         predicted, warp = _on_level_ground(found, poses[a], poses[b], flat[new], spots)
         shown = without_distortion(given, with_distortion(found, predicted))
-        at = match(pyramid(a), flat[new], pyramid(b), shown, REACH_PX, warp, MatchingConfig())
+        at = match(pyramid(a), flat[new], pyramid(b), shown, REACH_PX, warp)
         again = seen.landmark[new[at.ok]]
         return np.full_like(again, b), again, at.uv_px[at.ok].astype(np.float64)
 
@@ -251,11 +238,7 @@ def extended(
     if not more:
         return seen
     view, landmark, places = (np.concatenate(parts) for parts in zip(*more, strict=True))
-    at_px = with_distortion(given, places)
-    return Sightings(
-        np.append(seen.view, view), np.append(seen.landmark, landmark),
-        np.concatenate([seen.uv_px, at_px]),
-    )  # fmt: skip
+    return joint(seen, Sightings(view, landmark, with_distortion(given, places)))
 
 
 def _middles(seen: Sightings) -> I64:
