@@ -7,7 +7,7 @@ from collections import deque
 import cv2
 import numpy as np
 
-from recon.types import U8, Bool
+from recon.types import F32, U8, Bool
 
 WANTED_SPREAD = 45.0
 """Standard deviation in gray levels that an image of a well-lit scene has."""
@@ -39,6 +39,14 @@ def stretch(gray: U8, seen: Bool | None = None) -> U8:
     levels = (np.arange(256) - mean) * gain + 128.0
     table = np.clip(np.rint(levels), 0, 255).astype(np.uint8)
     return np.asarray(cv2.LUT(gray, table), np.uint8)
+
+
+def local_variance(gray: U8, side: int) -> F32:
+    """(H, W) variance of the gray levels in ``side`` x ``side`` pixels; rounding may make it
+    negative."""
+    mean = cv2.boxFilter(gray, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE)
+    square = cv2.sqrBoxFilter(gray, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(square - mean * mean, np.float32)
 
 
 def sharpness(gray: U8) -> float:

@@ -18,7 +18,6 @@ from recon.backends import load_backend
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.polar import reproject_polar
 from recon.stereo.virtual_stereo import (
-    PairRejection,
     View,
     VirtualStereoConfig,
     drop_unseen,
@@ -92,9 +91,9 @@ def rectified() -> list[tuple[int, int]]:
 
 @pytest.fixture(scope="module")
 def keyframes(rectified: list[tuple[int, int]]) -> Iterator[list[Keyframe]]:
-    def noted(left: View, right: View, *rest: Any) -> RectifiedPair | PairRejection:
+    def noted(left: View, right: View, *rest: Any) -> RectifiedPair | str:
         found = rectify(left, right, *rest)
-        if not isinstance(found, PairRejection):
+        if not isinstance(found, str):
             rectified.append((left.seq, right.seq))
         return found
 

@@ -8,7 +8,6 @@ import pytest
 from recon import se3
 from recon.stereo.reprojection import reproject
 from recon.stereo.virtual_stereo import (
-    PairRejection,
     View,
     VirtualStereoConfig,
     _homography,
@@ -115,10 +114,10 @@ def test_refusals_name_their_reason() -> None:
     }
     for reason, b in cases.items():
         found = check_pair(a, b, 60.0, CONFIG)
-        assert found is not None and found.reason == reason
+        assert found == reason
     good = view(1, (5.0, 0.0, 60.0), (0.0, 0.0, 0.0))
     assert check_pair(a, good, 60.0, CONFIG) is None
-    assert isinstance(rectify(a, good, np.zeros((3, 3)), CONFIG), PairRejection)
+    assert isinstance(rectify(a, good, np.zeros((3, 3)), CONFIG), str)
 
 
 def test_relief_widens_the_window() -> None:

@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit
 
 from recon.bands import in_bands
+from recon.image_quality import local_variance
 from recon.stereo.matching_cost import (
     COST_UNIT,
     MatchingCostConfig,
@@ -101,7 +102,8 @@ def drop_unreliable(
     ``px`` and ``confidence`` are changed in place. Every backend ends with this.
     """
     if config.min_contrast > 0:
-        confidence[_contrast(left) < config.min_contrast] = 0
+        contrast = np.sqrt(np.maximum(local_variance(left, 9), 0))
+        confidence[contrast < config.min_contrast] = 0
     if config.occlusion_tolerance >= 0:
         tolerance = float(config.occlusion_tolerance)
         _check_visibility(px, confidence, config.min_disparity, tolerance, config.fill_occluded)
@@ -111,13 +113,6 @@ def drop_unreliable(
         _drop_speckles(px, config.speckle_px)
     confidence[np.isnan(px)] = 0
     return DisparityMap(px, confidence)
-
-
-def _contrast(image: U8) -> F32:
-    """Standard deviation of the gray levels in 9x9, (h, w)."""
-    mean = cv2.boxFilter(image, cv2.CV_32F, (9, 9), borderType=cv2.BORDER_REPLICATE)
-    square = cv2.sqrBoxFilter(image, cv2.CV_32F, (9, 9), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(np.sqrt(np.maximum(square - mean * mean, 0)), np.float32)
 
 
 def _drop_speckles(px: F32, smallest: int) -> None:

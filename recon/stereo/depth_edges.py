@@ -7,13 +7,12 @@ contour matches. Either makes an object wider than it is.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 from numba import njit
 
 from recon.bands import in_bands
+from recon.stereo.reprojection import known_where
 from recon.types import F32, F64, U8, Bool, DepthMap
 
 FLAT_RADIUS, PLANE_RADIUS = 3, 5
@@ -77,14 +76,7 @@ def drop_edges(depth: DepthMap, bgr: U8) -> DepthMap:
     spilt = kept & (nearness - farthest > STEP_SIGMAS * noise)
     in_bands(_keep_spills, len(spilt), nearness, noise, kept, bgr, *windows, places, spilt)
     kept &= ~spilt
-    if kept.sum() == known.sum():
-        return depth
-    return replace(
-        depth,
-        depth_m=np.where(kept, depth.depth_m, np.float32(np.nan)),
-        sigma_m=np.where(kept, depth.sigma_m, np.float32(np.nan)),
-        views=np.where(kept, depth.views, np.uint8(0)),
-    )
+    return depth if kept.sum() == known.sum() else known_where(depth, kept)
 
 
 def _windows(x: F32, radius: int, is_slanted: bool) -> Windows:

@@ -19,7 +19,7 @@ from numba import njit
 
 from recon import se3
 from recon.bands import in_bands
-from recon.image_quality import halved, stretch
+from recon.image_quality import halved, local_variance, stretch
 from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE, PairDepth, label_at
 from recon.types import F32, F64, U8, Bool, DisparityMap, PolarPair
 
@@ -309,9 +309,7 @@ class _PolarView:
 
 def _has_detail(gray: U8) -> Bool:
     """(h, w) False where 5x5 pixels are plain, as the sky is: neighbours make the labels there."""
-    mean = cv2.boxFilter(gray, cv2.CV_32F, (5, 5), borderType=cv2.BORDER_REPLICATE)
-    square = cv2.sqrBoxFilter(gray, cv2.CV_32F, (5, 5), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(square - mean * mean > MIN_DETAIL**2)
+    return np.asarray(local_variance(gray, 5) > MIN_DETAIL**2)
 
 
 def reproject_polar(

@@ -327,14 +327,18 @@ def plausible(depth: DepthMap, prior: PosePrior) -> DepthMap | None:
         sky = _above_horizon(depth, prior.R_world_camera[2], TILT_SIGMAS * prior.sigma_tilt_rad)
         if sky.any():
             false = sky & ((depth.views == 1) | ~_reaching(depth.depth_m, ~sky))
-            nothing = np.float32(np.nan)
-            depth = replace(
-                depth,
-                depth_m=np.where(false, nothing, depth.depth_m),
-                sigma_m=np.where(false, nothing, depth.sigma_m),
-                views=np.where(false, np.uint8(0), depth.views),
-            )
+            depth = known_where(depth, ~false)
     return depth if np.isfinite(depth.depth_m).any() else None
+
+
+def known_where(depth: DepthMap, kept: Bool) -> DepthMap:
+    """``depth`` (h, w) without the pixels that are not ``kept``."""
+    return replace(
+        depth,
+        depth_m=np.where(kept, depth.depth_m, np.float32(np.nan)),
+        sigma_m=np.where(kept, depth.sigma_m, np.float32(np.nan)),
+        views=np.where(kept, depth.views, np.uint8(0)),
+    )
 
 
 def _reaching(depth_m: F32, ground: Bool) -> Bool:

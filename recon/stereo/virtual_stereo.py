@@ -83,9 +83,7 @@ class View:
     seen: U8 | None = None  # (H, W) zero where the image has nothing; None: all of it
     rows: Rows | None = None  # how the camera moved while it read the image; None: not at all
     scene: F64 | None = None  # (3,) inverse depth of the ground, times a ray with z = 1; with rows
-    blur_px: F64 | None = (
-        None  # (2,) how far the image moved while it was exposed; None: not at all
-    )
+    blur_px: F64 | None = None  # (2,) how far the image moved while exposed; None: not at all
     seq: int = -1  # number of its frame
 
     def inside(self, focal_px: float) -> U8:
@@ -96,16 +94,7 @@ class View:
         return inside
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PairRejection:
-    """Why two views do not make a stereo pair."""
-
-    reason: str
-
-
-def check_pair(
-    left: View, right: View, depth_m: float, config: VirtualStereoConfig
-) -> PairRejection | None:
+def check_pair(left: View, right: View, depth_m: float, config: VirtualStereoConfig) -> str | None:
     """The reason why the views make no stereo pair, or None when they do.
 
     ``depth_m`` is the median distance of what the left view sees.
@@ -114,14 +103,14 @@ def check_pair(
     t = T_left_right[:3, 3]
     base = float(np.linalg.norm(t))
     if not depth_m > 0:
-        return PairRejection("depth unknown")
+        return "depth unknown"
     if base < config.min_base_to_height * depth_m:
-        return PairRejection("baseline too short")
+        return "baseline too short"
     if base > config.max_base_to_height * depth_m:
-        return PairRejection("baseline too long")
+        return "baseline too long"
     H, W = left.gray.shape
     if _overlap(T_left_right, left.K, (W, H), depth_m) < config.min_overlap:
-        return PairRejection("too little overlap")
+        return "too little overlap"
     return None
 
 
@@ -141,9 +130,7 @@ def _overlap(T_left_right: F64, K: F64, size: tuple[int, int], depth_m: float) -
     """Share of the left image that the right one sees, for ground at one depth."""
     W, H = size
     u, v = np.meshgrid(np.linspace(0, W - 1, 12), np.linspace(0, H - 1, 8))
-    ray = np.stack(
-        [(u.ravel() - K[0, 2]) / K[0, 0], (v.ravel() - K[1, 2]) / K[1, 1], np.ones(u.size)], 1
-    )
+    ray = rays(K, np.column_stack([u.ravel(), v.ravel()]))
     P = se3.transform(se3.inverse(T_left_right), ray * depth_m)
     uv = P[:, :2] / P[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
     inside = (P[:, 2] > 0) & np.all((uv > 0) & (uv < [W, H]), axis=1)
@@ -156,7 +143,7 @@ def rectify(
     points_m: F64,
     config: VirtualStereoConfig,
     relief_m: tuple[float, float] = (0.0, 0.0),
-) -> RectifiedPair | PairRejection:
+) -> RectifiedPair | str:
     """The rectified pair of two views with its disparity window, or why there is none.
 
     Flown along the line of sight the pair is a polar one (:mod:`recon.stereo.polar`).
@@ -168,19 +155,18 @@ def rectify(
             plane; widens the window.
     """
     if len(points_m) < 8:
-        return PairRejection("depth unknown")
+        return "depth unknown"
     rejection = check_pair(left, right, float(np.median(points_m[:, 2])), config)
     if rejection is not None:
         return rejection
     if is_along_the_view(left, right, config):
-        pair = _polar(left, right, points_m, config, relief_m)
-        return PairRejection(pair) if isinstance(pair, str) else pair
+        return _polar(left, right, points_m, config, relief_m)
     T_left_right = se3.inverse(left.T_odom_camera) @ right.T_odom_camera
     base = float(np.linalg.norm(T_left_right[:3, 3]))
     R_rect_left = _rectifying_rotation(T_left_right)
     K, size = _rectified_intrinsics(left, R_rect_left, config.width_px)
     window = _disparity_window(points_m @ R_rect_left.T, K, base, config, relief_m)
-    if isinstance(window, PairRejection):
+    if isinstance(window, str):
         return window
     plane, labels = window
     R_rect_right = R_rect_left @ T_left_right[:3, :3]
@@ -341,15 +327,16 @@ def _disparity_window(
     base: float,
     config: VirtualStereoConfig,
     relief_m: tuple[float, float],
-) -> tuple[F64, int] | PairRejection:
-    """Disparity plane of label 0 and the number of labels, from points in the rectified view."""
+) -> tuple[F64, int] | str:
+    """Disparity plane of label 0 and the number of labels, from points in the rectified view; or
+    why there are none."""
     points = points[points[:, 2] > 0]
     u = K[0, 0] * points[:, 0] / points[:, 2] + K[0, 2]
     v = K[1, 1] * points[:, 1] / points[:, 2] + K[1, 2]
     d = K[0, 0] * base / points[:, 2]
     plane, residual = _fit_plane(u, v, d)
     if abs(plane[0]) > 0.7:
-        return PairRejection("ground too steep to rectify")
+        return "ground too steep to rectify"
     depth = float(np.median(points[:, 2]))
     per_metre = float(np.median(d)) / depth  # disparity per metre towards the camera, near it
     low, high = np.percentile(residual, [1.0, 99.0])
@@ -359,7 +346,7 @@ def _disparity_window(
     need = (high - low) / (1.0 - plane[0]) + 2 * config.margin_labels
     labels = config.labels_for(need)
     if labels > config.max_labels:
-        return PairRejection("relief too large for the baseline")
+        return "relief too large for the baseline"
     spare = 0.5 * (labels - 1 - need) * (1.0 - plane[0])
     offset = low - config.margin_labels * (1.0 - plane[0]) - spare
     return plane + np.array([0.0, 0.0, offset]), labels
@@ -384,25 +371,11 @@ def _homography(view: View, R_rect_view: F64, K: F64, oversample: float, plane: 
 
     The shift by the disparity plane is affine along the rows, so it is part of it.
     """
-    fine = np.array(
-        [
-            [1 / oversample, 0.0, 0.5 / oversample - 0.5],
-            [0.0, 1 / oversample, 0.5 / oversample - 0.5],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+    fine = scaled_K(np.eye(3), 1 / oversample, 1 / oversample)
     shift = np.eye(3)
     if plane is not None:
         shift[0] -= plane
     return np.asarray(view.K @ R_rect_view.T @ np.linalg.inv(K) @ shift @ fine)
-
-
-def _seen(
-    view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None = None
-) -> Bool:
-    """(h, w) True where the rectified image shows something, a pixel inside the border."""
-    M = _homography(view, R_rect_view, K, 1.0, plane)
-    return _sampled(view.inside(K[0, 0]), view, M, size, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT) > 0
 
 
 def _warp(
@@ -473,8 +446,10 @@ def at_middle_row(view: View, image: U8) -> U8:
 def _stereo_view(
     view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None
 ) -> tuple[U8, Bool]:
-    """Gray rectified view (h, w), averaged down from twice its size, and where it is seen."""
-    seen = _seen(view, R_rect_view, K, size, plane)
+    """Gray rectified view (h, w), averaged down from twice its size, and where it shows something,
+    a pixel inside the border."""
+    M, inside = _homography(view, R_rect_view, K, 1.0, plane), view.inside(K[0, 0])
+    seen = _sampled(inside, view, M, size, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT) > 0
     double = _warp(view.gray, view, R_rect_view, K, size, 2.0, plane)
     gray = np.asarray(cv2.resize(double, size, interpolation=cv2.INTER_AREA), np.uint8)
     return stretch(gray, seen), seen

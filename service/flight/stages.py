@@ -33,7 +33,6 @@ from recon.stereo.reprojection import (
 )
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.stereo.virtual_stereo import (
-    PairRejection,
     VirtualStereoConfig,
     at_middle_row,
     drop_unseen,
@@ -210,8 +209,8 @@ class Rectify:
                 continue
             with self._stopwatch("rectify"):
                 pair = rectify(view, partner, candidate.points, config, self._relief_m)
-            if isinstance(pair, PairRejection):
-                self._rejected[pair.reason] += 1
+            if isinstance(pair, str):
+                self._rejected[pair] += 1
                 continue
             pairs[partner.seq] = pair
             if self._debug is not None:
