@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.backends import DenseStages
 from recon.stereo import belief_propagation as compiled
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import DepthFusionConfig, PairDepth
@@ -225,7 +226,7 @@ def test_the_whole_path_equals_the_stages(device: str, guide: int) -> None:
     from recon.backends.torch_depth import DensePath
 
     matching = BeliefPropagationConfig()
-    path = DensePath(device, matching, UpsamplingConfig(), ALL)
+    path = DensePath(device, DenseStages(matching, UpsamplingConfig(), ALL))
     pairs = [stereo_pair(54, 96, 16, 1, guide), stereo_pair(55, 98, 18, 2, guide)]
     pairs.append(replace(stereo_pair(54, 90, 16, 3, guide), left_seen=None))
     for chosen in (pairs, pairs[:1], pairs[::-1]):
@@ -241,13 +242,12 @@ def test_the_path_needs_a_pair(device: str) -> None:
     from recon.backends.torch_depth import DensePath
 
     with pytest.raises(ValueError, match="no stereo pair"):
-        path = DensePath(device, BeliefPropagationConfig(), UpsamplingConfig(), ALL)
+        path = DensePath(device, DenseStages(BeliefPropagationConfig(), UpsamplingConfig(), ALL))
         path.depth([], K, SIZE, np.eye(4))
 
 
 def test_the_backend_gives_the_path_to_the_service_and_falls_back(device: str) -> None:
     """The same depth through the fallback; stage by stage once the device failed."""
-    from recon.backends import DenseStages
     from recon.backends.torch_backend import TorchBackend
     from service.compute.backend_choice import FallbackBackend
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.backends import DenseStages
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import DepthFusionConfig
@@ -168,20 +169,20 @@ class OffTheDevice(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 def test_nothing_is_made_on_the_host_between_upload_and_result() -> None:
     """A graph cannot capture a copy from the host's memory; on a processor it would not show."""
-    from recon.backends.torch_depth import DensePath, PairDepthStage
+    from recon.backends.torch_depth import pair_depth
     from recon.backends.torch_icp import _descent
 
     def empty(kind: Any, *shape: int) -> Any:
         return torch.empty(shape, dtype=kind, device="meta")
 
     matching = BeliefPropagationConfig(iterations=1, speckle_px=1)
-    path = DensePath("meta", matching, UpsamplingConfig(diameter_px=2), DepthFusionConfig())
+    stages = DenseStages(matching, UpsamplingConfig(diameter_px=2), DepthFusionConfig())
     pair = [empty(torch.uint8, 64, 96) for _ in range(4)]
     pair += [empty(torch.uint8, 128, 192, 3), empty(torch.int64, 5), empty(torch.float64, 15)]
     depth = [empty(torch.float32, 48, 60)] * 2 + [empty(torch.float64, 4)]
     with OffTheDevice() as off:
         found = [
-            *PairDepthStage(path, 4, 2, (96, 54))(*pair),
+            *pair_depth(*pair, labels=4, levels=2, size_px=(96, 54), stages=stages),
             *_descent(IcpConfig())(*depth, *depth, empty(torch.float64, 4, 4)),
         ]
     assert off.seen == []

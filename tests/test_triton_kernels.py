@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -86,14 +87,14 @@ def test_stereo(
     both: Both, size: tuple[int, int], labels: int, levels: int, settings: dict[str, float]
 ) -> None:
     """Odd sizes, room around the pair, partners outside, levels of the pyramid."""
-    from recon.backends.torch_stereo import DenseStereo
+    from recon.backends.torch_stereo import dense_stereo
 
     config = BeliefPropagationConfig(**settings)  # type: ignore[arg-type]
     h, w = size
     left = np.pad(noise(size, 1), ((0, 3), (0, 2)), mode="edge")
     right = np.pad(np.roll(noise(size, 1), -2, 1), ((0, 3), (0, 2)), mode="edge")
     given = tensors(left, right, np.array([h, w, labels]))
-    stereo = DenseStereo(labels + 2, levels, config)
+    stereo = partial(dense_stereo, labels=labels + 2, levels=levels, config=config)
     px, confidence = both(lambda: tuple(t[:h, :w] for t in stereo(*given)), 1e-6)
     assert np.isfinite(px.numpy()).mean() > 0.3
     assert (confidence.numpy() > 0).any()
@@ -122,14 +123,14 @@ def test_checks_of_labels(both: Both) -> None:
 
 def test_upsampling(both: Both) -> None:
     """Unknown taps, room around both images; means of a ratio that is not whole."""
-    from recon.backends.torch_depth import Upsampling, averaged
+    from recon.backends.torch_depth import averaged, upsampled
 
     rng = np.random.default_rng(0)
     px = rng.uniform(0, 16, (9, 11)).astype(np.float32)
     px[rng.random(px.shape) < 0.3] = np.nan
     sure = rng.uniform(0, 1, px.shape).astype(np.float32)
     given = tensors(px, sure, noise((23, 40, 3), 2), np.array([7, 9, 21, 27]))
-    stage = Upsampling(UpsamplingConfig(diameter_px=4))
+    stage = partial(upsampled, config=UpsamplingConfig(diameter_px=4))
     label, _ = both(lambda: tuple(t[:21, :27] for t in stage(*given)), 1e-5)
     assert 0.3 < torch.isfinite(label).float().mean() < 1.0
     true = torch.tensor([7, 9, 20, 33])

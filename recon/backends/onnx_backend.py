@@ -111,12 +111,13 @@ class OnnxBackend(CpuBackend):
         return kept(self._sessions, key, KEPT_SESSIONS, opened)
 
 
-def _run(session: Any, given: dict[str, Array]) -> tuple[Array, Array]:
+def _run(session: Any, given: dict[str, Array], outputs: list[str] | None = None) -> list[Array]:
+    """The ``outputs`` of a model, or all; RuntimeError where the device cannot compute them."""
     try:
-        first, second = session.run(None, given)
+        found: list[Array] = session.run(outputs, given)
     except ORT_ERRORS as error:
         raise RuntimeError(str(error)) from error
-    return first, second
+    return found
 
 
 def provider_options(
@@ -223,14 +224,10 @@ class LearnedStereoBackend(OnnxBackend):
         h, w = left.shape
         share = min(1.0, self.config.height / h, self.config.width / w)
         size = (max(1, int(w * share)), max(1, int(h * share)))
-        if share < 1:
-            images = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (left, right)]
-        else:
-            images = [left, right]
-        px = self._disparity(*(np.asarray(i, np.uint8) for i in images))
-        if share < 1:
-            grown = cv2.resize(px, (w, h), interpolation=cv2.INTER_NEAREST)
-            px = np.asarray(grown, np.float32) * np.float32(w / size[0])
+        images = (cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (left, right))
+        found = self._disparity(*(np.asarray(i, np.uint8) for i in images))
+        grown = cv2.resize(found, (w, h), interpolation=cv2.INTER_NEAREST)
+        px = np.asarray(grown, np.float32) * np.float32(w / size[0])
         px = px - np.float32(config.min_disparity)
         partner = np.arange(w)[None, :] - px - config.min_disparity
         sound = (px >= 0) & (px <= labels - 1) & (partner > -0.5) & (partner < w - 0.5)
@@ -243,10 +240,7 @@ class LearnedStereoBackend(OnnxBackend):
         """(h, w) pixels, of images that fit the model."""
         h, w = left.shape
         given = {self.config.left: self._image(left), self.config.right: self._image(right)}
-        try:
-            (raw,) = self._model.run([self.config.disparity], given)
-        except ORT_ERRORS as error:
-            raise RuntimeError(str(error)) from error
+        (raw,) = _run(self._model, given, [self.config.disparity])
         plane = np.asarray(raw, np.float32).squeeze()
         if plane.shape != (self.config.height, self.config.width):
             raise ValueError(

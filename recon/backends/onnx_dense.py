@@ -23,6 +23,8 @@ from recon.types import Array
 
 FAR = 1.0e6
 
+_AXIS_0 = np.array([0], np.int64)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pair:
@@ -84,7 +86,7 @@ def _census(graph: Graph, image: Value, size: tuple[int, int]) -> Value:
         for i in range(2 * r + 1):
             if (j, i) != (r, r):
                 darker = padded.part(0, j, j + h).part(1, i, i + w).less(image).numbers()
-                bits.append(graph.op("Unsqueeze", darker, np.array([0], np.int64)))
+                bits.append(graph.op("Unsqueeze", darker, _AXIS_0))
     return graph.join(bits, 0)
 
 
@@ -96,8 +98,7 @@ def _matching_cost(
     c = config.cost
     h, w = size
     bits_left, bits_right = _census(graph, left, size), _census(graph, right, size)
-    lift = np.array([0], np.int64)
-    gray_left, gray_right = (graph.op("Unsqueeze", image, lift) for image in (left, right))
+    gray_left, gray_right = (graph.op("Unsqueeze", image, _AXIS_0) for image in (left, right))
     layers = []
     for label in range(labels):
         shift = label + config.min_disparity
@@ -166,7 +167,7 @@ def _propagate(
     for level in range(len(pyramid) - 1, -1, -1):
         h, w = sizes[level]
         if level < len(pyramid) - 1:
-            messages = messages.take(np.arange(h) // 2, 2).take(np.arange(w) // 2, 3)
+            messages = messages.gather(np.arange(h) // 2, 2).gather(np.arange(w) // 2, 3)
             messages = messages * pairs[level].inside((h, w))
         slope = _per_direction(graph, edges[level], (h, w), COST_UNIT)
         cut = _per_direction(graph, edges[level], (h, w), config.truncation)
@@ -176,9 +177,6 @@ def _propagate(
             messages = graph.where(graph.constant(colour == t % 2), fresh, messages)
     arrived = _arriving(graph, messages, size).sum(0)
     return pyramid[0] + graph.op("Squeeze", arrived, _AXIS_0)
-
-
-_AXIS_0 = np.array([0], np.int64)
 
 
 def _cut(graph: Graph, data: Value, ours: Value, config: BeliefPropagationConfig) -> Value:
@@ -228,7 +226,7 @@ def _outgoing(
 ) -> Value:  # fmt: skip
     """Lower envelope of all other news."""
     arriving = _arriving(graph, messages, size)
-    rest = data + arriving.sum(0) - arriving.take([1, 0, 3, 2], 0)
+    rest = data + arriving.sum(0) - arriving.gather(np.array([1, 0, 3, 2]), 0)
     steps = min(math.ceil(config.truncation / COST_UNIT) + 1, labels - 1)
     wide = rest.pad([0, steps, 0, 0], [0, steps, 0, 0], FAR)
     best = rest

@@ -85,12 +85,8 @@ class Value:
         ends = [np.array([n], np.int64) for n in (first, 2**31 - 1, axis, step)]
         return self.graph.op("Slice", self, *ends)
 
-    def take(self, index: Any, axis: int) -> Value:
-        """The entries of a constant ``index`` along an axis."""
-        return self.graph.op("Gather", self, np.asarray(index, np.int64), axis=axis)
-
-    def gather(self, index: Value, axis: int) -> Value:
-        """The entries of an int64 ``index`` (N,) along an axis."""
+    def gather(self, index: Any, axis: int) -> Value:
+        """The entries of an int64 ``index`` (N,), given or computed, along an axis."""
         return self.graph.op("Gather", self, index, axis=axis)
 
     def pad(self, before: list[int], after: list[int], value: float | None = 0.0) -> Value:

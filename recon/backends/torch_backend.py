@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,9 +12,9 @@ from torch import Tensor
 
 from recon.backends import DenseStages
 from recon.backends.room import kept, pyramid_levels, room
-from recon.backends.torch_depth import DensePath, Upsampling
-from recon.backends.torch_plan import Part, Plan, part, read
-from recon.backends.torch_stereo import DenseStereo
+from recon.backends.torch_depth import DensePath, upsampled
+from recon.backends.torch_plan import Plan, part, read
+from recon.backends.torch_stereo import dense_stereo
 from recon.stereo.belief_propagation import BeliefPropagationConfig, drop_unreliable
 from recon.stereo.matching_cost import check_pair
 from recon.stereo.upsampling import UpsamplingConfig, check_guide
@@ -41,7 +42,7 @@ class TorchBackend:
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self._icp: DeviceIcp | None = None
         self._plans: dict[Any, Plan] = {}
-        self._path: tuple[DenseStages, DensePath] | None = None
+        self._path: DensePath | None = None
         torch.zeros(8, device=self.device).add_(1).cpu()  # fails here rather than in flight
 
     def belief_propagation(
@@ -52,12 +53,11 @@ class TorchBackend:
         h, w = left.shape
         *space, label_room = room(h, w, labels)
         levels = pyramid_levels(h, w, config)
-        true = np.array([h, w, labels])
         px, confidence = self._run(
             ("stereo", *space, label_room, levels, config),
-            lambda: DenseStereo(label_room, levels, config),
-            [part(left, (space[0], space[1])), part(right, (space[0], space[1])), part(true)],
-            (left, right, true),
+            partial(dense_stereo, labels=label_room, levels=levels, config=config),
+            (space, space, (3,)),
+            (left, right, np.array([h, w, labels])),
         )
         px, confidence = px[:h, :w].copy(), confidence[:h, :w].copy()
         return drop_unreliable(left, px, confidence, config)
@@ -67,13 +67,11 @@ class TorchBackend:
         check_guide(coarse, guide)
         (h, w), (H, W) = coarse.px.shape, guide.shape[:2]
         small, large = room(h, w, 1)[:2], room(H, W, 1)[:2]
-        given: tuple[Array, ...] = (coarse.px, coarse.confidence, guide, np.array([h, w, H, W]))
-        rooms = (small, small, (*large, 3), (4,))
         px, confidence = self._run(
             ("upsample", *small, *large, config),
-            lambda: Upsampling(config),
-            [part(a, shape) for a, shape in zip(given, rooms, strict=True)],
-            given,
+            partial(upsampled, config=config),
+            (small, small, (*large, 3), (4,)),
+            (coarse.px, coarse.confidence, guide, np.array([h, w, H, W])),
         )
         return DisparityMap(px[:H, :W].copy(), confidence[:H, :W].copy())
 
@@ -96,20 +94,20 @@ class TorchBackend:
         stages: DenseStages,
     ) -> DepthMap:
         """Depth of a keyframe without leaving the device."""
-        if self._path is None or self._path[0] != stages:
-            path = DensePath(self.device, stages.matching, stages.upsampling, stages.fusion)
-            self._path = stages, path
-        return self._path[1].depth(pairs, K, size_px, T_world_camera)
+        if self._path is None or self._path.stages != stages:
+            self._path = DensePath(self.device, stages)
+        return self._path.depth(pairs, K, size_px, T_world_camera)
 
     def _run(
         self,
         key: Any,
-        build: Callable[[], Callable[..., tuple[Tensor, ...]]],
-        parts: Sequence[Part],
+        operation: Callable[..., tuple[Tensor, ...]],
+        rooms: Sequence[Sequence[int]],
         arrays: Sequence[Array],
     ) -> list[Array]:
-        """The float32 results of the operation called ``key`` on ``arrays``."""
+        """The float32 results of the ``operation`` called ``key`` on ``arrays``, each in a room."""
+        parts = [part(a, tuple(shape)) for a, shape in zip(arrays, rooms, strict=True)]
         with torch.inference_mode():
-            plan = kept(self._plans, key, KEPT_PLANS, lambda: Plan(self.device, build(), parts))
+            plan = kept(self._plans, key, KEPT_PLANS, lambda: Plan(self.device, operation, parts))
             plan.upload(arrays)
             return read(plan.run())

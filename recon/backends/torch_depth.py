@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from recon.backends import DenseStages
 from recon.backends.room import kept, pyramid_levels, room
 from recon.backends.torch_plan import Plan, fused, part, read
-from recon.backends.torch_stereo import DenseStereo, drop_unreliable, drop_unseen
-from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.backends.torch_stereo import dense_stereo, drop_unreliable, drop_unseen
 from recon.stereo.reprojection import LABEL_SIGMA_PX, DepthFusionConfig
 from recon.stereo.reprojection import MIN_CONFIDENCE as MIN_REPROJECTED
 from recon.stereo.upsampling import MIN_CONFIDENCE, RANGE_FLOOR, UpsamplingConfig
@@ -30,17 +31,8 @@ KEPT_PLANS = 8
 class DensePath:
     """``device`` is "cuda" or "cpu"; one path serves one thread at a time."""
 
-    def __init__(
-        self,
-        device: str,
-        matching: BeliefPropagationConfig,
-        upsampling: UpsamplingConfig,
-        fusion: DepthFusionConfig,
-    ) -> None:
-        self.device = device
-        self.matching = matching
-        self.upsampling = upsampling
-        self.fusion = fusion
+    def __init__(self, device: str, stages: DenseStages) -> None:
+        self.device, self.stages = device, stages
         self._plans: dict[Any, Plan] = {}
         self._fusions: dict[Any, tuple[Tensor, Plan]] = {}
 
@@ -68,17 +60,20 @@ class DensePath:
     def _fusion(self, pairs: int, size_px: tuple[int, int]) -> tuple[Tensor, Plan]:
         """Room for depth and sigma of each pair, (2, P, h, w), and the plan that fuses them."""
         found = torch.zeros((2, pairs, size_px[1], size_px[0]), device=self.device)
-        return found, Plan(self.device, lambda: fuse(found[0], found[1], self.fusion), [])
+        return found, Plan(self.device, lambda: fuse(found[0], found[1], self.stages.fusion), [])
 
     def _plan(self, pair: StereoPair, size_px: tuple[int, int]) -> Plan:
         h, w = pair.left.shape
         space = room(h, w, pair.labels)
         fine = None if pair.guide is None else room(pair.guide.shape[0], pair.guide.shape[1], 1)[:2]
-        levels = pyramid_levels(h, w, self.matching)
+        levels = pyramid_levels(h, w, self.stages.matching)
         key = (space, fine, levels, size_px)
 
         def build() -> Plan:
-            stage = PairDepthStage(self, space[2], levels, size_px)
+            stage = partial(
+                pair_depth, labels=space[2], levels=levels, size_px=size_px,
+                stages=self.stages,
+            )  # fmt: skip
             shapes = [space[:2]] * 4 + [(*(fine or (0, 0)), 3), (5,), (15,)]
             given = _inputs(pair, np.eye(3))
             parts = [part(a, s) for a, s in zip(given, shapes, strict=True)]
@@ -87,42 +82,33 @@ class DensePath:
         return kept(self._plans, key, KEPT_PLANS, build)
 
 
-class PairDepthStage(torch.nn.Module):
-    """One pair to depth and sigma (h, w) on the keyframe's grid."""
+def pair_depth(
+    left: Tensor, right: Tensor, left_seen: Tensor, right_seen: Tensor, guide: Tensor,
+    true: Tensor, geometry: Tensor, *, labels: int, levels: int, size_px: tuple[int, int],
+    stages: DenseStages,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """One pair to depth and sigma (h, w) on the keyframe's grid, with room for ``labels``.
 
-    def __init__(self, path: DensePath, labels: int, levels: int, size_px: tuple[int, int]) -> None:
-        super().__init__()
-        self.stereo = DenseStereo(labels, levels, path.matching)
-        self.upsampling = Upsampling(path.upsampling)
-        self.matching = path.matching
-        self.size_px = size_px
-
-    def forward(
-        self, left: Tensor, right: Tensor, left_seen: Tensor, right_seen: Tensor, guide: Tensor,
-        true: Tensor, geometry: Tensor,
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """``true`` (5,) is h, w of the pair, H, W of the guide and the number of labels."""
-        own = torch.stack([true[0], true[1], true[4]])
-        px, confidence = self.stereo(left, right, own)
-        px, confidence = drop_unreliable(left, px, confidence, own, self.matching)
-        px, confidence = drop_unseen(px, confidence, left_seen, right_seen, own)
-        sizes = true[:4]
-        if guide.shape[0] > 0:
-            px, confidence = self.upsampling(px, confidence, guide, sizes)
-        else:
-            sizes = torch.cat([true[:2], true[:2]])
-        return reproject(px, confidence, geometry, sizes, self.size_px)
+    ``true`` (5,) is h, w of the pair, H, W of the guide and the number of labels.
+    """
+    own = torch.stack([true[0], true[1], true[4]])
+    px, confidence = dense_stereo(left, right, own, labels, levels, stages.matching)
+    px, confidence = drop_unreliable(left, px, confidence, own, stages.matching)
+    px, confidence = drop_unseen(px, confidence, left_seen, right_seen, own)
+    sizes = true[:4]
+    if guide.shape[0] > 0:
+        px, confidence = upsampled(px, confidence, guide, sizes, stages.upsampling)
+    else:
+        sizes = torch.cat([true[:2], true[:2]])
+    return reproject(px, confidence, geometry, sizes, size_px)
 
 
 def _inputs(pair: StereoPair, K: F64) -> list[Array]:
     """Inputs on the device: images, masks, guide, true sizes and geometry."""
     h, w = pair.left.shape
-    everywhere = np.ones((h, w), np.uint8)
-    seen = [
-        everywhere if m is None else m.view(np.uint8) for m in (pair.left_seen, pair.right_seen)
-    ]
-    if pair.left_seen is None or pair.right_seen is None:
-        seen = [everywhere, everywhere]
+    seen = [np.ones((h, w), np.uint8)] * 2
+    if pair.left_seen is not None and pair.right_seen is not None:
+        seen = [pair.left_seen.view(np.uint8), pair.right_seen.view(np.uint8)]
     guide = np.zeros((0, 0, 3), np.uint8) if pair.guide is None else pair.guide
     to_left = pair.K @ pair.R_left_keyframe @ np.linalg.inv(K)
     base = [pair.slope, pair.K[0, 0] * pair.baseline_m, LABEL_SIGMA_PX * pair.noise]
@@ -135,40 +121,36 @@ FAR_TAP = -1.0e4
 """Log of the weight of a tap outside the coarse image."""
 
 
-class Upsampling(torch.nn.Module):
-    """From (h, w) to the size of the guide (H, W, 3); Eq. 2."""
+def upsampled(
+    px: Tensor, confidence: Tensor, guide: Tensor, true: Tensor, config: UpsamplingConfig
+) -> tuple[Tensor, Tensor]:
+    """From (h, w) to the size of the guide (H, W, 3) in gray levels; Eq. 2.
 
-    def __init__(self, config: UpsamplingConfig) -> None:
-        super().__init__()
-        self.config = config
+    ``true`` (4,) is h, w, H, W.
+    """
+    taps = averaged(guide, (px.shape[0], px.shape[1]), true)
+    layers = tap_layers(px, confidence, taps)
+    if fused(px):
+        from recon.backends import triton_dense
 
-    def forward(
-        self, px: Tensor, confidence: Tensor, guide: Tensor, true: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """``guide`` (H, W, 3) in gray levels; ``true`` (4,) is h, w, H, W."""
-        taps = averaged(guide, (px.shape[0], px.shape[1]), true)
-        layers = tap_layers(px, confidence, taps)
-        if fused(px):
-            from recon.backends import triton_dense
-
-            return triton_dense.bilateral(layers, guide, true, self.config)
-        rows, log_y = window(px.shape[0], guide.shape[0], true[0], true[2], self.config)
-        columns, log_x = window(px.shape[1], guide.shape[1], true[1], true[3], self.config)
-        image = guide.float().permute(2, 0, 1)
-        everything = torch.zeros_like(image[0])
-        sums = torch.zeros_like(image)
-        for j in range(self.config.diameter_px):
-            row = layers.index_select(1, rows[j])
-            for i in range(self.config.diameter_px):
-                tap = row.index_select(2, columns[i])
-                tonal = -((image - tap[:3]) ** 2).sum(0) / (2 * self.config.range_sigma**2)
-                near = log_y[j][:, None] + log_x[i][None, :]
-                weight = torch.exp(tonal.clamp(min=RANGE_FLOOR * math.log(2)) + near)
-                everything = everything + weight
-                sums = sums + weight * tap[3:]
-        good = sums[2] > self.config.min_support * everything
-        out = torch.where(good, sums[1] / sums[0], math.nan)
-        return out, torch.where(good, sums[0] / everything, 0.0)
+        return triton_dense.bilateral(layers, guide, true, config)
+    rows, log_y = window(px.shape[0], guide.shape[0], true[0], true[2], config)
+    columns, log_x = window(px.shape[1], guide.shape[1], true[1], true[3], config)
+    image = guide.float().permute(2, 0, 1)
+    everything = torch.zeros_like(image[0])
+    sums = torch.zeros_like(image)
+    for j in range(config.diameter_px):
+        row = layers.index_select(1, rows[j])
+        for i in range(config.diameter_px):
+            tap = row.index_select(2, columns[i])
+            tonal = -((image - tap[:3]) ** 2).sum(0) / (2 * config.range_sigma**2)
+            near = log_y[j][:, None] + log_x[i][None, :]
+            weight = torch.exp(tonal.clamp(min=RANGE_FLOOR * math.log(2)) + near)
+            everything = everything + weight
+            sums = sums + weight * tap[3:]
+    good = sums[2] > config.min_support * everything
+    out = torch.where(good, sums[1] / sums[0], math.nan)
+    return out, torch.where(good, sums[0] / everything, 0.0)
 
 
 def tap_layers(px: Tensor, confidence: Tensor, taps: Tensor) -> Tensor:

@@ -27,23 +27,20 @@ _capturing = Lock()
 Part = tuple[tuple[int, ...], torch.dtype]
 """Shape and type of an input."""
 
-_NUMPY = {torch.uint8: np.uint8, torch.float32: np.float32, torch.float64: np.float64,
-          torch.int64: np.int64}  # fmt: skip
-
 
 class Plan:
-    """A module with its inputs in one buffer of the device; on CUDA captured as a graph.
+    """An operation with its inputs in one buffer of the device; on CUDA captured as a graph.
 
     Inputs are written to pinned memory and go to the device in one copy that the host does not
     wait for; each ``slot`` is a staging buffer of its own, free again once the results that
-    came of it were read. Elsewhere the same module runs without capture.
+    came of it were read. Elsewhere the same operation runs without capture.
     """
 
     def __init__(
-        self, device: str, module: Callable[..., tuple[Tensor, ...]], parts: Sequence[Part]
+        self, device: str, operation: Callable[..., tuple[Tensor, ...]], parts: Sequence[Part]
     ) -> None:
         self.device = device
-        self._module = module
+        self._operation = operation
         self._parts = list(parts)
         self._places = []
         at = 0
@@ -84,7 +81,7 @@ class Plan:
 
     def eager(self) -> tuple[Tensor, ...]:
         """The results, kernel by kernel, without a graph."""
-        return self._module(*self._inputs)
+        return self._operation(*self._inputs)
 
     @property
     def _on_cuda(self) -> bool:
@@ -102,11 +99,11 @@ class Plan:
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream), compiling():
             for _ in range(2):
-                self._module(*self._inputs)
+                self._operation(*self._inputs)
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
         with _capturing, torch.cuda.graph(graph, capture_error_mode="thread_local"):
-            self._outputs = self._module(*self._inputs)
+            self._outputs = self._operation(*self._inputs)
         self._replay = graph.replay
         log.debug("captured a CUDA graph for %s", [shape for shape, _ in self._parts])
 
@@ -116,17 +113,16 @@ def compiling() -> Iterator[None]:
     """RuntimeError, with the cause, where Triton cannot compile or load a kernel."""
     try:
         yield
+    except RuntimeError:
+        raise
     except Exception as error:  # its own classes, those of its compilers, and the code's
-        if isinstance(error, RuntimeError):
-            raise
         cause = (str(error).splitlines() or [""])[-1]
         raise RuntimeError(f"a kernel cannot run: {type(error).__name__} {cause}") from error
 
 
 def part(array: Array, shape: tuple[int, ...] | None = None) -> Part:
     """The input that holds such an array, in room for ``shape``."""
-    kinds = {np.dtype(n): k for k, n in _NUMPY.items()}
-    return shape or array.shape, kinds[array.dtype]
+    return shape or array.shape, torch.from_numpy(np.empty(0, array.dtype)).dtype
 
 
 def read(tensors: Sequence[Tensor]) -> list[Array]:

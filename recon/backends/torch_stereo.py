@@ -11,6 +11,7 @@ in float32 (they stay below 2**24) or in int16 (half the bytes). Axes are (label
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
@@ -34,42 +35,30 @@ MAX_SHORT_TRUNCATION = 1024
 """The largest truncation for which no sum of four costs leaves 16 bits."""
 
 
-class DenseStereo(torch.nn.Module):
-    """Gray images (h, w) in 0 to 255 to labels and their confidence, two (h, w).
+def dense_stereo(
+    left: Tensor, right: Tensor, true: Tensor, labels: int, levels: int,
+    config: BeliefPropagationConfig, messages: torch.dtype = torch.int16,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Labels of gray images (h, w), NaN where the partner is outside the right one; and their
+    confidence, 0 where rejected.
 
-    ``labels`` is the room for them, ``levels`` counts those of the pyramid; ``messages`` is the
-    type of costs and messages, torch.int16 (where they fit) or torch.float32.
+    Args:
+        true: (3,) height, width and labels of the pair; beyond them the images repeat their last
+            row and column, and the results mean nothing.
+        labels: the room for them.
+        levels: of the pyramid.
+        messages: type of costs and messages, torch.int16 (where they fit) or torch.float32.
     """
+    if config.truncation > MAX_SHORT_TRUNCATION:
+        messages = torch.float32
+    if fused(left) and messages == torch.int16:
+        from recon.backends import triton_dense
 
-    def __init__(
-        self,
-        labels: int,
-        levels: int,
-        config: BeliefPropagationConfig,
-        messages: torch.dtype = torch.int16,
-    ) -> None:
-        super().__init__()
-        self.labels = labels
-        self.levels = levels
-        self.config = config
-        short = messages == torch.int16 and config.truncation <= MAX_SHORT_TRUNCATION
-        self.messages = torch.int16 if short else torch.float32
-
-    def forward(self, left: Tensor, right: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
-        """Labels, NaN where the partner is outside the right image; confidence, 0: rejected.
-
-        ``true`` (3,) is height, width and labels of the pair; beyond them the images repeat
-        their last row and column, and the results mean nothing.
-        """
-        if fused(left) and self.messages == torch.int16:
-            from recon.backends import triton_dense
-
-            return triton_dense.stereo(left, right, self.labels, self.levels, true, self.config)
-        left, right = left.float(), right.float()
-        cost = matching_cost(left, right, self.labels, true, self.config)
-        edges = edge_weights(left, true, self.config)
-        belief = propagate(cost, edges, true, self.levels, self.config, self.messages)
-        return select(belief, cost, true, self.config)
+        return triton_dense.stereo(left, right, labels, levels, true, config)
+    left, right = left.float(), right.float()
+    cost = matching_cost(left, right, labels, true, config)
+    belief = propagate(cost, edge_weights(left, true, config), true, levels, config, messages)
+    return select(belief, cost, true, config)
 
 
 def edge_weights(image: Tensor, true: Tensor, config: BeliefPropagationConfig) -> Tensor:
@@ -374,15 +363,15 @@ def _speckles(px: Tensor, largest: int) -> Tensor:
     return small.view(h, w) & known
 
 
-def _of_neighbours(own: Tensor, across: Tensor, down: Tensor, none: int, best: object) -> Tensor:
+def _of_neighbours(
+    own: Tensor, across: Tensor, down: Tensor, none: int, best: Callable[[Tensor, Tensor], Tensor]
+) -> Tensor:
     """The best of the indices of the connected neighbours; ``none`` without any."""
-    assert callable(best)
     right = F.pad(torch.where(across, own[:, 1:], none), (0, 1), value=none)
     left = F.pad(torch.where(across, own[:, :-1], none), (1, 0), value=none)
     below = F.pad(torch.where(down, own[1:], none), (0, 0, 0, 1), value=none)
     above = F.pad(torch.where(down, own[:-1], none), (0, 0, 1, 0), value=none)
-    result: Tensor = best(best(right, left), best(below, above))
-    return result
+    return best(best(right, left), best(below, above))
 
 
 def drop_unseen(

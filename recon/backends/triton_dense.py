@@ -39,7 +39,7 @@ def stereo(
     left: Tensor, right: Tensor, labels: int, levels: int, true: Tensor,
     config: BeliefPropagationConfig,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Labels and confidence (h, w) of gray images (h, w) uint8, as ``DenseStereo``; Eq. 1."""
+    """Labels and confidence (h, w) of gray images (h, w) uint8, as ``dense_stereo``; Eq. 1."""
     room = max(triton.next_power_of_2(labels), 8)
     cost, data = matching_cost(left, right, room, true, config)
     edges = edge_weights(left, true, config)

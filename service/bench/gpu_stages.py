@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,12 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from recon.backends import DenseStages
 from recon.backends.room import pyramid_levels
-from recon.backends.torch_depth import DensePath, Upsampling, fuse, reproject
+from recon.backends.torch_depth import DensePath, fuse, reproject, upsampled
 from recon.backends.torch_icp import DeviceIcp
 from recon.backends.torch_plan import Plan, part
-from recon.backends.torch_stereo import DenseStereo, drop_unreliable, drop_unseen
+from recon.backends.torch_stereo import dense_stereo, drop_unreliable, drop_unseen
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX, DepthFusionConfig
@@ -100,8 +102,11 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     found = []
     for kind in (torch.int16, torch.float32):
         stereo = planned(
-            device, DenseStereo(LABELS, levels, matching, kind), pair.left, pair.right,
-            own,
+            device,
+            partial(
+                dense_stereo, labels=LABELS, levels=levels, config=matching, messages=kind
+            ),
+            pair.left, pair.right, own,
         )  # fmt: skip
         found.append(
             staged(f"stereo {w}x{h}, {LABELS} labels, on the device", device, stereo, moved,
@@ -117,7 +122,7 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
         pair.left, px, sure, seen, seen, own,
     )  # fmt: skip
     px, sure = (t.cpu().numpy() for t in trusted.run())
-    finer = planned(device, Upsampling(upsampling), px, sure, pair.guide, both)
+    finer = planned(device, partial(upsampled, config=upsampling), px, sure, pair.guide, both)
     fine = [t.cpu().numpy() for t in finer.run()]
     to_left = pair.K @ np.linalg.inv(camera((W, H)))
     base = [pair.slope, pair.K[0, 0] * pair.baseline_m, LABEL_SIGMA_PX]
@@ -147,14 +152,15 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
 def whole_path(device: str, pair: StereoPair) -> list[Stage]:
     """A cloud of one pair: inputs on the device, then images up and depth down, and four."""
     assert pair.guide is not None
-    path = DensePath(device, BeliefPropagationConfig(), UpsamplingConfig(), DepthFusionConfig())
+    stages = DenseStages(BeliefPropagationConfig(), UpsamplingConfig(), DepthFusionConfig())
+    path = DensePath(device, stages)
     H, W = pair.guide.shape[:2]
     K = camera((W, H))
     path.depth([pair], K, (W, H), np.eye(4))
     plan = next(iter(path._plans.values()))
-    moved, operations = propagation_work(path.matching, 2)
+    moved, operations = propagation_work(stages.matching, 2)
     moved += (11.0 + 12.0) * W * H
-    operations += 20.0 * path.upsampling.diameter_px**2 * W * H
+    operations += 20.0 * stages.upsampling.diameter_px**2 * W * H
     what = f"cloud of {W}x{H} from pairs of {SIZE[0]}x{SIZE[1]}"
 
     def cloud(count: int) -> Callable[[], object]:
