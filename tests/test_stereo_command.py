@@ -202,7 +202,7 @@ def test_learned_model_is_checked_and_used(
     graph = Graph()
     left = graph.input("image_l", onnx.TensorProto.FLOAT, (1, 3, 96, 192))
     right = graph.input("image_r", onnx.TensorProto.FLOAT, (1, 3, 96, 192))
-    lit = graph.where(left.above(0.01), 0.95, 0.0) + right * 0.0
+    lit = left.above(0.01).where(0.95, 0.0) + right * 0.0
     graph.output(lit.part(1, 0, 1), "disp", (1, 1, 96, 192))
     (tmp_path / "net.onnx").write_bytes(graph.model("test"))
     declaration = tmp_path / "net.toml"

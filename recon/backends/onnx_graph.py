@@ -31,6 +31,27 @@ class Value:
     def __truediv__(self, other: Any) -> Value:
         return self.graph.op("Div", self, other)
 
+    def __and__(self, other: Value) -> Value:
+        return self.graph.op("And", self, other)
+
+    def __or__(self, other: Value) -> Value:
+        return self.graph.op("Or", self, other)
+
+    def __invert__(self) -> Value:
+        return self.graph.op("Not", self)
+
+    def where(self, yes: Any, no: Any) -> Value:
+        """``yes`` where this is true, else ``no``."""
+        return self.graph.op("Where", self, yes, no)
+
+    def lift(self, *axes: int) -> Value:
+        """With an axis of length 1 at each of ``axes``."""
+        return self.graph.op("Unsqueeze", self, np.array(axes, np.int64))
+
+    def drop(self) -> Value:
+        """Without the first axis, whose length is 1."""
+        return self.graph.op("Squeeze", self, np.array([0], np.int64))
+
     def abs(self) -> Value:
         """Magnitude."""
         return self.graph.op("Abs", self)
@@ -97,6 +118,11 @@ class Value:
         return self.graph.op("Pad", self, widths, np.float32(value), mode="constant")
 
 
+def join(parts: list[Value]) -> Value:
+    """The parts one after the other along the first axis."""
+    return parts[0].graph.op("Concat", *parts, axis=0)
+
+
 class Graph:
     """The graph that is being built."""
 
@@ -133,14 +159,6 @@ class Graph:
         name = f"v{len(self._nodes)}"
         self._nodes.append(helper.make_node(kind, names, [name], **attributes))
         return Value(self, name)
-
-    def where(self, condition: Value, yes: Any, no: Any) -> Value:
-        """``yes`` where ``condition``, else ``no``."""
-        return self.op("Where", condition, yes, no)
-
-    def join(self, parts: list[Value], axis: int) -> Value:
-        """The parts one after the other along an axis."""
-        return self.op("Concat", *parts, axis=axis)
 
     def model(self, description: str) -> bytes:
         """The graph as a checked ONNX file."""
