@@ -247,8 +247,10 @@ def network(
     if near is not None:
         camera, rounds = near, ()
         points = crossings(poses, camera, joint(seen, marks), count, rows)
-    for sigma, gate in (*rounds, (0.0, 0.0)):
-        if sigma == 0.0:
+    for rough in (*rounds, None):
+        if rough is not None:
+            sigma, gate = rough
+        else:
             errors = errors_px(camera, poses, points, kept, rows)
             sigma = float(np.clip(np.median(errors) / RAYLEIGH_MEDIAN, 0.1, 2.0))
             gate = max(6.0 * sigma, 1.0)
@@ -263,7 +265,7 @@ def network(
         sigmas = np.append(np.full(len(kept.view), sigma), np.full(len(marks.view), mark_px))
         solution = solve(
             Problem(camera, given, poses, points, every, sigmas, known, held, rows=rows),
-            covariances=covariances and gate < 15.0,
+            covariances=covariances and rough is None,
         )
         poses, points = solution.poses, solution.points
         camera, rows = solution.camera, solution.rows
