@@ -78,7 +78,7 @@ def test_the_least_squared_error_is_found_whatever_the_order() -> None:
     inverse = np.linalg.inv(best.jac.T @ best.jac)[:18, :18]
     for block, c in enumerate(np.flatnonzero(free)):
         part = inverse[6 * block : 6 * block + 6, 6 * block : 6 * block + 6]
-        np.testing.assert_allclose(np.diag(found.covariance[c]), 0.3**2 * np.diag(part), rtol=2e-2)
+        np.testing.assert_allclose(np.diag(found.joint[c, c]), 0.3**2 * np.diag(part), rtol=2e-2)
 
 
 def test_outliers_hardly_move_the_poses() -> None:
@@ -106,7 +106,7 @@ def test_covariance_covers_the_errors() -> None:
             T, X, cam, pt, noisy, K, free, huber_px=10.0, sigma_px=0.3, iterations=20
         )
         error = se3.log(result.T_camera_world[-1] @ se3.inverse(T[-1]))
-        squared.append(error @ np.linalg.solve(result.covariance[-1], error))
+        squared.append(error @ np.linalg.solve(result.joint[-1, -1], error))
     assert 3.5 < np.mean(squared) < 9.5
 
 
@@ -124,10 +124,10 @@ def test_the_motion_between_two_views_is_known_better_than_their_poses() -> None
         error = se3.log((last @ se3.inverse(before)) @ se3.inverse(T[-1] @ se3.inverse(T[-2])))
         covariance = found.step_covariance(5, 6)
         squared.append(error @ np.linalg.solve(covariance, error))
-        sharper.append(np.trace(covariance[3:, 3:]) / np.trace(found.covariance[-1][3:, 3:]))
+        sharper.append(np.trace(covariance[3:, 3:]) / np.trace(found.joint[-1, -1][3:, 3:]))
     assert 3.5 < np.mean(squared) < 9.5
     assert np.median(sharper) < 0.8
-    np.testing.assert_allclose(found.step_covariance(1, 2), found.covariance[2])  # 1 is fixed
+    np.testing.assert_allclose(found.step_covariance(1, 2), found.joint[2, 2])  # 1 is fixed
 
 
 def test_pixels_that_move_together_are_in_the_covariance_of_a_motion() -> None:
@@ -152,7 +152,7 @@ def test_fixed_cameras_stay() -> None:
     free = np.array([False, False, True, False, True, True])
     result = bundle.adjust(T, X, cam, pt, uv + 0.2, K, free)
     np.testing.assert_array_equal(result.T_camera_world[~free], T[~free])
-    assert not result.covariance[~free].any()
+    assert not result.joint[~free].any()
 
 
 def test_triangulation_finds_points_and_refuses_those_behind() -> None:

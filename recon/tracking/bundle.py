@@ -40,11 +40,6 @@ class BundleResult:
     joint: F64  # (C, C, 6, 6) covariance, left perturbations of T_camera_world; zero where fixed
     converged: bool
 
-    @property
-    def covariance(self) -> F64:
-        """(C, 6, 6) of each pose."""
-        return np.asarray(np.einsum("ccij->cij", self.joint))
-
     def step_covariance(self, a: int, b: int) -> F64:
         """(6, 6) of the motion from camera ``a`` to ``b``, left perturbation of T_b_a."""
         A = se3.adjoint(self.T_camera_world[b] @ se3.inverse(self.T_camera_world[a]))
