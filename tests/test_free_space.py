@@ -137,6 +137,17 @@ def test_ground_below_an_eave_is_not_open(house: HouseFlight) -> None:
     assert not is_open.any() and not behind.any()
 
 
+def test_air_is_open_however_uncertain_the_lens(house: HouseFlight) -> None:
+    """A lens known to 5 % moves the ground and what stands on it alike."""
+    flat = house.keyframe(0, -100.0).depth
+    depth = flat.depth_m.copy()
+    depth[40:50, 70:90] = 37.0
+    unsure = replace(flat, depth_m=depth, sigma_m=(0.05 * depth).astype(np.float32))
+    below = np.array([[-100.0, 0.0, 0.0], [-90.0, 5.0, 0.0]])
+    is_open, _ = air_above(below, (-1.0, 1.0, 2.0), [unsure])
+    assert is_open.tolist() == [[False, False, False], [False, True, True]]
+
+
 def ground(n: int, seed: int = 0) -> F64:
     """Places in a landscape, one of them far away."""
     rng = np.random.default_rng(seed)
@@ -161,7 +172,7 @@ def test_tiles_keep_every_place_once_and_neighbours_together() -> None:
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 60.0])
-@pytest.mark.parametrize("up_m", [0.0, 8.0])
+@pytest.mark.parametrize("up_m", [-1.0, 0.0, 8.0])
 def test_every_place_in_the_image_lies_in_a_tile_in_view(
     house: HouseFlight, tilt_deg: float, up_m: float
 ) -> None:
@@ -182,7 +193,7 @@ def test_every_place_in_the_image_lies_in_a_tile_in_view(
     seen = (inside[:, 2] > 0) & (inside[:, 2] < far_m) & (abs(u - w / 2) < w / 2)
     seen &= abs(v - h / 2) < h / 2
     assert seen.sum() > 100
-    found = tiles.in_view(depth, slack_m=5.0, up_m=up_m)
+    found = tiles.in_view(depth, slack_m=5.0, up_m=(min(up_m, 0.0), max(up_m, 0.0)))
     tile_of = np.repeat(np.arange(len(tiles)), np.diff(tiles.first))
     assert set(tile_of[seen]) <= set(found)
     assert len(found) < 0.5 * len(tiles)  # and most of the others are left out

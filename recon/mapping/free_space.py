@@ -59,15 +59,18 @@ class Tiles:
         """How many tiles hold a place."""
         return len(self.first) - 1
 
-    def in_view(self, depth: DepthMap, slack_m: float = 0.0, up_m: float = 0.0) -> I64:
+    def in_view(
+        self, depth: DepthMap, slack_m: float = 0.0, up_m: tuple[float, float] = (0.0, 0.0)
+    ) -> I64:
         """(M,) undecided tiles that may hold a place in the image, no more than ``slack_m``
-        behind the farthest surface in it; or one that is raised by up to ``up_m``.
+        behind the farthest surface in it; or one that is raised by ``up_m``, from and to.
         """
         planes = _planes(depth, slack_m)
         if planes is None:
             return np.zeros(0, np.int64)
-        up = np.array([0.0, 0.0, 0.5 * up_m])
-        middle, half = self._middle + up, self._half + up
+        low, high = up_m
+        up = np.array([0.0, 0.0, 0.5])
+        middle, half = self._middle + up * (low + high), self._half + up * (high - low)
         reach = middle @ planes[:, :3].T + half @ np.abs(planes[:, :3]).T + planes[:, 3]
         return np.flatnonzero((reach >= 0.0).all(axis=1) & ~self.is_decided)
 
@@ -181,14 +184,16 @@ def air_above(
 
     A camera that looks sideways sees ground below a crown or an eave; where nothing above
     the ground was seen to be empty, the ground need not be the highest surface there. Places
-    are (N, 3) in the world of the depth maps.
+    are (N, 3) in the world of the depth maps. Where sigma exceeds the heights, most of it is the
+    lens's, which is the same at the place: the air is free if what is seen is nearer the place.
     """
     tiles = Tiles(places_m)
     up = np.asarray(heights_m, np.float64)
     is_open = np.zeros((len(places_m), len(up)), np.bool_)
     behind = np.zeros((len(places_m), len(up)), np.uint8)
+    around = float(up.min(initial=0.0)), float(up.max(initial=0.0))
     for depth in views:
-        reached = tiles.in_view(depth, AIR_SLACK_M, up_m=float(up.max(initial=0.0)))
+        reached = tiles.in_view(depth, AIR_SLACK_M, around)
         if len(reached):
             in_bands(
                 _look_above,
@@ -244,7 +249,8 @@ def _look_above(
                 u, v = int(np.floor(at + 0.5)), int(np.floor(down + 0.5))
                 if not (0 <= u < w and 0 <= v < h):
                     continue
-                if depth[v, u] - cz > AGREES_SIGMAS * float(depth_sigma[v, u]):
+                noise = AGREES_SIGMAS * float(depth_sigma[v, u])
+                if depth[v, u] - cz > (min(noise, 0.5 * up_m[j]) if up_m[j] > 0.0 else noise):
                     is_open[p, j] = True
                     left -= 1
                 elif depth[v, u] > 0.0 and behind[p, j] < 255:

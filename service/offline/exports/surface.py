@@ -149,11 +149,6 @@ def _places(scan: ScanView, raster: Raster, cells: Bool) -> F64:
 
 def _air(scan: ScanView, places: F64, up_m: Sequence[float]) -> tuple[Bool, U8]:
     """:func:`recon.mapping.free_space.air_above` at these heights above or below the places."""
-    lowest_m = min(0.0, *up_m)
     keyframes = scan.progress.over(main_keyframes(scan.store), len(scan.store.seqs()))
     with scan.progress.part("surface that is open to the sky", 0.3):
-        return air_above(
-            places + np.array([0.0, 0.0, lowest_m]),
-            [one - lowest_m for one in up_m],
-            (k.depth for k in keyframes),
-        )
+        return air_above(places, up_m, (k.depth for k in keyframes))
