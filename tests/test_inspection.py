@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
 
 import cv2
 import numpy as np
@@ -21,9 +22,11 @@ from service.scans.drawing import (
     debug_panels,
     debug_path,
     load_debug,
+    middle_keyframe,
     save_debug,
     sheet,
 )
+from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
     from conftest import HouseFlight
@@ -102,13 +105,27 @@ def test_wrong_arrays_are_refused(tmp_path: Path) -> None:
         load_debug(debug_path(tmp_path, 2))
 
 
+def test_the_keyframe_shown_is_one_with_points(tmp_path: Path) -> None:
+    def keyframe(seq: int) -> SimpleNamespace:
+        depth_m = np.full(30, np.nan)
+        depth_m[: seq if seq < 17 else 0] = 40.0
+        return SimpleNamespace(depth=SimpleNamespace(depth_m=depth_m))
+
+    store = cast(ScanStore, SimpleNamespace(keyframe=keyframe))
+    assert middle_keyframe(tmp_path, store, range(30)) == 16
+    assert middle_keyframe(tmp_path, store, range(3)) == 2
+    assert middle_keyframe(tmp_path, store, []) is None
+    save_debug(tmp_path, 4, stages())
+    assert middle_keyframe(tmp_path, store, range(30)) == 4
+
+
 def test_the_command(tmp_path: Path, house: HouseFlight) -> None:
     house.flown(tmp_path).close()
     run = CliRunner().invoke
     done = run(app, ["inspect", str(tmp_path), "--json"])
     assert done.exit_code == 0, done.exception
     figures = json.loads(done.stdout.splitlines()[-1])
-    assert figures["keyframe"] == 2 and not figures["stages"]
+    assert figures["keyframe"] == 0 and not figures["stages"]
     assert figures["depth_median_m"] == pytest.approx(40.0, abs=0.05)
     assert cv2.imread(figures["picture"]) is not None
     save_debug(tmp_path, 1, stages())

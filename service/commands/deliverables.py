@@ -172,7 +172,7 @@ def inspect(
 
     with ScanView(scan_dir) as scan:
         seqs = scan.store.seqs()
-        seq = middle_keyframe(scan_dir, seqs) if keyframe is None else keyframe
+        seq = middle_keyframe(scan_dir, scan.store, seqs) if keyframe is None else keyframe
         if not seqs or seq is None:
             raise InputError(f"{scan_dir} contains no keyframes yet; nothing to inspect")
         found = scan.store.keyframe(seq) if seq in seqs else None

@@ -19,6 +19,7 @@ import numpy as np
 from recon.surface.raster import Grid, Raster, fill_holes, hillshade, smoothed
 from recon.types import F32, F64, U8, Array, Keyframe
 from service.errors import InputError
+from service.stream.store import ScanStore
 
 BACKGROUND = (250, 248, 246)  # BGR
 INK = (40, 36, 32)
@@ -314,11 +315,18 @@ def load_debug(path: Path) -> dict[str, Array] | None:
     return arrays
 
 
-def middle_keyframe(folder: Path, seqs: Sequence[int]) -> int | None:
-    """Number of a keyframe in the middle, preferably one with every stage saved."""
+def middle_keyframe(folder: Path, store: ScanStore, seqs: Sequence[int]) -> int | None:
+    """Number of the keyframe with the most points of the ten in the middle, preferably of those
+    with every stage saved: of ground that is known already hardly anything is stored."""
     kept = [seq for seq in seqs if debug_path(folder, seq).is_file()]
     some = kept or list(seqs)
-    return some[len(some) // 2] if some else None
+    middle = max(0, len(some) // 2 - 5)
+    return max(some[middle : middle + 10], key=lambda seq: _points(store, seq), default=None)
+
+
+def _points(store: ScanStore, seq: int) -> int:
+    keyframe = store.keyframe(seq)
+    return 0 if keyframe is None else int(np.isfinite(keyframe.depth.depth_m).sum())
 
 
 def stages(folder: Path, scan_id: str, keyframe: Keyframe) -> tuple[U8, bool]:

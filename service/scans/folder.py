@@ -303,7 +303,7 @@ def files_due(folder: Path) -> bool:
 
 def _stages(folder: Path, store: ScanStore) -> bytes | None:
     """JPEG of a keyframe's stages for the report; None for a scan without keyframes."""
-    seq = middle_keyframe(folder, main_seqs(store))
+    seq = middle_keyframe(folder, store, main_seqs(store))
     keyframe = None if seq is None else store.keyframe(seq)
     if keyframe is None:
         return None

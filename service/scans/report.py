@@ -121,19 +121,20 @@ def _accuracy(summary: dict[str, Any], raster: Raster | None) -> list[tuple[str,
     rows = [
         ("trust", "; ".join([trust["level"], *trust["reasons"]])),
         ("points", f"{counts['points']} from {counts['keyframes']} keyframes"),
-        ("area", f"{quality['area_m2']:.0f} m2"),
+        ("area of the cloud", f"{quality['area_m2']:.0f} m2"),
         ("voxel", f"{quality['voxel_m']:.3f} m"),
     ]
     for name, key, unit in (
         ("sigma of the points, median", "sigma_median_m", "m"),
         ("sigma of the points, 90 %", "sigma_90_percent_m", "m"),
         ("stereo pairs per point, median", "views_median", ""),
-        ("seen by one pair only", "seen_once_share", "of 1"),
         ("sigma of the camera's position, horizontal", "position_sigma_h_median_m", "m"),
         ("sigma of the camera's position, vertical", "position_sigma_v_median_m", "m"),
     ):
         if quality[key] is not None:
             rows.append((name, f"{quality[key]:.3g} {unit}"))
+    if quality["seen_once_share"] is not None:
+        rows.append(("points that one pair sees", f"{100.0 * quality['seen_once_share']:.0f} %"))
     if raster is not None and quality["area_m2"]:
         rows.append(("points per m2", f"{counts['points'] / quality['area_m2']:.1f}"))
     return [*rows, *sensor_constants((summary.get("run") or {}).get("graph") or {})]
