@@ -70,7 +70,7 @@ def test_ply_by_open3d(scan_dir: Path, house: HouseFlight) -> None:
     path = written(scan_dir, "ply")
     cloud = o3d.io.read_point_cloud(str(path))
     assert_is_the_house(to_enu(np.asarray(cloud.points), 32632, house), house)
-    assert b"comment EPSG:32632, AMSL metres" in path.read_bytes()[:300]
+    assert b"comment EPSG:32632, metres AMSL" in path.read_bytes()[:300]
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
@@ -396,11 +396,16 @@ def test_an_old_deliverable_stays_until_the_new_one_is_whole(scan_dir: Path) -> 
 
 
 def test_without_georeference_local_files_are_written_and_maps_refused(
-    tmp_path: Path, house: HouseFlight
+    tmp_path: Path, house: HouseFlight, caplog: pytest.LogCaptureFixture
 ) -> None:
-    pytest.importorskip("rasterio", exc_type=ImportError)
+    rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
     house.flown(tmp_path / "s", georeferenced=False).close()
-    for kind in ("ply", "laz", "dsm", "ortho", "colmap"):
+    maps = written(tmp_path / "s", "all")
+    assert "contours is left out" in caplog.text and "kmz is left out" in caplog.text
+    assert not list(maps.glob("contours.*"))
+    with rasterio.open(maps / "dsm.tif") as image:
+        assert image.descriptions[0] == "height above the scan's origin, m"
+    for kind in ("ply", "colmap"):
         assert written(tmp_path / "s", kind).exists()
     for kind in ("contours", "geojson", "kml", "3dtiles"):
         with pytest.raises(InputError, match="no georeference"):

@@ -56,8 +56,7 @@ def write_ply(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """Binary PLY in UTM metres (doubles: single precision steps by half a metre there)."""
     crs = "local ENU metres"
     if scan.frame is not None:
-        heights = "AMSL metres" if options.to_datum is None else f"metres {options.above}"
-        crs = f"EPSG:{scan.frame.epsg}, {heights}"
+        crs = f"EPSG:{scan.frame.epsg}, metres {scan.above(options)}"
     count = 0
     with writing(out) as part, open(part, "wb") as file:
         file.write(_ply_head(crs, count))

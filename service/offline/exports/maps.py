@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,6 +25,8 @@ from service.offline.geopackage import lines, points, write_layers
 from service.scans.annotations import read_annotations
 from service.scans.writing import write_whole, writing
 from service.version import software
+
+log = logging.getLogger(__name__)
 
 MAX_OVERLAY_PX = 4096
 JPEG_QUALITY = 85
@@ -193,6 +196,7 @@ def write_all(scan: ScanView, out: Path, options: ExportOptions) -> None:
         try:
             done[kind] = export(view, kind, out / EXPORTERS[kind][1], options)
         except SkyreliefError as error:
+            log.warning("%s is left out: %s", kind, error)
             done[kind] = error
 
     _in_two_branches(scan, MAPS, write)

@@ -74,7 +74,7 @@ def dsm(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
     known = surface.raster.known
     bands = [surface.raster.height_m, surface.raster.sigma_m, surface.is_filled]
     image = np.where(known, np.stack(bands), NODATA_M).astype(np.float32)
-    names = (f"height {options.above}, m", "sigma, m", "filled")
+    names = (f"height {scan.above(options)}, m", "sigma, m", "filled")
     return Layers(surface.raster.grid, image, names, NODATA_M, options.datum).within(box)
 
 
@@ -83,7 +83,7 @@ def dtm(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
     raster, found = surface_model(scan, options.cell_m).raster, bare_ground(scan, options.cell_m)
     bands = np.stack([found.everywhere_m, found.is_bridged])
     image = np.where(found.is_inside, bands, NODATA_M).astype(np.float32)
-    names = (f"ground {options.above}, m", "bridged")
+    names = (f"ground {scan.above(options)}, m", "bridged")
     return Layers(raster.grid, image, names, NODATA_M, options.datum).within(box)
 
 

@@ -80,11 +80,6 @@ class ExportOptions:
         """Name of a property that holds a height."""
         return "height_amsl_m" if self.to_datum is None else "height_m"
 
-    @property
-    def above(self) -> str:
-        """What the written heights are above, in words."""
-        return "AMSL" if self.to_datum is None else f"above {self.to_datum}"
-
 
 Make = Callable[["ScanView", ExportOptions, Box], T | None]
 """Makes the part of a product in a box; a module's own function, so that it can travel."""
@@ -196,6 +191,12 @@ class ScanView:
     def flown_frame(self) -> LocalFrame | None:
         """The scan's georeference with heights as the autopilot reports them, or None."""
         return local_frame(self.store.header)
+
+    def above(self, options: ExportOptions) -> str:
+        """What the written heights are above, in words."""
+        if self.frame is None:
+            return "above the scan's origin"
+        return "AMSL" if options.datum is None else f"above {options.datum}"
 
     @cached_property
     def poses(self) -> list[PoseRecord]:
