@@ -192,7 +192,7 @@ def test_a_flight_over_weak_places_is_planned_while_the_scan_grows(
     page.open(f"{portal.url.split('/?')[0]}/#/map/drone-1/test-1")
     page.wait(SHOWN)
     page.run(f"{BOX.format('Fly again')}.querySelector('input').click()")
-    page.wait("document.querySelector('.layers').textContent.includes('nothing is weak')")
+    page.wait("document.querySelector('.layers').textContent.includes('nothing large enough')")
 
     def fly(seq: int, east_m: float) -> None:
         """A keyframe, then the page's next round."""

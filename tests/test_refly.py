@@ -272,6 +272,8 @@ def test_the_command_writes_both_kinds_and_refuses_in_one_line(
     assert plan["fileType"] == "Plan" and len(plan["mission"]["items"]) > 5
     out = tmp_path / "again.waypoints"
     assert run(app, ["refly", str(tmp_path / "scan"), "--sigma-m", "0.01", "--out", str(out)])
+    none = run(app, ["refly", str(tmp_path / "scan"), "--sigma-m", "9", "--views", "1"])
+    assert none.stdout == "no weak place is larger than 0.5% of an image; no flight is needed\n"
     assert out.read_text().startswith("QGC WPL 110\n")
     for arguments, match in (
         (["--out", str(tmp_path / "x.kml")], "name it .plan"),

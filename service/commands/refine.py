@@ -159,8 +159,10 @@ def refly(
     limits = {name: value for name, value in given.items() if value is not None}
     flight = _flight(scan_dir, limits, overlap, relative, photos)
     if flight is None:
+        from service.offline.refine.refly import NO_FLIGHT
+
         nothing = {"lines": 0, "weak_m2": 0.0, "plan": None}
-        print(json.dumps(nothing) if as_json else "no place is weak; no flight is needed")
+        print(json.dumps(nothing) if as_json else NO_FLIGHT)
         return
     _write_plan(path, flight)
     figures = _plan_figures(path, flight)

@@ -22,7 +22,13 @@ from service.ground.state import names_of, state_of
 from service.ground.storage import is_regular
 from service.offline.exports import EXPORTERS
 from service.offline.exports.maps import MANIFEST
-from service.offline.refine.refly import geojson, plan_json, suggest_as_flown, waypoints_text
+from service.offline.refine.refly import (
+    NO_FLIGHT,
+    geojson,
+    plan_json,
+    suggest_as_flown,
+    waypoints_text,
+)
 from service.scans.main_piece import main_track
 from service.stream.store import ScanStore
 
@@ -223,7 +229,7 @@ def _refly(request: Request) -> Response:
     if kind == "geojson":
         return Response(geojson(flight, found.frame), media_type="application/geo+json")
     if flight is None:
-        raise InputError("no place is weak; no flight is needed")
+        raise InputError(NO_FLIGHT)
     text = plan_json(flight) if kind == "plan" else waypoints_text(flight)
     name = f"{request.path_params['scan']}-refly.{kind}"
     return Response(text, headers={"content-disposition": f'attachment; filename="{name}"'})

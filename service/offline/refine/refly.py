@@ -31,6 +31,8 @@ AMSL, MISSION, RELATIVE = 0, 2, 3  # MAV_FRAME
 SMALLEST_SHARE = 0.005
 """Weak patches smaller than this share of an image are ignored."""
 
+NO_FLIGHT = f"no weak place is larger than {SMALLEST_SHARE:.1%} of an image; no flight is needed"
+
 FORWARD_OVERLAP = 0.8
 """Overlap of consecutive photographs."""
 
@@ -238,7 +240,7 @@ def suggest(
     relative: bool = False,
     photos: bool = False,
 ) -> Refly | None:
-    """A flight over the weak areas; None when nothing is weak.
+    """A flight over the weak areas; None when no weak place is large enough.
 
     ``overlap`` is that of neighbouring lines' images. Altitudes are AMSL as flown, or
     ``relative`` to home by the height above ground flown.

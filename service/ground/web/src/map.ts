@@ -247,7 +247,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
       const places = (g.type === "Polygon" ? g.coordinates[0]! : g.coordinates).map(([lon, lat]) => placeOf(lat, lon));
       return { polygon: g.type === "Polygon", places };
     });
-    lines.textContent = flight.length ? `${flight.length / 2} ${flight.length > 2 ? "lines" : "line"}` : "nothing is weak";
+    lines.textContent = flight.length ? `${flight.length / 2} ${flight.length > 2 ? "lines" : "line"}` : "nothing large enough";
     files.hidden = !flight.length;
   };
   const load = async (): Promise<void> => {
