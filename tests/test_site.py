@@ -294,6 +294,7 @@ def changed(tmp_path_factory: pytest.TempPathFactory) -> Path:
         app, ["site", "compare", str(one), str(two), "--out", str(folder / "out"), "--json"]
     )
     assert done.exit_code == 0, done.output
+    assert "site: seeking ties\n" in done.output and "site: comparing the" in done.output
     return folder / "out"
 
 
@@ -308,6 +309,7 @@ def test_a_box_removed_and_one_added_are_found(changed: Path) -> None:
         assert one["volume_m3"] * sign == pytest.approx(true, rel=0.15)
     assert "2 object(s)" in (changed / "report.html").read_text()
     page = (changed / "change.html").read_text()
+    assert " UTC. Right:" in page
     assert "resize:horizontal" in page and "<script" not in page and "http" not in page
 
 
@@ -331,6 +333,7 @@ def test_change_files_open_elsewhere(changed: Path) -> None:
 
     with rasterio.open(changed / "change.tif") as image:
         assert image.crs.to_epsg() == FRAME.epsg and image.count == 3
+        assert image.tags()["HEIGHTS"] == "metres, after less before"
         height = image.read(1, masked=True)
         assert float(height.max()) > 0.5 and float(height.min()) < -0.5
     db = sqlite3.connect(changed / "change.gpkg")

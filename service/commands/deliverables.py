@@ -238,7 +238,11 @@ def site(
         if not all(scan and points for scan, _, points in pairs):
             raise InputError("--start is SCAN:POINTS.json")
         starts = {Path(scan): read_start(Path(points)) for scan, _, points in pairs}
-        made = align_site(scans, out, starts=starts, tile_points=tile_points, scheduler=scheduler)
+        with showing("site") as progress:
+            made = align_site(
+                scans, out, starts=starts, progress=progress, tile_points=tile_points,
+                scheduler=scheduler,
+            )  # fmt: skip
         figures = made.document
         print(json.dumps(figures) if as_json else "\n".join(_aligned_lines(out, figures)))
         return
@@ -246,8 +250,8 @@ def site(
 
     if len(scans) != 2:
         raise InputError(f"site compare takes two scans, before and after, not {len(scans)}")
-    with needing("a change map"):
-        figures = compare(scans[0], scans[1], out, cell_m, tile_points, scheduler, bare)
+    with needing("a change map"), showing("site") as progress:
+        figures = compare(scans[0], scans[1], out, cell_m, tile_points, scheduler, bare, progress)
     print(json.dumps(figures) if as_json else "\n".join(_change_lines(out, figures)))
 
 

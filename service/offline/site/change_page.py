@@ -22,14 +22,16 @@ PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</t
 #map{{position:relative;line-height:0}}#map,img{{width:min(1000px,100vw - 3em)}}
 #over{{position:absolute;left:0;top:0;height:100%;width:50%;min-width:2em;max-width:100%;
 overflow:hidden;resize:horizontal;border-right:3px solid #fff;box-shadow:1px 0 3px #000}}
-td,th{{padding:.1em .8em;text-align:right}}</style>
+table{{display:block;overflow-x:auto}}td,th{{padding:.1em .8em;text-align:right}}</style>
 <h1>{title}</h1><p>{words}</p>
 <p>Left: {before}. Right: {after}. Red: added; blue: removed. Drag the corner at the lower
 end of the white line.</p>
 <div id="map"><img alt="after" src="{two}"><div id="over"><img alt="before" src="{one}"></div></div>
-<table><tr><th>object<th>kind<th>area, m²<th>volume, m³<th>95 %, m³<th>highest, m</tr>{rows}</table>
-{notes}</html>
+{table}{notes}</html>
 """
+
+
+HEAD = "<tr><th>object<th>kind<th>area, m²<th>volume, m³<th>95 %, m³<th>highest, m</tr>"
 
 
 def page(document: dict[str, Any], images: tuple[U8, U8]) -> str:
@@ -44,13 +46,17 @@ def page(document: dict[str, Any], images: tuple[U8, U8]) -> str:
     return PAGE.format(
         title=escape(f"Change {document['before']['scan']} to {document['after']['scan']}"),
         words=escape(document["in_words"]),
-        before=escape(document["before"]["started"]),
-        after=escape(document["after"]["started"]),
+        before=_utc(document["before"]["started"]),
+        after=_utc(document["after"]["started"]),
         one=_embedded(images[0]),
         two=_embedded(images[1]),
-        rows=rows,
+        table=rows and f"<table>{HEAD}{rows}</table>",
         notes="".join(f"<p>{escape(note)}</p>" for note in document["notes"]),
     )
+
+
+def _utc(iso: str) -> str:
+    return iso.replace("T", " ").replace("+00:00", " UTC")
 
 
 def _embedded(image: U8) -> str:

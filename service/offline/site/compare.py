@@ -100,6 +100,7 @@ def compare(
     tile_points: int = TILE_POINTS,
     scheduler: str | None = None,
     bare: bool = False,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Align two scans in the folder ``out``, and write what changed from one to the other.
 
@@ -107,14 +108,17 @@ def compare(
     Returns the content of change.json. Raises InputError for scans that are one flight, that no
     tie joins, or that share no ground.
     """
-    site = align_site([before, after], out, deliver=False)
+    progress = progress or Progress()
+    with progress.part("aligning", 0.4):
+        site = align_site([before, after], out, deliver=False, progress=progress)
     one, two = _pair(site, before, after)
     pair = site.members[one], site.members[two]
     with ScanView(out) as view:
         view.needs_place("a comparison")
         parts = ((pair[0].first, pair[0].last), (pair[1].first, pair[1].last))
         apart = _apart_m(site, one, two)
-        found = changes(view, out, parts, apart, cell_m, tile_points, scheduler, bare=bare)
+        with progress.part("comparing the surfaces", 0.7):
+            found = changes(view, out, parts, apart, cell_m, tile_points, scheduler, progress, bare)
         if found is None:
             raise InputError(f"{before} and {after} share no ground")
         document = _document(site, found, one, two)
@@ -124,7 +128,7 @@ def compare(
     hide_changed(out / "scan.db", site.members[one], out / CHANGE_TIF)
     with ScanStore.open(out / "scan.db") as store:
         store.update_header(notes=(*store.header.notes, document["in_words"]))
-    write_files(out, tile_points, scheduler)
+    write_files(out, tile_points, scheduler, progress)
     return document
 
 
@@ -186,6 +190,7 @@ def changes(
             objects += part.objects
             walls = None if walls is None or part.walls is None else [*walls, *part.walls]
         objects = _numbered(map_, objects)
+        map_.update_tags(HEIGHTS="metres, after less before")
     for image in images:
         for one in objects:
             draw_outlines(image, chain(*one.rings), one.body.volume_m3 > 0, grid)
