@@ -387,7 +387,7 @@ def _preview(
 
 
 def _key_figures(summary: dict[str, Any]) -> list[str]:
-    """Two or three lines of text for the preview (ASCII: OpenCV's fonts have no more)."""
+    """Three lines of text for the preview (ASCII: OpenCV's fonts have no more)."""
     counts, quality, origin = summary["counts"], summary["quality"], summary["origin"]
     place = "no georeference"
     if origin is not None:
@@ -402,5 +402,6 @@ def _key_figures(summary: dict[str, Any]) -> list[str]:
     figures.append(f"{quality['distance_m']:.0f} m flown")
     name = summary["id"].encode("ascii", "replace").decode()
     trust = quality["trust"]
-    words = f"{trust['level']}: {'; '.join(trust['reasons'])}" if trust["reasons"] else ""
-    return [f"{name}, {place}", ", ".join(figures), *([words] if words else [])]
+    reasons = "; ".join(trust["reasons"])
+    words = f"{trust['level']}: {reasons}" if reasons else trust["level"]
+    return [f"{name}, {place}", ", ".join(figures), words]
