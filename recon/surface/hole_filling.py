@@ -7,6 +7,8 @@ next to the step, where matching makes roofs too wide, it stays unknown.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numba import njit
@@ -60,7 +62,7 @@ def filled(
     )
     new = np.isfinite(out[..., 0]) & ~certain.known
     rgb = np.where(new[..., None], np.rint(out[..., 2:]), certain.rgb).astype(np.uint8)
-    return Raster(certain.grid, out[..., 0].copy(), out[..., 1].copy(), rgb), new
+    return replace(certain, height_m=out[..., 0].copy(), sigma_m=out[..., 1].copy(), rgb=rgb), new
 
 
 def outlined(known: Bool) -> Bool:

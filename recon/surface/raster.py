@@ -8,7 +8,7 @@ is not mixed with it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -30,6 +30,10 @@ SPARSE_CELLS = 8
 SPARSE_SHARE = 0.5
 
 INNER_GAPS = 2
+
+ALIKE = 3.0
+"""Sigmas within such a factor (5 to 95 % of the points) are mostly a part that neighbours share, as
+that of an uncertain lens: stereo's own differ by more than twice the factor."""
 
 LARGEST_CELLS = 200_000_000
 
@@ -114,6 +118,7 @@ class Raster:
     height_m: F32  # (rows, cols), NaN = unknown
     sigma_m: F32  # (rows, cols), NaN = unknown
     rgb: U8  # (rows, cols, 3), black where unknown
+    own_m: float = math.inf  # limit of sigma's part that neighbours do not share; else unknown
 
     @property
     def known(self) -> Bool:
@@ -171,6 +176,7 @@ def rasterise(cloud: PointCloud, grid: Grid) -> Raster:
 def rasterise_points(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
     """As :func:`rasterise` for arrays: (N, 3) m in any frame with z up, (N, 3), (N,)."""
     rows, cols = grid.shape
+    own_m = _own_limit(sigma_m, grid.cell_m)
     height, sigma, colour = _top_surface(
         np.ascontiguousarray(xyz_m),
         np.ascontiguousarray(rgb, np.uint8),
@@ -180,14 +186,24 @@ def rasterise_points(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Ras
         1.0 / grid.cell_m,
         rows,
         cols,
+        own_m,
     )
-    return Raster(grid, height, sigma, colour)
+    return Raster(grid, height, sigma, colour, own_m)
+
+
+def _own_limit(sigma_m: F32, cell_m: float) -> float:
+    """Limit of the part of sigma (N,) that neighbours do not share: a cell where sigmas are larger
+    and alike, so that they tell no point from another, else none."""
+    if not len(sigma_m):
+        return math.inf
+    low, high = np.quantile(sigma_m[:: max(1, len(sigma_m) // 100_000)], [0.05, 0.95])
+    return cell_m if cell_m < low and high < ALIKE * low else math.inf
 
 
 @njit(cache=True, nogil=True)
 def _top_surface(
     xyz: F64 | F32, rgb: U8, sigma: F32, west: float, north: float, inverse: float,
-    rows: int, cols: int,
+    rows: int, cols: int, own_m: float,
 ) -> tuple[F32, F32, U8]:  # fmt: skip
     """Height, sigma and colour per cell in two passes: the highest point, then its layer.
 
@@ -208,7 +224,7 @@ def _top_surface(
             r = int(np.floor((north - float(xyz[p, 1])) * inverse)) - first
             if 0 <= r < count and 0 <= c < cols and xyz[p, 2] > top[r, c]:
                 top[r, c] = xyz[p, 2]
-                floor[r, c] = xyz[p, 2] - TOP_SIGMAS * max(float(sigma[p]), 1e-6)
+                floor[r, c] = xyz[p, 2] - TOP_SIGMAS * max(min(float(sigma[p]), own_m), 1e-6)
         sums = np.zeros((count, cols, 5))
         for p in range(n):
             c = int(np.floor((float(xyz[p, 0]) - west) * inverse))
@@ -237,28 +253,35 @@ def reliable(raster: Raster) -> Raster:
     matching draws across the ground hidden behind a wall. Cells above a step, within the
     width that matching windows make a roof too wide, are kept only where they are known
     clearly better than their neighbourhood: a true roof edge is seen by all views, a spill
-    next to it by few. And cells high above ground nearby with less than SPARSE_SHARE
-    of the usual number of known neighbours: crumbs of what hides behind a roof or in a crown.
+    next to it by few; where sigmas are alike this does not show. And cells high above ground
+    nearby with less than SPARSE_SHARE of the usual number of known neighbours: crumbs of what
+    hides behind a roof or in a crown.
     """
     height = raster.height_m.copy()
-    sigma = np.nan_to_num(raster.sigma_m, nan=1.0)
+    sigma = np.minimum(np.nan_to_num(raster.sigma_m, nan=1.0), np.float32(raster.own_m))
     for reach in SMEAR_CELLS:
         high, low = highest_lowest(height, reach)
         limit = SMEAR_SLOPE * reach * raster.grid.cell_m + sigma
         height[(high - height > limit) & (height - low > limit)] = np.nan
-    known = np.isfinite(height)
-    precision = np.where(known, 1.0 / np.maximum(sigma, 1e-3), 0.0).astype(np.float32)
-    window = (9, 9)
-    count = cv2.boxFilter(known.astype(np.float32), -1, window, normalize=False)
-    mean = cv2.boxFilter(precision, -1, window, normalize=False) / np.maximum(count, 1.0)
-    above = height - highest_lowest(height, EDGE_CELLS)[1] > STEP_M
-    height[above & (precision < EDGE_PRECISION * mean)] = np.nan
+    if math.isinf(raster.own_m):
+        height[_spills(height, sigma)] = np.nan
     known = np.isfinite(height)
     held = cv2.boxFilter(known.astype(np.float32), -1, (5, 5))
     high = height - highest_lowest(height, SPARSE_CELLS)[1] > STEP_M
     usual = float(np.median(held[known])) if known.any() else 1.0
     height[high & (held < SPARSE_SHARE * usual)] = np.nan
     return without_cells(raster, ~np.isfinite(height))
+
+
+def _spills(height_m: F32, sigma_m: F32) -> Bool:
+    """(rows, cols) cells above a step that are not clearly better known than those around."""
+    known = np.isfinite(height_m)
+    precision = np.where(known, 1.0 / np.maximum(sigma_m, 1e-3), 0.0).astype(np.float32)
+    window = (9, 9)
+    count = cv2.boxFilter(known.astype(np.float32), -1, window, normalize=False)
+    mean = cv2.boxFilter(precision, -1, window, normalize=False) / np.maximum(count, 1.0)
+    above = height_m - highest_lowest(height_m, EDGE_CELLS)[1] > STEP_M
+    return np.asarray(above & (precision < EDGE_PRECISION * mean))
 
 
 def inner_doubtful(measured: Raster, sure: Raster) -> Bool:
@@ -277,7 +300,7 @@ def without_cells(raster: Raster, unknown: Bool) -> Raster:
     height = np.where(known, raster.height_m, np.float32(np.nan)).astype(np.float32)
     spread = np.where(known, raster.sigma_m, np.float32(np.nan)).astype(np.float32)
     rgb = np.where(known[..., None], raster.rgb, 0).astype(np.uint8)
-    return Raster(raster.grid, height, spread, rgb)
+    return replace(raster, height_m=height, sigma_m=spread, rgb=rgb)
 
 
 def standing_height(raster: Raster, reach_m: float = 2.0, share: float = 0.99) -> float:
@@ -320,7 +343,7 @@ def fill_holes(raster: Raster, largest_cells: int = 4) -> Raster:
     holes = closed & ~known
     height, sigma, rgb = raster.height_m.copy(), raster.sigma_m.copy(), raster.rgb.copy()
     _fill(np.ascontiguousarray(np.argwhere(holes)), known, largest_cells, height, sigma, rgb)
-    return Raster(raster.grid, height, sigma, rgb)
+    return replace(raster, height_m=height, sigma_m=sigma, rgb=rgb)
 
 
 @njit(cache=True, nogil=True)
@@ -360,14 +383,14 @@ def smoothed(raster: Raster, sigma_cells: float = 1.5) -> Raster:
     if not known.any():
         return raster
     far = np.float32(1e6)
-    tolerance = max(1.5 * float(np.median(raster.sigma_m[known])), 1e-3)
+    tolerance = max(1.5 * min(float(np.median(raster.sigma_m[known])), raster.own_m), 1e-3)
     middle = np.float32(np.median(raster.height_m[known]))
     height = np.where(known, raster.height_m - middle, far).astype(np.float32)
     median = cv2.medianBlur(height, 5)
     height = np.where(known & (median < 0.5 * far), median, height).astype(np.float32)
     smooth = cv2.bilateralFilter(height, -1, tolerance, sigma_cells)
     out = np.where(known, smooth + middle, np.float32(np.nan)).astype(np.float32)
-    return Raster(raster.grid, out, raster.sigma_m, raster.rgb)
+    return replace(raster, height_m=out)
 
 
 def hillshade(
