@@ -105,6 +105,9 @@ def test_a_image_tag_serves_when_there_is_no_telemetry() -> None:
     tag = GeoTag(30.0, -98.0, 300.0, ypr_deg=(90.0, -90.0, 0.0), relative_alt_m=80.0)
     prior = some.prior(None, tag)
     assert some.georeference == "exif" and prior.agl_m == 80.0
+    assert some.is_altitude_assumed and not rig().is_altitude_assumed
+    some.prior(None, replace(tag, sigma_v_m=3.4))
+    assert not some.is_altitude_assumed
     bare = rig().prior(None, replace(tag, relative_alt_m=None))
     assert prior.sigma_position_m is not None and bare.sigma_position_m is not None
     assert prior.sigma_position_m[2] < 10.0 < bare.sigma_position_m[2]  # a drone's barometer

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.scans.trust import TWO_ONLY, slope_deg, trust_of
+from service.scans.trust import BY_SURVEY, TWO_ONLY, slope_deg, trust_of
 
 SURE: dict[str, Any] = {
     "assumed": [],
@@ -28,6 +28,8 @@ SURE: dict[str, Any] = {
         ({"assumed": ["lens"]}, "gnss", "doubtful", "lens"),
         ({"assumed": ["view", "level"]}, "gnss", "doubtful", "taken as level"),
         ({"assumed": ["distortion"]}, "gnss", "georeferenced", "distortion"),
+        ({"assumed": ["altitude"]}, "exif", "georeferenced", "above sea level"),
+        ({"assumed": ["altitude"]}, BY_SURVEY, "georeferenced", ""),
         ({"sigma_focal": 0.008}, "gnss", "georeferenced", ""),
         ({"sigma_focal": 0.04}, "gnss", "georeferenced", "focal length is uncertain by 4%"),
         ({"sigma_focal": 0.2}, "gnss", "doubtful", "focal length is uncertain by 20%"),

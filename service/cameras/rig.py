@@ -74,6 +74,7 @@ class Rig:
         self._camera, self._scan, self._fusion = camera, scan, fusion
         self.frame: LocalFrame | None = None
         self.georeference = "none"
+        self._is_altitude_stated = False
         self._lever_body = np.array(
             [camera.lever_forward_m, camera.lever_right_m, camera.lever_down_m]
         )
@@ -86,6 +87,11 @@ class Rig:
             @ R_GIMBAL_CAMERA
         )
 
+    @property
+    def is_altitude_assumed(self) -> bool:
+        """True when there are positions, and none states the accuracy of its altitude."""
+        return self.georeference != "none" and not self._is_altitude_stated
+
     def prior(self, state: VehicleState | None, tag: GeoTag | None) -> PosePrior:
         """The prior of one frame from telemetry, otherwise from the image's own tag.
 
@@ -94,6 +100,7 @@ class Rig:
         """
         R, tilt, yaw = self._rotation(state, tag)
         fix = self._fix(state, tag)
+        self._is_altitude_stated |= fix is not None and fix.is_claimed
         position, sigma = self._position(fix)
         lever = self._lever(state)
         height = self._agl(state, tag, float(lever[2]))

@@ -306,7 +306,8 @@ class Scan:
         }
 
     def _assumed(self) -> list[str]:
-        """What was assumed in this scan: "lens", "distortion", "view", "level" and "height"."""
+        """What was assumed in this scan: "lens", "distortion", "view", "level", "height" and
+        "altitude"."""
         out = list(self.inputs.assumed)
         if self.attitudes == 0:
             out.append("view")
@@ -314,6 +315,8 @@ class Scan:
             out.append("level")
         if self.heights == 0 and self.rig.georeference == "none":
             out.append("height")
+        if self.rig.is_altitude_assumed:
+            out.append("altitude")
         return out
 
     def _doubts(self) -> list[str]:

@@ -119,6 +119,11 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         )
     if focal > MIN_LENS_SIGMA:
         limits.append(_uncertain(focal))
+    if "altitude" in assumed and georeference != BY_SURVEY:
+        limits.append(
+            "the altitudes state no accuracy: all heights above sea level may be off by tens of "
+            "metres together"
+        )
     lean_deg = _number(run, "lean_sigma_deg")
     if lean_deg is not None and lean_deg > MAX_LEAN_SIGMA_DEG:
         limits.append(
