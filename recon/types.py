@@ -64,6 +64,7 @@ class Camera:
     distortion: F64  # (5,) k1 k2 p1 p2 k3; zeros for an undistorted image
     size_px: tuple[int, int]  # (W, H)
     shutter: Shutter = GLOBAL_SHUTTER
+    sigma_focal: float = 0.0  # of the focal length, as a share; 0: not stated
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -208,6 +208,8 @@ def test_command_on_real_photographs(tmp_path: Path) -> None:
     camera = load_camera(out)
     assert camera.size_px == (640, 480)
     assert camera.K[0, 0] == pytest.approx(533.0, rel=0.02)  # all 13 photographs give 533
+    stated_px = report["sigma_focal_px"]
+    assert 0.0 < camera.sigma_focal * camera.K[0, 0] == pytest.approx(stated_px, abs=1e-3)
     assert yaml.safe_load(out.read_text())["calibration"]["rms_px"] == report["rms_px"]
     image = cv2.imread(str(tmp_path / "cam_coverage.png"))
     assert image is not None and image.std() > 10

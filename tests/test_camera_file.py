@@ -46,8 +46,10 @@ def document() -> dict[str, Any]:
 
 def test_round_trip_is_exact(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
-    save_camera(path, CAMERA, "gopro", {"calibration": {"rms_px": 0.59}})
+    known = replace(CAMERA, sigma_focal=0.012)
+    save_camera(path, known, "gopro", {"calibration": {"rms_px": 0.59}})
     back = load_camera(path)
+    assert back.sigma_focal == 0.012
     np.testing.assert_array_equal(back.K, CAMERA.K)
     np.testing.assert_array_equal(back.distortion, CAMERA.distortion)
     assert back.size_px == CAMERA.size_px
@@ -89,6 +91,8 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "four coefficients": ({"distortion_coefficients": {"data": [0, 0, 0, 0]}}, "length >= 5"),
     "matrix is a list": ({"camera_matrix": [1, 2]}, "camera_matrix"),
     "a number too large": ({"camera_matrix": {"data": [10**400] * 9}}, "out of range"),
+    "negative sigma": ({"sigma_focal": -0.01}, "sigma_focal"),
+    "sigma nan": ({"sigma_focal": float("nan")}, "sigma_focal"),
     "fisheye": ({"distortion_model": "equidistant"}, "equidistant"),
     "skew": ({"camera_matrix": {"data": [438, 9, 305, 0, 437, 243, 0, 0, 1]}}, "form"),
     "width of zero": ({"image_width": 0}, "image_width"),

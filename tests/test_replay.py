@@ -121,13 +121,14 @@ def test_subtitles_next_to_a_video_are_its_telemetry(flight: Path, tmp_path: Pat
 
 
 def test_without_telemetry_it_still_reconstructs(flight: Path, tmp_path: Path) -> None:
-    out = tmp_path / "scan"
+    out, model = tmp_path / "scan", tmp_path / "camera.yaml"
+    model.write_text((flight / "camera.yaml").read_text() + "sigma_focal: 0.013\n")
     done = skyrelief(
-        "replay", flight / "flight.mp4", "--camera-model", flight / "camera.yaml",
-        "--out", out, "--json", *SPARSEST,
+        "replay", flight / "flight.mp4", "--camera-model", model, "--out", out, "--json", *SPARSEST,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout.splitlines()[-1])
+    assert summary["sigma_focal"] == 0.013
     assert summary["georeference"] == "none" and summary["epsg"] is None
     assert any("scale" in warning for warning in summary["warnings"])
     report = score(out, flight)

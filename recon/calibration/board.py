@@ -133,7 +133,7 @@ def calibrate(
         rejected.append((kept.pop(worst).name, reason))
     coverage = _coverage(kept, size_px)
     return Calibration(
-        camera=Camera(K, distortion, size_px),
+        camera=Camera(K, distortion, size_px, sigma_focal=sigma / float(K[0, 0])),
         rms_px=rms,
         used=tuple(view.name for view in kept),
         view_rms_px=per_view,

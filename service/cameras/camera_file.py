@@ -1,9 +1,9 @@
 """Camera models on disk: YAML as written by ROS's ``camera_info_manager`` and ``calibrate``.
 
 Keys: ``image_width``, ``image_height``, ``camera_matrix.data`` (9, row by row),
-``distortion_model: plumb_bob``, ``distortion_coefficients.data`` (k1 k2 p1 p2 k3), and of a
-rolling shutter ``readout_ms`` and ``readout_direction``. Other keys of the format are allowed
-and not read.
+``distortion_model: plumb_bob``, ``distortion_coefficients.data`` (k1 k2 p1 p2 k3), of a
+rolling shutter ``readout_ms`` and ``readout_direction``, and ``sigma_focal`` of the focal length,
+as a share. Other keys of the format are allowed and not read.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class _Coefficients(msgspec.Struct):
 
 
 class _CameraInfo(msgspec.Struct):
-    """The keys that are read; :func:`shutter_of` checks the last two."""
+    """The keys that are read; :func:`shutter_of` checks those of the shutter."""
 
     image_width: Pixels
     image_height: Pixels
@@ -49,6 +49,7 @@ class _CameraInfo(msgspec.Struct):
     distortion_coefficients: _Coefficients
     readout_ms: Any = 0
     readout_direction: Any = None
+    sigma_focal: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
 
 
 def load_camera(path: str | Path) -> Camera:
@@ -69,7 +70,7 @@ def load_camera(path: str | Path) -> Camera:
     size = info.image_width, info.image_height
     try:
         shutter = shutter_of(info.readout_ms, info.readout_direction or "down")
-        camera = Camera(K, distortion, size, shutter)
+        camera = Camera(K, distortion, size, shutter, info.sigma_focal)
         _check_matrix(K)
         check_camera(camera)
     except ValueError as error:
@@ -141,6 +142,8 @@ def save_camera(
         "projection_matrix": _matrix(np.hstack([K, np.zeros((3, 1))])),
     }
     document |= shutter_document(camera.shutter)
+    if camera.sigma_focal:
+        document["sigma_focal"] = round(camera.sigma_focal, 6)
     clash = sorted(set(document) & set(extra or {}))
     if clash:
         raise ValueError(f"extra keys of the camera model already exist: {', '.join(clash)}")

@@ -72,7 +72,8 @@ def turned(camera: Camera, clockwise_deg: int) -> Camera:
         (W, H), K = camera.size_px, camera.K
         k1, k2, p1, p2, k3 = camera.distortion
         quarter = [[K[1, 1], 0.0, H - 1 - K[1, 2]], [0.0, K[0, 0], K[0, 2]], [0.0, 0.0, 1.0]]
-        camera = Camera(np.array(quarter), np.array([k1, k2, p2, -p1, k3]), (H, W))
+        bent = np.array([k1, k2, p2, -p1, k3])
+        camera = Camera(np.array(quarter), bent, (H, W), sigma_focal=camera.sigma_focal)
     return camera
 
 

@@ -193,6 +193,7 @@ def _replay(
         epoch_ns,
         history=log.history if log is not None else None,
         notes=tuple(notes),
+        sigma_focal=lens.sigma_focal,
         extra={"backend": chosen.name, "source": source.description},
     )
     unsure: set[str] = set()  # what the images may correct: then the scan begins again

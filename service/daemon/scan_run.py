@@ -184,6 +184,7 @@ class ScanRun:
             zero_ns,
             unix_offset_ns=offset_ns,
             history=vehicle.history,
+            sigma_focal=camera.sigma_focal,
             extra={"backend": backend.name, "source": source.description},
             latency_ms=earlier.latency_ms,
             warn=lambda text: vehicle.statustext(text, WARNING),

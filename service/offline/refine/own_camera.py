@@ -238,7 +238,7 @@ def write(found: SelfCalibrated, given: Camera, folder: Path) -> dict[str, Any]:
     """Write the camera file into ``folder``; the figures of it."""
     path = folder / FILE
     folder.mkdir(parents=True, exist_ok=True)
-    save_camera(path, found.camera)
+    save_camera(path, replace(found.camera, sigma_focal=found.sigma_focal))
     new, old = found.camera, given
     return {
         "camera_file": str(path),
