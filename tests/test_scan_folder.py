@@ -189,14 +189,14 @@ def test_an_empty_scan_still_makes_every_file(tmp_path: Path, house: HouseFlight
 
 def test_preview_and_report_say_what_limits_the_trust(tmp_path: Path, house: HouseFlight) -> None:
     rows = []
-    for name, assumed in (("sure", []), ("lens", ["lens"])):
+    for name, assumed in (("sure", []), ("lens", ["lens", "level", "height"])):
         with house.flown(tmp_path / name) as store:
             summary = write_deliverables(tmp_path / name, store, {"assumed": assumed})
         image = cv2.imread(str(tmp_path / name / PREVIEW))
         assert image is not None
         rows.append(len(image))
     assert summary["quality"]["trust"]["level"] == "doubtful"
-    assert rows[1] > rows[0]  # a line more
+    assert rows[1] > rows[0]  # the reasons need another line
     assert "doubtful; the lens is assumed" in (tmp_path / "lens" / REPORT).read_text("utf-8")
 
 
