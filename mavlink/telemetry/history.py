@@ -121,11 +121,14 @@ class VehicleHistory:
         with self._lock:
             gimbals: list[TimeSeries[Any]] = [self._gimbals[key] for key in self._gimbal_order()]
             heads, bodies = (
-                [t for t in tracks if (t.last_ns or -math.inf) > time_ns - MAX_GAP_NS]
+                [
+                    (t.last_ns, t.due_ns)
+                    for t in tracks
+                    if t.last_ns is not None and t.last_ns > time_ns - MAX_GAP_NS
+                ]
                 for tracks in (gimbals, (self._attitude, self._position))
             )
-            awaited = (*heads[:1], *bodies)
-            return all((t.last_ns or 0) >= time_ns or t.due_ns > until_ns for t in awaited)
+        return all(last >= time_ns or due > until_ns for last, due in (*heads[:1], *bodies))
 
     def attitudes(self) -> list[tuple[AttitudeSample, int]]:
         """Every attitude with its time in ns, oldest first."""
