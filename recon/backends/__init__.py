@@ -1,8 +1,8 @@
 """The heavy operations behind one protocol: one module a backend, one line in the table.
 
 Arrays enter and leave as NumPy; a backend moves them to its device at its own edge. Every
-operation has a short NumPy reference, in tests/dense_reference.py, that the tests compare every
-backend against.
+operation has a short NumPy reference, in tests/support/dense_reference.py, that the tests compare
+every backend against.
 """
 
 from __future__ import annotations

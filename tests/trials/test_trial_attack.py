@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import HouseFlight
 from hostile_media import hostile_media
 from hostile_records import (
     ATTACKER,
@@ -29,7 +28,9 @@ from hostile_records import (
     hostile_tunnels,
 )
 from hostile_stores import hostile_stores, numbered
+from house_flight import HouseFlight
 from loopback import free_port
+from paths import DEMO
 from trial_cage import Cage
 from trial_ground import Fleet, Ground, HonestDrone, Watch
 from trial_rig import WHOLE, Row, Service, stored
@@ -366,7 +367,7 @@ def test_hostile_media_is_refused_or_read(
     assert not faults, "\n".join(faults)
 
 
-FRAMES = Path(__file__).parents[2] / "demo" / "caliterra" / "frames"
+FRAMES = DEMO / "frames"
 REPLAYED: dict[str, Any] = {
     "video .mp4": lambda path: (path,),
     "images .jpg": lambda path: (path,),

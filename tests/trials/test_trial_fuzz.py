@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from paths import ROOT
 from trial_decoders import DECODERS, seeds
 from trial_rig import WHOLE, Row
 
@@ -87,7 +88,7 @@ def test_atheris_finds_nothing(name: str, record: Row, tmp_path: Path) -> None:
     corpus.mkdir()
     for i, seed in enumerate(seeds(name)):
         (corpus / str(i)).write_bytes(seed)
-    here = str(Path(__file__).parent)
+    here = str(ROOT / "tests" / "support")
     done = subprocess.run(
         [sys.executable, "-c", ATHERIS, name, here, str(tmp_path), str(corpus), str(ATHERIS_S)],
         capture_output=True,

@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from paths import DEMO
 from trial_autopilot import aircraft
 from trial_rig import (
     BACK_S,
-    DEMO,
     PATIENCE_S,
     WHOLE,
     Row,

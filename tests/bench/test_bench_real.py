@@ -1,0 +1,75 @@
+"""The benchmark over real flights, on a few of the demo's own stills."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from paths import DEMO
+
+from recon.types import DepthMap
+from service.bench import BenchOptions, real
+from service.bench.keyframes import make_keyframe
+from service.bench.real import ReplayedSet, _apart, level_ground, run
+from service.errors import InputError
+
+STILLS = sorted((DEMO / "frames").glob("*.jpg"))
+
+
+def test_a_few_real_stills_are_placed_and_measured(tmp_path: Path) -> None:
+    frames = tmp_path / "caliterra_nadir" / "frames"
+    frames.mkdir(parents=True)
+    for still in STILLS[:5]:
+        shutil.copy(still, frames)
+    results = run(BenchOptions(data=tmp_path, keep=tmp_path / "kept"))
+    figures = {r.what.removeprefix("Caliterra: "): r.value for r in results}
+    assert (tmp_path / "kept" / "caliterra.jpg").stat().st_size > 10_000
+    assert figures["frames placed by vision"] >= 80.0
+    assert figures["unbroken stretches"] == 1
+    assert figures["points"] > 0.05
+    assert figures["track to fixes, horizontal rms"] < 20.0
+    assert any(name.startswith("trust: ") for name in figures)
+
+
+@pytest.mark.parametrize("data", [None, "empty"])
+def test_without_a_set_it_says_what_it_needs(tmp_path: Path, data: str | None) -> None:
+    with pytest.raises(InputError, match=r"--data|none of Caliterra"):
+        run(BenchOptions(data=None if data is None else tmp_path))
+
+
+def test_a_shifted_surface_shows_as_a_seam() -> None:
+    depth = make_keyframe(0).depth
+    above = make_keyframe(0).depth
+    lifted = type(depth)(
+        depth.depth_m,
+        depth.sigma_m,
+        depth.views,
+        depth.K,
+        depth.T_world_camera + np.array([[0, 0, 0, 0]] * 2 + [[0, 0, 0, 0.5], [0, 0, 0, 0]]),
+    )
+    found = _apart(above, lifted, np.random.default_rng(0))
+    assert found is not None
+    off, sigma = found
+    assert np.median(off) == pytest.approx(0.5, abs=0.05)
+    assert np.median(sigma) == pytest.approx(np.sqrt(2) * np.nanmedian(depth.sigma_m), rel=0.1)
+
+
+def test_tilts_between_keyframes_are_told_from_the_bend_of_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    K = np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]])
+    level = np.full((90, 120), 80.0, np.float32)
+    maps = []
+    for n in range(6):
+        T = np.diag([1.0, -1, -1, 1])
+        T[:3, 3] = 0.0, 0.0, 80.0 + 2.0 * (n % 2)  # every second keyframe is 2 m too high
+        maps.append(DepthMap(level, 0.1 * level, np.ones_like(level, np.uint8), K, T))
+    monkeypatch.setattr(real, "_maps", lambda flight: maps)
+    figures = {
+        what: value for what, value, _ in level_ground(ReplayedSet(tmp_path, "", tmp_path, {}))
+    }
+    assert figures["flat ground, robust sigma about a plane"] == pytest.approx(1 / 0.6745, rel=0.01)
+    assert figures["flat ground, keyframes about their own planes"] == pytest.approx(0.0, abs=1e-6)
+    assert figures["flat ground, slope"] == pytest.approx(0.0, abs=1e-6)

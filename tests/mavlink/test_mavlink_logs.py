@@ -1,0 +1,786 @@
+"""Telemetry logs of every kind, whole and damaged; truth from the logs' own making."""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+import struct
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from paths import DATA, SHARED
+from scipy.spatial.transform import Rotation
+
+from mavlink.telemetry import quaternion
+from mavlink.telemetry.history import HistoryConfig, VehicleHistory
+from mavlink.telemetry.logs import TelemetryLog, load_telemetry
+from mavlink.telemetry.samples import F64
+from mavlink.wire.dialect import dialect
+
+TURN = DATA / "mavlink" / "arducopter_turn.tlog"
+US = 1_000_000
+T0_US = 1_700_000_000 * US
+
+
+def shared(name: str) -> Path:
+    path = SHARED / name
+    if not path.is_file():
+        pytest.skip(f"{name} is not here")
+    return path
+
+
+def angle(a: F64 | quaternion.Quaternion, b: F64 | quaternion.Quaternion) -> float:
+    ra, rb = (Rotation.from_quat([q[1], q[2], q[3], q[0]]) for q in (a, b))
+    return float((ra.inv() * rb).magnitude())
+
+
+class TlogWriter:
+    """Writes packets of any sender with pymavlink's own encoder."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self._encoders: dict[tuple[int, int], Any] = {}
+
+    def add(self, usec: int, message: Any, system: int = 1, component: int = 1) -> None:
+        key = (system, component)
+        encoder = self._encoders.setdefault(key, dialect.MAVLink(None, *key))
+        packet = bytes(message.pack(encoder))
+        encoder.seq = (encoder.seq + 1) % 256
+        self.data += usec.to_bytes(8, "big") + packet
+
+    def save(self, path: Path) -> Path:
+        path.write_bytes(self.data)
+        return path
+
+
+def heartbeat() -> Any:
+    return dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3)
+
+
+def attitude(boot_ms: int, yaw: float) -> Any:
+    return dialect.MAVLink_attitude_message(boot_ms & 0xFFFFFFFF, 0.05, -0.1, yaw, 0, 0, 0)
+
+
+def fly(
+    writer: TlogWriter,
+    seconds: float,
+    stamp_us: Callable[[float], int],
+    boot_ms: Callable[[float], float],
+    system: int = 1,
+) -> None:
+    """20 Hz of attitude whose yaw is 0.3 rad/s, with a heartbeat every second."""
+    for k in range(round(seconds * 20)):
+        t = k / 20
+        if k % 20 == 0:
+            writer.add(stamp_us(t), heartbeat(), system)
+        writer.add(stamp_us(t), attitude(round(boot_ms(t)), 0.3 * t), system)
+
+
+def yaw_at(history: VehicleHistory, usec: int) -> float | None:
+    state = history.state_at(usec * 1000)
+    if state is None or state.q_ned_body_wxyz is None:
+        return None
+    w, x, y, z = state.q_ned_body_wxyz
+    return quaternion.to_rpy((float(w), float(x), float(y), float(z)))[2]
+
+
+# tlog: clocks
+
+
+def test_jitter_of_arrival_does_not_reach_the_samples(tmp_path: Path) -> None:
+    rng = random.Random(1)
+    writer = TlogWriter()
+    # Arrival is 3 ms late at best and 150 ms at worst; the clock drifts by 60 ppm.
+    fly(
+        writer,
+        120,
+        lambda t: T0_US + round((t + 0.003 + rng.expovariate(1 / 0.03)) * US),
+        lambda t: 5000 + t * 1000 * (1 + 60e-6),
+    )
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    errors = []
+    for t in np.linspace(1.0, 119.0, 300):
+        yaw = yaw_at(log.history, T0_US + round(float(t) * US))
+        assert yaw is not None
+        errors.append((yaw - 0.3 * float(t) + math.pi) % (2 * math.pi) - math.pi)
+    lateness_ms = -np.array(errors) / 0.3 * 1000
+    assert np.abs(lateness_ms - 3.0).max() < 3.0
+    assert log.clock == "unix" and log.warnings == ()
+
+
+def test_a_faster_simulation_is_read_by_its_own_clock(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    fly(writer, 100, lambda t: T0_US + round(t / 5 * US), lambda t: 60_000 + t * 1000)
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert (log.last_ns - log.first_ns) * 1e-9 == pytest.approx(99.95)
+    assert yaw_at(log.history, T0_US + 10 * US) == pytest.approx(3.0, abs=1e-3)
+    assert any("clock" in warning for warning in log.warnings)
+
+
+def test_the_boot_counter_may_wrap_in_flight(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    fly(writer, 20, lambda t: T0_US + round(t * US), lambda t: 2**32 - 10_000 + t * 1000)
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert log.warnings == ()
+    for t in (5.0, 9.99, 10.01, 15.0):
+        yaw = yaw_at(log.history, T0_US + round(t * US))
+        assert yaw is not None
+        assert math.remainder(yaw - 0.3 * t, 2 * math.pi) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_reboot_starts_a_session_of_its_own(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    fly(writer, 20, lambda t: T0_US + round(t * US), lambda t: 300_000 + t * 1000)
+    fly(writer, 20, lambda t: T0_US + round((t + 40) * US), lambda t: 2_000 + t * 1000)
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert any("rebooted" in warning for warning in log.warnings)
+    assert yaw_at(log.history, T0_US + 5 * US) == pytest.approx(1.5, abs=1e-3)
+    assert yaw_at(log.history, T0_US + 45 * US) == pytest.approx(1.5, abs=1e-3)
+    assert yaw_at(log.history, T0_US + 30 * US) is None
+
+
+def test_a_clock_that_is_set_in_mid_log_is_followed(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    step = 400 * 86_400 * US  # the computer learnt the date
+    fly(
+        writer,
+        60,
+        lambda t: T0_US + round(t * US) + (step if t >= 30 else 0),
+        lambda t: 5_000 + t * 1000,
+    )
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert yaw_at(log.history, T0_US + 10 * US) == pytest.approx(3.0, abs=0.01)
+    late = yaw_at(log.history, T0_US + step + 50 * US)
+    assert late is not None and math.remainder(late - 15.0, 2 * math.pi) == pytest.approx(
+        0.0, abs=0.01
+    )
+
+
+def test_the_vehicle_with_an_attitude_is_taken_not_the_ground_station(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    fly(writer, 10, lambda t: T0_US + round(t * US), lambda t: 9_000 + t * 1000, system=7)
+    for k in range(10):
+        station = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+        writer.add(T0_US + k * US, station, 255, 190)
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert log.warnings == () and yaw_at(log.history, T0_US + 5 * US) is not None
+    fly(writer, 3, lambda t: T0_US + round(t * US), lambda t: 1_000 + t * 1000, system=8)
+    log = load_telemetry(writer.save(tmp_path / "b.tlog"))
+    assert any("several vehicles" in w and "7" in w for w in log.warnings)
+
+
+def test_the_attitude_of_a_gimbal_is_not_the_vehicles_in_a_log(tmp_path: Path) -> None:
+    writer = TlogWriter()
+    fly(writer, 10, lambda t: T0_US + round(t * US), lambda t: 9_000 + t * 1000)
+    gimbal = dialect.MAVLink_heartbeat_message(26, 8, 0, 0, 4, 3)
+    for k in range(100):
+        writer.add(T0_US + k * US // 10, gimbal, 1, 154)
+        writer.add(T0_US + k * US // 10, attitude(500 + 100 * k, -2.0), 1, 154)
+    for k in range(100):  # and it restarts
+        writer.add(T0_US + 10 * US + k * US // 10, attitude(500 + 100 * k, -2.0), 1, 154)
+    log = load_telemetry(writer.save(tmp_path / "a.tlog"))
+    assert len(log.history) == 200 and log.warnings == ()
+
+
+# tlog: damage
+
+
+def test_damage_is_skipped_and_counted(tmp_path: Path) -> None:
+    raw = bytearray(TURN.read_bytes())
+    rng = random.Random(2)
+    for _ in range(60):
+        at = rng.randrange(len(raw))
+        raw[at : at + rng.randrange(30)] = rng.randbytes(rng.randrange(50))
+    path = tmp_path / "damaged.tlog"
+    path.write_bytes(raw)
+    log, whole = load_telemetry(path), load_telemetry(TURN)
+    assert 0 < log.counts["skipped_bytes"] < 20_000
+    assert log.counts["packets"] > 0.95 * whole.counts["packets"]
+    assert any("damaged bytes" in warning for warning in log.warnings)
+    worst = 0.0
+    for t in np.linspace(whole.first_ns + 10**9, whole.last_ns - 10**9, 200).astype(int):
+        a, b = log.history.state_at(int(t)), whole.history.state_at(int(t))
+        assert b is not None and b.q_ned_body_wxyz is not None
+        if a is not None and a.q_ned_body_wxyz is not None:
+            worst = max(worst, angle(a.q_ned_body_wxyz, b.q_ned_body_wxyz))
+    assert worst < 0.05
+
+
+def test_a_damaged_first_stamp_does_not_cost_the_log(tmp_path: Path) -> None:
+    raw = bytearray(TURN.read_bytes())
+    raw[:8] = (T0_US + 40 * 365 * 86_400 * US).to_bytes(8, "big")
+    path = tmp_path / "first.tlog"
+    path.write_bytes(raw)
+    log, whole = load_telemetry(path), load_telemetry(TURN)
+    assert log.counts["packets"] == whole.counts["packets"] - 1
+    assert abs(log.first_ns - whole.first_ns) < 10**9
+
+
+@pytest.mark.parametrize("cut", [1, 7, 8, 9, 15, 40])
+def test_a_torn_end_is_no_failure(tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "torn.tlog"
+    path.write_bytes(TURN.read_bytes()[:-cut])
+    assert load_telemetry(path).counts["packets"] >= 3300
+
+
+@pytest.mark.parametrize("name", ["x.tlog", "x.BIN", "x.ulg", "x.SRT"])
+@pytest.mark.parametrize("content", ["empty", "random", "zeros", "text"])
+def test_what_is_no_log_is_refused_in_one_line(tmp_path: Path, name: str, content: str) -> None:
+    path = tmp_path / name
+    made = {
+        "empty": b"",
+        "random": random.Random(4).randbytes(50_000),
+        "zeros": bytes(50_000),
+        "text": b"no telemetry here\n" * 1000,
+    }
+    path.write_bytes(made[content])
+    with pytest.raises(ValueError) as caught:
+        load_telemetry(path)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("header", [b"\xa3\x95", b"ULog\x01\x12\x35"], ids=["dataflash", "ulog"])
+def test_garbage_behind_a_right_header_is_refused(tmp_path: Path, header: bytes) -> None:
+    if header.startswith(b"ULog"):
+        pytest.importorskip("pyulog")
+    path = tmp_path / ("x.bin" if header[0] == 0xA3 else "x.ulg")
+    for seed in range(5):
+        path.write_bytes(header + random.Random(seed).randbytes(5_000))
+        with pytest.raises(ValueError) as caught:
+            load_telemetry(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_no_file_and_an_unknown_kind_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no such"):
+        load_telemetry(tmp_path / "none.tlog")
+    (tmp_path / "x.txt").write_bytes(b"x")
+    with pytest.raises(ValueError, match=r"\.tlog, \.bin, \.ulg, \.srt"):
+        load_telemetry(tmp_path / "x.txt")
+
+
+# A real ArduCopter's log
+
+
+def left_out_errors(log: TelemetryLog, keep_every: int) -> tuple[F64, F64]:
+    """Errors and sigmas of attitudes left out of a thinned copy of a log's history."""
+    thin = VehicleHistory()
+    samples = log.history.attitudes()
+    for sample, time_ns in samples[::keep_every]:
+        thin.add(replace(sample, rates_rad_s=None), time_ns)
+    errors, sigmas = [], []
+    for sample, time_ns in samples:
+        state = thin.state_at(time_ns)
+        if state is not None and state.q_ned_body_wxyz is not None and state.sigma_attitude_rad:
+            errors.append(angle(state.q_ned_body_wxyz, sample.q_ned_body))
+            sigmas.append(state.sigma_attitude_rad)
+    return np.array(errors), np.array(sigmas)
+
+
+def check_interpolation(log: TelemetryLog) -> None:
+    errors, sigmas = left_out_errors(log, 2)
+    assert np.percentile(errors, 99) < math.radians(0.6)
+    thin_errors, thin_sigmas = left_out_errors(log, 7)  # about the 3.5 Hz of a slow radio
+    assert (thin_errors < 2.0 * thin_sigmas).mean() > 0.99
+    assert thin_sigmas.max() > 1.5 * sigmas.max()
+
+
+def test_attitude_left_out_of_a_real_log_is_interpolated_within_its_sigma() -> None:
+    check_interpolation(load_telemetry(TURN))
+
+
+def test_the_whole_survey_is_read_quickly_and_agrees_with_itself() -> None:
+    log = load_telemetry(shared("ardupilot_survey/survey_companion.tlog"))
+    assert log.warnings == () and log.counts["ATTITUDE"] == 5954
+    assert (log.last_ns - log.first_ns) * 1e-9 == pytest.approx(297.7, abs=0.2)
+    check_interpolation(log)
+    other = load_telemetry(shared("ardupilot_survey/survey_gcs.tlog"))
+    for t in np.linspace(log.first_ns + 60e9, log.last_ns - 60e9, 50).astype(int):
+        a, b = log.history.state_at(int(t)), other.history.state_at(int(t))
+        assert a is not None and b is not None
+        assert a.q_ned_body_wxyz is not None and b.q_ned_body_wxyz is not None
+        assert angle(a.q_ned_body_wxyz, b.q_ned_body_wxyz) < math.radians(0.5)
+        assert a.alt_agl_m is not None and b.alt_agl_m is not None
+        assert a.alt_agl_m == pytest.approx(b.alt_agl_m, abs=0.3)
+
+
+def nadir_angle_deg(q: F64) -> float:
+    r = Rotation.from_quat([q[1], q[2], q[3], q[0]])
+    return float(np.degrees(np.arccos(np.clip(r.as_matrix()[2, 0], -1, 1))))
+
+
+def test_the_servo_mount_of_a_real_log_looks_straight_down() -> None:
+    log = load_telemetry(TURN)
+    off = []
+    for t in np.linspace(log.first_ns + 1e9, log.last_ns - 1e9, 300).astype(int):
+        state = log.history.state_at(int(t))
+        assert state is not None and state.q_ned_gimbal_wxyz is not None
+        off.append(nadir_angle_deg(state.q_ned_gimbal_wxyz))
+    assert np.median(off) < 0.1
+    assert np.percentile(off, 90) < 5.0  # in the turns the servo runs into its stop
+
+
+def test_a_gimbal_device_that_keeps_the_horizon_is_accepted() -> None:
+    log = load_telemetry(shared("ardupilot_survey/gimbal_device_companion.tlog"))
+    state = log.history.state_at(log.first_ns + 50 * 10**9)
+    assert state is not None and state.q_ned_gimbal_wxyz is not None
+    assert nadir_angle_deg(state.q_ned_gimbal_wxyz) < 0.1
+    assert any("clock" in warning for warning in log.warnings)
+
+
+def test_the_slow_cmac_log_tags_with_terrain_height() -> None:
+    log = load_telemetry(shared("cuav_cmac_20180805/flight.tlog"))
+    start = 1_533_430_844_800_000_000  # the first frame, 01:00:44.80 UTC
+    seen = 0
+    for k in range(18):
+        state = log.history.state_at(start + k * 820_000_000)
+        if state is None or state.q_ned_body_wxyz is None or state.lat_deg is None:
+            continue
+        seen += 1
+        assert state.alt_agl_m is not None and 60.0 < state.alt_agl_m < 100.0
+        assert "terrain" in state.sources
+        assert state.sigma_h_m is not None and 0.2 < state.sigma_h_m < 1.0
+    assert seen >= 16
+
+
+# DJI subtitles
+
+
+SRT = {
+    "phantom": (
+        "1\n00:00:00,000 --> 00:00:01,000\nF/5.6, SS 400, GPS (-58.85, -34.23, 15), HOME (-58.8,"
+        " -34.2, -57.98m), D 698.70m, H 85.80m, F.PRY (2.7°, -7.0°, 110.1°), G.PRY (-24.4°, 0.0°,"
+        " 110.4°)\n\n"
+    ),
+    "phantom with a base station": (
+        "1\n00:00:00,000 --> 00:00:01,000\nF/6.3, SS 60, ISO 100, EV 0, RTK (-58.85, -34.23, 28),"
+        " HOME (-58.8, -34.2, 103.55m), D 75.36m, H 85.80m, G.PRY (-40.0°, 0.0°, 28.2°)\n\n"
+    ),
+    "mavic": (
+        '1\n00:00:00,000 --> 00:00:00,033\n<font size="36">SrtCnt : 1, DiffTime : 33ms\n'
+        "2022-05-01 15:01:58,531,716\n[iso : 100] [latitude: -34.23] [longitude: -58.85]"
+        " [rel_alt: 85.800 abs_alt: 210.500] [gb_yaw: 110.4 gb_pitch: -24.4 gb_roll: 0.0] </font>"
+        "\n\n"
+    ),
+    "matrice": (
+        "1\n00:00:00,000 --> 00:00:01,000\n2022.06.21 16:06:17\n"
+        "GPS(-34.2300,-58.8500,0.0M) BAROMETER:85.8M\n\n"
+    ),
+    "mavic of 2017": (
+        "1\n00:00:00,000 --> 00:00:01,000\nHOME(-58.85,-34.23) 2017.8.5 14:11:51\n"
+        "GPS(-58.8500,-34.2300,16) Hb:85.8 Hs:1.9\nISO:100 TV:60 EV: 0 IR:F2.8\n\n"
+    ),
+    "autel": (
+        "1\n00:00:00,000 --> 00:00:01,000\nHOME(W: 58.800000, S: 34.200000) 2022-05-01 15:01:58\n"
+        "GPS(W: 58.850000, S: 34.230000, 085.80m)\nISO:100 SHUTTER:30 EV:0.0 F-NUM:2.8\n"
+        "F.PRY (2.7°, -7.0°, 110.1°), G.PRY (-24.4°, 0.0°, 110.4°)\n\n"
+    ),
+}
+
+
+def with_commas(text: str) -> str:
+    """The same numbers with decimal commas."""
+    return re.sub(r": (-?\d+)\.(\d)", r": \1,\2", text)
+
+
+@pytest.mark.parametrize("layout", list(SRT))
+@pytest.mark.parametrize(
+    "stored",
+    [
+        str.encode,
+        lambda text: text.encode("cp1252"),
+        lambda text: b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode(),
+        lambda text: with_commas(text).encode(),
+    ],
+    ids=["utf-8", "cp1252", "windows", "commas"],
+)
+def test_subtitles_of_several_drones(
+    tmp_path: Path, layout: str, stored: Callable[[str], bytes]
+) -> None:
+    path = tmp_path / "flight.SRT"
+    path.write_bytes(stored(SRT[layout]))
+    log = load_telemetry(path)
+    assert log.clock == "video" and log.first_ns == 0
+    state = log.history.state_at(0)
+    assert state is not None
+    assert state.lat_deg == pytest.approx(-34.23) and state.lon_deg == pytest.approx(-58.85)
+    assert state.alt_agl_m == (None if layout == "autel" else pytest.approx(85.8))
+    assert state.alt_amsl_m == (pytest.approx(210.5) if layout == "mavic" else None)
+    if layout in ("phantom", "mavic", "autel"):
+        assert state.q_ned_gimbal_wxyz is not None
+        q = quaternion.from_rpy(0.0, math.radians(-24.4), math.radians(110.4))
+        assert angle(state.q_ned_gimbal_wxyz, q) < 1e-6
+    if layout in ("phantom", "autel"):
+        assert state.q_ned_body_wxyz is not None
+        q = quaternion.from_rpy(*map(math.radians, (-7.0, 2.7, 110.1)))
+        assert angle(state.q_ned_body_wxyz, q) < 1e-6
+
+
+def cue(number: int, text: str) -> str:
+    start, end = (
+        f"00:00:{ms // 1000:02d},{ms % 1000:03d}" for ms in (number * 40, number * 40 + 40)
+    )
+    return f"{number + 1}\n{start} --> {end}\n{text}\n\n"
+
+
+def test_subtitles_of_a_drone_without_a_position_give_its_height(tmp_path: Path) -> None:
+    lost = "[latitude: 0.000000] [longitude: 0.000000] [rel_alt: 30.000 abs_alt: 269.1]"
+    found = "[latitude: 45.0] [longitude: 13.0] [rel_alt: 30.000 abs_alt: 269.1]"
+    path = tmp_path / "flight.SRT"
+    path.write_text("".join(cue(n, found if n > 2 else lost) for n in range(5)))
+    log = load_telemetry(path)
+    assert log.warnings == ("3 cues without a position",)
+    for time_ns in (0, 40_000_000, 100_000_000):  # the last between a cue without and one with
+        state = log.history.state_at(time_ns)
+        assert state is not None and state.lat_deg is None and state.alt_amsl_m is None
+        assert state.alt_agl_m == pytest.approx(30.0)
+    state = log.history.state_at(150_000_000)
+    assert state is not None and state.lat_deg == pytest.approx(45.0)
+
+
+def test_subtitles_of_joined_recordings_follow_on(tmp_path: Path) -> None:
+    places = [f"[latitude: 45.0] [longitude: 13.0] [rel_alt: {n + 1}.0]" for n in range(60)]
+    files = ["".join(cue(n, text) for n, text in enumerate(part)) for part in (places, places[30:])]
+    path = tmp_path / "flight.SRT"
+    path.write_text("".join(files))
+    log = load_telemetry(path)
+    assert log.warnings == ("times begin again 1 time(s): joined, the rest follows on",)
+    assert log.last_ns == 89 * 40_000_000
+    for time_ns, height_m in ((0, 1.0), (59 * 40_000_000, 60.0), (60 * 40_000_000, 31.0)):
+        state = log.history.state_at(time_ns)
+        assert state is not None and state.alt_agl_m == pytest.approx(height_m)
+
+
+@pytest.mark.parametrize(
+    ("focals", "median_mm", "zooms"),
+    [
+        (("240", "240", "240"), 24.0, False),
+        (("24.00", "24.00", "24.00"), 24.0, False),
+        (("24,00", "24,00", "24,00"), 24.0, False),
+        (("162.00",) * 3, 162.0, False),
+        (("240", "240", "480"), 24.0, True),
+        (("0", "0", "0"), None, False),
+        (("240] [dzoom_ratio: 10000, delta:0",) * 3, 24.0, False),
+        (("240] [dzoom_ratio: 20000, delta:0",) * 3, 48.0, False),
+        (("24.00] [dzoom_ratio: 1.00", "24.00] [dzoom_ratio: 2.00") * 2, 36.0, True),
+        (("24.00] [dzoom_ratio: 999999999",) * 3, 24.0, False),
+    ],
+)
+def test_subtitles_give_the_focal_length(
+    tmp_path: Path, focals: tuple[str, ...], median_mm: float | None, zooms: bool
+) -> None:
+    place = "[latitude: 45.0] [longitude: 13.0] [rel_alt: 30.0]"
+    path = tmp_path / "flight.SRT"
+    path.write_text("".join(cue(n, f"[focal_len : {f}] {place}") for n, f in enumerate(focals)))
+    log = load_telemetry(path)
+    assert log.focal_35mm == median_mm
+    assert any("zooms between 24 and 48 mm" in warning for warning in log.warnings) == zooms
+
+
+@pytest.mark.parametrize("place", ["gb_yaw", "gb_pitch", "rel_alt", "abs_alt", "focal_len"])
+def test_subtitles_lose_no_more_than_a_number_that_is_none(tmp_path: Path, place: str) -> None:
+    good = (
+        "[latitude: 45.0] [longitude: 13.0] [rel_alt: 30.0 abs_alt: 269.1] "
+        "[gb_yaw: 1.0 gb_pitch: -90.0 gb_roll: 0.0] [focal_len: 24.0]"
+    )
+    texts = [good, re.sub(rf"{place}: \S+?(?=[ \]])", f"{place}: {'9' * 400}", good), good]
+    path = tmp_path / "flight.SRT"
+    path.write_text("".join(cue(n, text) for n, text in enumerate(texts)))
+    log = load_telemetry(path)
+    assert log.counts["positions"] == 3 and log.warnings == () and log.focal_35mm == 24.0
+    gimbals = len(log.history.heads())
+    assert gimbals == 2 if place.startswith("gb_") else gimbals == 3
+
+
+def test_subtitles_of_a_cue_without_end_take_no_memory(tmp_path: Path) -> None:
+    path = tmp_path / "flight.SRT"
+    found = "[latitude: 45.0] [longitude: 13.0] [rel_alt: 30.0]"
+    path.write_text(cue(0, found) + "a\n" * 1_000_000 + cue(1, found))
+    tracemalloc.start()
+    try:
+        assert load_telemetry(path).counts["positions"] == 2
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", ["p4_rtk.SRT", "mavic_air2.srt", "matrice_300.srt"])
+def test_real_subtitles_are_read_whole(name: str) -> None:
+    log = load_telemetry(shared(f"flight_logs/dji_srt/{name}"))
+    assert log.counts["positions"] == log.counts["cues"] > 20
+    assert log.warnings == ()
+
+
+# PX4 and ArduPilot onboard logs
+
+
+def test_a_real_px4_log_gives_its_attitude() -> None:
+    pytest.importorskip("pyulog")
+    log = load_telemetry(shared("flight_logs/px4_auav_x21_68s.ulg"))
+    assert log.clock == "boot" and any("no GPS time" in w for w in log.warnings)
+    assert log.counts["vehicle_attitude"] == 6461
+    errors, _ = left_out_errors(log, 2)
+    assert np.percentile(errors, 99) < math.radians(0.1)
+
+
+DATAFLASH = {
+    "ATT": ("QhhHH", "TimeUS,Roll,Pitch,Yaw,AEKF", "Qcccc"),
+    "POS": ("QiifffB", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt,X", "QLLfffB"),
+    "XKF1": ("QBfff", "TimeUS,C,VN,VE,VD", "QBfff"),
+    "GPS": ("QBBIHBfiB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,U", "QBBIHBfLB"),
+    "GPA": ("QBff", "TimeUS,I,HAcc,VAcc", "QBff"),
+    "RFND": ("QBfBB", "TimeUS,Instance,Dist,Stat,Orient", "QBfBB"),
+    "TERR": ("QBf", "TimeUS,Status,CHeight", "QBf"),
+    "MNT": ("QBffff", "TimeUS,I,Roll,Pitch,YawB,YawE", "QBffff"),
+    "RATE": ("Qffffff", "TimeUS,RDes,R,PDes,P,YDes,Y", "Qffffff"),
+    "IMU": ("QBfff", "TimeUS,I,GyrX,GyrY,GyrZ", "QBfff"),
+    "UNIT": ("QB64s", "TimeUS,Id,Label", "QBZ"),
+    "MULT": ("QBd", "TimeUS,Id,Mult", "Qbd"),
+    "FMTU": ("QB16s16s", "TimeUS,FmtType,UnitIds,MultIds", "QBNN"),
+}
+
+
+class DataflashWriter:
+    """Writes an ArduPilot .BIN log by its documented layout."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self._numbers = {name: 129 + k for k, name in enumerate(DATAFLASH)}
+        self._format(128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
+        for name, (fields, columns, kinds) in DATAFLASH.items():
+            size = 3 + struct.calcsize("<" + fields)
+            number = self._numbers[name]
+            self._format(number, size, name.encode(), kinds.encode(), columns.encode())
+
+    def _format(self, number: int, size: int, name: bytes, kinds: bytes, columns: bytes) -> None:
+        self.data += b"\xa3\x95\x80" + struct.pack(
+            "<BB4s16s64s", number, size, name, kinds, columns
+        )
+
+    def add(self, name: str, *values: float | bytes) -> None:
+        self.data += bytes((0xA3, 0x95, self._numbers[name]))
+        self.data += struct.pack("<" + DATAFLASH[name][0], *values)
+
+    def state_units_of_rate(self) -> None:
+        """As Copter does since 3.6."""
+        self.add("UNIT", 0, ord("s"), b"s")
+        self.add("UNIT", 0, ord("k"), b"deg/s")
+        self.add("MULT", 0, ord("F"), 1e-6)
+        self.add("MULT", 0, ord("?"), 1.0)
+        self.add("FMTU", 0, self._numbers["RATE"], b"skkkkkk", b"F??????")
+
+
+def dataflash_flight(dated: bool) -> DataflashWriter:
+    writer = DataflashWriter()
+    for k in range(200):
+        us = 30_000_000 + k * 50_000
+        if k % 4 == 0:
+            gms = 100_000_000 + k * 50 if dated else 0
+            writer.add("GPS", us, 0, 3, gms, 2200 if dated else 0, 12, 0.8, 473000000, 1)
+            writer.add("GPA", us, 0, 0.7, 1.1)
+        writer.add("XKF1", us, 0, 3.0, 1.0, -0.5)
+        writer.add("ATT", us, 500, -1000, 9000, 3)
+        writer.add("POS", us, 473000000, 85000000, 512.5, 62.5, 60.0, 0)
+        writer.add("MNT", us, 0, 0.0, -60.0, 10.0, 100.0)
+        if k >= 100:
+            writer.add("RFND", us, 0, 50.0, 4, 25)
+        writer.add("TERR", us, 2, 58.0)
+    return writer
+
+
+def test_a_damaged_time_of_an_onboard_log_costs_its_message_only(tmp_path: Path) -> None:
+    path = tmp_path / "log.BIN"
+    path.write_bytes(dataflash_flight(True).data)
+    sound = load_telemetry(path)
+    writer = dataflash_flight(True)
+    writer.add("ATT", 1 << 63, 500, -1000, 9000, 3)
+    writer.add("POS", 1 << 60, 473000000, 85000000, 512.5, 62.5, 60.0, 0)
+    path.write_bytes(writer.data)
+    damaged = load_telemetry(path)
+    assert (damaged.first_ns, damaged.last_ns) == (sound.first_ns, sound.last_ns)
+
+
+@pytest.mark.parametrize("dated", [True, False])
+def test_an_ardupilot_onboard_log(tmp_path: Path, dated: bool) -> None:
+    path = tmp_path / "log.BIN"
+    path.write_bytes(dataflash_flight(dated).data)
+    log = load_telemetry(path)
+    assert log.clock == ("unix" if dated else "boot")
+    # GPS week 2200, 100000 s into it, leap seconds off: 2022-03-07 03:46:40 UTC less 18 s.
+    if dated:
+        assert log.first_ns * 1e-9 == pytest.approx(315964800 + 2200 * 604800 + 100_000 - 18, abs=1)
+    early, late = (
+        log.history.state_at(log.first_ns + 10**9),
+        log.history.state_at(log.last_ns - 10**9),
+    )
+    for state in (early, late):
+        assert state is not None and state.q_ned_body_wxyz is not None
+        q = quaternion.from_rpy(*map(math.radians, (5.0, -10.0, 90.0)))
+        assert angle(state.q_ned_body_wxyz, q) < 1e-4
+        assert state.lat_deg == pytest.approx(47.3) and state.lon_deg == pytest.approx(8.5)
+        assert state.alt_amsl_m == pytest.approx(512.5)
+        assert state.v_ned_m_s is not None and list(state.v_ned_m_s) == pytest.approx([3, 1, -0.5])
+        assert state.sigma_h_m == pytest.approx(0.7, rel=0.01)
+        assert state.q_ned_gimbal_wxyz is not None
+        head = quaternion.from_rpy(0.0, math.radians(-60.0), math.radians(100.0))
+        assert angle(state.q_ned_gimbal_wxyz, head) < 1e-4
+    assert early is not None and early.sources[-1] == "terrain"
+    assert late is not None and late.sources[-1] == "rangefinder"
+    path.write_bytes(dataflash_flight(dated).data[:-700])
+    assert load_telemetry(path).counts["ATT"] > 190
+
+
+def test_a_second_receiver_without_a_fix_takes_no_position(tmp_path: Path) -> None:
+    writer = dataflash_flight(True)
+    for k in range(100):
+        us = 30_000_000 + k * 100_000
+        writer.add("GPS", us, 1, 1, 0, 0, 0, 99.9, 0, 0)
+        writer.add("GPA", us, 1, 500.0, 500.0)
+    path = tmp_path / "log.BIN"
+    path.write_bytes(writer.data)
+    log = load_telemetry(path)
+    for k in range(1, 10):
+        state = log.history.state_at(log.first_ns + k * 970_000_000)
+        assert state is not None and state.lat_deg == pytest.approx(47.3)
+        assert state.sigma_h_m == pytest.approx(0.7, rel=0.01)
+
+
+@pytest.mark.parametrize("has_rate", [True, False], ids=["RATE", "IMU"])
+def test_rates_of_an_onboard_log_turn_the_body_between_its_attitudes(
+    tmp_path: Path, has_rate: bool
+) -> None:
+    """Of a roll at 1 Hz, with an attitude ten times a second; RATE without a unit is not read."""
+    writer, swing = DataflashWriter(), 2.0 * math.pi
+    if has_rate:
+        writer.state_units_of_rate()
+    for k in range(400):
+        us, t = 30_000_000 + k * 10_000, 0.01 * k
+        if k % 4 == 1:
+            off = 100.0 if has_rate else 0.0  # read only where RATE is not
+            writer.add("IMU", us, 0, 0.35 * swing * math.cos(swing * t) + off, 0.0, 0.0)
+            writer.add("IMU", us, 1, 1.0, 2.0, 3.0)
+        if k % 10 == 0:
+            writer.add("ATT", us, round(math.degrees(35.0 * math.sin(swing * t))), 0, 0, 3)
+            deg_s = math.degrees(0.35 * swing * math.cos(swing * t))
+            writer.add("RATE", us, 0.0, deg_s if has_rate else 100.0 * deg_s, 0.0, 0.0, 0.0, 0.0)
+    path = tmp_path / "log.BIN"
+    path.write_bytes(writer.data)
+    history = load_telemetry(path).history
+    errors = []
+    for k in range(100, 300):
+        state = history.state_at(30_000_000_000 + k * 10_000_000)
+        assert state is not None and state.q_ned_body_wxyz is not None
+        true = quaternion.from_rpy(0.35 * math.sin(swing * 0.01 * k), 0.0, 0.0)
+        errors.append(angle(state.q_ned_body_wxyz, true))
+    assert max(errors) < math.radians(0.1)  # without rates 1.0
+
+
+class UlogWriter:
+    """Writes a PX4 .ulg log by its documented layout."""
+
+    def __init__(self, topics: dict[str, str]) -> None:
+        self.data = bytearray(b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 10_000_000))
+        self._codes: dict[str, tuple[int, str]] = {}
+        self._put(b"B", bytes(40))
+        for name, fields in topics.items():
+            self._put(b"F", f"{name}:{fields}".encode())
+        for number, (name, fields) in enumerate(topics.items()):
+            self._put(b"A", struct.pack("<BH", 0, number) + name.encode())
+            self._codes[name] = (number, "<" + "".join(self._code(f) for f in fields.split(";")))
+
+    @staticmethod
+    def _code(field: str) -> str:
+        if not field:
+            return ""
+        kind = field.split()[0]
+        codes = {"uint64_t": "Q", "float": "f", "double": "d", "bool": "?", "uint8_t": "B"}
+        codes |= {"uint16_t": "H", "float[4]": "4f"}
+        return codes[kind]
+
+    def _put(self, kind: bytes, content: bytes) -> None:
+        self.data += struct.pack("<H", len(content)) + kind + content
+
+    def add(self, name: str, *values: float) -> None:
+        number, code = self._codes[name]
+        self._put(b"D", struct.pack("<H", number) + struct.pack(code, *values))
+
+
+STAMP = "uint64_t timestamp;"
+GLOBAL = "double lat;double lon;float alt;float vel_n;float vel_e;float vel_d;float eph;float epv;"
+LOCAL = (
+    "double ref_lat;double ref_lon;float ref_alt;float x;float y;float z;float vx;float vy;"
+    "float vz;float eph;float epv;float dist_bottom;bool dist_bottom_valid;bool xy_global;"
+    "bool z_global;"
+)
+ULOG = {
+    "vehicle_attitude": STAMP + "float[4] q;",
+    "vehicle_global_position": STAMP + GLOBAL,
+    "vehicle_local_position": STAMP + LOCAL,
+    "distance_sensor": STAMP
+    + "float min_distance;float max_distance;float current_distance;uint8_t orientation;",
+    "gimbal_device_attitude_status": STAMP + "float[4] q;uint16_t device_flags;",
+    "sensor_gps": STAMP + "uint64_t time_utc_usec;",
+}
+
+
+@pytest.mark.parametrize("place", ["vehicle_global_position", "vehicle_local_position"])
+def test_a_px4_onboard_log(tmp_path: Path, place: str) -> None:
+    pytest.importorskip("pyulog")
+    writer = UlogWriter(ULOG)
+    body, head = quaternion.from_rpy(0.1, -0.1, 0.5), quaternion.from_rpy(0.0, -1.2, 0.0)
+    for k in range(100):
+        us = 10_000_000 + k * 50_000
+        writer.add("vehicle_attitude", us, *body)
+        writer.add("gimbal_device_attitude_status", us, *head, 64)
+        if place == "vehicle_global_position":
+            writer.add(place, us, 47.3, 8.5, 512.5, 3.0, 1.0, -0.5, 0.6, 0.9)
+        else:
+            # 111.31949 m north of the reference is a thousandth of a degree.
+            writer.add(
+                place, us, 47.299, 8.5, 450.0, 111.31949, 0.0, -62.5,
+                3.0, 1.0, -0.5, 0.6, 0.9, 55.0, True, True, True,
+            )  # fmt: skip
+        writer.add("sensor_gps", us, T0_US + k * 50_000)
+        if k >= 50:
+            writer.add("distance_sensor", us, 0.2, 100.0, 50.0, 25)
+        writer.add("distance_sensor", us + 1, 0.2, 100.0, 9.0, 0)  # looks ahead
+    path = tmp_path / "log.ulg"
+    path.write_bytes(writer.data)
+    log = load_telemetry(path)
+    assert log.clock == "unix" and log.first_ns == T0_US * 1000 and log.warnings == ()
+    early = log.history.state_at(log.first_ns + 10**9)
+    late = log.history.state_at(log.last_ns - 10**9)
+    for state in (early, late):
+        assert state is not None
+        assert state.lat_deg == pytest.approx(47.3, abs=1e-7)
+        assert state.lon_deg == pytest.approx(8.5)
+        assert state.alt_amsl_m == pytest.approx(512.5)
+        assert state.v_ned_m_s is not None and list(state.v_ned_m_s) == pytest.approx([3, 1, -0.5])
+        assert state.sigma_h_m == pytest.approx(0.6, rel=0.01)
+        assert state.q_ned_body_wxyz is not None and state.q_ned_gimbal_wxyz is not None
+        assert angle(state.q_ned_body_wxyz, body) < 1e-5
+        assert angle(state.q_ned_gimbal_wxyz, head) < 1e-5
+    assert late is not None and late.sources[-1] == "rangefinder"
+    assert early is not None and ("terrain" in early.sources) == (
+        place != "vehicle_global_position"
+    )
+
+
+def test_settings_of_the_history_reach_it() -> None:
+    config = HistoryConfig(keep_s=1.0)
+    log = load_telemetry(TURN, config)
+    assert log.history.config is config
+
+
+def test_a_ulg_that_breaks_off_within_a_damaged_message_ends(tmp_path: Path) -> None:
+    """pyulog would step back and read these three bytes for ever."""
+    path = tmp_path / "flight.ulg"
+    path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + b"\x01\x00\x00")
+    with pytest.raises(ValueError, match="is truncated within a damaged message"):
+        load_telemetry(path)

@@ -1,0 +1,300 @@
+"""The portal's pages in a real browser (Chromium); skipped without one."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+from loopback import free_port
+from person import Browser
+from portal_client import NEEDS, TOKEN, VEHICLE_SHOWN, browser, flown_store, listing
+from rehearsal import RehearsalVehicle
+from site_scans import Box, Errors, leg, write_scan
+
+from service.ground.live_site import FILE, Follower
+from service.ground.portal import Portal, PortalConfig
+from service.ground.vehicle import Vehicle
+from service.offline.exports.view import ExportOptions, ScanView, export
+from service.scans.folder import write_deliverables
+from service.stream.codec import encode
+from service.stream.records import Repose
+from service.stream.store import ScanStore
+
+if TYPE_CHECKING:
+    from house_flight import HouseFlight
+
+pytestmark = NEEDS
+__all__ = ["browser"]  # the fixture
+
+
+@pytest.fixture
+def scans(tmp_path: Path, house: HouseFlight) -> Path:
+    return flown_store(tmp_path, house)
+
+
+@pytest.fixture
+def portal(scans: Path) -> Iterator[Portal]:
+    one = Portal(PortalConfig(scans, port=0, token=TOKEN))
+    one.start()
+    yield one
+    one.close()
+
+
+def base(portal: Portal) -> str:
+    return portal.url.split("/?")[0]
+
+
+def test_rename_download_delete_and_bring_back(browser: Browser, portal: Portal) -> None:
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    assert browser.run("location.search") == ""  # the token is out of the address
+    browser.dialog = "<img src=x onerror=alert(1)> Hof"
+    browser.click("Rename")
+    browser.wait("document.querySelector('h2').textContent.startsWith('<img')")
+    assert browser.run("document.querySelectorAll('article h2 img').length") == 0
+    browser.dialog = "roof, spring"
+    browser.click("Tags")
+    browser.wait("document.querySelectorAll('.tags span').length === 2")
+    browser.run("document.querySelector('details').open = true")
+    size = browser.run(
+        "fetch([...document.querySelectorAll('details a')].find(a => a.textContent ==="
+        " 'cloud.laz').href).then(r => r.arrayBuffer()).then(b => b.byteLength)"
+    )
+    assert size > 10_000
+    browser.click("Delete")
+    browser.wait("document.querySelectorAll('article').length === 0")
+    browser.click("Restore")
+    browser.wait("document.querySelectorAll('article').length === 1")
+    assert browser.run("document.querySelector('h2').textContent").startswith("<img")
+
+
+def test_the_cloud_grows_and_moves_while_one_looks(
+    browser: Browser, portal: Portal, scans: Path, house: HouseFlight
+) -> None:
+    browser.open("about:blank")  # the page before this one asks its own portal no more
+    browser.wait("location.href === 'about:blank'")
+    browser.requests.clear()
+    browser.open(f"{base(portal)}/#/view/drone-1/test-1")
+    before = browser.wait("Number(document.body.dataset.points) || 0")
+    with ScanStore.open(scans / "drone-1/test-1/scan.db") as scan:
+        one = house.keyframe(5, 30.0)
+        scan.add_keyframe(5, encode(one, one.time_ns))
+        scan.add_reposes([Repose(1, 1, house.pose(7.0), 1.0, np.eye(6))])
+        scan.add_pose(house.record(5, 30.0))
+    browser.wait(f"Number(document.body.dataset.points) > {before}")
+    browser.wait("document.querySelector('.figures').textContent.includes('25 m')")
+    browser.wait("Number(document.body.dataset.fps) > 0", 40)
+    outside = [u for u in browser.requests if not u.startswith((base(portal), "data:", "ws:"))]
+    assert [u for u in outside if not u.startswith(("blob:", "about:", "chrome"))] == []
+
+
+def test_the_mesh_is_made_and_shown(browser: Browser, portal: Portal) -> None:
+    pytest.importorskip("open3d", exc_type=ImportError)
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    browser.open(f"{base(portal)}/#/view/drone-1/test-1")
+    browser.wait("Number(document.body.dataset.points) || 0")
+    browser.click("Mesh")
+    browser.wait("document.body.dataset.mesh === 'shown'", 60)
+    colour = "document.querySelector('[aria-label=\"colour by\"]').disabled"
+    time_shown = "document.querySelector('.time').checkVisibility()"
+    assert browser.run(f"[{colour}, {time_shown}]") == [True, False]  # both are of the points
+    browser.click("Points")
+    browser.wait("!document.body.dataset.mesh")
+    assert browser.run(f"[{colour}, {time_shown}]") == [False, True]
+
+
+def roof_red(browser: Browser) -> float:
+    """How bright the red roof is drawn, 0 to 255: (40, 40, 200) in the scan."""
+    script = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
+    data = np.frombuffer(base64.b64decode(browser.run(script)), np.uint8)
+    image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.int64)
+    red = image[image[..., 2] > 2 * image[..., 1]]
+    assert len(red) > 100
+    assert np.median(red[:, 1]) < 70
+    return float(np.median(red[:, 2]))
+
+
+def test_the_tiles_are_loaded_where_the_cloud_was(
+    browser: Browser, portal: Portal, scans: Path
+) -> None:
+    pytest.importorskip("py3dtiles")
+    with ScanView(scans / "drone-1/test-1") as scan:
+        export(scan, "3dtiles", None, ExportOptions())
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    browser.open(f"{base(portal)}/#/view/drone-1/test-1")
+    browser.wait("Number(document.body.dataset.points) || 0")
+    browser.click("Whole site")
+    browser.wait("document.body.dataset.still === 'yes'")
+    red = roof_red(browser)
+    browser.click("Tiles")
+    browser.wait("Number(document.body.dataset.tiles) > 0", 60)
+    browser.run("new Promise(r => setTimeout(r, 500))")
+    browser.wait("document.body.dataset.still === 'yes'")
+    assert abs(roof_red(browser) - red) < 25  # the same colours, not washed out
+    off = json.loads(browser.wait("document.body.dataset.tilesMiddle"))
+    assert np.abs(off[:2]).max() < 15.0 and abs(off[2]) < 5.0  # about the scan's own origin
+
+
+def test_the_latest_image_is_shown(browser: Browser, portal: Portal) -> None:
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    browser.open(f"{base(portal)}/#/view/drone-1/test-1")
+    browser.wait("document.body.dataset.image === '4'")
+    assert browser.run("document.querySelector('.latest img').naturalWidth") == 160
+
+
+def test_an_image_gets_finer_with_its_keyframe(
+    browser: Browser, portal: Portal, scans: Path, house: HouseFlight
+) -> None:
+    one = house.keyframe(5, 30.0)
+    coarse, *finer = encode(one, one.time_ns)
+    width = "document.querySelector('.latest img').naturalWidth"
+    faults: list[str] = []
+    browser.page.on("console", lambda said: faults.append(said.text))
+    with ScanStore.open(scans / "drone-1/test-1/scan.db") as scan:
+        scan.add_keyframe(5, [coarse])
+        browser.open("about:blank")
+        browser.open(f"{base(portal)}/#/view/drone-1/test-1")
+        browser.wait("document.body.dataset.image === '5'")
+        small = browser.run(width)
+        browser.wait("document.body.dataset.still === 'yes'")
+        scan.add_keyframe(5, finer)
+        browser.wait(f"{width} === 160", 20)
+    assert small == 80
+    assert [text for text in faults if "GL_" in text] == []  # the frustum shows it, too
+
+
+def test_the_buttons_reach_the_vehicle_and_show_its_answer(browser: Browser, scans: Path) -> None:
+    pytest.importorskip("mavsdk")
+    port = free_port()
+    vehicle = Vehicle(f"udpin://127.0.0.1:{port}")
+    one = Portal(PortalConfig(scans, port=0, token=TOKEN), vehicle=vehicle)
+    one.start()
+    try:
+        with RehearsalVehicle(f"udpout:127.0.0.1:{port}") as daemon:
+            vehicle.start()
+            browser.open(one.url)
+            browser.wait(VEHICLE_SHOWN, 30)
+            browser.click("Start scan")
+            browser.wait("document.querySelector('.note').textContent === 'start: accepted'")
+            browser.dialog = "2.5"
+            browser.click("Baseline")
+            browser.wait(
+                "[...document.querySelectorAll('.note')].some(n => n.textContent ==="
+                " 'baseline 2.5 m: accepted')",
+                30,
+            )
+            assert daemon.link.parameter("SR_BASELINE_M") == 2.5
+    finally:
+        one.close()
+
+
+def test_without_webgl_the_view_says_so_and_the_list_works(
+    browser: Browser, portal: Portal
+) -> None:
+    blind = Browser(browser.driver, "--disable-3d-apis")
+    try:
+        blind.open(portal.url)
+        blind.wait("document.querySelectorAll('article').length === 1")
+        blind.open(f"{base(portal)}/#/view/drone-1/test-1")
+        blind.wait("document.querySelector('.stage').textContent.includes('cannot draw in 3D')")
+        blind.open(f"{base(portal)}/#/")
+        blind.wait("document.querySelectorAll('article').length === 1")
+    finally:
+        blind.close()
+
+
+def test_an_empty_library_says_how_scans_get_there(browser: Browser, tmp_path: Path) -> None:
+    one = Portal(PortalConfig(tmp_path / "none", port=0, token=TOKEN))
+    one.start()
+    try:
+        browser.open(one.url)
+        browser.wait("document.querySelector('.empty h2').textContent === 'No scans yet'")
+    finally:
+        one.close()
+
+
+def test_a_scan_in_flight_is_drawn_with_those_it_is_tied_to(
+    browser: Browser, tmp_path: Path
+) -> None:
+    one = write_scan(tmp_path / "a/1", leg(0.0, 4), Errors((1.1, -0.7, 0.9)), finished=False)
+    write_scan(tmp_path / "b/2", leg(np.pi / 2, 4), finished=False)
+    follower = Follower(tmp_path)
+    with listing(browser, tmp_path, 2) as base:
+        browser.open(f"{base}/#/view/a/1")
+        alone = browser.wait(
+            f"Number(document.body.dataset.points) >= {samples(one)} && {samples(one)}"
+        )
+        assert browser.run("document.body.dataset.ties") is None
+        while follower.turn(time.time()):
+            pass
+        browser.wait("Number(document.body.dataset.ties) > 1")  # by the message `site`
+        browser.wait("document.querySelector('.figures').textContent.includes(' ties, ')")
+        browser.wait(f"Number(document.body.dataset.points) > {alone}")
+        choose = (
+            "(() => { const s = document.querySelector('.tools select'); s.value = 'scan';"
+            " s.dispatchEvent(new Event('change')); return s.value; })()"
+        )
+        assert browser.wait(choose) == "scan"
+        browser.wait("document.querySelector('.legend').textContent.includes('b/2')")
+        browser.image(tmp_path / "tied.png")  # to look at
+        (tmp_path / FILE).unlink()
+
+
+def test_what_is_new_since_the_last_visit_has_its_colours(browser: Browser, tmp_path: Path) -> None:
+    boxes: list[Box] = [(2.0, 3.0, 7.0, 7.0, 1.5), (-9.0, -7.0, -4.0, -3.0, 1.5)]
+    last = write_scan(tmp_path / "a/may", leg(0.0), Errors((1.1, -0.7, 0.9)), boxes[:1], day=-30)
+    with ScanStore.open(last / "scan.db") as store:
+        write_deliverables(last, store, {})
+    for path in last.glob("scan.db*"):
+        os.utime(path, (0, 0))
+    now = write_scan(tmp_path / "b/june", leg(np.pi / 2), None, boxes[1:], finished=False)
+    follower = Follower(tmp_path)
+    while follower.turn(time.time()):
+        pass
+    with listing(browser, tmp_path, 2) as base:
+        browser.screen(1280, 800, pixel_ratio=1.0)  # pixels are counted
+        browser.open(f"{base}/#/view/b/june")
+        browser.wait(f"Number(document.body.dataset.points) > {samples(now)}")
+        drawn = browser.wait("Number(document.body.dataset.drawn)")
+        assert drawn <= samples(now)  # the earlier date is only compared with
+        choose = (
+            "(() => { const s = document.querySelector('.tools select'); s.value = 'change';"
+            " s.dispatchEvent(new Event('change')); return s.value; })()"
+        )
+        assert browser.wait(choose) == "change"
+        browser.wait("document.querySelector('.legend').textContent.includes('not seen before')")
+        browser.click("Whole site")
+        red, blue = changed_px(browser, tmp_path / "change.png")
+        assert red > 300 and blue > 300
+        assert red + blue < 15_000  # of about 300,000 that show ground
+
+
+def changed_px(browser: Browser, path: Path) -> tuple[int, int]:
+    """Pixels of the scene that are clearly red and clearly blue, once there are any."""
+    script = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
+    end, found = time.monotonic() + 60.0, (0, 0)
+    while min(found) < 300 and time.monotonic() < end:
+        time.sleep(1.0)
+        data = np.frombuffer(base64.b64decode(browser.run(script)), np.uint8)
+        image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.int64)
+        b, g, r = np.moveaxis(image[..., :3], -1, 0)
+        found = int(np.sum(r - np.maximum(g, b) > 50)), int(np.sum(b - np.maximum(g, r) > 50))
+    browser.image(path)  # to look at
+    return found
+
+
+def samples(folder: Path) -> int:
+    """Points of all keyframes of a scan."""
+    with ScanStore.open(folder / "scan.db") as store:
+        return sum(int(one.fresh.sum()) for one in store.keyframes())

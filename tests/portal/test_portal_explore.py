@@ -1,0 +1,248 @@
+"""Time, clip box, images of keyframes, links and units of the view, in a real browser."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from house_flight import HouseFlight
+from person import Browser
+from portal_client import NEEDS, TOKEN, browser, flown_store
+
+from recon.types import F64
+from service.ground.portal import Portal, PortalConfig
+
+pytestmark = NEEDS
+__all__ = ["browser"]  # the fixture
+
+SET = "(() => {{ const f = document.querySelector({!r}); f.value = {!r};"
+SET += " f.dispatchEvent(new Event('input', {{ bubbles: true }})); }})()"
+CANVAS = "document.querySelector('.stage canvas')"
+COLOURED = f"""(() => {{
+  const c = document.createElement('canvas'), s = {CANVAS};
+  [c.width, c.height] = [s.width, s.height];
+  const g = c.getContext('2d');
+  g.drawImage(s, 0, 0);
+  const d = g.getImageData(0, 0, c.width, c.height).data;
+  let n = 0;
+  for (let i = 0; i < d.length; i += 4) n += Math.abs(d[i + 1] - d[i + 2]) > 20;
+  return n / (d.length / 4);
+}})()"""
+"""Share of the scene's pixels that are neither gray nor background."""
+SELECT = "(() => {{ const f = document.querySelector('[aria-label=\"colour by\"]'); f.value = {!r};"
+SELECT += " f.dispatchEvent(new Event('change', {{ bubbles: true }})); }})()"
+LIKE = (
+    COLOURED.replace("{", "{{")
+    .replace("}", "}}")
+    .replace("Math.abs(d[i + 1] - d[i + 2]) > 20", "like([d[i], d[i + 1], d[i + 2]], [{}, {}, {}])")
+    .replace(
+        "let n = 0;",
+        """let n = 0;
+  const like = (a, b) => {{
+    const of = v => Math.hypot(...v), dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    return dot > 0.98 * of(a) * of(b);
+  }};""",
+    )
+)
+"""Share of the scene's pixels of the hue of a colour."""
+
+
+@pytest.fixture
+def base(browser: Browser, tmp_path: Path, house: HouseFlight) -> Iterator[str]:
+    """The address of a portal with the scan drone-1/test-1, which no page shows yet."""
+    portal = Portal(PortalConfig(flown_store(tmp_path, house), port=0, token=TOKEN))
+    portal.start()
+    browser.screen(1280, 800)
+    browser.open("about:blank")
+    yield portal.url.split("/?")[0] + "/"
+    browser.run("localStorage.clear()")
+    portal.close()
+
+
+@pytest.fixture
+def page(browser: Browser, base: str) -> Browser:
+    """The scan, whole and at rest."""
+    browser.open(f"{base}#/view/drone-1/test-1")
+    browser.wait("document.body.dataset.points > 71000")  # all five keyframes
+    browser.click("Whole site")
+    settle(browser)
+    return browser
+
+
+def settle(page: Browser) -> None:
+    """Wait until the page shows what was asked for."""
+    page.run("new Promise(r => setTimeout(r, 100))")
+    page.wait("document.body.dataset.still === 'yes'")
+
+
+def again(page: Browser) -> None:
+    """Open the same page again."""
+    address = page.run("location.href")
+    page.open("about:blank")
+    page.open(address)
+
+
+def drawn(page: Browser) -> int:
+    """Points of the whole frame: the figure that stands while nothing is left to draw."""
+    figure = "[document.body.dataset.still, Number(document.body.dataset.drawn)]"
+    seen: list[list[object]] = []
+    while len(seen) < 2 or seen[-1] != seen[-2] or seen[-1][0] != "yes":
+        assert len(seen) < 40, seen
+        settle(page)
+        page.run("new Promise(r => setTimeout(r, 700))")  # the figures follow within 0.3 s
+        seen.append(page.run(figure))
+    return int(str(seen[-1][1]))
+
+
+def test_the_time_slider_shows_the_cloud_as_it_was(page: Browser) -> None:
+    whole = drawn(page)
+    page.run(SET.format(".time input", "2"))
+    assert drawn(page) == pytest.approx(whole * 2 / 5, rel=0.05)
+    assert page.run("document.querySelector('.time output').textContent") == "1 s"
+    page.run(SET.format(".time input", "5"))
+    assert drawn(page) == whole
+
+
+def test_the_clip_box_cuts_the_scene_and_gives_it_back(page: Browser) -> None:
+    before = page.run(COLOURED)
+    assert before > 0.05
+    page.run(SET.format("[aria-label='East, from']", "50"))
+    settle(page)
+    half = page.run(COLOURED)
+    assert 0.3 * before < half < 0.7 * before
+    page.run(SET.format("[aria-label='Height, from']", "50"))
+    settle(page)
+    assert page.run(COLOURED) < 0.6 * half  # the roof is left
+    said = page.run("[...document.querySelectorAll('.clip output')].map(o => o.value)")
+    (_, (west, east)), _, (_, (low, high)) = (
+        (text, [float(v) for v in re.findall(r"-?[\d.]+(?= m)", text)]) for text in said
+    )
+    assert west == pytest.approx(10.0, abs=3.0) and east > 30.0
+    datum = HouseFlight.origin[2]
+    assert (low, high) == pytest.approx((datum + 3.0, datum + 6.0), abs=0.2)
+    page.run(
+        "[...document.querySelectorAll('.clip button')].find(b => b.offsetParent || 1).click()"
+    )
+    settle(page)
+    assert page.run(COLOURED) == pytest.approx(before, rel=0.02)
+
+
+def test_the_scans_of_a_site_have_colours_of_their_own(page: Browser, tmp_path: Path) -> None:
+    choices = "document.querySelector('[aria-label=\\'colour by\\']').textContent"
+    assert "scan" not in page.run(choices)
+    parts = [{"name": "west", "keyframes": [0, 1]}, {"name": "east", "keyframes": [2, 4]}, None]
+    site = tmp_path / "drone-1" / "test-1" / "site.json"
+    site.write_text(json.dumps({"scans": parts}))
+    again(page)
+    page.wait("document.body.dataset.points > 71000")
+    assert page.run(choices).endswith("scan")
+    page.run(SELECT.format("scan"))
+    page.click("Whole site")
+    settle(page)
+    keys = "[...document.querySelectorAll('.legend .keys span')].map(k => k.textContent).join()"
+    assert page.run(keys) == "west,east"
+    both = [page.run(LIKE.format(*rgb)) for rgb in ((230, 159, 0), (86, 180, 233))]
+    page.run(SET.format(".time input", "2"))  # the west alone
+    settle(page)
+    west, east = (page.run(LIKE.format(*rgb)) for rgb in ((230, 159, 0), (86, 180, 233)))
+    assert min(both) > 0.02 and west > 0.02 and east < 0.1 * both[1]
+    page.run(SELECT.format("colour"))
+    assert page.run("document.querySelector('.legend').hidden")
+
+
+def test_a_site_with_damaged_facts_is_shown(page: Browser, tmp_path: Path) -> None:
+    (tmp_path / "drone-1" / "test-1" / "site.json").write_text('{"scans": 7}')
+    again(page)
+    page.wait("document.querySelector('[role=alert]')?.textContent.includes('site.json')")
+    page.wait("document.body.dataset.points > 71000")
+
+
+def view(page: Browser) -> F64:
+    """(6,) the eye and where it looks, from the link."""
+    page.click("Link")
+    return np.array(page.run("location.hash").split("/")[4].split(","), np.float64)
+
+
+def test_a_link_opens_the_same_view(page: Browser) -> None:
+    page.run(
+        f"{CANVAS}.dispatchEvent(new WheelEvent('wheel',"
+        " { deltaY: -400, clientX: 640, clientY: 400, bubbles: true }))"
+    )
+    settle(page)
+    here, address = view(page), page.run("location.href")
+    page.open("about:blank")
+    page.open(address)
+    page.wait("document.body.dataset.points > 71000")
+    settle(page)
+    assert np.abs(view(page) - here).max() < 0.02
+
+
+@pytest.mark.parametrize("broken", ["1,2,3", "1,2,3,4,5,x", "", "NaN,0,0,0,0,0"])
+def test_a_link_with_a_broken_view_shows_the_whole_site(
+    browser: Browser, base: str, broken: str
+) -> None:
+    browser.open(f"{base}#/view/drone-1/test-1/{broken}")
+    browser.wait("document.body.dataset.points > 71000")
+    settle(browser)
+    assert browser.run(COLOURED) > 0.05
+
+
+def test_a_click_on_a_camera_shows_its_image(
+    browser: Browser, base: str, house: HouseFlight
+) -> None:
+    browser.open(f"{base}#/view/drone-1/test-1/10,-130,70,10,0,20")
+    browser.wait("document.body.dataset.image === '4'")
+    settle(browser)
+    second = house.pose(5.0)[:3, 3]  # where the second was taken
+    browser.mouse(*projected(browser, view(browser), second))
+    browser.wait("document.body.dataset.image === '1'")
+    caption = "document.querySelector('.latest figcaption').textContent"
+    assert browser.run(caption).startswith("keyframe 1")
+    assert browser.run("document.querySelector('.latest img').naturalWidth") > 0
+    browser.click("Latest")
+    browser.wait("document.body.dataset.image === '4'")
+
+
+def projected(page: Browser, where: F64, point: F64) -> tuple[float, float]:
+    """CSS pixels at which the view (6,) shows a point (3,)."""
+    left, top, w, h = page.run(
+        f"(() => {{ const b = {CANVAS}.getBoundingClientRect();"
+        " return [b.x, b.y, b.width, b.height]; })()"
+    )
+    eye, target = where[:3], where[3:]
+    ahead = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    p = point - eye
+    depth = p @ ahead * np.tan(np.radians(30.0)) / (h / 2)
+    return left + w / 2 + p @ right / depth, top + h / 2 - p @ np.cross(right, ahead) / depth
+
+
+def test_lengths_in_feet_when_chosen(page: Browser) -> None:
+    figures = "document.querySelector('.figures').textContent"
+    metres = re.search(r"AMSL([\d.]+) m", page.wait(f"({figures}).includes(' m') && {figures}"))
+    assert metres is not None
+    field = "[...document.querySelectorAll('.settings label')]"
+    field += ".find(l => l.textContent.startsWith('Imperial')).querySelector('input')"
+    page.run(f"{field}.click()")
+    feet = re.search(r"AMSL([\d.]+) ft", page.wait(f"({figures}).includes(' ft') && {figures}"))
+    assert feet is not None
+    assert float(feet[1]) * 0.3048 == pytest.approx(float(metres[1]), abs=0.1)
+
+
+def test_the_list_follows_a_dark_desktop(browser: Browser, base: str) -> None:
+    background = "getComputedStyle(document.documentElement).backgroundColor"
+    browser.open(f"{base}#/")
+    browser.wait("document.querySelectorAll('article').length === 1")
+    light = browser.run(background)
+    dark = [{"name": "prefers-color-scheme", "value": "dark"}]
+    browser.call("Emulation.setEmulatedMedia", features=dark)
+    try:
+        shown = [int(v) for v in re.findall(r"\d+", browser.run(background))]
+        assert max(shown) < 60 < min(int(v) for v in re.findall(r"\d+", light))
+    finally:
+        browser.call("Emulation.setEmulatedMedia", features=[])

@@ -1,0 +1,248 @@
+"""The map page in a real browser: layers, moving, growing, phone; nothing from outside."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from basemaps import TILES, mbtiles
+from house_flight import HouseFlight
+from person import Browser, Page
+from portal_client import NEEDS, TOKEN, browser, flown_store
+
+from service.georeference import LocalFrame
+from service.ground import state
+from service.ground.portal import Portal, PortalConfig
+from service.offline.refine.refly import WAYPOINT
+from service.stream.codec import encode
+from service.stream.store import ScanStore
+
+pytestmark = NEEDS
+
+PHONE = (390, 844)
+__all__ = ["browser"]  # the fixture
+
+SHOWN = "document.body.dataset.map === 'shown'"
+BOX = "[...document.querySelectorAll('.layers label')].find(l => l.textContent.includes('{}'))"
+COLOURS = """(async () => {
+  const map = document.querySelector('.map').getBoundingClientRect();
+  const c = document.createElement('canvas'); [c.width, c.height] = [map.width, map.height];
+  const g = c.getContext('2d');
+  for (const i of document.querySelectorAll('.layer:not([hidden]) img')) {
+    const b = i.getBoundingClientRect();
+    g.drawImage(i, b.x - map.x, b.y - map.y, b.width, b.height); }
+  const d = g.getImageData(0, 0, c.width, c.height).data;
+  let known = 0, red = 0, left = 1e9, right = 0;
+  for (let p = 0; p < d.length; p += 4) { if (!d[p + 3]) continue; known++;
+    if (d[p] > 150 && d[p + 1] < 90) { red++; const x = (p / 4) % c.width;
+      left = Math.min(left, x); right = Math.max(right, x); } }
+  return { known, red, left, right };
+})()"""
+"""Pixels of the map with content, and those of the red roof."""
+
+
+@pytest.fixture
+def scans(tmp_path: Path, house: HouseFlight) -> Path:
+    return flown_store(tmp_path / "scans", house)
+
+
+@pytest.fixture
+def page(browser: Browser, tmp_path: Path, scans: Path) -> Iterator[Browser]:
+    below = mbtiles(tmp_path / "below.mbtiles", TILES)
+    portal = Portal(PortalConfig(scans, port=0, token=TOKEN, basemap=below))
+    portal.start()
+    browser.screen(1280, 800)
+    browser.open("about:blank")
+    browser.requests.clear()
+    browser.open(f"{portal.url.split('/?')[0]}/#/map/drone-1/test-1")
+    browser.wait(SHOWN)
+    yield browser
+    portal.close()
+
+
+def layer(page: Page, name: str) -> None:
+    page.run(f"{BOX.format(name)}.querySelector('input').click()")
+    page.run("new Promise(r => setTimeout(r, 100))")
+    page.wait(SHOWN)
+
+
+def steady(page: Browser) -> dict[str, float]:
+    """The map's colours once two looks in a row find the same."""
+    seen: list[dict[str, float]] = []
+    while len(seen) < 2 or seen[-1] != seen[-2]:
+        assert len(seen) < 40, seen
+        page.wait(SHOWN)
+        seen.append(page.run(COLOURS))
+        page.run("new Promise(r => setTimeout(r, 500))")
+    return seen[-1]
+
+
+def test_layers_lie_over_the_basemap_and_nothing_comes_from_outside(page: Browser) -> None:
+    with_base = steady(page)
+    assert with_base["known"] == pytest.approx(1280 * (800 - 50), rel=0.03)  # the basemap is below
+    layer(page, "Basemap")
+    alone = steady(page)
+    assert 0.1 < alone["known"] / with_base["known"] < 0.9 and alone["red"] > 1000
+    layer(page, "Surface")
+    assert steady(page)["red"] == 0  # the shaded surface covers the roof
+    layer(page, "Orthophoto")
+    layer(page, "Surface")
+    layer(page, "Contours")
+    assert 0 < steady(page)["known"] < 0.1 * alone["known"]
+    words = page.run(BOX.format("Contours") + ".textContent")
+    assert re.fullmatch(r" Contours, [\d.]+ m", words)
+    keys = "document.querySelector('.layers .keys')"
+    assert page.run(f"{keys}.hidden")
+    layer(page, "Coverage")
+    tops = page.run("[...document.querySelectorAll('.layers label')].map(l => l.textContent)")
+    assert tops.index(words) > tops.index(" Coverage")  # drawn above it
+    assert not page.run(f"{keys}.hidden") and "seldom seen" in page.run(f"{keys}.textContent")
+    assert steady(page)["known"] > 0.5 * alone["known"]
+    here = page.run("location.origin")
+    assert [u for u in page.requests if not u.startswith((here, "data:", "about:"))] == []
+
+
+FAILED = "[...document.querySelectorAll('.layer img')].filter(i => i.complete && !i.naturalWidth)"
+DRAWN_BROKEN = f"{FAILED}.filter(i => i.getClientRects().length).length"
+
+
+def test_tiles_that_do_not_come_show_nothing_and_are_asked_for_again(page: Browser) -> None:
+    whole = steady(page)
+    page.page.route("**/tiles/**", lambda route: route.abort())
+    for button in ("nearer", "farther", "farther"):
+        page.run(f"document.querySelector('[title={button}]').click()")
+    page.wait(f"{FAILED}.length > 0")
+    page.wait("document.querySelector('.state').textContent.includes('does not answer')")
+    assert page.run(DRAWN_BROKEN) == 0
+    page.run("document.querySelector('[title=nearer]').click()")
+    page.page.unroute("**/tiles/**")
+    page.wait(f"{FAILED}.length === 0", 10)
+    assert steady(page) == whole
+
+
+def colours(page: Browser, when: str) -> dict[str, float]:
+    """The map's colours ``s`` once no tile is missing and they are as ``when`` says."""
+    found: dict[str, float] = page.wait(f"({COLOURS}).then(s => {SHOWN} && s.red && {when} && s)")
+    return found
+
+
+def test_the_map_moves_and_zooms_about_the_pointer(page: Browser) -> None:
+    before = steady(page)
+    page.mouse(600, 500, to=(700, 540))
+    moved = colours(page, f"Math.abs(s.left - {before['left'] + 100}) <= 2")
+    x, y = moved["left"], 400
+    page.run(
+        "document.querySelector('.map').dispatchEvent(new WheelEvent('wheel', { deltaY: -300,"
+        f" clientX: {x}, clientY: {y}, bubbles: true, cancelable: true }}))"
+    )
+    twice = f"Math.abs(s.right - s.left - {2 * (moved['right'] - moved['left'])}) <= 12"
+    near = colours(page, f"{twice} && Math.abs(s.left - {x}) <= 8")
+    page.run("document.querySelector('.map').focus()")
+    page.key("ArrowRight")
+    colours(page, f"Math.abs(s.left - {near['left'] - 80}) <= 2")
+
+
+@pytest.mark.parametrize("name", ["Orthophoto", "Coverage"])
+def test_a_keyframe_is_on_the_map_after_its_next_round(
+    browser: Browser, scans: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """The page asks every 2 s, the server looks at the store at most 2 s before: 4 s in all."""
+    for age in ("MAP_AGE_S", "COVERAGE_AGE_S"):
+        assert getattr(state, age) <= 2.0
+        monkeypatch.setattr(state, age, 0.0)
+    portal = Portal(PortalConfig(scans, port=0, token=TOKEN))
+    portal.start()
+    page = browser.other()
+    page.page.clock.install()  # time passes for the page as the test says
+    page.open(f"{portal.url.split('/?')[0]}/#/map/drone-1/test-1")
+    page.wait(SHOWN)
+    if name != "Orthophoto":
+        layer(page, "Orthophoto")
+        layer(page, name)
+    page.wait(f"({COLOURS}).then(s => s.known > 1000)")  # it shows the scan, not the world
+    page.run("document.querySelector('[title=farther]').click()")  # now the map stays there
+    page.wait(SHOWN)
+    before = page.wait(f"({COLOURS}).then(s => s.known)")
+    with ScanStore.open(scans / "drone-1/test-1/scan.db") as scan:
+        one = house.keyframe(5, 35.0)
+        scan.add_keyframe(5, encode(one, one.time_ns))
+    page.page.clock.run_for(2000)
+    page.wait(f"({COLOURS}).then(s => s.known > 1.1 * {before})")
+    page.page.context.close()
+    portal.close()
+
+
+DRAWN = "[...document.querySelectorAll('.refly polygon, .refly polyline')].length"
+ENDS = """[...document.querySelectorAll('.refly polyline')].flatMap(l =>
+  l.getAttribute('points').split(' ').map(p => p.split(',').map(Number)))"""
+
+
+def test_a_flight_over_weak_places_is_planned_while_the_scan_grows(
+    browser: Browser, scans: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state, "COVERAGE_AGE_S", 0.0)
+    (scans / "drone-1/test-1/scan.json").unlink()  # it is in flight
+    portal = Portal(PortalConfig(scans, port=0, token=TOKEN))
+    portal.start()
+    page = browser.other()
+    page.page.clock.install()
+    page.open(f"{portal.url.split('/?')[0]}/#/map/drone-1/test-1")
+    page.wait(SHOWN)
+    page.run(f"{BOX.format('Fly again')}.querySelector('input').click()")
+    page.wait("document.querySelector('.layers').textContent.includes('nothing large enough')")
+
+    def fly(seq: int, east_m: float) -> None:
+        """A keyframe, then the page's next round."""
+        with ScanStore.open(scans / "drone-1/test-1/scan.db") as scan:
+            one = house.keyframe(seq, east_m)
+            scan.add_keyframe(seq, encode(one, one.time_ns))
+        page.page.clock.run_for(2000)
+
+    fly(5, 90.0)  # leaves a gap
+    page.wait(f"{DRAWN} > 0")
+    with page.page.expect_download() as download:
+        page.run("[...document.querySelectorAll('a')].find(a => a.text === '.plan').click()")
+    assert download.value.suggested_filename == "test-1-refly.plan"
+    items = json.loads(download.value.path().read_text())["mission"]["items"]
+    flown = np.array([i["params"][4:7] for i in items if i["command"] == WAYPOINT])
+    assert page.run(DRAWN) == len(flown)  # of each line its strip, and two places
+    places = LocalFrame(*house.origin).to_enu(flown)
+    assert 30.0 < places[:, 0].mean() < 90.0 and np.abs(places[:, 2] - house.height_m).max() < 0.1
+    along_m, along_px = np.diff(places[:, :2], axis=0)[0], np.diff(page.run(ENDS), axis=0)[0]
+    scale = np.hypot(*along_px) / np.hypot(*along_m)
+    assert np.abs(along_px - scale * along_m * (1, -1)).max() < 0.02 * np.hypot(*along_px)
+    fly(6, 60.0)
+    fly(7, 40.0)
+    page.wait(f"{DRAWN} === 0")
+    page.page.context.close()
+    portal.close()
+
+
+@pytest.mark.parametrize("size", [(1440, 900), PHONE])
+def test_the_map_is_reached_and_within_reach(
+    page: Browser, size: tuple[int, int], tmp_path: Path
+) -> None:
+    page.screen(*size, mobile=size == PHONE)
+    page.run("location.hash = '#/'")
+    page.wait("document.querySelectorAll('article').length === 1")
+    page.run(
+        "[...document.querySelectorAll('article a')].find(a => a.textContent === 'Map').click()"
+    )
+    page.wait(f"{SHOWN} && !!document.querySelector('.map')")
+    page.run("new Promise(r => setTimeout(r, 300))")
+    page.wait(SHOWN)
+    wide, high = page.run(
+        "[document.documentElement.scrollWidth, document.documentElement.scrollHeight]"
+    )
+    assert wide <= size[0] and high <= size[1]
+    assert page.run("document.querySelector('.map').clientHeight") > 0.5 * size[1]
+    page.image(tmp_path / "map.png")  # to look at
+
+
+def test_a_scan_that_is_not_there_is_said(page: Browser) -> None:
+    page.run("location.hash = '#/map/drone-1/none'")
+    page.wait("document.body.textContent.includes('no scan drone-1/none')")

@@ -1,0 +1,428 @@
+"""The portal's buttons and settings in a real browser; skipped without one.
+
+One browser and one portal serve all tests of this file.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+from loopback import free_port
+from person import Browser, Page
+from portal_client import NEEDS, TOKEN, VEHICLE_SHOWN, browser
+from rehearsal import RehearsalVehicle
+
+from mavlink.component.control import Answer, Result
+from recon.types import U8
+from service.ground.portal import Portal, PortalConfig
+from service.ground.vehicle import Vehicle
+from service.scans.folder import write_deliverables
+
+if TYPE_CHECKING:
+    from house_flight import HouseFlight
+
+pytestmark = NEEDS
+__all__ = ["browser"]  # the fixture
+
+FAKE_HEADSET = """
+window.headset = { asked: [], frames: 0, ended: null };
+delete window.XRWebGLBinding;
+window.XRWebGLLayer = class {
+  framebuffer = null; framebufferWidth = 640; framebufferHeight = 480; fixedFoveation = 0;
+  getViewport() { return { x: 0, y: 0, width: 640, height: 480 }; }
+};
+WebGL2RenderingContext.prototype.makeXRCompatible = async () => undefined;
+const view = {
+  eye: 'left',
+  transform: { matrix: [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,1.6,0,1] },
+  projectionMatrix: [1,0,0,0, 0,1.33,0,0, 0,0,-1,-1, 0,0,-0.2,0],
+};
+class Session extends EventTarget {
+  renderState = {}; inputSources = []; enabledFeatures = []; environmentBlendMode = 'opaque';
+  updateRenderState(state) { Object.assign(this.renderState, state); }
+  async requestReferenceSpace() { return {}; }
+  requestAnimationFrame(call) {
+    return setTimeout(() => {
+      headset.frames++;
+      call(performance.now(), { session: this, getViewerPose: () => ({ views: [view] }) });
+    }, 16);
+  }
+  cancelAnimationFrame(id) { clearTimeout(id); }
+  async end() { this.dispatchEvent(Object.assign(new Event('end'), { session: this })); }
+}
+Object.defineProperty(navigator, 'xr', { configurable: true, value: {
+  addEventListener() {},
+  isSessionSupported: async (mode) => mode === 'immersive-vr',
+  requestSession: async (mode) => {
+    headset.asked.push(mode);
+    return headset.session = new Session();
+  },
+} });
+"""
+CHANGED = " field.dispatchEvent(new Event('input', { bubbles: true }))"
+IMAGE = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Path:
+    root = tmp_path_factory.mktemp("scans")
+    folder = root / "drone-1" / "test-1"
+    with house.flown(folder) as scan:
+        scan.finish({})
+        write_deliverables(folder, scan, {"scale": {"from": "gnss", "sigma": 0.0065}})
+    return root
+
+
+@pytest.fixture(scope="module")
+def portal(store: Path) -> Iterator[Portal]:
+    one = Portal(PortalConfig(store, port=0, token=TOKEN))
+    one.start()
+    yield one
+    one.close()
+
+
+def open_scan(page: Page, portal: Portal) -> None:
+    """Show the scan, all its points drawn."""
+    page.open(portal.url)
+    page.wait("document.querySelectorAll('article').length === 1")
+    page.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/test-1")
+    page.wait("Number(document.body.dataset.points) > 1000")
+    page.wait("document.body.dataset.image === '4'")
+    page.wait("document.body.dataset.drawn === document.body.dataset.points")
+    page.wait("document.body.dataset.still === 'yes'")
+
+
+def drawn(page: Page) -> U8:
+    """The image on the stage, once it stands still."""
+    page.run("new Promise(r => setTimeout(r, 100))")
+    page.wait("document.body.dataset.still === 'yes'")
+    data = np.frombuffer(base64.b64decode(page.run(IMAGE)), np.uint8)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+
+
+def setting(page: Page, name: str, act: str) -> None:
+    """Do ``act`` with the input or list of a setting, as an operator would."""
+    page.run(
+        "(() => { const label = [...document.querySelectorAll('.settings label')]"
+        f".find(l => l.textContent.startsWith('{name}'));"
+        f" const field = label.querySelector('input, select'); {act} }})()"
+    )
+
+
+def difference(a: U8, b: U8) -> float:
+    """Share of the pixels that are not the same."""
+    return float((cv2.absdiff(a, b).max(axis=2) > 4).mean())
+
+
+def test_settings_change_the_image_and_go_back(browser: Browser, portal: Portal) -> None:
+    open_scan(browser, portal)
+    plain = drawn(browser)
+    sky = np.full_like(plain, plain[0, 0])
+    assert difference(plain, sky) > 0.05  # the site is there
+    assert difference(plain, drawn(browser)) == 0.0
+    for name in ("Bloom", "Depth of field"):
+        setting(browser, name, "field.click()")
+        browser.run("new Promise(r => setTimeout(r, 700))")  # the effects are loaded when asked
+        assert difference(plain, drawn(browser)) > 0.01, name
+        setting(browser, name, "field.click()")
+    setting(browser, "Field of view", "field.value = 25;" + CHANGED)
+    narrow = drawn(browser)
+    assert difference(plain, narrow) > 0.1
+    ground = narrow.max(axis=2) > 60
+    assert ground.mean() > 1.5 * (plain.max(axis=2) > 60).mean()  # nearer, so larger
+    setting(browser, "Field of view", "field.value = 60;" + CHANGED)
+    assert difference(plain, drawn(browser)) < 0.03  # points in one place hide each other by turns
+
+
+def solid_share(image: U8) -> float:
+    """Share of the site's inner area where the background does not show through."""
+    shown = (cv2.absdiff(image, np.full_like(image, image[0, 0])).max(axis=2) > 4).astype(np.uint8)
+    closed = cv2.morphologyEx(shown, cv2.MORPH_CLOSE, np.ones((31, 31)))
+    inner = cv2.erode(closed, np.ones((15, 15))).astype(bool)
+    assert inner.mean() > 0.02
+    return float(shown[inner].mean())
+
+
+def test_ground_looks_like_ground_at_the_first_look(browser: Browser, portal: Portal) -> None:
+    browser.screen(1280, 800, pixel_ratio=1.0)  # points and their shade are small
+    open_scan(browser, portal)
+    browser.click("Whole site")
+    browser.click("Cameras")
+    plain = drawn(browser)
+    assert solid_share(plain) > 0.97
+    setting(browser, "Shading", "field.value = 0;" + CHANGED)
+    flat = drawn(browser)
+    darker = flat.astype(int).sum(axis=2) - plain.astype(int).sum(axis=2)
+    assert 150 < (darker > 60).sum() < 0.02 * darker.size  # along the steps of the house alone
+    setting(browser, "Point size", "field.value = 0.3;" + CHANGED)
+    assert solid_share(drawn(browser)) < solid_share(plain) - 0.02
+    browser.screen(1280, 800)
+
+
+def test_a_scene_at_rest_asks_for_no_frames(browser: Browser, portal: Portal) -> None:
+    open_scan(browser, portal)
+    drawn(browser)
+    count = "window.requestAnimationFrame = f => (asked++, ask.call(window, f));"
+    browser.run(f"window.asked = 0; window.ask = requestAnimationFrame; {count} 0")
+    browser.run("new Promise(r => setTimeout(r, 400))")  # beyond the next turn of the figures
+    assert browser.run("asked") == 0
+    before = drawn(browser)
+    browser.page.keyboard.press("d", delay=200)  # flies
+    assert difference(before, drawn(browser)) > 0.01
+    assert browser.run("asked") > 0
+
+
+@pytest.mark.parametrize("screen", [(1440, 900), (390, 844)])
+def test_the_whole_site_fills_the_scene_above_the_time_slider(
+    browser: Browser, portal: Portal, screen: tuple[int, int]
+) -> None:
+    browser.screen(*screen)
+    open_scan(browser, portal)
+    browser.click("Whole site")
+    is_site = drawn(browser).max(axis=2) > 60
+    browser.screen(1440, 900)
+    bottom = np.flatnonzero(is_site.any(axis=1))[-1]
+    cols = np.flatnonzero(is_site.any(axis=0))
+    height, width = is_site.shape
+    assert bottom < height - (100 if width < 700 else 56)  # above the slider
+    assert cols[0] > 0 and cols[-1] < width - 1 and np.ptp(cols) > 0.84 * width
+
+
+def test_the_whole_site_stays_in_sight_beside_a_panel(browser: Browser, portal: Portal) -> None:
+    browser.screen(390, 1400)
+    open_scan(browser, portal)
+    browser.click("Whole site")
+    browser.click("Coverage")
+    browser.wait("document.querySelector('.coverage img').naturalHeight > 0")
+    shown = drawn(browser)
+    browser.click("Whole site")
+    again = drawn(browser)
+    browser.screen(1280, 800)
+    assert shown.shape == again.shape
+    assert np.abs(shown.astype(int) - again).mean() < 1.0
+
+
+@pytest.mark.parametrize("screen", [(1440, 900), (390, 844)])
+def test_a_long_name_leaves_the_view_its_width(
+    browser: Browser, portal: Portal, store: Path, screen: tuple[int, int]
+) -> None:
+    labels = store / "drone-1/test-1/library.json"
+    labels.write_text(json.dumps({"title": 200 * "W"}))
+    browser.screen(*screen)
+    open_scan(browser, portal)
+    labels.unlink()
+    wide = browser.run("document.documentElement.scrollWidth")
+    browser.screen(1280, 800)
+    assert wide == screen[0]
+
+
+SLOW_CARD = """
+window.since = Infinity;
+const late = new WeakSet(), gl = WebGL2RenderingContext.prototype;
+const { fenceSync, clientWaitSync } = gl;
+gl.fenceSync = function (...a) {
+  const sync = fenceSync.apply(this, a);
+  if (performance.now() > window.since) late.add(sync);
+  return sync;
+};
+gl.clientWaitSync = function (sync, ...a) {
+  const busy = window.since < Infinity && late.has(sync);
+  return busy ? this.TIMEOUT_EXPIRED : clientWaitSync.call(this, sync, ...a);
+};
+"""
+"""A graphics card that ends no work given to it after ``since``, until that is infinite again."""
+
+
+COUNTED = """
+window.frames_given = 0;
+const counted = WebGL2RenderingContext.prototype.fenceSync;
+WebGL2RenderingContext.prototype.fenceSync = function (...a) {
+  window.frames_given++;
+  return counted.apply(this, a);
+};
+"""
+FRAMES_LATER = """(async () => {
+  for (let k = 0; k < 5; k++) await new Promise(r => requestAnimationFrame(r));
+})()"""
+
+
+def test_what_changes_while_the_graphics_card_is_busy_is_drawn(
+    browser: Browser, portal: Portal
+) -> None:
+    browser.screen(1280, 800)
+    open_scan(browser, portal)
+    setting(browser, "Full detail", "field.click()")  # a frame holds all points, none follows it
+    drawn(browser)
+    browser.run(SLOW_CARD + ";0")
+    browser.run("since = performance.now(); dispatchEvent(new Event('input')); 0")
+    browser.run(FRAMES_LATER)  # a frame is being drawn
+    browser.screen(1000, 700)  # clears the canvas
+    browser.run(FRAMES_LATER)
+    browser.run("since = Infinity; 0")
+    corner = drawn(browser)[2, 2]
+    browser.screen(1280, 800)
+    assert corner.tolist() == [0x20, 0x1B, 0x17]  # the background, not black
+
+
+def test_the_view_follows_a_drag_that_lasts(browser: Browser, portal: Portal) -> None:
+    open_scan(browser, portal)
+    browser.click("Whole site")
+    before = drawn(browser)
+    browser.page.mouse.move(600, 400)
+    browser.page.mouse.down()
+    browser.run("new Promise(r => setTimeout(r, 700))")  # the scene rests
+    browser.page.mouse.move(700, 420)
+    turned = drawn(browser)
+    browser.page.mouse.up()
+    assert difference(before, turned) > 0.1
+
+
+def test_a_click_that_measures_does_not_draw_the_scene_again(
+    browser: Browser, portal: Portal
+) -> None:
+    open_scan(browser, portal)
+    browser.click("Measure")
+    drawn(browser)
+    browser.run(COUNTED + ";0")
+    browser.mouse(640, 430)
+    browser.wait("document.querySelectorAll('.overlay circle').length === 1")
+    browser.run(FRAMES_LATER)
+    assert browser.run("frames_given") == 0
+    browser.click("Cameras")
+    drawn(browser)
+    assert browser.run("frames_given") > 0
+
+
+def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, store: Path) -> None:
+    summary = json.loads((store / "drone-1/test-1/scan.json").read_text())
+    points, quality = f"{summary['counts']['points']:,}", summary["quality"]
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    facts = browser.run("document.querySelector('article .facts').innerText")
+    assert f"{points} points" in facts
+    assert f"{quality['sigma_median_m']:.2f} m relative" in facts
+    across, up = (quality[f"position_sigma_{way}_median_m"] for way in "hv")
+    absolute = f"{across:.2f} m horizontal, {up:.2f} m vertical"
+    assert f"absolute {absolute}" in facts
+    assert f"Trust\n{quality['trust']['level']}" in facts
+    open_scan(browser, portal)
+    browser.wait(f"document.querySelector('.figures').innerText.includes('{points}')")
+    figures = browser.run("document.querySelector('.figures').innerText")
+    assert f"Points\n{points}" in figures
+    for sigma in (f"{quality['sigma_median_m']:.2f} m", absolute):
+        assert f" \N{GREEK SMALL LETTER SIGMA}\n{sigma}" in figures
+    assert "Scale \N{GREEK SMALL LETTER SIGMA}\n0.7 %" in figures
+    assert "Speed" not in figures  # it has landed
+    follow = "[...document.querySelectorAll('button')].find(b => b.textContent === 'Follow')"
+    assert browser.run(f"{follow}.hidden")
+
+
+def test_the_colours_of_sigma_span_what_is_there(browser: Browser, portal: Portal) -> None:
+    open_scan(browser, portal)
+    browser.run(
+        "(s => { s.value = 'sigma'; s.dispatchEvent(new Event('change', { bubbles: true })) })"
+        "(document.querySelector('[aria-label=\"colour by\"]'))"
+    )
+    words = browser.wait("document.querySelector('.legend:not([hidden])')?.textContent")
+    found = re.search(r"([\d.]+) m and more", words)
+    assert found is not None and 0.03 < float(found.group(1)) < 0.1  # 0.05 m in the flight
+
+
+def test_tone_mapping_and_exposure_change_the_mesh(
+    browser: Browser, portal: Portal, store: Path
+) -> None:
+    pytest.importorskip("open3d", exc_type=ImportError)
+    open_scan(browser, portal)
+    browser.click("Mesh")
+    browser.wait("document.body.dataset.mesh === 'shown'", 60)
+    plain = drawn(browser)
+    choose = "field.value = [...field.options].find(o => o.text === 'Reinhard').value;"
+    setting(browser, "Tone", choose + CHANGED.replace("input", "change"))
+    reinhard = drawn(browser)
+    assert difference(plain, reinhard) > 0.05
+    setting(browser, "Exposure", "field.value = 1.5;" + CHANGED)
+    brighter = drawn(browser)
+    assert brighter.mean() > reinhard.mean() + 3.0
+    browser.click("Points")
+
+
+def test_vr_is_offered_entered_and_left(browser: Browser, portal: Portal) -> None:
+    """Through a headset that is only pretended: what the page asks of WebXR, and draws for it."""
+    script = browser.call("Page.addScriptToEvaluateOnNewDocument", source=FAKE_HEADSET)
+    try:
+        browser.open("about:blank")
+        open_scan(browser, portal)
+        browser.wait("document.querySelector('#VRButton').textContent === 'ENTER VR'")
+        browser.click("ENTER VR")
+        browser.wait("document.querySelector('#VRButton').textContent === 'EXIT VR'")
+        assert browser.run("headset.asked") == ["immersive-vr"]
+        browser.wait("headset.frames > 5")
+        assert browser.run("!!headset.session.renderState.baseLayer")
+        browser.click("EXIT VR")
+        browser.wait("document.querySelector('#VRButton').textContent === 'ENTER VR'")
+        after = browser.run("headset.frames")
+        browser.run("new Promise(r => setTimeout(r, 200))")
+        assert browser.run("headset.frames") <= after + 1
+        drawn(browser)
+    finally:
+        browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script["identifier"])
+        browser.open("about:blank")
+
+
+def test_without_a_headset_there_is_no_vr_button(browser: Browser, portal: Portal) -> None:
+    open_scan(browser, portal)
+    assert browser.run("document.querySelector('#VRButton')") is None
+
+
+def test_of_two_people_renaming_at_once_the_second_is_warned(
+    browser: Browser, portal: Portal
+) -> None:
+    other = browser.other()
+    for page in (browser, other):
+        page.open(portal.url)
+        page.wait("document.querySelectorAll('article').length === 1")
+    other.dialog = "south roof"
+    other.click("Rename")
+    other.wait("document.querySelector('article h2').textContent === 'south roof'")
+    browser.dialog = "garden"
+    browser.click("Tags")  # on a list that is no longer so
+    browser.wait("document.querySelector('.note').textContent.includes('someone else')")
+    browser.wait("document.querySelector('article h2').textContent === 'south roof'")
+    assert browser.run("document.querySelectorAll('.tags span').length") == 0
+    browser.click("Tags")  # having looked again
+    browser.wait("document.querySelector('.tags span').textContent === 'garden'")
+    assert browser.run("document.querySelector('article h2').textContent") == "south roof"
+
+
+def test_a_refused_stop_shows_the_companions_own_words(browser: Browser, store: Path) -> None:
+    """Over MAVLink between the portal's client and the companion's link, both ours and real."""
+    pytest.importorskip("mavsdk")
+    port = free_port()
+    vehicle = Vehicle(f"udpin://127.0.0.1:{port}")
+    one = Portal(PortalConfig(store, port=0, token=TOKEN), vehicle=vehicle)
+    one.start()
+    try:
+        with RehearsalVehicle(f"udpout:127.0.0.1:{port}") as companion:
+            companion.control.answers["stop_scan"] = Answer(Result.DENIED, "the disk is in use")
+            vehicle.start()
+            browser.open(one.url)
+            browser.wait(VEHICLE_SHOWN, 30)
+            browser.click("Start scan")
+            browser.wait("document.querySelector('.note').textContent === 'start: accepted'")
+            browser.click("Stop scan")
+            browser.wait(
+                "[...document.querySelectorAll('.note')].some(n =>"
+                " n.textContent.startsWith('stop denied'))",
+                30,
+            )
+            assert companion.control.asked == ["start_scan", "stop_scan"]
+    finally:
+        one.close()

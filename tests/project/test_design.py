@@ -1,0 +1,52 @@
+"""docs/design.md says what the code says."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+
+from paths import ROOT
+
+from service.workers import ROWS
+
+TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+
+
+def row(stop: str, name: str, queue: str, deadline: str, restarts: str, does: str) -> str:
+    return f"{stop:<4}  {name:<17} {queue:<14} {deadline:<8}  {restarts:<8}  {does}".rstrip()
+
+
+def test_the_table_of_workers_is_the_code_s() -> None:
+    table = [row("stop", "worker", "queue", "deadline", "restarts", "does")]
+    for worker in ROWS:
+        queue = " ".join(filter(None, (str(worker.bound or ""), worker.full)))
+        deadline = "" if worker.deadline_s is None else f"{worker.deadline_s:g} s"
+        restarts = "yes" if worker.restarts else ""
+        table.append(row(str(worker.stop), worker.name, queue, deadline, restarts, worker.does))
+    assert "```text\n" + "\n".join(table) + "\n```" in TEXT
+
+
+def test_every_path_in_it_exists() -> None:
+    paths = re.findall(r"`((?:service|recon|mavlink|tests)/[\w./]+)`", TEXT)
+    assert len(paths) > 20
+    assert [path for path in paths if not (ROOT / path).exists()] == []
+
+
+def test_the_image_of_the_architecture_is_up_to_date() -> None:
+    spec = importlib.util.spec_from_file_location("architecture", ROOT / "docs/architecture.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert module.SVG.read_text(encoding="utf-8") == module.drawing(), "run docs/architecture.py"
+
+
+def test_each_class_has_a_name_of_its_own() -> None:
+    found: dict[str, list[str]] = {}
+    for room in ("service", "recon", "mavlink"):
+        for path in sorted((ROOT / room).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ClassDef):
+                    found.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert len(found) > 500
+    assert {name: paths for name, paths in found.items() if len(paths) > 1} == {}

@@ -1,0 +1,225 @@
+"""Which backend is taken, what it keeps between starts, and a learned model in its place."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+import recon.backends
+from recon.backends import Backend
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from service.compute import backend_choice
+from service.compute.backend_choice import choose_backend, engine_folder, open_backend
+from service.config import ComputeConfig, load_config
+from service.daemon.diagnosis import examine
+from service.errors import InputError, OutsideError
+
+GOOD = 'model = "net.onnx"\nheight = 96\nwidth = 192\n'
+
+
+def declared(folder: Path, text: str = GOOD) -> Path:
+    """A model that answers three tenths of a unit everywhere, and its declaration."""
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    from recon.backends.onnx_graph import Graph
+
+    graph = Graph()
+    left = graph.input("left", onnx.TensorProto.FLOAT, (1, 3, 96, 192))
+    right = graph.input("right", onnx.TensorProto.FLOAT, (1, 3, 96, 192))
+    graph.output((left * 0.0 + right * 0.0 + 0.3).part(1, 0, 1), "disparity", (1, 1, 96, 192))
+    (folder / "net.onnx").write_bytes(graph.model("test"))
+    declaration = folder / "net.toml"
+    declaration.write_text(text)
+    return declaration
+
+
+def test_auto_never_takes_torch_on_the_processor(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Not even where a driver is found, torch found no device and would win the trial."""
+    pytest.importorskip("torch")
+    asked: list[str] = []
+
+    def trial(backend: Backend) -> float:
+        asked.append(backend.name)
+        return {"cpu": 1.0}.get(backend.name, 0.1)
+
+    monkeypatch.setattr(backend_choice, "pointless", lambda name: None)
+    monkeypatch.setattr(backend_choice, "trial", trial)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    caplog.set_level(logging.INFO)
+    chosen = choose_backend("auto")
+    assert "torch" not in asked
+    assert chosen.name != "torch"
+    assert "backend torch: not tried, it found no device but the CPU" in caplog.text
+
+
+def test_auto_says_what_it_took_and_why(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One line for each that is left out, and the times of those that were tried."""
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(backend_choice, "find_spec", lambda name: None)
+    assert choose_backend("auto").name == "cpu"
+    assert "backend torch: not tried, torch is not installed" in caplog.text
+    assert "backend cpu on cpu, the only one" in caplog.text
+
+    class Full:
+        """A device whose memory is taken."""
+
+        name, device = "torch", "cuda"
+
+    def load(name: str, engines: Path) -> object:
+        if name == "torch":
+            return Full()
+        return type("Other", (), {"name": name, "device": "cpu" if name == "cpu" else "cuda"})()
+
+    def trial(backend: Backend) -> float:
+        if backend.name == "torch":
+            raise RuntimeError("CUDA out of memory")
+        return {"cpu": 0.02, "onnx": 0.004}[backend.name]
+
+    monkeypatch.setattr(backend_choice, "pointless", lambda name: None)
+    monkeypatch.setattr(backend_choice, "load_backend", load)
+    monkeypatch.setattr(backend_choice, "trial", trial)
+    monkeypatch.setattr(backend_choice, "try_kernels", lambda device: None)
+    assert backend_choice.fastest_backend().name == "onnx"
+    assert "backend torch: failed its trial, CUDA out of memory" in caplog.text
+    assert "onnx on cuda: 4.0 ms a trial, the fastest of cpu 20.0 ms, onnx 4.0 ms" in caplog.text
+
+
+def test_doctor_explains_a_named_backend_that_cannot_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same reason stops the start."""
+
+    def refuse(name: str, engines: Path) -> None:
+        raise RuntimeError("CUDA driver is older than this torch")
+
+    monkeypatch.setattr(backend_choice, "load_backend", refuse)
+    config = load_config(None, ["compute.backend=torch"])
+    said = {f.what: f for f in examine(config, 0.0)}["compute"]
+    assert said.verdict == "bad"
+    assert said.text == "backend torch cannot run here: CUDA driver is older than this torch"
+    with pytest.raises(OutsideError, match="older than this torch"):
+        open_backend(config.compute)
+
+
+def test_tensorrt_keeps_its_engines_and_no_other_provider_is_reported(tmp_path: Path) -> None:
+    """Each model has its own folder: TensorRT tells models apart by names, which ours share."""
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnx")
+    from recon.backends.onnx_backend import provider_options
+
+    both = ["TensorrtExecutionProvider", "CPUExecutionProvider"]
+    (first, kept), (second, none) = provider_options(both, b"one", str(tmp_path))
+    assert (first, second) == tuple(both)
+    assert kept["trt_engine_cache_enable"] is True
+    assert Path(kept["trt_engine_cache_path"]).parent == tmp_path
+    assert none == {}
+    again, other = (provider_options(both, m, str(tmp_path))[0][1] for m in (b"one", b"two"))
+    assert again == kept
+    assert other["trt_engine_cache_path"] != kept["trt_engine_cache_path"]
+    assert provider_options(both, b"one", None)[0][1] == {}
+    cpu = ["CPUExecutionProvider"]
+    assert provider_options(cpu, b"one", str(tmp_path)) == [("CPUExecutionProvider", {})]
+
+
+@pytest.mark.parametrize("name", ["torch", "onnx"])
+def test_no_runtime_is_loaded_without_a_driver(name: str) -> None:
+    """Each takes tens of MiB for as long as the process lives."""
+    script = (
+        "import sys, importlib.util\n"
+        "from service.compute import backend_choice\n"
+        "backend_choice.find_spec = lambda name: 'found'\n"
+        "backend_choice.loads = lambda library: False\n"
+        f"assert 'no CUDA driver' in backend_choice.pointless('{name}')\n"
+        "assert not {'torch', 'onnx', 'onnxruntime'} & set(sys.modules)\n"
+    )
+    root = str(ROOT)
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=root)
+
+
+def test_engines_are_kept_where_the_service_may_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """systemd's cache folder when it gives one, else the user's."""
+    monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
+    monkeypatch.setenv("TRITON_CACHE_DIR", "")
+    monkeypatch.delenv("TRITON_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert engine_folder() == str(tmp_path / "skyrelief" / "engines")
+    assert os.environ["TRITON_CACHE_DIR"] == str(tmp_path / "skyrelief" / "engines" / "triton")
+    monkeypatch.setenv("CACHE_DIRECTORY", f"{tmp_path}/cache:/elsewhere")
+    assert engine_folder() == str(tmp_path / "cache" / "engines")
+
+
+def test_a_learned_model_serves_the_whole_path(tmp_path: Path) -> None:
+    """``compute.model`` gives a backend whose labels are the model's."""
+    text = GOOD + "disparity_scale = 10.0\n"
+    config = ComputeConfig(backend="onnx", model=str(declared(tmp_path, text)), stereo_width=160)
+    backend = open_backend(config, (640, 360))
+    assert backend.name == "learned"
+    image = np.random.default_rng(0).integers(0, 256, (90, 160), np.uint8)
+    found = backend.belief_propagation(image, image, 16, BeliefPropagationConfig())
+    assert np.nanmedian(found.px) == pytest.approx(3.0)
+    assert np.isfinite(found.px[:, 8:]).all()
+    large = np.random.default_rng(0).integers(0, 256, (180, 288), np.uint8)
+    found = backend.belief_propagation(large, large, 16, BeliefPropagationConfig())
+    shrunk = 288 / int(288 * 96 / 180)  # averaged down to fit; disparities grow back
+    assert found.px.shape == (180, 288)
+    assert np.nanmedian(found.px) == pytest.approx(3.0 * shrunk)
+
+
+@pytest.mark.parametrize(
+    ("text", "backend", "width", "image", "said"),
+    [
+        (GOOD, "torch", 160, None, "must be onnx or auto, not torch"),
+        (GOOD, "onnx", 320, None, "takes pairs up to 192x96, but they would be 320 wide"),
+        (GOOD, "auto", 160, (640, 480), "up to 192x96, but they would be 160x120"),
+        (GOOD.replace("192", "200"), "onnx", 160, None, r"\[1, 3, 96, 200\] was expected"),
+    ],
+)
+def test_a_learned_model_that_does_not_fit_is_refused(
+    tmp_path: Path, text: str, backend: str, width: int,
+    image: tuple[int, int] | None, said: str,
+) -> None:  # fmt: skip
+    """Before anything flies, with what was expected and what was found."""
+    model = str(declared(tmp_path, text))
+    with pytest.raises(InputError, match=said):
+        open_backend(ComputeConfig(backend=backend, model=model, stereo_width=width), image)
+
+
+@pytest.mark.parametrize(
+    ("failure", "said"),
+    [
+        (RuntimeError("Failed to find C compiler"), "Failed to find C compiler"),
+        (AttributeError("at 3:1:\n    area\n'int' object has no attribute 'to'"), "no attribute"),
+    ],
+)
+def test_plain_torch_computes_where_triton_compiles_nothing(
+    failure: Exception, said: str, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    """No C compiler, or a kernel that this Triton refuses: said once, and nothing fails."""
+    pytest.importorskip("torch")
+    from recon.backends import torch_plan
+
+    class Kernels:
+        """A module whose kernels do not compile."""
+
+        @staticmethod
+        def contrast(*given: object) -> None:
+            raise failure
+
+    monkeypatch.setattr(torch_plan, "HAS_TRITON", True)
+    monkeypatch.setitem(sys.modules, "recon.backends.triton_dense", Kernels)
+    monkeypatch.setattr(recon.backends, "triton_dense", Kernels, raising=False)
+    backend_choice.try_kernels("cpu")
+    assert not torch_plan.HAS_TRITON
+    assert said in caplog.text

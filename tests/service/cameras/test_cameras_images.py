@@ -1,0 +1,421 @@
+"""Folders of stills: times and places from EXIF, XMP and file names."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
+
+import cv2
+import numpy as np
+import pytest
+from paths import DEMO, SHARED
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from recon.frames import rotation_from_rpy
+from service.cameras import open_camera
+from service.cameras.exif import name_unix_ns, read_tags
+from service.cameras.images import natural_key
+from service.cameras.rig import Rig
+from service.config import CameraConfig, FusionConfig, ScanConfig
+from service.errors import InputError
+
+FRAMES = DEMO / "frames"
+
+NOON_UTC_NS = 1_717_243_200_000_000_000  # 2024-06-01T12:00:00Z
+
+
+def write_still(
+    path: Path,
+    local: str | None = None,
+    sub: str | None = None,
+    offset: str | None = None,
+    gps: dict[int, Any] | None = None,
+    size_px: tuple[int, int] = (64, 48),
+    xmp: str = "",
+    orientation: int | None = None,
+) -> None:
+    """A gray JPEG with the given tags."""
+    image = Image.fromarray(np.full((size_px[1], size_px[0], 3), 90, np.uint8))
+    exif = Image.Exif()
+    photo = exif.get_ifd(0x8769)
+    if local:
+        photo[36867] = local
+    if sub:
+        photo[37521] = sub
+    if offset:
+        photo[36881] = offset
+    if gps:
+        exif.get_ifd(0x8825).update(gps)
+    if orientation:
+        exif[274] = orientation
+    image.save(path, exif=exif, xmp=xmp.encode() if xmp else b"")
+
+
+def gps_tags(
+    lat: float, lon: float, alt: float, clock: tuple[int, int, int], day: str = "2024:06:01"
+) -> dict[int, Any]:
+    """A GPS block as cameras write it: unsigned degrees, minutes, seconds and letters."""
+
+    def dms(degrees: float) -> tuple[IFDRational, ...]:
+        degrees = abs(degrees)
+        minutes = (degrees % 1) * 60
+        seconds = Fraction((minutes % 1) * 60).limit_denominator(100_000)
+        return (
+            IFDRational(int(degrees)),
+            IFDRational(int(minutes)),
+            IFDRational(seconds.numerator, seconds.denominator),
+        )
+
+    return {
+        1: "N" if lat >= 0 else "S",
+        2: dms(lat),
+        3: "E" if lon >= 0 else "W",
+        4: dms(lon),
+        5: b"\0" if alt >= 0 else b"\1",
+        6: IFDRational(round(abs(alt) * 10), 10),
+        7: tuple(IFDRational(x) for x in clock),
+        29: day,
+    }
+
+
+def test_zone_comes_from_the_gps_time(tmp_path: Path) -> None:
+    for i in range(3):
+        gps = gps_tags(-33.5, 151.25, 42.5, (12, 0, 2 * i))
+        write_still(tmp_path / f"IMG_{i}.jpg", f"2024:06:01 22:00:0{2 * i + 1}", "25", gps=gps)
+    source = open_camera(str(tmp_path))
+    frames = list(source)
+    assert source.epoch_unix_ns == NOON_UTC_NS + 1_250_000_000
+    assert [f.time_ns for f in frames] == [0, 2_000_000_000, 4_000_000_000]
+    assert source.fps == pytest.approx(0.5)
+    tag = frames[0].geotag
+    assert tag is not None
+    assert (tag.lat_deg, tag.lon_deg) == pytest.approx((-33.5, 151.25), abs=1e-7)
+    assert tag.alt_amsl_m == pytest.approx(42.5)
+    assert tag.sigma_h_m == 5.0
+    assert tag.ypr_deg is None
+    assert source.warnings == []
+
+
+def test_written_zone_wins_and_a_wrong_clock_is_corrected(tmp_path: Path) -> None:
+    written = tmp_path / "written"
+    written.mkdir()
+    write_still(written / "a.jpg", "2024:06:01 14:00:00", offset="+02:00")
+    assert open_camera(str(written)).epoch_unix_ns == NOON_UTC_NS
+    wrong = tmp_path / "wrong"
+    wrong.mkdir()
+    for i in range(3):  # this camera's clock runs 5 minutes ahead of UTC
+        gps = gps_tags(10, 20, 30, (12, 0, i))
+        write_still(wrong / f"{i}.jpg", f"2024:06:01 12:05:0{i}", gps=gps)
+    assert open_camera(str(wrong)).epoch_unix_ns == NOON_UTC_NS
+
+
+def test_without_a_zone_local_time_counts_as_utc(tmp_path: Path) -> None:
+    for i in range(3):
+        write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i}")
+    source = open_camera(str(tmp_path))
+    assert source.epoch_unix_ns == NOON_UTC_NS
+    assert [f.time_ns for f in source] == [0, 10**9, 2 * 10**9]
+    assert any("time zone" in w for w in source.warnings)
+
+
+@pytest.mark.parametrize(
+    ("local", "gps"),
+    [
+        ("9000:01:01 12:00:01", None),
+        ("0001:01:01 12:00:01", None),
+        (None, {7: (1e18, 0.0, 0.0), 29: "2024:06:01"}),
+    ],
+)
+def test_a_time_that_no_clock_shows_is_none(
+    tmp_path: Path, local: str | None, gps: dict[int, Any] | None
+) -> None:
+    write_still(tmp_path / "0.jpg", "2024:06:01 12:00:00", offset="+00:00")
+    write_still(tmp_path / "1.jpg", local, offset="+00:00", gps=gps)
+    source = open_camera(str(tmp_path))
+    assert [f.time_ns for f in source] == [0, 10**9]
+    assert source.epoch_unix_ns == NOON_UTC_NS
+    assert any("1 of 2 images have no time" in w for w in source.warnings)
+
+
+@pytest.mark.parametrize("sub", [None, "00"])
+def test_stills_of_one_second_are_spread_over_it(tmp_path: Path, sub: str | None) -> None:
+    for i in range(4):
+        write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i // 2}", sub, offset="+00:00")
+    assert [f.time_ns for f in open_camera(str(tmp_path))] == [0, 5 * 10**8, 10**9, 15 * 10**8]
+
+
+def test_order_is_of_time_not_of_names(tmp_path: Path) -> None:
+    for i, name in enumerate(["IMG_9999.jpg", "IMG_0001.jpg", "IMG_0002.jpg"]):
+        write_still(tmp_path / name, f"2024:06:01 12:00:0{i}", offset="+00:00")
+    names = [f.name for f in open_camera(str(tmp_path))]
+    assert names == ["IMG_9999.jpg", "IMG_0001.jpg", "IMG_0002.jpg"]
+
+
+def test_names_order_and_space_stills_without_times(tmp_path: Path) -> None:
+    for i in (10, 9, 100):
+        write_still(tmp_path / f"f{i}.png")
+    source = open_camera(str(tmp_path))
+    assert [(f.name, f.time_ns) for f in source] == [
+        ("f9.png", 0),
+        ("f10.png", 10**9),
+        ("f100.png", 2 * 10**9),
+    ]
+    assert any("have no time" in w for w in source.warnings)
+    spaced = open_camera(f"images:{tmp_path}?interval_s=2.5")
+    assert [f.time_ns for f in spaced] == [0, 2_500_000_000, 5_000_000_000]
+    assert spaced.warnings == []
+    with pytest.raises(InputError, match="interval_s"):
+        open_camera(f"images:{tmp_path}?interval_s=soon")
+
+
+@pytest.mark.parametrize(
+    ("name", "unix_ns"),
+    [
+        ("2018080501004480Z.jpg", 1_533_430_844_800_000_000),
+        ("20180805T010044Z.jpg", 1_533_430_844_000_000_000),
+        ("cam1_20180805_010044.123Z.jpg", 1_533_430_844_123_000_000),
+        ("2018080501004480.jpg", None),  # no Z: not known to be UTC
+        ("2018139901004480Z.jpg", None),
+        ("IMG_9375.jpg", None),
+    ],
+)
+def test_times_in_names(name: str, unix_ns: int | None) -> None:
+    assert name_unix_ns(name) == unix_ns
+
+
+def test_dji_xmp_gives_attitude_height_and_accuracy(tmp_path: Path) -> None:
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description '
+        'drone-dji:AbsoluteAltitude="+129.56" drone-dji:RelativeAltitude="+60.02" '
+        'drone-dji:GimbalRollDegree="+0.00" drone-dji:GimbalYawDegree="-91.30" '
+        'drone-dji:RtkStdLon="0.012" drone-dji:RtkStdLat="0.015">'
+        "<drone-dji:GimbalPitchDegree>-89.90</drone-dji:GimbalPitchDegree>"
+        "</rdf:Description></x:xmpmeta>"
+    )
+    path = tmp_path / "DJI_0001.jpg"
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
+    tag = read_tags(path).geotag
+    assert tag is not None
+    assert tag.ypr_deg == (-91.3, -89.9, 0.0)
+    assert tag.relative_alt_m == 60.02
+    assert tag.sigma_h_m == 0.015
+
+
+@pytest.mark.parametrize(
+    "block",
+    [
+        # Autel: DJI's names
+        '<rdf:Description drone:GimbalYawDegree="146.5" drone:GimbalPitchDegree="-78.4" '
+        'drone:GimbalRollDegree="-0.3"/>',
+        # Parrot Anafi, which also counts from straight down
+        '<rdf:Description Camera:Yaw="140" Camera:Pitch="11" Camera:Roll="1">'
+        "<drone-parrot:CameraRollDegree>-0.3</drone-parrot:CameraRollDegree>"
+        "<drone-parrot:CameraPitchDegree>-78.4</drone-parrot:CameraPitchDegree>"
+        "<drone-parrot:CameraYawDegree>146.5</drone-parrot:CameraYawDegree></rdf:Description>",
+        # Skydio, older and newer, with angles in other frames of reference
+        '<drone-skydio:CameraOrientationFLU drone-skydio:Roll="9" drone-skydio:Pitch="9" '
+        'drone-skydio:Yaw="9"/><drone-skydio:CameraOrientationNED drone-skydio:Roll="-0.3" '
+        'drone-skydio:Pitch="-78.4" drone-skydio:Yaw="146.5"/>',
+        '<drone-skydio:CameraOrientationNED rdf:parseType="Resource">'
+        "<drone-skydio:Roll>-0.3</drone-skydio:Roll><drone-skydio:Pitch>-78.4</drone-skydio:Pitch>"
+        "<drone-skydio:Yaw>146.5</drone-skydio:Yaw></drone-skydio:CameraOrientationNED>"
+        '<drone-skydio:CameraOrientationFLU rdf:parseType="Resource">'
+        "<drone-skydio:Yaw>9</drone-skydio:Yaw></drone-skydio:CameraOrientationFLU>",
+    ],
+)
+def test_other_makers_state_the_attitude_too(tmp_path: Path, block: str) -> None:
+    path = tmp_path / "0001.jpg"
+    xmp = f'<x:xmpmeta xmlns:x="adobe:ns:meta/">{block}</x:xmpmeta>'
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
+    tag = read_tags(path).geotag
+    assert tag is not None and tag.ypr_deg == (146.5, -78.4, -0.3)
+
+
+def test_gimbal_angles_that_are_all_zero_are_unknown(tmp_path: Path) -> None:
+    """A DJI Mini 2 that another program flew: the image looks down, the nose to the south."""
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:RelativeAltitude="+110.80" '
+        'drone-dji:GimbalRollDegree="+0.00" drone-dji:GimbalYawDegree="+0.00" '
+        'drone-dji:GimbalPitchDegree="+0.00" drone-dji:FlightYawDegree="+176.50"/></x:xmpmeta>'
+    )
+    path = tmp_path / "DJI_0001.jpg"
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
+    tag = read_tags(path).geotag
+    assert tag is not None and tag.relative_alt_m == 110.8
+    assert tag.ypr_deg is None
+
+
+@pytest.mark.parametrize(
+    ("ypr_deg", "nose_deg", "is_known"),
+    [
+        ((34.2, -90, 0), 90.1, False),  # a Mavic 2's thermal camera; the track agrees with the nose
+        ((-171, -90, 0), 176.5, True),
+        ((-90, -90, 180), 90.1, True),  # the same direction by other angles
+        ((88, -20, 0), 90.1, True),
+        ((88, 20, 0), 90.1, True),
+        ((0, -45, 0), 90.1, False),
+    ],
+)
+def test_headings_that_the_aircraft_contradicts_are_unknown(
+    tmp_path: Path, ypr_deg: tuple[float, float, float], nose_deg: float, is_known: bool
+) -> None:
+    """But for one image out of three, taken in a turn."""
+    for i in range(3):
+        angles = dict(zip(("GimbalYaw", "GimbalPitch", "GimbalRoll"), ypr_deg, strict=True))
+        named = {**angles, "FlightYaw": (nose_deg + 60.0 * (i == 1) + 180.0) % 360.0 - 180.0}
+        values = " ".join(f'drone-dji:{name}Degree="{deg:+.2f}"' for name, deg in named.items())
+        xmp = f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description {values}/></x:xmpmeta>'
+        gps = gps_tags(23, 113, 133, (12, 0, i))
+        write_still(tmp_path / f"{i}.jpg", f"2024:06:01 14:00:0{i}", "25", gps=gps, xmp=xmp)
+    source = open_camera(str(tmp_path))
+    tags = [frame.geotag for frame in source]
+    assert [tag and tag.ypr_deg for tag in tags] == [ypr_deg] * 3
+    assert [tag and tag.is_yaw_known for tag in tags] == [is_known] * 3
+    assert any("off the aircraft's nose" in warning for warning in source.warnings) != is_known
+
+
+@pytest.mark.parametrize(
+    ("pitch_roll_deg", "looks_at_ned"),
+    [((0, 0), (0, 0, 1)), ((10, 0), (0, 0.1736, 0.9848)), ((0, 10), (0.1736, 0, 0.9848))],
+)
+def test_pix4d_xmp_counts_angles_from_straight_down(
+    tmp_path: Path, pitch_roll_deg: tuple[int, int], looks_at_ned: tuple[float, ...]
+) -> None:
+    """Of a vehicle that heads east: nose up, it looks ahead; right wing down, to its left."""
+    pitch, roll = pitch_roll_deg
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description '
+        f'Camera:Yaw="90" Camera:Pitch="{pitch}" Camera:Roll="{roll}" '
+        'Camera:GPSXYAccuracy="2.138" Camera:GPSZAccuracy="3.362"/></x:xmpmeta>'
+    )
+    path = tmp_path / "IMG_0001.jpg"
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
+    tag = read_tags(path).geotag
+    assert tag is not None and tag.ypr_deg is not None
+    assert (tag.sigma_h_m, tag.sigma_v_m) == (2.138, 3.362)
+    yaw, pitch, roll = np.radians(tag.ypr_deg)
+    head = rotation_from_rpy(roll, pitch, yaw)
+    np.testing.assert_allclose(head[:, 0], looks_at_ned, atol=1e-4)
+    if pitch_roll_deg == (0, 0):
+        np.testing.assert_allclose(-head[:, 2], [0, 1, 0], atol=1e-9)  # its upper side
+
+
+def test_useless_gps_is_no_position(tmp_path: Path) -> None:
+    broken = gps_tags(10, 20, 30, (1, 2, 3))
+    broken[2] = (IFDRational(10), IFDRational(0, 0), IFDRational(0))
+    cases = {"zero": gps_tags(0, 0, 0, (0, 0, 0)), "broken": broken, "none": {}}
+    for name, gps in cases.items():
+        path = tmp_path / f"{name}.jpg"
+        write_still(path, gps=gps)
+        assert read_tags(path).geotag is None, name
+
+
+def test_a_camera_without_a_fix_still_knows_its_attitude_and_height(tmp_path: Path) -> None:
+    """Under a bridge, or before the receiver has found its satellites."""
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:RelativeAltitude="+12.50" '
+        'drone-dji:GimbalRollDegree="+0.00" drone-dji:GimbalYawDegree="+90.00" '
+        'drone-dji:GimbalPitchDegree="-45.00"/></x:xmpmeta>'
+    )
+    path = tmp_path / "DJI_0001.jpg"
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(0, 0, 0, (12, 0, 0)), xmp=xmp)
+    tag = read_tags(path).geotag
+    assert tag is not None and (tag.lat_deg, tag.lon_deg) == (None, None)
+    prior = Rig(CameraConfig(), ScanConfig(), FusionConfig()).prior(None, tag)
+    assert prior.R_world_camera is not None and not prior.is_view_assumed
+    np.testing.assert_allclose(prior.R_world_camera[:, 2], [0.5**0.5, 0, -(0.5**0.5)], atol=1e-9)
+    assert prior.position_m is None and prior.agl_m == 12.5
+
+
+def test_a_position_of_another_day_is_not_used(tmp_path: Path) -> None:
+    """The receiver's last place, 20 km off, in the first two; a second site half an hour later."""
+    lats = [45.18, 45.18, *(45.0 + 1e-4 * i for i in range(4)), 45.4, 45.4]
+    for i, lat in enumerate(lats):
+        local = f"2024:06:01 12:{30 * (i > 5):02d}:{2 * i:02d}"
+        write_still(
+            tmp_path / f"{i}.jpg", local, offset="+00:00", gps=gps_tags(lat, 8, 90, (12, 0, i))
+        )
+    source = open_camera(str(tmp_path))
+    tags = [frame.geotag for frame in source]
+    assert [tag is not None and tag.lat_deg is not None for tag in tags] == [False] * 2 + [True] * 6
+    assert source.warnings == ["2 positions are far off all others: not used"]
+
+
+def test_odd_ones_are_left_out_and_reported(tmp_path: Path) -> None:
+    for i in range(3):
+        write_still(tmp_path / f"{i}.jpg", f"2024:06:01 12:00:0{i}", offset="+00:00")
+    write_still(tmp_path / "wide.jpg", "2024:06:01 12:00:09", size_px=(96, 48))
+    (tmp_path / "bad.jpg").write_bytes(b"no image")
+    (tmp_path / "empty.jpg").touch()
+    whole = (tmp_path / "1.jpg").read_bytes()
+    (tmp_path / "1.jpg").write_bytes(whole[: whole.index(b"\xff\xda")])  # tags, but no pixels
+    (tmp_path / "notes.txt").write_text("not looked at")
+    source = open_camera(str(tmp_path))
+    assert [(f.seq, f.name) for f in source] == [(0, "0.jpg"), (1, "2.jpg")]
+    reported = list(source.warnings)
+    for name in ("bad.jpg", "empty.jpg", "1.jpg", "not 64x48"):
+        assert name in "\n".join(reported)
+    assert len(list(source)) == 2 and source.warnings == reported  # once each
+
+
+def test_of_the_cameras_of_one_drone_that_in_colour_counts(tmp_path: Path) -> None:
+    """Beside each image a thermal one, or two of a spectral camera; and what a Mac adds."""
+    for i in range(3):
+        at = f"2024:06:01 12:00:0{i}"
+        write_still(tmp_path / f"DJI_{i}_T.jpg", at, size_px=(64, 51))
+        write_still(tmp_path / f"DJI_{i}_MS_G.jpg", at, size_px=(60, 45))
+        write_still(tmp_path / f"DJI_{i}_MS_R.jpg", at, size_px=(60, 45))
+        write_still(tmp_path / f"DJI_{i}_V.jpg", at, size_px=(80, 60))
+        (tmp_path / f"._DJI_{i}_V.jpg").write_bytes(b"\0\5\x16\7")
+    write_still(tmp_path / "panorama.jpg", "2024:06:01 12:00:09", size_px=(192, 96))
+    source = open_camera(str(tmp_path))
+    assert [f.name for f in source] == [f"DJI_{i}_V.jpg" for i in range(3)]
+    assert source.warnings[0] == "10 images are not 80x60 like the others; skipped"
+    assert not any("readable" in warning for warning in source.warnings)
+
+
+def test_a_still_is_not_skipped_for_want_of_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_still(tmp_path / "a.jpg")
+    source = open_camera(str(tmp_path))
+    short = cv2.error("Failed to allocate 5760000 bytes")
+    short.code = cv2.Error.StsNoMem
+    monkeypatch.setattr(cv2, "imdecode", Mock(side_effect=short))
+    with pytest.raises(MemoryError, match=r"a\.jpg"):
+        list(source)
+
+
+def test_folders_without_images_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no images"):
+        open_camera(str(tmp_path))
+    with pytest.raises(InputError, match="no such folder"):
+        open_camera(f"images:{tmp_path / 'none'}")
+
+
+def test_natural_order() -> None:
+    names = ["b2.jpg", "b10.jpg", "a.jpg", "b1.jpg", "10.jpg", "9.jpg"]
+    ordered = sorted((Path(n) for n in names), key=natural_key)
+    assert [p.name for p in ordered] == ["9.jpg", "10.jpg", "a.jpg", "b1.jpg", "b2.jpg", "b10.jpg"]
+
+
+def test_demo_flight_is_tagged() -> None:
+    source = open_camera(str(FRAMES))
+    frames = list(source)
+    assert len(frames) == 16
+    assert source.size_px == (1600, 1200)
+    assert source.epoch_unix_ns == 1_413_742_872_000_000_000  # 13:21:12 local, UTC-5
+    assert all(f.geotag is not None for f in frames)
+    assert source.warnings == []
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/data")
+def test_named_stills_get_utc() -> None:
+    source = open_camera(str(SHARED / "cuav_cmac_20180805" / "frames"))
+    times = [f.time_ns for f in source]
+    assert source.epoch_unix_ns == 1_533_430_844_800_000_000
+    assert len(times) == 18
+    assert times[-1] == 14_780_000_000

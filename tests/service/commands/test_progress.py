@@ -1,0 +1,203 @@
+"""The progress of long work: shares, time left, cancelling, and what a terminal shows of it."""
+
+from __future__ import annotations
+
+import io
+import os
+import pty
+import select
+import subprocess
+import sys
+import time
+from pathlib import Path
+from threading import Thread
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.commands import replay, showing
+from service.offline.exports.view import ExportOptions, ScanView, export
+from service.progress import CancelledError, Progress
+
+if TYPE_CHECKING:
+    from house_flight import HouseFlight
+
+
+@given(st.recursive(st.integers(0, 5), lambda inner: st.lists(inner, max_size=4), max_leaves=12))
+def test_shares_grow_up_to_one_however_parts_are_nested(work: object) -> None:
+    seen: list[float] = []
+    progress = Progress(lambda now: seen.append(now.share))
+
+    def do(one: object) -> None:
+        if isinstance(one, int):
+            assert len(list(progress.over(range(one), one))) == one
+        elif isinstance(one, list):
+            for number, inner in enumerate(one):
+                with progress.part("inner", 1.0 / (len(one) - number)):
+                    do(inner)
+
+    with progress.part("all"):
+        do(work)
+    assert progress.share == pytest.approx(1.0)
+    assert seen == sorted(seen) and min(seen) >= 0.0 and max(seen) <= 1.0 + 1e-9
+
+
+def test_branches_share_the_work_of_several_threads() -> None:
+    seen: list[float] = []
+    progress = Progress(lambda now: seen.append(now.share))
+
+    def do(branch: Progress) -> None:
+        for _ in branch.over(range(50), 50):
+            pass
+        branch.share = 1.0
+        branch("done")
+
+    with progress.part("first", 0.5):
+        pass
+    with progress.part("both at once"):
+        branches = progress.branches(2)
+        threads = [Thread(target=do, args=(branch,)) for branch in branches]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert progress.share == pytest.approx(1.0) and progress.text == "done"
+    assert seen == sorted(seen) and 0.5 < seen[60] < 1.0
+
+
+def test_a_cancelled_work_stops_in_every_branch() -> None:
+    progress = Progress()
+    for branch in progress.branches(2):
+        branch("goes on")
+    progress.cancel()
+    for branch in progress.branches(2):
+        with pytest.raises(CancelledError):
+            branch("ends")
+
+
+def test_branches_say_what_is_new_once() -> None:
+    said: list[str] = []
+    progress = Progress(lambda now: said.append(now.text))
+    one, other = progress.branches(2)
+    for branch in (one, other, one, other):
+        branch("left" if branch is one else "right")
+    assert said == ["left", "right", "right", "right"]
+
+
+def test_equal_parts_take_equal_shares() -> None:
+    progress, ends = Progress(), []
+    for left in (4, 3, 2, 1):
+        with progress.part("a quarter", 1.0 / left):
+            pass
+        ends.append(progress.share)
+    assert ends == pytest.approx([0.25, 0.5, 0.75, 1.0])
+
+
+def test_the_rest_takes_as_long_as_the_pace_so_far_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    progress = Progress()
+    now[0] = 500.0  # it waited in a queue
+    progress.begin()
+    for _ in progress.over(range(4), 4):
+        now[0] += 10.0
+    assert progress.share == pytest.approx(0.75)
+    assert progress.left_s == pytest.approx(40.0 * 0.25 / 0.75)
+    assert Progress().left_s is None
+
+
+def test_cancelled_work_stops_at_its_next_report_unless_it_is_committed() -> None:
+    progress = Progress()
+    done = []
+    with pytest.raises(CancelledError):
+        for n in progress.over(range(9), 9):
+            done.append(n)
+            if n == 2:
+                progress.cancel()
+    assert done == [0, 1, 2]
+    late = Progress()
+    late.commit("writing")
+    late.cancel()
+    late("still writing")
+
+
+@pytest.mark.parametrize("after", [1, 4, 12])
+def test_a_cancelled_export_leaves_nothing_behind(
+    tmp_path: Path, house: HouseFlight, after: int
+) -> None:
+    house.flown(tmp_path).close()
+    before = sorted(p.name for p in tmp_path.iterdir())
+    reports = [0]
+
+    def show(now: Progress) -> None:
+        reports[0] += 1
+        if reports[0] == after:
+            now.cancel()
+
+    with (
+        pytest.raises(CancelledError),
+        ScanView(tmp_path, progress=Progress(show)) as scan,
+    ):
+        export(scan, "dsm", None, ExportOptions())
+    assert sorted(p.name for p in tmp_path.iterdir() if "scan.db" not in p.name) == [
+        name for name in before if "scan.db" not in name
+    ]
+
+
+def test_without_a_terminal_each_step_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", text)
+    with showing("mesh") as progress:
+        progress("fusing")
+        for _ in progress.over(range(3), 3):
+            pass
+        progress("texture")
+    assert text.getvalue() == "mesh: fusing\nmesh: texture\n"
+
+
+SCRIPT = """
+import time
+from service.commands import replay, showing
+with showing("export") as progress, progress.part("fusing"):
+    for _ in progress.over(range(4), 4):
+        time.sleep(0.3)
+print("done")
+"""
+
+
+def test_in_a_terminal_there_is_one_bar_with_percent_and_time_left() -> None:
+    ours, theirs = pty.openpty()
+    env = os.environ | {"TERM": "xterm", "COLUMNS": "100", "PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen(
+        [sys.executable, "-c", SCRIPT], stderr=theirs, stdout=subprocess.PIPE, env=env
+    ) as process:
+        os.close(theirs)
+        shown = b""
+        while select.select([ours], [], [], 30.0)[0]:
+            try:
+                shown += os.read(ours, 65536)
+            except OSError:  # the other end is closed
+                break
+        assert process.stdout is not None and process.stdout.read() == b"done\n"
+    os.close(ours)
+    text = shown.decode()
+    assert "export: fusing" in text and "75%" in text and "0:00:0" in text
+
+
+def test_a_replay_shows_its_share_and_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[str, float]] = []
+    progress = Progress(lambda now: seen.append((now.text, round(now.share, 3))))
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    recorder = SimpleNamespace(frames=2, distance_m=31.4, keyframes=1)
+    with progress.part("tracking", of_rest=0.9):
+        show = replay._flown(cast(Any, SimpleNamespace(images=4)), progress)
+        for _ in range(4):
+            show(cast(Any, SimpleNamespace(recorder=recorder)))
+    assert seen[-1] == ("2 images, 31 m flown, 1 keyframes", 0.675)
+    assert [share for _, share in seen] == [0.0, 0.0, 0.225, 0.45, 0.675]
+    seen.clear()
+    replay._flown(cast(Any, object()), progress)(cast(Any, SimpleNamespace(recorder=recorder)))
+    assert seen == [("2 images, 31 m flown, 1 keyframes", 0.9)]  # a pipe: no share

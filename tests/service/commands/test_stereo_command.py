@@ -1,0 +1,244 @@
+"""``skyrelief stereo`` and ``export-model``: files in and out, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from paths import SHARED
+
+from recon.backends.cpu import CpuBackend
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.types import U8, DisparityMap
+from service.bench.stereo import (
+    bad_share,
+    semi_global_disparity,
+    true_pairs,
+)
+from service.cli import main
+from service.compute import backend_choice
+from service.compute.backend_choice import FallbackBackend, choose_backend
+from service.compute.rectified_pair import matching_config
+from service.errors import InputError, OutsideError
+
+DATA = SHARED / "stereo_gt_middlebury"
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    """Exit code of the command line."""
+    monkeypatch.setattr(sys, "argv", ["skyrelief", *(str(w) for w in words)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    return int(stop.value.code or 0)
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> tuple[Path, Path]:
+    """Two images of a textured wall at a disparity of 9.5 px."""
+    canvas = np.random.default_rng(0).normal(128, 90, (80, 300)).astype(np.float32)
+    canvas = np.asarray(cv2.GaussianBlur(canvas, (0, 0), 1.3))
+    v, u = np.mgrid[0:80, 0:160].astype(np.float32)
+    left = cv2.remap(canvas, u + 60 - np.float32(9.5), v, cv2.INTER_CUBIC)
+    paths = tmp_path / "left.png", tmp_path / "right.png"
+    for path, image in zip(paths, (left, canvas[:, 60:220]), strict=True):
+        cv2.imwrite(str(path), np.clip(image, 0, 255).astype(np.uint8))
+    return paths
+
+
+@pytest.mark.parametrize(("first", "labels"), [(0, 16), (5, 10), (-3, 20)])
+def test_writes_disparity_in_pixels(
+    pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str], first: int, labels: int,
+) -> None:  # fmt: skip
+    out, image = tmp_path / "d.npy", tmp_path / "d.png"
+    code = run(
+        monkeypatch, "stereo", *pair, "--labels", labels, "--min-disparity", first,
+        "--out", out, "--image", image, "--backend", "cpu", "--json",
+    )  # fmt: skip
+    assert code == 0
+    report = json.loads(capsys.readouterr().out.splitlines()[-1])
+    px = np.load(out)
+    assert px.dtype == np.float32
+    assert px.shape == (80, 160)
+    assert report["known_share"] == pytest.approx(np.isfinite(px).mean())
+    assert abs(np.nanmedian(px[:, 20:]) - 9.5) < 0.1
+    assert np.isfinite(px[:, 24:]).mean() > 0.98
+    drawn = cv2.imread(str(image))
+    assert drawn is not None
+    assert drawn.shape == (80, 160, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"--labels": "1"}, "2 to 1024"), ({"--iterations": "0"}, "iterations"),
+        ({"--backend": "abacus"}, "available: auto, cpu"), ({"--out": "d.txt"}, ".npy"),
+        ({"--out": "nowhere/d.npy"}, "no folder"), ({"--model": "none.toml"}, "none.toml"),
+    ],
+)  # fmt: skip
+def test_bad_usage_is_one_line(
+    pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str], change: dict[str, str], words: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    options = {"--labels": "16", "--out": "d.npy"} | change
+    assert run(monkeypatch, "stereo", *pair, *(w for item in options.items() for w in item)) == 2
+    error = capsys.readouterr().err.strip()
+    assert words in error
+    assert len([line for line in error.splitlines() if line.startswith("skyrelief")]) == 1
+
+
+def test_bad_images_are_named(
+    pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    text, empty, small = tmp_path / "notes.png", tmp_path / "empty.png", tmp_path / "small.png"
+    text.write_text("not an image")
+    empty.touch()
+    cv2.imwrite(str(small), np.zeros((40, 60), np.uint8))
+    for bad, words in (
+        (text, "not an image"), (empty, "not an image"), (small, "one size"),
+        (tmp_path / "gone.png", "no such file"), (tmp_path, "no such file"),
+    ):  # fmt: skip
+        out = tmp_path / "d.npy"
+        assert run(monkeypatch, "stereo", pair[0], bad, "--labels", 16, "--out", out) == 2
+        assert words in capsys.readouterr().err
+        assert not out.exists()
+
+
+def test_blank_pair_gives_an_unknown_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "blank.png"
+    cv2.imwrite(str(path), np.full((60, 80, 3), 200, np.uint8))
+    out = tmp_path / "d.npy"
+    assert run(monkeypatch, "stereo", path, path, "--labels", 16, "--out", out) == 0
+    assert np.isnan(np.load(out)).all()
+
+
+class Broken(CpuBackend):
+    """A backend whose device is lost."""
+
+    name, device = "torch", "cuda"
+
+    def belief_propagation(
+        self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
+    ) -> DisparityMap:
+        """Fails as torch does."""
+        raise RuntimeError("CUDA out of memory\nmore lines")
+
+    def upsample(self, *given: object) -> DisparityMap:
+        """Fails too."""
+        raise RuntimeError("CUDA out of memory")
+
+
+def test_a_lost_device_falls_back_to_the_cpu(caplog: pytest.LogCaptureFixture) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
+    backend = FallbackBackend(Broken())
+    found = backend.belief_propagation(image, image, 4, BeliefPropagationConfig())
+    assert np.nanmedian(found.px) == pytest.approx(0, abs=0.1)
+    assert backend.name == backend.device == "cpu"
+    assert backend.failure == "CUDA out of memory"
+    assert "the CPU takes over" in caplog.text
+
+
+def test_auto_takes_the_fastest_that_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert choose_backend("auto").name == "cpu"  # no GPU is tried where there is no driver
+    monkeypatch.setattr(backend_choice, "pointless", lambda name: None)
+    slow = {"cpu": 0.5, "torch": 0.1, "onnx": 0.3}
+    monkeypatch.setattr(backend_choice, "trial", lambda backend: slow[backend.name])
+
+    class Named(Broken):
+        """A backend of any name."""
+
+        def __init__(self, name: str, engines: Path) -> None:
+            self.name = name
+
+    monkeypatch.setattr(backend_choice, "load_backend", Named)
+    monkeypatch.setattr(backend_choice, "try_kernels", lambda device: None)  # there is no GPU
+    assert choose_backend("auto").name == "torch"
+    slow["torch"] = 0.9
+    assert choose_backend("auto").name == "onnx"
+
+
+def test_named_backend_that_cannot_run_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(name: str, engines: Path) -> None:
+        raise ImportError("No module named 'torch'")
+
+    monkeypatch.setattr(backend_choice, "load_backend", refuse)
+    with pytest.raises(OutsideError, match="torch cannot run here: No module named"):
+        choose_backend("torch")
+    with pytest.raises(InputError, match="available: auto"):
+        choose_backend("vulkan")
+
+
+def test_exported_model_gives_the_same_labels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: tuple[Path, Path]
+) -> None:
+    runtime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnx")
+    out = tmp_path / "stereo.onnx"
+    assert run(monkeypatch, "export-model", "--size", "160x80", "--out", out) == 0
+    left, right = (cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in pair)
+    session = runtime.InferenceSession(str(out), providers=["CPUExecutionProvider"])
+    px, confidence = session.run(None, {"left": left, "right": right})
+    accepted = confidence > 0
+    assert accepted[:, 24:].mean() > 0.95
+    assert abs(np.median(px[accepted]) - 9.5) < 0.1
+    assert run(monkeypatch, "export-model", "--size", "160", "--out", out) == 2
+    assert run(monkeypatch, "export-model", "--out", tmp_path / "stereo.bin") == 2
+
+
+def test_learned_model_is_checked_and_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: tuple[Path, Path],
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """A model that says 9.5 px wherever the left image is not black, declared rightly or not."""
+    pytest.importorskip("onnxruntime")
+    onnx = pytest.importorskip("onnx")
+    from recon.backends.onnx_graph import Graph
+
+    graph = Graph()
+    left = graph.input("image_l", onnx.TensorProto.FLOAT, (1, 3, 96, 192))
+    right = graph.input("image_r", onnx.TensorProto.FLOAT, (1, 3, 96, 192))
+    lit = left.above(0.01).where(0.95, 0.0) + right * 0.0
+    graph.output(lit.part(1, 0, 1), "disp", (1, 1, 96, 192))
+    (tmp_path / "net.onnx").write_bytes(graph.model("test"))
+    declaration = tmp_path / "net.toml"
+    good = 'model = "net.onnx"\nheight = 96\nwidth = 192\nleft = "image_l"\nright = "image_r"\n'
+    good += 'disparity = "disp"\ndisparity_scale = 10.0\n'
+    declaration.write_text(good)
+    out = tmp_path / "d.npy"
+    words = ("stereo", *pair, "--labels", 16, "--out", out, "--model", declaration)
+    assert run(monkeypatch, *words) == 0
+    px = np.load(out)
+    assert np.nanmedian(px) == pytest.approx(9.5)
+    assert np.isnan(px[:, :8]).all()  # their partners lie outside the right image
+    for wrong, said in (
+        (good.replace("192", "200"), "[1, 3, 96, 200] was expected"),
+        (good.replace("image_r", "image_x"), "'image_x' was expected"),
+        (good.replace('"disp"', '"depth"'), "'depth' was expected"),
+        (good + 'layout = "nhwc"\n', "was expected, found"),
+        (good + "colour = 3\n", "unknown colour"),
+        (good.replace("net.onnx", "other.onnx"), "not a file"),
+        (good.replace("height = 96\n", ""), "height must be given"),
+    ):
+        declaration.write_text(wrong)
+        assert run(monkeypatch, *words) == 2
+        assert said in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the Middlebury pairs are not here")
+def test_better_than_semi_global_matching_on_truth() -> None:
+    """Cones within 3.3 % bad pixels, and every pair better than OpenCV's matcher at its best."""
+    from recon.stereo.belief_propagation import belief_propagation
+
+    for pair in true_pairs(DATA):
+        config = matching_config(5, 0, checked=False)
+        px = belief_propagation(pair.left, pair.right, pair.labels, config).px
+        theirs = min(bad_share(semi_global_disparity(pair, mode), pair, 1.0) for mode in (0, 2))
+        ours = bad_share(px, pair, 1.0)
+        assert ours < 0.8 * theirs, pair.name
+        assert pair.name != "cones" or ours <= 0.033

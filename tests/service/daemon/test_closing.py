@@ -1,0 +1,203 @@
+"""Closing a scan: progress is seen, a hang is found out, the scan is kept."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from loopback import until
+from paths import ROOT
+
+from mavlink.component.control import Phase
+from service.config import load_config
+from service.daemon import runtime
+from service.daemon.runtime import Daemon
+from service.daemon.scan_run import ScanRun
+from service.daemon.scanning import Scanning
+from service.daemon.writing import ClosingWatch, sizes
+from service.memory import give_back, one_pool
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+
+
+def test_only_what_changes_is_progress() -> None:
+    now_s = 100.0
+    watch = ClosingWatch(lambda: now_s)
+    assert watch.look(None) == 0.0
+    assert watch.look((1, "a")) == 0.0
+    now_s = 130.0
+    assert watch.look((1, "a")) == 30.0
+    assert watch.look((2, "a")) == 0.0  # it got on
+    now_s = 135.0
+    assert watch.look((2, "a")) == 5.0
+    assert watch.look(None) == 0.0  # closed
+    now_s = 150.0
+    assert watch.look((2, "a")) == 0.0  # another scan is closed
+
+
+def test_files_grow_but_not_by_the_work_of_others(tmp_path: Path) -> None:
+    assert sizes(tmp_path / "none") == ()
+    (tmp_path / ".cloud.laz.part").write_bytes(b"12")
+    before = sizes(tmp_path)
+    for name in ("scan.db-wal", "scan.db", "link.tlog"):
+        (tmp_path / name).write_bytes(b"acknowledged by the ground meanwhile")
+    assert sizes(tmp_path) == before
+    (tmp_path / ".cloud.laz.part").write_bytes(b"123")
+    assert sizes(tmp_path) != before
+
+
+class Hung:
+    """A scan whose closing waits at a gate, then uses its store, then waits for good."""
+
+    def __init__(self, scanning: Scanning, folder: Path) -> None:
+        header = ScanHeader("s", "d", 1, camera={}, configuration={}, software="test")
+        self.store = ScanStore.create(folder / "s" / "scan.db", header)
+        self.scanning, self.step, self.end = scanning, threading.Event(), threading.Event()
+
+    def carry_out(self, given: ScanRun) -> None:
+        run: Any = given
+        run._thread_id = threading.get_ident()
+        run.scan = SimpleNamespace(
+            source=SimpleNamespace(close=lambda: None),
+            inputs=SimpleNamespace(folder=self.store.path.parent, scan_id="s"),
+            recorder=SimpleNamespace(keyframes=3),
+        )
+        run._store = self.store
+        run.stop.wait(60.0)
+        run.is_closing = True
+        self.step.wait(60.0)
+        self.store.seqs()
+        self.end.wait(60.0)
+
+
+def test_a_closing_that_hangs_is_no_progress(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+    scanning, now_s = daemon.scanning, 0.0
+    monkeypatch.setattr(type(daemon.vehicle), "is_serving", True)
+    scanning._watch = ClosingWatch(lambda: now_s)
+    hung = Hung(scanning, tmp_path)
+    monkeypatch.setattr(ScanRun, "carry_out", lambda run: hung.carry_out(run))
+    limit_s = runtime.CLOSING_S + daemon.config.datalink.drain_s
+    scanning.start()
+    now_s = 10.0 * limit_s
+    assert daemon.is_progressing  # scanning, not closing
+    scanning.stop()
+    until(lambda: scanning._run is not None and scanning._run.is_closing)
+    assert daemon.is_progressing
+    now_s += 0.9 * limit_s
+    assert daemon.is_progressing
+    hung.store.set_held("ground", {})  # another thread's use of the store is no progress
+    now_s += 0.2 * limit_s
+    assert not daemon.is_progressing
+    hung.step.set()  # a step of the closing itself is
+    until(lambda: daemon.is_progressing)
+    now_s += 1.1 * limit_s
+    assert not daemon.is_progressing
+    hung.end.set()
+    until(lambda: not scanning.is_running)
+    assert daemon.is_progressing
+    hung.store.close()
+
+
+def test_systemd_is_asked_to_wait_only_while_closing_gets_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+    scanning, now_s, asked = daemon.scanning, 0.0, []
+    scanning._watch = ClosingWatch(lambda: now_s)
+    hung = Hung(scanning, tmp_path)
+    monkeypatch.setattr(ScanRun, "carry_out", lambda run: hung.carry_out(run))
+    scanning.start()
+    until(lambda: scanning.scan is not None)
+
+    def alive() -> None:
+        nonlocal now_s
+        asked.append(now_s)
+        now_s += 100.0  # no progress from here on
+        hung.step.set()
+        hung.end.set()
+
+    scanning.end(alive)
+    assert asked[0] == 0.0
+    assert len(asked) <= 2
+    hung.store.close()
+
+
+def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = [f"scan.folder={tmp_path}", "scan.start=on-arm", "health.http="]
+    daemon, reported = Daemon(load_config(None, given)), []
+    scanning, hung = daemon.scanning, Hung(daemon.scanning, tmp_path)
+    monkeypatch.setattr(ScanRun, "carry_out", lambda run: hung.carry_out(run))
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_: reported.append(text))
+    daemon.actions.is_ready = True
+    armed, was = False, False
+
+    def look(arming: bool) -> bool:
+        nonlocal armed, was
+        armed = arming
+        was = daemon._follow_arming(was)
+        return was
+
+    monkeypatch.setattr(type(daemon.vehicle.presence), "is_armed", property(lambda _: armed))
+    assert look(True)
+    until(lambda: scanning.scan is not None)
+    assert not look(False)
+    assert scanning.is_closing
+    assert look(True)
+    assert reported == ["Scan starts when the previous one is closed"]
+    assert not look(False)  # and off again
+    hung.step.set()
+    assert look(True)
+    scanning.follow_intent()
+    assert scanning.is_closing  # waits
+    hung.end.set()
+    until(lambda: not scanning.is_running)
+    hung.end.clear()
+    scanning.follow_intent()
+    until(lambda: scanning.is_running and scanning.phase is Phase.SCANNING)
+    daemon.actions.stop_scan()  # by command, in the air
+    assert look(True)
+    hung.end.set()
+    until(lambda: not scanning.is_running)
+    assert look(True)
+    scanning.follow_intent()
+    assert not scanning.is_running  # the operator's stop holds until the next take-off
+    hung.store.close()
+
+
+def test_large_arrays_stay_out_of_the_pool() -> None:
+    script = (
+        "import ctypes\n"
+        "from service.memory import POOLED_BYTES, one_pool\n"
+        "one_pool()\n"
+        "libc, size = ctypes.CDLL(None), 2 * POOLED_BYTES\n"
+        "libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]\n"
+        "libc.free.argtypes = [ctypes.c_void_p]\n"
+        "libc.free(libc.malloc(3 * size))\n"  # after this the library would pool what is smaller
+        "libc.malloc(size)\n"
+        "kinds = [('of', ctypes.c_size_t * 10)]\n"
+        "info = type('Info', (ctypes.Structure,), {'_fields_': kinds})\n"
+        "libc.mallinfo2.restype = info\n"
+        "print(libc.mallinfo2().of[4] >= size)\n"
+    )
+    if not hasattr(ctypes.CDLL(None), "mallinfo2"):
+        pytest.skip("the C library does not say what it holds")
+    root = ROOT
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=root)
+    assert run.stdout == "True\n", run.stderr
+
+
+def test_memory_settings_are_taken_where_the_library_has_them() -> None:
+    assert one_pool()
+    assert give_back() in (True, False)
+    assert give_back(collect=True) in (True, False)

@@ -1,0 +1,207 @@
+"""The doctor tells what works and what does not, and never fails itself."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from loopback import free_port
+from paths import DEMO
+from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
+
+from service.config import load_config
+from service.daemon.diagnosis import BAD, GOOD, NOTE, examine
+
+
+def findings(*overrides: str, listen_s: float = 0.1) -> dict[str, tuple[str, str]]:
+    found = examine(
+        load_config(None, ["compute.backend=cpu", "health.http=", *overrides]), listen_s
+    )
+    return {f.what: (f.verdict, f.text) for f in found}
+
+
+def test_links_are_closed_where_it_is_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mavlink.component.vehicle.VehicleLink.report", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        findings(f"mavlink.links=udpin:127.0.0.1:{free_port()}")
+    assert not [t.name for t in threading.enumerate() if t.name.startswith("mavlink")]
+
+
+def test_everything_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = free_port()
+    ended = threading.Event()
+
+    def autopilot() -> None:
+        sender = dialect.MAVLink(None, srcSystem=7, srcComponent=1)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            while not ended.wait(0.05):
+                message: Any = sender.heartbeat_encode(2, 3, 0, 0, 4)
+                out.sendto(message.pack(sender), ("127.0.0.1", port))
+
+    thread = threading.Thread(target=autopilot, daemon=True)
+    thread.start()
+    with socket.create_server(("127.0.0.1", 0)) as ground:
+        found = findings(
+            f"scan.folder={tmp_path / 'scans'}",
+            f"camera.source={DEMO / 'frames'}",
+            f"camera.model={DEMO / 'camera.yaml'}",
+            f"mavlink.links=udpin:127.0.0.1:{port}",
+            f"datalink.connect=tcp/127.0.0.1:{ground.getsockname()[1]}",
+            listen_s=1.0,
+        )
+    ended.set()
+    thread.join()
+    assert "system 7" in found["mavlink"][1]
+    assert "1600x1200" in found["camera"][1]
+    assert {what for what, (verdict, _) in found.items() if verdict == BAD} == set()
+    for what in ("python", "packages", "scans", "compute", "camera", "mavlink", "datalink"):
+        assert found[what][0] == GOOD, found[what]
+
+
+def test_what_is_missing_is_reported(tmp_path: Path) -> None:
+    found = findings(
+        f"scan.folder={tmp_path}",
+        f"camera.source={tmp_path / 'none.mp4'}",
+        f"camera.model={tmp_path / 'none.yaml'}",
+        f"mavlink.links=udpin:127.0.0.1:{free_port()}",
+        f"datalink.connect=tcp/127.0.0.1:{free_port()}",
+    )
+    assert found["camera"] == (BAD, f"no such file or folder: {tmp_path / 'none.mp4'}")
+    assert found["camera model"][0] == BAD
+    assert found["mavlink"][0] == BAD
+    assert "silent" in found["mavlink"][1]
+    assert found["datalink"][0] == NOTE
+    bare = findings(f"scan.folder={tmp_path}")
+    for what in ("camera", "camera model", "mavlink", "datalink"):
+        assert bare[what][0] == NOTE
+    assert findings("mavlink.links=modem:1")["mavlink"][0] == BAD
+
+
+def test_camera_model_of_another_size_is_reported(tmp_path: Path) -> None:
+    model = tmp_path / "camera.yaml"
+    model.write_text(
+        (DEMO / "camera.yaml").read_text().replace("image_width: 1600", "image_width: 800")
+    )
+    found = findings(
+        f"scan.folder={tmp_path}", f"camera.source={DEMO / 'frames'}", f"camera.model={model}"
+    )
+    assert found["camera"][0] == BAD
+    assert "calibrate at 1600x1200" in found["camera"][1]
+
+
+def test_foreign_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.daemon.diagnosis._parent", lambda name: f"/somewhere/{name}")
+    assert "shadows one of ours" in findings()["packages"][1]
+
+
+def test_command_line(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "service.cli",
+            "doctor",
+            "--json",
+            "--set",
+            f"scan.folder={tmp_path}",
+            "--set",
+            "compute.backend=cpu",
+            "--set",
+            f"camera.source={tmp_path / 'no'}",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert done.returncode == 3
+    report = json.loads(done.stdout.splitlines()[-1])
+    assert report["ok"] is False
+    last = done.stderr.splitlines()[-1]
+    assert "not ready to fly: " in last and "camera" in last
+
+
+def test_what_is_missing_to_fly_is_reported(tmp_path: Path) -> None:
+    given = [f"scan.folder={tmp_path}", f"camera.source={DEMO / 'frames'}"]
+    assert findings(given[0])["settings"] == (
+        BAD,
+        "set camera.source and camera.model; the service does not start without them",
+    )
+    assert findings(*given)["settings"][1].startswith("set camera.model;")
+    assert findings(*given, f"camera.model={DEMO / 'camera.yaml'}")["settings"][0] == NOTE
+
+
+def test_the_boards_settings_are_compared() -> None:
+    from service.daemon.diagnosis import BOARDS, board_of, other_than_profile, profile_path
+
+    assert board_of("NVIDIA Jetson Orin Nano Developer Kit") == "orin-nano"
+    assert board_of("NVIDIA Jetson AGX Orin Developer Kit") == "orin-agx"
+    assert board_of("Raspberry Pi 5 Model B Rev 1.0") == "raspberry-pi-5"
+    for name in (*BOARDS, "x86-bench"):
+        path = profile_path(name)
+        assert path is not None
+        assert other_than_profile(load_config(path), path) == []
+    path = profile_path("raspberry-pi-5")
+    assert path is not None
+    changed = load_config(path, ["compute.threads=1"])
+    assert other_than_profile(changed, path) == ["compute.threads = 1, not 3"]
+    reported = findings("compute.threads=1")["board"]
+    assert reported[0] == NOTE
+
+
+def test_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.daemon.diagnosis.is_warm", lambda: True)
+    assert findings()["kernels"][0] == GOOD
+
+
+def test_what_a_running_service_holds_is_asked_of_it(tmp_path: Path) -> None:
+    from service.daemon.health import HealthServer
+
+    status = {
+        "ok": True,
+        "software": "skyrelief 9.9",
+        "state": "scanning",
+        "frames": 1234,
+        "mavlink": {"links_up": 1, "packets": 77},
+        "workers": [
+            {
+                "name": "camera",
+                "state": "running",
+                "restarts": 0,
+                "fault": "",
+                "waiting": 2,
+                "bound": 2,
+                "when_full": "drop oldest",
+                "lag_s": 0.26,
+            },
+        ],
+    }
+    server = HealthServer("127.0.0.1:0", lambda: status)
+    given = [
+        f"scan.folder={tmp_path}",
+        f"health.http=127.0.0.1:{server.port}",
+        f"mavlink.links=udpin:127.0.0.1:{free_port()}",
+        f"camera.source={tmp_path / 'held'}",
+    ]
+    try:
+        found = findings(*given)
+        status |= {"ok": False, "fault": "no image", "mavlink": {}}
+        worse = findings(*given)
+    finally:
+        server.close()
+    assert found["mavlink"] == (GOOD, "held by the running service: 1 open, 77 messages heard")
+    assert found["camera"] == (GOOD, "in the running scan: 1234 images so far")
+    assert found["service"] == (GOOD, "skyrelief 9.9 runs here: scanning")
+    assert found["worker"] == (GOOD, "camera: running, 2 of 2 waiting (drop oldest), 0.3 s behind")
+    assert worse["mavlink"][0] == NOTE
+    assert worse["service"] == (BAD, "skyrelief 9.9 runs here: no image")
+    assert "service" not in findings(*given)  # it ended

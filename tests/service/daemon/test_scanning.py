@@ -1,0 +1,219 @@
+"""One scan at a time; what a scan cannot start with is reported."""
+
+from __future__ import annotations
+
+import errno
+import gc
+import os
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from loopback import until
+from paths import DEMO
+
+from mavlink.component.control import Phase
+from recon.backends.cpu import CpuBackend
+from service.cameras.camera_file import load_camera
+from service.config import load_config
+from service.daemon.intent import MARK, Left
+from service.daemon.runtime import Daemon
+from service.daemon.scan_run import ScanRun
+from service.flight.scan import short_collections
+
+MODEL = DEMO / "camera.yaml"
+
+
+@pytest.fixture
+def daemon(tmp_path: Path) -> Daemon:
+    return Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+
+
+def test_images_that_the_camera_model_does_not_fit_are_refused(
+    daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed, reported, scanning = threading.Event(), [], daemon.scanning
+    source: Any = SimpleNamespace(
+        size_px=(320, 240), description="gimbal", start_monotonic_ns=0, close=closed.set
+    )
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_, **__: reported.append(text))
+    monkeypatch.setattr(ScanRun, "_open_camera", lambda _: source)
+    scanning.camera, scanning._backend = load_camera(MODEL), CpuBackend()
+    scanning.start()
+    until(lambda: reported and not scanning.is_running)
+    assert reported == [f"Scan failed: {scanning.fault}"]
+    assert "for 1600x1200 images, gimbal has 320x240" in scanning.fault
+    assert closed.is_set()
+    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
+    scanning.stop()
+
+
+def test_a_scan_that_was_stopped_counts_as_closing_at_once(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A camera that hangs holds its scan for seconds: a start then waits, and is not swallowed."""
+    end = threading.Event()
+    monkeypatch.setattr(ScanRun, "carry_out", lambda _: end.wait(60.0))
+    daemon.scanning.start()
+    assert daemon.actions.status().phase is Phase.SCANNING
+    daemon.actions.stop_scan()
+    assert daemon.actions.status().phase is Phase.FINALISING
+    end.set()
+    until(lambda: daemon.actions.status().phase is Phase.IDLE)
+
+
+def test_a_camera_that_fails_is_reported(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    reported, gate = [], SimpleNamespace(warnings=["known when it was opened"])
+    scanning: Any = daemon.scanning
+    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, _: reported.append(text))
+    daemon._report_camera()
+    run: Any = ScanRun(scanning, is_asked=True)
+    run.gate, run._news_reported, scanning._run = gate, 1, run
+    gate.warnings.append("the image is frozen for 8 s")
+    for silent_s in (0.0, 9.0, 11.0, 300.0):
+        run.progress_s = time.monotonic() - silent_s
+        daemon._report_camera()
+        daemon._report_camera()
+    run.progress_s = time.monotonic()
+    daemon._report_camera()
+    assert reported == [
+        "Camera: the image is frozen for 8 s",
+        "No images for 10 s: nothing is scanned",
+        "Camera images recovered",
+    ]
+    run.progress_s = time.monotonic() - 60.0
+    daemon._report_camera()
+    scanning._run = None  # stopped meanwhile
+    daemon._report_camera()
+    assert reported[3:] == ["No images for 10 s: nothing is scanned"]
+
+
+@pytest.mark.parametrize(
+    ("boot", "heard", "armed", "goes_on"),
+    [
+        ("this", False, False, True),  # the service was killed: nothing need say more
+        ("another", False, False, False),  # power cut: wait for the autopilot
+        ("another", True, True, True),
+        ("another", True, False, False),
+        ("", True, True, True),
+        ("none", True, True, False),
+    ],
+)
+def test_a_scan_by_command_goes_on_after_a_fall(
+    boot: str, heard: bool, armed: bool, goes_on: bool, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    (tmp_path / "boot").write_text("this")
+    monkeypatch.setattr("service.daemon.intent.BOOT", tmp_path / "boot")
+    if boot != "none":
+        (tmp_path / "scans").mkdir()
+        (tmp_path / "scans" / MARK).write_text(boot)
+    begun, end = threading.Event(), threading.Event()
+
+    def scan(_: ScanRun) -> None:
+        begun.set()
+        end.wait(60.0)
+
+    monkeypatch.setattr(ScanRun, "carry_out", scan)
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}/scans", "health.http="]))
+    presence = type(daemon.vehicle.presence)
+    monkeypatch.setattr(presence, "is_armed", property(lambda _: armed))
+    monkeypatch.setattr(presence, "autopilot", property(lambda _: (1, 1) if heard else None))
+    daemon.actions.is_ready = True
+    for _ in range(3):
+        daemon._resume()
+    assert begun.wait(10.0 if goes_on else 0.2) == goes_on
+    mark = tmp_path / "scans" / MARK
+    if goes_on:
+        assert mark.read_text() == "this"
+        daemon.actions.stop_scan()
+        end.set()
+        until(lambda: not daemon.scanning.is_running)
+    if heard:
+        assert not mark.exists()  # landed, or stopped
+
+
+def test_only_a_scan_that_was_not_ended_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def next_life(start: str = "on-command") -> Daemon:
+        return Daemon(
+            load_config(None, [f"scan.folder={tmp_path}", f"scan.start={start}", "health.http="])
+        )
+
+    def left(daemon: Daemon) -> Left:
+        return daemon.scanning.resumption.left
+
+    end = threading.Event()
+    monkeypatch.setattr(ScanRun, "carry_out", lambda _: end.wait(60.0))
+    killed = next_life()
+    killed.scanning.start()
+    assert left(next_life()) is Left.BY_SERVICE
+    killed.scanning.stop()
+    assert left(next_life()) is Left.NOTHING
+    end.set()
+    until(lambda: not killed.scanning.is_running)
+    killed.scanning.start()  # the recording ends by itself
+    until(lambda: not killed.scanning.is_running)
+    assert left(next_life()) is Left.NOTHING
+    by_itself = next_life("on-boot")
+    by_itself.scanning.start()
+    assert left(next_life()) is Left.NOTHING
+    (tmp_path / MARK).write_text("of a configuration that was on-command")
+    by_itself = next_life("on-boot")
+    by_itself._resume()
+    assert not by_itself.scanning.is_running
+
+
+def test_a_disk_that_goes_away_leaves_the_commands(
+    daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stat = os.stat
+
+    def away(path: Any, *more: Any, **options: Any) -> os.stat_result:
+        if str(path).startswith(str(tmp_path)):
+            raise OSError(errno.ENOTCONN, "Transport endpoint is not connected", str(path))
+        return stat(path, *more, **options)
+
+    scanning = daemon.scanning
+    source: Any = SimpleNamespace(
+        size_px=(1600, 1200), description="", start_monotonic_ns=0, close=lambda: None, warnings=[]
+    )
+    monkeypatch.setattr(ScanRun, "_open_camera", lambda _: source)
+    scanning.camera, scanning._backend = load_camera(MODEL), CpuBackend()
+    monkeypatch.setattr(os, "stat", away)
+    assert daemon.actions.status().storage_total_mib > 0
+    scanning.start()
+    until(lambda: scanning.fault and not scanning.is_running)
+    assert "internal" not in scanning.fault
+    assert daemon.snapshot()["state"]
+    scanning.stop()
+
+
+def test_a_scan_is_started_once(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, end = [], threading.Event()
+
+    def scan(_: ScanRun) -> None:
+        begun.append(threading.get_ident())
+        end.wait(60.0)
+
+    monkeypatch.setattr(ScanRun, "carry_out", scan)
+    callers = [threading.Thread(target=daemon.scanning.start) for _ in range(20)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    until(lambda: begun)
+    end.set()
+    until(lambda: not daemon.scanning.is_running)
+    assert len(begun) == 1
+
+
+def test_the_collector_leaves_out_what_was_loaded_until_the_scan_ends() -> None:
+    with pytest.raises(KeyError), short_collections():
+        assert gc.get_freeze_count() > 10_000
+        raise KeyError
+    assert gc.get_freeze_count() == 0

@@ -1,0 +1,353 @@
+"""A site in tiles: covered once, the same here and on a Dask cluster, sharper from its video."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("open3d", exc_type=ImportError)
+
+from recon.surface import triangle_grid
+from recon.surface.meshing import Mesh
+from service.cameras import CameraFrame
+from service.cli import app
+from service.errors import InputError, OutsideError
+from service.georeference import LocalFrame
+from service.offline import tiles
+from service.offline.exports import images, model
+from service.offline.exports.model import TileJob, TilePart, mesh_tile
+from service.offline.exports.view import ExportOptions, ScanView, export
+from service.offline.tiles import KeyframeFootprint, Tile, run_tiles, tile_boxes
+from service.progress import Progress
+from service.scans.fused_cloud import EVERYWHERE
+from service.stream.store import ScanStore
+
+if TYPE_CHECKING:
+    from house_flight import HouseFlight
+
+
+def noting(said: list[str]) -> Progress:
+    """Appends every text to ``said``."""
+    return Progress(lambda now: said.append(now.text))
+
+
+def jobs(folder: Path, count: int = 2) -> list[TileJob]:
+    edges = [-np.inf, *np.linspace(0, 20, count + 1)[1:-1], np.inf]
+    each = [
+        Tile(
+            str(folder), (west, -np.inf, east, np.inf), (west - 7.5, -np.inf, east + 7.5, np.inf),
+            (0, 1, 2, 3, 4),
+        )
+        for west, east in pairwise(edges)
+    ]  # fmt: skip
+    return [TileJob(tile, 0.3, "height", 60_000, 2048) for tile in each]
+
+
+def made(some: list[TileJob], scheduler: str | None, progress: Progress) -> list[TilePart]:
+    return [one for one in run_tiles(mesh_tile, some, scheduler, progress) if one is not None]
+
+
+def same(a: list[TilePart], b: list[TilePart]) -> None:
+    assert len(a) == len(b)
+    for one, other in zip(a, b, strict=True):
+        np.testing.assert_array_equal(one.mesh.vertices_m, other.mesh.vertices_m)
+        np.testing.assert_array_equal(one.mesh.faces, other.mesh.faces)
+        np.testing.assert_array_equal(one.mesh.uv, other.mesh.uv)
+        np.testing.assert_array_equal(one.image, other.image)
+
+
+def test_boxes_cover_the_site_once_and_hold_no_more_than_asked() -> None:
+    prints = [
+        KeyframeFootprint(n, 1000, 0.2, (10.0 * n, 5.0 * n, 10.0 * n + 30, 5.0 * n + 20))
+        for n in range(20)
+    ]
+    assert tile_boxes(prints, 100_000) == [EVERYWHERE]
+    boxes = tile_boxes(prints, 3000)
+    assert len(boxes) > 6
+    rng = np.random.default_rng(0)
+    for p in prints:
+        for x, y in rng.uniform(p.box[:2], p.box[2:], (50, 2)):
+            assert sum(w <= x < e and s <= y < n for w, s, e, n in boxes) == 1
+    for west, south, east, north in boxes:
+        held = 0.0
+        for p in prints:
+            over = max(0.0, min(p.box[2], east) - max(p.box[0], west))
+            over *= max(0.0, min(p.box[3], north) - max(p.box[1], south))
+            held += p.points * over / 600.0
+        assert held <= 3000.0 + 1e-6
+
+
+def test_tiles_together_are_the_whole(tmp_path: Path, house: HouseFlight) -> None:
+    house.flown(tmp_path).close()
+    (whole,) = made(jobs(tmp_path, 1), None, Progress())
+    parts = made(jobs(tmp_path, 2), None, Progress())
+    assert len(parts) == 2
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-15, 35, 60), np.linspace(-10, 10, 40)))
+    origins = np.column_stack([x, y, np.full(len(x), 100.0)])
+    down = np.tile([0.0, 0.0, -1.0], (len(x), 1))
+
+    def heights(part: TilePart) -> Any:
+        grid = triangle_grid.build(part.mesh.vertices_m, part.mesh.faces)
+        return 100.0 - grid.cast(origins, down)[0]
+
+    one, two = (heights(part) for part in parts)
+    assert (np.isfinite(one) ^ np.isfinite(two)).mean() > 0.99
+    together, alone = np.where(np.isfinite(one), one, two), heights(whole)
+    clear = np.abs(np.maximum(np.abs(x - 10) - 6.0, np.abs(y - 2) - 4.0)) > 1.0
+    assert np.nanmax(np.abs(together - alone)[clear]) < 0.1
+    assert (np.isfinite(together) == np.isfinite(alone)).mean() > 0.99
+
+
+@pytest.fixture
+def cluster() -> Iterator[Any]:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as one:
+        yield one
+
+
+def test_the_same_mesh_comes_from_a_cluster(
+    tmp_path: Path, house: HouseFlight, cluster: Any
+) -> None:
+    house.flown(tmp_path).close()
+    reported: list[str] = []
+    here = made(jobs(tmp_path), None, Progress())
+    there = made(jobs(tmp_path), cluster.scheduler_address, noting(reported))
+    assert [t for t in reported if "came from the cluster" in t] == [
+        "tile 1 of 2 came from the cluster",
+        "tile 2 of 2 came from the cluster",
+    ]
+    same(here, there)
+
+
+def test_a_scheduler_that_goes_away_is_said_and_the_rest_made_here(
+    tmp_path: Path, house: HouseFlight, cluster: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    house.flown(tmp_path).close()
+    here = made(jobs(tmp_path), None, Progress())
+    reported: list[str] = []
+
+    def say(now: Progress) -> None:
+        reported.append(now.text)
+        if now.text.startswith("tile 1 of 2 came"):
+            cluster.close()
+
+    same(here, made(jobs(tmp_path), cluster.scheduler_address, Progress(say)))
+    assert len([t for t in reported if "disconnected" in t]) == 1
+
+
+def test_a_scheduler_that_is_not_there_ends_in_one_line(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    house.flown(tmp_path).close()
+    monkeypatch.setattr(tiles, "CONNECT_S", 0.5)
+    with pytest.raises(OutsideError, match="no Dask scheduler answers"):
+        made(jobs(tmp_path), "tcp://127.0.0.1:9", Progress())
+
+
+def test_the_command_cuts_a_large_site(tmp_path: Path, house: HouseFlight) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    house.flown(tmp_path).close()
+    done = CliRunner().invoke(app, ["mesh", str(tmp_path), "--tile-points", "30000", "--json"])
+    assert done.exit_code == 0, done.exception
+    figures = json.loads(done.stdout.splitlines()[-1])
+    assert figures["tiles"] > 1 and len(figures["texture_px"]) == figures["tiles"]
+    scene = trimesh.load(tmp_path / "mesh.glb")
+    assert len(scene.geometry) == figures["tiles"]
+    assert sum(len(g.faces) for g in scene.geometry.values()) == figures["faces"]
+    data = (tmp_path / "mesh.glb").read_bytes()
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    uses = [view.get("target") for view in tree["bufferViews"]]  # indices, vertices, images
+    assert uses.count(34963) == figures["tiles"] and uses.count(None) == len(tree["images"])
+
+
+class FakeVideo:
+    """Images twice as fine as the keyframes', one of them at each keyframe's second."""
+
+    def __init__(self, house: HouseFlight, size_px: tuple[int, int] = (320, 180)) -> None:
+        self.size_px, self.closed = size_px, False
+        self._house = house
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        for n in range(9):
+            big = cv2.resize(
+                self._house.keyframe(n // 2, 2.5 * n).bgr,
+                self.size_px,
+                interpolation=cv2.INTER_AREA,
+            )
+            yield CameraFrame(np.asarray(big, np.uint8), n * 500_000_000, n, None, f"frame {n}")
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_images_come_from_the_video_at_the_keyframes_times(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with house.flown(tmp_path) as store:
+        keyframes = list(store.keyframes())
+        K = np.array([[280.0, 0, 159.5], [0, 280.0, 89.5], [0, 0, 1]])
+        camera = {"K": K.ravel().tolist(), "distortion": [0.0] * 5, "width": 320, "height": 180}
+        header = replace(store.header, camera=camera)
+    video = FakeVideo(house)
+    monkeypatch.setattr(images, "open_camera", lambda _: video)
+    views = images.video_images(keyframes, header, tmp_path, None)
+    assert len(views) == 5 and video.closed
+    for view, keyframe in zip(views, keyframes, strict=True):
+        assert view.bgra.shape == (180, 320, 4) and (view.bgra[..., 3] == 255).all()
+        np.testing.assert_array_equal(view.T_world_camera, keyframe.depth.T_world_camera)
+        np.testing.assert_allclose(view.K, K)
+    late = images.video_images(keyframes, header, tmp_path, header.started_unix_ns + 3 * 10**9)
+    assert [v.bgra.shape[0] for v in late] == [90, 90, 90, 180, 180]  # the rest from the store
+    monkeypatch.setattr(images, "MAX_BYTES", 5 * 4 * 160 * 90)
+    small = images.video_images(keyframes, header, tmp_path, None)
+    assert {v.bgra.shape[:2] for v in small} == {(90, 160)}
+    np.testing.assert_allclose(small[0].K[0, 0], 140.0)
+    with pytest.raises(InputError, match="--video-epoch"):
+        images.video_images(keyframes, header, tmp_path, 0)
+    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house, (640, 360)))
+    with pytest.raises(InputError, match="640x360"):
+        images.video_images(keyframes, header, tmp_path, None)
+    with pytest.raises(InputError, match="no camera model"):
+        images.video_images(keyframes, replace(header, camera={}), tmp_path, None)
+
+
+def test_the_file_names_no_path_of_this_machine(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("trimesh")
+    house.flown(tmp_path / "scan").close()
+    corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
+    mesh = Mesh(corner, np.array([[0, 1, 2]], np.int32), rgb=np.full((3, 3), 90, np.uint8))
+    figures = {"faces": 1, "vertices": 3, "seen": 1.0, "texture_px": [1, 1]}
+    part = SimpleNamespace(mesh=mesh, image=None, figures=figures)
+    monkeypatch.setattr(model, "run_tiles", lambda *_: [part])
+    monkeypatch.setattr(model, "check_video", lambda *_: None)
+    options = ExportOptions(video=tmp_path / "flight.mp4")
+    with ScanView(tmp_path / "scan") as scan:
+        said = model.write_mesh(scan, tmp_path / "mesh.glb", model.MeshOptions(), options)
+    written = (tmp_path / "mesh.glb").read_bytes()
+    assert said["pictures"] == str(tmp_path / "flight.mp4")
+    assert b'"pictures":"video"' in written and str(tmp_path).encode() not in written
+
+
+def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
+    from service.stream.records import ScanHeader
+
+    ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)).close()
+    failed = CliRunner().invoke(app, ["mesh", str(tmp_path)])
+    assert isinstance(failed.exception, InputError)
+
+
+def test_the_recording_that_a_scan_names_is_found(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "scan"
+    with house.flown(folder) as store:
+        camera = {"K": [1.0] * 9, "distortion": [0.0] * 5, "width": 320, "height": 180}
+        header = replace(store.header, camera=camera)
+    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house))
+    assert images.recording_of(folder, header).path is None  # no scan.json yet
+
+    def name(source: object) -> images.Recording:
+        (folder / "scan.json").write_text(json.dumps({"run": {"source": source}}))
+        return images.recording_of(folder, header)
+
+    assert name("flight.mp4").path is None and "is not there" in name("flight.mp4").words
+    video = tmp_path / "flight.mp4"
+    video.touch()
+    assert name("flight.mp4").path == video  # next to the scan folder
+    assert name(str(video)).path == video
+    for unfit in (None, 7, ["x"]):
+        assert "does not name" in name(unfit).words
+    assert "is not there" in name("x" * 5000).words
+    (folder / "scan.json").write_text("[" * 100_000)
+    assert "does not name" in images.recording_of(folder, header).words
+    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house, (640, 360)))
+    assert name("flight.mp4").path is None and "another recording" in name("flight.mp4").words
+    bare = replace(header, camera={})
+    assert images.recording_of(folder, bare).path is None
+
+
+def test_a_recording_found_by_itself_that_does_not_fit_is_left(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The scan names a file that is not a video: the mesh is made from the store, and says so."""
+    house.flown(tmp_path).close()
+    video = tmp_path / "none.mp4"
+    video.touch()
+    monkeypatch.setattr(images, "recording_of", lambda *_: images.Recording(video, ""))
+    (job, *_), reported = jobs(tmp_path), list[str]()
+    assert mesh_tile(job, noting(reported)) is not None
+    assert any("after all" in text for text in reported)
+    with pytest.raises(InputError, match="contains no camera model"):
+        mesh_tile(replace(job, options=ExportOptions(video=video)), noting(reported))
+
+
+def test_the_mesh_lies_on_the_globe_as_3d_tiles(tmp_path: Path, house: HouseFlight) -> None:
+    """Vertices of the glTF files, turned to z up and placed by the tileset, against PROJ."""
+    trimesh = pytest.importorskip("trimesh")
+    from pyproj import Transformer
+
+    house.flown(tmp_path).close()
+    with ScanView(tmp_path, 0.3) as scan:
+        folder = export(scan, "3dtiles-mesh", None, ExportOptions(voxel_m=0.3, stored=True))
+    tileset = json.loads((folder / "tileset.json").read_text())
+    assert tileset["asset"]["version"] == "1.1"
+    root = tileset["root"]
+    T = np.array(root["transform"]).reshape(4, 4).T
+    assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
+    assert tileset["geometricError"] > root["geometricError"] > 0.0
+    globe = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    for tile in root["children"]:
+        scene = trimesh.load(folder / tile["content"]["uri"])
+        xyz = np.concatenate([g.vertices for g in scene.geometry.values()])
+        up = np.column_stack([xyz[:, 0], -xyz[:, 2], xyz[:, 1]])
+        for box in (tile["boundingVolume"]["box"], root["boundingVolume"]["box"]):
+            middle, half = np.array(box[:3]), np.diag(np.array(box[3:]).reshape(3, 3))
+            assert (np.abs(up - middle) <= half + 1e-3).all()
+        lon, lat, height = globe.transform(*(up @ T[:3, :3].T + T[:3, 3]).T)
+        enu = LocalFrame(*house.origin).to_enu(np.column_stack([lat, lon, height]))
+        assert np.abs(enu - up).max() < 1e-3
+        assert up[:, 2].max() == pytest.approx(6.0, abs=0.5)  # the roof
+
+
+def test_the_mesh_as_obj_lies_in_its_utm_zone_with_its_texture(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    """Read by trimesh: vertices plus the offset, by PROJ, and uv are those of the glTF."""
+    trimesh = pytest.importorskip("trimesh")
+    from pyproj import CRS, Transformer
+
+    house.flown(tmp_path).close()
+    options = ExportOptions(voxel_m=0.3, stored=True)
+    with ScanView(tmp_path, 0.3) as scan:
+        folder = export(scan, "obj", None, options)
+        glb = export(scan, "glb", None, options)
+    read = trimesh.load(folder / "mesh.obj", force="mesh", process=False)
+    offset = np.array((folder / "mesh_offset.xyz").read_text().split(), float)
+    utm = CRS.from_wkt((folder / "mesh.prj").read_text())
+    lon, lat = Transformer.from_crs(utm, 4326, always_xy=True).transform(
+        *(read.vertices + offset)[:, :2].T
+    )
+    height = read.vertices[:, 2] + offset[2]
+    enu = LocalFrame(*house.origin).to_enu(np.column_stack([lat, lon, height]))
+    should = trimesh.load(glb, force="mesh", process=False)
+    up = np.column_stack([should.vertices[:, 0], -should.vertices[:, 2], should.vertices[:, 1]])
+    middle, faces = enu[read.faces].mean(axis=1), up[should.faces].mean(axis=1)
+    assert middle.shape == faces.shape and np.abs(middle - faces).max() < 2e-3
+    assert read.visual.material.image.size == should.visual.material.baseColorTexture.size
+    uv, uv_glb = (m.visual.uv[m.faces].mean(axis=1) for m in (read, should))
+    assert np.abs(uv - uv_glb).max() < 1e-5

@@ -1,0 +1,78 @@
+"""Surface models of a scan with a house, where keyframes decide what holes may hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from recon.types import F64, Array, Bool
+from service.offline.exports.surface import SurfaceHeights, cell_places, surface_model
+from service.offline.exports.view import ScanView
+from service.stream.codec import encode
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+
+if TYPE_CHECKING:
+    from house_flight import HouseFlight
+
+EYES_M = (-5.0, 0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
+CELL_M = 0.25
+
+
+def flown(folder: Path, house: HouseFlight, change: Callable[[F64, Array], Array]) -> Path:
+    """A scan without a place. ``change`` takes where each pixel's ray is at the roof's height,
+    east, and its depth."""
+    header = ScanHeader("test-1", "drone-1", house.start_ns, camera={"fx": 140.0}, software="0.0")
+    with ScanStore.create(folder / "scan.db", header) as store:
+        for seq, east_m in enumerate(EYES_M):
+            view = house.keyframe(seq, east_m)
+            a = (np.arange(view.fresh.shape[1]) - house.K[0, 2]) / house.K[0, 0]
+            depth = change(east_m + a * (house.height_m - 6.0), view.depth.depth_m.copy())
+            view = replace(view, depth=replace(view.depth, depth_m=depth))
+            store.add_keyframe(seq, encode(view, view.time_ns))
+    return folder
+
+
+def model(
+    folder: Path, house: HouseFlight, change: Callable[[F64, Array], Array], strict: bool = False
+) -> tuple[SurfaceHeights, F64]:
+    """The model of such a scan, and (rows, cols, 3) places of its cells."""
+    with ScanView(flown(folder, house, change)) as scan:
+        found = surface_model(scan, CELL_M, strict)
+        return found, cell_places(scan, found.raster)
+
+
+def on_roof(places: F64, margin_m: float) -> Bool:
+    """Cells inside the walls by at least the margin."""
+    x, y = np.abs(places[..., 0] - 10.0), np.abs(places[..., 1] - 2.0)
+    return np.asarray((x < 6.0 - margin_m) & (y < 4.0 - margin_m))
+
+
+def test_no_ground_is_filled_in_below_what_hides_the_air(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    """The roof's last 1.5 m in the east have no depth in any image."""
+
+    def change(x: F64, depth: Array) -> Array:
+        depth[(depth < house.height_m - 3.0) & (x > 14.5)] = np.nan
+        return depth
+
+    found, places = model(tmp_path, house, change)
+    inside = on_roof(places, 0.5) & found.raster.known
+    assert (found.raster.height_m[inside] > 5.0).all() and inside.sum() > 400
+
+
+def test_doubtful_edges_of_a_roof_that_keyframes_confirm_are_marked(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    strict, places = model(tmp_path / "strict", house, lambda x, depth: depth, strict=True)
+    found, _ = model(tmp_path / "filled", house, lambda x, depth: depth)
+    edge = on_roof(places, 0.25) & ~on_roof(places, 1.0)
+    more = edge & found.raster.known & ~strict.raster.known
+    assert more.sum() > 0.2 * edge.sum() and found.is_filled[more].all()
+    assert (np.abs(found.raster.height_m[edge & found.raster.known] - 6.0) < 0.3).all()
+    assert not strict.is_filled.any()
