@@ -1,4 +1,4 @@
-# make demo | test | lint | types | bench | trials | bundle | lock | notices | clean. The first call makes .venv.
+# make demo | test | test-all | lint | types | bench | trials | bundle | lock | notices | clean. The first call makes .venv.
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -13,7 +13,7 @@ CORE := $(VENV)/core
 STAMP := $(VENV)/installed
 PEERS := $(VENV)/peers/installed
 
-.PHONY: demo test lint types check bench trials format bundle lock notices clean
+.PHONY: demo test test-all lint types check bench trials format bundle lock notices clean
 
 # Needs the core and the portal alone, without torch and Open3D.
 demo: $(CORE)
@@ -23,10 +23,15 @@ demo: $(CORE)
 unexport PYTHONDONTWRITEBYTECODE
 
 # A worker a core and one more, as tests of services wait half of their time; JOBS=0: one after the
-# other, in one process.
+# other, in one process. `make test` is the quick tier; tests named by ARGS run whatever their tier.
 JOBS ?= $(shell $(PYTHON) -c 'import os; print(1 + (os.cpu_count() or 1))')
+PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 test: $(STAMP) $(PEERS)
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(PYTEST) $(if $(ARGS),$(ARGS),-m "not slow")
+
+# Everything: browsers, trials, documents' commands, hard flights, benchmarks, peers.
+test-all: $(STAMP) $(PEERS)
+	$(PYTEST) $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -36,7 +41,7 @@ lint: $(STAMP)
 types: $(STAMP)
 	$(BIN)/mypy
 
-check: lint types test
+check: lint types test-all
 
 bench: $(STAMP)
 	$(BIN)/skyrelief bench $(ARGS)

@@ -1,4 +1,4 @@
-"""``.ci/run``: the machine as it is first, then what was skipped, with what could be installed."""
+"""``.ci/run``: the quick tier on the machine as it is, then the rest with what it installed."""
 
 from __future__ import annotations
 
@@ -24,6 +24,10 @@ def test_with_the_tool(name):
 
 def test_of_the_core():
     assert CORE
+
+@pytest.mark.slow
+def test_that_is_slow():
+    pass
 """
 MODULE = """
 import shutil
@@ -35,7 +39,8 @@ def test_of_the_module():
     pass
 """
 TOOLS = {
-    "make": '#!/bin/bash\nexec "$PYTHON" -m pytest -q "${2#ARGS=}"\n',
+    "make": '#!/bin/bash\n[[ $1 == test ]] && exec "$PYTHON" -m pytest -q -m "not slow"\n'
+    'exec "$PYTHON" -m pytest -q "${2#ARGS=}"\n',
     "apt-get": '#!/bin/bash\n[[ $1 != install ]] || ln -s /bin/true "$(dirname "$0")/ffmpeg"\n',
     "id": "#!/bin/bash\necho 0\n",
 }
@@ -44,7 +49,7 @@ TOOLS = {
 @pytest.fixture
 def machine(tmp_path: Path) -> Path:
     """A machine without ffmpeg, whose apt-get installs it, with a small project."""
-    for name in ("tools", "project/.ci", "project/.venv/bin", "project/tests"):
+    for name in ("tools", "project/.ci", "project/.venv/bin", "project/tests/support"):
         (tmp_path / name).mkdir(parents=True)
     for name in ("bash", "dirname", "mktemp", "rm", "wc", "ln", "env", "sh"):
         (tmp_path / "tools" / name).symlink_to(str(shutil.which(name)))
@@ -58,6 +63,11 @@ def machine(tmp_path: Path) -> Path:
     python.write_text(f'#!/bin/bash\nexec "{sys.executable}" "$@"\n')
     python.chmod(0o755)
     shutil.copytree(ROOT / "service", project / "service", ignore=shutil.ignore_patterns("web"))
+    shutil.copy(ROOT / "tests" / "support" / "tiers.py", project / "tests" / "support")
+    (project / "tests" / "conftest.py").write_text('pytest_plugins = ["tiers"]\n')
+    (project / "pytest.ini").write_text(
+        "[pytest]\npythonpath = tests/support\nmarkers =\n    slow: not in the first run\n"
+    )
     (project / "tests" / "test_module.py").write_text(MODULE)
     return project
 
@@ -70,20 +80,25 @@ def run(project: Path, core: bool = True, works: bool = True) -> subprocess.Comp
         [str(project / ".ci" / "run")],
         env={
             "PATH": str(tools), "PYTHON": sys.executable, "HOME": os.environ.get("HOME", "/"),
-            "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_ADDOPTS": "-p xdist.plugin",
-            "PYTEST_XDIST_AUTO_NUM_WORKERS": "1",
+            "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
         },
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
 
 
-def test_only_what_was_skipped_runs_again(machine: Path) -> None:
+def test_what_did_not_run_yet_runs_then(machine: Path) -> None:
     done = run(machine)
     assert done.returncode == 0, done.stdout + done.stderr
-    first, _, second = done.stdout.partition("once more, with ")
-    assert "1 passed, 3 skipped" in first
-    assert "ffmpeg" in second.splitlines()[0] and "the 3 that were skipped" in second
-    assert "3 passed" in second
+    first, _, second = done.stdout.partition("all that did not run yet")
+    assert "1 passed, 3 skipped, 1 deselected" in first
+    assert "4 passed, 1 deselected" in second  # the slow one, and those that ffmpeg kept back
+
+
+def test_what_cannot_be_installed_is_named(machine: Path) -> None:
+    (machine.parent / "tools" / "id").write_text("#!/bin/bash\necho 1000\n")
+    done = run(machine)
+    assert done.returncode == 0 and "no ffmpeg" in done.stderr
+    assert "1 passed, 3 skipped, 1 deselected" in done.stdout.partition("run yet")[2]
 
 
 @pytest.mark.parametrize("broken", ["core", "works"])
