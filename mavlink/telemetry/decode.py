@@ -27,6 +27,7 @@ Message = Any
 DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
 HDOP_TO_M = 1.5  # range error of one sigma per unit of HDOP
 UNKNOWN_U16 = 65535
+MAX_SIGMA_M = 1e5  # a receiver that says more says nothing
 UNIX_USEC = 10**15  # a time_usec beyond this is unix time, not time since boot
 TERRAIN_MODEL_SIGMA_M = 5.0
 CLEARANCE_SIGMA_M = 1.0
@@ -76,6 +77,22 @@ def _gps_raw(m: Message) -> Sample | None:
 def _from_dop(dop_cent: int, unknown_m: float) -> float:
     """Metres, 1 sigma, from a dilution of precision in hundredths; ``unknown_m`` without one."""
     return unknown_m if dop_cent in (UNKNOWN_U16, 0) else dop_cent * 0.01 * HDOP_TO_M
+
+
+def receiver_accuracy(
+    has_fix: bool,
+    sigma_h_m: float = math.nan,
+    sigma_v_m: float = math.nan,
+    alt_amsl_m: float | None = None,
+) -> AccuracySample:
+    """The accuracy that a log states; that of usual receivers where it states none that can be."""
+    is_stated = 0.0 < sigma_h_m < MAX_SIGMA_M
+    return AccuracySample(
+        None, has_fix,
+        sigma_h_m if is_stated else RECEIVER_SIGMA_H_M,
+        sigma_v_m if 0.0 < sigma_v_m < MAX_SIGMA_M else RECEIVER_SIGMA_V_M,
+        alt_amsl_m, is_claimed=is_stated,
+    )  # fmt: skip
 
 
 def _distance_sensor(m: Message) -> Sample | None:

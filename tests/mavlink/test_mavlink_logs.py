@@ -6,18 +6,22 @@ import math
 import random
 import re
 import struct
+import tempfile
 import tracemalloc
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from paths import DATA, SHARED
 from scipy.spatial.transform import Rotation
 
 from mavlink.telemetry import quaternion
+from mavlink.telemetry.decode import READERS
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog, load_telemetry
 from mavlink.telemetry.samples import F64
@@ -549,12 +553,12 @@ DATAFLASH = {
 class DataflashWriter:
     """Writes an ArduPilot .BIN log by its documented layout."""
 
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self._numbers = {name: 129 + k for k, name in enumerate(DATAFLASH)}
+    def __init__(self, formats: Mapping[str, tuple[str, str, str]] = DATAFLASH) -> None:
+        self.data, self._formats = bytearray(), formats
+        self._numbers = {name: 129 + k for k, name in enumerate(formats)}
         self._format(128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
-        for name, (fields, columns, kinds) in DATAFLASH.items():
-            size = 3 + struct.calcsize("<" + fields)
+        for name, (packed, columns, kinds) in formats.items():
+            size = 3 + struct.calcsize("<" + packed)
             number = self._numbers[name]
             self._format(number, size, name.encode(), kinds.encode(), columns.encode())
 
@@ -565,7 +569,7 @@ class DataflashWriter:
 
     def add(self, name: str, *values: float | bytes) -> None:
         self.data += bytes((0xA3, 0x95, self._numbers[name]))
-        self.data += struct.pack("<" + DATAFLASH[name][0], *values)
+        self.data += struct.pack("<" + self._formats[name][0], *values)
 
     def state_units_of_rate(self) -> None:
         """As Copter does since 3.6."""
@@ -688,19 +692,20 @@ class UlogWriter:
         self.data = bytearray(b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 10_000_000))
         self._codes: dict[str, tuple[int, str]] = {}
         self._put(b"B", bytes(40))
-        for name, fields in topics.items():
-            self._put(b"F", f"{name}:{fields}".encode())
-        for number, (name, fields) in enumerate(topics.items()):
+        for name, declared in topics.items():
+            self._put(b"F", f"{name}:{declared}".encode())
+        for number, (name, declared) in enumerate(topics.items()):
             self._put(b"A", struct.pack("<BH", 0, number) + name.encode())
-            self._codes[name] = (number, "<" + "".join(self._code(f) for f in fields.split(";")))
+            self._codes[name] = (
+                number,
+                "<" + "".join(map(self.code, re.findall(r"(\S+) \w+;", declared))),
+            )
 
     @staticmethod
-    def _code(field: str) -> str:
-        if not field:
-            return ""
-        kind = field.split()[0]
+    def code(kind: str) -> str:
+        """Of the struct module."""
         codes = {"uint64_t": "Q", "float": "f", "double": "d", "bool": "?", "uint8_t": "B"}
-        codes |= {"uint16_t": "H", "float[4]": "4f"}
+        codes |= {"uint16_t": "H", "float[4]": "4f", "int32_t": "i"}
         return codes[kind]
 
     def _put(self, kind: bytes, content: bytes) -> None:
@@ -770,6 +775,211 @@ def test_a_px4_onboard_log(tmp_path: Path, place: str) -> None:
     assert early is not None and ("terrain" in early.sources) == (
         place != "vehicle_global_position"
     )
+
+
+MODERN = {
+    "vehicle_attitude": STAMP + "float[4] q;",
+    "vehicle_global_position": STAMP + "double lat;double lon;float alt;float eph;float epv;",
+    "vehicle_local_position": STAMP + "float vx;float vy;float vz;bool v_xy_valid;bool v_z_valid;",
+    "vehicle_gps_position": STAMP + "int32_t lat;int32_t lon;int32_t alt;uint8_t fix_type;",
+    "sensor_gps": STAMP + "uint64_t time_utc_usec;double latitude_deg;double longitude_deg;"
+    "double altitude_msl_m;float eph;float epv;float vel_n_m_s;float vel_e_m_s;float vel_d_m_s;"
+    "uint8_t fix_type;bool vel_ned_valid;",
+    "home_position": STAMP + "float alt;bool valid_alt;",
+}
+"""As PX4 writes them since 1.11, and vehicle_gps_position as it did before 1.14."""
+
+
+@pytest.mark.parametrize(
+    ("place", "alt_m", "sigma_m", "speed_m_s"),
+    [
+        ("vehicle_global_position", 538.0, 0.12, 5.0),
+        ("vehicle_gps_position", 537.0, 2.1, None),
+        ("sensor_gps", 536.0, 0.5, 4.0),
+    ],
+)
+def test_a_px4_log_since_1_11(
+    tmp_path: Path, place: str, alt_m: float, sigma_m: float, speed_m_s: float | None
+) -> None:
+    """Without velocities in the global position; the best place that is there is read."""
+    pytest.importorskip("pyulog")
+    better = ("vehicle_global_position", "vehicle_gps_position", "sensor_gps")
+    left_out = better[: better.index(place)]
+    writer = UlogWriter({name: one for name, one in MODERN.items() if name not in left_out})
+    for k in range(200):
+        us, lat = 10_000_000 + k * 50_000, 47.3977 + 5.0 * k * 0.05 / 111_319.49
+        writer.add("vehicle_attitude", us, 1.0, 0.0, 0.0, 0.0)
+        writer.add("vehicle_local_position", us + 9000, 5.0, 0.0, -0.5, True, True)
+        writer.add("sensor_gps", us, T0_US + us, lat, 8.5456, 536, 0.5, 0.9, 4, 0, 0, 3, True)
+        if place == "vehicle_gps_position":
+            writer.add(place, us, round(lat * 1e7), 85_456_000, 537_000, 3)
+        if place == "vehicle_global_position":
+            writer.add(place, us, lat, 8.5456, 538.0, 0.12, 0.2)
+    writer.add("home_position", 10_000_000, 488.0, True)
+    path = tmp_path / "log.ulg"
+    path.write_bytes(writer.data)
+    log = load_telemetry(path)
+    assert log.clock == "unix" and log.first_ns == (T0_US + 10_000_000) * 1000
+    state = log.history.state_at(log.first_ns + 8 * 10**9)
+    assert state is not None and state.alt_amsl_m == pytest.approx(alt_m)
+    assert state.lat_deg == pytest.approx(47.3977 + 40.0 / 111_319.49, abs=1e-7)
+    assert state.lon_deg == pytest.approx(8.5456)
+    assert state.sigma_h_m == pytest.approx(sigma_m, rel=0.01)
+    assert state.alt_agl_m == (50.0 if place == "vehicle_global_position" else None)
+    assert (state.v_ned_m_s is None) == (speed_m_s is None)
+    assert state.v_ned_m_s is None or state.v_ned_m_s[0] == pytest.approx(speed_m_s)
+
+
+def test_an_ardupilot_log_without_an_estimate_is_placed_by_its_receiver(tmp_path: Path) -> None:
+    """As Copter 3.2's, which has no POS, NKF1 and GPA."""
+    kept = {name: DATAFLASH[name] for name in ("ATT", "TERR")}
+    columns = "TimeUS,Status,GMS,GWk,HDop,Lat,Lng,Alt,Spd,GCrs,VZ"
+    writer = DataflashWriter(kept | {"GPS": ("QBIHfiiffff", columns, "QBIHfLLffff")})
+    for k in range(100):
+        us = 30_000_000 + k * 100_000
+        place = (473_000_000 + 100 * k, 85_000_000, 512.5, 11.132, 0.0, -0.5)
+        writer.add("GPS", us, 3, 100_000_000 + 100 * k, 2200, 0.8, *place)
+        writer.add("ATT", us, 500, -1000, 9000, 3)
+    path = tmp_path / "log.BIN"
+    path.write_bytes(writer.data)
+    log = load_telemetry(path)
+    state = log.history.state_at(log.first_ns + 5 * 10**9)
+    assert log.clock == "unix" and state is not None and not state.is_claimed
+    assert state.lat_deg == pytest.approx(47.3005, abs=2e-6)
+    assert state.alt_amsl_m == pytest.approx(512.5)
+    assert state.sigma_h_m == pytest.approx(1.2, rel=0.01)
+    assert state.v_ned_m_s is not None and state.v_ned_m_s[0] == pytest.approx(11.132)
+
+
+# Any subset of what is declared
+
+
+def check_log(path: Path) -> None:
+    """The log is read into finite values, or refused in one line."""
+    try:
+        log = load_telemetry(path)
+    except ValueError as refused:
+        assert "\n" not in str(refused)
+        return
+    for time_ns in np.linspace(log.first_ns, log.last_ns, 5).astype(int):
+        state = log.history.state_at(int(time_ns))
+        log.history.heads()
+        for field in fields(state) if state is not None else ():
+            value = getattr(state, field.name)
+            if isinstance(value, float | np.ndarray):
+                assert np.isfinite(value).all(), (field.name, value)
+        if state is not None and state.lat_deg is not None:
+            assert state.sigma_h_m is not None and state.sigma_h_m > 0.0
+
+
+ODD = (math.nan, math.inf, -math.inf, 0.0, -1.0, 1e30, 200.0)
+"""Values of fields that were never set."""
+
+
+class Draw(random.Random):
+    """Chooses what a log declares, and the values of its fields."""
+
+    def some(self, of: Collection[Any]) -> list[Any]:
+        """Most of them, in their order."""
+        return [one for one in of if self.random() < 0.85]
+
+    def value(self, code: str, sound: float = 3.0) -> Any:
+        """One that a field of the struct module's ``code`` can hold."""
+        value = self.choice(ODD) if self.random() < 0.2 else sound
+        if code[-1] in "fd":
+            return value
+        least, most = (-(2**7), 2**7 - 1) if code[-1].islower() else (0, 2**8 - 1)
+        return round(sound if not least <= value <= most else value)
+
+
+EACH_TIME = settings(max_examples=50)(given(st.integers(0, 2**32).map(Draw)))
+
+ULOG_MORE = {
+    "vehicle_global_position": GLOBAL + "bool lat_lon_valid;bool alt_valid;",
+    "vehicle_local_position": LOCAL + "bool v_xy_valid;bool v_z_valid;",
+    "sensor_gps": MODERN["sensor_gps"].removeprefix(STAMP) + "int32_t lat;int32_t lon;int32_t alt;",
+}
+SOUND = {"lat": 47.0, "lon": 8.0, "ref_lat": 47.0, "latitude_deg": 47.0, "longitude_deg": 8.0}
+
+
+@EACH_TIME
+def test_px4_logs_of_any_fields_are_read_or_refused(draw: Draw) -> None:
+    pytest.importorskip("pyulog")
+    every = MODERN | ULOG | {name: STAMP + more for name, more in ULOG_MORE.items()}
+    every["vehicle_gps_position"] = every["sensor_gps"]
+    topics = {
+        name: "".join(f"{field};" for field in draw.some(every[name].split(";")[:-1]))
+        for name in draw.some(every)
+    }
+    writer = UlogWriter(topics)
+    for k in range(8):
+        known = SOUND | {"timestamp": 10_000_000 + 50_000 * k, "time_utc_usec": T0_US + 50_000 * k}
+        for name, declared in topics.items():
+            values: list[Any] = []
+            for field in declared.split(";")[:-1]:
+                kind, called = field.split()
+                code = UlogWriter.code(kind)
+                sound = known.get(called, 1.0)
+                values.append(sound if code == "Q" else draw.value(code, sound))
+                values += [0.0] * 3 if code == "4f" else []
+            writer.add(name, *values)
+    check_log(_written(writer.data, "log.ulg"))
+
+
+@EACH_TIME
+def test_ardupilot_logs_of_any_fields_are_read_or_refused(draw: Draw) -> None:
+    formats, codes = {}, {}
+    for name in draw.some(DATAFLASH):
+        packed, columns, kinds = DATAFLASH[name]
+        declared = zip(re.findall(r"\d*[a-zA-Z]", packed), columns.split(","), kinds, strict=True)
+        kept = draw.some(list(declared))
+        codes[name] = [code for code, _, _ in kept]
+        formats[name] = (
+            "".join(codes[name]),
+            ",".join(c for _, c, _ in kept),
+            "".join(k for _, _, k in kept),
+        )
+    writer = DataflashWriter(formats)
+    for k in range(8):
+        us = 30_000_000 + 50_000 * k
+        for name, wanted in codes.items():
+            values = [us if c == "Q" else b"k" if c[-1] == "s" else draw.value(c) for c in wanted]
+            writer.add(name, *values)
+    check_log(_written(writer.data, "log.BIN"))
+
+
+@EACH_TIME
+def test_telemetry_logs_of_any_messages_are_read_or_refused(draw: Draw) -> None:
+    writer = TlogWriter()
+    for k in range(8):
+        for name in draw.some(READERS):
+            kind = getattr(dialect, f"MAVLink_{name.lower()}_message")
+            codes = {"float": "f", "double": "d", "int8_t": "b", "int16_t": "b", "int32_t": "b"}
+            sizes = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
+            values: list[Any] = []
+            for field, sort in zip(kind.fieldnames, kind.fieldtypes, strict=True):
+                value = draw.value(codes.get(sort, "B"))
+                values.append([value] * sizes[field] if sizes[field] else value)
+            writer.add(T0_US + 100_000 * k, kind(*values))
+    check_log(_written(writer.data, "log.tlog"))
+
+
+@EACH_TIME
+def test_subtitles_of_any_fields_are_read_or_refused(draw: Draw) -> None:
+    words = [word for text in SRT.values() for word in re.findall(r"[^\s,\[\]]+", text)]
+    words += ["rel_alt:", "latitude: 999", "longitude: 1e400", "focal_len: 0.0", "GPS (", "-->"]
+    cues = [cue(n, " ".join(draw.some(draw.choices(words, k=30)))) for n in range(6)]
+    check_log(_written("".join(draw.some(cues)).encode() or b"\n", "log.SRT"))
+
+
+def _written(content: bytes | bytearray, name: str) -> Path:
+    path = Path(tempfile.mkdtemp(dir=SCRATCH.name)) / name
+    path.write_bytes(content)
+    return path
+
+
+SCRATCH = tempfile.TemporaryDirectory()
+"""Removed at the end; hypothesis and pytest's tmp_path do not go together."""
 
 
 def test_settings_of_the_history_reach_it() -> None:

@@ -14,13 +14,15 @@ import numpy as np
 
 from mavlink.telemetry.decode import (
     DOWNWARD,
+    HDOP_TO_M,
     MAX_RATE_RAD_S,
     TERRAIN_MODEL_SIGMA_M,
     plausible_place,
+    receiver_accuracy,
 )
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog, finish
-from mavlink.telemetry.quaternion import from_rpy
+from mavlink.telemetry.quaternion import Vector, from_rpy
 from mavlink.telemetry.samples import (
     AccuracySample,
     AttitudeSample,
@@ -50,7 +52,7 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     history = VehicleHistory(config)
     counts: Counter[str] = Counter()
     reader = _Reader()
-    first_s: float | None = None
+    is_placed = False
     attitudes: list[tuple[AttitudeSample, float]] = []
     for message in _messages(path):
         if not 0.0 <= message._timestamp < 1e-6 * LATEST_USEC:
@@ -59,14 +61,18 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
         counts[name] += 1
         sample = reader.sample(name, message)
         if sample is not None:
-            first_s = message._timestamp if first_s is None else first_s
+            is_placed |= isinstance(sample, PositionSample)
             if isinstance(sample, AttitudeSample):
                 attitudes.append((sample, message._timestamp))
             else:
                 history.add(sample, round(message._timestamp * 1e9))
+    for fix, time_s in reader.fixes:
+        is_missing = not (counts["GPA"] if isinstance(fix, AccuracySample) else is_placed)
+        if is_missing:
+            history.add(fix, round(time_s * 1e9))
     for attitude, time_s in reader.gyros.turning(attitudes):
         history.add(attitude, round(time_s * 1e9))
-    dated = first_s is not None and first_s > UNIX_FROM_S
+    dated = (history.first_ns or 0) > UNIX_FROM_S * 1e9
     warnings = [] if dated else ["no GPS time in this log: its clock starts at boot"]
     return finish(path, history, counts, warnings, "unix" if dated else "boot")
 
@@ -119,6 +125,15 @@ class _Gyros:
             yield (replace(attitude, rates_rad_s=(x, y, z)) if is_known else attitude), time_s
 
 
+def _over_ground(m: Any) -> Vector | None:
+    """Velocity in NED m/s of a message GPS."""
+    speed, course, down = (getattr(m, name, math.nan) for name in ("Spd", "GCrs", "VZ"))
+    if not math.isfinite(speed + course + down):
+        return None
+    course = math.radians(course)
+    return speed * math.cos(course), speed * math.sin(course), down
+
+
 class _Reader:
     """Messages into samples; remembers velocities and rates, which have their own messages."""
 
@@ -128,6 +143,8 @@ class _Reader:
         self._receiver = 0  # the one in use
         self._fix = True
         self._fix_alt_m: float | None = None
+        self.fixes: list[tuple[Sample, float]] = []
+        """Place and accuracy of the receiver's fixes, with their times in s."""
 
     def sample(self, name: str, m: Any) -> Sample | None:
         try:
@@ -146,7 +163,7 @@ class _Reader:
         return None
 
     def _ekf_velocity(self, m: Any) -> Sample | None:
-        if getattr(m, "C", 0) == 0:
+        if getattr(m, "C", 0) == 0 and math.isfinite(m.VN + m.VE + m.VD):
             self._velocity = (m._timestamp, (m.VN, m.VE, m.VD))
         return None
 
@@ -165,12 +182,21 @@ class _Reader:
         self._receiver = getattr(m, "I", 0)
         self._fix = m.Status >= 3
         self._fix_alt_m = getattr(m, "Alt", None) if self._fix else None
-        return None if self._fix else AccuracySample(None, False, 1e3, 1e3)
+        if not self._fix:
+            return receiver_accuracy(False, 1e3, 1e3)
+        rough = receiver_accuracy(True, getattr(m, "HDop", math.nan) * HDOP_TO_M, math.nan)
+        self.fixes.append(
+            (replace(rough, alt_amsl_m=self._fix_alt_m, is_claimed=False), m._timestamp)
+        )
+        if plausible_place(m.Lat, m.Lng):
+            place = PositionSample(None, m.Lat, m.Lng, self._fix_alt_m, None, _over_ground(m))
+            self.fixes.append((place, m._timestamp))
+        return None
 
     def _gps_accuracy(self, m: Any) -> Sample | None:
         if getattr(m, "I", 0) != self._receiver:
             return None
-        return AccuracySample(None, self._fix, m.HAcc, m.VAcc, self._fix_alt_m)
+        return receiver_accuracy(self._fix, m.HAcc, m.VAcc, self._fix_alt_m)
 
     def _range(self, m: Any) -> Sample | None:
         if getattr(m, "Orient", DOWNWARD) != DOWNWARD or getattr(m, "Stat", GOOD) != GOOD:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import struct
 from collections import Counter
 from collections.abc import Callable
@@ -11,12 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from mavlink.telemetry.decode import CLEARANCE_SIGMA_M, DOWNWARD, plausible_place
+from mavlink.telemetry.decode import (
+    CLEARANCE_SIGMA_M,
+    DOWNWARD,
+    plausible_place,
+    receiver_accuracy,
+)
 from mavlink.telemetry.gimbal import frame_of_flags
 from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog, finish
-from mavlink.telemetry.quaternion import normalised
+from mavlink.telemetry.quaternion import Vector, normalised
 from mavlink.telemetry.samples import (
+    F64,
     AccuracySample,
     AttitudeSample,
     GimbalSample,
@@ -44,6 +51,15 @@ BROKEN = (
 Columns = dict[str, Any]
 """Field name to array (N,)."""
 
+Row = Callable[[str], float]
+"""The value of a declared field; NaN where the log does not declare it."""
+
+PLACES = ("vehicle_global_position", "vehicle_local_position", "vehicle_gps_position", "sensor_gps")
+"""Topics with a position, best first; the first that has one gives them all."""
+
+NEAR_US = 250_000
+"""Velocities are known so long before and after a sample of theirs."""
+
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     """The history in a .ulg log, on GPS time when the log has it, otherwise since boot."""
@@ -52,15 +68,57 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     offset_us = _unix_offset_us(topics)
     if offset_us is None:
         warnings.append("no GPS time in this log: its clock starts at boot")
-    # The global position is the estimator's; older logs have only the local one.
-    if len(topics.get("vehicle_global_position", {}).get("timestamp", ())):
-        topics.pop("vehicle_local_position", None)
-    for name, columns in topics.items():
+    _complete(topics)
+    is_placed = False
+    for name, read in TABLE.items():
+        columns = topics.get(name, {"timestamp": np.empty(0, np.int64)})
         times = columns["timestamp"].astype(np.int64) + (offset_us or 0)
-        for i in np.flatnonzero((times >= 0) & (times < LATEST_USEC)):  # others are damaged
-            for sample in TABLE[name](columns, i):
-                history.add(sample, int(times[i]) * 1000)
+        sound = np.flatnonzero((times >= 0) & (times < LATEST_USEC))  # others are damaged
+        found = [(int(times[i]), sample) for i in sound for sample in read(_row(columns, i))]
+        for time_us, sample in found:
+            if not (is_placed and name in PLACES and isinstance(sample, OF_PLACE)):
+                history.add(sample, time_us * 1000)
+        is_placed |= any(isinstance(sample, PositionSample) for _, sample in found)
     return finish(path, history, counts, warnings, "boot" if offset_us is None else "unix")
+
+
+OF_PLACE = (PositionSample, AccuracySample)
+
+
+def _row(columns: Columns, i: int) -> Row:
+    return lambda name: float(columns[name][i]) if name in columns else math.nan
+
+
+def _complete(topics: dict[str, Columns]) -> None:
+    """Add to global positions what has topics of its own: velocity since PX4 1.11, and home."""
+    place, local, home = (topics.get(name, {}) for name in (*PLACES[:2], "home_position"))
+    if not place:
+        return
+    if "vel_n" not in place:
+        for name, filled in {"vx": "vel_n", "vy": "vel_e", "vz": "vel_d"}.items():
+            place[filled] = _at(place, local, name, ("v_xy_valid", "v_z_valid"), NEAR_US)
+    place["home_alt"] = _at(place, home, "alt", ("valid_alt",))
+
+
+def _at(
+    place: Columns, other: Columns, name: str, flags: tuple[str, ...], near_us: float = math.inf
+) -> F64:
+    """(N,) a field of another topic at the times of ``place``; NaN where it is not near."""
+    at = place["timestamp"].astype(np.float64)
+    if name not in other:
+        return np.full(len(at), math.nan)
+    values = other[name].astype(np.float64)
+    sound = np.isfinite(values)
+    for flag in flags:
+        sound &= other.get(flag, 1) != 0
+    order = np.argsort(other["timestamp"][sound], kind="stable")
+    times, values = other["timestamp"][sound][order].astype(np.float64), values[sound][order]
+    if not len(times):
+        return np.full(len(at), math.nan)
+    after = np.clip(np.searchsorted(times, at), 1, max(len(times) - 1, 1))
+    around = times[np.minimum([after - 1, after], len(times) - 1)]
+    near = np.abs(around - at).min(axis=0) <= near_us
+    return np.where(near, np.interp(at, times, values), math.nan)
 
 
 def _topics(path: Path) -> tuple[dict[str, Columns], Counter[str], list[str]]:
@@ -76,11 +134,11 @@ def _topics(path: Path) -> tuple[dict[str, Columns], Counter[str], list[str]]:
         ) from error
     try:
         with _LimitedFile(path) as file:
-            log = ULog(file, list(TABLE))
+            log = ULog(file, [*TABLE, "home_position"])
     except (*BROKEN, ULogException) as error:
         raise ValueError(f"{path}: the .ulg log cannot be read ({error})") from error
-    counts = Counter({d.name: len(d.data["timestamp"]) for d in log.data_list if not d.multi_id})
-    topics = {d.name: d.data for d in log.data_list if d.multi_id == 0}
+    topics = {d.name: d.data for d in log.data_list if d.multi_id == 0 and "timestamp" in d.data}
+    counts = Counter({name: len(data["timestamp"]) for name, data in topics.items()})
     dropouts = len(log.dropouts)
     return topics, counts, [f"{dropouts} dropouts while logging"] if dropouts else []
 
@@ -117,65 +175,82 @@ def _unix_offset_us(topics: dict[str, Columns]) -> int | None:
     return None
 
 
-def _attitude(c: Columns, i: int) -> list[Sample]:
-    q = normalised([float(c[f"q[{k}]"][i]) for k in range(4)])
+def _attitude(row: Row) -> list[Sample]:
+    q = normalised([row(f"q[{k}]") for k in range(4)])
     return [] if q is None else [AttitudeSample(None, q)]
 
 
-def _global(c: Columns, i: int) -> list[Sample]:
-    lat, lon = float(c["lat"][i]), float(c["lon"][i])
-    if not plausible_place(lat, lon):
+def _global(row: Row) -> list[Sample]:
+    lat, lon = row("lat"), row("lon")
+    if not plausible_place(lat, lon) or row("lat_lon_valid") == 0:
         return []
-    v = (float(c["vel_n"][i]), float(c["vel_e"][i]), float(c["vel_d"][i]))
-    found: list[Sample] = [PositionSample(None, lat, lon, float(c["alt"][i]), None, v)]
-    if "eph" in c and "epv" in c:
-        found.append(AccuracySample(None, True, float(c["eph"][i]), float(c["epv"][i])))
-    return found
+    alt = math.nan if row("alt_valid") == 0 else row("alt")
+    velocity = _velocity(row, "vel_n", "vel_e", "vel_d")
+    return [
+        PositionSample(None, lat, lon, alt, alt - row("home_alt"), velocity),
+        receiver_accuracy(True, row("eph"), row("epv")),
+    ]
 
 
-def _local(c: Columns, i: int) -> list[Sample]:
+def _velocity(row: Row, *names: str) -> Vector | None:
+    north, east, down = map(row, names)
+    return (north, east, down) if math.isfinite(north + east + down) else None
+
+
+def _local(row: Row) -> list[Sample]:
     found: list[Sample] = []
-    if "dist_bottom_valid" in c and c["dist_bottom_valid"][i]:
-        found.append(TerrainSample(None, float(c["dist_bottom"][i]), CLEARANCE_SIGMA_M))
-    ref = float(c["ref_lat"][i]), float(c["ref_lon"][i])
-    if not (c["xy_global"][i] and c["z_global"][i] and plausible_place(*ref)):
+    if row("dist_bottom_valid") == 1:
+        found.append(TerrainSample(None, row("dist_bottom"), CLEARANCE_SIGMA_M))
+    ref = row("ref_lat"), row("ref_lon")
+    north, east, down = row("x"), row("y"), row("z")
+    is_global = row("xy_global") == 1 and row("z_global") == 1
+    if not (is_global and plausible_place(*ref) and math.isfinite(north + east)):
         return found
-    north, east, down = float(c["x"][i]), float(c["y"][i]), float(c["z"][i])
     lat = ref[0] + north / M_PER_DEG
-    lon = ref[1] + east / (M_PER_DEG * np.cos(np.radians(ref[0])))
-    v = (float(c["vx"][i]), float(c["vy"][i]), float(c["vz"][i]))
-    alt = float(c["ref_alt"][i]) - down
-    found.append(PositionSample(None, lat, float(lon), alt, -down, v))
-    found.append(AccuracySample(None, True, float(c["eph"][i]), float(c["epv"][i])))
+    lon = ref[1] + east / (M_PER_DEG * math.cos(math.radians(ref[0])))
+    velocity = _velocity(row, "vx", "vy", "vz")
+    found.append(PositionSample(None, lat, lon, row("ref_alt") - down, -down, velocity))
+    found.append(receiver_accuracy(True, row("eph"), row("epv")))
     return found
 
 
-def _distance(c: Columns, i: int) -> list[Sample]:
-    distance = float(c["current_distance"][i])
-    low, high = float(c["min_distance"][i]), float(c["max_distance"][i])
-    if int(c["orientation"][i]) != DOWNWARD or not low <= distance < high:
+def _receiver(row: Row) -> list[Sample]:
+    """A fix in degrees and metres, or, before PX4 1.14, in 1e-7 degrees and millimetres."""
+    lat, lon, alt = row("latitude_deg"), row("longitude_deg"), row("altitude_msl_m")
+    if math.isnan(lat):
+        lat, lon, alt = 1e-7 * row("lat"), 1e-7 * row("lon"), 1e-3 * row("alt")
+    if not (row("fix_type") >= 3 and plausible_place(lat, lon)):
+        return [receiver_accuracy(False)]
+    velocity = _velocity(row, "vel_n_m_s", "vel_e_m_s", "vel_d_m_s")
+    velocity = None if row("vel_ned_valid") == 0 else velocity
+    return [
+        PositionSample(None, lat, lon, alt, None, velocity),
+        receiver_accuracy(True, row("eph"), row("epv"), alt),
+    ]
+
+
+def _distance(row: Row) -> list[Sample]:
+    distance = row("current_distance")
+    is_within = row("min_distance") <= distance < row("max_distance")
+    if row("orientation") != DOWNWARD or not is_within:
         return []
     return [RangeSample(None, distance)]
 
 
-def _gimbal(c: Columns, i: int) -> list[Sample]:
-    q = normalised([float(c[f"q[{k}]"][i]) for k in range(4)])
-    if q is None:
+def _gimbal(row: Row) -> list[Sample]:
+    q, flags = normalised([row(f"q[{k}]") for k in range(4)]), row("device_flags")
+    if q is None or math.isnan(flags):
         return []
-    return [GimbalSample(None, q, frame_of_flags(int(c["device_flags"][i])), 154, 0)]
+    return [GimbalSample(None, q, frame_of_flags(int(flags)), 154, 0)]
 
 
-def _nothing(_: Columns, __: int) -> list[Sample]:
-    return []
-
-
-TABLE: dict[str, Callable[[Columns, int], list[Sample]]] = {
+TABLE: dict[str, Callable[[Row], list[Sample]]] = {
     "vehicle_attitude": _attitude,
     "vehicle_global_position": _global,
     "vehicle_local_position": _local,
+    "vehicle_gps_position": _receiver,
+    "sensor_gps": _receiver,
     "distance_sensor": _distance,
     "gimbal_device_attitude_status": _gimbal,
-    "vehicle_gps_position": _nothing,  # read for its UTC alone
-    "sensor_gps": _nothing,
 }
 """Topic to reader. A new topic is one function and one line."""
