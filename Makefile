@@ -1,4 +1,4 @@
-# make demo | test | test-all | lint | types | bench | trials | bundle | lock | notices | clean. The first call makes .venv.
+# make demo | test | test-all | lint | types | bench | trials | reports | bundle | lock | notices | clean. The first call makes .venv.
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -13,7 +13,7 @@ CORE := $(VENV)/core
 STAMP := $(VENV)/installed
 PEERS := $(VENV)/peers/installed
 
-.PHONY: demo test test-all lint types check bench trials format bundle lock notices clean
+.PHONY: demo test test-all lint types check bench trials reports format bundle lock notices clean
 
 # Needs the core and the portal alone, without torch and Open3D.
 demo: $(CORE)
@@ -48,18 +48,22 @@ bench: $(STAMP)
 
 # Over an hour: fifty kills, the fuzzers, and in parallel an hour of flights and a scan of an hour
 # (MINUTES=6 is shorter), which are their load. As root with systemd-container and debootstrap it
-# also installs into a bare Debian and boots that. Writes trials.md and boot-log.md of docs/reports.
+# also installs into a bare Debian and boots that. Writes docs/reports/runs.
 MINUTES ?= 60
 SOAK := tests/trials/test_trial_soak.py
 trials: $(STAMP)
 	$(BIN)/python -m pip install --no-compile --disable-pip-version-check -qq -c constraints.txt -e '.[$(EXTRAS),trials]'
 	@export SKYRELIEF_TRIALS=whole SKYRELIEF_SOAK_MINUTES=$(MINUTES); \
-	  export SKYRELIEF_TRIALS_TABLE=docs/reports/trials.md SKYRELIEF_BOOT_LOG=docs/reports/boot-log.md; \
+	  export SKYRELIEF_TRIALS_TABLE=docs/reports/runs/trials.json SKYRELIEF_BOOT_LOG=docs/reports/runs/boot.json; \
 	  $(BIN)/python -m pytest -m trial $(SOAK) -k flights $(ARGS) & flights=$$!; \
 	  $(BIN)/python -m pytest -m trial $(SOAK) -k scan $(ARGS) & scan=$$!; \
 	  $(BIN)/python -m pytest -m trial tests/trials --ignore=$(SOAK) $(ARGS); rest=$$?; \
-	  wait $$flights; flights=$$?; wait $$scan; scan=$$?; cat docs/reports/trials.md; \
+	  wait $$flights; flights=$$?; wait $$scan; scan=$$?; $(BIN)/python docs/report.py; cat docs/reports/trials.md; \
 	  for rc in $$rest $$flights $$scan; do case $$rc in 0|5) ;; *) exit $$rc;; esac; done  # 5: none
+
+# docs/reports/*.md from the JSON there and in docs/reports/runs.
+reports:
+	$(PYTHON) docs/report.py
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from paths import ROOT
 
-LOGS = ("boot-log.md", "install-log.md")
-"""Transcripts of what ran once; their text is not written by hand."""
 PAGES = sorted(
     page
     for page in (
@@ -18,7 +16,6 @@ PAGES = sorted(
         *(ROOT / "docs").rglob("*.md"),
         *(ROOT / "demo").rglob("*.md"),
     )
-    if page.name not in LOGS
 )
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^ {4,}\S.*\n)+", re.MULTILINE)

@@ -56,9 +56,9 @@ class Line:
 
 
 class Table:
-    """The outcomes, kept as JSON and as a page; lines of earlier runs stay until tried again.
+    """The outcomes, kept as JSON; lines of earlier runs stay until tried again.
 
-    Several runs may fill one table at the same time.
+    Several runs may fill one table at the same time. docs/report.py makes a page of it.
     """
 
     def __init__(self, target: Path | None) -> None:
@@ -70,37 +70,24 @@ class Table:
         """See :class:`Row`. Written at once: a run that is broken off keeps what it found."""
         if self._target is None:
             return
-        kept = self._target.with_suffix(".json")
         now = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
         rounded = None if back_s is None else round(back_s, 1)
-        with kept.open("a+", encoding="utf-8") as file:
+        with self._target.open("a+", encoding="utf-8") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             file.seek(0)
             known = json.loads(file.read() or '{"trials": []}')["trials"]
             lines = {line["fault"]: Line(**line) for line in known}
             lines[fault] = Line(fault, times, outcome, lost, rounded, now)
-            _write(self._target, kept, sorted(lines.values(), key=lambda line: line.fault))
+            content = {
+                "machine": machine(),
+                "trials": [asdict(lines[name]) for name in sorted(lines)],
+            }
+            self._target.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def _write(page: Path, kept: Path, lines: list[Line]) -> None:
-    machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
-    content = {"machine": machine, "trials": [asdict(line) for line in lines]}
-    kept.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    rows = [
-        f"| {x.fault} | {x.times} | {x.outcome} | {x.lost} | "
-        f"{'-' if x.back_s is None else f'{x.back_s:.1f} s'} | {x.when} |"
-        for x in lines
-    ]
-    page.write_text(
-        "# Trials\n\n"
-        f"Written by the trials ({machine}); rows of earlier runs stay until they run again.\n"
-        "*Lost*: part of what the store had acknowledged; *scanning again*: longest time\n"
-        "from the end of the cause to the next frame; *when*: UTC. `make trials` is the\n"
-        "whole form, `make test` has a short one.\n\n"
-        "| fault | times | outcome | lost | scanning again | when |\n"
-        "|---|---|---|---|---|---|\n" + "\n".join(rows) + "\n",
-        encoding="utf-8",
-    )
+def machine() -> str:
+    """The machine that the trials run on, in words."""
+    return f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
 
 
 def answer(port: int, path: str = "/status") -> dict[str, Any]:

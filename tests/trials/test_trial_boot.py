@@ -6,6 +6,7 @@ Only in the whole form; it needs root, systemd-nspawn and debootstrap.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -142,23 +143,9 @@ def aircraft(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Aircraft]:
         sender.wait()
         log = os.environ.get("SKYRELIEF_BOOT_LOG", "")
         if log:
-            Path(log).write_text(_page(machine.transcript), encoding="utf-8")
+            content = {"typed": [text for text in machine.transcript if text]}
+            Path(log).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         shutil.rmtree(machine.root, ignore_errors=True)
-
-
-def _page(transcript: list[str]) -> str:
-    typed = "\n".join(line for line in transcript if line)
-    return f"""# From a bare Debian to an aircraft
-
-Written by `tests/trials/test_trial_boot.py` (`make trials`): what was typed in a root made by
-debootstrap and booted by its own systemd, and what it printed. `/root/bundle` was made by
-`make bundle`; `next` and `bad` are the same as later releases, of which `bad` ends 8 s after it
-has come up.
-
-```
-{typed}
-```
-"""
 
 
 def test_install_and_first_start(aircraft: Aircraft, record: Row) -> None:

@@ -1,6 +1,6 @@
 """The table of docs/reports/sensors.md: one simulated flight under each subset of its sensors.
 
-    python docs/reports/benchmarks/sensors.py FLIGHT OUT [ROW ...]
+    python tests/bench/sensors.py FLIGHT OUT [ROW ...]
 
 ``FLIGHT`` is made by ``skyrelief simulate``. The flight's other logs are made as it was, with
 the sensors' noise of their row and without images. Prints a row of the table for each, or

@@ -1,0 +1,89 @@
+"""Reports are what docs/report.py writes, and documents keep to the rules of their form."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from doc_pages import FENCE, PAGES, ROOT, text_of
+
+REPORTS = ROOT / "docs" / "reports"
+MOST_WORDS, MOST_CHARACTERS = 8000, 140
+HASH = re.compile(r"\b(?=[0-9a-f]*[0-9])(?=[0-9a-f]*[a-f])[0-9a-f]{7,40}\b")
+"""Seven to forty hexadecimal digits with a number and a letter: a commit."""
+
+
+@pytest.fixture(scope="module")
+def report() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("report", ROOT / "docs" / "report.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def faults(text: str) -> Iterator[str]:
+    """Lines outside tables that are too long, or name a commit outside code blocks."""
+    for line in text.split("\n"):
+        if not line.startswith("|") and len(line) > MOST_CHARACTERS:
+            yield line
+    for line in FENCE.sub("", text).split("\n"):
+        if not line.startswith("|") and HASH.search(re.sub(r"\]\(\S+\)", "", line)):
+            yield line
+
+
+def test_reports_are_what_their_data_says(report: ModuleType) -> None:
+    there = {page.name: text_of(page) for page in REPORTS.glob("*.md")}
+    assert there == report.pages(), "run make reports"
+
+
+def test_reports_are_short() -> None:
+    assert sum(len(text_of(page).split()) for page in REPORTS.glob("*.md")) <= MOST_WORDS
+
+
+def test_a_long_conclusion_is_refused(report: ModuleType) -> None:
+    assert len(report.conclusions({"title": "", "conclusions": ["a"] * 10})) == 10
+    with pytest.raises(ValueError, match="11 lines of conclusion"):
+        report.conclusions({"title": "", "conclusions": ["a"] * 9 + ["word " * 40]})
+
+
+def test_the_newest_result_of_a_benchmark_is_shown(report: ModuleType) -> None:
+    shown = report.bench({"title": "", "bench": ["stereo"], "only": "^320x180"})
+    run = report.newest("stereo", "")
+    assert run["date"][:10] == shown["date"] and run["commit"] == shown["commit"]
+    assert [row[0] for row in shown["rows"]] == ["320x180, 16 labels, 5 iterations"]
+
+
+def test_like_faults_share_a_row(report: ModuleType) -> None:
+    def tried(fault: str, lost: str = "-", back_s: float | None = None) -> dict[str, object]:
+        return {"fault": fault, "times": 5, "outcome": "kept; more", "lost": lost, "back_s": back_s}
+
+    lines = [
+        tried("fuzz: a (Hypothesis)"), tried("fuzz: b (Hypothesis)"),
+        tried("power cut", "0 of 9 chunks", 1.25), tried("kill", "2 of 9 chunks"),
+    ]  # fmt: skip
+    assert list(report.trials(lines)) == [
+        ["5 x fuzz: a, b (Hypothesis)", "kept"],
+        ["5 x power cut", "kept (1.2 s)"],
+        ["5 x kill", "kept; lost 2 of 9 chunks"],
+    ]
+
+
+PLAIN = [page for page in PAGES if REPORTS in page.parents or page.name == "CHANGELOG.md"]
+
+
+@pytest.mark.parametrize("page", PLAIN, ids=lambda page: str(page.relative_to(ROOT)))
+def test_lines_are_short_and_name_no_commit(page: Path) -> None:
+    assert list(faults(text_of(page))) == []
+
+
+def test_wrong_lines_are_found() -> None:
+    text = (
+        "| c9297af3 |\nas of c9297af3\n[a](b/c9297af3.json)\n```\nversion c9297af3\n```\n"
+        + "a " * 71
+    )
+    assert list(faults(text)) == ["a " * 71, "as of c9297af3"]
