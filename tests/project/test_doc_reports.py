@@ -9,7 +9,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from doc_pages import FENCE, PAGES, ROOT, text_of
+from doc_pages import FENCE, PAGES, text_of
+from paths import ROOT
 
 REPORTS = ROOT / "docs" / "reports"
 MOST_WORDS, MOST_CHARACTERS = 8000, 140
