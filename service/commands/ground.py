@@ -125,6 +125,11 @@ class GroundOptions:
 
         connect, listen, has_keys = self.connect or [], self.listen or [], self.keys is not None
         ca, certificate, key = tls_files(self.keys) if self.keys is not None else ("", "", "")
+        if has_keys and connect and listen:
+            raise InputError(
+                "with --keys a station listens or joins another: its key does not let it pass on "
+                "what drones send; a drone can name several stations in datalink.connect"
+            )
         if not connect and not listen:
             host = "tls/0.0.0.0" if has_keys else "tcp/127.0.0.1"
             listen = [f"{host}:{DEFAULT_PORT}"]

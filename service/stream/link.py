@@ -10,16 +10,22 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from service.config import DatalinkConfig
-from service.errors import OutsideError, SkyreliefError
+from service.errors import InputError, OutsideError, SkyreliefError
 from service.stream.messages import Ask, Held, unpack
 from service.stream.naming import ROOT, check_name
 from service.stream.outbox import Outbox, Outgoing
 from service.stream.ranges import RangeSet, ranges_from_text
 from service.stream.reports import TAKE_S, HeldNotes, Reports
-from service.stream.session import SessionConfig, check_endpoints, open_session
+from service.stream.session import (
+    SessionConfig,
+    check_endpoints,
+    is_encrypted,
+    open_session,
+)
 from service.stream.store import ScanStore
 from service.stream.tunnel import Carrier, RadioSender, TunnelConfig
 from service.workers import Worker, Workers
@@ -36,8 +42,10 @@ MAX_WAITING_ASKS = 64
 RETRY_S = 1.0
 """Minimum interval between attempts to open a session; a tenth of it after a timeout."""
 SILENCE_S = 5.0
-"""When all stations heard so far are silent for this long, a new session is opened: TCP backs off
+"""When all stations heard on a session are silent for this long, a new one is opened: TCP backs off
 before it retries a dead connection."""
+LOOK_S = 0.2
+"""Interval between two looks at a session."""
 FIRST_PATIENCE_S, MIN_PATIENCE_S = 10.0, 1.5
 PATIENCE = 3.0
 """Timeout of an attempt, as a multiple of the last one: a new session finds a recovered link sooner
@@ -53,7 +61,7 @@ PRIORITIES = ("REAL_TIME", "INTERACTIVE_HIGH", "DATA_HIGH", "DATA", "DATA_LOW", 
 class LinkProgress:
     """Progress of the datalink with the scans it offers."""
 
-    connected: bool  # connected to a router
+    connected: bool  # a session is open
     listened: bool  # a ground station was heard recently
     items: int  # items in the stores: poses, layers …
     lacking: dict[str, int] = field(default_factory=dict)  # by kind, at the best ground station
@@ -66,12 +74,30 @@ class LinkProgress:
         return self.items > 0 and not self.lacking
 
 
+@dataclass(slots=True, eq=False)
+class _Connection:
+    """A session with one ground station or router, or with those that call us."""
+
+    config: SessionConfig
+    session: zenoh.Session | None = None  # while it is open
+    heard_at: float | None = None  # on this session; monotonic s
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether those heard on it are silent. Who is called waits for the others to call."""
+        at = self.heard_at
+        is_caller = not self.config.listen
+        return is_caller and at is not None and time.monotonic() - at > SILENCE_S
+
+
 class DatalinkSender:
     """Publishes a scan while it grows, and answers requests of ground stations. All puts happen on
-    its own thread. Without endpoints in ``config`` nothing is opened. Raises InputError when an
-    endpoint or a name cannot be used; a ground station that is not there yet is waited for. Between
-    flights ``store`` is None and ``drone`` says whose scans :meth:`add` will bring. ``radio``
-    carries the narrow fallback.
+    its own thread. Each endpoint of ``config.connect`` has a client session of its own: as a router
+    between two stations the drone would carry their messages over its radio, and its rights at one
+    station would decide what the other one gets. Without endpoints in ``config`` nothing is opened.
+    Raises InputError when an endpoint or a name cannot be used; a ground station that is not there
+    yet is waited for. Between flights ``store`` is None and ``drone`` says whose scans :meth:`add`
+    will bring. ``radio`` carries the narrow fallback.
     """
 
     def __init__(
@@ -83,17 +109,9 @@ class DatalinkSender:
     ) -> None:
         self._config = config
         self._drone = check_name(drone if store is None else store.header.drone, "drone")
-        self._session_config = SessionConfig(
-            mode="router" if config.listen or len(config.connect) > 1 else "client",
-            connect=config.connect,
-            listen=config.listen,
-            plain=config.plain,
-            tls_ca=config.tls_ca,
-            tls_certificate=config.tls_certificate,
-            tls_key=config.tls_key,
-            rate_bytes_s=_rate(config.budget_kbit_s, config.share),
-        )
-        check_endpoints(self._session_config)
+        self._connections = [_Connection(config) for config in _sessions(config)]
+        for connection in self._connections:
+            check_endpoints(connection.config)
         self._lock = threading.Lock()  # of the outbox
         self._outbox = Outbox(_rate(config.budget_kbit_s, config.share), time.monotonic())
         self._stores: list[tuple[ScanStore, Callable[[str, int], None]]] = []
@@ -103,11 +121,8 @@ class DatalinkSender:
         self._is_looked_for = False  # somebody asks for the heads
         self._wake = threading.Event()
         self._stop = threading.Event()
-        self._connected = False
-        self._heard_at: float | None = None  # on the session that is open
-        self._opening_s = FIRST_PATIENCE_S / PATIENCE  # what the last session took to open
         self._workers = Workers()
-        self._thread: Worker | None = None
+        self._threads: list[Worker] = []
         self._owned: list[ScanStore] = []
         self._radio = None
         if store is not None and radio is not None:
@@ -117,8 +132,11 @@ class DatalinkSender:
             )
         if store is not None:
             self.add(store)
-        if config.connect or config.listen:
-            self._thread = self._workers.start("datalink", self._run)
+        if self._connections:
+            self._threads.append(self._workers.start("datalink", self._serve))
+        for connection in self._connections:
+            name = f"datalink {' '.join(connection.config.connect) or 'calls'}"
+            self._threads.append(self._workers.start(name, partial(self._keep, connection)))
         atexit.register(self.close)  # Zenoh aborts a process that ends around an open session
 
     def _listened(self) -> bool:
@@ -169,7 +187,7 @@ class DatalinkSender:
                 for kind, numbers in self._outbox.lacking(store.header.name).items():
                     lacking[kind] = lacking.get(kind, 0) + len(numbers)
             return LinkProgress(
-                self._connected,
+                bool(self._open_sessions),
                 self._outbox.listened(time.monotonic()),
                 items,
                 lacking,
@@ -192,7 +210,7 @@ class DatalinkSender:
 
     def _may_send(self) -> bool:
         """Whether anything is still on its way, by IP or by radio."""
-        if self._thread is not None:
+        if self._threads:
             return True
         return self._radio is not None and not self._radio.all_sent
 
@@ -201,9 +219,9 @@ class DatalinkSender:
         atexit.unregister(self.close)
         self._stop.set()
         self._wake.set()
-        if self._thread is not None:
-            self._thread.join(CLOSING_S)
-            self._thread = None
+        deadline = time.monotonic() + CLOSING_S
+        while self._threads:
+            self._threads.pop().join(max(0.0, deadline - time.monotonic()))
         if self._radio is not None:
             self._radio.close()
             self._radio = None
@@ -220,16 +238,22 @@ class DatalinkSender:
 
     # The link's side
 
-    def _run(self, _: Worker) -> None:
+    @property
+    def _open_sessions(self) -> list[zenoh.Session]:
+        return [c.session for c in self._connections if c.session is not None]
+
+    def _keep(self, connection: _Connection, _: Worker) -> None:
+        """Keep a session open until the stop; a new one follows when its stations fall silent."""
         attempt = 0
+        opening_s = FIRST_PATIENCE_S / PATIENCE  # what the last session took to open
         while not self._stop.is_set():
             began = time.monotonic()
             attempt += 1
-            patience = max(PATIENCE * self._opening_s, MIN_PATIENCE_S)
+            patience = max(PATIENCE * opening_s, MIN_PATIENCE_S)
             if attempt % PATIENT_ATTEMPT == 0:  # the link may have become a slower one
                 patience = FIRST_PATIENCE_S
             try:
-                session = open_session(replace(self._session_config, open_timeout_s=patience))
+                session = open_session(replace(connection.config, open_timeout_s=patience))
             except OutsideError as error:
                 log.log(logging.WARNING if attempt == 1 else logging.DEBUG, "%s", error)
                 pause = max(RETRY_S / 10, RETRY_S - (time.monotonic() - began))
@@ -238,22 +262,37 @@ class DatalinkSender:
             except SkyreliefError as error:
                 log.error("datalink stays closed: %s", error)
                 return
-            self._opening_s = time.monotonic() - began
+            opening_s = time.monotonic() - began
             attempt = 0
             log.info("datalink open")
             pumps: list[Worker] = []
             try:
-                pumps = self._listen(session)
-                self._serve(session)
+                pumps = self._listen(connection, session)
+                self._begin(connection, session)
+                while not self._stop.wait(LOOK_S) and not session.is_closed():
+                    if connection.is_silent:
+                        log.info("datalink silent; opening it again")
+                        break
             finally:
-                self._connected = False
+                connection.session = None
                 self._close_session(session, pumps)
+
+    def _begin(self, connection: _Connection, session: zenoh.Session) -> None:
+        """Send on a session that has just been opened too."""
+        now = time.monotonic()
+        with self._lock:
+            if not self._open_sessions:
+                self._outbox.reconnected(now)
+            self._outbox.publish_heads(now)
+            connection.session, connection.heard_at = session, None
+        self._wake.set()
 
     def _close_session(self, session: zenoh.Session, pumps: list[Worker]) -> None:
         """Close it on a separate thread: over a dead link that takes long."""
-        self._asks.clear()
         with self._lock:
-            self._outbox.forget_requests()
+            if not self._open_sessions:
+                self._asks.clear()
+                self._outbox.forget_requests()
         closed = threading.Event()
 
         def wait() -> None:
@@ -269,7 +308,7 @@ class DatalinkSender:
         if self._stop.is_set():
             closed.wait(PROMPT_CLOSING_S)
 
-    def _listen(self, session: zenoh.Session) -> list[Worker]:
+    def _listen(self, connection: _Connection, session: zenoh.Session) -> list[Worker]:
         """Workers that take what arrives. They end with the session.
 
         Channels and threads of our own: a callback's thread would belong to the library, and
@@ -283,31 +322,25 @@ class DatalinkSender:
         looks = session.declare_queryable(f"{base}/*/head", channel)
         start = self._workers.start
         return [
-            start("datalink reports", lambda _: _pump(held, self._on_held)),
-            start("datalink requests", lambda _: _pump(asks, self._on_query)),
+            start("datalink reports", lambda _: _pump(held, partial(self._on_held, connection))),
+            start("datalink requests", lambda _: _pump(asks, partial(self._on_query, connection))),
             start("datalink looks", lambda _: _pump(looks, self._on_look)),
         ]
 
-    def _serve(self, session: zenoh.Session) -> None:
-        """Send and answer until the stop, or until those who listened fall silent."""
-        self._heard_at = None
-        with self._lock:
-            self._outbox.reconnected(time.monotonic())
-        while not self._stop.is_set() and not session.is_closed():
-            self._connected = True
+    def _serve(self, _: Worker) -> None:
+        """Send and answer on the open sessions until the stop."""
+        while not self._stop.is_set():
             self._wake.clear()
-            with self._lock:
-                self._take_in(time.monotonic())
-                todo = self._outbox.next(time.monotonic())
+            sessions = self._open_sessions
+            todo: Outgoing | float = 1.0
+            if sessions:
+                with self._lock:
+                    self._take_in(time.monotonic())
+                    todo = self._outbox.next(time.monotonic(), len(sessions))
             if isinstance(todo, Outgoing):
-                self._send(session, todo)
+                self._send(sessions, todo)
             else:
                 self._wake.wait(min(todo, TAKE_S) if self._reports else todo)
-            heard = self._heard_at
-            is_caller = not self._config.listen  # who is called waits for the others to call
-            if is_caller and heard is not None and time.monotonic() - heard > SILENCE_S:
-                log.info("datalink silent; opening it again")
-                return
 
     def _take_in(self, now: float) -> None:
         """Events since the last turn, here and at the ground stations."""
@@ -317,32 +350,32 @@ class DatalinkSender:
             query, scan_id, kind, numbers, ask = self._asks.popleft()
             for ended in self._outbox.ask(scan_id, kind, numbers, ask, query, now):
                 ended.drop()
-            if self._outbox.serves(ask.peer):
-                self._heard_at = now
         if self._is_looked_for:
             self._is_looked_for = False
             self._outbox.publish_heads(now)
         reports = self._reports.take(now)
         for scan_id, peer, payload in reports:
             held = unpack(payload, Held)
-            if held is not None and self._outbox.held(scan_id, peer, held, now):
-                self._heard_at = now
+            if held is not None:
+                self._outbox.held(scan_id, peer, held, now)
         for store, _ in list(self._stores) if reports else ():
             self._notes.keep(store, now)
 
-    def _send(self, session: zenoh.Session, message: Outgoing) -> None:
+    def _send(self, sessions: list[zenoh.Session], message: Outgoing) -> None:
+        """Answer a request, or put a live message on each session."""
         import zenoh
 
         key = f"{ROOT}/{self._drone}/{message.scan_id}/{message.topic}"
         try:
             if message.token is None:
-                session.put(
-                    key,
-                    message.payload,
-                    priority=getattr(zenoh.Priority, PRIORITIES[message.lane]),
-                    congestion_control=zenoh.CongestionControl.DROP,
-                    express=message.lane < 2,
-                )
+                for session in sessions:
+                    session.put(
+                        key,
+                        message.payload,
+                        priority=getattr(zenoh.Priority, PRIORITIES[message.lane]),
+                        congestion_control=zenoh.CongestionControl.DROP,
+                        express=message.lane < 2,
+                    )
                 return
             if message.payload:
                 message.token.reply(key, message.payload)
@@ -353,7 +386,8 @@ class DatalinkSender:
 
     # The threads that take what comes
 
-    def _on_held(self, sample: zenoh.Sample) -> None:
+    def _on_held(self, connection: _Connection, sample: zenoh.Sample) -> None:
+        connection.heard_at = time.monotonic()
         if self._reports.put(str(sample.key_expr), sample.payload.to_bytes()):
             self._wake.set()
 
@@ -362,7 +396,8 @@ class DatalinkSender:
         self._is_looked_for = True
         self._wake.set()
 
-    def _on_query(self, query: zenoh.Query) -> None:
+    def _on_query(self, connection: _Connection, query: zenoh.Query) -> None:
+        connection.heard_at = time.monotonic()
         parts = str(query.key_expr).split("/")
         ask = unpack(query.payload.to_bytes(), Ask) if query.payload is not None else None
         numbers = ranges_from_text(parts[5]) if len(parts) == 6 else None
@@ -390,3 +425,26 @@ def _close(session: zenoh.Session, pumps: list[Worker]) -> None:
 
 def _rate(budget_kbit_s: float, share: float) -> float:
     return budget_kbit_s * 1000 / 8 * share
+
+
+def _sessions(config: DatalinkConfig) -> list[SessionConfig]:
+    """A client for each endpoint to connect to, and a router where others connect to us.
+
+    Raises InputError for encrypted endpoints to listen on.
+    """
+    for endpoint in config.listen:
+        if is_encrypted(endpoint):
+            raise InputError(
+                f"datalink.listen {endpoint}: an aircraft's key cannot serve, because a stolen one "
+                "could then pose as a ground station; give the ground station in datalink.connect"
+            )
+    shared = SessionConfig(
+        plain=config.plain,
+        tls_ca=config.tls_ca,
+        tls_certificate=config.tls_certificate,
+        tls_key=config.tls_key,
+        rate_bytes_s=_rate(config.budget_kbit_s, config.share),
+    )
+    calls = [replace(shared, connect=(endpoint,)) for endpoint in config.connect]
+    called = [replace(shared, mode="router", listen=config.listen)] if config.listen else []
+    return calls + called

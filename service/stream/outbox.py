@@ -44,6 +44,7 @@ class Outgoing:
     payload: bytes
     lane: int = 0
     token: Any = None  # the request that it answers; None for a live message
+    peer: str = ""  # the station that it answers
     last: bool = False  # it completes that request
 
 
@@ -156,7 +157,7 @@ class AskedLane:
             else:
                 name = request.store.header.name
                 self._messages.append(
-                    Outgoing(name, request.topic, b"", token=request.token, last=True)
+                    Outgoing(name, request.topic, b"", 0, request.token, request.ask.peer, True)
                 )
         return self._messages[0] if self._messages else None
 
@@ -197,7 +198,8 @@ def _bundle(request: Request, parts: list[Part], part_bytes: int) -> list[Outgoi
         else:
             payloads.append(data)
     scan_id = request.store.header.name
-    return [Outgoing(scan_id, request.topic, p, token=request.token) for p in payloads]
+    peer = request.ask.peer
+    return [Outgoing(scan_id, request.topic, p, 0, request.token, peer) for p in payloads]
 
 
 STATUS, POSE, COARSE, ASKED, FINE, BACKFILL = range(6)
@@ -223,7 +225,16 @@ class _Feed:
     head_due: float
     head_sent: float = -1e9
     held: dict[str, Numbers] = field(default_factory=dict)
-    sent_bytes: int = 0  # for parts of this scan's items
+    live_bytes: int = 0  # of this scan's items, sent to all stations
+    answered_bytes: dict[str, int] = field(default_factory=dict)  # and to each on request
+
+    def count(self, message: Outgoing) -> None:
+        """Count a message of items that is being sent."""
+        size, answered = len(message.payload), self.answered_bytes
+        if message.peer:
+            answered[message.peer] = answered.get(message.peer, 0) + size
+        else:
+            self.live_bytes += size
 
 
 class Outbox:
@@ -291,7 +302,8 @@ class Outbox:
         if is_first:
             self._catch_up(feed, report.numbers)
         estimate = self._estimates.setdefault((scan_id, peer), RateEstimate(self._configured))
-        estimate.report(feed.sent_bytes, report.received_bytes, now)
+        sent_bytes = feed.live_bytes + feed.answered_bytes.get(peer, 0)
+        estimate.report(sent_bytes, report.received_bytes, now)
         self._adapt(now)
         return True
 
@@ -312,6 +324,7 @@ class Outbox:
         self._head = None
         for feed in self._feeds.values():
             feed.head_due = now
+            feed.answered_bytes.clear()
 
     def forget_requests(self) -> None:
         """Drop all requests, and their tokens."""
@@ -368,6 +381,8 @@ class Outbox:
             del self._heard[silent]
             for key in [key for key in self._estimates if key[1] == silent]:
                 del self._estimates[key]
+            for feed in self._feeds.values():
+                feed.answered_bytes.pop(silent, None)
         if not self.listened(now):
             self.publish_heads(now)
         self._heard[peer] = now
@@ -375,8 +390,11 @@ class Outbox:
 
     # Output
 
-    def next(self, now: float) -> Outgoing | float:
-        """The message to send now, or the seconds to wait; any event may shorten the wait."""
+    def next(self, now: float, sessions: int = 1) -> Outgoing | float:
+        """The message to send now, or the seconds to wait; any event may shorten the wait.
+
+        A live message goes over the link once for each of the ``sessions``, an answer once.
+        """
         if not self.listened(now):
             self._clear_live()
         part_bytes = self.bucket.part_bytes
@@ -388,10 +406,11 @@ class Outbox:
             wait = self.bucket.ready_in(size, now)
             if wait > 0:
                 return wait
+            size *= sessions if message.token is None else 1
             self.bucket.take(size, now)
             self.sent_bytes += size
             if number != STATUS and message.scan_id in self._feeds:
-                self._feeds[message.scan_id].sent_bytes += len(message.payload)
+                self._feeds[message.scan_id].count(message)
             self._pop(number)
             return replace(message, lane=number)
         due = min((feed.head_due for feed in self._feeds.values()), default=now + 1.0)

@@ -43,6 +43,11 @@ class SessionConfig:
     rate_bytes_s: float = 0.0  # our send rate; determines the send buffer
 
 
+def is_encrypted(endpoint: str) -> bool:
+    """Whether an endpoint uses TLS."""
+    return endpoint.partition("/")[0] in _ENCRYPTED
+
+
 def check_endpoints(config: SessionConfig) -> None:
     """Raise InputError for endpoints that are malformed, unencrypted to another machine, or lack
     certificates."""
