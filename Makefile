@@ -1,4 +1,4 @@
-# make demo | test | test-all | lint | types | bench | trials | reports | bundle | lock | notices | clean. The first call makes .venv.
+# make demo | test | test-all | lint | types | bench | trials | pages | bundle | lock | notices | clean. The first call makes .venv.
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -13,7 +13,7 @@ CORE := $(VENV)/core
 STAMP := $(VENV)/installed
 PEERS := $(VENV)/peers/installed
 
-.PHONY: demo test test-all lint types check bench trials reports format bundle lock notices clean
+.PHONY: demo test test-all lint types check bench trials pages format bundle lock notices clean
 
 # Needs the core and the portal alone, without torch and Open3D.
 demo: $(CORE)
@@ -61,9 +61,9 @@ trials: $(STAMP)
 	  wait $$flights; flights=$$?; wait $$scan; scan=$$?; $(BIN)/python docs/report.py; cat docs/reports/trials.md; \
 	  for rc in $$rest $$flights $$scan; do case $$rc in 0|5) ;; *) exit $$rc;; esac; done  # 5: none
 
-# docs/reports/*.md from the JSON there and in docs/reports/runs.
-reports:
-	$(PYTHON) docs/report.py
+# What commands write in docs: reports, configuration and pictures.
+pages: $(CORE)
+	for script in report configuration architecture; do $(BIN)/python docs/$$script.py || exit; done
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

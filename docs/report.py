@@ -46,7 +46,7 @@ def index(reports: dict[str, Json]) -> str:
         for name, one in reports.items()
     ]
     text = (
-        "`make reports` writes these pages from the JSON next to them and the results in `runs/`, "
+        "`make pages` writes these pages from the JSON next to them and the results in `runs/`, "
         "which `skyrelief bench NAME --keep docs/reports/runs` and `make trials` write. A new "
         "figure replaces the old one."
     )

@@ -1,4 +1,4 @@
-"""Reports are what docs/report.py writes, and documents keep to the rules of their form."""
+"""Pages that commands write are up to date, and documents keep to the rules of their form."""
 
 from __future__ import annotations
 
@@ -12,19 +12,26 @@ import pytest
 from doc_pages import FENCE, PAGES, text_of
 from paths import ROOT
 
+from service.config import keys
+
 REPORTS = ROOT / "docs" / "reports"
 MOST_WORDS, MOST_CHARACTERS = 8000, 140
 HASH = re.compile(r"\b(?=[0-9a-f]*[0-9])(?=[0-9a-f]*[a-f])[0-9a-f]{7,40}\b")
 """Seven to forty hexadecimal digits with a number and a letter: a commit."""
 
 
-@pytest.fixture(scope="module")
-def report() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("report", ROOT / "docs" / "report.py")
+def script(name: str) -> ModuleType:
+    """A command of docs as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def report() -> ModuleType:
+    return script("report")
 
 
 def faults(text: str) -> Iterator[str]:
@@ -39,7 +46,14 @@ def faults(text: str) -> Iterator[str]:
 
 def test_reports_are_what_their_data_says(report: ModuleType) -> None:
     there = {page.name: text_of(page) for page in REPORTS.glob("*.md")}
-    assert there == report.pages(), "run make reports"
+    assert there == report.pages(), "run make pages"
+
+
+def test_the_configuration_reference_is_up_to_date() -> None:
+    module = script("configuration")
+    page = text_of(module.PAGE)
+    assert page == module.page(), "run make pages"
+    assert all(f"| `{field.name}` |" in page for _, field in keys())
 
 
 def test_reports_are_short() -> None:
