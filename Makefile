@@ -44,7 +44,7 @@ types: $(STAMP)
 check: lint types test-all
 
 bench: $(STAMP)
-	$(BIN)/skyrelief bench $(ARGS)
+	PYTHONPATH=tests/support $(BIN)/python tests/bench/bench_run.py $(ARGS)
 
 # Over an hour: fifty kills, the fuzzers, and in parallel an hour of flights and a scan of an hour
 # (MINUTES=6 is shorter), which are their load. As root with systemd-container and debootstrap it

@@ -1,9 +1,9 @@
 """Screenshots of the portal's states at the sizes of a desktop and a phone.
 
-    python docs/portal_states.py STORE OUT
+    PYTHONPATH=tests/support python docs/portal_states.py STORE OUT
 
 STORE is a ground station's folder; its newest scan is shown. Needs Chromium, the built page and
-the extras "ground" and "bench". Maps, mesh and report are shown where the scan has them.
+the extras "ground" and "dev". Maps, mesh and report are shown where the scan has them.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from person import Browser
 from playwright.sync_api import sync_playwright
 
-from service.bench.portal import Browser
 from service.ground.portal import Portal, PortalConfig
 
 SIZES = {"desktop": (1440, 900), "phone": (390, 844)}

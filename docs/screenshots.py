@@ -1,8 +1,8 @@
 """Take the screenshots in docs/images from the output of the demo.
 
-    make demo && python docs/screenshots.py demo-output
+    make demo && PYTHONPATH=tests/support python docs/screenshots.py demo-output
 
-Needs Chromium, Pillow and the extras "ground" and "bench". The mesh is made first if it is missing.
+Needs Chromium, Pillow and the extras "ground" and "dev". The mesh is made first if it is missing.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import sys
 from pathlib import Path
 
 import cv2
+from person import Browser
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from service.bench.portal import Browser
 from service.ground.portal import Portal, PortalConfig
 from service.offline.exports.view import ExportOptions, ScanView, export
 

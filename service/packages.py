@@ -22,7 +22,6 @@ EXTRAS = {
     "onnx": "onnx",
     "onnxruntime": "onnx",
     "open3d": "ground",
-    "playwright": "bench",
     "py3dtiles": "ground",
     "pyulog": "logs",
     "rasterio": "ground",

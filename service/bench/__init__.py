@@ -6,17 +6,20 @@ Ours and the peer's rounds alternate, after a warm-up, so that a busy machine sl
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import statistics
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+from service.errors import InputError, OutsideError
 
 BENCHMARKS: dict[str, str] = {
     "stereo": "service.bench.stereo:run",
@@ -25,16 +28,9 @@ BENCHMARKS: dict[str, str] = {
     "matching": "service.bench.tracking:run",
     "pose": "service.bench.tracking:run_pose",
     "icp": "service.bench.mapping:run",
-    "map": "service.bench.mapping:run_map",
-    "graph": "service.bench.graph:run",
     "pipeline": "service.bench.pipeline:run",
-    "memory": "service.bench.pipeline:run_memory",
-    "mavlink": "service.bench.mavlink:run",
     "codec": "service.bench.codec:run",
     "link": "service.bench.link:run",
-    "portal": "service.bench.portal:run",
-    "real": "service.bench.real:run",
-    "site": "service.bench.site:run",
 }
 """Name to ``module:function``; imported when it runs."""
 
@@ -47,9 +43,6 @@ class BenchOptions:
     warm_up: int = 3
     backend: str = "cpu"
     device: str = ""  # of the benchmark gpu: "cuda", "cpu", or empty for what is there
-    scans: int = 0  # of the benchmark site: that many instead of two
-    data: Path | None = None  # folder with ground truth, for the benchmarks that score
-    keep: Path | None = None  # folder for the previews of real flights
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,11 +95,16 @@ def compare(
     return BenchResult(what, value, "ms", spread, peer, theirs_ms, _spread(taken[1]), note)
 
 
-def run_benchmarks(names: list[str], options: BenchOptions) -> list[BenchResult]:
-    """Every figure of the named benchmarks, in order."""
+def run_benchmarks(
+    names: Sequence[str], options: BenchOptions, known: Mapping[str, str] = BENCHMARKS
+) -> list[BenchResult]:
+    """Every figure of the named benchmarks, in order; InputError for a name that is not known."""
+    for name in names:
+        if name not in known:
+            raise InputError(f"bench {name}: there are {', '.join(known)}")
     results: list[BenchResult] = []
     for name in names:
-        module, _, function = BENCHMARKS[name].partition(":")
+        module, _, function = known[name].partition(":")
         found = getattr(import_module(module), function)(options)
         results += [replace(result, name=result.name or name) for result in found]
     return results
@@ -136,6 +134,21 @@ def record(results: list[BenchResult], options: BenchOptions) -> dict[str, Any]:
         "rounds": options.rounds,
         "results": [result.to_dict() for result in results],
     }
+
+
+def keep(folder: Path, names: Sequence[str], report: dict[str, Any]) -> Path:
+    """Write the result file; its name has the benchmarks, the date and the commit.
+
+    Raises OutsideError when it cannot be written.
+    """
+    day = str(report["date"])[:10]
+    path = folder / f"{day}-{str(report['commit']).rstrip('+')}-{'-'.join(names)}.json"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutsideError(f"{path}: cannot be written: {error.strerror}") from error
+    return path
 
 
 def commit() -> str:

@@ -111,14 +111,14 @@ class _Flown(NamedTuple):
 
 def _path(video: Path, folder: Path, upsample: bool, sgbm: bool) -> _Flown:
     flags = [f"compute.upsample={str(upsample).lower()}", "compute.pairs=30"]
-    summary, elapsed = _fly(video, folder, flags, SgbmBackend() if sgbm else CpuBackend())
+    summary, elapsed = fly(video, folder, flags, SgbmBackend() if sgbm else CpuBackend())
     return _Flown(
         summary["clouds"] / elapsed, summary["frames"] / elapsed, resident_mib(),
         summary["stage_ms"],
     )  # fmt: skip
 
 
-def _fly(
+def fly(
     video: Path,
     folder: Path,
     flags: list[str],
@@ -165,44 +165,3 @@ class SgbmBackend(CpuBackend):
         px: F32 = matcher.compute(left, right).astype(np.float32) / np.float32(16)
         px[px < 0] = np.nan
         return DisparityMap(px, np.where(np.isfinite(px), 1.0, 0.0).astype(np.float32))
-
-
-def run_memory(options: BenchOptions) -> list[BenchResult]:
-    """Resident memory and milliseconds a frame at the end, against the first tenth."""
-    frames = max(200, int(options.rounds / 3.0 * FPS) * 10)
-    with tempfile.TemporaryDirectory() as folder:
-        short, video = Path(folder) / "short.mp4", Path(folder) / "flight.mp4"
-        make_video(short, 120)
-        backend = CpuBackend()
-        _fly(short, Path(folder) / "warm", [], backend)  # what compilers need is not the flight's
-        make_video(video, frames)
-        watch = _Watch()
-        summary, _ = _fly(video, Path(folder) / "scan", [], backend, watch)
-    note = f"{summary['frames']} frames, {summary['keyframes']} keyframes"
-    early, late = watch.tenth(0), watch.tenth(9)
-    return [
-        BenchResult(
-            "resident at the end of the flight", late[0], "MiB",
-            peer="after a tenth of it", peer_value=early[0], note=note,
-        ),
-        BenchResult(
-            "a frame in the last tenth", late[1], "ms",
-            peer="in the second tenth", peer_value=watch.tenth(1)[1],
-        ),
-    ]  # fmt: skip
-
-
-class _Watch:
-    """Resident memory and time after every frame."""
-
-    def __init__(self) -> None:
-        self._seen: list[tuple[float, float]] = []  # s, MiB
-
-    def __call__(self, scan: Scan) -> None:
-        self._seen.append((time.perf_counter(), resident_mib()))
-
-    def tenth(self, index: int) -> tuple[float, float]:
-        """Memory in MiB at the end of a tenth of the flight, and its ms a frame."""
-        first, last = (int(n * len(self._seen) / 10) for n in (index, index + 1))
-        part = self._seen[first:last]
-        return part[-1][1], 1e3 * (part[-1][0] - part[0][0]) / (len(part) - 1)

@@ -5,14 +5,15 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import bench_real
 import numpy as np
 import pytest
+from bench_options import DataOptions
+from bench_real import ReplayedSet, level_ground, run, shared_ground
 from paths import DEMO
 
 from recon.types import DepthMap
-from service.bench import BenchOptions, real
 from service.bench.keyframes import make_keyframe
-from service.bench.real import ReplayedSet, _apart, level_ground, run
 from service.errors import InputError
 
 STILLS = sorted((DEMO / "frames").glob("*.jpg"))
@@ -23,7 +24,7 @@ def test_a_few_real_stills_are_placed_and_measured(tmp_path: Path) -> None:
     frames.mkdir(parents=True)
     for still in STILLS[:5]:
         shutil.copy(still, frames)
-    results = run(BenchOptions(data=tmp_path, keep=tmp_path / "kept"))
+    results = run(DataOptions(data=tmp_path, previews=tmp_path / "kept"))
     figures = {r.what.removeprefix("Caliterra: "): r.value for r in results}
     assert (tmp_path / "kept" / "caliterra.jpg").stat().st_size > 10_000
     assert figures["frames placed by vision"] >= 80.0
@@ -36,7 +37,7 @@ def test_a_few_real_stills_are_placed_and_measured(tmp_path: Path) -> None:
 @pytest.mark.parametrize("data", [None, "empty"])
 def test_without_a_set_it_says_what_it_needs(tmp_path: Path, data: str | None) -> None:
     with pytest.raises(InputError, match=r"--data|none of Caliterra"):
-        run(BenchOptions(data=None if data is None else tmp_path))
+        run(DataOptions(data=None if data is None else tmp_path))
 
 
 def test_a_shifted_surface_shows_as_a_seam() -> None:
@@ -49,7 +50,7 @@ def test_a_shifted_surface_shows_as_a_seam() -> None:
         depth.K,
         depth.T_world_camera + np.array([[0, 0, 0, 0]] * 2 + [[0, 0, 0, 0.5], [0, 0, 0, 0]]),
     )
-    found = _apart(above, lifted, np.random.default_rng(0))
+    found = shared_ground(above, lifted, np.random.default_rng(0))
     assert found is not None
     off, sigma = found
     assert np.median(off) == pytest.approx(0.5, abs=0.05)
@@ -66,7 +67,7 @@ def test_tilts_between_keyframes_are_told_from_the_bend_of_each(
         T = np.diag([1.0, -1, -1, 1])
         T[:3, 3] = 0.0, 0.0, 80.0 + 2.0 * (n % 2)  # every second keyframe is 2 m too high
         maps.append(DepthMap(level, 0.1 * level, np.ones_like(level, np.uint8), K, T))
-    monkeypatch.setattr(real, "_maps", lambda flight: maps)
+    monkeypatch.setattr(bench_real, "_maps", lambda flight: maps)
     figures = {
         what: value for what, value, _ in level_ground(ReplayedSet(tmp_path, "", tmp_path, {}))
     }

@@ -6,24 +6,28 @@ import json
 from pathlib import Path
 from typing import Any
 
+import bench_site
+import bench_site_drones
+import bench_site_scale
 import numpy as np
 import pytest
+from bench_options import DataOptions
 
-from service.bench import BenchOptions, BenchResult, site, site_drones, site_scale
+from service.bench import BenchResult
 from service.sim.recording import ORIGIN
 
 rasterio = pytest.importorskip("rasterio")
 
 
 def test_a_site_of_scans_is_measured_by_its_products(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(site_scale, "KINDS", ("dsm", "change"))
-    monkeypatch.setattr(site_scale, "WORKERS", ())
-    results = site.run(BenchOptions(scans=4))
+    monkeypatch.setattr(bench_site_scale, "KINDS", ("dsm", "change"))
+    monkeypatch.setattr(bench_site_scale, "WORKERS", ())
+    results = bench_site.run(DataOptions(scans=4))
     figures = {result.what: result for result in results}
     peak = figures["dsm: peak memory"]
     assert peak.note == "4 scans, 2 tiles" and 100 < peak.value < 2000
     assert figures["change: processor time of a tile, median"].value > 0.0
-    assert 0.0 < figures["dsm: error of height, median"].value < site_scale.SIGMA_M
+    assert 0.0 < figures["dsm: error of height, median"].value < bench_site_scale.SIGMA_M
     boxes = figures["change: objects"]
     assert boxes.note == "12 boxes placed" and 6 <= boxes.value <= 12
 
@@ -31,8 +35,8 @@ def test_a_site_of_scans_is_measured_by_its_products(monkeypatch: pytest.MonkeyP
 def test_drones_at_once_are_shown_together_and_keep_their_size(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(site_drones, "HEADINGS_DEG", (0.0, 90.0))
-    figures = {result.what: result for result in site_drones.run(tmp_path, 8.0)}
+    monkeypatch.setattr(bench_site_drones, "HEADINGS_DEG", (0.0, 90.0))
+    figures = {result.what: result for result in bench_site_drones.run(tmp_path, 8.0)}
     assert figures["four drones: shown together, after the first overlap"].note.startswith("1 of 1")
     apart = figures["four drones: shown apart at the end"]
     assert apart.peer_value is not None and apart.value < 0.3 < 1.0 < apart.peer_value
@@ -63,7 +67,7 @@ def counted(folder: Path, objects: list[tuple[float, float, float]]) -> dict[str
         image.write(np.zeros((1, 160, 160), np.float32))
     rows = [{"east_m": east + x, "north_m": north + y, "volume_m3": v} for x, y, v in objects]
     change = {"objects": rows, "compared_m2": 5000.0}
-    results = site.change_results(change, folder, folder / "change.tif", np.zeros(3))
+    results = bench_site.change_results(change, folder, folder / "change.tif", np.zeros(3))
     return {result.what: result for result in results}
 
 

@@ -2,21 +2,59 @@
 
 from __future__ import annotations
 
+import shutil
+import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import service.bench.portal as bench
+if TYPE_CHECKING:
+    import playwright.sync_api as playwright
+
+FLAGS = (
+    "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --window-size=1280,800"
+    " --disable-dev-shm-usage"
+)
 
 
-class Page(bench.Page):
+def chromium() -> str:
+    """The path of a Chromium on this machine; empty when there is none."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    return next(filter(None, map(shutil.which, names)), "")
+
+
+class Page:
     """One page; dialogs are accepted with :attr:`dialog` as the text."""
 
-    def __init__(self, page: Any) -> None:
+    def __init__(self, page: playwright.Page) -> None:
+        self.page = page
         self.requests: list[str] = []
         self.dialog = ""  # what the next prompt is answered with
         page.on("request", lambda request: self.requests.append(request.url))
         page.on("dialog", lambda dialog: dialog.accept(self.dialog))
-        super().__init__(page)
+        self._tools = page.context.new_cdp_session(page)
+        self._tools.send("Page.enable")
+
+    def call(self, method: str, **params: Any) -> Any:
+        """The result of a DevTools method."""
+        return self._tools.send(method, params)
+
+    def run(self, script: str) -> Any:
+        """The value of ``script``, awaited."""
+        return self.page.evaluate(script)
+
+    def open(self, url: str) -> None:
+        """Go to ``url``; does not wait until it is loaded."""
+        self.page.goto(url, wait_until="commit")
+
+    def wait(self, script: str, timeout_s: float = 60.0) -> Any:
+        """The first true value of ``script``; a page that is still loading has none."""
+        quiet = f"(async () => {{ try {{ return await {script} }} catch {{ return null }} }})()"
+        deadline = time.monotonic() + timeout_s
+        while not (value := self.run(quiet)):
+            if time.monotonic() >= deadline:
+                raise RuntimeError(f"the page did not get there in {timeout_s:g} s: {script}")
+            self.page.wait_for_timeout(50.0)
+        return value
 
     def click(self, text: str) -> None:
         """Click the button with this text, as an event of its own."""
@@ -57,8 +95,19 @@ class Page(bench.Page):
         self.page.screenshot(path=path)
 
 
-class Browser(bench.Browser, Page):
+class Browser(Page):
     """A Chromium and its first page; close it at the end."""
+
+    def __init__(self, driver: playwright.Playwright, *flags: str) -> None:
+        self.driver = driver
+        self.browser = driver.chromium.launch(
+            executable_path=chromium(), args=[*FLAGS.split(), *flags]
+        )
+        super().__init__(self.browser.new_page(no_viewport=True))
+
+    def close(self) -> None:
+        """End the browser."""
+        self.browser.close()
 
     def other(self) -> Page:
         """A page as of another person's browser: nothing is shared with the first."""

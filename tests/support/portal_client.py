@@ -23,10 +23,9 @@ pytest.importorskip("uvicorn")
 pytest.importorskip("websockets")
 pytest.importorskip("playwright")
 
-from person import Browser
+from person import Browser, chromium
 from playwright.sync_api import sync_playwright
 
-from service.bench.portal import chromium
 from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
 from service.scans.folder import write_deliverables

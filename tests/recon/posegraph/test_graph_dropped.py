@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from bench_graph import HEIGHT_M, legs
 from flown_track import SPREAD, landed, publish, sensed
 
 from recon import se3
@@ -17,7 +18,6 @@ from recon.posegraph.records import Loop, Node
 from recon.posegraph.thinning import moved_loops, over_gaps, surplus, thinned
 from recon.posegraph.trajectory import Placed, Trajectory
 from recon.types import F64, PosePrior
-from service.bench.graph import HEIGHT_M, legs
 
 FLOWN, COUNT, MOST, EACH = 200, 150, 50, 5
 STEP_M, SCALE = 5.0, 1.3

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from bench_graph import HEIGHT_M, legs
 from flown_track import SPREAD, landed, publish, sensed
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
-from service.bench.graph import HEIGHT_M, legs
 
 COUNT, ALL = 160, 100_000
 LOOP = np.diag([5e-4**2] * 3 + [0.03**2] * 3)

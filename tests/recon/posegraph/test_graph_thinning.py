@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from bench_graph import HEIGHT_M, legs
 from flown_track import SPREAD, landed, publish, sensed
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,7 +19,6 @@ from recon.posegraph.records import Loop, Node
 from recon.posegraph.thinning import moved_loop, surplus, thinned
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
-from service.bench.graph import HEIGHT_M, legs
 
 COUNT, MOST, LEG = 200, 60, 50
 STEP_M, SCALE = 5.0, 1.3

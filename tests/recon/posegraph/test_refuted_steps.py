@@ -7,12 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from bench_graph import legs
 from flown_track import SPREAD, sensed
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
 from recon.types import F64, PosePrior
-from service.bench.graph import legs
 from service.flight.reports import GraphWatch
 
 COUNT, SMEARED, SCALE = 40, range(30, 34), 1.3

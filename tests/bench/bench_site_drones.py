@@ -18,12 +18,12 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
+from bench_site_scale import noisy
 
 from recon import se3
 from recon.camera_model import rays
 from recon.types import F64, Pose
 from service.bench import BenchResult
-from service.bench.site_scale import noisy
 from service.ground.live_site import FILE, Follower, Shown
 from service.offline.site.alignment import align_site
 from service.sim.flight import FlightPlan, fly

@@ -117,7 +117,7 @@ def _rate(parse: Callable[[], int]) -> float:
 @contextlib.contextmanager
 def vehicle_process(mode: str, seconds: float, port: int) -> Iterator[subprocess.Popen[str]]:
     """Our daemon's MAVLink side in a fresh process that talks to us on a UDP port."""
-    command = [sys.executable, "-m", "service.bench.mavlink", mode, str(port), str(seconds)]
+    command = [sys.executable, __file__, mode, str(port), str(seconds)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         yield process

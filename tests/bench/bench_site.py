@@ -15,13 +15,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import bench_site_drones
+import bench_site_scale
 import numpy as np
+from bench_options import DataOptions
+from bench_real import skyrelief
 
 from recon import se3
 from recon.camera_model import rays
 from recon.types import F64, Keyframe
-from service.bench import BenchOptions, BenchResult, site_drones, site_scale
-from service.bench.real import _skyrelief as skyrelief
+from service.bench import BenchResult
 from service.georeference import LocalFrame
 from service.scans.track import local_frame
 from service.sim.flight import FlightPlan, Sensors
@@ -47,13 +50,13 @@ FOUND_M = 1.5
 REAL = "caliterra_nadir/frames"
 
 
-def run(options: BenchOptions) -> list[BenchResult]:
+def run(options: DataOptions) -> list[BenchResult]:
     """Every figure; flights are rendered once and replayed for each seed."""
     if options.scans:
-        return site_scale.run(options)
+        return bench_site_scale.run(options)
     with tempfile.TemporaryDirectory(prefix="skyrelief-site-") as folder:
         results = _simulated(Path(folder), options)
-        results += site_drones.run(Path(folder) / "drones")
+        results += bench_site_drones.run(Path(folder) / "drones")
         if options.data is not None and (options.data / REAL).is_dir():
             results += _real(Path(folder) / "real", options.data / REAL, options)
     return results
@@ -68,7 +71,7 @@ def flight_options(heading_deg: float, date: int) -> SimulationOptions:
     )  # fmt: skip
 
 
-def _simulated(folder: Path, options: BenchOptions) -> list[BenchResult]:
+def _simulated(folder: Path, options: DataOptions) -> list[BenchResult]:
     flown = {}
     for name, heading, date in (("one", 0.0, 1), ("two", 90.0, 1), ("later", 90.0, 2)):
         flown[name] = prepare(flight_options(heading, date))
@@ -96,7 +99,7 @@ def _simulated(folder: Path, options: BenchOptions) -> list[BenchResult]:
 
 
 def _replayed(
-    folder: Path, flown: dict[str, Simulation], name: str, seed: int, options: BenchOptions
+    folder: Path, flown: dict[str, Simulation], name: str, seed: int, options: DataOptions
 ) -> Path:
     """The scan of a flight whose sensors err by ``seed``."""
     simulation, out = flown[name], folder / f"{name}-{seed}"
@@ -257,7 +260,7 @@ def _is_compared(map_: Path, middle: F64) -> bool:
 # ---- a real set ------------------------------------------------------------------------------
 
 
-def _real(folder: Path, frames: Path, options: BenchOptions) -> list[BenchResult]:
+def _real(folder: Path, frames: Path, options: DataOptions) -> list[BenchResult]:
     """Even and odd images of one flight as two: nothing may differ."""
     images = sorted(p for p in frames.iterdir() if p.suffix.lower() in (".jpg", ".jpeg"))
     scans = []

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from bench_options import DataOptions
 from pyproj import Transformer
 
 from recon import se3
@@ -29,7 +30,7 @@ from recon.camera_model import project, rays
 from recon.mapping.disagreement import NORMAL_MEDIAN
 from recon.posegraph.alignment import umeyama
 from recon.types import F64, DepthMap
-from service.bench import BenchOptions, BenchResult
+from service.bench import BenchResult
 from service.cameras import open_camera
 from service.errors import InputError, OutsideError
 from service.offline.refine.control_points import ScanImages, candidates_of
@@ -74,7 +75,7 @@ class RealSet:
     checks: tuple[Check, ...] = ()
 
 
-def run(options: BenchOptions) -> list[BenchResult]:
+def run(options: DataOptions) -> list[BenchResult]:
     """Replay every set that is there, and measure. Raises InputError when there is none."""
     if options.data is None:
         raise InputError("bench real needs --data with the folder that holds the real sets")
@@ -85,15 +86,15 @@ def run(options: BenchOptions) -> list[BenchResult]:
     for one in there:
         with tempfile.TemporaryDirectory(prefix="skyrelief-real-") as folder:
             flight = _replayed(one, options, Path(folder))
-            if options.keep is not None:
-                _keep_preview(flight, options.keep, one.name)
+            if options.previews is not None:
+                _keep_preview(flight, options.previews, one.name)
             for check in (_placed, seams, *one.checks):
                 for what, value, unit in check(flight):
                     results.append(BenchResult(f"{one.name}: {what}", value, unit))
     return results
 
 
-def _replayed(one: RealSet, options: BenchOptions, folder: Path) -> ReplayedSet:
+def _replayed(one: RealSet, options: DataOptions, folder: Path) -> ReplayedSet:
     assert options.data is not None
     source = options.data / one.source
     words = ["replay", str(source), "--out", str(folder / "scan"), "--backend", options.backend]
@@ -101,9 +102,9 @@ def _replayed(one: RealSet, options: BenchOptions, folder: Path) -> ReplayedSet:
         words += ["--telemetry", str(options.data / one.telemetry)]
     if one.boards:
         model = folder / "camera.yaml"
-        _skyrelief("calibrate", str(options.data / one.boards), *BOARD, "--out", str(model))
+        skyrelief("calibrate", str(options.data / one.boards), *BOARD, "--out", str(model))
         words += ["--camera-model", str(model)]
-    _skyrelief(*words)
+    skyrelief(*words)
     data = options.data / one.source.split("/")[0]
     summary = json.loads((folder / "scan" / "scan.json").read_text(encoding="utf-8"))
     return ReplayedSet(data, str(source), folder / "scan", summary)
@@ -119,7 +120,7 @@ def _keep_preview(flight: ReplayedSet, folder: Path, name: str) -> None:
         raise OutsideError(f"{to}: cannot be written: {error.strerror}") from error
 
 
-def _skyrelief(*words: str) -> None:
+def skyrelief(*words: str) -> None:
     """Run a command. Raises OutsideError with its last line when it fails."""
     command = [sys.executable, "-m", "service.cli", *words]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -151,7 +152,7 @@ def seams(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
     apart: list[F64] = []
     ratio: list[F64] = []
     for a, b in pairs:
-        found = _apart(maps[a], maps[b], rng)
+        found = shared_ground(maps[a], maps[b], rng)
         if found is None:
             continue
         apart.append(found[0])
@@ -176,7 +177,7 @@ def _maps(flight: ReplayedSet) -> list[DepthMap]:
         ]
 
 
-def _apart(a: DepthMap, b: DepthMap, rng: np.random.Generator) -> tuple[F64, F64] | None:
+def shared_ground(a: DepthMap, b: DepthMap, rng: np.random.Generator) -> tuple[F64, F64] | None:
     """Depth differences of a's points in b (n,) and the sigmas of them; None without overlap."""
     known = np.flatnonzero(np.isfinite(a.depth_m))
     if not len(known):

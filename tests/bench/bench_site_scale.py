@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench_options import DataOptions
 
 from recon import se3
 from recon.camera_model import rays
 from recon.types import F32, F64, U8, DepthMap, Keyframe, Pose
-from service.bench import BenchOptions, BenchResult
+from service.bench import BenchResult
 from service.georeference import LocalFrame
 from service.offline.site.gather import Member, gather
 from service.progress import Progress
@@ -45,7 +46,7 @@ WORKERS = (1, 2, 4)
 """Of a Dask cluster, for the first kind."""
 
 
-def run(options: BenchOptions) -> list[BenchResult]:
+def run(options: DataOptions) -> list[BenchResult]:
     """Peak memory and time per tile of each product of a site of ``options.scans`` scans."""
     with tempfile.TemporaryDirectory(prefix="skyrelief-scale-") as name:
         folder = Path(name)
@@ -152,7 +153,7 @@ def noisy(
 
 
 def _results(
-    kind: str, site: Path, members: list[Member], options: BenchOptions
+    kind: str, site: Path, members: list[Member], options: DataOptions
 ) -> list[BenchResult]:
     half = len(members) // 2
     parts = (members[0].first, members[half - 1].last), (members[half].first, members[-1].last)

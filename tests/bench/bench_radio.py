@@ -1,4 +1,4 @@
-"""The coarse map over a telemetry radio: part of ``skyrelief bench link``.
+"""The coarse map over a telemetry radio.
 
 A flight of 100 m in 20 s. The drone's MAVLink link and the ground station's are two
 pseudo-terminals; between them a radio of 57,600 baud that loses packets and reports the state of
@@ -28,11 +28,11 @@ from mavlink.wire.framing import Framer
 from recon import se3
 from recon.posegraph.submap_loops import points_of
 from recon.types import F64, DepthMap, Keyframe, Pose
-from service.bench import BenchResult
+from service.bench import BenchOptions, BenchResult
+from service.bench.link import BareReceiver
 from service.bench.link_emulator import free_port
 from service.config import DatalinkConfig
-from service.ground.received import ReceivedScan
-from service.ground.receiver import Receiver, ReceiverConfig
+from service.ground.receiver import ReceiverConfig
 from service.radio import GROUND, TUNNEL, RadioLink, VehicleRadio
 from service.stream import codec
 from service.stream.link import DatalinkSender
@@ -120,8 +120,9 @@ class _TileTimes:
             self.last[tile[1].seq] = time.monotonic()
 
 
-def fly() -> list[BenchResult]:
+def run(options: BenchOptions) -> list[BenchResult]:
     """Fly over the radio alone; the state of the ground at the end."""
+    del options  # one flight is one round
     with tempfile.TemporaryDirectory() as folder:
         return _fly(Path(folder))
 
@@ -158,14 +159,6 @@ def _fly(folder: Path) -> list[BenchResult]:
         radio.close()
     with onboard, ScanStore.open(folder / "ground" / "drone" / "scan" / "scan.db") as ground:
         return _outcome(onboard, ground, flight, sent)
-
-
-class BareReceiver(Receiver):
-    """A receiver that writes no deliverables."""
-
-    def write(self, scan: ReceivedScan) -> None:
-        """Write nothing."""
-        scan.unwritten, scan.is_writing, scan.is_written = False, False, True
 
 
 def _produce(store: ScanStore, flight: _TileTimes, at_s: float) -> None:

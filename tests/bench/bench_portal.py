@@ -1,93 +1,31 @@
-"""``skyrelief bench portal``: the page in a headless Chromium, drawn in software.
+"""The page in a headless Chromium, drawn in software.
 
 Page load on loopback, from the list to the first points of a scan, from a keyframe in the
 receiver's store to its points in the browser and to the tiles of the map, and ten million points:
 frame times while flying, and how long all of them take, slice by slice. SwiftShader draws on the
-processor: a graphics card is one to two orders of magnitude faster. Playwright (extra ``bench``)
-drives the browser.
+processor: a graphics card is one to two orders of magnitude faster.
 """
 
 from __future__ import annotations
 
-import shutil
 import statistics
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+
+from person import Browser, chromium
+from playwright.sync_api import sync_playwright
 
 from service.bench import BenchOptions, BenchResult
 from service.bench.keyframes import make_keyframe
 from service.errors import OutsideError
 from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
-from service.packages import needing
 from service.stream.codec import encode
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
-
-if TYPE_CHECKING:
-    import playwright.sync_api as playwright
-
-FLAGS = (
-    "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --window-size=1280,800"
-    " --disable-dev-shm-usage"
-)
-
-
-def chromium() -> str:
-    """The path of a Chromium on this machine; empty when there is none."""
-    names = ("chromium", "chromium-browser", "google-chrome")
-    return next(filter(None, map(shutil.which, names)), "")
-
-
-class Page:
-    """One page of a browser."""
-
-    def __init__(self, page: playwright.Page) -> None:
-        self.page = page
-        self._tools = page.context.new_cdp_session(page)
-        self._tools.send("Page.enable")
-
-    def call(self, method: str, **params: Any) -> Any:
-        """The result of a DevTools method."""
-        return self._tools.send(method, params)
-
-    def run(self, script: str) -> Any:
-        """The value of ``script``, awaited."""
-        return self.page.evaluate(script)
-
-    def open(self, url: str) -> None:
-        """Go to ``url``; does not wait until it is loaded."""
-        self.page.goto(url, wait_until="commit")
-
-    def wait(self, script: str, timeout_s: float = 60.0) -> Any:
-        """The first true value of ``script``; a page that is still loading has none."""
-        quiet = f"(async () => {{ try {{ return await {script} }} catch {{ return null }} }})()"
-        deadline = time.monotonic() + timeout_s
-        while not (value := self.run(quiet)):
-            if time.monotonic() >= deadline:
-                raise RuntimeError(f"the page did not get there in {timeout_s:g} s: {script}")
-            self.page.wait_for_timeout(50.0)
-        return value
-
-
-class Browser(Page):
-    """A Chromium and its first page; close it at the end."""
-
-    def __init__(self, driver: playwright.Playwright, *flags: str) -> None:
-        self.driver = driver
-        self.browser = driver.chromium.launch(
-            executable_path=chromium(), args=[*FLAGS.split(), *flags]
-        )
-        super().__init__(self.browser.new_page(no_viewport=True))
-
-    def close(self) -> None:
-        """End the browser."""
-        self.browser.close()
-
 
 NOTE = "software rendering (SwiftShader), 1280x800"
 LARGE_PX = (640, 360)
@@ -184,8 +122,6 @@ def _large_scan(folder: Path) -> ScanStore:
 @contextmanager
 def _page(root: Path) -> Iterator[tuple[Browser, str]]:
     """A browser and the address of a portal on the scans below ``root``."""
-    with needing("bench portal"):
-        from playwright.sync_api import sync_playwright
     portal = Portal(PortalConfig(root / "scans", port=0, token=TOKEN))
     portal.start()
     try:

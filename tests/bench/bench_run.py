@@ -1,0 +1,60 @@
+"""``make bench ARGS="NAME ..."``: the benchmarks of development, and those of the command.
+
+make bench ARGS="real --data ../shared/data"
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from bench_options import DataOptions
+
+from service.bench import BENCHMARKS, keep, record, run_benchmarks, table
+from service.errors import InputError, OutsideError
+
+DEVELOPMENT = {
+    "graph": "bench_graph:run",
+    "map": "bench_map:run",
+    "mavlink": "bench_mavlink:run",
+    "memory": "bench_memory:run",
+    "portal": "bench_portal:run",
+    "radio": "bench_radio:run",
+    "middlebury": "bench_middlebury:run",
+    "real": "bench_real:run",
+    "site": "bench_site:run",
+}
+"""Name to ``module:function`` of this folder."""
+
+ASKED_FOR = ("middlebury", "real", "site")
+"""Those that need data or an hour, and run by name only."""
+
+
+def main(
+    names: Annotated[list[str] | None, typer.Argument(help="benchmarks; default: most")] = None,
+    rounds: Annotated[int, typer.Option(help="timed rounds of each figure", min=1)] = 30,
+    backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "cpu",
+    device: Annotated[str, typer.Option(help="for 'gpu': cuda or cpu; default: auto")] = "",
+    data: Annotated[Path | None, typer.Option(help="folder of the real sets")] = None,
+    scans: Annotated[int, typer.Option(min=0, help="site: tiles of a site of so many scans")] = 0,
+    kept: Annotated[
+        Path | None, typer.Option("--keep", help="folder for result (JSON) and previews")
+    ] = None,
+) -> None:
+    """Print our figure, the peer's in the same run, and the ratio."""
+    options = DataOptions(rounds, 3, backend, device, scans, data, kept)
+    known = BENCHMARKS | DEVELOPMENT
+    chosen = names or [name for name in known if name not in ASKED_FOR]
+    try:
+        results = run_benchmarks(chosen, options, known)
+        print(table(results))
+        if kept is not None:
+            print(f"kept in {keep(kept, chosen, record(results, options))}")
+    except (InputError, OutsideError) as error:
+        sys.exit(str(error))
+
+
+if __name__ == "__main__":
+    typer.run(main)
