@@ -30,9 +30,9 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
     "stac": ("maps:write_stac", "stac.json", "STAC item of the rasters."),
     "kml": ("flight:write_kml", "flight.kml", "The flight, KML."),
     "colmap": (
-        "flight:write_colmap",
+        "colmap:write_colmap",
         "colmap",
-        "Keyframes as a COLMAP text model with images.",
+        "COLMAP text model: frames, poses, tracks.",
     ),
     "3dtiles": ("clouds:write_tiles", "3dtiles", "Point tiles for Cesium."),
     "3dtiles-mesh": (

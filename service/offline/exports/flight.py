@@ -1,4 +1,4 @@
-"""The flight for maps and for other reconstruction tools: GeoJSON, KML, COLMAP."""
+"""The flight for maps: GeoJSON, KML."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
-import cv2
 import numpy as np
 
 from recon import se3
-from recon.types import F64, Keyframe
+from recon.types import F64
 from service.georeference import LocalFrame
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
-from service.scans.writing import write_whole, writing_folder
+from service.scans.writing import write_whole
 
 
 def _geodetic(scan: ScanView, frame: LocalFrame) -> F64:
@@ -82,52 +81,3 @@ def write_kml(scan: ScanView, out: Path, options: ExportOptions) -> None:
         "</gx:Track></Placemark></Document></kml>\n"
     )
     write_whole(out, text)
-
-
-def write_colmap(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """A folder: ``images/`` and ``sparse/0/`` with cameras, images and points as text.
-
-    World coordinates are the scan's ENU metres. Images are the keyframes as stored,
-    without distortion; the points are the fused cloud.
-    """
-    with writing_folder(out) as part:
-        (part / "images").mkdir()
-        model = part / "sparse" / "0"
-        model.mkdir(parents=True)
-        cameras: dict[tuple[float, ...], int] = {}
-        with open(model / "images.txt", "w", encoding="ascii") as images:
-            for one in main_keyframes(scan.store):
-                number = cameras.setdefault(_pinhole(one), len(cameras) + 1)
-                images.write(_image_lines(one, number))
-                cv2.imwrite(str(part / "images" / _name(one)), one.bgr)
-        lines = (
-            f"{n} PINHOLE {int(c[0])} {int(c[1])} {c[2]:.9g} {c[3]:.9g} {c[4]:.9g} {c[5]:.9g}\n"
-            for c, n in cameras.items()
-        )
-        (model / "cameras.txt").write_text("".join(lines), encoding="ascii")
-        with open(model / "points3D.txt", "w", encoding="ascii") as points:
-            cloud = scan.fused.cloud
-            rows = zip(cloud.xyz_m.tolist(), cloud.rgb.tolist(), strict=True)
-            for n, (xyz, rgb) in enumerate(rows, 1):
-                place = f"{xyz[0]:.4f} {xyz[1]:.4f} {xyz[2]:.4f}"
-                points.write(f"{n} {place} {rgb[0]} {rgb[1]} {rgb[2]} 0\n")
-
-
-def _pinhole(one: Keyframe) -> tuple[float, ...]:
-    """Width, height, fx, fy, cx, cy in COLMAP's pixels, whose centres lie at halves."""
-    h, w = one.depth.depth_m.shape
-    K = one.depth.K
-    values = (w, h, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
-    return tuple(round(float(v), 6) for v in values)
-
-
-def _name(one: Keyframe) -> str:
-    return f"keyframe_{one.seq:06d}.jpg"
-
-
-def _image_lines(one: Keyframe, camera: int) -> str:
-    """The two lines of an image: world to camera, then no 2D points."""
-    T = se3.inverse(one.depth.T_world_camera)
-    q = se3.quaternion_from_rotation(T[:3, :3])
-    numbers = " ".join(f"{v:.9f}" for v in (*q, *T[:3, 3]))
-    return f"{one.seq + 1} {numbers} {camera} {_name(one)}\n\n"

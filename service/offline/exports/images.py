@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,25 +125,24 @@ def _opened(header: ScanHeader, video: Path) -> CameraSource:
     return source
 
 
-def video_images(
+def frames_at(
     keyframes: Sequence[Keyframe],
     header: ScanHeader,
     video: Path,
     epoch_ns: int | None,
     progress: Progress | None = None,
-) -> list[TextureView]:
-    """A view per keyframe from the frame of ``video`` (file or folder) taken at its time.
+) -> Iterator[tuple[int, U8]]:
+    """Place of each keyframe in ``keyframes``, and the frame of ``video`` taken at its time.
 
-    The camera is the scan's own. ``epoch_ns`` is unix time of the video's start; by default
-    the scan's start. Keyframes without a frame keep their stored image. Raises InputError
-    when the video is of another size, or none of its frames is a keyframe.
+    Frames are (H, W, 3) BGR with the lens's distortion; ``video`` is a file or a folder.
+    ``epoch_ns`` is unix time of the video's start; by default the scan's start. Keyframes without
+    a frame are left out. Raises InputError when the video is of another size, or none of its
+    frames is a keyframe.
     """
-    camera, source = camera_of(header), _opened(header, video)
+    source = _opened(header, video)
     start = header.started_unix_ns if epoch_ns is None else epoch_ns
-    undistort = Undistorter(camera)
-    shrink = min(1.0, (MAX_BYTES / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
     times = np.array([k.time_ns for k in keyframes], np.int64)
-    found: dict[int, TextureView] = {}
+    found = set[int]()
 
     if isinstance(source, VideoSource):
         source.only_near((times - start).tolist(), SAME_TIME_NS)
@@ -153,9 +152,8 @@ def video_images(
             time_ns = start + frame.time_ns
             nearest = int(np.abs(times - time_ns).argmin())
             if abs(int(times[nearest]) - time_ns) <= SAME_TIME_NS:
-                image = _bgra(undistort.image(frame.image), undistort.valid)
-                pose = keyframes[nearest].depth.T_world_camera
-                found[nearest] = _view(image, camera, pose, shrink)
+                found.add(nearest)
+                yield nearest, frame.image
                 say("reading the images")
             if len(found) == len(times) or time_ns > times.max() + SAME_TIME_NS:
                 break
@@ -164,6 +162,26 @@ def video_images(
             f"{video}: no frame was taken at the time of a keyframe; give the --video-epoch "
             "that the scan was made with"
         )
+
+
+def video_images(
+    keyframes: Sequence[Keyframe],
+    header: ScanHeader,
+    video: Path,
+    epoch_ns: int | None,
+    progress: Progress | None = None,
+) -> list[TextureView]:
+    """A view per keyframe by :func:`frames_at`, without distortion.
+
+    Keyframes without a frame keep their stored image.
+    """
+    camera = camera_of(header)
+    undistort = Undistorter(camera)
+    shrink = min(1.0, (MAX_BYTES / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
+    found: dict[int, TextureView] = {}
+    for n, image in frames_at(keyframes, header, video, epoch_ns, progress):
+        bgra = _bgra(undistort.image(image), undistort.valid)
+        found[n] = _view(bgra, camera, keyframes[n].depth.T_world_camera, shrink)
     return [found.get(n) or stored_images([k])[0] for n, k in enumerate(keyframes)]
 
 

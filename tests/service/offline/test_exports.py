@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unittest.mock import Mock
 
-import cv2
 import laspy
 import numpy as np
 import pytest
@@ -327,29 +326,6 @@ def test_geojson_and_kml_follow_the_flight(scan_dir: Path, house: HouseFlight) -
     assert "2023-11-14T22:13:20.123Z" in text
 
 
-def test_colmap_projects_the_points_onto_their_pixels(scan_dir: Path, house: HouseFlight) -> None:
-    folder = written(scan_dir, "colmap")
-    camera = (folder / "sparse/0/cameras.txt").read_text().split()
-    assert camera[1] == "PINHOLE"
-    fx, fy, cx, cy = map(float, camera[4:8])
-    points = np.loadtxt(folder / "sparse/0/points3D.txt")
-    lines = (folder / "sparse/0/images.txt").read_text().splitlines()[::2]
-    assert len(lines) == 5
-    parts = lines[2].split()
-    w, x, y, z = map(float, parts[1:5])
-    from scipy.spatial.transform import Rotation
-
-    local = points[:, 1:4] @ Rotation.from_quat([x, y, z, w]).as_matrix().T
-    local += np.array(parts[5:8], float)
-    u, v = fx * local[:, 0] / local[:, 2] + cx, fy * local[:, 1] / local[:, 2] + cy
-    image = cv2.imread(str(folder / "images" / parts[9]))
-    assert image is not None
-    inside = (u > 2) & (u < 158) & (v > 2) & (v < 88)
-    roof = inside & (points[:, 3] > 5.5)
-    pixels = image[np.floor(v[roof]).astype(int), np.floor(u[roof]).astype(int)].astype(int)
-    assert (pixels[:, 2] > 120).mean() > 0.97
-
-
 def test_3d_tiles_hold_all_points_on_the_globe(scan_dir: Path, house: HouseFlight) -> None:
     pytest.importorskip("py3dtiles")
     from py3dtiles.tileset.tileset import TileSet
@@ -388,9 +364,9 @@ def test_3d_tiles_on_a_full_disk_end_in_one_line(
 
 
 def test_an_old_deliverable_stays_until_the_new_one_is_whole(scan_dir: Path) -> None:
-    first = written(scan_dir, "colmap")
+    first = written(scan_dir, "3dtiles")
     (first / "mine.txt").write_text("old")
-    written(scan_dir, "colmap")
+    written(scan_dir, "3dtiles")
     assert not (first / "mine.txt").exists()
     assert not [p for p in scan_dir.iterdir() if p.name.startswith(".")]
 
@@ -405,8 +381,7 @@ def test_without_georeference_local_files_are_written_and_maps_refused(
     assert not list(maps.glob("contours.*"))
     with rasterio.open(maps / "dsm.tif") as image:
         assert image.descriptions[0] == "height above the scan's origin, m"
-    for kind in ("ply", "colmap"):
-        assert written(tmp_path / "s", kind).exists()
+    assert written(tmp_path / "s", "ply").exists()
     for kind in ("contours", "geojson", "kml", "3dtiles"):
         with pytest.raises(InputError, match="no georeference"):
             written(tmp_path / "s", kind)
