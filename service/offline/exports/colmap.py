@@ -76,7 +76,8 @@ def _tracks(
     seen = sightings(gray, camera, poses, ground_m).seen
     count = int(seen.landmark.max()) + 1
     points = crossings(poses, camera, seen, count)
-    seen = shared(seen, np.isfinite(points).all(axis=1)[seen.landmark])
+    is_known = np.asarray(np.isfinite(points[seen.landmark]).all(axis=1), np.bool_)
+    seen = shared(seen, is_known)
     used, landmark = np.unique(seen.landmark, return_inverse=True)
     return points[used], Sightings(seen.view, np.asarray(landmark, np.int64), seen.uv_px)
 
