@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib.util
 import re
 
@@ -39,14 +38,3 @@ def test_the_image_of_the_architecture_is_up_to_date() -> None:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     assert module.SVG.read_text(encoding="utf-8") == module.drawing(), "run docs/architecture.py"
-
-
-def test_each_class_has_a_name_of_its_own() -> None:
-    found: dict[str, list[str]] = {}
-    for room in ("service", "recon", "mavlink"):
-        for path in sorted((ROOT / room).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.ClassDef):
-                    found.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
-    assert len(found) > 500
-    assert {name: paths for name, paths in found.items() if len(paths) > 1} == {}

@@ -8,13 +8,22 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from doc_pages import FENCE, PAGES, text_of
 from paths import ROOT
 
+from recon.posegraph.alignment import HUBER as MIN_FIT_SIGMAS
+from recon.posegraph.alignment import WILD
+from recon.posegraph.factors import BLOCK
+from recon.posegraph.loop_book import CHI2_LIMIT
+from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.segment_frames import REFIT_GROWTH, SETTLED_GROWTH
+from recon.posegraph.sensor_noise import PRECISE_TAU_S, TAUS_S
 from service.config import keys
 
 REPORTS = ROOT / "docs" / "reports"
+ROOMS = ("recon", "mavlink", "service")
 MOST_WORDS, MOST_CHARACTERS = 8000, 140
 HASH = re.compile(r"\b(?=[0-9a-f]*[0-9])(?=[0-9a-f]*[a-f])[0-9a-f]{7,40}\b")
 """Seven to forty hexadecimal digits with a number and a letter: a commit."""
@@ -56,6 +65,56 @@ def test_the_configuration_reference_is_up_to_date() -> None:
     assert all(f"| `{field.name}` |" in page for _, field in keys())
 
 
+def test_the_images_of_the_concepts_are_up_to_date() -> None:
+    module = script("concepts")
+    assert text_of(module.IMAGES / "frame_life.svg") == module.life(), "run make pages"
+    drawn, now = text_of(module.IMAGES / "reposes.svg"), module.correction(module.track())
+    number = re.compile(r"-?\d+(?:\.\d+)?")
+    assert number.sub("", drawn) == number.sub("", now), "run make pages"
+    places = [np.array(number.findall(text), float) for text in (drawn, now)]
+    np.testing.assert_allclose(places[0], places[1], atol=2.0)  # px: another machine's last digits
+
+
+def test_private_concepts_are_names_of_the_code() -> None:
+    text = text_of(ROOT / "docs" / "concepts.md").partition("## Private concepts")[2]
+    named = re.findall(r"`([A-Z]\w+)`", text)
+    code = "".join(text_of(path) for room in ROOMS for path in (ROOT / room).rglob("*.py"))
+    assert len(named) > 15
+    assert [name for name in named if f"class {name}" not in code] == []
+
+
+def test_the_page_on_the_pose_graph_has_the_factors_and_numbers_of_the_code() -> None:
+    page = " ".join(text_of(ROOT / "docs" / "pose-graph.md").split())
+    rows = page.partition("| kind | error")[2].partition("Huber's loss begins")[0]
+    kinds = re.findall(r'"([\w ]+)"', PoseGraph.residuals.__doc__ or "")
+    assert len(kinds) == 11
+    assert [kind for kind in kinds if f"`{kind}`" not in rows] == []
+    config = PoseGraphConfig()
+    for words in (
+        f"grown by {(REFIT_GROWTH - 1) * 100:.0f} % ({(SETTLED_GROWTH - 1) * 100:.0f} % from",
+        f"block of {BLOCK} keyframes",
+        f"({config.sigma_step} of its length)",
+        f"{MIN_FIT_SIGMAS} sigmas. Fixes and attitudes beyond {WILD} sigmas",
+        f"claimed, inflated over {config.attitude_s:.0f} s",
+        f"claimed and inflated over {config.fix_s:.0f} s",
+        f"claimed, inflated over {config.altitude_s:.0f} s",
+        f"\\sqrt{{{BLOCK} \\cdot {config.blocks_per_height:.0f}}}",
+        f"{config.sigma_scale_walk} for {BLOCK} keyframes; the first {config.sigma_scale} to 1",
+        f"depths at a loop's ends | {config.sigma_loop_scale} |",
+        f"{config.sigma_link_rad} rad (1.5 without a heading); 5 m and {config.sigma_link_m:.0f} m",
+        f"Huber's loss begins at {config.huber_sigmas} sigmas",
+        f"more than {config.gate_sigmas:.0f} sigmas from the prediction",
+        f"{config.altitude_slack_m:.0f} m further off",
+        f"{config.loop_slack_m:.0f} m and {config.loop_drift * 100:.0f} % of the path",
+        f"{config.loop_turn_rad} rad; and",
+        f"within {config.loop_window} keyframes",
+        f"below {CHI2_LIMIT}",
+        f"from {TAUS_S[0]:.0f} to {TAUS_S[-1]:.0f} s",
+        f"{PRECISE_TAU_S:.0f} s for RTK",
+    ):
+        assert words in page, words
+
+
 def test_reports_are_short() -> None:
     assert sum(len(text_of(page).split()) for page in REPORTS.glob("*.md")) <= MOST_WORDS
 
@@ -88,7 +147,12 @@ def test_like_faults_share_a_row(report: ModuleType) -> None:
     ]
 
 
-PLAIN = [page for page in PAGES if REPORTS in page.parents or page.name == "CHANGELOG.md"]
+PLAIN = [
+    page
+    for page in PAGES
+    if REPORTS in page.parents
+    or page.name in ("CHANGELOG.md", "concepts.md", "pose-graph.md", "configuration.md")
+]
 
 
 @pytest.mark.parametrize("page", PLAIN, ids=lambda page: str(page.relative_to(ROOT)))
