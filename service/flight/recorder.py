@@ -26,6 +26,7 @@ from service.scans.drawing import save_debug
 from service.scans.track import cell, seconds_text
 from service.scans.trust import FIRST_TELEMETRY
 from service.stream.codec import encode
+from service.stream.images import IMAGE_SHARE, encode_image
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
@@ -56,7 +57,7 @@ class Recorder:
         self._batch, self._due = batch, list[PoseRecord]()
         self.store, self.pipeline, self._rig = store, pipeline, rig
         self._chain, self._is_settled = pipeline.stages.chain, pipeline.stages.track.is_settled
-        self.points = self.keyframes = self.frames = self.chunk_bytes = 0
+        self.points = self.keyframes = self.frames = self.chunk_bytes = self.image_bytes = 0
         self.states: Counter[Tracking] = Counter()
         self.distance_m = self.speed_m_s = self.turn_rate_rad_s = 0.0
         self.last: PoseRecord | None = None
@@ -148,6 +149,7 @@ class Recorder:
             "keyframes": self.keyframes,
             "points": self.points,
             "chunk_bytes": self.chunk_bytes,
+            "image_bytes": self.image_bytes,
             "distance_m": round(self.distance_m, 2),
             "georeference": self._rig.georeference,
             "scale": self._scale(),
@@ -204,11 +206,14 @@ class Recorder:
         for keyframe in step.keyframes:
             with self.pipeline.stages.stopwatch("encode"):
                 layers = encode(keyframe, keyframe.time_ns + self._offset_ns)
+                self.chunk_bytes += sum(map(len, layers))
+                room = IMAGE_SHARE * self.chunk_bytes - self.image_bytes
+                image = encode_image(keyframe.bgr, room)
+                self.image_bytes += len(image)
             with self.pipeline.stages.stopwatch("store"):
-                self.store.add_keyframe(keyframe.seq, layers)
+                self.store.add_keyframe(keyframe.seq, layers, image)
             self.keyframes += 1
             self.points += int((keyframe.fresh & np.isfinite(keyframe.depth.depth_m)).sum())
-            self.chunk_bytes += sum(map(len, layers))
             if self._on_keyframe is not None:
                 self._on_keyframe(keyframe)
         if self.pipeline.stages.debug and step.keyframes:

@@ -88,7 +88,7 @@ TIMED, MAX_TIMED = 64, 4096
 REST_S = 2.0
 """Pause after a request without an answer."""
 
-BATCH = {"header": 1, "summary": 1, "repose": 64, "pose": 64, "k0": 8}
+BATCH = {"header": 1, "summary": 1, "repose": 64, "pose": 64, "k0": 8, "image": 8}
 """Items of a kind that one request names, in the order of asking."""
 MAX_FINE = 16
 BRIEF_S, LONG_S = 1.5, 4.0

@@ -5,18 +5,15 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from recon.mapping.cloud_fusion import cloud_of
-from recon.types import U8, Bool, Keyframe
 from service.errors import InputError
 from service.ground.state import names_of, state_of
 from service.ground.storage import is_regular
@@ -30,6 +27,7 @@ from service.offline.refine.refly import (
     waypoints_text,
 )
 from service.scans.main_piece import main_track
+from service.stream.images import encode_image
 from service.stream.store import ScanStore
 
 TILE = re.compile(r"[A-Za-z0-9_]{1,80}\.(json|pnts|b3dm|glb)")
@@ -41,12 +39,8 @@ MAPS = EXPORTERS[MAPS_KIND][1]
 ZIP_PART_BYTES = 1 << 20
 SEQ = re.compile(r"[0-9]{1,9}")
 
-JPEG_QUALITY = 82
-EARLIER_KEYFRAMES, EARLIER_NS = 12, 300 * 10**9
-"""Keyframes that complete the image of one, where it brought nothing new, and how long before. In
-flight an image is asked for with each keyframe; to read all poses of an hour takes 2 s."""
-
 DARK = (45, 38, 32)
+"""Where an image shows nothing, BGR."""
 SANDBOX = {
     "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline';"
     " img-src data:"
@@ -133,74 +127,20 @@ def _tile(request: Request) -> Response:
 
 
 def _image(request: Request) -> Response:
-    """A keyframe's image as JPEG: its own colours, the rest from the nearest ones before it."""
+    """The JPEG of a whole keyframe; of an older scan only what was new in it."""
     folder = state_of(request).library.folder(*names_of(request))
     if not SEQ.fullmatch(request.path_params["seq"]):
         raise InputError("no such keyframe")
     seq = int(request.path_params["seq"])
     with ScanStore.peek(folder / "scan.db") as store:
-        keyframe = store.keyframe(seq)
+        data = store.image(seq)
+        keyframe = store.keyframe(seq) if data is None else None
+    if data is None:
         if keyframe is None:
             raise InputError("no such keyframe")
-        where = {
-            p.keyframe_seq: p.T_world_camera[:3, 3]
-            for p in store.poses(keyframe.time_ns - EARLIER_NS)
-        }
-        here = keyframe.depth.T_world_camera[:3, 3]
-        before = [s for s in reversed(store.seqs()) if s < seq]
-        placed = [s for s in before if s in where] or before  # a site's have no poses: the newest
-        earlier = sorted(placed, key=lambda s: float(np.linalg.norm(where.get(s, here) - here)))[
-            :EARLIER_KEYFRAMES
-        ]
-        bgr, known = _completed(keyframe, filter(None, map(store.keyframe, earlier)))
-    _, data = cv2.imencode(".jpg", _closed(bgr, known), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return Response(data.tobytes(), media_type="image/jpeg")
-
-
-def _completed(keyframe: Keyframe, earlier: Iterable[Keyframe]) -> tuple[U8, Bool]:
-    """(H, W, 3) colours of a keyframe and (H, W) which are known.
-
-    A chunk has no colours where nothing is new. Earlier keyframes have them: their points are
-    projected into this camera, keyframe by keyframe, the nearest point to each pixel.
-    """
-    bgr, known = keyframe.bgr.copy(), keyframe.fresh.copy()
-    K, T_camera_world = keyframe.depth.K, np.linalg.inv(keyframe.depth.T_world_camera)
-    h, w = known.shape
-    for other in earlier:
-        if known.all():
-            break
-        cloud = cloud_of(other.depth, other.bgr, other.fresh)
-        xyz = cloud.xyz_m @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-        front = np.flatnonzero(xyz[:, 2] > 1e-3)
-        front = front[np.argsort(-xyz[front, 2], kind="stable")]  # the nearest is written last
-        with np.errstate(over="ignore"):
-            u, v = (
-                np.rint(K[i, i] * xyz[front, i] / xyz[front, 2] + K[i, 2]).clip(-1, 1e6)
-                for i in (0, 1)
-            )
-        inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
-        cols, rows = u[inside].astype(np.int64), v[inside].astype(np.int64)
-        seen, colours = np.zeros((h, w), np.bool_), np.zeros_like(bgr)
-        seen[rows, cols] = True
-        colours[rows, cols] = cloud.rgb[front[inside], ::-1]
-        new = seen & ~known
-        bgr[new], known[new] = colours[new], True
-    return bgr, known
-
-
-def _closed(bgr: U8, known: Bool) -> U8:
-    """The image with gaps filled from around, as far as a twentieth of its width."""
-    out = np.where(known[..., None], bgr, 0).astype(np.float32)
-    weight = known.astype(np.float32)
-    side = max(3, bgr.shape[1] // 80)
-    for k in (3, side | 1, (2 * side) | 1, (4 * side) | 1):
-        total = cv2.boxFilter(weight, -1, (k, k), normalize=False)
-        new = (weight == 0.0) & (total > 0.08 * k * k)
-        sums = cv2.boxFilter(out * weight[..., None], -1, (k, k), normalize=False)
-        out[new] = sums[new] / total[new, None]
-        weight[new] = 1.0
-    out[weight == 0.0] = DARK
-    return np.clip(np.rint(out), 0, 255).astype(np.uint8)
+        dark = np.array(DARK, np.uint8)
+        data = encode_image(np.where(keyframe.fresh[..., None], keyframe.bgr, dark))
+    return Response(data, media_type="image/jpeg")
 
 
 def _coverage(request: Request) -> Response:

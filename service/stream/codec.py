@@ -28,6 +28,8 @@ MAX_PIXELS = 1 << 22
 """Width times height of a grid; 2704x1520 fits. Decoding allocates less than 160 MB."""
 MAX_LAYER_BYTES = 1 << 24
 MAX_LAYERS = 8
+IMAGE_LAYER = MAX_LAYERS
+"""Place of a keyframe's image among its layers in the store."""
 
 _ID = struct.Struct("<4sBBBBIq")  # magic, version, layer, layers, sources, seq, time
 _GRID = struct.Struct("<HHBB4H")  # full w, full h, factor, depth method, box x y w h

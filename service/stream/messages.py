@@ -17,6 +17,7 @@ from typing import Annotated, TypeVar
 import msgspec
 from msgspec import Meta
 
+from service.stream.images import MAX_IMAGE_BYTES
 from service.stream.naming import MAX_NAME, NAME
 from service.stream.ranges import RangeSet, ranges_from_pairs
 from service.stream.validity import MAX_HEADER_BYTES, MAX_SUMMARY_BYTES
@@ -27,6 +28,7 @@ MAGIC = b"SK"
 PART_VERSION = 1
 MAX_RECORD_BYTES, MAX_SMALL_BYTES = 1 << 24, 1024
 MAX_BYTES = {
+    "image": MAX_IMAGE_BYTES,
     "header": MAX_HEADER_BYTES,
     "summary": MAX_SUMMARY_BYTES,
     "pose": MAX_SMALL_BYTES,
@@ -42,7 +44,9 @@ MAX_OPEN_BYTES = 1 << 25
 PIECE_BYTES = 160
 """Memory per part beyond its payload."""
 
-KINDS = {0: "header", 1: "summary", 2: "pose", 3: "repose"} | {16 + k: f"k{k}" for k in range(8)}
+KINDS = {0: "header", 1: "summary", 2: "pose", 3: "repose", 4: "image"} | {
+    16 + k: f"k{k}" for k in range(8)
+}
 """Code of a part to the kind of its record: ``k0`` is the coarsest layer of a keyframe."""
 CODES = {name: code for code, name in KINDS.items()}
 WHOLE = ("header", "summary")

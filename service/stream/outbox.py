@@ -213,8 +213,8 @@ MAX_ESTIMATES = 256
 HEAD_AFTER_NEWS_S = 0.5
 HEAD_IDLE_S = 2.0
 HEAD_COMPLETE_S = 10.0
-POSE_ROOM, COARSE_ROOM, FINE_ROOM = 64, 32, 2
-"""Capacity of each live lane."""
+POSE_ROOM, COARSE_ROOM, FINE_ROOM = 64, 32, 4
+"""Capacity of each live lane; the last one carries image and fine layer of a keyframe."""
 
 
 @dataclass(slots=True, eq=False)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from typing import Any
 
-from service.stream.codec import MAX_LAYERS
+from service.stream.codec import IMAGE_LAYER
 from service.stream.database import Database
 
 MAX_RANGES = 4096
@@ -22,6 +22,11 @@ Pairs = list[tuple[int, int]]
 def is_number(column: str) -> str:
     """The SQL condition that a column holds a number of an item."""
     return f"typeof({column}) = 'integer' AND {column} BETWEEN 0 AND {MAX_NUMBER}"
+
+
+def chunk_kind(layer: int) -> str:
+    """The kind of item that the store holds as this layer of a keyframe."""
+    return "image" if layer == IMAGE_LAYER else f"k{layer}"
 
 
 class RangeSet:
@@ -228,9 +233,8 @@ class Inventory:
                 self._numbers[kind] = RangeSet.of([zlib.crc32(text.encode())])
         sql = f"SELECT seq, layer FROM chunks WHERE {is_number('seq')} ORDER BY layer, seq"
         for seq, layer in database.all(sql):
-            if layer not in range(MAX_LAYERS):
-                continue
-            self._numbers.setdefault(f"k{layer}", RangeSet()).add(seq)
+            if layer in range(IMAGE_LAYER + 1):
+                self._numbers.setdefault(chunk_kind(layer), RangeSet()).add(seq)
 
     def all(self) -> dict[str, RangeSet]:
         """Kind to numbers; kinds without any are left out."""

@@ -32,12 +32,14 @@ from service.stream.database import (
     peek_meta,
     rescue,
 )
+from service.stream.images import is_image
 from service.stream.radio_tiles import RadioStore
 from service.stream.ranges import (
     MAX_NUMBER,
     Inventory,
     Listener,
     RangeSet,
+    chunk_kind,
     is_number,
     ranges_from_pairs,
 )
@@ -199,18 +201,24 @@ class ScanStore:
 
     # Chunks
 
-    def add_keyframe(self, seq: int, layers: Sequence[bytes]) -> int:
-        """Store the coded ``layers`` of keyframe ``seq`` at once; returns the number of new ones.
+    def add_keyframe(self, seq: int, layers: Sequence[bytes], image: bytes | None = None) -> int:
+        """Store the coded ``layers`` of keyframe ``seq`` and its ``image``, a JPEG, at once;
+        returns the number of new ones.
 
         Over the quota only the coarse layer is kept. Raises ValueError for bytes that are no
-        layer of this keyframe, OutsideError when the disk is full.
+        layer or image of this keyframe, OutsideError when the disk is full.
         """
         found = [(head, data) for data in layers if (head := codec.peek(data)) is not None]
         if len(found) < len(layers) or any(head.seq != seq for head, _ in found):
             raise ValueError(f"not the layers of keyframe {seq}")
+        rows = [_chunk_row(head, data) for head, data in found]
+        if image is not None:
+            if not is_image(image):
+                raise ValueError(f"not the image of keyframe {seq}")
+            rows.append(_image_row(seq, image))
         with self._lock:
-            kept = found if self._room(sum(map(len, layers))) else found[:1]
-            self.refused += len(found) - len(kept)
+            kept = rows if self._room(sum(map(len, layers))) else rows[:1]
+            self.refused += len(rows) - len(kept)
             return self._put_chunks(kept)
 
     def add_chunk(self, data: bytes) -> bool:
@@ -218,23 +226,27 @@ class ScanStore:
         head = codec.peek(data)
         if head is None:
             return False
+        return self._add_row(_chunk_row(head, data))
+
+    def add_image(self, seq: int, data: bytes) -> bool:
+        """Store the JPEG of keyframe ``seq``; False when it is known, invalid or above the
+        quota."""
+        return is_image(data) and self._add_row(_image_row(seq, data))
+
+    def _add_row(self, row: tuple[Any, ...]) -> bool:
         with self._lock:
-            if head.layer > 0 and not self._room(len(data)):
+            if row[1] > 0 and not self._room(len(row[-1])):
                 self.refused += 1
                 return False
-            return self._put_chunks([(head, data)]) > 0
+            return self._put_chunks([row]) > 0
 
-    def _put_chunks(self, layers: Sequence[tuple[codec.LayerHead, bytes]]) -> int:
+    def _put_chunks(self, rows: Sequence[tuple[Any, ...]]) -> int:
         sql = "INSERT OR IGNORE INTO chunks VALUES (?, ?, ?, ?, ?, ?, ?)"
-        fresh = [
-            (head, data)
-            for head, data in layers
-            if head.seq not in self._inventory.of(f"k{head.layer}")
-        ]
-        self.database.write([(sql, _chunk_row(head, data)) for head, data in fresh])
-        for head, data in fresh:
-            self.chunk_bytes += len(data)
-            self._inventory.note(f"k{head.layer}", head.seq)
+        fresh = [row for row in rows if row[0] not in self._inventory.of(chunk_kind(row[1]))]
+        self.database.write([(sql, row) for row in fresh])
+        for row in fresh:
+            self.chunk_bytes += len(row[-1])
+            self._inventory.note(chunk_kind(row[1]), row[0])
         return len(fresh)
 
     def chunk(self, seq: int, number: int) -> bytes | None:
@@ -242,6 +254,11 @@ class ScanStore:
         sql = f"SELECT data FROM chunks WHERE seq = ? AND layer = ? AND {_NOT_TOO_LARGE}"
         row = self.database.one(sql, (seq, number))
         return None if row is None else blob(row[0])
+
+    def image(self, seq: int) -> bytes | None:
+        """The JPEG of the whole keyframe ``seq``; None in scans without."""
+        data = self.chunk(seq, codec.IMAGE_LAYER)
+        return data if data is not None and is_image(data) else None
 
     def keyframe(self, seq: int) -> Keyframe | None:
         """Keyframe ``seq`` at its finest stored layer, with the newest re-pose applied.
@@ -296,7 +313,7 @@ class ScanStore:
         """Numbers of the keyframes with any stored layer."""
         if self._only is not None:
             return sorted(self._only)
-        sql = f"SELECT DISTINCT seq FROM chunks WHERE {is_number('seq')}"
+        sql = f"SELECT DISTINCT seq FROM chunks WHERE {is_number('seq')} AND {_IS_LAYER}"
         stored = {row[0] for row in self.database.all(sql)}
         return sorted(stored | self._radio.seqs())
 
@@ -421,6 +438,8 @@ class ScanStore:
             return data if zlib.crc32(data) == number else None
         if kind.startswith("k"):
             return self.chunk(number, int(kind[1:]))
+        if kind == "image":
+            return self.image(number)
         table = {"pose": "poses", "repose": "reposes"}[kind]
         row = self.database.one(f"SELECT data FROM {table} WHERE id = ?", (number,))
         return None if row is None else blob(row[0])
@@ -433,7 +452,7 @@ class ScanStore:
             return self.put_repose(number, data)
         if kind in ("header", "summary"):
             return self._put_whole(kind, number, data)
-        return self.add_chunk(data)
+        return self.add_image(number, data) if kind == "image" else self.add_chunk(data)
 
     def _put_whole(self, kind: str, number: int, data: bytes) -> bool:
         with self._lock:
@@ -531,3 +550,8 @@ def _chunk_row(head: codec.LayerHead, data: bytes) -> tuple[Any, ...]:
         time.time_ns(),
         data,
     )
+
+
+def _image_row(seq: int, data: bytes) -> tuple[Any, ...]:
+    """A keyframe's image in the table of layers; the keyframe states its time."""
+    return seq, codec.IMAGE_LAYER, 0, 0, zlib.crc32(data), time.time_ns(), data

@@ -324,7 +324,8 @@ def hide_changed(path: Path, earlier: Member, map_: Path) -> None:
                 depth = replace(own.depth, depth_m=np.where(hidden, np.nan, own.depth.depth_m))
                 layers[seq] = codec.encode(replace(own, depth=depth), own.time_ns)
     database = Database(path)
-    database.write([("DELETE FROM chunks WHERE seq = ?", (seq,)) for seq in layers])
+    sql = "DELETE FROM chunks WHERE seq = ? AND layer != ?"
+    database.write([(sql, (seq, codec.IMAGE_LAYER)) for seq in layers])
     database.close()
     with ScanStore.open(path) as store:
         for seq, coded_layers in layers.items():

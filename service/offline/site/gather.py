@@ -208,7 +208,7 @@ def _copied(
                 layers.append(codec.pack(head, sections))
         if not layers:
             continue  # only tiles of the narrow radio
-        site.add_keyframe(new, layers)
+        site.add_keyframe(new, layers, store.image(seq))
         if spread is not None:
             T, scale = head.T_world_camera, 1.0 if repose is None else repose.scale
             around = se3.about(-T[:3, 3], spread)

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
 
 from recon import se3
+from recon.camera_model import scaled_K
 from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.trajectory import Placed
 from recon.tracking.odometry import Tracked, Tracking
+from recon.types import DepthMap, Keyframe
 from service.cameras.rig import Rig
 from service.flight.anchorage import Anchorage, SettledKey
 from service.flight.chain import Uncarried
 from service.flight.pipeline import Pipeline, Step
 from service.flight.recorder import REPLAYED, Recorder
+from service.stream.images import IMAGE_SHARE
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
+
+if TYPE_CHECKING:
+    from conftest import HouseFlight
 
 
 def placed(seq: int, sigma_m: float) -> Placed:
@@ -51,7 +58,7 @@ def recorder_of(store: ScanStore, batch: int, sigma_m: float) -> Recorder:
 
     chain = SimpleNamespace(place=place)
     track = SimpleNamespace(is_settled=lambda _key: False)
-    stages = SimpleNamespace(chain=chain, track=track, debug=None)
+    stages = SimpleNamespace(chain=chain, track=track, debug=None, stopwatch=nullcontext)
     pipeline = SimpleNamespace(stages=stages, drain=lambda: nothing, finish=lambda: nothing)
     rig = SimpleNamespace(frame=None, georeference="none")
     return Recorder(store, cast(Pipeline, pipeline), cast(Rig, rig), batch=batch)
@@ -142,3 +149,34 @@ def test_the_scale_names_what_measured_it(sources: tuple[str, ...], sigma: float
     assert "gnss_over_heights" not in recorder._scale()
     growth[0] = -0.1 - 3.0 * sigma
     assert recorder._scale()["sigma"] == pytest.approx(0.1 + 3.0 * sigma)
+
+
+def test_each_keyframe_has_its_image_within_the_flights_budget(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    """Where little is new the image of what is known still travels, at what the flight saved."""
+    rng = np.random.default_rng(3)
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("scan", "drone", 0)) as store:
+        recorder = recorder_of(store, batch=1, sigma_m=0.1)
+        for seq in range(8):
+            one = larger(house.keyframe(seq, 5.0 * seq), 3, rng)
+            one = replace(one, fresh=one.fresh & (seq % 2 == 0))
+            recorder.write(replace(step(seq), keyframes=(one,)), seq, None)
+        images = [store.image(k) or b"" for k in range(8)]
+    assert all(images) and sum(map(len, images)) == recorder.image_bytes
+    assert recorder.image_bytes <= IMAGE_SHARE * recorder.chunk_bytes
+
+
+def larger(one: Keyframe, factor: int, rng: np.random.Generator) -> Keyframe:
+    """The keyframe with this many times the pixels a side, and noise in its depth."""
+
+    def enlarged(plane: Any) -> Any:
+        return plane.repeat(factor, axis=0).repeat(factor, axis=1)
+
+    depth = one.depth
+    rough = enlarged(depth.depth_m) + rng.normal(0, 0.5, enlarged(one.fresh).shape)
+    large = DepthMap(
+        rough.astype(np.float32), enlarged(depth.sigma_m), enlarged(depth.views),
+        scaled_K(depth.K, factor, factor), depth.T_world_camera,
+    )  # fmt: skip
+    return replace(one, depth=large, bgr=enlarged(one.bgr), fresh=enlarged(one.fresh))
