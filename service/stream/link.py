@@ -75,7 +75,7 @@ class LinkProgress:
 
 
 @dataclass(slots=True, eq=False)
-class _Connection:
+class _LinkSession:
     """A session with one ground station or router, or with those that call us."""
 
     config: SessionConfig
@@ -109,7 +109,7 @@ class DatalinkSender:
     ) -> None:
         self._config = config
         self._drone = check_name(drone if store is None else store.header.drone, "drone")
-        self._connections = [_Connection(config) for config in _sessions(config)]
+        self._connections = [_LinkSession(config) for config in _sessions(config)]
         for connection in self._connections:
             check_endpoints(connection.config)
         self._lock = threading.Lock()  # of the outbox
@@ -242,7 +242,7 @@ class DatalinkSender:
     def _open_sessions(self) -> list[zenoh.Session]:
         return [c.session for c in self._connections if c.session is not None]
 
-    def _keep(self, connection: _Connection, _: Worker) -> None:
+    def _keep(self, connection: _LinkSession, _: Worker) -> None:
         """Keep a session open until the stop; a new one follows when its stations fall silent."""
         attempt = 0
         opening_s = FIRST_PATIENCE_S / PATIENCE  # what the last session took to open
@@ -277,7 +277,7 @@ class DatalinkSender:
                 connection.session = None
                 self._close_session(session, pumps)
 
-    def _begin(self, connection: _Connection, session: zenoh.Session) -> None:
+    def _begin(self, connection: _LinkSession, session: zenoh.Session) -> None:
         """Send on a session that has just been opened too."""
         now = time.monotonic()
         with self._lock:
@@ -308,7 +308,7 @@ class DatalinkSender:
         if self._stop.is_set():
             closed.wait(PROMPT_CLOSING_S)
 
-    def _listen(self, connection: _Connection, session: zenoh.Session) -> list[Worker]:
+    def _listen(self, connection: _LinkSession, session: zenoh.Session) -> list[Worker]:
         """Workers that take what arrives. They end with the session.
 
         Channels and threads of our own: a callback's thread would belong to the library, and
@@ -386,7 +386,7 @@ class DatalinkSender:
 
     # The threads that take what comes
 
-    def _on_held(self, connection: _Connection, sample: zenoh.Sample) -> None:
+    def _on_held(self, connection: _LinkSession, sample: zenoh.Sample) -> None:
         connection.heard_at = time.monotonic()
         if self._reports.put(str(sample.key_expr), sample.payload.to_bytes()):
             self._wake.set()
@@ -396,7 +396,7 @@ class DatalinkSender:
         self._is_looked_for = True
         self._wake.set()
 
-    def _on_query(self, connection: _Connection, query: zenoh.Query) -> None:
+    def _on_query(self, connection: _LinkSession, query: zenoh.Query) -> None:
         connection.heard_at = time.monotonic()
         parts = str(query.key_expr).split("/")
         ask = unpack(query.payload.to_bytes(), Ask) if query.payload is not None else None

@@ -30,7 +30,7 @@ pytest.importorskip("cryptography")
 pytest.importorskip("zenoh")
 
 
-class Fleet:
+class StationsAndDrones:
     """Drones and stations of one fleet, with keys or without; all end with the ``exit_stack``."""
 
     def __init__(self, folder: Path, exit_stack: ExitStack, has_keys: bool) -> None:
@@ -82,10 +82,10 @@ class Fleet:
 @pytest.fixture(params=[True, False], ids=["keys", "plain"])
 def fleet(
     request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Fleet]:
+) -> Iterator[StationsAndDrones]:
     monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
     with ExitStack() as exit_stack:
-        yield Fleet(tmp_path, exit_stack, request.param)
+        yield StationsAndDrones(tmp_path, exit_stack, request.param)
 
 
 def complete(station: Receiver) -> list[str]:
@@ -93,7 +93,7 @@ def complete(station: Receiver) -> list[str]:
 
 
 def test_a_drone_with_two_stations_delivers_to_both_and_carries_nothing_between_them(
-    fleet: Fleet,
+    fleet: StationsAndDrones,
 ) -> None:
     at_base, at_van, missing = (fleet.endpoint() for _ in range(3))
     base, van = fleet.station("base", [at_base]), fleet.station("van", [at_van])
@@ -103,7 +103,7 @@ def test_a_drone_with_two_stations_delivers_to_both_and_carries_nothing_between_
     assert [entry["drone"] for entry in base.progress()] == ["red"]
 
 
-def test_stations_that_join_another_receive_what_it_does(fleet: Fleet) -> None:
+def test_stations_that_join_another_receive_what_it_does(fleet: StationsAndDrones) -> None:
     endpoint = fleet.endpoint()
     stations = [fleet.station("hub", [endpoint])]
     stations += [fleet.station(name, connect=[endpoint]) for name in ("base", "van")]
@@ -112,7 +112,7 @@ def test_stations_that_join_another_receive_what_it_does(fleet: Fleet) -> None:
 
 
 def test_what_keys_do_not_allow_is_refused_in_one_line(
-    fleet: Fleet, request: pytest.FixtureRequest
+    fleet: StationsAndDrones, request: pytest.FixtureRequest
 ) -> None:
     endpoint, other = fleet.endpoint(), fleet.endpoint()
     if "keys" in request.node.callspec.id:
