@@ -12,6 +12,7 @@ import contextlib
 import logging
 import os
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -93,8 +94,6 @@ ROWS: tuple[Row, ...] = (
     Row("exports", "deliverables asked for in the portal", 4, 20, "refuse", is_awaited=True),
     Row("replay", "process: the scan of an uploaded recording", 4),
     Row("vehicle", "looks for the vehicle that the portal steers", 5, restarts=True),
-    Row("foxglove", "process: growing scans for Foxglove; a queue per client", 5, 32, DROP,
-        restarts=True),
     Row("portal", "the web server", 5, None, "", 60.0, True, True),
     Row("closing", "keeps the init system waiting while all is closed", 6, restarts=True,
         is_essential=True),
@@ -286,6 +285,21 @@ _PROCESSES: list[tuple[str, subprocess.Popen[bytes]]] = []
 
 PROCESS = Workers()
 """The workers without a closer supervisor."""
+
+
+WITHOUT_THE_CURRENT_FOLDER = (
+    "import sys; sys.path[:] = filter(None, sys.path); import runpy; "
+    "runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
+)
+
+
+def python_command(module: str, *arguments: str) -> list[str]:
+    """The command that runs a module of ours in a process of its own.
+
+    ``python -m`` imports from the current folder first, which may be a stranger's card; its option
+    -P needs Python 3.11.
+    """
+    return [sys.executable, "-c", WITHOUT_THE_CURRENT_FOLDER, module, *arguments]
 
 
 def open_process(name: str, command: Sequence[str], **streams: Any) -> subprocess.Popen[bytes]:

@@ -87,10 +87,6 @@ class GroundOptions:
     basemap: Annotated[
         Path | None, typer.Option(help="MBTiles or PMTiles basemap of the portal's maps")
     ] = None
-    foxglove: Annotated[
-        str | None,
-        typer.Option(help="serve growing scans to Foxglove at HOST:PORT, such as 127.0.0.1:8765"),
-    ] = None
     vehicle: Annotated[
         str | None,
         typer.Option(help="MAVLink of the vehicle for the portal: udpin://0.0.0.0:14550"),
@@ -169,11 +165,6 @@ def ground(given: GroundOptions) -> None:
     taken = _take_in(config.store, given.take or [])
     stop, workers = stop_by_signals(), Workers()
     receiver = Receiver(config, workers)
-    viewers = None
-    if given.foxglove is not None:
-        from service.ground.foxglove import FoxgloveServer
-
-        viewers = FoxgloveServer(given.foxglove, config.store, config.session.plain, workers)
     radios = [RadioLink(endpoint, GROUND, receiver.add_radio) for endpoint in given.mavlink or []]
     receiver.start()
     for folder in taken:
@@ -186,9 +177,6 @@ def ground(given: GroundOptions) -> None:
     try:
         if given.portal is not None:
             page = _open_portal(given.portal, given, receiver, workers)
-        if viewers is not None:
-            viewers.start()
-            print(f"Foxglove: ws://{given.foxglove}", file=sys.stderr, flush=True)
         notifier.ready()
         _watch(stop, receiver, workers, notifier, radios, given)
         entries = receiver.progress()
@@ -197,8 +185,6 @@ def ground(given: GroundOptions) -> None:
         closing = workers.start("closing", lambda worker: _ask_for_time(notifier, worker))
         if page is not None:
             page.close()
-        if viewers is not None:
-            viewers.close()
         for radio in radios:
             radio.close()
         receiver.close()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import select
 import sys
 import time
@@ -22,7 +23,6 @@ import numpy as np
 from recon import se3
 from recon.types import F64
 from service.errors import InputError, SkyreliefError
-from service.ground.foxglove import growing
 from service.ground.scan_facts import UnixTime
 from service.ground.sites import references
 from service.ground.storage import is_regular
@@ -30,7 +30,7 @@ from service.offline.site import DRONE, SAME_VISIT_S
 from service.offline.site.live import LiveSite, PlacedScan
 from service.scans.writing import write_whole
 from service.small_file import read_json
-from service.workers import Worker, guarded, run_process
+from service.workers import Worker, guarded, python_command, run_process
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +39,8 @@ FILE = ".live-site.json"
 
 MAX_BYTES = 200_000
 POLL_S = 0.25
+GROWING_S = 60.0
+"""A scan that did not change for so long is no longer in flight."""
 MAX_FLYING, MAX_SCANS = 16, 48
 """Scans in flight, and all that are followed."""
 
@@ -49,7 +51,7 @@ REFUSED_S = 3.0
 def run(store: Path, worker: Worker) -> None:
     """Keep the process until the worker's stop."""
     try:
-        run_process(worker, "live site", [sys.executable, "-m", __name__, str(store)])
+        run_process(worker, "live site", python_command(__name__, str(store)))
     finally:
         with contextlib.suppress(OSError):
             (store / FILE).unlink(missing_ok=True)
@@ -70,11 +72,7 @@ class Follower:
     def turn(self, now_unix_s: float) -> bool:
         """Compare one keyframe of each scan; False when there was none to compare."""
         scans = self._site.scans
-        grown = [
-            folder
-            for folder in growing(self._store, now_unix_s, MAX_FLYING)
-            if folder.parent.name != DRONE
-        ]
+        grown = growing(self._store, now_unix_s)
         for folder in grown:
             if folder not in scans and now_unix_s >= self._refused.get(folder, now_unix_s):
                 self._begin(folder, now_unix_s)
@@ -120,6 +118,21 @@ class Follower:
         if placed is not None:
             write_shown(self._store, placed)
         return bool(due)
+
+
+def growing(store: Path, now_unix_s: float) -> list[Path]:
+    """The folder of each drone's newest scan, if it grows; MAX_FLYING of them at most."""
+    newest: dict[str, tuple[float, Path]] = {}
+    for path in store.glob("*/*/scan.db*"):
+        folder = path.parent
+        drone = folder.parent.name
+        is_store = path.name in ("scan.db", "scan.db-wal") and is_regular(path)
+        if is_store and drone[0] != "." and drone != DRONE:
+            with contextlib.suppress(OSError):
+                changed = path.lstat().st_mtime, folder
+                newest[drone] = max(newest.get(drone, (-math.inf, folder)), changed)
+    found = sorted(newest.values(), reverse=True)[:MAX_FLYING]
+    return [folder for changed, folder in found if changed > now_unix_s - GROWING_S]
 
 
 def serve(store: Path) -> None:

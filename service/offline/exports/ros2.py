@@ -1,4 +1,4 @@
-"""A scan's keyframes and poses as ROS 2 messages in CDR, for a recording and for live clients.
+"""A scan's keyframes and poses as ROS 2 messages in CDR, for a recording.
 
 Frames follow REP-105 and REP-103: ``map`` is ENU metres about the scan's origin,
 ``camera_optical`` looks along z with x right and y down. A keyframe's points are in
@@ -6,7 +6,7 @@ Frames follow REP-105 and REP-103: ``map`` is ENU metres about the scan's origin
 
 Topics: ``/tf`` TFMessage, and below ``/camera``: ``points`` PointCloud2, ``image/compressed``
 CompressedImage, ``camera_info`` CameraInfo (of the image, without distortion), ``fix`` NavSatFix
-(altitude AMSL). With a name, frames and topics begin with it, except ``/tf``.
+(altitude AMSL).
 """
 
 from __future__ import annotations
@@ -46,13 +46,14 @@ FIELDS = (
 """Name, offset and type of the parts of POINT."""
 
 
-class Ros2Channels:
-    """Channels of one camera in ``context``, which a file or a server reads."""
+MAP, CAMERA = "map", "camera_optical"
 
-    def __init__(self, context: Any, name: str = "") -> None:
+
+class Ros2Channels:
+    """Channels of one camera in ``context``, which a file reads."""
+
+    def __init__(self, context: Any) -> None:
         self._context = context
-        self._names = f"{name}/" if name else ""
-        self._map, self._camera = f"{self._names}map", f"{self._names}camera_optical"
         self._tf = self._channel("/tf", "tf2_msgs/msg/TFMessage")
         self._points = self._channel("points", "sensor_msgs/msg/PointCloud2")
         self._image = self._channel("image/compressed", "sensor_msgs/msg/CompressedImage")
@@ -63,7 +64,7 @@ class Ros2Channels:
         import foxglove
 
         text, _ = _types().generate_msgdef(kind, ros_version=2)
-        topic = topic if topic.startswith("/") else f"/{self._names}camera/{topic}"
+        topic = topic if topic.startswith("/") else f"/camera/{topic}"
         schema = foxglove.Schema(name=kind, encoding="ros2msg", data=text.encode())
         channel = foxglove.Channel(
             topic, schema=schema, message_encoding="cdr", context=self._context
@@ -76,8 +77,8 @@ class Ros2Channels:
         e, n, u = (float(v) for v in T_map_camera[:3, 3])
         transform = _new(
             "geometry_msgs/msg/TransformStamped",
-            _header(self._map, time_ns),
-            self._camera,
+            _header(MAP, time_ns),
+            CAMERA,
             _new(
                 "geometry_msgs/msg/Transform",
                 _new("geometry_msgs/msg/Vector3", e, n, u),
@@ -93,7 +94,7 @@ class Ros2Channels:
         _log(
             self._fix,
             pose.time_unix_ns,
-            _header(self._camera, pose.time_unix_ns),
+            _header(CAMERA, pose.time_unix_ns),
             _new("sensor_msgs/msg/NavSatStatus", 0, 1),  # a fix, of GPS
             pose.lat_deg,
             pose.lon_deg,
@@ -105,7 +106,7 @@ class Ros2Channels:
     def log_keyframe(self, keyframe: Keyframe) -> None:
         """The keyframe's pose, points, image and camera."""
         time_ns, depth = keyframe.time_ns, keyframe.depth
-        header = _header(self._camera, time_ns)
+        header = _header(CAMERA, time_ns)
         self.log_transform(depth.T_world_camera, time_ns)
         points = known_points(keyframe)
         fields = [_new("sensor_msgs/msg/PointField", *field, 1) for field in FIELDS]
