@@ -61,6 +61,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
 """Name to (``module:function``, one line of help). A new command is a function and a line."""
 
 
+NUMBA_SETTINGS = ".numba_config.yaml"
+"""Numba reads it from the current folder: where compiled code lies, which it then runs."""
+
 SERVICES = ("run", "ground")
 """These log what they do; the other commands log warnings only, unless --verbose."""
 
@@ -145,6 +148,10 @@ def main() -> None:
         hook.exc_type, hook.exc_value or hook.exc_type(), hook.exc_traceback
     )
     try:
+        if os.path.lexists(NUMBA_SETTINGS):
+            raise InputError(
+                f"{NUMBA_SETTINGS} in this folder could run foreign code; use another folder"
+            )
         with needing("this command"):
             app(standalone_mode=True)
     except SkyreliefError as error:

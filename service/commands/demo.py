@@ -17,10 +17,10 @@ import typer
 
 from service.commands import AsJson
 from service.errors import InputError, OutsideError
+from service.workers import python_command
 
 FLIGHT = Path("demo") / "caliterra"
 MARKER = ".skyrelief-demo"
-COMPILE = "from service.commands.demo import compile_kernels; compile_kernels()"
 READY_S = 60.0
 END_S = 120.0
 
@@ -100,7 +100,7 @@ def _compile_meanwhile() -> list[subprocess.Popen[str]]:
 
     if has_kernels():
         return []
-    return [subprocess.Popen([sys.executable, "-c", COMPILE], stdin=subprocess.DEVNULL, text=True)]
+    return [subprocess.Popen(python_command(__name__), stdin=subprocess.DEVNULL, text=True)]
 
 
 def _flight(flight: Path | None) -> Path:
@@ -131,7 +131,7 @@ def _prepare(out: Path) -> None:
 
 
 def _skyrelief(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "service.cli", *arguments]
+    return python_command("service.cli", *arguments)
 
 
 def _start_ground(out: Path, endpoint: str, portal: str) -> subprocess.Popen[str]:
@@ -245,3 +245,7 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return document
+
+
+if __name__ == "__main__":
+    compile_kernels()

@@ -12,7 +12,6 @@ import dataclasses
 import logging
 import os
 import socket
-import sys
 from pathlib import Path
 
 from service.cameras import parse_source, reject_options
@@ -20,7 +19,7 @@ from service.config import Config, ScanConfig
 from service.errors import InputError
 from service.init_system import Notifier
 from service.scans.writing import writing_folder
-from service.workers import PROCESS, Worker, run_process
+from service.workers import PROCESS, Worker, python_command, run_process
 
 log = logging.getLogger(__name__)
 
@@ -78,11 +77,11 @@ class SimulatedFlight:
 
     def _play(self, worker: Worker) -> None:
         video, telemetry = self._ports
-        command = [
-            sys.executable, "-m", "service.cli", "simulate", "--out", str(self.folder), "--live",
+        command = python_command(
+            "service.cli", "simulate", "--out", str(self.folder), "--live",
             "--loop", "--video-to", f"udp://127.0.0.1:{video}?pkt_size=1316",
             "--mavlink-to", f"127.0.0.1:{telemetry}", "--until-stdin-ends",
-        ]  # fmt: skip
+        )  # fmt: skip
         run_process(worker, worker.name, command)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import queue
-import sys
 import time
 from collections.abc import Collection, Iterator, Sequence
 from functools import partial
@@ -27,7 +26,7 @@ from service.offline.site import DRONE, SAME_VISIT_S, SITE
 from service.offline.site.start import StartPoints
 from service.progress import Progress
 from service.small_file import read_json
-from service.workers import Worker, guarded, run_to_end
+from service.workers import Worker, guarded, python_command, run_to_end
 
 log = logging.getLogger(__name__)
 
@@ -77,8 +76,7 @@ class Sites:
         def goes_on(_: str) -> bool:
             return not worker.stop.is_set() and time.monotonic() < deadline
 
-        command = [sys.executable, "-m", "service.cli", *words]
-        fault = run_to_end("alignment", command, goes_on)
+        fault = run_to_end("alignment", python_command("service.cli", *words), goes_on)
         if fault:
             raise InputError(f"{site}: {fault}")
         if goes_on(""):

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import re
 import struct
-import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Sequence
@@ -30,7 +29,7 @@ from service.ground.storage import (
     workplace,
 )
 from service.progress import Progress
-from service.workers import run_to_end
+from service.workers import python_command, run_to_end
 
 KINDS = (".zip", ".db", ".mcap")
 """Of an upload that is a scan already."""
@@ -180,7 +179,7 @@ def _replay(paths: Sequence[Path], out: Path, progress: Progress) -> None:
         )
         if path.suffix in suffixes
     }
-    command = [sys.executable, "-m", "service.cli", "replay", str(of.pop("video"))]
+    command = python_command("service.cli", "replay", str(of.pop("video")))
     command += [word for option, path in of.items() for word in (option, str(path))]
 
     def goes_on(line: str) -> bool:
