@@ -10,26 +10,26 @@ from __future__ import annotations
 import math
 import re
 import struct
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from mavlink.telemetry.decode import plausible_place
+from mavlink.telemetry.history import M_PER_DEG
 from recon.frames import rotation_from_rpy, rpy_from_rotation
 from service.cameras.lens import Lens, finite_number, finite_numbers, lens_of
 from service.cameras.source import GeoTag
-
-XMP_BYTES = 1 << 18  # DJI's block sits in the first 64 KiB
-PREFIXES = "(?:drone-dji|drone-parrot|drone|Camera)"
-"""Of XMP names. Autel's are those of DJI with the prefix drone."""
+from service.cameras.xmp import xmp_values
 
 DEFAULT_SIGMA_H_M, MAX_SIGMA_M = 5.0, 1000.0
 NAME_TIME = re.compile(r"(?<!\d)(20\d{6})[T_-]?(\d{6})[._]?(\d{1,6})?Z(?![A-Za-z0-9])")
-SKYDIO_ANGLES = re.compile(
-    "<drone-skydio:CameraOrientationNED([^>]*/>|.{0,999}?</drone-skydio:CameraOrientationNED>)",
-    re.DOTALL,
-)
-"""Other frames of reference have angles of the same names."""
+EXIF_BYTES = 1 << 22
+"""Of a file's EXIF that is read; cameras write 64 KiB, and a maker's note."""
+
+FINE_M, DIFFER_M = 0.1, 1.0
+"""Steps of a stated value that make no difference, and a difference of two that does."""
 
 TURNED_DEG = {3: 180, 6: 90, 8: 270}
 """EXIF orientation to degrees clockwise; no camera writes the mirrored ones."""
@@ -51,6 +51,9 @@ class Tags:
     pan_deg: float | None = None  # heading of the image less the aircraft's, which are both stated
     lens: Lens | None = None
     turned_deg: int = 0  # clockwise rotation that viewers apply to the stored pixels
+    camera: str = ""  # of several of a drone, as its maker names it
+    differences: tuple[tuple[str, float], ...] = ()  # two sources of one value, metres apart
+    is_hemisphere_missing: bool = False  # there is a position without N, S, E, W
 
 
 BROKEN = (
@@ -66,26 +69,61 @@ BROKEN = (
 """Pillow's errors, besides OSError, for invalid images or broken tags."""
 
 
-def read_tags(path: Path) -> Tags:
+def read_tags(path: Path, hemisphere: str = "") -> Tags:
     """The tags of the image at ``path``; raises OSError when it is not an image, or when it
-    claims more pixels than any camera has."""
+    claims more pixels than any camera has.
+
+    ``hemisphere`` ("NW") is that of positions that state none.
+    """
     from PIL import Image
 
     try:
-        return _read_tags(path)
+        return _read_tags(path, hemisphere)
     except (*BROKEN, Image.DecompressionBombError) as error:
         raise OSError(" ".join(str(error).split())[:200] or type(error).__name__) from error
 
 
-def _read_tags(path: Path) -> Tags:
+class _Metered:
+    """A file of which ``EXIF_BYTES`` can be read: a list in a TIFF is as long as the file."""
+
+    def __init__(self, file: Any) -> None:
+        self._file, self._left = file, EXIF_BYTES
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def read(self, size: int = -1) -> bytes:
+        """Read like any file; raises OSError where too much has been read."""
+        self._left -= size if size >= 0 else EXIF_BYTES + 1
+        self.check()
+        data: bytes = self._file.read(size)
+        return data
+
+    def check(self) -> None:
+        """Raise OSError where too much has been read, which Pillow ignores."""
+        if self._left < 0:
+            raise OSError("the tags are too large")
+
+
+def _read_tags(path: Path, hemisphere: str) -> Tags:
     from PIL import Image
 
     with Image.open(path) as image:
         size_px = (int(image.width), int(image.height))
+        packet = image.info.get("xmp") or b""
+        if len(image.info.get("exif") or b"") > EXIF_BYTES:
+            raise OSError("the tags are too large")
+        metered = None
+        if hasattr(image, "tag_v2"):  # a TIFF, whose tags are not in memory yet
+            image.fp = metered = _Metered(image.fp)
         exif = image.getexif()
         photo, gps = dict(exif.get_ifd(0x8769)), dict(exif.get_ifd(0x8825))
-    xmp = _xmp(path)
-    geotag = _geotag(gps, xmp)
+        if metered is not None:
+            metered.check()
+    xmp = xmp_values(packet) if isinstance(packet, bytes) else {}
+    place, is_hemisphere_missing, apart = _place(gps, xmp, hemisphere)
+    altitude, differs = _altitude(gps, xmp)
+    geotag = _geotag(gps, xmp, place, altitude)
     text = str(photo.get(36867) or photo.get(36868) or exif.get(306) or "")
     sub = str(photo.get(37521) or photo.get(37522) or photo.get(37520) or "").strip("\0 ")
     return Tags(
@@ -99,6 +137,9 @@ def _read_tags(path: Path) -> Tags:
         pan_deg=_pan_deg(geotag, xmp),
         lens=lens_of(photo, xmp, size_px),
         turned_deg=TURNED_DEG.get(exif.get(274), 0),
+        camera=xmp.get("ImageSource", "").strip()[:40],
+        differences=(*apart, *differs),
+        is_hemisphere_missing=is_hemisphere_missing,
     )
 
 
@@ -149,32 +190,113 @@ def _is_known(moment: datetime) -> bool:
     return 1970 <= moment.year < 2106
 
 
-def _geotag(gps: dict[int, Any], xmp: dict[str, str]) -> GeoTag | None:
-    lat = _degrees(gps.get(2), gps.get(1), "S")
-    lon = _degrees(gps.get(4), gps.get(3), "W")
-    if lat is None or lon is None:
-        lat, lon = (
-            _xmp_number(xmp, "GpsLatitude"),
-            _xmp_number(xmp, "GpsLongitude", "GpsLongtitude"),
-        )
-    ypr_deg, relative_m = _gimbal_ypr_deg(xmp), _xmp_number(xmp, "RelativeAltitude")
-    if lat is None or lon is None or abs(lat) > 90 or abs(lon) > 180 or (lat == 0 and lon == 0):
-        if ypr_deg is None and relative_m is None:
-            return None
-        lat = lon = None
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A value as one source states it."""
+
+    source: str
+    value: tuple[float, ...]  # (latitude, longitude) in degrees, or an altitude in metres
+    step_m: float  # the finest difference that the source can state
+
+
+Differences = tuple[tuple[str, float], ...]
+"""Of two sources of one value: what they differ in, and by how many metres."""
+
+
+def better(
+    what: str,
+    plausible: Sequence[Reading],
+    apart_m: Callable[[Reading, Reading], float],
+    doubtful: Sequence[Reading] = (),
+) -> tuple[Reading | None, Differences]:
+    """The finest of plausible readings, the first of equals; and how far the others are off it.
+
+    Steps below ``FINE_M`` are equal, as no receiver is that good: a program that corrects
+    positions writes them to EXIF, which comes first.
+    """
+    if not plausible:
+        return None, ()
+    best = min(plausible, key=lambda one: max(one.step_m, FINE_M))
+    off = [(one, apart_m(one, best)) for one in (*plausible, *doubtful)]
+    return best, tuple(
+        (f"{one.source} and {best.source} state another {what}; that of {best.source} counts", m)
+        for one, m in off
+        if m > DIFFER_M + one.step_m + best.step_m
+    )
+
+
+def _place(
+    gps: dict[int, Any], xmp: dict[str, str], hemisphere: str
+) -> tuple[Reading | None, bool, Differences]:
+    """The position; whether it has no N, S, E, W; and how far sources are apart."""
+    readings = []
+    letters = [str(gps.get(tag, "")).strip("\0 ").upper() for tag in (1, 3)]
+    given = [one if one in pair else "" for one, pair in zip(letters, ("NS", "EW"), strict=True)]
+    given = [one or more for one, more in zip(given, hemisphere or "  ", strict=True)]
+    degrees = [_degrees(gps.get(tag)) for tag in (2, 4)]
+    is_signed = any(one is not None and one[0] < 0.0 for one in degrees)
+    is_stated = all(map(str.strip, given)) or is_signed
+    signs = [-1.0 if one in ("S", "W") else 1.0 for one in given]
+    if degrees[0] is not None and degrees[1] is not None:
+        (lat, lat_step), (lon, lon_step) = degrees[0], degrees[1]
+        step_m = M_PER_DEG * math.hypot(lat_step, lon_step)
+        readings.append(Reading("EXIF", (lat * signs[0], lon * signs[1]), step_m))
+    names = (("GpsLatitude",), ("GpsLongitude", "GpsLongtitude"))
+    texts = [next((xmp[n] for n in some if n in xmp), "") for some in names]
+    if None not in (numbers := [finite_number(text) for text in texts]):
+        step_m = M_PER_DEG * math.hypot(*map(_last_digit, texts))
+        readings.append(Reading("XMP", (numbers[0] or 0.0, numbers[1] or 0.0), step_m))
+    sound = [one for one in readings if plausible_place(*one.value)]
+    stated = [one for one in sound if is_stated or one.source != "EXIF"]
+    best, apart = better("position", stated, _metres)
+    return best, bool(sound) and not stated, apart
+
+
+def _metres(one: Reading, other: Reading) -> float:
+    """Distance of two positions, near enough where they differ little."""
+    north, east = (b - a for a, b in zip(one.value, other.value, strict=True))
+    across = math.remainder(east, 360.0) * math.cos(math.radians(one.value[0]))
+    return M_PER_DEG * math.hypot(north, across)
+
+
+def _altitude(gps: dict[int, Any], xmp: dict[str, str]) -> tuple[float | None, Differences]:
+    """The altitude in metres above what the tags state, and how far sources are apart."""
+    readings = []
     altitude = finite_number(gps.get(6))
-    if altitude is not None and gps.get(5) in (1, b"\x01"):
-        altitude = -altitude
+    if altitude is not None:
+        below = gps.get(5) in (1, b"\x01", 3, b"\x03")
+        readings.append(Reading("EXIF", (-altitude if below else altitude,), _step(gps.get(6))))
+    if (absolute := finite_number(text := xmp.get("AbsoluteAltitude", ""))) is not None:
+        readings.append(Reading("XMP", (absolute,), _last_digit(text)))
+    # Exactly 0 is what a program writes that does not know it.
+    unset = [one for one in readings if not one.value[0]]
+    known = [one for one in readings if one.value[0]]
+    best, apart = better(
+        "altitude", known or unset, lambda a, b: abs(a.value[0] - b.value[0]), unset
+    )
+    return None if best is None else best.value[0], apart
+
+
+def _geotag(
+    gps: dict[int, Any], xmp: dict[str, str], place: Reading | None, altitude: float | None
+) -> GeoTag | None:
+    ypr_deg, relative_m = _gimbal_ypr_deg(xmp), _xmp_number(xmp, "RelativeAltitude")
+    if place is None and ypr_deg is None and relative_m is None:
+        return None
     across = _sigma(xmp, "RtkStdLat", "RtkStdLon", "GPSXYAccuracy")
     stated = across or _plausible(finite_number(gps.get(31)))
+    step_m = 0.0 if place is None or place.step_m < DIFFER_M else place.step_m
+    lat, lon = (None, None) if place is None else place.value
     return GeoTag(
         lat_deg=lat,
         lon_deg=lon,
-        alt_amsl_m=altitude if altitude is not None else _xmp_number(xmp, "AbsoluteAltitude"),
-        sigma_h_m=stated or DEFAULT_SIGMA_H_M,
+        alt_amsl_m=altitude,
+        sigma_h_m=math.hypot(stated or DEFAULT_SIGMA_H_M, step_m / math.sqrt(3.0)),
         sigma_v_m=_sigma(xmp, "RtkStdHgt", "GPSZAccuracy"),
+        is_sigma_h_stated=stated is not None,
         ypr_deg=ypr_deg,
         relative_alt_m=relative_m,
+        datum="ellipsoid" if xmp.get("AltitudeType", "").strip() == "RtkAlt" else "",
     )
 
 
@@ -222,22 +344,6 @@ def _pix4d_ypr_deg(xmp: dict[str, str]) -> tuple[float, float, float] | None:
     return yaw, pitch, roll
 
 
-def _xmp(path: Path) -> dict[str, str]:
-    """The values of makers and of Pix4D in the XMP block, as attributes or as elements."""
-    with path.open("rb") as stream:
-        head = stream.read(XMP_BYTES)
-    text = head.decode("latin-1")
-    pairs = re.findall(rf"{PREFIXES}:(\w+)=\"([^\"]*)\"", text)
-    pairs += re.findall(rf"<{PREFIXES}:(\w+)>([^<]*)</", text)
-    for block in SKYDIO_ANGLES.findall(text):
-        angles = re.findall(r"(?<!/)drone-skydio:(Yaw|Pitch|Roll)(?:=\"|>)([^\"<]*)", block)
-        pairs += [(f"Gimbal{name}Degree", value) for name, value in angles]
-    # Lists: <Camera:PrincipalPoint><rdf:Seq><rdf:li>3.4,2.6</rdf:li>...
-    for name, block in re.findall(r"<Camera:(\w+)>\s*<rdf:Seq>(.*?)</rdf:Seq>", text, re.DOTALL):
-        pairs.append((name, ",".join(re.findall(r"<rdf:li>([^<]*)</rdf:li>", block))))
-    return dict(pairs)
-
-
 def _xmp_number(xmp: dict[str, str], *names: str) -> float | None:
     for name in names:
         value = finite_number(xmp.get(name))
@@ -246,12 +352,24 @@ def _xmp_number(xmp: dict[str, str], *names: str) -> float | None:
     return None
 
 
-def _degrees(value: Any, reference: Any, negative: str) -> float | None:
+def _degrees(value: Any) -> tuple[float, float] | None:
+    """Degrees of EXIF's degrees, minutes and seconds, and the finest step that they can state."""
     parts = finite_numbers(value, 3)
     if parts is None:
         return None
-    degrees = parts[0] + parts[1] / 60 + parts[2] / 3600
-    return -degrees if str(reference).strip("\0 ").upper() == negative else degrees
+    step = min(_step(part) / sixties for part, sixties in zip(value, (1, 60, 3600), strict=True))
+    sign = math.copysign(1.0, parts[0]) if any(parts) else 1.0
+    return sign * (abs(parts[0]) + parts[1] / 60 + parts[2] / 3600), step
+
+
+def _step(value: Any) -> float:
+    """The unit of an EXIF rational."""
+    return 1.0 / max(getattr(value, "denominator", 1), 1)
+
+
+def _last_digit(text: str) -> float:
+    """The unit of a decimal number's last digit."""
+    return float(10.0 ** -len(text.strip().partition(".")[2]))
 
 
 def _unix_ns(moment: datetime) -> int:

@@ -6,7 +6,7 @@ import logging
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +31,10 @@ ZOOM = 0.03
 AS_OFTEN = 0.9
 """Of two cameras of one drone, one misses some images at times."""
 
+FEW_PIXELS = 0.1
+"""Share of another camera's pixels below which one does not count: a zoom camera has up to four
+times as many as its wide one, and a thermal one a twelfth."""
+
 MAX_PAN_DEG = 30.0
 """Gimbals follow the nose: where images head further off it than that, their heading is wrong, as
 that of a gimbal without a compass, which drifts; or turned on purpose, and the track shows it."""
@@ -45,16 +49,28 @@ ROLLED_DEG = 45.0
 ZONE_NS = 900 * SECOND_NS  # time zones are multiples of a quarter of an hour
 
 
+Still = tuple[Path, Tags]
+"""A file and its tags."""
+
+
 class ImagesSource:
     """The stills of one folder in order of time; unreadable ones are skipped with a warning."""
 
-    def __init__(self, folder: Path, interval_s: float | None) -> None:
-        """Read the tags of every still; ``interval_s`` sets times by name instead of by tags."""
+    def __init__(
+        self, folder: Path, interval_s: float | None = None, camera: str = "", hemisphere: str = ""
+    ) -> None:
+        """Read the tags of every still.
+
+        ``interval_s`` sets times by name instead of by tags, ``camera`` names that of several,
+        ``hemisphere`` ("NW") is that of positions that state none.
+        """
         self.description = str(folder)
         self.is_live = False
         self.start_monotonic_ns: int | None = None
         self.warnings: list[str] = []
-        tagged = self._headings(self._same_lens(self._same_size(self._read(folder))))
+        self._hemisphere = hemisphere
+        tagged = self._sources(self._one_camera(self._read(folder), camera))
+        tagged = self._headings(self._same_lens(self._same_size(tagged)))
         times, self.epoch_unix_ns = self._times(tagged, interval_s)
         tagged = self._places(tagged, times)
         order = sorted(range(len(tagged)), key=lambda i: (times[i], i))
@@ -99,7 +115,7 @@ class ImagesSource:
     def close(self) -> None:
         """Nothing is open."""
 
-    def _read(self, folder: Path) -> list[tuple[Path, Tags]]:
+    def _read(self, folder: Path) -> list[Still]:
         paths = sorted(
             (
                 p
@@ -111,7 +127,7 @@ class ImagesSource:
         tagged = []
         for path in paths:
             try:
-                tagged.append((path, read_tags(path)))
+                tagged.append((path, read_tags(path, self._hemisphere)))
             except OSError as error:
                 why = " ".join(str(error).split())[:120] or type(error).__name__
                 self._warn(f"{path.name} is not a readable image ({why}); skipped")
@@ -119,34 +135,85 @@ class ImagesSource:
             raise InputError(f"{folder} contains no images (jpg, png, tif); give their folder")
         return tagged
 
-    def _same_size(self, tagged: list[tuple[Path, Tags]]) -> list[tuple[Path, Tags]]:
+    def _one_camera(self, tagged: list[Still], chosen: str) -> list[Still]:
+        """Stills of the camera ``chosen`` by its name or size, else of the one that sees most."""
+        cameras = by_camera(tagged, lambda tags: tags.camera)
+        if chosen:
+            for one in (cameras, by_camera(tagged, size_of)):
+                if chosen in one:
+                    return one[chosen]
+            known = ", ".join([*filter(None, cameras), *by_camera(tagged, size_of)])
+            raise InputError(f"{self.description}: no images of camera {chosen!r}, but of {known}")
+        if len(cameras) - ("" in cameras) < 2:
+            return tagged
+        used = widest(cameras)
+        others = [name for name in cameras if name not in ("", used)]
+        self._warn(
+            f"the camera that sees most is used: {used or 'unnamed'}, {len(cameras[used])} of "
+            f"{len(tagged)} images; images:DIR?camera={others[0]} takes another "
+            f"({', '.join(others)})"
+        )
+        return cameras[used]
+
+    def _sources(self, tagged: list[Still]) -> list[Still]:
+        """The same stills; a warning where two sources differ, or a hemisphere is missing."""
+        apart: dict[str, list[float]] = {}
+        for _, tags in tagged:
+            for words, metres in tags.differences:
+                apart.setdefault(words, []).append(metres)
+        for words, far in apart.items():
+            self._warn(f"{words} ({len(far)} of {len(tagged)} images, {median(far):.1f} m apart)")
+        missing = sum(tags.is_hemisphere_missing for _, tags in tagged)
+        if missing:
+            self._warn(
+                f"{missing} positions state no hemisphere (N or S, E or W): not used; "
+                "images:DIR?hemisphere=NW gives it"
+            )
+        return self._one_datum(tagged)
+
+    def _one_datum(self, tagged: list[Still]) -> list[Still]:
+        """The stills without altitudes above another datum than most of them state."""
+        known = [t.geotag.datum for _, t in tagged if t.geotag and t.geotag.alt_amsl_m is not None]
+        if len(set(known)) < 2:
+            return tagged
+        usual = Counter(known).most_common(1)[0][0]
+        self._warn(
+            f"{len(known) - known.count(usual)} altitudes are above another datum than the others' "
+            f"({usual or 'not stated'}): not used"
+        )
+        return [
+            (path, replace(tags, geotag=replace(tags.geotag, alt_amsl_m=None)))
+            if tags.geotag is not None and tags.geotag.datum != usual
+            else (path, tags)
+            for path, tags in tagged
+        ]
+
+    def _same_size(self, tagged: list[Still]) -> list[Still]:
         """Stills of the size taken at most moments: a camera model is for one size.
 
-        Of sizes taken about as often it is the largest: a drone takes thermal or spectral images
-        with those in colour.
+        Of sizes taken about as often it is that of the camera that sees most: a drone takes
+        thermal or spectral images with those in colour.
         """
-        moments: dict[tuple[int, int], set[object]] = {}
-        for path, tags in tagged:
-            moment = tags.local_ns or tags.gps_unix_ns or path
-            moments.setdefault(tags.size_px, set()).add(moment)
-        usual = AS_OFTEN * max(map(len, moments.values()))
-        size_px = max((s for s, m in moments.items() if len(m) >= usual), key=math.prod)
-        kept = [(path, tags) for path, tags in tagged if tags.size_px == size_px]
-        if len(kept) < len(tagged):
+        sizes = by_camera(tagged, size_of)
+        size = widest(sizes)
+        others = sorted(sizes.keys() - {size}, key=lambda other: -len(sizes[other]))
+        if others:
             self._warn(
-                f"{len(tagged) - len(kept)} images are not {size_px[0]}x{size_px[1]} like the "
-                "others; skipped"
+                f"{len(tagged) - len(sizes[size])} images are not {size} like the others; skipped "
+                f"(images:DIR?camera={others[0]} takes those)"
             )
-        return kept
+        return sizes[size]
 
-    def _same_lens(self, tagged: list[tuple[Path, Tags]]) -> list[tuple[Path, Tags]]:
-        """Stills of the most frequent focal length: a camera model is for one zoom."""
+    def _same_lens(self, tagged: list[Still]) -> list[Still]:
+        """Stills of the most frequent focal length, the shortest of those as frequent: a camera
+        model is for one zoom."""
         focal = [0.0 if tags.lens is None else tags.lens.focal for _, tags in tagged]
         known = Counter(f for f in focal if f)
         if not known:
             return tagged
         alike = {f: sum(known[g] for g in known if abs(f / g - 1) < ZOOM) for f in known}
-        usual = max(alike, key=alike.__getitem__)
+        most = max(alike.values())
+        usual = min(f for f, times in alike.items() if times >= AS_OFTEN * most)
         kept = [t for t, f in zip(tagged, focal, strict=True) if f and abs(f / usual - 1) < ZOOM]
         if len(kept) < len(tagged):
             self._warn(
@@ -155,7 +222,7 @@ class ImagesSource:
             )
         return kept
 
-    def _headings(self, tagged: list[tuple[Path, Tags]]) -> list[tuple[Path, Tags]]:
+    def _headings(self, tagged: list[Still]) -> list[Still]:
         """The stills without headings that the aircraft's own contradict."""
         pans = [abs(tags.pan_deg) for _, tags in tagged if tags.pan_deg is not None]
         if not pans or median(pans) <= MAX_PAN_DEG:
@@ -169,9 +236,7 @@ class ImagesSource:
             for path, tags in tagged
         ]
 
-    def _places(
-        self, tagged: list[tuple[Path, Tags]], times_ns: list[int]
-    ) -> list[tuple[Path, Tags]]:
+    def _places(self, tagged: list[Still], times_ns: list[int]) -> list[Still]:
         """The stills without positions from which no aircraft reaches most of its flight in time.
 
         A receiver that has just been switched on may say where it was last.
@@ -203,7 +268,7 @@ class ImagesSource:
             for i, (path, tags) in enumerate(tagged)
         ]
 
-    def _turn(self, tagged: list[tuple[Path, Tags]]) -> int:
+    def _turn(self, tagged: list[Still]) -> int:
         """Rotation in degrees clockwise for all stills, by their tags.
 
         A camera that looks down has no defined upper side: where the tags differ, or the gimbal
@@ -222,9 +287,7 @@ class ImagesSource:
             return 0
         return turns.pop()
 
-    def _times(
-        self, tagged: list[tuple[Path, Tags]], interval_s: float | None
-    ) -> tuple[list[int], int | None]:
+    def _times(self, tagged: list[Still], interval_s: float | None) -> tuple[list[int], int | None]:
         """(ns since the first still, UTC of the first still when known) of every still."""
         tags = [t for _, t in tagged]
         unix = [utc_ns(t, clock_offset_ns(tags)) for t in tags]
@@ -253,8 +316,8 @@ class ImagesSource:
 
 
 def open_images(rest: str, options: Mapping[str, str]) -> ImagesSource:
-    """The stills in folder ``rest``; option ``interval_s`` sets their interval."""
-    reject_options("images", options, ("interval_s",))
+    """The stills in folder ``rest``; options as for :class:`ImagesSource`."""
+    reject_options("images", options, ("interval_s", "camera", "hemisphere"))
     folder = Path(rest)
     if not folder.is_dir():
         raise InputError(f"no such folder of images: {folder}")
@@ -266,7 +329,41 @@ def open_images(rest: str, options: Mapping[str, str]) -> ImagesSource:
             interval_s = 0.0
         if not 0.0 < interval_s < 1e6:
             raise InputError(f"images: interval_s must be seconds, not {options['interval_s']!r}")
-    return ImagesSource(folder, interval_s)
+    hemisphere = options.get("hemisphere", "").upper()
+    if hemisphere not in ("", "NE", "NW", "SE", "SW"):
+        raise InputError(f"images: hemisphere must be NE, NW, SE or SW, not {hemisphere!r}")
+    return ImagesSource(folder, interval_s, options.get("camera", ""), hemisphere)
+
+
+def size_of(tags: Tags) -> str:
+    """The image's size in pixels, as in 1600x1200."""
+    return "{}x{}".format(*tags.size_px)
+
+
+def by_camera(tagged: list[Still], name: Callable[[Tags], str]) -> dict[str, list[Still]]:
+    """Stills by what tells cameras apart."""
+    cameras: dict[str, list[Still]] = {}
+    for still in tagged:
+        cameras.setdefault(name(still[1]), []).append(still)
+    return cameras
+
+
+def widest(cameras: Mapping[str, list[Still]]) -> str:
+    """The camera that sees most, of those that took about as many shots as any.
+
+    Those with few pixels are thermal; without focal lengths the most pixels count.
+    """
+    moments = {
+        name: len({tags.local_ns or tags.gps_unix_ns or path for path, tags in stills})
+        for name, stills in cameras.items()
+    }
+    usual = [name for name in cameras if moments[name] >= AS_OFTEN * max(moments.values())]
+    pixels = {name: median(math.prod(t.size_px) for _, t in cameras[name]) for name in usual}
+    sharp = [name for name in usual if pixels[name] >= FEW_PIXELS * max(pixels.values())]
+    focals = {n: [t.lens.focal for _, t in cameras[n] if t.lens is not None] for n in sharp}
+    if all(focals.values()):
+        return min(sharp, key=lambda name: (median(focals[name]), -pixels[name]))
+    return max(sharp, key=pixels.__getitem__)
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:

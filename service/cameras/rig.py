@@ -33,6 +33,10 @@ TAG_HEIGHT_M, BAROMETER_M = 50.0, 5.0
 """Sigma of an altitude in a still's tags: of a camera's receiver, and of a drone that also writes
 its height above the take-off point."""
 
+VERTICAL_SHARE = 2.5
+"""Sigma of a fix's altitude over that of its position, where the latter alone is stated: of
+receivers two to three."""
+
 NO_ALTITUDE_M = 1000.0
 """Sigma of the height of a position without an altitude."""
 
@@ -74,6 +78,7 @@ class Rig:
         self._camera, self._scan, self._fusion = camera, scan, fusion
         self.frame: LocalFrame | None = None
         self.georeference = "none"
+        self.vertical_datum = ""
         self._is_altitude_stated = False
         self._lever_body = np.array(
             [camera.lever_forward_m, camera.lever_right_m, camera.lever_down_m]
@@ -185,7 +190,10 @@ class Rig:
             return None
         if tag.lat_deg is not None and tag.lon_deg is not None:
             self.georeference = "exif"
+            self.vertical_datum = self.vertical_datum or tag.datum
             usual_m = TAG_HEIGHT_M if tag.relative_alt_m is None else BAROMETER_M
+            if tag.is_sigma_h_stated:
+                usual_m = min(usual_m, VERTICAL_SHARE * tag.sigma_h_m)
             sigma_v = tag.sigma_v_m or usual_m
             is_claimed = tag.sigma_v_m is not None or tag.alt_amsl_m is None
             return Fix(

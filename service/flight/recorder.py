@@ -197,6 +197,7 @@ class Recorder:
             origin_alt_amsl_m=frame.alt_amsl_m,
             epsg=frame.epsg,
             georeference=self._rig.georeference,
+            vertical_datum=self._rig.vertical_datum,
         )
         self._origin_written = True
 

@@ -49,7 +49,15 @@ from service.scans.main_piece import (
     stretches_apart,
 )
 from service.scans.report import report_html
-from service.scans.track import csv_table, flown_m, latest, local_frame, tum_lines
+from service.scans.track import (
+    csv_table,
+    flown_datum,
+    flown_m,
+    heights_above,
+    latest,
+    local_frame,
+    tum_lines,
+)
 from service.scans.trust import scale_sigma, slope_deg, trust_of
 from service.scans.writing import write_whole, writing
 from service.stream.records import PoseRecord, ScanHeader
@@ -162,7 +170,9 @@ class _Files:
                 yield part
 
         with writing(self._folder / CLOUD) as part:
-            write_laz(part, parts(), self._frame, self._store.header.started_unix_ns)
+            datum = flown_datum(self._store.header)
+            started = self._store.header.started_unix_ns
+            write_laz(part, parts(), self._frame, started, vertical=datum)
         return FusedCloud(
             joined(kept), tiled.voxel_m, tiled.ground_sample_m, tiled.keyframes, tiled.points_in,
             points_out=count,
@@ -221,7 +231,7 @@ class _Files:
             "finished": store.finished,
             "origin": origin,
             "epsg": None if frame is None else frame.epsg,
-            "heights": "metres above mean sea level" if frame else "metres above the scan's origin",
+            "heights": heights_above(frame, flown_datum(header)),
             "georeference": header.georeference,
             "camera": header.camera,
             "configuration": public_configuration(header.configuration),
@@ -247,7 +257,10 @@ class _Files:
         if self._fused is not NOTHING and self._tiled is None:
             with self.failures.noted(CLOUD), writing(self._folder / CLOUD) as part:
                 started = self._store.header.started_unix_ns
-                write_laz(part, [(self._fused.cloud, None, None)], self._frame, started)
+                datum = flown_datum(self._store.header)
+                write_laz(
+                    part, [(self._fused.cloud, None, None)], self._frame, started, vertical=datum
+                )
 
     def draw(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Write the preview and the report; returns the content of scan.json."""

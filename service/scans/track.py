@@ -13,7 +13,7 @@ from recon import se3
 from recon.types import F64, Camera
 from service.cameras.camera_file import shutter_of
 from service.errors import InputError
-from service.georeference import LocalFrame
+from service.georeference import DATUMS, LocalFrame
 from service.stream.records import PoseRecord, ScanHeader
 
 CSV_COLUMNS = (
@@ -39,6 +39,18 @@ def local_frame(header: ScanHeader) -> LocalFrame | None:
     if lat is None or lon is None:
         return None
     return LocalFrame(lat, lon, alt or 0.0)
+
+
+def flown_datum(header: ScanHeader) -> str | None:
+    """The datum of heights as flown (``service.georeference.DATUMS``), where the scan states it."""
+    return header.vertical_datum if header.vertical_datum in DATUMS else None
+
+
+def heights_above(frame: LocalFrame | None, datum: str | None) -> str:
+    """What heights are above, in words."""
+    if frame is None:
+        return "metres above the scan's origin"
+    return f"metres above {datum or 'mean sea level'}"
 
 
 def camera_of(header: ScanHeader) -> Camera:

@@ -42,6 +42,7 @@ class ScanHeader:
     configuration: dict[str, Any] = field(default_factory=dict)
     software: validity.Text = ""
     georeference: validity.Text = "none"  # "gnss", "exif" or "none"
+    vertical_datum: validity.Text = ""  # of heights as flown, where the images' tags state it
     notes: validity.Notes = ()
     run_id: validity.RunId = ""  # 32 hexadecimal digits, random for each run; old scans have none
 

@@ -20,6 +20,8 @@ from service.cli import app
 from service.errors import InputError
 from service.georeference import LocalFrame, height_change, vertical_code
 from service.offline.exports.view import ExportOptions, ScanView, export
+from service.scans.folder import write_deliverables
+from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
     from house_flight import HouseFlight
@@ -203,3 +205,22 @@ def test_nothing_is_assumed(scan_dir: Path) -> None:
     for bad in ("EPSG:", "EPSG:999999", "EPSG:x", ""):
         with pytest.raises(ValueError, match="give ellipsoid"):
             vertical_code(bad)
+
+
+def test_heights_above_what_the_tags_state(scan_dir: Path) -> None:
+    """In scan.json and in the deliverables, without a word of the operator."""
+    import rasterio
+
+    with ScanStore.open(scan_dir / "scan.db") as store:
+        store.update_header(vertical_datum="ellipsoid")
+        write_deliverables(scan_dir, store, {})
+    facts = json.loads((scan_dir / "scan.json").read_text())
+    assert facts["heights"] == "metres above ellipsoid"
+    with ScanView(scan_dir) as scan:
+        with rasterio.open(export(scan, "dsm", None, ExportOptions())) as dsm:
+            assert dsm.tags()["HEIGHTS"] == "metres above ellipsoid"
+        lines = json.loads(export(scan, "contours", None, ExportOptions(contour_m=2.5)).read_text())
+        assert all("height_m" in line["properties"] for line in lines["features"])
+        said = ExportOptions(vertical_datum="EGM96")
+        with rasterio.open(export(scan, "dsm", None, said)) as dsm:
+            assert dsm.tags()["HEIGHTS"] == "metres above EGM96"

@@ -23,6 +23,7 @@ from service.offline.exports.rasters import contours_of, open_map, write_ortho
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.geopackage import lines, points, write_layers
 from service.scans.annotations import read_annotations
+from service.scans.track import flown_datum
 from service.scans.writing import write_whole, writing
 from service.version import software
 
@@ -262,9 +263,11 @@ def _heights(scan: ScanView, options: ExportOptions) -> str:
     if scan.frame is None:
         return "metres above the scan's origin"
     datum = options.vertical_datum
+    is_of_tags = datum == flown_datum(scan.store.header)
+    says = "the images' tags say" if is_of_tags else "the operator says"
     if options.to_datum is not None:
-        return f"metres above {options.to_datum}; above {datum} as flown, the operator says"
-    return HEIGHTS if datum is None else f"metres above {datum}, as the operator says"
+        return f"metres above {options.to_datum}; above {datum} as flown, {says}"
+    return HEIGHTS if datum is None else f"metres above {datum}, as {says}"
 
 
 def _entry(kind: str, path: Path) -> dict[str, Any]:

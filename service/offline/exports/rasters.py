@@ -30,6 +30,7 @@ from service.offline.tiles import grown
 from service.scans.coverage import coverage_of
 from service.scans.fused_cloud import EVERYWHERE, Box
 from service.scans.main_piece import main_keyframes, main_seqs
+from service.scans.track import heights_above
 from service.scans.writing import write_whole, writing
 
 NODATA_M = -9999.0
@@ -219,9 +220,7 @@ def mosaic(scan: ScanView, out: Path, grid: Grid, like: Layers) -> Iterator[Any]
         # GeoTIFF has no code for ellipsoidal heights on a map.
         coded = None if like.vertical == "ellipsoid" else like.vertical
         profile["crs"] = rasterio.crs.CRS.from_wkt(map_crs(scan.frame.epsg, coded).to_wkt())
-    heights = "metres above mean sea level" if scan.frame else "metres above the scan's origin"
-    if scan.frame is not None and like.vertical is not None:
-        heights = f"metres above {like.vertical}"
+    heights = heights_above(scan.frame, like.vertical)
     with (
         writing(out) as part,
         tempfile.TemporaryDirectory(dir=out.parent) as folder,

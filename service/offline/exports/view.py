@@ -24,7 +24,7 @@ from service.packages import needing
 from service.progress import Progress
 from service.scans.fused_cloud import EVERYWHERE, Box, FusedCloud, fused_cloud, placed
 from service.scans.main_piece import main_keyframes, main_track
-from service.scans.track import local_frame
+from service.scans.track import flown_datum, local_frame
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
@@ -78,7 +78,8 @@ class ExportOptions:
     @property
     def height_key(self) -> str:
         """Name of a property that holds a height."""
-        return "height_amsl_m" if self.to_datum is None else "height_m"
+        is_amsl = self.to_datum is None and self.vertical_datum != "ellipsoid"
+        return "height_amsl_m" if is_amsl else "height_m"
 
 
 Make = Callable[["ScanView", ExportOptions, Box], T | None]
@@ -286,6 +287,8 @@ def export(view: ScanView, kind: str, out: Path | None, options: ExportOptions) 
     target, usual, _ = EXPORTERS[kind]
     path = out or view.folder / usual
     module, _, name = target.partition(":")
+    if options.vertical_datum is None:
+        options = replace(options, vertical_datum=flown_datum(view.store.header))
     with needing(f"export to {kind}"):
         if path.suffix == ".tif":
             import_module("rasterio")  # missing: known before the work

@@ -350,6 +350,7 @@ class _Refinement:
         self.header = replace(
             self.header, origin_lat_deg=f.lat_deg, origin_lon_deg=f.lon_deg,
             origin_alt_amsl_m=f.alt_amsl_m, epsg=f.epsg, georeference=BY_SURVEY,
+            vertical_datum="",
         )  # fmt: skip
 
     def _enough(self, candidates: Sequence[Candidate]) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
+import struct
+import time
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -36,6 +37,7 @@ def write_still(
     size_px: tuple[int, int] = (64, 48),
     xmp: str = "",
     orientation: int | None = None,
+    focal_mm: int | None = None,
 ) -> None:
     """A gray JPEG with the given tags."""
     image = Image.fromarray(np.full((size_px[1], size_px[0], 3), 90, np.uint8))
@@ -45,6 +47,8 @@ def write_still(
         photo[36867] = local
     if sub:
         photo[37521] = sub
+    if focal_mm:
+        photo[41989] = focal_mm
     if offset:
         photo[36881] = offset
     if gps:
@@ -62,12 +66,11 @@ def gps_tags(
     def dms(degrees: float) -> tuple[IFDRational, ...]:
         degrees = abs(degrees)
         minutes = (degrees % 1) * 60
-        seconds = Fraction((minutes % 1) * 60).limit_denominator(100_000)
-        return (
-            IFDRational(int(degrees)),
-            IFDRational(int(minutes)),
-            IFDRational(seconds.numerator, seconds.denominator),
-        )
+        seconds = round((minutes % 1) * 60 * 100_003)
+        seconds += (
+            degrees > 0 and seconds % 100_003 == 0
+        )  # whole ones would be written without their decimals
+        return IFDRational(int(degrees)), IFDRational(int(minutes)), IFDRational(seconds, 100_003)
 
     return {
         1: "N" if lat >= 0 else "S",
@@ -373,8 +376,191 @@ def test_of_the_cameras_of_one_drone_that_in_colour_counts(tmp_path: Path) -> No
     write_still(tmp_path / "panorama.jpg", "2024:06:01 12:00:09", size_px=(192, 96))
     source = open_camera(str(tmp_path))
     assert [f.name for f in source] == [f"DJI_{i}_V.jpg" for i in range(3)]
-    assert source.warnings[0] == "10 images are not 80x60 like the others; skipped"
+    assert source.warnings[0] == (
+        "10 images are not 80x60 like the others; skipped (images:DIR?camera=60x45 takes those)"
+    )
     assert not any("readable" in warning for warning in source.warnings)
+
+
+def dji(**values: object) -> str:
+    """An XMP packet as DJI writes it."""
+    attributes = " ".join(f'drone-dji:{name}="{value}"' for name, value in values.items())
+    return f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description {attributes}/></x:xmpmeta>'
+
+
+def test_of_several_named_cameras_the_one_that_sees_most_counts(tmp_path: Path) -> None:
+    """As DJI's H20T: the zoom camera has more pixels than the wide one, the thermal one few."""
+    cameras = {"ZoomCamera": ("Z", (128, 96), 104), "WideCamera": ("W", (64, 48), 26)}
+    cameras["InfraredCamera"] = ("T", (32, 24), 20)
+    for i in range(3):
+        for name, (letter, size_px, focal_mm) in cameras.items():
+            write_still(
+                tmp_path / f"DJI_{i}_{letter}.jpg", f"2024:06:01 12:00:0{i}", size_px=size_px,
+                xmp=dji(ImageSource=name), focal_mm=focal_mm,
+            )  # fmt: skip
+    source = open_camera(str(tmp_path))
+    assert [f.name for f in source] == [f"DJI_{i}_W.jpg" for i in range(3)]
+    assert source.warnings[0] == (
+        "the camera that sees most is used: WideCamera, 3 of 9 images; "
+        "images:DIR?camera=InfraredCamera takes another (InfraredCamera, ZoomCamera)"
+    )
+    for chosen, letter in (("ZoomCamera", "Z"), ("32x24", "T")):
+        names = [f.name for f in open_camera(f"images:{tmp_path}?camera={chosen}")]
+        assert names == [f"DJI_{i}_{letter}.jpg" for i in range(3)]
+    with pytest.raises(InputError, match="of camera 'Wide', but of InfraredCamera, WideCamera, Z"):
+        open_camera(f"images:{tmp_path}?camera=Wide")
+
+
+def test_of_two_unnamed_cameras_of_one_size_the_wider_counts(tmp_path: Path) -> None:
+    for i in range(3):
+        for letter, focal_mm in (("A", 70), ("B", 24)):
+            path = tmp_path / f"{letter}{i}.jpg"
+            write_still(path, f"2024:06:01 12:00:0{i}", focal_mm=focal_mm)
+    assert [f.name for f in open_camera(str(tmp_path))] == ["B0.jpg", "B1.jpg", "B2.jpg"]
+
+
+TRUE_LAT, TRUE_LON = 30.1707953, -98.0892133
+
+
+@pytest.mark.parametrize(
+    ("exif", "xmp", "place", "alt_m", "said"),
+    [
+        ({}, {}, (TRUE_LAT, TRUE_LON), 350.0, ()),
+        ({1: "", 2: (0, 0, 0), 3: "", 4: (0, 0, 0)}, {}, (TRUE_LAT, TRUE_LON), 350.0, ()),
+        ({6: IFDRational(0)}, {}, (TRUE_LAT, TRUE_LON), 350.0, ("another altitude; that of XMP",)),
+        ({2: (30, 10, 14), 4: (98, 5, 21)}, {}, (TRUE_LAT, TRUE_LON), 350.0, ()),  # cut
+        ({1: "", 3: ""}, {}, (TRUE_LAT, TRUE_LON), 350.0, ()),
+        # Corrected positions in EXIF, the receiver's own in XMP
+        ({}, {"GpsLatitude": "+30.1708100"}, (TRUE_LAT, TRUE_LON), 350.0, ("that of EXIF",)),
+        ({6: IFDRational(350)}, {"AbsoluteAltitude": "+350.43"}, (TRUE_LAT, TRUE_LON), 350.43, ()),
+        ({}, {"AbsoluteAltitude": "+0.00"}, (TRUE_LAT, TRUE_LON), 350.0, ("that of EXIF",)),
+    ],
+    ids=["same", "zeros", "altitude 0", "cut", "letters", "corrected", "metres", "XMP 0"],
+)
+def test_of_two_sources_of_one_value_the_better_one_counts(
+    tmp_path: Path,
+    exif: dict[int, Any],
+    xmp: dict[str, str],
+    place: tuple[float, float],
+    alt_m: float,
+    said: tuple[str, ...],
+) -> None:
+    values = {"GpsLatitude": f"{TRUE_LAT:+.7f}", "GpsLongitude": f"{TRUE_LON:+.7f}"}
+    values |= {"AbsoluteAltitude": "+350.00"} | xmp
+    gps = gps_tags(TRUE_LAT, TRUE_LON, 350.0, (12, 0, 0)) | exif
+    gps |= {k: tuple(map(IFDRational, v)) for k, v in exif.items() if isinstance(v, tuple)}
+    write_still(tmp_path / "a.jpg", "2024:06:01 12:00:00", "5", "+00:00", gps, xmp=dji(**values))
+    source = open_camera(str(tmp_path))
+    (frame,) = source
+    tag = frame.geotag
+    assert tag is not None
+    assert (tag.lat_deg, tag.lon_deg) == pytest.approx(place, abs=2e-7)
+    assert tag.alt_amsl_m == pytest.approx(alt_m) and tag.sigma_h_m == pytest.approx(5.0)
+    assert [s in w for s, w in zip(said, source.warnings, strict=True)] == [True] * len(said)
+
+
+def test_a_position_cut_to_seconds_is_as_uncertain(tmp_path: Path) -> None:
+    cut = {2: (IFDRational(30), IFDRational(10), IFDRational(14)), 6: IFDRational(350)}
+    cut[4] = (IFDRational(98), IFDRational(5), IFDRational(21))
+    write_still(tmp_path / "a.jpg", gps=gps_tags(1, 1, 1, (1, 1, 1)) | {1: "N", 3: "W"} | cut)
+    tag = read_tags(tmp_path / "a.jpg").geotag
+    assert tag is not None and 20.0 < tag.sigma_h_m < 30.0
+
+
+def test_a_position_without_its_hemisphere_waits_for_it(tmp_path: Path) -> None:
+    """Texas lay in Myanmar."""
+    gps = gps_tags(TRUE_LAT, TRUE_LON, 350.0, (12, 0, 0))
+    del gps[1], gps[3]
+    write_still(tmp_path / "a.jpg", "2024:06:01 12:00:00", "5", "+00:00", gps)
+    source = open_camera(str(tmp_path))
+    assert [frame.geotag for frame in source] == [None]
+    assert source.warnings == [
+        "1 positions state no hemisphere (N or S, E or W): not used; "
+        "images:DIR?hemisphere=NW gives it"
+    ]
+    (frame,) = open_camera(f"images:{tmp_path}?hemisphere=nw")
+    assert frame.geotag is not None
+    assert frame.geotag.lon_deg == pytest.approx(TRUE_LON, abs=1e-7)
+    with pytest.raises(InputError, match="NE, NW, SE or SW"):
+        open_camera(f"images:{tmp_path}?hemisphere=N")
+
+
+def test_a_height_of_an_rtk_receiver_is_above_the_ellipsoid(tmp_path: Path) -> None:
+    gps = gps_tags(TRUE_LAT, TRUE_LON, 350.0, (12, 0, 0))
+    write_still(tmp_path / "a.jpg", gps=gps, xmp=dji(AltitudeType="RtkAlt", RtkFlag=50))
+    write_still(tmp_path / "b.jpg", gps=gps, xmp=dji(AltitudeType="GpsFusionAlt"))
+    datums = [tag and tag.datum for n in "ab" for tag in [read_tags(tmp_path / f"{n}.jpg").geotag]]
+    assert datums == ["ellipsoid", ""]
+
+
+def test_altitudes_of_two_datums_are_not_mixed(tmp_path: Path) -> None:
+    """The receiver lost its corrections in one of three."""
+    for i, kind in enumerate(("RtkAlt", "GpsFusionAlt", "RtkAlt")):
+        gps = gps_tags(TRUE_LAT, TRUE_LON, 350.0, (12, 0, i))
+        at = f"2024:06:01 12:00:0{i}"
+        write_still(tmp_path / f"{i}.jpg", at, "5", "+00:00", gps, xmp=dji(AltitudeType=kind))
+    source = open_camera(str(tmp_path))
+    tags = [frame.geotag for frame in source]
+    assert [tag and tag.alt_amsl_m for tag in tags] == [350.0, None, 350.0]
+    assert source.warnings == [
+        "1 altitudes are above another datum than the others' (ellipsoid): not used"
+    ]
+
+
+# Packets and tags that are made to harm
+
+
+def hostile_still(path: Path, packet: bytes) -> Path:
+    """A JPEG with a packet of any length in as many segments as it needs."""
+    write_still(path)
+    whole, head = path.read_bytes(), b"http://ns.adobe.com/xap/1.0/\0"
+    parts = [head + packet[i : i + 65_000] for i in range(0, len(packet), 65_000)]
+    segments = [b"\xff\xe1" + (len(p) + 2).to_bytes(2, "big") + p for p in parts]
+    path.write_bytes(whole[:2] + b"".join(segments) + whole[2:])
+    return path
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        b"<Camera:a><rdf:Seq>" * 15_000,
+        b"<drone-skydio:CameraOrientationNED" * 8_000,
+        b"<drone-skydio:CameraOrientationNED>" * 8_000,
+        b'<drone-dji:a b="' * 15_000,
+        b'<!DOCTYPE a [<!ENTITY a "' + b"a" * 30_000 + b'">]><drone:Yaw>' + b"&a;" * 10_000,
+        bytes(range(256)) * 1_000,
+    ],
+    ids=["lists", "names", "elements", "attributes", "entities", "bytes"],
+)
+def test_hostile_packets_take_no_time(tmp_path: Path, packet: bytes) -> None:
+    """By processor time; the first two took a minute."""
+    path = hostile_still(tmp_path / "a.jpg", packet)
+    began_s = time.process_time()
+    assert read_tags(path).geotag is None
+    assert time.process_time() - began_s < 10.0
+
+
+def test_a_damaged_packet_gives_what_comes_before_the_damage(tmp_path: Path) -> None:
+    packet = dji(RelativeAltitude="+12.50", GimbalYawDegree="5", GimbalPitchDegree="-90")
+    hostile_still(tmp_path / "a.jpg", packet.encode()[:-12] + b">& <")
+    tag = read_tags(tmp_path / "a.jpg").geotag
+    assert tag is not None and tag.relative_alt_m == 12.5 and tag.ypr_deg == (5.0, -90.0, 0.0)
+
+
+def test_tags_of_a_large_tiff_are_read_up_to_a_limit(tmp_path: Path) -> None:
+    """A list of a million fractions as a latitude."""
+    entries = [(256, 3, 8), (257, 3, 8), (258, 3, 8), (259, 3, 1), (262, 3, 1), (273, 4, 8)]
+    entries += [(278, 3, 8), (279, 4, 64), (0x8825, 4, 200)]
+    table = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in entries)
+    data = b"II*\0" + struct.pack("<I", 72) + bytes(64) + struct.pack("<H", len(entries)) + table
+    gps = struct.pack("<HHHIII", 1, 2, 5, 1_000_000, 300, 0)
+    path = tmp_path / "a.tif"
+    path.write_bytes((data.ljust(200, b"\0") + gps).ljust(300, b"\0") + bytes(8_000_000))
+    with (
+        pytest.warns(UserWarning, match="tags"),
+        pytest.raises(OSError, match="tags are too large"),
+    ):
+        read_tags(path)
 
 
 def test_a_still_is_not_skipped_for_want_of_memory(

@@ -219,3 +219,18 @@ def test_without_attitude_or_time_the_turn_is_unknown() -> None:
     assert rig().turn(state, state) is None
     assert rig().turn(None, state) is None
     assert rig().turn(state, VehicleState(1_000_000)) is None
+
+
+def test_an_altitude_without_accuracy_is_as_good_as_its_position_allows() -> None:
+    """A fix known to 2 cm across is not off by metres in height; one of a phone may be."""
+    for sigma_h_m, relative_m, sigma_v_m in (
+        (0.02, None, 0.05), (4.0, None, 10.0), (100.0, None, 50.0), (4.0, 30.0, 5.0),
+    ):  # fmt: skip
+        tag = GeoTag(
+            30.0, -98.0, 300.0, sigma_h_m, is_sigma_h_stated=True, relative_alt_m=relative_m
+        )
+        prior = rig().prior(None, tag)
+        assert prior.sigma_position_m is not None and not prior.is_sigma_claimed
+        assert prior.sigma_position_m[2] == pytest.approx(sigma_v_m)
+    guessed = rig().prior(None, GeoTag(30.0, -98.0, 300.0, 0.02))
+    assert guessed.sigma_position_m is not None and guessed.sigma_position_m[2] == 50.0

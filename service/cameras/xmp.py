@@ -1,0 +1,84 @@
+"""The values that makers of drones and Pix4D write into a still's XMP packet (ISO 16684-1)."""
+
+from __future__ import annotations
+
+from xml.parsers import expat
+
+MAX_BYTES = 1 << 18
+"""Of a packet that is read; those of DJI have 10 KiB."""
+
+PREFIXES = frozenset(("drone-dji", "drone-parrot", "drone", "Camera"))
+"""Autel's names are those of DJI with the prefix drone."""
+
+SKYDIO, NED = "drone-skydio", "CameraOrientationNED"
+"""Skydio's angles by frame of reference; those of other frames have the same names."""
+
+
+class _RefusedError(Exception):
+    """The packet declares entities, which no camera does."""
+
+
+def xmp_values(packet: bytes) -> dict[str, str]:
+    """Values by name without prefix; elements of a list are joined by commas.
+
+    Of a packet that is no XML the part before the error counts; one with a document type is
+    not read.
+    """
+    reader = _Reader()
+    parser = expat.ParserCreate("utf-8")
+    parser.buffer_text = True
+    parser.StartElementHandler = reader.start
+    parser.EndElementHandler = reader.end
+    parser.CharacterDataHandler = reader.text
+    parser.StartDoctypeDeclHandler = _refuse
+    try:
+        parser.Parse(packet[:MAX_BYTES].decode("utf-8", "replace").encode(), True)
+    except _RefusedError:
+        return {}
+    except expat.ExpatError:
+        pass
+    return reader.values
+
+
+def _refuse(*_: object) -> None:
+    raise _RefusedError
+
+
+class _Reader:
+    """Collects attributes, and the texts within elements, of the names that are read."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, str] = {}
+        self._open: list[str | None] = []  # names of the elements, None where it is not read
+        self._texts: list[str] = []  # since the last one that is read
+        self._skydio: list[bool] = [False]
+
+    def start(self, element: str, attributes: dict[str, str]) -> None:
+        is_ned = self._skydio[-1] or element == f"{SKYDIO}:{NED}"
+        self._skydio.append(is_ned)
+        for attribute, value in attributes.items():
+            if (name := _name(attribute, is_ned)) is not None:
+                self.values[name] = value
+        name = _name(element, is_ned)
+        self._open.append(name)
+        if name is not None:
+            self._texts.clear()
+
+    def text(self, data: str) -> None:
+        if data.strip():
+            self._texts.append(data.strip())
+
+    def end(self, _: str) -> None:
+        self._skydio.pop()
+        name = self._open.pop()
+        if name is not None and self._texts:
+            self.values[name] = ",".join(self._texts)
+            self._texts.clear()
+
+
+def _name(qualified: str, is_ned: bool) -> str | None:
+    """The name that a value is stored by; None where it is not read."""
+    prefix, _, name = qualified.partition(":")
+    if prefix in PREFIXES:
+        return name
+    return f"Gimbal{name}Degree" if is_ned and prefix == SKYDIO and name != NED else None
