@@ -12,6 +12,7 @@ them by PROJ's grids, which are not part of this package.
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
@@ -126,6 +127,40 @@ def map_crs(epsg: int, vertical: str | None = None) -> CRS:
         return flat
     heights = vertical_code(vertical)
     return flat.to_3d() if heights is None else CRS(f"EPSG:{epsg}+{heights}")
+
+
+UTM_NAME = re.compile(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
+
+
+def system_of(text: str) -> tuple[Transformer, str]:
+    """The horizontal coordinate system in a surveyor's file, and the datum of its heights.
+
+    ``text`` is what PROJ knows (``EPSG:25832``, ``EPSG:25832+7837``, a PROJ string) or ``WGS84 UTM
+    32N``. The transformer gives longitude and latitude of x and y (of latitude and longitude in
+    degrees as well, x is the longitude). The datum is one of :func:`vertical_code`, empty where the
+    system has no heights. Raises ValueError.
+    """
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import CRSError
+
+    if zone := UTM_NAME.fullmatch(text.strip()):
+        text = f"EPSG:{(32600 if zone[2] in 'Nn' else 32700) + int(zone[1])}"
+    try:
+        crs = CRS.from_user_input(text.strip())
+        flat, *more = crs.sub_crs_list or [crs]
+        if not (flat.is_geographic or flat.is_projected):
+            raise CRSError("neither degrees nor a map")
+        vertical = [one.to_epsg() for one in more if one.is_vertical]
+        names = {code: name for name, code in DATUMS.items() if code is not None}
+        datum = "ellipsoid" if not more and len(flat.axis_info) == 3 else ""
+        if vertical and vertical[0] is not None:
+            datum = names.get(vertical[0], f"EPSG:{vertical[0]}")
+        return Transformer.from_crs(flat.to_2d(), "EPSG:4326", always_xy=True), datum
+    except CRSError as error:
+        raise ValueError(
+            f"{text.strip()[:80]!r} is not a coordinate system; give EPSG:n, a PROJ string or "
+            "WGS84 UTM 32N"
+        ) from error
 
 
 def utm_epsg(lat_deg: float, lon_deg: float) -> int:

@@ -17,8 +17,9 @@ import numpy as np
 from recon.types import U8
 from service.cameras import reject_options
 from service.cameras.exif import Tags, read_tags
+from service.cameras.geo_file import geo_file_of, read_geo
 from service.cameras.lens import turned
-from service.cameras.source import CameraFrame
+from service.cameras.source import CameraFrame, GeoTag
 from service.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -57,19 +58,27 @@ class ImagesSource:
     """The stills of one folder in order of time; unreadable ones are skipped with a warning."""
 
     def __init__(
-        self, folder: Path, interval_s: float | None = None, camera: str = "", hemisphere: str = ""
+        self,
+        folder: Path,
+        interval_s: float | None = None,
+        camera: str = "",
+        hemisphere: str = "",
+        geo: Path | None = None,
     ) -> None:
         """Read the tags of every still.
 
         ``interval_s`` sets times by name instead of by tags, ``camera`` names that of several,
-        ``hemisphere`` ("NW") is that of positions that state none.
+        ``hemisphere`` ("NW") is that of positions that state none. Positions in ``geo``, or in
+        the ``geo.txt`` of the folder, replace those of the tags.
         """
         self.description = str(folder)
         self.is_live = False
         self.start_monotonic_ns: int | None = None
         self.warnings: list[str] = []
         self._hemisphere = hemisphere
-        tagged = self._sources(self._one_camera(self._read(folder), camera))
+        geo = geo_file_of(folder) if geo is None else geo
+        tagged = self._one_camera(self._read(folder), camera)
+        tagged = self._sources(tagged) if geo is None else self._surveyed(tagged, geo)
         tagged = self._headings(self._same_lens(self._same_size(tagged)))
         times, self.epoch_unix_ns = self._times(tagged, interval_s)
         tagged = self._places(tagged, times)
@@ -170,6 +179,21 @@ class ImagesSource:
                 "images:DIR?hemisphere=NW gives it"
             )
         return self._one_datum(tagged)
+
+    def _surveyed(self, tagged: list[Still], geo: Path) -> list[Still]:
+        """The stills at the positions in ``geo``, and with none where it has none."""
+        places, out, missing = read_geo(geo), [], 0
+        for path, tags in tagged:
+            at, own = places.get(path.name.lower()), tags.geotag
+            missing += at is None
+            tag = at or (own and GeoTag(None, None))
+            if tag is not None and own is not None:
+                tag = replace(tag, ypr_deg=own.ypr_deg, relative_alt_m=own.relative_alt_m)
+            out.append((path, replace(tags, geotag=tag)))
+        if missing == len(tagged):
+            raise InputError(f"{geo} names none of the images in {self.description}")
+        self._warn(f"positions are those of {geo.name}: {len(tagged) - missing} of {len(tagged)}")
+        return out
 
     def _one_datum(self, tagged: list[Still]) -> list[Still]:
         """The stills without altitudes above another datum than most of them state."""
@@ -317,7 +341,7 @@ class ImagesSource:
 
 def open_images(rest: str, options: Mapping[str, str]) -> ImagesSource:
     """The stills in folder ``rest``; options as for :class:`ImagesSource`."""
-    reject_options("images", options, ("interval_s", "camera", "hemisphere"))
+    reject_options("images", options, ("interval_s", "camera", "hemisphere", "geo"))
     folder = Path(rest)
     if not folder.is_dir():
         raise InputError(f"no such folder of images: {folder}")
@@ -332,7 +356,8 @@ def open_images(rest: str, options: Mapping[str, str]) -> ImagesSource:
     hemisphere = options.get("hemisphere", "").upper()
     if hemisphere not in ("", "NE", "NW", "SE", "SW"):
         raise InputError(f"images: hemisphere must be NE, NW, SE or SW, not {hemisphere!r}")
-    return ImagesSource(folder, interval_s, options.get("camera", ""), hemisphere)
+    geo = Path(options["geo"]) if "geo" in options else None
+    return ImagesSource(folder, interval_s, options.get("camera", ""), hemisphere, geo)
 
 
 def size_of(tags: Tags) -> str:

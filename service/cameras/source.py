@@ -29,7 +29,7 @@ class GeoTag:
     sigma_h_m: float = 5.0  # 1 sigma, horizontal; the default for tags without accuracy
     sigma_v_m: float | None = None  # of the altitude; None: not stated
     is_sigma_h_stated: bool = False
-    datum: str = ""  # of the altitude where it is stated, as in service.georeference.DATUMS
+    datum: str = ""  # of the altitude where it is stated, as for service.georeference.vertical_code
     ypr_deg: tuple[float, float, float] | None = None
     """Yaw from true north, pitch, roll of the gimbal head (FRD in NED); pitch -90 looks down."""
     is_yaw_known: bool = True  # False: the aircraft's own headings contradict it

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 def refine(
     scan_dir: ScanDir,
     gcp: Annotated[
-        Path | None, typer.Option(help="CSV of ground control and check points (docs/refine.md)")
+        Path | None,
+        typer.Option(help="CSV or gcp_list.txt of ground control points (docs/refine.md)"),
     ] = None,
     telemetry: Annotated[
         Path | None, typer.Option(help="flight log; default: link.tlog next to the scan, if any")

@@ -13,7 +13,7 @@ from recon import se3
 from recon.types import F64, Camera
 from service.cameras.camera_file import shutter_of
 from service.errors import InputError
-from service.georeference import DATUMS, LocalFrame
+from service.georeference import LocalFrame, vertical_code
 from service.stream.records import PoseRecord, ScanHeader
 
 CSV_COLUMNS = (
@@ -42,8 +42,12 @@ def local_frame(header: ScanHeader) -> LocalFrame | None:
 
 
 def flown_datum(header: ScanHeader) -> str | None:
-    """The datum of heights as flown (``service.georeference.DATUMS``), where the scan states it."""
-    return header.vertical_datum if header.vertical_datum in DATUMS else None
+    """The datum of heights as flown, as for ``vertical_code``, where the scan states it."""
+    try:
+        vertical_code(header.vertical_datum)
+    except ValueError:
+        return None
+    return header.vertical_datum
 
 
 def heights_above(frame: LocalFrame | None, datum: str | None) -> str:

@@ -1,9 +1,12 @@
-"""Surveyed points of a CSV: where they are on the globe, and where images or the map have them.
+"""Surveyed points: where they are on the globe, and where images or the map have them.
 
-A row without ``alt_amsl_m`` is of a point surveyed horizontally only.
+A file is a CSV, or a ``gcp_list.txt`` as OpenDroneMap's users have it: the first line is a
+coordinate system, each other one x, y, z of a point, its pixel, and the name of a still and of
+the point. Heights that are all 0 are not surveyed.
 
-One row is one sighting: ``keyframe_seq``, ``time`` or ``image`` with ``u_px,v_px`` in the camera's
-own image, or ``x,y,z`` in the delivered cloud's coordinates. Rows of one name are one point.
+A row of a CSV without ``alt_amsl_m`` is of a point surveyed horizontally only. One row is one
+sighting: ``keyframe_seq``, ``time`` or ``image`` with ``u_px,v_px`` in the camera's own image, or
+``x,y,z`` in the delivered cloud's coordinates. Rows of one name are one point.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import msgspec
 from msgspec import Meta
 
 from service.errors import InputError
+from service.georeference import system_of
 from service.small_file import read_small
 
 LARGEST_BYTES = 10_000_000
@@ -85,12 +89,17 @@ class SurveyPoint:
 
 
 def read_survey(path: Path) -> list[SurveyPoint]:
-    """The points of a CSV in order of their first row.
+    """The points of a file in order of their first row.
 
     Raises InputError in one line, with the number of the line, for anything that is wrong.
     """
     points: dict[str, SurveyPoint] = {}
-    for line, row in _rows(path):
+    try:
+        text = read_small(path, LARGEST_BYTES, "file of surveyed points").decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} cannot be read ({error}); it should be CSV in UTF-8") from error
+    lines = text.splitlines()
+    for line, row in (_marks if is_list(lines) else _rows)(path, lines):
         point = _point(line, row)
         before = points.get(point.name)
         if before is None:
@@ -105,7 +114,7 @@ def read_survey(path: Path) -> list[SurveyPoint]:
             *_said(before), before.line, before.sightings + point.sightings
         )
     if not points:
-        raise InputError(f"{path}: no points below the header")
+        raise InputError(f"{path}: no points below the first line")
     return list(points.values())
 
 
@@ -133,13 +142,50 @@ def _said(p: SurveyPoint) -> tuple[str, float, float, float | None, float, float
     return p.name, p.lat_deg, p.lon_deg, p.alt_amsl_m, p.sigma_h_m, p.sigma_v_m, p.is_check
 
 
-def _rows(path: Path) -> Iterator[tuple[int, SurveyRow]]:
-    """Line number and content of each row."""
+LIST_COLUMNS = 6
+
+
+def is_list(lines: Sequence[str]) -> bool:
+    """Whether a file is a ``gcp_list.txt``: rows of six columns between spaces."""
+    rows = (line.split() for line in lines[1:] if line.strip() and not line.startswith("#"))
+    return len(next(rows, ())) >= LIST_COLUMNS and "lat" not in lines[0].split(",")
+
+
+def _marks(path: Path, lines: Sequence[str]) -> Iterator[tuple[int, SurveyRow]]:
+    """Line number and content of each row of a ``gcp_list.txt``."""
     try:
-        text = read_small(path, LARGEST_BYTES, "CSV of surveyed points").decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} cannot be read ({error}); it should be CSV in UTF-8") from error
-    table = csv.reader(text.splitlines())
+        system, datum = system_of(lines[0])
+    except ValueError as error:
+        raise InputError(f"{path} line 1: {error}") from error
+    if datum == "ellipsoid":
+        raise InputError(f"{path} line 1: heights above mean sea level are needed, not ellipsoidal")
+    table = [(n, s.split()) for n, s in enumerate(lines[1:], 2) if s.strip() and s[0] != "#"]
+    is_flat = all(
+        cells[2:3] in (["0"], ["0.0"], ["0.00"], ["0.000"], ["NaN"]) for _, cells in table
+    )
+    names: dict[tuple[str, ...], str] = {}
+    for number, cells in table:
+        where = f"{path} line {number}"
+        if len(cells) < LIST_COLUMNS:
+            raise InputError(
+                f"{where}: {len(cells)} columns; x, y, z, u, v and an image are needed"
+            )
+        name = names.setdefault(tuple(cells[:3]), f"point {len(names) + 1}")
+        try:
+            lon, lat = system.transform(float(cells[0]), float(cells[1]))
+            row = {
+                "name": cells[6] if len(cells) > LIST_COLUMNS else name, "lat": lat, "lon": lon,
+                "alt_amsl_m": None if is_flat else float(cells[2]),
+                "u_px": float(cells[3]), "v_px": float(cells[4]), "image": cells[5],
+            }  # fmt: skip
+            yield number, msgspec.convert(row, SurveyRow)
+        except (ValueError, msgspec.ValidationError) as error:
+            raise InputError(f"{where}: {str(error).replace(' - at `$', ', ')}") from error
+
+
+def _rows(path: Path, lines: Sequence[str]) -> Iterator[tuple[int, SurveyRow]]:
+    """Line number and content of each row of a CSV."""
+    table = csv.reader(lines)
     try:
         header = [name.strip() for name in next(table, [])]
         _check_header(path, header)

@@ -603,6 +603,45 @@ def test_files_that_are_no_tables(tmp_path: Path) -> None:
         read_survey(tmp_path / "bytes.csv")
 
 
+LIST = "WGS84 UTM 32N\n465000.5 5249000.25 410.5 12.5 30 a.jpg GCP1\n"
+
+
+def test_a_list_of_odm_is_read_as_a_table_is(tmp_path: Path) -> None:
+    """Named and unnamed points, of which images see some twice; heights of 0 are not surveyed."""
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(
+        LIST + "465000.5 5249000.25 410.5 80 7 b.jpg GCP1\n\n# left out\n"
+        "465010.5 5249010.25 411.5 1 2 a.jpg\n465010.5 5249010.25 411.5 3 4 b.jpg\n"
+    )
+    first, second = read_survey(path)
+    assert (first.name, second.name) == ("GCP1", "point 2")
+    assert [s.image for s in second.sightings] == ["a.jpg", "b.jpg"]
+    assert first.sightings[1].uv_px == (80.0, 7.0) and first.alt_amsl_m == 410.5
+    place = LocalFrame(first.lat_deg, first.lon_deg, 0.0).to_utm(np.zeros((1, 3)))[0]
+    np.testing.assert_allclose(place[:2], (465000.5, 5249000.25), atol=1e-3)
+    path.write_text(LIST.replace("410.5", "0.0"))
+    assert read_survey(path)[0].alt_amsl_m is None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (LIST.replace("WGS84", "Mars"), "line 1: 'Mars UTM 32N' is not a coordinate system"),
+        (LIST.replace("WGS84 UTM 32N", "EPSG:4979"), "not ellipsoidal"),
+        (LIST + "1 2 3 4\n", "line 3: 4 columns"),
+        (LIST.replace("12.5", "west"), "line 2: could not convert"),
+        (LIST.replace("465000.5", "1e300"), "line 2: Expected"),
+        (LIST + "465000.5 5249000.25 410.5 1 2 a.jpg GCP1\n1e5 5e6 4 1 2 b.jpg GCP1\n", "differs"),
+    ],
+)
+def test_a_bad_list_is_said_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(text)
+    with pytest.raises(InputError) as raised:
+        read_survey(path)
+    assert said in str(raised.value) and str(path) in str(raised.value)
+
+
 def test_the_command_reports_and_takes_no_other_video(flight: Flight) -> None:
     gcp = write_csv(flight.folder / "points.csv", flight.survey(SPOTS))
     run = CliRunner().invoke

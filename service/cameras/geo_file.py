@@ -1,0 +1,80 @@
+"""Positions of stills in a file of their folder: ``geo.txt``, as OpenDroneMap's users have it.
+
+The first line is a coordinate system; each other one a name, x, y and, where they are known, z,
+three angles and the accuracies across and up, in metres. The angles are not used: their meaning
+differs between programs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+from mavlink.telemetry.decode import plausible_place
+from service.cameras.source import GeoTag
+from service.errors import InputError
+from service.georeference import system_of
+from service.small_file import read_small
+
+NAME, IMAGES = "geo.txt", "images"
+LARGEST_BYTES = 10_000_000
+NUMBERS = 8
+"""x, y, z, three angles, two accuracies."""
+
+MAX_SIGMA_M, MAX_HEIGHT_M = 1000.0, 1e5
+
+
+def geo_file_of(folder: Path) -> Path | None:
+    """The file of a folder of stills: in it or, where it is called ``images``, in the one above."""
+    places = [folder, folder.resolve().parent] if folder.resolve().name == IMAGES else [folder]
+    return next((path for one in places if (path := one / NAME).is_file()), None)
+
+
+def read_geo(path: Path) -> dict[str, GeoTag]:
+    """Positions by the file names of stills, in lower case.
+
+    Raises InputError in one line, with its number, for anything that is wrong.
+    """
+    lines = read_small(path, LARGEST_BYTES, "file of positions").decode("utf-8-sig", "replace")
+    head, *rows = lines.splitlines() or [""]
+    try:
+        system, datum = system_of(head)
+    except ValueError as error:
+        raise InputError(f"{path} line 1: {error}") from error
+    found = {}
+    for number, row in enumerate(rows, 2):
+        name, *cells = row.split()[: NUMBERS + 1] or [""]
+        if not name or name.startswith("#"):
+            continue
+        numbers = _numbers(cells)
+        if len(numbers) < 2:
+            raise InputError(f"{path} line {number}: {row[:80]!r}; give name, x, y and z")
+        lon, lat = system.transform(numbers[0], numbers[1])
+        height = numbers[2] if len(numbers) > 2 else None
+        if not plausible_place(lat, lon) or abs(height or 0.0) > MAX_HEIGHT_M:
+            raise InputError(f"{path} line {number}: {row[:80]!r} is not on the globe")
+        tag = GeoTag(lat, lon, height, datum="" if height is None else datum)
+        across, up = numbers[6:NUMBERS] if len(numbers) == NUMBERS else (0.0, 0.0)
+        if 0.0 < across < MAX_SIGMA_M:
+            tag = replace(tag, sigma_h_m=across, is_sigma_h_stated=True)
+        if 0.0 < up < MAX_SIGMA_M:
+            tag = replace(tag, sigma_v_m=up)
+        found[name.lower()] = tag
+    if not found:
+        raise InputError(f"{path}: no positions below the first line")
+    return found
+
+
+def _numbers(cells: list[str]) -> list[float]:
+    """The finite numbers before the first cell that is none."""
+    out = []
+    for cell in cells:
+        try:
+            number = float(cell)
+        except ValueError:
+            break
+        if not math.isfinite(number):
+            break
+        out.append(number)
+    return out
