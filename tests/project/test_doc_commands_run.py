@@ -45,6 +45,12 @@ ELSEWHERE = {
     "skyrelief ground --mavlink serial:": "a telemetry radio",
     "skyrelief site ": "test_site.py",
     "skyrelief replay flight.mp4 --backend onnx --set compute.model": "test_backend_choice.py",
+    "git ": "the shell: test_doc_first_change.py",
+    "cd skyrelief": "the shell: test_doc_first_change.py",
+    "make format": "the shell",
+    "make lint types": "the shell",
+    "make test": "the shell",
+    ".venv/bin/python -m pytest -q tests/mavlink": "test_doc_first_change.py",
 }
 """Start of a line: what it needs, or the test that runs it."""
 
