@@ -118,7 +118,7 @@ def shots(browser: Browser, base: str, scan: Path, out: Path) -> None:
 
 def main(store: Path, out: Path) -> None:
     """All states into a folder for each size."""
-    scan = max(store.glob("*/*/scan.db"), key=lambda path: path.stat().st_mtime).parent
+    scan = max(store.rglob("scan.db"), key=lambda path: path.stat().st_mtime).parent
     portal = Portal(PortalConfig(store, port=0))
     portal.start()
     with sync_playwright() as driver:

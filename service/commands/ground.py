@@ -155,7 +155,7 @@ class GroundOptions:
 
 @with_options(GroundOptions)
 def ground(given: GroundOptions) -> None:
-    """Receive scans from drones; end with Ctrl-C. Scans are stored in STORE/DRONE/SCAN."""
+    """Receive scans from drones; end with Ctrl-C. Scans: STORE/drones/DRONE/SCAN."""
     from service.ground.receiver import Receiver
     from service.init_system import Notifier
     from service.radio import GROUND, RadioLink

@@ -497,7 +497,7 @@ async def _live(socket: WebSocket) -> None:
     state.views_without_token += without_token
     try:
         await socket.accept()
-        await serve_live(socket, folder, state.progress)
+        await serve_live(socket, state.library.store, folder, state.progress)
     finally:
         state.live_views -= 1
         state.views_without_token -= without_token

@@ -1,7 +1,8 @@
 """The scans kept at a ground station: list, rename, tag, delete to a bin, bring back, import.
 
-A scan is a folder with a ``scan.db``, two levels below the store (drone, then scan). Names
-given by people live in ``library.json`` next to it and are never used as paths.
+A scan is a folder with a ``scan.db`` (:mod:`service.ground.storage` says where); a site is one of
+the drone ``site``. Names given by people live in ``library.json`` next to it and are never used as
+paths.
 """
 
 from __future__ import annotations
@@ -23,13 +24,18 @@ from service.ground.mcap_import import header_in, store_from_mcap
 from service.ground.scan_facts import Labels, facts_of, labels_in
 from service.ground.storage import (
     OTHER_FILES,
+    SITES,
     STORE_FILES,
     clear_leftovers,
     copy_files,
+    drone_folder,
     is_regular,
     run_folder,
+    scan_files,
+    site_folders,
     workplace,
 )
+from service.offline.site import SITE
 from service.scans.annotations import Annotation, Spot, add_annotation, delete_annotation
 from service.scans.folder import PIECE, SUMMARY, write_deliverables
 from service.scans.writing import write_whole
@@ -110,7 +116,9 @@ class Library:
         """The folder of a scan. Raises InputError when there is none, whatever the names."""
         if not (NAME.fullmatch(drone) and NAME.fullmatch(scan)):
             raise InputError("no such scan: a name may hold letters, digits, dots and dashes")
-        folder = self.store / drone / scan
+        site = self.store / SITES / scan
+        is_site = drone == SITES and is_regular(site / "scan.db")
+        folder = site if is_site else drone_folder(self.store, drone) / scan
         if not is_regular(folder / "scan.db"):
             raise InputError(f"no scan {drone}/{scan}")
         return folder
@@ -206,11 +214,12 @@ class Library:
         parts = name.split("~")
         if name not in self.bin() or len(parts) != 3:
             raise InputError("no such scan in the bin")
-        target = self.store / parts[0] / parts[1]
+        folder = self.store / BIN / name
+        target = self._home(parts[0], folder) / parts[1]
         with self._lock:
             if target.exists():
                 raise InputError(f"there is a scan {parts[0]}/{parts[1]}; rename its folder first")
-            _move(self.store / BIN / name, target)
+            _move(folder, target)
         return parts[0], parts[1]
 
     def bring_in(self, source: Path) -> tuple[str, str]:
@@ -244,7 +253,7 @@ class Library:
                 write_deliverables(part, store, {})
             return header
 
-        self._check_new(header)
+        self._check_new(header, source)
         return self._take(fill)
 
     def import_folder(self, source: Path) -> tuple[str, str]:
@@ -261,7 +270,7 @@ class Library:
                     header = store.header
             except (sqlite3.Error, ValueError) as error:
                 raise InputError(f"{str(source)[:200]} contains no valid scan ({error})") from error
-            self._check_new(header)
+            self._check_new(header, source)
             copy_files(source, part, ({*FILES, *OTHER_FILES} - {*STORE_FILES}))
             return header
 
@@ -274,25 +283,30 @@ class Library:
             part.mkdir(0o750)
             header = fill(part)
             with self._lock:
-                target = self._check_new(header)
+                target = self._check_new(header, part)
                 _move(part, target)
         return target.parent.name, target.name
 
-    def _check_new(self, header: ScanHeader) -> Path:
+    def _home(self, drone: str, source: Path) -> Path:
+        """Where the scan in ``source`` belongs: the drone's folder, or that of the sites."""
+        is_site = drone == SITES and is_regular(source / SITE)
+        return self.store / SITES if is_site else drone_folder(self.store, drone)
+
+    def _check_new(self, header: ScanHeader, source: Path) -> Path:
         """The folder for a scan; InputError when the library has it already."""
         drone, scan = _safe(header.drone, "drone"), _safe(header.scan_id, "scan")
-        target = run_folder(self.store / drone, scan, header.identity)
+        target = run_folder(self._home(drone, source), scan, header.identity)
         if target.exists():
             raise InputError(f"the library holds {drone}/{target.name} already")
         return target
 
     def _names(self) -> list[tuple[str, str]]:
-        """(drone, scan) of every folder that holds a scan."""
-        return sorted(
-            (path.parent.parent.name, path.parent.name)
-            for path in self.store.glob("*/*/scan.db")
-            if NAME.fullmatch(path.parent.parent.name) and NAME.fullmatch(path.parent.name)
-        )
+        """(drone, scan) of every folder that holds a scan or a site."""
+        folders = {path.parent for path in scan_files(self.store, "scan.db")}
+        names = {
+            (folder.parent.name, folder.name) for folder in (*folders, *site_folders(self.store))
+        }
+        return sorted(pair for pair in names if all(map(NAME.fullmatch, pair)))
 
 
 def read_labels(folder: Path) -> Labels:

@@ -282,7 +282,10 @@ def _news(feed: LiveFeed, site: SiteNews, link: _LinkNews) -> Iterator[str | byt
 
 
 async def serve_live(
-    socket: WebSocket, folder: Path, progress: Callable[[], list[dict[str, Any]]]
+    socket: WebSocket,
+    library: Path,
+    folder: Path,
+    progress: Callable[[], list[dict[str, Any]]],
 ) -> None:
     """Send what is new in the scan of ``folder`` over an accepted socket; close it at the end."""
     store = None
@@ -291,7 +294,7 @@ async def serve_live(
         store = await run_in_threadpool(ScanStore.open, folder / "scan.db")
         feed = LiveFeed(store, _max_points(socket))
         gone = asyncio.create_task(_until_gone(socket))
-        site, link = SiteNews(folder), _LinkNews(folder, progress)
+        site, link = SiteNews(library, folder), _LinkNews(folder, progress)
         while not gone.done():
             async for message in iterate_in_threadpool(_news(feed, site, link)):
                 await _send(socket, message)  # before the next one is made

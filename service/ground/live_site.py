@@ -25,8 +25,8 @@ from recon.types import F64
 from service.errors import InputError, SkyreliefError
 from service.ground.scan_facts import UnixTime
 from service.ground.sites import references
-from service.ground.storage import is_regular
-from service.offline.site import DRONE, SAME_VISIT_S
+from service.ground.storage import STORE_FILES, is_regular, scan_files
+from service.offline.site import SAME_VISIT_S
 from service.offline.site.live import LiveSite, PlacedScan
 from service.scans.writing import write_whole
 from service.small_file import read_json
@@ -123,14 +123,11 @@ class Follower:
 def growing(store: Path, now_unix_s: float) -> list[Path]:
     """The folder of each drone's newest scan, if it grows; MAX_FLYING of them at most."""
     newest: dict[str, tuple[float, Path]] = {}
-    for path in store.glob("*/*/scan.db*"):
-        folder = path.parent
-        drone = folder.parent.name
-        is_store = path.name in ("scan.db", "scan.db-wal") and is_regular(path)
-        if is_store and drone[0] != "." and drone != DRONE:
-            with contextlib.suppress(OSError):
-                changed = path.lstat().st_mtime, folder
-                newest[drone] = max(newest.get(drone, (-math.inf, folder)), changed)
+    for path in scan_files(store, *STORE_FILES):
+        drone, folder = path.parent.parent.name, path.parent
+        with contextlib.suppress(OSError):
+            changed = path.lstat().st_mtime, folder
+            newest[drone] = max(newest.get(drone, (-math.inf, folder)), changed)
     found = sorted(newest.values(), reverse=True)[:MAX_FLYING]
     return [folder for changed, folder in found if changed > now_unix_s - GROWING_S]
 
@@ -175,8 +172,8 @@ def write_shown(store: Path, placed: list[PlacedScan]) -> None:
 class SiteNews:
     """Gives where the scans tied to one scan are shown, in its own coordinates."""
 
-    def __init__(self, folder: Path) -> None:
-        self._path = folder.parent.parent / FILE
+    def __init__(self, store: Path, folder: Path) -> None:
+        self._path = store / FILE
         self._names = folder.parent.name, folder.name
         self._seen = 0
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from service.errors import InputError
 from service.ground.intake import ScanIntake
-from service.ground.storage import is_regular
+from service.ground.storage import is_regular, scan_files
 from service.scans.folder import files_due, write_deliverables
 from service.stream.naming import ROOT
 from service.stream.store import ScanStore
@@ -49,7 +49,7 @@ def end_files(folder: Path) -> None:
 
 def folders_due(store: Path) -> list[Path]:
     """The folders with files yet to be written, those of the newest scans first."""
-    found = {path.parent for name in (MARK, BEGUN) for path in store.glob(f"*/*/{name}")}
+    found = {path.parent for name in (MARK, BEGUN) for path in scan_files(store, name)}
     sound = [folder for folder in found if is_regular(folder / "scan.db")]
     return sorted(sound, key=lambda folder: folder.name, reverse=True)
 

@@ -1,6 +1,6 @@
 """The ground station: receives the scans of any number of drones into scan folders.
 
-Each scan lives in ``<store>/<drone>/<scan>/scan.db``, the same database as onboard. When a
+Each scan lives in ``<store>/drones/<drone>/<scan>/scan.db``, the same database as onboard. When a
 finished scan is complete, and when the receiver closes, the deliverables are written next to
 it. Everything may be killed at any time and started again.
 

@@ -21,7 +21,7 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.ground.drone import DroneLimits
 from service.ground.scan_facts import Corner, Ground, Times, ground_in
-from service.ground.storage import DiskShare, is_regular
+from service.ground.storage import DiskShare, is_regular, scan_files
 from service.offline.site import DRONE, SAME_VISIT_S, SITE
 from service.offline.site.start import StartPoints
 from service.progress import Progress
@@ -191,12 +191,10 @@ def _sites(store: Path) -> Iterator[tuple[Path, set[Path]]]:
 
 
 def _grounds(store: Path) -> Iterator[tuple[Path, Ground]]:
-    for path in sorted(store.glob("*/*/scan.json")):
-        drone = path.parent.parent.name
-        if drone == DRONE or drone.startswith(".") or not is_regular(path.parent / "scan.db"):
-            continue
-        with contextlib.suppress(InputError):
-            yield path.parent, ground_in(path)
+    for path in sorted(scan_files(store, "scan.json")):
+        if is_regular(path.parent / "scan.db"):
+            with contextlib.suppress(InputError):
+                yield path.parent, ground_in(path)
 
 
 def _is_same_visit(a: Ground, b: Ground) -> bool:

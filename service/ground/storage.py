@@ -1,6 +1,9 @@
 """The folders of a ground station's store: the quota of each drone, the folder of each scan, and
 scans copied from a card.
 
+Scans lie in ``drones/DRONE/SCAN``, where nothing else does, because others choose these names;
+sites in ``site/NAME``. Drones of earlier versions lie in the store itself and are read there too.
+
 The card may come from a stranger: regular files of known names only, as many bytes as fit. Links in
 it are not followed, nothing on it is written, and pipes, devices and symbolic links are left out.
 """
@@ -18,6 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.errors import InputError, OutsideError
+from service.offline.site import DRONE
 from service.scans.retention import Claim, existing
 from service.stream.naming import check_name, split_scan_name
 from service.stream.records import ScanHeader
@@ -102,6 +106,39 @@ def folder_bytes(folder: Path) -> int:
     return total
 
 
+DRONES, SITES = "drones", DRONE
+"""The folders of the drones, and of the sites, in a store."""
+
+
+def drone_folder(store: Path, drone: str) -> Path:
+    """The folder of a drone's scans: in the store itself where it has some there already."""
+    earlier = store / drone
+    if drone != SITES and any(is_regular(scan / "scan.db") for scan in _within(earlier)):
+        return earlier
+    return store / DRONES / drone
+
+
+def site_folders(store: Path) -> Iterator[Path]:
+    """The folders of the sites."""
+    return (folder for folder in _within(store / SITES) if is_regular(folder / "scan.db"))
+
+
+def scan_files(store: Path, *names: str) -> Iterator[Path]:
+    """Regular files of these names in the folders of the drones' scans."""
+    earlier = (path for path in _within(store) if path.name != SITES and path.name[0] != ".")
+    for drone in (*_within(store / DRONES), *earlier):
+        for scan in _within(drone):
+            yield from filter(is_regular, (scan / name for name in names))
+
+
+def _within(folder: Path) -> list[Path]:
+    """What is in a folder; nothing where it is deleted meanwhile, or no folder."""
+    try:
+        return [folder / name for name in os.listdir(folder)]
+    except OSError:
+        return []
+
+
 MAX_RUNS = 100
 """Folders of scans of the same drone and time; more are not made."""
 
@@ -113,7 +150,7 @@ def scan_folder(store: Path, drone: str, name: str) -> Path:
     Raises InputError when there are MAX_RUNS already.
     """
     scan_id, run_id = split_scan_name(name)
-    return run_folder(store / drone, scan_id, (drone, scan_id, run_id))
+    return run_folder(drone_folder(store, drone), scan_id, (drone, scan_id, run_id))
 
 
 def run_folder(drone: Path, scan: str, identity: tuple[str, str, str]) -> Path:

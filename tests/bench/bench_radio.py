@@ -157,7 +157,10 @@ def _fly(folder: Path) -> list[BenchResult]:
         receiver.close()
         vehicle.stop()
         radio.close()
-    with onboard, ScanStore.open(folder / "ground" / "drone" / "scan" / "scan.db") as ground:
+    with (
+        onboard,
+        ScanStore.open(folder / "ground" / "drones" / "drone" / "scan" / "scan.db") as ground,
+    ):
         return _outcome(onboard, ground, flight, sent)
 
 

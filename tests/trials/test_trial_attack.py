@@ -274,7 +274,7 @@ def test_hostile_stores_are_refused_or_read(
     copies, made, codes = tmp_path / "copies", [], Counter[int]()
     copies.mkdir()
     for number, (what, copy) in enumerate(hostile_stores(flown, copies, STORES, SEED)):
-        kept = tmp_path / "ground" / "card" / f"scan-{number}"
+        kept = tmp_path / "ground" / "drones" / "card" / f"scan-{number}"
         shutil.copytree(copy, kept, symlinks=True, ignore=no_pipes)
         if number % 2:
             numbered(kept, number)

@@ -179,8 +179,8 @@ def test_junk_makes_no_folder(tmp_path: Path) -> None:
         session.put(f"{base}/../item/k0/1", b"SK")
         assert until(lambda: _introduced(ground, session, "evil", "valid"))
         assert arrives(tmp_path, endpoint)
-        names = sorted(path.parent.name for path in store.glob("*/*/scan.db"))
-        folders = sorted(path.name for path in store.glob("*/*") if path.is_dir())
+        names = sorted(path.parent.name for path in store.glob("drones/*/*/scan.db"))
+        folders = sorted(path.name for path in store.glob("drones/*/*") if path.is_dir())
         assert names == folders == ["scan-1", "valid"]
         assert ground.dropped >= 2
 
@@ -213,7 +213,9 @@ def test_scans_are_open_only_while_they_are_used(
     assert most == 3
     assert sum("/ground/red/" in path for path in held) <= 3 * 3
     for k in range(10):
-        with ScanStore.open(tmp_path / "ground" / "red" / f"scan-{k}" / "scan.db") as received:
+        with ScanStore.open(
+            tmp_path / "ground" / "drones" / "red" / f"scan-{k}" / "scan.db"
+        ) as received:
             assert received.finished and len(list(received.poses())) == 20
 
 
@@ -232,8 +234,8 @@ def test_a_drone_over_its_share_of_the_disk_is_refused_and_another_is_not(
     monkeypatch.setattr(drone_module, "FULL_DISK_REST_S", 0.5)
     total = os.statvfs(tmp_path).f_blocks * os.statvfs(tmp_path).f_frsize
     store = tmp_path / "ground"
-    (store / "greedy" / "earlier").mkdir(parents=True)
-    with (store / "greedy" / "earlier" / "cloud.laz").open("wb") as file:
+    (store / "drones" / "greedy" / "earlier").mkdir(parents=True)
+    with (store / "drones" / "greedy" / "earlier" / "cloud.laz").open("wb") as file:
         file.truncate(2_000_000)
     limits = DroneLimits(None, 2_000_000 / total, 0)
     greedy = scan_of(tmp_path, "greedy")
@@ -243,8 +245,8 @@ def test_a_drone_over_its_share_of_the_disk_is_refused_and_another_is_not(
         try:
             assert arrives(tmp_path, endpoint)
             assert not link.progress.complete
-            assert not (store / "greedy" / "scan-1").exists()
-            (store / "greedy" / "earlier" / "cloud.laz").unlink()
+            assert not (store / "drones" / "greedy" / "scan-1").exists()
+            (store / "drones" / "greedy" / "earlier" / "cloud.laz").unlink()
             monkeypatch.setattr(drone_module, "UNREADABLE_REST_S", 0.0)
         finally:
             link.close()
@@ -284,7 +286,7 @@ def test_poses_stop_at_the_reserve_and_go_on_when_there_is_room(
 
 def test_a_scan_that_is_deleted_while_it_comes_in_is_received_anew(tmp_path: Path) -> None:
     onboard = ScanStore.create(tmp_path / "a.db", ScanHeader("scan-1", "red", 1))
-    place = tmp_path / "ground" / "red" / "scan-1"
+    place = tmp_path / "ground" / "drones" / "red" / "scan-1"
     with serving(tmp_path / "ground") as (ground, endpoint):
         link = DatalinkSender(onboard, DatalinkConfig(connect=(endpoint,), budget_kbit_s=50_000.0))
         try:

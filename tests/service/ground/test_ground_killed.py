@@ -111,7 +111,7 @@ def test_killed_and_restarted_on_both_sides(tmp_path: Path) -> None:
     finally:
         kill(drone)
         kill(ground)
-    received = tmp_path / "ground" / "drone-a" / "scan-1" / "scan.db"
+    received = tmp_path / "ground" / "drones" / "drone-a" / "scan-1" / "scan.db"
     with ScanStore.open(onboard) as a, ScanStore.open(received) as b:
         assert a.seqs() == list(range(30))
         assert a.numbers() == b.numbers()

@@ -58,7 +58,7 @@ def followed(store: Path) -> Follower:
 
 
 def said(folder: Path) -> dict[tuple[str, str], dict[str, object]]:
-    text = SiteNews(folder).message()
+    text = SiteNews(folder.parent.parent, folder).message()
     return {(one["drone"], one["scan"]): one for one in json.loads(text or "{}")["scans"]}
 
 
@@ -81,7 +81,7 @@ def test_two_scans_in_flight_are_shown_in_one_another(tmp_path: Path) -> None:
 def test_what_is_known_is_not_said_again(tmp_path: Path) -> None:
     one = flying(tmp_path / "a" / "1", NORTH[:1])
     followed(tmp_path)
-    news = SiteNews(one)
+    news = SiteNews(one.parent.parent, one)
     assert news.message() is not None and news.message() is None
     (tmp_path / FILE).write_text('[{"drone": 1e999}]')
     assert json.loads(news.message() or "") == {"type": "site", "scans": []}

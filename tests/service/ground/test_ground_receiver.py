@@ -109,7 +109,7 @@ def test_two_runs_of_one_time_stay_two_scans(tmp_path: Path, written: list[Path]
         for link in links:
             link.close()
         ground.close()
-    folders = [tmp_path / "ground" / "drone-a" / name for name in ("scan-1", "scan-1-2")]
+    folders = [tmp_path / "ground" / "drones" / "drone-a" / name for name in ("scan-1", "scan-1-2")]
     headers = [header_of(folder / "scan.db") for folder in folders]
     by_run = {
         header.run_id: folder for header, folder in zip(headers, folders, strict=True) if header
@@ -162,7 +162,7 @@ def test_what_was_flown_before_the_ground_came_is_fetched_once(tmp_path: Path) -
     finally:
         link.close()
         ground.close()
-    assert_equal(onboard, tmp_path / "ground" / "drone-a" / "scan-1" / "scan.db")
+    assert_equal(onboard, tmp_path / "ground" / "drones" / "drone-a" / "scan-1" / "scan.db")
     onboard.close()
 
 
@@ -189,7 +189,7 @@ def test_both_ends_may_restart(tmp_path: Path) -> None:
     finally:
         link.close()
         ground.close()
-    assert_equal(onboard, tmp_path / "ground" / "drone-a" / "scan-1" / "scan.db")
+    assert_equal(onboard, tmp_path / "ground" / "drones" / "drone-a" / "scan-1" / "scan.db")
     onboard.close()
 
 
@@ -293,7 +293,9 @@ def test_two_drones_with_the_same_scan_id_and_a_late_second_ground(tmp_path: Pat
         ground.close()
     for store in stores:
         for folder in ("ground", "late"):
-            assert_equal(store, tmp_path / folder / store.header.drone / "scan-1" / "scan.db")
+            assert_equal(
+                store, tmp_path / folder / "drones" / store.header.drone / "scan-1" / "scan.db"
+            )
         store.close()
 
 

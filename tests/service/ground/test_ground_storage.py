@@ -14,8 +14,9 @@ import pytest
 from recon.types import DepthMap, Keyframe, Pose
 from service.errors import InputError, OutsideError
 from service.ground import storage
+from service.ground.guard import kept_token
 from service.ground.library import Library
-from service.ground.storage import take_in
+from service.ground.storage import scan_folder, take_in
 from service.stream import codec
 from service.stream.naming import NAME, station_name
 from service.stream.radio_messages import pack_announce, pack_tile, tag_of, unpack_announce
@@ -63,7 +64,7 @@ def test_the_card_completes_what_the_radio_brought(
     monkeypatch.setattr(storage, "_deliver", lambda *_: None)
     announced = unpack_announce(pack_announce(HEADER))
     assert announced is not None
-    path = tmp_path / "ground" / "red" / "scan-1" / "scan.db"
+    path = tmp_path / "ground" / "drones" / "red" / "scan-1" / "scan.db"
     with ScanStore.create(path, announced) as ground:
         coarse = codec.decode(codec.encode(keyframe(0), 0)[:1])
         assert coarse is not None
@@ -73,7 +74,7 @@ def test_the_card_completes_what_the_radio_brought(
     assert take_in(tmp_path / "ground", card) == [path.parent]
     assert take_in(tmp_path / "ground", card / "scan-1") == [path.parent]  # once more: no harm
     assert {p.name: p.read_bytes() for p in (card / "scan-1").iterdir()} == before
-    assert [p.name for p in (tmp_path / "ground").iterdir()] == ["red"]
+    assert [p.name for p in (tmp_path / "ground").iterdir()] == ["drones"]
     with ScanStore.open(path) as ground, ScanStore.open(card / "scan-1" / "scan.db") as aircraft:
         assert ground.numbers() == aircraft.numbers()
         assert ground.header == HEADER and ground.summary == {"points": 1}
@@ -173,3 +174,41 @@ def test_the_library_imports_two_runs_of_one_time_and_no_run_twice(tmp_path: Pat
     ]
     with pytest.raises(InputError, match="holds red/scan-1-2 already"):
         library.import_folder(cards[1])
+
+
+def test_a_drone_of_any_name_keeps_to_its_own_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(storage, "_deliver", lambda *_: None)
+    store = tmp_path / "ground"
+    token, library = kept_token(store), Library(store)
+    kept = {path.name: path.read_bytes() for path in store.iterdir()}
+    names = ("portal-token", "audit.jsonl", "station.txt", "site", "drones")
+    for name in names:
+        header = ScanHeader("scan-1", name, 1)
+        ScanStore.create(tmp_path / "card" / name / "scan.db", header).close()
+    assert take_in(store, tmp_path / "card") == [
+        store / "drones" / n / "scan-1" for n in sorted(names)
+    ]
+    assert {path.name: path.read_bytes() for path in store.iterdir() if path.is_file()} == kept
+    assert kept_token(store) == token and not (store / "site").exists()
+    assert {entry["drone"] for entry in library.scans()} == set(names)
+    for name in names:
+        bin_name = library.delete(name, "scan-1")
+        assert library.restore(bin_name) == (name, "scan-1")
+    assert {entry["drone"] for entry in library.scans()} == set(names)
+
+
+def test_drones_of_an_earlier_version_stay_where_they_are(tmp_path: Path) -> None:
+    store, header = tmp_path / "ground", ScanHeader("scan-1", "red", 1)
+    ScanStore.create(store / "red" / "scan-1" / "scan.db", header).close()
+    ScanStore.create(store / "site" / "red-scan-1" / "scan.db", header).close()
+    library = Library(store)
+    assert library.folder("red", "scan-1") == store / "red" / "scan-1"
+    assert library.folder("site", "red-scan-1") == store / "site" / "red-scan-1"
+    assert [(e["drone"], e["scan"]) for e in library.scans()] == [
+        ("red", "scan-1"), ("site", "red-scan-1"),
+    ]  # fmt: skip
+    assert scan_folder(store, "red", "scan-1") == store / "red" / "scan-1"
+    assert scan_folder(store, "red", "scan-2") == store / "red" / "scan-2"
+    assert scan_folder(store, "blue", "scan-1") == store / "drones" / "blue" / "scan-1"

@@ -73,7 +73,7 @@ def test_pieces_of_a_scan_are_listed_given_and_imported(
     for name in ("piece-x.laz", "piece-2.laz", "piece-0.laz"):
         assert client.ask(f"{ONE}/files/{name}")[0] == 404
     drone, scan = Library(tmp_path / "other").bring_in(folder)
-    copied = (tmp_path / "other" / drone / scan).glob("piece-*")
+    copied = (tmp_path / "other" / "drones" / drone / scan).glob("piece-*")
     assert sorted(path.name for path in copied) == ["piece-1.laz", "piece-12.laz"]
 
 
@@ -284,7 +284,7 @@ def test_an_mcap_from_the_aircraft_becomes_a_scan(
     entry = client.ask("/api/scans/drone-1/test-1")[1]
     assert entry["finished"] and entry["preview"] and entry["trouble"] is None
     assert entry["origin"]["lat_deg"] == pytest.approx(47.39)
-    with ScanStore.open(store / "drone-1/test-1/scan.db") as scan:
+    with ScanStore.open(store / "drones/drone-1/test-1/scan.db") as scan:
         after = list(scan.keyframes())
         np.testing.assert_allclose([p.T_world_camera for p in scan.poses()], track, atol=1e-5)
     assert [k.seq for k in after] == [k.seq for k in before]

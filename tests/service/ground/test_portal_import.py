@@ -42,7 +42,7 @@ def test_an_import_takes_regular_files_of_known_names_only(
     client.ask(ONE, "DELETE")
     before = sorted(path.name for path in card.iterdir())
     assert client.ask("/api/import", "POST", {"folder": str(card)})[0] == 201
-    assert {p.name for p in (store / "drone-1/test-1").iterdir()} == {"scan.db", "scan.json"}
+    assert {p.name for p in (store / "drones/drone-1/test-1").iterdir()} == {"scan.db", "scan.json"}
     assert sorted(path.name for path in card.iterdir()) == before
     assert not list(store.glob(".taking-*"))
 

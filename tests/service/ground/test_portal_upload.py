@@ -74,10 +74,13 @@ def test_an_archive_becomes_a_scan_and_no_path_in_it_is_used(
     )
     status, answer = send(client, "a.zip", archive.read_bytes())
     assert (status, answer) == (201, {"drone": "drone-1", "scan": "test-1"})
-    assert {p.name for p in (store / "drone-1/test-1").iterdir()} == {"scan.db", "report.html"}
+    assert {p.name for p in (store / "drones/drone-1/test-1").iterdir()} == {
+        "scan.db",
+        "report.html",
+    }
     with (
         ScanStore.open(flown / "scan.db") as a,
-        ScanStore.open(store / "drone-1/test-1/scan.db") as b,
+        ScanStore.open(store / "drones/drone-1/test-1/scan.db") as b,
     ):
         assert a.seqs() == b.seqs() and a.header == b.header
     assert not (tmp_path / "escaped").exists() and not Path("/tmp/skyrelief-escaped").exists()

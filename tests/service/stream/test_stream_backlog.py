@@ -96,7 +96,7 @@ def test_the_backlog_reaches_the_ground_and_is_then_empty(
         link.close()
         ground.close()
     assert open_backlog(config) is None
-    with ScanStore.open(tmp_path / "ground" / "red" / "two" / "scan.db") as two:
+    with ScanStore.open(tmp_path / "ground" / "drones" / "red" / "two" / "scan.db") as two:
         assert two.summary == {"interrupted": True} and len(list(two.poses())) == 5
 
 
