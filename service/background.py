@@ -6,10 +6,10 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from functools import partial
 from queue import SimpleQueue
-from threading import Condition
+from threading import Condition, Event
 from typing import Generic, TypeVar
 
 from service.workers import PROCESS, Worker
@@ -17,6 +17,9 @@ from service.workers import PROCESS, Worker
 T = TypeVar("T")
 In = TypeVar("In")
 Out = TypeVar("Out")
+
+LOOK_S = 0.2
+"""How often one who waits for work looks whether it ends."""
 
 
 class Channel(Generic[T]):
@@ -105,6 +108,7 @@ class BackgroundWorker(Generic[In, Out]):
         self._offered: dict[Future[Out], In] = {}  # in order; dropped items leave at once
         self.dropped = 0
         self._began_s: list[float] = []  # start of the current work, if any
+        self._ends, self._patience_s = Event(), 0.0
         self._todo: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._worker: Worker | None = None
         if row is not None:
@@ -119,8 +123,16 @@ class BackgroundWorker(Generic[In, Out]):
         """Seconds since the current work began; 0 when idle."""
         return _since(self._began_s)
 
+    def end_by(self, event: Event, patience_s: float) -> None:
+        """Once ``event`` is set, drop what has not begun, and after ``patience_s`` also what has:
+        nothing waits longer."""
+        self._ends, self._patience_s = event, patience_s
+
     def offer(self, item: In) -> None:
         """Queue one item."""
+        if self._ends.is_set():
+            self.dropped += 1
+            return
         future: Future[Out] = Future()
         self._offered[future] = item
         if self._worker is None:
@@ -131,7 +143,7 @@ class BackgroundWorker(Generic[In, Out]):
         if len(waiting) <= self._bound + 1:  # one is being worked on
             return
         if not self._live:
-            waiting[0].exception()  # waits
+            self._wait(waiting[0])
         elif (late := next((one for one in waiting[1:] if one.cancel()), None)) is not None:
             del self._offered[late]
             self.dropped += 1
@@ -144,12 +156,21 @@ class BackgroundWorker(Generic[In, Out]):
         out: list[tuple[In, Out]] = []
         while self._offered:
             future = next(iter(self._offered))
-            if not everything and not future.done():
-                break
-            if future.exception() is not None and out:  # waits
+            if everything and not self._wait(future):
+                del self._offered[future]
+                self.dropped += 1
+                continue
+            if not future.done() or (future.exception() is not None and out):
                 break
             out.append((self._offered.pop(future), future.result()))
         return out
+
+    def _wait(self, future: Future[Out]) -> bool:
+        """Wait for work; False where it is dropped."""
+        while not self._ends.is_set():
+            if wait([future], LOOK_S).done:
+                return True
+        return not future.cancel() and bool(wait([future], self._patience_s).done)
 
     def close(self) -> None:
         """End the thread; queued items are discarded."""
@@ -158,7 +179,7 @@ class BackgroundWorker(Generic[In, Out]):
                 del self._offered[future]
         self._todo.put(None)
         if self._worker is not None:
-            self._worker.join()
+            self._worker.join(0.0 if self._ends.is_set() else None)
 
     def _do(self, future: Future[Out]) -> None:
         if not future.set_running_or_notify_cancel():

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import difflib
+import json
 import logging
 import os
 import signal
 import sys
 import threading
 import traceback
+from collections.abc import Mapping
 from importlib import import_module
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, NoReturn
 
 import typer
@@ -94,6 +96,17 @@ class LazyCommands(typer.core.TyperGroup):
         name, _, rest = super().resolve_command(ctx, args)
         return name, load_command(str(name)), rest
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run the subcommand; Ctrl-C ends it in one line, and JSON has errors of usage too."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            _end(CancelledByUser("cancelled"))
+        except Exception as error:
+            if hasattr(error, "format_message"):  # wrong usage; the terminal's line is typer's
+                _as_json(str(error.format_message()), InputError.exit_code)
+            raise
+
 
 def load_command(name: str) -> Any:
     """The command called ``name`` in the table, imported."""
@@ -153,7 +166,7 @@ def main() -> None:
                 f"{NUMBA_SETTINGS} in this folder could run foreign code; use another folder"
             )
         with needing("this command"):
-            app(standalone_mode=True)
+            app(standalone_mode=True, prog_name="skyrelief")
     except SkyreliefError as error:
         _end(error)
     except OSError as error:
@@ -161,13 +174,29 @@ def main() -> None:
             raise
         place = str(error.filename)[:200]
         _end(OutsideError(f"{place}: {error.strerror}; check the path and its rights"))
+    except Exception as error:
+        _as_json(f"{type(error).__name__}: {error}", SkyreliefError.exit_code)
+        raise
     finally:
         sys.excepthook = _print_fault  # replaces typer's
 
 
+class CancelledByUser(SkyreliefError):
+    """Ctrl-C."""
+
+    exit_code = 128 + signal.SIGINT
+
+
 def _end(error: SkyreliefError) -> NoReturn:
     print(f"skyrelief: {error}", file=sys.stderr)
+    _as_json(str(error), error.exit_code, error.report)
     sys.exit(error.exit_code)
+
+
+def _as_json(error: str, exit_code: int, report: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """The last line of standard output where ``--json`` is given."""
+    if "--json" in sys.argv[1:]:
+        print(json.dumps({**report, "error": without_credentials(error), "exit_code": exit_code}))
 
 
 def _print_fault(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from service.redaction import without_credentials
 
 
@@ -15,6 +18,7 @@ class SkyreliefError(Exception):
 
     def __init__(self, text: str = "") -> None:
         super().__init__(without_credentials(text))
+        self.report: Mapping[str, Any] = {}  # what was done all the same, for --json
 
 
 class InputError(SkyreliefError):

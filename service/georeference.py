@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -113,6 +113,38 @@ def _nodes(x: F64) -> tuple[F64, F64]:
     """Evenly spaced nodes over ``x`` (N,), and (N, nodes) their shares in each of its values."""
     nodes = np.linspace(x.min(), x.max(), NODES)
     return nodes, np.column_stack([np.interp(x, nodes, one) for one in np.eye(NODES)])
+
+
+def unwrapped(lon_deg: Array) -> F64:
+    """Longitudes (N,) without a step at 180 degrees, so that some may lie beyond it."""
+    return np.asarray(np.unwrap(np.asarray(lon_deg, np.float64), period=360.0))
+
+
+def cut_at_180(places: F64) -> list[F64]:
+    """A line (N, K) of longitude, latitude and more columns, cut where it crosses 180 degrees.
+
+    The parts end at -180 or 180, as RFC 7946 (3.1.9) asks for.
+    """
+    lon = unwrapped(places[:, 0])
+    turns = np.floor((lon + 180.0) / 360.0)  # a piece of the line lies in one turn
+    parts, first = [], 0
+    row = np.column_stack([lon, places[:, 1:]])
+    for k in np.flatnonzero(np.diff(turns)).tolist():
+        edge = 360.0 * max(turns[k], turns[k + 1]) - 180.0
+        share = (edge - lon[k]) / (lon[k + 1] - lon[k])
+        end = row[k] + share * (row[k + 1] - row[k])
+        parts.append((turns[k], np.vstack([row[first : k + 1], end])))
+        row[k], first = end, k
+    parts.append((turns[-1] if len(turns) else 0.0, row[first:]))
+    return [np.column_stack([p[:, 0] - 360.0 * turn, p[:, 1:]]) for turn, p in parts if len(p) > 1]
+
+
+def line_geometry(places: F64) -> dict[str, Any]:
+    """The GeoJSON geometry of a line (N, 3): longitude, latitude, height in metres."""
+    parts = [np.column_stack([p[:, :2].round(8), p[:, 2:].round(3)]) for p in cut_at_180(places)]
+    if len(parts) == 1:
+        return {"type": "LineString", "coordinates": parts[0].tolist()}
+    return {"type": "MultiLineString", "coordinates": [part.tolist() for part in parts]}
 
 
 def map_crs(epsg: int, vertical: str | None = None) -> CRS:

@@ -26,13 +26,16 @@ EXTRAS = {
     "pyulog": "logs",
     "rasterio": "ground",
     "rosbags": "ros2",
-    "starlette": "ground",
+    "starlette": "portal",
     "torch": "gpu",
     "trimesh": "ground",
-    "uvicorn": "ground",
-    "websockets": "ground",
+    "uvicorn": "portal",
+    "websockets": "portal",
 }
-"""Import name to the extra of skyrelief that installs it."""
+"""Import name to the smallest extra of skyrelief that installs it."""
+
+NAMES = {"foxglove": "foxglove-sdk", "google": "protobuf"}
+"""Import name to the package's name, where they differ."""
 
 LIBRARIES = {
     "open3d": {
@@ -86,10 +89,14 @@ def remedy(error: ImportError) -> str | None:
     if not package or package in OURS:
         return None
     if isinstance(error, ModuleNotFoundError):
-        extra = EXTRAS.get(package)
-        wanted = f"'skyrelief[{extra}]'" if extra else package
-        return f"the package {error.name}; pip install {wanted}"
+        return f"the package {error.name}; pip install {installs(package)}"
     return f"a {package} that fits ({error}); install skyrelief again in a fresh environment"
+
+
+def installs(package: str) -> str:
+    """What to give to pip for an import: the extra, or of the large ``ground`` one package."""
+    extra = EXTRAS.get(package, "ground")
+    return NAMES.get(package, package) if extra == "ground" else f"'skyrelief[{extra}]'"
 
 
 def _package(error: ImportError) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,12 +31,16 @@ class BoardSet:
     size_px: tuple[int, int]  # (W, H)
 
 
-def find_boards(sources: Sequence[Path], board: Board) -> BoardSet:
+def find_boards(
+    sources: Sequence[Path], board: Board, say: Callable[[str], object] = lambda text: None
+) -> BoardSet:
     """Find the board in images, folders of images, or videos; InputError when none is usable."""
     views: list[BoardView] = []
     missed: list[tuple[str, str]] = []
     size: tuple[int, int] | None = None
+    say("looking for the board")
     for name, gray in _images(sources):
+        say(f"{name}: {len(views)} boards so far")
         if gray is None:
             missed.append((name, "cannot be read as an image"))
             continue

@@ -3,7 +3,7 @@
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from inspect import Parameter, Signature
@@ -15,6 +15,12 @@ import typer
 
 from service.errors import InputError
 from service.progress import Progress
+
+
+def choices(values: Iterable[str]) -> Callable[[str], list[str]]:
+    """What the shell offers for an option: those of the values that begin as typed."""
+    return lambda incomplete: [value for value in values if value.startswith(incomplete)]
+
 
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
@@ -30,6 +36,7 @@ TilePoints = Annotated[
 Scheduler = Annotated[
     str | None, typer.Option(help="Dask scheduler that makes the tiles: tcp://HOST:8786")
 ]
+BACKENDS = ("auto", "cpu", "torch", "onnx")
 AsJson = Annotated[bool, typer.Option("--json", help="one JSON object at the end")]
 
 Options = TypeVar("Options")

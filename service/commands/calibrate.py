@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import AsJson
+from service.commands import AsJson, showing
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,9 +34,12 @@ def calibrate(
     from recon.calibration.board import calibrate as fit
     from service.cameras.board_images import draw_coverage, find_boards, write_image
     from service.cameras.camera_file import save_camera
+    from service.scans.writing import check_writable
 
     board = _board(pattern, square_m)
-    boards = find_boards(sources, board)
+    check_writable(out)
+    with showing("calibrate") as progress:
+        boards = find_boards(sources, board, progress)
     if len(boards.views) < MIN_VIEWS:
         raise InputError(
             f"the board was found in {len(boards.views)} of "

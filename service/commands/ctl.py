@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import AsJson
+from service.commands import AsJson, choices
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +23,9 @@ ACTIONS = (
 
 
 def ctl(
-    action: Annotated[str, typer.Argument(help=", ".join(ACTIONS))],
+    action: Annotated[
+        str, typer.Argument(help=", ".join(ACTIONS), autocompletion=choices(ACTIONS))
+    ],
     metres: Annotated[float | None, typer.Argument(help="baseline: metres; 0: by altitude")] = None,
     connect: Annotated[
         str, typer.Option(help="where the vehicle's MAVLink comes from")
@@ -107,6 +109,8 @@ def _print(result: dict[str, Any], as_json: bool) -> None:
         print(json.dumps(_plain(result)))
         return
     for name, value in result.items():
+        if isinstance(value, float):
+            value = f"{value:.7f}" if name.startswith(("lat", "lon")) else f"{value:.2f}"
         print(f"{name.replace('_', ' ')}: {'unknown' if value is None else value}")
 
 

@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import json
+import logging
+import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from service.commands import AsJson, ScanDir, Scheduler, TilePoints, Voxel, showing
+from service.commands import AsJson, ScanDir, Scheduler, TilePoints, Voxel, choices, showing
 from service.errors import InputError
-from service.offline.exports import EXPORTERS
+from service.offline.exports import EXPORTERS, kind_of
 from service.packages import needing
-
-KINDS = "|".join(EXPORTERS)
 
 
 def export(
     scan_dir: ScanDir,
-    to: Annotated[list[str], typer.Option("--to", help=f"{KINDS}; may be repeated")],
+    to: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--to",
+            help="what to write, of the list above; may be repeated",
+            autocompletion=choices(EXPORTERS),
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="file to write; default: in the scan folder")
     ] = None,
@@ -53,10 +60,17 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write deliverables of a scan: clouds, surface model, orthophoto, tiles, mesh, flight."""
+    if not to:
+        print(product_list())
+        raise InputError("name what to export with --to, such as --to dsm")
     from service.offline.exports.maps import write_kinds
     from service.offline.exports.view import ExportOptions, ScanView
+    from service.scans.folder import Failures
 
-    _check_kinds(to, out)
+    if out is not None and len(to) > 1:
+        raise InputError("--out names one file; give one --to with it")
+    for kind in to:
+        kind_of(kind, out)
     try:
         options = ExportOptions(
             voxel_m,
@@ -73,25 +87,35 @@ def export(
         )
     except ValueError as error:
         raise InputError(f"export: {error}") from error
-    done: dict[str, Path] = {}
-    try:
-        with showing("export") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
-            write_kinds(scan, to, out, options, done)
-    finally:
-        written = {kind: str(done[kind]) for kind in dict.fromkeys(to) if kind in done}
-        if not as_json:
-            print(*written.values(), sep="\n", end="\n" if written else "")
-    if as_json:
-        print(json.dumps({"scan": str(scan_dir), "written": written}))
+    kinds = list(dict.fromkeys(to))
+    with showing("export") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
+        failures = Failures(scan_dir, logging.DEBUG)
+        done = write_kinds(
+            scan, kinds, lambda kind: out or scan_dir / EXPORTERS[kind][1], options, failures
+        )
+    written = {kind: str(done[kind]) for kind in kinds if kind in done}
+    report = {"scan": str(scan_dir), "written": written, "failed": failures.why}
+    if failures.first is not None:
+        failures.first.report = report
+    elif as_json:
+        print(json.dumps(report))
+    if written and not as_json:
+        print(*written.values(), sep="\n")
+    for kind, why in list(failures.why.items())[1:]:
+        print(f"not written: {kind}: {why}", file=sys.stderr)
+    if failures.first is not None:
+        raise failures.first
 
 
-def _check_kinds(to: list[str], out: Path | None) -> None:
-    """Raise InputError for a deliverable that there is not, or one file for several."""
-    for kind in to:
-        if kind not in EXPORTERS:
-            raise InputError(f"--to {kind}: there are {', '.join(EXPORTERS)}")
-    if out is not None and len(to) > 1:
-        raise InputError("--out names one file; give one --to with it")
+def product_list() -> str:
+    """A line for each deliverable: its name, its file, what it is."""
+    wide = max(map(len, EXPORTERS)) + 2
+    return "\n".join(
+        f"{kind:<{wide}}{file:<19}{words}" for kind, (_, file, words) in EXPORTERS.items()
+    )
+
+
+export.__doc__ = f"{export.__doc__}\n\n\b\n{product_list()}"
 
 
 def _epoch_ns(seconds: float | None) -> int | None:
@@ -100,7 +124,14 @@ def _epoch_ns(seconds: float | None) -> int | None:
 
 def mesh(
     scan_dir: ScanDir,
-    method: Annotated[str, typer.Option("--method", help="auto, height or poisson")] = "auto",
+    method: Annotated[
+        str,
+        typer.Option(
+            "--method",
+            help="auto, height or poisson",
+            autocompletion=choices(("auto", "height", "poisson")),
+        ),
+    ] = "auto",
     faces: Annotated[int, typer.Option("--faces", min=100, help="triangles at most")] = 400_000,
     voxel_m: Voxel = None,
     video: Annotated[
@@ -121,8 +152,9 @@ def mesh(
     as_json: AsJson = False,
 ) -> None:
     """Mesh and texture a scan into one binary glTF file."""
-    from service.offline.exports.model import MeshOptions, write_mesh
+    from service.offline.exports.model import METHODS, MeshOptions, write_mesh
     from service.offline.exports.view import ExportOptions, ScanView
+    from service.scans.writing import check_writable
 
     try:
         options = ExportOptions(
@@ -133,7 +165,12 @@ def mesh(
         raise InputError(f"mesh: {error}") from error
     if stored and video is not None:
         raise InputError("mesh: give either --video or --stored")
+    if method not in METHODS:
+        raise InputError(f"--method {method}: there are {', '.join(METHODS)}")
+    kind_of("glb", out)
     path = out or scan_dir / "mesh.glb"
+    if scan_dir.is_dir():
+        check_writable(path)
     started = time.monotonic()
     with showing("mesh") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
         figures = write_mesh(scan, path, MeshOptions(method, faces), options)
@@ -168,8 +205,12 @@ def inspect(
 
     from service.offline.exports.view import ScanView
     from service.scans.drawing import middle_keyframe, stages
-    from service.scans.writing import write_whole
+    from service.scans.writing import check_writable, write_whole
 
+    if out is not None and out.suffix.lower() != ".png":
+        raise InputError(f"{out}: the image is written as .png")
+    if scan_dir.is_dir():
+        check_writable(out or scan_dir / "keyframe.png")
     with ScanView(scan_dir) as scan:
         seqs = scan.store.seqs()
         seq = middle_keyframe(scan_dir, scan.store, seqs) if keyframe is None else keyframe
@@ -206,7 +247,9 @@ ACTIONS = ("align", "compare")
 
 
 def site(
-    action: Annotated[str, typer.Argument(help="align or compare")],
+    action: Annotated[
+        str, typer.Argument(help="align or compare", autocompletion=choices(("align", "compare")))
+    ],
     scans: Annotated[list[Path], typer.Argument(help="scan folders; compare: before and after")],
     out: Annotated[Path, typer.Option("--out", help="folder of the site")],
     start: Annotated[

@@ -63,12 +63,14 @@ def demo(
         for process in (ground, *compilers):
             _stop(process)
     report = _figures(out, received, time.monotonic() - began)
-    print(json.dumps(report) if as_json else _in_words(report))
     if report["ground_points"] != report["points"]:
-        raise OutsideError(
+        error = OutsideError(
             f"the ground holds {report['ground_points']} of {report['points']} points; "
             f"see {out / 'ground.log'}"
         )
+        error.report = report
+        raise error
+    print(json.dumps(report) if as_json else _in_words(report))
 
 
 def _say(step: int, what: str) -> None:

@@ -54,7 +54,8 @@ def refine(
     if intrinsics and video is not None:
         if gcp or undo:
             raise InputError("--intrinsics takes --video, --telemetry and --out only")
-        figures = run_intrinsics(scan_dir, video, telemetry, out)
+        with showing("refine") as progress:
+            figures = run_intrinsics(scan_dir, video, telemetry, out, progress)
         print(json.dumps(figures) if as_json else "\n".join(_camera_lines(figures)))
         return
     if undo:
@@ -150,12 +151,17 @@ def refly(
     as_json: AsJson = False,
 ) -> None:
     """Plan a mission over gaps, places in too few images and places of large sigma."""
+    from service.scans.writing import check_writable
 
     path = out or scan_dir / "refly.plan"
     if path.suffix not in (".plan", ".waypoints"):
         raise InputError(f"--out {path}: name it .plan (QGroundControl) or .waypoints")
     if (views is not None and views < 1) or (sigma_m is not None and not sigma_m > 0):
         raise InputError("--views must be at least 1 and --sigma-m positive")
+    if not 0.0 <= overlap <= 0.9:
+        raise InputError(f"--overlap {overlap:g}: give 0 to 0.9")
+    if scan_dir.is_dir():
+        check_writable(path)
     given: dict[str, Any] = {"min_views": views, "max_sigma_m": sigma_m}
     limits = {name: value for name, value in given.items() if value is not None}
     flight = _flight(scan_dir, limits, overlap, relative, photos)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Collection
@@ -16,9 +17,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import AsJson, ConfigFile, Overrides, showing, stop_by_signals
+from service.commands import (
+    BACKENDS,
+    AsJson,
+    ConfigFile,
+    Overrides,
+    choices,
+    showing,
+    stop_by_signals,
+)
 from service.errors import InputError
-from service.progress import Progress
+from service.progress import CancelledError, Progress
 
 if TYPE_CHECKING:
     from mavlink.telemetry.history import HistoryConfig
@@ -28,6 +37,9 @@ if TYPE_CHECKING:
     from service.config import Config
     from service.flight.scan import Scan, ScanInputs
 
+
+PATIENCE_S = 3.0
+"""After a stop: for the keyframe that is in work, and then for the files of the scan."""
 
 LATENCY = "camera.latency_ms"
 WIDTH, STEREO_WIDTH_PX = "compute.stereo_width", 640
@@ -47,7 +59,10 @@ def replay(
         float | None, typer.Option(help="unix seconds of the video's first instant")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="scan folder to make")] = None,
-    backend: Annotated[str | None, typer.Option(help="auto, cpu, torch or onnx")] = None,
+    backend: Annotated[
+        str | None,
+        typer.Option(help="auto, cpu, torch or onnx", autocompletion=choices(BACKENDS)),
+    ] = None,
     realtime: Annotated[
         bool, typer.Option("--realtime", help="at the video's pace; late frames are dropped")
     ] = False,
@@ -66,11 +81,17 @@ def replay(
     from service.cameras import open_camera
     from service.cameras.source import Paced
     from service.config import is_given, load_config
+    from service.flight.scan import check_new
+    from service.scans.writing import check_writable
+    from service.workers import PROCESS
 
     overrides = list(set_ or [])
     if backend is not None:
         overrides.append(f"compute.backend={backend}")
     chosen = load_config(config, overrides)
+    if out is not None:
+        check_new(out)
+        check_writable(out, is_folder=True)
     camera = _load_model(camera_model, chosen)
     log = _load_telemetry(telemetry, chosen) if telemetry else _subtitles(video, chosen)
     source = open_camera(video)
@@ -83,6 +104,10 @@ def replay(
             chosen, as_json, is_given(LATENCY, config, overrides),
         )  # fmt: skip
     _report(summary, as_json)
+    if any(w.row.name == "dense" and not w.is_done for w in PROCESS.table()):
+        # Dropped at a stop: torch aborts a process that ends while it computes.
+        sys.stdout.flush()
+        os._exit(0)
 
 
 def denser(config: Config, source: CameraSource) -> Config:
@@ -245,6 +270,7 @@ def _fly(
     link = open_datalink(store, inputs.config)
     unsure = unsure if link is None else ()
     scan = Scan(inputs, store)
+    scan.pipeline.end_by(stop, PATIENCE_S)
     correction = None
     try:
         work = "tracking and reconstructing"
@@ -259,6 +285,8 @@ def _fly(
         if correction is not None:
             scan.discard()
         else:
+            if stop.is_set():
+                progress("stopped: closing the scan")
             summary = scan.close()
             del scan  # its images and its map
             if link is not None:
@@ -266,9 +294,29 @@ def _fly(
                 summary["datalink_complete"] = link.drain(inputs.config.datalink.drain_s)
                 link.close()
             give_back(collect=True)
-            summary |= write_deliverables(inputs.folder, store, {}, progress=progress)
+            try:
+                summary |= write_deliverables(
+                    inputs.folder, store, {}, progress=_until_stopped(stop, progress)
+                )
+            except CancelledError:
+                summary["failed"] = {"files of the scan": "stopped; exports need scan.db alone"}
             store.close()
     return correction or summary
+
+
+def _until_stopped(stop: Event, progress: Progress) -> Progress:
+    """Progress of work that ends :data:`PATIENCE_S` after a stop, shown by ``progress``."""
+    stopped_s: list[float] = []
+
+    def show(now: Progress) -> None:
+        progress.share = max(progress.share, 0.9 + 0.1 * now.share)
+        progress(now.text)
+        if stop.is_set():
+            stopped_s.append(time.monotonic())
+            if stopped_s[-1] - stopped_s[0] > PATIENCE_S:
+                now.cancel()
+
+    return Progress(show)
 
 
 def _correction(scan: Scan, unsure: Collection[str], has_ended: bool = False) -> _Correction | None:
@@ -328,3 +376,7 @@ def _report(summary: dict[str, Any], as_json: bool) -> None:
     if summary["refusals"]:
         refused = (f"{why} ({n})" for why, n in summary["refusals"].items())
         print(f"frames, views and pairs not used: {', '.join(refused)}")
+    if "quality" in summary:
+        trust = summary["quality"]["trust"]
+        reasons = "; ".join(trust["reasons"]) or "nothing limits it"
+        print(f"trust: {trust['level']}, georeference: {summary['georeference']}: {reasons}")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands import AsJson, ConfigFile, Overrides, showing
+from service.commands import AsJson, ConfigFile, Overrides, choices, showing
 from service.config import keys as configuration_keys
 from service.config import load_config
 from service.errors import InputError, OutsideError
@@ -20,7 +20,9 @@ ACTIONS = ("check", "show", "default")
 
 
 def config(
-    action: Annotated[str, typer.Argument(help="check, show or default")],
+    action: Annotated[
+        str, typer.Argument(help="check, show or default", autocompletion=choices(ACTIONS))
+    ],
     file: Annotated[Path | None, typer.Argument(help="configuration file (TOML)")] = None,
     set_: Overrides = None,
     as_json: AsJson = False,
@@ -75,6 +77,9 @@ def doctor(
     ] = None,
     set_: Overrides = None,
     listen_s: Annotated[float, typer.Option(help="seconds to listen on the MAVLink links")] = 3.0,
+    desk: Annotated[
+        bool, typer.Option("--desk", help="only what replay, exports and the ground station need")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Report what works, what does not, and the remedy. Exit code 3 when something is bad."""
@@ -82,15 +87,19 @@ def doctor(
 
     chosen = config or (INSTALLED if INSTALLED.is_file() else None)
     findings = []
-    for finding in examine(load_config(chosen, set_ or []), listen_s):
+    for finding in examine(load_config(chosen, set_ or []), None if desk else listen_s):
         findings.append(finding)
         if not as_json:
             print(f"{finding.verdict.value:<4}  {finding.what:<13}{finding.text}", flush=True)
     bad = [finding.what for finding in findings if finding.verdict is BAD]
-    if as_json:
-        print(json.dumps({"ok": not bad, "findings": [asdict(f) for f in findings]}))
+    report = {"ok": not bad, "findings": [asdict(f) for f in findings]}
     if bad:
-        raise OutsideError(f"not ready to fly: {', '.join(dict.fromkeys(bad))}")
+        ready = "for the desk" if desk else "to fly"
+        error = OutsideError(f"not ready {ready}: {', '.join(dict.fromkeys(bad))}")
+        error.report = report
+        raise error
+    if as_json:
+        print(json.dumps(report))
 
 
 def keys(

@@ -170,6 +170,7 @@ def simulate(given: SimulateOptions) -> None:
     --live plays it in real time, as a camera's stream and an autopilot's MAVLink. A flight that
     exists is not rendered again.
     """
+    from service.scans.writing import filling_folder
     from service.sim import recording
 
     if given.live and (given.out / "flight.mp4").exists():
@@ -177,16 +178,29 @@ def simulate(given: SimulateOptions) -> None:
         return
     started = time.monotonic()
     try:
-        simulation = recording.prepare(given.simulation())
+        options = given.simulation()
+        _check_new(given.out)
+        with showing("simulate") as progress:
+            progress("laying out the site")
+            simulation = recording.prepare(options)
     except ValueError as error:
         raise InputError(f"simulate: {error}") from error
-    with showing("simulate") as progress:
-        result = recording.write(simulation, given.out, partial(_frames, progress))
+    with showing("simulate") as progress, filling_folder(given.out) as part:
+        result = recording.write(simulation, part, partial(_frames, progress))
     if not given.live:
         _report(given.out, result, time.monotonic() - started, given.as_json)
         return
     print(f"{given.out}: {result['frames']} frames rendered", file=sys.stderr)
     _play(given)
+
+
+def _check_new(folder: Path) -> None:
+    """Raise InputError when ``folder`` holds a flight; OutsideError when it cannot be written."""
+    from service.scans.writing import check_writable
+
+    if any((folder / name).exists() for name in ("flight.mp4", "truth")):
+        raise InputError(f"{folder} already holds a flight; give another folder with --out")
+    check_writable(folder, is_folder=True)
 
 
 def _play(given: SimulateOptions) -> None:
@@ -253,7 +267,8 @@ def score(
     """Measure accuracy, completeness and trajectory error of a scan of a simulated flight."""
     from service.sim import scoring
 
-    report = scoring.score(scan_dir, truth_dir, deliverables)
+    with showing("score") as progress:
+        report = scoring.score(scan_dir, truth_dir, deliverables, progress)
     print(json.dumps(report) if as_json else _text(report))
 
 

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.commands import AsJson, parse_size
+from service.commands import BACKENDS, AsJson, choices, parse_size
 from service.compute.rectified_pair import matching_config, read_gray
 from service.errors import InputError, OutsideError
 from service.packages import needing
+from service.scans.writing import check_writable
 
 if TYPE_CHECKING:
     from recon.backends import Backend
@@ -26,7 +27,10 @@ def stereo(
     out: Annotated[Path, typer.Option(help="float32 (h, w) pixels, NaN = unknown (.npy)")],
     min_disparity: Annotated[int, typer.Option(help="the smallest disparity, px")] = 0,
     iterations: Annotated[int, typer.Option(help="of belief propagation, per level")] = 5,
-    backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "auto",
+    backend: Annotated[
+        str,
+        typer.Option(help="auto, cpu, torch or onnx", autocompletion=choices(BACKENDS)),
+    ] = "auto",
     model: Annotated[
         Path | None, typer.Option(help="TOML file of a learned model to use instead")
     ] = None,
@@ -84,6 +88,7 @@ def check_output(path: Path, suffix: str) -> None:
         raise InputError(f"{path}: the name must end in {suffix}")
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")
+    check_writable(path)
 
 
 def write(out: Path, image: Path | None, px: F32, labels: int, min_disparity: int) -> None:

@@ -27,7 +27,7 @@ from service.daemon.simulated import is_simulated
 from service.daemon.vehicle_config import vehicle_config, watch_config
 from service.daemon.warm_up import is_warm, warm_up_command
 from service.errors import InputError, SkyreliefError
-from service.packages import unusable_packages
+from service.packages import installs, unusable_packages
 from service.scans.retention import existing
 
 if TYPE_CHECKING:
@@ -35,6 +35,15 @@ if TYPE_CHECKING:
     from recon.types import Camera
 
 CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", "eclipse-zenoh")
+DESK = {
+    "maps": ("rasterio",),
+    "clouds": ("copclib", "py3dtiles"),
+    "meshes": ("trimesh", "open3d"),
+    "recordings": ("foxglove", "rosbags", "mcap"),
+    "flight logs": ("pyulog",),
+    "portal": ("starlette", "uvicorn", "websockets"),
+}
+"""What a desk makes, and the optional packages for it."""
 NEEDED_MIB = {"disk": 1000.0, "memory": 700.0}
 HOT_C = 85.0
 SOON_DAYS = 30  # a certificate that expires sooner gives a note
@@ -80,8 +89,16 @@ class Finding:
     text: str
 
 
-def examine(config: Config, listen_s: float) -> Iterator[Finding]:
-    """Every finding, as soon as it is available."""
+def examine(config: Config, listen_s: float | None) -> Iterator[Finding]:
+    """Every finding, as soon as it is available.
+
+    Without seconds to listen on the links only what a desk needs: no camera, no vehicle, no
+    datalink, but the packages of the products.
+    """
+    if listen_s is None:
+        for check in (_software, _products, _clock, lambda: _compute(config)):
+            yield from check()
+        return
     running = running_service(config.health.http) if config.health.http else None
     checks: tuple[Callable[[], Iterator[Finding]], ...] = (
         _software,
@@ -121,6 +138,17 @@ def _software() -> Iterator[Finding]:
         yield Finding(
             "packages", BAD, f"another package shadows one of ours ({where}); use a fresh venv"
         )
+
+
+def _products() -> Iterator[Finding]:
+    """Which products the optional packages allow."""
+    for what, packages in DESK.items():
+        missing = [name for name in packages if find_spec(name) is None]
+        if missing:
+            remedy = f"pip install {' '.join(dict.fromkeys(map(installs, missing)))}"
+            yield Finding(what, NOTE, f"needs {', '.join(missing)}; {remedy}")
+        else:
+            yield Finding(what, GOOD, ", ".join(packages))
 
 
 def _parent(name: str) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from threading import Event
 
 from recon.posegraph.trajectory import Placed
 from recon.tracking.odometry import Tracked, Tracking
@@ -131,6 +132,10 @@ class Pipeline:
             self.stages.chain.reconstructed(view, keyframe)
         self.stages.chain.settle()
         return tuple(keyframe for _, keyframe in done if keyframe is not None)
+
+    def end_by(self, stop: Event, patience_s: float) -> None:
+        """Drop unfinished reconstructions, at most ``patience_s`` after ``stop`` is set."""
+        self._background.end_by(stop, patience_s)
 
     # ---- in flight ---------------------------------------------------------------------
 

@@ -152,5 +152,6 @@ def _home_distance(place: dict[str, Any], home: dict[str, Any]) -> float | None:
     if lat is None or lon is None or home_lat is None or home_lon is None:
         return None
     north = math.radians((lat - home_lat) * 1e-7)
-    east = math.radians((lon - home_lon) * 1e-7) * math.cos(math.radians(lat * 1e-7))
+    turned = ((lon - home_lon) * 1e-7 + 180.0) % 360.0 - 180.0
+    east = math.radians(turned) * math.cos(math.radians(lat * 1e-7))
     return round(EARTH_M * math.hypot(north, east), 1)

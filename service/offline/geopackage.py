@@ -46,6 +46,7 @@ class Layer:
     shapes: Sequence[bytes]
     places: Sequence[F64]  # (N, 2) each
     columns: Columns
+    with_heights: int = 0  # whether the shapes have them
 
 
 def polygons(table: str, shapes: Sequence[Sequence[Sequence[F64]]], columns: Columns) -> Layer:
@@ -58,8 +59,9 @@ def polygons(table: str, shapes: Sequence[Sequence[Sequence[F64]]], columns: Col
 
 
 def lines(table: str, shapes: Sequence[F64], columns: Columns) -> Layer:
-    """A layer of lines, (N, 2) map metres each."""
-    return Layer(table, "LINESTRING", [_line(line) for line in shapes], shapes, columns)
+    """A layer of lines, (N, 3) each: map metres and heights."""
+    places = [line[:, :2] for line in shapes]
+    return Layer(table, "LINESTRING", [_line(line) for line in shapes], places, columns, 1)
 
 
 def points(table: str, places: F64, columns: Columns) -> Layer:
@@ -102,7 +104,8 @@ def _put(db: sqlite3.Connection, epsg: int, layer: Layer) -> None:
         (table, table, *box, epsg),
     )
     db.execute(
-        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", (table, kind, epsg)
+        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, ?, 0)",
+        (table, kind, epsg, layer.with_heights),
     )
     typed = "".join(f', "{n}" {of}' for n, of in kinds.items())
     db.execute(
@@ -127,5 +130,5 @@ def _polygons(polygons: Sequence[Sequence[F64]]) -> bytes:
 
 
 def _line(line: F64) -> bytes:
-    """A LineString as little-endian WKB."""
-    return struct.pack("<BII", 1, 2, len(line)) + np.asarray(line, "<f8").tobytes()
+    """A LineString Z as little-endian WKB."""
+    return struct.pack("<BII", 1, 1002, len(line)) + np.asarray(line, "<f8").tobytes()

@@ -26,7 +26,7 @@ from recon.surface.raster import Raster, grid_over, rasterise
 from recon.types import PointCloud
 from service.errors import OutsideError, SkyreliefError
 from service.memory import give_back
-from service.progress import Progress
+from service.progress import CancelledError, Progress
 from service.redaction import public_configuration, redacted
 from service.scans.coverage import IMAGE as COVERAGE
 from service.scans.coverage import Coverage, write_coverage_files
@@ -282,24 +282,33 @@ class _Files:
 class Failures:
     """The files of a scan that could not be made, and why. A failure affects one file only."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, level: int = logging.ERROR) -> None:
+        """``level`` is that of the log's line about a failure; of a fault it is an error."""
+        self._folder, self._level = folder, level
         self.why: dict[str, str] = {}
         self.of_the_disk: OutsideError | None = None  # the first one; it justifies another attempt
+        self.first: SkyreliefError | None = None
 
     @contextmanager
     def noted(self, name: str) -> Iterator[None]:
         """Run the block that makes the file ``name``; note its exception."""
         try:
             yield
+        except CancelledError:
+            raise
         except Exception as error:  # a corrupt scan must not stop the other files
             if isinstance(error, OutsideError) and self.of_the_disk is None:
                 self.of_the_disk = error
             first, *_ = str(error).strip().splitlines() or [""]
             known = isinstance(error, SkyreliefError)
             why = first if known else f"{type(error).__name__}: {first}"
+            as_said = (
+                error if isinstance(error, SkyreliefError) else SkyreliefError(f"{name}: {why}")
+            )
+            self.first = self.first or as_said
             self.why.setdefault(name, why[:LONGEST_REASON])
-            log.error("%s is not written: %s", self._folder / name, why, exc_info=not known)
+            level = self._level if known else logging.ERROR
+            log.log(level, "%s is not written: %s", self._folder / name, why, exc_info=not known)
 
 
 def files_due(folder: Path) -> bool:

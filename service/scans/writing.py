@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from service.errors import OutsideError
+from service.errors import InputError, OutsideError
 
 
 @contextmanager
@@ -47,6 +47,42 @@ def writing_folder(path: Path) -> Iterator[Path]:
         if path.is_dir():
             shutil.rmtree(path)
         os.replace(part, path)
+
+
+@contextmanager
+def filling_folder(path: Path) -> Iterator[Path]:
+    """An empty folder inside the folder ``path``, whose content moves there on success; otherwise
+    nothing of it stays.
+
+    A disk failure becomes an OutsideError.
+    """
+    is_new = not path.exists()
+    try:
+        with _beside(path / "new") as part:
+            part.mkdir()
+            yield part
+            for one in sorted(part.iterdir(), key=lambda one: one.is_file()):
+                os.replace(one, path / one.name)
+    finally:
+        if is_new:
+            with suppress(OSError):  # it holds what was made, or was never there
+                path.rmdir()
+
+
+def check_writable(path: Path, is_folder: bool = False) -> None:
+    """Raise InputError, before any work, where no file (or folder) can be written at ``path``.
+
+    OutsideError where rights are missing.
+    """
+    if path.exists() and path.is_dir() != is_folder:
+        raise InputError(f"{path} is a {'file' if is_folder else 'folder'}; give another --out")
+    there = path if path.is_dir() else path.parent
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir():
+        raise InputError(f"{path}: {there} is a file, not a folder; give another --out")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise OutsideError(f"cannot write {path}: no rights to write in {there}")
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -49,11 +50,17 @@ class ScanResult:
     placed: bool  # False: coordinates are the scan's own
 
 
-def score(scan_folder: Path, truth_folder: Path, deliverables: bool = False) -> dict[str, Any]:
+def score(
+    scan_folder: Path,
+    truth_folder: Path,
+    deliverables: bool = False,
+    say: Callable[[str], object] = lambda text: None,
+) -> dict[str, Any]:
     """All figures of a scan against the truth, ready for JSON; InputError for missing parts.
 
     With ``deliverables`` the exported files in the scan folder are measured too.
     """
+    say("reading the truth and the scan")
     truth = read_truth(truth_folder)
     scan = read_scan(scan_folder, truth.frame)
     at_truth, known = metrics.poses_at(truth.times_s, truth.poses, scan.times_s)
@@ -70,6 +77,7 @@ def score(scan_folder: Path, truth_folder: Path, deliverables: bool = False) -> 
             f"{scan_folder}: no pose lies within the flight's time and there is no georeference; "
             "was the scan made from this flight's video?"
         )
+    say("comparing trajectory and surface")
     fits = _fits(scan, truth, at_truth, known)
     report["trajectory"] = {
         name: asdict(metrics.trajectory_errors(fit.poses(scan.poses[known]), at_truth[known]))
@@ -84,11 +92,13 @@ def score(scan_folder: Path, truth_folder: Path, deliverables: bool = False) -> 
     # A wrong scale moves the rim of a placed map: only the similarity shows what else is wrong.
     chosen = fits["surface"] if scan.placed else {best: fits["surface"][best]}
     report["dsm"] = {name: _dsm(scan, truth, fit) for name, fit in chosen.items()}
+    say("completeness")
     seen = seen_surface(truth)
     report["completeness"] = _completeness(scan, truth, seen, fits["surface"][best])
     for name, fit in fits["surface"].items():
         report["surface"][name]["fit"] = _fit_size(fit, scan.points)
     if deliverables:
+        say("measuring the exported files")
         report["deliverables"] = score_files(scan_folder, truth, seen.places, chosen)
     return report
 

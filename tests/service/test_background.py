@@ -124,3 +124,22 @@ def test_a_fault_at_the_end_of_a_scan_leaves_no_thread_behind() -> None:
     with pytest.raises(RuntimeError, match="no luck"):
         pipeline.finish()
     assert not any(t.name == "dense" for t in threading.enumerate())
+
+
+def test_after_an_end_nothing_waits_for_work_that_lasts() -> None:
+    gate, end = threading.Event(), threading.Event()
+
+    def work(n: int) -> int:
+        if n == 1:
+            end.set()
+            gate.wait(60)
+        return n
+
+    jobs = BackgroundWorker("dense", work, 2)
+    jobs.end_by(end, patience_s=0.01)
+    for n in range(9):  # the fifth would wait for the second
+        jobs.offer(n)
+    kept = jobs.finished(everything=True)
+    jobs.close()
+    assert kept == [(0, 0)] and jobs.dropped == 8
+    gate.set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,3 +87,17 @@ class HouseFlight:
             store.add_keyframe(seq, encode(one, one.time_ns))
             store.add_pose(self.record(seq, 5.0 * seq))
         return store
+
+
+class HillsideFlight(HouseFlight):
+    """The same flight over ground that rises to the north, without a house."""
+
+    slope = 0.15
+
+    def keyframe(self, seq: int, east_m: float, sigma_m: float = 0.05) -> Keyframe:
+        """The exact view of the camera."""
+        one = super().keyframe(seq, east_m, sigma_m)
+        h, w = one.depth.depth_m.shape
+        b = (np.arange(h) - self.K[1, 2]) / self.K[1, 1]
+        depth_m = np.repeat(self.height_m / (1.0 - self.slope * b)[:, None], w, axis=1)
+        return replace(one, depth=replace(one.depth, depth_m=depth_m.astype(np.float32)))

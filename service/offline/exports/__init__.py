@@ -6,44 +6,104 @@ writes ``out`` whole or not at all. The next kind is one file and one line in EX
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
+from service.errors import InputError
+
 EXPORTERS: dict[str, tuple[str, str, str]] = {
-    "ply": ("clouds:write_ply", "cloud.ply", "Fused cloud, binary PLY, UTM."),
-    "laz": ("clouds:write_laz_file", "cloud.laz", "Fused cloud, LAZ 1.4."),
-    "copc": ("clouds:write_copc", "cloud.copc.laz", "Cloud-optimised LAZ."),
-    "dsm": ("rasters:write_dsm", "dsm.tif", "Surface model, GeoTIFF (COG)."),
-    "dtm": ("rasters:write_dtm", "dtm.tif", "Bare ground, GeoTIFF (COG)."),
-    "ortho": ("rasters:write_ortho", "ortho.tif", "Orthophoto, GeoTIFF (COG)."),
-    "contours": (
-        "rasters:write_contours",
-        "contours.geojson",
-        "Height contours, GeoJSON.",
+    "ply": ("clouds:write_ply", "cloud.ply", "The cloud in UTM, as binary PLY."),
+    "laz": (
+        "clouds:write_laz_file",
+        "cloud.laz",
+        "The cloud in UTM as LAZ 1.4, with sigma and views.",
     ),
-    "gpkg": ("maps:write_contours_gpkg", "contours.gpkg", "Contours, GeoPackage, UTM."),
-    "dxf": ("maps:write_contours_dxf", "contours.dxf", "Contours, DXF, UTM."),
+    "copc": ("clouds:write_copc", "cloud.copc.laz", "The same as a cloud-optimised octree."),
+    "dsm": (
+        "rasters:write_dsm",
+        "dsm.tif",
+        "Heights with buildings and trees, as GeoTIFF.",
+    ),
+    "dtm": ("rasters:write_dtm", "dtm.tif", "Heights of the ground without them, as GeoTIFF."),
+    "ortho": ("rasters:write_ortho", "ortho.tif", "The true orthophoto, as GeoTIFF."),
+    "contours": (
+        "contours:write_contours",
+        "contours.geojson",
+        "Contours of the bare ground, as GeoJSON; or .gpkg, .dxf.",
+    ),
+    "gpkg": ("contours:write_contours_gpkg", "contours.gpkg", "The same as GeoPackage, in UTM."),
+    "dxf": ("contours:write_contours_dxf", "contours.dxf", "The same as DXF for CAD, in UTM."),
     "coverage": (
         "rasters:write_coverage",
         "coverage.tif",
-        "Views, sigma, height, COG.",
+        "Views, sigma and height of the ground, as GeoTIFF.",
     ),
-    "geojson": ("flight:write_geojson", "flight.geojson", "The flight, GeoJSON."),
-    "kmz": ("maps:write_kmz", "ortho.kmz", "Orthophoto for Google Earth."),
-    "stac": ("maps:write_stac", "stac.json", "STAC item of the rasters."),
-    "kml": ("flight:write_kml", "flight.kml", "The flight, KML."),
+    "geojson": (
+        "flight:write_geojson",
+        "flight.geojson",
+        "The track and keyframes, as GeoJSON.",
+    ),
+    "kmz": ("maps:write_kmz", "ortho.kmz", "The orthophoto for Google Earth."),
+    "stac": ("maps:write_stac", "stac.json", "A STAC item of the rasters in its folder."),
+    "kml": ("flight:write_kml", "flight.kml", "The track for Google Earth."),
     "colmap": (
         "colmap:write_colmap",
         "colmap",
-        "COLMAP text model: frames, poses, tracks.",
+        "Frames, poses and tracks for COLMAP.",
     ),
-    "3dtiles": ("clouds:write_tiles", "3dtiles", "Point tiles for Cesium."),
+    "3dtiles": ("clouds:write_tiles", "3dtiles", "The cloud as 3D Tiles, for Cesium."),
     "3dtiles-mesh": (
         "model:write_mesh_tiles",
         "3dtiles-mesh",
-        "Textured mesh, 3D Tiles 1.1.",
+        "The textured mesh as 3D Tiles.",
     ),
-    "glb": ("model:write_glb", "mesh.glb", "Textured mesh, binary glTF."),
-    "obj": ("model:write_obj", "mesh-obj", "Textured mesh, OBJ, UTM less an offset."),
-    "all": ("maps:write_all", "maps", "Clouds and maps with a manifest, one folder."),
-    "mcap": ("recording:write_mcap", "flight.mcap", "Recording for Foxglove."),
-    "ros2": ("ros2:write_ros2", "ros2.mcap", "Recording for ROS 2 (CDR)."),
+    "glb": ("model:write_glb", "mesh.glb", "The textured mesh as binary glTF."),
+    "obj": ("model:write_obj", "mesh-obj", "The textured mesh as OBJ, in UTM less an offset."),
+    "all": ("maps:write_all", "maps", "laz and the maps in one folder, with a manifest."),
+    "mcap": ("recording:write_mcap", "flight.mcap", "The scan as a recording for Foxglove."),
+    "ros2": ("ros2:write_ros2", "ros2.mcap", "The scan as ROS 2 messages."),
 }
 """Name to (``module:function`` of this package, usual name in the folder, one line of help)."""
+
+MAPPED = ("contours", "gpkg", "dxf", "geojson", "kml", "kmz", "stac", "3dtiles", "3dtiles-mesh")
+"""Kinds that need a georeference."""
+
+PACKAGES = {
+    "copc": ("copclib",),
+    "3dtiles": ("py3dtiles",),
+    "mcap": ("foxglove",),
+    "ros2": ("rosbags", "mcap"),
+} | dict.fromkeys(("dsm", "dtm", "ortho", "coverage", "kmz", "stac", "all"), ("rasterio",))
+"""Optional packages of kinds."""
+
+ENDINGS = {
+    "contours": {".json": "contours", ".gpkg": "gpkg", ".dxf": "dxf"},
+    "laz": {".las": "laz"},
+} | {kind: {".tiff": kind} for kind in ("dsm", "dtm", "ortho", "coverage")}
+"""Endings of a file besides the usual one, with the kind that writes it."""
+
+
+def kind_of(kind: str, out: Path | None) -> str:
+    """The kind that writes ``out``, whose ending decides the format.
+
+    Raises InputError for an unknown kind, and for an ending that is not of this kind.
+    """
+    if kind not in EXPORTERS:
+        raise InputError(f"cannot export to {kind!r}; there are {', '.join(EXPORTERS)}")
+    usual = EXPORTERS[kind][1]
+    ending = "".join(Path(usual).suffixes)
+    if out is None:
+        return kind
+    if not ending:
+        if re.fullmatch(r"\.[a-z]+[0-9]?", out.suffix.lower()):
+            raise InputError(f"{out}: {kind} is a folder; give its name without {out.suffix}")
+        return kind
+    if out.name.lower().endswith(ending):
+        return kind
+    known = ENDINGS.get(kind, {})
+    if out.suffix.lower() in known:
+        return known[out.suffix.lower()]
+    endings = " or ".join([ending, *known])
+    others = [k for k, (_, name, _) in EXPORTERS.items() if Path(name).suffix == out.suffix.lower()]
+    hint = f"; {out.suffix} is --to {' or '.join(others)}" if others and out.suffix else ""
+    raise InputError(f"{out}: {kind} is written as {endings}{hint}")

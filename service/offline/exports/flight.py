@@ -12,7 +12,7 @@ import numpy as np
 
 from recon import se3
 from recon.types import F64
-from service.georeference import LocalFrame
+from service.georeference import LocalFrame, line_geometry
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
 from service.scans.writing import write_whole
@@ -35,15 +35,14 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """The track as one line, and a point per keyframe with its time, attitude and sigma."""
     frame = scan.needs_place("a map of the flight")
     geodetic = _geodetic(scan, frame)
-    places = [[round(g[1], 8), round(g[0], 8), round(g[2], 3)] for g in geodetic.tolist()]
     header = scan.store.header
     features: list[dict[str, Any]] = []
-    if len(places) > 1:
+    if len(geodetic) > 1:
         features.append(
             {
                 "type": "Feature",
                 "properties": {"scan": header.scan_id, "drone": header.drone},
-                "geometry": {"type": "LineString", "coordinates": places},
+                "geometry": line_geometry(geodetic[:, [1, 0, 2]]),
             }
         )
     for one in main_keyframes(scan.store):

@@ -1,10 +1,12 @@
-"""Contours for GIS and CAD, KMZ of the orthophoto, the STAC item; all maps in one folder."""
+"""KMZ of the orthophoto, the STAC item; all maps in one folder."""
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import logging
+import math
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,57 +17,19 @@ import numpy as np
 
 from recon.bands import at_once
 from recon.types import F32, F64
-from service.errors import InputError, SkyreliefError
-from service.georeference import between_nodes
+from service.errors import InputError
+from service.georeference import between_nodes, unwrapped
 from service.offline.exports import EXPORTERS
 from service.offline.exports.flight import iso_time
-from service.offline.exports.rasters import contours_of, open_map, write_ortho
-from service.offline.exports.view import ExportOptions, ScanView, export
-from service.offline.geopackage import lines, points, write_layers
-from service.scans.annotations import read_annotations
+from service.offline.exports.rasters import open_map, write_ortho
+from service.offline.exports.view import ExportOptions, ScanView, check, export
+from service.scans.folder import Failures
 from service.scans.track import flown_datum
 from service.scans.writing import write_whole, writing
 from service.version import software
 
-log = logging.getLogger(__name__)
-
 MAX_OVERLAY_PX = 4096
 JPEG_QUALITY = 85
-
-
-def write_contours_dxf(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Contours as 3D polylines of DXF R12 in UTM metres; a layer per height."""
-    rows = ["0", "SECTION", "2", "ENTITIES"]
-    for height_m, line in contours_of(scan, options):
-        layer = f"CONTOUR_{height_m:g}".replace("-", "M").replace(".", "_")
-        rows += ["0", "POLYLINE", "8", layer, "66", "1", "70", "8", "10", "0", "20", "0", "30", "0"]
-        for x, y in line.tolist():
-            place = ["10", f"{x:.3f}", "20", f"{y:.3f}", "30", f"{height_m:.3f}"]
-            rows += ["0", "VERTEX", "8", layer, *place, "70", "32"]
-        rows += ["0", "SEQEND", "8", layer]
-    write_whole(out, "\n".join([*rows, "0", "ENDSEC", "0", "EOF", ""]))
-
-
-def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Contours and annotations as a GeoPackage: a layer each, in the scan's UTM zone."""
-    frame = scan.needs_place("a contour map")
-    found = contours_of(scan, options)
-    heights = {options.height_key: [height_m for height_m, _ in found]}
-    layers = [lines("contours", [line for _, line in found], heights)]
-    notes = read_annotations(scan.folder).features
-    if notes:
-        spots = np.array([one.geometry.coordinates for one in notes])[:, [1, 0, 2]]
-        if frame.heights is not None:
-            spots = frame.heights(spots)
-        about = {
-            options.height_key: spots[:, 2].tolist(),
-            "text": [one.properties.text for one in notes],
-            "by": [one.properties.by for one in notes],
-            "made_unix_s": [one.properties.made_unix_s for one in notes],
-        }
-        places = frame.to_utm(frame.to_enu(spots))[:, :2]
-        layers.append(points("annotations", places, about))
-    write_layers(out, frame.epsg, layers)
 
 
 def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -92,16 +56,14 @@ def _in_degrees(path: Path) -> tuple[Any, tuple[float, float, float, float]]:
     """(h, w, 4) BGRA of a raster in longitude and latitude, and its bounds in degrees."""
     from pyproj import Transformer
     from rasterio.enums import Resampling
-    from rasterio.transform import array_bounds
-    from rasterio.warp import calculate_default_transform
 
     with open_map(path, 4) as image:
-        to, w, h = calculate_default_transform(
-            image.crs, "EPSG:4326", image.width, image.height, *image.bounds
-        )
-        shrink = max(1.0, max(w, h) / MAX_OVERLAY_PX)
-        w, h = round(w / shrink), round(h / shrink)
-        to = to * to.scale(shrink)
+        west, south, east, north = _box_in_degrees(image)
+        # Square in degrees, and as many along the diagonal as the raster has.
+        pixel = math.hypot(east - west, north - south) / math.hypot(image.width, image.height)
+        pixel = max(pixel, max(east - west, north - south) / MAX_OVERLAY_PX)
+        w, h = max(1, round((east - west) / pixel)), max(1, round((north - south) / pixel))
+        shrink = max(1.0, max(image.width, image.height) / MAX_OVERLAY_PX)
         size = round(image.height / shrink), round(image.width / shrink)
         bands = image.read(out_shape=(4, *size), resampling=Resampling.average)
         to_map = Transformer.from_crs("EPSG:4326", image.crs, always_xy=True)
@@ -113,11 +75,25 @@ def _in_degrees(path: Path) -> tuple[Any, tuple[float, float, float, float]]:
         cols, rows = from_map * np.array(to_map.transform(*lon_lat.T))
         return np.column_stack([cols - 0.5, rows - 0.5]).astype(np.float32)
 
-    lon, lat = to.c + to.a * (np.arange(w) + 0.5), to.f + to.e * (np.arange(h) + 0.5)
+    lon = west + (east - west) * (np.arange(w) + 0.5) / w
+    lat = north - (north - south) * (np.arange(h) + 0.5) / h
     x, y = between_nodes(lon, lat, pixels)
     bgra = np.ascontiguousarray(bands[[2, 1, 0, 3]].transpose(1, 2, 0))
-    west, south, east, north = array_bounds(h, w, to)
     return cv2.remap(bgra, x, y, cv2.INTER_LINEAR), (west, south, east, north)
+
+
+def _box_in_degrees(image: Any) -> tuple[float, float, float, float]:
+    """West, south, east and north of a map; across 180 degrees one longitude lies beyond it."""
+    from pyproj import Transformer
+
+    west, south, east, north = image.bounds
+    side = np.linspace(0.0, 1.0, 33)[:, None]
+    corners = np.array([[west, north], [east, north], [east, south], [west, south], [west, north]])
+    border = np.concatenate([a + side * (b - a) for a, b in itertools.pairwise(corners)])
+    to_degrees = Transformer.from_crs(image.crs, "EPSG:4326", always_xy=True)
+    lon, lat = to_degrees.transform(*border.T)
+    lon = unwrapped(lon)
+    return float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())
 
 
 RASTERS = {"ortho.tif": "visual", "dsm.tif": "data", "dtm.tif": "data", "coverage.tif": "data"}
@@ -133,9 +109,7 @@ def write_stac(scan: ScanView, out: Path, options: ExportOptions) -> None:
         raise InputError(f"{folder} contains no raster; export dsm or ortho first")
     corners = np.concatenate([a.pop("corners") for a in found.values()])
     geodetic = frame.to_geodetic(frame.from_utm(corners))
-    south, west = geodetic[:, :2].min(axis=0).tolist()
-    north, east = geodetic[:, :2].max(axis=0).tolist()
-    ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    bbox, geometry = _extent(geodetic[:, 0], geodetic[:, 1])
     times = [p.time_unix_ns for p in scan.poses] or [scan.store.header.started_unix_ns]
     start, end = iso_time(min(times)), iso_time(max(times))
     item = {
@@ -145,8 +119,8 @@ def write_stac(scan: ScanView, out: Path, options: ExportOptions) -> None:
             "https://stac-extensions.github.io/projection/v1.1.0/schema.json",
         ],
         "id": scan.store.header.scan_id,
-        "bbox": [west, south, east, north],
-        "geometry": {"type": "Polygon", "coordinates": [ring]},
+        "bbox": bbox,
+        "geometry": geometry,
         "properties": {
             "datetime": start,
             "start_datetime": start,
@@ -158,6 +132,19 @@ def write_stac(scan: ScanView, out: Path, options: ExportOptions) -> None:
         "assets": {Path(name).stem: asset for name, asset in found.items()},
     }
     write_whole(out, json.dumps(item, indent=1))
+
+
+def _extent(lat_deg: F64, lon_deg: F64) -> tuple[list[float], dict[str, Any]]:
+    """Box and GeoJSON polygon of places; across 180 degrees west is above east and the polygon is
+    cut (RFC 7946, 3.1.9 and 5.2)."""
+    lon = unwrapped(lon_deg)
+    low, high, south, north = (float(f(v)) for v in (lon, lat_deg) for f in (np.min, np.max))
+    west, east = ((v + 180.0) % 360.0 - 180.0 for v in (low, high))
+    sides = [(west, east)] if west <= east else [(west, 180.0), (-180.0, east)]
+    rings = [[[[w, south], [e, south], [e, north], [w, north], [w, south]]] for w, e in sides]
+    if len(rings) == 1:
+        return [west, south, east, north], {"type": "Polygon", "coordinates": rings[0]}
+    return [west, south, east, north], {"type": "MultiPolygon", "coordinates": rings}
 
 
 def _asset(path: Path, role: str) -> dict[str, Any]:
@@ -188,48 +175,48 @@ MANIFEST = "manifest.json"
 def write_all(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """MAPS into the folder ``out``; ``manifest.json`` lists files, sizes, SHA-256 and failures.
 
-    A kind that fails does not stop the others. Raises the last error when none is written.
+    Raises the first error when none is written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    done: dict[str, Path | SkyreliefError] = {}
-
-    def write(view: ScanView, kind: str) -> None:
-        try:
-            done[kind] = export(view, kind, out / EXPORTERS[kind][1], options)
-        except SkyreliefError as error:
-            log.warning("%s is left out: %s", kind, error)
-            done[kind] = error
-
-    _in_two_branches(scan, MAPS, write)
-    failures = {k: error for k in MAPS if isinstance(error := done[k], SkyreliefError)}
-    if len(failures) == len(MAPS):
-        raise failures[MAPS[-1]]
+    failures = Failures(out, logging.WARNING)
+    done = write_kinds(scan, MAPS, lambda kind: out / EXPORTERS[kind][1], options, failures)
+    if not done and failures.first is not None:
+        raise failures.first
     frame = scan.frame
     document = {
         "scan": scan.store.header.scan_id,
         "software": software(),
         "epsg": None if frame is None else frame.epsg,
         "heights": _heights(scan, options),
-        "files": [_entry(k, path) for k in MAPS if isinstance(path := done[k], Path)],
-        "failed": {kind: str(error) for kind, error in failures.items()},
+        "files": [_entry(kind, done[kind]) for kind in MAPS if kind in done],
+        "failed": failures.why,
     }
-    (out / MANIFEST).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_whole(out / MANIFEST, json.dumps(document, indent=1) + "\n")
 
 
 def write_kinds(
     scan: ScanView,
     kinds: Sequence[str],
-    out: Path | None,
+    path_of: Callable[[str], Path],
     options: ExportOptions,
-    done: dict[str, Path],
-) -> None:
-    """Write some kinds, those from images at the same time as the others; ``done`` takes each
-    one's path. Raises the first error, after the other branch has ended."""
+    failures: Failures,
+) -> dict[str, Path]:
+    """Write some kinds, those from images at the same time as the others.
+
+    Returns the path of each that is written; ``failures`` takes the others: one never ends
+    another. What can be checked is checked before the first is made.
+    """
+    done: dict[str, Path] = {}
 
     def write(view: ScanView, kind: str) -> None:
-        done[kind] = export(view, kind, out, options)
+        with failures.noted(kind):
+            done[kind] = export(view, kind, path_of(kind), options)
 
-    _in_two_branches(scan, kinds, write)
+    for kind in kinds:
+        with failures.noted(kind):
+            check(scan, kind, path_of(kind), options)
+    _in_two_branches(scan, [kind for kind in kinds if kind not in failures.why], write)
+    return done
 
 
 def _in_two_branches(

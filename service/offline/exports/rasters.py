@@ -1,8 +1,7 @@
-"""Surface model, orthophoto and contours, as Cloud Optimized GeoTIFF and GeoJSON."""
+"""Surface model, bare ground and orthophoto as Cloud Optimized GeoTIFF."""
 
 from __future__ import annotations
 
-import json
 import math
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -20,7 +19,7 @@ from recon.mapping.voxel_map import ground_sample_m
 from recon.surface.orthophoto import STEPS, Terrain, orthophoto
 from recon.surface.raster import Grid, Raster, fill_holes, round_cell
 from recon.surface.texture_views import TextureView
-from recon.types import F64, Array
+from recon.types import Array
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
 from service.offline.exports.images import recording_of, scan_images
@@ -28,10 +27,10 @@ from service.offline.exports.surface import bare_ground, cell_places, surface_mo
 from service.offline.exports.view import ExportOptions, Make, ScanView, in_parts
 from service.offline.tiles import grown
 from service.scans.coverage import coverage_of
-from service.scans.fused_cloud import EVERYWHERE, Box
+from service.scans.fused_cloud import Box
 from service.scans.main_piece import main_keyframes, main_seqs
 from service.scans.track import heights_above
-from service.scans.writing import write_whole, writing
+from service.scans.writing import writing
 
 NODATA_M = -9999.0
 QUICKLY = {"level": 4, "overview_resampling": "AVERAGE"}
@@ -41,11 +40,6 @@ RAW = {"tiled": True, "sparse_ok": True, "bigtiff": "IF_SAFER"}
 GDAL_CACHE_BYTES = 128_000_000
 
 ORTHO_HOLE_M = 4.0
-SHORTEST_CONTOUR_CELLS = 12
-MAX_CONTOURS = 5000
-"""Heights at which contours are drawn: every metre up to the highest mountains."""
-
-
 DSM_MARGIN_M, ORTHO_MARGIN_M = 10.0, 20.0
 GROUND_MARGIN_M = 40.0
 """Around a tile: the widest hole that is filled, the farthest that a building hides in a view, the
@@ -249,99 +243,6 @@ def window_in(image: Any, grid: Grid) -> tuple[tuple[int, int], tuple[int, int]]
     row = round((image.transform.f - grid.north_m) / grid.cell_m)
     col = round((grid.west_m - image.transform.c) / grid.cell_m)
     return (row, row + grid.shape[0]), (col, col + grid.shape[1])
-
-
-def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Height contours as GeoJSON lines (longitude, latitude), with their height AMSL.
-
-    Drawn on the surface smoothed over a few cells; lines shorter than a few cells are noise
-    and left out.
-    """
-    frame = scan.needs_place("a contour map")
-    features = []
-    found = contours_of(scan, options)
-    places = [np.column_stack([line, np.full(len(line), height_m)]) for height_m, line in found]
-    ends = np.cumsum([len(line) for line in places])[:-1]
-    whole = frame.to_geodetic(frame.from_utm(np.concatenate([np.zeros((0, 3)), *places])))
-    lon_lat = np.round(whole[:, [1, 0]], 8)
-    for (height_m, _), line in zip(found, np.split(lon_lat, ends), strict=bool(found)):
-        features.append(
-            {
-                "type": "Feature",
-                "properties": {options.height_key: round(height_m, 3)},
-                "geometry": {
-                    "type": "LineString",
-                    "coordinates": line.tolist(),
-                },
-            }
-        )
-    write_whole(out, json.dumps({"type": "FeatureCollection", "features": features}))
-
-
-def contours_of(scan: ScanView, options: ExportOptions) -> list[tuple[float, F64]]:
-    """(height, (N, 2) UTM metres) of the contours; InputError without a georeference.
-
-    Where there are more points than one tile may have, lines end at the borders of tiles.
-    """
-    scan.needs_place("a contour map")
-
-    def lines() -> list[tuple[float, F64]]:
-        return list(chain(*in_parts(scan, _contours, options, DSM_MARGIN_M)))
-
-    return scan.shared(("contours", options), lines)
-
-
-def _contours(scan: ScanView, options: ExportOptions, box: Box) -> list[tuple[float, F64]]:
-    surface = fill_holes(scan.raster(options.cell_m))
-    return list(contour_lines(surface, options.contour_m, box))
-
-
-def contour_lines(
-    raster: Raster, step_m: float, box: Box = EVERYWHERE
-) -> Iterator[tuple[float, F64]]:
-    """(height, (N, 2) x y) of the closed or open contours at whole multiples of ``step_m``.
-
-    A contour is the border of the cells at or above its height, cut where it runs along
-    unknown ground, and at the border of ``box``: there the lines of both sides meet in a cell.
-    """
-    known = raster.known
-    if not known.any():
-        return
-    filled = np.where(known, raster.height_m, np.float32(np.nanmedian(raster.height_m)))
-    smooth = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), 1.5)
-    low, high = float(smooth[known].min()), float(smooth[known].max())
-    if (high - low) / step_m > MAX_CONTOURS:
-        raise InputError(
-            f"contours every {step_m:g} m over {high - low:.0f} m of height are too many; "
-            "give a larger --contour-m"
-        )
-    inner = cv2.erode(np.pad(known, 1).astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
-    rows, cols = raster.grid.window(box)
-    mine = np.zeros_like(known)
-    mine[rows.start : rows.stop + 1, cols.start : cols.stop + 1] = True
-    for n in range(math.ceil(low / step_m), math.floor(high / step_m) + 1):
-        above = ((smooth >= n * step_m) & known).astype(np.uint8)
-        loops, _ = cv2.findContours(above, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        for loop in loops:
-            runs = (r for r in _inside_runs(loop[:, 0], inner) if len(r) >= SHORTEST_CONTOUR_CELLS)
-            for run in chain(*(_stretches(r, mine[r[:, 1], r[:, 0]]) for r in runs)):
-                if len(run) > 1:
-                    yield n * step_m, raster.grid.centres(run[:, 1], run[:, 0])
-
-
-def _inside_runs(loop: Array, inside: Array) -> list[Array]:
-    """The stretches of a closed loop of (col, row) that lie inside the known ground."""
-    ok = inside[loop[:, 1], loop[:, 0]]
-    if ok.all():
-        return [np.concatenate([loop, loop[:1]])]
-    start = int(np.argmin(ok))
-    return _stretches(np.roll(loop, -start, axis=0), np.roll(ok, -start))
-
-
-def _stretches(line: Array, ok: Array) -> list[Array]:
-    """The parts of a line whose vertices are all ``ok`` (N,)."""
-    edges = np.flatnonzero(np.diff(np.r_[False, ok, False].astype(np.int8)))
-    return [line[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def write_coverage(scan: ScanView, out: Path, options: ExportOptions) -> None:

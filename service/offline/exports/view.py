@@ -18,13 +18,14 @@ from recon.surface.raster import Grid, Raster, grid_over, rasterise_points, roun
 from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame, height_change, vertical_code
-from service.offline.exports import EXPORTERS
+from service.offline.exports import EXPORTERS, MAPPED, PACKAGES, kind_of
 from service.offline.tiles import TILE_POINTS, Tile, Tiling, run_tiles, tiling
 from service.packages import needing
 from service.progress import Progress
 from service.scans.fused_cloud import EVERYWHERE, Box, FusedCloud, fused_cloud, placed
 from service.scans.main_piece import main_keyframes, main_track
 from service.scans.track import flown_datum, local_frame
+from service.scans.writing import check_writable
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
@@ -281,20 +282,40 @@ class ScanView:
 
 
 def export(view: ScanView, kind: str, out: Path | None, options: ExportOptions) -> Path:
-    """Write one deliverable; the path written. InputError for an unknown kind."""
-    if kind not in EXPORTERS:
-        raise InputError(f"cannot export to {kind!r}; there are {', '.join(EXPORTERS)}")
-    target, usual, _ = EXPORTERS[kind]
-    path = out or view.folder / usual
-    module, _, name = target.partition(":")
+    """Write one deliverable; the path written. Raises as :func:`check`, and what it cannot see."""
     if options.vertical_datum is None:
         options = replace(options, vertical_datum=flown_datum(view.store.header))
+    write, path = check(view, kind, out, options)
     with needing(f"export to {kind}"):
-        if path.suffix == ".tif":
-            import_module("rasterio")  # missing: known before the work
-        write = getattr(import_module(f"service.offline.exports.{module}"), name)
         write(view.converted(options), path, options)
     return path
+
+
+Write = Callable[[ScanView, Path, ExportOptions], None]
+
+
+def check(
+    view: ScanView, kind: str, out: Path | None, options: ExportOptions
+) -> tuple[Write, Path]:
+    """What writes a deliverable, and its path; everything that needs no work is checked.
+
+    Raises InputError for an unknown kind, another format's ending, a missing georeference and
+    heights that cannot be converted; OutsideError for missing packages and a folder that cannot be
+    written.
+    """
+    kind = kind_of(kind, out)
+    target, usual, _ = EXPORTERS[kind]
+    path = out or view.folder / usual
+    if kind in MAPPED:
+        view.needs_place(f"{kind}")
+    view.converted(options).frame  # noqa: B018
+    check_writable(path, is_folder=not Path(usual).suffix)
+    module, _, name = target.partition(":")
+    with needing(f"export to {kind}"):
+        for package in PACKAGES.get(kind, ()):
+            import_module(package)
+        write: Write = getattr(import_module(f"service.offline.exports.{module}"), name)
+    return write, path
 
 
 def in_parts(

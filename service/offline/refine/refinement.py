@@ -8,7 +8,8 @@ the deliverables written again.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -65,6 +66,7 @@ from service.progress import Progress
 from service.scans.folder import write_deliverables
 from service.scans.track import camera_of, local_frame
 from service.scans.trust import BY_SURVEY
+from service.scans.writing import check_writable, filling_folder
 from service.stream.records import (
     Repose,
     ScanHeader,
@@ -108,37 +110,43 @@ def refine(
     Raises InputError, in one line, for a scan that is not finished or holds fewer than two
     keyframes, and for bad control points.
     """
-    target = _open_target(folder, options.out)
-    with ScanStore.open(target / "scan.db") as store:
-        store.hold_decoded()
-        figures = _Refinement(folder, store, options, progress).run()
-    return _deliver(target, figures)
+    if options.gcp is not None:
+        read_survey(options.gcp)  # refused before the work
+    with _target(folder, options.out) as target:
+        with ScanStore.open(target / "scan.db") as store:
+            store.hold_decoded()
+            figures = _Refinement(folder, store, options, progress, target).run()
+        return _deliver(target, figures) | {"scan_folder": str(options.out or folder)}
 
 
 def undo(folder: Path) -> dict[str, Any]:
     """Bring back the unrefined state, as a further revision, and write the deliverables again."""
-    target = _open_target(folder, None)
-    with ScanStore.open(target / "scan.db") as store:
+    _check_finished(folder)
+    with ScanStore.open(folder / "scan.db") as store:
         revisions = Revisions(store)
         if not revisions.refined:
             raise InputError(f"{folder} was never refined; there is nothing to undo")
         states = [s for seq in store.seqs() if (s := revisions.keyframe_state(seq)) is not None]
         back = [Repose(s.seq, 0, s.T_world_camera, s.scale, s.covariance) for s in states]
         revisions.append(back, revisions.frames(), revisions.header, {"undone": True})
-    return _deliver(target, {"undone": True, "keyframes": len(states)})
+    return _deliver(folder, {"undone": True, "keyframes": len(states)})
 
 
 def intrinsics(
-    folder: Path, video: Path, telemetry: Path | None, out: Path | None
+    folder: Path,
+    video: Path,
+    telemetry: Path | None,
+    out: Path | None,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Find the camera from the flight's video and write its file next to the scan, or in ``out``.
 
     The scan itself stays as it is. Raises InputError, in one line, where the flight
     does not determine the camera.
     """
-    _open_target(folder, None)
+    _check_finished(folder)
     with ScanStore.open(folder / "scan.db") as store:
-        job = _Refinement(folder, store, RefineOptions(telemetry=telemetry))
+        job = _Refinement(folder, store, RefineOptions(telemetry=telemetry), progress)
         try:
             found, given = job.own_camera(video)
         except InputError as error:
@@ -151,7 +159,7 @@ def lens(folder: Path, images: Path, config: SelfCalibrationConfig) -> SelfCalib
 
     Raises InputError, in one line, where they do not determine it.
     """
-    _open_target(folder, None)
+    _check_finished(folder)
     with ScanStore.open(folder / "scan.db") as store:
         job = _Refinement(folder, store, RefineOptions())
         return job.own_camera(images, config)[0]
@@ -164,8 +172,24 @@ def _deliver(target: Path, figures: dict[str, Any]) -> dict[str, Any]:
     return figures | {"scan_folder": str(target)}
 
 
-def _open_target(folder: Path, out: Path | None) -> Path:
-    """The folder to work in: the scan's own, or a copy of its store in ``out``."""
+@contextmanager
+def _target(folder: Path, out: Path | None) -> Iterator[Path]:
+    """The folder to work in: the scan's own, or one with a copy of its store, which becomes
+    ``out`` on success."""
+    _check_finished(folder)
+    if out is None or out.resolve() == folder.resolve():
+        yield folder
+        return
+    if (out / "scan.db").exists():
+        raise InputError(f"{out} exists and holds a scan; choose another, nothing was changed")
+    check_writable(out, is_folder=True)
+    with filling_folder(out) as part:
+        copy_store(folder / "scan.db", part / "scan.db")
+        yield part
+
+
+def _check_finished(folder: Path) -> None:
+    """Raise InputError for a folder without a finished scan of two keyframes or more."""
     path = folder / "scan.db"
     if not path.is_file():
         raise InputError(f"{folder} contains no scan.db; give a scan folder")
@@ -175,10 +199,6 @@ def _open_target(folder: Path, out: Path | None) -> Path:
         count = len(store.seqs())
     if count < 2:
         raise InputError(f"{folder} holds {count} keyframe(s); refining takes two or more")
-    if out is None or out.resolve() == folder.resolve():
-        return folder
-    copy_store(path, out / "scan.db")
-    return out
 
 
 class _Refinement:
@@ -190,8 +210,10 @@ class _Refinement:
         store: ScanStore,
         options: RefineOptions,
         progress: Progress | None = None,
+        target: Path | None = None,
     ) -> None:
         self.folder, self.store, self.options = folder, store, options
+        self.target = target or folder
         self.revisions = revisions = Revisions(store)
         self.progress = progress or Progress()
         self.header = revisions.header
@@ -256,7 +278,9 @@ class _Refinement:
         """The camera by the flight's own images, and the one that it was flown with."""
         track, given = self._track(), camera_of(self.header)
         times = [s.time_ns for s in self.states]
+        self.progress("reading the images of the keyframes")
         images = own_camera.images_at(video, self.header.started_unix_ns, times)
+        self.progress(f"matching {len(images)} images, and fitting the camera")
         ahead = track.poses[:, :3, 2] * self._ahead_m()
         ground_m = float(np.median(track.poses[:, 2, 3] + ahead[:, 2]))
         log = track.readings()
@@ -303,7 +327,7 @@ class _Refinement:
         if images.doubt:
             self.notes.append(f"the given camera is kept: {images.doubt}")
             return
-        path = (self.options.out or self.folder) / own_camera.FILE
+        path = self.target / own_camera.FILE
         save_camera(path, images.camera)
         self.notes.append(
             f"the camera found from the images: {path.name}; surfaces keep the "

@@ -12,14 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from command_line import skyrelief
 from typer.testing import CliRunner
 
 import service.cli
+from recon.backends import BACKENDS
 from service.cli import COMMANDS, app, load_command
 from service.commands.ground import _show_news
 from service.errors import InputError, OutsideError, SkyreliefError
+from service.offline.exports import EXPORTERS
 from service.offline.exports.model import MeshOptions
 from service.offline.exports.view import ExportOptions, ScanView
+from service.packages import installs
 from service.stream.session import SessionConfig, open_session
 from service.version import software
 
@@ -247,3 +251,72 @@ def test_config_command(tmp_path: Path) -> None:
     assert "labels = 48" in merged and len(merged) >= len(printed.stdout)
     assert run_cli("config", "check").returncode == 2
     assert run_cli("config", "chekc", str(path)).returncode == 2
+
+
+def test_a_bare_export_lists_every_product(tmp_path: Path) -> None:
+    ended = skyrelief("export", tmp_path)
+    lines = ended.stdout.splitlines()
+    assert ended.returncode == 2 and "--to" in ended.stderr
+    assert [line.split()[0] for line in lines] == list(EXPORTERS)
+    assert all(line.rstrip().endswith(".") and len(line) <= 100 for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("export x --to d", {"dsm", "dtm", "dxf"}),
+        ("mesh x --method p", {"poisson"}),
+        ("ctl st", {"start", "stop", "status"}),
+        ("replay x --backend ", {"auto", *BACKENDS}),
+    ],
+)
+def test_the_shell_is_offered_values(
+    words: str, offered: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("_SKYRELIEF_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", f"skyrelief {words}")
+    monkeypatch.setenv("COMP_CWORD", str(words.count(" ") + 1))
+    found = set(skyrelief().stdout.split())
+    assert offered <= found and (not words.split()[-1].isalpha() or found == offered)
+
+
+def test_ctrl_c_ends_a_command_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("service.commands.setup.load_config", stopped)
+    ended = skyrelief("config", "show", "--json")
+    assert (ended.returncode, ended.stderr) == (130, "skyrelief: cancelled\n")
+    assert json.loads(ended.stdout) == {"error": "cancelled", "exit_code": 130}
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "error"),
+    [
+        (["config", "what", "--json"], 2, "config what: there are check, show, default"),
+        (["export", "--json"], 2, "Missing argument"),
+        (["nothing", "--json"], 2, "no command 'nothing'"),
+    ],
+)
+def test_errors_are_objects_with_json(words: list[str], code: int, error: str) -> None:
+    ended = skyrelief(*words)
+    report = json.loads(ended.stdout.splitlines()[-1])
+    assert ended.returncode == report["exit_code"] == code and error in report["error"]
+
+
+def test_long_commands_say_at_once_what_they_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("service.sim.scoring.read_truth", stopped)
+    assert "reading the truth" in skyrelief("score", tmp_path, tmp_path).stderr
+    monkeypatch.setattr("service.cameras.board_images._images", stopped)
+    words = ("calibrate", tmp_path, "--pattern", "9x6", "--square-m", "1", "--out", tmp_path / "c")
+    assert "looking for the board" in skyrelief(*words).stderr
+
+
+def test_the_smallest_extra_or_package_is_named() -> None:
+    assert installs("starlette") == "'skyrelief[portal]'"
+    assert installs("rasterio") == "rasterio" and installs("foxglove") == "foxglove-sdk"

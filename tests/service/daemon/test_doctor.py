@@ -205,3 +205,10 @@ def test_what_a_running_service_holds_is_asked_of_it(tmp_path: Path) -> None:
     assert worse["mavlink"][0] == NOTE
     assert worse["service"] == (BAD, "skyrelief 9.9 runs here: no image")
     assert "service" not in findings(*given)  # it ended
+
+
+def test_a_desk_needs_no_aircraft() -> None:
+    found = {f.what: f for f in examine(load_config(None, ["compute.backend=cpu"]), None)}
+    assert not [what for what, f in found.items() if f.verdict is BAD]
+    assert found["maps"].verdict in (GOOD, NOTE) and "compute" in found
+    assert not {"camera", "mavlink", "settings", "datalink", "board"} & set(found)

@@ -16,6 +16,7 @@ import cv2
 import laspy
 import numpy as np
 import pytest
+from house_flight import HillsideFlight
 
 from recon.types import F64, Keyframe
 from service.georeference import LocalFrame
@@ -63,7 +64,7 @@ def test_the_maps_share_what_they_are_made_from(
     tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Cloud, surface, bare ground and contours are computed once for all of them."""
-    from service.offline.exports import rasters, surface, view
+    from service.offline.exports import contours, surface, view
 
     made: list[str] = []
 
@@ -79,7 +80,7 @@ def test_the_maps_share_what_they_are_made_from(
     counted(view, "fused_cloud")
     counted(surface, "_surface_model")
     counted(surface, "terrain")
-    counted(rasters, "contour_lines")
+    counted(contours, "contour_lines")
     house.flown(tmp_path / "scan").close()
     with ScanView(tmp_path / "scan") as scan:
         export(scan, "all", None, ExportOptions())
@@ -142,14 +143,16 @@ def contours_gpkg(path: Path) -> list[tuple[float, F64]]:
     with sqlite3.connect(path) as file:
         assert file.execute("PRAGMA application_id").fetchone()[0] == 0x47504B47
         kind = file.execute("SELECT * FROM gpkg_geometry_columns").fetchall()
-        assert kind == [("contours", "geom", "LINESTRING", EPSG, 0, 0)]
+        assert kind == [("contours", "geom", "LINESTRING", EPSG, 1, 0)]
         box = file.execute("SELECT min_x, min_y, max_x, max_y FROM gpkg_contents").fetchone()
-        rows = file.execute("SELECT geom, height_amsl_m FROM contours").fetchall()
+        rows = file.execute("SELECT geom, height_amsl_m, label FROM contours").fetchall()
     out = []
-    for data, height_m in rows:
+    for data, height_m, label in rows:
         magic, _, _, srs, order, form, count = struct.unpack_from("<2sBBiBII", data)
-        assert (magic, srs, order, form) == (b"GP", EPSG, 1, 2)
-        line = np.frombuffer(data, "<f8", offset=17).reshape(count, 2)
+        assert (magic, srs, order, form) == (b"GP", EPSG, 1, 1002)
+        line = np.frombuffer(data, "<f8", offset=17).reshape(count, 3)
+        assert (line[:, 2] == height_m).all() and label == ("410" if height_m == 410.0 else "")
+        line = line[:, :2]
         assert (line >= np.array(box[:2])).all() and (line <= np.array(box[2:])).all()
         out.append((height_m, line))
     return out
@@ -175,15 +178,30 @@ def contours_dxf(path: Path) -> list[tuple[float, F64]]:
     return out
 
 
-def test_contours_are_the_same_in_every_format(maps: Path, house: HouseFlight) -> None:
-    gpkg, dxf = contours_gpkg(maps / "contours.gpkg"), contours_dxf(maps / "contours.dxf")
-    features = json.loads((maps / "contours.geojson").read_text())["features"]
-    assert len(gpkg) == len(dxf) == len(features) > 0
-    for (height_m, line), (level_m, same) in zip(gpkg, dxf, strict=True):
-        assert height_m == level_m == 410.0
+def test_contours_are_the_same_in_every_format(tmp_path: Path) -> None:
+    hillside = HillsideFlight()
+    hillside.origin = (*hillside.origin[:2], 410.2)
+    hillside.flown(tmp_path).close()
+    with ScanView(tmp_path) as scan:
+        paths = [export(scan, k, None, ExportOptions()) for k in ("gpkg", "dxf", "contours")]
+    gpkg, dxf = contours_gpkg(paths[0]), contours_dxf(paths[1])
+    features = json.loads(paths[2].read_text())["features"]
+    assert len(gpkg) == len(dxf) == len(features)
+    assert {height_m for height_m, _ in gpkg} == {409.0, 410.0, 411.0}
+    for (height_m, line), (level_m, same), feature in zip(gpkg, dxf, features, strict=True):
+        assert height_m == level_m == feature["properties"]["height_amsl_m"]
+        assert feature["properties"]["index"] == (height_m == 410.0)
         np.testing.assert_allclose(line, same, atol=0.001)
-        enu = enu_of(house, np.column_stack([line, np.full(len(line), height_m)]))
-        assert np.abs(from_wall(enu)).max() < 1.2
+        enu = enu_of(hillside, np.column_stack([line, np.full(len(line), height_m)]))
+        np.testing.assert_allclose(enu[:, 2], hillside.slope * enu[:, 1], atol=0.05)
+        place = np.array(feature["geometry"]["coordinates"])
+        assert place.shape == (len(line), 3) and (place[:, 2] == height_m).all()
+    words = paths[1].read_text().split("\n")
+    assert words[words.index("TEXT") + 2] == "CONTOUR_LABELS" and "410" in words
+
+
+def test_level_ground_with_a_house_has_no_contours(maps: Path) -> None:
+    assert contours_gpkg(maps / "contours.gpkg") == contours_dxf(maps / "contours.dxf") == []
 
 
 def test_the_overlay_shows_the_house_at_its_place(maps: Path, house: HouseFlight) -> None:

@@ -1,0 +1,155 @@
+"""What can be checked is refused before the work; what is refused or stopped leaves nothing."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import skyrelief
+from house_flight import HouseFlight
+
+from service.commands import replay
+from service.compute import backend_choice
+from service.offline.exports import EXPORTERS, kind_of
+from service.progress import Progress
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Path:
+    folder = tmp_path_factory.mktemp("before") / "scan"
+    house.flown(folder).close()
+    return folder
+
+
+def never(*_: Any, **__: Any) -> None:
+    raise AssertionError("work has begun")
+
+
+@pytest.mark.parametrize(
+    "name", ["flight.mp4", "truth/params.json", "camera.yaml/a"], ids=["flight", "truth", "file"]
+)
+def test_simulate_refuses_a_folder_in_use_before_it_works(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.sim.recording.prepare", never)
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).touch()
+    out = tmp_path if name != "camera.yaml/a" else tmp_path / name / "below"
+    ended = skyrelief("simulate", "--out", out)
+    assert ended.returncode == 2 and ended.stderr.count("\n") == 1
+
+
+def test_a_stopped_simulation_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("service.sim.recording._write_video", stopped)
+    few = ("--duration-s", "1", "--fps", "1", "--size", "64x64", "--density", "0")
+    skyrelief("simulate", "--out", tmp_path / "flight", *few)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_refused_refinement_leaves_no_folder(scan: Path, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.csv"
+    bad.write_text("name\nA\n")
+    for words in (["--gcp", bad], ["--telemetry", bad]):
+        ended = skyrelief("refine", scan, *words, "--out", tmp_path / "new")
+        assert ended.returncode == 2 and not (tmp_path / "new").exists()
+
+
+def test_replay_refuses_a_folder_with_a_scan_before_it_reads_the_log(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replay, "_load_telemetry", never)
+    words = ("replay", tmp_path, "--telemetry", "flight.tlog", "--out", scan)
+    ended = skyrelief(*words)
+    assert ended.returncode == 2 and "already holds a scan" in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["refly", "--overlap", "0.95"], "--overlap 0.95: give 0 to 0.9"),
+        (["mesh", "--method", "magic"], "there are auto, height, poisson"),
+        (["mesh", "--out", "x.obj"], "glb is written as .glb"),
+        (["export", "--to", "dsm", "--out", "x.laz"], "dsm is written as .tif or .tiff; .laz is"),
+        (["export", "--to", "gpkg", "--out", "x"], "gpkg is written as .gpkg"),
+        (["export", "--to", "obj", "--out", "x.obj"], "obj is a folder"),
+        (["export", "--to", "dsm", "--out", "/dev/null/x.tif"], "/dev/null is a file"),
+        (["inspect", "--out", "x.jpg"], "the image is written as .png"),
+    ],
+)
+def test_wrong_usage_is_refused_before_the_work(
+    scan: Path, words: list[str], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.offline.exports.view.fused_cloud", never)
+    ended = skyrelief(words[0], scan, *words[1:])
+    assert ended.returncode == 2 and why in ended.stderr and ended.stderr.count("\n") == 1
+
+
+def test_the_ending_decides_the_format_of_contours() -> None:
+    made = {end: kind_of("contours", Path("x" + end)) for end in (".geojson", ".gpkg", ".dxf")}
+    assert made == {".geojson": "contours", ".gpkg": "gpkg", ".dxf": "dxf"}
+    assert kind_of("laz", Path("x.las")) == "laz"
+    for kind, (_, usual, _) in EXPORTERS.items():
+        assert kind_of(kind, Path(usual)) == kind
+
+
+def test_a_fault_in_one_product_ends_no_other(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def faulty(*_: Any) -> None:
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr("service.offline.exports.flight._geodetic", faulty)
+    out = tmp_path / "maps"
+    ended = skyrelief("export", scan, "--to", "geojson", "--to", "ply", "--json")
+    report = json.loads(ended.stdout.splitlines()[-1])
+    assert ended.returncode == 1
+    assert set(report["written"]) == {"ply"}
+    assert report["failed"] == {"geojson": "ZeroDivisionError: division by zero"}
+    monkeypatch.setattr("service.offline.exports.maps.MAPS", ("geojson", "laz", "coverage"))
+    assert skyrelief("export", scan, "--to", "all", "--out", out).returncode == 0
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert [f["kind"] for f in manifest["files"]] == ["laz", "coverage"]
+    assert manifest["failed"] == {"geojson": "ZeroDivisionError: division by zero"}
+
+
+def test_cancelling_is_no_fault_of_a_product(scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from service.offline.exports.view import ExportOptions, ScanView, export
+    from service.progress import CancelledError
+
+    progress = Progress()
+    with ScanView(scan, progress=progress) as view:
+        progress.cancel()
+        with pytest.raises(CancelledError):
+            export(view, "all", scan / "cancelled", ExportOptions())
+
+
+def test_replay_ends_with_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:
+    trust = {"level": "doubtful", "reasons": ["the lens is assumed", "no attitude"]}
+    summary = {
+        "warnings": [], "failed": {}, "scan_folder": "scan", "frames": 10, "distance_m": 5.0,
+        "segments": 1, "pairs": 3, "clouds_per_second": 1.0, "refusals": {"blurred": 2},
+        "quality": {"trust": trust}, "georeference": "none",
+    }  # fmt: skip
+    replay._report(summary, as_json=False)
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == "trust: doubtful, georeference: none: the lens is assumed; no attitude"
+
+
+def test_a_backend_without_a_device_warns(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Slow:
+        name, device = "torch", "cpu"
+
+    monkeypatch.setattr(backend_choice, "named_backend", lambda name: Slow())
+    with caplog.at_level(logging.WARNING):
+        backend_choice.choose_backend("torch")
+    assert "about 12 times the duration" in caplog.text
