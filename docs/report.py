@@ -8,7 +8,7 @@ hand, at most ten lines) and ``tables``. A table has a ``title``, a ``note`` on 
 
 - ``columns`` and ``rows``,
 - ``list``: lines,
-- ``bench``: names of benchmarks; the newest result of each that ``skyrelief bench --keep`` wrote
+- ``bench``: names of benchmarks; the newest result of each that ``make bench`` kept
   on a machine with ``machine`` in its name, of the figures that the regular expression ``only``
   fits,
 - ``trials``: a file of runs/ that ``make trials`` wrote.
@@ -47,7 +47,7 @@ def index(reports: dict[str, Json]) -> str:
     ]
     text = (
         "`make pages` writes these pages from the JSON next to them and the results in `runs/`, "
-        "which `skyrelief bench NAME --keep docs/reports/runs` and `make trials` write. A new "
+        'which `make bench ARGS="NAME --keep docs/reports/runs"` and `make trials` write. A new '
         "figure replaces the old one."
     )
     return "\n".join(["# Reports", "", wrapped(text), "", *rows, ""])
