@@ -62,6 +62,13 @@ def test_relative_links_lead_somewhere(page: Path) -> None:
     assert broken_links(page) == []
 
 
+def test_every_image_is_shown() -> None:
+    shown = "".join(page.read_text(encoding="utf-8") for page in documents())
+    images = [path.name for path in (ROOT / "docs" / "images").iterdir()]
+    assert len(images) > 10
+    assert [name for name in images if name not in shown] == []
+
+
 def test_a_broken_link_is_found(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("# Here I am\n[a](#here-i-am) [b](other.md) [c](#gone) [d](https://x.org)\n")
