@@ -47,7 +47,7 @@ UNIT_M, FIX_M, SEED = 40.0, 1.5, 4
 """Metres of a unit of the drawn odometry, and sigma of a fix."""
 
 
-def picture(width: int, height: int, parts: list[str]) -> str:
+def image_of(width: int, height: int, parts: list[str]) -> str:
     """An SVG image of these parts."""
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
@@ -70,7 +70,7 @@ def life() -> str:
             f'font-weight="bold">{escape(name)}</text><text x="{middle:g}" y="{y + 38}" '
             f'text-anchor="middle" font-size="11">{escape(holds)}</text>'
         )
-    return picture(850, 370, parts)
+    return image_of(850, 370, parts)
 
 
 def arrow(start: str, end: str) -> str:
@@ -165,7 +165,7 @@ def correction(flight: dict[str, F64]) -> str:
     for k, (colour, text) in enumerate(words):
         x = 40 + (0, 110, 160, 390)[k]
         parts.append(f'<text x="{x}" y="30" fill="{colour}" font-weight="bold">{text}</text>')
-    return picture(740, 450, parts)
+    return image_of(740, 450, parts)
 
 
 if __name__ == "__main__":

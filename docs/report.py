@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 REPORTS = Path(__file__).resolve().parent / "reports"
-WIDTH, MOST_LINES = 120, 10
+WIDTH, MAX_LINES = 120, 10
 """Characters of a line, and lines of conclusion."""
 
 Json = dict[str, Any]
@@ -66,11 +66,11 @@ def page(name: str, report: Json) -> str:
 
 
 def conclusions(report: Json) -> list[str]:
-    """Lines of the conclusion, at most ``MOST_LINES``."""
+    """Lines of the conclusion, at most ``MAX_LINES``."""
     lines = [line for one in report["conclusions"] for line in wrapped(one, "- ").split("\n")]
-    if len(lines) > MOST_LINES:
+    if len(lines) > MAX_LINES:
         raise ValueError(
-            f"{report['title']}: {len(lines)} lines of conclusion, at most {MOST_LINES}"
+            f"{report['title']}: {len(lines)} lines of conclusion, at most {MAX_LINES}"
         )
     return lines
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from doc_pages import FENCE, PAGES, text_of
 from paths import ROOT
+from trial_rig import Table
 
 from recon.posegraph.alignment import HUBER as MIN_FIT_SIGMAS
 from recon.posegraph.alignment import WILD
@@ -24,7 +25,7 @@ from service.config import keys
 
 REPORTS = ROOT / "docs" / "reports"
 ROOMS = ("recon", "mavlink", "service")
-MOST_WORDS, MOST_CHARACTERS = 8000, 140
+MAX_WORDS, MAX_CHARACTERS = 8000, 140
 HASH = re.compile(r"\b(?=[0-9a-f]*[0-9])(?=[0-9a-f]*[a-f])[0-9a-f]{7,40}\b")
 """Seven to forty hexadecimal digits with a number and a letter: a commit."""
 
@@ -46,7 +47,7 @@ def report() -> ModuleType:
 def faults(text: str) -> Iterator[str]:
     """Lines outside tables that are too long, or name a commit outside code blocks."""
     for line in text.split("\n"):
-        if not line.startswith("|") and len(line) > MOST_CHARACTERS:
+        if not line.startswith("|") and len(line) > MAX_CHARACTERS:
             yield line
     for line in FENCE.sub("", text).split("\n"):
         if not line.startswith("|") and HASH.search(re.sub(r"\]\(\S+\)", "", line)):
@@ -116,7 +117,7 @@ def test_the_page_on_the_pose_graph_has_the_factors_and_numbers_of_the_code() ->
 
 
 def test_reports_are_short() -> None:
-    assert sum(len(text_of(page).split()) for page in REPORTS.glob("*.md")) <= MOST_WORDS
+    assert sum(len(text_of(page).split()) for page in REPORTS.glob("*.md")) <= MAX_WORDS
 
 
 def test_readme_and_changelog_are_short() -> None:
@@ -150,6 +151,20 @@ def test_like_faults_share_a_row(report: ModuleType) -> None:
         ["5 x power cut", "kept (1.2 s)"],
         ["5 x kill", "kept; lost 2 of 9 chunks"],
     ]
+
+
+def test_what_the_trials_write_is_a_table_of_the_report(
+    report: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "runs").mkdir()
+    table = Table(tmp_path / "runs" / "trials.json")
+    table.add("kill", 2, "kept", "0 of 4 chunks", 1.04)
+    table.add("cut", 1, "kept")
+    table.add("kill", 3, "kept", "0 of 6 chunks", 2.0)  # tried again
+    monkeypatch.setattr(report, "REPORTS", tmp_path)
+    shown = report.with_origin({"title": "Faults", "trials": "trials.json"})
+    assert shown["rows"] == [["cut", "kept"], ["3 x kill", "kept (2.0 s)"]]
+    assert "cores" in shown["machine"] and shown["date"][:2] == "20"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
