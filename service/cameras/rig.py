@@ -37,6 +37,9 @@ VERTICAL_SHARE = 2.5
 """Sigma of a fix's altitude over that of its position, where the latter alone is stated: of
 receivers two to three."""
 
+CORRECTED_M = 0.5
+"""A receiver that states less has corrections of a base: its height does not wander by itself."""
+
 NO_ALTITUDE_M = 1000.0
 """Sigma of the height of a position without an altitude."""
 
@@ -195,7 +198,8 @@ class Rig:
             if tag.is_sigma_h_stated:
                 usual_m = min(usual_m, VERTICAL_SHARE * tag.sigma_h_m)
             sigma_v = tag.sigma_v_m or usual_m
-            is_claimed = tag.sigma_v_m is not None or tag.alt_amsl_m is None
+            is_corrected = tag.is_sigma_h_stated and tag.sigma_h_m < CORRECTED_M
+            is_claimed = tag.sigma_v_m is not None or tag.alt_amsl_m is None or is_corrected
             return Fix(
                 tag.lat_deg, tag.lon_deg, tag.alt_amsl_m, tag.sigma_h_m, sigma_v, is_claimed
             )  # fmt: skip

@@ -230,7 +230,8 @@ def test_an_altitude_without_accuracy_is_as_good_as_its_position_allows() -> Non
             30.0, -98.0, 300.0, sigma_h_m, is_sigma_h_stated=True, relative_alt_m=relative_m
         )
         prior = rig().prior(None, tag)
-        assert prior.sigma_position_m is not None and not prior.is_sigma_claimed
+        assert prior.sigma_position_m is not None
+        assert prior.is_sigma_claimed == (sigma_h_m < 0.1)  # no height of RTK wanders
         assert prior.sigma_position_m[2] == pytest.approx(sigma_v_m)
     guessed = rig().prior(None, GeoTag(30.0, -98.0, 300.0, 0.02))
     assert guessed.sigma_position_m is not None and guessed.sigma_position_m[2] == 50.0
