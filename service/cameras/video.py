@@ -11,7 +11,7 @@ import itertools
 import logging
 import sys
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from fractions import Fraction
@@ -293,27 +293,55 @@ LONGEST_CUE = 8192
 """Bytes of a cue that are read; drones write a few hundred."""
 
 
+LARGEST_METADATA = 1 << 20
+"""Bytes of a packet of metadata that are read; cameras write some kilobytes."""
+
+
 def subtitles(path: Path) -> Iterator[tuple[int, str]]:
     """(ns since the video's start, text) of the cues in a video's own subtitles, if it has any."""
+    for time_ns, _, packet in _packets(path, "subtitle"):
+        codec = packet.stream.codec_context.name
+        head = 2 if codec == "mov_text" else 0  # the number of bytes
+        text = bytes(packet)[head:LONGEST_CUE].decode("utf-8", "replace")
+        if text:
+            yield time_ns, text
+
+
+def metadata(path: Path, marks: Sequence[bytes]) -> Iterator[tuple[int, int, bytes]]:
+    """(ns since the video's start, duration in ns, bytes) of the packets of a video's metadata, of
+    the first stream one of whose packets begins with one of ``marks``."""
+    used: int | None = None
+    for time_ns, duration_ns, packet in _packets(path, "data"):
+        data = bytes(memoryview(packet)[:LARGEST_METADATA])
+        if used is None and data.startswith(tuple(marks)):
+            used = packet.stream.index
+        if packet.stream.index == used:
+            yield time_ns, duration_ns, data
+
+
+def _packets(path: Path, kind: str) -> Iterator[tuple[int, int, Any]]:
+    """(ns since the video's start, duration in ns, packet) of streams of a kind; of subtitles the
+    first stream."""
     import av.error
 
     try:
         with open_container(str(path)) as container:
-            stream = next(iter(container.streams.subtitles), None)
-            if stream is None or not container.streams.video:
+            streams = [s for s in container.streams if s.type == kind]
+            streams = streams[:1] if kind == "subtitle" else streams
+            if not streams or not container.streams.video:
                 return
             video = container.streams.video[0]
             start_s = (video.start_time or 0) * (video.time_base or Fraction(0))
             for other in container.streams:
-                if other is not stream and hasattr(other, "discard"):  # since PyAV 18
+                if other not in streams and hasattr(other, "discard"):  # since PyAV 18
                     other.discard = type(other.discard).all  # most of the file is not read
-            head = 2 if stream.codec_context.name == "mov_text" else 0  # the number of bytes
-            for packet in container.demux(stream):
-                text = bytes(packet)[head:LONGEST_CUE].decode("utf-8", "replace")
-                if packet.pts is not None and packet.time_base is not None and text:
-                    yield round((packet.pts * packet.time_base - start_s) * NS_PER_S), text
+            for packet in container.demux(streams):
+                base = packet.time_base
+                if packet.pts is not None and base is not None and packet.size:
+                    time_ns = round((packet.pts * base - start_s) * NS_PER_S)
+                    yield time_ns, round((packet.duration or 0) * base * NS_PER_S), packet
     except (av.error.FFmpegError, OSError, ValueError) as error:
-        log.debug("%s: its subtitles end: %s", path, error)
+        log.debug("%s: its %s ends: %s", path, kind, error)
 
 
 def creation_unix_ns(container: Any, stream: Any) -> int | None:

@@ -50,7 +50,7 @@ def replay(
     video: Annotated[str, typer.Argument(help="a video, a folder of images, or - for a pipe")],
     telemetry: Annotated[
         Path | None,
-        typer.Option(help="flight log: .tlog, .BIN, .ulg or .SRT; default: the video's own .SRT"),
+        typer.Option(help="flight log: .tlog, .BIN, .ulg or .SRT; default: the video's own"),
     ] = None,
     camera_model: Annotated[
         Path | None, typer.Option(help="camera_info YAML of 'skyrelief calibrate'")
@@ -93,7 +93,7 @@ def replay(
         check_new(out)
         check_writable(out, is_folder=True)
     camera = _load_model(camera_model, chosen)
-    log = _load_telemetry(telemetry, chosen) if telemetry else _subtitles(video, chosen)
+    log = _load_telemetry(telemetry, chosen) if telemetry else own_telemetry(video, chosen)
     source = open_camera(video)
     played = Paced(source) if realtime else source
     with closing(played):
@@ -145,11 +145,9 @@ def _load_telemetry(path: Path, config: Config) -> TelemetryLog:
         raise InputError(str(error)) from error
 
 
-def _subtitles(video: str, config: Config) -> TelemetryLog | None:
-    """The telemetry in the subtitles of a video: next to it, under its name, or in it."""
-    from mavlink.telemetry.logs.srt import of_cues
+def own_telemetry(video: str, config: Config) -> TelemetryLog | None:
+    """The telemetry of a video: in subtitles next to it, under its name, or in the video."""
     from service.cameras import parse_source
-    from service.cameras.video import subtitles
 
     kind, name = parse_source(video)[:2]
     if kind != "file":
@@ -159,17 +157,34 @@ def _subtitles(video: str, config: Config) -> TelemetryLog | None:
     try:
         if path is not None:
             found, where = _load_telemetry(path, config), f"{path.name}, next to the video"
+        elif (inside := telemetry_inside(Path(name), _history_config(config))) is not None:
+            found, where = inside
         else:
-            cues = subtitles(Path(name))
-            first = next(cues, None)
-            if first is None:
-                return None
-            found = of_cues(Path(name), chain((first,), cues), _history_config(config))
-            where = "the video's own subtitles"
+            return None
     except (InputError, ValueError) as error:
         logging.getLogger(__name__).warning("no telemetry: %s", error)
         return None
     return replace(found, warnings=(f"telemetry from {where}", *found.warnings))
+
+
+def telemetry_inside(path: Path, config: HistoryConfig) -> tuple[TelemetryLog, str] | None:
+    """The telemetry in a video's own streams, and their kind in words; None without any.
+
+    Raises ValueError where they hold none that can be used.
+    """
+    from mavlink.telemetry.logs import gpmf, klv, srt
+    from service.cameras.video import metadata, subtitles
+
+    cues = subtitles(path)
+    if (cue := next(cues, None)) is not None:
+        return srt.of_cues(path, chain((cue,), cues), config), "the video's own subtitles"
+    packets = metadata(path, (gpmf.MARK, klv.MARK))
+    if (packet := next(packets, None)) is None:
+        return None
+    every = chain((packet,), packets)
+    if packet[2].startswith(gpmf.MARK):
+        return gpmf.of_packets(path, every, config), "the camera's own track (GPMF)"
+    return klv.of_packets(path, every, config), "the video's own metadata (MISB KLV)"
 
 
 def _replay(

@@ -20,7 +20,7 @@ from loopback import until
 from paths import ROOT
 
 from recon.types import Shutter
-from service.commands.replay import _subtitles
+from service.commands.replay import own_telemetry
 from service.config import load_config
 from service.flight.scan import Scan
 from service.stream.store import ScanStore
@@ -107,13 +107,13 @@ def test_the_cloud_is_close_to_the_truth(scan: tuple[Path, dict[str, Any]], flig
 def test_subtitles_next_to_a_video_are_its_telemetry(flight: Path, tmp_path: Path) -> None:
     video = tmp_path / "DJI_0001.MP4"
     shutil.copy(flight / "flight.mp4", video)
-    assert _subtitles(str(video), load_config(None, [])) is None
+    assert own_telemetry(str(video), load_config(None, [])) is None
     subtitles = tmp_path / "DJI_0001.SRT"
     subtitles.write_text("1\n00:00:01,000 --> 00:00:02,000\n- Hello.\n", encoding="utf-8")
-    assert _subtitles(str(video), load_config(None, [])) is None
+    assert own_telemetry(str(video), load_config(None, [])) is None
     place = "[latitude: 47.1] [longitude: 8.5] [rel_alt: 40.000 abs_alt: 450.000]"
     subtitles.write_text(f"1\n00:00:00,000 --> 00:00:00,033\n{place}\n", encoding="utf-8")
-    found = _subtitles(str(video), load_config(None, []))
+    found = own_telemetry(str(video), load_config(None, []))
     assert found is not None and found.counts["positions"] == 1
     assert any("DJI_0001.SRT" in warning for warning in found.warnings)
     # They begin with the video: at any other date there is no telemetry.
@@ -178,7 +178,7 @@ def test_subtitles_in_a_video_are_its_telemetry(
          "-map", "0:v", "-map", "1:s", "-c:v", "copy", "-c:s", coded, str(video)],
         check=True, stdin=subprocess.DEVNULL,
     )  # fmt: skip
-    found = _subtitles(str(video), load_config(None, []))
+    found = own_telemetry(str(video), load_config(None, []))
     assert found is not None and found.counts["positions"] == 3  # no drone writes 10 kB in a cue
     assert found.warnings[0] == "telemetry from the video's own subtitles"
     for k in range(3):

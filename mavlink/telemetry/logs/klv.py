@@ -1,0 +1,177 @@
+"""MISB metadata in a video: the local set of ST 0601 and the universal set of EG 0104.
+
+A set is a key of 16 bytes, a BER length, and items of key, length, value: of the local set a tag
+and an integer over the item's range, of the universal set 16 bytes and a float. Read are the
+sensor's place, the platform's attitude, the sensor's direction, and the slant range, which gives
+the height above the ground that it sees. The times are those of the packets in the video.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from mavlink.telemetry.decode import plausible_place
+from mavlink.telemetry.history import MAX_AGL_M, HistoryConfig, VehicleHistory
+from mavlink.telemetry.logs import TelemetryLog, finish
+from mavlink.telemetry.logs.gpmf import Packet
+from mavlink.telemetry.quaternion import from_rpy, multiply
+from mavlink.telemetry.samples import (
+    AttitudeSample,
+    GimbalFrame,
+    GimbalSample,
+    PositionSample,
+    Sample,
+    TerrainSample,
+)
+
+MARK = bytes.fromhex("060e2b34")
+LOCAL_SET = bytes.fromhex("060e2b34020b01010e01030101000000")
+UNIVERSAL_SET = bytes.fromhex("060e2b34020101010e01010201010000")
+MAX_ITEMS, CHECKSUM = 256, 1
+
+CAMERA = 100  # component id for the head's attitude
+AGL_SHARE = 0.05
+"""Relative sigma of the ground's height below, which is that of what the sensor sees."""
+
+LOCAL: dict[int, tuple[str, float, float]] = {
+    5: ("heading", 0.0, 360.0),
+    6: ("pitch", -20.0, 20.0),
+    7: ("roll", -50.0, 50.0),
+    13: ("lat", -90.0, 90.0),
+    14: ("lon", -180.0, 180.0),
+    15: ("alt", -900.0, 19_000.0),
+    18: ("azimuth", 0.0, 360.0),
+    19: ("elevation", -180.0, 180.0),
+    20: ("turned", 0.0, 360.0),
+    21: ("slant", 0.0, 5_000_000.0),
+    90: ("pitch", -90.0, 90.0),
+    91: ("roll", -90.0, 90.0),
+}
+"""Tag of ST 0601 to name and range; of a range from below 0 the integer has a sign."""
+
+UNIVERSAL: dict[bytes, str] = {
+    bytes.fromhex(key): name
+    for key, name in {
+        "0701020102040200": "lat",
+        "0701020102060200": "lon",
+        "0701020102020000": "alt",
+        "0701100106000000": "heading",
+        "0701100105000000": "pitch",
+        "0701100104000000": "roll",
+        "0701100102000000": "north",  # of the sensor's direction, from north
+        "0701100103000000": "obliquity",
+        "0701080101000000": "slant",
+    }.items()
+}
+"""Second half of the key to name; degrees and metres."""
+
+
+def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> TelemetryLog:
+    """The history in the packets of a metadata stream; ValueError where they give none."""
+    history, counts = VehicleHistory(config), Counter[str]()
+    for time_ns, _, data in packets:
+        counts["packets"] += 1
+        for sample in samples_of(fields_of(data)):
+            counts[type(sample).__name__] += 1
+            history.add(sample, time_ns)
+    return replace(finish(path, history, counts, []), clock="video")
+
+
+def fields_of(data: bytes) -> dict[str, float]:
+    """Values by name in the first set of a packet; empty for any other bytes."""
+    key, (content, _) = data[:16], _value(data, 16)
+    if key == UNIVERSAL_SET:
+        pairs = ((UNIVERSAL.get(name[8:]), _float(value)) for name, value in _items(content, 16))
+    elif key == LOCAL_SET and _is_sound(data, content):
+        pairs = (_local(name, value) for name, value in _items(content, 1))
+    else:
+        return {}
+    return {name: number for name, number in pairs if name and number is not None}
+
+
+def _is_sound(data: bytes, content: bytes) -> bool:
+    """Whether the checksum at the end of a local set, where there is one, is that of the set."""
+    if len(content) < 4 or content[-4:-2] != bytes([CHECKSUM, 2]):
+        return True
+    end = data.index(content, 16) + len(content)
+    summed = sum(data[0 : end - 2 : 2]) * 256 + sum(data[1 : end - 2 : 2])
+    return summed & 0xFFFF == int.from_bytes(content[-2:], "big")
+
+
+def _items(content: bytes, wide: int) -> Iterator[tuple[bytes, bytes]]:
+    """Key and value of items, those before an error."""
+    at = 0
+    for _ in range(MAX_ITEMS):
+        key = content[at : at + wide]
+        if wide == 1 and key and key[0] & 0x80:  # tags above 127 have two bytes; none is read
+            at += 1
+        value, at = _value(content, at + wide)
+        if len(key) < wide or at < 0:
+            return
+        yield key, value
+
+
+def _value(data: bytes, at: int) -> tuple[bytes, int]:
+    """What follows a BER length, and the place after it; -1 where it is cut off."""
+    if not 0 <= at < len(data):
+        return b"", -1
+    length, at = data[at], at + 1
+    if length & 0x80:
+        wide = length & 0x7F
+        length, at = int.from_bytes(data[at : at + min(wide, 8)], "big"), at + wide
+    end = at + length
+    return (data[at:end], end) if end <= len(data) else (b"", -1)
+
+
+def _float(value: bytes) -> float | None:
+    code = {4: ">f", 8: ">d"}.get(len(value))
+    number = struct.unpack(code, value)[0] if code else math.nan
+    return float(number) if math.isfinite(number) else None
+
+
+def _local(key: bytes, value: bytes) -> tuple[str | None, float | None]:
+    """Of an integer over its range; its lowest value, where it has a sign, says unknown."""
+    name, low, high = LOCAL.get(key[0], ("", 0.0, 0.0))
+    if not name or len(value) not in (2, 4):
+        return None, None
+    is_signed = low == -high
+    number, bits = int.from_bytes(value, "big", signed=is_signed), 8 * len(value)
+    if is_signed:
+        most = 2 ** (bits - 1) - 1
+        return name, None if number < -most else high * number / most
+    return name, low + (high - low) * number / (2**bits - 1)
+
+
+def samples_of(found: dict[str, float]) -> list[Sample]:
+    """The samples of vehicle and camera in the fields of one set."""
+    out: list[Sample] = []
+    lat, lon = found.get("lat", math.nan), found.get("lon", math.nan)
+    if plausible_place(lat, lon):
+        out.append(PositionSample(None, lat, lon, found.get("alt"), None, None))
+    body = [found.get(name) for name in ("roll", "pitch", "heading")]
+    head, down = None, None
+    if None not in body:
+        q_body = from_rpy(*(math.radians(angle) for angle in body if angle is not None))
+        out.append(AttitudeSample(None, q_body))
+        relative = [found.get(name) for name in ("turned", "elevation", "azimuth")]
+        if None not in relative:
+            head = multiply(q_body, from_rpy(*(math.radians(a) for a in relative if a is not None)))
+            down = 2.0 * (head[1] * head[3] - head[0] * head[2])  # of the optical axis, x
+    if "north" in found and "obliquity" in found:
+        # Some count the angle down from level, others up.
+        depression = math.radians(abs(found["obliquity"]))
+        head, down = from_rpy(0.0, -depression, math.radians(found["north"])), math.sin(depression)
+    if head is not None:
+        out.append(GimbalSample(None, head, GimbalFrame.EARTH, CAMERA, 0))
+    if (
+        down is not None
+        and down > 0.1
+        and 0.0 < (agl := found.get("slant", 0.0) * down) < MAX_AGL_M
+    ):
+        out.append(TerrainSample(None, agl, AGL_SHARE * agl))
+    return out

@@ -1,0 +1,224 @@
+"""Telemetry in videos: GoPro's GPMF and MISB's KLV, of real cameras, written here, and damaged."""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from paths import DATA, SHARED
+from scipy.spatial.transform import Rotation
+
+from mavlink.telemetry.history import HistoryConfig
+from mavlink.telemetry.logs import TelemetryLog, gpmf, klv
+from mavlink.telemetry.samples import VehicleState
+from service.commands.replay import telemetry_inside
+
+SECOND_NS = 1_000_000_000
+REAL = DATA / "video_metadata"
+HERE = Path("flight.mp4")
+
+
+def at(log: TelemetryLog, time_s: float) -> VehicleState:
+    state = log.history.state_at(round(time_s * 1e9))
+    assert state is not None
+    return state
+
+
+def item(key: bytes, kind: str, size: int, content: bytes) -> bytes:
+    """One item of GPMF; of structures of ``size`` bytes."""
+    head = key + (b"\0" if kind == "nest" else kind.encode()) + bytes([size])
+    count = len(content) // size
+    return head + struct.pack(">H", count) + content + bytes(-len(content) % 4)
+
+
+def nest(key: bytes, *inside: bytes) -> bytes:
+    return item(key, "nest", 1, b"".join(inside))
+
+
+def gopro(stream: bytes) -> bytes:
+    return nest(b"DEVC", item(b"DVID", "L", 4, bytes(4)), nest(b"STRM", stream))
+
+
+def gps5(lat: float, fix: int, dop: float) -> bytes:
+    """A second of a HERO5: 18 positions, a thousandth of a degree apart in all."""
+    scale = (10**7, 10**7, 1000, 1000, 100)
+    rows = [(lat + 1e-3 * k / 18, 8.5, 412.5, 5.0, 5.0) for k in range(18)]
+    whole = [round(v * s) for row in rows for v, s in zip(row, scale, strict=True)]
+    return gopro(
+        item(b"GPSF", "L", 4, struct.pack(">L", fix))
+        + item(b"GPSP", "S", 2, struct.pack(">H", round(100 * dop)))
+        + item(b"SCAL", "l", 4, struct.pack(">5l", *scale))
+        + item(b"GPS5", "l", 20, struct.pack(f">{len(whole)}l", *whole))
+    )
+
+
+def gps9(lat: float, fix: int, dop: float) -> bytes:
+    """A tenth of a second of a HERO11."""
+    scale = (10**7, 10**7, 1000, 1000, 100, 1, 1000, 100, 1)
+    row = struct.pack(
+        ">7lHH", round(lat * 1e7), 85_000_000, 412_500, 5000, 500, 9000, 1, round(100 * dop), fix
+    )
+    return gopro(
+        item(b"TYPE", "c", 1, b"lllllllSS")
+        + item(b"SCAL", "l", 4, struct.pack(">9l", *scale))
+        + item(b"GPS9", "?", 32, row)
+    )
+
+
+def test_positions_of_a_gopro_spread_over_the_second_of_their_packet() -> None:
+    packets = [(k * SECOND_NS, SECOND_NS, gps5(47.0 + 1e-3 * k, 3, 1.4)) for k in range(3)]
+    log = gpmf.of_packets(HERE, packets, HistoryConfig())
+    assert log.clock == "video" and log.counts["GPS5"] == 54
+    for time_s in (0.0, 0.25, 1.5, 2.9):
+        state = at(log, time_s)
+        assert state.lat_deg == pytest.approx(47.0 + 1e-3 * time_s, abs=2e-7)
+        assert state.lon_deg == pytest.approx(8.5) and state.alt_amsl_m == pytest.approx(412.5)
+        assert state.sigma_h_m == pytest.approx(2.1, rel=0.02) and not state.is_claimed
+
+
+def test_newer_gopros_state_fix_and_accuracy_with_each_position() -> None:
+    packets = [(k * SECOND_NS // 10, SECOND_NS // 10, gps9(47.0, 3, 1.0)) for k in range(20)]
+    packets += [((20 + k) * SECOND_NS // 10, 0, gps9(47.0, 0, 99.99)) for k in range(50)]
+    log = gpmf.of_packets(HERE, packets, HistoryConfig())
+    assert at(log, 1.0).lat_deg == pytest.approx(47.0)
+    assert at(log, 1.0).sigma_h_m == pytest.approx(1.5, rel=0.01)
+    with_none = [gps5(47.0, 0, 99.99)] * 3
+    with pytest.raises(ValueError, match="no position"):
+        gpmf.of_packets(
+            HERE, [(k * SECOND_NS, SECOND_NS, p) for k, p in enumerate(with_none)], HistoryConfig()
+        )
+
+
+def test_a_real_karma_gives_its_autopilots_position() -> None:
+    packets = [
+        (k * 1001 * 10**6, 1001 * 10**6, (REAL / f"karma_{k}.gpmf").read_bytes()) for k in (0, 1)
+    ]
+    log = gpmf.of_packets(HERE, packets, HistoryConfig())
+    assert log.counts["GLPI"] == 8
+    state = at(log, 1.0)
+    assert state.lat_deg == pytest.approx(33.12538, abs=2e-5)
+    assert state.lon_deg == pytest.approx(-117.33108, abs=2e-5)
+    assert state.alt_amsl_m == pytest.approx(15.6, abs=0.2)
+    assert state.sigma_h_m == pytest.approx(0.25, abs=0.02) and state.v_ned_m_s is not None
+
+
+def test_videos_give_the_telemetry_that_they_hold() -> None:
+    """The whole clips, where they are here: GPMF within 0.1 s of the fixes read by others."""
+    karma = SHARED / "gopro_karma_clip" / "karma.mp4"
+    aphill = SHARED / "aphill_orbit_fmv" / "aphill_klv_10s.ts"
+    if not (karma.is_file() and aphill.is_file()):
+        pytest.skip("needs ../shared/data")
+    log, where = telemetry_inside(karma, HistoryConfig()) or (None, "")
+    assert log is not None and "GPMF" in where
+    fixes = np.loadtxt(karma.with_name("gps.csv"), delimiter=",", skiprows=1, usecols=(1, 2, 3, 4))
+    off_m = []
+    for time_s, lat, lon, alt in fixes[10:40]:
+        state = at(log, 0.2 + time_s)
+        assert state.lat_deg is not None and state.lon_deg is not None and state.alt_amsl_m
+        off_m.append(
+            (
+                111_320 * (state.lat_deg - lat),
+                93_200 * (state.lon_deg - lon),
+                state.alt_amsl_m - alt,
+            )
+        )
+    assert np.abs(np.median(off_m, axis=0)).max() < 1.0
+    log, where = telemetry_inside(aphill, HistoryConfig()) or (None, "")
+    assert log is not None and "KLV" in where and log.counts["PositionSample"] == 300
+
+
+# MISB
+
+
+def looks_at(state: VehicleState) -> np.ndarray:
+    """North, east, down of the optical axis."""
+    assert state.q_ned_gimbal_wxyz is not None
+    w, x, y, z = state.q_ned_gimbal_wxyz
+    axis: np.ndarray = Rotation.from_quat([x, y, z, w]).as_matrix()[:, 0]
+    return axis
+
+
+def test_a_real_universal_set_looks_at_its_frame_centre() -> None:
+    data = (REAL / "aphill.klv").read_bytes()
+    log = klv.of_packets(HERE, [(0, 0, data)], HistoryConfig())
+    state = at(log, 0.0)
+    assert (state.lat_deg, state.lon_deg) == pytest.approx((38.15993, -77.356214))
+    assert state.alt_amsl_m == pytest.approx(1984.6) and state.alt_agl_m == pytest.approx(
+        1984.6, abs=1
+    )
+    north, east = 111_320 * (38.18508914 - 38.15993), 87_500 * (-77.3581198 + 77.356214)
+    there = np.array([north, east, 1984.6])
+    assert math.degrees(math.acos(looks_at(state) @ there / np.linalg.norm(there))) < 2.0
+
+
+def local_set(values: dict[int, tuple[int, bool, float]]) -> bytes:
+    """ST 0601 of tag to (bits, signed, share of the range)."""
+    body = b""
+    for tag, (bits, signed, share) in values.items():
+        most = 2 ** (bits - 1) - 1 if signed else 2**bits - 1
+        body += bytes([tag, bits // 8]) + round(share * most).to_bytes(
+            bits // 8, "big", signed=signed
+        )
+    return klv.LOCAL_SET + bytes([0x82]) + struct.pack(">H", len(body)) + body
+
+
+LEVEL = {
+    13: (32, True, 47.3 / 90), 14: (32, True, -8.5 / 180), 15: (16, False, (512.5 + 900) / 19_900),
+    5: (16, False, 90 / 360), 6: (16, True, 0.0), 7: (16, True, 0.0), 21: (32, False, 2000 / 5e6),
+    18: (32, False, 90 / 360), 19: (32, True, -30 / 180), 20: (32, False, 0.0),
+}  # fmt: skip
+
+
+def test_a_local_set_gives_place_and_direction() -> None:
+    """Heading east, the sensor to the right and 30 degrees down: it looks south."""
+    log = klv.of_packets(HERE, [(0, 0, local_set(LEVEL))], HistoryConfig())
+    state = at(log, 0.0)
+    assert (state.lat_deg, state.lon_deg) == pytest.approx((47.3, -8.5), abs=1e-7)
+    assert state.alt_amsl_m == pytest.approx(512.5, abs=0.2)
+    assert state.alt_agl_m == pytest.approx(1000.0, abs=1.0)
+    np.testing.assert_allclose(looks_at(state), [-math.cos(math.radians(30)), 0.0, 0.5], atol=1e-3)
+
+
+def test_a_set_with_another_checksum_is_not_read() -> None:
+    data = bytearray(local_set(LEVEL)) + b"\x01\x02\0\0"
+    data[17:19] = struct.pack(">H", len(data) - 19)
+    total = sum(byte << 8 * ((k + 1) % 2) for k, byte in enumerate(data[:-2]))
+    data[-2:] = struct.pack(">H", total & 0xFFFF)
+    assert klv.fields_of(bytes(data))["lat"] == pytest.approx(47.3)
+    data[40] ^= 1
+    assert klv.fields_of(bytes(data)) == {}
+
+
+def test_a_value_that_says_unknown_is_left_out() -> None:
+    data = local_set(LEVEL).replace(local_set({13: LEVEL[13]})[19:], b"\x0d\x04\x80\0\0\0")
+    found = klv.fields_of(data)
+    assert "lat" not in found and found["lon"] == pytest.approx(-8.5)
+
+
+KARMA, APHILL = (REAL / "karma_0.gpmf").read_bytes(), (REAL / "aphill.klv").read_bytes()
+
+
+@settings(max_examples=150)
+@given(
+    st.binary(max_size=300),
+    st.integers(0, 8000),
+    st.sampled_from([KARMA, APHILL, local_set(LEVEL), gps9(1, 3, 1)]),
+)
+@example(b"DEVC\0\xff\xff\xff" * 30, 0, b"")
+@example(klv.LOCAL_SET + b"\xff" * 200, 0, b"")
+def test_any_bytes_are_read_or_refused(bytes_: bytes, place: int, whole: bytes) -> None:
+    """Alone, and in the place of some of a real packet."""
+    for data in (bytes_, whole[:place] + bytes_ + whole[place + len(bytes_) :], whole[:place]):
+        for reader in (gpmf, klv):
+            try:
+                log = reader.of_packets(HERE, [(0, SECOND_NS, data)] * 2, HistoryConfig())
+            except ValueError as refused:
+                assert "\n" not in str(refused)
+                continue
+            state = log.history.state_at(log.first_ns)
+            assert state is None or state.sigma_h_m is None or 0.0 < state.sigma_h_m < 1e6
