@@ -24,7 +24,7 @@ from typing import Any
 
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
-from starlette.responses import JSONResponse, RedirectResponse
+from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
@@ -41,11 +41,17 @@ MAX_TOKEN_FILE_BYTES = 65_536
 TOKEN_LINE = re.compile(r"(?:([A-Za-z0-9][A-Za-z0-9_-]{0,39})[ \t]+)?([!-~]{1,200})")
 
 
+SESSION_S = 12 * 3600.0
+"""A browser's session ends so long after its last cookie, which is renewed at half of it."""
+
+
 class Tokens:
     """Tokens by the name of who holds them. A browser's session is signed with its token."""
 
-    def __init__(self, by_name: Mapping[str, str]) -> None:
+    def __init__(self, by_name: Mapping[str, str], clock: Callable[[], float] = time.time) -> None:
         self._by_name = {name: token.encode() for name, token in by_name.items()}
+        self._clock = clock
+        self._ended: dict[str, float] = {}  # holders that logged out; until no cookie is valid
 
     def name_of(self, token: str) -> str | None:
         """Name of the holder of ``token``; None for a wrong one."""
@@ -55,17 +61,41 @@ class Tokens:
 
     def new_session(self, name: str) -> str:
         """A cookie's value for a new browser of ``name``; it does not hold the token."""
-        session = f"{name}.{secrets.token_hex(4)}"
-        return f"{session}.{self._signature(name, session)}"
+        return self._session(f"{name}.{secrets.token_hex(4)}")
 
     def holder_of(self, session: str) -> str | None:
-        """NAME.BROWSER of a cookie's value; None when we did not make it."""
+        """NAME.BROWSER of a cookie's value; None when we did not make it, or it has ended."""
+        return self._holder(session, 0.0)
+
+    def renewed(self, session: str) -> str | None:
+        """The same browser's next value; None while this one has half of its time left."""
+        holder = self._holder(session, 0.0)
+        is_due = holder is not None and self._holder(session, SESSION_S / 2) is None
+        return self._session(holder) if is_due and holder is not None else None
+
+    def end_session(self, session: str) -> None:
+        """Let no cookie of this browser be valid any more."""
+        holder, now = self.holder_of(session), self._clock()
+        if holder is not None:
+            left = {name: until for name, until in self._ended.items() if until > now}
+            self._ended = {**left, holder: now + SESSION_S}
+
+    def _session(self, holder: str) -> str:
+        body = f"{holder}.{int(self._clock() + SESSION_S)}"
+        return f"{body}.{self._signature(holder.partition('.')[0], body)}"
+
+    def _holder(self, session: str, left_s: float) -> str | None:
+        """NAME.BROWSER of a value that is valid for so much longer."""
         body, _, signature = session.rpartition(".")
-        name = body.partition(".")[0]
-        if name not in self._by_name:
+        holder, _, end = body.rpartition(".")
+        name = holder.partition(".")[0]
+        if name not in self._by_name or holder in self._ended:
             return None
         expected = self._signature(name, body).encode()
-        return body if hmac.compare_digest(signature.encode(errors="replace"), expected) else None
+        if not hmac.compare_digest(signature.encode(errors="replace"), expected):
+            return None
+        is_valid = end.isascii() and end.isdigit() and int(end) > self._clock() + left_s
+        return holder if is_valid else None
 
     def _signature(self, name: str, session: str) -> str:
         return hmac.new(self._by_name[name], session.encode(), hashlib.sha256).hexdigest()
@@ -304,6 +334,17 @@ async def _gone(receive: Receive) -> None:
 
 
 COOKIE = "skyrelief"
+
+
+def cookie_name(connection: HTTPConnection) -> str:
+    """Name of the session's cookie. Browsers take __Host- from this host by TLS only."""
+    return f"__Host-{COOKIE}" if _is_tls(connection) else COOKIE
+
+
+def _is_tls(connection: HTTPConnection) -> bool:
+    return connection.scope["scheme"] in ("https", "wss")
+
+
 WHO = "skyrelief.who"
 """Key of a request's scope for its sender; None without a token."""
 
@@ -315,7 +356,7 @@ HEADERS = (
     (
         b"content-security-policy",
         b"default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline';"
-        b" connect-src 'self' blob: ws: wss:; worker-src 'self' blob:; frame-ancestors 'none'",
+        b" connect-src 'self' blob:; worker-src 'self' blob:; frame-ancestors 'none'",
     ),
 )
 
@@ -332,8 +373,9 @@ class Guard:
             await self._app(scope, receive, send)
             return
         connection = HTTPConnection(scope)
-        send = _with_headers(send)
-        who = scope[WHO] = self._who(connection)
+        session = connection.cookies.get(cookie_name(connection)) or ""
+        who = scope[WHO] = self._who(connection, session)
+        send = _with_headers(send, *self._renewal(connection, session))
         opening = scope["path"] == "/" and "token" in connection.query_params
         refusal = self._refusal(connection, who, opening)
         if refusal is not None:
@@ -346,12 +388,21 @@ class Guard:
         else:
             await self._app(scope, receive, send)
 
-    def _who(self, connection: HTTPConnection) -> str | None:
+    def _who(self, connection: HTTPConnection, session: str) -> str | None:
         """NAME of a token's holder, or NAME.BROWSER of a session's; None for anybody else."""
         bearer = connection.headers.get("authorization", "").removeprefix("Bearer ")
         if bearer:
             return self._tokens.name_of(bearer)
-        return self._tokens.holder_of(connection.cookies.get(COOKIE) or "")
+        return self._tokens.holder_of(session)
+
+    def _renewal(self, connection: HTTPConnection, session: str) -> list[tuple[bytes, bytes]]:
+        """The header with the session's next cookie when it is due."""
+        following = self._tokens.renewed(session)
+        if following is None:
+            return []
+        answer = Response()
+        _set_cookie(answer, connection, following)
+        return [(b"set-cookie", answer.headers["set-cookie"].encode())]
 
     def _refusal(
         self, connection: HTTPConnection, who: str | None, opening: bool
@@ -383,9 +434,8 @@ class Guard:
             self._note_refusal(connection, None, 401)
             return answer
         session = self._tokens.new_session(name)
-        is_tls = connection.scope["scheme"] in ("https", "wss")
-        answer.set_cookie(COOKIE, session, httponly=True, samesite="strict", secure=is_tls)
-        self._audit.write(session.rpartition(".")[0], where(connection), "login", 303)
+        _set_cookie(answer, connection, session)
+        self._audit.write(str(self._tokens.holder_of(session)), where(connection), "login", 303)
         return answer
 
     async def _change(
@@ -412,6 +462,22 @@ class Guard:
             self._audit.write(who or "", where(connection), action, status)
 
 
+def _set_cookie(answer: Response, connection: HTTPConnection, session: str) -> None:
+    answer.set_cookie(
+        cookie_name(connection), session, max_age=int(SESSION_S), httponly=True,
+        samesite="strict", secure=_is_tls(connection),
+    )  # fmt: skip
+
+
+def logged_out(connection: HTTPConnection, tokens: Tokens) -> Response:
+    """End the browser's session; the answer deletes its cookie."""
+    name = cookie_name(connection)
+    tokens.end_session(connection.cookies.get(name) or "")
+    answer = Response(status_code=204)
+    answer.delete_cookie(name, httponly=True, samesite="strict", secure=_is_tls(connection))
+    return answer
+
+
 def where(connection: HTTPConnection) -> str:
     """The address that a request came from."""
     return connection.client.host if connection.client is not None else ""
@@ -425,12 +491,13 @@ async def _refuse(scope: Scope, receive: Receive, send: Send, refusal: tuple[int
     await JSONResponse({"error": reason}, status, CLOSE)(scope, receive, send)
 
 
-def _with_headers(send: Send) -> Send:
+def _with_headers(send: Send, *more: tuple[bytes, bytes]) -> Send:
     async def wrapped(message: Message) -> None:
         if message["type"] == "http.response.start":
             present = {name.lower() for name, _ in message["headers"]}
             message["headers"] = [
                 *message["headers"],
+                *more,
                 *(pair for pair in HEADERS if pair[0] not in present),
             ]
         await send(message)

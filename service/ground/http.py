@@ -42,6 +42,7 @@ from service.ground.guard import (
     Pace,
     Tokens,
     is_length,
+    logged_out,
     note,
 )
 from service.ground.library import ConflictError
@@ -158,6 +159,7 @@ def portal_app(state: PortalState, tokens: Tokens, local: bool) -> ASGIApp:
         Route("/api/import", _import, methods=["POST"]),
         Route(UPLOAD, _may_upload, methods=["GET"]),
         Route(UPLOAD, _upload, methods=["POST"]),
+        Route("/api/logout", _logout, methods=["POST"]),
         Route("/api/status", _status),
         Route("/api/vehicle", _figures, methods=["GET"]),
         Route("/api/vehicle", _order, methods=["POST"]),
@@ -173,6 +175,7 @@ def portal_app(state: PortalState, tokens: Tokens, local: bool) -> ASGIApp:
         exception_handlers={InputError: _said, OutsideError: _said, HTTPException: _refused},
     )
     app.state.portal = state
+    app.state.tokens = tokens
     app.state.order_pace = Pace(ORDERS_HZ, ORDERS_AT_ONCE)
     return Guard(app, tokens, local, AuditLog(state.library.store))
 
@@ -236,6 +239,8 @@ async def _body(request: Request, kind: type[T]) -> T:
     """The JSON object sent; InputError for anything else."""
     try:
         return msgspec.json.decode(await request.body(), type=kind)
+    except ClientDisconnect:
+        raise InputError("the request was cancelled") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"the request is not valid: {error}"[:300]) from error
 
@@ -428,6 +433,12 @@ async def _upload(request: Request) -> Response:
         await run_in_threadpool(upload.close)
     note(request, "upload", scan=f"{drone}/{scan}")
     return JSONResponse({"drone": drone, "scan": scan}, 201)
+
+
+def _logout(request: Request) -> Response:
+    """End this browser's session."""
+    note(request, "logout")
+    return logged_out(request, request.app.state.tokens)
 
 
 def _status(request: Request) -> Response:

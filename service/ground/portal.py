@@ -15,6 +15,7 @@ from service.ground import drone
 from service.ground.basemap import open_basemap
 from service.ground.guard import (
     MAX_BODY_BYTES,
+    Pace,
     RequestLimits,
     Tokens,
     kept_token,
@@ -37,6 +38,9 @@ from service.workers import Worker, Workers
 log = logging.getLogger(__name__)
 
 MIN_TOKEN_LETTERS = 16
+
+WARNINGS_HZ, WARNINGS_AT_ONCE = 1.0, 10
+"""Rate limit of the web server's warnings: each malformed request makes one."""
 
 BACKLOG = 64
 """Connections that may wait to be accepted, and that are accepted at once."""
@@ -127,6 +131,9 @@ class Portal:
     def _new_server(self, listener: BoundedListener) -> Any:
         import uvicorn
 
+        server_log = logging.getLogger("uvicorn.error")
+        if not any(isinstance(found, _PacedWarnings) for found in server_log.filters):
+            server_log.addFilter(_PacedWarnings())
         return uvicorn.Server(
             uvicorn.Config(
                 RequestLimits(self._app, listener),
@@ -179,6 +186,18 @@ class Portal:
             self._listener.close()
         if self._vehicle is not None:
             self._vehicle.close()
+
+
+class _PacedWarnings(logging.Filter):
+    """Lets through few warnings; errors all."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pace = Pace(WARNINGS_HZ, WARNINGS_AT_ONCE)
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether it is logged."""
+        return record.levelno > logging.WARNING or self._pace.take()
 
 
 def listener_limits() -> ListenerLimits:

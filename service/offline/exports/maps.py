@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
 import cv2
 import numpy as np
@@ -40,7 +41,7 @@ def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
         write_ortho(scan, path, options)
     image, (west, south, east, north) = _in_degrees(path)
     _, data = cv2.imencode(".png", image)
-    name = scan.store.header.scan_id
+    name = escape(scan.store.header.scan_id)
     kml = (
         '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">'
         f"<GroundOverlay><name>{name}</name><Icon><href>ortho.png</href></Icon><LatLonBox>"

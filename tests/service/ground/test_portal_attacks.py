@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from loopback import until
 from portal_client import ONE, TOKEN, Client, client, store
 
 from service.ground.portal import Portal, PortalConfig
@@ -157,3 +160,37 @@ def test_a_file_that_became_a_link_is_not_served(client: Client, store: Path) ->
         assert client.ask(f"{ONE}/{path}")[0] == 404
     entry = client.ask(ONE)[1]
     assert "report.html" not in {f["name"] for f in entry["files"]} and not entry["tiles"]
+
+
+@pytest.fixture
+def server_log() -> Iterator[list[str]]:
+    """What the web server logs."""
+    said: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
+    log = logging.getLogger("uvicorn.error")
+    log.addHandler(handler)
+    yield said
+    log.removeHandler(handler)
+
+
+def test_malformed_requests_do_not_flood_the_log(client: Client, server_log: list[str]) -> None:
+    port = int(client.base.rpartition(":")[2])
+    for _ in range(40):
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as one:
+            one.sendall(b"\x00\x01 no request\r\n\r\n")
+            assert one.recv(100).split()[1] == b"400"
+    assert 1 <= len(server_log) < 30
+
+
+def test_a_client_that_leaves_during_a_body_leaves_no_traceback(
+    client: Client, store: Path, server_log: list[str]
+) -> None:
+    port = int(client.base.rpartition(":")[2])
+    request = f"PATCH {ONE} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n"
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as one:
+        one.sendall(f"{request}Content-Length: 100\r\n\r\n{{".encode())
+    log = store / "audit.jsonl"
+    until(lambda: log.exists() and "rename" in log.read_text())
+    assert client.ask(ONE)[0] == 200
+    assert not server_log

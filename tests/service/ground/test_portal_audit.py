@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,15 @@ from loopback import until
 from portal_client import ONE, TOKEN, Client, FakeOperator, client, store
 
 from service.errors import InputError
-from service.ground.guard import TOKEN_FILE, AuditLog, Pace, Tokens, kept_token, parse_tokens
+from service.ground.guard import (
+    SESSION_S,
+    TOKEN_FILE,
+    AuditLog,
+    Pace,
+    Tokens,
+    kept_token,
+    parse_tokens,
+)
 from service.ground.library import Library
 from service.ground.portal import Portal, PortalConfig, config_of
 from service.ground.vehicle import Vehicle
@@ -136,14 +145,57 @@ def test_a_token_file_names_its_holders() -> None:
     session = tokens.new_session("ann")
     assert TOKEN not in session and session != tokens.new_session("ann")
     assert (tokens.holder_of(session) or "").startswith("ann.")
-    name, browser, signature = session.split(".")
-    for forged in (f"bob.{browser}.{signature}", f"{name}.{browser}.", "", ".", "x.y.z", "\ud800"):
+    name, browser, end, signature = session.split(".")
+    later = f"{name}.{browser}.{end}0.{signature}"
+    bob = f"bob.{browser}.{end}.{signature}"
+    for forged in (bob, later, f"{name}.{browser}.{end}.", "", ".", "x.y.z", "x.y.z.w", "\ud800"):
         assert tokens.holder_of(forged) is None
     other = Tokens(parse_tokens(f"ann {TOKEN}-3"))
     assert other.holder_of(session) is None
     for bad in ("", "# nothing", "a b c", f"ann {TOKEN}\nann {TOKEN}", "ann/x " + TOKEN):
         with pytest.raises(InputError):
             parse_tokens(bad)
+
+
+def test_a_session_is_renewed_while_it_is_used_and_then_ends() -> None:
+    clock = Clock()
+    tokens = Tokens({"ann": TOKEN}, clock)
+    first = tokens.new_session("ann")
+    holder = tokens.holder_of(first)
+    clock.now += 0.4 * SESSION_S
+    assert tokens.renewed(first) is None and tokens.holder_of(first) == holder
+    clock.now += 0.4 * SESSION_S
+    second = tokens.renewed(first)
+    assert second is not None and tokens.holder_of(second) == holder
+    clock.now += 0.4 * SESSION_S
+    assert tokens.holder_of(first) is None and tokens.renewed(first) is None
+    other = tokens.new_session("ann")
+    tokens.end_session(second)
+    assert tokens.holder_of(second) is None and tokens.holder_of(other) is not None
+
+
+def test_a_browser_logs_out(client: Client, store: Path) -> None:
+    tokens = Tokens({"operator": TOKEN})  # as the portal's
+    cookies = [f"skyrelief={tokens.new_session('operator')}" for _ in range(2)]
+
+    def rename(cookie: str) -> int:
+        return client.ask(ONE, "PATCH", {"title": "new"}, None, {"Cookie": cookie})[0]
+
+    assert [rename(cookie) for cookie in cookies] == [200, 200]
+    status, _, headers = client.ask("/api/logout", "POST", {}, None, {"Cookie": cookies[0]})
+    assert status == 204 and headers["set-cookie"].startswith('skyrelief=""; ')
+    assert "Max-Age=0" in headers["set-cookie"]
+    assert [rename(cookie) for cookie in cookies] == [401, 200]
+    assert lines_of(store)[2]["action"] == "logout"
+
+
+def test_a_session_in_use_gets_its_next_cookie(client: Client) -> None:
+    half = Tokens({"operator": TOKEN}, lambda: time.time() - 0.7 * SESSION_S)
+    value = half.new_session("operator")
+    *_, headers = client.ask("/api/scans", token=None, headers={"Cookie": f"skyrelief={value}"})
+    following = headers["set-cookie"].partition(";")[0].removeprefix("skyrelief=")
+    now = Tokens({"operator": TOKEN})
+    assert following != value and now.holder_of(following) == now.holder_of(value) is not None
 
 
 def test_a_short_token_among_several_is_refused_on_open_addresses(tmp_path: Path) -> None:
@@ -179,6 +231,10 @@ def test_the_session_cookie_is_secure_under_tls(store: Path, scheme: str, secure
     headers = dict(sent[0]["headers"])
     cookie = headers[b"set-cookie"].decode().lower()
     assert ("secure" in cookie.split("; ")) is secure
+    assert cookie.startswith("__host-skyrelief=" if secure else "skyrelief=")
+    assert "max-age=43200" in cookie and "path=/" in cookie and "domain" not in cookie
+    policy = headers[b"content-security-policy"].decode()
+    assert "connect-src 'self' blob:;" in policy
     assert TOKEN not in cookie
     assert [e["action"] for e in lines_of(store)] == ["login"]
 

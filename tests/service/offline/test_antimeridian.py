@@ -14,6 +14,7 @@ from house_flight import HillsideFlight
 from service.georeference import cut_at_180
 from service.offline.exports.view import ExportOptions, ScanView, export
 
+NAME = "barn & <b>field"
 KINDS = ("kmz", "contours", "geojson", "stac")
 
 
@@ -24,7 +25,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dateline")
     moved = HillsideFlight()
     moved.origin = (-16.83, 179.999925, 408.0)
-    moved.flown(folder).close()
+    with moved.flown(folder) as store:
+        store.update_header(scan_id=NAME)
     with ScanView(folder) as scan:
         options = ExportOptions(contour_m=1.0, cell_m=0.5, stored=True)
         for kind in KINDS:
@@ -36,6 +38,7 @@ def test_the_overlay_lies_across_180_degrees(exported: Path) -> None:
     with zipfile.ZipFile(exported / "ortho.kmz") as file:
         box = ElementTree.fromstring(file.read("doc.kml"))
     space = "{http://www.opengis.net/kml/2.2}"
+    assert next(box.iter(space + "name")).text == NAME
     west, east = (float(next(box.iter(space + side)).text or "") for side in ("west", "east"))
     assert 179.999 < west < 180.0 < east < 180.001
 
