@@ -183,6 +183,12 @@ def by_full_frame(focal_mm: float, size_px: tuple[int, int], sensor_aspect: floa
     return Lens(focal_mm * share, sigma_focal=math.hypot(SIGMA_FOCAL, rounded))
 
 
+def by_view(hfov_deg: float, size_px: tuple[int, int]) -> Lens:
+    """The lens of a field of view from side to side."""
+    across = size_px[0] / max(size_px)
+    return Lens(0.5 * across / math.tan(0.5 * math.radians(hfov_deg)))
+
+
 def _sensor_aspect(full_frame_mm: float, focal_mm: float | None) -> float:
     """Width over height of the sensor.
 

@@ -23,7 +23,7 @@ from service.cameras import open_camera, parse_source
 from service.cameras.camera_file import seeks_readout
 from service.cameras.dji_metadata import stated_shutter
 from service.cameras.images import ImagesSource
-from service.cameras.lens import Lens, by_full_frame
+from service.cameras.lens import Lens, by_full_frame, by_view
 from service.config import change
 from service.errors import InputError
 from service.flight.scan import Scan, ScanInputs, check_new, create_store
@@ -82,6 +82,9 @@ def start_lens(source: CameraSource, telemetry: TelemetryLog | None) -> StartLen
     if telemetry is not None and telemetry.focal_35mm is not None:
         lens = by_full_frame(telemetry.focal_35mm, source.size_px)
         of = f"{telemetry.focal_35mm:.0f} mm (35 mm equivalent in the telemetry)"
+    if telemetry is not None and telemetry.hfov_deg is not None:
+        lens = by_view(telemetry.hfov_deg, source.size_px)
+        of = f"{telemetry.hfov_deg:.1f} degrees (in the telemetry)"
     note = f"a lens of {of} without distortion is assumed"
     search = bent(by_tags(lens.sigma_focal))
     return StartLens(lens.camera(source.size_px), _advice(note), ("lens",), search)

@@ -153,6 +153,7 @@ def test_a_real_universal_set_looks_at_its_frame_centre() -> None:
     )
     north, east = 111_320 * (38.18508914 - 38.15993), 87_500 * (-77.3581198 + 77.356214)
     there = np.array([north, east, 1984.6])
+    assert log.hfov_deg == pytest.approx(0.8)
     assert math.degrees(math.acos(looks_at(state) @ there / np.linalg.norm(there))) < 2.0
 
 

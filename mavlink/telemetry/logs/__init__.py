@@ -30,6 +30,7 @@ class TelemetryLog:
     warnings: tuple[str, ...]
     counts: Mapping[str, int]  # messages by name, skipped_bytes, bad_checksums
     focal_35mm: float | None = None  # the camera's, as the 35 mm equivalent in mm
+    hfov_deg: float | None = None  # the camera's field of view from side to side
 
 
 def load_telemetry(path: str | Path, config: HistoryConfig | None = None) -> TelemetryLog:

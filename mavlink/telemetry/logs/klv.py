@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 
 from mavlink.telemetry.decode import plausible_place
 from mavlink.telemetry.history import MAX_AGL_M, HistoryConfig, VehicleHistory
@@ -35,6 +36,9 @@ UNIVERSAL_SET = bytes.fromhex("060e2b34020101010e01010201010000")
 MAX_ITEMS, CHECKSUM = 256, 1
 
 CAMERA = 100  # component id for the head's attitude
+SAME_VIEW = 0.02
+"""Relative tolerance of a field of view that does not zoom."""
+
 AGL_SHARE = 0.05
 """Relative sigma of the ground's height below, which is that of what the sensor sees."""
 
@@ -45,6 +49,7 @@ LOCAL: dict[int, tuple[str, float, float]] = {
     13: ("lat", -90.0, 90.0),
     14: ("lon", -180.0, 180.0),
     15: ("alt", -900.0, 19_000.0),
+    16: ("hfov", 0.0, 180.0),
     18: ("azimuth", 0.0, 360.0),
     19: ("elevation", -180.0, 180.0),
     20: ("turned", 0.0, 360.0),
@@ -66,6 +71,7 @@ UNIVERSAL: dict[bytes, str] = {
         "0701100102000000": "north",  # of the sensor's direction, from north
         "0701100103000000": "obliquity",
         "0701080101000000": "slant",
+        "0420020101080000": "hfov",
     }.items()
 }
 """Second half of the key to name; degrees and metres."""
@@ -73,13 +79,22 @@ UNIVERSAL: dict[bytes, str] = {
 
 def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> TelemetryLog:
     """The history in the packets of a metadata stream; ValueError where they give none."""
-    history, counts = VehicleHistory(config), Counter[str]()
+    history, counts, views = VehicleHistory(config), Counter[str](), list[float]()
     for time_ns, _, data in packets:
         counts["packets"] += 1
-        for sample in samples_of(fields_of(data)):
+        found = fields_of(data)
+        views += [found["hfov"]] if 0.0 < found.get("hfov", 0.0) < 180.0 else []
+        for sample in samples_of(found):
             counts[type(sample).__name__] += 1
             history.add(sample, time_ns)
-    return replace(finish(path, history, counts, []), clock="video")
+    warnings = []
+    if views and max(views) > (1.0 + SAME_VIEW) * min(views):
+        warnings.append(
+            f"the lens zooms between {min(views):.2f} and {max(views):.2f} degrees: one lens is "
+            "used for all, so shapes and scale are wrong"
+        )
+    log = replace(finish(path, history, counts, warnings), clock="video")
+    return replace(log, hfov_deg=median(views) if views else None)
 
 
 def fields_of(data: bytes) -> dict[str, float]:

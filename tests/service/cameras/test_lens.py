@@ -21,7 +21,7 @@ from mavlink.telemetry.logs import TelemetryLog
 from recon.types import F64, U8, Camera
 from service.cameras import open_camera
 from service.cameras.exif import read_tags
-from service.cameras.lens import SIGMA_FOCAL, Lens, fitted, turned
+from service.cameras.lens import SIGMA_FOCAL, Lens, by_view, fitted, turned
 from service.cameras.source import CameraSource
 from service.cli import app
 from service.commands.unstated import start_lens
@@ -290,3 +290,9 @@ def test_a_real_kite_camera_tells_its_lens() -> None:
     lens = read_tags(next((SHARED / "copr_kap_gcp" / "images").glob("*.jpg"))).lens
     assert lens is not None
     assert lens.camera((1600, 1067)).K[0, 0] == pytest.approx(2152.0, rel=2e-3)
+
+
+def test_a_field_of_view_gives_the_lens_of_any_shape() -> None:
+    for size_px in ((640, 360), (360, 640)):
+        K = by_view(60.0, size_px).camera(size_px).K
+        assert math.degrees(2.0 * math.atan(0.5 * size_px[0] / K[0, 0])) == pytest.approx(60.0)
