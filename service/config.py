@@ -335,6 +335,9 @@ def change(config: Config, name: str, value: object) -> Config:
     return _override(config, f"{name}={value}")
 
 
+MIN_BASELINE_M, MAX_BASELINE_M = 0.01, 1000.0
+
+
 def parse_baseline(value: float | str) -> tuple[Literal["auto", "metres", "frames"], float, int]:
     """("auto", 0, 0), ("metres", m, 0) or ("frames", n, m) of ``scan.baseline``.
 
@@ -350,8 +353,11 @@ def parse_baseline(value: float | str) -> tuple[Literal["auto", "metres", "frame
         metres = float(value)
     except ValueError:
         metres = -1.0
-    if not 0.0 < metres <= 1000.0:
-        raise ValueError(f"scan.baseline {value!r} is not 'auto', metres, or frames like '2/10'")
+    if not MIN_BASELINE_M <= metres <= MAX_BASELINE_M:
+        raise ValueError(
+            f"scan.baseline {value!r} is not 'auto', {MIN_BASELINE_M:g} to {MAX_BASELINE_M:g} "
+            "metres, or frames like '2/10'"
+        )
     return "metres", metres, 0
 
 

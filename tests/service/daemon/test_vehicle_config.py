@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from service.config import load_config
-from service.daemon.vehicle_config import vehicle_config
+from service.daemon.vehicle_config import vehicle_config, with_parameter
 from service.errors import InputError
 
 
@@ -51,3 +51,12 @@ def test_what_cannot_be_is_refused_in_one_line(setting: str, words: str) -> None
     with pytest.raises(InputError, match=words) as caught:
         vehicle_config(load_config(None, [setting]))
     assert "\n" not in str(caught.value)
+
+
+def test_a_baseline_that_no_flight_has_is_refused() -> None:
+    config = load_config(None, [])
+    assert with_parameter(config, "SR_BASELINE_M", 0.0).scan.baseline == "auto"
+    assert with_parameter(config, "SR_BASELINE_M", 0.01).scan.baseline == 0.01
+    for metres in (1e-40, 0.009):
+        with pytest.raises(InputError, match="to 1000 metres"):
+            with_parameter(config, "SR_BASELINE_M", metres)
