@@ -36,10 +36,13 @@ class AutopilotLink:
         history: VehicleHistory,
         outbox: SendQueue,
         say: Callable[[int, str], None],
+        restarted: Callable[[], None] = lambda: None,
     ) -> None:
+        """``restarted`` is called when the autopilot has restarted."""
         self.link: int | None = None  # where the autopilot was heard last
         self.timesync, self.wall_time = TimesyncFilter(), WallTime()
         self._presence, self._history, self._outbox, self._say = presence, history, outbox, say
+        self._restarted = restarted
         self._rates = RateKeeper()
         self._clocks: dict[int, BootClock] = {}  # by component of our system
         self._followed = (presence.system, presence.autopilot)
@@ -101,6 +104,7 @@ class AutopilotLink:
         if autopilot is None or component != autopilot[1]:
             return
         self._start_over()
+        self._restarted()
         self._say(texts.WARNING, "Autopilot restarted; telemetry starts over")
 
     def _hear_system_time(self, message: Any, packet: Packet, now_ns: int) -> None:

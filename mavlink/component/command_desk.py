@@ -4,7 +4,9 @@ Rules of the MAVLink command service: immediate acknowledgement, IN_PROGRESS whi
 final result after it, TEMPORARILY_REJECTED for the same command while it runs, UNSUPPORTED for
 unknown commands. Clients do not number their retransmissions reliably, so a repetition is
 recognised by its content: within a time window the last executed command is acknowledged again,
-not executed again. A stop is executed every time, also while the same command runs.
+not executed again. A refused one has changed nothing and may succeed now, so it is remembered only
+for the moment in which it arrives on several links. A stop is executed every time, also while the
+same command runs.
 """
 
 from __future__ import annotations
@@ -23,6 +25,8 @@ INT_UNSET = 0x7FFFFFFF
 PROGRESS_EVERY_NS = 500_000_000
 WORK_LIMIT_NS = 180_000_000_000
 S = 1_000_000_000
+MOMENT_NS = 300_000_000
+REFUSED = frozenset({Result.TEMPORARILY_REJECTED, Result.DENIED, Result.UNSUPPORTED})
 BUSY = Answer(Result.TEMPORARILY_REJECTED, "busy")
 
 
@@ -171,6 +175,8 @@ class CommandDesk:
         self, key: tuple[object, ...], answer: Answer, now_ns: int, window_ns: int
     ) -> None:
         """Remember an executed command; queries are not remembered, so that they hide none."""
+        if answer.result in REFUSED:
+            window_ns = min(window_ns, MOMENT_NS)
         if window_ns:
             self._last = _Done(key, answer, now_ns + window_ns)
 
@@ -194,6 +200,8 @@ class CommandDesk:
         """Report progress and final results of running work."""
         for (component, number), running in list(self._running.items()):
             answer = running.work.answer
+            if isinstance(answer, Work):
+                running.work, answer = answer, None
             if answer is None and now_ns >= running.until_ns:
                 running.work.cancel()
                 answer = Answer(Result.FAILED, "timed out")

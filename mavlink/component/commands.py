@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from mavlink.component.camera import MIN_INTERVAL_S
@@ -46,9 +47,9 @@ def is_stop(call: Call) -> bool:
 def start_scan(call: Call, host: Companion) -> Handled:
     """VIDEO_START_CAPTURE: start or resume a scan; a second start changes nothing.
 
-    Param 2 requests CAMERA_CAPTURE_STATUS at that rate in Hz (0: none).
+    Param 2 requests CAMERA_CAPTURE_STATUS at that rate in Hz (0: none) until the scan ends.
     """
-    return _start(host, call.param(2, 0.0))
+    return _start(call, host, call.param(2, 0.0))
 
 
 def stop_scan(call: Call, host: Companion) -> Handled:
@@ -60,28 +61,26 @@ def control_video(call: Call, host: Companion) -> Handled:
     """DO_CONTROL_VIDEO, the old command to start (param 4 = 1 or 2) and stop (0) recording."""
     recording = call.param(4, -1.0)
     if recording in (1.0, 2.0):
-        return _start(host)
+        return _start(call, host)
     if recording == 0.0:
         return _stop(host, host.control.stop_scan)
     return Answer(Result.DENIED, "DO_CONTROL_VIDEO: param 4 must be 0, 1 or 2")
 
 
-def _start(host: Companion, status_hz: float = 0.0) -> Handled:
+def _start(call: Call, host: Companion, status_hz: float = 0.0) -> Handled:
     """Start a scan unless one takes frames, and stream the camera's status at a rate."""
-    phase = host.control.status().phase
-    host.camera.stream_status(status_hz)
-    handled = ACCEPTED if phase is Phase.SCANNING else host.control.start_scan()
-    host.camera.send_capture_status()
-    return handled
+    host.camera.stream_while_recording(call.source, status_hz)
+    if host.control.status().phase is Phase.SCANNING:
+        return ACCEPTED
+    return host.control.start_scan()
 
 
 def _stop(host: Companion, how: Callable[[], Handled]) -> Handled:
-    """End the scan, its retries, the keyframe series and the camera status stream.
+    """End the scan, its retries and the series of photos.
 
     ``how`` is the control's method of stopping. It is called in every state, because a scan may
     be pending although none runs.
     """
-    host.camera.stream_status(0.0)
     handled = how()
     host.camera.stop_shooting()
     return handled
@@ -90,7 +89,7 @@ def _stop(host: Companion, how: Callable[[], Handled]) -> Handled:
 def set_baseline(call: Call, host: Companion) -> Handled:
     """DO_SET_CAM_TRIGG_DIST: set the virtual stereo baseline.
 
-    Param 1: metres, 0 lets it follow the altitude; param 3 = 1 takes a keyframe now.
+    Param 1: metres, 0 lets it follow the altitude; param 3 = 1 takes a photo now.
     """
     answer = host.parameters.change("SR_BASELINE_M", call.param(1, 0.0))
     if answer.result is Result.ACCEPTED and call.param(3, 0.0) == 1.0:
@@ -118,46 +117,47 @@ def user(call: Call, host: Companion) -> Handled:
             return Answer(Result.TEMPORARILY_REJECTED, "stop the scan before the self-test")
         return control.self_test()
     if action == START:
-        return _start(host)
+        return _start(call, host)
     if action in (FINALISE, STOP):
         return _stop(host, control.finalise if action == FINALISE else control.stop_scan)
     return Answer(Result.DENIED, "USER_1: unknown action, use 1 to 8")
 
 
-# Keyframes.
+# Photos.
 
 
 def start_capture(call: Call, host: Companion) -> Handled:
-    """IMAGE_START_CAPTURE: one keyframe now, or several at an interval.
+    """IMAGE_START_CAPTURE: one photo now, or several at an interval.
 
     Param 2: interval in s, param 3: count (0: until stopped), param 4: sequence. A numbered single
-    shot is taken once, however often it arrives. Without a number, a repetition within a moment is
-    the same call received on two links.
+    shot that is repeated within seconds is taken once. Without a number, a repetition within a
+    moment is the same call received on two links.
     """
+    host.camera.show_status()  # a ground station's button waits for it, whatever the answer
     interval_s, count = call.param(2, 0.0), call.param(3, 1.0)
     if not 0.0 <= interval_s <= MAX_SERIES_INTERVAL_S or not 0.0 <= count <= MAX_SHOTS:
         return Answer(Result.DENIED, "photo refused: interval or count out of range")
     if count == 1.0:
-        sequence = call.param(4, 0.0)
-        if sequence > 0.0 and not host.camera.is_new_shot(call.source, sequence):
-            return ACCEPTED
-        return host.camera.shoot()
+        number = call.param(4, 0.0)
+        return host.camera.shoot_once(call.source, number) if number > 0.0 else host.camera.shoot()
     if interval_s < MIN_INTERVAL_S:
         return Answer(Result.DENIED, "photo refused: interval too short")
     return host.camera.shoot_every(interval_s, int(count))
 
 
 def stop_capture(call: Call, host: Companion) -> Handled:
-    """IMAGE_STOP_CAPTURE: end a series of keyframes; also accepted when there is none."""
+    """IMAGE_STOP_CAPTURE: end a series of photos; also accepted when there is none."""
     host.camera.stop_shooting()
+    host.camera.show_status()
     return ACCEPTED
 
 
 def digicam(call: Call, host: Companion) -> Handled:
-    """DO_DIGICAM_CONTROL: one keyframe when param 5 = 1 (ArduPilot's CAM1_TYPE=5 sends it).
+    """DO_DIGICAM_CONTROL: one photo when param 5 = 1 (ArduPilot's CAM1_TYPE=5 sends it).
 
     Zoom, focus and session are ignored.
     """
+    host.camera.show_status()
     return host.camera.shoot() if call.param(5, 0.0) == 1.0 else Answer(Result.UNSUPPORTED)
 
 
@@ -174,7 +174,7 @@ def reboot(call: Call, host: Companion) -> Handled | None:
         action = Power.RESTART_SERVICE
     if action is None:
         return None  # for the autopilot or another component
-    return _unless_disarmed(host, action.value) or host.control.power(action)
+    return host.when_disarmed(action.value, partial(host.control.power, action))
 
 
 def erase(call: Call, host: Companion) -> Handled:
@@ -184,34 +184,31 @@ def erase(call: Call, host: Companion) -> Handled:
     """
     if call.param(1, 0.0) not in (0.0, 1.0) or call.param(2, 0.0) != 1.0:
         return Answer(Result.DENIED, "erase refused: storage 1 and param 2 = 1 are needed")
-    if host.control.status().phase is not Phase.IDLE:
-        return Answer(Result.TEMPORARILY_REJECTED, "erase refused while scanning")
-    refusal = _unless_disarmed(host, "erase")
-    if refusal is not None:
-        return refusal
-    if call.param(3, 0.0) == 1.0:
-        host.camera.reset_image_log()
-    return host.control.erase_scans()
+
+    def act() -> Handled:
+        refusal = _unless_idle(host, "erase")
+        if refusal is None and call.param(3, 0.0) == 1.0:
+            host.camera.reset_image_log()
+        return refusal or host.control.erase_scans()
+
+    return _unless_idle(host, "erase") or host.when_disarmed("erase", act)
 
 
-def _unless_disarmed(host: Companion, what: str) -> Answer | None:
-    """The refusal; None where the autopilot has just reported that it is disarmed."""
-    if host.presence.is_armed:
-        return Answer(Result.TEMPORARILY_REJECTED, f"{what} refused while armed")
-    if not host.is_disarmed:
-        text = f"{what} refused: armed state unknown"
-        return Answer(Result.TEMPORARILY_REJECTED, text)
-    return None
+def _unless_idle(host: Companion, what: str) -> Answer | None:
+    """The refusal while a scan runs, waits or is being closed."""
+    if host.control.status().phase is Phase.IDLE:
+        return None
+    return Answer(Result.TEMPORARILY_REJECTED, f"{what} refused while scanning")
 
 
 def reset_settings(call: Call, host: Companion) -> Handled:
     """RESET_CAMERA_SETTINGS: reset every parameter (param 1 = 1); refused while scanning."""
     if call.param(1, 0.0) != 1.0:
         return Answer(Result.DENIED, "reset refused: param 1 must be 1")
-    if host.control.status().phase is not Phase.IDLE:
-        return Answer(Result.TEMPORARILY_REJECTED, "reset refused while scanning")
-    host.parameters.reset()
-    return ACCEPTED
+    refusal = _unless_idle(host, "reset")
+    if refusal is None:
+        host.parameters.reset()
+    return refusal or ACCEPTED
 
 
 # Queries.
@@ -236,10 +233,8 @@ CAMERA_MESSAGES = {521: 259, 522: 260, 525: 261, 527: 262, 2504: 269, 2505: 270}
 
 
 def request_camera(call: Call, host: Companion) -> Handled:
-    """Send the message that the command requests; 525 has its flag in param 2."""
-    flag = 2 if call.number == 525 else 1
-    if call.number not in (2504, 2505) and call.param(flag, 1.0) != 1.0:
-        return ACCEPTED  # nothing requested
+    """Send the message that the command requests, whatever its parameter: some ground stations
+    set it to 0, which is no request by the protocol."""
     sent = host.send_requested(CAMERA, CAMERA_MESSAGES[call.number], 0, call.link)
     return ACCEPTED if sent else Answer(Result.UNSUPPORTED)
 
@@ -247,20 +242,22 @@ def request_camera(call: Call, host: Companion) -> Handled:
 def message_interval(call: Call, host: Companion) -> Handled | None:
     """SET_MESSAGE_INTERVAL and GET_MESSAGE_INTERVAL for the messages that can be streamed.
 
-    Param 1: message, param 2: interval in us, 0 for the default, -1 for never.
+    Param 1: message, param 2: interval in us, 0 for the default, -1 for never. Of several ground
+    stations' intervals the shortest counts.
     """
     if call.is_broadcast:
         return None
     component, number = call.target.component, int(call.param(1, -1.0))
-    if not host.streams.can_repeat(component, number):
+    stream = host.streams.get((component, number))
+    if stream is None:
         return Answer(Result.UNSUPPORTED)
     if call.number == GET_MESSAGE_INTERVAL:
-        host.streams.send_interval(component, number, call.link)
+        host.send_interval(component, number, call.link)
         return ACCEPTED
     interval_us = call.param(2, 0.0)
     if 0.0 < interval_us < MIN_MESSAGE_US or interval_us > MAX_MESSAGE_US:
         return Answer(Result.DENIED)
-    host.streams.set_interval(component, number, int(interval_us))
+    stream.set_interval(call.source, int(interval_us))
     return ACCEPTED
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from mavlink.component import status as texts
@@ -15,7 +16,7 @@ from mavlink.component.autopilot_link import AutopilotLink
 from mavlink.component.camera import CAPTURE_STATUS, CameraComponent, KeyframeReport
 from mavlink.component.command_desk import CommandDesk, decode_call
 from mavlink.component.commands import COMMANDS, is_stop
-from mavlink.component.control import Answer, Result, ScanControl
+from mavlink.component.control import Answer, Handled, Result, ScanControl, Work
 from mavlink.component.ftp import FileServer
 from mavlink.component.link_watch import LinkWatch, WatchConfig
 from mavlink.component.metadata import (
@@ -28,15 +29,15 @@ from mavlink.component.metadata import (
 )
 from mavlink.component.metadata import NUMBER as METADATA
 from mavlink.component.parameters import YAW_FRAME, Parameters, with_defaults
-from mavlink.component.presence import Presence
+from mavlink.component.presence import RECENT_NS, Presence
 from mavlink.component.status import ComputerLoad, StatusTexts, computer_status, motion_values
 from mavlink.telemetry.decode import READERS
 from mavlink.telemetry.gimbal import YAW_FRAMES
 from mavlink.telemetry.history import VehicleHistory
-from mavlink.wire.dialect import COMMAND_CANCEL, numbers_of
+from mavlink.wire.dialect import COMMAND_CANCEL, dialect, numbers_of
 from mavlink.wire.first_beat import CAMERA, ONBOARD
 from mavlink.wire.framing import Decoder, Packet
-from mavlink.wire.messages import Address, OutgoingMessage, SendQueue, Streams
+from mavlink.wire.messages import Address, OutgoingMessage, SendQueue, Stream
 
 S = 1_000_000_000
 MS = 1_000_000
@@ -70,6 +71,16 @@ class CompanionConfig:
     motion_every_s: float = 1.0
 
 
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """An action that waits for the report that the vehicle is disarmed."""
+
+    what: str
+    act: Callable[[], Handled]
+    work: Work
+    since_ns: int
+
+
 class Companion:
     """The protocol of our two components, apart from their heartbeats."""
 
@@ -93,8 +104,10 @@ class Companion:
         self._start_ns = self._now_ns = now_ns
         self._outbox = SendQueue()
         self._decoder = Decoder()
-        self.autopilot = AutopilotLink(presence, history, self._outbox, self.say)
-        self.streams = Streams(self._outbox)
+        self.watch = LinkWatch(config.watch, presence, now_ns)
+        self.autopilot = AutopilotLink(
+            presence, history, self._outbox, self.say, lambda: self.watch.restart(self._now_ns)
+        )
         self.texts = StatusTexts(self._outbox)
         self.parameters = Parameters(
             self._outbox,
@@ -110,14 +123,16 @@ class Companion:
             definition_version(table),
             control,
             self._outbox,
-            self.streams,
             self._boot_ms,
             lambda: self._now_ns,
+            self._answer,
         )
         self.desk = CommandDesk(COMMANDS, self._outbox, self, self._answer, is_stop)
-        self.streams.add(ONBOARD, LOAD_STATUS, round(config.load_every_s * 1e6), self._send_load)
-        self.streams.add(ONBOARD, MOTION, round(config.motion_every_s * 1e6), self._send_motion)
-        self.watch = LinkWatch(config.watch, presence, now_ns)
+        self.streams = {
+            (ONBOARD, LOAD_STATUS): Stream(round(config.load_every_s * 1e6), self._send_load),
+            (ONBOARD, MOTION): Stream(round(config.motion_every_s * 1e6), self._send_motion),
+        } | {(CAMERA, n): Stream(-1, partial(self._send_camera, n)) for n in self.camera.STREAMED}
+        self._waiting: list[_Waiting] = []
         self._is_recording, self._watch_ns = False, now_ns
 
     # Input.
@@ -150,10 +165,28 @@ class Companion:
             return
         self.desk.receive(call, COMPONENTS, now_ns)
 
-    @property
-    def is_disarmed(self) -> bool:
-        """True only where the autopilot has just reported it."""
-        return self.presence.is_disarmed(self._now_ns)
+    def when_disarmed(self, what: str, act: Callable[[], Handled]) -> Handled:
+        """Act once the autopilot reports from now on that it is disarmed; what it reported before
+        may have changed since. Refused while it is armed or silent."""
+        if self.presence.is_armed:
+            return Answer(Result.TEMPORARILY_REJECTED, f"{what} refused while armed")
+        waiting = _Waiting(what, act, Work(), self._now_ns)
+        self._waiting.append(waiting)
+        return waiting.work
+
+    def _look_at_arming(self) -> None:
+        """Act, refuse or wait on, by the autopilot's last report."""
+        waiting, self._waiting = self._waiting, []
+        for w in waiting:
+            if w.work.cancelled:
+                w.work.finish()
+            elif self.presence.is_disarmed(w.since_ns):
+                w.work.finish(w.act())
+            elif self.presence.is_armed or self._now_ns - w.since_ns > RECENT_NS:
+                why = " while armed" if self.presence.is_armed else ": armed state unknown"
+                w.work.finish(Answer(Result.TEMPORARILY_REJECTED, f"{w.what} refused{why}"))
+            else:
+                self._waiting.append(w)
 
     def _is_for_us(self, target: Address) -> bool:
         ours = target.system in (0, self.presence.system)
@@ -214,8 +247,10 @@ class Companion:
         for text in self.presence.take_news():
             self.say(texts.WARNING, text)
         self.camera.tick(now_ns)
+        self._look_at_arming()
         self.desk.tick(now_ns)
-        self.streams.tick(now_ns)
+        for stream in self.streams.values():
+            stream.tick(now_ns)
         self.texts.tick(now_ns)
         self.autopilot.tick(now_ns)
         self._watch_links(now_ns)
@@ -260,11 +295,20 @@ class Companion:
             message = None
         if message is None:
             return False
-        if number == CAPTURE_STATUS:
-            self.camera.send_capture_status()  # ground stations' buttons depend on it
-        else:
-            self._outbox.put(component, message, link)
+        is_for_all = number == CAPTURE_STATUS  # every ground station's buttons depend on it
+        self._outbox.put(component, message, None if is_for_all else link)
         return True
+
+    def send_interval(self, component: int, number: int, link: int) -> None:
+        """Send the MESSAGE_INTERVAL of a message that is streamed."""
+        interval_us = self.streams[component, number].interval_us
+        message = dialect.MAVLink_message_interval_message(number, interval_us)
+        self._outbox.put(component, message, link)
+
+    def _send_camera(self, number: int) -> None:
+        message = self.camera.message(number)
+        if message is not None:
+            self._outbox.put(CAMERA, message)
 
     def _send_load(self) -> None:
         if self.load is not None:

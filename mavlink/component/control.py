@@ -42,15 +42,15 @@ class Work:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self.fraction = 0.0  # progress, 0 to 1
-        self.answer: Answer | None = None  # the result; None while it runs
+        self.answer: Handled | None = None  # the result, or the work that follows; None: it runs
         self.cancelled = False
 
     def report(self, fraction: float) -> None:
         """Report progress, 0 to 1."""
         self.fraction = min(1.0, max(0.0, fraction))
 
-    def finish(self, answer: Answer = ACCEPTED) -> None:
-        """Report the result; the first one counts."""
+    def finish(self, answer: Handled = ACCEPTED) -> None:
+        """Report the result, or hand over to other work; the first one counts."""
         with self._lock:
             self.answer = self.answer or answer
 
@@ -66,10 +66,10 @@ class Phase(Enum):
     """State of the scan."""
 
     IDLE = "idle"
-    WAITING = "waiting"  # a scan is wanted, does not run, and is retried soon
+    WAITING = "waiting"  # a scan is wanted: it is retried soon, or follows the one being closed
     SCANNING = "scanning"
     PAUSED = "paused"
-    FINALISING = "finalising"
+    FINALISING = "finalising"  # and no other scan is wanted
 
 
 class Power(Enum):
@@ -117,7 +117,7 @@ class ScanControl(Protocol):
         return UNAVAILABLE
 
     def capture_keyframe(self) -> Handled:
-        """Make the next frame a keyframe and report it."""
+        """Take the next frame as a photo and report it."""
         return UNAVAILABLE
 
     def pause(self) -> Handled:

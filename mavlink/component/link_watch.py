@@ -34,6 +34,7 @@ TO_ONE = numbers_of(
 )
 """Messages that name their target component."""
 ASK_WAIT_S = 60.0
+BREAK_NS = 5 * S  # of the autopilot: afterwards its messages are waited for again
 PX4 = 12  # MAV_AUTOPILOT
 
 SILENT = "No autopilot: check mavlink.links, SERIALn_PROTOCOL and SERIALn_BAUD (PX4: MAV_n_CONFIG)"
@@ -72,7 +73,8 @@ class LinkWatch:
 
     def __init__(self, config: WatchConfig, presence: Presence, now_ns: int) -> None:
         self._config, self._presence = config, presence
-        self._first_autopilot_ns: int | None = None
+        self._autopilot_ns: int | None = None  # its last message
+        self._since_ns = now_ns  # it is heard without a break
         self._modern_ns = self._old_ns = self._gimbal_ns = -(1 << 62)  # never
         self._start_ns = self._ground_ns = now_ns
         self._asked_ns: int | None = None  # when a ground station addressed one of our components
@@ -83,8 +85,9 @@ class LinkWatch:
         """Process one packet and its message."""
         system = self._presence.system
         if (packet.system, packet.component) == self._presence.autopilot:
-            if self._first_autopilot_ns is None:
-                self._first_autopilot_ns = now_ns
+            if self._autopilot_ns is None or now_ns - self._autopilot_ns > BREAK_NS:
+                self.restart(now_ns)
+            self._autopilot_ns = now_ns
             if packet.data[0] == MAGIC_V1:
                 self._old_ns = now_ns
             else:
@@ -97,9 +100,13 @@ class LinkWatch:
             is_ours = message.target_component in TYPES
             self._asked_ns = now_ns if is_ours else self._asked_ns
 
+    def restart(self, now_ns: int) -> None:
+        """Wait for the messages of an autopilot that has just started."""
+        self._since_ns = now_ns
+
     def troubles(self, now_ns: int) -> tuple[Trouble, ...]:
         """Whatever is missing now, the most severe first."""
-        found = (self._autopilot(now_ns) or self._telemetry(now_ns), self._ground(now_ns))
+        found = (self._autopilot(now_ns) or self._telemetry(), self._ground(now_ns))
         return tuple(trouble for trouble in found if trouble is not None)
 
     def _is_stale(self, since_ns: int, wait_s: float, now_ns: int) -> bool:
@@ -121,14 +128,14 @@ class LinkWatch:
         text = f"No autopilot of system {given}, but of {names}: correct mavlink.system_id"
         return Trouble("autopilot", text)
 
-    def _telemetry(self, now_ns: int) -> Trouble | None:
-        """Messages that the autopilot does not send."""
-        first_ns, wait_s = self._first_autopilot_ns, self._config.wait_s
-        if first_ns is None or not self._is_stale(first_ns, wait_s, now_ns):
+    def _telemetry(self) -> Trouble | None:
+        """Messages that the autopilot does not send while it sends others."""
+        heard_ns, wait_s = self._autopilot_ns, self._config.wait_s
+        if heard_ns is None or not self._is_stale(self._since_ns, wait_s, heard_ns):
             return None
-        if self._old_ns > self._modern_ns and self._is_stale(self._modern_ns, wait_s, now_ns):
+        if self._old_ns > self._modern_ns and self._is_stale(self._modern_ns, wait_s, heard_ns):
             return Trouble("mavlink 1", MAVLINK_1)
-        if self._config.gimbal is False or not self._is_stale(self._gimbal_ns, wait_s, now_ns):
+        if self._config.gimbal is False or not self._is_stale(self._gimbal_ns, wait_s, heard_ns):
             return None
         return Trouble("gimbal", NO_GIMBAL, is_grave=bool(self._config.gimbal))
 

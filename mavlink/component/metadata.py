@@ -124,6 +124,8 @@ def definition_version(table: Sequence[Parameter]) -> int:
 
 def _described(p: Parameter) -> str:
     attributes = f'name={quoteattr(p.name)} type="float" default="{p.default:g}"'
+    if p.is_constant:
+        attributes += ' readonly="1" control="0"'
     if not p.options:
         attributes += f' min="{p.low:g}" max="{p.high:g}" step="{p.step:g}"'
         if p.unit:

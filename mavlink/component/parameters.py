@@ -44,6 +44,11 @@ class Parameter:
         if not self.low <= self.default <= self.high:
             raise ValueError(f"parameter {self.name}: default {self.default} is out of range")
 
+    @property
+    def is_constant(self) -> bool:
+        """True for a value that only describes us."""
+        return self.low == self.high
+
     def accepts(self, value: float) -> bool:
         """True for a value in range; only whole numbers where values have names."""
         if not math.isfinite(value) or not self.low <= value <= self.high:
@@ -58,8 +63,9 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter(YAW_FRAME, 0.0, 0.0, len(YAW_FRAMES) - 1.0, "Gimbal yaw frame", options=YAW_FRAMES),
     Parameter("SR_CAM_LATENCY", 0.0, -500.0, 2000.0, "Camera latency", (), "ms", 5.0),
     Parameter("SR_CAM_LAT_AUTO", 0.0, 0.0, 1.0, "Apply measured latency", ("off", "on")),
+    Parameter("CAM_MODE", 1.0, 1.0, 1.0, "Camera mode", ("photo", "video")),  # clients expect it
 )
-"""A new parameter is one line here and one in the service's table."""
+"""A new parameter is one line here and, unless it is constant, one in the service's table."""
 
 
 def with_defaults(values: Mapping[str, float]) -> tuple[Parameter, ...]:
@@ -125,7 +131,7 @@ class Parameters:
         if not parameter.accepts(value):
             span = f"{parameter.low:g} to {parameter.high:g}"
             return Answer(Result.DENIED, f"{name} refused: {value:g} is not {span}")
-        answer = self._on_change(name, value)
+        answer = Answer() if parameter.is_constant else self._on_change(name, value)
         if answer.result is Result.ACCEPTED and self._values[name] != _real32(value):
             self._take(name, value)
         return answer

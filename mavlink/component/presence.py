@@ -20,7 +20,7 @@ from mavlink.wire.messages import OutgoingMessage
 S = 1_000_000_000
 PERIOD_NS = S
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
-RECENT_NS = 3 * S  # an older armed state counts as unknown
+RECENT_NS = 3 * S  # the autopilot's state is heard as often, or it is unknown
 
 
 class Health(IntEnum):
@@ -110,12 +110,12 @@ class Presence:
         followed = self.autopilots.followed
         return followed is not None and followed.is_armed
 
-    def is_disarmed(self, now_ns: int) -> bool:
-        """True only where the autopilot, certainly ours, has just reported it."""
+    def is_disarmed(self, since_ns: int) -> bool:
+        """True only where the autopilot, certainly ours, has reported it after ``since_ns``."""
         followed = self.autopilots.followed
         if followed is None or followed.is_armed or not self.is_certain:
             return False
-        return now_ns - followed.seen_ns <= RECENT_NS
+        return followed.seen_ns > since_ns
 
     def confirm(self, health: Health, now_ns: int) -> None:
         """Confirm that the service is alive and in this state; repeat every few seconds."""

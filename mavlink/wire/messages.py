@@ -92,47 +92,42 @@ def _with_signed_flag(data: bytes, crc_extra: int) -> bytes:
     return body + crc.to_bytes(2, "little")
 
 
-@dataclass(slots=True)
-class _Stream:
-    default_us: int  # -1: only sent on request
-    interval_us: int
-    send: Callable[[], None]
-    next_ns: int
+MAX_SUBSCRIBERS = 16  # of one message; the oldest makes room
 
 
-class Streams:
-    """A table of (component, message number), each with an interval and a sender."""
+class Stream:
+    """A repeated message. Each subscriber has an interval of its own; the shortest one counts."""
 
-    def __init__(self, outbox: SendQueue) -> None:
-        self._outbox = outbox
-        self._streams: dict[tuple[int, int], _Stream] = {}
+    def __init__(self, default_us: int, send: Callable[[], None]) -> None:
+        """``default_us`` holds without subscribers; -1: only sent on request."""
+        self._default_us, self._send = default_us, send
+        self._wanted: dict[Address, int] = {}
+        self._next_ns = 0
 
-    def add(self, component: int, number: int, default_us: int, send: Callable[[], None]) -> None:
-        """Make a message repeatable."""
-        self._streams[(component, number)] = _Stream(default_us, default_us, send, 0)
+    @property
+    def interval_us(self) -> int:
+        """The interval in force; -1 where nothing is sent."""
+        wanted = [us for us in self._wanted.values() if us > 0]
+        return min(wanted) if wanted else -1 if self._wanted else self._default_us
 
-    def can_repeat(self, component: int, number: int) -> bool:
-        """True for a message that was added."""
-        return (component, number) in self._streams
-
-    def set_interval(self, component: int, number: int, interval_us: int) -> None:
+    def set_interval(self, subscriber: Address, interval_us: int) -> None:
         """0 is the default interval; -1 (any negative) stops the stream."""
-        stream = self._streams[(component, number)]
-        stream.interval_us = stream.default_us if interval_us == 0 else max(-1, interval_us)
-        stream.next_ns = 0
+        self._wanted.pop(subscriber, None)
+        while len(self._wanted) >= MAX_SUBSCRIBERS:
+            del self._wanted[next(iter(self._wanted))]
+        self._wanted[subscriber] = max(-1, interval_us or self._default_us)
+        self._next_ns = 0
 
-    def send_interval(self, component: int, number: int, link: int) -> None:
-        """Answer with MESSAGE_INTERVAL."""
-        interval = self._streams[(component, number)].interval_us
-        message = dialect.MAVLink_message_interval_message(number, interval)
-        self._outbox.put(component, message, link)
+    def end(self) -> None:
+        """Forget the subscribers."""
+        self._wanted.clear()
 
     def tick(self, now_ns: int) -> None:
-        """Send messages that are due."""
-        for stream in self._streams.values():
-            if stream.interval_us > 0 and now_ns >= stream.next_ns:
-                stream.next_ns = now_ns + stream.interval_us * 1000
-                stream.send()
+        """Send the message if it is due."""
+        interval_us = self.interval_us
+        if interval_us > 0 and now_ns >= self._next_ns:
+            self._next_ns = now_ns + interval_us * 1000
+            self._send()
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from mavlink.component.control import (
     ScanStatus,
     Work,
 )
+from service.daemon.load_shedding import Level
 from service.daemon.scanning import Scanning
 from service.daemon.vehicle_config import with_parameter
 from service.errors import InputError, OutsideError, SkyreliefError
@@ -35,7 +36,7 @@ NO_PHOTO = {
     Phase.PAUSED: "the scan is paused, resume it first",
     Phase.FINALISING: "the scan is being closed",
 }
-"""Reasons why no keyframe can be taken."""
+"""Reasons why no photo can be taken."""
 
 
 class ControlActions:
@@ -98,13 +99,17 @@ class ControlActions:
         return ACCEPTED if is_resumed else Answer(Result.DENIED, "the scan is not paused")
 
     def capture_keyframe(self) -> Handled:
-        """Make the next frame a keyframe; refused while no scan takes frames."""
+        """Take the next frame as a photo; refused while no scan takes frames."""
         scan, phase = self._scanning.scan, self._scanning.phase
         if phase is not Phase.SCANNING:
-            return Answer(Result.TEMPORARILY_REJECTED, f"photo refused: {NO_PHOTO[phase]}")
+            why = NO_PHOTO[Phase.FINALISING if self._scanning.is_closing else phase]
+            return Answer(Result.TEMPORARILY_REJECTED, f"photo refused: {why}")
         if scan is None:
             return Answer(Result.TEMPORARILY_REJECTED, "photo refused: the camera is being opened")
-        scan.pipeline.take_next()
+        if self._scanning.level is Level.RECORD_ONLY:
+            why = "photo refused: the computer is overloaded, images are only stored"
+            return Answer(Result.TEMPORARILY_REJECTED, why)
+        scan.take_photo()
         return ACCEPTED
 
     def clear_map(self) -> Handled:

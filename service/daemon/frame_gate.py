@@ -1,14 +1,12 @@
 """The gate between camera and scan: passes frames, or only stores them on disk.
 
-Stored images are JPEG files named by their time, a folder that ``skyrelief replay`` accepts: frames
-not reconstructed in flight can be reconstructed later from it and the scan's .tlog.
+Frames not reconstructed in flight can be reconstructed later from the stored images and the scan's
+.tlog.
 """
 
 from __future__ import annotations
 
 import logging
-import os
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,14 +14,12 @@ from threading import Event
 
 from service.cameras.source import CameraFrame, CameraSource, Dropping
 from service.daemon.load_shedding import STRIDE, Level
+from service.daemon.stored_image import image_name, store_image
 
 log = logging.getLogger(__name__)
 
 KEEP_EVERY_NS = 200_000_000
 """Interval between stored images; 2 m of flight at 10 m/s."""
-
-QUALITY = 90
-MIN_FREE_MIB = 500.0
 
 
 class FrameGate:
@@ -106,7 +102,8 @@ class FrameGate:
             return
         self._kept_ns = frame.time_ns
         try:
-            self._write(frame)
+            name = image_name(self._zero_unix_ns + frame.time_ns)
+            store_image(self._folder / name, frame.image)
         except OSError as error:
             self.lost += 1
             if not self._faulty:
@@ -115,22 +112,3 @@ class FrameGate:
         else:
             self.kept += 1
             self._faulty = False
-
-    def _write(self, frame: CameraFrame) -> None:
-        import cv2
-
-        self._folder.mkdir(parents=True, exist_ok=True)
-        if shutil.disk_usage(self._folder).free < MIN_FREE_MIB * 2**20:
-            raise OSError(28, "the disk is nearly full")
-        _, data = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-        path = self._folder / image_name(self._zero_unix_ns + frame.time_ns)
-        part = path.with_suffix(".part")
-        part.write_bytes(data.tobytes())
-        os.replace(part, path)
-
-
-def image_name(unix_ns: int) -> str:
-    """A file name with the UTC time to the microsecond: 20261121130501123456Z.jpg."""
-    seconds, rest_ns = divmod(unix_ns, 1_000_000_000)
-    moment = time.strftime("%Y%m%d%H%M%S", time.gmtime(seconds))
-    return f"{moment}{rest_ns // 1000:06d}Z.jpg"

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mavlink.component.control import Phase
-from mavlink.component.presence import Health
+from mavlink.component.presence import RECENT_NS, Health
 from mavlink.component.status import CRITICAL, NOTICE, WARNING
 from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.first_beat import FirstBeats
@@ -293,7 +293,7 @@ class Daemon:
         landing = self._landing.look(
             self.scanning.intent.wants_scan and scan.start == "on-command",
             presence.is_armed,
-            presence.is_disarmed(time.monotonic_ns()),
+            presence.is_disarmed(time.monotonic_ns() - RECENT_NS),
             scan.close_after_landing_s,
             time.monotonic(),
         )

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mavlink.component.camera import KeyframeReport
 from mavlink.component.status import WARNING
 from mavlink.telemetry.clock import agree, computer_offset_ns
 from service.config import Config, change
@@ -27,13 +28,13 @@ if TYPE_CHECKING:
     from service.daemon.frame_gate import FrameGate
     from service.daemon.scanning import Scanning
     from service.flight.pipeline import Step
-    from service.flight.scan import Scan, ScanInputs
+    from service.flight.scan import Photo, Scan, ScanInputs
     from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
 
-LATER = "later"
-"""Subfolder of a scan for images that are only stored."""
+LATER, PHOTOS = "later", "photos"
+"""Subfolders of a scan: images that are only stored, and those that operators asked for."""
 
 
 class ScanRun:
@@ -51,6 +52,7 @@ class ScanRun:
         self._store: ScanStore | None = None
         self._thread_id = 0
         self._news_reported = 0  # camera warnings reported so far
+        self._photos: set[int] = set()  # times of the frames that were reported as photos
 
     @property
     def is_ending(self) -> bool:
@@ -190,6 +192,7 @@ class ScanRun:
             warn=lambda text: vehicle.statustext(text, WARNING),
             on_step=odometry_reporter(host.config, vehicle),
             on_keyframe=self._on_keyframe,
+            on_photo=self._on_photo,
         )
         return inputs, gate
 
@@ -221,8 +224,14 @@ class ScanRun:
 
     def _on_keyframe(self, keyframe: Keyframe) -> None:
         scan = self.scan
-        if scan is not None:
+        if scan is not None and keyframe.time_ns not in self._photos:
             report_keyframe(self._host.vehicle, scan, keyframe)
+
+    def _on_photo(self, photo: Photo) -> None:
+        scan = self.scan
+        if scan is not None:
+            self._photos.add(photo.time_ns)
+            report_photo(self._host.vehicle, scan, photo)
 
 
 def new_folder(scans: Path, unix_s: float) -> Path:
@@ -261,7 +270,29 @@ def report_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> Non
     agl_m = None if state is None else state.alt_agl_m
     time_ns = keyframe.time_ns + inputs.unix_offset_ns
     T = keyframe.pose.T_world_camera
-    vehicle.report_keyframe(keyframe_report(time_ns, T, scan.rig.frame, agl_m))
+    report = keyframe_report(time_ns, T[:3, :3], T[:3, 3], scan.rig.frame, agl_m)
+    vehicle.report_keyframe(report)
+
+
+def report_photo(vehicle: VehicleLink, scan: Scan, photo: Photo) -> None:
+    """Store a photo and report it to ground stations, or why that failed."""
+    from service.daemon.stored_image import image_name, store_image
+    from service.flight.vehicle_reports import keyframe_report
+
+    inputs = scan.inputs
+    time_ns = photo.time_ns + inputs.unix_offset_ns
+    path = inputs.folder / PHOTOS / image_name(time_ns)
+    report = keyframe_report(
+        time_ns, photo.R_world_camera, photo.position_m, scan.rig.frame, photo.agl_m,
+        f"{inputs.scan_id}/{PHOTOS}/{path.name}",
+    )  # fmt: skip
+    try:
+        store_image(path, photo.image, report)
+    except OSError as error:
+        why = f"photo failed: {error.strerror or error}"
+        vehicle.statustext(why, WARNING, is_answer=True)
+        report = KeyframeReport(ok=False)
+    vehicle.report_keyframe(report)
 
 
 def disagreement(offset_ns: int) -> list[str]:

@@ -162,10 +162,10 @@ class Scanning:
     def phase(self) -> Phase:
         """The current phase."""
         with self._lock:
-            if self._run is None:
-                return Phase.WAITING if self.intent.wants_scan else Phase.IDLE
-            if self._run.is_ending:
-                return Phase.FINALISING
+            if self._run is None or self._run.is_ending:
+                if self.intent.wants_scan:
+                    return Phase.WAITING
+                return Phase.IDLE if self._run is None else Phase.FINALISING
             return Phase.PAUSED if self.intent.wanted is Wanted.PAUSE else Phase.SCANNING
 
     @property
@@ -176,7 +176,8 @@ class Scanning:
     @property
     def is_closing(self) -> bool:
         """True from the end of a scan until its files are written."""
-        return self.phase is Phase.FINALISING
+        run = self._run
+        return run is not None and run.is_ending
 
     @property
     def scan(self) -> Scan | None:

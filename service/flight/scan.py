@@ -8,6 +8,7 @@ import math
 import os
 import secrets
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -20,7 +21,7 @@ from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
 from recon.posegraph.between_keyframes import Odometer
 from recon.tracking.known_track import KnownTrack
-from recon.types import Camera, Frame, Keyframe, PosePrior, Shutter
+from recon.types import F64, U8, Camera, Frame, Keyframe, PosePrior, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter
 from service.cameras.rig import ASSUMED_AGL_M, Rig, turn_sigma_rad_s
 from service.cameras.source import CameraFrame, CameraSource, ahead
@@ -62,6 +63,17 @@ def short_collections() -> Iterator[None]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Photo:
+    """A frame that was asked for as a photo, with its tag; unknown parts are None."""
+
+    image: U8  # (H, W, 3) BGR
+    time_ns: int  # exposure
+    R_world_camera: F64 | None  # (3, 3)
+    position_m: F64 | None  # (3,) ENU about the scan's origin
+    agl_m: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ScanInputs:
     """Inputs of a scan."""
 
@@ -83,6 +95,7 @@ class ScanInputs:
     warn: Callable[[str], None] = log.warning  # the operator
     on_step: Callable[[Step, VehicleState | None, int], None] | None = None  # and its exposure
     on_keyframe: Callable[[Keyframe], None] | None = None
+    on_photo: Callable[[Photo], None] | None = None
 
 
 def check_new(folder: Path) -> Path:
@@ -156,7 +169,13 @@ class Scan:
         self.shutter = ShutterWatch(odometry.exposure, coarser, inputs.warn)
         self.tags = FrameTags(inputs.folder / TAGS_FILE) if inputs.history is not None else None
         self.tagged = self.odd_sized = self.heights = self.attitudes = 0
+        self._photos: deque[None] = deque()  # one for each that was asked for
         self._started = time.monotonic()
+
+    def take_photo(self) -> None:
+        """Hand out the next frame as a photo; it becomes a keyframe where it has partners."""
+        self._photos.append(None)
+        self.pipeline.take_next()
 
     def feed(self, frame: CameraFrame) -> Step | None:
         """One frame through the pipeline; None when its size is not the camera's."""
@@ -178,7 +197,8 @@ class Scan:
         prior = self._odometer.take(exposed_ns, prior)
         if self.pipeline.stages.track.odometry.needs_turn(exposed_ns):
             prior = self._turning(prior, exposed_ns)
-        step = self.pipeline.skip(exposed_ns, prior)
+        is_photo = bool(self._photos)
+        step = None if is_photo else self.pipeline.skip(exposed_ns, prior)
         if step is None:
             step = self.pipeline.step(Frame(frame.image, exposed_ns, frame.seq, prior))
         self.check.add(time_ns, step.tracked)
@@ -187,9 +207,23 @@ class Scan:
         for doubt in self.pipeline.stages.chain.new_doubts():
             inputs.warn(doubt)
         self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)
+        if is_photo:
+            self._hand_out(Frame(frame.image, exposed_ns, frame.seq, prior), step, state)
         if inputs.on_step is not None:
             inputs.on_step(step, state, exposed_ns)
         return step
+
+    def _hand_out(self, frame: Frame, step: Step, state: VehicleState | None) -> None:
+        """A photo, by telemetry, or by vision where telemetry does not tell."""
+        self._photos.popleft()
+        prior, placed = frame.prior, step.placed
+        R = None if prior.is_view_assumed else prior.R_world_camera
+        position = prior.position_m
+        if placed is not None and (R is None or position is None):
+            R, position = placed.T_world_camera[:3, :3], placed.T_world_camera[:3, 3]
+        agl_m = state.alt_agl_m if state is not None else None
+        if self.inputs.on_photo is not None:
+            self.inputs.on_photo(Photo(frame.image, frame.time_ns, R, position, agl_m))
 
     def _turning(self, prior: PosePrior, exposed_ns: int) -> PosePrior:
         """The prior with the camera's turn about the moment of exposure, by telemetry."""

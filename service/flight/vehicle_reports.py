@@ -100,12 +100,19 @@ def _covariance(covariance: F64) -> list[list[float]]:
 
 
 def keyframe_report(
-    time_unix_ns: int, T_world_camera: F64, frame: LocalFrame | None, agl_m: float | None
+    time_unix_ns: int,
+    R_world_camera: F64 | None,
+    position_m: F64 | None,
+    frame: LocalFrame | None,
+    agl_m: float | None,
+    file: str = "",
 ) -> KeyframeReport:
     """Its geographic position and the attitude of its head; no place without a georeference."""
-    R_ned_head = R_ENU_NED.T @ T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T
-    w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(np.asarray(R_ned_head)))
-    lat = lon = alt = None
-    if frame is not None:
-        lat, lon, alt = (float(v) for v in frame.to_geodetic(T_world_camera[None, :3, 3])[0])
-    return KeyframeReport(time_unix_ns // 1000, lat, lon, alt, agl_m, (w, x, y, z))
+    head = lat = lon = alt = None
+    if R_world_camera is not None:
+        R_ned_head = np.asarray(R_ENU_NED.T @ R_world_camera @ R_GIMBAL_CAMERA.T)
+        w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(R_ned_head))
+        head = w, x, y, z
+    if position_m is not None and frame is not None:
+        lat, lon, alt = (float(v) for v in frame.to_geodetic(position_m[None])[0])
+    return KeyframeReport(time_unix_ns // 1000, lat, lon, alt, agl_m, head, file=file)

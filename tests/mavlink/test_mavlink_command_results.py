@@ -74,15 +74,15 @@ class Vehicle:
     def be(self, phase: Phase) -> None:
         self.control.state = replace(self.control.state, phase=phase)
 
-    def arm(self, armed: bool = True) -> None:
+    def arm(self, armed: bool = True) -> list[Result]:
         beat = dialect.MAVLink_heartbeat_message(2, 3, 128 if armed else 0, 0, 4, 3)
-        self.say(bytes(beat.pack(dialect.MAVLink(None, 1, 1))))
+        return self.say(bytes(beat.pack(dialect.MAVLink(None, 1, 1))))
 
-    def cancel(self, number: int, component: int) -> None:
+    def cancel(self, number: int, component: int) -> list[Result]:
         payload = struct.pack("<HBB", number, 1, component)
         head = bytes((0xFD, len(payload), 0, 0, 0, *STATION, COMMAND_CANCEL, 0, 0))
         crc = x25crc(head[1:] + payload + bytes((14,))).crc
-        self.say(head + payload + struct.pack("<H", crc))
+        return self.say(head + payload + struct.pack("<H", crc))
 
 
 Asked = Callable[[Vehicle], list[Result]]
@@ -108,6 +108,17 @@ def during(phase: Phase, asked: Asked) -> Asked:
     return ask
 
 
+def disarmed(asked: Asked) -> Asked:
+    """Asked of a vehicle that reports afterwards that it is disarmed."""
+
+    def ask(v: Vehicle) -> list[Result]:
+        assert asked(v) == [RUNNING]
+        v.later(0.5)
+        return v.arm(False) + v.later(0.1)
+
+    return ask
+
+
 def armed(asked: Asked) -> Asked:
     def ask(v: Vehicle) -> list[Result]:
         v.arm()
@@ -117,11 +128,11 @@ def armed(asked: Asked) -> Asked:
 
 
 def unheard(asked: Asked) -> Asked:
-    """Asked when the autopilot's heartbeats have stopped a while ago."""
+    """Asked when the autopilot's heartbeats stop."""
 
     def ask(v: Vehicle) -> list[Result]:
-        v.later(4.0)
-        return asked(v)
+        assert asked(v) == [RUNNING]
+        return v.later(4.0)
 
     return ask
 
@@ -132,6 +143,8 @@ def worked(what: str, end: str, number: int, component: int, *params: float) -> 
     def ask(v: Vehicle) -> list[Result]:
         work = v.control.works[what] = Work()
         first = v.ask(number, component, *params)
+        v.later(0.1)
+        v.arm(False)
         if end == "runs":
             return first
         if end == "cancelled":
@@ -139,6 +152,16 @@ def worked(what: str, end: str, number: int, component: int, *params: float) -> 
             assert work.cancelled
         work.finish(Answer(Result.FAILED, "no") if end == "fails" else Answer())
         return v.later(0.1)
+
+    return ask
+
+
+def stopped(number: int, component: int, *params: float) -> Asked:
+    """Cancelled while it waits for the autopilot."""
+
+    def ask(v: Vehicle) -> list[Result]:
+        assert v.ask(number, component, *params) == [RUNNING]
+        return v.cancel(number, component)
 
     return ask
 
@@ -190,7 +213,10 @@ CASES: dict[int, dict[Result, list[Asked]]] = {
         DENIED: [plain(200, CAMERA, 0, 0, 0, 9)],
     },
     526: {
-        ACCEPTED: [plain(526, CAMERA, 1, 1), worked("erase_scans", "ends", 526, CAMERA, 1, 1)],
+        ACCEPTED: [
+            disarmed(plain(526, CAMERA, 1, 1)),
+            worked("erase_scans", "ends", 526, CAMERA, 1, 1),
+        ],
         RUNNING: [worked("erase_scans", "runs", 526, CAMERA, 1, 1)],
         REJECTED: [
             during(SCANNING, plain(526, CAMERA, 1, 1)),
@@ -233,23 +259,30 @@ CASES: dict[int, dict[Result, list[Asked]]] = {
         CANCELLED: [worked("finalise", "cancelled", 31010, ONBOARD, 5)],
     },
     246: {
-        ACCEPTED: [plain(246, ONBOARD, 0, k) for k in (1, 2)] + [plain(246, ONBOARD, 0, 0, 1, 191)],
+        ACCEPTED: [disarmed(plain(246, ONBOARD, 0, k)) for k in (1, 2)]
+        + [disarmed(plain(246, ONBOARD, 0, 0, 1, 191))],
+        RUNNING: [plain(246, ONBOARD, 0, 1)],
         REJECTED: [armed(plain(246, ONBOARD, 0, k)) for k in (1, 2)]
         + [armed(plain(246, ONBOARD, 0, 0, 1, 191))]
         + [unheard(plain(246, ONBOARD, 0, k)) for k in (1, 2)],
         DENIED: [plain(246, ONBOARD, 1, 0)],
-        FAILED: [refused("power: reboot", FAILED, plain(246, ONBOARD, 0, 1))],
+        FAILED: [refused("power: reboot", FAILED, disarmed(plain(246, ONBOARD, 0, 1)))],
+        CANCELLED: [stopped(246, ONBOARD, 0, 1)],
     },
     512: {
         ACCEPTED: [plain(512, CAMERA, k) for k in (259, 260, 261, 262)],
         UNSUPPORTED: [plain(512, CAMERA, 269), plain(512, ONBOARD, 259), plain(512, CAMERA, 5)],
     },
     511: {
-        ACCEPTED: [plain(511, CAMERA, 262, 1e6), plain(511, ONBOARD, 390, -1)],
+        ACCEPTED: [plain(511, CAMERA, k, 1e6) for k in (259, 260, 261, 262)]
+        + [plain(511, ONBOARD, 390, -1)],
         DENIED: [plain(511, CAMERA, 262, 100), plain(511, CAMERA, 262, 1e12)],
         UNSUPPORTED: [plain(511, CAMERA, 30, 1e6)],
     },
-    510: {ACCEPTED: [plain(510, CAMERA, 262)], UNSUPPORTED: [plain(510, CAMERA, 30)]},
+    510: {
+        ACCEPTED: [plain(510, CAMERA, k) for k in (259, 260, 261, 262)],
+        UNSUPPORTED: [plain(510, CAMERA, 30)],
+    },
     521: {ACCEPTED: [plain(521, CAMERA, 1), plain(521, CAMERA, 0)]},
     522: {ACCEPTED: [plain(522, CAMERA, 1)]},
     525: {ACCEPTED: [plain(525, CAMERA, 0, 1), plain(525, CAMERA, 0, 0)]},

@@ -18,13 +18,14 @@ from mavlink.component.command_desk import Command
 from mavlink.component.commands import COMMANDS
 from mavlink.component.companion import Companion, CompanionConfig
 from mavlink.component.control import Answer, Phase, Result, Work
+from mavlink.component.metadata import VERSION
 from mavlink.component.parameters import PARAMETERS
 from mavlink.component.presence import Health, Presence, PresenceConfig
 from mavlink.component.status import ComputerLoad
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.wire.dialect import COMMAND_CANCEL, dialect, x25crc
 from mavlink.wire.framing import Framer
-from mavlink.wire.messages import Packer
+from mavlink.wire.messages import Address, Packer
 
 S = 1_000_000_000
 MS = 1_000_000
@@ -109,9 +110,10 @@ class Ends:
             assert ack.get_srcSystem() == self.presence.system
         return [ack.result for ack in acks]
 
-    def arm(self, armed: bool = True, system: int = 1) -> None:
+    def arm(self, armed: bool = True, system: int = 1) -> list[Any]:
+        """The autopilot's report; what the companion sent then."""
         beat = dialect.MAVLink_heartbeat_message(2, 3, 128 if armed else 0, 0, 4, 3)
-        self.say(beat, (system, 1))
+        return self.say(beat, (system, 1))
 
     def disarm(self) -> None:
         """Be disarmed for long enough that it is certainly our autopilot that says so."""
@@ -121,6 +123,12 @@ class Ends:
 
     def texts(self) -> list[str]:
         return [m.text for m in self.heard if m.get_type() == "STATUSTEXT"]
+
+
+def results(messages: Iterable[Any], number: int) -> list[int]:
+    """The acknowledgements of a command, in order."""
+    acks = [m for m in messages if m.get_type() == "COMMAND_ACK" and m.command == number]
+    return [ack.result for ack in acks]
 
 
 def kinds(messages: Iterable[Any]) -> list[str]:
@@ -151,7 +159,7 @@ def test_no_command_falls_over_any_parameters(number: int) -> None:
         params = [rng.choice(values) for _ in range(7)]
         component = rng.choice([100, 191])
         results = ends.command(number, component, *params)
-        assert len(results) >= 1 and results[-1] in (0, 1, 2, 3)
+        assert len(results) >= 1 and results[-1] in (0, 1, 2, 3, 5)
         ends.pass_time(rng.choice([0.1, 4.0]), 1.0)
 
 
@@ -263,6 +271,58 @@ def test_recording_status_is_streamed_at_the_rate_asked_for(ends: Ends) -> None:
     assert "CAMERA_CAPTURE_STATUS" not in kinds(ends.pass_time(3.0))
 
 
+@pytest.mark.parametrize("other", [(2501, 100, ()), (2500, 100, (0, NAN)), (31010, 191, (7,))])
+def test_another_station_leaves_a_stations_stream_alone(
+    ends: Ends, other: tuple[int, int, tuple[float, ...]]
+) -> None:
+    ends.command(511, 100, 262, 1e6)
+    number, component, params = other
+    ends.command(number, component, *params, source=(254, 190))
+    ends.command(511, 100, 262, -1, source=(253, 190))
+    ends.pass_time(1.0)
+    assert len(statuses(ends.pass_time(6.0))) == 6
+    ends.command(511, 100, 262, -1)
+    assert statuses(ends.pass_time(3.0)) == []
+
+
+def test_the_rate_of_a_start_is_the_starters_own_and_ends_with_the_scan(ends: Ends) -> None:
+    ends.command(2500, 100, 0, 1.0)
+    ends.command(2500, 100, 0, 0, source=(254, 190))
+    ends.pass_time(1.0)
+    assert len(statuses(ends.pass_time(6.0))) == 6
+    ends.command(2500, 100, 0, 0)  # the same station wants none
+    assert statuses(ends.pass_time(3.0)) == []
+    ends.command(2500, 100, 0, 1.0)
+    ends.control.state = replace(ends.control.state, phase=Phase.IDLE)  # closed after landing
+    ends.pass_time(0.1)
+    assert statuses(ends.pass_time(5.0)) == []
+
+
+def test_the_status_is_sent_whenever_it_changes(ends: Ends) -> None:
+    """By arming, after landing, by a fault: ground stations ask only while they see a recording."""
+    seen = []
+    for phase in (
+        Phase.SCANNING, Phase.PAUSED, Phase.WAITING, Phase.FINALISING, Phase.IDLE, Phase.WAITING,
+    ):  # fmt: skip
+        ends.control.state = replace(ends.control.state, phase=phase)
+        seen += [m.video_status for m in statuses(ends.pass_time(2.0))]
+    assert seen == [1, 0, 1]
+
+
+def test_the_end_of_a_scan_ends_what_was_asked_of_it(ends: Ends) -> None:
+    ends.command(2500, 100)
+    ends.command(2000, 100, 0, 30.0, 0)  # a series
+    assert statuses(ends.heard)[-1].image_status == 3
+    ends.control.state = replace(ends.control.state, phase=Phase.IDLE)
+    heard = ends.pass_time(0.1)
+    assert [m.capture_result for m in heard if hasattr(m, "capture_result")] == [0]
+    assert (statuses(heard)[-1].image_status, statuses(heard)[-1].image_interval) == (0, 0.0)
+    assert "photo failed: the scan has ended" in ends.texts()
+    ends.control.state = replace(ends.control.state, phase=Phase.SCANNING)
+    ends.pass_time(40.0, 1.0)
+    assert ends.control.asked == ["start_scan", "capture_keyframe"]
+
+
 def test_old_control_video_is_an_alias(ends: Ends) -> None:
     assert ends.command(200, 100, 0, 0, 0, 1) == [ACCEPTED]
     assert ends.command(200, 100, 0, 0, 0, 0) == [ACCEPTED]
@@ -274,11 +334,17 @@ def test_old_control_video_is_an_alias(ends: Ends) -> None:
 # Keyframes
 
 
+PHOTO = KeyframeReport(1_700_000_000_000_000, 47.3, 8.5, 512.25, 80.5, file="photos/1.jpg")
+
+
 def shot(ends: Ends) -> list[Any]:
-    ends.companion.report(KeyframeReport(1_700_000_000_000_000, 47.3, 8.5, 512.25, 80.5))
-    start = len(ends.heard)
-    ends.hear()
-    return ends.heard[start:]
+    """The service has taken the photo; what is sent then."""
+    ends.companion.report(PHOTO)
+    return ends.pass_time(0.05)
+
+
+def statuses(heard: Iterable[Any]) -> list[Any]:
+    return [m for m in heard if m.get_type() == "CAMERA_CAPTURE_STATUS"]
 
 
 def test_one_photo_from_button_to_report(ends: Ends) -> None:
@@ -289,7 +355,7 @@ def test_one_photo_from_button_to_report(ends: Ends) -> None:
     assert captured.get_type() == "CAMERA_IMAGE_CAPTURED" and captured.capture_result == 1
     assert (captured.lat, captured.lon) == (473000000, 85000000)
     assert (captured.alt, captured.relative_alt, captured.image_index) == (512250, 80500, 0)
-    assert captured.time_utc == 1_700_000_000_000_000
+    assert captured.time_utc == 1_700_000_000_000_000 and captured.file_url == "photos/1.jpg"
     assert after.image_status == 0 and after.image_count == 1
 
 
@@ -300,6 +366,59 @@ def test_a_numbered_shot_is_taken_once_however_often_it_comes(ends: Ends) -> Non
     assert ends.control.asked == ["capture_keyframe"]
     assert ends.command(2000, 100, 0, 0, 1, 18) == [ACCEPTED]
     assert ends.control.asked == ["capture_keyframe"] * 2
+
+
+def test_numbers_that_start_over_are_new_shots(ends: Ends) -> None:
+    """Mission Planner numbers from 1 on every connection, ArduPilot after every boot."""
+    for _ in range(2):
+        for number in (1, 2, 3):
+            assert ends.command(2000, 100, 0, 0, 1, number) == [ACCEPTED]
+            ends.pass_time(1.0)
+    assert ends.control.asked == ["capture_keyframe"] * 6
+    assert ends.command(2000, 100, 0, 0, 1, 3) == [ACCEPTED]  # another sender is heard meanwhile
+    assert ends.command(2000, 100, 0, 0, 1, 3, source=(1, 1)) == [ACCEPTED]
+    ends.pass_time(5.0)
+    assert ends.command(2000, 100, 0, 0, 1, 3) == [ACCEPTED]  # one photo in each session
+    assert ends.control.asked == ["capture_keyframe"] * 8
+
+
+def test_a_numbered_shot_that_was_refused_is_not_taken_for_taken(ends: Ends) -> None:
+    ends.control.answers["capture_keyframe"] = Answer(Result.TEMPORARILY_REJECTED, "no scan")
+    assert ends.command(2000, 100, 0, 0, 1, 7) == [BUSY]
+    ends.pass_time(1.0)
+    assert ends.command(2000, 100, 0, 0, 1, 7) == [BUSY]
+    ends.control.answers.clear()
+    ends.pass_time(1.0)
+    assert ends.command(2000, 100, 0, 0, 1, 7) == [ACCEPTED]
+
+
+def test_shots_of_any_number_of_senders_take_bounded_memory(ends: Ends) -> None:
+    for component in range(1, 100):
+        ends.command(2000, 100, 0, 0, 1, 7, source=(255, component))
+        ends.command(511, 100, 262, 1e6, source=(255, component))
+    assert len(ends.companion.camera._numbered) <= 16
+    assert len(ends.companion.streams[100, 262]._wanted) <= 16
+
+
+@pytest.mark.parametrize(
+    ("number", "params", "result"),
+    [
+        (2000, (0, 0, 1, 3), BUSY),
+        (2000, (0, 0.01, 5), DENIED),
+        (2000, (0, -1, 1), DENIED),
+        (203, (0, 0, 0, 0, 1), BUSY),
+        (203, (0, 1), UNSUPPORTED),
+    ],
+)
+def test_a_refused_photo_frees_the_button(
+    ends: Ends, number: int, params: tuple[float, ...], result: int
+) -> None:
+    ends.control.answers["capture_keyframe"] = Answer(Result.TEMPORARILY_REJECTED, "no scan")
+    start = len(ends.heard)
+    assert ends.command(number, 100, *params) == [result]
+    said = kinds(ends.heard[start:])
+    assert said.index("COMMAND_ACK") < said.index("CAMERA_CAPTURE_STATUS")
+    assert [m.image_status for m in statuses(ends.heard[start:])] == [0]
 
 
 def test_an_unnumbered_shot_heard_on_two_links_is_one(ends: Ends) -> None:
@@ -344,9 +463,19 @@ def test_a_shot_that_never_comes_is_reported_as_failed(ends: Ends) -> None:
     ends.command(2000, 100, 0, 0, 1)
     heard = ends.pass_time(11.0)
     failed = [m for m in heard if m.get_type() == "CAMERA_IMAGE_CAPTURED"]
-    assert [m.capture_result for m in failed] == [0]
-    status = [m for m in heard if m.get_type() == "CAMERA_CAPTURE_STATUS"][-1]
-    assert status.image_status == 0
+    assert [(m.capture_result, m.image_index) for m in failed] == [(0, 0)]
+    assert statuses(heard)[-1].image_status == 0
+    assert "photo failed: no image for 10 s" in ends.texts()
+    (captured,) = shot(ends)
+    assert captured.image_index == 1  # an index is used once
+
+
+def test_a_keyframe_that_nobody_asked_for_answers_no_request(ends: Ends) -> None:
+    ends.command(2000, 100, 0, 0, 1)
+    ends.companion.report(replace(PHOTO, file=""))
+    heard = ends.pass_time(0.1)
+    assert kinds(heard) == ["CAMERA_IMAGE_CAPTURED"]
+    assert statuses(shot(ends))[-1].image_status == 0
 
 
 def test_photos_are_passed_on_refusals_too(ends: Ends) -> None:
@@ -410,13 +539,35 @@ def test_power_is_refused_while_armed(ends: Ends, params: tuple[float, ...], ask
     assert ends.control.asked == []
     assert any("while armed" in text for text in ends.texts())
     ends.disarm()
-    ends.pass_time(4.0)
-    assert ends.command(246, 191, *params) == [BUSY]  # silence is not disarmed
+    assert ends.command(246, 191, *params) == [RUNNING]
+    assert results(ends.pass_time(4.0), 246)[-1] == BUSY  # silence is not disarmed
     assert any("armed state unknown" in text for text in ends.texts())
-    ends.pass_time(4.0)
     ends.disarm()
-    assert ends.command(246, 191, *params) == [ACCEPTED]
+    assert ends.command(246, 191, *params) == [RUNNING]
+    ends.pass_time(0.5)
+    assert ends.control.asked == []
+    assert results(ends.arm(False), 246) == [ACCEPTED]
     assert ends.control.asked == [f"power: {asked}"]
+
+
+def test_the_last_heartbeat_before_arming_permits_nothing(ends: Ends) -> None:
+    """A second passes between heartbeats: an order within it finds the motors running."""
+    ends.disarm()
+    assert ends.command(246, 191, 0, 1) == [RUNNING]
+    assert ends.command(526, 100, 1, 1) == [RUNNING]
+    ends.pass_time(0.3)
+    heard = ends.arm()
+    assert results(heard, 246) == results(heard, 526) == [BUSY]
+    assert ends.control.asked == []
+
+
+def test_a_scan_that_starts_meanwhile_is_not_erased(ends: Ends) -> None:
+    ends.disarm()
+    assert ends.command(526, 100, 1, 1) == [RUNNING]
+    ends.command(2500, 100)
+    ends.pass_time(0.5)
+    assert results(ends.arm(False), 526) == [BUSY]
+    assert ends.control.asked == ["start_scan"]
 
 
 def test_a_reboot_of_the_autopilot_is_not_ours(ends: Ends) -> None:
@@ -433,11 +584,14 @@ def test_erase(ends: Ends) -> None:
     assert ends.command(526, 100, 1, 1) == [BUSY]
     assert any("refused while scanning" in text for text in ends.texts())
     ends.command(2501, 100)
-    assert ends.command(526, 100, 1, 1, 0, 1) == [BUSY]  # nothing says that it is disarmed
+    assert ends.command(526, 100, 1, 1, 0, 1) == [RUNNING]
+    assert results(ends.pass_time(4.0), 526)[-1] == BUSY  # nothing says that it is disarmed
     ends.arm()
     assert ends.command(526, 100, 1, 1, 0, 2) == [BUSY]
     ends.disarm()
-    assert ends.command(526, 100, 1, 1, 1) == [ACCEPTED]
+    assert ends.command(526, 100, 1, 1, 1) == [RUNNING]
+    ends.pass_time(0.5)
+    assert results(ends.arm(False), 526) == [ACCEPTED]
     assert ends.control.asked == ["start_scan", "stop_scan", "erase_scans"]
     status = ends.companion.camera.message(262, 0)
     assert isinstance(status, dialect.MAVLink_message) and status.image_count == 0
@@ -510,15 +664,15 @@ def test_work_without_end_fails(ends: Ends) -> None:
 # Questions
 
 
-@pytest.mark.parametrize(
-    ("number", "name"),
-    [
-        (259, "CAMERA_INFORMATION"),
-        (260, "CAMERA_SETTINGS"),
-        (261, "STORAGE_INFORMATION"),
-        (262, "CAMERA_CAPTURE_STATUS"),
-    ],
-)
+CAMERA_MESSAGES = [
+    (259, "CAMERA_INFORMATION"),
+    (260, "CAMERA_SETTINGS"),
+    (261, "STORAGE_INFORMATION"),
+    (262, "CAMERA_CAPTURE_STATUS"),
+]
+
+
+@pytest.mark.parametrize(("number", "name"), CAMERA_MESSAGES)
 def test_camera_messages_on_request_old_and_new(ends: Ends, number: int, name: str) -> None:
     legacy = {259: (521, 1), 260: (522, 1), 261: (525, 0, 1), 262: (527, 1)}[number]
     for command, *params in ((512, number), legacy):
@@ -538,6 +692,9 @@ def test_what_the_camera_says_of_itself(ends: Ends) -> None:
     info = next(m for m in ends.heard if m.get_type() == "CAMERA_INFORMATION")
     assert bytes(info.vendor_name).rstrip(b"\0") == b"skyrelief"
     assert info.flags == 1 | 2 | 8 | 16
+    major, minor, _ = VERSION
+    assert list(info.firmware_version.to_bytes(4, "little"))[:2] == [major, minor]  # ArduPilot
+    assert list(info.firmware_version.to_bytes(4, "big"))[:2] == [major, minor]  # QGroundControl
     storage = next(m for m in ends.heard if m.get_type() == "STORAGE_INFORMATION")
     assert (storage.total_capacity, storage.used_capacity) == (1000.0, 250.0)
     assert storage.status == 2
@@ -552,10 +709,22 @@ def test_no_video_stream_is_offered(ends: Ends) -> None:
     assert ends.command(2505, 100, 0) == [UNSUPPORTED]
 
 
-def test_a_legacy_question_for_nothing_sends_nothing(ends: Ends) -> None:
-    start = len(ends.heard)
-    assert ends.command(521, 100, 0) == [ACCEPTED]
-    assert kinds(ends.heard[start:]) == ["COMMAND_ACK"]
+@pytest.mark.parametrize(("number", "name"), CAMERA_MESSAGES)
+def test_mission_planner_finds_the_camera_by_any_of_its_ways(
+    ends: Ends, number: int, name: str
+) -> None:
+    """It asks for an interval of 30 s and for its confirmation; earlier, by param 1 = 0."""
+    assert ends.command(511, 100, number, 30e6) == [ACCEPTED]
+    assert ends.command(510, 100, number) == [ACCEPTED]
+    confirmed = [m for m in ends.heard if m.get_type() == "MESSAGE_INTERVAL"][-1]
+    assert (confirmed.message_id, confirmed.interval_us) == (number, 30_000_000)
+    assert kinds(ends.heard).count(name) == 1
+    assert kinds(ends.pass_time(61.0, 0.5)).count(name) == 2
+    legacy = {259: 521, 260: 522, 261: 525, 262: 527}.get(number)
+    if legacy is not None:
+        start = len(ends.heard)
+        assert ends.command(legacy, 100, 0) == [ACCEPTED]
+        assert name in kinds(ends.heard[start:])
 
 
 def test_message_intervals(ends: Ends) -> None:
@@ -611,6 +780,17 @@ def test_retransmissions_are_answered_again_but_not_carried_out_again(ends: Ends
     assert ends.control.asked == ["clear_map"] * 3  # later: meant again
 
 
+def test_a_refusal_is_not_remembered_beyond_its_moment(ends: Ends) -> None:
+    ends.control.answers["start_scan"] = Answer(Result.TEMPORARILY_REJECTED, "still starting")
+    assert ends.command(2500, 100) == [BUSY]
+    assert ends.command(2500, 100) == [BUSY]  # the same call on another link
+    assert ends.control.asked == ["start_scan"]
+    ends.control.answers.clear()
+    ends.pass_time(1.0)
+    assert ends.command(2500, 100) == [ACCEPTED]
+    assert ends.control.state.phase is Phase.SCANNING
+
+
 def test_not_a_number_means_default(ends: Ends) -> None:
     assert ends.command(2500, 100, *[NAN] * 7) == [ACCEPTED]
     assert ends.command(2000, 100, *[NAN] * 7) == [ACCEPTED]
@@ -647,6 +827,7 @@ def test_parameters_are_listed_read_set_and_refused(ends: Ends) -> None:
     ends.control.answers["SR_LINK_KBIT_S"] = Answer(Result.DENIED, "not now")
     answers = put(b"SR_LINK_KBIT_S", 500.0)
     assert [m.param_value for m in answers if hasattr(m, "param_value")] == [1000.0]
+    assert put(b"CAM_MODE", 0.0)[0].param_value == 1.0  # it only describes the camera
     assert put(b"UNKNOWN", 1.0) == [] or "no parameter UNKNOWN" in ends.texts()
     assert ends.say(dialect.MAVLink_param_set_message(2, 191, b"SR_BASELINE_M", 9.0, 9)) == []
     assert ends.say(dialect.MAVLink_param_set_message(1, 1, b"SR_BASELINE_M", 9.0, 9)) == []
@@ -716,7 +897,7 @@ def test_a_long_text_comes_in_chunks(ends: Ends) -> None:
 
 def test_speed_and_distance_without_gps_are_reported() -> None:
     ends = Ends()
-    ends.companion.streams.set_interval(191, 251, 1_000_000)
+    ends.companion.streams[191, 251].set_interval(Address(*STATION), 1_000_000)
     ends.control.state = replace(
         ends.control.state, speed_m_s=5.5, distance_m=120.0, turn_rate_rad_s=math.nan
     )

@@ -26,6 +26,7 @@ from mavlink.wire.framing import Framer
 from mavlink.wire.tlog import packets
 from recon.types import Camera
 from service.cameras.camera_file import save_camera
+from service.cameras.exif import read_tags
 from service.config import load_config
 from service.daemon.runtime import Daemon
 from service.scans.folder import SUMMARY
@@ -147,7 +148,8 @@ def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
         come(lambda: len(autopilot.of("ODOMETRY")) >= 20)
         autopilot.order(2000, 100, 0, 0, 1, 7)
         come(lambda: any(a.command == 2000 for a in autopilot.of("COMMAND_ACK")))
-        come(lambda: len(autopilot.of("CAMERA_IMAGE_CAPTURED")) >= 3)
+        come(lambda: len(autopilot.of("CAMERA_IMAGE_CAPTURED")) >= 4)
+        come(lambda: any(m.file_url for m in autopilot.of("CAMERA_IMAGE_CAPTURED")))
         autopilot.order(2501, 100)
         come(lambda: not daemon.scanning.is_running)
     finally:
@@ -157,7 +159,7 @@ def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
     assert acks == {(2500, 0), (2000, 0), (2501, 0)}
     (folder,) = (path.parent for path in (tmp_path / "scans").glob("*/" + SUMMARY))
     _check_odometry(autopilot.of("ODOMETRY"))
-    _check_keyframes(autopilot.of("CAMERA_IMAGE_CAPTURED"), folder)
+    _check_images(autopilot.of("CAMERA_IMAGE_CAPTURED"), folder)
     assert {v.name for v in autopilot.of("NAMED_VALUE_FLOAT")} >= {"SR_SPEED", "SR_DIST", "SR_TURN"}
     counts: Counter[str] = Counter()
     with (folder / "link.tlog").open("rb") as file:
@@ -170,11 +172,17 @@ def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
     assert kinds[(1, 191, 0)] and kinds[(1, 191, 331)] >= 20 and kinds[(255, 190, 76)] >= 1
 
 
-def _check_keyframes(reported: list[Any], folder: Path) -> None:
-    """Every keyframe is reported once, at its own place."""
-    assert len(reported) == json.loads((folder / SUMMARY).read_text())["counts"]["keyframes"] >= 3
-    assert [m.image_index for m in reported] == list(range(len(reported)))
-    assert all(m.capture_result == 1 for m in reported)
+def _check_images(images: list[Any], folder: Path) -> None:
+    """The photo, and every keyframe once, at its own place."""
+    assert [m.image_index for m in images] == list(range(len(images)))
+    assert all(m.capture_result == 1 for m in images)
+    (photo,) = (m for m in images if m.file_url)
+    stored = read_tags(folder.parent / photo.file_url)
+    assert stored.geotag is not None and stored.geotag.lon_deg is not None
+    assert stored.geotag.lon_deg == pytest.approx(photo.lon * 1e-7, abs=1e-6)
+    reported = [m for m in images if not m.file_url]
+    keyframes = json.loads((folder / SUMMARY).read_text())["counts"]["keyframes"]
+    assert len(reported) in (keyframes - 1, keyframes)  # the photo may be one of them
     lons = [m.lon for m in reported]
     assert lons == sorted(lons) and abs(reported[0].lat * 1e-7 - LAT) < 5e-5
     assert reported[0].relative_alt == pytest.approx(AGL_M * 1e3, rel=0.05)

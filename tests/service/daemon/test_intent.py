@@ -229,6 +229,7 @@ def test_a_refused_photo_says_why(
 ) -> None:
     daemon = daemon_in(tmp_path)
     monkeypatch.setattr(Scanning, "phase", phase)
+    monkeypatch.setattr(Scanning, "is_closing", phase is Phase.FINALISING)
     answer: Any = daemon.actions.capture_keyframe()
     assert answer.result is Result.TEMPORARILY_REJECTED and word in answer.text
 
@@ -452,7 +453,8 @@ class AnyOrder(RuleBasedStateMachine):
         if self.run is None:
             assert phase is (Phase.IDLE if self.wanted == "nothing" else Phase.WAITING)
         elif self.run.stop.is_set():
-            assert phase is Phase.FINALISING
+            assert phase is (Phase.FINALISING if self.wanted == "nothing" else Phase.WAITING)
+            assert self.scanning.is_closing
         else:
             assert self.wanted != "nothing"
             assert phase is (Phase.PAUSED if self.wanted == "pause" else Phase.SCANNING)

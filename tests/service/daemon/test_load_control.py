@@ -19,10 +19,11 @@ from service.cameras import CameraFrame, open_camera
 from service.cameras.source import CameraSource
 from service.compute.backend_choice import FallbackBackend
 from service.config import load_config
-from service.daemon.frame_gate import FrameGate, image_name
+from service.daemon.frame_gate import FrameGate
 from service.daemon.load_shedding import Level
 from service.daemon.machine import Machine
 from service.daemon.runtime import Daemon
+from service.daemon.stored_image import image_name
 
 START_NS = 1_790_000_000_123_456_000
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from autopilot import beat, packed
+from autopilot import attitude, beat, packed
 from loopback import free_port, until
 from rehearsal import RehearsalControl
 from vehicles_around import Net, Vehicle
@@ -136,6 +136,27 @@ def test_missing_gimbal_angles_are_reported_where_they_are_expected(
     net.wait(25)
     assert net.troubles() == troubles and net.state() is state
     assert ("MNT1_TYPE" in net.said()) is bool(troubles)
+
+
+@pytest.mark.parametrize("silent_s", [3, 9, 14])
+def test_a_restart_of_the_autopilot_is_no_missing_gimbal(silent_s: int) -> None:
+    """Its messages stop together and start one after the other."""
+    autopilot = Vehicle(1, 0.002)
+    net = Watched(autopilot, watch=WatchConfig(gimbal=True))
+    net.wait(20)
+    net.feed(attitude(60_000), (1, 1))
+    autopilot.is_on = net.has_gimbal = False
+    net.wait(silent_s)
+    autopilot.is_on = True
+    for boot_ms in (500, 600, 700):
+        net.feed(attitude(boot_ms), (1, 1))
+    net.wait(9)
+    net.has_gimbal = True
+    net.wait(5)
+    assert "Autopilot restarted" in net.said() and "No gimbal angles" not in net.said()
+    net.has_gimbal = False
+    net.wait(25)
+    assert "No gimbal angles" in net.said()
 
 
 def test_mavlink_1_is_reported_with_the_protocol_to_set() -> None:

@@ -61,6 +61,13 @@ def test_a_scan_that_was_stopped_counts_as_closing_at_once(
     assert daemon.actions.status().phase is Phase.SCANNING
     daemon.actions.stop_scan()
     assert daemon.actions.status().phase is Phase.FINALISING
+    assert not daemon.actions.status().is_recording
+    daemon.actions.is_ready = True
+    assert "previous one is closed" in daemon.actions.start_scan().text
+    assert daemon.actions.status().is_recording  # ground stations show the scan that follows
+    assert "being closed" in daemon.actions.capture_keyframe().text  # type: ignore[union-attr]
+    daemon.actions.stop_scan()
+    assert daemon.actions.status().phase is Phase.FINALISING
     end.set()
     until(lambda: daemon.actions.status().phase is Phase.IDLE)
 

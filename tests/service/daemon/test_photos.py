@@ -1,0 +1,135 @@
+"""A photo is an image with its tag, whatever the camera does; without one, the reason is given."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mavlink.component.camera import KeyframeReport
+from mavlink.component.control import Phase, Result
+from mavlink.telemetry.samples import VehicleState
+from recon.backends.cpu import CpuBackend
+from recon.tracking.odometry import Tracked, Tracking
+from recon.types import Camera
+from service.cameras.exif import read_tags
+from service.cameras.source import CameraFrame
+from service.config import load_config
+from service.daemon.load_shedding import Level
+from service.daemon.runtime import Daemon
+from service.daemon.scan_run import report_photo
+from service.daemon.scanning import Scanning
+from service.daemon.stored_image import image_name, store_image
+from service.flight.pipeline import Step
+from service.flight.scan import Photo, Scan, ScanInputs, create_store
+
+S = 1_000_000_000
+START_NS = 1_790_000_000 * S
+IMAGE = np.full((90, 160, 3), (200, 100, 50), np.uint8)
+HOVER = VehicleState(
+    time_ns=S,
+    q_ned_body_wxyz=np.array([1.0, 0.0, 0.0, 0.0]),
+    lat_deg=-33.8567844,
+    lon_deg=151.2152967,
+    alt_amsl_m=62.25,
+    alt_agl_m=50.0,
+    sources=("attitude", "gnss", "relative"),
+)
+
+
+class OperatorEnd:
+    """The operator's end of a vehicle link."""
+
+    def __init__(self) -> None:
+        self.reports: list[KeyframeReport] = []
+        self.texts: list[str] = []
+
+    def report_keyframe(self, report: KeyframeReport) -> None:
+        self.reports.append(report)
+
+    def statustext(self, text: str, *_: object, **__: object) -> None:
+        self.texts.append(text)
+
+
+def photos_in(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, *steps: Step
+) -> tuple[Scan, OperatorEnd]:
+    """A scan with steps in place of its pipeline's, whose photos reach the operator."""
+    K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 44.5], [0.0, 0.0, 1.0]])
+    operator: Any = OperatorEnd()
+    inputs = ScanInputs(
+        SimpleNamespace(is_live=True, warnings=[]),
+        Camera(K, np.zeros(5), (160, 90)), load_config(None, []), CpuBackend(), folder / "scan",
+        "scan", 0, unix_offset_ns=START_NS,
+        history=SimpleNamespace(state_at=lambda _: HOVER, gap_s=lambda _: 0.1),  # type: ignore[arg-type]
+        on_photo=lambda photo: report_photo(operator, scan, photo),
+    )  # fmt: skip
+    scan = Scan(inputs, create_store(inputs))
+    coming = iter(steps)
+    monkeypatch.setattr(scan.pipeline, "skip", lambda *_: Step(Tracked(Tracking.SKIPPED, 0)))
+    monkeypatch.setattr(scan.pipeline, "step", lambda _: next(coming))
+    return scan, operator
+
+
+def test_a_photo_in_a_steady_hover_is_an_image_with_its_tag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost = Step(Tracked(Tracking.LOST, 0, reason="the image does not move"))
+    scan, operator = photos_in(tmp_path, monkeypatch, lost, lost)
+    for k in range(6):
+        if k == 3:
+            scan.take_photo()
+            scan.take_photo()  # by another ground station: a photo each
+        scan.feed(CameraFrame(IMAGE, k * S, k, None, f"frame {k}"))
+    assert len(operator.reports) == 2 and operator.texts == []
+    scan.pipeline.finish()
+    scan.store.close()
+    for k, report in zip((3, 4), operator.reports, strict=True):
+        assert report.ok and report.unix_us == (START_NS + k * S) // 1000
+        assert (report.lat_deg, report.lon_deg) == pytest.approx((-33.8567844, 151.2152967))
+        assert report.alt_amsl_m == pytest.approx(62.25) and report.alt_agl_m == 50.0
+        assert report.q_ned_camera_wxyz is not None
+        stored = tmp_path / report.file
+        tags = read_tags(stored)
+        assert tags.size_px == (160, 90) and tags.name_unix_ns == START_NS + k * S
+        assert tags.geotag is not None and tags.geotag.lat_deg is not None
+        assert tags.geotag.lat_deg == pytest.approx(-33.8567844, abs=1e-7)
+        assert tags.geotag.lon_deg == pytest.approx(151.2152967, abs=1e-7)
+        assert tags.geotag.alt_amsl_m == pytest.approx(62.25, abs=0.01)
+
+
+def test_a_photo_without_telemetry_has_the_place_by_vision_or_none(tmp_path: Path) -> None:
+    store_image(tmp_path / image_name(START_NS), IMAGE, KeyframeReport())
+    assert read_tags(tmp_path / image_name(START_NS)).geotag is None
+    below = KeyframeReport(lat_deg=31.5, lon_deg=-35.5, alt_amsl_m=-430.0)
+    store_image(tmp_path / "dead_sea.jpg", IMAGE, below)
+    tag = read_tags(tmp_path / "dead_sea.jpg").geotag
+    assert tag is not None and (tag.lat_deg, tag.lon_deg) == pytest.approx((31.5, -35.5))
+    assert tag.alt_amsl_m == pytest.approx(-430.0)
+
+
+def test_a_photo_that_cannot_be_stored_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scan, operator = photos_in(tmp_path, monkeypatch)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(9, 8, 1))
+    scan.inputs.on_photo(Photo(IMAGE, S, None, None, None))  # type: ignore[misc]
+    assert operator.texts == ["photo failed: the disk is nearly full"]
+    assert operator.reports == [KeyframeReport(ok=False)]
+    scan.pipeline.finish()
+    scan.store.close()
+
+
+def test_a_photo_while_images_are_only_stored_is_refused_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+    monkeypatch.setattr(Scanning, "phase", Phase.SCANNING)
+    monkeypatch.setattr(Scanning, "scan", SimpleNamespace())
+    daemon.scanning.level = Level.RECORD_ONLY
+    answer: Any = daemon.actions.capture_keyframe()
+    assert answer.result is Result.TEMPORARILY_REJECTED and "only stored" in answer.text
