@@ -109,15 +109,6 @@ def seeks_readout(camera: Camera, config: CameraConfig) -> bool:
     return config.readout_ms == "auto" or is_unknown
 
 
-def check_size(camera: Camera, size_px: tuple[int, int], source: str) -> None:
-    """InputError when the image size (W, H) of ``source`` differs from the camera model's."""
-    if camera.size_px != size_px:
-        raise InputError(
-            f"the camera model is for {camera.size_px[0]}x{camera.size_px[1]} images, "
-            f"{source} has {size_px[0]}x{size_px[1]}; calibrate at that size"
-        )
-
-
 def save_camera(
     path: str | Path,
     camera: Camera,

@@ -10,12 +10,16 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from recon.camera_model import check_camera, scaled
 from recon.types import Camera
+from service.errors import InputError
+
+if TYPE_CHECKING:
+    from service.cameras.source import CameraSource
 
 DIAGONAL_35MM = 43.2666
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -77,20 +81,30 @@ def turned(camera: Camera, clockwise_deg: int) -> Camera:
     return camera
 
 
-def fitted(camera: Camera, size_px: tuple[int, int], turned_deg: int) -> Camera | None:
-    """The camera model for images of ``size_px`` (W, H); None for another aspect ratio.
+def same_shape(a_px: tuple[int, int], b_px: tuple[int, int]) -> bool:
+    """True for two sizes (W, H) of one aspect ratio."""
+    return abs(a_px[0] / a_px[1] / (b_px[0] / b_px[1]) - 1.0) < SAME_SHAPE
 
-    The model may be for another size, and for the images as stored: those are rotated clockwise by
-    ``turned_deg`` when read.
+
+def fitted(camera: Camera, source: CameraSource) -> tuple[Camera, list[str]]:
+    """The camera model for a source's images, with a note if it is scaled to their size;
+    InputError for another aspect ratio.
+
+    The model may be for the images as stored: some sources turn them when they are read.
     """
-    for clockwise_deg in dict.fromkeys((turned_deg, 0)):
-        model = turned(camera, clockwise_deg)
+    size_px = source.size_px
+    (w, h), (W, H) = camera.size_px, size_px
+    for clockwise_deg in dict.fromkeys((getattr(source, "turned_deg", 0), 0)):
+        model = turned(camera, clockwise_deg) if clockwise_deg else camera
         if model.size_px == size_px:
-            return model
-        aspects = [size[0] / size[1] for size in (model.size_px, size_px)]
-        if abs(aspects[0] / aspects[1] - 1.0) < SAME_SHAPE:
-            return scaled(model, size_px)
-    return None
+            return model, []
+        if same_shape(model.size_px, size_px):
+            note = f"the camera model is for {w}x{h} images: scaled to {W}x{H}"
+            return scaled(model, size_px), [note]
+    raise InputError(
+        f"the camera model is for {w}x{h} images, {source.description} has {W}x{H}; "
+        "calibrate at that size"
+    )
 
 
 def lens_of(

@@ -27,8 +27,11 @@ from pathlib import Path
 from threading import Event
 from typing import IO, TYPE_CHECKING, Any
 
+import numpy as np
+
 from recon.types import U8
 from service.cameras import open_container, reject_options
+from service.cameras.lens import same_shape
 from service.cameras.source import CameraFrame, CameraSource, Paced
 from service.cameras.video import decoded_frames, frame_bgr, video_stream
 from service.errors import InputError, OutsideError
@@ -113,8 +116,7 @@ class LiveSource:
         self.fps: float | None = None
         self.warnings: list[str] = []
         self.losses = 0
-        self.misfits = 0  # images of another size, dropped
-        self._fits = True  # whether the last image had the right size
+        self.misfits = 0  # images of another aspect ratio, dropped
         self.epoch_unix_ns: int | None = time.time_ns()
         self._start_ns = time.monotonic_ns()
         self.start_monotonic_ns: int | None = self._start_ns
@@ -128,7 +130,7 @@ class LiveSource:
             raise OutsideError(
                 f"{description}: gives no image; is the camera on and streaming?{why}"
             )
-        self.size_px = (first[0].shape[1], first[0].shape[0])
+        self.size_px = self._given_px = (first[0].shape[1], first[0].shape[0])
         self._first = first
 
     def __iter__(self) -> Iterator[CameraFrame]:
@@ -149,12 +151,11 @@ class LiveSource:
         seq = 0
         last_ns = -1
         for image, time_ns in itertools.chain((self._first,), self._endless()):
-            if (image.shape[1], image.shape[0]) != self.size_px:
-                self._warn_misfit(image)
+            fitting = self._fitted(image)
+            if fitting is None:
                 continue
-            self._fits = True
             if time_ns > last_ns:
-                yield CameraFrame(image, time_ns, seq, None, f"frame {seq}")
+                yield CameraFrame(fitting, time_ns, seq, None, f"frame {seq}")
                 seq += 1
                 last_ns = time_ns
 
@@ -222,15 +223,25 @@ class LiveSource:
     def _damage(self, error: Exception) -> None:
         log.debug("%s: packet dropped: %s", self.description, error)
 
-    def _warn_misfit(self, image: U8) -> None:
-        if self._fits:
+    def _fitted(self, image: U8) -> U8 | None:
+        """The image at the first one's size; None for one of another aspect ratio."""
+        import cv2
+
+        size_px = image.shape[1], image.shape[0]
+        was_px, self._given_px = self._given_px, size_px
+        if size_px == self.size_px:
+            return image
+        is_alike = same_shape(size_px, self.size_px)
+        if size_px != was_px:
             self._warn(
-                f"now gives {image.shape[1]}x{image.shape[0]} images instead of "
-                f"{self.size_px[0]}x{self.size_px[1]}; they are dropped: the camera model does "
-                "not fit them"
+                f"now gives {size_px[0]}x{size_px[1]} images instead of "
+                f"{self.size_px[0]}x{self.size_px[1]}; they are "
+                + ("scaled" if is_alike else "dropped: the camera model does not fit them")
             )
-        self._fits = False
-        self.misfits += 1
+        if not is_alike:
+            self.misfits += 1
+            return None
+        return np.asarray(cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _warn(self, text: str) -> None:
         text = without_credentials(text)  # FFmpeg's errors contain the address

@@ -147,6 +147,7 @@ class Paced:
         self.description, self.size_px = source.description, source.size_px
         self.epoch_unix_ns, self.fps = source.epoch_unix_ns, source.fps
         self.start_monotonic_ns = source.start_monotonic_ns
+        self.turned_deg = getattr(source, "turned_deg", 0)
         self.is_live = True
         self.warnings = source.warnings
 

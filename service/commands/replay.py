@@ -201,6 +201,7 @@ def _replay(
     is_latency_given: bool,
 ) -> dict[str, Any]:
     from service.cameras import open_camera, parse_source
+    from service.cameras.lens import fitted
     from service.commands.all_stills import all_stills
     from service.commands.unstated import (
         start_lens,
@@ -213,7 +214,7 @@ def _replay(
 
     notes: list[str] = []
     if camera is not None:
-        start, lens = None, _fitted(camera, source, notes)
+        start, (lens, notes) = None, fitted(camera, source)
     else:
         start = start_lens(source, log)
         lens = start.camera
@@ -343,21 +344,6 @@ def _correction(scan: Scan, unsure: Collection[str], has_ended: bool = False) ->
         return _Correction("clock", at_another_time(scan.inputs, off_ms))
     shutter = scan.found_shutter() if "readout" in unsure else None
     return None if shutter is None else _Correction("readout", with_readout(scan.inputs, shutter))
-
-
-def _fitted(camera: Camera, source: CameraSource, notes: list[str]) -> Camera:
-    """The camera model for the source's images; with a note if it is of another size."""
-    from service.cameras.camera_file import check_size
-    from service.cameras.lens import fitted
-
-    model = fitted(camera, source.size_px, getattr(source, "turned_deg", 0))
-    if model is None:
-        check_size(camera, source.size_px, source.description)
-        return camera
-    if sorted(model.size_px) != sorted(camera.size_px):
-        (w, h), (W, H) = camera.size_px, source.size_px
-        notes.append(f"the camera model is for {w}x{h} images: scaled to {W}x{H}")
-    return model
 
 
 def _flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:

@@ -151,7 +151,7 @@ class ControlActions:
 
     def _test(self, work: Work) -> None:
         from service.cameras import open_camera
-        from service.cameras.camera_file import check_size
+        from service.cameras.lens import fitted
 
         config = self._scanning.config
         try:
@@ -159,7 +159,7 @@ class ControlActions:
             work.report(0.5)
             source.close()
             if self._scanning.camera is not None:
-                check_size(self._scanning.camera, source.size_px, source.description)
+                fitted(self._scanning.camera, source)
             folder = existing(Path(config.scan.folder))
             free_mib = shutil.disk_usage(folder).free / 2**20
             if free_mib < MIN_FREE_MIB:

@@ -132,6 +132,8 @@ class ScanRun:
         host = self._host
         inputs, gate = self._inputs(source)
         store = create_store(inputs)
+        for text in inputs.notes:
+            host.vehicle.statustext(text, WARNING)
         for text in disagreement(inputs.unix_offset_ns):
             gate.warnings.append(text)
             host.vehicle.statustext(text, WARNING)
@@ -155,19 +157,20 @@ class ScanRun:
 
     def _inputs(self, source: CameraSource) -> tuple[ScanInputs, FrameGate]:
         """Inputs of the scan, with its camera behind a gate."""
-        from service.cameras.camera_file import check_size, seeks_readout
+        from service.cameras.camera_file import seeks_readout
+        from service.cameras.lens import fitted
         from service.daemon.camera_memory import measured
         from service.daemon.frame_gate import FrameGate
         from service.flight.scan import ScanInputs
 
         host, vehicle = self._host, self._host.vehicle
-        camera, backend = host.equipment()
+        model, backend = host.equipment()
+        camera, notes = fitted(model, source)
         config = host.config
         earlier = measured(Path(host.config.scan.folder), source.description, source.size_px)
         if earlier.shutter is not None and seeks_readout(camera, config.camera):
             camera = replace(camera, shutter=earlier.shutter)
             config = change(config, "camera.readout_ms", "auto")  # sought on from there
-        check_size(camera, source.size_px, source.description)
         zero_ns, offset_ns = _zero_ns(source), vehicle.unix_offset_ns()
         unix_s = 1e-9 * (time.monotonic_ns() + offset_ns)
         folder = new_folder(Path(host.config.scan.folder), unix_s)
@@ -185,6 +188,7 @@ class ScanRun:
             scan_id,
             zero_ns,
             unix_offset_ns=offset_ns,
+            notes=tuple(notes),
             history=vehicle.history,
             sigma_focal=camera.sigma_focal,
             extra={"backend": backend.name, "source": source.description},

@@ -157,12 +157,14 @@ def test_absent_camera_is_reported_at_once() -> None:
         LiveSource(opener(OSError("no route")), "test", QUICK)
 
 
-def test_images_of_another_size_are_dropped() -> None:
-    source = LiveSource(opener(clip(3), clip(5, (96, 64)), clip(50)), "test", QUICK)
-    frames = take(source, 6)
+def test_images_of_another_size_are_scaled_and_of_another_shape_dropped() -> None:
+    parts = clip(3), clip(5, (96, 64)), clip(5, (128, 96)), clip(50)
+    source = LiveSource(opener(*parts), "test", QUICK)
+    frames = take(source, 12)
     assert all(f.image.shape == (48, 64, 3) for f in frames)
     assert 0 < source.misfits <= 4  # the first of a connection has no time
-    assert any("96x64" in w for w in source.warnings)
+    assert any("96x64" in w and "dropped" in w for w in source.warnings)
+    assert any("128x96" in w and "scaled" in w for w in source.warnings)
 
 
 def test_frozen_image_is_found_out() -> None:

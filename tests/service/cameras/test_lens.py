@@ -25,6 +25,7 @@ from service.cameras.lens import SIGMA_FOCAL, Lens, by_view, fitted, turned
 from service.cameras.source import CameraSource
 from service.cli import app
 from service.commands.unstated import start_lens
+from service.errors import InputError
 
 DEWARP = "2020-05-27;3666.66,3665.99,-27.8,30.0,-0.269,0.112,0.0003,-0.0001,-0.033"
 DEWARP_1600 = "2022-03-02;1973.1,1955.7,-19.0,-11.4,-0.423,0.369,0.0041,0.0041,-0.264"
@@ -183,15 +184,22 @@ def test_a_turned_camera_sees_the_same(clockwise_deg: int) -> None:
         assert np.abs(got[:, 0] - expected[:, axis]).max() < 0.05
 
 
+def images(size_px: tuple[int, int], turned_deg: int = 0) -> Any:
+    """A source of images of this size."""
+    return SimpleNamespace(size_px=size_px, turned_deg=turned_deg, description="gimbal")
+
+
 def test_a_model_of_another_size_is_scaled_and_of_another_shape_refused() -> None:
     camera = Lens(0.75).camera((4000, 3000))
-    small = fitted(camera, (1600, 1200), 0)
-    assert small is not None and small.K[0, 0] == pytest.approx(1200.0)
-    assert small.K[0, 2] == pytest.approx(799.5)
-    assert fitted(camera, (1600, 900), 0) is None
-    portrait = fitted(camera, (1200, 1600), 90)
-    assert portrait is not None and portrait.size_px == (1200, 1600)
-    assert fitted(camera, (1200, 1600), 0) is None
+    assert fitted(camera, images((4000, 3000))) == (camera, [])
+    small, notes = fitted(camera, images((1600, 1200)))
+    assert small.K[0, 0] == pytest.approx(1200.0) and small.K[0, 2] == pytest.approx(799.5)
+    assert notes == ["the camera model is for 4000x3000 images: scaled to 1600x1200"]
+    portrait, notes = fitted(camera, images((3000, 4000), 90))
+    assert portrait.size_px == (3000, 4000) and notes == []
+    for refused in (images((1600, 900)), images((1200, 1600))):
+        with pytest.raises(InputError, match="4000x3000 images, gimbal has 1"):
+            fitted(camera, refused)
 
 
 def upper_left(image: U8) -> bool:

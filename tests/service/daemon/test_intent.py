@@ -59,7 +59,7 @@ def daemon_in(folder: Path, *given: str) -> Daemon:
 
 
 class Refused:
-    """A daemon that watches over a camera of another size than its model's."""
+    """A daemon that watches over a camera of another aspect ratio than its model's."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, *given: str) -> None:
         self.opened, self.looks, self.texts = 0, 0, list[str]()
@@ -78,7 +78,7 @@ class Refused:
     def _open(self, _: str) -> Any:
         self.opened += 1
         return SimpleNamespace(
-            size_px=(320, 240), description="gimbal", is_live=True, close=lambda: None
+            size_px=(320, 180), description="gimbal", is_live=True, close=lambda: None
         )
 
     def _look(self, _: Health) -> None:

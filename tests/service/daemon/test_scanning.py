@@ -37,7 +37,7 @@ def test_images_that_the_camera_model_does_not_fit_are_refused(
 ) -> None:
     closed, reported, scanning = threading.Event(), [], daemon.scanning
     source: Any = SimpleNamespace(
-        size_px=(320, 240), description="gimbal", start_monotonic_ns=0, close=closed.set
+        size_px=(320, 180), description="gimbal", start_monotonic_ns=0, close=closed.set
     )
     monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_, **__: reported.append(text))
     monkeypatch.setattr(ScanRun, "_open_camera", lambda _: source)
@@ -45,10 +45,25 @@ def test_images_that_the_camera_model_does_not_fit_are_refused(
     scanning.start()
     until(lambda: reported and not scanning.is_running)
     assert reported == [f"Scan failed: {scanning.fault}"]
-    assert "for 1600x1200 images, gimbal has 320x240" in scanning.fault
+    assert "for 1600x1200 images, gimbal has 320x180" in scanning.fault
     assert closed.is_set()
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
     scanning.stop()
+
+
+def test_a_camera_model_of_another_size_is_scaled_as_by_a_replay(daemon: Daemon) -> None:
+    """A stream that changes from 1600x1200 to 320x240 ended every later scan."""
+    scanning = daemon.scanning
+    source: Any = SimpleNamespace(
+        size_px=(320, 240), description="gimbal", start_monotonic_ns=0, epoch_unix_ns=None,
+        fps=None, warnings=[],
+    )  # fmt: skip
+    scanning.camera, scanning._backend = load_camera(MODEL), CpuBackend()
+    inputs, _ = ScanRun(scanning, is_asked=True)._inputs(source)
+    assert inputs.camera.size_px == (320, 240)
+    assert inputs.camera.K[0, 0] == pytest.approx(scanning.camera.K[0, 0] / 5)
+    note = "the camera model is for 1600x1200 images: scaled to 320x240"
+    assert inputs.notes == (note,)
 
 
 def test_a_scan_that_was_stopped_counts_as_closing_at_once(
