@@ -7,31 +7,48 @@ import logging
 import os
 from pathlib import Path
 
+from mavlink.wire.signing import StreamTimes
+
 log = logging.getLogger(__name__)
 
 FILE = "mavlink.json"
 
 
 class Memory:
-    """Parameters, signing time and system id, kept in a file over restarts."""
+    """Parameters, signing times and system id, kept in a file over restarts."""
 
-    def __init__(self, folder: Path | None) -> None:
+    def __init__(self, folder: Path | None, key: str = "") -> None:
+        """``key`` is the fingerprint of the signing key: another key's streams are forgotten."""
+        self._key = key
         self._path = None if folder is None else folder / FILE
         self._revision = 0
-        self._written = _text({}, 0, None)  # equivalent to no file
+        self.system: int | None = None
+        self._written = self._text({}, 0, {})  # equivalent to no file
         self.parameters: dict[str, float] = {}
         self.signing_timestamp = 0
-        self.system: int | None = None
+        self.signing_streams: StreamTimes = {}
         if self._path is None or not self._path.is_file():
             return
         try:
             kept = json.loads(self._path.read_text())
             self.parameters = {str(k): float(v) for k, v in kept["parameters"].items()}
             self.signing_timestamp = int(kept["signing_timestamp"])
+            of_key = kept["signing_streams"] if kept.get("signing_key") == key else ()
+            streams = [tuple(map(int, stream)) for stream in of_key]
+            self.signing_streams = {(a, b, c): time for a, b, c, time in streams}
             system = kept.get("system")
             self.system = system if type(system) is int and 1 <= system <= 255 else None
-            self._written = _text(self.parameters, self.signing_timestamp, self.system)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            self._written = self._text(
+                self.parameters, self.signing_timestamp, self.signing_streams
+            )
+        except (
+            OSError,
+            ArithmeticError,
+            AttributeError,
+            LookupError,
+            TypeError,
+            ValueError,
+        ) as error:
             log.warning("%s is not used: %s", self._path, error)
 
     def is_stale(self, revision: int, system: int | None) -> bool:
@@ -40,7 +57,12 @@ class Memory:
         return self._path is not None and changed
 
     def save(
-        self, values: dict[str, float], revision: int, timestamp: int, system: int | None
+        self,
+        values: dict[str, float],
+        revision: int,
+        timestamp: int,
+        streams: StreamTimes,
+        system: int | None,
     ) -> None:
         """Save what has changed; a full disk is logged, not raised.
 
@@ -48,7 +70,7 @@ class Memory:
         """
         self._revision = revision
         self.system = system or self.system
-        text = _text(values, timestamp, self.system)
+        text = self._text(values, timestamp, streams)
         if self._path is None or text == self._written:
             return
         fresh = self._path.with_suffix(".new")
@@ -60,7 +82,12 @@ class Memory:
         except OSError as error:
             log.error("parameters could not be kept: %s", error)
 
-
-def _text(values: dict[str, float], timestamp: int, system: int | None) -> str:
-    kept = {"parameters": values, "signing_timestamp": timestamp, "system": system}
-    return json.dumps(kept)
+    def _text(self, values: dict[str, float], timestamp: int, streams: StreamTimes) -> str:
+        kept = {
+            "parameters": values,
+            "signing_timestamp": timestamp,
+            "signing_key": self._key,
+            "signing_streams": [(*stream, time) for stream, time in streams.items()],
+            "system": self.system,
+        }
+        return json.dumps(kept)

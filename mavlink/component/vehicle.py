@@ -35,13 +35,13 @@ from mavlink.wire.first_beat import FirstBeats
 from mavlink.wire.framing import Packet
 from mavlink.wire.link import Job, Link, LinkInbox, parse_link
 from mavlink.wire.messages import LinkReport, Links, OutgoingMessage
-from mavlink.wire.signing import Signing, read_key
+from mavlink.wire.signing import UNIT_PER_S, Signing, fingerprint, read_key
 from mavlink.wire.tlog import TlogRecorder
 
 log = logging.getLogger(__name__)
 
 S = 1_000_000_000
-SAVE_EVERY_NS = 30 * S
+SAVE_EVERY_NS, SAVE_SIGNED_NS = 30 * S, S  # with a key, what a crash forgets could be replayed
 TELEMETRY = numbers_of(READERS)
 BACKLOG = 10_000  # packets queued for the protocol's thread
 STUCK_NS = 10 * S
@@ -95,8 +95,9 @@ class VehicleLink:
         now_ns = time.monotonic_ns()
         self.history = VehicleHistory(config.history, PATIENCE_S)
         self.recorder = TlogRecorder()
-        self._memory = Memory(config.state_dir)
-        self._signing = self._make_signing()
+        key = None if config.signing_key is None else read_key(config.signing_key)
+        self._memory = Memory(config.state_dir, "" if key is None else fingerprint(key))
+        self._signing = None if key is None else self._make_signing(key)
         self.presence = Presence(
             config.presence,
             secrets.randbits(32) or 1 if first is None else first.token,
@@ -122,10 +123,9 @@ class VehicleLink:
         sequence = 0 if first is None else first.sequence
         self._links = Links(opened, self._on_packet, self._signing, sequence)
 
-    def _make_signing(self) -> Signing | None:
-        if self.config.signing_key is None:
-            return None
-        return Signing(read_key(self.config.signing_key), self._memory.signing_timestamp)
+    def _make_signing(self, key: bytes) -> Signing:
+        ours = self._memory.signing_timestamp + UNIT_PER_S  # a crash forgets what was sent last
+        return Signing(key, ours, self._memory.signing_streams)
 
     # Called by the service.
 
@@ -258,14 +258,15 @@ class VehicleLink:
 
     def _run(self) -> None:
         """The protocol's thread, the only one that uses the companion."""
-        save_ns = time.monotonic_ns() + SAVE_EVERY_NS
+        every_ns = SAVE_EVERY_NS if self._signing is None else SAVE_SIGNED_NS
+        save_ns = time.monotonic_ns() + every_ns
         while not self._stop.is_set():
             self._serve(TICK_S)
             now_ns = self._alive_ns = time.monotonic_ns()
             self._guard(partial(self._companion.tick, now_ns))
             self._send(self._companion.take())
             if now_ns >= save_ns or self._is_stale():
-                save_ns = now_ns + SAVE_EVERY_NS
+                save_ns = now_ns + every_ns
                 self._save()
         self._serve(0.0)
         self._send(self._companion.take())
@@ -313,6 +314,6 @@ class VehicleLink:
 
     def _save(self) -> None:
         parameters = self._companion.parameters
-        timestamp = 0 if self._signing is None else self._signing.timestamp
-        system = self.presence.proven_system
-        self._memory.save(parameters.kept(), parameters.revision, timestamp, system)
+        signing, system = self._signing, self.presence.proven_system
+        timestamp, streams = (0, {}) if signing is None else (signing.timestamp, signing.streams)
+        self._memory.save(parameters.kept(), parameters.revision, timestamp, streams, system)

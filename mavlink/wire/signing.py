@@ -2,7 +2,8 @@
 
 A packet is accepted when its signature is correct and its time is newer than the last one of its
 stream (link, system, component), and, for a new stream, at most a minute behind ours.
-Only verified packets advance the stream's time.
+Only verified packets advance the stream's time. The times survive restarts, so that a packet of the
+run before is refused, too.
 """
 
 from __future__ import annotations
@@ -21,6 +22,13 @@ MAX_STREAMS = 256
 UNSIGNED_ALLOWED = frozenset({109})  # RADIO_STATUS: radios cannot sign
 KEY_LENGTH = 32
 LARGEST = 2**48 - 1
+StreamTimes = dict[tuple[int, int, int], int]
+"""(link, system, component) to the signing time of the newest packet of one key."""
+
+
+def fingerprint(key: bytes) -> str:
+    """Names a key without revealing it."""
+    return hashlib.sha256(b"fingerprint" + key).hexdigest()[:16]
 
 
 def read_key(path: Path) -> bytes:
@@ -59,14 +67,21 @@ def _digest(key: bytes, data: bytes) -> bytes:
 class Signing:
     """One key, the times of the streams received with it, and our own time. Thread-safe."""
 
-    def __init__(self, key: bytes, timestamp: int = 0) -> None:
+    def __init__(self, key: bytes, timestamp: int = 0, streams: StreamTimes | None = None) -> None:
+        """``timestamp`` and ``streams`` as they were in the run before."""
         if len(key) != KEY_LENGTH:
             raise ValueError(f"a signing key has {KEY_LENGTH} bytes, got {len(key)}")
         self._key = key
         self._lock = threading.Lock()
-        self._streams: dict[tuple[int, int, int], int] = {}
-        self.timestamp = timestamp  # of the newest packet sent or verified; survives restarts
+        self._streams: StreamTimes = dict(streams or {})
+        self.timestamp = timestamp  # of the newest packet sent or verified
         self.refused = 0
+
+    @property
+    def streams(self) -> StreamTimes:
+        """The newest time of each stream."""
+        with self._lock:
+            return dict(self._streams)
 
     def sign(self, packet: bytes, link: int, unix_ns: int) -> bytes:
         """The packet with our signature; times increase strictly even when the clock steps back."""

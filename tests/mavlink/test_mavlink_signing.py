@@ -8,11 +8,15 @@ from typing import Any
 
 import pytest
 from autopilot import beat, packed
+from loopback import until
+from rehearsal import RehearsalControl
 
+from mavlink.component.memory import Memory
+from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from mavlink.wire.messages import OutgoingMessage, Packer
-from mavlink.wire.signing import Signing, read_key, timestamp_of
+from mavlink.wire.signing import UNIT_PER_S, Signing, fingerprint, read_key, timestamp_of
 
 S = 1_000_000_000
 KEY = bytes(range(32))
@@ -71,6 +75,50 @@ def test_our_signatures_satisfy_pymavlink_and_times_only_grow() -> None:
         assert message.get_signed() and message.get_srcComponent() == 191
         stamps.append(signing.timestamp)
     assert stamps == sorted(set(stamps))
+
+
+def link_with(key: bytes, folder: Path) -> tuple[VehicleLink, Signing]:
+    path = folder / "key"
+    path.write_bytes(key)
+    path.chmod(0o600)
+    config = VehicleConfig(signing_key=path, state_dir=folder / "state")
+    link = VehicleLink(config, RehearsalControl())
+    assert link._signing is not None
+    return link, link._signing
+
+
+def test_a_packet_of_the_run_before_is_refused(tmp_path: Path) -> None:
+    link, signing = link_with(KEY, tmp_path)
+    order = signed(beat(), NOW + 10)
+    assert accepts(signing, order)
+    link._save()
+    sent = signing.timestamp
+    _, again = link_with(KEY, tmp_path)
+    assert not accepts(again, order) and not accepts(again, signed(beat(), NOW + 5))
+    assert accepts(again, signed(beat(), NOW + 11))
+    assert accepts(again, signed(beat(), NOW + 5, link=4))  # another stream
+    assert again.timestamp >= sent + UNIT_PER_S  # ours grow, whatever a crash has forgotten
+    _, other = link_with(bytes(32), tmp_path)  # times of another key bind nobody
+    assert accepts(other, signed(beat(), NOW + 5, bytes(32)))
+
+
+@pytest.mark.parametrize("streams", ["[[1]]", "7", '[["a", 1, 1, 1]]', "[[1, 1, 1, 1e999]]"])
+def test_broken_times_are_not_used(streams: str, tmp_path: Path) -> None:
+    (tmp_path / "mavlink.json").write_text(
+        f'{{"parameters": {{}}, "signing_timestamp": 1, "signing_key": "k", '
+        f'"signing_streams": {streams}, "system": null}}'
+    )
+    assert Memory(tmp_path, "k").signing_streams == {}
+
+
+def test_times_are_saved_within_a_second_of_a_crash(tmp_path: Path) -> None:
+    link, signing = link_with(KEY, tmp_path)
+    assert accepts(signing, signed(beat(), NOW + 10))
+    link.start()
+    kept = tmp_path / "state" / "mavlink.json"
+    until(lambda: kept.is_file() and str(NOW + 10) in kept.read_text())
+    assert Memory(kept.parent, fingerprint(KEY)).signing_streams == {(3, 255, 190): NOW + 10}
+    link.stop()
 
 
 def test_keys_must_be_private_and_whole(tmp_path: Path) -> None:
