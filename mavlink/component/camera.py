@@ -39,6 +39,7 @@ MAX_SENDERS = 16
 MIN_INTERVAL_S = 0.2  # of a series of shots
 KEPT = 500  # keyframes that can be requested again
 UNKNOWN_I32 = 0
+UNKNOWN_PLACE = (2**31 - 1,) * 3  # of CAMERA_FOV_STATUS
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,6 +248,17 @@ class CameraComponent:
             self._count,
         )
 
+    def _field_of_view(self) -> object:
+        view = self._control.view()
+        camera, ground = (
+            (_scaled(p[0], 1e7), _scaled(p[1], 1e7), _scaled(p[2], 1e3)) if p else UNKNOWN_PLACE
+            for p in (view.camera, view.ground)
+        )
+        head = list(view.q_ned_camera_wxyz or (math.nan,) * 4)
+        return dialect.MAVLink_camera_fov_status_message(
+            self._boot_ms(), *camera, *ground, head, view.hfov_deg, view.vfov_deg
+        )
+
     def _image_captured(self, index: int, boot_ms: int, k: KeyframeReport) -> object:
         return dialect.MAVLink_camera_image_captured_message(
             boot_ms,
@@ -267,6 +279,7 @@ class CameraComponent:
         260: _settings,
         261: _storage,
         CAPTURE_STATUS: _capture_status,
+        271: _field_of_view,
     }
     STREAMED = tuple(_MAKERS)
 

@@ -101,12 +101,31 @@ class ScanStatus:
         return self.phase in (Phase.WAITING, Phase.SCANNING, Phase.PAUSED)
 
 
+Place = tuple[float, float, float]
+"""Latitude and longitude in degrees, metres above mean sea level."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraView:
+    """Where the camera is and looks, as far as known."""
+
+    camera: Place | None = None
+    ground: Place | None = None  # in the middle of the image
+    q_ned_camera_wxyz: tuple[float, float, float, float] | None = None  # of the head, FRD
+    hfov_deg: float = float("nan")
+    vfov_deg: float = float("nan")
+
+
 class ScanControl(Protocol):
     """The service as commands see it. Every call returns at once; long work is a Work."""
 
     def status(self) -> ScanStatus:
         """A snapshot."""
         return ScanStatus()
+
+    def view(self) -> CameraView:
+        """The camera's view now."""
+        return CameraView()
 
     def start_scan(self) -> Handled:
         """Start a scan, resume a paused one, or retry at once; a second start changes nothing."""

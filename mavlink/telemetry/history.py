@@ -234,8 +234,11 @@ class VehicleHistory:
             return self._gimbals.setdefault((sample.rank, sample.component), TimeSeries())
         return self._tracks[type(sample)]
 
-    def state_at(self, time_ns: int) -> VehicleState | None:
+    def state_at(self, time_ns: int, waits: bool = True) -> VehicleState | None:
         """The state interpolated at ``time_ns``, or None when no part of it is known.
+
+        It waits for samples that are on their way, for as long as the patience given; not so the
+        thread that delivers them, where ``waits`` is False.
 
         Attitude by a cubic through angles and rates at both ends, by slerp where no rates are
         known; position by a cubic through positions and velocities.
@@ -244,7 +247,7 @@ class VehicleHistory:
         one second apart (positions: three) is left out. The height above ground comes from the
         first available of rangefinder, terrain, height above home.
         """
-        if self._patience_s:
+        if waits and self._patience_s:
             self._await(time_ns)
         return self._state_at(time_ns)
 

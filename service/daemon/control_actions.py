@@ -12,6 +12,7 @@ from pathlib import Path
 from mavlink.component.control import (
     ACCEPTED,
     Answer,
+    CameraView,
     Handled,
     Phase,
     Power,
@@ -29,6 +30,9 @@ from service.workers import PROCESS
 MIN_FREE_MIB = 500.0
 """The self-test fails with less free disk space."""
 
+
+VIEW_AGES_NS = (200_000_000, 1_200_000_000)
+"""Ages of the camera's view: by positions of 5 and of 1 Hz."""
 
 NO_PHOTO = {
     Phase.IDLE: "start a scan first",
@@ -68,6 +72,18 @@ class ControlActions:
             camera_latency_ms=latency.latency_ms if latency is not None else math.nan,
             camera_latency_sigma_ms=latency.sigma_ms if latency is not None else math.nan,
         )
+
+    def view(self) -> CameraView:
+        """The camera's view by telemetry, which takes a moment to arrive."""
+        camera = self._scanning.camera
+        if camera is None or not self.is_ready:
+            return CameraView()
+        from service.flight.vehicle_reports import camera_view
+
+        history, now_ns = self._scanning.vehicle.history, time.monotonic_ns()
+        states = (history.state_at(now_ns - age_ns, waits=False) for age_ns in VIEW_AGES_NS)
+        state = next((s for s in states if s is not None and s.lat_deg is not None), None)
+        return camera_view(self._scanning.config.camera, camera, state)
 
     def start_scan(self) -> Answer:
         """Start a scan, once a scan that is being closed permits it."""

@@ -1,24 +1,29 @@
-"""Reports to the autopilot and the ground station: odometry and keyframes."""
+"""Reports to the autopilot and the ground station: odometry, keyframes and the field of view."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from mavlink.component.camera import KeyframeReport
+from mavlink.component.control import CameraView
 from mavlink.component.status import BodyOdometry
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
-from recon.types import F64
-from service.config import CameraConfig
+from recon.types import F64, Camera
+from service.cameras.rig import Rig
+from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.flight.pipeline import Step
 from service.georeference import LocalFrame
 
 LONGEST_STEP_S = 0.5  # between two poses that give a velocity
 JUMP_M = 0.5  # off the way that the velocity before would have led
 BEST_TRACKS = 200
+MIN_DOWN = 0.05  # of the optical axis: closer to the horizon it meets no ground that is known
 
 
 class OdometryReport:
@@ -108,11 +113,41 @@ def keyframe_report(
     file: str = "",
 ) -> KeyframeReport:
     """Its geographic position and the attitude of its head; no place without a georeference."""
-    head = lat = lon = alt = None
-    if R_world_camera is not None:
-        R_ned_head = np.asarray(R_ENU_NED.T @ R_world_camera @ R_GIMBAL_CAMERA.T)
-        w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(R_ned_head))
-        head = w, x, y, z
+    head = None if R_world_camera is None else _head(R_world_camera)
+    lat = lon = alt = None
     if position_m is not None and frame is not None:
-        lat, lon, alt = (float(v) for v in frame.to_geodetic(position_m[None])[0])
+        lat, lon, alt = _place(frame, position_m)
     return KeyframeReport(time_unix_ns // 1000, lat, lon, alt, agl_m, head, file=file)
+
+
+def camera_view(config: CameraConfig, camera: Camera, state: VehicleState | None) -> CameraView:
+    """The view by telemetry, on level ground."""
+    rig = Rig(config, ScanConfig(), FusionConfig())
+    prior = rig.prior(state, None)
+    (W, H), K = camera.size_px, camera.K
+    hfov, vfov = (
+        2.0 * math.degrees(math.atan2(n, 2.0 * f)) for n, f in ((W, K[0, 0]), (H, K[1, 1]))
+    )
+    R = None if prior.is_view_assumed else prior.R_world_camera
+    view = CameraView(None, None, None if R is None else _head(R), hfov, vfov)
+    frame, position = rig.frame, prior.position_m
+    if frame is None or position is None or state is None or state.alt_amsl_m is None:
+        return view
+    view = replace(view, camera=_place(frame, position))
+    if R is None or prior.is_agl_assumed or prior.agl_m is None or R[2, 2] > -MIN_DOWN:
+        return view
+    middle = position - R[:, 2] * (prior.agl_m / R[2, 2])
+    return replace(view, ground=_place(frame, middle))
+
+
+def _head(R_world_camera: F64) -> tuple[float, float, float, float]:
+    """The attitude of the camera's head in NED, wxyz."""
+    R_ned_head = np.asarray(R_ENU_NED.T @ R_world_camera @ R_GIMBAL_CAMERA.T)
+    w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(R_ned_head))
+    return w, x, y, z
+
+
+def _place(frame: LocalFrame, position_m: F64) -> tuple[float, float, float]:
+    """Latitude, longitude and altitude of (3,) ENU metres."""
+    lat, lon, alt = (float(v) for v in frame.to_geodetic(position_m[None])[0])
+    return lat, lon, alt

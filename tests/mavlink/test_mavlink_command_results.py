@@ -270,17 +270,17 @@ CASES: dict[int, dict[Result, list[Asked]]] = {
         CANCELLED: [stopped(246, ONBOARD, 0, 1)],
     },
     512: {
-        ACCEPTED: [plain(512, CAMERA, k) for k in (259, 260, 261, 262)],
+        ACCEPTED: [plain(512, CAMERA, k) for k in (259, 260, 261, 262, 271)],
         UNSUPPORTED: [plain(512, CAMERA, 269), plain(512, ONBOARD, 259), plain(512, CAMERA, 5)],
     },
     511: {
-        ACCEPTED: [plain(511, CAMERA, k, 1e6) for k in (259, 260, 261, 262)]
+        ACCEPTED: [plain(511, CAMERA, k, 1e6) for k in (259, 260, 261, 262, 271)]
         + [plain(511, ONBOARD, 390, -1)],
         DENIED: [plain(511, CAMERA, 262, 100), plain(511, CAMERA, 262, 1e12)],
         UNSUPPORTED: [plain(511, CAMERA, 30, 1e6)],
     },
     510: {
-        ACCEPTED: [plain(510, CAMERA, k) for k in (259, 260, 261, 262)],
+        ACCEPTED: [plain(510, CAMERA, k) for k in (259, 260, 261, 262, 271)],
         UNSUPPORTED: [plain(510, CAMERA, 30)],
     },
     521: {ACCEPTED: [plain(521, CAMERA, 1), plain(521, CAMERA, 0)]},

@@ -17,7 +17,7 @@ from mavlink.component.camera import KeyframeReport
 from mavlink.component.command_desk import Command
 from mavlink.component.commands import COMMANDS
 from mavlink.component.companion import Companion, CompanionConfig
-from mavlink.component.control import Answer, Phase, Result, Work
+from mavlink.component.control import Answer, CameraView, Phase, Result, Work
 from mavlink.component.metadata import VERSION
 from mavlink.component.parameters import PARAMETERS
 from mavlink.component.presence import Health, Presence, PresenceConfig
@@ -669,13 +669,14 @@ CAMERA_MESSAGES = [
     (260, "CAMERA_SETTINGS"),
     (261, "STORAGE_INFORMATION"),
     (262, "CAMERA_CAPTURE_STATUS"),
+    (271, "CAMERA_FOV_STATUS"),
 ]
+LEGACY = {259: (521, 1), 260: (522, 1), 261: (525, 0, 1), 262: (527, 1)}
 
 
 @pytest.mark.parametrize(("number", "name"), CAMERA_MESSAGES)
 def test_camera_messages_on_request_old_and_new(ends: Ends, number: int, name: str) -> None:
-    legacy = {259: (521, 1), 260: (522, 1), 261: (525, 0, 1), 262: (527, 1)}[number]
-    for command, *params in ((512, number), legacy):
+    for command, *params in ((512, number), LEGACY.get(number, (512, number))):
         start = len(ends.heard)
         assert ends.command(command, 100, *params) == [ACCEPTED]
         assert name in kinds(ends.heard[start:])
@@ -683,6 +684,22 @@ def test_camera_messages_on_request_old_and_new(ends: Ends, number: int, name: s
     assert ends.command(512, 0, number) == [ACCEPTED]  # to all: the camera answers alone
     assert name in kinds(ends.heard[start:])
     assert ends.command(512, 191, number) == [UNSUPPORTED]
+
+
+def test_the_field_of_view_is_sent_as_far_as_it_is_known(ends: Ends) -> None:
+    def sent() -> Any:
+        assert ends.command(512, 100, 271) == [ACCEPTED]
+        return [m for m in ends.heard if m.get_type() == "CAMERA_FOV_STATUS"][-1]
+
+    unknown = sent()
+    assert {unknown.lat_camera, unknown.alt_camera, unknown.lat_image} == {2**31 - 1}
+    assert math.isnan(unknown.hfov) and math.isnan(unknown.q[0])
+    head = 0.5, 0.5, 0.5, 0.5
+    ends.control.sees = CameraView((47.3, 8.5, 512.25), (47.301, 8.5, 412.25), head, 70.0, 50.0)
+    known = sent()
+    assert (known.lat_camera, known.lon_camera) == (473000000, 85000000)
+    assert (known.lat_image, known.alt_camera, known.alt_image) == (473010000, 512250, 412250)
+    assert (known.hfov, known.vfov, tuple(known.q)) == (70.0, 50.0, head)
 
 
 def test_what_the_camera_says_of_itself(ends: Ends) -> None:
@@ -720,10 +737,9 @@ def test_mission_planner_finds_the_camera_by_any_of_its_ways(
     assert (confirmed.message_id, confirmed.interval_us) == (number, 30_000_000)
     assert kinds(ends.heard).count(name) == 1
     assert kinds(ends.pass_time(61.0, 0.5)).count(name) == 2
-    legacy = {259: 521, 260: 522, 261: 525, 262: 527}.get(number)
-    if legacy is not None:
+    if number in LEGACY:
         start = len(ends.heard)
-        assert ends.command(legacy, 100, 0) == [ACCEPTED]
+        assert ends.command(LEGACY[number][0], 100, 0) == [ACCEPTED]
         assert name in kinds(ends.heard[start:])
 
 

@@ -13,6 +13,7 @@ from typing import Any
 from mavlink.component.control import (
     ACCEPTED,
     Answer,
+    CameraView,
     Handled,
     Phase,
     Power,
@@ -34,6 +35,7 @@ class RehearsalControl:
     asked: list[str] = field(default_factory=list)
     works: dict[str, Work] = field(default_factory=dict)  # answers that take time, by name
     answers: dict[str, Answer] = field(default_factory=dict)  # answers other than ACCEPTED
+    sees: CameraView = field(default_factory=CameraView)
 
     def _ask(self, name: str, phase: Phase | None = None) -> Handled:
         self.asked.append(name)
@@ -44,6 +46,9 @@ class RehearsalControl:
 
     def status(self) -> ScanStatus:
         return self.state
+
+    def view(self) -> CameraView:
+        return self.sees
 
     def start_scan(self) -> Handled:
         return self._ask("start_scan", Phase.SCANNING)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import socket
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from rehearsal import RehearsalVehicle
 from scipy.spatial.transform import Rotation
 
 from mavlink.component.status import BodyOdometry
-from mavlink.telemetry.samples import VehicleState
+from mavlink.telemetry.history import VehicleHistory
+from mavlink.telemetry.samples import PositionSample, VehicleState
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from recon import se3
@@ -22,11 +24,12 @@ from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.posegraph.trajectory import Placed
 from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.odometry import Tracked, Tracking
-from recon.types import F64
-from service.config import CameraConfig
+from recon.types import F64, Camera
+from service.config import CameraConfig, load_config
+from service.daemon.runtime import Daemon
 from service.flight.anchorage import Anchorage
 from service.flight.pipeline import Step
-from service.flight.vehicle_reports import OdometryReport
+from service.flight.vehicle_reports import OdometryReport, camera_view
 
 S = 1_000_000_000
 BODY = Rotation.from_euler("ZYX", [0.7, 0.05, -0.1])  # q_ned_body
@@ -127,3 +130,66 @@ def test_it_reaches_the_autopilot_stamped_with_its_clock_only_when_wanted(wanted
         assert heard[0].time_usec == pytest.approx((now_ns - boot) / 1000, abs=20_000_000)
         assert (heard[0].x, heard[0].y, heard[0].z) == (2.0, 1.0, -30.0)
         assert heard[0].pose_covariance[0] == pytest.approx(0.09)
+
+
+K = np.array([[500.0, 0.0, 499.5], [0.0, 500.0, 374.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera(K, np.zeros(5), (1000, 750))
+
+
+def above(head: Rotation | None, **known: Any) -> VehicleState:
+    """A vehicle 100 m above ground in Zurich."""
+    place = {"lat_deg": 47.4, "lon_deg": 8.5, "alt_amsl_m": 550.0, "alt_agl_m": 100.0}
+    q = None if head is None else wxyz(head)
+    return VehicleState(0, q_ned_gimbal_wxyz=q, sources=("terrain",), **(place | known))
+
+
+def test_the_field_of_view_ends_on_the_ground_where_the_camera_looks() -> None:
+    east = Rotation.from_euler("ZYX", [math.pi / 2, -math.pi / 4, 0.0])
+    view = camera_view(CameraConfig(mount="gimbal"), CAMERA, above(east))
+    assert view.camera == pytest.approx((47.4, 8.5, 550.0), abs=1e-6)
+    assert view.hfov_deg == pytest.approx(90.0)
+    assert view.vfov_deg == pytest.approx(2 * math.degrees(math.atan(0.75)))
+    assert view.q_ned_camera_wxyz == pytest.approx(list(wxyz(east)))
+    assert view.ground is not None
+    a_degree_m = 6_388_000 * math.pi / 180 * math.cos(math.radians(47.4))
+    assert view.ground[0] == pytest.approx(47.4, abs=1e-6)
+    assert (view.ground[1] - 8.5) * a_degree_m == pytest.approx(100.0, rel=0.01)
+    assert view.ground[2] == pytest.approx(450.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("state", "has_place", "has_head"),
+    [
+        (None, False, False),
+        (above(None), True, False),
+        (above(HEAD, alt_amsl_m=None), False, True),
+        (above(HEAD, alt_agl_m=None), True, True),
+        (above(Rotation.identity()), True, True),  # at the horizon
+    ],
+)
+def test_what_telemetry_does_not_tell_stays_unknown(
+    state: VehicleState | None, has_place: bool, has_head: bool
+) -> None:
+    view = camera_view(CameraConfig(mount="gimbal"), CAMERA, state)
+    assert (view.camera is not None, view.q_ned_camera_wxyz is not None) == (has_place, has_head)
+    assert view.ground is None and view.hfov_deg == pytest.approx(90.0)
+
+
+def test_the_field_of_view_never_waits_for_telemetry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread that asks is the one that delivers it."""
+
+    def wait(*_: object) -> None:
+        raise AssertionError("waited")
+
+    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+    assert daemon.actions.view().camera is None
+    daemon.scanning.camera, daemon.actions.is_ready = CAMERA, True
+    history, now_ns = daemon.vehicle.history, time.monotonic_ns()
+    monkeypatch.setattr(VehicleHistory, "_await", wait)
+    for age_s in (2.0, 1.0, 0.0):
+        history.add(PositionSample(None, 47.4, 8.5, 550.0, 100.0, None), now_ns - round(age_s * S))
+    view = daemon.actions.view()
+    assert view.camera == pytest.approx((47.4, 8.5, 550.0), abs=1e-6)
+    assert view.q_ned_camera_wxyz is None
