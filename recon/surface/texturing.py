@@ -87,6 +87,7 @@ def _split(mesh: Mesh, layout: Layout) -> Mesh:
         number.reshape(-1, 3).astype(np.int32),
         uv.astype(np.float32),
         mesh.rgb[vertex],
+        None if mesh.measured is None else mesh.measured[vertex],
     )
 
 

@@ -124,14 +124,6 @@ def _epoch_ns(seconds: float | None) -> int | None:
 
 def mesh(
     scan_dir: ScanDir,
-    method: Annotated[
-        str,
-        typer.Option(
-            "--method",
-            help="auto, height or poisson",
-            autocompletion=choices(("auto", "height", "poisson")),
-        ),
-    ] = "auto",
     faces: Annotated[int, typer.Option("--faces", min=100, help="triangles at most")] = 400_000,
     voxel_m: Voxel = None,
     video: Annotated[
@@ -152,7 +144,7 @@ def mesh(
     as_json: AsJson = False,
 ) -> None:
     """Mesh and texture a scan into one binary glTF file."""
-    from service.offline.exports.model import METHODS, MeshOptions, write_mesh
+    from service.offline.exports.model import write_mesh
     from service.offline.exports.view import ExportOptions, ScanView
     from service.scans.writing import check_writable
 
@@ -165,22 +157,20 @@ def mesh(
         raise InputError(f"mesh: {error}") from error
     if stored and video is not None:
         raise InputError("mesh: give either --video or --stored")
-    if method not in METHODS:
-        raise InputError(f"--method {method}: there are {', '.join(METHODS)}")
     kind_of("glb", out)
     path = out or scan_dir / "mesh.glb"
     if scan_dir.is_dir():
         check_writable(path)
     started = time.monotonic()
     with showing("mesh") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
-        figures = write_mesh(scan, path, MeshOptions(method, faces), options)
+        figures = write_mesh(scan, path, faces, options)
     figures["seconds"] = round(time.monotonic() - started, 1)
     if as_json:
         print(json.dumps({"file": str(path)} | figures))
     else:
         print(
             f"{path}: {figures['faces']} triangles in {figures['tiles']} tile(s), "
-            f"{figures['method']}, {figures['seen']:.0%} seen by an image, "
+            f"{figures['measured']:.0%} measured, {figures['seen']:.0%} seen by an image, "
             f"{figures['seconds']} s"
         )
 

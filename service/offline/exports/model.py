@@ -12,10 +12,11 @@ from typing import Any, TextIO
 import cv2
 import numpy as np
 
-from recon.mapping.cloud_fusion import cloud_of
-from recon.surface.meshing import Mesh, cut, height_mesh, poisson_mesh
-from recon.surface.raster import fill_holes, grid_over, rasterise, smoothed
+from recon.surface.hole_filling import outlined
+from recon.surface.meshing import Mesh, cut
+from recon.surface.raster import grid_over, rasterise
 from recon.surface.texturing import texture
+from recon.surface.volume import closed, volume_mesh
 from recon.types import F64, U8, Keyframe, PointCloud
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
@@ -30,7 +31,6 @@ from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
 
-METHODS = ("auto", "height", "poisson")
 LARGEST_ATLAS_PX = 8192
 TILED_ATLAS_PX = 4096
 MARGIN_VOXELS = 25
@@ -40,27 +40,22 @@ TEXTURE_STEPS = 15
 """Reports of :func:`recon.surface.texturing.texture`."""
 
 
-@dataclass(frozen=True, slots=True)
-class MeshOptions:
-    """How a mesh is made; see ``skyrelief mesh --help``."""
-
-    method: str = "auto"
-    largest_faces: int = 400_000
+LARGEST_FACES = 400_000
 
 
 def write_glb(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """The mesh that ``skyrelief mesh`` makes by default."""
-    write_mesh(scan, out, MeshOptions(), options)
+    write_mesh(scan, out, LARGEST_FACES, options)
 
 
 def write_mesh(
-    scan: ScanView, out: Path, how: MeshOptions, options: ExportOptions
+    scan: ScanView, out: Path, largest_faces: int, options: ExportOptions
 ) -> dict[str, Any]:
     """Mesh and texture the scan, and write it in local ENU metres; figures of the mesh.
 
     Raises what :func:`mesh_parts` raises.
     """
-    parts, figures = mesh_parts(scan, how, options)
+    parts, figures = mesh_parts(scan, largest_faces, options)
     scan.progress(f"writing {figures['faces']} triangles")
     source = "store" if figures["pictures"] == "store" else "video"
     with writing(out) as part:
@@ -70,24 +65,26 @@ def write_mesh(
 
 
 def mesh_parts(
-    scan: ScanView, how: MeshOptions, options: ExportOptions
+    scan: ScanView, largest_faces: int, options: ExportOptions
 ) -> tuple[list[TilePart], dict[str, Any]]:
-    """The textured tiles of the scan's mesh in ENU metres, and their figures.
+    """The textured tiles of the scan's mesh in ENU metres, and their figures; made once.
 
-    ``height`` is one sheet over the ground; ``poisson`` a surface through all points; ``auto``
-    takes ``height`` unless many keyframes look sideways. Raises InputError when there is too
-    little surface or the video does not fit, OutsideError when a cluster was named and does not
-    answer.
+    Raises InputError when there is too little surface or the video does not fit, OutsideError when
+    a cluster was named and does not answer.
     """
-    if how.method not in METHODS:
-        raise InputError(f"mesh by {how.method!r}: there are {', '.join(METHODS)}")
+    key = ("mesh", largest_faces, options.voxel_m, options.video, options.stored)
+    return scan.shared(key, lambda: _mesh_parts(scan, largest_faces, options))
+
+
+def _mesh_parts(
+    scan: ScanView, largest_faces: int, options: ExportOptions
+) -> tuple[list[TilePart], dict[str, Any]]:
     with needing("a mesh file"):
-        import trimesh  # noqa: F401  # before the long work, not after it
+        import fast_simplification  # noqa: F401  # before the long work, not after it
+        import open3d  # noqa: F401
+        import trimesh  # noqa: F401
     if options.video is not None:
         check_video(scan.store.header, options.video)
-    method = how.method
-    if method == "auto":
-        method = "poisson" if scan.oblique else "height"
     prints = footprints(scan.store)
     if not prints:
         raise InputError(f"{scan.folder} contains no points yet; nothing to mesh")
@@ -101,8 +98,7 @@ def mesh_parts(
         TileJob(
             tile,
             voxel_m,
-            method,
-            max(1000, how.largest_faces // len(tiles)),
+            max(1000, largest_faces // len(tiles)),
             LARGEST_ATLAS_PX if len(tiles) == 1 else TILED_ATLAS_PX,
             options if options.video is None else replace(options, video=options.video.resolve()),
         )
@@ -113,13 +109,17 @@ def mesh_parts(
     if not parts:
         raise InputError(f"{scan.folder}: cannot be meshed, there is too little surface")
     figures = {
-        "method": method,
         "tiles": len(parts),
         "faces": sum(p.figures["faces"] for p in parts),
         "vertices": sum(p.figures["vertices"] for p in parts),
         "seen": float(
             np.average(
                 [p.figures["seen"] for p in parts], weights=[p.figures["faces"] for p in parts]
+            )
+        ),
+        "measured": float(
+            np.average(
+                [p.figures["measured"] for p in parts], weights=[p.figures["faces"] for p in parts]
             )
         ),
         "pictures": "store" if video is None else str(video),
@@ -134,7 +134,6 @@ class TileJob:
 
     tile: Tile
     voxel_m: float
-    method: str  # height or poisson
     largest_faces: int
     largest_texture_px: int
     options: ExportOptions = field(default_factory=ExportOptions)  # where images come from
@@ -174,6 +173,7 @@ def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None
         "faces": len(done.mesh.faces),
         "vertices": len(done.mesh.vertices_m),
         "seen": round(done.seen_share, 4),
+        "measured": round(float(mesh.measured.mean()), 4) if mesh.measured is not None else 1.0,
         "views": done.views_used,
         "charts": done.charts,
         "texture_px": [done.image.shape[1], done.image.shape[0]],
@@ -188,34 +188,15 @@ def _surface(
     progress: Progress,
 ) -> Mesh:
     """The untextured mesh, with colours at its vertices."""
-    if job.method == "poisson":
-        progress("Poisson surface")
-        return poisson_mesh(cloud, _seen_from(cloud, keyframes), job.voxel_m, job.largest_faces)
     if not len(cloud):
         raise ValueError("no points")
-    progress("filling and smoothing the surface")
+    progress("filling the upper surface")
     grid = grid_over(cloud.xyz_m[:, :2].astype(np.float64), job.voxel_m, margin_cells=1)
-    raster = fill_holes(rasterise(cloud, grid), largest_cells=8)
-    progress("triangles")
-    mesh = height_mesh(smoothed(raster), job.largest_faces)
-    rgb = raster.rgb[raster.grid.cells(mesh.vertices_m[:, :2])]
-    return Mesh(mesh.vertices_m, mesh.faces, None, rgb)
-
-
-def _seen_from(cloud: PointCloud, keyframes: Sequence[Keyframe]) -> F64:
-    """(N, 3) the camera that looked at each fused point: that of the nearest stored point."""
-    from scipy.spatial import cKDTree
-
-    places, cameras = [], []
-    for k in keyframes:
-        step = k.fresh.copy()
-        step[1::3] = step[2::3] = False
-        step[:, 1::3] = step[:, 2::3] = False
-        part = cloud_of(k.depth, k.bgr, step)
-        places.append(part.xyz_m)
-        cameras.append(np.tile(k.depth.T_world_camera[:3, 3], (len(part), 1)))
-    nearest = cKDTree(np.concatenate(places)).query(cloud.xyz_m, workers=-1)[1]
-    return np.asarray(np.concatenate(cameras)[nearest])
+    upper = rasterise(cloud, grid)
+    is_inside = outlined(upper.known)
+    progress("signed distances")
+    depths = [k.depth for k in keyframes]
+    return volume_mesh(depths, closed(upper, is_inside), is_inside, job.largest_faces)
 
 
 def mesh_extras(scan: ScanView) -> dict[str, Any]:
@@ -285,6 +266,8 @@ def _geometry(mesh: Mesh, textured: bool) -> Any:
 
     xyz = mesh.vertices_m[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
     made: Any = Trimesh(xyz, mesh.faces, process=False)
+    if mesh.measured is not None:
+        made.vertex_attributes["_MEASURED"] = mesh.measured.astype(np.float32)
     if textured and mesh.uv is not None:
         uv = mesh.uv.astype(np.float64)
         uv[:, 1] = 1.0 - uv[:, 1]  # trimesh counts v upwards
@@ -327,7 +310,7 @@ SPAN_M = 1000.0
 def write_mesh_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """A folder with ``tileset.json`` and a glTF for each tile; heights are AMSL metres."""
     frame = scan.needs_place("3D Tiles")
-    parts, _ = mesh_parts(scan, MeshOptions(), options)
+    parts, _ = mesh_parts(scan, LARGEST_FACES, options)
     children = []
     with writing_folder(out) as folder:
         for number, part in enumerate(parts):
@@ -375,7 +358,7 @@ def write_obj(scan: ScanView, out: Path, options: ExportOptions) -> None:
     many readers keep single precision; ``mesh.prj`` is the coordinate system. Without a
     georeference they are ENU metres.
     """
-    parts, _ = mesh_parts(scan, MeshOptions(), options)
+    parts, _ = mesh_parts(scan, LARGEST_FACES, options)
     frame = scan.frame
     places = [
         p.mesh.vertices_m if frame is None else frame.to_utm(p.mesh.vertices_m) for p in parts

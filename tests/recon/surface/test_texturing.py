@@ -7,9 +7,10 @@ from itertools import product
 
 import numpy as np
 import pytest
+from sheets import height_mesh
 
 from recon.surface import triangle_grid
-from recon.surface.meshing import Mesh, cut, height_mesh
+from recon.surface.meshing import Mesh, cut
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import BORDER_PX, lay_out, pack
 from recon.surface.texture_views import TextureView, TriangleViews, consistent, look

@@ -75,7 +75,7 @@ def test_replay_refuses_a_folder_with_a_scan_before_it_reads_the_log(
     ("words", "why"),
     [
         (["refly", "--overlap", "0.95"], "--overlap 0.95: give 0 to 0.9"),
-        (["mesh", "--method", "magic"], "there are auto, height, poisson"),
+        (["mesh", "--voxel-m", "-2"], "voxel_m is -2.0, must be positive"),
         (["mesh", "--out", "x.obj"], "glb is written as .glb"),
         (["export", "--to", "dsm", "--out", "x.laz"], "dsm is written as .tif or .tiff; .laz is"),
         (["export", "--to", "gpkg", "--out", "x"], "gpkg is written as .gpkg"),

@@ -21,7 +21,7 @@ from service.cli import COMMANDS, app, load_command
 from service.commands.ground import _show_news
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.offline.exports import EXPORTERS
-from service.offline.exports.model import MeshOptions
+from service.offline.exports.model import LARGEST_FACES
 from service.offline.exports.view import ExportOptions, ScanView
 from service.packages import installs
 from service.stream.session import SessionConfig, open_session
@@ -169,10 +169,10 @@ def test_a_mesh_without_its_package_or_video_fails_before_the_work(
     missing = ExportOptions(video=tmp_path / "none.mp4")
     with ScanView(tmp_path / "scan") as scan:
         with pytest.raises(InputError, match=r"none\.mp4: no such file or folder"):
-            model.write_mesh(scan, tmp_path / "mesh.glb", MeshOptions(), missing)
+            model.write_mesh(scan, tmp_path / "mesh.glb", LARGEST_FACES, missing)
         monkeypatch.setitem(sys.modules, "trimesh", None)
         with pytest.raises(OutsideError, match="a mesh file needs the package trimesh; pip"):
-            model.write_mesh(scan, tmp_path / "mesh.glb", MeshOptions(), ExportOptions())
+            model.write_mesh(scan, tmp_path / "mesh.glb", LARGEST_FACES, ExportOptions())
 
 
 def test_ground_prints_a_line_only_when_it_has_changed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -265,7 +265,6 @@ def test_a_bare_export_lists_every_product(tmp_path: Path) -> None:
     ("words", "offered"),
     [
         ("export x --to d", {"dsm", "dtm", "dxf"}),
-        ("mesh x --method p", {"poisson"}),
         ("ctl st", {"start", "stop", "status"}),
         ("replay x --backend ", {"auto", *BACKENDS}),
     ],

@@ -50,7 +50,7 @@ def jobs(folder: Path, count: int = 2) -> list[TileJob]:
         )
         for west, east in pairwise(edges)
     ]  # fmt: skip
-    return [TileJob(tile, 0.3, "height", 60_000, 2048) for tile in each]
+    return [TileJob(tile, 0.3, 60_000, 2048) for tile in each]
 
 
 def made(some: list[TileJob], scheduler: str | None, progress: Progress) -> list[TilePart]:
@@ -231,13 +231,13 @@ def test_the_file_names_no_path_of_this_machine(
     house.flown(tmp_path / "scan").close()
     corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
     mesh = Mesh(corner, np.array([[0, 1, 2]], np.int32), rgb=np.full((3, 3), 90, np.uint8))
-    figures = {"faces": 1, "vertices": 3, "seen": 1.0, "texture_px": [1, 1]}
+    figures = {"faces": 1, "vertices": 3, "seen": 1.0, "measured": 1.0, "texture_px": [1, 1]}
     part = SimpleNamespace(mesh=mesh, image=None, figures=figures)
     monkeypatch.setattr(model, "run_tiles", lambda *_: [part])
     monkeypatch.setattr(model, "check_video", lambda *_: None)
     options = ExportOptions(video=tmp_path / "flight.mp4")
     with ScanView(tmp_path / "scan") as scan:
-        said = model.write_mesh(scan, tmp_path / "mesh.glb", model.MeshOptions(), options)
+        said = model.write_mesh(scan, tmp_path / "mesh.glb", model.LARGEST_FACES, options)
     written = (tmp_path / "mesh.glb").read_bytes()
     assert said["pictures"] == str(tmp_path / "flight.mp4")
     assert b'"pictures":"video"' in written and str(tmp_path).encode() not in written

@@ -1,0 +1,379 @@
+"""One closed surface from posed depth images: signed distances in a sparse volume.
+
+Each voxel near the surface holds the mean signed distance to what the depth images show, in units
+of the truncation (Curless and Levoy 1996, doi:10.1145/237170.237269), and each image that sees
+through a voxel votes for free space. What no image sees follows the upper surface: below a roof
+is building, beside it is air. So the zero crossing is closed inside the outline: walls that no
+image sees stand below the edge of the roof.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, cast
+
+import cv2
+import numpy as np
+from numba import njit
+
+from recon import se3
+from recon.bands import in_bands
+from recon.surface.meshing import Mesh, reduced, used_vertices
+from recon.surface.raster import Raster
+from recon.types import F32, F64, I32, I64, Bool, DepthMap
+
+SIDE = 8
+"""Voxels along the side of a block, the unit of memory."""
+
+TRUNCATION_VOXELS = 3.0
+TRUNCATION_SIGMAS = 3.0
+"""Distances are cut off at the larger of the two: below it noise makes two surfaces of one."""
+
+PRIOR_WEIGHT = 0.05
+"""Of the upper surface's own distance, beside 1 for an image whose sigma is below a voxel."""
+
+SMOOTHINGS = 5
+"""Taubin 1995 (doi:10.1109/ICCV.1995.466848): noise of single voxels goes, corners stay."""
+
+MIN_PART = 0.01
+"""Parts of fewer triangles than this share of the largest one float in the air: noise."""
+
+LOW_REACH_M, LOW_STEP_M, SLOPE = 5.0, 0.8, 0.3
+"""A height is no ground where the ground within this reach lies a step below what a slope does."""
+
+LARGEST_BLOCKS = 120_000
+"""Some 6 GB; a tile has about a thousandth of it to a tenth."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Volume:
+    """Signed distances, positive in the air, in blocks of SIDE voxels a side."""
+
+    origin_m: F64  # (3,) of voxel (0, 0, 0)
+    voxel_m: float
+    block: I32  # (B, 3) place of each block, in blocks
+    distance: F32  # (B, SIDE, SIDE, SIDE) by z, y, x, in truncations
+    weight: F32  # the same: of the images; 0 where only the upper surface counts
+    is_inside: Bool  # (B, SIDE, SIDE) by y, x: columns inside the outline
+
+
+def volume_mesh(
+    depths: Iterable[DepthMap],
+    upper: Raster,
+    is_inside: Bool,
+    largest_faces: int = 400_000,
+) -> Mesh:
+    """The surface inside the outline, closed but at the outline itself.
+
+    Args:
+        depths: all images of the surface.
+        upper: its upper surface, known wherever ``is_inside``; the cells are the voxels' size.
+        is_inside: (rows, cols) cells inside the outline.
+
+    Returns a mesh with colours of ``upper``. Raises ValueError when there is too little surface,
+    or too much for the memory.
+    """
+    volume = prior(upper, is_inside)
+    images = list(depths)
+    truncation_m = _truncation(images, volume.voxel_m)
+    _vote(volume, upper, images, truncation_m)
+    vertices, faces = _extracted(volume)
+    if len(faces) > largest_faces:
+        vertices, faces = reduced(vertices, faces, largest_faces)
+    rgb = upper.rgb[upper.grid.cells(vertices[:, :2])]
+    return Mesh(vertices, faces, None, rgb, _measured(volume, vertices))
+
+
+def filled_low(height_m: F32, is_inside: Bool, cell_m: float) -> F32:
+    """(rows, cols) heights with every cell inside known, holes filled from their lower side.
+
+    Holes grow together ring by ring, from cells that no ground lies far below: next to a wall the
+    ground goes on, not the roof. What only roofs surround takes their height.
+    """
+    out = np.where(is_inside, height_m, np.nan).astype(np.float32)
+    known = np.isfinite(out)
+    reach = 2 * round(LOW_REACH_M / cell_m) + 1
+    lowest = _lowest(out, reach)
+    high = known & (out - lowest > LOW_STEP_M + SLOPE * LOW_REACH_M)
+    held, out = out, np.where(high, np.nan, out).astype(np.float32)
+    while True:
+        rows, cols = np.nonzero(is_inside & ~known & np.isnan(out) & np.isfinite(_lowest(out, 3)))
+        if not len(rows):
+            if not high.any():
+                return out
+            out, high = np.where(high, held, out), np.zeros_like(high)
+            continue
+        padded = np.pad(out, 1, constant_values=np.nan)
+        near = np.stack([padded[rows + i, cols + j] for i in range(3) for j in range(3)])
+        out[rows, cols] = np.nanmean(near, axis=0)
+
+
+def _lowest(height: F32, side: int) -> F32:
+    """(rows, cols) the least height in a square of so many cells; infinite without any."""
+    return np.asarray(
+        cv2.erode(
+            np.where(np.isfinite(height), height, np.float32(np.inf)),
+            np.ones((side, side), np.uint8), borderValue=np.inf,
+        ), np.float32,
+    )  # fmt: skip
+
+
+def prior(upper: Raster, is_inside: Bool) -> Volume:
+    """The blocks that the surface can be in, without any image's vote."""
+    grid = upper.grid
+    rows, cols = grid.shape
+    wide = -(-np.array([rows, cols]) // SIDE) * SIDE
+    height = np.full(wide, np.nan, np.float32)
+    inside = np.zeros(wide, np.bool_)
+    height[:rows, :cols], inside[:rows, :cols] = upper.height_m[::-1], is_inside[::-1]
+    if not (np.isfinite(height) & inside).any():
+        raise ValueError("the surface has no cell inside its outline")
+    height[~inside] = np.nan
+    base_m = float(np.nanmin(height))
+    origin = np.array(
+        [grid.west_m + 0.5 * grid.cell_m, grid.north_m - (rows - 0.5) * grid.cell_m, base_m]
+    )
+    tiles = height.reshape(wide[0] // SIDE, SIDE, wide[1] // SIDE, SIDE)
+    low = np.where(np.isfinite(tiles), tiles, np.inf).min(axis=(1, 3))
+    high = np.where(np.isfinite(tiles), tiles, -np.inf).max(axis=(1, 3))
+    near = np.ones((3, 3), np.uint8)
+    low, high = (
+        cv2.erode(low, near, borderValue=np.inf),
+        cv2.dilate(high, near, borderValue=-np.inf),
+    )
+    span_m = SIDE * grid.cell_m
+    has = inside.reshape(tiles.shape).any(axis=(1, 3))
+    blocks = []
+    for y, x in zip(*np.nonzero(has), strict=True):
+        first = int(np.floor((low[y, x] - base_m) / span_m - 0.5))
+        last = int(np.floor((high[y, x] - base_m) / span_m + 0.5))
+        blocks += [(x, y, z) for z in range(first, last + 1)]
+    if len(blocks) > LARGEST_BLOCKS:
+        raise ValueError(f"{len(blocks)} blocks are too many; mesh it in smaller tiles")
+    block = np.array(blocks, np.int32)
+    shape = (len(block), SIDE, SIDE, SIDE)
+    columns = inside.reshape(tiles.shape).transpose(0, 2, 1, 3)[block[:, 1], block[:, 0]]
+    return Volume(
+        origin, grid.cell_m, block, np.zeros(shape, np.float32), np.zeros(shape, np.float32),
+        columns,
+    )  # fmt: skip
+
+
+def _truncation(depths: Iterable[DepthMap], voxel_m: float) -> float:
+    sigmas = [d.sigma_m[np.isfinite(d.sigma_m)] for d in depths]
+    typical = float(np.median(np.concatenate(sigmas))) if any(map(len, sigmas)) else 0.0
+    return max(TRUNCATION_VOXELS * voxel_m, TRUNCATION_SIGMAS * typical)
+
+
+def _vote(volume: Volume, upper: Raster, depths: Iterable[DepthMap], truncation_m: float) -> None:
+    """Add each image's distances, then the upper surface's own, and divide by the weights."""
+    middle = volume.origin_m + (volume.block * SIDE + 0.5 * (SIDE - 1)) * volume.voxel_m
+    radius = 0.5 * np.sqrt(3.0) * SIDE * volume.voxel_m
+    for one in depths:
+        T = se3.inverse(one.T_world_camera)
+        seen = _in_view(middle, radius, one, T)
+        if len(seen):
+            in_bands(
+                _add, len(seen), seen, volume.block, volume.distance,
+                volume.weight, volume.origin_m, volume.voxel_m, truncation_m, one.depth_m,
+                one.sigma_m, one.K, T, cells=SIDE**3 * len(seen),
+            )  # fmt: skip
+    height = np.ascontiguousarray(upper.height_m[::-1])
+    every = np.arange(len(volume.block))
+    in_bands(
+        _add_upper, len(every), every, volume.block, volume.distance,
+        volume.weight, volume.origin_m, volume.voxel_m, truncation_m, height,
+        cells=SIDE**3 * len(every),
+    )  # fmt: skip
+
+
+def _in_view(middle: F64, radius: float, depth: DepthMap, T: F64) -> I64:
+    """Blocks whose sphere touches the image's view, no farther than its surface."""
+    known = np.isfinite(depth.depth_m)
+    if not known.any():
+        return np.zeros(0, np.int64)
+    local = middle @ T[:3, :3].T + T[:3, 3]
+    h, w = depth.depth_m.shape
+    (fx, _, cx), (_, fy, cy) = depth.K[:2]
+    z = local[:, 2]
+    ok = (z > -radius) & (z < float(depth.depth_m[known].max()) + 2.0 * radius)
+    for axis, f, c, size in ((0, fx, cx, w), (1, fy, cy, h)):
+        for side in (1.0, -1.0):
+            edge = (c + 0.5) / f if side > 0 else (size - 0.5 - c) / f
+            inward = (side * local[:, axis] + edge * z) / np.hypot(1.0, edge)
+            ok &= inward > -radius
+    return np.flatnonzero(ok)
+
+
+@njit(cache=True, nogil=True)
+def _add(
+    begin: int, end: int, seen: I64, block: I32, distance: F32, weight: F32, origin: F64,
+    voxel: float, truncation: float, depth: F32, sigma: F32, K: F64, T: F64,
+) -> None:  # fmt: skip
+    h, w = depth.shape
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    for n in range(begin, end):
+        b = seen[n]
+        for k in range(SIDE):
+            z = origin[2] + (block[b, 2] * SIDE + k) * voxel
+            for j in range(SIDE):
+                y = origin[1] + (block[b, 1] * SIDE + j) * voxel
+                for i in range(SIDE):
+                    x = origin[0] + (block[b, 0] * SIDE + i) * voxel
+                    ahead = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+                    if ahead <= 0.0:
+                        continue
+                    u = fx * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / ahead + cx
+                    v = fy * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / ahead + cy
+                    col, row = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+                    if col < 0 or row < 0 or col >= w or row >= h:
+                        continue
+                    d = depth[row, col]
+                    if not np.isfinite(d):
+                        continue
+                    t = (d - ahead) / truncation
+                    if t < -1.0:
+                        continue
+                    s = max(sigma[row, col] / voxel, 1.0)
+                    one = 1.0 / (s * s)
+                    distance[b, k, j, i] += np.float32(one * min(t, 1.0))
+                    weight[b, k, j, i] += np.float32(one)
+
+
+@njit(cache=True, nogil=True)
+def _add_upper(
+    begin: int, end: int, every: I64, block: I32, distance: F32, weight: F32, origin: F64,
+    voxel: float, truncation: float, height: F32,
+) -> None:  # fmt: skip
+    rows, cols = height.shape
+    for n in range(begin, end):
+        b = every[n]
+        for j in range(SIDE):
+            row = block[b, 1] * SIDE + j
+            for i in range(SIDE):
+                col = block[b, 0] * SIDE + i
+                if row >= rows or col >= cols or not np.isfinite(height[row, col]):
+                    continue
+                for k in range(SIDE):
+                    z = origin[2] + (block[b, 2] * SIDE + k) * voxel
+                    t = min(max((z - height[row, col]) / truncation, -1.0), 1.0)
+                    whole = weight[b, k, j, i] + PRIOR_WEIGHT
+                    distance[b, k, j, i] = (distance[b, k, j, i] + PRIOR_WEIGHT * t) / whole
+
+
+def _extracted(volume: Volume) -> tuple[F64, I32]:
+    """Vertices (V, 3) and faces (F, 3) of the zero crossing, by marching cubes of Open3D."""
+    import open3d as o3d
+
+    core: Any = o3d.core
+    grid: Any = cast(Any, o3d.t.geometry.VoxelBlockGrid)(
+        attr_names=("tsdf", "weight"), attr_dtypes=(core.float32, core.float32),
+        attr_channels=((1,), (1,)), voxel_size=volume.voxel_m, block_resolution=SIDE,
+        block_count=len(volume.block),
+    )  # fmt: skip
+    places, _ = grid.hashmap().activate(core.Tensor(volume.block))
+    at = places.numpy().astype(np.int64)
+    grid.attribute("tsdf").numpy()[at, ..., 0] = volume.distance
+    grid.attribute("weight").numpy()[at, ..., 0] = volume.is_inside[:, None]
+    made = grid.extract_triangle_mesh(weight_threshold=0.5).to_legacy()
+    if not len(made.triangles):
+        raise ValueError("no surface crosses the volume")
+    vertices = np.asarray(made.vertices, np.float64)
+    faces = _without_floating(len(vertices), np.asarray(made.triangles, np.int32))
+    used, faces = used_vertices(len(vertices), faces)
+    vertices, faces = _in_order(vertices[used], faces)
+    return _smoothed(vertices, faces) + volume.origin_m, faces
+
+
+def _in_order(vertices: F64, faces: I32) -> tuple[F64, I32]:
+    """The same mesh in an order that does not depend on threads, vertices of one place joined."""
+    order = np.lexsort(vertices.T)
+    ordered = vertices[order]
+    is_new = np.ones(len(order), np.bool_)
+    is_new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    place = np.empty(len(order), np.int32)
+    place[order] = np.cumsum(is_new) - 1
+    faces = place[faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    first = (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3
+    faces = np.take_along_axis(faces, first, 1)
+    return ordered[is_new], faces[np.lexsort(faces.T[::-1])]
+
+
+def _edges(count: int, faces: I32) -> Any:
+    """(V, V) sparse, symmetric: 1 where two vertices share an edge."""
+    from scipy.sparse import coo_matrix
+
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    whole = coo_matrix((np.ones(len(ends), np.float32), ends.T), (count, count)).tocsr()
+    whole = whole + whole.T
+    whole.data[:] = 1.0
+    return whole
+
+
+def _without_floating(count: int, faces: I32) -> I32:
+    """The faces of parts that are at least MIN_PART as large as the largest one."""
+    from scipy.sparse.csgraph import connected_components
+
+    _, part = connected_components(_edges(count, faces), directed=False)
+    size = np.bincount(part[faces[:, 0]])
+    return np.asarray(faces[(size >= MIN_PART * size.max())[part[faces[:, 0]]]], np.int32)
+
+
+def _smoothed(vertices: F64, faces: I32) -> F64:
+    """(V, 3) vertices after SMOOTHINGS steps forth and back; the outline stays."""
+    from scipy.sparse import diags
+
+    near = _edges(len(vertices), faces)
+    mean = diags(1.0 / np.maximum(near.sum(axis=1).A1, 1.0)) @ near
+    ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    key, times = np.unique(ends[:, 0].astype(np.int64) * len(vertices) + ends[:, 1],
+                           return_counts=True)  # fmt: skip
+    free = np.ones(len(vertices), np.bool_)
+    border = key[times == 1]
+    free[border // len(vertices)] = free[border % len(vertices)] = False
+    out = vertices.copy()
+    for step in (0.5, -0.53) * SMOOTHINGS:
+        out[free] += step * (mean @ out - out)[free]
+    return np.asarray(out, np.float64)
+
+
+def _measured(volume: Volume, vertices: F64) -> Bool:
+    """(V,) whether images have voted for all voxels around each vertex: what only one side was
+    seen of is guessed."""
+    at = (vertices - volume.origin_m) / volume.voxel_m
+    order = np.lexsort(volume.block.T)
+    low = volume.block.min(axis=0).astype(np.int64)
+    span = volume.block.max(axis=0) - low + 1
+
+    def key(block: I64) -> I64:
+        x, y, z = (block - low).T
+        return np.asarray((z * span[1] + y) * span[0] + x)
+
+    keys = key(volume.block[order].astype(np.int64))
+    out = np.ones(len(vertices), np.bool_)
+    for corner in np.ndindex(2, 2, 2):
+        voxel = np.floor(at).astype(np.int64) + corner
+        block, (i, j, k) = voxel // SIDE, (voxel % SIDE).T
+        n = np.clip(np.searchsorted(keys, key(block)), 0, len(keys) - 1)
+        held = (keys[n] == key(block)) & ((block >= low) & (block < low + span)).all(axis=1)
+        out &= held & (volume.weight[order[n], k, j, i] > 0.0)
+    return out
+
+
+def closed(raster: Raster, is_inside: Bool) -> Raster:
+    """The raster with every cell inside the outline known, and none outside."""
+    height = filled_low(raster.height_m, is_inside, raster.grid.cell_m)
+    rgb = raster.rgb.copy()
+    hole = is_inside & ~raster.known
+    if hole.any():
+        mask = np.where(raster.known, 0, 255).astype(np.uint8)
+        _, label = cv2.distanceTransformWithLabels(
+            mask, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        colour = np.zeros((int(label.max()) + 1, 3), np.uint8)
+        colour[label[raster.known]] = raster.rgb[raster.known]
+        rgb[hole] = colour[label[hole]]
+    sigma = np.where(np.isfinite(height), raster.sigma_m, np.nan).astype(np.float32)
+    return Raster(raster.grid, height, sigma, rgb)

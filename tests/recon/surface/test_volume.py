@@ -1,0 +1,113 @@
+"""One closed surface from exact depth images of a house: walls, holes, stray heights, outline."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from house_flight import HouseFlight
+
+pytest.importorskip("open3d", exc_type=ImportError)
+pytest.importorskip("fast_simplification")
+
+from recon.mapping.cloud_fusion import cloud_of
+from recon.surface.hole_filling import outlined
+from recon.surface.meshing import Mesh
+from recon.surface.raster import Raster, grid_over, rasterise
+from recon.surface.volume import closed, filled_low, volume_mesh
+from recon.types import I64, Bool, DepthMap
+
+VOXEL_M = 0.3
+
+
+def seen(house: HouseFlight) -> tuple[list[DepthMap], Raster, Bool]:
+    """Depth images, the upper surface of their points, and what lies inside its outline."""
+    keyframes = [house.keyframe(k, 5.0 * k) for k in range(5)]
+    clouds = [cloud_of(k.depth, k.bgr, k.fresh) for k in keyframes]
+    cloud = replace(
+        clouds[0],
+        xyz_m=np.concatenate([c.xyz_m for c in clouds]),
+        rgb=np.concatenate([c.rgb for c in clouds]),
+        sigma_m=np.concatenate([c.sigma_m for c in clouds]),
+    )
+    upper = rasterise(cloud, grid_over(cloud.xyz_m[:, :2].astype(np.float64), VOXEL_M, 1))
+    return [k.depth for k in keyframes], upper, outlined(upper.known)
+
+
+def border(mesh: Mesh) -> I64:
+    """Vertices of edges that belong to one face alone."""
+    ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    edges, count = np.unique(np.sort(ends, axis=1), axis=0, return_counts=True)
+    assert count.max() == 2
+    return np.unique(edges[count == 1])
+
+
+@pytest.fixture(scope="module")
+def mesh() -> Mesh:
+    depths, upper, is_inside = seen(HouseFlight())
+    return volume_mesh(depths, closed(upper, is_inside), is_inside)
+
+
+def test_it_is_open_at_the_outline_alone(mesh: Mesh) -> None:
+    places = mesh.vertices_m[border(mesh)]
+    low, high = mesh.vertices_m[:, :2].min(axis=0), mesh.vertices_m[:, :2].max(axis=0)
+    inward = np.minimum(places[:, :2] - low, high - places[:, :2]).min(axis=1)
+    assert len(places) and inward.max() < 2.0 * VOXEL_M
+
+
+def test_roof_ground_and_walls_are_where_the_house_is(mesh: Mesh) -> None:
+    x, y, z = mesh.vertices_m.T
+    roof = (np.abs(x - 10.0) < 5.0) & (np.abs(y - 2.0) < 3.0)
+    assert np.abs(z[roof] - 6.0).max() < 0.1
+    away = (np.abs(x - 10.0) > 7.0) | (np.abs(y - 2.0) > 5.0)
+    assert np.abs(z[away]).max() < 0.1
+    wall = (z > 1.5) & (z < 4.5)
+    assert wall.sum() > 100
+    outside = np.maximum(np.abs(x[wall] - 10.0) - 6.0, np.abs(y[wall] - 2.0) - 4.0)
+    assert np.percentile(np.abs(outside), 90) < 1.3 * VOXEL_M
+    assert np.abs(outside).max() < 2.2 * VOXEL_M
+
+
+def test_what_no_image_shows_is_marked(mesh: Mesh) -> None:
+    assert mesh.measured is not None
+    x, y, z = mesh.vertices_m.T
+    flat = (np.abs(x - 10.0) > 8.0) & (np.abs(x - 10.0) < 15.0) & (np.abs(y - 2.0) < 5.0)
+    assert mesh.measured[flat & (z < 0.5)].mean() > 0.95
+    hidden = (z > 1.0) & (z < 5.0) & (y > 5.5)  # the cameras fly south of this wall
+    assert hidden.sum() > 20 and not mesh.measured[hidden].any()
+
+
+def test_a_stray_tower_that_images_look_through_goes() -> None:
+    depths, upper, is_inside = seen(HouseFlight())
+    height = upper.height_m.copy()
+    rows, cols = upper.grid.cells(np.array([[22.0, -4.0]]))
+    height[rows[0] - 1 : rows[0] + 2, cols[0] - 1 : cols[0] + 2] = 9.0
+    mesh = volume_mesh(depths, closed(replace(upper, height_m=height), is_inside), is_inside)
+    near = np.hypot(*(mesh.vertices_m[:, :2] - [22.0, -4.0]).T) < 2.0
+    assert near.any() and mesh.vertices_m[near, 2].max() < 0.5
+
+
+def test_a_hole_beside_a_wall_takes_the_ground() -> None:
+    height = np.zeros((12, 30), np.float32)
+    height[:, 6:] = 5.0
+    height[3:9, 3:6] = height[5:7, 20:22] = np.nan
+    filled = filled_low(height, np.ones(height.shape, np.bool_), 0.5)
+    np.testing.assert_array_equal(filled[:, :6], 0.0)
+    np.testing.assert_array_equal(filled[:, 6:], 5.0)  # on the roof, far from the ground
+
+
+def test_fewer_triangles_are_the_same_surface(mesh: Mesh) -> None:
+    depths, upper, is_inside = seen(HouseFlight())
+    small = volume_mesh(depths, closed(upper, is_inside), is_inside, largest_faces=3000)
+    assert len(small.faces) <= 3000 < len(mesh.faces)
+    x, y, z = small.vertices_m.T
+    roof = (np.abs(x - 10.0) < 5.0) & (np.abs(y - 2.0) < 3.0)
+    assert np.abs(z[roof] - 6.0).max() < 0.15
+    border(small)
+
+
+def test_no_surface_is_an_error() -> None:
+    depths, upper, _ = seen(HouseFlight())
+    with pytest.raises(ValueError, match="no cell inside"):
+        volume_mesh(depths, upper, np.zeros(upper.grid.shape, np.bool_))
