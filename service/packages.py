@@ -19,7 +19,6 @@ EXTRAS = {
     "google": "ground",
     "mavsdk": "ground",
     "mcap": "ground",
-    "onnx": "onnx",
     "onnxruntime": "onnx",
     "open3d": "ground",
     "py3dtiles": "ground",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from importlib.util import find_spec
 from pathlib import Path
 
 # Threads of OpenBLAS and torch spin: up to fifty times the processor time. Read at their import.
@@ -26,9 +27,34 @@ def house() -> HouseFlight:
     return HouseFlight()
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Without a GPU Triton interprets its kernels; it decides so when it is imported."""
+    if config.getoption("--device") == "cpu":
+        os.environ.setdefault("TRITON_INTERPRET", "1")
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--device cuda`` runs the tests of the backends on a GPU."""
     parser.addoption("--device", default="cpu", choices=("cpu", "cuda"), help="of the backends")
+
+
+@pytest.fixture
+def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Where Triton's kernels run, "cuda" or its interpreter; skips where they cannot."""
+    chosen = str(request.config.getoption("--device"))
+    if find_spec("torch") is None or find_spec("triton") is None:
+        pytest.skip("torch or triton is not installed")
+    if chosen == "cpu":
+        from recon.backends import room, triton_dense, triton_icp
+
+        for module, name in (
+            (triton_dense, "PIXELS"), (triton_dense, "CELLS"), (triton_dense, "FUSED_PIXELS"),
+            (triton_icp, "POINTS"),
+        ):  # fmt: skip
+            monkeypatch.setattr(module, name, 512)  # few programs: each takes long here
+        monkeypatch.setattr(room, "ROOM_PX", 4)
+        # Not SWEPT: a scan takes one element after the other, also those beyond the image.
+    return chosen
 
 
 @pytest.fixture(scope="session")

@@ -80,22 +80,18 @@ class Backend(Protocol):
 BACKENDS: dict[str, str] = {
     "cpu": "recon.backends.cpu:CpuBackend",
     "torch": "recon.backends.torch_backend:TorchBackend",
-    "onnx": "recon.backends.onnx_backend:OnnxBackend",
 }
-"""Name to ``module:class``; imported on first use."""
+"""Name to ``module:class``; imported on first use. A model on ONNX Runtime is one by its file."""
 
 
-def load_backend(name: str, engines: str | None = None) -> Backend:
+def load_backend(name: str) -> Backend:
     """The backend called ``name``, ready to run.
 
-    ``engines`` is a folder for TensorRT's engines (onnx backend), which take minutes to build and
-    are reused at the next start. Raises ValueError for a name that is not in the table, and
-    whatever the backend raises when it cannot run here (ImportError, RuntimeError), with the
-    reason.
+    Raises ValueError for a name that is not in the table, and whatever the backend raises when it
+    cannot run here (ImportError, RuntimeError), with the reason.
     """
     if name not in BACKENDS:
         raise ValueError(f"no backend {name!r}; there are {', '.join(sorted(BACKENDS))}")
     module, _, cls = BACKENDS[name].partition(":")
-    made = getattr(import_module(module), cls)
-    backend: Backend = made(engines) if name == "onnx" else made()
+    backend: Backend = getattr(import_module(module), cls)()
     return backend

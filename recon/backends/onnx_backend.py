@@ -1,14 +1,12 @@
-"""The heavy operations by ONNX Runtime, with the fastest provider that it brings.
+"""Disparity from a learned or exported model, on the fastest provider of ONNX Runtime.
 
-:class:`LearnedStereoBackend` takes the disparity from a model that the operator brings: two
-rectified images in, one disparity out. The model's inputs are declared in a file and checked when
-it is loaded, before the flight.
+Two rectified images in, one disparity out. The model's inputs are declared in a file and checked
+when it is loaded, before the flight.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,17 +16,12 @@ import onnxruntime  # type: ignore[import-untyped]
 from onnxruntime.capi import onnxruntime_pybind11_state  # type: ignore[import-untyped]
 
 from recon.backends.cpu import CpuBackend
-from recon.backends.onnx_dense import stereo_model, tap_windows, upsampling_model
-from recon.backends.room import kept, place, pyramid_levels, room
 from recon.stereo.belief_propagation import BeliefPropagationConfig, drop_unreliable
 from recon.stereo.matching_cost import check_pair
-from recon.stereo.upsampling import UpsamplingConfig, check_guide, guide_at_taps
-from recon.types import F32, U8, Array, DisparityMap
+from recon.types import F32, U8, DisparityMap
 
 PROVIDERS = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider")
 """Fastest first; ONNX Runtime falls back along the list."""
-
-KEPT_SESSIONS = 8
 
 ORT_ERRORS: tuple[type[Exception], ...] = (
     RuntimeError,
@@ -44,90 +37,13 @@ ORT_ERRORS: tuple[type[Exception], ...] = (
 ENGINE_NAME_DIGITS = 16
 
 
-class OnnxBackend(CpuBackend):
-    """Builds one model per shape and keeps its session; needs no torch.
-
-    Shapes are few, see :mod:`recon.backends.room`.
-
-    TensorRT builds an engine of each model, which takes minutes; ``engines`` is the folder that
-    keeps them between starts (None: nothing is kept). ICP is the compiled one.
-    """
-
-    name = "onnx"
-
-    def __init__(self, engines: str | None = None) -> None:
-        self.engines = engines
-        found = onnxruntime.get_available_providers()
-        self.providers = [p for p in PROVIDERS if p in found]
-        if not self.providers:
-            raise RuntimeError(f"ONNX Runtime offers none of {', '.join(PROVIDERS)}")
-        self.device = self.providers[0].removesuffix("ExecutionProvider").lower()
-        self._sessions: dict[Any, Any] = {}
-
-    def belief_propagation(
-        self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
-    ) -> DisparityMap:
-        """Labels of the left view, (h, w); Eq. 1."""
-        check_pair(left, right, labels)
-        h, w = left.shape
-        *size, label_room = room(h, w, labels)
-        levels = pyramid_levels(h, w, config)
-        key = ("stereo", *size, label_room, levels, config)
-        session = self._session(
-            key, lambda: stereo_model((size[0], size[1]), label_room, config, levels)
-        )
-        given = {name: np.empty(size, np.uint8) for name in ("left", "right")}
-        place(given["left"], left)
-        place(given["right"], right)
-        px, confidence = _run(session, {**given, "true": np.array([h, w, labels])})
-        return drop_unreliable(left, px[:h, :w].copy(), confidence[:h, :w].copy(), config)
-
-    def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
-        """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
-        check_guide(coarse, guide)
-        (h, w), (H, W) = coarse.px.shape, guide.shape[:2]
-        small, large = room(h, w, 1)[:2], room(H, W, 1)[:2]
-        key = ("upsample", small, large, config)
-        session = self._session(key, lambda: upsampling_model(small, large, config, fixed=False))
-        given: dict[str, Array] = {
-            "px": np.empty(small, np.float32),
-            "confidence": np.empty(small, np.float32),
-            "taps": np.empty((*small, 3), np.uint8),
-            "guide": np.empty((*large, 3), np.uint8),
-        }
-        arrays: list[Array] = [coarse.px, coarse.confidence, guide_at_taps(guide, (h, w)), guide]
-        for name, array in zip(given, arrays, strict=True):
-            place(given[name], array)
-        px, sure = _run(session, given | tap_windows((h, w), (H, W), large, config))
-        return DisparityMap(px[:H, :W].copy(), sure[:H, :W].copy())
-
-    def _session(self, key: Any, model: Callable[[], bytes]) -> Any:
-        def opened() -> Any:
-            try:
-                return open_session(model(), self.providers, self.engines)
-            except ValueError as error:  # our own model: it is the device that cannot
-                raise RuntimeError(str(error)) from error
-
-        return kept(self._sessions, key, KEPT_SESSIONS, opened)
-
-
-def _run(session: Any, given: dict[str, Array], outputs: list[str] | None = None) -> list[Array]:
-    """The ``outputs`` of a model, or all; RuntimeError where the device cannot compute them."""
-    try:
-        found: list[Array] = session.run(outputs, given)
-    except ORT_ERRORS as error:
-        raise RuntimeError(str(error)) from error
-    return found
-
-
 def provider_options(
     providers: list[str], model: bytes, engines: str | None
 ) -> list[tuple[str, dict[str, Any]]]:
     """The providers with their options: TensorRT keeps its engines, the others need none.
 
     Each model has a folder of its own, named by its digest: TensorRT distinguishes engines by the
-    names in a model, which ours share whatever numbers they hold. ``engines`` must exist;
-    TensorRT makes the folders in it.
+    names in a model. ``engines`` must exist; TensorRT makes the folders in it.
     """
     kept: dict[str, Any] = {}
     if engines is not None and "TensorrtExecutionProvider" in providers:
@@ -188,11 +104,13 @@ class LearnedStereoConfig:
         return (1, self.height, self.width, self.channels)
 
 
-class LearnedStereoBackend(OnnxBackend):
-    """The onnx backend with the model's disparity in place of belief propagation's.
+class LearnedStereoBackend(CpuBackend):
+    """The model's disparity in place of belief propagation's; the rest is the compiled code's.
 
-    Contrast, visibility and speckles are checked as for every backend. Raises ValueError when
-    the model's inputs or output are not as declared, with what was expected and found.
+    Contrast, visibility and speckles are checked as for every backend. TensorRT builds an engine
+    of the model, which takes minutes; ``engines`` is the folder that keeps it between starts.
+    Raises ValueError when the model's inputs or output are not as declared, with what was
+    expected and found.
     """
 
     name = "learned"
@@ -200,9 +118,13 @@ class LearnedStereoBackend(OnnxBackend):
     def __init__(
         self, model: bytes, config: LearnedStereoConfig, engines: str | None = None
     ) -> None:
-        super().__init__(engines)
+        offered = onnxruntime.get_available_providers()
+        providers = [p for p in PROVIDERS if p in offered]
+        if not providers:
+            raise ValueError(f"ONNX Runtime offers none of {', '.join(PROVIDERS)}")
+        self.device = providers[0].removesuffix("ExecutionProvider").lower()
         self.config = config
-        self._model = open_session(model, self.providers, engines)
+        self._model = open_session(model, providers, engines)
         found = {i.name: (tuple(i.shape), i.type) for i in self._model.get_inputs()}
         for name in (config.left, config.right):
             _check_input(name, found, config.image_shape)
@@ -240,7 +162,10 @@ class LearnedStereoBackend(OnnxBackend):
         """(h, w) pixels, of images that fit the model."""
         h, w = left.shape
         given = {self.config.left: self._image(left), self.config.right: self._image(right)}
-        (raw,) = _run(self._model, given, [self.config.disparity])
+        try:
+            (raw,) = self._model.run([self.config.disparity], given)
+        except ORT_ERRORS as error:
+            raise RuntimeError(str(error)) from error
         plane = np.asarray(raw, np.float32).squeeze()
         if plane.shape != (self.config.height, self.config.width):
             raise ValueError(

@@ -1,4 +1,4 @@
-"""The heavy operations in torch, on CUDA where there is a device, else on the processor."""
+"""The heavy operations on a CUDA device: Triton kernels, captured by torch as graphs."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch import Tensor
 from recon.backends import DenseStages
 from recon.backends.room import kept, pyramid_levels, room
 from recon.backends.torch_depth import DensePath, upsampled
-from recon.backends.torch_plan import Plan, part, read
-from recon.backends.torch_stereo import dense_stereo
+from recon.backends.torch_plan import Plan, compiling, part, read
+from recon.backends.triton_dense import contrast, stereo
 from recon.stereo.belief_propagation import BeliefPropagationConfig, drop_unreliable
 from recon.stereo.matching_cost import check_pair
 from recon.stereo.upsampling import UpsamplingConfig, check_guide
@@ -29,21 +29,25 @@ KEPT_PLANS = 8
 
 
 class TorchBackend:
-    """``device`` is "cuda" when torch has one, else "cpu"; RuntimeError when it cannot compute.
+    """An operation is captured once per shape as a graph; a call then uploads, replays and waits
+    once, for its result. One backend serves one thread at a time.
 
-    On CUDA an operation is captured once per shape as a graph; a call then uploads, replays
-    and waits once, for its result. One backend serves one thread at a time.
+    Raises RuntimeError where there is no CUDA device, or where a kernel cannot be compiled. With
+    ``device`` "cpu" the kernels run in Triton's interpreter, as the tests do.
     """
 
     name = "torch"
     keeps_pairs = True
 
-    def __init__(self, device: str | None = None) -> None:
-        self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    def __init__(self, device: str = "cuda") -> None:
+        if device == "cuda" and not torch.cuda.is_available():
+            raise RuntimeError("torch finds no CUDA device; the processor's backend is cpu")
+        self.device = device
         self._icp: DeviceIcp | None = None
         self._plans: dict[Any, Plan] = {}
         self._path: DensePath | None = None
-        torch.zeros(8, device=self.device).add_(1).cpu()  # fails here rather than in flight
+        with compiling():  # fails here rather than in flight
+            contrast(torch.zeros((8, 8), dtype=torch.uint8, device=device), 1).cpu()
 
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
@@ -55,7 +59,7 @@ class TorchBackend:
         levels = pyramid_levels(h, w, config)
         px, confidence = self._run(
             ("stereo", *space, label_room, levels, config),
-            partial(dense_stereo, labels=label_room, levels=levels, config=config),
+            lambda a, b, true: stereo(a, b, label_room, levels, true, config),
             (space, space, (3,)),
             (left, right, np.array([h, w, labels])),
         )

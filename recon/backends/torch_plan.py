@@ -6,7 +6,6 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from threading import Lock
 from typing import Any
 
@@ -33,7 +32,7 @@ class Plan:
 
     Inputs are written to pinned memory and go to the device in one copy that the host does not
     wait for; each ``slot`` is a staging buffer of its own, free again once the results that
-    came of it were read. Elsewhere the same operation runs without capture.
+    came of it were read. In Triton's interpreter the same operation runs without capture.
     """
 
     def __init__(
@@ -141,16 +140,3 @@ def to_host(tensor: Tensor) -> Tensor:
     host.copy_(tensor, non_blocking=True)
     torch.cuda.current_stream().synchronize()
     return host
-
-
-def fused(tensor: Tensor) -> bool:
-    """Whether Triton's kernels compute with the tensor: on CUDA, where Triton is installed."""
-    return HAS_TRITON and (tensor.is_cuda or INTERPRETED)
-
-
-HAS_TRITON = find_spec("triton") is not None
-"""Some of torch's wheels for Jetsons come without it; plain torch then does the same."""
-
-
-INTERPRETED = False
-"""Tests run the kernels on the processor, in Triton's interpreter."""

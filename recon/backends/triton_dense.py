@@ -1,8 +1,11 @@
 """The dense stages as Triton kernels: cost, messages, labels, their checks and depth, Eq. 1 to 3.
 
-Each function computes what its namesake in torch_stereo or torch_depth does. A kernel is compiled
-once for all sizes. Costs and messages are (h, w, L) int16, L a power of two: a thread holds labels
-that lie side by side in memory. Sums have 32 bits, so all integers are exact.
+Each function computes what the compiled one of :mod:`recon.stereo` does, which the tests compare.
+A kernel is compiled once for all sizes. The pairs of a flight differ by a few pixels and labels
+from each other: arrays are a little larger than the pair (see :mod:`recon.backends.room`), and its
+true height, width and number of labels come as a tensor ``true``. What lies beyond them says
+nothing. Costs and messages are (h, w, L) int16, L a power of two: a thread holds labels that lie
+side by side in memory. Sums have 32 bits, so all integers are exact.
 """
 
 # mypy: allow-untyped-defs, allow-incomplete-defs
@@ -39,7 +42,12 @@ def stereo(
     left: Tensor, right: Tensor, labels: int, levels: int, true: Tensor,
     config: BeliefPropagationConfig,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Labels and confidence (h, w) of gray images (h, w) uint8, as ``dense_stereo``; Eq. 1."""
+    """Labels of gray images (h, w) uint8, NaN where the partner is outside the right one, and their
+    confidence, 0 where rejected; Eq. 1.
+
+    ``true`` (3,) is height, width and labels of the pair; beyond them the images repeat their last
+    row and column. ``labels`` is the room for them, ``levels`` of the pyramid.
+    """
     room = max(triton.next_power_of_2(labels), 8)
     cost, data = matching_cost(left, right, room, true, config)
     edges = edge_weights(left, true, config)
@@ -350,7 +358,7 @@ def _sweep(
 def select(
     data: Tensor, messages: Tensor, cost: Tensor, true: Tensor, config: BeliefPropagationConfig
 ) -> tuple[Tensor, Tensor]:
-    """Labels and confidence (h, w), as :func:`recon.backends.torch_stereo.select`."""
+    """Labels and confidence (h, w), as :func:`recon.stereo.belief_propagation.select`."""
     h, w, room = data.shape
     px, confidence = torch.empty((2, h, w), device=data.device)
     evidence = config.min_evidence if config.min_evidence > 0 else -math.inf
@@ -425,6 +433,29 @@ def _select(
     tl.store(px + pixel, tl.where(sees, found, float("nan")), mask=here)
     trust = tl.where(accepted, tl.minimum(margin, 1.0) * sure, 0.0)
     tl.store(confidence + pixel, trust, mask=here)
+
+
+CONTRAST_PX = 9
+UNKNOWN = -2048 * SPECKLE_STEP
+
+
+def drop_unreliable(
+    left: Tensor, px: Tensor, confidence: Tensor, true: Tensor, config: BeliefPropagationConfig
+) -> tuple[Tensor, Tensor]:
+    """Labels (h, w), NaN where they are unreliable, and their confidence."""
+    if config.min_contrast > 0:
+        flat = contrast(left, CONTRAST_PX // 2) < config.min_contrast
+        confidence = torch.where(flat, 0.0, confidence)
+    gone = confidence <= 0
+    if config.occlusion_tolerance >= 0:
+        gone = gone | hidden(px, confidence, true, config)
+    rows, columns = (torch.arange(n, device=px.device) for n in px.shape)
+    inside = (rows[:, None] < true[0]) & (columns[None, :] < true[1])
+    px = torch.where(gone | ~inside, math.nan, px)
+    if config.speckle_px > 0:
+        level = torch.where(px == px, px * SPECKLE_STEP, float(UNKNOWN)).int()
+        px = torch.where(speckles(level, config.speckle_px, UNKNOWN), math.nan, px)
+    return px, torch.where(px == px, confidence, 0.0)
 
 
 def contrast(image: Tensor, radius: int) -> Tensor:
@@ -536,7 +567,9 @@ def _unseen(
 def speckles(level: Tensor, largest: int, unknown: int) -> Tensor:
     """(h, w) True on surfaces of at most ``largest`` pixels; ``level`` (h, w) int32.
 
-    As in :func:`recon.backends.torch_stereo._speckles`, the least index wanders ``largest`` steps.
+    The least index of a surface wanders from neighbour to neighbour. After ``largest`` steps it
+    has been everywhere on a surface that small; a set of pixels with one index is a whole
+    surface when no neighbour of the same surface has another index.
     """
     h, w = level.shape
     grid = (blocks(h * w, PIXELS),)
@@ -611,13 +644,12 @@ def bilateral(
 ) -> tuple[Tensor, Tensor]:
     """Labels and confidence (H, W) of a guide (H, W, 3); Eq. 2, all sums in registers.
 
-    ``layers`` (6, h, w) are those of :func:`recon.backends.torch_depth.tap_layers`.
+    ``layers`` (5, h, w) are what a tap brings: three colours, trust, trust times label.
     """
     _, h, w = layers.shape
     height, width, _ = guide.shape
     tonal = math.sqrt(0.5 * LOG2_E) / config.range_sigma
     spatial = math.sqrt(0.5 * LOG2_E) / config.spatial_sigma
-    layers = layers[:5].clone()
     layers[:3] *= tonal
     out, sure = torch.empty((2, height, width), device=guide.device)
     _bilateral[(blocks(height, ROWS), blocks(width, COLUMNS))](
@@ -682,7 +714,10 @@ def _bilateral(
 
 
 def averaged(guide: Tensor, room: tuple[int, int], true: Tensor) -> Tensor:
-    """(h, w, 3) float32 means of the guide (H, W, 3) over each tap, in whole levels."""
+    """(h, w, 3) float32 means of the guide (H, W, 3) over each tap, in whole levels.
+
+    As :func:`recon.stereo.upsampling.guide_at_taps`, where halves may round the other way.
+    """
     H, W, _ = guide.shape
     out = torch.empty((*room, 3), device=guide.device)
     _averaged[(blocks(room[0] * room[1], PIXELS),)](guide, true, out, H, W, *room, PIXELS)
@@ -728,7 +763,13 @@ def reproject(
     px: Tensor, confidence: Tensor, geometry: Tensor, true: Tensor, size_px: tuple[int, int],
     min_confidence: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Depth and sigma (h, w) float32, as :func:`recon.backends.torch_depth.reproject`; Eq. 3."""
+    """Depth and sigma in metres (h, w) float32 on the keyframe's grid of ``size_px`` (w, h); Eq. 3.
+
+    As :func:`recon.stereo.reprojection.reproject`. ``geometry`` (15,) float64 is the homography to
+    the left image (9), the plane (3), slope, f B, and sigma of a label of full confidence in
+    pixels; ``true`` (4,) is the size h, w of the pair and that of ``px``, which may be a larger
+    array.
+    """
     width, height = size_px
     depth, sigma = torch.empty((2, height, width), device=px.device)
     _reproject[(blocks(height * width, PIXELS),)](
@@ -785,7 +826,11 @@ def _reproject(
 
 
 def fuse(depth: Tensor, sigma: Tensor, config: DepthFusionConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth and sigma (h, w) float32 and views uint8 of pairs (P, h, w)."""
+    """Depth, sigma (h, w) float32 and number of views uint8 of pairs (P, h, w); no view: NaN.
+
+    As :func:`recon.stereo.reprojection.fuse`: inverse depth of the largest group that agrees,
+    nothing where several pairs read and none comes near another.
+    """
     pairs, height, width = depth.shape
     plane, device = height * width, depth.device
     out, error = torch.empty((2, height, width), device=device)

@@ -1,29 +1,23 @@
 """Projective ICP as Triton kernels: surface elements, and an iteration in four of them.
 
-Each function computes what its namesake in torch_icp does. ``weigh`` matches every point and
-writes its residual; the scale of the residuals is their median; then the points are matched again,
+``weigh`` matches every point, as :func:`recon.mapping.icp_kernels.residuals`, and writes its
+residual; the scale of the residuals is their median; then the points are matched again,
 weighed, and summed up, a row of partial sums for a block of points. ``advance`` is one program: the
 directions that the surface determines, the step along them, and what has settled. All numbers are
-float64, as on the host. An iteration has some 15 launches, where plain torch has 275.
+float64, as on the host.
 """
 
 # mypy: allow-untyped-defs, allow-incomplete-defs
 # Triton reads annotations of a kernel as values of its own, so its arguments have none.
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from recon.backends import torch_icp
-from recon.backends.torch_icp import (
-    SHARED,
-    SIGN_ROUNDS,
-    DeviceSurface,
-    SourcePoints,
-    Weighed,
-)
 from recon.backends.triton_dense import blocks
 from recon.mapping.icp_kernels import MIN_PIXELS, REACH
 from recon.mapping.registration import MIN_PARTNERS, IcpConfig
@@ -34,12 +28,57 @@ POINTS = 128
 ROW = 83
 """Numbers of a row of sums: H, H with the source's normals on one side, g, sums, partners."""
 
+MEDIAN_OF = 4000
+"""About so many residuals give the scale of all."""
+
+SHARED = 0.35
+"""A direction counts when this share of its information is common to both surfaces."""
+
+SIGN_ROUNDS = 26
+"""A round takes a small eigenvalue 1.5 times nearer to one: to 3e-5 of the largest."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DeviceSurface:
+    """As :class:`recon.mapping.registration.DepthSurface`, on a device."""
+
+    elements: Tensor  # (h, w, 6) float32
+    intrinsics: Tensor  # (4,) float64 fx fy cx cy
+    centre: Tensor  # (3,) m
+    lever_m: Tensor  # ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SourcePoints:
+    """Every ``stride``-th element of the source, flat."""
+
+    shape: tuple[int, int]
+    point: Tensor  # (N, 3) m, where the ray meets the element: it averages the noise of 25 pixels
+    normal: Tensor  # (N, 3)
+    sigma: Tensor  # (N,) m of depth
+    known: Tensor  # (N,) where there is an element
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weighed:
+    """The weighted normal equations, as :class:`recon.mapping.registration.Equations`."""
+
+    H: Tensor  # (6, 6)
+    common: Tensor  # (6, 6)
+    g: Tensor  # (6,)
+    sums: Tensor  # (4,)
+    scale: Tensor  # ()
+    centre: Tensor  # (3,) m, target frame
+    partners: Tensor  # () how many
+    residual: Tensor  # (N,) in sigmas, 0 without a partner
+    found: Tensor  # (N,) 1 where there is one
+
 
 def weigh(
     seen: SourcePoints, a: DeviceSurface, b: DeviceSurface, T: Tensor, tukey: bool,
     config: IcpConfig,
 ) -> Weighed:  # fmt: skip
-    """As :func:`recon.backends.torch_icp.weigh`."""
+    """The problem of the points ``seen`` of ``a`` against ``b`` at the motion ``T`` (4, 4)."""
     count = len(seen.sigma)
     residual, found = torch.empty((2, count), dtype=torch.float64, device=T.device)
     programs = blocks(count, POINTS)
@@ -49,7 +88,8 @@ def weigh(
     _residuals[(programs,)](
         *given, residual, found, count, h, w, config.gate_share, POINTS, num_warps=1
     )
-    scale = torch_icp.scale_of(residual, found)
+    every = max(count // MEDIAN_OF, 1)
+    scale = scale_of(residual[::every], found[::every])
     sigmas = config.tukey_sigmas if tukey else config.huber_sigmas
     _normal_equations[(programs,)](
         *given, a.centre, scale, partial, count, h, w, config.gate_share, sigmas, int(tukey),
@@ -67,7 +107,16 @@ def weigh(
 def advance(
     weighed: Weighed, a: DeviceSurface, T: Tensor, state: Tensor, share: float, config: IcpConfig
 ) -> tuple[Tensor, Tensor]:
-    """As :func:`recon.backends.torch_icp.advance`; ``T`` and ``state`` are new ones."""
+    """The motion after a step, unless it stands still, and the new state; both are new tensors.
+
+    ``state`` (3,): 1 while there are partners enough, 1 while it moves, steps made. It stands
+    still once a step is less than ``share`` of its own sigma.
+
+    The host splits the directions by the eigenvectors of H. Here the split is the spectral
+    projector of ``C - SHARED H``, C the part of H that both surfaces share: positive where more
+    than that share is common and the slope is above ``weak_slope``. Its sign is found by Newton
+    and Schulz (Higham, Functions of Matrices, 2008, chapter 5), with matrix products alone.
+    """
     T, state = T.clone(), state.clone()
     _advance[(1,)](
         weighed.H, weighed.common, weighed.g, weighed.partners, weighed.centre, a.lever_m, T,
@@ -309,7 +358,7 @@ def _advance(
     H, common, g, partners, centre, lever, T, state, share, weak_slope, shared, least,
     rounds,
 ):  # fmt: skip
-    """See :func:`recon.backends.torch_icp.advance`."""
+    """See :func:`advance`; one program."""
     c = tl.arange(0, 8)
     r, s = c[:, None], c[None, :]
     inside = (r < 6) & (s < 6)

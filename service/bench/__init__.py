@@ -42,7 +42,6 @@ class BenchOptions:
     rounds: int = 30
     warm_up: int = 3
     backend: str = "cpu"
-    device: str = ""  # of the benchmark gpu: "cuda", "cpu", or empty for what is there
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,23 +9,19 @@ from typing import Annotated
 import typer
 
 from service.commands import AsJson
-from service.errors import InputError
 
 
 def bench(
     names: Annotated[list[str] | None, typer.Argument(help="benchmarks; default: all")] = None,
     rounds: Annotated[int, typer.Option(help="timed rounds of each figure", min=1)] = 30,
     backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "cpu",
-    device: Annotated[str, typer.Option(help="for 'gpu': cuda or cpu; default: auto")] = "",
     keep: Annotated[Path | None, typer.Option(help="folder for the result (JSON)")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Print our figure, the peer's in the same run, and the ratio."""
     from service import bench as benchmarks
 
-    if device not in ("", "cuda", "cpu"):
-        raise InputError(f"--device {device}: give cuda or cpu")
-    options = benchmarks.BenchOptions(rounds=rounds, backend=backend, device=device)
+    options = benchmarks.BenchOptions(rounds=rounds, backend=backend)
     chosen = names or list(benchmarks.BENCHMARKS)
     results = benchmarks.run_benchmarks(chosen, options)
     print(benchmarks.table(results))

@@ -123,37 +123,29 @@ def export_model(
     labels: Annotated[int, typer.Option(help="number of disparities")] = 16,
     min_disparity: Annotated[int, typer.Option(help="the smallest disparity, px")] = 0,
     iterations: Annotated[int, typer.Option(help="of belief propagation, per level")] = 5,
-    guide: Annotated[
-        str | None, typer.Option(help="export the upsampling to this WIDTHxHEIGHT instead")
-    ] = None,
 ) -> None:
-    """Write the stereo stage, or with --guide the upsampling, as ONNX with fixed iterations.
+    """Write belief propagation as an ONNX model, and its declaration (.toml) for compute.model.
 
-    Stereo: left, right (h, w) uint8 to px, confidence (h, w) float32. Upsampling: px,
-    confidence (h, w) float32, taps (h, w, 3) and guide (H, W, 3) uint8 to fine_px,
-    fine_confidence (H, W).
+    The model takes left, right (1, 1, h, w) float32 gray levels and gives disparity (1, 1, h, w),
+    px.
     """
-    shape = _shape(size, "--size")
-    fine = _shape(guide, "--guide") if guide else None
+    height, width = _shape(size, "--size")
     _check_labels(labels)
     check_output(out, ".onnx")
-    with needing("an ONNX model"):
-        from recon.backends.onnx_dense import stereo_model, upsampling_model
-    from recon.stereo.belief_propagation import BeliefPropagationConfig
-    from recon.stereo.upsampling import UpsamplingConfig
-
+    config = matching_config(iterations, min_disparity, checked=False)
+    with needing("export-model"):
+        from recon.backends.exported_stereo import exported_stereo
+    declaration = out.with_suffix(".toml")
     try:
-        if fine is None:
-            config = BeliefPropagationConfig(iterations=iterations, min_disparity=min_disparity)
-            model = stereo_model(shape, labels, config)
-        else:
-            model = upsampling_model(shape, fine, UpsamplingConfig())
-        out.write_bytes(model)
-    except ValueError as error:
-        raise InputError(f"export-model: {error}") from error
+        out.write_bytes(model := exported_stereo((height, width), labels, config))
+        declaration.write_text(
+            f'model = "{out.name}"\nheight = {height}\nwidth = {width}\n'
+            "channels = 1\nscale = 1.0\n",
+            encoding="utf-8",
+        )
     except OSError as error:
         raise OutsideError(f"{out}: cannot be written: {error.strerror}") from error
-    print(f"{out}: {len(model) / 1e6:.1f} MB")
+    print(f"{out}: {len(model) / 1e6:.1f} MB; use it with compute.model = {declaration}")
 
 
 def _shape(text: str, option: str) -> tuple[int, int]:

@@ -148,11 +148,8 @@ def engine_folder() -> str | None:
 
 
 def fastest_backend() -> Backend:
-    """The fastest working backend in a short measured trial.
-
-    torch without a device is left out: on a CPU it has less than half the speed of the compiled
-    backend.
-    """
+    """The fastest working backend in a short measured trial."""
+    engine_folder()
     working: list[Backend] = []
     for candidate in BACKENDS:
         reason = pointless(candidate)
@@ -160,14 +157,9 @@ def fastest_backend() -> Backend:
             log.info("backend %s: not tried, %s", candidate, reason)
             continue
         try:
-            backend = loaded(candidate)
+            working.append(load_backend(candidate))
         except (ImportError, RuntimeError, ValueError) as error:
             log.info("backend %s: cannot run here, %s", candidate, error)
-            continue
-        if candidate != "cpu" and backend.device == "cpu":
-            log.info("backend %s: not tried, it found no device but the CPU", candidate)
-            continue
-        working.append(backend)
     if len(working) == 1:
         log.info("backend %s on %s, the only one", working[0].name, working[0].device)
         return working[0]
@@ -188,39 +180,21 @@ def fastest_backend() -> Backend:
     return chosen
 
 
-def loaded(name: str) -> Backend:
-    """The backend called ``name``; torch on a GPU with Triton's kernels, where one compiles."""
-    backend = load_backend(name, engine_folder())
-    if backend.name == "torch" and backend.device != "cpu":
-        try_kernels(backend.device)
-    return backend
-
-
-def try_kernels(device: str) -> None:
-    """Compile and run one kernel; where that fails, plain torch computes from now on."""
-    import torch
-
-    from recon.backends import torch_plan
-
-    try:
-        from recon.backends import triton_dense
-
-        with torch_plan.compiling():
-            triton_dense.contrast(torch.zeros((8, 8), dtype=torch.uint8, device=device), 1)
-    except (ImportError, RuntimeError) as error:
-        torch_plan.HAS_TRITON = False
-        log.warning("Triton compiles no kernels here (%s): plain torch is slower", error)
-
-
 def named_backend(name: str) -> Backend:
     """The backend called ``name``, ready to run.
 
     Raises InputError when there is none of that name, OutsideError when it cannot run here.
     """
+    if name == "onnx":
+        raise InputError(
+            "backend onnx runs a stereo model: give it with compute.model (stereo: --model); "
+            "'skyrelief export-model' writes one"
+        )
     if name not in BACKENDS:
-        raise InputError(f"backend {name}: available: auto, {', '.join(BACKENDS)}")
+        raise InputError(f"backend {name}: available: auto, {', '.join(BACKENDS)}, onnx")
+    engine_folder()
     try:
-        backend = loaded(name)
+        backend = load_backend(name)
     except (ImportError, RuntimeError, ValueError) as error:
         raise OutsideError(f"backend {name} cannot run here: {error}") from error
     log.info("backend %s on %s, as configured", backend.name, backend.device)
@@ -231,16 +205,8 @@ def pointless(name: str) -> str | None:
     """Why ``auto`` skips this backend, or None; imports nothing heavy."""
     if name == "torch" and find_spec("torch") is None:
         return "torch is not installed"
-    if name == "onnx" and (find_spec("onnxruntime") is None or find_spec("onnx") is None):
-        return "onnx and onnxruntime are not installed"
     if name != "cpu" and not loads("libcuda.so.1"):
         return "there is no CUDA driver, and on a CPU the cpu backend is faster"
-    if name == "onnx":
-        import onnxruntime  # type: ignore[import-untyped]
-
-        providers = set(onnxruntime.get_available_providers())
-        if not providers & {"TensorrtExecutionProvider", "CUDAExecutionProvider"}:
-            return "ONNX Runtime has no GPU provider, and on a CPU the cpu backend is faster"
     return None
 
 

@@ -16,6 +16,7 @@ from service.bench import BENCHMARKS, keep, record, run_benchmarks, table
 from service.errors import InputError, OutsideError
 
 DEVELOPMENT = {
+    "device": "bench_device:run",
     "graph": "bench_graph:run",
     "map": "bench_map:run",
     "mavlink": "bench_mavlink:run",
@@ -28,15 +29,14 @@ DEVELOPMENT = {
 }
 """Name to ``module:function`` of this folder."""
 
-ASKED_FOR = ("middlebury", "real", "site")
-"""Those that need data or an hour, and run by name only."""
+ASKED_FOR = ("device", "middlebury", "real", "site")
+"""Those that need a GPU, data or an hour, and run by name only."""
 
 
 def main(
     names: Annotated[list[str] | None, typer.Argument(help="benchmarks; default: most")] = None,
     rounds: Annotated[int, typer.Option(help="timed rounds of each figure", min=1)] = 30,
     backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "cpu",
-    device: Annotated[str, typer.Option(help="for 'gpu': cuda or cpu; default: auto")] = "",
     data: Annotated[Path | None, typer.Option(help="folder of the real sets")] = None,
     scans: Annotated[int, typer.Option(min=0, help="site: tiles of a site of so many scans")] = 0,
     kept: Annotated[
@@ -44,7 +44,7 @@ def main(
     ] = None,
 ) -> None:
     """Print our figure, the peer's in the same run, and the ratio."""
-    options = DataOptions(rounds, 3, backend, device, scans, data, kept)
+    options = DataOptions(rounds, 3, backend, scans, data, kept)
     known = BENCHMARKS | DEVELOPMENT
     chosen = names or [name for name in known if name not in ASKED_FOR]
     try:

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from paths import ROOT
 
-import recon.backends
-from recon.backends import Backend
+from recon.backends import Backend, load_backend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from service.compute import backend_choice
 from service.compute.backend_choice import choose_backend, engine_folder, open_backend
@@ -26,39 +25,33 @@ GOOD = 'model = "net.onnx"\nheight = 96\nwidth = 192\n'
 
 def declared(folder: Path, text: str = GOOD) -> Path:
     """A model that answers three tenths of a unit everywhere, and its declaration."""
-    onnx = pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    from recon.backends.onnx_graph import Graph
+    from exported_network import write_network
 
-    graph = Graph()
-    left = graph.input("left", onnx.TensorProto.FLOAT, (1, 3, 96, 192))
-    right = graph.input("right", onnx.TensorProto.FLOAT, (1, 3, 96, 192))
-    graph.output((left * 0.0 + right * 0.0 + 0.3).part(1, 0, 1), "disparity", (1, 1, 96, 192))
-    (folder / "net.onnx").write_bytes(graph.model("test"))
+    write_network(folder / "net.onnx", 0.3)
     declaration = folder / "net.toml"
     declaration.write_text(text)
     return declaration
 
 
-def test_auto_never_takes_torch_on_the_processor(
+def test_torch_needs_a_cuda_device(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Not even where a driver is found, torch found no device and would win the trial."""
+    """``auto`` goes on without it, where a driver is found but no device; by name it is refused."""
     pytest.importorskip("torch")
-    asked: list[str] = []
-
-    def trial(backend: Backend) -> float:
-        asked.append(backend.name)
-        return {"cpu": 1.0}.get(backend.name, 0.1)
-
+    pytest.importorskip("triton")
     monkeypatch.setattr(backend_choice, "pointless", lambda name: None)
-    monkeypatch.setattr(backend_choice, "trial", trial)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     caplog.set_level(logging.INFO)
-    chosen = choose_backend("auto")
-    assert "torch" not in asked
-    assert chosen.name != "torch"
-    assert "backend torch: not tried, it found no device but the CPU" in caplog.text
+    assert choose_backend("auto").name == "cpu"
+    assert "backend torch: cannot run here, torch finds no CUDA device" in caplog.text
+    with pytest.raises(OutsideError, match="no CUDA device; the processor's backend is cpu"):
+        choose_backend("torch")
+
+
+def test_onnx_is_for_a_model() -> None:
+    """Without one a line says where it comes from."""
+    with pytest.raises(InputError, match=r"give it with compute\.model .*export-model"):
+        open_backend(ComputeConfig(backend="onnx"))
 
 
 def test_auto_says_what_it_took_and_why(
@@ -71,34 +64,35 @@ def test_auto_says_what_it_took_and_why(
     assert "backend torch: not tried, torch is not installed" in caplog.text
     assert "backend cpu on cpu, the only one" in caplog.text
 
-    class Full:
-        """A device whose memory is taken."""
+    class Gpu:
+        """A backend on a device."""
 
         name, device = "torch", "cuda"
 
-    def load(name: str, engines: Path) -> object:
-        if name == "torch":
-            return Full()
-        return type("Other", (), {"name": name, "device": "cpu" if name == "cpu" else "cuda"})()
-
     def trial(backend: Backend) -> float:
-        if backend.name == "torch":
+        if backend.name == "torch" and is_full:
             raise RuntimeError("CUDA out of memory")
-        return {"cpu": 0.02, "onnx": 0.004}[backend.name]
+        return {"cpu": 0.02, "torch": 0.004}[backend.name]
 
     monkeypatch.setattr(backend_choice, "pointless", lambda name: None)
-    monkeypatch.setattr(backend_choice, "load_backend", load)
+    monkeypatch.setattr(
+        backend_choice,
+        "load_backend",
+        lambda name: Gpu() if name == "torch" else load_backend(name),
+    )
     monkeypatch.setattr(backend_choice, "trial", trial)
-    monkeypatch.setattr(backend_choice, "try_kernels", lambda device: None)
-    assert backend_choice.fastest_backend().name == "onnx"
+    is_full = True
+    assert backend_choice.fastest_backend().name == "cpu"
     assert "backend torch: failed its trial, CUDA out of memory" in caplog.text
-    assert "onnx on cuda: 4.0 ms a trial, the fastest of cpu 20.0 ms, onnx 4.0 ms" in caplog.text
+    is_full = False
+    assert backend_choice.fastest_backend().name == "torch"
+    assert "torch on cuda: 4.0 ms a trial, the fastest of cpu 20.0 ms, torch 4.0 ms" in caplog.text
 
 
 def test_doctor_explains_a_named_backend_that_cannot_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same reason stops the start."""
 
-    def refuse(name: str, engines: Path) -> None:
+    def refuse(name: str) -> None:
         raise RuntimeError("CUDA driver is older than this torch")
 
     monkeypatch.setattr(backend_choice, "load_backend", refuse)
@@ -111,9 +105,8 @@ def test_doctor_explains_a_named_backend_that_cannot_run(monkeypatch: pytest.Mon
 
 
 def test_tensorrt_keeps_its_engines_and_no_other_provider_is_reported(tmp_path: Path) -> None:
-    """Each model has its own folder: TensorRT tells models apart by names, which ours share."""
+    """Each model has its own folder: TensorRT tells models apart by names, which may be shared."""
     pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnx")
     from recon.backends.onnx_backend import provider_options
 
     both = ["TensorrtExecutionProvider", "CPUExecutionProvider"]
@@ -130,15 +123,14 @@ def test_tensorrt_keeps_its_engines_and_no_other_provider_is_reported(tmp_path: 
     assert provider_options(cpu, b"one", str(tmp_path)) == [("CPUExecutionProvider", {})]
 
 
-@pytest.mark.parametrize("name", ["torch", "onnx"])
-def test_no_runtime_is_loaded_without_a_driver(name: str) -> None:
-    """Each takes tens of MiB for as long as the process lives."""
+def test_no_runtime_is_loaded_without_a_driver() -> None:
+    """It takes tens of MiB for as long as the process lives."""
     script = (
         "import sys, importlib.util\n"
         "from service.compute import backend_choice\n"
         "backend_choice.find_spec = lambda name: 'found'\n"
         "backend_choice.loads = lambda library: False\n"
-        f"assert 'no CUDA driver' in backend_choice.pointless('{name}')\n"
+        "assert 'no CUDA driver' in backend_choice.pointless('torch')\n"
         "assert not {'torch', 'onnx', 'onnxruntime'} & set(sys.modules)\n"
     )
     root = str(ROOT)
@@ -202,24 +194,17 @@ def test_a_learned_model_that_does_not_fit_is_refused(
         (AttributeError("at 3:1:\n    area\n'int' object has no attribute 'to'"), "no attribute"),
     ],
 )
-def test_plain_torch_computes_where_triton_compiles_nothing(
-    failure: Exception, said: str, monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
-    """No C compiler, or a kernel that this Triton refuses: said once, and nothing fails."""
+def test_kernels_that_do_not_compile_stop_the_start(
+    failure: Exception, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No C compiler, or a kernel that this Triton refuses: before the flight, not in it."""
     pytest.importorskip("torch")
-    from recon.backends import torch_plan
+    pytest.importorskip("triton")
+    from recon.backends import torch_backend
 
-    class Kernels:
-        """A module whose kernels do not compile."""
+    def contrast(*given: object) -> None:
+        raise failure
 
-        @staticmethod
-        def contrast(*given: object) -> None:
-            raise failure
-
-    monkeypatch.setattr(torch_plan, "HAS_TRITON", True)
-    monkeypatch.setitem(sys.modules, "recon.backends.triton_dense", Kernels)
-    monkeypatch.setattr(recon.backends, "triton_dense", Kernels, raising=False)
-    backend_choice.try_kernels("cpu")
-    assert not torch_plan.HAS_TRITON
-    assert said in caplog.text
+    monkeypatch.setattr(torch_backend, "contrast", contrast)
+    with pytest.raises(RuntimeError, match=said):
+        torch_backend.TorchBackend("cpu")

@@ -54,12 +54,6 @@ class Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 
 @pytest.fixture
-def device(request: pytest.FixtureRequest) -> str:
-    """Where the torch code runs."""
-    return str(request.config.getoption("--device"))
-
-
-@pytest.fixture
 def reads(device: str, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Grows by one with each read of a tensor on the host."""
     from recon.backends import torch_plan
@@ -95,7 +89,7 @@ def watched(device: str, work: Callable[[], object]) -> list[str]:
     work()
     with waiting_allowed(device, False), Watch() as watch:
         work()
-    assert device != "cpu" or watch.launches > 50
+    assert device != "cpu" or watch.launches > 20
     found: list[str] = watch.waits
     return found
 
@@ -114,19 +108,19 @@ K = np.array([[100.0, 0, 47.5], [0, 100.0, 26.5], [0, 0, 1]])
 
 def test_a_keyframe_from_images_to_fused_depth(device: str, reads: list[int]) -> None:
     """Two pairs, one read of depth, sigma and views."""
-    from recon.backends import DenseStages
     from recon.backends.torch_backend import TorchBackend
 
-    left = texture(54, 96)
+    left = texture(54, 96) if device == "cuda" else texture(12, 20)
     seen = np.ones(left.shape, np.bool_)
     pair = StereoPair(
-        left=left, right=np.roll(left, -5, 1), baseline_m=4.0, K=K, labels=16,
+        left=left, right=np.roll(left, -5, 1), baseline_m=4.0, K=K, labels=8,
         plane=np.array([0.0, 0.0, 8.0]), slope=1.0,
         R_left_keyframe=np.eye(3), guide=np.repeat(left[:, :, None], 3, 2), left_seen=seen,
         right_seen=seen,
     )  # fmt: skip
     stages = DenseStages(
-        BeliefPropagationConfig(iterations=2, speckle_px=4), UpsamplingConfig(diameter_px=3),
+        BeliefPropagationConfig(iterations=1, levels=1, speckle_px=4),
+        UpsamplingConfig(diameter_px=3),
         DepthFusionConfig(),
     )  # fmt: skip
     backend = TorchBackend(device)
@@ -146,50 +140,9 @@ def test_a_registration(device: str, reads: list[int]) -> None:
                      np.eye(4))  # fmt: skip
     backend = TorchBackend(device)
     reads.clear()
-    assert watched(device, lambda: backend.register(depth, depth, np.eye(4), IcpConfig())) == []
+    config = IcpConfig() if device == "cuda" else IcpConfig(strides=(6, 3), iterations=(1, 1))
+    assert watched(device, lambda: backend.register(depth, depth, np.eye(4), config)) == []
     assert len(reads) == 2 and max(reads) < 1600
-
-
-class OffTheDevice(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Notes tensors of the host in the work of a device without contents."""
-
-    def __init__(self) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
-        self.seen: list[str] = []
-
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        out = func(*args, **(kwargs or {}))
-        made = out if isinstance(out, (tuple, list)) else (out,)
-        if any(isinstance(t, torch.Tensor) and t.device.type != "meta" and t.dim() for t in made):
-            self.seen.append(func.overloadpacket.__name__)
-        return out
-
-
-def test_nothing_is_made_on_the_host_between_upload_and_result() -> None:
-    """A graph cannot capture a copy from the host's memory; on a processor it would not show."""
-    from recon.backends.torch_depth import pair_depth
-    from recon.backends.torch_icp import _descent
-
-    def empty(kind: Any, *shape: int) -> Any:
-        return torch.empty(shape, dtype=kind, device="meta")
-
-    matching = BeliefPropagationConfig(iterations=1, speckle_px=1)
-    stages = DenseStages(matching, UpsamplingConfig(diameter_px=2), DepthFusionConfig())
-    pair = [empty(torch.uint8, 64, 96) for _ in range(4)]
-    pair += [empty(torch.uint8, 128, 192, 3), empty(torch.int64, 5), empty(torch.float64, 15)]
-    depth = [empty(torch.float32, 48, 60)] * 2 + [empty(torch.float64, 4)]
-    with OffTheDevice() as off:
-        found = [
-            *pair_depth(*pair, labels=4, levels=2, size_px=(96, 54), stages=stages),
-            *_descent(IcpConfig())(*depth, *depth, empty(torch.float64, 4, 4)),
-        ]
-    assert off.seen == []
-    assert all(t.device.type == "meta" for t in found)
-    with OffTheDevice() as off:
-        torch.tensor([1.0, 2.0]).to("meta")
-    assert off.seen
 
 
 def test_a_wait_would_be_seen(device: str) -> None:

@@ -143,24 +143,23 @@ def test_a_lost_device_falls_back_to_the_cpu(caplog: pytest.LogCaptureFixture) -
 def test_auto_takes_the_fastest_that_works(monkeypatch: pytest.MonkeyPatch) -> None:
     assert choose_backend("auto").name == "cpu"  # no GPU is tried where there is no driver
     monkeypatch.setattr(backend_choice, "pointless", lambda name: None)
-    slow = {"cpu": 0.5, "torch": 0.1, "onnx": 0.3}
+    slow = {"cpu": 0.5, "torch": 0.1}
     monkeypatch.setattr(backend_choice, "trial", lambda backend: slow[backend.name])
 
     class Named(Broken):
         """A backend of any name."""
 
-        def __init__(self, name: str, engines: Path) -> None:
+        def __init__(self, name: str) -> None:
             self.name = name
 
     monkeypatch.setattr(backend_choice, "load_backend", Named)
-    monkeypatch.setattr(backend_choice, "try_kernels", lambda device: None)  # there is no GPU
     assert choose_backend("auto").name == "torch"
     slow["torch"] = 0.9
-    assert choose_backend("auto").name == "onnx"
+    assert choose_backend("auto").name == "cpu"
 
 
 def test_named_backend_that_cannot_run_stops(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(name: str, engines: Path) -> None:
+    def refuse(name: str) -> None:
         raise ImportError("No module named 'torch'")
 
     monkeypatch.setattr(backend_choice, "load_backend", refuse)
@@ -170,19 +169,25 @@ def test_named_backend_that_cannot_run_stops(monkeypatch: pytest.MonkeyPatch) ->
         choose_backend("vulkan")
 
 
+@pytest.mark.slow
 def test_exported_model_gives_the_same_labels(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: tuple[Path, Path]
-) -> None:
-    runtime = pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnx")
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: tuple[Path, Path],
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """``export-model`` writes a model and the declaration that runs it."""
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("torch")
     out = tmp_path / "stereo.onnx"
-    assert run(monkeypatch, "export-model", "--size", "160x80", "--out", out) == 0
-    left, right = (cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in pair)
-    session = runtime.InferenceSession(str(out), providers=["CPUExecutionProvider"])
-    px, confidence = session.run(None, {"left": left, "right": right})
-    accepted = confidence > 0
-    assert accepted[:, 24:].mean() > 0.95
-    assert abs(np.median(px[accepted]) - 9.5) < 0.1
+    size = ("--size", "160x80", "--iterations", "1")
+    assert run(monkeypatch, "export-model", *size, "--out", out) == 0
+    model, found = tmp_path / "stereo.toml", tmp_path / "d.npy"
+    words = ("stereo", *pair, "--labels", 16, "--out", found, "--backend", "onnx")
+    assert run(monkeypatch, *words, "--model", model) == 0
+    px = np.load(found)
+    assert np.isfinite(px)[:, 24:].mean() > 0.95
+    assert abs(np.nanmedian(px) - 9.5) < 0.1
+    assert run(monkeypatch, *words) == 2
+    assert "give it with compute.model" in capsys.readouterr().err
     assert run(monkeypatch, "export-model", "--size", "160", "--out", out) == 2
     assert run(monkeypatch, "export-model", "--out", tmp_path / "stereo.bin") == 2
 
@@ -191,17 +196,10 @@ def test_learned_model_is_checked_and_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: tuple[Path, Path],
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    """A model that says 9.5 px wherever the left image is not black, declared rightly or not."""
-    pytest.importorskip("onnxruntime")
-    onnx = pytest.importorskip("onnx")
-    from recon.backends.onnx_graph import Graph
+    """A model that says 9.5 px everywhere, declared rightly or not."""
+    from exported_network import write_network
 
-    graph = Graph()
-    left = graph.input("image_l", onnx.TensorProto.FLOAT, (1, 3, 96, 192))
-    right = graph.input("image_r", onnx.TensorProto.FLOAT, (1, 3, 96, 192))
-    lit = left.above(0.01).where(0.95, 0.0) + right * 0.0
-    graph.output(lit.part(1, 0, 1), "disp", (1, 1, 96, 192))
-    (tmp_path / "net.onnx").write_bytes(graph.model("test"))
+    write_network(tmp_path / "net.onnx", 0.95, ("image_l", "image_r", "disp"))
     declaration = tmp_path / "net.toml"
     good = 'model = "net.onnx"\nheight = 96\nwidth = 192\nleft = "image_l"\nright = "image_r"\n'
     good += 'disparity = "disp"\ndisparity_scale = 10.0\n'

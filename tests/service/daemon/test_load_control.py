@@ -204,11 +204,14 @@ def test_a_device_that_fails_is_reported_once_and_the_cpu_goes_on(
     assert "out of memory" in daemon.snapshot()["backend_failure"]
 
 
-def test_onnx_runtime_out_of_memory_falls_back_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its exceptions are not RuntimeErrors; neither running nor opening may end the scan."""
+def test_onnx_runtime_out_of_memory_falls_back_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its exceptions are not RuntimeErrors; none may end the scan."""
     state = pytest.importorskip("onnxruntime.capi.onnxruntime_pybind11_state")
-    pytest.importorskip("onnx")
-    from recon.backends import onnx_backend
+    from exported_network import write_network
+
+    from recon.backends.onnx_backend import LearnedStereoBackend, LearnedStereoConfig
 
     class Full:
         """A session on a device without memory."""
@@ -217,13 +220,12 @@ def test_onnx_runtime_out_of_memory_falls_back_too(monkeypatch: pytest.MonkeyPat
             """Fails."""
             raise state.RuntimeException("CUDA failure 2: out of memory")
 
-    def refuse(*_: object) -> None:
-        raise ValueError("ONNX Runtime cannot use the model: out of memory")
-
+    write_network(tmp_path / "net.onnx", 0.3, size=(48, 64))
+    model = (tmp_path / "net.onnx").read_bytes()
+    learned = LearnedStereoBackend(model, LearnedStereoConfig(48, 64))
+    monkeypatch.setattr(learned, "_model", Full())
     gray = np.zeros((48, 64), np.uint8)
-    for opener in (lambda *_: Full(), refuse):
-        monkeypatch.setattr(onnx_backend, "open_session", opener)
-        backend = FallbackBackend(load_backend("onnx"))
-        backend.belief_propagation(gray, gray, 4, BeliefPropagationConfig())
-        assert backend.name == "cpu"
-        assert backend.failure is not None and "out of memory" in backend.failure
+    backend = FallbackBackend(learned)
+    backend.belief_propagation(gray, gray, 4, BeliefPropagationConfig())
+    assert backend.name == "cpu"
+    assert backend.failure is not None and "out of memory" in backend.failure

@@ -1,8 +1,15 @@
-"""The stages of the device, each with its inputs there and the work that it cannot do without."""
+"""Every stage on a GPU, and the whole dense path, compared with the floor of that device.
+
+The floor is the larger of the bytes that a stage must move over the bandwidth of a copy, and its
+operations over the rate of a matrix product, both measured in the same run. Figures "on the device"
+have their inputs there and leave their results there; figures "with uploads" start from images of
+the host and end with results on it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -13,18 +20,128 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from recon.backends import DenseStages
 from recon.backends.room import pyramid_levels
-from recon.backends.torch_depth import DensePath, fuse, reproject, upsampled
+from recon.backends.torch_depth import DensePath, upsampled
 from recon.backends.torch_icp import DeviceIcp
 from recon.backends.torch_plan import Plan, part
-from recon.backends.torch_stereo import dense_stereo, drop_unreliable, drop_unseen
+from recon.backends.triton_dense import drop_unreliable, drop_unseen, fuse, reproject, stereo
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import LABEL_SIGMA_PX, DepthFusionConfig
+from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE, DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import Array, StereoPair
-from service.bench.gpu import LABELS, SIZE, Stage, camera, ground, propagation_work
+from service.bench import BenchOptions, BenchResult, compare
+from service.bench.gpu import DEPTH, GUIDE, LABELS, SIZE, camera, flown_pair, ground
 
 PAIRS = 4
+COPY_MB, PRODUCT = 1024, 8192
+"""Size of the copy and of the matrix product that give the floor."""
+
+
+def run(options: BenchOptions, device: str = "cuda") -> list[BenchResult]:
+    """The device itself, every stage on it, and the whole path."""
+    floor, results = measure_floor(device, options)
+    found = [*stages(device, flown_pair(GUIDE)), *whole_path(device, flown_pair(DEPTH))]
+    return results + [against_floor(stage, floor, options) for stage in found]
+
+
+def against_floor(stage: Stage, floor: Floor, options: BenchOptions) -> BenchResult:
+    """The stage on the device compared with its floor."""
+    found = compare(stage.what, finished(stage.device, stage.work), options)
+    least = floor.ms(stage.moved_bytes, stage.operations)
+    return BenchResult(
+        stage.what, found.value, "ms", found.spread, "floor of the device", least,
+        note=f"{stage.moved_bytes / 1e6:.3g} MB, {stage.operations / 1e6:.3g} Mop; {stage.note}",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stage:
+    """Something to be timed on a device."""
+
+    what: str
+    device: str
+    work: Callable[[], object]
+    moved_bytes: float
+    operations: float
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Floor:
+    """The device's bandwidth and arithmetic rate at best."""
+
+    bytes_per_s: float
+    operations_per_s: float
+
+    def ms(self, moved_bytes: float, operations: float) -> float:
+        """Least milliseconds for that much work."""
+        return 1e3 * max(moved_bytes / self.bytes_per_s, operations / self.operations_per_s)
+
+
+def device_name(device: str) -> str:
+    """Of the GPU, or how many threads of the processor."""
+    import torch
+
+    if device == "cuda":
+        return str(torch.cuda.get_device_name())
+    return f"processor, {torch.get_num_threads()} threads"
+
+
+def finished(device: str, work: Callable[[], object]) -> Callable[[], None]:
+    """``work``, and the wait until the device has done it."""
+    import torch
+
+    def timed() -> None:
+        with torch.inference_mode():
+            work()
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    return timed
+
+
+def measure_floor(device: str, options: BenchOptions) -> tuple[Floor, list[BenchResult]]:
+    """Rates of a large copy and of a float32 matrix product, and their results."""
+    import torch
+
+    source = torch.ones(COPY_MB << 18, device=device)
+    target = torch.empty_like(source)
+    n = PRODUCT
+    a = torch.ones((n, n), device=device)
+    b = torch.empty_like(a)
+    name = device_name(device)
+    copy = compare(
+        f"copy of {COPY_MB} MiB", finished(device, lambda: target.copy_(source)),
+        options, note=name,
+    )  # fmt: skip
+    product = compare(
+        f"matrix product of {n}", finished(device, lambda: torch.matmul(a, a, out=b)),
+        options, note=name,
+    )  # fmt: skip
+    moved = 2.0 * source.numel() * 4
+    floor = Floor(moved / copy.value * 1e3, 2.0 * n**3 / product.value * 1e3)
+    rates = [
+        BenchResult("bandwidth of the device", floor.bytes_per_s / 1e9, "GB/s", note=name),
+        BenchResult("float32 rate of the device", floor.operations_per_s / 1e9, "Gop/s", note=name),
+    ]
+    return floor, [copy, product, *rates]
+
+
+def propagation_work(config: BeliefPropagationConfig, bytes_each: int) -> tuple[float, float]:
+    """Bytes and operations that belief propagation cannot do without.
+
+    An iteration reads cost and four messages of every other pixel and writes four; it adds
+    them, goes through the labels up and down for the envelope in four directions, normalises
+    and cuts: 36 operations a label.
+    """
+    h, w = SIZE[1], SIZE[0]
+    moved = operations = 0.0
+    for _ in range(config.levels):
+        cells = 0.5 * h * w * LABELS * config.iterations
+        moved += 9 * cells * bytes_each
+        operations += 36 * cells
+        h, w = (h + 1) // 2, (w + 1) // 2
+    return moved, operations
 
 
 VIEWS = {
@@ -99,20 +216,11 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     own, both = np.array([h, w, LABELS]), np.array([h, w, H, W])
     levels = pyramid_levels(h, w, matching)
     moved, operations = propagation_work(matching, 2)
-    found = []
-    for kind in (torch.int16, torch.float32):
-        stereo = planned(
-            device,
-            partial(
-                dense_stereo, labels=LABELS, levels=levels, config=matching, messages=kind
-            ),
-            pair.left, pair.right, own,
-        )  # fmt: skip
-        found.append(
-            staged(f"stereo {w}x{h}, {LABELS} labels, on the device", device, stereo, moved,
-                  operations, f"messages of {str(kind).removeprefix('torch.')}")
-        )  # fmt: skip
-    px, sure = (t.cpu().numpy() for t in stereo.run())
+    labels = planned(
+        device, lambda a, b, true: stereo(a, b, LABELS, levels, true, matching),
+        pair.left, pair.right, own,
+    )  # fmt: skip
+    px, sure = (t.cpu().numpy() for t in labels.run())
     seen = np.ones((h, w), np.uint8)
     trusted = planned(
         device,
@@ -128,7 +236,11 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     base = [pair.slope, pair.K[0, 0] * pair.baseline_m, LABEL_SIGMA_PX]
     geometry = np.array([*to_left.ravel(), *pair.plane, *base])
     depth = planned(
-        device, lambda p, s, g, true: reproject(p, s, g, true, (W, H)), *fine, geometry, both
+        device,
+        lambda p, s, g, true: reproject(p, s, g, true, (W, H), MIN_CONFIDENCE),
+        *fine,
+        geometry,
+        both,
     )
     z, sigma = (t.cpu().numpy() for t in depth.run())
     fused = planned(
@@ -137,7 +249,8 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     )  # fmt: skip
     taps, pixels = upsampling.diameter_px**2, w * h
     return [
-        *found,
+        staged(f"stereo {w}x{h}, {LABELS} labels, on the device", device, labels, moved,
+               operations),
         staged(f"checks of labels, {w}x{h}, on the device", device, trusted,
               20.0 * pixels, 60.0 * pixels, "contrast, visibility, speckles, both images"),
         staged(f"upsampling to {W}x{H}, exact, on the device", device, finer,
