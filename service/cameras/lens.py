@@ -27,7 +27,8 @@ MAX_CROP_ONE_INCH = 3.2
 """Above this crop factor a sensor is smaller than one inch (2.7)."""
 
 MIN_FOCAL, MAX_FOCAL = 0.2, 20.0
-"""Focal length over the longer side of the image; a tag outside this range is wrong."""
+"""Focal length over the longer side of the image; a tag outside this range is wrong, and
+with a view so narrow vision cannot tell a turn of the camera from its distance."""
 
 SAME_SHAPE = 0.005
 """Relative tolerance of aspect ratios: sizes are whole pixels."""

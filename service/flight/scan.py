@@ -23,6 +23,7 @@ from recon.posegraph.between_keyframes import Odometer
 from recon.tracking.known_track import KnownTrack
 from recon.types import F64, U8, Camera, Frame, Keyframe, PosePrior, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter
+from service.cameras.lens import MAX_FOCAL
 from service.cameras.rig import ASSUMED_AGL_M, Rig, turn_sigma_rad_s
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config
@@ -340,8 +341,8 @@ class Scan:
         }
 
     def _assumed(self) -> list[str]:
-        """What was assumed in this scan: "lens", "distortion", "view", "level", "height" and
-        "altitude"."""
+        """What was assumed in this scan: "lens", "distortion", "view", "level", "height",
+        "altitude", and with a narrow view "turn", as vision alone cannot tell it from distance."""
         out = list(self.inputs.assumed)
         if self.attitudes == 0:
             out.append("view")
@@ -351,6 +352,8 @@ class Scan:
             out.append("height")
         if self.rig.is_altitude_assumed:
             out.append("altitude")
+        if self.inputs.camera.K[0, 0] > MAX_FOCAL * max(self.inputs.camera.size_px):
+            out.append("turn")
         return out
 
     def _doubts(self) -> list[str]:

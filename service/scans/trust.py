@@ -76,6 +76,11 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         doubts.append("the lens is assumed: shapes bend; calibrate the camera")
     elif focal > MAX_LENS_SIGMA:
         doubts.append(_uncertain(focal))
+    if "turn" in assumed:
+        doubts.append(
+            "the view is narrower than 3 degrees: how far the ground is and how the camera turns "
+            "cannot be told apart"
+        )
     if "view" in assumed and slope_deg > MAX_SLOPE_DEG:
         doubts.append(
             f"the view direction is assumed, and the site slopes by {slope_deg:.0f} degrees"

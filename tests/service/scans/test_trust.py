@@ -28,6 +28,7 @@ SURE: dict[str, Any] = {
         ({"assumed": ["lens"]}, "gnss", "doubtful", "lens"),
         ({"assumed": ["view", "level"]}, "gnss", "doubtful", "taken as level"),
         ({"assumed": ["distortion"]}, "gnss", "georeferenced", "distortion"),
+        ({"assumed": ["turn"]}, "gnss", "doubtful", "narrower than 3 degrees"),
         ({"assumed": ["altitude"]}, "exif", "georeferenced", "above sea level"),
         ({"assumed": ["altitude"]}, BY_SURVEY, "georeferenced", ""),
         ({"sigma_focal": 0.008}, "gnss", "georeferenced", ""),
