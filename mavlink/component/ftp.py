@@ -73,19 +73,19 @@ class FileServer:
     def __init__(self, files: Mapping[str, bytes]) -> None:
         self._files = dict(files)
         self._sessions: dict[int, tuple[Address, bytes]] = {}
-        self._last: dict[Address, tuple[int, list[bytes]]] = {}  # to repeat lost answers
+        self._last: dict[Address, tuple[FtpRequest, list[bytes]]] = {}  # to repeat lost answers
 
     def answer(self, payload: bytes, source: Address) -> list[bytes]:
         """The answers to a request; empty for any other payload."""
         request = parse_request(payload)
         if request is None or request.opcode in (0, ACK, NAK):
             return []
-        last = self._last.get(source)
-        if last is not None and last[0] == request.sequence and request.opcode != BURST:
-            return last[1]
-        answers = self._serve(request, source)
-        if source in self._last or len(self._last) < MAX_CLIENTS:
-            self._last[source] = (request.sequence, answers)
+        last = self._last.pop(source, None)
+        is_repeated = last is not None and last[0] == request and request.opcode != BURST
+        answers = last[1] if last is not None and is_repeated else self._serve(request, source)
+        if len(self._last) >= MAX_CLIENTS:
+            del self._last[next(iter(self._last))]
+        self._last[source] = request, answers
         return answers
 
     def serve(self, message: Any, link: int, outbox: SendQueue) -> None:

@@ -159,6 +159,19 @@ def test_lost_answers_are_given_again_and_sessions_belong_to_their_owner() -> No
     assert code == ACK
 
 
+def test_a_client_that_starts_over_gets_the_answer_to_its_own_request() -> None:
+    """Sequence numbers start over with a ground station: only a whole request tells a repetition.
+    The answers of clients that are gone make way."""
+    server = FileServer({"a.xml": b"A" * 10, "b.xml": b"B" * 20})
+    for component in range(1, 41):
+        assert Client(server, Address(255, component)).open(b"a.xml")[1] == 10
+        again = Client(server, Address(255, component))  # the station has restarted
+        session, size = again.open(b"b.xml")
+        again.sequence -= 1
+        assert size == 20 and again.open(b"b.xml") == (session, size)
+    assert len(server._last) <= 16
+
+
 def test_sessions_that_nobody_closes_make_way() -> None:
     server = FileServer({"a.bin": CONTENT})
     client, other = Client(server), Client(server, Address(254, 1))
