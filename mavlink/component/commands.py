@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from mavlink.component.camera import MIN_INTERVAL_S
 from mavlink.component.command_desk import Call, Command
-from mavlink.component.control import ACCEPTED, Answer, Handled, Phase, Power, Result
+from mavlink.component.control import ACCEPTED, Answer, Handled, Phase, Power, Result, Work
 from mavlink.wire.first_beat import CAMERA, ONBOARD
 
 if TYPE_CHECKING:
@@ -69,10 +69,11 @@ def control_video(call: Call, host: Companion) -> Handled:
 
 def _start(call: Call, host: Companion, status_hz: float = 0.0) -> Handled:
     """Start a scan unless one takes frames, and stream the camera's status at a rate."""
-    host.camera.stream_while_recording(call.source, status_hz)
-    if host.control.status().phase is Phase.SCANNING:
-        return ACCEPTED
-    return host.control.start_scan()
+    is_scanning = host.control.status().phase is Phase.SCANNING
+    handled = ACCEPTED if is_scanning else host.control.start_scan()
+    if isinstance(handled, Work) or handled.result is Result.ACCEPTED:
+        host.camera.stream_while_recording(call.source, status_hz)
+    return handled
 
 
 def _stop(host: Companion, how: Callable[[], Handled]) -> Handled:

@@ -298,6 +298,12 @@ def test_the_rate_of_a_start_is_the_starters_own_and_ends_with_the_scan(ends: En
     assert statuses(ends.pass_time(5.0)) == []
 
 
+def test_a_start_that_is_refused_streams_nothing(ends: Ends) -> None:
+    ends.control.answers["start_scan"] = Answer(Result.TEMPORARILY_REJECTED, "still starting")
+    ends.command(2500, 100, 0, 1.0)
+    assert statuses(ends.pass_time(5.0)) == []
+
+
 def test_the_status_is_sent_whenever_it_changes(ends: Ends) -> None:
     """By arming, after landing, by a fault: ground stations ask only while they see a recording."""
     seen = []
