@@ -259,16 +259,13 @@ def _report(out: Path, result: dict[str, Any], seconds: float, as_json: bool) ->
 def score(
     scan_dir: Annotated[Path, typer.Argument(help="Scan folder of replay or run.")],
     truth_dir: Annotated[Path, typer.Argument(help="truth/ of simulate.")],
-    deliverables: Annotated[
-        bool, typer.Option("--deliverables", help="Measure the exported files in it as well.")
-    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure accuracy, completeness and trajectory error of a scan of a simulated flight."""
     from service.sim import scoring
 
     with showing("score") as progress:
-        report = scoring.score(scan_dir, truth_dir, deliverables, progress)
+        report = scoring.score(scan_dir, truth_dir, progress)
     print(json.dumps(report) if as_json else _text(report))
 
 
@@ -325,33 +322,7 @@ def _text(report: dict[str, Any]) -> str:
                 f"  the {_label(name)} moved the cloud by {f['shift_m']:.2f} m "
                 f"({f['shift_up_m']:+.2f} m up), {f['turn_deg']:.2f} deg, scale {f['scale']:.4f}"
             )
-    return "\n".join(lines + _files(report.get("deliverables", {})))
-
-
-def _files(found: dict[str, Any]) -> list[str]:
-    """A line per exported file and fit."""
-    lines = ["", "exported files: median, 95th percentile (of clouds the 90th)"] if found else []
-    for part in found.values():
-        if "trouble" in part:
-            lines.append(f"  {part['file']}: {part['trouble']}")
-        for name in ("raw", "rigid", "similarity"):
-            figures = part.get(name)
-            if not figures:
-                continue
-            tail = "p95_m" if "p95_m" in figures else "p90_m"
-            words = [f"{figures['median_m']:7.3f} m", f"{figures[tail]:6.3f} m"]
-            words += [w.format(figures[key]) for key, w in _WORDS.items() if key in figures]
-            lines.append(f"  {part['file']}, {_label(name)}: {'  '.join(words)}")
-    return lines
-
-
-_WORDS = {
-    "rms_m": "rms {:.3f} m",
-    "median_percent_of_altitude": "median {:.2f} % of altitude",
-    "within_30cm": "{:.1%} within 0.3 m",
-    "within_50cm": "{:.1%} within 0.5 m",
-    "completeness": "{:.1%} complete",
-}
+    return "\n".join(lines)
 
 
 def _label(name: str) -> str:

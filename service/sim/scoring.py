@@ -18,7 +18,6 @@ from recon.surface.raster import Grid, grid_over, rasterise_points
 from recon.types import F32, F64
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.sim.deliverable_scoring import score_files
 from service.sim.truth import (
     SeenSurface,
     Truth,
@@ -53,13 +52,9 @@ class ScanResult:
 def score(
     scan_folder: Path,
     truth_folder: Path,
-    deliverables: bool = False,
     say: Callable[[str], object] = lambda text: None,
 ) -> dict[str, Any]:
-    """All figures of a scan against the truth, ready for JSON; InputError for missing parts.
-
-    With ``deliverables`` the exported files in the scan folder are measured too.
-    """
+    """All figures of a scan against the truth, ready for JSON; InputError for missing parts."""
     say("reading the truth and the scan")
     truth = read_truth(truth_folder)
     scan = read_scan(scan_folder, truth.frame)
@@ -78,7 +73,7 @@ def score(
             "was the scan made from this flight's video?"
         )
     say("comparing trajectory and surface")
-    fits = _fits(scan, truth, at_truth, known)
+    fits = alignments(scan, truth, at_truth, known)
     report["trajectory"] = {
         name: asdict(metrics.trajectory_errors(fit.poses(scan.poses[known]), at_truth[known]))
         for name, fit in fits["trajectory"].items()
@@ -97,13 +92,12 @@ def score(
     report["completeness"] = _completeness(scan, truth, seen, fits["surface"][best])
     for name, fit in fits["surface"].items():
         report["surface"][name]["fit"] = _fit_size(fit, scan.points)
-    if deliverables:
-        say("measuring the exported files")
-        report["deliverables"] = score_files(scan_folder, truth, seen.places, chosen)
     return report
 
 
-def _fits(scan: ScanResult, truth: Truth, at_truth: F64, known: Any) -> dict[str, dict[str, Fit]]:
+def alignments(
+    scan: ScanResult, truth: Truth, at_truth: F64, known: Any
+) -> dict[str, dict[str, Fit]]:
     """Alignments by name: from the trajectory, and refined on the surface."""
     by_track: dict[str, Fit] = {}
     if scan.placed:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deliverable_scoring import options_of, score_deliverables, view_from_above
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -20,7 +21,6 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.model import glb
 from service.scans.fused_cloud import write_laz
-from service.sim.deliverable_scoring import options_of, view_from_above
 from service.sim.recording import Faults, SimulationOptions
 from service.sim.truth import heights_below, read_surface, read_truth
 
@@ -295,7 +295,7 @@ def test_files_are_measured_where_they_say_they_are(flight: Path, tmp_path: Path
         tmp_path / "scan", flight, true_cloud(flight), True, np.eye(3), np.zeros(3), 0.1
     )
     delivered(scan, flight, 0.8, 0.3)
-    found = score(scan, flight, "--deliverables")["deliverables"]
+    found = score_deliverables(scan, flight)
     assert {k: v["file"] for k, v in found.items()} == {
         "dsm": "dsm.tif", "ortho": "ortho.tif", "mesh": "mesh.glb", "laz": "cloud.laz",
     }  # fmt: skip
@@ -315,10 +315,9 @@ def test_a_file_that_is_none_is_named(flight: Path, tmp_path: Path) -> None:
         tmp_path / "scan", flight, true_cloud(flight), True, np.eye(3), np.zeros(3), 0.1
     )
     (scan / "dsm.tif").write_bytes(b"II*\0 not much more")
-    arguments = ["score", str(scan), str(flight), "--deliverables"]
-    result = CliRunner().invoke(app, arguments)
-    assert isinstance(result.exception, InputError)
-    assert "dsm.tif" in str(result.exception) and "\n" not in str(result.exception)
+    with pytest.raises(InputError, match=r"dsm\.tif") as refused:
+        score_deliverables(scan, flight)
+    assert "\n" not in str(refused.value)
 
 
 def test_options_come_back_from_their_file() -> None:

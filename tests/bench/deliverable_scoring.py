@@ -1,4 +1,6 @@
-"""The exported files of a scan against the truth of a simulated flight.
+"""The exported files of a scan against the truth of a simulated flight, as JSON.
+
+    python tests/bench/deliverable_scoring.py SCAN FLIGHT/truth
 
 The files are read as anyone would read them (rasterio, laspy, trimesh), and placed by what
 they declare: the coordinate system and geotransform, or the origin in the glTF's
@@ -10,8 +12,9 @@ from __future__ import annotations
 import json
 import logging
 import struct
+import sys
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +23,22 @@ import msgspec
 import numpy as np
 
 from recon.surface import metrics, triangle_grid
-from recon.surface.metrics import Fit, patch_shifts
+from recon.surface.metrics import Fit
 from recon.surface.triangle_grid import TriangleGrid
-from recon.types import F32, F64, U8, Array, Camera
+from recon.types import F32, F64, U8, Array, Bool, Camera
 from service.errors import InputError
 from service.georeference import LocalFrame
 from service.sim.recording import SimulationOptions, prepare
 from service.sim.render import Look, Renderer
-from service.sim.truth import Truth, heights_below, read_surface, reading
+from service.sim.scoring import alignments, read_scan
+from service.sim.truth import (
+    Truth,
+    heights_below,
+    read_surface,
+    read_truth,
+    reading,
+    seen_surface,
+)
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +49,16 @@ SAMPLE_SPACING_M = 0.25
 MAX_POINTS = 300_000
 
 Fits = dict[str, Fit]
+
+
+def score_deliverables(scan_folder: Path, truth_folder: Path) -> dict[str, Any]:
+    """Figures of each exported file, after the alignments by which the scan is judged."""
+    truth = read_truth(truth_folder)
+    scan = read_scan(scan_folder, truth.frame)
+    at_truth, known = metrics.poses_at(truth.times_s, truth.poses, scan.times_s)
+    fits = alignments(scan, truth, at_truth, known)["surface"]
+    chosen = fits if scan.placed else {"similarity": fits["similarity"]}
+    return score_files(scan_folder, truth, seen_surface(truth).places, chosen)
 
 
 def score_files(folder: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:
@@ -350,3 +371,94 @@ def options_of(values: dict[str, Any]) -> SimulationOptions:
     Raises ValueError for unfit values.
     """
     return msgspec.convert(values, SimulationOptions, dec_hook=lambda kind, value: kind(value))
+
+
+# ---- shifts of an orthophoto's patches --------------------------------------------------------
+
+MIN_KNOWN = 0.9
+MIN_LIKENESS = 0.5
+MIN_CONTRAST = 1.5
+PATCH_PX = 64
+BROAD_PX = 8.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchShifts:
+    """Shifts of an image's patches against the same patches of the other image."""
+
+    middle_px: F64  # (N, 2) column and row
+    shift_px: F64  # (N, 2) column and row: where the content is, less where it should be
+    likeness: F64  # (N,) normalised correlation at that shift
+    tried: int  # patches that are known and have texture
+
+    @property
+    def matched_share(self) -> float:
+        """Share of the patches tried whose shift is known."""
+        return len(self.likeness) / self.tried if self.tried else 0.0
+
+
+def patch_shifts(found: F32, truth: F32, known: Bool, reach_px: int) -> PatchShifts:
+    """The displacement of ``found`` against ``truth``, (H, W) each, in patches half overlapping.
+
+    Normalised cross-correlation over shifts of up to ``reach_px``, with a parabola through the
+    peak. Shading broader than BROAD_PX is taken out of both first. A patch is tried where
+    ``known`` holds nearly everywhere and the truth has texture; a peak at the end of the reach
+    or below MIN_LIKENESS is not a match.
+    """
+    a, b = (_fine(image, known) for image in (found, truth))
+    rows, cols = known.shape
+    middles, shifts, likenesses, tried = [], [], [], 0
+    for top in range(reach_px, rows - PATCH_PX - reach_px + 1, PATCH_PX // 2):
+        for left in range(reach_px, cols - PATCH_PX - reach_px + 1, PATCH_PX // 2):
+            patch = np.s_[top : top + PATCH_PX, left : left + PATCH_PX]
+            if known[patch].mean() < MIN_KNOWN or b[patch].std() < MIN_CONTRAST:
+                continue
+            tried += 1
+            around = b[
+                top - reach_px : top + PATCH_PX + reach_px,
+                left - reach_px : left + PATCH_PX + reach_px,
+            ]
+            surface = cv2.matchTemplate(around, a[patch], cv2.TM_CCOEFF_NORMED)
+            likeness, shift = _peak(np.asarray(surface, np.float32))
+            if likeness >= MIN_LIKENESS and np.isfinite(shift).all():
+                middles.append([left + 0.5 * (PATCH_PX - 1), top + 0.5 * (PATCH_PX - 1)])
+                shifts.append(reach_px - shift)
+                likenesses.append(likeness)
+    return PatchShifts(
+        np.array(middles, np.float64).reshape(-1, 2),
+        np.array(shifts, np.float64).reshape(-1, 2),
+        np.array(likenesses, np.float64),
+        tried,
+    )
+
+
+def _fine(image: F32, known: Bool) -> F32:
+    """The image without its broad shading; zero where it is not known."""
+    weight = known.astype(np.float32)
+    values = np.where(known, image, 0.0).astype(np.float32)
+    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), BROAD_PX), 1e-3)
+    mean = cv2.GaussianBlur(values, (0, 0), BROAD_PX) / share
+    return np.asarray(np.where(known, values - mean, 0.0), np.float32)
+
+
+def _peak(surface: F32) -> tuple[float, F64]:
+    """(height, (column, row)) of the highest place; NaN at the border, where none was found."""
+    row, col = np.unravel_index(int(surface.argmax()), surface.shape)
+    height = float(surface[row, col])
+    if not (0 < row < surface.shape[0] - 1 and 0 < col < surface.shape[1] - 1):
+        return height, np.full(2, np.nan)
+    du = _vertex(surface[row, col - 1 : col + 2])
+    dv = _vertex(surface[row - 1 : row + 2, col])
+    return height, np.array([col + du, row + dv])
+
+
+def _vertex(three: F32) -> float:
+    """Offset of the vertex of the parabola through three equidistant heights, from the middle
+    one."""
+    left, middle, right = (float(v) for v in three)
+    bend = left - 2.0 * middle + right
+    return 0.0 if bend >= 0.0 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))
+
+
+if __name__ == "__main__":
+    print(json.dumps(score_deliverables(Path(sys.argv[1]), Path(sys.argv[2])), indent=1))
