@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 
 import cv2
+import numpy as np
 
-from recon.types import U8
+from recon.types import U8, Keyframe
 from service.stream.planes import image_size
 
 IMAGE_SHARE = 0.05
@@ -34,6 +35,23 @@ def encode_image(bgr: U8, max_bytes: float = math.inf) -> bytes:
         if len(data) <= max_bytes:
             break
     return data
+
+
+def whole_bgr(keyframe: Keyframe, image: bytes | None) -> U8:
+    """(h, w, 3) the keyframe's colours where it is new, and those of its ``image`` around them.
+
+    Without a readable image, as in scans of before there were any, what is not new stays as stored:
+    blocks of one colour.
+    """
+    small = (
+        None if image is None else cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
+    )
+    if small is None:
+        return keyframe.bgr
+    h, w = keyframe.bgr.shape[:2]
+    whole = np.asarray(cv2.resize(small, (w, h), interpolation=cv2.INTER_CUBIC), np.uint8)
+    whole[keyframe.fresh] = keyframe.bgr[keyframe.fresh]
+    return whole
 
 
 def is_image(data: bytes) -> bool:

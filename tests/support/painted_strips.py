@@ -29,16 +29,22 @@ def flown() -> F64:
     return np.array([*one, *two])
 
 
-def depth_of(T: F64) -> F64:
+def depth_of(T: F64, size: tuple[int, int] = SMALL) -> F64:
     """(h, w) exact depth of the plane z = 0."""
-    k = scaled_K(K, SMALL[0] / SIZE[0], SMALL[1] / SIZE[1])
-    v, u = np.mgrid[0 : SMALL[1], 0 : SMALL[0]].astype(np.float64)
+    k = scaled_K(K, size[0] / SIZE[0], size[1] / SIZE[1])
+    v, u = np.mgrid[0 : size[1], 0 : size[0]].astype(np.float64)
     ways = np.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones_like(u)], -1)
     return np.asarray(-T[2, 3] / (ways @ T[:3, :3].T)[..., 2])
 
 
-def made(folder: Path, truth: F64, placed: bool = True) -> Path:
-    """A scan whose poses err one by one and whose surfaces are 4 % too deep, and its stills."""
+def made(
+    folder: Path, truth: F64, placed: bool = True, size: tuple[int, int] = SMALL,
+    new_px: int | None = None,
+) -> Path:  # fmt: skip
+    """A scan whose poses err one by one and whose surfaces are 4 % too deep, and its stills.
+
+    Keyframes are of ``size``; ``new_px`` of their columns are new, by default all.
+    """
     rng = np.random.default_rng(4)
     camera = {"width": SIZE[0], "height": SIZE[1], "K": K.ravel().tolist(), "distortion": [0.0] * 5}
     header = ScanHeader(
@@ -54,14 +60,16 @@ def made(folder: Path, truth: F64, placed: bool = True) -> Path:
         for k, T in enumerate(truth):
             time_ns = START_NS + k * 10**9
             here = T @ se3.exp(rng.normal(size=6) * ([0.01] * 3 + [0.7] * 3))
-            depth = (TOO_DEEP * depth_of(T)).astype(np.float32)
+            depth = (TOO_DEEP * depth_of(T, size)).astype(np.float32)
             bgr = np.full((*depth.shape, 3), 120, np.uint8)
-            K_small = scaled_K(K, SMALL[0] / SIZE[0], SMALL[1] / SIZE[1])
+            fresh = np.ones(depth.shape, np.bool_)
+            fresh[:, new_px:] = new_px is None
+            K_small = scaled_K(K, size[0] / SIZE[0], size[1] / SIZE[1])
             one = Keyframe(
                 k, time_ns,
                 DepthMap(depth, np.full_like(depth, 0.05), np.full(depth.shape, 3, np.uint8),
                          K_small, here),
-                bgr, Pose(here, spread, ("vision",)), np.ones(depth.shape, np.bool_),
+                bgr, Pose(here, spread, ("vision",)), fresh,
             )  # fmt: skip
             store.add_keyframe(k, encode(one, time_ns))
             store.add_pose(PoseRecord(time_ns, here, spread, sources=("vision",), keyframe_seq=k))

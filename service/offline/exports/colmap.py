@@ -6,7 +6,7 @@ the training of splats go on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -25,6 +25,7 @@ from service.offline.refine.own_camera import sightings
 from service.scans.main_piece import main_keyframes
 from service.scans.track import camera_of
 from service.scans.writing import writing_folder
+from service.stream.images import whole_bgr
 
 JPEG_QUALITY = 95
 
@@ -33,24 +34,25 @@ def write_colmap(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """A folder: ``images/`` and ``sparse/0/`` with cameras, images and points as text.
 
     World coordinates are the scan's ENU metres, poses are the scan's. Images are the recording's
-    frames at full size without distortion; points are places that at least two of them show, with
-    the pixels where they do. Raises InputError without the recording: the images that a scan
-    stores lack what earlier keyframes showed.
+    frames at full size without distortion, or those that the scan stores where there is no
+    recording; points are places that at least two of them show, with the pixels where they do.
+    Raises InputError where neither shows whole images.
     """
     header, keyframes = scan.store.header, list(main_keyframes(scan.store))
-    video = options.video or recording_of(scan.folder, header).path
-    if video is None:
-        raise InputError(
-            f"{scan.folder}: colmap needs the frames of the flight, and the scan's recording is "
-            "not where it was; give --video"
-        )
-    camera = camera_of(header)
+    video = options.video
+    if video is None and not options.stored:
+        video = recording_of(scan.folder, header).path
+    frames: Iterable[tuple[int, U8]]
+    if video is not None:
+        camera = camera_of(header)
+        frames = frames_at(keyframes, header, video, options.video_epoch_ns, scan.progress)
+    else:
+        camera, frames = _stored(scan, keyframes)
     with writing_folder(out) as part:
         (part / "images").mkdir()
         model = part / "sparse" / "0"
         model.mkdir(parents=True)
         undistort, gray = Undistorter(camera), dict[int, U8]()
-        frames = frames_at(keyframes, header, video, options.video_epoch_ns, scan.progress)
         for n, frame in frames:
             gray[n] = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
             quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
@@ -65,6 +67,23 @@ def write_colmap(scan: ScanView, out: Path, options: ExportOptions) -> None:
         errors = errors_px(camera, poses, points, seen)
         _write_images(model / "images.txt", {n: keyframes[n] for n in sorted(gray)}, seen, uv)
         _write_points(model / "points3D.txt", keyframes, points, rgb, errors, seen)
+
+
+def _stored(
+    scan: ScanView, keyframes: Sequence[Keyframe]
+) -> tuple[Camera, Iterator[tuple[int, U8]]]:
+    """The camera of the stored keyframes, and their whole images; InputError without these."""
+    images = [scan.store.image(k.seq) for k in keyframes]
+    if not keyframes or None in images:
+        raise InputError(
+            f"{scan.folder}: colmap needs whole frames; this scan stores none, and its recording "
+            "is not where it was; give --video"
+        )
+    depth = keyframes[0].depth
+    h, w = depth.depth_m.shape
+    scan.progress(f"images of {w}x{h} from the scan itself; --video gives those of full size")
+    whole = (whole_bgr(k, image) for k, image in zip(keyframes, images, strict=True))
+    return Camera(depth.K, np.zeros(5), (w, h)), enumerate(whole)
 
 
 def _tracks(

@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon import se3
-from recon.types import F64, Keyframe
+from recon.types import F64, U8, Keyframe
 from service.errors import InputError
 from service.offline.exports.view import ExportOptions, ScanView
 from service.packages import needing
 from service.scans.writing import writing
+from service.stream.images import whole_bgr
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
@@ -44,7 +45,7 @@ def export_mcap(store: ScanStore, out_path: Path) -> int:
             if isinstance(item, PoseRecord):
                 recording.log_pose(item)
             else:
-                recording.log_keyframe(item)
+                recording.log_keyframe(item, whole_bgr(item, store.image(item.seq)))
         recording.log_summary(store)
     return recording.messages
 
@@ -155,8 +156,8 @@ class _Recording:
         )
         self._write(self._fix, fix, time_ns)
 
-    def log_keyframe(self, keyframe: Keyframe) -> None:
-        """The keyframe's points, image and camera."""
+    def log_keyframe(self, keyframe: Keyframe, bgr: U8) -> None:
+        """The keyframe's points, its image ``bgr`` and camera."""
         import cv2
         from foxglove import messages
 
@@ -164,7 +165,7 @@ class _Recording:
         stamp = _stamp(time_ns)
         frame_id = f"keyframe-{keyframe.seq}"
         self._write(self._points, _points(keyframe, stamp), time_ns)
-        _, jpeg = cv2.imencode(".jpg", keyframe.bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        _, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         image = messages.CompressedImage(
             timestamp=stamp, frame_id=frame_id, data=jpeg.tobytes(), format="jpeg"
         )

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.types import F64, Keyframe
+from recon.types import F64, U8, Keyframe
 from service.offline.exports.recording import (
     JPEG_QUALITY,
     POINT,
@@ -30,6 +30,7 @@ from service.offline.exports.recording import (
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
 from service.scans.writing import writing
+from service.stream.images import whole_bgr
 from service.stream.records import PoseRecord
 
 MAX_STAMP_NS = (1 << 31) * 10**9 - 1
@@ -103,8 +104,8 @@ class Ros2Channels:
             3,  # the covariance is known
         )
 
-    def log_keyframe(self, keyframe: Keyframe) -> None:
-        """The keyframe's pose, points, image and camera."""
+    def log_keyframe(self, keyframe: Keyframe, bgr: U8) -> None:
+        """The keyframe's pose, points, its image ``bgr`` and camera."""
         time_ns, depth = keyframe.time_ns, keyframe.depth
         header = _header(CAMERA, time_ns)
         self.log_transform(depth.T_world_camera, time_ns)
@@ -116,7 +117,7 @@ class Ros2Channels:
             self._points, time_ns, header, 1, points.size, fields, False, POINT.itemsize, size,
             data, True,
         )  # fmt: skip
-        _, jpeg = cv2.imencode(".jpg", keyframe.bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        _, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         _log(self._image, time_ns, header, "jpeg", jpeg.ravel())
         K = np.ascontiguousarray(depth.K, np.float64)
         P = np.hstack([K, np.zeros((3, 1))])
@@ -158,7 +159,7 @@ def write_ros2(scan: ScanView, out: Path, options: ExportOptions) -> None:
         placed_ns = None  # the last keyframe, which has its own transform
         for item in in_order(main_keyframes(scan.store), scan.poses):
             if isinstance(item, Keyframe):
-                channels.log_keyframe(item)
+                channels.log_keyframe(item, whole_bgr(item, scan.store.image(item.seq)))
                 placed_ns = item.time_ns
                 continue
             if item.time_unix_ns != placed_ns:

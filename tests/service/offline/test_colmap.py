@@ -16,6 +16,8 @@ from scipy.spatial.transform import Rotation
 from recon import se3
 from service.errors import InputError
 from service.offline.exports.view import ExportOptions, ScanView, export
+from service.stream.images import encode_image, whole_bgr
+from service.stream.store import ScanStore
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +112,28 @@ def test_without_the_recording_it_is_refused_in_one_line(
 ) -> None:
     house.flown(tmp_path / "s").close()
     with ScanView(tmp_path / "s") as scan:
-        with pytest.raises(InputError, match=r"needs the frames of the flight.*--video"):
+        with pytest.raises(InputError, match=r"needs whole frames.*--video"):
             export(scan, "colmap", None, ExportOptions())
         assert not list((tmp_path / "s").glob("*colmap*"))
+
+
+def test_without_the_recording_the_whole_stored_images_serve(tmp_path: Path) -> None:
+    scan_dir = made(tmp_path, flown(), size=(240, 180), new_px=4)
+    with ScanStore.open(scan_dir / "scan.db") as store:
+        for seq in store.seqs():
+            frame = cv2.imread(str(tmp_path / "stills" / f"{seq}.png"))
+            keyframe = store.keyframe(seq)
+            assert frame is not None and keyframe is not None
+            image = encode_image(np.asarray(frame, np.uint8))
+            assert whole_bgr(keyframe, None) is keyframe.bgr
+            assert whole_bgr(keyframe, b"no JPEG") is keyframe.bgr
+            shown = whole_bgr(keyframe, image)
+            np.testing.assert_array_equal(shown[:, :4], keyframe.bgr[:, :4])
+            true = cv2.resize(frame, (240, 180), interpolation=cv2.INTER_AREA)
+            assert cv2.PSNR(shown[:, 4:], true[:, 4:]) > 25.0
+            store.add_keyframe(seq, [], image)
+    with ScanView(scan_dir) as scan:
+        folder = export(scan, "colmap", None, ExportOptions(stored=True))
+    images, points = read(folder)
+    assert len(images) == 10 and len(points) > 50
+    assert (folder / "sparse/0/cameras.txt").read_text().split()[2:4] == ["240", "180"]
