@@ -91,7 +91,6 @@ class JournalHandler(logging.Handler):
             print(f"{record.levelname} {record.name}: {text}", file=sys.stderr)
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
         super().close()
 

@@ -131,7 +131,6 @@ class Worker:
         return (self.thread.ident if self.thread is not None else None) or 0
 
     def beat(self) -> None:
-        """Note progress."""
         self.beat_at = time.monotonic()
 
     @property
@@ -234,7 +233,6 @@ class Workers:
 
     @property
     def stalled(self) -> list[Worker]:
-        """Stalled workers."""
         return [worker for worker in self.table() if worker.is_stalled]
 
     def report(self) -> list[dict[str, Any]]:

@@ -37,8 +37,6 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeSample(Sample):
-    """Attitude of the body."""
-
     q_ned_body: Quaternion
     rates_rad_s: Vector | None = None  # of the body, about its own axes
 

@@ -94,11 +94,9 @@ class NumbersMessage:
         return self._name
 
     def get_srcSystem(self) -> int:
-        """The system that sent it."""
         return self._packet.system
 
     def get_srcComponent(self) -> int:
-        """The component that sent it."""
         return self._packet.component
 
 

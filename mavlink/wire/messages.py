@@ -132,8 +132,6 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class LinkReport:
-    """State of one link."""
-
     name: str
     is_up: bool
     opened: int  # how many times
@@ -162,12 +160,10 @@ class Links:
             link.on_data = partial(self._on_data, i)
 
     def start(self) -> None:
-        """Open them."""
         for link in self._links:
             link.start()
 
     def stop(self) -> None:
-        """Close them."""
         for link in self._links:
             link.stop()
 
@@ -189,7 +185,6 @@ class Links:
         return sent
 
     def report(self) -> tuple[LinkReport, ...]:
-        """State of each link."""
         return tuple(
             LinkReport(
                 link.spec.name,

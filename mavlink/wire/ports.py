@@ -71,8 +71,6 @@ class Port(Protocol):
 
 
 class SerialPort:
-    """A serial line."""
-
     is_quick = False
 
     def __init__(self, spec: LinkSpec) -> None:
@@ -94,14 +92,12 @@ class SerialPort:
             raise OSError("closed") from error
 
     def write(self, data: bytes) -> None:
-        """Send."""
         try:
             self._line.write(data)
         except TypeError as error:
             raise OSError("closed") from error
 
     def close(self) -> None:
-        """Close the line."""
         self._line.close()
 
 
@@ -150,7 +146,6 @@ class UdpPort:
                 self._socket.sendto(data, peer)
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
 
@@ -173,11 +168,9 @@ class TcpPort:
         return data
 
     def write(self, data: bytes) -> None:
-        """Send."""
         self._socket.sendall(data)
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
 
@@ -225,7 +218,6 @@ class TcpServerPort:
         client.close()
 
     def close(self) -> None:
-        """Close all sockets."""
         for client in list(self._clients):
             self._drop(client)
         self._server.close()

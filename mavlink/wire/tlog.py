@@ -100,7 +100,6 @@ class TlogRecorder:
                 log.error("the telemetry log was not closed cleanly: %s", error)
 
     def write(self, packet: bytes, monotonic_ns: int) -> None:
-        """Write one packet."""
         if self._file is None:
             return
         with self._lock:

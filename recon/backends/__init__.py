@@ -34,9 +34,7 @@ class Backend(Protocol):
     """Operations that a backend offers to the pipeline."""
 
     @property
-    def name(self) -> str:
-        """As in the table."""
-        ...
+    def name(self) -> str: ...
 
     @property
     def device(self) -> str:

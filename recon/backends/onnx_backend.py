@@ -98,7 +98,6 @@ class LearnedStereoConfig:
 
     @property
     def image_shape(self) -> tuple[int, ...]:
-        """Of one input."""
         if self.layout == "nchw":
             return (1, self.channels, self.height, self.width)
         return (1, self.height, self.width, self.channels)

@@ -50,7 +50,6 @@ class DeviceIcp:
     def register(
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
     ) -> Registration:
-        """As :func:`recon.mapping.registration.register_projective`."""
         start = np.array(T_target_source, np.float64)
         if start.shape != (4, 4) or not np.isfinite(start).all():
             raise ValueError("T_target_source must be (4, 4) finite numbers")

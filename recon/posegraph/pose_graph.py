@@ -50,7 +50,6 @@ class PoseGraph:
     """
 
     def __init__(self, config: PoseGraphConfig | None = None) -> None:
-        """An empty graph."""
         self.config = config or PoseGraphConfig()
         self._kept_counts: Counter[str] = Counter()  # of what happens once, whatever is rebuilt
         self._nodes: dict[int, Node] = {}  # by keyframe number, in order of time

@@ -12,8 +12,6 @@ from recon.types import F64, PosePrior
 
 @dataclass(frozen=True, slots=True)
 class PoseGraphConfig:
-    """Parameters of the pose graph."""
-
     sigma_scale: float = 0.1  # of a segment's scale after its alignment, before the readings
     sigma_scale_walk: float = 0.003  # change of the scale per twenty keyframes
     sigma_step: float = 0.002  # of one vision motion, as a share of its length

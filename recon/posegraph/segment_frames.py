@@ -58,7 +58,6 @@ class SegmentFrames:
         return self._frames.get(segment)
 
     def largest(self) -> Similarity | None:
-        """That of :meth:`largest_segment`."""
         segment = self.largest_segment()
         return None if segment is None else self._frames[segment]
 

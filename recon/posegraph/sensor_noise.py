@@ -66,7 +66,6 @@ class Noise:
 
     @property
     def total(self) -> float:
-        """Of one reading."""
         return float(np.hypot(self.white, self.wander))
 
     def change(self, passed_s: float) -> float:

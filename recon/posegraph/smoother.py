@@ -132,8 +132,6 @@ def scale_columns(at: State, keys: I64) -> I64:
 
 
 class Factors:
-    """The factors of one kind."""
-
     def __init__(
         self, form: Callable[[Rows, State], Linear], dtype: np.dtype[Any], huber: float,
         cauchy: float = np.inf,
@@ -166,7 +164,6 @@ class System:
 
     @staticmethod
     def of(factors: list[Factors], at: State) -> System:
-        """That of all factors."""
         bands.give_way()
         count, first_log = 6 * len(at.R) + len(at.logs), 6 * len(at.R)
         held = np.array([first_log + NO_SCALE])

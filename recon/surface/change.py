@@ -36,8 +36,6 @@ MIN_PLACES = 50
 
 @dataclass(frozen=True, slots=True)
 class ChangeConfig:
-    """Thresholds for a change."""
-
     windows: tuple[int, ...] = (3, 5)  # cells of a side, over which heights are averaged
     level_sigmas: float = 2.58  # 99 %: a cell belongs to a change
     false_alarm: float = 0.05  # chance that ground without change shows any object

@@ -46,8 +46,6 @@ Tile = tuple[int, int]
 
 @dataclass(slots=True, eq=False)
 class _Cells:
-    """One tile."""
-
     views: Array = field(default_factory=lambda: np.zeros((TILE, TILE), np.int32))
     sigma: F32 = field(default_factory=lambda: np.full((TILE, TILE), np.inf, np.float32))
     height: F32 = field(default_factory=lambda: np.zeros((TILE, TILE), np.float32))

@@ -283,7 +283,6 @@ class BareReceiver(Receiver):
     """A receiver that writes no deliverables."""
 
     def write(self, scan: ReceivedScan) -> None:
-        """Write nothing."""
         scan.unwritten, scan.is_writing, scan.is_written = False, False, True
 
 

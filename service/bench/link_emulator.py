@@ -47,7 +47,6 @@ class Traffic:
     log: list[tuple[float, int]] = field(default_factory=list)
 
     def total_bytes(self) -> int:
-        """Bytes in all."""
         return sum(size for _, size in self.log)
 
     def busiest_window_bytes(self, window_s: float = 1.0) -> int:

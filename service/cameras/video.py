@@ -193,7 +193,6 @@ class VideoSource:
         return round(ticks * time_base * NS_PER_S)
 
     def close(self) -> None:
-        """Close the container."""
         if self._open:
             self._open = False
             self._container.close()

@@ -141,7 +141,6 @@ class GroundOptions:
         )
 
     def _limits(self) -> DroneLimits:
-        """Limits of one drone."""
         from service.ground.drone import DroneLimits
 
         if not 0.0 < self.drone_share <= 100.0:

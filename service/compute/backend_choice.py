@@ -68,23 +68,19 @@ class FallbackBackend:
 
     @property
     def keeps_pairs(self) -> bool:
-        """See :class:`recon.backends.Backend`."""
         return self._backend.keeps_pairs
 
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
     ) -> DisparityMap:
-        """See :class:`recon.backends.Backend`."""
         return self._run(lambda b: b.belief_propagation(left, right, labels, config))
 
     def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
-        """See :class:`recon.backends.Backend`."""
         return self._run(lambda b: b.upsample(coarse, guide, config))
 
     def register(
         self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
     ) -> Registration:
-        """See :class:`recon.backends.Backend`."""
         return self._run(lambda b: b.register(source, target, T_target_source, config))
 
     def fused_depth(
@@ -95,7 +91,6 @@ class FallbackBackend:
         T_world_camera: F64,
         stages: DenseStages,
     ) -> DepthMap | None:
-        """See :class:`recon.backends.Backend`."""
         return self._run(lambda b: b.fused_depth(pairs, K, size_px, T_world_camera, stages))
 
     def fail(self, error: Exception) -> None:

@@ -65,7 +65,6 @@ class _Kept:
 
     @cached_property
     def signature(self) -> U8:
-        """Its look."""
         return signature(self.gray())
 
     def unpacked(self, scale: float) -> LoopView:

@@ -290,7 +290,6 @@ class FrameTags:
             self._give_up(error)
 
     def write(self, time_unix_ns: int, state: VehicleState | None) -> None:
-        """One frame, at its exposure."""
         if self._file is None or state is None:
             return
         try:

@@ -76,8 +76,6 @@ class Photo:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanInputs:
-    """Inputs of a scan."""
-
     source: CameraSource
     camera: Camera
     config: Config

@@ -161,7 +161,6 @@ class Track:
 
     @property
     def segment(self) -> int:
-        """Number of the segment."""
         return self.odometry.segment
 
     def is_settled(self, key: Key) -> bool:

@@ -108,7 +108,6 @@ class Viewpoint:
 
     @property
     def segment(self) -> int:
-        """Number of the segment."""
         return self.key.segment
 
     @property

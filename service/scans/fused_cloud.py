@@ -61,8 +61,6 @@ class FusedCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Extent:
-    """The extent of one keyframe."""
-
     seq: int
     points: int
     ground_sample_m: float

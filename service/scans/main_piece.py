@@ -32,7 +32,6 @@ class Piece:
         return self.own
 
     def keyframe(self, seq: int) -> Keyframe | None:
-        """One of them."""
         return self.whole.keyframe(seq)
 
 

@@ -118,7 +118,6 @@ class Claim:
         return True
 
     def give_up(self) -> None:
-        """Release it."""
         if self._held is not None:
             os.close(self._held)
         self._held, self.is_ours = None, False

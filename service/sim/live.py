@@ -115,7 +115,6 @@ class MavlinkPlayer:
             log.debug("MAVLink packet not sent: %s", error)
 
     def close(self) -> None:
-        """Close the socket."""
         self.socket.close()
 
 

@@ -50,8 +50,6 @@ REPEATABLE = "bframes=0:mbtree=0:scenecut=0"
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Injected faults."""
-
     blank: tuple[tuple[int, int], ...] = ()  # (first frame, count) black images
     exposure: tuple[tuple[float, float], ...] = ()  # (from second, gain)
 

@@ -30,8 +30,6 @@ Timed = tuple[Any, int, float]
 
 @dataclass(frozen=True, slots=True)
 class TelemetryOptions:
-    """Options of the simulated telemetry."""
-
     gimbal_frame: str = "earth"  # or "vehicle": the frame of the gimbal's yaw
     rangefinder: bool = True
     gap_s: tuple[float, float] | None = None  # nothing is sent between these times

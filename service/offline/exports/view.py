@@ -153,7 +153,6 @@ class ScanView:
 
     @property
     def is_whole(self) -> bool:
-        """Whether this is no tile."""
         return self._box is EVERYWHERE
 
     def with_progress(self, progress: Progress) -> ScanView:

@@ -78,7 +78,6 @@ class ImageNetwork:
     doubt: str  # why the camera is held; empty when it is found
 
     def figures(self) -> dict[str, Any]:
-        """Figures of the network."""
         return {
             "sightings": len(self.seen.view),
             "places": len(np.unique(self.seen.landmark)),

@@ -93,8 +93,6 @@ MAX_REFUSALS = 0.4
 
 @dataclass(frozen=True, slots=True)
 class RefineOptions:
-    """Options of a refinement."""
-
     gcp: Path | None = None
     telemetry: Path | None = None
     out: Path | None = None

@@ -46,7 +46,6 @@ class Line:
 
     @property
     def length_m(self) -> float:
-        """From end to end."""
         return float(np.linalg.norm(self.end_m - self.start_m))
 
 
@@ -65,8 +64,6 @@ class Swath:
 
 @dataclass(frozen=True, slots=True)
 class MissionItem:
-    """One MAVLink mission item."""
-
     command: int
     frame: int
     params: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
