@@ -37,7 +37,7 @@ VERTICAL_SHARE = 2.5
 """Sigma of a fix's altitude over that of its position, where the latter alone is stated: of
 receivers two to three."""
 
-CORRECTED_M = 0.5
+CORRECTED_M = 0.1
 """A receiver that states less has corrections of a base: its height does not wander by itself."""
 
 NO_ALTITUDE_M = 1000.0
