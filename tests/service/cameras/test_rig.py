@@ -224,7 +224,8 @@ def test_without_attitude_or_time_the_turn_is_unknown() -> None:
 def test_an_altitude_without_accuracy_is_as_good_as_its_position_allows() -> None:
     """A fix known to 2 cm across is not off by metres in height; one of a phone may be."""
     for sigma_h_m, relative_m, sigma_v_m in (
-        (0.02, None, 0.05), (0.4, None, 1.0), (4.0, None, 10.0), (100.0, None, 50.0), (4.0, 30.0, 5.0),
+        (0.02, None, 0.05), (0.4, None, 1.0), (4.0, None, 10.0), (100.0, None, 50.0),
+        (4.0, 30.0, 5.0),
     ):  # fmt: skip
         tag = GeoTag(
             30.0, -98.0, 300.0, sigma_h_m, is_sigma_h_stated=True, relative_alt_m=relative_m
