@@ -71,7 +71,9 @@ class BoundedListener(socket.socket):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        super().__init__(fileno=socket.create_server((host, port), family=family).detach())
+        both = host == "::" and socket.has_dualstack_ipv6()
+        opened = socket.create_server((host, port), family=family, dualstack_ipv6=both)
+        super().__init__(fileno=opened.detach())
         self._limits = limits or ListenerLimits()
         self._clock = clock
         self._open: dict[Peer, _Connection] = {}

@@ -82,6 +82,8 @@ ROWS: tuple[Row, ...] = (
     Row("health", "/healthz, /status and /metrics; a thread a request", 7, 32, "refuse"),
     Row("simulated flight", "process: camera and autopilot of sim:", 8, restarts=True),
     # The ground.
+    Row("front", "passes on connections of drones, within limits", 2, restarts=True,
+        is_essential=True),
     Row("receiver", "the session with the drones", 1, None, "", _STALL_S, True, True),
     Row("heads", "receives what drones announce", 1, restarts=True, is_essential=True),
     Row("items", "receives what drones send", 1, restarts=True, is_essential=True),

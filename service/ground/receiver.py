@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 from service.errors import InputError, SkyreliefError
 from service.ground.drone import DroneLimits
 from service.ground.drones import Drones
+from service.ground.front import behind_fronts
 from service.ground.inbox import CHANNEL, Inbox, Replies
 from service.ground.live_site import run as run_live_site
 from service.ground.received import (
@@ -94,6 +95,8 @@ class Receiver:
         self._writes: queue.Queue[ReceivedScan | None] = queue.Queue()
         self._sites = Sites(config.store, config.limits)
         self._running: list[Worker] = []
+        self._fronts: list[Worker] = []
+        self._session_config = config.session
         self._refresh_at = -1e9
         self._dropped = 0
         self._last_news_at = time.monotonic()
@@ -101,6 +104,8 @@ class Receiver:
     def start(self) -> None:
         """Begin; returns when the endpoints are open. Raises OutsideError when they cannot."""
         start = self.workers.start
+        self._session_config, fronts = behind_fronts(self._config.session)
+        self._fronts = [start(f"front {front.endpoint}", front.run) for front in fronts]
         self._running = [
             start("deliverables", self._write_all),
             start("replies", self._replies.run),
@@ -125,6 +130,8 @@ class Receiver:
         self._running = []
         main.join()
         replies.join()
+        for front in self._fronts:
+            front.join()
         scans = self._drones.close()
         for scan in scans:
             if scan.unwritten and not scan.is_writing:
@@ -168,7 +175,7 @@ class Receiver:
         while not worker.stop.is_set():
             worker.beat()
             try:
-                session = open_session(self._config.session)
+                session = open_session(self._session_config)
             except SkyreliefError as error:
                 if not self._opened.is_set() and (
                     self._config.session.listen or isinstance(error, InputError)
