@@ -11,12 +11,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from scipy import ndimage
-from scipy.spatial import Delaunay
 
+from recon.surface.harmonic import between
 from recon.surface.raster import Raster
-from recon.types import F32, I64, Bool
+from recon.types import F32, Bool
 
 LARGEST_OBJECT_M = 36.0
 """Width of the widest building that is removed."""
@@ -34,9 +33,10 @@ def ground_cells(surface: Raster) -> Bool:
     cell_m = surface.grid.cell_m
     shrink = max(1, round(WORKING_CELL_M / cell_m))
     low = _lowest(surface.height_m, shrink)
-    objects = np.zeros(low.shape, np.bool_)
-    coarse_m = cell_m * shrink
-    last = whole = _bridged(low, np.isfinite(low))
+    objects, coarse_m = np.zeros(low.shape, np.bool_), cell_m * shrink
+    known = np.isfinite(low)
+    inside = np.asarray(ndimage.binary_fill_holes(known), np.bool_)
+    last = whole = _bridged(low, known, inside, coarse_m)
     radius = 1
     while (2 * radius + 1) * coarse_m <= LARGEST_OBJECT_M + 2 * coarse_m:
         window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
@@ -59,7 +59,7 @@ def _steps(radius: int) -> int:
 class BareGround:
     """The bare ground of a surface model.
 
-    Ground is bridged by triangles below what stands on it and in holes of the surface model.
+    Ground is bridged smoothly below what stands on it and in holes of the surface model.
     """
 
     everywhere_m: F32  # (rows, cols) beyond the outline that of the nearest; NaN without ground
@@ -67,12 +67,15 @@ class BareGround:
     is_bridged: Bool  # (rows, cols) inside, and not seen as ground
 
 
-def terrain(surface: Raster) -> BareGround:
-    """The bare ground below ``surface``."""
+def terrain(surface: Raster, inside: Bool | None = None) -> BareGround:
+    """The bare ground below ``surface``; ``inside`` is by default what its cells enclose."""
     ground = ground_cells(surface)
-    inside = np.asarray(ndimage.binary_fill_holes(surface.known)) & ground.any()
+    if inside is None:
+        inside = np.asarray(ndimage.binary_fill_holes(surface.known), np.bool_)
+    inside = inside & ground.any()
     height = np.where(ground, surface.height_m, np.float32(np.nan)).astype(np.float32)
-    return BareGround(_bridged(height, ground), inside, inside & ~ground)
+    bridged = _bridged(height, ground, inside, surface.grid.cell_m)
+    return BareGround(bridged, inside, inside & ~ground)
 
 
 def _lowest(height_m: F32, shrink: int) -> F32:
@@ -85,44 +88,13 @@ def _lowest(height_m: F32, shrink: int) -> F32:
     return np.where(np.isfinite(blocks), blocks, np.float32(np.nan)).astype(np.float32)
 
 
-def _bridged(height_m: F32, known: Bool) -> F32:
-    """All cells: the known as they are, the others by triangles between the borders of the known,
-    beyond those by the nearest."""
-    rim = known & ~ndimage.binary_erosion(known, np.ones((3, 3)), border_value=1)
-    if not known.any() or known.all() or not rim.any():
+def _bridged(height_m: F32, known: Bool, inside: Bool, cell_m: float) -> F32:
+    """All cells: the known as they are, the others inside without facets between the known, those
+    beyond by the nearest."""
+    if not known.any() or known.all():
         return height_m
     near = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     out: F32 = height_m[tuple(near)]
-    at = np.argwhere(rim)
-    if np.linalg.matrix_rank(at - at[0]) == 2:  # not all on one line
-        triangles = Delaunay(at).simplices.astype(np.int64)
-        _span(at.astype(np.int64), height_m[rim], triangles, known, out)
+    wanted = inside & ~known
+    out[wanted] = between(height_m, known, wanted, cell_m)[wanted]
     return out
-
-
-@njit(cache=True, nogil=True)
-def _span(at: I64, height_m: F32, triangles: I64, known: Bool, out: F32) -> None:
-    """Interpolate ``out`` in the unknown cells of each triangle between the cells ``at`` (N, 2)."""
-    for n in range(len(triangles)):
-        corners = triangles[n]
-        r, c = at[corners, 0], at[corners, 1]
-        twice_area = (c[1] - c[0]) * (r[2] - r[0]) - (c[2] - c[0]) * (r[1] - r[0])
-        if twice_area == 0:
-            continue
-        for row in range(r.min(), r.max() + 1):
-            first, last = np.inf, -np.inf  # columns where the row crosses the sides
-            for k in range(3):
-                j = (k + 1) % 3
-                if r[k] == r[j] or (row - r[k]) * (row - r[j]) > 0:
-                    continue
-                crossing = c[k] + (row - r[k]) * (c[j] - c[k]) / (r[j] - r[k])
-                first, last = min(first, crossing), max(last, crossing)
-            for col in range(int(np.ceil(first - 1e-6)), int(np.floor(last + 1e-6)) + 1):
-                if known[row, col]:
-                    continue
-                total = 0.0
-                for k in range(3):
-                    i, j = (k + 1) % 3, (k + 2) % 3
-                    part = (c[j] - c[i]) * (row - r[i]) - (col - c[i]) * (r[j] - r[i])
-                    total += part * np.float64(height_m[corners[k]])
-                out[row, col] = total / twice_area

@@ -2,7 +2,8 @@
 
 Views that a higher part of the surface hides are left out, and so are those whose colour differs
 from most others (:func:`recon.surface.texture_views.drop_outliers`). The views' exposures are
-levelled, and neighbouring views blend across one cell of the surface model.
+levelled, and neighbouring views blend across one cell of the surface model. An object is shown by
+one view as far as that sees it, so that seams run around buildings.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ class Terrain:
     raster: Raster
     places_m: F64  # (rows, cols, 3) world; NaN heights are unknown
     eyes_m: F64  # (V, 3) the views' centres in the raster's own coordinates
+    objects: I32 | None = None  # (rows, cols) numbers of what stands on the ground, 0 elsewhere
 
 
 def orthophoto(
@@ -61,7 +63,10 @@ def orthophoto(
     lens, images = cameras(views), flat(views)
     found = _sightings(terrain, views, (*lens, *images), progress)
     progress("painting the orthophoto")
-    label = found.view[:, 0].reshape(terrain.raster.grid.shape)
+    label = found.view[:, 0]
+    if terrain.objects is not None:
+        label = one_view_each(found, terrain.objects.ravel())
+    label = label.reshape(terrain.raster.grid.shape)
     rgb = np.zeros((*grid.shape, 3), np.uint8)
     known = np.zeros(grid.shape, np.bool_)
     old = terrain.raster.grid
@@ -71,7 +76,8 @@ def orthophoto(
         grid.cell_m / old.cell_m,
     )
     in_bands(
-        _paint, len(rgb), np.ascontiguousarray(terrain.places_m), terrain.raster.height_m,
+        _paint, len(rgb), np.ascontiguousarray(terrain.places_m), _axes(terrain.places_m),
+        terrain.raster.height_m,
         terrain.raster.rgb, np.ascontiguousarray(label), *lens, levels(found, len(views)),
         *images, to_cell, rgb, known,
     )  # fmt: skip
@@ -101,6 +107,27 @@ def _sightings(
             *images, out.view, out.px_per_m, out.bgr,
         )  # fmt: skip
     return out
+
+
+def one_view_each(found: TriangleViews, objects: I32) -> I32:
+    """(N,) the view of each cell, of the cells of one object (N,) as far as possible the same: no
+    seam then runs across a roof."""
+    label: I32 = found.view[:, 0].copy()
+    cells = np.flatnonzero(objects)
+    views, owner = found.view[cells], objects[cells].astype(np.int64)
+    is_seen = views >= 0
+    if not is_seen.any():
+        return label
+    number = int(views.max()) + 1
+    keys, pair = np.unique((owner[:, None] * number + views)[is_seen], return_inverse=True)
+    total = np.bincount(pair, found.px_per_m[cells][is_seen])
+    best = np.full(int(owner.max()) + 1, -1, np.int32)
+    rising = np.argsort(total)
+    best[keys[rising] // number] = keys[rising] % number  # the last one stays
+    chosen = best[owner]
+    shown = (views == chosen[:, None]).any(axis=1)
+    label[cells[shown]] = chosen[shown]
+    return label
 
 
 def _sharpness(views: Sequence[TextureView]) -> F64:
@@ -167,7 +194,8 @@ def _is_hidden(
 
 @njit(cache=True, nogil=True)
 def _paint(
-    begin: int, end: int, places: F64, height: F32, fallback: U8, label: I32, K: F64, T: F64,
+    begin: int, end: int, places: F64, axes: F64, height: F32, fallback: U8, label: I32, K: F64,
+    T: F64,
     levels: F32, pixels: U8, start: I64, sides: I64, to_cell: tuple[float, float, float], rgb: U8,
     known: Bool,
 ) -> None:  # fmt: skip
@@ -180,36 +208,75 @@ def _paint(
         for j in range(rgb.shape[1]):
             x = min(max(to_cell[0] + j * to_cell[2], 0.0), cols - 1.0)
             c = min(int(x), cols - 2)
-            near_r, near_c = r + round(y - r), c + round(x - c)
-            if np.isnan(height[near_r, near_c]):
-                continue
-            known[i, j] = True
             a, b = y - r, x - c
             share[0], share[1] = (1.0 - a) * (1.0 - b), (1.0 - a) * b
             share[2], share[3] = a * (1.0 - b), a * b
-            _place(places, height, r, c, share, height[near_r, near_c], place)
+            near = _one_surface(height, r, c, share)
+            if near < 0:
+                continue
+            known[i, j] = True
+            _place(places, axes, r, c, near, a, b, share, place)
             total = _mix(
                 place, label, r, c, share, K, T, levels, pixels, start, sides, colour, mixed
             )
             for k in range(3):
-                value = float(fallback[near_r, near_c, k])
+                value = float(fallback[r + near // 2, c + near % 2, k])
                 if total > 1e-3:
                     value = mixed[2 - k] / total
                 rgb[i, j, k] = np.uint8(min(max(value + 0.5, 0.0), 255.0))
 
 
+def _axes(places_m: F64) -> F64:
+    """(2, 2) metres east and north from one row of cells to the next, and from column to column."""
+    steps = (np.diff(places_m[..., :2], axis=axis).reshape(-1, 2) for axis in (0, 1))
+    known = [step[np.isfinite(step).all(axis=1)] for step in steps]
+    return np.array([np.median(one, axis=0) if len(one) else np.zeros(2) for one in known])
+
+
 @njit(cache=True, nogil=True)
-def _place(places: F64, height: F32, r: int, c: int, share: F64, near_m: float, out: F64) -> None:
-    """World place between four cells; their heights count where they are of one surface."""
-    out[:] = 0.0
-    total = 0.0
+def _one_surface(height: F32, r: int, c: int, share: F64) -> int:
+    """The cell of four that has the largest share of those of the surface with the largest share;
+    the others' shares become 0. -1 where most is unknown.
+
+    So an edge runs across cells, not around them.
+    """
+    best, most, unknown = -1, 0.0, 0.0
     for n in range(4):
-        row, col = r + n // 2, c + n % 2
-        out[0] += share[n] * places[row, col, 0]
-        out[1] += share[n] * places[row, col, 1]
-        if abs(height[row, col] - near_m) <= STEP_M:
+        own = height[r + n // 2, c + n % 2]
+        if np.isnan(own):
+            unknown += share[n]
+            continue
+        total = 0.0
+        for m in range(4):
+            if abs(height[r + m // 2, c + m % 2] - own) <= STEP_M:
+                total += share[m]
+        if total > most + 1e-9 or (total > most - 1e-9 and share[n] > share[best]):
+            best, most = n, total
+    if best < 0 or unknown > 0.5:
+        return -1
+    own = height[r + best // 2, c + best % 2]
+    for n in range(4):
+        if not abs(height[r + n // 2, c + n % 2] - own) <= STEP_M:
+            share[n] = 0.0
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _place(
+    places: F64, axes: F64, r: int, c: int, near: int, down: float, right: float, share: F64,
+    out: F64,
+) -> None:  # fmt: skip
+    """World place, so many cells down and right of the first of four; the heights of those with a
+    share count."""
+    row, col = r + near // 2, c + near % 2
+    for k in range(2):
+        out[k] = places[row, col, k]
+        out[k] += (down - near // 2) * axes[0, k] + (right - near % 2) * axes[1, k]
+    out[2] = total = 0.0
+    for n in range(4):
+        if share[n] > 0.0:
             total += share[n]
-            out[2] += share[n] * places[row, col, 2]
+            out[2] += share[n] * places[r + n // 2, c + n % 2, 2]
     out[2] /= total
 
 

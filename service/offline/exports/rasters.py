@@ -17,13 +17,13 @@ import numpy as np
 from recon.bands import at_once, threads
 from recon.mapping.voxel_map import ground_sample_m
 from recon.surface.orthophoto import STEPS, Terrain, orthophoto
-from recon.surface.raster import Grid, Raster, fill_holes, round_cell
+from recon.surface.raster import Grid, Raster, round_cell
 from recon.surface.texture_views import TextureView
 from recon.types import Array
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
 from service.offline.exports.images import recording_of, scan_images
-from service.offline.exports.surface import bare_ground, cell_places, surface_model
+from service.offline.exports.surface import bare_ground, cell_places, complete_model, surface_model
 from service.offline.exports.view import ExportOptions, Make, ScanView, in_parts
 from service.offline.tiles import grown
 from service.scans.coverage import coverage_of
@@ -39,11 +39,11 @@ QUICKLY = {"level": 4, "overview_resampling": "AVERAGE"}
 RAW = {"tiled": True, "sparse_ok": True, "bigtiff": "IF_SAFER"}
 GDAL_CACHE_BYTES = 128_000_000
 
-ORTHO_HOLE_M = 4.0
-DSM_MARGIN_M, ORTHO_MARGIN_M = 10.0, 20.0
+OBJECT_M = 1.0
+"""Above the bare ground; seams of the orthophoto run around what is higher."""
+
 GROUND_MARGIN_M = 40.0
-"""Around a tile: the widest hole that is filled, the farthest that a building hides in a view, the
-widest object that the bare ground is bridged below."""
+"""Around a tile: the widest object that the bare ground is bridged below."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,13 +64,17 @@ class Layers:
 
 
 def dsm(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
-    """Heights in metres (float32, -9999 where unknown), their sigma, and 1 where filled."""
-    surface = surface_model(scan, options.cell_m, options.strict)
-    known = surface.raster.known
-    bands = [surface.raster.height_m, surface.raster.sigma_m, surface.is_filled]
-    image = np.where(known, np.stack(bands), NODATA_M).astype(np.float32)
+    """Heights in metres (float32, -9999 where unknown), their sigma, and 1 where filled, 2 where
+    measured but uncertain."""
+    if options.strict:
+        raster = surface_model(scan, options.cell_m, strict=True).raster
+        origin = np.zeros(raster.grid.shape, np.uint8)
+    else:
+        raster, origin = complete_model(scan, options.cell_m)
+    bands = np.stack([raster.height_m, raster.sigma_m, origin.astype(np.float32)])
+    image = np.where(raster.known, bands, NODATA_M).astype(np.float32)
     names = (f"height {scan.above(options)}, m", "sigma, m", "filled")
-    return Layers(surface.raster.grid, image, names, NODATA_M, options.datum).within(box)
+    return Layers(raster.grid, image, names, NODATA_M, options.datum).within(box)
 
 
 def dtm(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
@@ -96,7 +100,7 @@ def ortho(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
         surface: list[Raster] = []
         views: list[TextureView] = []
         at_once(
-            lambda: surface.append(_closed_surface(scan.with_progress(here))),
+            lambda: surface.append(complete_model(scan.with_progress(here), None)[0]),
             lambda: views.extend(
                 scan_images(keyframes, scan.folder, scan.store.header, options, there)
             ),
@@ -117,7 +121,7 @@ def ortho(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
 
 def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """:func:`dsm` as GeoTIFF."""
-    _write(scan, out, options, dsm, DSM_MARGIN_M)
+    _write(scan, out, options, dsm, GROUND_MARGIN_M)
 
 
 def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
@@ -127,7 +131,7 @@ def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """:func:`ortho` as GeoTIFF."""
-    _write(scan, out, options, ortho, ORTHO_MARGIN_M)
+    _write(scan, out, options, ortho, GROUND_MARGIN_M)
 
 
 def _write(
@@ -160,22 +164,15 @@ def _finer(scan: ScanView, options: ExportOptions) -> float:
     return float(camera["K"][0]) / float(first.depth.K[0, 0])
 
 
-def _closed_surface(scan: ScanView) -> Raster:
-    """The surface model with all its holes closed, as an orthophoto needs it."""
-    measured = scan.raster(None)
-    certain = surface_model(scan, None).raster
-    doubtful = measured.known & ~certain.known
-    height, rgb = certain.height_m.copy(), certain.rgb.copy()
-    height[doubtful], rgb[doubtful] = measured.height_m[doubtful], measured.rgb[doubtful]
-    largest = max(1, round(ORTHO_HOLE_M / measured.grid.cell_m))
-    return fill_holes(replace(measured, height_m=height, rgb=rgb), largest)
-
-
 def _terrain(scan: ScanView, raster: Raster, views: Sequence[TextureView]) -> Terrain:
     eyes = np.array([v.T_world_camera[:3, 3] for v in views])
     if scan.frame is not None:
         eyes = scan.frame.to_utm(eyes)
-    return Terrain(raster, cell_places(scan, raster), eyes)
+    above_m = raster.height_m - bare_ground(scan, None).everywhere_m
+    high = (above_m > OBJECT_M).astype(np.uint8)
+    whole = cv2.morphologyEx(high, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    objects = np.asarray(cv2.connectedComponents(whole)[1], np.int32)
+    return Terrain(raster, cell_places(scan, raster), eyes, objects)
 
 
 def over(bounds: Box, cell_m: float) -> Grid:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from recon.mapping.free_space import air_above
 from recon.surface.ground import BareGround, terrain
-from recon.surface.hole_filling import LEVEL_M, filled, outlined
+from recon.surface.hole_filling import LEVEL_M, completed, filled, outline, outlined
 from recon.surface.raster import (
     STEP_M,
     Raster,
@@ -53,6 +53,9 @@ PROBE_M = 1.0
 """A surface is no surface where a keyframe sees through the place so far below it."""
 
 
+FILLED, UNCERTAIN = 1, 2
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceHeights:
     """Heights of the upper surface, and (rows, cols) those that are no certain measurements."""
@@ -76,8 +79,48 @@ def surface_model(scan: ScanView, cell_m: float | None, strict: bool = False) ->
 
 
 def bare_ground(scan: ScanView, cell_m: float | None) -> BareGround:
-    """The bare ground below the surface model."""
-    return scan.shared(("ground", cell_m), lambda: terrain(surface_model(scan, cell_m).raster))
+    """The bare ground below the surface model, within the outline of the survey."""
+
+    def made() -> BareGround:
+        return terrain(surface_model(scan, cell_m).raster, _inside(scan, cell_m))
+
+    return scan.shared(("ground", cell_m), made)
+
+
+def _inside(scan: ScanView, cell_m: float | None) -> Bool:
+    measured, sure = scan.raster(cell_m), surface_model(scan, cell_m).raster
+
+    def made() -> Bool:
+        return outline(measured.known, sure.known, measured.grid.cell_m)
+
+    return scan.shared(("inside", cell_m), made)
+
+
+def complete_model(scan: ScanView, cell_m: float | None) -> tuple[Raster, U8]:
+    """The surface without holes inside the outline of the survey, and none beyond it; (rows, cols)
+    0 where it is measured, FILLED, or UNCERTAIN.
+
+    Uncertain heights are measured ones that :func:`surface_model` leaves out and no keyframe sees
+    through. Other cells are filled from the lower side.
+    """
+    return scan.shared(("complete", cell_m), lambda: _complete_model(scan, cell_m))
+
+
+def _complete_model(scan: ScanView, cell_m: float | None) -> tuple[Raster, U8]:
+    measured, seen, inside = scan.raster(cell_m), surface_model(scan, cell_m), _inside(scan, cell_m)
+    known = seen.raster.known
+    kept = _unrefuted(scan, measured, inside & measured.known & ~known, ())
+    both = replace(
+        seen.raster,
+        height_m=np.where(kept, measured.height_m, seen.raster.height_m),
+        sigma_m=np.where(kept, measured.sigma_m, seen.raster.sigma_m),
+        rgb=np.where(kept[..., None], measured.rgb, seen.raster.rgb),
+    )
+    unsure = kept | seen.is_filled
+    whole = completed(both, bare_ground(scan, cell_m).everywhere_m, inside, unsure)
+    origin = np.where(known & ~seen.is_filled, 0, FILLED).astype(np.uint8)
+    origin[kept] = UNCERTAIN
+    return without_cells(whole, ~inside), origin
 
 
 def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> SurfaceHeights:
