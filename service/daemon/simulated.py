@@ -123,6 +123,7 @@ def _render(folder: Path, given: dict[str, str]) -> None:
             fps=float(given["fps"]),
             depth_frames=0,
         )
+        log.info("laying out the site of the simulated flight; rendering takes some minutes, once")
         simulation = recording.prepare(options)
     except ValueError as error:
         raise InputError(f"camera.source sim: {error}") from error

@@ -319,3 +319,12 @@ def test_long_commands_say_at_once_what_they_do(
 def test_the_smallest_extra_or_package_is_named() -> None:
     assert installs("starlette") == "'skyrelief[portal]'"
     assert installs("rasterio") == "rasterio" and installs("foxglove") == "foxglove-sdk"
+
+
+def test_ctl_rounds_what_people_read(capsys: pytest.CaptureFixture[str]) -> None:
+    from service.commands.ctl import _print
+
+    found = {"distance_m": 12.3456789, "lat_deg": 47.123456789, "keyframes": 3, "sigma_m": None}
+    _print(found, as_json=False)
+    said = capsys.readouterr().out.splitlines()
+    assert said == ["distance m: 12.35", "lat deg: 47.1234568", "keyframes: 3", "sigma m: unknown"]
