@@ -7,6 +7,7 @@ and MicaSense write.
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import struct
@@ -25,6 +26,7 @@ from service.cameras.xmp import xmp_values
 
 DEFAULT_SIGMA_H_M, MAX_SIGMA_M = 5.0, 1000.0
 NAME_TIME = re.compile(r"(?<!\d)(20\d{6})[T_-]?(\d{6})[._]?(\d{1,6})?Z(?![A-Za-z0-9])")
+EXIF_HEAD = b"Exif\0\0"
 EXIF_BYTES = 1 << 22
 """Of a file's EXIF that is read; cameras write 64 KiB, and a maker's note."""
 
@@ -84,7 +86,8 @@ def read_tags(path: Path, hemisphere: str = "") -> Tags:
 
 
 class _Metered:
-    """A file of which ``EXIF_BYTES`` can be read: a list in a TIFF is as long as the file."""
+    """A file of which ``EXIF_BYTES`` can be read: tags may state one place again and again, and a
+    list in a TIFF is as long as the file."""
 
     def __init__(self, file: Any) -> None:
         self._file, self._left = file, EXIF_BYTES
@@ -111,15 +114,17 @@ def _read_tags(path: Path, hemisphere: str) -> Tags:
     with Image.open(path) as image:
         size_px = (int(image.width), int(image.height))
         packet = image.info.get("xmp") or b""
-        if len(image.info.get("exif") or b"") > EXIF_BYTES:
-            raise OSError("the tags are too large")
-        metered = None
-        if hasattr(image, "tag_v2"):  # a TIFF, whose tags are not in memory yet
-            image.fp = metered = _Metered(image.fp)
-        exif = image.getexif()
+        block = (image.info.get("exif") or b"").removeprefix(EXIF_HEAD)
+        metered = _Metered(io.BytesIO(block) if block else image.fp)
+        exif = Image.Exif()
+        if block:
+            exif.load_from_fp(metered)  # type: ignore[arg-type]
+        else:
+            if hasattr(image, "tag_v2"):  # a TIFF, whose tags are not in memory yet
+                image.fp = metered
+            exif = image.getexif()
         photo, gps = dict(exif.get_ifd(0x8769)), dict(exif.get_ifd(0x8825))
-        if metered is not None:
-            metered.check()
+        metered.check()
     xmp = xmp_values(packet) if isinstance(packet, bytes) else {}
     place, is_hemisphere_missing, apart = _place(gps, xmp, hemisphere)
     altitude, differs = _altitude(gps, xmp)
@@ -136,7 +141,7 @@ def _read_tags(path: Path, hemisphere: str) -> Tags:
         geotag=geotag,
         pan_deg=_pan_deg(geotag, xmp),
         lens=lens_of(photo, xmp, size_px),
-        turned_deg=TURNED_DEG.get(exif.get(274), 0),
+        turned_deg=TURNED_DEG.get(exif.get(274, 1), 0),
         camera=xmp.get("ImageSource", "").strip()[:40],
         differences=(*apart, *differs),
         is_hemisphere_missing=is_hemisphere_missing,
