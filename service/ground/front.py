@@ -18,7 +18,13 @@ from dataclasses import replace
 from functools import partial
 
 from service.errors import OutsideError
-from service.listener import BoundedListener, ListenerLimits, Peer, network_of
+from service.listener import (
+    BoundedListener,
+    ListenerLimits,
+    Peer,
+    network_of,
+    raise_descriptor_limit,
+)
 from service.stream.session import ENDPOINT, SessionConfig
 from service.workers import Worker
 
@@ -59,7 +65,7 @@ class Front:
 
     def _listen(self) -> BoundedListener:
         try:
-            listener = BoundedListener(self._host, self._port, LIMITS)
+            listener = BoundedListener(self._host, self._port, _limits())
         except OSError as error:
             raise OutsideError(
                 f"datalink does not open at {self.endpoint}: {error.strerror}; another program may "
@@ -194,6 +200,12 @@ async def _exchange(
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _limits() -> ListenerLimits:
+    """LIMITS, but at most a quarter of the descriptors; a connection takes two."""
+    total = max(1, min(LIMITS.total, raise_descriptor_limit() // 8))
+    return replace(LIMITS, total=total, per_address=min(LIMITS.per_address, total))
 
 
 def _is_closed(connection: socket.socket) -> bool:

@@ -16,7 +16,7 @@ from service.errors import InputError, OutsideError
 from service.ground import storage
 from service.ground.guard import kept_token
 from service.ground.library import Library
-from service.ground.storage import scan_folder, take_in
+from service.ground.storage import scan_files, scan_folder, take_in
 from service.stream import codec
 from service.stream.naming import NAME, station_name
 from service.stream.radio_messages import pack_announce, pack_tile, tag_of, unpack_announce
@@ -197,6 +197,17 @@ def test_a_drone_of_any_name_keeps_to_its_own_folder(
         bin_name = library.delete(name, "scan-1")
         assert library.restore(bin_name) == (name, "scan-1")
     assert {entry["drone"] for entry in library.scans()} == set(names)
+
+
+def test_scans_that_are_deleted_meanwhile_are_left_out(tmp_path: Path) -> None:
+    for drone in ("red", "blue"):
+        for scan in ("scan-1", "scan-2"):
+            ScanStore.create(tmp_path / "drones" / drone / scan / "scan.db", HEADER).close()
+    files = scan_files(tmp_path, "scan.db")
+    first = next(files)
+    for drone in ("red", "blue"):
+        shutil.rmtree(tmp_path / "drones" / drone)
+    assert list(files) == [] and first.name == "scan.db"
 
 
 def test_drones_of_an_earlier_version_stay_where_they_are(tmp_path: Path) -> None:
