@@ -53,6 +53,15 @@ def kind(browser: Browser, wanted: str) -> None:
     browser.wait(f"document.querySelector('.state').classList.contains('{wanted}')", 30)
 
 
+def test_logging_out_ends_the_session(browser: Browser, scans: Path) -> None:
+    may_change = "fetch('/api/upload').then(answer => String(answer.status))"
+    with page_of(browser, scans, []):
+        browser.wait(f"await {may_change} !== '401'")
+        browser.click("Log out")
+        browser.wait(f"await {may_change} === '401'")
+        browser.wait("document.querySelectorAll('article').length === 1")  # this machine may read
+
+
 def test_the_state_says_when_the_drone_was_heard(browser: Browser, scans: Path) -> None:
     entry = {
         "drone": "drone-1", "scan": "test-1", "heard_unix_s": time.time() - 25.0, "open": True,

@@ -47,8 +47,13 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   const [upload, line, endUploads] = uploads(again);
   const cut = el("p", { className: "stale", hidden: true });
   cut.setAttribute("role", "status");
+  const leave = el("button", {
+    textContent: "Log out",
+    title: "End this browser's session",
+    onclick: () => void api.ask("/api/logout", "POST").then(() => location.reload(), notify),
+  });
   root.replaceChildren(
-    el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again, upload)),
+    el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again, upload), leave),
     cut,
     line,
     jobList(title),
