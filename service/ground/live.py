@@ -1,23 +1,21 @@
-"""Live data of a growing scan for a browser: chunks of points, corrections, the track.
+"""Live data of a growing scan for a browser: depth images, corrections, the track.
 
-A message is either JSON text or a binary chunk (little-endian):
+A message is either JSON text or a layer of a keyframe in binary (little-endian):
 
 ======  =======================================================================
 bytes   content
 ======  =======================================================================
 4       length J of the JSON
-J       JSON: ``seq``, ``layer``, ``points`` N, ``unit_m``, ``apart`` (of neighbouring
-        points at depth 1), ``T`` (16, column by column)
-pad     zeros up to a multiple of 4
-6 N     int16 x, y, z of the camera frame, in ``unit_m``
-3 N     uint8 red, green, blue (sRGB)
-N       uint8 sigma, in steps of 2 cm
-N       uint8 views
+J       JSON: ``seq``, ``layer``, ``time_unix_s``; ``size`` w, h of the layer's grid and its
+        ``K`` fx, fy, cx, cy; ``box``, ``low`` and ``step`` as in docs/wire.md; ``T`` (16, column
+        by column) and ``scale`` in force; ``bytes`` of the sections
+..      sections: mask, depth (prediction), sigma, views, colour
 ======  =======================================================================
 
-Points stay in the camera's frame, so a correction is a new matrix and scale. JSON texts have a
-``type``: ``repose``, ``track``, ``state``, ``site`` (where this scan and those tied to it are
-shown), and once a second ``link``.
+Mask, depth and colour are the bytes of docs/wire.md, as they are stored; sigma and views are their
+codes under zlib in place of JPEG-LS, which browsers do not decode. Depth stays in the camera's
+frame, so a correction is a new matrix and scale. JSON texts have a ``type``: ``repose``, ``track``,
+``state``, ``site`` (where this scan and those tied to it are shown), and once a second ``link``.
 """
 
 from __future__ import annotations
@@ -29,6 +27,7 @@ import logging
 import math
 import struct
 import time
+import zlib
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,54 +37,65 @@ import numpy as np
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from recon.mapping.cloud_fusion import cloud_of
-from recon.types import F64, DepthMap, Keyframe
+from recon.types import F64
 from service.errors import SkyreliefError
 from service.ground.live_site import SiteNews
+from service.stream import codec, planes
 from service.stream.ranges import RangeSet
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
 
-SIGMA_STEP_M = 0.02
 TRACK_POINTS = 2000
 MAX_REASON_BYTES = 123  # of a WebSocket's close frame
 
 
-def chunk_message(keyframe: Keyframe, layer: int, max_points: int | None = None) -> bytes:
-    """The points of ``keyframe`` as a binary message, thinned to ``max_points``.
+def chunk_message(store: ScanStore, seq: int, layer: int) -> bytes | None:
+    """A layer of a keyframe as a binary message; None when there is nothing to decode.
 
-    They come in random order, so that a viewer may draw any first part of them.
+    What does not decode, tiles of the narrow radio, and depth in JPEG-LS are coded again.
     """
-    depth = keyframe.depth
-    local = DepthMap(depth.depth_m, depth.sigma_m, depth.views, depth.K, np.eye(4))
-    cloud = cloud_of(local, keyframe.bgr, keyframe.fresh)
-    rows = np.random.default_rng(keyframe.seq).permutation(len(cloud))[:max_points]
-    xyz = cloud.xyz_m[rows]
-    reach = float(np.abs(xyz).max()) if len(xyz) else 1.0
-    unit = max(reach, 1e-3) / 32767.0
-    head = json.dumps(
+    data = store.chunk(seq, layer) or b""
+    opened = codec.unpack(data)
+    if (
+        opened is None
+        or opened[0].method != planes.METHOD_PREDICTION
+        or opened[0].seq != seq
+        or codec.decode([data]) is None
+    ):
+        sent = store.keyframe_as_sent(seq)
+        opened = None if sent is None else codec.unpack(codec.encode(sent, sent.time_ns)[-1])
+    if opened is None:
+        return None
+    head, (mask, depth, sigma, views, colour) = opened
+    sections = mask, depth, _codes(sigma), _codes(views), colour
+    repose = store.repose(seq)
+    K = head.grid_K
+    text = json.dumps(
         {
             "type": "chunk",
-            "seq": keyframe.seq,
+            "seq": seq,
             "layer": layer,
-            "points": len(rows),
-            "unit_m": unit,
-            "apart": 1.0 / float(depth.K[0, 0]),
-            "time_unix_s": keyframe.time_ns / 1e9,
-            "T": columns(depth.T_world_camera),
+            "time_unix_s": head.time_unix_ns / 1e9,
+            "size": head.grid_px,
+            "K": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+            "box": head.box,
+            "low": head.inverse_min,
+            "step": head.inverse_step,
+            "T": columns(head.T_world_camera if repose is None else repose.T_world_camera),
+            "scale": 1.0 if repose is None else repose.scale,
+            "bytes": [len(section) for section in sections],
         }
     ).encode()
-    sigma = np.clip(np.rint(cloud.sigma_m[rows] / SIGMA_STEP_M), 0, 255).astype(np.uint8)
-    body = (
-        np.rint(xyz / unit).astype("<i2").tobytes(),
-        cloud.rgb[rows].tobytes(),
-        sigma.tobytes(),
-        cloud.views[rows].tobytes(),
-    )
-    padding = b"\0" * (-(4 + len(head)) % 4)
-    return b"".join([struct.pack("<I", len(head)), head, padding, *body])
+    return b"".join([struct.pack("<I", len(text)), text, *sections])
+
+
+def _codes(section: bytes) -> bytes:
+    """The codes of a JPEG-LS section under zlib; empty when it is."""
+    size = planes.image_size(section)
+    codes = None if size is None else planes.open_jpeg_ls(section, *size)
+    return b"" if codes is None else zlib.compress(codes.astype(np.uint8).tobytes(), 1)
 
 
 def columns(T: F64) -> list[float]:
@@ -136,10 +146,9 @@ class LiveFeed:
     """
 
     store: ScanStore
-    max_points: int | None = None  # of one chunk
+    coarse: bool = False  # send coarse layers only
     heard_unix_s: float = 0.0  # when this feed saw the scan grow or change; else its last pose
     _sent: dict[int, int] = field(default_factory=dict)  # keyframe to the layer sent
-    _scale: dict[int, float] = field(default_factory=dict)
     _revision: dict[int, int] = field(default_factory=dict)
     _track: FlightPath = field(init=False)
     _finished: bool | None = None
@@ -163,14 +172,18 @@ class LiveFeed:
 
     def _unsent(self, max_chunks: int) -> Iterator[str | bytes]:
         states = self.store.states()
-        due = [seq for seq, (layer, _) in states.items() if layer > self._sent.get(seq, -2)]
+        finest = {
+            seq: min(layer, 0) if self.coarse else layer for seq, (layer, _) in states.items()
+        }
+        due = [seq for seq, layer in finest.items() if layer > self._sent.get(seq, -2)]
         self._more = len(due) > max_chunks
         for seq in due[:max_chunks]:
-            self._sent[seq] = states[seq][0]
-            keyframe = self.store.keyframe(seq)
-            if keyframe is not None:
-                self._note_repose(seq)
-                yield chunk_message(keyframe, states[seq][0], self.max_points)
+            self._sent[seq] = finest[seq]
+            repose = self.store.repose(seq)
+            message = chunk_message(self.store, seq, finest[seq])
+            if message is not None:
+                self._revision[seq] = -1 if repose is None else repose.revision
+                yield message
         yield from self._corrections(states)
         if self._track.grown():
             if not self.heard_unix_s and self._track.last is not None:
@@ -180,11 +193,6 @@ class LiveFeed:
         if state != self._finished and not self._more:
             self._finished = state
             yield json.dumps({"type": "state", "finished": state, "keyframes": len(states)})
-
-    def _note_repose(self, seq: int) -> None:
-        repose = self.store.repose(seq)
-        self._revision[seq] = -1 if repose is None else repose.revision
-        self._scale[seq] = 1.0 if repose is None else repose.scale
 
     def _corrections(self, states: dict[int, tuple[int, int]]) -> Iterator[str]:
         """Re-poses newer than the pose that a chunk was sent with."""
@@ -198,7 +206,7 @@ class LiveFeed:
                 {
                     "type": "repose",
                     "seq": seq,
-                    "scale": repose.scale / self._scale[seq],
+                    "scale": repose.scale,
                     "T": columns(repose.T_world_camera),
                 }
             )
@@ -292,7 +300,7 @@ async def serve_live(
     reason = ""
     try:
         store = await run_in_threadpool(ScanStore.open, folder / "scan.db")
-        feed = LiveFeed(store, _max_points(socket))
+        feed = LiveFeed(store, socket.query_params.get("layer") == "0")
         gone = asyncio.create_task(_until_gone(socket))
         site, link = SiteNews(library, folder), _LinkNews(folder, progress)
         while not gone.done():
@@ -308,12 +316,6 @@ async def serve_live(
             await run_in_threadpool(store.close)
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             await socket.close(reason=reason.encode()[:MAX_REASON_BYTES].decode(errors="ignore"))
-
-
-def _max_points(socket: WebSocket) -> int | None:
-    text = socket.query_params.get("points", "")
-    is_number = text.isascii() and text.isdigit() and len(text) < 9
-    return min(max(int(text), 100), 1_000_000) if is_number else None
 
 
 def _send(socket: WebSocket, message: str | bytes) -> Awaitable[None]:

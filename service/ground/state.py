@@ -35,7 +35,7 @@ KEPT = 100
 MAP_AGE_S, COVERAGE_AGE_S = 1.0, 2.0
 """Age at which the live map and the coverage layer of a scan are made again."""
 
-SHOWN_S = 60.0
+SHOWN_S = 86400.0
 """A job that has ended is listed for so long."""
 
 CLOSE_S = 5.0
@@ -85,6 +85,7 @@ class Job:
             "percent": round(100.0 * self.progress.share),
             "left_s": None if left_s is None else round(left_s),
             "queued_unix_s": self.queued_unix_s,
+            "ended_s": None if self.ended_unix_s is None else time.time() - self.ended_unix_s,
             "file": self.file,
             "error": self.error,
         }
@@ -147,7 +148,7 @@ class Jobs:
             return [job.shown() for job in self._jobs if job.folder == folder]
 
     def listed(self) -> list[dict[str, Any]]:
-        """The jobs that wait, run or have just ended, the oldest first."""
+        """The jobs that wait, run or have ended lately, the oldest first."""
         since = time.time() - SHOWN_S
         with self._lock:
             return [j.shown() for j in self._jobs if (j.ended_unix_s or since) >= since]

@@ -18,8 +18,8 @@ IMAGE_SHARE = 0.05
 """Bytes of a flight's images over those of its layers."""
 MAX_IMAGE_BYTES, MAX_IMAGE_PX = 1 << 16, 1024
 """A larger image is invalid."""
-STEPS = ((320, 70), (320, 50), (320, 35), (320, 25), (320, 18), (256, 18), (208, 18), (160, 18))
-"""Width in pixels and quality of JPEG, the best first."""
+STEPS = ((320, 28), (320, 23), (320, 18), (256, 20), (208, 20))
+"""Width in pixels and quality of JPEG, the best first: what one image leaves is for later ones."""
 
 
 def encode_image(bgr: U8, max_bytes: float = math.inf) -> bytes:

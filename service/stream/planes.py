@@ -126,7 +126,7 @@ def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float)
     if method == METHOD_PREDICTION:
         codes = plane_coders.decode_codes(data, known)
     elif method == METHOD_JPEG_LS:
-        codes = _open_jpeg_ls(data, w, h)
+        codes = open_jpeg_ls(data, w, h)
     if codes is None:
         return None
     return np.asarray(1.0 / (low + step * codes.astype(np.float64)), np.float32)
@@ -151,7 +151,7 @@ def decode_sigma(data: bytes, w: int, h: int) -> F32 | None:
     """(h, w) sigma in metres; an empty section means that none is known (NaN)."""
     if not data:
         return np.full((h, w), np.nan, np.float32)
-    codes = _open_jpeg_ls(data, -(-w // SIGMA_BLOCK_PX), -(-h // SIGMA_BLOCK_PX))
+    codes = open_jpeg_ls(data, -(-w // SIGMA_BLOCK_PX), -(-h // SIGMA_BLOCK_PX))
     if codes is None:
         return None
     table = SIGMA_UNIT_M * 2.0 ** ((np.arange(256) - 1) / SIGMA_STEPS_PER_OCTAVE)
@@ -173,7 +173,7 @@ def decode_views(data: bytes, w: int, h: int) -> U8 | None:
     """(h, w) counts of views; an empty section means one."""
     if not data:
         return np.ones((h, w), np.uint8)
-    codes = _open_jpeg_ls(data, -(-w // VIEWS_BLOCK_PX), -(-h // VIEWS_BLOCK_PX))
+    codes = open_jpeg_ls(data, -(-w // VIEWS_BLOCK_PX), -(-h // VIEWS_BLOCK_PX))
     if codes is None:
         return None
     return _enlarge(np.clip(codes, 1, MAX_VIEWS).astype(np.uint8), VIEWS_BLOCK_PX, w, h)
@@ -247,7 +247,7 @@ def _jpeg_ls(codes: Array) -> bytes:
     return b"".join(bytes(part) for part in (*encoder.encode(frame), *encoder.encode(None)))
 
 
-def _open_jpeg_ls(data: bytes, w: int, h: int) -> Array | None:
+def open_jpeg_ls(data: bytes, w: int, h: int) -> Array | None:
     """(h, w) codes of a JPEG-LS image of exactly that size and one component."""
     if image_size(data) != (w, h):
         return None

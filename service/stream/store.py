@@ -265,15 +265,18 @@ class ScanStore:
 
         Without a layer, the tiles of the narrow radio are used.
         """
+        decoded = self.keyframe_as_sent(seq)
+        repose = self.repose(seq)
+        return decoded if decoded is None or repose is None else repose.applied_to(decoded)
+
+    def keyframe_as_sent(self, seq: int) -> Keyframe | None:
+        """As :meth:`keyframe`, without the re-pose."""
         sql = f"SELECT layer FROM chunks WHERE seq = ? AND {_IS_LAYER} ORDER BY layer DESC"
         for (number,) in self.database.all(sql, (seq,)):
             decoded = self._decoded(seq, number)
             if decoded is not None and decoded.seq == seq:
-                break
-        else:
-            decoded = self._radio.keyframe(seq)
-        repose = self.repose(seq)
-        return decoded if decoded is None or repose is None else repose.applied_to(decoded)
+                return decoded
+        return self._radio.keyframe(seq)
 
     def hold_decoded(self, max_bytes: int = HELD_BYTES) -> None:
         """Hold decoded layers in memory, for who reads all keyframes several times; they must not

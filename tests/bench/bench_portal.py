@@ -51,6 +51,7 @@ FRAME_TIMES = """new Promise(done => {
   };
   requestAnimationFrame(tick);
 })"""
+POINTS = "[...document.querySelectorAll('button')].find(b => b.textContent === 'Points').click()"
 BUDGET = """(() => {
   const label = [...document.querySelectorAll('.settings label')]
     .find(l => l.textContent.startsWith('Points drawn'));
@@ -87,12 +88,13 @@ def run(options: BenchOptions) -> list[BenchResult]:
             first = _first_points(browser, base, max(3, options.rounds // 5))
             arrivals = _arrivals(browser, base, growing)
             tiles = _tiles_arrive(browser, base, growing)
-            flying, whole, stops = _frame_times(browser, base)
+            surface, flying, whole, stops = _frame_times(browser, base)
     return [
         _result("page load, cold cache, list drawn", load),
         _result("from the list to the first points of 10.1 M", first),
         _result("keyframe in the store to points in the browser", arrivals),
         _result("keyframe in the store to all tiles of the map", tiles),
+        _result("frame while flying over surfaces of 10.1 M points, coarser to keep up", surface),
         _result("frame while flying over 10.1 M points, thinned to keep up", flying),
         _result("all 10.1 M points drawn after a movement, slice by slice", whole),
         _result("longest stop of the page meanwhile", stops),
@@ -198,11 +200,17 @@ def _tiles_arrive(browser: Browser, base: str, store: ScanStore) -> list[float]:
     return times
 
 
-def _frame_times(browser: Browser, base: str) -> tuple[list[float], list[float], list[float]]:
-    """Milliseconds of frames while flying over the scan, until all of it is drawn, of stops."""
+def _frame_times(
+    browser: Browser, base: str
+) -> tuple[list[float], list[float], list[float], list[float]]:
+    """Milliseconds of frames while flying over surfaces and over points, until all points are
+    drawn, of stops."""
     points = KEYFRAMES * LARGE_PX[0] * LARGE_PX[1]
     browser.open(f"{base}/#/view/bench/large")
     browser.wait(f"Number(document.body.dataset.points) >= {0.99 * points}", 120)
+    browser.run(FRAME_TIMES % SETTLING)
+    surface = [float(t) for t in browser.run(FRAME_TIMES % FRAMES)]
+    browser.run(POINTS)
     browser.run(BUDGET)
     browser.run(FRAME_TIMES % SETTLING)  # until the page knows what this machine can draw
     flying = [float(t) for t in browser.run(FRAME_TIMES % FRAMES)]
@@ -211,4 +219,4 @@ def _frame_times(browser: Browser, base: str) -> tuple[list[float], list[float],
         total, *ticks = browser.run(ALL_DRAWN % {"points": round(0.99 * points)})
         whole.append(float(total))
         stops.append(max(float(t) for t in ticks))
-    return flying, whole, stops
+    return surface, flying, whole, stops

@@ -7,6 +7,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,7 @@ from service.ground.vehicle import Vehicle
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.scans.folder import write_deliverables
 from service.stream.codec import encode
+from service.stream.images import encode_image
 from service.stream.records import Repose
 from service.stream.store import ScanStore
 
@@ -145,12 +147,21 @@ def test_the_tiles_are_loaded_where_the_cloud_was(
     assert np.abs(off[:2]).max() < 15.0 and abs(off[2]) < 5.0  # about the scan's own origin
 
 
-def test_the_latest_image_is_shown(browser: Browser, portal: Portal) -> None:
+def test_the_latest_image_is_shown(
+    browser: Browser, portal: Portal, scans: Path, house: HouseFlight
+) -> None:
     browser.open(portal.url)
     browser.wait("document.querySelectorAll('article').length === 1")
     browser.open(f"{base(portal)}/#/view/drone-1/test-1")
     browser.wait("document.body.dataset.image === '4'")
     assert browser.run("document.querySelector('.latest img').naturalWidth") == 160
+    whole = np.full((240, 320, 3), 128, np.uint8)
+    one = house.keyframe(5, 30.0)
+    little = replace(one, fresh=one.fresh & (np.arange(160) < 8))
+    with ScanStore.open(scans / "drone-1/test-1/scan.db") as scan:
+        scan.add_keyframe(5, encode(little, one.time_ns), encode_image(whole))
+    browser.wait("document.body.dataset.image === '5'")
+    assert browser.run("document.querySelector('.latest img').naturalWidth") == 320
 
 
 def test_an_image_gets_finer_with_its_keyframe(
@@ -239,8 +250,15 @@ def test_a_scan_in_flight_is_drawn_with_those_it_is_tied_to(
         while follower.turn(time.time()):
             pass
         browser.wait("Number(document.body.dataset.ties) > 1")  # by the message `site`
-        browser.wait("document.querySelector('.figures').textContent.includes(' ties, ')")
+        browser.wait("document.querySelector('.figures').textContent.includes('joined in ')")
         browser.wait(f"Number(document.body.dataset.points) > {alone}")
+        own = "document.querySelector('.figures').innerText.match(/Images\\n(\\d+)/)?.[1]"
+        slider = "document.querySelector('.time input')"
+        assert browser.run(f"[{own}, {slider}.max]") == ["4", "4"]  # of this scan alone
+        browser.run(f"{slider}.value = 2; {slider}.dispatchEvent(new Event('input'))")
+        browser.wait(f"{own} === '2'")
+        browser.run(f"{slider}.value = 4; {slider}.dispatchEvent(new Event('input'))")
+        browser.wait(f"{own} === '4'")
         choose = (
             "(() => { const s = document.querySelector('.tools select'); s.value = 'scan';"
             " s.dispatchEvent(new Event('change')); return s.value; })()"
@@ -266,6 +284,7 @@ def test_what_is_new_since_the_last_visit_has_its_colours(browser: Browser, tmp_
         browser.screen(1280, 800, pixel_ratio=1.0)  # pixels are counted
         browser.open(f"{base}/#/view/b/june")
         browser.wait(f"Number(document.body.dataset.points) > {samples(now)}")
+        browser.click("Points")
         drawn = browser.wait("Number(document.body.dataset.drawn)")
         assert drawn <= samples(now)  # the earlier date is only compared with
         choose = (

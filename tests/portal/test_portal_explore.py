@@ -29,7 +29,11 @@ COLOURED = f"""(() => {{
   g.drawImage(s, 0, 0);
   const d = g.getImageData(0, 0, c.width, c.height).data;
   let n = 0;
-  for (let i = 0; i < d.length; i += 4) n += Math.abs(d[i + 1] - d[i + 2]) > 20;
+  const isSky = i => {{  // as the left border in the same row
+    const s = i - i % (4 * c.width);
+    return [0, 1, 2].every(k => Math.abs(d[i + k] - d[s + k]) < 4);
+  }};
+  for (let i = 0; i < d.length; i += 4) n += !isSky(i) && Math.abs(d[i + 1] - d[i + 2]) > 20;
   return n / (d.length / 4);
 }})()"""
 """Share of the scene's pixels that are neither gray nor background."""
@@ -68,6 +72,7 @@ def page(browser: Browser, base: str) -> Browser:
     """The scan, whole and at rest."""
     browser.open(f"{base}#/view/drone-1/test-1")
     browser.wait("document.body.dataset.points > 71000")  # all five keyframes
+    browser.click("Points")
     browser.click("Whole site")
     settle(browser)
     return browser
@@ -103,8 +108,12 @@ def test_the_time_slider_shows_the_cloud_as_it_was(page: Browser) -> None:
     page.run(SET.format(".time input", "2"))
     assert drawn(page) == pytest.approx(whole * 2 / 5, rel=0.05)
     assert page.run("document.querySelector('.time output').textContent") == "1 s"
+    page.wait("document.body.dataset.image === '1'")  # the image and the figures go along
+    images = "document.querySelector('.figures').innerText.match(/Images\\n(\\d+)/)?.[1]"
+    page.wait(f"{images} === '2'")
     page.run(SET.format(".time input", "5"))
     assert drawn(page) == whole
+    page.wait(f"document.body.dataset.image === '4' && {images} === '5'")
 
 
 def test_the_clip_box_cuts_the_scene_and_gives_it_back(page: Browser) -> None:
@@ -196,6 +205,7 @@ def test_a_click_on_a_camera_shows_its_image(
 ) -> None:
     browser.open(f"{base}#/view/drone-1/test-1/10,-130,70,10,0,20")
     browser.wait("document.body.dataset.image === '4'")
+    browser.click("Cameras")
     settle(browser)
     second = house.pose(5.0)[:3, 3]  # where the second was taken
     browser.mouse(*projected(browser, view(browser), second))
@@ -203,6 +213,14 @@ def test_a_click_on_a_camera_shows_its_image(
     caption = "document.querySelector('.latest figcaption').textContent"
     assert browser.run(caption).startswith("keyframe 1")
     assert browser.run("document.querySelector('.latest img').naturalWidth") > 0
+    browser.run("document.querySelector('.latest .image').click()")
+    large = "document.querySelector('dialog.large img')"
+    browser.wait(f"{large}.naturalWidth > 0")
+    assert browser.run(f"{large}.clientWidth") > 3 * browser.run(
+        "document.querySelector('.latest img').clientWidth"
+    )
+    browser.key("Escape")
+    browser.wait(f"{large} === null")
     browser.click("Latest")
     browser.wait("document.body.dataset.image === '4'")
 

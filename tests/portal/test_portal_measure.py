@@ -159,6 +159,10 @@ def test_clicks_measure_the_house(ruler: Ruler, house: HouseFlight) -> None:
     assert len(ruler.spots) == 2
     ruler.page.mouse(600, 400, to=(640, 400))  # turns the view
     assert len(ruler.spots) == 2
+    figures = ruler.figures
+    ruler.page.click("Measure")  # left: what is measured stays
+    assert len(ruler.spots) == 2 and ruler.figures == figures
+    ruler.page.click("Measure")
     ruler.page.key("Escape")
     ruler.page.key("Escape")
     assert ruler.page.run("document.querySelector('.measure').hidden")

@@ -18,6 +18,7 @@ from service.ground.live import LiveFeed
 from service.ground.portal import Portal, PortalConfig
 from service.scans.folder import write_deliverables
 from service.stream.codec import encode
+from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
@@ -86,6 +87,26 @@ def test_the_state_says_when_the_drone_was_heard(browser: Browser, scans: Path) 
             " performance.now = () => now() + 6e4; }; 0"
         )  # a minute later, and no chunk came
         browser.wait(f"/receiving · .* · no keyframe for [67][0-9] s/.test({STATE})")
+
+
+def test_a_drone_that_is_back_with_a_new_scan_is_linked(
+    browser: Browser, scans: Path, house: HouseFlight
+) -> None:
+    silent = {"drone": "drone-1", "scan": "test-1", "heard_unix_s": time.time() - 25.0}
+    entries = [silent]
+    with page_of(browser, scans, entries) as base:
+        browser.open(f"{base}/#/view/drone-1/test-1")
+        kind(browser, "silent")
+        browser.wait("document.querySelector('.figures').classList.contains('old')")
+        header = ScanHeader("test-2", "drone-1", house.start_ns + 10**12)
+        with ScanStore.create(scans / "drone-1/test-2/scan.db", header) as scan:
+            one = house.keyframe(0, 0.0)
+            scan.add_keyframe(0, encode(one, one.time_ns))
+            entries.append(silent | {"scan": "test-2", "heard_unix_s": time.time() + 60.0})
+            back = "document.querySelector('a.newer')"
+            browser.wait(f"{back}?.textContent === 'back as scan test-2: open'", 30)
+            browser.run(f"{back}.click()")
+            browser.wait("location.hash.endsWith('/drone-1/test-2')")
 
 
 def test_the_report_is_linked_when_the_scan_has_finished(

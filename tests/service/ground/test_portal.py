@@ -8,6 +8,7 @@ import struct
 import threading
 import urllib.error
 import urllib.request
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,16 +19,15 @@ import pytest
 from loopback import until
 from portal_client import ONE, TOKEN, Client, FakeOperator, client, flown_store, serving, store
 
-from recon import se3
-from recon.types import Keyframe
 from service.errors import InputError, OutsideError
 from service.ground import live
 from service.ground.http import PAGE
 from service.ground.library import Library
-from service.ground.live import SIGMA_STEP_M, LiveFeed
+from service.ground.live import LiveFeed
 from service.ground.portal import Portal, PortalConfig, config_of
 from service.ground.vehicle import Vehicle
 from service.listener import parse_address
+from service.stream import codec, plane_coders, planes
 from service.stream.codec import encode
 from service.stream.images import encode_image
 from service.stream.records import Repose, ScanHeader
@@ -337,19 +337,30 @@ def unpack(message: bytes) -> tuple[dict[str, Any], np.ndarray[Any, Any], np.nda
     """Head, world points and colours of a binary chunk, as the page reads them."""
     (size,) = struct.unpack_from("<I", message)
     head = json.loads(message[4 : 4 + size])
-    at = 4 + size + (-(4 + size) % 4)
-    n = head["points"]
-    xyz = np.frombuffer(message, "<i2", 3 * n, at).reshape(n, 3) * head["unit_m"]
-    rgb = np.frombuffer(message, np.uint8, 3 * n, at + 6 * n).reshape(n, 3)
-    assert len(message) == at + 11 * n
+    ends = 4 + size + np.cumsum(head["bytes"])
+    assert len(message) == ends[-1]
+    mask, depth, sigma, views, colour = np.split(np.frombuffer(message, np.uint8), ends)[:5]
+    mask = mask[4 + size :]
+    x, y, w, h = head["box"]
+    known = planes.decode_mask(mask.tobytes(), w, h)
+    codes = plane_coders.decode_codes(depth.tobytes(), known)
+    bgr = planes.decode_colour(colour.tobytes(), w, h)
+    assert codes is not None and bgr is not None
+    for coded, block in ((sigma, 4), (views, 2)):
+        blocks = -(-w // block) * -(-h // block)
+        assert not len(coded) or len(zlib.decompress(coded.tobytes())) == blocks
+    rows, cols = np.nonzero(known)
+    z = head["scale"] / (head["low"] + head["step"] * codes[rows, cols])
+    fx, fy, cx, cy = head["K"]
+    xyz = np.column_stack([(cols + x - cx) / fx * z, (rows + y - cy) / fy * z, z])
     T = np.array(head["T"]).reshape(4, 4).T
-    return head, xyz @ T[:3, :3].T + T[:3, 3], rgb
+    return head, xyz @ T[:3, :3].T + T[:3, 3], bgr[rows, cols, ::-1]
 
 
 def test_the_live_view_grows_with_the_scan(client: Client, store: Path, house: HouseFlight) -> None:
     from websockets.sync.client import connect
 
-    url = client.base.replace("http", "ws") + "/api/scans/drone-1/test-1/live?points=5000"
+    url = client.base.replace("http", "ws") + "/api/scans/drone-1/test-1/live"
     with ScanStore.open(store / "drone-1/test-1/scan.db") as scan, connect(url) as socket:
         chunks: dict[int, Any] = {}
         while len(chunks) < 5:
@@ -358,7 +369,7 @@ def test_the_live_view_grows_with_the_scan(client: Client, store: Path, house: H
                 head, xyz, rgb = unpack(message)
                 chunks[head["seq"]] = (xyz, rgb)
         xyz, rgb = chunks[2]
-        assert len(xyz) == 5000
+        assert len(xyz) == 160 * 90
         on_roof = xyz[:, 2] > 5.5
         assert np.abs(xyz[on_roof][:, :2] - [10, 2]).max(axis=0)[0] < 6.2
         assert np.median(rgb[on_roof, 0]) > 150
@@ -384,12 +395,12 @@ def test_a_chunk_is_sent_before_the_next_one_is_made(
 
     arrived, real = threading.Event(), live.chunk_message
 
-    def slow(keyframe: Keyframe, *arguments: Any) -> bytes:
-        assert keyframe.seq == 0 or arrived.wait(20)
-        return real(keyframe, *arguments)
+    def slow(scan: ScanStore, seq: int, layer: int) -> bytes | None:
+        assert seq == 0 or arrived.wait(20)
+        return real(scan, seq, layer)
 
     monkeypatch.setattr(live, "chunk_message", slow)
-    url = client.base.replace("http", "ws") + "/api/scans/drone-1/test-1/live?points=5000"
+    url = client.base.replace("http", "ws") + "/api/scans/drone-1/test-1/live"
     with connect(url) as socket:
         while not isinstance(socket.recv(timeout=5), bytes):
             pass
@@ -431,8 +442,38 @@ def test_the_feed_sends_each_thing_once(tmp_path: Path, house: HouseFlight) -> N
         scan.finish({})
         assert [json.loads(m)["finished"] for m in feed.news()] == [True]
     head, _, _ = unpack(first[0])
-    sigma = first[0][-2 * head["points"] : -head["points"]]
-    assert np.median(np.frombuffer(sigma, np.uint8)) * SIGMA_STEP_M == pytest.approx(0.05, abs=0.02)
+    sigmas = zlib.decompress(first[0][-sum(head["bytes"][2:]) : -sum(head["bytes"][3:])])
+    code = np.median(np.frombuffer(sigmas, np.uint8))
+    assert 0.001 * 2 ** ((code - 1) / 4) == pytest.approx(0.05, rel=0.2)
+
+
+def test_depth_in_another_coding_is_coded_anew(tmp_path: Path, house: HouseFlight) -> None:
+    imagecodecs = pytest.importorskip("imagecodecs")
+    one = house.keyframe(0, 0.0)
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)) as scan:
+        for seq, layer in enumerate(codec.encode(one, one.time_ns)):
+            opened = codec.unpack(layer)
+            assert opened is not None
+            head, sections = opened
+            known = planes.decode_mask(sections[0], *head.box[2:])
+            codes = plane_coders.decode_codes(sections[1], known)
+            assert codes is not None
+            old = sections[0], bytes(imagecodecs.jpegls_encode(codes)), *sections[2:]
+            method = planes.METHOD_JPEG_LS
+            scan.add_chunk(codec.pack(replace(head, seq=seq, method=method), old))
+        heads = [unpack(m) for m in LiveFeed(scan).news() if isinstance(m, bytes)]
+    assert [head["seq"] for head, _, _ in heads] == [0, 1]
+    np.testing.assert_allclose(heads[1][1][:, 2].min(), 0.0, atol=0.05)
+
+
+def test_of_a_scan_beside_another_only_coarse_layers_are_sent(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    with house.flown(tmp_path) as scan:
+        feed = LiveFeed(scan, coarse=True)
+        sent = [unpack(m)[0] for m in feed.news() if isinstance(m, bytes)]
+        assert [head["layer"] for head in sent] == [0] * 5
+        assert list(feed.news()) == []
 
 
 def test_a_finer_layer_replaces_the_coarse_one(tmp_path: Path, house: HouseFlight) -> None:
@@ -445,7 +486,7 @@ def test_a_finer_layer_replaces_the_coarse_one(tmp_path: Path, house: HouseFligh
         scan.add_chunk(fine)
         heads += [unpack(m)[0] for m in feed.news() if isinstance(m, bytes)]
     assert [(h["seq"], h["layer"]) for h in heads] == [(0, 0), (0, 1)]
-    assert heads[1]["points"] > heads[0]["points"]
+    assert heads[1]["size"] > heads[0]["size"]
 
 
 def test_the_page_takes_the_token_into_a_cookie(client: Client) -> None:
@@ -521,16 +562,17 @@ def test_a_taken_port_is_said(store: Path) -> None:
         first.close()
 
 
-def test_a_moved_keyframe_carries_its_points(house: HouseFlight) -> None:
-    """The matrix alone places the points, as a re-pose relies on."""
-    from service.ground.live import chunk_message
-
-    one = house.keyframe(0, 5.0)
-    _, xyz, _ = unpack(chunk_message(one, 1))
-    flat = np.abs(xyz[:, 2]) < 0.01
+def test_a_moved_keyframe_carries_its_points(tmp_path: Path, house: HouseFlight) -> None:
+    """Matrix and scale alone place the depth image, as a re-pose relies on."""
+    with house.flown(tmp_path) as scan:
+        scan.add_reposes([Repose(1, 1, house.pose(60.0), 1.5, np.eye(6))])
+        feed = LiveFeed(scan)
+        chunks = dict(enumerate(unpack(m) for m in feed.news() if isinstance(m, bytes)))
+    head, xyz, _ = chunks[1]
+    assert head["scale"] == 1.5
+    flat = np.abs(xyz[:, 2] - 40.0 + 1.5 * 40.0) < 0.02
     assert flat.sum() > 10_000
-    T = se3.inverse(house.pose(5.0))
-    assert np.abs(se3.transform(T, xyz)[flat, 2] - 40.0).max() < 0.01
+    np.testing.assert_allclose(head["T"][12:15], [60.0, 0.0, 40.0])
 
 
 def test_the_ground_command_serves_the_portal(store: Path, tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def test_odd_bodies_are_refused(client: Client, body: bytes) -> None:
 def test_odd_live_views_open_with_the_usual_points(client: Client, points: str) -> None:
     from websockets.sync.client import connect as open_socket
 
-    url = client.base.replace("http", "ws") + f"{ONE}/live?points={points}"
+    url = client.base.replace("http", "ws") + f"{ONE}/live?layer={points}"
     with open_socket(url) as one:
         assert isinstance(one.recv(timeout=20), bytes)
 

@@ -15,6 +15,7 @@ export interface Job {
   doing: string;
   percent: number;
   left_s: number | null;
+  ended_s: number | null; // ago
   file: string | null;
   error: string | null;
 }

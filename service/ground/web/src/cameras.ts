@@ -1,4 +1,4 @@
-// Where images were taken: a frustum per keyframe, and one image in its frustum.
+// The drone, where images were taken (a frustum per keyframe), and one image in its frustum.
 
 import * as THREE from "three";
 
@@ -9,7 +9,8 @@ const CORNERS: [number, number][] = [
 export class Cameras {
   readonly group = new THREE.Group();
   private readonly taken = new Map<number, THREE.Matrix4>();
-  private last = Infinity;
+  /** Whether the camera of a keyframe is shown. */
+  shows: (seq: number) => boolean = () => true;
   private readonly all = new THREE.LineSegments(
     new THREE.BufferGeometry(),
     new THREE.LineBasicMaterial({ color: 0x6f8296, transparent: true, opacity: 0.55 }),
@@ -22,16 +23,20 @@ export class Cameras {
     pane(),
     new THREE.MeshBasicMaterial({ side: THREE.DoubleSide, toneMapped: false }),
   );
+  private readonly drone = quadcopter();
   private reach = 10;
   private stale = false;
+  private drawn = 0; // frusta
 
   constructor() {
     for (const object of [this.all, this.now, this.image]) object.frustumCulled = false;
+    this.all.visible = false;
     for (const object of [this.now, this.image]) {
       object.matrixAutoUpdate = false;
       object.visible = false;
     }
-    this.group.add(this.all, this.now, this.image);
+    this.drone.visible = false;
+    this.group.add(this.all, this.now, this.image, this.drone);
   }
 
   get shown(): boolean {
@@ -49,19 +54,13 @@ export class Cameras {
     this.stale = true;
   }
 
-  /** Shows the keyframes up to `seq` only. */
-  until(seq: number): void {
-    this.stale ||= seq !== this.last;
-    this.last = seq;
-  }
-
   /** The keyframe whose camera or image centre is drawn nearest to a place (px), at most `near` away. */
   at(place: THREE.Vector2, camera: THREE.Camera, size: THREE.Vector2, near: number): number | null {
     if (!this.shown) return null;
     camera.updateMatrixWorld();
     let best: { seq: number; px: number } | null = null;
     for (const [seq, T] of this.taken) {
-      if (seq > this.last) continue;
+      if (!this.shows(seq)) continue;
       for (const z of [0, this.reach / 12]) {
         const p = new THREE.Vector3(0, 0, z).applyMatrix4(T).applyMatrix4(this.group.matrixWorld).project(camera);
         const seen = new THREE.Vector2((size.x / 2) * (1 + p.x), (size.y / 2) * (1 - p.y));
@@ -82,6 +81,11 @@ export class Cameras {
     this.now.matrix.fromArray(T).scale(new THREE.Vector3(s, s, s));
     this.now.matrixWorldNeedsUpdate = true;
     this.now.visible = true;
+    const e = this.now.matrix.elements;
+    this.drone.position.setFromMatrixPosition(this.now.matrix);
+    this.drone.rotation.z = Math.atan2(e[9] - e[5], e[8] - e[4]); // ahead: along the view, and where its upper side points
+    this.drone.scale.setScalar(s / 3);
+    this.drone.visible = true;
   }
 
   /** Moves all cameras as a whole. */
@@ -102,24 +106,46 @@ export class Cameras {
     this.image.material.map = texture;
     this.image.material.needsUpdate = true;
     const s = this.reach / 4;
-    this.image.matrix.copy(T).scale(new THREE.Vector3(s, s, s));
+    const flat = ((shown.naturalHeight || 1) / (shown.naturalWidth || 1)) * (CORNERS[1]![0] / CORNERS[2]![1]);
+    this.image.matrix.copy(T).scale(new THREE.Vector3(s, s * flat, s));
     this.image.matrixWorldNeedsUpdate = true;
     this.image.visible = true;
   }
 
   /** Draws the frusta again when keyframes came; call now and then. True when it did. */
   refresh(): boolean {
-    if (!this.stale) return false;
+    let shown = 0;
+    for (const seq of this.taken.keys()) shown += this.shows(seq) ? 1 : 0;
+    if (!this.stale && shown === this.drawn) return false;
     this.stale = false;
+    this.drawn = shown;
     const s = this.reach / 12;
     const lines = frustum().map((p) => p.multiplyScalar(s));
     const points: THREE.Vector3[] = [];
     for (const [seq, T] of this.taken)
-      if (seq <= this.last) for (const p of lines) points.push(p.clone().applyMatrix4(T));
+      if (this.shows(seq)) for (const p of lines) points.push(p.clone().applyMatrix4(T));
     this.all.geometry.dispose();
     this.all.geometry = new THREE.BufferGeometry().setFromPoints(points);
     return true;
   }
+}
+
+/** A drone that flies along x, about two units across. */
+function quadcopter(): THREE.Group {
+  const [body, rotor] = [0xe8edf2, 0x59b4ff].map((color) => new THREE.MeshBasicMaterial({ color, side: THREE.DoubleSide }));
+  const nose = new THREE.MeshBasicMaterial({ color: 0xff6b4a });
+  const out = new THREE.Group();
+  const add = (geometry: THREE.BufferGeometry, material: THREE.Material, x: number, y: number, turn = 0): void => {
+    const part = new THREE.Mesh(geometry, material);
+    part.position.set(x, y, 0.15);
+    part.rotation.z = turn;
+    out.add(part);
+  };
+  add(new THREE.BoxGeometry(0.8, 0.4, 0.25), body!, 0, 0);
+  add(new THREE.BoxGeometry(0.15, 0.3, 0.2), nose, 0.45, 0);
+  for (const turn of [Math.PI / 4, -Math.PI / 4]) add(new THREE.BoxGeometry(1.8, 0.08, 0.08), body!, 0, 0, turn);
+  for (const [x, y] of [[1, 1], [1, -1], [-1, 1], [-1, -1]] as const) add(new THREE.CircleGeometry(0.38, 20), rotor!, 0.65 * x, 0.65 * y);
+  return out;
 }
 
 /** A pyramid along z with a mark at its upper (minus y) side. */

@@ -1,5 +1,5 @@
 // Eye-dome lighting: the scene is drawn into a target with its depth, and what stands behind its
-// neighbours is shaded (Boucheny 2009). So a cloud without normals looks like a surface.
+// neighbours is shaded (Boucheny 2009). So a cloud without normals looks like a surface. And exposure.
 
 import * as THREE from "three";
 
@@ -9,6 +9,7 @@ const FRAGMENT = /* glsl */ `
   uniform vec2 pixel;
   uniform vec2 planes;
   uniform float strength;
+  uniform float gain;
   varying vec2 place;
 
   float far(vec2 at) {
@@ -17,13 +18,13 @@ const FRAGMENT = /* glsl */ `
   }
   void main() {
     vec3 seen = texture2D(colour, place).rgb;
-    if (strength > 0.0 && texture2D(depth, place).x < 1.0) {
+    if (texture2D(depth, place).x < 1.0) {
       float here = far(place);
       float sum = max(0.0, here - far(place + vec2(pixel.x, 0.0)))
         + max(0.0, here - far(place - vec2(pixel.x, 0.0)))
         + max(0.0, here - far(place + vec2(0.0, pixel.y)))
         + max(0.0, here - far(place - vec2(0.0, pixel.y)));
-      seen *= max(0.35, exp(-strength * sum));
+      seen *= gain * max(0.35, exp(-strength * sum));
     }
     gl_FragColor = vec4(seen, 1.0);
     #include <tonemapping_fragment>
@@ -36,6 +37,8 @@ const STRENGTH = 12;
 export class Dome {
   /** 1 is usual, 0 switches it off. */
   strength = 1;
+  /** What all that is drawn is multiplied with, but for the sky. */
+  gain = 1;
   private readonly target = new THREE.WebGLRenderTarget(1, 1, {
     type: THREE.HalfFloatType,
     depthTexture: new THREE.DepthTexture(1, 1, THREE.UnsignedIntType),
@@ -46,6 +49,7 @@ export class Dome {
     pixel: { value: new THREE.Vector2() },
     planes: { value: new THREE.Vector2() },
     strength: { value: 0 },
+    gain: { value: 1 },
   };
   private readonly sheet = new THREE.Mesh(
     new THREE.PlaneGeometry(2, 2),
@@ -77,6 +81,7 @@ export class Dome {
     this.uniforms.pixel.value.set(radius / size.x, radius / size.y);
     this.uniforms.planes.value.set(camera.near, camera.far);
     this.uniforms.strength.value = this.strength * STRENGTH;
+    this.uniforms.gain.value = this.gain;
     renderer.render(this.sheet, this.flat);
   }
 

@@ -11,6 +11,7 @@ import * as units from "./units";
 const IMAGE_EVERY_MS = 1500;
 const CLICK_PX = 5; // a pointer that moved farther turned the view
 const NEAR_PX = 14;
+const DAY_S = 86400;
 
 export interface Site {
   stage: Stage;
@@ -20,7 +21,7 @@ export interface Site {
 }
 
 /** A slider over the keyframes: the cloud as it was when each was taken; at its end it follows. */
-export function timeSlider({ stage, cloud, cameras }: Site): { element: HTMLElement; refresh: () => void } {
+export function timeSlider({ stage, cloud }: Site): { element: HTMLElement; refresh: () => void } {
   const input = el("input", { type: "range", min: "1", value: "1", max: "1" });
   input.setAttribute("aria-label", "time of the flight");
   const shown = el("output", {});
@@ -29,14 +30,13 @@ export function timeSlider({ stage, cloud, cameras }: Site): { element: HTMLElem
     const moments = cloud.moments();
     const k = Number(input.value) - 1;
     const last = k >= moments.length - 1;
-    cloud.until(last ? Infinity : moments[k]!.seq);
-    cameras.until(last ? Infinity : moments[k]!.seq);
-    shown.value = `${(moments[k]!.time - moments[0]!.time).toFixed(0)} s`;
+    cloud.until(last ? Infinity : moments[k]!);
+    shown.value = moment(moments[k]!, moments[0]!, moments.at(-1)!);
     stage.touch();
   };
   input.oninput = show;
   const refresh = (): void => {
-    const n = cloud.keyframes;
+    const n = cloud.moments().length;
     element.hidden = n < 2;
     if (n < 2 || Number(input.max) === n) return;
     const followed = input.value === input.max;
@@ -47,13 +47,19 @@ export function timeSlider({ stage, cloud, cameras }: Site): { element: HTMLElem
   return { element, refresh };
 }
 
+/** A time: seconds of a flight, the date of a site. */
+function moment(time: number, first: number, last: number): string {
+  if (last - first < DAY_S) return `${(time - first).toFixed(0)} s`;
+  return new Date(1000 * time).toISOString().slice(0, 16).replace("T", " ");
+}
+
 /** Six sliders that cut the scene to a box, as shares of the cloud's extent, with the lengths they stand for. */
 export function clipBox({ stage, cloud }: Site): HTMLElement {
   const panel = el("div", { className: "settings clip" });
   const axes: [string, "x" | "y" | "z"][] = [["East", "x"], ["North", "y"], ["Height", "z"]];
   const fields: { axis: "x" | "y" | "z"; low: HTMLInputElement; high: HTMLInputElement; shown: HTMLOutputElement }[] = [];
   const cut = (): void => {
-    if (!cloud.keyframes) return;
+    if (!cloud.total) return;
     const box = new THREE.Box3().setFromObject(cloud.group);
     const size = box.getSize(new THREE.Vector3());
     const planes: THREE.Plane[] = [];
@@ -114,11 +120,20 @@ export function linkButton(site: Site): HTMLElement {
   return el("button", { textContent: "Link", title: "copy a link to this view", onclick: act });
 }
 
+/** Shows an image as large as the page, until a click or Esc. */
+function enlarge(image: HTMLImageElement, text: string): void {
+  const large = el("img", { src: image.src, alt: image.alt });
+  const dialog = el("dialog", { className: "large" }, el("button", { textContent: "Close", autofocus: true }), large, el("p", { textContent: text }));
+  dialog.onclick = () => dialog.close();
+  dialog.onclose = () => dialog.remove();
+  document.body.append(dialog);
+  dialog.showModal();
+}
+
 /** The image of the newest keyframe in the corner and in its frustum; a click on a frustum shows its own. */
 export class Images {
   readonly element = el("figure", { className: "panel latest", hidden: true });
   private readonly timer = setInterval(() => this.refresh(), IMAGE_EVERY_MS);
-  private newest = -1;
   private chosen: number | null = null;
   private shown = -1;
   private version = 0;
@@ -138,7 +153,6 @@ export class Images {
 
   /** A keyframe came, or a finer layer of one: its image is fetched again. */
   arrived(seq: number): void {
-    this.newest = Math.max(this.newest, seq);
     this.version += 1;
     if (seq === this.shown) this.shown = -1;
   }
@@ -154,8 +168,8 @@ export class Images {
   }
 
   private refresh(): void {
-    const seq = this.chosen ?? this.newest;
-    if (seq === this.shown) return;
+    const seq = this.chosen ?? this.site.cloud.own.newest;
+    if (seq < 0 || seq === this.shown) return;
     this.shown = seq;
     const image = new Image();
     image.alt = `keyframe ${seq}, seen from the aircraft`;
@@ -172,7 +186,8 @@ export class Images {
     const back = el("button", { textContent: "Latest", title: "back to the newest keyframe" });
     back.onclick = () => ((this.chosen = null), this.refresh());
     this.element.hidden = false;
-    this.element.replaceChildren(image, el("figcaption", {}, text, this.chosen !== null && back));
+    const open = el("button", { className: "image", title: "show it large", onclick: () => enlarge(image, text) }, image);
+    this.element.replaceChildren(open, el("figcaption", {}, text, this.chosen !== null && back));
     document.body.dataset["image"] = String(seq);
   }
 }

@@ -5,26 +5,38 @@ import { el, notify } from "./dom";
 
 const BUSY_MS = 500;
 const IDLE_MS = 2000;
+const ENDED_S = 60;
 
 interface Row {
   element: HTMLElement;
   show: (job: api.Job) => void;
 }
 
-/** A list that keeps itself up to date while it is in the page; hidden while there is nothing. */
-export function jobList(title = (job: api.Job): string => job.scan): HTMLElement {
+/**
+ * A list that keeps itself up to date while it is in the page; hidden while there is nothing. A job is shown where
+ * `homeOf` says, with its history; all others here, until a while after they have ended.
+ */
+export function jobList(
+  title = (job: api.Job): string => job.scan,
+  homeOf: (job: api.Job) => Element | null = () => null,
+): HTMLElement {
   const list = el("ul", {});
   const section = el("section", { className: "panel jobs", hidden: true }, list);
   section.setAttribute("aria-label", "jobs");
   let rows = new Map<number, Row>();
   const refresh = async (): Promise<void> => {
-    const jobs = await api.jobs().catch(() => []);
-    rows = new Map(jobs.map((job) => [job.number, rows.get(job.number) ?? row(job, title(job))]));
-    for (const job of jobs) rows.get(job.number)!.show(job);
-    const shown = [...rows.values()].map((r) => r.element);
-    for (const old of [...list.children]) if (!shown.includes(old as HTMLElement)) old.remove();
-    list.append(...shown.filter((element) => !element.isConnected));
-    section.hidden = !jobs.length;
+    const all = await api.jobs().catch(() => []);
+    const jobs = all.filter((job) => homeOf(job) || (job.ended_s ?? 0) < ENDED_S);
+    const old = rows;
+    rows = new Map(jobs.map((job) => [job.number, old.get(job.number) ?? row(job, title(job))]));
+    for (const [number, { element }] of old) if (!rows.has(number)) element.remove();
+    for (const job of jobs) {
+      const { element, show } = rows.get(job.number)!;
+      const home = homeOf(job) ?? list;
+      show(job);
+      if (element.parentElement !== home) home.append(element);
+    }
+    section.hidden = !list.children.length;
     const busy = jobs.some((job) => job.state === "running");
     setTimeout(() => section.isConnected && void refresh(), busy ? BUSY_MS : IDLE_MS);
   };

@@ -56,7 +56,7 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
     el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again, upload), leave),
     cut,
     line,
-    jobList(title),
+    jobList(title, (job) => cards.get(`${job.drone}/${job.scan}`)?.element.querySelector(".made") ?? null),
     list,
     bin,
   );
@@ -223,6 +223,7 @@ function card(s: api.Scan, again: () => void): HTMLElement {
     s.trouble ? el("p", { className: "trouble", textContent: s.trouble }) : null,
     el("p", { className: "tags" }, ...s.tags.map((t) => el("span", { textContent: t }))),
     downloads(s),
+    el("ul", { className: "jobs made" }),
     el(
       "p",
       { className: "acts" },
@@ -245,9 +246,9 @@ function facts(s: api.Scan): HTMLElement {
   if (area_m2) size.push(`${count(area_m2)} m²`);
   if (size.length) rows.push(["Size", size.join(", ")]);
   const sigma: string[] = [];
-  if (sigma_median_m) sigma.push(`${units.length(sigma_median_m)} relative`);
-  if (s.origin && across && up) sigma.push(`absolute ${units.sigmas(across, up)}`);
-  if (sigma.length) rows.push(["Sigma", sigma.join(", ")]);
+  if (sigma_median_m) sigma.push(`detail ${units.accuracy(sigma_median_m)}`);
+  if (s.origin && across && up) sigma.push(`position ${units.sigmas(across, up)}`);
+  if (sigma.length) rows.push(["Accuracy", sigma.join(", ")]);
   if (trust) rows.push(["Trust", [trust.level, ...trust.reasons].join("; ")]);
   return el(
     "dl",

@@ -34,6 +34,11 @@ export class LinkState {
     this.grown = performance.now();
   }
 
+  /** Nothing of this scan was heard for a while, and it has not finished. */
+  get isSilent(): boolean {
+    return !this.finished && this.element.classList.contains("silent");
+  }
+
   /** Shows the state as it is now. */
   draw(): void {
     const [kind, text] = this.words();

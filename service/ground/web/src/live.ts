@@ -1,21 +1,7 @@
 // The live WebSocket: binary chunks and JSON news, as service/ground/live.py describes them.
 
 import { NO_ANSWER } from "./api";
-
-export interface Chunk {
-  seq: number;
-  layer: number;
-  points: number;
-  unit_m: number;
-  /** Distance of neighbouring points at depth 1. */
-  apart: number;
-  time_unix_s: number;
-  T: number[];
-  xyz: Int16Array;
-  rgb: Uint8Array;
-  sigma: Uint8Array;
-  views: Uint8Array;
-}
+import { type Chunk, decode } from "./depth";
 
 export interface LastPose {
   T: number[];
@@ -55,25 +41,11 @@ export interface Link {
   trouble: string | null;
 }
 
-/** The chunk in a binary message; throws when it is cut short. */
-export function decode(data: ArrayBuffer): Chunk {
-  const length = new DataView(data).getUint32(0, true);
-  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length))) as Chunk;
-  let at = 4 * Math.ceil((4 + length) / 4);
-  const n = head.points;
-  head.xyz = new Int16Array(data, at, 3 * n);
-  at += 6 * n;
-  head.rgb = new Uint8Array(data, at, 3 * n);
-  at += 3 * n;
-  head.sigma = new Uint8Array(data, at, n);
-  head.views = new Uint8Array(data, at + n, n);
-  return head;
-}
-
 /** Keeps a live view open until closed; connects again after a break. */
 export class LiveView {
   private socket: WebSocket | null = null;
   private closed = false;
+  private work = Promise.resolve(); // messages are handled in their order
 
   constructor(
     private readonly address: string,
@@ -96,8 +68,14 @@ export class LiveView {
     socket.binaryType = "arraybuffer";
     socket.onopen = () => this.onState("");
     socket.onmessage = ({ data }: MessageEvent<ArrayBuffer | string>) => {
-      if (typeof data === "string") this.onNews(JSON.parse(data) as News);
-      else this.onChunk(decode(data));
+      const opened = typeof data === "string" ? null : decode(data);
+      opened?.catch(() => undefined); // thrown below
+      this.work = this.work.then(async () => {
+        const chunk = await opened;
+        if (this.closed) return;
+        if (chunk) this.onChunk(chunk);
+        else this.onNews(JSON.parse(data as string) as News);
+      }).catch((error: unknown) => console.error(error));
     };
     socket.onclose = ({ code, reason }) => {
       if (this.closed) return;

@@ -20,6 +20,7 @@ export class Look implements Effects {
     private readonly target: THREE.Vector3,
     bloom: boolean,
     depthOfField: boolean,
+    isLight: boolean,
   ) {
     const size = renderer.getSize(new THREE.Vector2());
     this.composer = new EffectComposer(renderer);
@@ -27,7 +28,7 @@ export class Look implements Effects {
     this.focus = new BokehPass(scene, camera, { focus: 100, aperture: 2e-5, maxblur: 0.008 });
     this.focus.enabled = depthOfField;
     this.composer.addPass(this.focus);
-    if (bloom) this.composer.addPass(new UnrealBloomPass(size, 0.25, 0.4, 0.7));
+    if (bloom) this.composer.addPass(new UnrealBloomPass(size, 0.25, 0.4, isLight ? 1 : 0.7)); // a light sky would shine over all
     this.composer.addPass(new OutputPass());
   }
 

@@ -98,8 +98,8 @@ export class Ruler {
 
   toggle(): void {
     this.active = !this.active;
-    this.clear();
-    this.panel.hidden = !this.active;
+    this.panel.hidden = !this.active && !this.places.length; // what is measured stays until it is cleared
+    this.rewrite();
     this.changed();
   }
 
@@ -133,6 +133,7 @@ export class Ruler {
 
   private clear(): void {
     this.places.length = 0;
+    this.panel.hidden = !this.active;
     this.measure();
   }
 
@@ -141,7 +142,7 @@ export class Ruler {
     const place = pickAt(this.scene, event.clientX, event.clientY);
     this.cursor.value = place ? coordinates(this.scene.origin, place) : "";
     if (!this.active) return;
-    if (!place) return notify("no point there");
+    if (!place) return notify("nothing was measured there");
     this.places.push(place);
     this.measure();
   }
@@ -228,8 +229,7 @@ export class Ruler {
     }
     const sigma = this.scene.scaleSigma();
     if (sigma) {
-      words["Scale σ"] = units.share(sigma);
-      if (this.volume) words["Volume σ"] = `${units.share(3 * sigma)} by the scale`;
+      words["Accuracy"] = `±${units.share(sigma)} by the scale${this.volume ? `, ±${units.share(3 * sigma)} of volumes` : ""}`;
     }
     return words;
   }

@@ -8,6 +8,10 @@ import { Dome } from "./dome";
 export interface Gradual {
   /** How many points there are to draw. */
   readonly wanted: number;
+  /** Each range adds to what the frame shows; else each draws the whole, and a larger one finer. */
+  readonly isAdditive: boolean;
+  /** The last range did not show all it asked for: it has to be drawn again. */
+  readonly isUnbuilt: boolean;
   /** Draws the points between two shares, 0 to 1; `whole` when the others follow. */
   range(from: number, to: number, whole: boolean): void;
 }
@@ -20,8 +24,11 @@ export interface Effects {
 }
 
 const MOVING_MS = 70;
+const NEWS_TIMES = 3; // as long for a frame that shows news, while no hand turns the view
 const SLICE_MS = 90;
 const FIRST_POINTS = 100_000;
+const FINER = 4; // times the triangles of the frame before, once the view rests
+const UNBUILT = 0.99; // of the frame is shown while some of it is still to be made
 const MIN_POINTS = 20_000;
 const MAX_SLICES = 64; // showing a slice takes its time however few the points
 const SHOWN_FROM = 0.5; // of the points; until then the last, thinned frame with large points stays
@@ -31,7 +38,7 @@ const EFFECTS_TIMES = 3; // of the points drawn while moving, once the view stan
 interface Work {
   sync: WebGLSync | null;
   since: number;
-  kind: "whole" | "slice";
+  kind: "whole" | "slice" | "finer";
 }
 
 export class Painter {
@@ -44,11 +51,14 @@ export class Painter {
   /** The frame shows what is no more: it is drawn again, at the next tick or when the graphics card is done. */
   stale = true;
   gradual: Gradual | null = null;
+  /** The view is being moved by hand: frames have to follow each other fast. */
+  hasty = false;
   readonly dome = new Dome();
   /** Objects drawn with every slice; all others are in the first frame only. */
   readonly again = new Set<THREE.Object3D>();
   private moving = FIRST_POINTS;
   private slice = FIRST_POINTS;
+  private finer = 0; // share of the surfaces' triangles in the frame
   private work: Work | null = null;
   private settled = false;
 
@@ -88,23 +98,37 @@ export class Painter {
     this.give("whole", now);
   }
 
+  /** As many points may a frame have as while the view is moved. */
+  private get times(): number {
+    return this.hasty || this.gradual?.isAdditive ? 1 : NEWS_TIMES;
+  }
+
   /** Draws the frame again; when the view stands still, slices follow unless effects lie over it. */
   private whole(still: boolean): void {
     const wanted = Math.max(1, this.gradual?.wanted ?? 0);
     const last = still && this.effects !== null;
-    const points = last ? EFFECTS_TIMES * this.moving : this.moving;
+    const points = last ? EFFECTS_TIMES * this.moving : this.times * this.moving;
     const share = this.fullDetail ? 1 : Math.min(1, points / wanted);
+    this.finer = share;
     this.gradual?.range(0, share, still && !last);
     if (this.renderer.xr.isPresenting) this.renderer.render(this.scene, this.camera);
     else if (this.effects) this.effects.render();
-    else this.dome.render(this.renderer, this.scene, this.camera, true, !still || share > SHOWN_FROM);
-    this.shown = last || !this.gradual?.wanted ? 1 : share;
+    else this.dome.render(this.renderer, this.scene, this.camera, true, !still || share > SHOWN_FROM || !this.gradual?.isAdditive);
+    this.shown = last || !this.gradual?.wanted ? 1 : this.gradual.isUnbuilt ? Math.min(share, UNBUILT) : share;
   }
 
   /** Draws the next slice of the points over the frame there is. */
   private addSlice(now: number): void {
     const gradual = this.gradual;
     if (!gradual) return;
+    if (!gradual.isAdditive) {
+      const share = gradual.isUnbuilt ? Math.max(this.shown, this.finer) : Math.min(1, FINER * Math.max(this.shown, this.finer));
+      this.finer = share;
+      gradual.range(0, share, true);
+      this.dome.render(this.renderer, this.scene, this.camera, true, true);
+      this.shown = gradual.isUnbuilt ? Math.min(share, UNBUILT) : share;
+      return this.give("finer", now);
+    }
     const next = Math.min(1, this.shown + this.slice / Math.max(1, gradual.wanted));
     gradual.range(this.shown, next, true);
     const hidden = this.world.children.filter((c) => c.visible && !this.again.has(c));
@@ -140,6 +164,7 @@ export class Painter {
   /** Fits the number of points to the time that the last ones took. */
   private paced(work: Work, now: number): void {
     const ms = Math.max(now - work.since, 1);
+    if (work.kind === "finer") return;
     if (work.kind === "slice") {
       const least = Math.max(MIN_POINTS, (this.gradual?.wanted ?? 0) / MAX_SLICES);
       this.slice = Math.max(least, this.slice * Math.min(Math.max(SLICE_MS / ms, 0.25), 1.2));
@@ -147,7 +172,7 @@ export class Painter {
     }
     this.frames_per_s = 1000 / ms;
     const most = Math.max(this.gradual?.wanted ?? 0, FIRST_POINTS);
-    const change = Math.min(Math.max(MOVING_MS / ms, 0.5), 1.2);
+    const change = Math.min(Math.max((this.times * MOVING_MS) / ms, 0.5), 1.2);
     this.moving = Math.min(Math.max(this.moving * change, MIN_POINTS), most);
   }
 }

@@ -1,10 +1,12 @@
-// The cloud in the scene: one Points object per chunk, so that a correction is a matrix.
+// The keyframes in the scene: of each a surface and its points, so that a correction is a matrix.
 
 import * as THREE from "three";
 import type { Part } from "./api";
 import { Before, CHANGE } from "./before";
-import type { Chunk } from "./live";
+import { type Chunk, sigmaAt, viewsAt } from "./depth";
+import { Ground, type Samples } from "./fill";
 import type { Gradual } from "./painter";
+import { LEVELS, Surface } from "./surface";
 import { length } from "./units";
 
 /** Between the keyframes' numbers of two scans that are drawn together. */
@@ -19,7 +21,46 @@ const PARTS = ["#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00",
 /** Of the change since an earlier date, as on the maps of `site compare`. */
 const CHANGES: [string, string][] = [["higher", "#d03027"], ["lower", "#2b6fd0"], ["as before", "#9a9a9a"], ["not seen before", "#3a3a3a"]];
 
-const MAX_SIGMA_M = 5.1; // of the 255 steps of a chunk
+const SIGMA_STEP_M = 0.02;
+const MAX_SIGMA_M = 255 * SIGMA_STEP_M;
+const SHARP_PX = 1.3; // of the screen, between two vertices of a surface
+const BUILD_MS = 25; // for finer surfaces, a frame
+const GROUND_SAMPLES = 400_000; // of the heightfield below
+const GROUND_MS = 1500; // between two of them
+const MAX_TRIANGLES = 12_000_000; // in memory
+
+/** GLSL: the colour that a place is shown in; linear, as `rgb`. */
+const SHADE = /* glsl */ `
+  uniform float mode;
+  uniform vec2 range;
+  uniform float age;
+  uniform vec3 part;
+  uniform vec3 higher, lower, same, unseen;
+  ${CHANGE}
+  vec3 linear(vec3 s) {
+    return mix(s / 12.92, pow((s + 0.055) / 1.055, vec3(2.4)), step(0.04045, s));
+  }
+  vec3 ramp(float t) {
+    t = clamp(t, 0.0, 1.0);
+    vec3 low = mix(vec3(0.27, 0.0, 0.33), vec3(0.13, 0.57, 0.55), min(2.0 * t, 1.0));
+    return linear(mix(low, vec3(0.99, 0.91, 0.14), max(2.0 * t - 1.0, 0.0)));
+  }
+  vec3 shade(vec3 world, vec3 rgb, float sigma_m, float views) {
+    float gray = pow(max(dot(rgb, vec3(0.21, 0.72, 0.07)), 0.0), 0.4545);
+    if (mode > 5.5) {
+      float d = change(world, 0.15 + 3.0 * sigma_m);
+      vec3 kind = d > 1e8 ? unseen : mix(same, d > 0.0 ? higher : lower, min(abs(d) / 0.3, 1.0));
+      return kind * (0.4 + 0.6 * gray);
+    }
+    if (mode > 4.5) return part * (0.3 + 0.7 * gray);
+    if (mode > 3.5) return ramp(age);
+    if (mode > 2.5) return ramp(views / 8.0);
+    if (mode > 1.5) return ramp(sigma_m / max(range.y, 0.01));
+    if (mode > 0.5) return ramp((world.z - range.x) / max(range.y - range.x, 0.01));
+    return rgb;
+  }
+`;
+
 const VERTEX = /* glsl */ `
   #define SIGMA_M float(${MAX_SIGMA_M})
   attribute vec3 rgb;
@@ -29,40 +70,16 @@ const VERTEX = /* glsl */ `
   uniform float apart;   // of neighbours, in depths of the camera that took them
   uniform float thin;    // as 1, for the points left out of the frame
   uniform float height_px;
-  uniform float mode;
-  uniform vec2 range;
-  uniform float age;
-  uniform vec3 part;
-  uniform vec3 higher, lower, same, unseen;
   varying vec3 shown;
   #include <clipping_planes_pars_vertex>
-  ${CHANGE}
-  vec3 linear(vec3 s) {
-    return mix(s / 12.92, pow((s + 0.055) / 1.055, vec3(2.4)), step(0.04045, s));
-  }
-  vec3 ramp(float t) {
-    t = clamp(t, 0.0, 1.0);
-    vec3 low = mix(vec3(0.27, 0.0, 0.33), vec3(0.13, 0.57, 0.55), min(2.0 * t, 1.0));
-    return mix(low, vec3(0.99, 0.91, 0.14), max(2.0 * t - 1.0, 0.0));
-  }
+  ${SHADE}
   void main() {
     vec4 world = modelMatrix * vec4(position, 1.0);
     vec4 seen = viewMatrix * world;
     gl_Position = projectionMatrix * seen;
     float gap = size * thin * apart * position.z * length(modelMatrix[2].xyz);
     gl_PointSize = clamp(gap * projectionMatrix[1][1] * height_px / max(-seen.z, 0.01), 1.5, 40.0);
-    vec3 s = rgb;
-    if (mode > 0.5) s = ramp((world.z - range.x) / max(range.y - range.x, 0.01));
-    if (mode > 1.5) s = ramp(sigma * SIGMA_M / max(range.y, 0.01));
-    if (mode > 2.5) s = ramp(views * 255.0 / 8.0);
-    if (mode > 3.5) s = ramp(age);
-    shown = linear(s);
-    if (mode > 4.5) shown = part * (0.3 + 0.7 * dot(rgb, vec3(0.30, 0.59, 0.11)));
-    if (mode > 5.5) {
-      float d = change(world.xyz, 0.15 + 3.0 * sigma * SIGMA_M);
-      vec3 kind = d > 1e8 ? unseen : mix(same, d > 0.0 ? higher : lower, min(abs(d) / 0.3, 1.0));
-      shown = kind * (0.4 + 0.6 * dot(rgb, vec3(0.30, 0.59, 0.11)));
-    }
+    shown = shade(world.xyz, linear(rgb), sigma * SIGMA_M, views * 255.0);
     vec4 mvPosition = seen;
     #include <clipping_planes_vertex>
   }
@@ -80,10 +97,16 @@ const FRAGMENT = /* glsl */ `
   }
 `;
 
+/** What is drawn of the keyframes. */
+export type Layer = "surface" | "points";
+
 interface Held {
   object: THREE.Points<THREE.BufferGeometry, THREE.ShaderMaterial>;
+  surface: Surface;
+  shown: boolean;
   unit_m: number;
   points: number;
+  bright: Uint8Array; // of 200 points
   time: number;
   T: number[];
   scale: number;
@@ -107,6 +130,13 @@ export class Cloud implements Gradual {
   private readonly moves = new Map<number, THREE.Matrix4>();
   private readonly chunks = new Map<number, Held>();
   private last = Infinity;
+  private kind: Layer = "surface";
+  private camera: THREE.PerspectiveCamera | null = null;
+  private unbuilt = false;
+  private exposure = 1;
+  private measured = false;
+  private groundStale = false;
+  private groundAt = -Infinity;
   private readonly shared = {
     size: { value: 1.3 },
     thin: { value: 1 },
@@ -117,6 +147,9 @@ export class Cloud implements Gradual {
     ...Object.fromEntries(["higher", "lower", "same", "unseen"].map((name, k) => [name, { value: new THREE.Color(CHANGES[k]![1]) }])),
   };
 
+  /** What lies below the surfaces; not measured. */
+  readonly ground = new Ground();
+
   get total(): number {
     let sum = 0;
     for (const held of this.chunks.values()) sum += held.points;
@@ -124,37 +157,124 @@ export class Cloud implements Gradual {
   }
 
   /** Points of the keyframes that are shown. */
-  private get visible(): number {
+  private get shownPoints(): number {
     let sum = 0;
-    for (const held of this.chunks.values()) if (held.object.visible) sum += held.points;
+    for (const held of this.chunks.values()) if (held.shown) sum += held.points;
     return sum;
   }
 
-  get keyframes(): number {
-    return this.chunks.size;
+  /** Keyframes of this scan that are shown, and their points. */
+  get own(): { keyframes: number; points: number; newest: number } {
+    const out = { keyframes: 0, points: 0, newest: -1 };
+    let time = -Infinity;
+    for (const [seq, held] of this.chunks) {
+      if (seq >= STRIDE || !held.shown) continue;
+      out.keyframes += 1;
+      out.points += held.points;
+      if (held.time >= time) [time, out.newest] = [held.time, seq];
+    }
+    return out;
   }
 
-  /** Adds a chunk, in place of the one with the same number. */
+  /** Whether a keyframe of this scan is shown. */
+  readonly shows = (seq: number): boolean => this.chunks.get(seq)?.shown ?? true;
+
+  /** Adds a keyframe, in place of the one with the same number. */
   add(chunk: Chunk): void {
     this.remove(chunk.seq);
+    const { xyz, rgb, sigma, views, unit_m } = pointsOf(chunk);
     const geometry = new THREE.BufferGeometry();
-    geometry.setAttribute("position", new THREE.BufferAttribute(chunk.xyz, 3, false));
-    geometry.setAttribute("rgb", new THREE.BufferAttribute(chunk.rgb, 3, true));
-    geometry.setAttribute("sigma", new THREE.BufferAttribute(chunk.sigma, 1, true));
-    geometry.setAttribute("views", new THREE.BufferAttribute(chunk.views, 1, true));
+    geometry.setAttribute("position", new THREE.BufferAttribute(xyz, 3, false));
+    geometry.setAttribute("rgb", new THREE.BufferAttribute(rgb, 3, true));
+    geometry.setAttribute("sigma", new THREE.BufferAttribute(sigma, 1, true));
+    geometry.setAttribute("views", new THREE.BufferAttribute(views, 1, true));
+    const own = { age: { value: 0 }, part: { value: this.partOf(chunk.seq) } };
     const material = new THREE.ShaderMaterial({
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
       clipping: true,
-      uniforms: { ...this.shared, age: { value: 0 }, apart: { value: chunk.apart }, part: { value: this.partOf(chunk.seq) } },
+      uniforms: { ...this.shared, ...own, apart: { value: 1 / chunk.K[0] } },
     });
     const object = new THREE.Points(geometry, material);
     object.matrixAutoUpdate = false;
-    const held = { object, unit_m: chunk.unit_m, points: chunk.points, time: chunk.time_unix_s, T: chunk.T, scale: 1 };
+    const surface = new Surface(chunk, { ...this.shared, ...own }, SHADE);
+    const bright = rgb.slice(0, 600).sort();
+    const held: Held = { object, surface, shown: true, unit_m, points: sigma.length, bright, time: chunk.time_unix_s, T: chunk.T, scale: chunk.scale };
     this.chunks.set(chunk.seq, held);
-    object.visible = this.isShown(chunk.seq);
     this.place(chunk.seq, held);
-    this.groupOf(chunk.seq).add(object);
+    this.groupOf(chunk.seq).add(object, surface.mesh);
+    this.expose();
+    this.show(chunk.seq, held);
+  }
+
+  /** As bright as the day: of the brightest tenths of the keyframes' colours, as in the preview. */
+  private expose(): void {
+    const tops = [...this.chunks.values()].filter(({ bright }) => bright.length).map(({ bright }) => bright[Math.floor(0.98 * bright.length)]!);
+    tops.sort((a, b) => a - b);
+    const top = tops[tops.length >> 1] ?? 230;
+    this.exposure = Math.min(Math.max(230 / Math.max(top, 1), 1), 2) ** 2.2;
+  }
+
+  /** The exposure that the colours are shown with; 1 for those of figures. */
+  get gain(): number {
+    return this.shared.mode.value ? 1 : this.exposure;
+  }
+
+  /** Shows the keyframes as surfaces or as points. */
+  set layer(kind: Layer) {
+    this.kind = kind;
+    for (const [seq, held] of this.chunks) this.show(seq, held);
+    this.showGround();
+  }
+
+  /** Shows only what was measured, without the ground below. */
+  set measuredOnly(only: boolean) {
+    this.measured = only;
+    this.showGround();
+  }
+
+  get measuredOnly(): boolean {
+    return this.measured;
+  }
+
+  /** Shows or hides all of it. */
+  set visible(on: boolean) {
+    this.group.visible = on;
+    this.showGround();
+  }
+
+  private showGround(): void {
+    this.ground.mesh.visible = this.group.visible && this.kind === "surface" && !this.measured;
+  }
+
+  /** An even sample of the points that are shown. */
+  private readonly samples: Samples = (use) => {
+    const share = Math.min(1, GROUND_SAMPLES / Math.max(1, this.shownPoints));
+    for (const { object, shown, points } of this.chunks.values()) {
+      if (!shown) continue;
+      const e = object.matrixWorld.elements;
+      const xyz = (object.geometry.getAttribute("position") as THREE.BufferAttribute).array;
+      const rgb = (object.geometry.getAttribute("rgb") as THREE.BufferAttribute).array;
+      for (let i = 0; i < 3 * Math.ceil(share * points); i += 3) {
+        const [x, y, z] = [xyz[i]!, xyz[i + 1]!, xyz[i + 2]!];
+        use(
+          e[0] * x + e[4] * y + e[8] * z + e[12],
+          e[1] * x + e[5] * y + e[9] * z + e[13],
+          e[2] * x + e[6] * y + e[10] * z + e[14],
+          rgb[i]!, rgb[i + 1]!, rgb[i + 2]!,
+        );
+      }
+    }
+  };
+
+  get layer(): Layer {
+    return this.kind;
+  }
+
+  private show(seq: number, held: Held): void {
+    held.shown = this.isShown(seq);
+    held.object.visible = held.shown && this.kind === "points";
+    held.surface.mesh.visible = held.shown && this.kind === "surface";
   }
 
   private groupOf(seq: number): THREE.Group {
@@ -163,29 +283,46 @@ export class Cloud implements Gradual {
     return isPast ? this.past : this.group;
   }
 
-  /** Compares with what has come of the earlier date, when that is shown; true when it is news. */
+  /** Takes what has come into the ground, and into the earlier date when that is shown; true when it is news. */
   refresh(): boolean {
+    const grew = this.groundStale && performance.now() - this.groundAt > GROUND_MS;
+    if (grew) {
+      this.groundStale = false;
+      this.ground.build(this.samples);
+      this.groundAt = performance.now();
+    }
+    return this.compare() || grew;
+  }
+
+  private compare(): boolean {
     if (!this.isStale || COLOURS[this.shared.mode.value] !== "change") return false;
     this.isStale = false;
     this.before.build(this.past);
     return true;
   }
 
-  /** The keyframes and when they were taken, in order. */
-  moments(): { seq: number; time: number }[] {
+  /** When the keyframes of this scan were taken, unix seconds, in order. */
+  moments(): number[] {
     const own = [...this.chunks].filter(([seq]) => seq < STRIDE);
-    const all = own.map(([seq, held]) => ({ seq, time: held.time }));
-    return all.sort((a, b) => a.seq - b.seq);
+    return own.map(([, held]) => held.time).sort((a, b) => a - b);
   }
 
-  /** Shows the keyframes up to `seq` only. */
-  until(seq: number): void {
-    this.last = seq;
-    for (const [own, { object }] of this.chunks) object.visible = this.isShown(own);
+  /** False while the time slider leaves keyframes out. */
+  get isWhole(): boolean {
+    return this.last === Infinity;
+  }
+
+  /** Shows the keyframes up to a time only, unix seconds. */
+  until(time: number): void {
+    if (time === this.last) return;
+    this.last = time;
+    this.groundStale = true;
+    for (const [own, held] of this.chunks) this.show(own, held);
   }
 
   private isShown(seq: number): boolean {
-    return seq < STRIDE ? seq <= this.last : !this.earlier.has(Math.floor(seq / STRIDE));
+    const time = this.chunks.get(seq)?.time ?? 0;
+    return seq < STRIDE ? time <= this.last : !this.earlier.has(Math.floor(seq / STRIDE));
   }
 
   /** Moves all chunks of a scan, numbered from k * STRIDE on, as a whole. */
@@ -199,10 +336,10 @@ export class Cloud implements Gradual {
     if (names.length === this.parts.length) return;
     this.parts = names.map((name, k) => ({ name, keyframes: [k * STRIDE, (k + 1) * STRIDE - 1] }));
     for (const k of earlier) this.earlier.add(k);
-    for (const [seq, { object }] of this.chunks) {
-      object.material.uniforms["part"]!.value = this.partOf(seq);
-      this.groupOf(seq).add(object);
-      object.visible = this.isShown(seq);
+    for (const [seq, held] of this.chunks) {
+      held.object.material.uniforms["part"]!.value = this.partOf(seq); // the surface has the same
+      this.groupOf(seq).add(held.object, held.surface.mesh);
+      this.show(seq, held);
     }
     this.named();
   }
@@ -243,7 +380,7 @@ export class Cloud implements Gradual {
     const words: Record<Colour, [string, string] | null> = {
       colour: null,
       height: [x, y].map((z) => length(z + this.datum_m, 1)) as [string, string],
-      sigma: [length(0), `σ ${length(y)} and more`],
+      sigma: ["±" + length(0), `±${length(y)} and more`],
       views: ["1 view", "8 views"],
       age: ["first", "last"],
       scan: null,
@@ -257,22 +394,37 @@ export class Cloud implements Gradual {
     this.shared.size.value = distances;
   }
 
-  /** Half the height of what is drawn into, pixels of the screen. */
-  screen(half_px: number): void {
+  /** The camera, and half the height of what it draws into, pixels of the screen. */
+  screen(camera: THREE.PerspectiveCamera, half_px: number): void {
+    this.camera = camera;
     this.shared.height_px.value = half_px;
   }
 
-  /** Points to draw: all, or the budget; none while they are hidden. */
+  /** Points are drawn slice by slice; surfaces as a whole, each time finer. */
+  get isAdditive(): boolean {
+    return this.kind === "points";
+  }
+
+  /** Some surfaces that the last range asked for are still to be made. */
+  get isUnbuilt(): boolean {
+    return this.kind === "surface" && this.unbuilt;
+  }
+
+  /** Points to draw: all, or the budget; triangles of the sharpest image; none while they are hidden. */
   get wanted(): number {
-    return this.group.visible ? Math.min(this.visible, this.budget) : 0;
+    if (!this.group.visible) return 0;
+    if (this.kind === "surface") return cost(this.seen(), 0);
+    return Math.min(this.shownPoints, this.budget);
   }
 
   /**
-   * Draws the points between two shares of what is wanted. Each chunk's points are shuffled, so
-   * any part of them is an even sample; drawn alone, a part has larger points.
+   * Draws the points between two shares of what is wanted. Each keyframe's points are shuffled, so
+   * any part of them is an even sample; drawn alone, a part has larger points. Of surfaces, the
+   * finest levels within the share.
    */
   range(from: number, to: number, whole: boolean): void {
-    const share = Math.min(1, this.budget / Math.max(1, this.visible));
+    if (this.kind === "surface") return this.fit(to);
+    const share = Math.min(1, this.budget / Math.max(1, this.shownPoints));
     this.shared.thin.value = 1 / Math.sqrt(Math.max(1e-6, share * (whole ? 1 : to)));
     this.drawn = 0;
     for (const { object, points } of this.chunks.values()) {
@@ -280,6 +432,41 @@ export class Cloud implements Gradual {
       object.geometry.setDrawRange(start, end - start);
       if (this.group.visible && object.visible) this.drawn += end - start;
     }
+  }
+
+  /** The surfaces in sight, and the level at which each is sharp. */
+  private seen(): [Surface, number][] {
+    const camera = this.camera;
+    if (!camera) return [];
+    camera.updateMatrixWorld();
+    const frustum = new THREE.Frustum().setFromProjectionMatrix(new THREE.Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse));
+    const focal_px = camera.projectionMatrix.elements[5]! * this.shared.height_px.value;
+    const eye = new THREE.Vector3().setFromMatrixPosition(camera.matrixWorld);
+    const found: [Surface, number][] = [];
+    for (const { surface } of this.chunks.values()) {
+      if (!surface.mesh.visible || !surface.triangles || !surface.isSeen(frustum)) continue;
+      const level = Math.floor(Math.log2(SHARP_PX / surface.magnified(eye, focal_px)));
+      found.push([surface, Math.min(Math.max(level, 0), LEVELS - 1)]);
+    }
+    return found;
+  }
+
+  private fit(share: number): void {
+    const seen = this.seen();
+    const room = share * cost(seen, 0);
+    let coarser = 0;
+    while (coarser < LEVELS - 1 && cost(seen, coarser) > 1.01 * room) coarser++;
+    const until = performance.now() + BUILD_MS;
+    this.unbuilt = false;
+    this.drawn = 0;
+    for (const [surface, level] of seen) {
+      const is = surface.show(Math.min(level + coarser, LEVELS - 1), performance.now() < until);
+      this.unbuilt ||= !is;
+      this.drawn += surface.drawn;
+    }
+    let kept = 0;
+    for (const { surface } of this.chunks.values()) kept += surface.kept;
+    for (const { surface } of this.chunks.values()) if (kept > MAX_TRIANGLES) kept -= surface.shrink();
   }
 
   /** Heights of the middle 96 % of a sample of the points, for the colour scale. */
@@ -319,11 +506,14 @@ export class Cloud implements Gradual {
 
   private place(seq: number, held: Held): void {
     const unit = held.unit_m * held.scale;
-    held.object.matrix.fromArray(held.T).scale(new THREE.Vector3(unit, unit, unit));
     const move = this.moves.get(Math.floor(seq / STRIDE));
-    if (move) held.object.matrix.premultiply(move);
     this.isStale ||= this.earlier.has(Math.floor(seq / STRIDE));
-    held.object.updateMatrixWorld(true);
+    this.groundStale = true;
+    for (const [object, size] of [[held.object, unit], [held.surface.mesh, held.scale]] as [THREE.Object3D, number][]) {
+      object.matrix.fromArray(held.T).scale(new THREE.Vector3(size, size, size));
+      if (move) object.matrix.premultiply(move);
+      object.updateMatrixWorld(true);
+    }
   }
 
   private remove(seq: number): void {
@@ -332,6 +522,50 @@ export class Cloud implements Gradual {
     held.object.removeFromParent();
     held.object.geometry.dispose();
     held.object.material.dispose();
+    held.surface.close();
     this.chunks.delete(seq);
   }
+}
+
+/** Triangles of surfaces that are drawn this many levels coarser than sharp. */
+function cost(seen: [Surface, number][], coarser: number): number {
+  return seen.reduce((sum, [surface, level]) => sum + surface.triangles / 4 ** Math.min(level + coarser, LEVELS - 1), 0);
+}
+
+/** The points of a keyframe in its camera's frame, in `unit_m`; shuffled, so that any part is an even sample. */
+function pointsOf(chunk: Chunk): { xyz: Int16Array; rgb: Uint8Array; sigma: Uint8Array; views: Uint8Array; unit_m: number } {
+  const { codes, w, h, K, low, step, box, colour } = chunk;
+  const at: number[] = [];
+  for (let i = 0; i < codes.length; i++) if (codes[i]) at.push(i);
+  let seed = chunk.seq + 1;
+  for (let i = at.length - 1; i > 0; i--) {
+    seed = (Math.imul(seed, 1664525) + 1013904223) >>> 0;
+    const j = Math.floor((seed / 2 ** 32) * (i + 1));
+    [at[i], at[j]] = [at[j]!, at[i]!];
+  }
+  const n = at.length;
+  const place = new Float32Array(3 * n);
+  let far = 1e-3;
+  at.forEach((i, k) => {
+    const [u, v] = [i % w, (i / w) | 0];
+    const z = 1 / (low + step * (codes[i]! - 1));
+    place.set([((box[0] + u - K[2]) / K[0]) * z, ((box[1] + v - K[3]) / K[1]) * z, z], 3 * k);
+  });
+  for (const value of place) far = Math.max(far, Math.abs(value));
+  const unit_m = far / 32767;
+  const [rgb, sigma, views] = [new Uint8Array(3 * n), new Uint8Array(n), new Uint8Array(n)];
+  const pixels = colour && pixelsOf(colour, w, h);
+  at.forEach((i, k) => {
+    const [u, v] = [i % w, (i / w) | 0];
+    if (pixels) rgb.set(pixels.subarray(4 * i, 4 * i + 3), 3 * k);
+    sigma[k] = Math.min(Math.round(sigmaAt(chunk, u, v) / SIGMA_STEP_M), 255);
+    views[k] = viewsAt(chunk, u, v);
+  });
+  return { xyz: Int16Array.from(place, (value) => Math.round(value / unit_m)), rgb, sigma, views, unit_m };
+}
+
+function pixelsOf(image: ImageBitmap, w: number, h: number): Uint8ClampedArray {
+  const context = new OffscreenCanvas(w, h).getContext("2d", { willReadFrequently: true })!;
+  context.drawImage(image, 0, 0);
+  return context.getImageData(0, 0, w, h).data;
 }

@@ -6,9 +6,9 @@ import type { Cameras } from "./cameras";
 import { LiveView, type SiteNews } from "./live";
 import { type Cloud, STRIDE } from "./points";
 import type { Stage } from "./stage";
+import * as units from "./units";
 
 const MAX_OTHERS = 6; // a portal serves few live views
-const POINTS = 12_000; // of a keyframe of another scan
 
 /** Places this scan's cloud, cameras and track, and adds the clouds of the others. */
 export class SiteView {
@@ -29,7 +29,7 @@ export class SiteView {
     if (!own) return;
     this.own.fromArray(own.T);
     const [east, north, up] = own.sigma_m;
-    this.words = own.ties ? `${own.ties} ties, σ ${Math.hypot(east, north).toFixed(2)} m, ${up.toFixed(2)} m up` : "";
+    this.words = own.ties ? `joined in ${own.ties} places, ${units.sigmas(Math.hypot(east, north), up)}` : "";
     this.cloud.move(0, own.T);
     this.cameras.move(this.own);
     this.stage.moveTrack(this.own);
@@ -47,7 +47,7 @@ export class SiteView {
 
   private open(scan: { drone: string; scan: string }, k: number): LiveView {
     return new LiveView(
-      `${api.liveAddress(scan)}?points=${POINTS}`,
+      `${api.liveAddress(scan)}?layer=0`,
       (chunk) => {
         chunk.seq += k * STRIDE;
         this.cloud.add(chunk);

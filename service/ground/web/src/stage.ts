@@ -6,8 +6,9 @@ import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { VRButton } from "three/addons/webxr/VRButton.js";
 import { type Gradual, Painter } from "./painter";
 
-export const BACKGROUND = 0x171b20;
-export const LIGHT = 0xffffff;
+/** Sky above, ground below the horizon. */
+const DARK = ["#243648", "#465a6b", "#2b3036", "#171b20"];
+const LIGHT = ["#c6dcf3", "#f3f8fd", "#ffffff", "#f1f1ee"];
 const INPUTS = ["click", "input", "change"];
 // Until then a part of many points is drawn: after a movement, after other news.
 const MOVED_MS = 250;
@@ -34,6 +35,7 @@ export class Stage {
   readonly controls: OrbitControls;
   readonly model = new THREE.Group();
   follow = true;
+  isLight = false;
   readonly painter: Painter;
   /** Called before each frame. */
   readonly before: (() => void)[] = [];
@@ -44,6 +46,7 @@ export class Stage {
   );
   private readonly watcher: ResizeObserver;
   private rests = 0; // from this time on
+  private moved = 0; // by hand, until then
   private ticking = false;
   private closed = false; // what is still loading may come later
   private framed = false; // the view is still that of frame()
@@ -51,7 +54,6 @@ export class Stage {
   private last = performance.now();
 
   constructor(private readonly host: HTMLElement) {
-    this.scene.background = new THREE.Color(BACKGROUND);
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(0, -120, 90);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
@@ -59,11 +61,12 @@ export class Stage {
       if (this.follow) this.touch();
       this.follow = this.framed = false;
     });
-    this.controls.addEventListener("change", () => this.changed(MOVED_MS));
+    this.controls.addEventListener("change", () => this.changed(MOVED_MS, !this.follow));
     this.track.frustumCulled = false;
     this.world.add(this.track, this.model);
-    this.scene.add(this.world, new THREE.AmbientLight(0xffffff, 2));
+    this.scene.add(this.world, new THREE.AmbientLight(0xffffff, Math.PI));
     this.painter = new Painter(this.renderer, this.scene, this.camera, this.world);
+    this.light(false);
     host.append(this.renderer.domElement);
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.xr.enabled = true;
@@ -73,6 +76,23 @@ export class Stage {
     addEventListener("keydown", this.press);
     addEventListener("keyup", this.release);
     for (const name of INPUTS) addEventListener(name, this.input);
+  }
+
+  /** A light or a dark background. */
+  light(on: boolean): void {
+    this.isLight = on;
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [1, 256];
+    const paint = canvas.getContext("2d")!;
+    const ramp = paint.createLinearGradient(0, 0, 0, 256);
+    (on ? LIGHT : DARK).forEach((colour, k) => ramp.addColorStop([0, 0.42, 0.5, 1][k]!, colour));
+    paint.fillStyle = ramp;
+    paint.fillRect(0, 0, 1, 256);
+    const texture = new THREE.CanvasTexture(canvas);
+    texture.colorSpace = THREE.SRGBColorSpace;
+    (this.scene.background as THREE.Texture | null)?.dispose();
+    this.scene.background = texture;
+    this.touch();
   }
 
   add(object: THREE.Object3D): void {
@@ -223,7 +243,8 @@ export class Stage {
   /** Something changed that is to be seen: the next tick draws a frame. */
   readonly touch = (): void => this.changed(NEWS_MS);
 
-  private changed(busy_ms: number): void {
+  private changed(busy_ms: number, byHand = false): void {
+    if (byHand) this.moved = performance.now() + busy_ms;
     document.body.dataset["still"] = "no";
     this.painter.stale = true;
     this.rests = Math.max(this.rests, performance.now() + busy_ms);
@@ -243,11 +264,12 @@ export class Stage {
     const now = performance.now();
     const presenting = this.renderer.xr.isPresenting;
     if (!presenting) {
-      if (this.fly((now - this.last) / 1000)) this.changed(MOVED_MS);
+      if (this.fly((now - this.last) / 1000)) this.changed(MOVED_MS, true);
       this.controls.update();
     }
     this.last = now;
     if (presenting) this.painter.stale = true;
+    this.painter.hasty = now < this.moved;
     this.painter.tick(now, now >= this.rests, this.before);
     const still = this.painter.still ? "yes" : "no";
     if (document.body.dataset["still"] !== still) document.body.dataset["still"] = still;

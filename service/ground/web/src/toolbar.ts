@@ -9,7 +9,7 @@ import { coverageKeys, key } from "./keys";
 import type { Ruler } from "./measure";
 import type { Notes } from "./notes";
 import { COLOURS, type Cloud, type Colour } from "./points";
-import { BACKGROUND, LIGHT, type Stage } from "./stage";
+import type { Stage } from "./stage";
 import * as units from "./units";
 
 export interface Parts {
@@ -48,7 +48,7 @@ export function toolbar(parts: Parts): HTMLElement {
     group(colour),
     group(whole, follow, linkButton(parts)),
     group(...measure(parts), cameraButton(parts.cameras), coverageButton(parts)),
-    showGroup(parts, colour),
+    ...showGroup(parts, colour),
     clipBox(parts),
     settings(parts),
   );
@@ -58,15 +58,17 @@ export function toolbar(parts: Parts): HTMLElement {
 
 const group = (...children: HTMLElement[]): HTMLElement => el("span", { className: "group" }, ...children);
 
+const word = (colour: Colour): string => (colour === "sigma" ? "accuracy" : colour);
+
 function colours({ cloud, legend }: Parts): HTMLSelectElement {
   const select = el(
     "select",
     {},
-    ...COLOURS.filter((c) => cloud.offers(c)).map((c) => el("option", { value: c, textContent: c })),
+    ...COLOURS.filter((c) => cloud.offers(c)).map((c) => el("option", { value: c, textContent: word(c) })),
   );
   cloud.named = () => {
     const known = [...select.options].map((o) => o.value);
-    for (const c of COLOURS.filter((one) => cloud.offers(one) && !known.includes(one))) select.append(el("option", { value: c, textContent: c }));
+    for (const c of COLOURS.filter((one) => cloud.offers(one) && !known.includes(one))) select.append(el("option", { value: c, textContent: word(c) }));
     if (select.value === "scan") select.dispatchEvent(new Event("change"));
   };
   select.setAttribute("aria-label", "colour by");
@@ -111,7 +113,7 @@ function pressed(button: HTMLElement, on: boolean): void {
 }
 
 function cameraButton(cameras: Cameras): HTMLElement {
-  const button = el("button", { textContent: "Cameras", className: "on", title: "where images were taken; click one to see it" });
+  const button = el("button", { textContent: "Cameras", title: "where images were taken; click one to see it" });
   button.onclick = () => {
     cameras.toggle();
     pressed(button, cameras.shown);
@@ -140,23 +142,28 @@ function coverageButton({ coverage, id }: Parts): HTMLElement {
   return button;
 }
 
-/** Points, tiles or mesh: one at a time; colours and time are of the points. */
-function showGroup(parts: Parts, colour: HTMLSelectElement): HTMLElement {
+/** Surface, points, tiles or mesh: one at a time; colours and time are of the keyframes. */
+function showGroup(parts: Parts, colour: HTMLSelectElement): HTMLElement[] {
   const { stage, cloud, id } = parts;
   let close: () => void = () => undefined;
-  const points = el("button", { textContent: "Points", className: "on" });
+  const surface = el("button", { textContent: "Surface", className: "on", title: "the depth images as they are" });
+  const points = el("button", { textContent: "Points" });
   const tiles = el("button", { textContent: "Tiles", title: "3D Tiles: detail where one looks" });
   const mesh = el("button", { textContent: "Mesh", title: "the textured mesh" });
-  const buttons = [points, tiles, mesh];
-  const show = async (chosen: HTMLElement, open: () => Promise<() => void>): Promise<void> => {
+  const own = [surface, points];
+  const buttons = [surface, points, tiles, mesh];
+  const show = async (chosen: HTMLButtonElement, open: () => Promise<() => void>): Promise<void> => {
     buttons.forEach((b) => (b.disabled = true));
     try {
       const next = await open();
       close();
       close = next;
-      cloud.group.visible = chosen === points;
-      colour.disabled = chosen !== points;
-      for (const part of [parts.legend, parts.time]) part.classList.toggle("off", chosen !== points);
+      const isOwn = own.includes(chosen);
+      cloud.visible = isOwn;
+      if (isOwn) cloud.layer = chosen === points ? "points" : "surface";
+      colour.disabled = !isOwn;
+      measured.disabled = chosen !== surface;
+      for (const part of [parts.legend, parts.time]) part.classList.toggle("off", !isOwn);
       stage.touch();
       buttons.forEach((b) => pressed(b, b === chosen));
     } catch (error) {
@@ -164,7 +171,12 @@ function showGroup(parts: Parts, colour: HTMLSelectElement): HTMLElement {
     }
     buttons.forEach((b) => (b.disabled = false));
   };
-  points.onclick = () => void show(points, async () => () => undefined);
+  const measured = el("button", { textContent: "Measured only", title: "without the ground that is filled in where nothing was seen" });
+  measured.onclick = () => {
+    cloud.measuredOnly = !cloud.measuredOnly;
+    pressed(measured, cloud.measuredOnly);
+  };
+  for (const one of own) one.onclick = () => void show(one, async () => () => undefined);
   mesh.onclick = () =>
     void show(mesh, async () => {
       await made(id, "glb", "mesh.glb", "There is no mesh yet. Make one now?");
@@ -182,7 +194,7 @@ function showGroup(parts: Parts, colour: HTMLSelectElement): HTMLElement {
       const { showTiles } = await import("./tiles");
       return showTiles(stage, `${api.scanAddress(id)}/tiles/tileset.json`, scan.origin, () => 2);
     });
-  return group(...buttons);
+  return [group(...buttons), group(measured)];
 }
 
 /** The scan, once it has a deliverable; makes it when the operator says so. */
@@ -208,7 +220,7 @@ function settings({ stage, cloud, ruler }: Parts): HTMLElement {
     };
     panel.append(el("label", {}, el("span", { textContent: text }), input, shown));
   };
-  slide("Point size", 0.3, 5, 0.1, 1.3, (v) => cloud.pointSize(v), (v) => `${v.toFixed(1)} x`);
+  slide("Point size", 0.3, 1.5, 0.1, 1.3, (v) => cloud.pointSize(v), (v) => `${v.toFixed(1)} x`);
   slide("Shading", 0, 3, 0.1, 1, (v) => (stage.painter.dome.strength = v), (v) => v.toFixed(1));
   slide("Points drawn", 5, 8, 0.1, 6.5, (v) => (cloud.budget = 10 ** v), (v) => `${(10 ** (v - 6)).toFixed(1)} M`);
   slide("Field of view", 20, 100, 1, 60, (v) => stage.fieldOfView(v), (v) => `${v}°`);
@@ -239,8 +251,8 @@ function settings({ stage, cloud, ruler }: Parts): HTMLElement {
   };
   const light = el("input", { type: "checkbox" });
   light.onchange = () => {
-    stage.scene.background = new THREE.Color(light.checked ? LIGHT : BACKGROUND);
-    stage.touch();
+    stage.light(light.checked);
+    if (stage.painter.effects) bloom.onchange?.(new Event("change"));
   };
   panel.append(
     el("label", { title: "feet, cubic yards and miles an hour" }, el("span", { textContent: "Imperial" }), feet),
@@ -259,7 +271,7 @@ async function looks(stage: Stage, bloom: boolean, depthOfField: boolean): Promi
   painter.effects = null;
   if (bloom || depthOfField) {
     const { Look } = await import("./look");
-    painter.effects = new Look(renderer, scene, camera, controls.target, bloom, depthOfField);
+    painter.effects = new Look(renderer, scene, camera, controls.target, bloom, depthOfField, stage.isLight);
   }
   stage.touch();
 }

@@ -23,8 +23,20 @@ export function setImperial(on: boolean): void {
 export const length = (m: number, digits = 2): string =>
   imperial() ? `${(m / FOOT).toFixed(digits)} ft` : `${m.toFixed(digits)} m`;
 
-/** A sigma of the position: horizontal, vertical. */
-export const sigmas = (h_m: number, v_m: number): string => `${length(h_m)} horizontal, ${length(v_m)} vertical`;
+/** The accuracy (one sigma) of a length. */
+export const accuracy = (m: number): string => `±${length(m)}`;
+
+/** The accuracy of a position: horizontal, vertical. */
+export const sigmas = (h_m: number, v_m: number): string => `${accuracy(h_m)} across, ${accuracy(v_m)} up`;
+
+/** The longest round length of at most `m`: metres, and as it is read. */
+export const round = (m: number): [number, string] => {
+  const unit = imperial() ? FOOT : 1;
+  const tens = 10 ** Math.floor(Math.log10(Math.max(m, 1e-6) / unit));
+  const value = tens * ([5, 2, 1].find((k) => k * tens * unit <= m) ?? 1);
+  const digits = Math.max(0, -Math.floor(Math.log10(value) + 1e-9));
+  return [value * unit, length(value * unit, digits)];
+};
 
 export const area = (m2: number): string =>
   imperial() ? `${(m2 / FOOT ** 2).toFixed(1)} ft²` : `${m2.toFixed(1)} m²`;

@@ -3,6 +3,7 @@
 import { Matrix4 } from "three";
 import * as api from "./api";
 import { Cameras } from "./cameras";
+import { compass } from "./compass";
 import { count, el, notify, toScans } from "./dom";
 import { Images, takeView, timeSlider } from "./explore";
 import { jobList } from "./jobs";
@@ -19,6 +20,7 @@ import * as units from "./units";
 import { vehicleStrip } from "./vehicle";
 
 const ASK_EVERY_MS = 2000;
+const NADIR_DEG = -75; // steeper, roll and heading say little
 
 /** Shows a scan; gives what closes it. */
 export async function showView(root: HTMLElement, drone: string, name: string, place?: string): Promise<() => void> {
@@ -35,7 +37,8 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const report = el("a", { href: api.file(id, "report.html"), textContent: "Report" });
   const map = el("a", { href: api.mapAddress(id), textContent: "Map", hidden: !scan.origin });
   const changes = el("a", { href: api.file(id, "change.html"), textContent: "Changes" });
-  const bar = el("header", {}, toScans(), title, link.element, vehicleStrip(), map, report, changes);
+  const back = el("a", { className: "newer", hidden: true });
+  const bar = el("header", {}, toScans(), title, link.element, back, vehicleStrip(), map, report, changes);
   const host = el("main", { className: "stage" });
   const legend = el("div", { className: "panel legend", hidden: true });
   const coverage = el("div", { className: "panel coverage", hidden: true });
@@ -71,6 +74,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     origin: scan.origin,
     scaleSigma: () => known.quality?.scale_sigma,
   };
+  cameras.shows = cloud.shows;
   const ruler = new Ruler(scene);
   ruler.offer = placing(scan, () => ruler.rewrite());
   const notes = new Notes(scene, id, (point) => stage.lookAt(point));
@@ -83,10 +87,15 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const time = timeSlider(site);
   side.append(images.element);
   host.append(time.element);
-  stage.before.push(ruler.draw, notes.draw, () => cloud.screen(stage.renderer.domElement.height / 2));
+  stage.before.push(ruler.draw, notes.draw, () => {
+    cloud.screen(stage.camera, stage.renderer.domElement.height / 2);
+    stage.painter.dome.gain = cloud.gain;
+  });
   stage.drawGradually(cloud);
   stage.add(cameras.group);
   stage.addAgain(cloud.group);
+  stage.add(cloud.ground.mesh);
+  host.append(compass(stage));
   bar.append(toolbar({ ...site, ruler, notes, legend, coverage, time: time.element, finished: () => link.finished }));
   if (awaited(scan)) ruler.toggle();
 
@@ -127,16 +136,19 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
       time.refresh();
       empty.hidden = true;
       document.body.dataset["chunk"] = `${chunk.seq} ${Date.now()}`;
-      if (cloud.keyframes === 1 && !framed) stage.frame();
+      if (cloud.own.keyframes === 1 && !framed) stage.frame();
     },
     news,
     (text) => (link.cut = text),
   );
   const asking = setInterval(() => {
     if (link.finished && report.hidden) void api.scan(id.drone, id.scan).then(learn, () => undefined);
+    if (link.isSilent) void newer(known).then((scan) => scan && linkTo(back, scan), () => undefined);
+    else back.hidden = true;
   }, ASK_EVERY_MS);
   const clock = setInterval(() => {
     link.draw();
+    figures.classList.toggle("old", link.isSilent);
     if (cameras.refresh()) stage.touch();
     if (cloud.refresh()) stage.touch();
     const now = rows(cloud, known, link.finished, last, others.words);
@@ -158,25 +170,35 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   };
 }
 
+/** The scan that the drone of a silent one makes by now. */
+async function newer({ drone, started_unix_s }: api.Scan): Promise<api.Scan | undefined> {
+  const growing = (await api.scans()).filter((s) => s.drone === drone && s.growing);
+  return growing.find((s) => (s.started_unix_s ?? 0) > (started_unix_s ?? 0));
+}
+
+function linkTo(link: HTMLAnchorElement, scan: api.Scan): void {
+  link.href = api.viewAddress(scan);
+  link.textContent = `back as scan ${scan.title}: open`;
+  link.hidden = false;
+}
+
 /** The figures; of a finished scan none of the moment. */
 function rows(cloud: Cloud, { counts, quality }: api.Scan, finished: boolean, last: LastPose | undefined, site: string): HTMLElement[] {
   const facts: [string, string][] = [
-    ...(counts?.points === undefined ? [] : [["Points", count(counts.points)] as [string, string]]),
-    ["Samples", count(cloud.total)],
-    ...(cloud.total > cloud.budget ? [["Drawn", count(cloud.drawn)] as [string, string]] : []),
-    ["Keyframes", String(cloud.keyframes)],
+    ["Points", count(cloud.isWhole && counts?.points !== undefined ? counts.points : cloud.own.points)],
+    ["Images", String(cloud.own.keyframes)],
   ];
-  if (finished && quality?.sigma_median_m) facts.push(["Relative σ", units.length(quality.sigma_median_m)]);
+  if (finished && quality?.sigma_median_m) facts.push(["Detail", units.accuracy(quality.sigma_median_m)]);
   const [across, up] = finished ? [quality?.position_sigma_h_median_m, quality?.position_sigma_v_median_m] : (last?.sigma_h_v_m ?? []);
-  if (across && up) facts.push(["Absolute σ", units.sigmas(across, up)]);
-  if (finished && quality?.scale_sigma) facts.push(["Scale σ", units.share(quality.scale_sigma)]);
+  if (across && up) facts.push(["Position", units.sigmas(across, up)]);
+  if (finished && quality?.scale_sigma) facts.push(["Scale", `±${units.share(quality.scale_sigma)}`]);
   if (last) facts.push(["Flown", units.length(last.distance_m, 0)]);
   if (last && !finished) {
     facts.push(["Speed", units.speed(last.speed_m_s)]);
     if (last.agl_m !== null) facts.push(["Height", units.length(last.agl_m, 1)]);
     if (last.alt_amsl_m !== null) facts.push(["AMSL", units.length(last.alt_amsl_m, 1)]);
-    facts.push(["Roll, pitch, yaw", `${last.roll_deg}° ${last.pitch_deg}° ${last.yaw_deg}°`]);
-    facts.push(["From", last.sources.join(", ")]);
+    facts.push(["Camera", last.pitch_deg < NADIR_DEG ? "looks down" : `${last.pitch_deg}°, heading ${Math.round((last.yaw_deg + 360) % 360)}°`]);
+    facts.push(["By", last.sources.join(", ")]);
     if (last.lat_deg !== null && last.lon_deg !== null)
       facts.push(["At", `${last.lat_deg.toFixed(6)}, ${last.lon_deg.toFixed(6)}`]);
   }

@@ -1,0 +1,337 @@
+// A keyframe's depth image as a surface: grids of triangles in four levels of detail, which the
+// vertex shader displaces along the rays of its camera.
+
+import * as THREE from "three";
+import { type Chunk, sigmaAt, viewsAt } from "./depth";
+
+/** Pixels of the depth image between two vertices, by level. */
+const STEPS = [1, 2, 4, 8];
+export const LEVELS = STEPS.length;
+const FIRST_LEVEL = 2; // made when the keyframe comes
+
+/** Two pixels are one surface if their depths differ by no more than a slope of this tangent explains, and sigmas. */
+const STEEPEST = 4;
+const SIGMAS = 4;
+/** Vertices by which a mask grows, by level: two keyframes are cut from each other without an overlap. */
+const GROWN = [2, 1, 1, 1];
+const DIP = 0.006; // of depth, by which each of them lies lower, so that it hides nothing that is measured
+const AROUND = [[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]] as const;
+const OUTSIDE_PX = 16; // grown vertices lie outside the box; attributes have no sign
+const SAME = 0.03; // share of inverse depth by which neighbours of one grown vertex may differ
+const MIN_TRIANGLES = 200; // triangles of a patch that is drawn, of the finest level
+const MIN_COARSE = 8; // of the others
+
+const VERTEX = /* glsl */ `
+  attribute vec4 pixel;   // column, row, code of inverse depth, code of sigma * 256 + views
+  attribute vec2 at;      // in the texture
+  uniform vec4 K;
+  uniform vec2 inverse;   // of code 0, and its step
+  uniform vec2 corner;
+  varying vec2 place;
+  varying vec3 where;
+  varying vec2 sure;      // sigma, m, and views
+  #include <clipping_planes_pars_vertex>
+  void main() {
+    float z = 1.0 / (inverse.x + inverse.y * pixel.z);
+    vec2 p = pixel.xy - float(${OUTSIDE_PX}) + corner;
+    vec4 world = modelMatrix * vec4((p - K.zw) / K.xy * z, z, 1.0);
+    vec4 mvPosition = viewMatrix * world;
+    gl_Position = projectionMatrix * mvPosition;
+    float code = floor(pixel.w / 256.0);
+    sure = vec2(code > 0.0 ? 0.001 * exp2((code - 1.0) / 4.0) * length(modelMatrix[2].xyz) : 0.0, pixel.w - 256.0 * code);
+    place = at;
+    where = world.xyz;
+    #include <clipping_planes_vertex>
+  }
+`;
+
+const fragment = (shade: string): string => /* glsl */ `
+  uniform sampler2D image;
+  varying vec2 place;
+  varying vec3 where;
+  varying vec2 sure;
+  #include <clipping_planes_pars_fragment>
+  ${shade}
+  void main() {
+    #include <clipping_planes_fragment>
+    gl_FragColor = vec4(shade(where, texture2D(image, place).rgb, sure.x, sure.y), 1.0);
+    #include <colorspace_fragment>
+  }
+`;
+
+interface Grid {
+  pixel: Uint16Array;
+  at: Uint16Array;
+  index: Uint16Array | Uint32Array;
+}
+
+/** The surface of one keyframe. */
+export class Surface {
+  readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
+  /** Triangles of the finest level, about. */
+  readonly triangles: number;
+  private readonly levels: (THREE.BufferGeometry | undefined)[] = [];
+  private readonly sphere: THREE.Sphere;
+
+  constructor(private readonly chunk: Chunk, uniforms: Record<string, THREE.IUniform>, shade: string) {
+    const { K, low, step, box, colour } = chunk;
+    let known = 0;
+    for (const code of chunk.codes) known += code ? 1 : 0;
+    this.triangles = 2 * known;
+    const texture = new THREE.Texture(colour ?? undefined);
+    texture.colorSpace = THREE.SRGBColorSpace;
+    texture.flipY = false;
+    texture.anisotropy = 4;
+    texture.needsUpdate = colour !== null;
+    const material = new THREE.ShaderMaterial({
+      vertexShader: VERTEX,
+      fragmentShader: fragment(shade),
+      clipping: true,
+      side: THREE.DoubleSide,
+      uniforms: {
+        ...uniforms,
+        image: { value: texture },
+        K: { value: new THREE.Vector4(...K) },
+        inverse: { value: new THREE.Vector2(low, step) },
+        corner: { value: new THREE.Vector2(box[0], box[1]) },
+      },
+    });
+    this.sphere = reach(chunk);
+    this.mesh = new THREE.Mesh(this.make(FIRST_LEVEL), material);
+    this.mesh.matrixAutoUpdate = false;
+    this.mesh.raycast = () => undefined; // measuring takes its points
+  }
+
+  /** Pixels of the screen per pixel of the depth image, seen from `eye` by a lens of `focal_px`. */
+  magnified(eye: THREE.Vector3, focal_px: number): number {
+    const centre = this.sphere.center.clone().applyMatrix4(this.mesh.matrixWorld);
+    const scale = this.mesh.matrixWorld.getMaxScaleOnAxis();
+    const near = Math.max(centre.distanceTo(eye) - 0.7 * this.sphere.radius * scale, 0.05 * this.sphere.center.z * scale, 1e-3);
+    return (this.sphere.center.z * scale * focal_px) / (this.chunk.K[0] * near);
+  }
+
+  isSeen(frustum: THREE.Frustum): boolean {
+    return frustum.intersectsSphere(this.sphere.clone().applyMatrix4(this.mesh.matrixWorld));
+  }
+
+  has(level: number): boolean {
+    return this.levels[level] !== undefined;
+  }
+
+  /** Draws a level, which is made when `mayMake`, or the next one there is; true when it is that level. */
+  show(level: number, mayMake: boolean): boolean {
+    const found = this.levels[level] ?? (mayMake ? this.make(level) : undefined);
+    const order = [level, level + 1, level + 2, level + 3, level - 1, level - 2, level - 3];
+    this.mesh.geometry = found ?? order.map((k) => this.levels[k]).find((g) => g !== undefined)!;
+    return found !== undefined;
+  }
+
+  /** Triangles in memory. */
+  get kept(): number {
+    return this.levels.reduce((sum, geometry) => sum + (geometry?.index?.count ?? 0) / 3, 0);
+  }
+
+  /** Triangles drawn. */
+  get drawn(): number {
+    return (this.mesh.geometry.index?.count ?? 0) / 3;
+  }
+
+  /** Gives up the levels finer than the first that are not drawn; returns their triangles. */
+  shrink(): number {
+    let freed = 0;
+    this.levels.forEach((geometry, k) => {
+      if (!geometry || k >= FIRST_LEVEL || geometry === this.mesh.geometry) return;
+      freed += geometry.index!.count / 3;
+      geometry.dispose();
+      delete this.levels[k];
+    });
+    return freed;
+  }
+
+  close(): void {
+    for (const geometry of this.levels) geometry?.dispose();
+    (this.mesh.material.uniforms["image"]!.value as THREE.Texture).dispose();
+    this.mesh.material.dispose();
+    this.mesh.removeFromParent();
+    this.chunk.colour?.close();
+  }
+
+  private make(level: number): THREE.BufferGeometry {
+    const { pixel, at, index } = triangulate(this.chunk, level);
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("pixel", new THREE.BufferAttribute(pixel, 4));
+    geometry.setAttribute("at", new THREE.BufferAttribute(at, 2, true));
+    geometry.setIndex(new THREE.BufferAttribute(index, 1));
+    geometry.boundingSphere = this.sphere;
+    return (this.levels[level] = geometry);
+  }
+}
+
+/** A sphere around the points of a depth image, in its camera's frame. */
+function reach({ codes, w, h, K, low, step, box }: Chunk): THREE.Sphere {
+  const bounds = new THREE.Box3();
+  const p = new THREE.Vector3();
+  const every = Math.max(1, Math.floor(Math.min(w, h) / 60));
+  for (let y = 0; y < h; y += every)
+    for (let x = 0; x < w; x += every) {
+      const code = codes[y * w + x]!;
+      if (!code) continue;
+      const z = 1 / (low + step * (code - 1));
+      bounds.expandByPoint(p.set(((box[0] + x - K[2]) / K[0]) * z, ((box[1] + y - K[3]) / K[1]) * z, z));
+    }
+  const sphere = bounds.isEmpty() ? new THREE.Sphere(new THREE.Vector3(0, 0, 1), 0) : bounds.getBoundingSphere(new THREE.Sphere());
+  sphere.radius *= 1.1;
+  return sphere;
+}
+
+/**
+ * The triangles of a level.
+ *
+ * A vertex is the known pixel nearest to the middle of its block. The mask grows by a skirt: vertices on the plane of
+ * those next to them (planes are linear in inverse depth) and a little lower. A triangle is drawn where its corners are one surface.
+ */
+export function triangulate(chunk: Chunk, level: number): Grid {
+  const { codes, w, h, low, step, K } = chunk;
+  const side = STEPS[level]!;
+  const ring = GROWN[level]!;
+  const [cols, rows] = [Math.ceil(w / side) + 2 * ring, Math.ceil(h / side) + 2 * ring];
+  const n = cols * rows;
+  const code = new Float32Array(n).fill(-1);
+  const [x, y] = [new Int16Array(n), new Int16Array(n)]; // of the vertex
+  const from = new Int32Array(n); // the pixel whose colour and sigma it has
+  const half = side >> 1;
+  for (let j = ring; j < rows - ring; j++)
+    for (let i = ring; i < cols - ring; i++) {
+      const [left, top] = [(i - ring) * side, (j - ring) * side];
+      const [cx, cy] = [Math.min(left + half, w - 1), Math.min(top + half, h - 1)];
+      let best = codes[cy * w + cx] ? cy * w + cx : -1;
+      if (best < 0 && side > 1) {
+        let least = Infinity;
+        for (let v = top; v < Math.min(top + side, h); v++)
+          for (let u = left; u < Math.min(left + side, w); u++) {
+            const d = (u - cx) ** 2 + (v - cy) ** 2;
+            if (codes[v * w + u] && d < least) [least, best] = [d, v * w + u];
+          }
+      }
+      if (best < 0) continue;
+      const k = j * cols + i;
+      code[k] = codes[best]! - 1;
+      x[k] = best % w;
+      y[k] = (best - x[k]!) / w;
+      from[k] = best;
+    }
+  for (let pass = 0; pass < ring; pass++) grow();
+  const depth = code.map((c) => (c < 0 ? 0 : 1 / (low + step * c)));
+
+  const index = new Uint32Array(6 * (cols - 1) * (rows - 1));
+  let count = 0;
+  const isOne = (a: number, b: number, c: number): boolean => {
+    const [p, q, r] = [depth[a]!, depth[b]!, depth[c]!];
+    if (!p || !q || !r) return false;
+    const far = Math.max(p, q, r);
+    const sigma = sigmaAt(chunk, from[a]! % w, (from[a]! / w) | 0);
+    return far - Math.min(p, q, r) <= (STEEPEST * side * far) / K[0] + SIGMAS * sigma;
+  };
+  const add = (a: number, b: number, c: number): void => {
+    if (!isOne(a, b, c)) return;
+    index[count++] = a;
+    index[count++] = b;
+    index[count++] = c;
+  };
+  for (let j = 0; j + 1 < rows; j++)
+    for (let i = 0; i + 1 < cols; i++) {
+      const a = j * cols + i;
+      const [b, c, d] = [a + 1, a + cols, a + cols + 1];
+      const falling = depth[a] && depth[d] ? Math.abs(depth[a]! - depth[d]!) : Infinity;
+      const rising = depth[b] && depth[c] ? Math.abs(depth[b]! - depth[c]!) : Infinity;
+      if (falling < rising) {
+        add(a, c, d);
+        add(a, d, b);
+      } else if (rising < Infinity) {
+        add(a, c, b);
+        add(b, c, d);
+      }
+    }
+  return compact(index.subarray(0, withoutSmall(index.subarray(0, count), n, side)));
+
+  /** Adds the vertices next to known ones. */
+  function grow(): void {
+    const grown: [number, number, number][] = [];
+    for (let j = 0; j < rows; j++)
+      for (let i = 0; i < cols; i++) {
+        const k = j * cols + i;
+        if (code[k]! >= 0) continue;
+        let [least, sum, number, near] = [Infinity, 0, 0, -1];
+        for (let twice = 0; twice < 2; twice++)
+          for (const [di, dj] of AROUND) {
+            const [ai, aj] = [i + di, j + dj];
+            if (ai < 0 || aj < 0 || ai >= cols || aj >= rows) continue;
+            const a = code[aj * cols + ai]!;
+            if (a < 0) continue;
+            const [bi, bj] = [ai + di, aj + dj];
+            const b = bi < 0 || bj < 0 || bi >= cols || bj >= rows ? -1 : code[bj * cols + bi]!;
+            const inverse = low + step * a;
+            const guess = b >= 0 && step * Math.abs(a - b) < SAME * inverse ? 2 * a - b : a;
+            if (!twice) {
+              if (near < 0) near = aj * cols + ai;
+              least = Math.min(least, guess);
+            } else if (step * (guess - least) < SAME * inverse) {
+              sum += guess;
+              number++;
+            }
+          }
+        const guess = sum / number;
+        if (number) grown.push([k, Math.min(Math.max(guess - (DIP * (low + step * guess)) / step, 0), 65535), near]);
+      }
+    for (const [k, c, near] of grown) {
+      code[k] = c;
+      x[k] = ((k % cols) - ring) * side + half;
+      y[k] = (Math.floor(k / cols) - ring) * side + half;
+      from[k] = from[near]!;
+    }
+  }
+
+  /** The vertices that triangles have, and their triangles. */
+  function compact(triangles: Uint32Array): Grid {
+    const number = new Int32Array(n).fill(-1);
+    let used = 0;
+    for (const k of triangles) if (number[k]! < 0) number[k] = used++;
+    const pixel = new Uint16Array(4 * used);
+    const at = new Uint16Array(2 * used);
+    for (let k = 0; k < n; k++) {
+      const v = number[k]!;
+      if (v < 0) continue;
+      const [fx, fy] = [from[k]! % w, (from[k]! / w) | 0];
+      const sigma = chunk.sigma[(fy >> 2) * Math.ceil(w / 4) + (fx >> 2)] ?? 0;
+      pixel.set([x[k]! + OUTSIDE_PX, y[k]! + OUTSIDE_PX, Math.round(code[k]!), 256 * sigma + viewsAt(chunk, fx, fy)], 4 * v);
+      at.set([((fx + 0.5) / w) * 65535, ((fy + 0.5) / h) * 65535], 2 * v);
+    }
+    const small = used <= 65535 ? new Uint16Array(triangles.length) : new Uint32Array(triangles.length);
+    for (let i = 0; i < triangles.length; i++) small[i] = number[triangles[i]!]!;
+    return { pixel, at, index: small };
+  }
+}
+
+/** Moves the triangles of patches that are too small to be a surface to the end; returns where they begin. */
+function withoutSmall(index: Uint32Array, vertices: number, side: number): number {
+  const parent = Int32Array.from({ length: vertices }, (_, k) => k);
+  const root = (k: number): number => {
+    while (parent[k] !== k) k = parent[k] = parent[parent[k]!]!;
+    return k;
+  };
+  for (let i = 0; i < index.length; i += 3) {
+    const a = root(index[i]!);
+    parent[root(index[i + 1]!)] = a;
+    parent[root(index[i + 2]!)] = a;
+  }
+  const size = new Uint32Array(vertices);
+  for (let i = 0; i < index.length; i += 3) size[root(index[i]!)]!++;
+  let end = 0;
+  const least = Math.max(MIN_TRIANGLES / side ** 2, MIN_COARSE);
+  for (let i = 0; i < index.length; i += 3) {
+    if (size[root(index[i]!)]! < least) continue;
+    index.copyWithin(end, i, i + 3);
+    end += 3;
+  }
+  return end;
+}
