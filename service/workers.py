@@ -68,7 +68,7 @@ ROWS: tuple[Row, ...] = (
     # The daemon.
     Row("backlog", "opens the earlier scans that the ground lacks", 4),
     Row("backlog closing", "ends the Zenoh session of earlier scans", 4, is_awaited=True),
-    Row("datalink", "the scan to the ground; threads of one Zenoh session", 4, restarts=True,
+    Row("datalink", "the scan to the ground; a Zenoh session for each station", 4, restarts=True,
         is_essential=True),
     Row("datalink closing", "ends a Zenoh session; over a dead link that takes long", 4),
     Row("radio", "the coarse scan over a telemetry radio, both ends", 4, restarts=True,
