@@ -34,13 +34,14 @@ class Wanted(Enum):
 class Intent:
     """The intended state, and when to try it next. Its owner guards it against other threads."""
 
-    def __init__(self) -> None:
+    def __init__(self, first_s: float = FIRST_RETRY_S, last_s: float = LAST_RETRY_S) -> None:
+        """The wait between two attempts grows from ``first_s`` to ``last_s``."""
         self.wanted = Wanted.NOTHING
         self.failures = 0  # since the scan was requested
         self.paused = threading.Event()  # set while a pause is wanted
         self.is_over = False  # the service ends
         self._due_s = 0.0
-        self._retry_s = FIRST_RETRY_S
+        self._first_s, self._last_s, self._retry_s = first_s, last_s, first_s
 
     @property
     def wants_scan(self) -> bool:
@@ -50,7 +51,7 @@ class Intent:
     def scan(self, now_s: float) -> None:
         """Request a scan now; also ends a pause."""
         self._due_s, self.failures = now_s, 0
-        self._retry_s = FIRST_RETRY_S
+        self._retry_s = self._first_s
         self._want(Wanted.SCAN)
 
     def stop(self) -> None:
@@ -91,13 +92,13 @@ class Intent:
     def failed(self, now_s: float) -> float:
         """Note a failed attempt; return the seconds until the next one."""
         self.failures += 1
-        wait_s, self._retry_s = self._retry_s, min(2 * self._retry_s, LAST_RETRY_S)
+        wait_s, self._retry_s = self._retry_s, min(2 * self._retry_s, self._last_s)
         self._due_s = now_s + wait_s
         return wait_s
 
     def succeeded(self) -> None:
         """Note that the attempt produces data, so that the next fault is retried soon."""
-        self._retry_s = FIRST_RETRY_S
+        self._retry_s = self._first_s
 
 
 class Left(Enum):
@@ -111,8 +112,9 @@ class Left(Enum):
 class Resumption:
     """The scan to resume; known until the operator starts or stops a scan."""
 
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / MARK
+    def __init__(self, folder: Path, boot: Path = BOOT) -> None:
+        """``boot``: a file with the id of this boot of the computer."""
+        self._path, self._boot_id = folder / MARK, boot
         self.left = self._read()
 
     def _read(self) -> Left:
@@ -120,7 +122,7 @@ class Resumption:
             boot = self._path.read_text(encoding="utf-8")
         except (OSError, ValueError):
             return Left.NOTHING
-        return Left.BY_SERVICE if boot and boot == _boot() else Left.BY_COMPUTER
+        return Left.BY_SERVICE if boot and boot == self._boot() else Left.BY_COMPUTER
 
     def note(self) -> None:
         """Mark a running scan that must resume after a crash."""
@@ -128,7 +130,7 @@ class Resumption:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with self._path.open("w", encoding="utf-8") as file:
-                file.write(_boot())
+                file.write(self._boot())
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
@@ -152,13 +154,12 @@ class Resumption:
             self.forget()
         return self.left is Left.BY_SERVICE or (self.left is Left.BY_COMPUTER and is_armed)
 
-
-def _boot() -> str:
-    """Id of this boot of the computer; empty where the system has none."""
-    try:
-        return BOOT.read_text(encoding="ascii").strip()
-    except OSError:
-        return ""
+    def _boot(self) -> str:
+        """Id of this boot of the computer; empty where the system has none."""
+        try:
+            return self._boot_id.read_text(encoding="ascii").strip()
+        except OSError:
+            return ""
 
 
 class Landing(Enum):

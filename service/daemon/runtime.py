@@ -10,6 +10,7 @@ import logging
 import math
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -62,20 +63,29 @@ class Daemon:
     """The onboard service."""
 
     def __init__(
-        self, config: Config, first: FirstBeats | None = None, fault: InputError | None = None
+        self,
+        config: Config,
+        first: FirstBeats | None = None,
+        fault: InputError | None = None,
+        *,
+        scanning: Scanning | None = None,
+        link: type[VehicleLink] = VehicleLink,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """``first`` sends heartbeats on the MAVLink links already. With a ``fault`` of the
         configuration, the service only reports it."""
         self._wanted = config  # as last loaded; operators may have tuned it since
         self._quit = threading.Event()
         self._fault = fault
+        self._clock_ns = clock_ns
         self._landing = LandingWatch()
+        self._was_armed = False
         self._cores = CoreLoad()
         self._is_silent = False  # no images arrive, and that was reported
-        self.scanning = Scanning(config)
+        self.scanning = scanning or Scanning(config)
         self.load_control = LoadControl(self.scanning)
         self.actions = ControlActions(self.scanning, self.quit)
-        self.vehicle = VehicleLink(vehicle_config(config), self.actions, first)
+        self.vehicle = link(vehicle_config(config), self.actions, first)
         self.scanning.vehicle = self.vehicle
 
     @property
@@ -83,9 +93,9 @@ class Daemon:
         """The configuration in force."""
         return self.scanning.config
 
-    def run(self) -> None:
+    def run(self, notifier: Notifier | None = None) -> None:
         """Serve until :meth:`quit`; raises InputError when the configuration is unusable."""
-        notifier = Notifier()
+        notifier = notifier or Notifier()
         self.vehicle.set_health(Health.BOOT)
         self.vehicle.start()
         http = self._serve_health()
@@ -97,7 +107,7 @@ class Daemon:
             notifier.ready()
             PROCESS.every("housekeeping", HOUSEKEEPING_S, self._housekeeping)
             PROCESS.start("recover", lambda _: self._recover())
-            self._watch(notifier)
+            self.watch(notifier)
         finally:
             notifier.stopping()
             self.scanning.end(lambda: self._wait_for_closing(notifier))
@@ -124,18 +134,21 @@ class Daemon:
                 self._quit.wait(REPORT_FAULT_S)
             raise
 
-    def _watch(self, notifier: Notifier) -> None:
+    def watch(self, notifier: Notifier) -> None:
         """Report to the operator and the init system until :meth:`quit`."""
-        scanning, was_armed = self.scanning, False
         while not self._quit.wait(0.25):
-            self.vehicle.set_health(self._health())
-            was_armed = self._follow_arming(was_armed)
-            self._resume()
-            self._report_camera()
-            self._close_after_landing()
-            scanning.follow_intent()
+            self.look()
             if self.is_progressing:
-                notifier.alive(scanning.phase.value)
+                notifier.alive(self.scanning.phase.value)
+
+    def look(self) -> None:
+        """Report to the operator, and follow the vehicle and the intent."""
+        self.vehicle.set_health(self._health())
+        self._follow_arming()
+        self._resume()
+        self._report_camera()
+        self._close_after_landing()
+        self.scanning.follow_intent()
 
     def _wait_for_closing(self, notifier: Notifier) -> None:
         """Report once a second that the last scan is being closed, unless that hangs."""
@@ -277,25 +290,25 @@ class Daemon:
         if self.scanning.start_again(is_heard, report.is_armed and report.is_certain):
             self.vehicle.statustext("Scan resumed after a restart", WARNING)
 
-    def _follow_arming(self, was_armed: bool) -> bool:
-        """Start and stop a scan with arming, if configured; returns whether it is armed."""
+    def _follow_arming(self) -> None:
+        """Start and stop a scan with arming, if configured."""
         report = self.vehicle.report()
-        is_armed = report.is_armed and report.is_certain
+        was_armed, is_armed = self._was_armed, report.is_armed and report.is_certain
+        self._was_armed = is_armed
         if self.config.scan.start == "on-arm" and is_armed != was_armed:
             answer = (self.actions.start_scan if is_armed else self.actions.stop_scan)()
             if answer.text:
                 self.vehicle.statustext(answer.text, NOTICE)
-        return is_armed
 
     def _close_after_landing(self) -> None:
         """Close a commanded scan after landing: the stop command may have been lost."""
-        scan, presence = self.config.scan, self.vehicle.presence
+        scan, presence, now_ns = self.config.scan, self.vehicle.presence, self._clock_ns()
         landing = self._landing.look(
             self.scanning.intent.wants_scan and scan.start == "on-command",
             presence.is_armed,
-            presence.is_disarmed(time.monotonic_ns() - RECENT_NS),
+            presence.is_disarmed(now_ns - RECENT_NS),
             scan.close_after_landing_s,
-            time.monotonic(),
+            1e-9 * now_ns,
         )
         if landing is Landing.LANDED:
             text = f"Landed: scan closes in {scan.close_after_landing_s:g} s unless you arm"

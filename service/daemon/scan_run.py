@@ -40,17 +40,23 @@ LATER, PHOTOS = "later", "photos"
 class ScanRun:
     """One attempt at a scan, from opening the camera until its files are written."""
 
-    def __init__(self, host: Scanning, is_asked: bool) -> None:
-        """``is_asked``: a command waits for this attempt; it is not a retry."""
+    def __init__(
+        self,
+        host: Scanning,
+        is_asked: bool,
+        opener: Callable[[str], CameraSource] | None = None,
+    ) -> None:
+        """``is_asked``: a command waits for this attempt; it is not a retry. ``opener`` opens
+        the camera (default: :func:`service.cameras.open_camera`)."""
         self.stop = threading.Event()
         self.scan: Scan | None = None
         self.gate: FrameGate | None = None
         self.is_feeding = False  # frames go into the scan
         self.is_closing = False
         self.started_s = self.progress_s = time.monotonic()
-        self._host, self._is_asked = host, is_asked
-        self._store: ScanStore | None = None
-        self._thread_id = 0
+        self._host, self._is_asked, self._opener = host, is_asked, opener
+        self.store: ScanStore | None = None
+        self.thread_id = 0
         self._news_reported = 0  # camera warnings reported so far
         self._photos: set[int] = set()  # times of the frames that were reported as photos
 
@@ -88,16 +94,16 @@ class ScanRun:
 
     def closing_marks(self) -> tuple[Any, ...]:
         """Values that change when closing makes progress: uses of the store, keyframes."""
-        scan, store = self.scan, self._store
+        scan, store = self.scan, self.store
         if scan is None or store is None:
             return (self.is_closing,)
-        return (self.is_closing, store.uses(self._thread_id), scan.recorder.keyframes)
+        return (self.is_closing, store.uses(self.thread_id), scan.recorder.keyframes)
 
     # ---- on the scan's thread ----------------------------------------------------------------
 
     def carry_out(self) -> None:
         """Scan until stopped or the recording ends, then close the scan."""
-        self._thread_id = threading.get_ident()
+        self.thread_id = threading.get_ident()
         try:
             source = self._open_camera()
             if source is not None:
@@ -105,7 +111,7 @@ class ScanRun:
                     self._scan(source)
         finally:
             self.is_closing = True
-            self.scan = self.gate = self._store = None
+            self.scan = self.gate = self.store = None
 
     def _open_camera(self) -> CameraSource | None:
         """The camera at its own pace, retried until it answers; None when stopped meanwhile."""
@@ -115,7 +121,7 @@ class ScanRun:
         wait_s, is_answer = FIRST_RETRY_S, self._is_asked
         while not self.stop.is_set():
             try:
-                source = open_camera(self._host.config.camera.source)
+                source = (self._opener or open_camera)(self._host.config.camera.source)
                 return source if isinstance(source, Paced) else Paced(source)
             except OutsideError as error:
                 log.warning("%s; retry in %.1f s", error, wait_s)
@@ -140,7 +146,7 @@ class ScanRun:
         self._news_reported = len(gate.warnings)
         host.vehicle.record(inputs.folder / "link.tlog", inputs.unix_offset_ns)
         host.link.take_off(store, host.config, host.vehicle)
-        self._store, self.gate, self.scan = store, gate, Scan(inputs, store)
+        self.store, self.gate, self.scan = store, gate, Scan(inputs, store)
         host.set_level(host.level)
         host.vehicle.statustext(f"Scan {inputs.scan_id} started")
         try:

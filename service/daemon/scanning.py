@@ -25,7 +25,7 @@ from service.errors import InputError, SkyreliefError
 from service.flight.datalink import DaemonLink
 from service.memory import give_back
 from service.scans.retention import Claim
-from service.workers import PROCESS, Worker
+from service.workers import PROCESS, Worker, Workers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,24 +45,36 @@ class Scanning:
     vehicle: VehicleLink
     """Telemetry and the operator; set by the owner of both, before the first scan."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(
+        self,
+        config: Config,
+        *,
+        attempt: Callable[[Scanning, bool], ScanRun] = ScanRun,
+        intent: Intent | None = None,
+        resumption: Resumption | None = None,
+        closing_watch: ClosingWatch | None = None,
+        workers: Workers = PROCESS,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``attempt`` makes a run from this object and whether a command waits for it."""
         self.config = config
-        self.intent = Intent()
+        self.intent = intent or Intent()
         self.fault = ""  # why the last attempt failed; cleared when another starts
         self.level = Level.FULL
         self.is_warm = is_warm()  # all kernels are compiled
         self.camera: Camera | None = None  # the model; None before it is loaded
         self.link = DaemonLink()
         self.made: set[str] = set()  # names of the scans of this process
-        self.resumption = Resumption(Path(config.scan.folder))
+        self.resumption = resumption or Resumption(Path(config.scan.folder))
         self.claim = Claim()  # to the folder of scans; its holder manages earlier ones
-        self._backend: Backend | None = None
+        self.backend: Backend | None = None  # None before it is loaded
+        self._attempt, self._workers, self._clock_s = attempt, workers, clock_s
         self._lock = threading.RLock()  # guards the intent, the run and the work of closing it
-        self._run: ScanRun | None = None
+        self.run: ScanRun | None = None  # the current attempt
         self._worker: Worker | None = None  # of the run
         self._closing: Work | None = None  # ends with the run
         self._writings = Writings(lambda text: self.vehicle.statustext(text, WARNING))
-        self._watch = ClosingWatch()
+        self._watch = closing_watch or ClosingWatch()
 
     def load(self) -> None:
         """Load camera model and backend, which takes long; InputError if they are unusable."""
@@ -76,8 +88,8 @@ class Scanning:
                 "camera.model is not set; make one with 'skyrelief calibrate' and set it"
             )
         self.camera = load_camera(Path(self.config.camera.model))
-        self._backend = open_backend(self.config.compute, self.camera.size_px)
-        log.info("ready: backend %s", self._backend.name)
+        self.backend = open_backend(self.config.compute, self.camera.size_px)
+        log.info("ready: backend %s", self.backend.name)
 
     # ---- intent ------------------------------------------------------------------------------
 
@@ -86,7 +98,7 @@ class Scanning:
         with self._lock:
             is_new = not self.intent.wants_scan
             self.resume()
-            self.intent.scan(time.monotonic())
+            self.intent.scan(self._clock_s())
             if is_new and self.intent.wants_scan and self.config.scan.start == "on-command":
                 self.resumption.note()  # otherwise it starts by itself anyway
 
@@ -109,7 +121,7 @@ class Scanning:
         with self._lock:
             self.intent.stop()
             self.resumption.forget()
-            run = self._run
+            run = self.run
             if run is not None:
                 run.stop.set()
         if run is not None:
@@ -118,7 +130,7 @@ class Scanning:
     def finalise(self) -> Work | None:
         """Stop; returns the work of writing everything, or None when nothing runs."""
         with self._lock:
-            if self._run is not None:
+            if self.run is not None:
                 self._closing = self._closing or Work()
             work = self._closing
         self.stop()
@@ -132,7 +144,7 @@ class Scanning:
     def resume(self) -> bool:
         """Take frames again after a pause; False without a pause."""
         with self._lock:
-            run = self._run
+            run = self.run
             if run is not None:
                 run.alive()
             return self.intent.resume()
@@ -140,12 +152,12 @@ class Scanning:
     def follow_intent(self) -> None:
         """Start the wanted scan when it is due and none runs; call it often."""
         with self._lock:
-            if self._run is not None or not self.intent.is_due(time.monotonic()):
+            if self.run is not None or not self.intent.is_due(self._clock_s()):
                 return
             self.fault = ""
-            run = self._run = ScanRun(self, is_asked=self.intent.failures == 0)
-            self._worker = PROCESS.start(
-                "scan", lambda _: self._carry_out(run), lag_s=lambda: run.busy_s
+            run = self.run = self._attempt(self, self.intent.failures == 0)
+            self._worker = self._workers.start(
+                "scan", lambda _: self.carry_out(run), lag_s=lambda: run.busy_s
             )
 
     def fulfilled(self, run: ScanRun) -> None:
@@ -162,33 +174,33 @@ class Scanning:
     def phase(self) -> Phase:
         """The current phase."""
         with self._lock:
-            if self._run is None or self._run.is_ending:
+            if self.run is None or self.run.is_ending:
                 if self.intent.wants_scan:
                     return Phase.WAITING
-                return Phase.IDLE if self._run is None else Phase.FINALISING
+                return Phase.IDLE if self.run is None else Phase.FINALISING
             return Phase.PAUSED if self.intent.wanted is Wanted.PAUSE else Phase.SCANNING
 
     @property
     def is_running(self) -> bool:
         """True from the start of an attempt at a scan until its files are written."""
-        return self._run is not None
+        return self.run is not None
 
     @property
     def is_closing(self) -> bool:
         """True from the end of a scan until its files are written."""
-        run = self._run
+        run = self.run
         return run is not None and run.is_ending
 
     @property
     def scan(self) -> Scan | None:
         """The running scan."""
-        run = self._run
+        run = self.run
         return None if run is None else run.scan
 
     @property
     def gate(self) -> FrameGate | None:
         """The gate between the camera and the running scan."""
-        run = self._run
+        run = self.run
         return None if run is None else run.gate
 
     @property
@@ -200,19 +212,19 @@ class Scanning:
     @property
     def started_s(self) -> float:
         """Monotonic start time of the run; the current time without one."""
-        run = self._run
+        run = self.run
         return time.monotonic() if run is None else run.started_s
 
     @property
     def busy_s(self) -> float:
         """Seconds spent on the current frame or view; 0 while waiting for the camera."""
-        run = self._run
+        run = self.run
         return 0.0 if run is None else run.busy_s
 
     @property
     def progress_s(self) -> float:
         """Monotonic time of the last processed frame; the current time without a scan."""
-        run = self._run
+        run = self.run
         return time.monotonic() if run is None else run.progress_s
 
     @property
@@ -224,7 +236,7 @@ class Scanning:
 
     def camera_news(self) -> list[str]:
         """Warnings of a running scan's camera since the last call."""
-        run = self._run
+        run = self.run
         return [] if run is None else run.camera_news()
 
     @property
@@ -233,7 +245,7 @@ class Scanning:
 
         Call it often: progress is any change since the last call.
         """
-        run = self._run
+        run = self.run
         is_last = self.intent.is_over and len(self._writings) > 0
         if run is not None and run.is_ending:
             marks: tuple[Any, ...] | None = (*run.closing_marks(), *self._writings.marks())
@@ -250,16 +262,16 @@ class Scanning:
     @property
     def backend_name(self) -> str:
         """Name of the backend in use; empty during start-up."""
-        return self._backend.name if self._backend is not None else ""
+        return self.backend.name if self.backend is not None else ""
 
     @property
     def backend_failure(self) -> str:
         """Why the CPU replaced the chosen backend; empty when it did not."""
-        if self._backend is None:
+        if self.backend is None:
             return ""
         from service.compute.backend_choice import FallbackBackend
 
-        return (isinstance(self._backend, FallbackBackend) and self._backend.failure) or ""
+        return (isinstance(self.backend, FallbackBackend) and self.backend.failure) or ""
 
     # ---- changes in flight --------------------------------------------------------------------
 
@@ -305,7 +317,8 @@ class Scanning:
 
     # ---- the scan's thread ------------------------------------------------------------------
 
-    def _carry_out(self, run: ScanRun) -> None:
+    def carry_out(self, run: ScanRun) -> None:
+        """Carry out the run; a fault is reported, and retried while a scan is wanted."""
         fault = ""
         try:
             run.carry_out()
@@ -320,7 +333,7 @@ class Scanning:
         with self._lock:
             if fault:
                 self._failed(fault)
-            self._run = None
+            self.run = None
             closing, self._closing = self._closing, None
         if closing is not None:
             closing.finish(Answer(Result.FAILED, fault) if fault else ACCEPTED)
@@ -332,12 +345,12 @@ class Scanning:
         is_first = self.intent.failures == 0
         self.vehicle.statustext(f"Scan failed: {fault}", CRITICAL, is_answer=is_first)
         if self.intent.wants_scan:
-            log.warning("next attempt in %.1f s", self.intent.failed(time.monotonic()))
+            log.warning("next attempt in %.1f s", self.intent.failed(self._clock_s()))
 
     def equipment(self) -> tuple[Camera, Backend]:
         """The camera's model and the backend."""
-        assert self.camera is not None and self._backend is not None
-        return self.camera, self._backend
+        assert self.camera is not None and self.backend is not None
+        return self.camera, self.backend
 
     def write_files(self, folder: Path, store: ScanStore) -> None:
         """Write a scan's files, in the background when another scan is wanted meanwhile."""

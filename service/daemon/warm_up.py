@@ -116,18 +116,18 @@ def has_kernels() -> bool:
     return any(Path(folder).rglob("*.nbi"))
 
 
-def warm_up_command() -> str:
+def warm_up_command(prefix: str = sys.prefix) -> str:
     """The command that compiles the kernels where this installation looks for them."""
-    if not _services_cache():
+    if not _services_cache(prefix):
         return "skyrelief warm-up"
     return f"{AS_SERVICE} {INSTALLED}/current/bin/skyrelief warm-up"
 
 
-def is_warm() -> bool:
-    """True when this version was warmed up with this cache or that of the installed service."""
+def is_warm(version: str = "") -> bool:
+    """True when this version (or ``version``) was warmed up with this cache or the service's."""
     marker = _marker(os.environ.get("NUMBA_CACHE_DIR", "") or _services_cache())
     try:
-        return marker is not None and marker.read_text(encoding="utf-8") == software()
+        return marker is not None and marker.read_text(encoding="utf-8") == (version or software())
     except OSError:
         return False
 
@@ -142,9 +142,9 @@ def _mark() -> None:
         log.warning("%s", error)
 
 
-def _services_cache() -> str:
+def _services_cache(prefix: str = sys.prefix) -> str:
     """Kernel cache of an installed service; empty for any other installation."""
-    return SERVICE_CACHE if Path(sys.prefix).is_relative_to(INSTALLED) else ""
+    return SERVICE_CACHE if Path(prefix).is_relative_to(INSTALLED) else ""
 
 
 def _marker(folder: str) -> Path | None:

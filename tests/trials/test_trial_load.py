@@ -211,7 +211,7 @@ def test_gpu_out_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reco
     monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_, **__: heard.append(text))
     daemon.scanning.load()
     gpu = OutOfMemory()
-    daemon.scanning._backend = FallbackBackend(gpu)
+    daemon.scanning.backend = FallbackBackend(gpu)
     daemon.scanning.start()
 
     def keyframes(more_than: int) -> int:

@@ -18,7 +18,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from loopback import free_port
+from loopback import free_port, until
+from onboard import Onboard
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 from trial_autopilot import Autopilot
 from trial_rig import (
@@ -36,9 +37,8 @@ from trial_rig import (
     with_site,
 )
 
-from mavlink.component.control import Phase
-from service.config import load_config
-from service.daemon.runtime import Daemon
+from mavlink.component.control import Phase, Result
+from service.daemon.intent import Intent
 from service.daemon.scan_run import ScanRun
 from service.errors import OutsideError
 from service.stream.store import ScanStore
@@ -356,11 +356,7 @@ def test_broken_configuration_at_reload_changes_nothing(tmp_path: Path, record: 
     record("broken configuration at reload", 4, "refused, service unharmed")
 
 
-def test_a_scan_that_fails_is_started_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Row
-) -> None:
-    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
-    daemon.actions.is_ready = True
+def test_a_scan_that_fails_is_started_again(tmp_path: Path, record: Row) -> None:
     faults: list[Exception] = [OutsideError("camera gone"), RuntimeError("ours"), OSError("disk")]
     tried = len(faults)
     scanning = []
@@ -371,8 +367,8 @@ def test_a_scan_that_fails_is_started_again(
         scanning.append(daemon.scanning.phase)
         run.stop.wait(PATIENCE_S)
 
-    monkeypatch.setattr(ScanRun, "carry_out", carry_out)
-    monkeypatch.setattr("service.daemon.intent.FIRST_RETRY_S", 0.01)
+    daemon = Onboard(tmp_path, script=carry_out, intent=Intent(0.01))
+    daemon.actions.is_ready = True
     daemon.actions.start_scan()
     deadline = time.monotonic() + PATIENCE_S
     while not scanning and time.monotonic() < deadline:
@@ -387,18 +383,14 @@ def test_a_scan_that_fails_is_started_again(
     record("faults of camera, disk and our own code", tried, "scanning again each time")
 
 
-def test_stopping_ends_the_retries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
-    daemon.actions.is_ready = True
-
+def test_stopping_ends_the_retries(tmp_path: Path) -> None:
     def carry_out(run: ScanRun) -> None:
         raise OutsideError("camera gone")
 
-    monkeypatch.setattr(ScanRun, "carry_out", carry_out)
-    monkeypatch.setattr("service.daemon.intent.FIRST_RETRY_S", 0.0)
-    daemon.actions.start_scan()
-    assert daemon.scanning._worker is not None
-    assert daemon.scanning._worker.join(30.0)
+    daemon = Onboard(tmp_path, script=carry_out)
+    daemon.actions.is_ready = True
+    assert daemon.actions.start_scan().result is Result.ACCEPTED
+    assert until(lambda: not daemon.scanning.is_running, 30.0)
     assert daemon.scanning.fault == "camera gone"
     assert daemon.scanning.intent.wants_scan  # waits to try again
     daemon.actions.stop_scan()

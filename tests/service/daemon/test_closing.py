@@ -7,23 +7,17 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from loopback import until
+from onboard import Onboard, real_scan
 from paths import ROOT
 
 from mavlink.component.control import Phase
-from service.config import load_config
 from service.daemon import runtime
-from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
-from service.daemon.scanning import Scanning
 from service.daemon.writing import ClosingWatch, sizes
 from service.memory import give_back, one_pool
-from service.stream.records import ScanHeader
-from service.stream.store import ScanStore
 
 
 def test_only_what_changes_is_progress() -> None:
@@ -55,42 +49,36 @@ def test_files_grow_but_not_by_the_work_of_others(tmp_path: Path) -> None:
 class Hung:
     """A scan whose closing waits at a gate, then uses its store, then waits for good."""
 
-    def __init__(self, scanning: Scanning, folder: Path) -> None:
-        header = ScanHeader("s", "d", 1, camera={}, configuration={}, software="test")
-        self.store = ScanStore.create(folder / "s" / "scan.db", header)
-        self.scanning, self.step, self.end = scanning, threading.Event(), threading.Event()
+    def __init__(self, folder: Path) -> None:
+        self.scan = real_scan(folder / "s")
+        self.store = self.scan.store
+        self.step, self.end = threading.Event(), threading.Event()
 
-    def carry_out(self, given: ScanRun) -> None:
-        run: Any = given
-        run._thread_id = threading.get_ident()
-        run.scan = SimpleNamespace(
-            source=SimpleNamespace(close=lambda: None),
-            inputs=SimpleNamespace(folder=self.store.path.parent, scan_id="s"),
-            recorder=SimpleNamespace(keyframes=3),
-        )
-        run._store = self.store
+    def __call__(self, run: ScanRun) -> None:
+        run.thread_id = threading.get_ident()
+        run.scan, run.store = self.scan, self.store
         run.stop.wait(60.0)
         run.is_closing = True
         self.step.wait(60.0)
         self.store.seqs()
         self.end.wait(60.0)
 
+    def close(self) -> None:
+        """End the scan's threads."""
+        self.scan.pipeline.finish()
+        self.store.close()
 
-def test_a_closing_that_hangs_is_no_progress(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
-    scanning, now_s = daemon.scanning, 0.0
-    monkeypatch.setattr(type(daemon.vehicle), "is_serving", True)
-    scanning._watch = ClosingWatch(lambda: now_s)
-    hung = Hung(scanning, tmp_path)
-    monkeypatch.setattr(ScanRun, "carry_out", lambda run: hung.carry_out(run))
+
+def test_a_closing_that_hangs_is_no_progress(tmp_path: Path) -> None:
+    now_s, hung = 0.0, Hung(tmp_path)
+    daemon = Onboard(tmp_path, script=hung, closing_watch=ClosingWatch(lambda: now_s))
+    scanning = daemon.scanning
     limit_s = runtime.CLOSING_S + daemon.config.datalink.drain_s
     scanning.start()
     now_s = 10.0 * limit_s
     assert daemon.is_progressing  # scanning, not closing
     scanning.stop()
-    until(lambda: scanning._run is not None and scanning._run.is_closing)
+    until(lambda: scanning.run is not None and scanning.run.is_closing)
     assert daemon.is_progressing
     now_s += 0.9 * limit_s
     assert daemon.is_progressing
@@ -104,17 +92,13 @@ def test_a_closing_that_hangs_is_no_progress(
     hung.end.set()
     until(lambda: not scanning.is_running)
     assert daemon.is_progressing
-    hung.store.close()
+    hung.close()
 
 
-def test_systemd_is_asked_to_wait_only_while_closing_gets_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
-    scanning, now_s, asked = daemon.scanning, 0.0, []
-    scanning._watch = ClosingWatch(lambda: now_s)
-    hung = Hung(scanning, tmp_path)
-    monkeypatch.setattr(ScanRun, "carry_out", lambda run: hung.carry_out(run))
+def test_systemd_is_asked_to_wait_only_while_closing_gets_on(tmp_path: Path) -> None:
+    now_s, asked, hung = 0.0, list[float](), Hung(tmp_path)
+    daemon = Onboard(tmp_path, script=hung, closing_watch=ClosingWatch(lambda: now_s))
+    scanning = daemon.scanning
     scanning.start()
     until(lambda: scanning.scan is not None)
 
@@ -128,27 +112,20 @@ def test_systemd_is_asked_to_wait_only_while_closing_gets_on(
     scanning.end(alive)
     assert asked[0] == 0.0
     assert len(asked) <= 2
-    hung.store.close()
+    hung.close()
 
 
-def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given = [f"scan.folder={tmp_path}", "scan.start=on-arm", "health.http="]
-    daemon, reported = Daemon(load_config(None, given)), []
-    scanning, hung = daemon.scanning, Hung(daemon.scanning, tmp_path)
-    monkeypatch.setattr(ScanRun, "carry_out", lambda run: hung.carry_out(run))
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_: reported.append(text))
+def test_an_arming_while_the_last_scan_is_closed_is_followed_then(tmp_path: Path) -> None:
+    hung = Hung(tmp_path)
+    daemon = Onboard(tmp_path, "scan.start=on-arm", script=hung)
+    scanning, reported = daemon.scanning, daemon.vehicle.said
     daemon.actions.is_ready = True
-    armed, was = False, False
 
     def look(arming: bool) -> bool:
-        nonlocal armed, was
-        armed = arming
-        was = daemon._follow_arming(was)
-        return was
+        daemon.vehicle.arm(arming)
+        daemon.look()
+        return daemon.vehicle.report().is_armed
 
-    monkeypatch.setattr(type(daemon.vehicle.presence), "is_armed", property(lambda _: armed))
     assert look(True)
     until(lambda: scanning.scan is not None)
     assert not look(False)
@@ -172,7 +149,7 @@ def test_an_arming_while_the_last_scan_is_closed_is_followed_then(
     assert look(True)
     scanning.follow_intent()
     assert not scanning.is_running  # the operator's stop holds until the next take-off
-    hung.store.close()
+    hung.close()
 
 
 def test_large_arrays_stay_out_of_the_pool() -> None:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from onboard import Onboard
 
 from recon.backends import load_backend
 from recon.backends.cpu import CpuBackend
@@ -22,7 +23,6 @@ from service.config import load_config
 from service.daemon.frame_gate import FrameGate
 from service.daemon.load_shedding import Level
 from service.daemon.machine import Machine
-from service.daemon.runtime import Daemon
 from service.daemon.stored_image import image_name
 
 START_NS = 1_790_000_000_123_456_000
@@ -94,13 +94,17 @@ def test_record_only_keeps_images_that_a_replay_can_read(tmp_path: Path) -> None
 
 
 def test_levels_change_while_frames_come(tmp_path: Path) -> None:
-    gate, _ = gate_over(Film(), tmp_path, Level.FULL)
+    gate: FrameGate
+
+    def alive() -> None:
+        gate.level = Level.FULL
+
+    gate = FrameGate(Film(), tmp_path / "later", START_NS, alive, Event())
     seen = []
     for frame in gate:
         seen.append(frame.seq)
         if frame.seq == 9:
             gate.level = Level.RECORD_ONLY
-            gate._alive = lambda: setattr(gate, "level", Level.FULL)
     assert seen == [*range(10), *range(11, 100)]
     assert gate.kept == 1
 
@@ -121,23 +125,13 @@ def test_names_of_images_are_times() -> None:
     assert image_name(1_533_459_888_480_000_000) == "20180805090448480000Z.jpg"
 
 
-class Operator:
-    """Collects what is said."""
-
-    def __init__(self, daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.heard: list[str] = []
-        monkeypatch.setattr(daemon.vehicle, "statustext", lambda t, *_: self.heard.append(t))
-
-
 @pytest.fixture
-def daemon(tmp_path: Path) -> Daemon:
-    return Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
+def daemon(tmp_path: Path) -> Onboard:
+    return Onboard(tmp_path)
 
 
-def test_heat_is_reported_acted_on_and_undone(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    operator = Operator(daemon, monkeypatch)
+def test_heat_is_reported_acted_on_and_undone(daemon: Onboard) -> None:
+    said = daemon.vehicle.said
     control = daemon.load_control
     for now_s in range(0, 100, 2):
         control.look(Machine("m", temperature_c=97.0), float(now_s))
@@ -146,25 +140,25 @@ def test_heat_is_reported_acted_on_and_undone(
     for now_s in range(100, 400, 2):
         control.look(Machine("m", temperature_c=60.0), float(now_s))
     assert control.to_dict()["level"] == Level.FULL
-    assert operator.heard[0] == "Load: lower rate (97 degrees)"
-    assert operator.heard[3] == "Load: record only (97 degrees)"
-    assert operator.heard[-1] == "Load: full quality again"
-    assert len(operator.heard) == 8
+    assert said[0] == "Load: lower rate (97 degrees)"
+    assert said[3] == "Load: record only (97 degrees)"
+    assert said[-1] == "Load: full quality again"
+    assert len(said) == 8
     assert daemon.snapshot()["load"]["level"] == 0
 
 
-def test_relief_can_be_switched_off(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
-    operator = Operator(daemon, monkeypatch)
+def test_relief_can_be_switched_off(daemon: Onboard) -> None:
+    said = daemon.vehicle.said
     for now_s in range(0, 60, 2):
         daemon.load_control.look(Machine("m", temperature_c=97.0), float(now_s))
     assert daemon.load_control.to_dict()["level"] == Level.LOWER_RESOLUTION
     daemon.reload(load_config(None, ["compute.relief=false"]))
     daemon.load_control.look(Machine("m", temperature_c=97.0), 60.0)
     assert daemon.load_control.to_dict() == {"level": 0, "name": "full", "reason": ""}
-    heard = len(operator.heard)
+    heard = len(said)
     for now_s in range(62, 200, 2):
         assert daemon.load_control.look(Machine("m", temperature_c=97.0), float(now_s)) is None
-    assert len(operator.heard) == heard
+    assert len(said) == heard
 
 
 class Dying(CpuBackend):
@@ -185,12 +179,10 @@ class Dying(CpuBackend):
         return super().belief_propagation(left, right, labels, config)
 
 
-def test_a_device_that_fails_is_reported_once_and_the_cpu_goes_on(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    operator = Operator(daemon, monkeypatch)
+def test_a_device_that_fails_is_reported_once_and_the_cpu_goes_on(daemon: Onboard) -> None:
+    said = daemon.vehicle.said
     backend = FallbackBackend(Dying())
-    daemon.scanning._backend = backend
+    daemon.scanning.backend = backend
     gray = np.zeros((48, 64), np.uint8)
     arguments: tuple[Any, ...] = (gray, gray, 4, BeliefPropagationConfig())
     truth = load_backend("cpu").belief_propagation(*arguments).px
@@ -198,8 +190,8 @@ def test_a_device_that_fails_is_reported_once_and_the_cpu_goes_on(
         found = backend.belief_propagation(*arguments).px
         np.testing.assert_array_equal(found, truth)
         daemon.load_control.look(Machine("m"), float(i))
-        assert len(operator.heard) == (i >= 2)
-    assert operator.heard == ["Compute device failed: CUDA out of memory. Tried to allocate 20 MiB"]
+        assert len(said) == (i >= 2)
+    assert said == ["Compute device failed: CUDA out of memory. Tried to allocate 20 MiB"]
     assert daemon.snapshot()["backend"] == "cpu"
     assert "out of memory" in daemon.snapshot()["backend_failure"]
 

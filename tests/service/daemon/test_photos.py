@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from onboard import Onboard, real_scan
 
 from mavlink.component.camera import KeyframeReport
-from mavlink.component.control import Phase, Result
+from mavlink.component.control import Result
+from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
-from recon.backends.cpu import CpuBackend
-from recon.tracking.odometry import Tracked, Tracking
-from recon.types import Camera
 from service.cameras.exif import read_tags
 from service.cameras.source import CameraFrame
-from service.config import load_config
 from service.daemon.load_shedding import Level
-from service.daemon.runtime import Daemon
 from service.daemon.scan_run import report_photo
-from service.daemon.scanning import Scanning
 from service.daemon.stored_image import image_name, store_image
-from service.flight.pipeline import Step
-from service.flight.scan import Photo, Scan, ScanInputs, create_store
+from service.flight.scan import Photo, Scan
 
 S = 1_000_000_000
 START_NS = 1_790_000_000 * S
@@ -55,31 +50,28 @@ class OperatorEnd:
         self.texts.append(text)
 
 
-def photos_in(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, *steps: Step
-) -> tuple[Scan, OperatorEnd]:
-    """A scan with steps in place of its pipeline's, whose photos reach the operator."""
-    K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 44.5], [0.0, 0.0, 1.0]])
+class Hovering(VehicleHistory):
+    """The vehicle hovers, without a gap."""
+
+    def state_at(self, *_: object, **__: object) -> VehicleState:
+        return HOVER
+
+    def gap_s(self, *_: object) -> float:
+        return 0.1
+
+
+def photos_in(folder: Path) -> tuple[Scan, OperatorEnd]:
+    """A scan whose photos reach the operator."""
     operator: Any = OperatorEnd()
-    inputs = ScanInputs(
-        SimpleNamespace(is_live=True, warnings=[]),
-        Camera(K, np.zeros(5), (160, 90)), load_config(None, []), CpuBackend(), folder / "scan",
-        "scan", 0, unix_offset_ns=START_NS,
-        history=SimpleNamespace(state_at=lambda _: HOVER, gap_s=lambda _: 0.1),  # type: ignore[arg-type]
+    scan: Scan = real_scan(
+        folder / "scan", history=Hovering(), unix_offset_ns=START_NS,
         on_photo=lambda photo: report_photo(operator, scan, photo),
     )  # fmt: skip
-    scan = Scan(inputs, create_store(inputs))
-    coming = iter(steps)
-    monkeypatch.setattr(scan.pipeline, "skip", lambda *_: Step(Tracked(Tracking.SKIPPED, 0)))
-    monkeypatch.setattr(scan.pipeline, "step", lambda _: next(coming))
     return scan, operator
 
 
-def test_a_photo_in_a_steady_hover_is_an_image_with_its_tag(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lost = Step(Tracked(Tracking.LOST, 0, reason="the image does not move"))
-    scan, operator = photos_in(tmp_path, monkeypatch, lost, lost)
+def test_a_photo_in_a_steady_hover_is_an_image_with_its_tag(tmp_path: Path) -> None:
+    scan, operator = photos_in(tmp_path)
     for k in range(6):
         if k == 3:
             scan.take_photo()
@@ -115,7 +107,7 @@ def test_a_photo_without_telemetry_has_the_place_by_vision_or_none(tmp_path: Pat
 def test_a_photo_that_cannot_be_stored_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scan, operator = photos_in(tmp_path, monkeypatch)
+    scan, operator = photos_in(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(9, 8, 1))
     scan.inputs.on_photo(Photo(IMAGE, S, None, None, None))  # type: ignore[misc]
     assert operator.texts == ["photo failed: the disk is nearly full"]
@@ -124,12 +116,16 @@ def test_a_photo_that_cannot_be_stored_says_why(
     scan.store.close()
 
 
-def test_a_photo_while_images_are_only_stored_is_refused_with_the_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
-    monkeypatch.setattr(Scanning, "phase", Phase.SCANNING)
-    monkeypatch.setattr(Scanning, "scan", SimpleNamespace())
+def test_a_photo_while_images_are_only_stored_is_refused_with_the_reason(tmp_path: Path) -> None:
+    end = threading.Event()
+    daemon = Onboard(tmp_path, script=lambda _: end.wait(60.0))
+    daemon.scanning.start()
+    assert daemon.scanning.run is not None
+    scan = daemon.scanning.run.scan = real_scan(tmp_path / "scan")
     daemon.scanning.level = Level.RECORD_ONLY
     answer: Any = daemon.actions.capture_keyframe()
     assert answer.result is Result.TEMPORARILY_REJECTED and "only stored" in answer.text
+    end.set()
+    daemon.scanning.end()
+    scan.pipeline.finish()
+    scan.store.close()

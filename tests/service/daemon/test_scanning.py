@@ -7,71 +7,65 @@ import gc
 import os
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from loopback import until
-from paths import DEMO
+from onboard import FakeCamera, Onboard, camera_of
 
 from mavlink.component.control import Phase
-from recon.backends.cpu import CpuBackend
-from service.cameras.camera_file import load_camera
-from service.config import load_config
-from service.daemon.intent import MARK, Left
+from service.cameras.source import CameraFrame
+from service.daemon.frame_gate import FrameGate
+from service.daemon.intent import MARK, Left, Resumption
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
 from service.flight.scan import short_collections
 
-MODEL = DEMO / "camera.yaml"
+
+class Silent(FakeCamera):
+    """A camera that is open and sends no image."""
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        self.closed.wait(60.0)
+        return iter(())
 
 
-@pytest.fixture
-def daemon(tmp_path: Path) -> Daemon:
-    return Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
-
-
-def test_images_that_the_camera_model_does_not_fit_are_refused(
-    daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    closed, reported, scanning = threading.Event(), [], daemon.scanning
-    source: Any = SimpleNamespace(
-        size_px=(320, 180), description="gimbal", start_monotonic_ns=0, close=closed.set
-    )
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_, **__: reported.append(text))
-    monkeypatch.setattr(ScanRun, "_open_camera", lambda _: source)
-    scanning.camera, scanning._backend = load_camera(MODEL), CpuBackend()
+def test_images_that_the_camera_model_does_not_fit_are_refused(tmp_path: Path) -> None:
+    source = FakeCamera((320, 180))
+    daemon = Onboard(tmp_path, opener=camera_of(source))
+    scanning, reported = daemon.scanning, daemon.vehicle.said
+    daemon.equip()
     scanning.start()
     until(lambda: reported and not scanning.is_running)
     assert reported == [f"Scan failed: {scanning.fault}"]
     assert "for 1600x1200 images, gimbal has 320x180" in scanning.fault
-    assert closed.is_set()
+    assert source.closed.is_set()
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
     scanning.stop()
 
 
-def test_a_camera_model_of_another_size_is_scaled_as_by_a_replay(daemon: Daemon) -> None:
+def test_a_camera_model_of_another_size_is_scaled_as_by_a_replay(tmp_path: Path) -> None:
     """A stream that changes from 1600x1200 to 320x240 ended every later scan."""
+    daemon = Onboard(tmp_path, opener=camera_of(Silent((320, 240))))
     scanning = daemon.scanning
-    source: Any = SimpleNamespace(
-        size_px=(320, 240), description="gimbal", start_monotonic_ns=0, epoch_unix_ns=None,
-        fps=None, warnings=[],
-    )  # fmt: skip
-    scanning.camera, scanning._backend = load_camera(MODEL), CpuBackend()
-    inputs, _ = ScanRun(scanning, is_asked=True)._inputs(source)
+    daemon.equip()
+    scanning.start()
+    inputs = until(lambda: scanning.scan and scanning.scan.inputs)
     assert inputs.camera.size_px == (320, 240)
+    assert scanning.camera is not None
     assert inputs.camera.K[0, 0] == pytest.approx(scanning.camera.K[0, 0] / 5)
     note = "the camera model is for 1600x1200 images: scaled to 320x240"
     assert inputs.notes == (note,)
+    scanning.end()
+    assert scanning.fault == "" and note in daemon.vehicle.said
 
 
-def test_a_scan_that_was_stopped_counts_as_closing_at_once(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scan_that_was_stopped_counts_as_closing_at_once(tmp_path: Path) -> None:
     """A camera that hangs holds its scan for seconds: a start then waits, and is not swallowed."""
     end = threading.Event()
-    monkeypatch.setattr(ScanRun, "carry_out", lambda _: end.wait(60.0))
+    daemon = Onboard(tmp_path, script=lambda _: end.wait(60.0))
     daemon.scanning.start()
     assert daemon.actions.status().phase is Phase.SCANNING
     daemon.actions.stop_scan()
@@ -87,29 +81,35 @@ def test_a_scan_that_was_stopped_counts_as_closing_at_once(
     until(lambda: daemon.actions.status().phase is Phase.IDLE)
 
 
-def test_a_camera_that_fails_is_reported(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
-    reported, gate = [], SimpleNamespace(warnings=["known when it was opened"])
-    scanning: Any = daemon.scanning
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, _: reported.append(text))
-    daemon._report_camera()
-    run: Any = ScanRun(scanning, is_asked=True)
-    run.gate, run._news_reported, scanning._run = gate, 1, run
-    gate.warnings.append("the image is frozen for 8 s")
+def test_a_camera_that_fails_is_reported(tmp_path: Path) -> None:
+    end = threading.Event()
+    daemon = Onboard(tmp_path, script=lambda _: end.wait(60.0))
+    scanning, reported, source = daemon.scanning, daemon.vehicle.said, FakeCamera((64, 48))
+    daemon.look()
+    scanning.start()
+    run = scanning.run
+    assert run is not None
+    run.gate = FrameGate(source, tmp_path, 0, run.alive, threading.Event())
+    source.warnings.append("known when it was opened")
+    assert run.camera_news() == ["known when it was opened"]
+    source.warnings.append("the image is frozen for 8 s")
     for silent_s in (0.0, 9.0, 11.0, 300.0):
         run.progress_s = time.monotonic() - silent_s
-        daemon._report_camera()
-        daemon._report_camera()
+        daemon.look()
+        daemon.look()
     run.progress_s = time.monotonic()
-    daemon._report_camera()
+    daemon.look()
     assert reported == [
         "Camera: the image is frozen for 8 s",
         "No images for 10 s: nothing is scanned",
         "Camera images recovered",
     ]
     run.progress_s = time.monotonic() - 60.0
-    daemon._report_camera()
-    scanning._run = None  # stopped meanwhile
-    daemon._report_camera()
+    daemon.look()
+    scanning.stop()
+    end.set()
+    until(lambda: not scanning.is_running)  # stopped meanwhile
+    daemon.look()
     assert reported[3:] == ["No images for 10 s: nothing is scanned"]
 
 
@@ -125,11 +125,9 @@ def test_a_camera_that_fails_is_reported(daemon: Daemon, monkeypatch: pytest.Mon
     ],
 )
 def test_a_scan_by_command_goes_on_after_a_fall(
-    boot: str, heard: bool, armed: bool, goes_on: bool, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    boot: str, heard: bool, armed: bool, goes_on: bool, tmp_path: Path
+) -> None:
     (tmp_path / "boot").write_text("this")
-    monkeypatch.setattr("service.daemon.intent.BOOT", tmp_path / "boot")
     if boot != "none":
         (tmp_path / "scans").mkdir()
         (tmp_path / "scans" / MARK).write_text(boot)
@@ -139,14 +137,16 @@ def test_a_scan_by_command_goes_on_after_a_fall(
         begun.set()
         end.wait(60.0)
 
-    monkeypatch.setattr(ScanRun, "carry_out", scan)
-    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}/scans", "health.http="]))
-    presence = type(daemon.vehicle.presence)
-    monkeypatch.setattr(presence, "is_armed", property(lambda _: armed))
-    monkeypatch.setattr(presence, "autopilot", property(lambda _: (1, 1) if heard else None))
+    daemon = Onboard(
+        tmp_path / "scans",
+        script=scan,
+        resumption=Resumption(tmp_path / "scans", tmp_path / "boot"),
+    )
+    if heard:
+        daemon.vehicle.arm(armed)
     daemon.actions.is_ready = True
     for _ in range(3):
-        daemon._resume()
+        daemon.look()
     assert begun.wait(10.0 if goes_on else 0.2) == goes_on
     mark = tmp_path / "scans" / MARK
     if goes_on:
@@ -158,19 +158,15 @@ def test_a_scan_by_command_goes_on_after_a_fall(
         assert not mark.exists()  # landed, or stopped
 
 
-def test_only_a_scan_that_was_not_ended_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_scan_that_was_not_ended_goes_on(tmp_path: Path) -> None:
+    end = threading.Event()
+
     def next_life(start: str = "on-command") -> Daemon:
-        return Daemon(
-            load_config(None, [f"scan.folder={tmp_path}", f"scan.start={start}", "health.http="])
-        )
+        return Onboard(tmp_path, f"scan.start={start}", script=lambda _: end.wait(60.0))
 
     def left(daemon: Daemon) -> Left:
         return daemon.scanning.resumption.left
 
-    end = threading.Event()
-    monkeypatch.setattr(ScanRun, "carry_out", lambda _: end.wait(60.0))
     killed = next_life()
     killed.scanning.start()
     assert left(next_life()) is Left.BY_SERVICE
@@ -186,12 +182,12 @@ def test_only_a_scan_that_was_not_ended_goes_on(
     assert left(next_life()) is Left.NOTHING
     (tmp_path / MARK).write_text("of a configuration that was on-command")
     by_itself = next_life("on-boot")
-    by_itself._resume()
+    by_itself.look()
     assert not by_itself.scanning.is_running
 
 
 def test_a_disk_that_goes_away_leaves_the_commands(
-    daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stat = os.stat
 
@@ -200,12 +196,9 @@ def test_a_disk_that_goes_away_leaves_the_commands(
             raise OSError(errno.ENOTCONN, "Transport endpoint is not connected", str(path))
         return stat(path, *more, **options)
 
+    daemon = Onboard(tmp_path, opener=camera_of(FakeCamera((1600, 1200))))
     scanning = daemon.scanning
-    source: Any = SimpleNamespace(
-        size_px=(1600, 1200), description="", start_monotonic_ns=0, close=lambda: None, warnings=[]
-    )
-    monkeypatch.setattr(ScanRun, "_open_camera", lambda _: source)
-    scanning.camera, scanning._backend = load_camera(MODEL), CpuBackend()
+    daemon.equip()
     monkeypatch.setattr(os, "stat", away)
     assert daemon.actions.status().storage_total_mib > 0
     scanning.start()
@@ -215,14 +208,14 @@ def test_a_disk_that_goes_away_leaves_the_commands(
     scanning.stop()
 
 
-def test_a_scan_is_started_once(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scan_is_started_once(tmp_path: Path) -> None:
     begun, end = [], threading.Event()
 
     def scan(_: ScanRun) -> None:
         begun.append(threading.get_ident())
         end.wait(60.0)
 
-    monkeypatch.setattr(ScanRun, "carry_out", scan)
+    daemon = Onboard(tmp_path, script=scan)
     callers = [threading.Thread(target=daemon.scanning.start) for _ in range(20)]
     for caller in callers:
         caller.start()

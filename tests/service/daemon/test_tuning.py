@@ -8,21 +8,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from loopback import until
+from onboard import real_scan
 
 from mavlink.component.parameters import PARAMETERS
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
-from recon.types import Camera
-from service.cameras.images import open_images
 from service.config import Config, load_config
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
 from service.daemon.vehicle_config import TUNABLES, parameters_of, with_parameter
 from service.errors import InputError
-from service.flight.scan import Scan, ScanInputs, create_store
 
 
 class Operator:
@@ -167,26 +164,14 @@ class Budget:
 
 
 def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> None:
-    import cv2
-
-    from recon.backends.cpu import CpuBackend
-
-    images = tmp_path / "images"
-    images.mkdir()
-    cv2.imwrite(str(images / "20260101000000000Z.png"), np.zeros((90, 160, 3), np.uint8))
-    source = open_images(str(images), {})
-    K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 44.5], [0.0, 0.0, 1.0]])
-    camera = Camera(K, np.zeros(5), (160, 90))
     operator.set("SR_RESOLUTION_M", 0.5)
-    inputs = ScanInputs(
-        source, camera, operator.config, CpuBackend(), tmp_path / "scan", "scan", 0,
-        history=operator.daemon.vehicle.history,
-    )  # fmt: skip
-    with create_store(inputs) as store:
+    scan = real_scan(
+        tmp_path / "scan", config=operator.config, history=operator.daemon.vehicle.history
+    )
+    with scan.store as store:
         assert store.header.configuration["scan"]["resolution_m"] == 0.5
-        scan = Scan(inputs, store)
         scanning, link = operator.daemon.scanning, Budget()
-        run = scanning._run = ScanRun(scanning, is_asked=True)
+        run = scanning.run = ScanRun(scanning, is_asked=True)
         run.scan, scanning.link.flying = scan, link  # type: ignore[assignment]
         operator.set("SR_LINK_KBIT_S", 64.0)
         assert link.budgets[-1] == (64.0, operator.config.datalink.share)
@@ -197,5 +182,5 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         assert scan.check.exposed_ns(3 * 10**9) == 3 * 10**9 - 70_000_000
         operator.set("SR_YAW_FRAME", 2.0)
         assert operator.daemon.vehicle.history.config.yaw_frame == "earth"
-        scanning._run = scanning.link.flying = None
+        scanning.run = scanning.link.flying = None
         scan.pipeline.finish()
