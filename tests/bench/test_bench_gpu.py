@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from service.bench import BenchOptions, gpu
 from service.cli import main
@@ -27,10 +28,10 @@ def test_every_stage_is_compared_with_its_floor(
 
     device = str(request.config.getoption("--device"))
     for module in (bench_device, gpu):
-        monkeypatch.setattr(module, "SIZE", (24, 16))
+        monkeypatch.setattr(module, "SIZE", (20, 12))
         monkeypatch.setattr(module, "LABELS", 8)
-        monkeypatch.setattr(module, "GUIDE", (48, 32))
-        monkeypatch.setattr(module, "DEPTH", (48, 32))
+        monkeypatch.setattr(module, "GUIDE", (40, 24))
+        monkeypatch.setattr(module, "DEPTH", (40, 24))
     for table in ("COPY_MB", "PRODUCT"):
         monkeypatch.setattr(bench_device, table, 16)
     monkeypatch.setattr(bench_device, "PAIRS", 1)
@@ -40,6 +41,11 @@ def test_every_stage_is_compared_with_its_floor(
         monkeypatch.setattr(room, "ROOM_PX", 4)
         for name in ("PIXELS", "CELLS", "FUSED_PIXELS"):
             monkeypatch.setattr(triton_dense, name, 512)
+        quick = BeliefPropagationConfig(iterations=1, levels=1, speckle_px=1)
+        monkeypatch.setattr(bench_device, "BeliefPropagationConfig", lambda: quick)
+        monkeypatch.setattr(
+            bench_device, "IcpConfig", lambda **_: IcpConfig(strides=(1,), iterations=(1,))
+        )
     results = bench_device.run(BenchOptions(rounds=1, warm_up=0), device)
     on_device = {r.what: r for r in results if r.peer == "floor of the device"}
     for stage in STAGES:
