@@ -17,7 +17,7 @@ from torch import Tensor
 
 from recon.backends.room import pyramid_levels
 from recon.stereo.belief_propagation import RADIUS, BeliefPropagationConfig
-from recon.stereo.matching_cost import CENSUS_RADIUS, COST_UNIT
+from recon.stereo.matching_cost import CENSUS_OFFSETS, CENSUS_REACH, COST_UNIT
 from recon.stereo.message_passing import FULL_WEIGHT
 
 FAR = 1.0e6
@@ -84,12 +84,12 @@ def matching_cost(
 
 
 def census(image: Tensor) -> Tensor:
-    """(24, h, w) float32: 1 where the neighbour is darker than the pixel."""
+    """(32, h, w) float32: 1 where the neighbour is darker than the pixel."""
     h, w = image.shape
-    r = CENSUS_RADIUS
+    r = CENSUS_REACH
     padded = F.pad(image[None, None], (r, r, r, r), mode="replicate")[0, 0]
-    offsets = [(j, i) for j in range(2 * r + 1) for i in range(2 * r + 1) if (j, i) != (r, r)]
-    return torch.stack([(padded[j : j + h, i : i + w] < image).float() for j, i in offsets])
+    bits = (padded[r + j : r + j + h, r + i : r + i + w] < image for j, i in CENSUS_OFFSETS)
+    return torch.stack([bit.float() for bit in bits])
 
 
 def edge_weights(image: Tensor, config: BeliefPropagationConfig) -> Tensor:

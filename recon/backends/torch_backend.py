@@ -16,6 +16,7 @@ from recon.backends.torch_depth import DensePath, upsampled
 from recon.backends.torch_plan import Plan, compiling, part, read
 from recon.backends.triton_dense import contrast, stereo
 from recon.stereo.belief_propagation import BeliefPropagationConfig, drop_unreliable
+from recon.stereo.exposure import equalised
 from recon.stereo.matching_cost import check_pair
 from recon.stereo.upsampling import UpsamplingConfig, check_guide
 from recon.types import F64, U8, Array, DepthMap, DisparityMap, Registration, StereoPair
@@ -54,6 +55,7 @@ class TorchBackend:
     ) -> DisparityMap:
         """Labels of the left view, (h, w); Eq. 1."""
         check_pair(left, right, labels)
+        right = equalised(left, right, labels, config.min_disparity)
         h, w = left.shape
         *space, label_room = room(h, w, labels)
         levels = pyramid_levels(h, w, config)

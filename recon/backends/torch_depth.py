@@ -27,6 +27,7 @@ from recon.backends.triton_dense import (
     reproject,
     stereo,
 )
+from recon.stereo.exposure import equalised
 from recon.stereo.reprojection import LABEL_SIGMA_PX
 from recon.stereo.reprojection import MIN_CONFIDENCE as MIN_REPROJECTED
 from recon.stereo.upsampling import MIN_CONFIDENCE, UpsamplingConfig
@@ -59,7 +60,7 @@ class DensePath:
             )  # fmt: skip
             for slot, pair in enumerate(pairs):
                 plan = self._plan(pair, size_px)
-                plan.upload(_inputs(pair, K), slot)
+                plan.upload(_inputs(pair, K, self.stages.matching.min_disparity), slot)
                 found[:, slot].copy_(torch.stack(plan.run()))
             depth, sigma, views = read(fusion.run())
         return DepthMap(depth, sigma, views, K, T_world_camera)
@@ -82,7 +83,7 @@ class DensePath:
                 stages=self.stages,
             )  # fmt: skip
             shapes = [space[:2]] * 4 + [(*(fine or (0, 0)), 3), (5,), (15,)]
-            given = _inputs(pair, np.eye(3))
+            given = _inputs(pair, np.eye(3), self.stages.matching.min_disparity)
             parts = [part(a, s) for a, s in zip(given, shapes, strict=True)]
             return Plan(self.device, stage, parts)
 
@@ -110,7 +111,7 @@ def pair_depth(
     return reproject(px, confidence, geometry, sizes, size_px, MIN_REPROJECTED)
 
 
-def _inputs(pair: StereoPair, K: F64) -> list[Array]:
+def _inputs(pair: StereoPair, K: F64, min_disparity: int) -> list[Array]:
     """Inputs on the device: images, masks, guide, true sizes and geometry."""
     h, w = pair.left.shape
     seen = [np.ones((h, w), np.uint8)] * 2
@@ -121,7 +122,8 @@ def _inputs(pair: StereoPair, K: F64) -> list[Array]:
     base = [pair.slope, pair.K[0, 0] * pair.baseline_m, LABEL_SIGMA_PX * pair.noise]
     geometry = np.concatenate([to_left.ravel(), pair.plane, base]).astype(np.float64)
     true = np.array([h, w, guide.shape[0], guide.shape[1], pair.labels], np.int64)
-    return [pair.left, pair.right, *seen, guide, true, geometry]
+    right = equalised(pair.left, pair.right, pair.labels, min_disparity)
+    return [pair.left, right, *seen, guide, true, geometry]
 
 
 def upsampled(

@@ -26,7 +26,7 @@ from recon.stereo.belief_propagation import (
     SURE_EVIDENCE,
     BeliefPropagationConfig,
 )
-from recon.stereo.matching_cost import CENSUS_RADIUS, COST_UNIT
+from recon.stereo.matching_cost import CENSUS_OFFSETS, COST_UNIT
 from recon.stereo.message_passing import FULL_WEIGHT
 from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import RANGE_FLOOR, UpsamplingConfig
@@ -76,7 +76,7 @@ def matching_cost(
     c = config.cost
     h, w = left.shape
     words = torch.empty((2, h, w), dtype=torch.int32, device=left.device)
-    _census[(blocks(h * w, PIXELS), 2)](left, right, words, h, w, CENSUS_RADIUS, PIXELS)
+    _census[(blocks(h * w, PIXELS), 2)](left, right, words, h, w, CENSUS_OFFSETS, PIXELS)
     cost, data = torch.empty((2, h, w, room), dtype=torch.int16, device=left.device)
     _cost[(blocks(h * w, CELLS),)](
         left, right, words, true, cost, data, h, w, config.min_disparity, c.census_truncation,
@@ -88,7 +88,7 @@ def matching_cost(
 
 
 @triton.jit(do_not_specialize=["height", "width"])
-def _census(left, right, words, height, width, radius: tl.constexpr, PIXELS: tl.constexpr):
+def _census(left, right, words, height, width, offsets: tl.constexpr, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     image = left
     if tl.program_id(1) == 1:
@@ -97,9 +97,9 @@ def _census(left, right, words, height, width, radius: tl.constexpr, PIXELS: tl.
     v, u = at // width, at % width
     centre = tl.load(image + at, mask=here, other=0)
     word = tl.full((PIXELS,), 0, tl.int32)
-    for n in tl.static_range((2 * radius + 1) * (2 * radius + 1)):
-        y = tl.minimum(tl.maximum(v + n // (2 * radius + 1) - radius, 0), height - 1)
-        x = tl.minimum(tl.maximum(u + n % (2 * radius + 1) - radius, 0), width - 1)
+    for n in tl.static_range(32):
+        y = tl.minimum(tl.maximum(v + offsets[n][0], 0), height - 1)
+        x = tl.minimum(tl.maximum(u + offsets[n][1], 0), width - 1)
         darker = tl.load(image + y * width + x, mask=here, other=0) < centre
         word = 2 * word + darker.to(tl.int32)
     tl.store(words + tl.program_id(1) * height * width + at, word, mask=here)
@@ -107,7 +107,7 @@ def _census(left, right, words, height, width, radius: tl.constexpr, PIXELS: tl.
 
 @triton.jit
 def _ones(word):
-    """How many bits are set of 25."""
+    """How many bits are set of 32."""
     word = word - ((word >> 1) & 0x55555555)
     word = (word & 0x33333333) + ((word >> 2) & 0x33333333)
     word = (word + (word >> 4)) & 0x0F0F0F0F

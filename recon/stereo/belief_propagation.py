@@ -22,6 +22,7 @@ from numba import njit
 
 from recon.bands import in_bands
 from recon.image_quality import local_variance
+from recon.stereo.exposure import equalised
 from recon.stereo.matching_cost import (
     COST_UNIT,
     MatchingCostConfig,
@@ -50,7 +51,7 @@ class BeliefPropagationConfig:
     edge_contrast: int = 32  # gray levels between neighbours that make a strong edge
     min_disparity: int = 0  # px, disparity of label 0
     cost: MatchingCostConfig = field(default_factory=MatchingCostConfig)
-    min_evidence: float = 0.22  # how much better than the mean label, 0 to 1; 0: accept all
+    min_evidence: float = 0.18  # how much better than the mean label, 0 to 1; 0: accept all
     min_contrast: float = 0.5  # gray levels of standard deviation in 9x9; 0: accept all
     occlusion_tolerance: float = 1.0  # labels; a surface seen behind another one; < 0: no check
     fill_occluded: bool = False  # with the farther neighbour of the row, at low confidence
@@ -82,6 +83,7 @@ def belief_propagation(
     ``l`` matches ``right[v, u - l - config.min_disparity]``. Raises ValueError for bad input.
     """
     check_pair(left, right, labels)
+    right = equalised(left, right, labels, config.min_disparity)
     height, width = left.shape
     volume = _space.take("cost", (height, labels, width))
     cost = matching_cost(left, right, labels, config.cost, config.min_disparity, volume)

@@ -1,8 +1,8 @@
 """Cost of a left pixel at a label: census and absolute difference, truncated.
 
 Census (Zabih and Woodfill, https://doi.org/10.1007/BFb0028345) survives changes of exposure,
-the absolute difference keeps edges in their place. Of wider census windows the edge of a near
-surface decides about more of the background next to it. Costs are integers so that belief
+the absolute difference keeps edges in their place. Of full windows wider than 5x5 the edge of a
+near surface decides about more of the background next to it. Costs are integers so that belief
 propagation runs on SIMD lanes of 16 bits; ``COST_UNIT`` of them are one label of smoothness.
 """
 
@@ -26,11 +26,14 @@ U32 = npt.NDArray[np.uint32]
 COST_UNIT = 100
 """Integer cost of a disparity step of one label between neighbours."""
 
-CENSUS_RADIUS = 2
-"""The census window is 5x5: 24 comparisons in one 32-bit word."""
+_NEAR = [(dv, du) for dv in range(-2, 3) for du in range(-2, 3) if dv or du]
+_FAR = [(-3, -1), (-3, 1), (-1, -3), (-1, 3), (1, -3), (1, 3), (3, -1), (3, 1)]
+CENSUS_OFFSETS = tuple(_NEAR + _FAR)
+"""Row and column of the neighbours that a pixel is compared with: 5x5, and eight on a ring around
+them, which tell weak texture from noise. They fill one 32-bit word."""
 
-_WINDOW = 2 * CENSUS_RADIUS + 1
-CENSUS_BITS = _WINDOW**2 - 1
+CENSUS_REACH = 3
+"""The farthest row or column of a neighbour."""
 
 MAX_SPARE = 8
 """Memory this many times larger than requested is released."""
@@ -44,8 +47,8 @@ class MatchingCostConfig:
     each part stops growing at its truncation.
     """
 
-    census_weight: float = 0.16
-    census_truncation: int = 14  # bits
+    census_weight: float = 0.08
+    census_truncation: int = 16  # bits
     difference_weight: float = 0.04
     difference_truncation: int = 20  # gray levels
     unseen: float = 1.0  # of a label whose partner is outside the image, above the best one
@@ -101,9 +104,10 @@ def check_pair(left: U8, right: U8, labels: int) -> None:
 def census(image: U8) -> U32:
     """Census word of every pixel, (h, w) uint32: bit set where a neighbour is darker.
 
-    The window is 5x5; beyond the border the image repeats its last row and column.
+    The first of :data:`CENSUS_OFFSETS` is the highest bit; beyond the border the image repeats its
+    last row and column.
     """
-    padded = np.pad(image, CENSUS_RADIUS, mode="edge")
+    padded = np.pad(image, CENSUS_REACH, mode="edge")
     words = np.empty(image.shape, np.uint32)
     in_bands(_census, len(image), padded, words, cells=image.size)
     return words
@@ -111,29 +115,32 @@ def census(image: U8) -> U32:
 
 @njit(cache=True, nogil=True)
 def _census(begin: int, end: int, padded: Any, words: Any) -> None:  # pragma: no cover - compiled
-    """Eight comparisons at a time in bytes, of which a vector register holds the most."""
-    width = words.shape[1]
-    parts = np.empty((CENSUS_BITS // 8, width), np.uint8)
+    parts = np.empty((4, words.shape[1]), np.uint8)
     for v in range(begin, end):
-        centre = padded[v + CENSUS_RADIUS, CENSUS_RADIUS : CENSUS_RADIUS + width]
-        bit = 0
-        for dv in range(_WINDOW):
-            for du in range(_WINDOW):
-                if dv != CENSUS_RADIUS or du != CENSUS_RADIUS:
-                    shifted = padded[v + dv, du : du + width]
-                    row = parts[bit // 8]
-                    for u in range(width):
-                        row[u] = np.uint8(row[u] << 1) | np.uint8(shifted[u] < centre[u])
-                    bit += 1
+        census_row(padded, v, parts, words[v])
+
+
+@njit(cache=True, nogil=True)
+def census_row(padded: Any, v: int, parts: Any, words: Any) -> None:  # pragma: no cover - compiled
+    """Words of a row; eight comparisons at a time in bytes, of which a vector register holds the
+    most. ``parts`` is memory, (4, w)."""
+    width = words.shape[0]
+    centre = padded[v + CENSUS_REACH, CENSUS_REACH : CENSUS_REACH + width]
+    for bit, (dv, du) in enumerate(CENSUS_OFFSETS):
+        start = CENSUS_REACH + du
+        shifted = padded[v + CENSUS_REACH + dv, start : start + width]
+        row = parts[bit // 8]
         for u in range(width):
-            word = np.uint32(0)
-            for k in range(parts.shape[0]):
-                word = np.uint32(word << np.uint32(8)) | np.uint32(parts[k, u])
-            words[v, u] = word
+            row[u] = np.uint8(row[u] << 1) | np.uint8(shifted[u] < centre[u])
+    for u in range(width):
+        word = np.uint32(0)
+        for k in range(4):
+            word = np.uint32(word << np.uint32(8)) | np.uint32(parts[k, u])
+        words[u] = word
 
 
 @intrinsic
-def _popcount(typingctx: Any, word: Any) -> Any:
+def popcount(typingctx: Any, word: Any) -> Any:
     """How many bits of a 32-bit word are set: one instruction, or a few on vector registers."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -173,7 +180,7 @@ def _cost_volume(
             cb = census_right[v, first - shift : last - shift]
             low = best[first:last]
             for i in range(count):
-                differ = np.int32(_popcount(np.uint32(ca[i] ^ cb[i])))
+                differ = np.int32(popcount(np.uint32(ca[i] ^ cb[i])))
                 bits = min(differ, np.int32(census_truncation))
                 gray = min(abs(np.int32(a[i]) - np.int32(b[i])), np.int32(difference_truncation))
                 value = np.int16(bits * census_weight + gray * difference_weight)

@@ -22,7 +22,7 @@ def matching_config(iterations: int, min_disparity: int, checked: bool) -> Belie
         return BeliefPropagationConfig(
             iterations=iterations,
             min_disparity=min_disparity,
-            min_evidence=0.1,
+            min_evidence=0.05,
             min_contrast=0.3,
             fill_occluded=True,
         )

@@ -1,85 +1,35 @@
-"""Stereo on Middlebury's pairs against OpenCV's semi-global matcher: share of bad pixels.
-
-The matcher is at its best: images padded on the left by the number of disparities, dense (no
-uniqueness or left-right check), block size 3, and the better of its two-pass modes.
-"""
+"""Stereo on real pairs with true disparity against OpenCV's semi-global matcher."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from bench_options import DataOptions
 
-from recon.types import F32, U8, Bool
+from recon.types import F32, Bool
 from service.bench import BenchResult
-from service.bench.stereo import ITERATIONS, semi_global
+from service.bench.stereo import accuracy
+from service.bench.stereo_scenes import TruePair
 from service.compute.backend_choice import choose_backend
-from service.compute.rectified_pair import matching_config, read_gray
+from service.compute.rectified_pair import read_gray
 from service.errors import InputError
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TruePair:
-    """A rectified pair whose disparity is known."""
-
-    name: str
-    left: U8  # (h, w)
-    right: U8  # (h, w)
-    truth_px: F32  # (h, w), NaN = unknown
-    visible: Bool  # (h, w) truth known and seen by both views
-    labels: int
+OPENCV_SAMPLES = Path("/usr/share/doc/opencv-doc/examples/data")
+"""Where Debian's opencv-doc puts them."""
 
 
 def run(options: DataOptions) -> list[BenchResult]:
     """Shares of bad pixels on the pairs in ``options.data``."""
     if options.data is None:
         raise InputError("bench middlebury needs --data with the folder that holds the pairs")
-    backend = choose_backend(options.backend)
-    results = []
-    for pair in true_pairs(options.data):
-        config = matching_config(ITERATIONS, 0, checked=False)
-        ours = backend.belief_propagation(pair.left, pair.right, pair.labels, config).px
-        theirs = min(
-            (semi_global_disparity(pair, mode) for mode in (0, 2)),
-            key=lambda px: bad_share(px, pair, 1.0),
-        )
-        for limit in (1.0, 0.5):
-            results.append(
-                BenchResult(
-                    f"{pair.name}, bad-{limit}, not occluded",
-                    100 * bad_share(ours, pair, limit),
-                    "%",
-                    peer="OpenCV SGBM, padded",
-                    peer_value=100 * bad_share(theirs, pair, limit),
-                    note=f"{pair.labels} labels",
-                )
-            )
-    return results
-
-
-def semi_global_disparity(pair: TruePair, mode: int) -> F32:
-    """Disparity of the matcher on the padded pair, NaN where it found none."""
-    pad = -(-pair.labels // 16) * 16
-    left, right = (
-        cv2.copyMakeBorder(image, 0, 0, pad, 0, cv2.BORDER_REPLICATE)
-        for image in (pair.left, pair.right)
-    )
-    found = semi_global(pair.labels, mode).compute(left, right)[:, pad:].astype(np.float32) / 16
-    found[found < 0] = np.nan
-    return np.asarray(found, np.float32)
-
-
-def bad_share(px: F32, pair: TruePair, limit: float) -> float:
-    """Share of the visible pixels that are unknown or wrong by more than ``limit`` px."""
-    good = np.abs(px - pair.truth_px) <= limit
-    return float(1 - good[pair.visible].mean())
+    return accuracy(true_pairs(options.data), choose_backend(options.backend))
 
 
 def true_pairs(folder: Path) -> list[TruePair]:
-    """The Middlebury pairs in a folder laid out as ``cones``, ``cloth3`` and ``motorcycle``."""
+    """The pairs in a folder laid out as ``cones``, ``teddy``, ``cloth3``, ``motorcycle`` and
+    ``aloe`` (of OpenCV's samples, at half size). Those that are missing are named."""
     found = []
     for name, left, right, truth, other, scale, labels in (
         ("cones", "im2", "im6", "disp2", "disp6", 4, 64),
@@ -104,9 +54,28 @@ def true_pairs(folder: Path) -> list[TruePair]:
         px[~np.isfinite(px)] = np.nan
         images = [read_gray(place / f"motorcycle_{side}.png") for side in ("left", "right")]
         found.append(TruePair("motorcycle", images[0], images[1], px, not_hidden(px), 64))
+    found += aloe(folder / "aloe") or aloe(OPENCV_SAMPLES)
+    missing = {"cones", "teddy", "cloth3", "motorcycle", "aloe"} - {pair.name for pair in found}
     if not found:
-        raise InputError(f"{folder}: holds none of cones, teddy, cloth3, motorcycle")
+        raise InputError(f"{folder}: holds none of {', '.join(sorted(missing))}")
+    if missing:
+        print(f"not in {folder}: {', '.join(sorted(missing))}")
     return found
+
+
+def aloe(folder: Path) -> list[TruePair]:
+    """The pair of OpenCV's samples at half size, if it is there."""
+    if not (folder / "aloeGT.png").is_file():
+        return []
+    truth = read_gray(folder / "aloeGT.png").astype(np.float32)[::2, ::2] / np.float32(2)
+    truth[truth == 0] = np.nan
+    left, right = (
+        cv2.resize(
+            read_gray(folder / f"aloe{side}.jpg"), truth.shape[::-1], interpolation=cv2.INTER_AREA
+        ).astype(np.uint8)
+        for side in "LR"
+    )
+    return [TruePair("aloe", left, right, truth, not_hidden(truth), 112)]
 
 
 def seen_by_both(left: F32, right: F32) -> Bool:

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_middlebury import TruePair as Pair
-from bench_middlebury import bad_share, not_hidden, seen_by_both, semi_global_disparity
+from bench_middlebury import not_hidden, seen_by_both
 from bench_run import DEVELOPMENT
 
 from service import bench
 from service.bench import BENCHMARKS, BenchOptions, BenchResult, compare, record, table
-from service.bench.stereo import scene
+from service.bench.stereo import bad_share, scene, semi_global_disparity
+from service.bench.stereo_scenes import TruePair as Pair
 from service.cli import main
 
 

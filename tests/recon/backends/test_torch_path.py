@@ -197,7 +197,7 @@ def test_reprojection_equals_the_compiled_one(device: str, finer: int) -> None:
     confidence = rng.uniform(0, 1, px.shape).astype(np.float32)
     pair = replace(pair, noise=1.7)
     want = compiled_reproject(DisparityMap(px, confidence), pair, K, SIZE)
-    geometry = _inputs(pair, K)[-1]
+    geometry = _inputs(pair, K, 0)[-1]
     true = torch.tensor([50, 90, 50 * finer, 90 * finer], device=device)
     wide = [np.pad(a, ((0, 7), (0, 5)), constant_values=3) for a in (px, confidence)]
     labels, sure, numbers = on(device, *wide, geometry)

@@ -33,7 +33,7 @@ def compiled(kernel, words, warps=4, **constants):
     print(found.name)
 
 sizes = "i32 i32 "
-compiled(dense._census, "*u8 *u8 *i32 " + sizes, radius=2, PIXELS=128)
+compiled(dense._census, "*u8 *u8 *i32 " + sizes, offsets=dense.CENSUS_OFFSETS, PIXELS=128)
 compiled(dense._cost, "*u8 *u8 *i32 *i64 *i16 *i16 " + sizes * 4 + "i32", LABELS=16, CELLS=32)
 compiled(dense._edges, "*u8 *i64 *i32 i32 i32 fp32 fp32 i32", PIXELS=128)
 compiled(dense._coarser, "*i16 *i32 *i64 *i16 *i32 " + sizes * 2, LABELS=16, CELLS=32)

@@ -13,6 +13,7 @@ from recon import bands
 from recon.stereo import message_passing
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.matching_cost import (
+    CENSUS_OFFSETS,
     COST_UNIT,
     MatchingCostConfig,
     Workspace,
@@ -113,10 +114,10 @@ def test_one_row_finds_the_exact_minimum_of_the_energy() -> None:
 def test_census_against_its_definition() -> None:
     image = np.random.default_rng(1).integers(0, 256, (12, 15), np.uint8)
     words = census(image)
-    padded = np.pad(image, 2, mode="edge").astype(int)
+    padded = np.pad(image, 3, mode="edge").astype(int)
+    assert len(set(CENSUS_OFFSETS)) == 32
     for v, u in ((0, 0), (5, 7), (11, 14), (3, 0)):
-        window = padded[v : v + 5, u : u + 5].ravel()
-        bits = np.delete(window < int(image[v, u]), 12)
+        bits = [padded[v + 3 + dv, u + 3 + du] < int(image[v, u]) for dv, du in CENSUS_OFFSETS]
         assert int(words[v, u]) == int("".join("1" if b else "0" for b in bits), 2)
 
 

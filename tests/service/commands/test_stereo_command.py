@@ -9,12 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from bench_middlebury import bad_share, semi_global_disparity, true_pairs
+from bench_middlebury import true_pairs
 from paths import SHARED
 
 from recon.backends.cpu import CpuBackend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DisparityMap
+from service.bench.stereo import bad_share, semi_global_disparity
 from service.cli import main
 from service.compute import backend_choice
 from service.compute.backend_choice import FallbackBackend, choose_backend

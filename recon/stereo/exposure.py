@@ -1,0 +1,148 @@
+"""The right image with the gray levels of the left one, wherever their exposures differ.
+
+Auto exposure, tone curves and vignetting give one surface two gray levels. The matching cost
+compares them, so the right image is corrected first: clear matches by census, which needs no equal
+levels, say which pairs of levels belong together; a curve of the gray level, whose gain varies
+smoothly over the image, is fitted to them by least squares with Tukey's weights. What it cannot
+explain (highlights, shadows, wrong matches) counts as an outlier.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from recon.bands import in_bands
+from recon.small_matrices import solve_symmetric
+from recon.stereo.matching_cost import CENSUS_REACH, census_row, plain, popcount
+from recon.types import U8
+
+SAMPLES = 3600
+"""About so many pixels, in a grid, are matched."""
+
+MAX_BITS, MARGIN = 4, 4
+"""A clear match: at most so many bits of census differ, and so many more at any other label."""
+
+TERMS = 8
+"""1, g, g^2, g x, g y, g x^2, g x y, g y^2 of the gray level and the place, -1 to 1."""
+
+PRIOR = 0.1
+"""Weight of no change, in samples."""
+
+STEPS = 4
+MIN_SAMPLES, FITTED = 64, 500
+"""Clear matches that are needed, and at most used."""
+
+
+def equalised(left: U8, right: U8, labels: int, min_disparity: int = 0) -> U8:
+    """``right`` (h, w) with the gray levels that its surfaces have in ``left``.
+
+    The labels are those of :func:`recon.stereo.matching_cost.matching_cost`. Returns ``right``
+    itself where too little matches clearly.
+    """
+    height, width = left.shape
+    step = max(2, round(float(np.sqrt(height * width / SAMPLES))))
+    rows, columns = height // step, width // step
+    if rows * columns < MIN_SAMPLES:
+        return right
+    places = np.full((rows, columns, 2), -1, np.int32)
+    padded = [np.pad(plain(image), CENSUS_REACH, mode="edge") for image in (left, right)]
+    in_bands(
+        _match, rows, *padded, step, labels, min_disparity, places, cells=rows * columns * labels,
+    )  # fmt: skip
+    row, column = np.nonzero(places[:, :, 1] >= 0)
+    if len(row) < MIN_SAMPLES:
+        return right
+    row, column = (indices[:: len(row) // FITTED + 1] for indices in (row, column))
+    v, (u, partner) = row * step + step // 2, places[row, column].T
+    gray = right[v, partner].astype(np.float64)
+    g, x, y = gray / 255, 2 * partner / width - 1, 2 * v / height - 1
+    terms = np.stack([np.ones_like(g), g, g * g, g * x, g * y, g * x * x, g * x * y, g * y * y], 1)
+    change = np.empty((TERMS, 1))
+    _fit(np.ascontiguousarray(terms), left[v, u] - gray, change)
+    out = np.empty_like(right)
+    in_bands(_apply, height, plain(right), change[:, 0].astype(np.float32), out, cells=right.size)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _fit(terms: Any, change: Any, solution: Any) -> None:  # pragma: no cover - compiled
+    """Coefficients of the terms (n, TERMS), by reweighted least squares: towards the least sum of
+    absolutes, then with Tukey's weights."""
+    count = len(change)
+    off = np.abs(change)
+    normal = np.empty((TERMS, TERMS))
+    for step in range(STEPS):
+        scale = max(1.5 * np.median(off), 1.0)
+        normal[:] = 0
+        solution[:] = 0
+        for n in range(count):
+            if step < STEPS // 2:
+                weight = min(1.0, scale / max(off[n], 1e-9))
+            else:
+                weight = max(1 - (off[n] / (4 * scale)) ** 2, 0.0) ** 2
+            for i in range(TERMS):
+                part = weight * terms[n, i]
+                solution[i, 0] += part * change[n]
+                for j in range(i + 1):
+                    normal[i, j] += part * terms[n, j]
+        for i in range(TERMS):
+            normal[i, i] += PRIOR
+        solve_symmetric(normal, solution)  # reads the lower half
+        for n in range(count):
+            left = change[n]
+            for i in range(TERMS):
+                left -= terms[n, i] * solution[i, 0]
+            off[n] = abs(left)
+
+
+@njit(cache=True, nogil=True)
+def _match(
+    begin: int, end: int, left: Any, right: Any, step: int, labels: int, min_disparity: int,
+    places: Any,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Column of each sample of a row, and of its clear match in the right image."""
+    width = left.shape[1] - 2 * CENSUS_REACH
+    here, there = np.empty(width, np.uint32), np.empty(width, np.uint32)
+    parts = np.empty((4, width), np.uint8)
+    differ = np.empty(labels, np.int32)
+    for n in range(begin, end):
+        v = n * step + step // 2
+        census_row(left, v, parts, here)
+        census_row(right, v, parts, there)
+        for k in range(places.shape[1]):
+            u = k * step + step // 2
+            first = max(0, u - min_disparity - width + 1)
+            last = min(labels, u - min_disparity + 1)
+            least, best = np.int32(99), -1
+            for label in range(first, last):
+                differ[label] = popcount(np.uint32(here[u] ^ there[u - label - min_disparity]))
+                if differ[label] < least:
+                    least, best = differ[label], label
+            clear = least <= MAX_BITS
+            for label in range(first, last):
+                clear &= abs(label - best) <= 1 or differ[label] >= least + MARGIN
+            if clear:
+                places[n, k, 0], places[n, k, 1] = u, u - best - min_disparity
+
+
+@njit(cache=True, nogil=True)
+def _apply(
+    begin: int, end: int, right: Any, change: Any, out: Any
+) -> None:  # pragma: no cover - compiled
+    """Add the change to each gray level."""
+    height, width = right.shape
+    one, half, most = np.float32(1), np.float32(0.5), np.float32(255)
+    for v in range(begin, end):
+        y = np.float32(2 * v / height) - one
+        start = change[1] + y * (change[4] + change[7] * y)
+        across = change[3] + change[6] * y
+        for u in range(width):
+            x = np.float32(2 * u) / np.float32(width) - one
+            level = np.float32(right[v, u])
+            g = level / most
+            gain = start + change[2] * g + x * (across + change[5] * x)
+            level += change[0] + g * gain + half
+            out[v, u] = np.uint8(np.int32(min(max(level, np.float32(0)), most)))
