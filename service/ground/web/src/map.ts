@@ -253,12 +253,11 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   const load = async (): Promise<void> => {
     const [now, found, { features }] = await Promise.all([
       api.scan(drone, name),
-      tileJson(`${at}/ortho.json`),
+      tileJson(`${at}/ortho.json`).then((json) => ((none.hidden = json !== null), json)),
       api.annotations(id).catch(() => ({ features: [] })),
       plans().catch((error) => (lines.textContent = String(error.message ?? error))),
       ...layers.map((layer) => layer.refresh()),
     ]);
-    none.hidden = found !== null;
     if (now.finished) say("finished", "finished");
     else if (now.growing) say("receiving", "receiving");
     else say("silent", "silent");
