@@ -39,13 +39,10 @@ MAX_REST_S = 0.5
 takes more than half of a core."""
 REPORT_S = 1.0
 REPORT_IDLE_S = 3.0
-DRONE_TIMEOUT_S, BUSY_S = 30.0, 10.0
+BUSY_S = 10.0
 """A scan of which something was heard so lately, and that lacks something, stays open."""
-CLOSE_AFTER_S, CLOSE_WHOLE_AFTER_S = 600.0, 60.0
+CLOSE_AFTER_S = 600.0
 """A scan without data for so long is written and closed; a whole one sooner."""
-MAX_UNFINISHED_BYTES = 1 << 25
-"""Memory of the unfinished records of one drone's scans; beyond it the largest make way."""
-FULL_DISK_REST_S = 10.0
 MAX_INTRODUCTIONS = 32
 """Scans without a folder whose header is waited for; a drone offers 21 at once."""
 MAX_CLOSED = 200
@@ -55,11 +52,17 @@ UNREADABLE_REST_S, MAX_UNREADABLE = 60.0, 64
 
 @dataclass(frozen=True, slots=True)
 class DroneLimits:
-    """Limits of one drone at the ground station."""
+    """Limits of the drones at the ground station, each for one drone unless it says otherwise."""
 
     scan_bytes: int | None = None  # of one scan's chunks; beyond it only coarse layers
     drone_share: float = 0.5  # of the disk
     reserve_bytes: int | None = None  # that stay free on the disk; None: by its size
+    drones: int = 64  # received at once, of all; more wait until one is silent
+    open_scans: int = 32  # where the descriptors allow it
+    unfinished_bytes: int = 1 << 25  # of records; beyond it the largest make way
+    silent_s: float = 30.0  # without a message for so long, it is silent
+    close_whole_s: float = 60.0  # a whole scan without data for so long is written and closed
+    full_disk_rest_s: float = 10.0  # until a full disk is tried again
 
 
 class DroneReceiver:
@@ -80,7 +83,7 @@ class DroneReceiver:
         self._closed: OrderedDict[str, dict[str, Any]] = OrderedDict()
         self._introductions: OrderedDict[str, Introduction] = OrderedDict()
         self._unreadable: OrderedDict[str, float] = OrderedDict()
-        limits = station.limits
+        limits = self._limits = station.limits
         folder = station.folder(drone, "scan").parent
         self._share = DiskShare(folder, limits.drone_share, limits.reserve_bytes)
         self._published_at = 0.0
@@ -159,8 +162,8 @@ class DroneReceiver:
         One whose database was deleted is forgotten: the drone's next head begins it again.
         """
         if trouble != scan.trouble:
-            log.error("%s; trying again every %.0f s", trouble, FULL_DISK_REST_S)
-        scan.trouble, scan.rest_until = trouble, now + FULL_DISK_REST_S
+            log.error("%s; trying again every %.0f s", trouble, self._limits.full_disk_rest_s)
+        scan.trouble, scan.rest_until = trouble, now + self._limits.full_disk_rest_s
         if self._scans.get(scan.name) is scan and not scan.is_writing:
             try:
                 os.stat(scan.intake.store.path)
@@ -317,24 +320,24 @@ class DroneReceiver:
 
     def _look_after(self, now: float) -> None:
         for introduction in list(self._introductions.values()):
-            if now - introduction.seen_at > DRONE_TIMEOUT_S:
+            if now - introduction.seen_at > self._limits.silent_s:
                 del self._introductions[introduction.name]
                 continue
             wanted = introduction.next_ask(now)
             if wanted is not None:
                 self._get(introduction.name, "header", wanted, Ask(self._station.name), None)
-        while sum(scan.intake.held_bytes for scan in self.scans) > MAX_UNFINISHED_BYTES:
+        while sum(scan.intake.held_bytes for scan in self.scans) > self._limits.unfinished_bytes:
             max(self.scans, key=lambda scan: scan.intake.held_bytes).intake.forget_unfinished()
         for scan in list(self._scans.values()):
             limit_s = CLOSE_AFTER_S
             if scan.intake.complete and not scan.changed:  # and the drone knows it
-                limit_s = CLOSE_WHOLE_AFTER_S
+                limit_s = self._limits.close_whole_s
             if now - scan.used_at > limit_s:
                 if scan.may_close:
                     self._close(scan)
                 elif scan.unwritten:
                     self._write(scan)
-            elif now - scan.intake.head_at <= DRONE_TIMEOUT_S:
+            elif now - scan.intake.head_at <= self._limits.silent_s:
                 self._tend(scan, now)
 
     def _tend(self, scan: ReceivedScan, now: float) -> None:

@@ -9,7 +9,7 @@ import time
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Any
 
-from service.ground.drone import DRONE_TIMEOUT_S, DroneReceiver
+from service.ground.drone import DroneReceiver
 from service.ground.received import ReceivedScan
 from service.workers import Workers
 
@@ -18,10 +18,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MAX_DRONES = 64
-"""Drones received at once; more wait until one is silent."""
-MAX_OPEN_SCANS = 32
-"""Scans of one drone that may be open, where the descriptors allow it."""
 DESCRIPTORS_PER_SCAN, DESCRIPTOR_SHARE = 3, 4
 """An open scan holds so many; all of them together get this fraction (1/n) of the limit."""
 MAX_RESTING = 256
@@ -36,7 +32,7 @@ class Drones:
     """The table of drones. Safe between threads, but for :meth:`retire` and :meth:`close`."""
 
     def __init__(self, station: Receiver, workers: Workers) -> None:
-        self._station, self._workers = station, workers
+        self._station, self._workers, self._limits = station, workers, station.limits
         self._lock = threading.Lock()
         self._drones: dict[str, DroneReceiver] = {}  # those that have a worker
         self._resting: OrderedDict[str, DroneReceiver] = OrderedDict()
@@ -50,11 +46,11 @@ class Drones:
             found = self._drones.get(name)
             if found is not None:
                 return found
-            if len(self._drones) >= MAX_DRONES and not self._make_way():
+            if len(self._drones) >= self._limits.drones and not self._make_way():
                 self._is_wanted = True
                 if time.monotonic() - self._refused_at > REFUSAL_S:
                     self._refused_at = time.monotonic()
-                    log.warning("%s is not received: %d drones are", name, MAX_DRONES)
+                    log.warning("%s is not received: %d drones are", name, self._limits.drones)
                 return None
             drone = self._resting.pop(name, None) or DroneReceiver(name, self._station)
             drone.heard_at = time.monotonic()
@@ -89,7 +85,7 @@ class Drones:
         """Scans that one drone may have open now."""
         soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         room = soft // DESCRIPTOR_SHARE // DESCRIPTORS_PER_SCAN
-        return max(2, min(MAX_OPEN_SCANS, room // max(1, len(self._drones))))
+        return max(2, min(self._limits.open_scans, room // max(1, len(self._drones))))
 
     def retire(self, now: float) -> None:
         """End the workers of drones that are silent and have nothing open, or that failed.
@@ -101,9 +97,9 @@ class Drones:
                 name: drone
                 for name, drone in self._drones.items()
                 if drone.worker.is_done
-                or (not drone.scans and now - drone.heard_at > DRONE_TIMEOUT_S)
+                or (not drone.scans and now - drone.heard_at > self._limits.silent_s)
             }
-            if self._is_wanted and len(self._drones) - len(gone) >= MAX_DRONES:
+            if self._is_wanted and len(self._drones) - len(gone) >= self._limits.drones:
                 gone |= self._min_silent(now)
             self._is_wanted = False
             for name in gone:
@@ -137,7 +133,7 @@ class Drones:
                 name,
             )
             for name, drone in self._drones.items()
-            if now - drone.heard_at > DRONE_TIMEOUT_S
+            if now - drone.heard_at > self._limits.silent_s
             and not any(scan.is_writing for scan in drone.scans)
         ]
         return {name: self._drones[name] for *_, name in sorted(silent)[:1]}

@@ -89,10 +89,10 @@ class Portal:
         """``progress`` gives one entry per scan being received (``Receiver.progress``)."""
         self.config = config
         self._workers = workers or Workers()
-        self._jobs = Jobs(self._workers)
+        self.jobs = Jobs(self._workers)
         below = None if config.basemap is None else open_basemap(config.basemap)
         library = Library(config.store)
-        state = PortalState(library, self._jobs, progress or list, vehicle, below, config.limits)
+        state = PortalState(library, self.jobs, progress or list, vehicle, below, config.limits)
         tokens = parse_tokens(config.token or secrets.token_urlsafe(24))
         self.token = next(iter(tokens.values()))
         self._app = portal_app(state, Tokens(tokens), is_loopback(config.host))
@@ -176,7 +176,7 @@ class Portal:
 
     def close(self) -> None:
         """End; open connections and the vehicle's link are closed, jobs cancelled."""
-        self._jobs.close()
+        self.jobs.close()
         if self._server is not None and self._worker is not None:
             self._worker.stop.set()
             self._server.should_exit = True

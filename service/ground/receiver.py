@@ -75,9 +75,15 @@ class Receiver:
     Raises InputError for endpoints or a store that cannot be used.
     """
 
-    def __init__(self, config: ReceiverConfig, workers: Workers | None = None) -> None:
+    def __init__(
+        self,
+        config: ReceiverConfig,
+        workers: Workers | None = None,
+        deliver: Callable[[ReceivedScan], None] = deliver,
+    ) -> None:
+        """``deliver`` writes the deliverables of a scan."""
         check_endpoints(config.session)
-        self._config = config
+        self._config, self._deliver = config, deliver
         try:
             config.store.mkdir(parents=True, exist_ok=True)
             self.name = config.name or station_name(config.store)
@@ -349,7 +355,7 @@ class Receiver:
             if scan is None:
                 return
             begin_files(scan.folder)
-            scan.trouble = guarded(f"deliverables of {scan.folder}", partial(deliver, scan))
+            scan.trouble = guarded(f"deliverables of {scan.folder}", partial(self._deliver, scan))
             if scan.intake.complete and not scan.trouble:
                 self.align(scan.folder)
             end_files(scan.folder)

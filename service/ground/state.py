@@ -107,8 +107,15 @@ def carry_out(job: Job) -> str:
 class Jobs:
     """A queue of exports and refinements, made one after the other."""
 
-    def __init__(self, workers: Workers) -> None:
-        self._workers = workers
+    def __init__(
+        self,
+        workers: Workers,
+        carry_out: Callable[[Job], str] = carry_out,
+        shown_s: float = SHOWN_S,
+    ) -> None:
+        """``carry_out`` makes a job's deliverable; an ended job is listed for ``shown_s``."""
+        self._workers, self._shown_s = workers, shown_s
+        self.carry_out = carry_out
         self._worker: Worker | None = None  # while jobs wait
         self._lock = threading.Lock()
         self._jobs: list[Job] = []
@@ -149,7 +156,7 @@ class Jobs:
 
     def listed(self) -> list[dict[str, Any]]:
         """The jobs that wait, run or have ended lately, the oldest first."""
-        since = time.time() - SHOWN_S
+        since = time.time() - self._shown_s
         with self._lock:
             return [j.shown() for j in self._jobs if (j.ended_unix_s or since) >= since]
 
@@ -197,7 +204,7 @@ class Jobs:
 
     def _run(self, job: Job) -> None:
         try:
-            job.file = carry_out(job)
+            job.file = self.carry_out(job)
             job.end("done")
         except CancelledError:
             job.end("cancelled")

@@ -13,7 +13,6 @@ from loopback import free_port, until
 
 from service.config import DatalinkConfig
 from service.errors import OutsideError
-from service.ground import receiver as receiver_module
 from service.ground.front import MAX_OF_ADDRESS, Front, behind_fronts
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.keys import make_keys, tls_files
@@ -31,9 +30,7 @@ pytest.importorskip("zenoh")
 def test_strangers_do_not_keep_a_drone_out(
     said: bytes,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
     make_keys(tmp_path, {"drone": ["red"], "ground": ["base"]})
     port = free_port(socket.SOCK_STREAM)
     endpoint, names = f"tls/127.0.0.1:{port}", ("tls_ca", "tls_certificate", "tls_key")
@@ -42,7 +39,7 @@ def test_strangers_do_not_keep_a_drone_out(
         for member in ("ground/base", "drone/red")
     ]
     session = SessionConfig("router", listen=(endpoint,), fleet_rights=True, **keys[0])
-    ground = Receiver(ReceiverConfig(tmp_path / "store", session))
+    ground = Receiver(ReceiverConfig(tmp_path / "store", session), deliver=lambda _: None)
     with contextlib.ExitStack() as exit_stack:
         ground.start()
         exit_stack.callback(ground.close)

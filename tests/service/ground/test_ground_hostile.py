@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,6 @@ from loopback import free_port, until
 from paths import ROOT
 
 from service.config import DatalinkConfig
-from service.ground import drone as drone_module
-from service.ground import drones as drones_module
-from service.ground import receiver as receiver_module
 from service.ground.drone import DroneLimits
 from service.ground.inbox import MAX_HEADS, MAX_ITEM_BYTES, MAX_ITEMS, Inbox
 from service.ground.intake import ScanIntake
@@ -41,19 +38,18 @@ zenoh = pytest.importorskip("zenoh")
 WHOLE = os.environ.get("SKYRELIEF_TRIALS") == "whole"
 
 
-@pytest.fixture(autouse=True)
-def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
-
-
 @contextlib.contextmanager
 def serving(
-    folder: Path, limits: DroneLimits | None = None, refresh_s: float = 0.0
+    folder: Path,
+    limits: DroneLimits | None = None,
+    refresh_s: float = 0.0,
+    deliver: Callable[[ReceivedScan], None] = lambda _: None,
 ) -> Iterator[tuple[Receiver, str]]:
     """A ground station and where it listens."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     session = SessionConfig(mode="router", listen=(endpoint,))
-    ground = Receiver(ReceiverConfig(folder, session, limits or DroneLimits(), "base", refresh_s))
+    config = ReceiverConfig(folder, session, limits or DroneLimits(), "base", refresh_s)
+    ground = Receiver(config, deliver=deliver)
     ground.start()
     try:
         yield ground, endpoint
@@ -143,9 +139,7 @@ def test_a_fault_of_ours_in_one_drones_work_is_reported_and_stops_no_other(
         assert not ground.workers.failed
 
 
-def test_deliverables_that_fail_are_said_and_stop_no_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_deliverables_that_fail_are_said_and_stop_no_others(tmp_path: Path) -> None:
     written = []
 
     def deliver(scan: ReceivedScan) -> None:
@@ -153,8 +147,7 @@ def test_deliverables_that_fail_are_said_and_stop_no_others(
             raise KeyError("made up")
         written.append(scan.drone)
 
-    monkeypatch.setattr(receiver_module, "deliver", deliver)
-    with serving(tmp_path / "ground") as (ground, endpoint):
+    with serving(tmp_path / "ground", deliver=deliver) as (ground, endpoint):
         assert arrives(tmp_path, endpoint, "evil")
         entry = until(lambda: next((e for e in ground.progress() if e["trouble"]), None))
         assert entry["drone"] == "evil" and "KeyError" in entry["trouble"]
@@ -185,12 +178,9 @@ def test_junk_makes_no_folder(tmp_path: Path) -> None:
         assert ground.dropped >= 2
 
 
-def test_scans_are_open_only_while_they_are_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(drones_module, "MAX_OPEN_SCANS", 3)
+def test_scans_are_open_only_while_they_are_used(tmp_path: Path) -> None:
     most = 0
-    with serving(tmp_path / "ground") as (ground, endpoint):
+    with serving(tmp_path / "ground", DroneLimits(open_scans=3)) as (ground, endpoint):
         stores = [scan_of(tmp_path, "red", f"scan-{k}") for k in range(10)]
         config = DatalinkConfig(connect=(endpoint,), budget_kbit_s=50_000.0)
         link = DatalinkSender(None, config, "red")
@@ -228,16 +218,13 @@ def _descriptors() -> list[str]:
     return out
 
 
-def test_a_drone_over_its_share_of_the_disk_is_refused_and_another_is_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(drone_module, "FULL_DISK_REST_S", 0.5)
+def test_a_drone_over_its_share_of_the_disk_is_refused_and_another_is_not(tmp_path: Path) -> None:
     total = os.statvfs(tmp_path).f_blocks * os.statvfs(tmp_path).f_frsize
     store = tmp_path / "ground"
     (store / "drones" / "greedy" / "earlier").mkdir(parents=True)
     with (store / "drones" / "greedy" / "earlier" / "cloud.laz").open("wb") as file:
         file.truncate(2_000_000)
-    limits = DroneLimits(None, 2_000_000 / total, 0)
+    limits = DroneLimits(None, 2_000_000 / total, 0, full_disk_rest_s=0.5)
     greedy = scan_of(tmp_path, "greedy")
     with serving(store, limits) as (ground, endpoint):
         config = DatalinkConfig(connect=(endpoint,), budget_kbit_s=50_000.0)
@@ -247,7 +234,6 @@ def test_a_drone_over_its_share_of_the_disk_is_refused_and_another_is_not(
             assert not link.progress.complete
             assert not (store / "drones" / "greedy" / "scan-1").exists()
             (store / "drones" / "greedy" / "earlier" / "cloud.laz").unlink()
-            monkeypatch.setattr(drone_module, "UNREADABLE_REST_S", 0.0)
         finally:
             link.close()
             greedy.close()
@@ -264,9 +250,8 @@ def test_poses_stop_at_the_reserve_and_go_on_when_there_is_room(
     usage = type("Usage", (), {"total": 10_000_000, "free": property(lambda _: free[0])})
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage())
     monkeypatch.setattr(storage, "LOOK_S", 0.0)
-    monkeypatch.setattr(drone_module, "FULL_DISK_REST_S", 0.3)
     onboard = ScanStore.create(tmp_path / "a.db", ScanHeader("scan-1", "red", 1))
-    with serving(tmp_path / "ground") as (ground, endpoint):
+    with serving(tmp_path / "ground", DroneLimits(full_disk_rest_s=0.3)) as (ground, endpoint):
         config = DatalinkConfig(connect=(endpoint,), budget_kbit_s=50_000.0)
         link = DatalinkSender(onboard, config)
         try:
@@ -315,11 +300,11 @@ def test_an_inbox_holds_no_more_than_its_bounds() -> None:
     assert inbox.dropped == 2 + MAX_ITEMS
 
 
-def test_many_drones_share_the_station_and_one_more_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(drones_module, "MAX_DRONES", 3)
-    with serving(tmp_path / "ground") as (ground, endpoint), hostile(endpoint) as session:
+def test_many_drones_share_the_station_and_one_more_is_refused(tmp_path: Path) -> None:
+    with (
+        serving(tmp_path / "ground", DroneLimits(drones=3)) as (ground, endpoint),
+        hostile(endpoint) as session,
+    ):
         for name in ("a", "b", "c"):
             assert until(partial(_introduced, ground, session, name, "scan-1"))
         for k in range(50):
@@ -329,13 +314,9 @@ def test_many_drones_share_the_station_and_one_more_is_refused(
         assert not list((tmp_path / "ground").glob("invented-*"))
 
 
-def test_a_silent_drone_that_brought_min_makes_way_for_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_silent_drone_that_brought_min_makes_way_for_another(tmp_path: Path) -> None:
     """Invented drones with a scan each fill the table; who comes later is received all the same."""
-    monkeypatch.setattr(drones_module, "MAX_DRONES", 3)
-    monkeypatch.setattr(drones_module, "DRONE_TIMEOUT_S", 0.5)
-    station = serving(tmp_path / "ground", refresh_s=0.2)
+    station = serving(tmp_path / "ground", DroneLimits(drones=3, silent_s=0.5), refresh_s=0.2)
     with station as (ground, endpoint), hostile(endpoint) as session:
         for name in ("ghost-1", "ghost-2"):
             assert until(partial(_introduced, ground, session, name, "scan-1"))
@@ -345,14 +326,14 @@ def test_a_silent_drone_that_brought_min_makes_way_for_another(
         assert len({entry["drone"] for entry in ground.progress()}) == 4
 
 
-def test_a_silent_drone_has_no_worker_and_its_scans_stay_listed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(drones_module, "DRONE_TIMEOUT_S", 0.5)
-    monkeypatch.setattr(drone_module, "CLOSE_WHOLE_AFTER_S", 0.0)
+def test_a_silent_drone_has_no_worker_and_its_scans_stay_listed(tmp_path: Path) -> None:
     written: list[str] = []
-    monkeypatch.setattr(receiver_module, "deliver", lambda scan: written.append(scan.name))
-    with serving(tmp_path / "ground") as (ground, endpoint):
+    limits = DroneLimits(silent_s=0.5, close_whole_s=0.0)
+
+    def deliver(scan: ReceivedScan) -> None:
+        written.append(scan.name)
+
+    with serving(tmp_path / "ground", limits, deliver=deliver) as (ground, endpoint):
         for scan_id in ("first", "second"):
             store = scan_of(tmp_path, "red", scan_id)
             link = DatalinkSender(store, DatalinkConfig(connect=(endpoint,)))
@@ -373,12 +354,12 @@ def _running(ground: Receiver) -> list[dict[str, object]]:
     return [worker for worker in ground.workers.report() if worker["state"] == "running"]
 
 
-def test_unfinished_records_of_all_scans_of_a_drone_share_one_bound(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(drone_module, "MAX_UNFINISHED_BYTES", 100_000)
+def test_unfinished_records_of_all_scans_of_a_drone_share_one_bound(tmp_path: Path) -> None:
     part = split("k1", 1, bytes(90_000), 60_000)[0].pack()
-    with serving(tmp_path / "ground") as (ground, endpoint), hostile(endpoint) as session:
+    with (
+        serving(tmp_path / "ground", DroneLimits(unfinished_bytes=100_000)) as (ground, endpoint),
+        hostile(endpoint) as session,
+    ):
         for k in range(4):
             until(partial(_introduced, ground, session, "evil", f"scan-{k}"))
             key = f"skyrelief/evil/scan-{k}/item/k1/1"

@@ -16,7 +16,6 @@ from loopback import until
 from service.config import DatalinkConfig, load_config
 from service.daemon.diagnosis import BAD, GOOD, NOTE, _certificate
 from service.errors import InputError, OutsideError
-from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.keys import (
     access_control,
@@ -48,18 +47,15 @@ def session_config(home: Path, **more: object) -> SessionConfig:
 
 
 @contextlib.contextmanager
-def served(
-    fleet: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[tuple[Receiver, str]]:
+def served(fleet: Path, folder: Path) -> Iterator[tuple[Receiver, str]]:
     """A ground station of the fleet, and where it listens."""
-    monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tls/127.0.0.1:{probe.getsockname()[1]}"
     config = session_config(
         fleet / "ground" / "base", mode="router", listen=(endpoint,), fleet_rights=True
     )
-    receiver = Receiver(ReceiverConfig(folder / "ground", config))
+    receiver = Receiver(ReceiverConfig(folder / "ground", config), deliver=lambda _: None)
     receiver.start()
     try:
         yield receiver, endpoint
@@ -68,10 +64,8 @@ def served(
 
 
 @pytest.fixture
-def ground(
-    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[tuple[Receiver, str]]:
-    with served(fleet, tmp_path, monkeypatch) as both:
+def ground(fleet: Path, tmp_path: Path) -> Iterator[tuple[Receiver, str]]:
+    with served(fleet, tmp_path) as both:
         yield both
 
 
@@ -125,14 +119,12 @@ def test_a_viewer_reads_and_cannot_write(
         viewer.close()
 
 
-def test_a_station_reports_under_its_own_name_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_station_reports_under_its_own_name_only(tmp_path: Path) -> None:
     fleet = tmp_path / "fleet"
     make_keys(fleet, {"drone": ["red"], "ground": ["base", "mobile"]})
     assert member_name(fleet / "ground" / "mobile" / "certificate.pem") == "mobile"
     heard: list[str] = []
-    with served(fleet, tmp_path, monkeypatch) as (_, endpoint):
+    with served(fleet, tmp_path) as (_, endpoint):
         drone = open_session(session_config(fleet / "drone" / "red", connect=(endpoint,)))
         drone.declare_subscriber("skyrelief/red/*/held/*", lambda s: heard.append(str(s.key_expr)))
         mobile = open_session(session_config(fleet / "ground" / "mobile", connect=(endpoint,)))
@@ -191,13 +183,11 @@ def test_who_is_not_of_the_fleet_does_not_get_in(
         open_session(config)
 
 
-def test_a_clock_that_is_behind_does_not_keep_a_drone_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_clock_that_is_behind_does_not_keep_a_drone_out(tmp_path: Path) -> None:
     """Keys made a month from now stand for a computer here whose clock is a month behind."""
     fleet, members = tmp_path / "fleet", {"drone": ["red"], "ground": ["base"]}
     make_keys(fleet, members, now=time.time() + 30 * 86400)
-    with served(fleet, tmp_path, monkeypatch) as (_, endpoint):
+    with served(fleet, tmp_path) as (_, endpoint):
         link = sender(fleet, tmp_path, "drone/red", "red", endpoint)
         try:
             assert link.drain(15.0)
@@ -240,9 +230,7 @@ def test_rights_name_every_member_and_deny_the_rest(fleet: Path) -> None:
     assert {"drone.red", "drone.blue", "ground.base", "viewer.eye"} <= names
 
 
-def test_a_revoked_drone_has_no_rights_and_its_successor_has(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_revoked_drone_has_no_rights_and_its_successor_has(tmp_path: Path) -> None:
     fleet, stolen = tmp_path / "fleet", tmp_path / "stolen"
     make_keys(fleet, {"drone": ["red", "blue"], "ground": ["base"]})
     shutil.copytree(fleet / "drone" / "red", stolen / "drone" / "red")
@@ -250,7 +238,7 @@ def test_a_revoked_drone_has_no_rights_and_its_successor_has(
     assert not (fleet / "drone" / "red").exists()
     assert make_keys(fleet, {"drone": ["red"]}) == [fleet / "drone" / "red"]
     (tmp_path / "old").mkdir()
-    with served(fleet, tmp_path, monkeypatch) as (receiver, endpoint), contextlib.ExitStack() as up:
+    with served(fleet, tmp_path) as (receiver, endpoint), contextlib.ExitStack() as up:
         old = sender(stolen, tmp_path / "old", "drone/red", "red", endpoint)
         up.callback(old.close)
         assert not old.drain(3.0) and receiver.progress() == []
@@ -261,16 +249,14 @@ def test_a_revoked_drone_has_no_rights_and_its_successor_has(
         assert sorted(e["drone"] for e in receiver.progress()) == ["blue", "red"]
 
 
-def test_a_revoked_viewer_sees_nothing_and_its_successor_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_revoked_viewer_sees_nothing_and_its_successor_does(tmp_path: Path) -> None:
     fleet, stolen = tmp_path / "fleet", tmp_path / "stolen"
     make_keys(fleet, {"drone": ["red"], "ground": ["base"], "viewer": ["eye"]})
     shutil.copytree(fleet / "viewer" / "eye", stolen)
     revoke(fleet, "eye")
     make_keys(fleet, {"viewer": ["eye"]})
     seen: list[str] = []
-    with served(fleet, tmp_path, monkeypatch) as (_, endpoint), contextlib.ExitStack() as up:
+    with served(fleet, tmp_path) as (_, endpoint), contextlib.ExitStack() as up:
         for who, home in (("old", stolen), ("new", fleet / "viewer" / "eye")):
             session = up.enter_context(open_session(session_config(home, connect=(endpoint,))))
             session.declare_subscriber("skyrelief/**", lambda _, who=who: seen.append(who))
@@ -286,9 +272,7 @@ def test_a_revoked_viewer_sees_nothing_and_its_successor_does(
         assert "old" not in seen
 
 
-def test_a_revoked_ground_station_cannot_serve_and_the_others_have_new_keys(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_revoked_ground_station_cannot_serve_and_the_others_have_new_keys(tmp_path: Path) -> None:
     fleet, stolen = tmp_path / "fleet", tmp_path / "stolen"
     make_keys(fleet, {"drone": ["red"], "ground": ["base", "van"]})
     shutil.copytree(fleet / "ground" / "van", stolen)
@@ -301,7 +285,7 @@ def test_a_revoked_ground_station_cannot_serve_and_the_others_have_new_keys(
     impostor = open_session(session_config(stolen, mode="router", listen=(false_endpoint,)))
     with impostor, pytest.raises(OutsideError):
         open_session(session_config(home, connect=(false_endpoint,)))
-    with served(fleet, tmp_path, monkeypatch) as (_, endpoint), contextlib.ExitStack() as up:
+    with served(fleet, tmp_path) as (_, endpoint), contextlib.ExitStack() as up:
         link = sender(fleet, tmp_path, "drone/red", "red", endpoint)
         up.callback(link.close)
         assert link.drain(15.0)

@@ -16,7 +16,6 @@ from loopback import until
 from person import Browser
 from portal_client import NEEDS, ONE, TOKEN, Client, browser, flown_store
 
-from service.ground import state
 from service.ground.drone import DroneLimits
 from service.ground.portal import Portal, PortalConfig
 from service.ground.state import Job
@@ -107,9 +106,7 @@ def portal_jobs(client: Client) -> list[str]:
 
 
 @pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
-def test_the_datum_is_chosen_on_the_page(
-    browser: Browser, portal: Portal, monkeypatch: pytest.MonkeyPatch, needs: None
-) -> None:
+def test_the_datum_is_chosen_on_the_page(browser: Browser, portal: Portal, needs: None) -> None:
     made: list[Job] = []
 
     def carry_out(job: Job) -> str:
@@ -119,7 +116,7 @@ def test_the_datum_is_chosen_on_the_page(
     def has_made(kind: str) -> bool:
         return bool(made) and made[-1].kind == kind
 
-    monkeypatch.setattr(state, "carry_out", carry_out)
+    portal.jobs.carry_out = carry_out
     choose = (
         "(() => {{ const s = document.querySelectorAll('article select')[{}];"
         " s.value = [...s.options].find(o => o.text === '{}').value;"
@@ -157,7 +154,7 @@ def test_all_maps_come_in_one_zip(portal: Portal, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
 def test_all_maps_are_two_clicks_away(
-    browser: Browser, portal: Portal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, needs: None
+    browser: Browser, portal: Portal, tmp_path: Path, needs: None
 ) -> None:
     def carry_out(job: Job) -> str:
         maps = job.folder / "maps"
@@ -165,7 +162,7 @@ def test_all_maps_are_two_clicks_away(
         (maps / "manifest.json").write_text("{}")
         return maps.name
 
-    monkeypatch.setattr(state, "carry_out", carry_out)
+    portal.jobs.carry_out = carry_out
     browser.screen(1280, 800)
     browser.open(portal.url)
     browser.wait("document.querySelectorAll('article').length === 1")
@@ -184,7 +181,7 @@ def test_all_maps_are_two_clicks_away(
 @pytest.mark.parametrize("where", ["/", "/#/view/drone-1/test-1"])
 @pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
 def test_a_job_shows_its_percent_and_is_cancelled_by_its_button(
-    browser: Browser, portal: Portal, monkeypatch: pytest.MonkeyPatch, where: str, needs: None
+    browser: Browser, portal: Portal, where: str, needs: None
 ) -> None:
     def slow(job: Job) -> str:
         for _ in job.progress.over(range(4), 4):
@@ -193,7 +190,7 @@ def test_a_job_shows_its_percent_and_is_cancelled_by_its_button(
                 time.sleep(0.05)
         return "dsm.tif"
 
-    monkeypatch.setattr(state, "carry_out", slow)
+    portal.jobs.carry_out = slow
     browser.screen(1280, 800)
     browser.open(portal.url)
     browser.wait("document.querySelectorAll('article').length === 1")

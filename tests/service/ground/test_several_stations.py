@@ -16,7 +16,6 @@ from loopback import free_port, until
 from service.commands.ground import GroundOptions
 from service.config import DatalinkConfig
 from service.errors import InputError
-from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver
 from service.stream.keys import make_keys, tls_files
 from service.stream.link import DatalinkSender
@@ -60,7 +59,7 @@ class StationsAndDrones:
             keys=keys,
             sites=False,
         )
-        station = Receiver(replace(options.receiver(), name=name))
+        station = Receiver(replace(options.receiver(), name=name), deliver=lambda _: None)
         station.start()
         self._exit_stack.callback(station.close)
         return station
@@ -80,10 +79,7 @@ class StationsAndDrones:
 
 
 @pytest.fixture(params=[True, False], ids=["keys", "plain"])
-def fleet(
-    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[StationsAndDrones]:
-    monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
+def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[StationsAndDrones]:
     with ExitStack() as exit_stack:
         yield StationsAndDrones(tmp_path, exit_stack, request.param)
 

@@ -16,7 +16,6 @@ from rehearsal import RehearsalControl
 from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from service.config import Config
 from service.flight.datalink import DaemonLink, open_backlog
-from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, ScanHeader
@@ -68,10 +67,7 @@ def test_only_what_was_not_delivered_is_offered(tmp_path: Path) -> None:
             store.close()
 
 
-def test_the_backlog_reaches_the_ground_and_is_then_empty(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
+def test_the_backlog_reaches_the_ground_and_is_then_empty(tmp_path: Path) -> None:
     scans = tmp_path / "scans"
     make_scan(scans, "one")
     make_scan(scans, "two", finished=False)
@@ -85,7 +81,8 @@ def test_the_backlog_reaches_the_ground_and_is_then_empty(
         datalink=dataclasses.replace(base.datalink, connect=(endpoint,)),
     )
     ground = Receiver(
-        ReceiverConfig(tmp_path / "ground", SessionConfig(mode="router", listen=(endpoint,)))
+        ReceiverConfig(tmp_path / "ground", SessionConfig(mode="router", listen=(endpoint,))),
+        deliver=lambda _: None,
     )
     ground.start()
     link = open_backlog(config)
@@ -100,10 +97,7 @@ def test_the_backlog_reaches_the_ground_and_is_then_empty(
         assert two.summary == {"interrupted": True} and len(list(two.poses())) == 5
 
 
-def test_the_daemon_offers_earlier_scans_between_flights(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
+def test_the_daemon_offers_earlier_scans_between_flights(tmp_path: Path) -> None:
     scans = tmp_path / "scans"
     make_scan(scans, "one")
     with socket.socket() as probe:
@@ -116,7 +110,7 @@ def test_the_daemon_offers_earlier_scans_between_flights(
         datalink=dataclasses.replace(base.datalink, connect=(endpoint,)),
     )
     session = SessionConfig(mode="router", listen=(endpoint,))
-    ground = Receiver(ReceiverConfig(tmp_path / "ground", session))
+    ground = Receiver(ReceiverConfig(tmp_path / "ground", session), deliver=lambda _: None)
     ground.start()
     vehicle = VehicleLink(VehicleConfig(), RehearsalControl())
     link = DaemonLink()

@@ -25,7 +25,6 @@ from recon import se3
 from recon.types import DepthMap, Keyframe, Pose
 from service.config import Config, DatalinkConfig
 from service.flight.datalink import OWN_LINKS, DaemonLink
-from service.ground import receiver as receiver_module
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.radio import DRONE, GROUND, TUNNEL, RadioLink
 from service.stream import codec
@@ -255,11 +254,8 @@ def test_a_full_radio_buffer_slows_it_down_and_an_empty_one_speeds_it_up(tmp_pat
         assert slowed < 0.4 * full_speed
 
 
-def test_over_a_real_link_into_the_ground_station(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_over_a_real_link_into_the_ground_station(tmp_path: Path) -> None:
     pytest.importorskip("zenoh")
-    monkeypatch.setattr(receiver_module, "deliver", lambda _: None)
     with socket.socket(type=socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         udp = probe.getsockname()[1]
@@ -267,7 +263,7 @@ def test_over_a_real_link_into_the_ground_station(
         probe.bind(("127.0.0.1", 0))
         tcp = probe.getsockname()[1]
     session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{tcp}",))
-    ground = Receiver(ReceiverConfig(tmp_path / "ground", session))
+    ground = Receiver(ReceiverConfig(tmp_path / "ground", session), deliver=lambda _: None)
     ground.start()
     radio = RadioLink(f"udpin:127.0.0.1:{udp}", GROUND, ground.add_radio)
     radio.open()
@@ -282,7 +278,7 @@ def test_over_a_real_link_into_the_ground_station(
         radio.close()
         ground.close()
         store.close()
-    path = tmp_path / "ground" / HEADER.drone / HEADER.scan_id / "scan.db"
+    path = tmp_path / "ground" / "drones" / HEADER.drone / HEADER.scan_id / "scan.db"
     with ScanStore.open(path) as kept:
         (frame,) = kept.keyframes()
         assert np.isfinite(frame.depth.depth_m).mean() > 0.95
