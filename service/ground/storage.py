@@ -16,7 +16,7 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -261,13 +261,15 @@ TAKING = ".taking-"
 """Begins the name of a folder that a scan is copied to, from a card or into the library."""
 
 
-def take_in(store: Path, folder: Path) -> list[Path]:
+def take_in(
+    store: Path, folder: Path, deliver: Callable[[Path, ScanStore], None] | None = None
+) -> list[Path]:
     """The scan folders under ``store`` that now hold what those in ``folder`` hold.
 
     ``folder`` is a scan folder or a folder of them, such as a card's; nothing is written there.
     Items received before by radio or network are kept and completed. A damaged scan is left out
-    where there are others. Raises InputError when there is not a scan, OutsideError when the disk
-    is full.
+    where there are others. ``deliver`` writes a scan's files. Raises InputError when there is not a
+    scan, OutsideError when the disk is full.
     """
     given = Path(os.path.realpath(folder))  # the operator's own link is followed
     paths = [given / STORE_FILES[0], *sorted(given.glob(f"*/{STORE_FILES[0]}"))]
@@ -277,7 +279,7 @@ def take_in(store: Path, folder: Path) -> list[Path]:
     taken, faults = [], []
     for path in paths:
         try:
-            taken.append(_take(store, path.parent))
+            taken.append(_take(store, path.parent, deliver or _deliver))
         except InputError as error:
             log.error("%s is not taken: %s", path.parent, error)
             faults.append(error)
@@ -286,7 +288,7 @@ def take_in(store: Path, folder: Path) -> list[Path]:
     return taken
 
 
-def _take(store: Path, folder: Path) -> Path:
+def _take(store: Path, folder: Path, deliver: Callable[[Path, ScanStore], None]) -> Path:
     with workplace(store) as place:
         copy_files(folder, place, STORE_FILES)
         with ScanStore.open(place / STORE_FILES[0]) as source:
@@ -295,7 +297,7 @@ def _take(store: Path, folder: Path) -> Path:
             path = scan_folder(store, drone, scan) / STORE_FILES[0]
             with _open(path, header) as target:
                 news = merge(source, target)
-                _deliver(path.parent, target)
+                deliver(path.parent, target)
     log.info("%s/%s: %d records from %s", drone, scan, news, folder)
     return path.parent
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +54,9 @@ class Recording:
     words: str  # for the operator
 
 
-def recording_of(folder: Path, header: ScanHeader) -> Recording:
+def recording_of(
+    folder: Path, header: ScanHeader, opener: Callable[[str], CameraSource] = open_camera
+) -> Recording:
     """The video or folder of stills that a scan was made from, when it still is where it was.
 
     ``scan.json`` names it (``run.source``). A relative path is tried from the working directory,
@@ -71,7 +73,7 @@ def recording_of(folder: Path, header: ScanHeader) -> Recording:
     if found is None:
         return Recording(None, f"{stored}: {named} is not there; give the flight's --video")
     try:
-        camera, source = camera_of(header), open_camera(str(found))
+        camera, source = camera_of(header), opener(str(found))
         size_px = source.size_px
         source.close()
     except SkyreliefError as error:

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,9 @@ def keyframe(seq: int) -> Keyframe:
     return Keyframe(seq, 5, depth, bgr, Pose(np.eye(4), np.eye(6)), np.ones((90, 160), bool))
 
 
+received = partial(take_in, deliver=lambda *_: None)  # the files are another module's matter
+
+
 @pytest.fixture
 def card(tmp_path: Path) -> Path:
     """The aircraft's storage, as a power cut left it: the write-ahead log is not folded in."""
@@ -58,10 +62,7 @@ def card(tmp_path: Path) -> Path:
     return tmp_path / "card"
 
 
-def test_the_card_completes_what_the_radio_brought(
-    tmp_path: Path, card: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(storage, "_deliver", lambda *_: None)
+def test_the_card_completes_what_the_radio_brought(tmp_path: Path, card: Path) -> None:
     announced = unpack_announce(pack_announce(HEADER))
     assert announced is not None
     path = tmp_path / "ground" / "drones" / "red" / "scan-1" / "scan.db"
@@ -71,8 +72,8 @@ def test_the_card_completes_what_the_radio_brought(
         for tile in tiles_of(coarse):
             ground.add_radio("tile", 0, tile.index, pack_tile(tag_of("red", "scan-1"), tile))
     before = {p.name: p.read_bytes() for p in (card / "scan-1").iterdir()}
-    assert take_in(tmp_path / "ground", card) == [path.parent]
-    assert take_in(tmp_path / "ground", card / "scan-1") == [path.parent]  # once more: no harm
+    assert received(tmp_path / "ground", card) == [path.parent]
+    assert received(tmp_path / "ground", card / "scan-1") == [path.parent]  # once more: no harm
     assert {p.name: p.read_bytes() for p in (card / "scan-1").iterdir()} == before
     assert [p.name for p in (tmp_path / "ground").iterdir()] == ["drones"]
     with ScanStore.open(path) as ground, ScanStore.open(card / "scan-1" / "scan.db") as aircraft:
@@ -82,16 +83,13 @@ def test_the_card_completes_what_the_radio_brought(
             np.testing.assert_array_equal(a.depth.depth_m, b.depth.depth_m)
 
 
-def test_two_cards_with_runs_of_one_time_are_kept_apart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(storage, "_deliver", lambda *_: None)
+def test_two_cards_with_runs_of_one_time_are_kept_apart(tmp_path: Path) -> None:
     for n, run_id in enumerate(("a" * 32, "b" * 32)):
         path = tmp_path / f"card-{n}" / "scan-1" / "scan.db"
         with ScanStore.create(path, replace(HEADER, run_id=run_id)) as store:
             for seq in range(n, n + 3):
                 store.add_keyframe(seq, codec.encode(keyframe(seq), seq))
-    taken = [take_in(tmp_path / "ground", tmp_path / f"card-{n}")[0] for n in (0, 1, 0)]
+    taken = [received(tmp_path / "ground", tmp_path / f"card-{n}")[0] for n in (0, 1, 0)]
     assert [path.name for path in taken] == ["scan-1", "scan-1-2", "scan-1"]
     for n, path in enumerate(taken[:2]):
         with ScanStore.open(path / "scan.db") as store:
@@ -100,7 +98,7 @@ def test_two_cards_with_runs_of_one_time_are_kept_apart(
 
 def test_a_folder_without_scans_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="contains no scan"):
-        take_in(tmp_path / "ground", tmp_path)
+        received(tmp_path / "ground", tmp_path)
 
 
 def test_what_a_killed_process_left_is_deleted_at_the_start(tmp_path: Path, card: Path) -> None:
@@ -135,13 +133,12 @@ def test_a_damaged_scan_leaves_the_others_and_no_card_fills_the_disk(
     (card / "scan-0").mkdir()
     (card / "scan-0" / "scan.db").write_bytes(b"no database")
     (card / "scan-2").symlink_to(tmp_path)
-    monkeypatch.setattr(storage, "_deliver", lambda *_: None)
     (tmp_path / "link").symlink_to(card)  # the operator's own
-    assert [path.name for path in take_in(tmp_path / "ground", tmp_path / "link")] == ["scan-1"]
+    assert [path.name for path in received(tmp_path / "ground", tmp_path / "link")] == ["scan-1"]
     nearly_full = shutil.disk_usage(tmp_path)._replace(free=10)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: nearly_full)
     with pytest.raises(OutsideError, match="has room for"):
-        take_in(tmp_path / "ground", card)
+        received(tmp_path / "ground", card)
 
 
 def test_a_station_whose_name_is_damaged_takes_another(tmp_path: Path) -> None:
@@ -176,10 +173,7 @@ def test_the_library_imports_two_runs_of_one_time_and_no_run_twice(tmp_path: Pat
         library.import_folder(cards[1])
 
 
-def test_a_drone_of_any_name_keeps_to_its_own_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(storage, "_deliver", lambda *_: None)
+def test_a_drone_of_any_name_keeps_to_its_own_folder(tmp_path: Path) -> None:
     store = tmp_path / "ground"
     token, library = kept_token(store), Library(store)
     kept = {path.name: path.read_bytes() for path in store.iterdir()}
@@ -187,7 +181,7 @@ def test_a_drone_of_any_name_keeps_to_its_own_folder(
     for name in names:
         header = ScanHeader("scan-1", name, 1)
         ScanStore.create(tmp_path / "card" / name / "scan.db", header).close()
-    assert take_in(store, tmp_path / "card") == [
+    assert received(store, tmp_path / "card") == [
         store / "drones" / n / "scan-1" for n in sorted(names)
     ]
     assert {path.name: path.read_bytes() for path in store.iterdir() if path.is_file()} == kept

@@ -177,6 +177,10 @@ class FakeVideo:
     """Images twice as fine as the keyframes', one of them at each keyframe's second."""
 
     def __init__(self, house: HouseFlight, size_px: tuple[int, int] = (320, 180)) -> None:
+        self.description, self.is_live, self.warnings = "video", False, list[str]()
+        self.start_monotonic_ns: int | None = None
+        self.epoch_unix_ns: int | None = None
+        self.fps: float | None = 2.0
         self.size_px, self.closed = size_px, False
         self._house = house
 
@@ -251,19 +255,21 @@ def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
     assert isinstance(failed.exception, InputError)
 
 
-def test_the_recording_that_a_scan_names_is_found(
-    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_recording_that_a_scan_names_is_found(tmp_path: Path, house: HouseFlight) -> None:
     folder = tmp_path / "scan"
     with house.flown(folder) as store:
         camera = {"K": [1.0] * 9, "distortion": [0.0] * 5, "width": 320, "height": 180}
         header = replace(store.header, camera=camera)
-    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house))
-    assert images.recording_of(folder, header).path is None  # no scan.json yet
+    video_px = (320, 180)
+
+    def found() -> images.Recording:
+        return images.recording_of(folder, header, lambda _: FakeVideo(house, video_px))
+
+    assert found().path is None  # no scan.json yet
 
     def name(source: object) -> images.Recording:
         (folder / "scan.json").write_text(json.dumps({"run": {"source": source}}))
-        return images.recording_of(folder, header)
+        return found()
 
     assert name("flight.mp4").path is None and "is not there" in name("flight.mp4").words
     video = tmp_path / "flight.mp4"
@@ -274,8 +280,8 @@ def test_the_recording_that_a_scan_names_is_found(
         assert "does not name" in name(unfit).words
     assert "is not there" in name("x" * 5000).words
     (folder / "scan.json").write_text("[" * 100_000)
-    assert "does not name" in images.recording_of(folder, header).words
-    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house, (640, 360)))
+    assert "does not name" in found().words
+    video_px = (640, 360)
     assert name("flight.mp4").path is None and "another recording" in name("flight.mp4").words
     bare = replace(header, camera={})
     assert images.recording_of(folder, bare).path is None
