@@ -391,7 +391,7 @@ class NoWorkers(Workers):
 
 
 class Offered(Scanning):
-    """Earlier scans are offered to nobody."""
+    """Offers no earlier scans."""
 
     def offer_backlog(self) -> None:
         pass
