@@ -12,6 +12,8 @@ BIN := $(VENV)/bin
 CORE := $(VENV)/core
 STAMP := $(VENV)/installed
 PEERS := $(VENV)/peers/installed
+WEB := service/ground/web
+PAGE := $(addprefix $(WEB)/,package-lock.json index.html vite.config.ts) $(wildcard $(WEB)/src/*)
 
 .PHONY: demo test test-all lint types check bench trials pages format bundle lock notices clean
 
@@ -87,9 +89,9 @@ notices:
 clean:
 	rm -rf demo-output build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 
-# Installed again only when what is installed changes. Python compiles a module when it is first
-# imported: to compile all of them takes longer than to download them.
-$(CORE): pyproject.toml constraints.txt
+# Installed again only when what is installed changes, which includes the portal's page. Python
+# compiles a module when it is first imported: to compile all of them takes longer than to download them.
+$(CORE): pyproject.toml constraints.txt hatch_build.py $(PAGE)
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' || \
 	  { echo "skyrelief needs Python 3.10 to 3.13; say which with: make $(MAKECMDGOALS) PYTHON=python3.12" >&2; exit 2; }
 	@echo "installing skyrelief and some 40 packages into $(VENV): once, a minute or two"

@@ -84,6 +84,17 @@ def test_wheel_holds_the_packages_and_nothing_else(tmp_path: Path) -> None:
     assert "skyrelief = service.cli:main" in entry
 
 
+@pytest.mark.parametrize("source", ["src/jobs.ts", "src/style.css", "index.html"])
+def test_make_installs_again_when_the_portal_page_changes(tmp_path: Path, source: str) -> None:
+    def said(*options: str) -> str:
+        order = ("make", "--dry-run", f"VENV={tmp_path}", *options, str(tmp_path / "core"))
+        return subprocess.run(order, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+    (tmp_path / "core").touch()
+    assert "pip install" not in said()
+    assert "pip install" in said("--what-if", f"service/ground/web/{source}")
+
+
 def test_systemd_folder_is_no_package() -> None:
     """With an __init__.py it would hide the systemd Python package from the repo's root."""
     assert not (ROOT / "systemd" / "__init__.py").exists()
