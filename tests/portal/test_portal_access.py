@@ -6,16 +6,14 @@ import json
 import shutil
 import threading
 import time
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 from person import Browser
-from portal_client import NEEDS, ONE, TOKEN, browser, flown_store
+from portal_client import NEEDS, ONE, TOKEN, Client, browser, flown_store
 
-from service.ground import state
 from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
 from service.ground.state import Job
@@ -123,8 +121,8 @@ def test_choosing_a_deliverable_by_keyboard_starts_nothing(browser: Browser, bas
 
 
 @pytest.fixture(scope="module")
-def busy(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Iterator[str]:
-    """A portal with a scan that is received, a site, a broken scan, a bin and a job that waits."""
+def station(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Iterator[Portal]:
+    """A portal with a scan that is received, a site, a broken scan and a bin."""
     store = flown_store(tmp_path_factory.mktemp("busy"), house)
     scan = store / "drone-1/test-1"
     site = Path(shutil.copytree(scan, store / "drone-1/site-1"))
@@ -139,13 +137,13 @@ def busy(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Iterat
     }  # fmt: skip
     portal = Portal(PortalConfig(store, port=0, token=TOKEN), lambda: [entry])
     portal.start()
-    yield portal.url.split("/?")[0]
+    yield portal
     portal.close()
 
 
 @pytest.fixture
-def job(monkeypatch: pytest.MonkeyPatch, busy: str) -> Iterator[None]:
-    """A job that is half done until the test ends."""
+def busy(station: Portal) -> Iterator[str]:
+    """The address of that portal, with a job that is half done until the test ends."""
     ended = threading.Event()
 
     def half(job: Job) -> str:
@@ -154,12 +152,10 @@ def job(monkeypatch: pytest.MonkeyPatch, busy: str) -> Iterator[None]:
                 ended.wait(60.0)
         return "dsm.tif"
 
-    monkeypatch.setattr(state, "carry_out", half)
-    order = urllib.request.Request(
-        f"{busy}{ONE}/exports", b'{"kind": "dsm"}', {"Authorization": f"Bearer {TOKEN}"}
-    )
-    urllib.request.urlopen(order, timeout=10).close()
-    yield
+    station.jobs.carry_out = half
+    client = Client(station)
+    assert client.ask(ONE + "/exports", "POST", {"kind": "dsm"})[0] == 202
+    yield client.base
     ended.set()
 
 
@@ -176,7 +172,6 @@ def axe(browser: Browser, page: str, image: Path, findings: str = SERIOUS) -> li
 def test_axe_finds_nothing_serious(
     browser: Browser,
     busy: str,
-    job: None,
     size: tuple[int, int],
     scheme: Literal["light", "dark"],
     tmp_path: Path,
