@@ -33,7 +33,7 @@ EXTRAS = {
 }
 """Import name to the smallest extra of skyrelief that installs it."""
 
-NAMES = {"foxglove": "foxglove-sdk", "google": "protobuf"}
+NAMES = {"foxglove": "foxglove-sdk", "google": "protobuf", "skimage": "scikit-image"}
 """Import name to the package's name, where they differ."""
 
 LIBRARIES = {

@@ -77,9 +77,9 @@ class Backend(Protocol):
 
 BACKENDS: dict[str, str] = {
     "cpu": "recon.backends.cpu:CpuBackend",
-    "torch": "recon.backends.torch_backend:TorchBackend",
+    "torch": "recon.backends.torch_plain:open_torch",
 }
-"""Name to ``module:class``; imported on first use. A model on ONNX Runtime is one by its file."""
+"""Name to ``module:factory``; imported on first use. A model on ONNX Runtime is one by its file."""
 
 
 def load_backend(name: str) -> Backend:

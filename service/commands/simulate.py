@@ -258,15 +258,46 @@ def _report(out: Path, result: dict[str, Any], seconds: float, as_json: bool) ->
 
 def score(
     scan_dir: Annotated[Path, typer.Argument(help="Scan folder of replay or run.")],
-    truth_dir: Annotated[Path, typer.Argument(help="truth/ of simulate.")],
+    truth_dir: Annotated[
+        Path, typer.Argument(help="truth/ of simulate; with --views the video or folder of stills.")
+    ],
+    views: Annotated[
+        bool,
+        typer.Option("--views", help="draw frames that took no part and compare them instead"),
+    ] = False,
+    pictures: Annotated[
+        Path | None, typer.Option(help="with --views: folder for what was seen and drawn")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure accuracy, completeness and trajectory error of a scan of a simulated flight."""
     from service.sim import scoring
 
+    if views:
+        _score_views(scan_dir, truth_dir, pictures, as_json)
+        return
     with showing("score") as progress:
         report = scoring.score(scan_dir, truth_dir, progress)
     print(json.dumps(report) if as_json else _text(report))
+
+
+def _score_views(scan_dir: Path, video: Path, pictures: Path | None, as_json: bool) -> None:
+    from service.offline.exports.view import ScanView
+    from service.offline.view_scoring import score_views
+
+    if (video / "flight.mp4").is_file():
+        video = video / "flight.mp4"  # a flight of simulate
+    with showing("score") as progress, ScanView(scan_dir, progress=progress) as scan:
+        report = score_views(scan, video, pictures)
+    if as_json:
+        print(json.dumps(report))
+        return
+    print(f"{'drawn from':<12} {'frames':>6} {'covered':>9} {'PSNR':>9} {'SSIM':>7}")
+    for name, r in report.items():
+        print(
+            f"{name:<12} {r['frames']:>6} {r['covered']:>8.2%} {r['psnr_db']:>6.2f} dB "
+            f"{r['ssim']:>7.4f}"
+        )
 
 
 def _text(report: dict[str, Any]) -> str:

@@ -40,6 +40,10 @@ TRIAL_LABELS = 16
 TRIAL_ROUNDS = 5
 
 
+WITHOUT_DEVICE = 12
+"""Duration of a replay by torch on the processor over that of the compiled backend, about."""
+
+
 class FallbackBackend:
     """A backend on a device, with the CPU as fallback.
 
@@ -115,6 +119,11 @@ def choose_backend(name: str = "auto") -> Backend:
     backend cannot run here.
     """
     chosen = named_backend(name) if name != "auto" else fastest_backend()
+    if chosen.name != "cpu" and chosen.device == "cpu":
+        log.warning(
+            "backend %s found no device but the processor: expect about %d times the duration of "
+            "'--backend cpu'", chosen.name, WITHOUT_DEVICE,
+        )  # fmt: skip
     return chosen if chosen.name == "cpu" else FallbackBackend(chosen)
 
 

@@ -45,7 +45,9 @@ def write_colmap(scan: ScanView, out: Path, options: ExportOptions) -> None:
     frames: Iterable[tuple[int, U8]]
     if video is not None:
         camera = camera_of(header)
-        frames = frames_at(keyframes, header, video, options.video_epoch_ns, scan.progress)
+        frames = frames_at(
+            [k.time_ns for k in keyframes], header, video, options.video_epoch_ns, scan.progress
+        )
     else:
         camera, frames = _stored(scan, keyframes)
     with writing_folder(out) as part:

@@ -128,22 +128,22 @@ def _opened(header: ScanHeader, video: Path) -> CameraSource:
 
 
 def frames_at(
-    keyframes: Sequence[Keyframe],
+    times_ns: Sequence[int],
     header: ScanHeader,
     video: Path,
     epoch_ns: int | None,
     progress: Progress | None = None,
 ) -> Iterator[tuple[int, U8]]:
-    """Place of each keyframe in ``keyframes``, and the frame of ``video`` taken at its time.
+    """Place of each time in ``times_ns`` (unix), and the frame of ``video`` taken then.
 
     Frames are (H, W, 3) BGR with the lens's distortion; ``video`` is a file or a folder.
-    ``epoch_ns`` is unix time of the video's start; by default the scan's start. Keyframes without
-    a frame are left out. Raises InputError when the video is of another size, or none of its
-    frames is a keyframe.
+    ``epoch_ns`` is unix time of the video's start; by default the scan's start. Times without
+    a frame are left out. Raises InputError when the video is of another size, or has no frame of
+    these times.
     """
     source = _opened(header, video)
     start = header.started_unix_ns if epoch_ns is None else epoch_ns
-    times = np.array([k.time_ns for k in keyframes], np.int64)
+    times = np.array(times_ns, np.int64)
     found = set[int]()
 
     if isinstance(source, VideoSource):
@@ -181,7 +181,7 @@ def video_images(
     undistort = Undistorter(camera)
     shrink = min(1.0, (MAX_BYTES / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
     found: dict[int, TextureView] = {}
-    for n, image in frames_at(keyframes, header, video, epoch_ns, progress):
+    for n, image in frames_at([k.time_ns for k in keyframes], header, video, epoch_ns, progress):
         bgra = _bgra(undistort.image(image), undistort.valid)
         found[n] = _view(bgra, camera, keyframes[n].depth.T_world_camera, shrink)
     return [found.get(n) or stored_images([k])[0] for n, k in enumerate(keyframes)]

@@ -33,19 +33,15 @@ def declared(folder: Path, text: str = GOOD) -> Path:
     return declaration
 
 
-def test_torch_needs_a_cuda_device(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_torch_without_a_device_runs_and_says_how_slow_it_is(
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """``auto`` goes on without it, where a driver is found but no device; by name it is refused."""
-    pytest.importorskip("torch")
-    pytest.importorskip("triton")
-    monkeypatch.setattr(backend_choice, "pointless", lambda name: None)
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    caplog.set_level(logging.INFO)
-    assert choose_backend("auto").name == "cpu"
-    assert "backend torch: cannot run here, torch finds no CUDA device" in caplog.text
-    with pytest.raises(OutsideError, match="no CUDA device; the processor's backend is cpu"):
-        choose_backend("torch")
+    torch = pytest.importorskip("torch")
+    if torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    backend = choose_backend("torch")
+    assert (backend.name, backend.device) == ("torch", "cpu")
+    assert "expect about 12 times the duration of '--backend cpu'" in caplog.text
 
 
 def test_onnx_is_for_a_model() -> None:

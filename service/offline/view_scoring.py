@@ -1,0 +1,243 @@
+"""How a scan looks to cameras that took no part in it: their frames, drawn from its products.
+
+Each frame is rendered at its own pose and compared with what the camera saw: the share of pixels
+that are covered, and PSNR and SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.819861) of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+
+from recon import se3
+from recon.camera_model import Undistorter, rays
+from recon.surface.hole_filling import outlined
+from recon.types import F32, F64, I64, U8, Bool, Camera, Keyframe
+from service.errors import InputError
+from service.offline.exports.images import frames_at
+from service.offline.exports.view import ScanView
+from service.packages import needing
+from service.scans.main_piece import main_keyframes
+from service.scans.track import camera_of
+from service.stream.records import PoseRecord
+
+EVERY = 10
+"""Of the frames that are no keyframe, the first of so many is drawn."""
+
+MAX_SLOPE = 0.03
+"""Four pixels are one surface where their depths differ by less than this share."""
+
+POINT_PX = 3
+FLOOR_DB = 60.0  # PSNR of images that are the same
+
+Draw = Callable[[F64], tuple[U8, Bool]]
+"""(H, W, 3) BGR and (H, W) covered pixels of the view from a T_world_camera (4, 4)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Triangles:
+    """What is drawn: triangles with colours at their vertices, or with a texture."""
+
+    vertices_m: F64  # (V, 3)
+    faces: I64  # (F, 3)
+    bgr: F32 | None = None  # (V, 3)
+    uv: F64 | None = None  # (V, 2) from the texture's lower left corner
+    texture: U8 | None = None  # (h, w, 3) BGR
+
+
+def score_views(scan: ScanView, video: Path, pictures: Path | None = None) -> dict[str, Any]:
+    """Figures of each product at the frames of ``video`` that took no part.
+
+    ``pictures`` is a folder for each frame beside what was drawn of it, as PNG. Raises InputError
+    when the video is not the scan's, or has no such frame.
+    """
+    with needing("score --views"):
+        import open3d  # noqa: F401
+        from skimage.metrics import structural_similarity
+    keyframes, camera = list(main_keyframes(scan.store)), camera_of(scan.store.header)
+    poses = left_out(scan.poses, {k.time_ns for k in keyframes})
+    products = _products(scan, keyframes, camera)
+    inside, undistort = _outline(scan), Undistorter(camera)
+    sums: dict[str, list[tuple[float, float, float]]] = {name: [] for name in products}
+    times = [p.time_unix_ns for p in poses]
+    frames = frames_at(times, scan.store.header, video, None, scan.progress)
+    for n, frame in frames:
+        T, seen = poses[n].T_world_camera, undistort.image(frame)
+        counts = inside(camera, T) & (undistort.valid > 0)
+        if counts.mean() < 0.5:
+            continue
+        row = [seen]
+        for name, draw in products.items():
+            drawn, covered = draw(T)
+            covered &= counts
+            _, likeness = structural_similarity(
+                seen, np.where(covered[..., None], drawn, seen), channel_axis=2, full=True
+            )
+            if covered.any():
+                error = float(np.mean((seen[covered].astype(np.float64) - drawn[covered]) ** 2))
+                psnr = min(10.0 * float(np.log10(255.0**2 / max(error, 1e-9))), FLOOR_DB)
+                share = float(covered.sum() / counts.sum())
+                sums[name].append((share, psnr, float(likeness[covered].mean())))
+            row.append(drawn)
+        if pictures is not None:
+            pictures.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(pictures / f"view_{n:04d}.png"), np.hstack(row))
+    if not any(sums.values()):
+        raise InputError(f"{video}: none of its frames that took no part shows the map")
+    return {
+        name: {
+            "frames": len(rows),
+            "covered": round(float(np.mean([r[0] for r in rows])), 4),
+            "psnr_db": round(float(np.mean([r[1] for r in rows])), 2),
+            "ssim": round(float(np.mean([r[2] for r in rows])), 4),
+        }
+        for name, rows in sums.items()
+        if rows
+    }
+
+
+def left_out(poses: Sequence[PoseRecord], used_ns: set[int]) -> list[PoseRecord]:
+    """Every EVERY-th pose of a frame that is no keyframe."""
+    return [p for p in poses if p.time_unix_ns not in used_ns and p.keyframe_seq is None][::EVERY]
+
+
+def _products(scan: ScanView, keyframes: Sequence[Keyframe], camera: Camera) -> dict[str, Draw]:
+    """What the scan can be drawn from: its depth images as surfaces and as points, and its mesh."""
+    grids = depth_grids(keyframes)
+    assert grids.bgr is not None
+    places, colours = grids.vertices_m, grids.bgr
+    used = np.unique(grids.faces)
+    out: dict[str, Draw] = {
+        "points": lambda T: draw_points(camera, T, places[used], colours[used]),
+        "surface": by_rays(grids, camera),
+    }
+    mesh = scan.folder / "mesh.glb"
+    if mesh.is_file():
+        out["mesh"] = by_rays(read_glb(mesh), camera)
+    return out
+
+
+def _outline(scan: ScanView) -> Callable[[Camera, F64], Bool]:
+    """Which pixels of a view look into the outline of the map, by its middle height."""
+    raster = scan.raster(None)
+    is_inside = outlined(raster.known)
+    height = float(np.nanmedian(raster.height_m))
+    frame = scan.frame
+
+    def inside(camera: Camera, T: F64) -> Bool:
+        w, h = camera.size_px
+        u, v = np.meshgrid(np.arange(w, dtype=np.float64), np.arange(h, dtype=np.float64))
+        ways = rays(camera.K, np.column_stack([u.ravel(), v.ravel()])) @ T[:3, :3].T
+        middle = T[:3, 3] if frame is None else frame.to_utm(T[None, :3, 3])[0]
+        drop = np.where(ways[:, 2] < -0.05, (height - middle[2]) / np.minimum(ways[:, 2], -0.05), 0)
+        ground = T[:3, 3] + ways * drop[:, None]
+        places = ground if frame is None else frame.to_utm(ground)
+        on = raster.grid.holds(places[:, :2]) & (drop > 0)
+        out = np.zeros(len(places), np.bool_)
+        rows, cols = raster.grid.cells(places[on, :2])
+        out[on] = is_inside[rows, cols]
+        return out.reshape(h, w)
+
+    return inside
+
+
+def depth_grids(keyframes: Sequence[Keyframe]) -> Triangles:
+    """Each keyframe's depth image as two triangles per four pixels of one surface."""
+    vertices, faces, colours, first = [], [], [], 0
+    for k in keyframes:
+        z, (h, w) = k.depth.depth_m, k.depth.depth_m.shape
+        u, v = np.meshgrid(np.arange(w, dtype=np.float64), np.arange(h, dtype=np.float64))
+        ways = rays(k.depth.K, np.column_stack([u.ravel(), v.ravel()]))
+        known = np.nan_to_num(z.ravel()[:, None])
+        vertices.append(se3.transform(k.depth.T_world_camera, ways * known))
+        colours.append(k.bgr.reshape(-1, 3).astype(np.float32))
+        four = np.stack([z[:-1, :-1], z[:-1, 1:], z[1:, :-1], z[1:, 1:]])
+        good = np.isfinite(four).all(axis=0) & (np.ptp(four, axis=0) < MAX_SLOPE * four.min(axis=0))
+        good &= k.fresh[:-1, :-1] | k.fresh[1:, 1:]
+        at = first + np.arange(h * w).reshape(h, w)
+        a, b, c, d = (one[good] for one in (at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]))
+        faces += [np.column_stack([a, c, b]), np.column_stack([b, c, d])]
+        first += h * w
+    return Triangles(np.concatenate(vertices), np.concatenate(faces), np.concatenate(colours))
+
+
+def read_glb(path: Path) -> Triangles:
+    """A textured mesh in one glTF file, in metres east, north and up."""
+    import trimesh
+
+    vertices, faces, uv, first, texture = [], [], [], 0, None
+    for one in trimesh.load_scene(path).geometry.values():
+        shown: Any = one
+        x, y, z = shown.vertices.T
+        vertices.append(np.column_stack([x, -z, y]))
+        faces.append(shown.faces + first)
+        uv.append(shown.visual.uv)
+        first += len(shown.vertices)
+        texture = np.asarray(shown.visual.material.baseColorTexture)[..., 2::-1]
+    if len(faces) != 1 or texture is None:
+        raise InputError(
+            f"{path}: views are drawn of a mesh in one tile; make it with fewer points"
+        )
+    return Triangles(vertices[0], faces[0], None, uv[0], np.asarray(texture, np.uint8))
+
+
+def by_rays(shown: Triangles, camera: Camera) -> Draw:
+    """Draws triangles by casting a ray through each pixel (Open3D, Embree)."""
+    import open3d as o3d
+
+    core: Any = o3d.core
+    scene = cast(Any, o3d.t.geometry.RaycastingScene)()
+    scene.add_triangles(
+        core.Tensor(shown.vertices_m.astype(np.float32)), core.Tensor(shown.faces.astype(np.uint32))
+    )
+
+    def draw(T: F64) -> tuple[U8, Bool]:
+        w, h = camera.size_px
+        looks = scene.create_rays_pinhole(
+            core.Tensor(camera.K), core.Tensor(np.asarray(se3.inverse(T))), w, h
+        )
+        hit = scene.cast_rays(looks)
+        covered: Bool = np.isfinite(hit["t_hit"].numpy())
+        corners = shown.faces[np.where(covered, hit["primitive_ids"].numpy(), 0)]
+        b, c = np.moveaxis(hit["primitive_uvs"].numpy(), -1, 0)
+        weights = np.stack([1.0 - b - c, b, c], axis=-1)[..., None]
+        if shown.texture is None:
+            assert shown.bgr is not None
+            bgr = (shown.bgr[corners] * weights).sum(axis=-2)
+        else:
+            assert shown.uv is not None
+            rows, cols = shown.texture.shape[:2]
+            at = (shown.uv[corners] * weights).sum(axis=-2) * [cols, -rows] + [-0.5, rows - 0.5]
+            u, v = np.moveaxis(at.astype(np.float32), -1, 0)
+            bgr = cv2.remap(shown.texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.where(covered[..., None], np.rint(bgr), 0).astype(np.uint8), covered
+
+    return draw
+
+
+def draw_points(camera: Camera, T: F64, xyz_m: F64, bgr: F32) -> tuple[U8, Bool]:
+    """Points as squares of POINT_PX, the near over the far."""
+    w, h = camera.size_px
+    local = se3.transform(se3.inverse(T), xyz_m)
+    ahead = np.flatnonzero(local[:, 2] > 0.1)
+    ahead = ahead[np.argsort(-local[ahead, 2], kind="stable")]
+    flat = local[ahead] @ camera.K.T
+    u, v = np.rint(flat[:, :2] / flat[:, 2:]).T
+    reach = POINT_PX // 2
+    inside = (u >= reach) & (u < w - reach) & (v >= reach) & (v < h - reach)
+    u, v, colour = u[inside].astype(int), v[inside].astype(int), bgr[ahead[inside]]
+    out, covered = np.zeros((h, w, 3), np.uint8), np.zeros((h, w), np.bool_)
+    for dv, du in _around(reach):
+        out[v + dv, u + du], covered[v + dv, u + du] = colour, True
+    return out, covered
+
+
+def _around(reach: int) -> Iterator[tuple[int, int]]:
+    for dv in range(-reach, reach + 1):
+        for du in range(-reach, reach + 1):
+            yield dv, du

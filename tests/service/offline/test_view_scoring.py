@@ -1,0 +1,88 @@
+"""``score --views``: frames that took no part, drawn at their poses and compared."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from house_flight import HouseFlight
+from typer.testing import CliRunner
+
+from service.cli import app
+from service.errors import InputError
+from service.stream.codec import encode
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
+
+pytest.importorskip("open3d", exc_type=ImportError)
+pytest.importorskip("skimage")
+
+STEP_M = 2.5
+
+
+def flown(folder: Path, house: HouseFlight, off_m: float = 0.0) -> Path:
+    """Nine stills a second apart, every other a keyframe; poses of the others err by ``off_m``."""
+    camera = {"width": 160, "height": 90, "K": house.K.ravel().tolist(), "distortion": [0.0] * 5}
+    lat, lon, alt = house.origin
+    header = ScanHeader(
+        "test-1", "drone-1", house.start_ns, camera=camera, origin_lat_deg=lat,
+        origin_lon_deg=lon, origin_alt_amsl_m=alt, georeference="gnss",
+    )  # fmt: skip
+    (folder / "stills").mkdir(parents=True)
+    with ScanStore.create(folder / "scan" / "scan.db", header) as store:
+        for k in range(9):
+            keyframe = house.keyframe(k, STEP_M * k)
+            assert cv2.imwrite(str(folder / "stills" / f"{k}.png"), keyframe.bgr)
+            record = house.record(k, STEP_M * k)
+            if k % 2 == 0:
+                store.add_keyframe(k, encode(keyframe, keyframe.time_ns))
+            else:
+                T = house.pose(STEP_M * k + off_m)
+                record = replace(record, T_world_camera=T, keyframe_seq=None)
+            store.add_pose(record)
+        store.finish({"frames": 9})
+    return folder / "scan"
+
+
+def scored(scan: Path, *more: str) -> dict[str, dict[str, float]]:
+    command = ["score", str(scan), str(scan.parent / "stills"), "--views", "--json", *more]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.exception
+    figures: dict[str, dict[str, float]] = json.loads(done.stdout.splitlines()[-1])
+    return figures
+
+
+def test_each_product_is_drawn_at_the_poses_of_the_others(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    scan = flown(tmp_path, house)
+    pictures = tmp_path / "pictures"
+    assert set(scored(scan)) == {"points", "surface"}
+    done = CliRunner().invoke(app, ["mesh", str(scan), "--stored"])
+    assert done.exit_code == 0, done.exception
+    found = scored(scan, "--pictures", str(pictures))
+    assert set(found) == {"points", "surface", "mesh"}
+    for name, figures in found.items():
+        assert figures["covered"] > (0.98 if name == "mesh" else 0.9), name
+        assert figures["psnr_db"] > 20.0 and 0.5 < figures["ssim"] <= 1.0, name
+    (image,) = pictures.glob("*.png")
+    drawn = cv2.imread(str(image))
+    assert drawn is not None and drawn.shape == (90, 4 * 160, 3)
+
+
+def test_a_wrong_pose_is_seen(tmp_path: Path, house: HouseFlight) -> None:
+    right, wrong = scored(flown(tmp_path / "a", house)), scored(flown(tmp_path / "b", house, 2.0))
+    for name in right:
+        assert wrong[name]["psnr_db"] < right[name]["psnr_db"] - 3.0
+
+
+def test_another_video_is_refused(tmp_path: Path, house: HouseFlight) -> None:
+    scan = flown(tmp_path, house)
+    (tmp_path / "other").mkdir()
+    cv2.imwrite(str(tmp_path / "other" / "0.png"), np.zeros((48, 64, 3), np.uint8))
+    done = CliRunner().invoke(app, ["score", str(scan), str(tmp_path / "other"), "--views"])
+    assert isinstance(done.exception, InputError) and "160x90" in str(done.exception)
