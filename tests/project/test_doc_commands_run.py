@@ -28,7 +28,7 @@ from rehearsal import RehearsalVehicle
 from typer.testing import CliRunner
 
 from service.cli import app
-from service.daemon.frame_gate import image_name
+from service.daemon.stored_image import image_name
 from service.offline.exports.view import ScanView
 
 REPORTS = ROOT / "docs" / "reports"

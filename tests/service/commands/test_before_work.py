@@ -57,8 +57,8 @@ def test_a_stopped_simulation_leaves_nothing(
 def test_a_refused_refinement_leaves_no_folder(scan: Path, tmp_path: Path) -> None:
     bad = tmp_path / "bad.csv"
     bad.write_text("name\nA\n")
-    for words in (["--gcp", bad], ["--telemetry", bad]):
-        ended = skyrelief("refine", scan, *words, "--out", tmp_path / "new")
+    for option in ("--gcp", "--telemetry"):
+        ended = skyrelief("refine", scan, option, bad, "--out", tmp_path / "new")
         assert ended.returncode == 2 and not (tmp_path / "new").exists()
 
 

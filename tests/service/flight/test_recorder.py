@@ -27,7 +27,7 @@ from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
-    from conftest import HouseFlight
+    from house_flight import HouseFlight
 
 
 def placed(seq: int, sigma_m: float) -> Placed:

@@ -20,7 +20,7 @@ from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
-    from conftest import HouseFlight
+    from house_flight import HouseFlight
 
 HEADER = ScanHeader("scan", "drone", 1_700_000_000_000_000_000)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from loopback import until
 
-from mavlink.component.control import Result, Work
+from mavlink.component.control import Answer, Result, Work
 from service.daemon.writing import Writings
 from service.errors import OutsideError
 from service.stream.records import ScanHeader
@@ -127,5 +127,6 @@ def test_a_fault_during_another_scan_is_reported(slow: Slow, landing: Landing) -
     slow.may_end.set()
     until(lambda: landing.work.answer)
     assert landing.reported == ["Scan s is stored, its files are not written: the disk is full"]
-    assert landing.work.answer is not None and landing.work.answer.result is Result.FAILED
+    answer = landing.work.answer
+    assert isinstance(answer, Answer) and answer.result is Result.FAILED
     assert not landing.is_open
