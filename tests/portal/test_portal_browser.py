@@ -240,14 +240,14 @@ def test_a_scan_in_flight_is_drawn_with_those_it_is_tied_to(
 ) -> None:
     one = write_scan(tmp_path / "a/1", leg(0.0, 4), Errors((1.1, -0.7, 0.9)), finished=False)
     write_scan(tmp_path / "b/2", leg(np.pi / 2, 4), finished=False)
-    follower = Follower(tmp_path)
+    follower, written_unix_s = Follower(tmp_path), time.time()
     with listing(browser, tmp_path, 2) as base:
         browser.open(f"{base}/#/view/a/1")
         alone = browser.wait(
             f"Number(document.body.dataset.points) >= {samples(one)} && {samples(one)}"
         )
         assert browser.run("document.body.dataset.ties") is None
-        while follower.turn(time.time()):
+        while follower.turn(written_unix_s):  # however long the page took to draw
             pass
         browser.wait("Number(document.body.dataset.ties) > 1")  # by the message `site`
         browser.wait("document.querySelector('.figures').textContent.includes('joined in ')")

@@ -47,10 +47,10 @@ class Page:
         self.page.goto(url, wait_until="commit")
 
     def wait(self, script: str, timeout_s: float = 60.0) -> Any:
-        """The first true value of ``script``; a page that is still loading has none."""
+        """The first true value of ``script``; a page that is loading or being left has none."""
         quiet = f"(async () => {{ try {{ return await {script} }} catch {{ return null }} }})()"
         deadline = time.monotonic() + timeout_s
-        while not (value := self.run(quiet)):
+        while not (value := self._run_or_left(quiet)):
             if time.monotonic() >= deadline:
                 raise RuntimeError(f"the page did not get there in {timeout_s:g} s: {script}")
             self.page.wait_for_timeout(50.0)
@@ -61,7 +61,18 @@ class Page:
         find = f"[...document.querySelectorAll('button')].find(b => b.textContent === '{text}')"
         self.wait(f"!!{find} && !{find}.disabled")
         self.run(f"setTimeout(() => {find}.click(), 0)")
-        self.run("new Promise(r => setTimeout(r, 50))")
+        self._run_or_left("new Promise(r => setTimeout(r, 50))")
+
+    def _run_or_left(self, script: str) -> Any:
+        """The value of ``script``; None when the page is left meanwhile."""
+        from playwright.sync_api import Error
+
+        try:
+            return self.run(script)
+        except Error as error:
+            if "navigation" not in error.message:
+                raise
+            return None
 
     def mouse(self, x: float, y: float, *, to: tuple[float, float] | None = None) -> None:
         """Click at a place of the page, or press there and release at ``to``; CSS pixels."""
