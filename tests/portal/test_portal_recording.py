@@ -66,7 +66,7 @@ def test_a_video_with_its_log_becomes_a_scan(
     job = ended(client, job["number"])
     assert job["state"] == "done", job["error"]
     drone, _, scan = job["file"].partition("/")
-    with ScanStore.open(store / drone / scan / "scan.db") as made:
+    with ScanStore.open(store / "drones" / drone / scan / "scan.db") as made:
         assert made.finished and len(made.seqs()) > 2
         camera = made.header.camera
     assert camera is not None and made.header.origin_lat_deg is not None
