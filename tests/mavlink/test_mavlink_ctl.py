@@ -27,6 +27,7 @@ def run_ctl(port: int, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
+@pytest.mark.slow
 def test_ctl_steers_a_scan() -> None:
     pytest.importorskip("mavsdk")
     port = free_port()

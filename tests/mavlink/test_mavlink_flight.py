@@ -119,6 +119,7 @@ def autopilot() -> Iterator[Autopilot]:
         yield one
 
 
+@pytest.mark.slow
 def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
     draw_flight(tmp_path / "images")
     settings = {

@@ -65,6 +65,7 @@ def attitudes(
 @pytest.mark.parametrize(
     ("camera_hz", "telemetry_hz"), [(15.0, 50.0), (30.0, 20.0), (25.0, 10.0), (15.0, 3.3)]
 )
+@pytest.mark.slow
 def test_the_latency_is_found(latency_s: float, camera_hz: float, telemetry_hz: float) -> None:
     found = watch_flight(latency_s, 5e-4, 1.0, camera_hz).estimate(
         attitudes(telemetry_hz, noise_rad=1e-3)

@@ -299,6 +299,7 @@ def test_attitude_left_out_of_a_real_log_is_interpolated_within_its_sigma() -> N
     check_interpolation(load_telemetry(TURN))
 
 
+@pytest.mark.slow
 def test_the_whole_survey_is_read_quickly_and_agrees_with_itself() -> None:
     log = load_telemetry(shared("ardupilot_survey/survey_companion.tlog"))
     assert log.warnings == () and log.counts["ATTITUDE"] == 5954
@@ -502,6 +503,7 @@ def test_subtitles_lose_no_more_than_a_number_that_is_none(tmp_path: Path, place
     assert gimbals == 2 if place.startswith("gb_") else gimbals == 3
 
 
+@pytest.mark.slow
 def test_subtitles_of_a_cue_without_end_take_no_memory(tmp_path: Path) -> None:
     path = tmp_path / "flight.SRT"
     found = "[latitude: 45.0] [longitude: 13.0] [rel_alt: 30.0]"

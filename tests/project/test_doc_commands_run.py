@@ -160,6 +160,7 @@ def desk(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("line", TO_AN_END)
+@pytest.mark.slow
 def test_the_command_runs(line: str, desk: Path) -> None:
     words = words_of(line)[1:]
     out = Path(words[words.index("--out") + 1]) if "--out" in words else None
@@ -227,12 +228,14 @@ def on_free_ports(line: str, ports: dict[str, int]) -> list[str]:
 
 
 @pytest.mark.parametrize("line", [line for line in HERE if line.startswith("skyrelief ground")])
+@pytest.mark.slow
 def test_the_ground_station_starts_and_ends(line: str, desk: Path, start: Any) -> None:
     ground = start("ground", on_free_ports(line, {}))
     until(lambda: ground.wrote("portal: http"), 60)
     ground.ends()
 
 
+@pytest.mark.slow
 def test_the_simulator_is_seen_at_the_ground(desk: Path, start: Any) -> None:
     """The two terminals of the first flight: the ground receives what the aircraft scans."""
     pages = list(lines(ROOT / "docs" / "first-flight.md"))
@@ -251,6 +254,7 @@ def test_the_simulator_is_seen_at_the_ground(desk: Path, start: Any) -> None:
     assert list(desk.glob("scans/*/scan.db"))
 
 
+@pytest.mark.slow
 def test_a_played_flight_sends_mavlink(desk: Path, start: Any) -> None:
     (line,) = (line for line in HERE if "--live" in line)
     ports: dict[str, int] = {}

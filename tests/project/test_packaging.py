@@ -59,6 +59,7 @@ def test_recon_touches_nothing_outside() -> None:
     assert found == []
 
 
+@pytest.mark.slow
 def test_wheel_holds_the_packages_and_nothing_else(tmp_path: Path) -> None:
     pytest.importorskip("hatchling")
     subprocess.run(

@@ -72,6 +72,7 @@ def install(bundle: Path) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_bundle_installs_and_a_wheel_that_was_exchanged_does_not(bundle: Path) -> None:
     done = install(bundle)
     assert done.returncode == 0, done.stderr

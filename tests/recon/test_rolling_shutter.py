@@ -328,6 +328,7 @@ def searched(readout_s: float, frames: int) -> tuple[ReadoutEstimate, float | No
 
 
 @pytest.mark.parametrize(("readout_s", "frames"), [(0.02, 260), (-0.015, 140)])
+@pytest.mark.slow
 def test_the_readout_is_found_from_the_images(readout_s: float, frames: int) -> None:
     found, used = searched(readout_s, frames)
     assert found.is_sure and used == found.readout_s
@@ -360,6 +361,7 @@ def test_a_known_readout_gives_way_to_sharp_images_alone(
     assert clock.readout_s == pytest.approx(expected)
 
 
+@pytest.mark.slow
 def test_a_global_shutter_is_not_taken_for_a_rolling_one() -> None:
     found, used = searched(0.0, 140)
     assert not found.is_sure and abs(found.readout_s) < 3e-4

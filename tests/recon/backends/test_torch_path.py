@@ -28,6 +28,8 @@ from recon.stereo.upsampling import upsample as compiled_upsample
 from recon.stereo.virtual_stereo import drop_unseen as compiled_drop
 from recon.types import F32, U8, Array, DepthMap, DisparityMap, StereoPair
 
+pytestmark = pytest.mark.slow
+
 torch = pytest.importorskip("torch")
 
 SIZE = (96, 54)

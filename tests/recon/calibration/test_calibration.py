@@ -82,6 +82,7 @@ def test_corners_of_a_rendered_board_are_sub_pixel() -> None:
         assert gap < 0.08
 
 
+@pytest.mark.slow
 def test_known_camera_is_found_from_images() -> None:
     views = []
     for k, (turn, shift) in enumerate(board_poses(12)):
@@ -224,6 +225,7 @@ def test_command_on_real_photographs(tmp_path: Path) -> None:
         ("calib_gopro_wide", "*.jpg", "8x6"),
     ],
 )
+@pytest.mark.slow
 def test_whole_sets_are_as_good_as_opencv(
     folder: str, glob: str, pattern: str, tmp_path: Path
 ) -> None:

@@ -153,6 +153,7 @@ def _about_nadir() -> F64:
     [(_oblique_turn(), 0.0), (_oblique_turn(), 0.3), (_about_nadir(), 0.3)],
     ids=["oblique", "oblique, in patches", "nadir, in patches"],
 )
+@pytest.mark.slow
 def test_the_sigma_holds_where_the_sightings_of_a_view_err_alike(
     poses: F64, amplitude_px: float
 ) -> None:

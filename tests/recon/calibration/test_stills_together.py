@@ -99,6 +99,7 @@ def off_m(poses: F64) -> float:
 
 
 @pytest.mark.parametrize("readout_s", [READOUT_S, -0.02])
+@pytest.mark.slow
 def test_the_readout_is_found_by_the_turns_of_the_rows(readout_s: float) -> None:
     rng = np.random.default_rng(4)
     seen = sighted(replace(CAMERA, shutter=Shutter(readout_s)), rng, 0.3)
@@ -116,6 +117,7 @@ def test_the_readout_is_found_by_the_turns_of_the_rows(readout_s: float) -> None
 
 
 @pytest.mark.parametrize("share", [0.0, 1e-17])
+@pytest.mark.slow
 def test_a_log_of_a_steady_camera_shows_no_readout(share: float) -> None:
     rng = np.random.default_rng(4)
     seen = sighted(replace(CAMERA, shutter=Shutter(READOUT_S)), rng, 0.3)
@@ -213,6 +215,7 @@ def surface(inputs: ScanInputs) -> tuple[F64, int]:
     return np.concatenate(out), len(out)
 
 
+@pytest.mark.slow
 def test_drawn_stills_that_come_late_with_a_slow_log(tmp_path: Path) -> None:
     """Stamps are 0.2 s late, the log has 4 attitudes a second, and no readout is stated."""
     inputs = flown(tmp_path, READOUT_S, hz=4.0, late_s=0.2)

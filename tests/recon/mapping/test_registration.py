@@ -126,6 +126,7 @@ def normalised(result: Registration, T: F64) -> float:
 
 @pytest.mark.parametrize("kind", ["hills", "houses"])
 @pytest.mark.parametrize("shift_m", [0.05, 0.27, 0.6])
+@pytest.mark.slow
 def test_forward_and_backward_to_a_centimetre(kind: str, shift_m: float) -> None:
     b, a = pair(kind, 0, 0.0)
     forward = register_projective(b, a, start(1, T_A_B, shift_m))

@@ -75,6 +75,7 @@ def flown() -> Flown:
     return Flown(trajectory, most, poses, before + 1, published, is_looped, segments)
 
 
+@pytest.mark.slow
 def test_many_short_segments_keep_to_the_bound_and_near_the_truth(flown: Flown) -> None:
     whole, trajectory = Trajectory(graph=PoseGraph()), flown.trajectory
     assert fly(whole) == COUNT

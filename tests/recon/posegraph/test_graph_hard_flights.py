@@ -96,7 +96,12 @@ FLIGHTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FLIGHTS)
+QUICK = "two breaks, no attitude, a straight first leg"
+
+
+@pytest.mark.parametrize(
+    "name", [QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in FLIGHTS if n != QUICK)]
+)
 def test_the_track_keeps_to_the_truth(name: str) -> None:
     hard, max_m = FLIGHTS[name]
     truth, trajectory = flown(hard)

@@ -63,6 +63,7 @@ def whole() -> F64:
     return landed(trajectory, COUNT)
 
 
+@pytest.mark.slow
 def test_a_thinned_graph_is_as_near_to_the_truth_as_the_whole_one() -> None:
     trajectory = Trajectory(graph=bounded())
     fly(trajectory)
@@ -86,6 +87,7 @@ def thin() -> Trajectory:
     return trajectory
 
 
+@pytest.mark.slow
 def test_nodes_stand_evenly_and_the_newest_all_stay() -> None:
     seqs = np.array(thin().graph.seqs)
     assert seqs[0] == 0 and seqs[-1] == COUNT - 1
@@ -117,6 +119,7 @@ def test_riders_lie_between_their_nodes_as_vision_saw_them() -> None:
         trajectory.place(COUNT)
 
 
+@pytest.mark.slow
 def test_everything_published_is_corrected_at_the_end_and_counted() -> None:
     trajectory = Trajectory(graph=bounded())
     fly(trajectory)

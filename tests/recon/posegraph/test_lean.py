@@ -152,6 +152,7 @@ def test_the_drift_of_altitudes_does_not_bend_the_track() -> None:
 
 
 @pytest.mark.parametrize("broken_at", [12, 66])
+@pytest.mark.slow
 def test_a_short_segment_has_the_noise_and_the_height_of_its_flight(broken_at: int) -> None:
     """Altitudes state no accuracy, and ten stills show none: 50 m are typical."""
     flown = stills(4, 4.0, turns=True)
@@ -168,6 +169,7 @@ def test_altitudes_that_drift_lay_no_segment_on_another() -> None:
     assert max(sigma or 0.0 for sigma in sigma_m) > 20.0
 
 
+@pytest.mark.slow
 def test_what_is_level_is_as_unsure_as_vision_bends() -> None:
     flown = stills(4, 0.0)
     straight, bent = (

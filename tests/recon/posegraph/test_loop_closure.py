@@ -317,6 +317,7 @@ def apart_m(search: LoopSearch, poses: list[F64], a: int, b: int) -> float:
     return float(np.linalg.norm((moved - se3.inverse(poses[a]) @ poses[b])[:3, 3]))
 
 
+@pytest.mark.slow
 def test_the_search_closes_two_legs_of_a_drifting_chain() -> None:
     there = [camera(8.0 * i, 0.0, 40.0, 0.0) for i in range(5)]
     poses = [*there, *(camera(8.0 * (4 - i), 9.0, 40.0, np.pi) for i in range(5))]
@@ -335,6 +336,7 @@ def test_the_search_closes_two_legs_of_a_drifting_chain() -> None:
     assert apart_m(search, poses, 1, 8) < 0.5 * before
 
 
+@pytest.mark.slow
 def test_a_lost_stretch_is_found_again_from_the_images() -> None:
     """Over the same ground after a gap, in a frame of another origin, heading and scale."""
     poses = [camera(6.0 * i, 0.0, 40.0, 0.0) for i in range(4)]
@@ -346,6 +348,7 @@ def test_a_lost_stretch_is_found_again_from_the_images() -> None:
     assert apart_m(search, poses, 1, 6) < 0.2
 
 
+@pytest.mark.slow
 def test_a_lost_stretch_is_found_by_its_look_among_many() -> None:
     """Three keyframes over ground seen long ago, in a frame that says nothing of the place."""
     poses = [camera(9.0 * i - 50.0, 0.0, 40.0, 0.0) for i in range(12)]

@@ -142,6 +142,7 @@ def test_all_sensors_give_decimetres() -> None:
     assert not graph.counts
 
 
+@pytest.mark.slow
 def test_reported_covariance_holds() -> None:
     """Normalised squared errors average to six degrees of freedom, at the end and before."""
     last: list[float] = []
@@ -202,6 +203,7 @@ def test_the_gauge_is_free() -> None:
         np.testing.assert_allclose(second[i], move @ first[i], atol=0.02)
 
 
+@pytest.mark.slow
 def test_more_accurate_fixes_make_a_more_accurate_track() -> None:
     errors = [rms_m(fly(f)[0], f) for f in (flight(60, sigma_gnss_m=s) for s in (2.0, 0.5, 0.02))]
     assert errors[0] > errors[1] > errors[2]
@@ -258,6 +260,7 @@ def test_a_compass_wrong_from_the_start_yields_to_the_track() -> None:
     assert rms_m(graph, f) < 0.8
 
 
+@pytest.mark.slow
 def test_the_attitude_of_a_wrong_frame_is_left_out() -> None:
     f = flight(90)
     for i in range(50, 90):  # of the body instead of the gimbal: level instead of straight down
@@ -274,6 +277,7 @@ def test_the_attitude_of_a_wrong_frame_is_left_out() -> None:
     assert rms_m(graph, f) < 0.5
 
 
+@pytest.mark.slow
 def test_a_hover_of_an_hour_bends_nothing() -> None:
     f = flight(40)
     rng = np.random.default_rng(5)
@@ -291,6 +295,7 @@ def test_a_hover_of_an_hour_bends_nothing() -> None:
 # ---- lost vision, loops ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_stretch_without_vision_is_bridged_and_said() -> None:
     f, later = flight(120), flight(120, scale=0.6)
     graph = PoseGraph(WHITE)
@@ -355,6 +360,7 @@ def to_and_fro(breaks: int, seed: int) -> PoseGraph:
 
 
 @pytest.mark.parametrize("seed", range(2))
+@pytest.mark.slow
 def test_breaks_in_vision_do_not_swing_the_track(seed: int) -> None:
     """A turn that nothing knows at the break must not become a way at the end of its lever."""
     z_m = to_and_fro(5, seed).poses()[:, 2, 3]
@@ -452,6 +458,7 @@ def test_wandering_fixes_do_not_bend_what_vision_sees_straight() -> None:
     ("sigma_m", "is_claimed", "least", "most"),
     [(1.0, True, 0.6, 1.6), (2.0, True, 0.3, 0.8), (2.0, False, 0.5, 1.6)],
 )
+@pytest.mark.slow
 def test_the_place_is_as_sure_as_the_receiver(
     sigma_m: float, is_claimed: bool, least: float, most: float
 ) -> None:
@@ -475,6 +482,7 @@ def test_the_place_is_as_sure_as_the_receiver(
     assert least < rms.min() and rms.max() < most
 
 
+@pytest.mark.slow
 def test_errors_that_are_new_in_each_fix_average_out() -> None:
     """The receiver's scatter is all that it claims, so the filtered position has no other error."""
     found = []
@@ -534,6 +542,7 @@ def test_a_lost_stretch_is_tied_by_two_loops_in_scale_and_heading() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.slow
 def test_vision_and_loops_that_contradict_each_other_leave_the_scale_to_the_fixes(
     seed: int,
 ) -> None:
@@ -613,6 +622,7 @@ def test_a_rebuild_gives_way_to_threads_that_wait(monkeypatch: pytest.MonkeyPatc
     {"R_world_camera": np.full((3, 3), np.nan)}, {"sigma_tilt_rad": 0.0, "sigma_yaw_rad": 0.0},
     {"agl_m": 0.0}, {"agl_m": 60.0, "sigma_agl_m": 0.0}, {"sigma_position_m": np.full(3, np.inf)},
 ])  # fmt: skip
+@pytest.mark.slow
 def test_readings_that_cannot_be_are_left_out(fault: dict[str, Any]) -> None:
     f = flight(30)
     graph = PoseGraph(WHITE)

@@ -115,6 +115,7 @@ def fly() -> list[Keyframe]:
     return out + list(pipeline.finish().keyframes)
 
 
+@pytest.mark.slow
 def test_the_ground_ahead_is_measured(keyframes: list[Keyframe]) -> None:
     """Of what lies within 150 m nearly all, to a hundredth of the distance once scale is known."""
     assert len(keyframes) >= 3
@@ -175,6 +176,7 @@ def shot(levels: list[U8], T: F64, blur_px: float) -> U8:
 
 
 @pytest.mark.parametrize("blurs_px", [(0.0, 0.0), (8.0, 8.0), (8.0, 3.0)])
+@pytest.mark.slow
 def test_sigma_covers_motion_blur(blurs_px: tuple[float, float]) -> None:
     """Of a pair with exact poses, at the images' own resolution."""
     levels, views = ground(), []

@@ -73,6 +73,7 @@ def angles(ray: F64) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("seed", range(8))
+@pytest.mark.slow
 def test_pair_and_depth_agree_with_projection(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A point lies on one row of both images, and its label gives its depth."""
     monkeypatch.setattr("recon.stereo.polar.stretch", lambda gray, seen: gray)

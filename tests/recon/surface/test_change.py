@@ -100,6 +100,7 @@ def uneven(seed: int, boxes: list[tuple[int, int, int, int, float]]) -> Raster:
     return Raster(GRID, z.astype(np.float32), flat.sigma_m, flat.rgb)
 
 
+@pytest.mark.slow
 def test_errors_that_neighbours_share_unevenly_are_no_change() -> None:
     shown = (change_between(uneven(s, []), uneven(500 + s, [])).bodies for s in range(30))
     assert sum(bool(bodies) for bodies in shown) <= 2

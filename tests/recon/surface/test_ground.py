@@ -47,6 +47,7 @@ def holes() -> Bool:
     return np.asarray(np.random.default_rng(4).random(X.shape) < 0.1)
 
 
+@pytest.mark.slow
 def test_what_stands_on_a_hill_is_taken_off_and_the_hill_stays() -> None:
     ground, above = hill(), things()
     surface = np.where(holes(), np.float32(np.nan), ground + above).astype(np.float32)

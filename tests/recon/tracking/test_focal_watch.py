@@ -125,6 +125,7 @@ def test_without_a_window_there_is_no_estimate() -> None:
     assert FocalWatch(K).estimate is None
 
 
+@pytest.mark.slow
 def test_a_camera_model_that_is_too_long_is_reported(tmp_path: Path) -> None:
     made = skyrelief(
         "simulate", "--out", tmp_path / "flight", "--size", "320x180", "--fps", "6",

@@ -286,6 +286,7 @@ def test_wrong_shapes_are_named() -> None:
     st.floats(-180, 180), st.floats(0.6, 1.6), st.floats(-90, 90), st.floats(-70, 70)
 )  # fmt: skip
 @example(0.0, 0.6015625, 1.0, 0.0)  # a wrong match that SIFT describes twice
+@pytest.mark.slow
 def test_any_turn_and_zoom_is_found(angle: float, scale: float, du: float, dv: float) -> None:
     a, b, A, t = turned(angle, scale, (du, dv))
     view = common_view(features(a), features(b))

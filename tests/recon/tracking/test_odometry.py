@@ -169,6 +169,7 @@ def test_a_turn_on_the_spot_without_attitude_makes_no_surface(ground: U8, focal_
         assert found.state in ("started", "waiting")
 
 
+@pytest.mark.slow
 def test_another_place_begins_a_new_segment(ground: U8) -> None:
     """A jump to where nothing of the map is seen is a loss, then a fresh start."""
     track = poses(12)

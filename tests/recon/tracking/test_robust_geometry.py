@@ -105,6 +105,7 @@ def test_points_that_determine_no_pose_give_none(
 
 @settings(max_examples=80)
 @given(kind=kinds, seed=seeds, share=st.floats(0.2, 1.0), in_points=st.booleans())
+@pytest.mark.slow
 def test_a_pose_from_partly_degenerate_points_never_raises(
     kind: str, seed: int, share: float, in_points: bool
 ) -> None:

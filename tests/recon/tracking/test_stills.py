@@ -60,6 +60,7 @@ def assert_one_piece(track: list[F64], found: list[Tracked], share_of_height: fl
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0])
+@pytest.mark.slow
 def test_stills_at_60_percent_overlap_are_one_piece(yaw_deg: float) -> None:
     """Straight on, and with a quarter turn before every shot."""
     step = 0.4 * FOOTPRINT_M * (1.0 if yaw_deg == 0.0 else 0.75)
@@ -74,6 +75,7 @@ def test_a_time_lapse_is_one_piece() -> None:
     assert_one_piece(track, found, 0.02)
 
 
+@pytest.mark.slow
 def test_headings_that_are_wrong_do_not_part_the_flight() -> None:
     """Tags that say north to five degrees while the camera turns by 40 at every shot."""
     track = [pose(0.3 * FOOTPRINT_M * (i - 3), 40.0 * i, seed=i) for i in range(7)]
@@ -100,6 +102,7 @@ def test_a_still_that_shows_nothing_does_not_part_the_flight() -> None:
     assert_one_piece(track, found, 0.02)
 
 
+@pytest.mark.slow
 def test_two_views_bridge_what_has_no_landmarks() -> None:
     """Forty percent overlap: hardly anything is seen three times."""
     track = [pose(0.2 * FOOTPRINT_M * i - 60.0, seed=i) for i in range(3)]
@@ -115,6 +118,7 @@ def larger(width: int, monkeypatch: pytest.MonkeyPatch) -> Camera:
     return camera
 
 
+@pytest.mark.slow
 def test_stills_whose_corners_differ_are_tied_by_their_features(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -190,6 +194,7 @@ def test_stills_of_other_places_are_not_joined() -> None:
     assert [f.before for f in found if f is not found[4]] == [None] * 5
 
 
+@pytest.mark.slow
 def test_the_first_still_of_a_segment_is_placed_and_reconstructed() -> None:
     """It is lost when it comes, as nothing before shows its ground; the next one proves it."""
     track = [pose(0.3 * FOOTPRINT_M * i - 100.0, seed=i) for i in range(3)]

@@ -94,6 +94,7 @@ def _off(poses: F64) -> F64:
     return np.array([se3.exp(rng.normal(size=6) * ([3e-3] * 3 + [0.15] * 3)) @ T for T in poses])
 
 
+@pytest.mark.slow
 def test_the_images_of_an_oblique_turn_tell_the_focal_length(tmp_path: Path) -> None:
     poses = _flight(38.0)
     images = {k: _image(T, k) for k, T in enumerate(poses)}
@@ -107,6 +108,7 @@ def test_the_images_of_an_oblique_turn_tell_the_focal_length(tmp_path: Path) -> 
     assert figures["focal_px"] == [367.2, pytest.approx(360.0, abs=1.1)]
 
 
+@pytest.mark.slow
 def test_a_leg_flown_back_ties_its_images_to_those_of_the_first() -> None:
     """Only views turned to each other show a lens off its axis."""
     out = [_pose(0.0, 9.0 * k, 0.0, 0.0) for k in range(5)]
@@ -150,6 +152,7 @@ def test_images_are_found_by_the_times_of_their_exposures(tmp_path: Path) -> Non
     assert [int(found[k].mean()) for k in range(4)] == [0, 40, 80, 120]
 
 
+@pytest.mark.slow
 def test_a_straight_line_looking_down_is_refused_in_one_line() -> None:
     poses = _flight(0.0)
     images = {k: _image(T, k) for k, T in enumerate(poses)}

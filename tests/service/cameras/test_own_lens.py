@@ -73,6 +73,7 @@ def replayed(source: str | Path, out: Path, *more: str) -> tuple[dict[str, Any],
 
 
 @pytest.mark.parametrize("wanted", [True, False])
+@pytest.mark.slow
 def test_the_lens_of_a_video_is_found(tmp_path: Path, wanted: bool) -> None:
     """70 degrees are assumed, 343 px; without distortion the ground would be off by metres."""
     more = [] if wanted else ["--no-find-lens"]
@@ -86,6 +87,7 @@ def test_the_lens_of_a_video_is_found(tmp_path: Path, wanted: bool) -> None:
 
 
 @pytest.mark.parametrize("wanted", [True, False])
+@pytest.mark.slow
 def test_the_distortion_that_exif_does_not_give_is_found(tmp_path: Path, wanted: bool) -> None:
     folder = stills(tmp_path / "stills", 10)
     more = [] if wanted else ["--no-find-lens"]
@@ -97,6 +99,7 @@ def test_the_distortion_that_exif_does_not_give_is_found(tmp_path: Path, wanted:
     assert camera["K"][0] == pytest.approx(K[0, 0] if wanted else given.K[0, 0], rel=0.003)
 
 
+@pytest.mark.slow
 def test_a_lens_that_the_images_do_not_determine_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

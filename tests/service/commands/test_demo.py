@@ -11,6 +11,7 @@ from typing import Any
 
 import laspy
 import numpy as np
+import pytest
 from command_line import skyrelief
 from paths import DEMO
 
@@ -25,6 +26,7 @@ def points(path: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.asarray(xyz[np.lexsort(xyz.T)])
 
 
+@pytest.mark.slow
 def test_ground_holds_what_was_made_onboard(tmp_path: Path) -> None:
     flight = tmp_path / "flight"
     (flight / "frames").mkdir(parents=True)

@@ -126,6 +126,7 @@ class Refused:
     ("number", "component", "params"),
     [(2501, 100, ()), (200, 100, (0, 0, 0, 0)), (31010, 191, (8,)), (31010, 191, (5,))],
 )
+@pytest.mark.slow
 def test_every_stop_ends_the_retries_of_a_scan_that_fails(
     number: int,
     component: int,
@@ -147,6 +148,7 @@ def test_every_stop_ends_the_retries_of_a_scan_that_fails(
         until(lambda: refused.opened > opened)
 
 
+@pytest.mark.slow
 def test_a_scan_that_fails_ends_with_its_flight(tmp_path: Path) -> None:
     with Refused(tmp_path, "scan.start=on-arm") as refused:
         refused.hear(beat(armed=True), (1, 1))
@@ -254,6 +256,7 @@ def test_a_refused_photo_says_why(phase: Phase, word: str, tmp_path: Path) -> No
     scanning.end()
 
 
+@pytest.mark.slow
 def test_why_a_start_failed_is_said_each_time_but_not_of_its_retries(tmp_path: Path) -> None:
     def fail(_: ScanRun) -> None:
         raise OutsideError("camera gone")

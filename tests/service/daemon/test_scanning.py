@@ -124,6 +124,7 @@ def test_a_camera_that_fails_is_reported(tmp_path: Path) -> None:
         ("none", True, True, False),
     ],
 )
+@pytest.mark.slow
 def test_a_scan_by_command_goes_on_after_a_fall(
     boot: str, heard: bool, armed: bool, goes_on: bool, tmp_path: Path
 ) -> None:
@@ -158,6 +159,7 @@ def test_a_scan_by_command_goes_on_after_a_fall(
         assert not mark.exists()  # landed, or stopped
 
 
+@pytest.mark.slow
 def test_only_a_scan_that_was_not_ended_goes_on(tmp_path: Path) -> None:
     end = threading.Event()
 

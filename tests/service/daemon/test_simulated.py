@@ -76,6 +76,7 @@ def service(tmp_path: Path) -> Iterator[type[Service]]:
         one.process.wait()
 
 
+@pytest.mark.slow
 def test_it_flies_and_ends_with_its_camera(tmp_path: Path, service: type[Service]) -> None:
     first = service(tmp_path)
     until(first.flies, 240)

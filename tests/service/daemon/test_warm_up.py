@@ -20,6 +20,7 @@ from service.daemon.warm_up import SyntheticGround, is_warm, warm_up, warm_up_co
 from service.progress import Progress
 
 
+@pytest.mark.slow
 def test_made_up_ground_is_scanned_and_marked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

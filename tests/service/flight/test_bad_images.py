@@ -119,6 +119,7 @@ def test_the_clean_flight_gives_the_plane(clean: list[U8]) -> None:
 
 
 @pytest.mark.parametrize("spoil", [half_green, over_exposed, smeared, dark])
+@pytest.mark.slow
 def test_spoiled_frames_make_no_false_surface(clean: list[U8], spoil: Callable[[U8], U8]) -> None:
     images = [spoil(p) if 25 <= i < 29 else p for i, p in enumerate(clean)]
     keyframes, reasons, pipeline = fly(images)
@@ -134,6 +135,7 @@ def test_frames_that_come_twice_change_nothing(clean: list[U8]) -> None:
     assert len(keyframes) >= 5 and all(off_the_plane(k) < 0.002 for k in keyframes)
 
 
+@pytest.mark.slow
 def test_a_ploughed_field_gives_the_plane_or_nothing() -> None:
     ground = ploughed()
     keyframes, reasons, _ = fly([photograph(ground, i) for i in range(FRAMES)])
@@ -141,6 +143,7 @@ def test_a_ploughed_field_gives_the_plane_or_nothing() -> None:
     assert keyframes or sum(reasons.values()) > 0
 
 
+@pytest.mark.slow
 def test_water_that_never_looks_the_same_gives_nothing() -> None:
     rng = np.random.default_rng(3)
     waves = []
@@ -152,6 +155,7 @@ def test_water_that_never_looks_the_same_gives_nothing() -> None:
     assert not keyframes and sum(reasons.values()) > 20, reasons
 
 
+@pytest.mark.slow
 def test_telemetry_goes_on_where_vision_was_lost() -> None:
     """Fixes that are 3 m off when the images end do not throw an aligned camera there."""
     ground = textured()

@@ -121,6 +121,7 @@ def test_subtitles_next_to_a_video_are_its_telemetry(flight: Path, tmp_path: Pat
     assert done.returncode != 0 and "the telemetry covers 1970-01-01" in done.stderr
 
 
+@pytest.mark.slow
 def test_without_telemetry_it_still_reconstructs(flight: Path, tmp_path: Path) -> None:
     out, model = tmp_path / "scan", tmp_path / "camera.yaml"
     model.write_text((flight / "camera.yaml").read_text() + "sigma_focal: 0.013\n")
@@ -136,6 +137,7 @@ def test_without_telemetry_it_still_reconstructs(flight: Path, tmp_path: Path) -
     assert report["surface"]["similarity"]["median_m"] < 0.006 * 40.0
 
 
+@pytest.mark.slow
 def test_a_recording_begins_again_once_its_readout_is_found(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,6 +166,7 @@ def test_a_recording_begins_again_once_its_readout_is_found(
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 @pytest.mark.parametrize(("name", "coded"), [("DJI_0001.MP4", "mov_text"), ("flight.mkv", "srt")])
+@pytest.mark.slow
 def test_subtitles_in_a_video_are_its_telemetry(
     flight: Path, tmp_path: Path, name: str, coded: str
 ) -> None:
@@ -187,6 +190,7 @@ def test_subtitles_in_a_video_are_its_telemetry(
 
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
+@pytest.mark.slow
 def test_a_pipe_gives_the_same_cloud_as_the_file(
     flight: Path, scan: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -214,6 +218,7 @@ def test_a_second_run_into_the_same_folder_is_refused(
     np.testing.assert_array_equal(points(scan[0]), before)
 
 
+@pytest.mark.slow
 def test_an_interrupt_closes_the_scan(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "scan"
     command = [
@@ -288,6 +293,7 @@ def test_bad_input_gets_one_line_and_exit_code_two(case: str, flight: Path, tmp_
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_damaged_input_gives_a_smaller_scan_with_a_warning(flight: Path, tmp_path: Path) -> None:
     """Telemetry with bytes knocked out of it, and a transport stream cut in the middle."""
     log = bytearray((flight / "flight.tlog").read_bytes())

@@ -101,6 +101,7 @@ def test_the_latency_is_shown_and_not_applied_unless_asked(gimbal: str) -> None:
         (-130.0, 0.0, None),
     ],
 )
+@pytest.mark.slow
 def test_stamps_that_are_off_by_more_than_a_latency_show_a_clock(
     set_ms: float, strength: float, off_ms: float | None
 ) -> None:

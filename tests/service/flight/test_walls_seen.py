@@ -81,6 +81,7 @@ def points(keyframe: Keyframe) -> F64:
     return se3.transform(depth.T_world_camera, seen)
 
 
+@pytest.mark.slow
 def test_a_wall_has_its_surface_where_oblique_views_show_it(site: Simulation) -> None:
     """From straight above the same flight has a fifth of it."""
     apart, _ = cKDTree(flown(site, 40.0)).query(wall_of(house_of(site))[0])

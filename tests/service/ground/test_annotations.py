@@ -141,6 +141,7 @@ def test_the_geopackage_holds_them_at_their_places(tmp_path: Path, house: HouseF
 
 
 @pytest.mark.skipif(NEEDS[0].args[0] or NEEDS[1].args[0], reason="needs Chromium and the page")
+@pytest.mark.slow
 def test_a_note_is_written_where_one_clicks(
     browser: Browser, tmp_path: Path, house: HouseFlight
 ) -> None:

@@ -370,6 +370,7 @@ def test_unfinished_records_of_all_scans_of_a_drone_share_one_bound(tmp_path: Pa
 
 
 @pytest.mark.timeout(3600 if WHOLE else 300)
+@pytest.mark.slow
 def test_ground_ends_with_zero_each_time(tmp_path: Path) -> None:
     """Threads of the session that outlive the interpreter abort the process."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"

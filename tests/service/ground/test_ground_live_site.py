@@ -89,6 +89,7 @@ def test_what_is_known_is_not_said_again(tmp_path: Path) -> None:
     assert json.loads(news.message() or "") == {"type": "site", "scans": []}
 
 
+@pytest.mark.slow
 def test_a_scan_in_flight_meets_the_site_on_the_ground(tmp_path: Path) -> None:
     members = [landed(tmp_path / "a" / "1", NORTH), landed(tmp_path / "a" / "2", NORTH[1:])]
     site = tmp_path / "site" / "a-1"
@@ -121,6 +122,7 @@ def test_the_last_visit_is_shown_as_an_earlier_date(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["text", "empty", "pose", "gone"])
+@pytest.mark.slow
 def test_a_broken_scan_stops_no_other(tmp_path: Path, damage: str) -> None:
     broken = tmp_path / "bad" / "0"
     far = [T.copy() for T in NORTH[:2]]
@@ -164,6 +166,7 @@ def wait_for(reached: Callable[[], bool], seconds: float = 60.0) -> None:
     assert reached()
 
 
+@pytest.mark.slow
 def test_the_process_is_started_again_when_it_is_killed(tmp_path: Path) -> None:
     one = flying(tmp_path / "a" / "1", NORTH[:1])
 

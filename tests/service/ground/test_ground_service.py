@@ -38,6 +38,7 @@ def test_the_unit_has_the_watchdog_that_the_daemon_has() -> None:
     assert 1 < float(ground["WatchdogSec"]) <= 60
 
 
+@pytest.mark.slow
 def test_ground_feeds_the_watchdog_and_asks_for_time_to_close(tmp_path: Path) -> None:
     heard: list[str] = []
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:

@@ -100,6 +100,7 @@ def wait_for(path: Path, worker: Worker, seconds: float = 120.0) -> None:
     assert path.exists(), worker.fault
 
 
+@pytest.mark.slow
 def test_scans_that_end_are_aligned(tmp_path: Path, working: tuple[Sites, Worker]) -> None:
     sites, worker = working
     one = flown(tmp_path / "a" / "1", 0.0, Errors((1.0, 0.0, 0.5)))

@@ -84,6 +84,7 @@ except InputError as error:
 
 
 @pytest.mark.parametrize("how", ["honest claim", "small claim", "lz4", "plain", "long record"])
+@pytest.mark.slow
 def test_a_small_file_takes_no_large_memory(tmp_path: Path, how: str) -> None:
     """In a process of its own, whose peak is read at the end."""
     size = 1 << 30

@@ -575,6 +575,7 @@ def test_a_moved_keyframe_carries_its_points(tmp_path: Path, house: HouseFlight)
     np.testing.assert_allclose(head["T"][12:15], [60.0, 0.0, 40.0])
 
 
+@pytest.mark.slow
 def test_the_ground_command_serves_the_portal(store: Path, tmp_path: Path) -> None:
     import subprocess
     import sys

@@ -180,6 +180,7 @@ def test_all_maps_are_two_clicks_away(
 
 @pytest.mark.parametrize("where", ["/", "/#/view/drone-1/test-1"])
 @pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
+@pytest.mark.slow
 def test_a_job_shows_its_percent_and_is_cancelled_by_its_button(
     browser: Browser, portal: Portal, where: str, needs: None
 ) -> None:

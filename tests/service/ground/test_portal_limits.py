@@ -35,6 +35,7 @@ def address_of(client: Client) -> tuple[str, int]:
     return host, int(port)
 
 
+@pytest.mark.slow
 def test_1100_half_open_requests_stop_neither_portal_nor_datalink(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and hard < 3000:

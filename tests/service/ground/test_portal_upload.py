@@ -232,6 +232,7 @@ DROP = """
 
 
 @pytest.mark.parametrize("_", [pytest.param(0, marks=NEEDS)])
+@pytest.mark.slow
 def test_a_file_dropped_on_the_page_becomes_a_card(
     browser: Browser, client: Client, flown: Path, tmp_path: Path, _: int
 ) -> None:

@@ -49,6 +49,7 @@ def read(model: Path) -> tuple[Images, Points]:
     return images, points
 
 
+@pytest.mark.slow
 def test_the_images_are_the_frames_at_full_size(model: Path) -> None:
     images, _ = read(model)
     assert len(images) == 10

@@ -23,6 +23,8 @@ from service.stream.codec import encode
 from service.stream.records import Repose, pack_pose, pack_repose
 from service.stream.store import ScanStore
 
+pytestmark = pytest.mark.slow
+
 
 def layer_with(data: bytes, at: int, kind: str, *values: float) -> bytes:
     """``data`` with fields overwritten and its checksum made right (wire.md 1.1)."""
@@ -120,6 +122,7 @@ def at_the_pole(store: ScanStore, house: HouseFlight) -> None:
 
 
 @pytest.mark.parametrize("change", [strewn, wide, far, odd_words, at_the_pole])
+@pytest.mark.slow
 def test_extreme_records_within_bounds_give_files_or_one_line(
     tmp_path: Path,
     house: HouseFlight,

@@ -117,6 +117,7 @@ def cluster() -> Iterator[Any]:
         yield one
 
 
+@pytest.mark.slow
 def test_the_same_mesh_comes_from_a_cluster(
     tmp_path: Path, house: HouseFlight, cluster: Any
 ) -> None:
@@ -131,6 +132,7 @@ def test_the_same_mesh_comes_from_a_cluster(
     same(here, there)
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_goes_away_is_said_and_the_rest_made_here(
     tmp_path: Path, house: HouseFlight, cluster: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -157,6 +159,7 @@ def test_a_scheduler_that_is_not_there_ends_in_one_line(
         made(jobs(tmp_path), "tcp://127.0.0.1:9", Progress())
 
 
+@pytest.mark.slow
 def test_the_command_cuts_a_large_site(tmp_path: Path, house: HouseFlight) -> None:
     trimesh = pytest.importorskip("trimesh")
     house.flown(tmp_path).close()

@@ -154,6 +154,7 @@ def replayed(tmp_path: Path, track: list[F64]) -> tuple[dict[str, Any], F64]:
     return json.loads((out / "scan.json").read_text()), xyz
 
 
+@pytest.mark.slow
 def test_two_places_are_not_laid_into_one_cloud(tmp_path: Path) -> None:
     """Five stills here, five far away, no telemetry: the cloud is as wide as one place."""
     step = 0.25 * FOOTPRINT_M
@@ -166,6 +167,7 @@ def test_two_places_are_not_laid_into_one_cloud(tmp_path: Path) -> None:
     assert any("left out of the cloud" in warning for warning in scan["run"]["warnings"])
 
 
+@pytest.mark.slow
 def test_a_scan_finished_at_its_end_is_not_called_empty(tmp_path: Path) -> None:
     """Of three stills all surface comes when the scan is closed."""
     scan, xyz = replayed(tmp_path, [pose(0.25 * FOOTPRINT_M * i, seed=i) for i in range(3)])

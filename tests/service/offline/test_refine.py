@@ -237,6 +237,7 @@ def test_marks_by_time_and_points_of_the_cloud_count_too(flight: Flight) -> None
     assert errors(flight).max() < 0.2
 
 
+@pytest.mark.slow
 def test_the_same_input_twice_changes_nothing_and_undo_brings_all_back(flight: Flight) -> None:
     gcp = write_csv(flight.folder / "points.csv", flight.survey(SPOTS))
     with ScanStore.open(flight.scan / "scan.db") as store:
@@ -419,6 +420,7 @@ def test_a_map_of_another_shape_is_not_called_a_line(tmp_path: Path) -> None:
         ({"alt_amsl_m": 456.0}, "not above the ellipsoid"),
     ],
 )
+@pytest.mark.slow
 def test_an_outlier_is_refused_and_named(
     flight: Flight, change: dict[str, float], why: str
 ) -> None:

@@ -42,6 +42,7 @@ def survey(path: Path, truth: F64, by_name: bool = False) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_images_and_control_points_bring_a_bent_scan_to_the_truth(tmp_path: Path) -> None:
     truth = flown()
     scan, points = made(tmp_path, truth), survey(tmp_path / "points.csv", truth)
@@ -67,6 +68,7 @@ def test_images_and_control_points_bring_a_bent_scan_to_the_truth(tmp_path: Path
     assert back.exit_code == 0, back.output
 
 
+@pytest.mark.slow
 def test_a_scan_without_a_place_takes_its_images_along(tmp_path: Path) -> None:
     """Points marked in stills by their names; a mark in one that vision lost is left out."""
     truth = flown()

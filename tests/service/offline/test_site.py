@@ -31,6 +31,8 @@ from service.offline.site.compare import compare
 from service.offline.site.gather import between_frames
 from service.stream.store import ScanStore
 
+pytestmark = pytest.mark.slow
+
 NORTH, EAST = leg(0.0), leg(np.pi / 2)
 WRONG = Errors((1.1, -0.7, 0.9), (0.002, -0.001, 0.004), 1.002)
 

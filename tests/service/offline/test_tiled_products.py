@@ -26,6 +26,8 @@ rasterio = pytest.importorskip("rasterio")
 if TYPE_CHECKING:
     from house_flight import HouseFlight
 
+pytestmark = pytest.mark.slow
+
 VOXEL_M = 0.3
 TILE_POINTS = 30_000  # the flight of the house has 72,000
 

@@ -18,6 +18,8 @@ from service.stream.codec import encode
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("skimage")
 

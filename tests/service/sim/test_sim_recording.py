@@ -25,6 +25,8 @@ from service.errors import InputError
 from service.sim.ground_texture import patchwork
 from service.sim.truth import read_surface, write_surface
 
+pytestmark = pytest.mark.slow
+
 SMALL = [
     "--size", "320x180", "--fps", "5", "--duration-s", "4", "--height-m", "40",
     "--depth-frames", "3",

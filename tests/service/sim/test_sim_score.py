@@ -24,6 +24,8 @@ from service.scans.fused_cloud import write_laz
 from service.sim.recording import Faults, SimulationOptions
 from service.sim.truth import heights_below, read_surface, read_truth
 
+pytestmark = pytest.mark.slow
+
 TRUTH_AT = LocalFrame(47.3977, 8.5456, 488.0)
 SCAN_AT = LocalFrame(47.3980, 8.5450, 540.0)  # another origin, 33 m north and 45 m west
 
