@@ -3,7 +3,7 @@
 Each voxel near the surface holds the mean signed distance to what the depth images show, in units
 of the truncation (Curless and Levoy 1996, doi:10.1145/237170.237269), and each image that sees
 through a voxel votes for free space. What no image sees follows the upper surface: below a roof
-is building, beside it is air. So the zero crossing is closed inside the outline: walls that no
+is building, around it is air. So the zero crossing is closed inside the outline: walls that no
 image sees stand below the edge of the roof.
 """
 

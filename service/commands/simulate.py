@@ -265,7 +265,7 @@ def score(
         bool,
         typer.Option("--views", help="draw frames that took no part and compare them instead"),
     ] = False,
-    pictures: Annotated[
+    images: Annotated[
         Path | None, typer.Option(help="with --views: folder for what was seen and drawn")
     ] = None,
     as_json: AsJson = False,
@@ -274,21 +274,21 @@ def score(
     from service.sim import scoring
 
     if views:
-        _score_views(scan_dir, truth_dir, pictures, as_json)
+        _score_views(scan_dir, truth_dir, images, as_json)
         return
     with showing("score") as progress:
         report = scoring.score(scan_dir, truth_dir, progress)
     print(json.dumps(report) if as_json else _text(report))
 
 
-def _score_views(scan_dir: Path, video: Path, pictures: Path | None, as_json: bool) -> None:
+def _score_views(scan_dir: Path, video: Path, images: Path | None, as_json: bool) -> None:
     from service.offline.exports.view import ScanView
     from service.offline.view_scoring import score_views
 
     if (video / "flight.mp4").is_file():
         video = video / "flight.mp4"  # a flight of simulate
     with showing("score") as progress, ScanView(scan_dir, progress=progress) as scan:
-        report = score_views(scan, video, pictures)
+        report = score_views(scan, video, images)
     if as_json:
         print(json.dumps(report))
         return

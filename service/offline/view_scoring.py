@@ -50,10 +50,10 @@ class Triangles:
     texture: U8 | None = None  # (h, w, 3) BGR
 
 
-def score_views(scan: ScanView, video: Path, pictures: Path | None = None) -> dict[str, Any]:
+def score_views(scan: ScanView, video: Path, images: Path | None = None) -> dict[str, Any]:
     """Figures of each product at the frames of ``video`` that took no part.
 
-    ``pictures`` is a folder for each frame beside what was drawn of it, as PNG. Raises InputError
+    ``images`` is a folder for each frame beside what was drawn of it, as PNG. Raises InputError
     when the video is not the scan's, or has no such frame.
     """
     with needing("score --views"):
@@ -84,9 +84,9 @@ def score_views(scan: ScanView, video: Path, pictures: Path | None = None) -> di
                 share = float(covered.sum() / counts.sum())
                 sums[name].append((share, psnr, float(likeness[covered].mean())))
             row.append(drawn)
-        if pictures is not None:
-            pictures.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(pictures / f"view_{n:04d}.png"), np.hstack(row))
+        if images is not None:
+            images.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(images / f"view_{n:04d}.png"), np.hstack(row))
     if not any(sums.values()):
         raise InputError(f"{video}: none of its frames that took no part shows the map")
     return {

@@ -62,16 +62,16 @@ def test_each_product_is_drawn_at_the_poses_of_the_others(
     tmp_path: Path, house: HouseFlight
 ) -> None:
     scan = flown(tmp_path, house)
-    pictures = tmp_path / "pictures"
+    images = tmp_path / "images"
     assert set(scored(scan)) == {"points", "surface"}
     done = CliRunner().invoke(app, ["mesh", str(scan), "--stored"])
     assert done.exit_code == 0, done.exception
-    found = scored(scan, "--pictures", str(pictures))
+    found = scored(scan, "--images", str(images))
     assert set(found) == {"points", "surface", "mesh"}
     for name, figures in found.items():
         assert figures["covered"] > (0.98 if name == "mesh" else 0.9), name
         assert figures["psnr_db"] > 20.0 and 0.5 < figures["ssim"] <= 1.0, name
-    (image,) = pictures.glob("*.png")
+    (image,) = images.glob("*.png")
     drawn = cv2.imread(str(image))
     assert drawn is not None and drawn.shape == (90, 4 * 160, 3)
 
