@@ -7,9 +7,9 @@ its labels are the same. Axes are (labels, h, w), messages (4, labels, h, w).
 
 from __future__ import annotations
 
-import io
 import math
 import warnings
+from typing import BinaryIO
 
 import torch
 import torch.nn.functional as F
@@ -26,10 +26,15 @@ FAR = 1.0e6
 OPSET = 17
 
 
-def exported_stereo(size: tuple[int, int], labels: int, config: BeliefPropagationConfig) -> bytes:
-    """An ONNX file: gray levels ``left`` and ``right`` (1, 1, h, w) float32, 0 to 255, to
-    ``disparity`` (1, 1, h, w) px, NaN where the partner is outside the right image."""
-    model, file = BeliefPropagation(size, labels, config), io.BytesIO()
+def export_stereo(
+    file: BinaryIO, size: tuple[int, int], labels: int, config: BeliefPropagationConfig
+) -> None:
+    """Write an ONNX model into ``file``.
+
+    Gray levels ``left`` and ``right`` (1, 1, h, w) float32, 0 to 255, to ``disparity``
+    (1, 1, h, w) px, NaN where the partner is outside the right image.
+    """
+    model = BeliefPropagation(size, labels, config)
     images = torch.zeros((2, 1, 1, *size))
     with warnings.catch_warnings(), torch.inference_mode():
         # The newer exporter needs onnxscript and splits the loops no better.
@@ -39,7 +44,6 @@ def exported_stereo(size: tuple[int, int], labels: int, config: BeliefPropagatio
             input_names=["left", "right"],
             output_names=["disparity"], opset_version=OPSET, dynamo=False,
         )  # fmt: skip
-    return file.getvalue()
 
 
 class BeliefPropagation(torch.nn.Module):

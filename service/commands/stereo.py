@@ -134,10 +134,11 @@ def export_model(
     check_output(out, ".onnx")
     config = matching_config(iterations, min_disparity, checked=False)
     with needing("export-model"):
-        from recon.backends.exported_stereo import exported_stereo
+        from recon.backends.exported_stereo import export_stereo
     declaration = out.with_suffix(".toml")
     try:
-        out.write_bytes(model := exported_stereo((height, width), labels, config))
+        with out.open("wb") as file:
+            export_stereo(file, (height, width), labels, config)
         declaration.write_text(
             f'model = "{out.name}"\nheight = {height}\nwidth = {width}\n'
             "channels = 1\nscale = 1.0\n",
@@ -145,7 +146,7 @@ def export_model(
         )
     except OSError as error:
         raise OutsideError(f"{out}: cannot be written: {error.strerror}") from error
-    print(f"{out}: {len(model) / 1e6:.1f} MB; use it with compute.model = {declaration}")
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; use it with compute.model = {declaration}")
 
 
 def _shape(text: str, option: str) -> tuple[int, int]:
