@@ -19,6 +19,7 @@ EXTRAS = {
     "google": "ground",
     "mavsdk": "ground",
     "mcap": "ground",
+    "onnx": "onnx",
     "onnxruntime": "onnx",
     "open3d": "ground",
     "py3dtiles": "ground",

@@ -6,8 +6,10 @@ import json
 import logging
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mavlink.wire.signing import StreamTimes
+if TYPE_CHECKING:  # the first heartbeat does not wait for the dialect
+    from mavlink.wire.signing import StreamTimes
 
 log = logging.getLogger(__name__)
 

@@ -15,8 +15,8 @@ from recon import se3
 from recon.types import DepthMap, Keyframe, Pose
 from service.config import DatalinkConfig
 from service.errors import InputError, OutsideError
-from service.ground import receiver as receiver_module
 from service.ground.drone import DroneLimits
+from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream import codec
 from service.stream import link as link_module
@@ -61,9 +61,17 @@ def fly(store: ScanStore, first: int, last: int) -> None:
         store.add_pose(PoseRecord(1000 * seq, np.eye(4), np.eye(6), keyframe_seq=seq))
 
 
+WRITTEN: list[Path] = []
+
+
+def note(scan: ReceivedScan) -> None:
+    """Instead of writing the deliverables, which are another module's matter."""
+    WRITTEN.append(scan.folder)
+
+
 def start_ground(folder: Path, endpoint: str, name: str = "") -> Receiver:
     session = SessionConfig(mode="router", listen=(endpoint,))
-    ground = Receiver(ReceiverConfig(folder, session, name=name))
+    ground = Receiver(ReceiverConfig(folder, session, name=name), deliver=note)
     ground.start()
     return ground
 
@@ -79,11 +87,10 @@ def assert_equal(onboard: ScanStore, path: Path) -> None:
 
 
 @pytest.fixture(autouse=True)
-def written(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """The folders whose deliverables were asked for; the files are another module's matter."""
-    folders: list[Path] = []
-    monkeypatch.setattr(receiver_module, "deliver", lambda scan: folders.append(scan.folder))
-    return folders
+def written() -> list[Path]:
+    """The folders whose deliverables were asked for."""
+    WRITTEN.clear()
+    return WRITTEN
 
 
 def fast(endpoint: str) -> DatalinkConfig:
@@ -118,7 +125,7 @@ def test_two_runs_of_one_time_stay_two_scans(tmp_path: Path, written: list[Path]
         assert_equal(store, by_run[store.header.run_id] / "scan.db")
         store.close()
     # The receiver that is started again finds each run's folder.
-    again = Receiver(ReceiverConfig(tmp_path / "ground"))
+    again = Receiver(ReceiverConfig(tmp_path / "ground"), deliver=note)
     for store in runs:
         assert again.folder("drone-a", store.header.name) == by_run[store.header.run_id]
     assert again.folder("drone-a", "scan-1." + "2" * 32).name == "scan-1-3"
@@ -227,7 +234,9 @@ def test_a_router_between_them_may_restart(tmp_path: Path) -> None:
     router_config = SessionConfig(mode="router", listen=(endpoint,))
     router = open_session(router_config)
     onboard = new_store(tmp_path / "air")
-    ground = Receiver(ReceiverConfig(tmp_path / "ground", SessionConfig(connect=(endpoint,))))
+    ground = Receiver(
+        ReceiverConfig(tmp_path / "ground", SessionConfig(connect=(endpoint,))), deliver=note
+    )
     ground.start()
     link = DatalinkSender(onboard, fast(endpoint))
     try:
@@ -280,7 +289,7 @@ def test_two_drones_with_the_same_scan_id_and_a_late_second_ground(tmp_path: Pat
         fly(store, 0, 4 + k)
         store.finish({})
     late_session = SessionConfig(mode="client", connect=(endpoint,))
-    late = Receiver(ReceiverConfig(tmp_path / "late", late_session, name="second"))
+    late = Receiver(ReceiverConfig(tmp_path / "late", late_session, name="second"), deliver=note)
     try:
         assert all(link.drain(20.0) for link in links)
         late.start()
@@ -305,7 +314,9 @@ def test_over_the_quota_the_ground_keeps_coarse_layers_and_says_so(tmp_path: Pat
     fly(onboard, 0, 6)
     onboard.finish({})
     session = SessionConfig(mode="router", listen=(endpoint,))
-    ground = Receiver(ReceiverConfig(tmp_path / "ground", session, DroneLimits(120_000)))
+    ground = Receiver(
+        ReceiverConfig(tmp_path / "ground", session, DroneLimits(120_000)), deliver=note
+    )
     ground.start()
     link = DatalinkSender(onboard, fast(endpoint))
     try:
