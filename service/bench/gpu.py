@@ -27,7 +27,9 @@ SIZE, LABELS = (320, 180), 16
 def run(options: BenchOptions) -> list[BenchResult]:
     """Milliseconds of each call; one line where the device cannot run."""
     try:
-        backend = load_backend("torch")
+        from recon.backends.torch_backend import TorchBackend
+
+        backend = TorchBackend()
     except (ImportError, RuntimeError) as error:
         first = str(error).splitlines()[0]
         return [BenchResult("torch", float("nan"), "ms", note=f"cannot run: {first}")]

@@ -212,7 +212,9 @@ class HonestDrone:
     def lost(self, ground: Ground) -> tuple[int, int]:
         """(chunks that the ground's store lacks, all that the drone's has)."""
         aboard = {chunk[1:] for chunk in stored(self.scans)}
-        return len(aboard - {chunk[1:] for chunk in stored(ground.store / self.name)}), len(aboard)
+        return len(
+            aboard - {chunk[1:] for chunk in stored(ground.store / "drones" / self.name)}
+        ), len(aboard)
 
 
 class Watch:
@@ -224,7 +226,7 @@ class Watch:
 
     def __init__(self, ground: Ground, name: str) -> None:
         self.ages_s: list[float] = []
-        self._place, self._last = ground.store / name, 0
+        self._place, self._last = ground.store / "drones" / name, 0
         self._late: list[tuple[float, float]] = []  # (age, time since the start) over a second
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)

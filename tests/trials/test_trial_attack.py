@@ -105,7 +105,7 @@ def test_hostile_records_stop_nothing(tmp_path: Path, cage: Cage, record: Row) -
         Ground(tmp_path, more=("--mavlink", f"udpin:{radio}")) as ground,
         HonestDrone(tmp_path, "honest", ground.endpoint) as drone,
     ):
-        ground.until(lambda: stored(ground.store / "honest"), "an honest chunk")
+        ground.until(lambda: stored(ground.store / "drones" / "honest"), "an honest chunk")
         session = open_session(SessionConfig(connect=(ground.endpoint,)))
         known = list(hostile_puts())
         more = itertools.islice(endless_puts(SEED), 20_000 if WHOLE else 300)
@@ -122,20 +122,24 @@ def test_hostile_records_stop_nothing(tmp_path: Path, cage: Cage, record: Row) -
                             count += 1
             count += tunnelled(f"udpout:{radio}", 5000 if WHOLE else 400)
             before = len(stored(drone.scans))
-            ground.until(lambda: len(stored(ground.store / "honest")) > before, "later chunks")
+            ground.until(
+                lambda: len(stored(ground.store / "drones" / "honest")) > before, "later chunks"
+            )
             ground.check()
             assert ground.ask("/api/scans")[0] == 200
         finally:
             session.close()
         if WHOLE:  # invented drones have filled the table
             with HonestDrone(tmp_path, "newcomer", ground.endpoint) as late:
-                ground.until(lambda: stored(ground.store / "newcomer"), "a drone that came later")
+                ground.until(
+                    lambda: stored(ground.store / "drones" / "newcomer"), "a drone that came later"
+                )
                 assert late.land() and late.lost(ground)[0] == 0
         assert drone.land(), ground.said[-3000:]
         lost, made = drone.lost(ground)
         assert ground.stop() == 0, ground.said[-3000:]
         assert "Traceback" not in ground.said, ground.said[-6000:]
-    scans = sorted((ground.store / ATTACKER).glob("*/scan.db"))
+    scans = sorted((ground.store / "drones" / ATTACKER).glob("*/scan.db"))
     faults = exported(cage, [path.parent for path in scans])
     record(
         "attack: hostile messages of the datalink and the radio",
@@ -209,7 +213,9 @@ def test_hostile_datalink_next_to_honest_drones(tmp_path: Path, record: Row) -> 
             for name in names
         ]
         keys = [one.key for one in drones]
-        ground.until(lambda: all(stored(ground.store / n) for n in names), "honest chunks")
+        ground.until(
+            lambda: all(stored(ground.store / "drones" / n) for n in names), "honest chunks"
+        )
         watches = [Watch(ground, name) for name in names]
         drone, station = fleet.session(ground.endpoint), fleet.session(ground.endpoint, "rogue")
         attackers = [
@@ -413,7 +419,7 @@ def test_slow_connections_stop_nothing(tmp_path: Path, record: Row) -> None:
     requests = list(slow_requests())
     opened, refused, held = [], 0, 0
     with Ground(tmp_path) as ground, HonestDrone(tmp_path, "honest", ground.endpoint) as drone:
-        ground.until(lambda: stored(ground.store / "honest"), "an honest chunk")
+        ground.until(lambda: stored(ground.store / "drones" / "honest"), "an honest chunk")
         watch = Watch(ground, "honest")
         answers: list[float] = []
         try:
@@ -436,7 +442,9 @@ def test_slow_connections_stop_nothing(tmp_path: Path, record: Row) -> None:
                         one.send(rest)
                 time.sleep(1.0 if WHOLE else 0.1)
             before = len(stored(drone.scans))
-            ground.until(lambda: len(stored(ground.store / "honest")) > before, "later chunks")
+            ground.until(
+                lambda: len(stored(ground.store / "drones" / "honest")) > before, "later chunks"
+            )
             for one, _, _ in opened:
                 with contextlib.suppress(BlockingIOError):
                     try:
