@@ -248,7 +248,7 @@ def test_the_simulator_is_seen_at_the_ground(desk: Path, start: Any) -> None:
     words[words.index("camera.source=sim:")] += "?size=320x180&fps=5&duration_s=4"
     words += ["--set", f"health.http=127.0.0.1:{free_port(socket.SOCK_STREAM)}"]
     aircraft = start("run", words)
-    until(lambda: aircraft.wrote("") and list(desk.glob("ground-scans/*/*/scan.db")), 120)
+    until(lambda: aircraft.wrote("") and list(desk.glob("ground-scans/drones/*/*/scan.db")), 120)
     aircraft.ends()
     ground.ends()
     assert list(desk.glob("scans/*/scan.db"))
