@@ -215,7 +215,7 @@ class DatalinkConfig:
     )
     radio_baud: int = key(57600, "baud rate of that telemetry radio")
     radio_share: float = key(0.3, "share of it for our traffic")
-    drain_s: float = key(20.0, "after a replay, maximum wait for the ground to fetch the rest")
+    drain_s: float = key(20.0, "at the end, maximum wait for the ground to fetch the rest")
 
     def __post_init__(self) -> None:
         """Check ranges and the form of the endpoints."""

@@ -86,14 +86,17 @@ def stop_by_signals() -> Event:
 
 @contextmanager
 def showing(name: str) -> Iterator[Progress]:
-    """Progress of long work on stderr: a bar in a terminal, else a line for each step."""
+    """Progress of long work on stderr: a bar in a terminal, else a line for each step and for
+    each twentieth of the work."""
     if not sys.stderr.isatty():
-        said = [""]
+        said: list[tuple[str, int]] = [("", 0)]
 
         def say(now: Progress) -> None:
-            if now.text != said[-1]:
-                said[:] = [now.text]
-                print(f"{name}: {now.text}", file=sys.stderr)
+            step = now.text, int(now.share * 20.0)
+            if step != said[-1]:
+                said[:] = [step]
+                share = f", {5 * step[1]} %" if step[1] else ""
+                print(f"{name}: {now.text}{share}", file=sys.stderr)
 
         yield Progress(say)
         return

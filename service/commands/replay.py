@@ -356,8 +356,8 @@ def _flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:
 
     def show(scan: Scan) -> None:
         r = scan.recorder
-        if sys.stderr.isatty():
-            say(f"{r.frames} images, {r.distance_m:.0f} m flown, {r.keyframes} keyframes")
+        figures = f"{r.frames} images, {r.distance_m:.0f} m flown, {r.keyframes} keyframes"
+        say(figures if sys.stderr.isatty() else progress.text)
 
     return show
 

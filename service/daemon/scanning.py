@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -306,7 +305,7 @@ class Scanning:
             if worker is not None:
                 worker.join(1.0)
             self._writings.wait(1.0)
-        self.link.rest()
+        self.link.rest(self.config.datalink.drain_s, wait)
 
     def offer_backlog(self) -> None:
         """Send earlier scans that the ground lacks while no scan runs."""
@@ -354,7 +353,10 @@ class Scanning:
 
     def write_files(self, folder: Path, store: ScanStore) -> None:
         """Write a scan's files, in the background when another scan is wanted meanwhile."""
-        land = partial(self.link.land, self.config)
+
+        def land() -> None:
+            self.link.land(self.config, is_last=self.intent.is_over)
+
         self._writings.write(folder, store, lambda: self.intent.wants_scan, land, self._hand_over)
 
     def _hand_over(self) -> Work | None:

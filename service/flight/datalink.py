@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from service.stream.tunnel import Carrier
 
 log = logging.getLogger(__name__)
+
+LOOK_S = 1.0  # between two looks at what the ground lacks
 
 OWN_LINKS = "mavlink"
 """The value of ``datalink.radio`` that means the links of the [mavlink] section."""
@@ -67,6 +70,22 @@ def open_backlog(config: Config) -> DatalinkSender | None:
     return sender
 
 
+def deliver(sender: DatalinkSender, max_s: float, wait: Callable[[], None] = lambda: None) -> None:
+    """Wait until a ground station that is heard has everything, and log what is missing.
+
+    ``wait`` is called about once a second.
+    """
+    end_s = time.monotonic() + max_s
+    while not sender.drain(min(LOOK_S, max_s)):
+        now = sender.progress
+        if time.monotonic() >= end_s or not now.listened:
+            break
+        wait()
+    missing = sum(sender.progress.lacking.values())
+    if missing:
+        log.warning("the ground lacks %d items; the next start sends them", missing)
+
+
 class DaemonLink:
     """The datalink over a daemon's life: a scan's sender while one is flown, else the backlog.
 
@@ -97,14 +116,18 @@ class DaemonLink:
             log.error("the scan is only stored: %s", error)
             vehicle.statustext(f"Scan is only stored: {error}", WARNING)
 
-    def land(self, config: Config, in_haste: bool = False) -> None:
+    def land(self, config: Config, in_haste: bool = False, is_last: bool = False) -> None:
         """End the scan's sender. The backlog sends the rest. By radio alone there is no backlog:
-        then wait for the rest, unless the next scan is ``in_haste``."""
+        then wait for the rest, unless the next scan is ``in_haste``. So does the ``is_last`` of
+        the process, as :func:`deliver` says."""
         sender, self.flying = self.flying, None
         if sender is None:
             return
-        if not (in_haste or config.datalink.connect or config.datalink.listen):
+        has_backlog = config.datalink.connect or config.datalink.listen
+        if not (in_haste or has_backlog):
             sender.drain(config.datalink.drain_s)
+        elif is_last:
+            deliver(sender, config.datalink.drain_s)
         sender.close()
 
     def offer_backlog(self, config: Config, is_idle: Callable[[], bool] = lambda: True) -> None:
@@ -133,12 +156,15 @@ class DaemonLink:
         if sender is not None:
             sender.close()
 
-    def rest(self) -> None:
-        """End the backlog; a separate thread closes the rest."""
+    def rest(self, deliver_s: float = 0.0, wait: Callable[[], None] = lambda: None) -> None:
+        """End the backlog, after :func:`deliver` if it may take a while; a separate thread closes
+        the rest."""
         with self._lock:
             self._is_wanted = False
             sender, self._backlog = self._backlog, None
         if sender is not None:
+            if deliver_s:
+                deliver(sender, deliver_s, wait)
             # The process does not end before it has: Zenoh would abort it.
             PROCESS.start("backlog closing", lambda _: sender.close())
 

@@ -43,12 +43,14 @@ def send_recording(client: Client, *files: Path) -> tuple[int, Any]:
     return found
 
 
-def ended(client: Client, number: int) -> dict[str, Any]:
-    """A job once it has ended."""
+def ended(client: Client, number: int, percents: set[int] | None = None) -> dict[str, Any]:
+    """A job once it has ended; ``percents`` is what it said to be done meanwhile."""
 
     def find() -> dict[str, Any] | None:
         jobs = client.ask("/api/jobs")[1]
         found = next(job for job in jobs if job["number"] == number)
+        if percents is not None:
+            percents.add(found["percent"])
         return found if found["state"] not in ("waiting", "running") else None
 
     job: dict[str, Any] = until(find, 200.0, lambda: client.ask("/api/jobs")[1])
@@ -63,8 +65,10 @@ def test_a_video_with_its_log_becomes_a_scan(
     files = [recording / name for name in ("camera.yaml", "flight.mp4", "flight.tlog")]
     status, job = send_recording(client, *files)
     assert (status, job["kind"], job["scan"]) == (202, "scan", "flight.mp4")
-    job = ended(client, job["number"])
+    percents: set[int] = set()
+    job = ended(client, job["number"], percents)
     assert job["state"] == "done", job["error"]
+    assert any(0 < percent < 100 for percent in percents)
     drone, _, scan = job["file"].partition("/")
     with ScanStore.open(store / "drones" / drone / scan / "scan.db") as made:
         assert made.finished and len(made.seqs()) > 2

@@ -6,7 +6,7 @@ import dataclasses
 import socket
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from service.config import Config
 from service.flight.datalink import DaemonLink, open_backlog
 from service.ground.receiver import Receiver, ReceiverConfig
-from service.stream.link import DatalinkSender
+from service.stream.link import DatalinkSender, LinkProgress
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.reports import delivered, open_undelivered
 from service.stream.session import SessionConfig
@@ -35,6 +35,39 @@ def make_scan(scans: Path, name: str, finished: bool = True, held: bool = False)
             store.finish({"points": 1})
         if held:
             store.set_held("base", store.numbers())
+
+
+class FakeSender:
+    """A sender to a ground station that fetches one item a look, unless it is silent."""
+
+    def __init__(self, lacking: int, listened: bool = True) -> None:
+        self.lacking, self.listened, self.closed = lacking, listened, False
+
+    @property
+    def progress(self) -> LinkProgress:
+        return LinkProgress(True, self.listened, 9, {"k1": self.lacking} if self.lacking else {})
+
+    def drain(self, _: float) -> bool:
+        self.lacking -= self.listened
+        return not self.lacking
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.mark.parametrize(
+    ("sender", "left"), [(FakeSender(3), 0), (FakeSender(3, False), 3), (FakeSender(10**9), None)]
+)
+def test_at_the_end_the_ground_gets_the_rest_or_what_it_lacks_is_said(
+    sender: FakeSender, left: int | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    datalink = dataclasses.replace(Config().datalink, connect=("tcp/10.0.0.1:1",), drain_s=0.05)
+    link = DaemonLink()
+    link.flying = cast(DatalinkSender, sender)
+    link.land(dataclasses.replace(Config(), datalink=datalink), is_last=True)
+    assert sender.closed and left in (None, sender.lacking)
+    said = f"the ground lacks {sender.lacking} items; the next start sends them"
+    assert [r.message for r in caplog.records] == ([said] if sender.lacking else [])
 
 
 @pytest.mark.parametrize("drone", ["red", "r" * 60])
@@ -138,6 +171,14 @@ def test_the_daemon_offers_earlier_scans_between_flights(tmp_path: Path) -> None
         flown.close()
         link.offer_backlog(config)
         assert complete("two")
+        link.rest()
+        flown = ScanStore.create(scans / "three" / "scan.db", ScanHeader("three", "red", 1))
+        link.take_off(flown, config, vehicle)
+        flown.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
+        flown.finish({})
+        link.land(config, is_last=True)  # waits: no backlog will follow
+        assert delivered(flown)
+        flown.close()
     finally:
         link.rest()
         ground.close()
