@@ -24,6 +24,7 @@ from recon.stereo.belief_propagation import (
     RADIUS,
     SPECKLE_STEP,
     SURE_EVIDENCE,
+    UNKNOWN,
     BeliefPropagationConfig,
 )
 from recon.stereo.matching_cost import CENSUS_OFFSETS, COST_UNIT
@@ -436,7 +437,6 @@ def _select(
 
 
 CONTRAST_PX = 9
-UNKNOWN = -2048 * SPECKLE_STEP
 
 
 def drop_unreliable(

@@ -39,6 +39,9 @@ _space = Workspace()
 SPECKLE_STEP = 16
 """Sixteenths of a label: neighbours further apart than one label belong to two surfaces."""
 
+UNKNOWN = -32768
+"""Where there is no label; none within 1024 comes near it."""
+
 
 @dataclass(frozen=True, slots=True)
 class BeliefPropagationConfig:
@@ -104,26 +107,37 @@ def drop_unreliable(
     ``px`` and ``confidence`` are changed in place. Every backend ends with this.
     """
     if config.min_contrast > 0:
-        contrast = np.sqrt(np.maximum(local_variance(left, 9), 0))
-        confidence[contrast < config.min_contrast] = 0
+        confidence[local_variance(left, 9) < config.min_contrast**2] = 0
     if config.occlusion_tolerance >= 0:
         tolerance = float(config.occlusion_tolerance)
         _check_visibility(px, confidence, config.min_disparity, tolerance, config.fill_occluded)
     else:
         px[confidence <= 0] = np.nan
+    coarse = np.empty(px.shape, np.int16)
+    _round(px, coarse)
     if config.speckle_px > 0:
-        _drop_speckles(px, config.speckle_px)
-    confidence[np.isnan(px)] = 0
+        cv2.filterSpeckles(coarse, UNKNOWN, config.speckle_px, SPECKLE_STEP)
+    _forget(coarse, px, confidence)
     return DisparityMap(px, confidence)
 
 
-def _drop_speckles(px: F32, smallest: int) -> None:
-    """NaN for surfaces of at most ``smallest`` pixels."""
-    unknown = -32768
-    labels = np.where(np.isnan(px), -2048, px) * SPECKLE_STEP
-    coarse = np.ascontiguousarray(labels, np.int16)
-    cv2.filterSpeckles(coarse, unknown, smallest, SPECKLE_STEP)
-    px[coarse == unknown] = np.nan
+@njit(cache=True, nogil=True)
+def _round(px: Any, coarse: Any) -> None:  # pragma: no cover - compiled
+    """Labels in ``1 / SPECKLE_STEP``, and UNKNOWN."""
+    for v in range(px.shape[0]):
+        for u in range(px.shape[1]):
+            known = not np.isnan(px[v, u])
+            coarse[v, u] = np.int16(px[v, u] * np.float32(SPECKLE_STEP)) if known else UNKNOWN
+
+
+@njit(cache=True, nogil=True)
+def _forget(coarse: Any, px: Any, confidence: Any) -> None:  # pragma: no cover - compiled
+    """NaN and no confidence where the label is UNKNOWN."""
+    for v in range(px.shape[0]):
+        for u in range(px.shape[1]):
+            known = coarse[v, u] != UNKNOWN
+            px[v, u] = px[v, u] if known else np.float32(np.nan)
+            confidence[v, u] = confidence[v, u] if known else np.float32(0)
 
 
 RADIUS = 3

@@ -16,10 +16,10 @@ from numba import njit
 
 from recon.bands import in_bands
 from recon.small_matrices import solve_symmetric
-from recon.stereo.matching_cost import CENSUS_REACH, census_row, plain, popcount
+from recon.stereo.matching_cost import CENSUS_REACH, bordered, census_row, plain, popcount
 from recon.types import U8
 
-SAMPLES = 3600
+SAMPLES = 2400
 """About so many pixels, in a grid, are matched."""
 
 MAX_BITS, MARGIN = 4, 4
@@ -48,9 +48,9 @@ def equalised(left: U8, right: U8, labels: int, min_disparity: int = 0) -> U8:
     if rows * columns < MIN_SAMPLES:
         return right
     places = np.full((rows, columns, 2), -1, np.int32)
-    padded = [np.pad(plain(image), CENSUS_REACH, mode="edge") for image in (left, right)]
     in_bands(
-        _match, rows, *padded, step, labels, min_disparity, places, cells=rows * columns * labels,
+        _match, rows, bordered(left), bordered(right), step, labels, min_disparity, places,
+        cells=rows * columns * labels,
     )  # fmt: skip
     row, column = np.nonzero(places[:, :, 1] >= 0)
     if len(row) < MIN_SAMPLES:

@@ -13,6 +13,7 @@ import threading
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from numba import njit, types
@@ -107,10 +108,15 @@ def census(image: U8) -> U32:
     The first of :data:`CENSUS_OFFSETS` is the highest bit; beyond the border the image repeats its
     last row and column.
     """
-    padded = np.pad(image, CENSUS_REACH, mode="edge")
     words = np.empty(image.shape, np.uint32)
-    in_bands(_census, len(image), padded, words, cells=image.size)
+    in_bands(_census, len(image), bordered(image), words, cells=image.size)
     return words
+
+
+def bordered(image: U8) -> Any:
+    """The image and, as far as census reaches beyond it, its last row and column again."""
+    reach = CENSUS_REACH
+    return cv2.copyMakeBorder(image, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
 
 
 @njit(cache=True, nogil=True)
