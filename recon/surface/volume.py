@@ -19,8 +19,10 @@ from numba import njit
 
 from recon import se3
 from recon.bands import in_bands
+from recon.surface.ground import terrain
+from recon.surface.hole_filling import completed, outline
 from recon.surface.meshing import Mesh, reduced, used_vertices
-from recon.surface.raster import Raster
+from recon.surface.raster import Raster, reliable, without_cells
 from recon.types import F32, F64, I32, I64, Bool, DepthMap
 
 SIDE = 8
@@ -39,9 +41,6 @@ SMOOTHINGS = 5
 MIN_PART = 0.01
 """Parts of fewer triangles than this share of the largest one float in the air: noise."""
 
-LOW_REACH_M, LOW_STEP_M, SLOPE = 5.0, 0.8, 0.3
-"""A height is no ground where the ground within this reach lies a step below what a slope does."""
-
 LARGEST_BLOCKS = 120_000
 """Some 6 GB; a tile has about a thousandth of it to a tenth."""
 
@@ -58,23 +57,21 @@ class Volume:
     is_inside: Bool  # (B, SIDE, SIDE) by y, x: columns inside the outline
 
 
-def volume_mesh(
-    depths: Iterable[DepthMap],
-    upper: Raster,
-    is_inside: Bool,
-    largest_faces: int = 400_000,
-) -> Mesh:
-    """The surface inside the outline, closed but at the outline itself.
+def volume_mesh(depths: Iterable[DepthMap], upper: Raster, largest_faces: int = 400_000) -> Mesh:
+    """The surface inside the outline of ``upper``, closed but at the outline itself.
 
     Args:
         depths: all images of the surface.
-        upper: its upper surface, known wherever ``is_inside``; the cells are the voxels' size.
-        is_inside: (rows, cols) cells inside the outline.
+        upper: its upper surface as measured; the cells are the voxels' size.
 
     Returns a mesh with colours of ``upper``. Raises ValueError when there is too little surface,
     or too much for the memory.
     """
-    volume = prior(upper, is_inside)
+    sure = reliable(upper)
+    inside = outline(upper.known, sure.known, upper.grid.cell_m)
+    low_m = terrain(sure, inside).everywhere_m
+    upper = without_cells(completed(upper, low_m, inside, upper.known & ~sure.known), ~inside)
+    volume = _prior(upper)
     images = list(depths)
     truncation_m = _truncation(images, volume.voxel_m)
     _vote(volume, upper, images, truncation_m)
@@ -85,56 +82,20 @@ def volume_mesh(
     return Mesh(vertices, faces, None, rgb, _measured(volume, vertices))
 
 
-def filled_low(height_m: F32, is_inside: Bool, cell_m: float) -> F32:
-    """(rows, cols) heights with every cell inside known, holes filled from their lower side.
-
-    Holes grow together ring by ring, from cells that no ground lies far below: next to a wall the
-    ground goes on, not the roof. What only roofs surround takes their height.
-    """
-    out = np.where(is_inside, height_m, np.nan).astype(np.float32)
-    known = np.isfinite(out)
-    reach = 2 * round(LOW_REACH_M / cell_m) + 1
-    lowest = _lowest(out, reach)
-    high = known & (out - lowest > LOW_STEP_M + SLOPE * LOW_REACH_M)
-    held, out = out, np.where(high, np.nan, out).astype(np.float32)
-    while True:
-        rows, cols = np.nonzero(is_inside & ~known & np.isnan(out) & np.isfinite(_lowest(out, 3)))
-        if not len(rows):
-            if not high.any():
-                return out
-            out, high = np.where(high, held, out), np.zeros_like(high)
-            continue
-        padded = np.pad(out, 1, constant_values=np.nan)
-        near = np.stack([padded[rows + i, cols + j] for i in range(3) for j in range(3)])
-        out[rows, cols] = np.nanmean(near, axis=0)
-
-
-def _lowest(height: F32, side: int) -> F32:
-    """(rows, cols) the least height in a square of so many cells; infinite without any."""
-    return np.asarray(
-        cv2.erode(
-            np.where(np.isfinite(height), height, np.float32(np.inf)),
-            np.ones((side, side), np.uint8), borderValue=np.inf,
-        ), np.float32,
-    )  # fmt: skip
-
-
-def prior(upper: Raster, is_inside: Bool) -> Volume:
+def _prior(upper: Raster) -> Volume:
     """The blocks that the surface can be in, without any image's vote."""
     grid = upper.grid
     rows, cols = grid.shape
-    wide = -(-np.array([rows, cols]) // SIDE) * SIDE
-    height = np.full(wide, np.nan, np.float32)
-    inside = np.zeros(wide, np.bool_)
-    height[:rows, :cols], inside[:rows, :cols] = upper.height_m[::-1], is_inside[::-1]
-    if not (np.isfinite(height) & inside).any():
+    height = np.full(-(-np.array([rows, cols]) // SIDE) * SIDE, np.nan, np.float32)
+    height[:rows, :cols] = upper.height_m[::-1]
+    inside = np.isfinite(height)
+    if not inside.any():
         raise ValueError("the surface has no cell inside its outline")
-    height[~inside] = np.nan
     base_m = float(np.nanmin(height))
     origin = np.array(
         [grid.west_m + 0.5 * grid.cell_m, grid.north_m - (rows - 0.5) * grid.cell_m, base_m]
     )
-    tiles = height.reshape(wide[0] // SIDE, SIDE, wide[1] // SIDE, SIDE)
+    tiles = height.reshape(height.shape[0] // SIDE, SIDE, -1, SIDE)
     low = np.where(np.isfinite(tiles), tiles, np.inf).min(axis=(1, 3))
     high = np.where(np.isfinite(tiles), tiles, -np.inf).max(axis=(1, 3))
     near = np.ones((3, 3), np.uint8)
@@ -279,11 +240,9 @@ def _extracted(volume: Volume) -> tuple[F64, I32]:
     made = grid.extract_triangle_mesh(weight_threshold=0.5).to_legacy()
     if not len(made.triangles):
         raise ValueError("no surface crosses the volume")
-    vertices = np.asarray(made.vertices, np.float64)
-    faces = _without_floating(len(vertices), np.asarray(made.triangles, np.int32))
-    used, faces = used_vertices(len(vertices), faces)
-    vertices, faces = _in_order(vertices[used], faces)
-    return _smoothed(vertices, faces) + volume.origin_m, faces
+    vertices, faces = _in_order(np.asarray(made.vertices, np.float64), np.asarray(made.triangles))
+    vertices, faces = _cleaned(vertices, faces)
+    return vertices + volume.origin_m, faces
 
 
 def _in_order(vertices: F64, faces: I32) -> tuple[F64, I32]:
@@ -301,42 +260,30 @@ def _in_order(vertices: F64, faces: I32) -> tuple[F64, I32]:
     return ordered[is_new], faces[np.lexsort(faces.T[::-1])]
 
 
-def _edges(count: int, faces: I32) -> Any:
-    """(V, V) sparse, symmetric: 1 where two vertices share an edge."""
-    from scipy.sparse import coo_matrix
-
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    whole = coo_matrix((np.ones(len(ends), np.float32), ends.T), (count, count)).tocsr()
-    whole = whole + whole.T
-    whole.data[:] = 1.0
-    return whole
-
-
-def _without_floating(count: int, faces: I32) -> I32:
-    """The faces of parts that are at least MIN_PART as large as the largest one."""
+def _cleaned(vertices: F64, faces: I32) -> tuple[F64, I32]:
+    """Parts at least MIN_PART as large as the largest one, after SMOOTHINGS steps forth and back;
+    the outline stays."""
+    from scipy.sparse import coo_matrix, diags
     from scipy.sparse.csgraph import connected_components
 
-    _, part = connected_components(_edges(count, faces), directed=False)
-    size = np.bincount(part[faces[:, 0]])
-    return np.asarray(faces[(size >= MIN_PART * size.max())[part[faces[:, 0]]]], np.int32)
-
-
-def _smoothed(vertices: F64, faces: I32) -> F64:
-    """(V, 3) vertices after SMOOTHINGS steps forth and back; the outline stays."""
-    from scipy.sparse import diags
-
-    near = _edges(len(vertices), faces)
-    mean = diags(1.0 / np.maximum(near.sum(axis=1).A1, 1.0)) @ near
-    ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    key, times = np.unique(ends[:, 0].astype(np.int64) * len(vertices) + ends[:, 1],
-                           return_counts=True)  # fmt: skip
-    free = np.ones(len(vertices), np.bool_)
-    border = key[times == 1]
-    free[border // len(vertices)] = free[border % len(vertices)] = False
-    out = vertices.copy()
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    size = (len(vertices), len(vertices))
+    edges = coo_matrix((np.ones(len(ends), np.float32), ends.T), size).tocsr()
+    edges = edges + edges.T  # faces at each edge: one at the outline
+    _, part = connected_components(edges, directed=False)
+    count = np.bincount(part[faces[:, 0]], minlength=part.max() + 1)
+    used, faces = used_vertices(
+        len(vertices), faces[(count >= MIN_PART * count.max())[part[faces[:, 0]]]]
+    )
+    edges, vertices = edges[used][:, used], vertices[used]
+    border = np.repeat(np.arange(len(vertices)), np.diff(edges.indptr))[edges.data == 1.0]
+    edges.data[:] = 1.0
+    mean = diags(1.0 / np.maximum(np.diff(edges.indptr), 1)) @ edges
+    held = vertices[border]
     for step in (0.5, -0.53) * SMOOTHINGS:
-        out[free] += step * (mean @ out - out)[free]
-    return np.asarray(out, np.float64)
+        vertices = vertices + step * (mean @ vertices - vertices)
+        vertices[border] = held
+    return np.asarray(vertices, np.float64), faces
 
 
 def _measured(volume: Volume, vertices: F64) -> Bool:
@@ -360,20 +307,3 @@ def _measured(volume: Volume, vertices: F64) -> Bool:
         held = (keys[n] == key(block)) & ((block >= low) & (block < low + span)).all(axis=1)
         out &= held & (volume.weight[order[n], k, j, i] > 0.0)
     return out
-
-
-def closed(raster: Raster, is_inside: Bool) -> Raster:
-    """The raster with every cell inside the outline known, and none outside."""
-    height = filled_low(raster.height_m, is_inside, raster.grid.cell_m)
-    rgb = raster.rgb.copy()
-    hole = is_inside & ~raster.known
-    if hole.any():
-        mask = np.where(raster.known, 0, 255).astype(np.uint8)
-        _, label = cv2.distanceTransformWithLabels(
-            mask, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-        )
-        colour = np.zeros((int(label.max()) + 1, 3), np.uint8)
-        colour[label[raster.known]] = raster.rgb[raster.known]
-        rgb[hole] = colour[label[hole]]
-    sigma = np.where(np.isfinite(height), raster.sigma_m, np.nan).astype(np.float32)
-    return Raster(raster.grid, height, sigma, rgb)

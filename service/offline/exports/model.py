@@ -12,11 +12,10 @@ from typing import Any, TextIO
 import cv2
 import numpy as np
 
-from recon.surface.hole_filling import outlined
 from recon.surface.meshing import Mesh, cut
 from recon.surface.raster import grid_over, rasterise
 from recon.surface.texturing import texture
-from recon.surface.volume import closed, volume_mesh
+from recon.surface.volume import volume_mesh
 from recon.types import F64, U8, Keyframe, PointCloud
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
@@ -33,8 +32,8 @@ log = logging.getLogger(__name__)
 
 LARGEST_ATLAS_PX = 8192
 TILED_ATLAS_PX = 4096
-MARGIN_VOXELS = 25
-"""About a tile's mesh, which is then cut exactly at the tile's borders."""
+MARGIN_VOXELS, MARGIN_M = 25, 5.0
+"""About a tile's mesh, the larger of the two; it is then cut exactly at the tile's borders."""
 
 TEXTURE_STEPS = 15
 """Reports of :func:`recon.surface.texturing.texture`."""
@@ -92,7 +91,7 @@ def _mesh_parts(
     video = options.video
     if video is None and not options.stored:
         video = recording_of(scan.folder, scan.store.header).path
-    margin_m = MARGIN_VOXELS * voxel_m
+    margin_m = max(MARGIN_VOXELS * voxel_m, MARGIN_M)
     tiles = tiles_over(scan.folder, prints, options.tile_points, margin_m)
     jobs = [
         TileJob(
@@ -190,13 +189,9 @@ def _surface(
     """The untextured mesh, with colours at its vertices."""
     if not len(cloud):
         raise ValueError("no points")
-    progress("filling the upper surface")
-    grid = grid_over(cloud.xyz_m[:, :2].astype(np.float64), job.voxel_m, margin_cells=1)
-    upper = rasterise(cloud, grid)
-    is_inside = outlined(upper.known)
     progress("signed distances")
-    depths = [k.depth for k in keyframes]
-    return volume_mesh(depths, closed(upper, is_inside), is_inside, job.largest_faces)
+    grid = grid_over(cloud.xyz_m[:, :2].astype(np.float64), job.voxel_m, margin_cells=1)
+    return volume_mesh((k.depth for k in keyframes), rasterise(cloud, grid), job.largest_faces)
 
 
 def mesh_extras(scan: ScanView) -> dict[str, Any]:

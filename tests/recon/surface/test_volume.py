@@ -12,17 +12,16 @@ pytest.importorskip("open3d", exc_type=ImportError)
 pytest.importorskip("fast_simplification")
 
 from recon.mapping.cloud_fusion import cloud_of
-from recon.surface.hole_filling import outlined
 from recon.surface.meshing import Mesh
-from recon.surface.raster import Raster, grid_over, rasterise
-from recon.surface.volume import closed, filled_low, volume_mesh
-from recon.types import I64, Bool, DepthMap
+from recon.surface.raster import Raster, grid_over, rasterise, without_cells
+from recon.surface.volume import volume_mesh
+from recon.types import I64, DepthMap
 
 VOXEL_M = 0.3
 
 
-def seen(house: HouseFlight) -> tuple[list[DepthMap], Raster, Bool]:
-    """Depth images, the upper surface of their points, and what lies inside its outline."""
+def seen(house: HouseFlight) -> tuple[list[DepthMap], Raster]:
+    """Depth images, and the upper surface of their points."""
     keyframes = [house.keyframe(k, 5.0 * k) for k in range(5)]
     clouds = [cloud_of(k.depth, k.bgr, k.fresh) for k in keyframes]
     cloud = replace(
@@ -32,7 +31,7 @@ def seen(house: HouseFlight) -> tuple[list[DepthMap], Raster, Bool]:
         sigma_m=np.concatenate([c.sigma_m for c in clouds]),
     )
     upper = rasterise(cloud, grid_over(cloud.xyz_m[:, :2].astype(np.float64), VOXEL_M, 1))
-    return [k.depth for k in keyframes], upper, outlined(upper.known)
+    return [k.depth for k in keyframes], upper
 
 
 def border(mesh: Mesh) -> I64:
@@ -45,8 +44,7 @@ def border(mesh: Mesh) -> I64:
 
 @pytest.fixture(scope="module")
 def mesh() -> Mesh:
-    depths, upper, is_inside = seen(HouseFlight())
-    return volume_mesh(depths, closed(upper, is_inside), is_inside)
+    return volume_mesh(*seen(HouseFlight()))
 
 
 def test_it_is_open_at_the_outline_alone(mesh: Mesh) -> None:
@@ -79,27 +77,18 @@ def test_what_no_image_shows_is_marked(mesh: Mesh) -> None:
 
 
 def test_a_stray_tower_that_images_look_through_goes() -> None:
-    depths, upper, is_inside = seen(HouseFlight())
+    depths, upper = seen(HouseFlight())
     height = upper.height_m.copy()
     rows, cols = upper.grid.cells(np.array([[22.0, -4.0]]))
     height[rows[0] - 1 : rows[0] + 2, cols[0] - 1 : cols[0] + 2] = 9.0
-    mesh = volume_mesh(depths, closed(replace(upper, height_m=height), is_inside), is_inside)
+    mesh = volume_mesh(depths, replace(upper, height_m=height))
     near = np.hypot(*(mesh.vertices_m[:, :2] - [22.0, -4.0]).T) < 2.0
     assert near.any() and mesh.vertices_m[near, 2].max() < 0.5
 
 
-def test_a_hole_beside_a_wall_takes_the_ground() -> None:
-    height = np.zeros((12, 30), np.float32)
-    height[:, 6:] = 5.0
-    height[3:9, 3:6] = height[5:7, 20:22] = np.nan
-    filled = filled_low(height, np.ones(height.shape, np.bool_), 0.5)
-    np.testing.assert_array_equal(filled[:, :6], 0.0)
-    np.testing.assert_array_equal(filled[:, 6:], 5.0)  # on the roof, far from the ground
-
-
 def test_fewer_triangles_are_the_same_surface(mesh: Mesh) -> None:
-    depths, upper, is_inside = seen(HouseFlight())
-    small = volume_mesh(depths, closed(upper, is_inside), is_inside, largest_faces=3000)
+    depths, upper = seen(HouseFlight())
+    small = volume_mesh(depths, upper, largest_faces=3000)
     assert len(small.faces) <= 3000 < len(mesh.faces)
     x, y, z = small.vertices_m.T
     roof = (np.abs(x - 10.0) < 5.0) & (np.abs(y - 2.0) < 3.0)
@@ -108,6 +97,7 @@ def test_fewer_triangles_are_the_same_surface(mesh: Mesh) -> None:
 
 
 def test_no_surface_is_an_error() -> None:
-    depths, upper, _ = seen(HouseFlight())
+    depths, upper = seen(HouseFlight())
+    nowhere = without_cells(upper, upper.known)
     with pytest.raises(ValueError, match="no cell inside"):
-        volume_mesh(depths, upper, np.zeros(upper.grid.shape, np.bool_))
+        volume_mesh(depths, nowhere)
