@@ -7,17 +7,25 @@ repeated at will.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import Protocol
 
-from mavlink.component.camera import MIN_INTERVAL_S
+from mavlink.component.camera import MIN_INTERVAL_S, CameraComponent
 from mavlink.component.command_desk import Call, Command
-from mavlink.component.control import ACCEPTED, Answer, Handled, Phase, Power, Result, Work
+from mavlink.component.control import (
+    ACCEPTED,
+    Answer,
+    Handled,
+    Phase,
+    Power,
+    Result,
+    ScanControl,
+    Work,
+)
+from mavlink.component.parameters import Parameters
 from mavlink.wire.first_beat import CAMERA, ONBOARD
-
-if TYPE_CHECKING:
-    from mavlink.component.companion import Companion
+from mavlink.wire.messages import Stream
 
 MAX_SERIES_INTERVAL_S = 3600.0
 MAX_SHOTS = 100_000
@@ -35,6 +43,21 @@ STOPS: dict[int, tuple[int, tuple[float, ...]]] = {
 """Stop commands: number to (parameter, values) that make it a stop (0: always)."""
 
 
+class Host(Protocol):
+    """What commands act on: the companion computer's components."""
+
+    control: ScanControl
+    camera: CameraComponent
+    parameters: Parameters
+    streams: Mapping[tuple[int, int], Stream]
+
+    def when_disarmed(self, what: str, act: Callable[[], Handled]) -> Handled: ...
+
+    def send_requested(self, component: int, number: int, index: int, link: int) -> bool: ...
+
+    def send_interval(self, component: int, number: int, link: int) -> None: ...
+
+
 def is_stop(call: Call) -> bool:
     """True for a call that stops something: it is executed however often it arrives."""
     k, values = STOPS.get(call.number, (1, ()))
@@ -44,7 +67,7 @@ def is_stop(call: Call) -> bool:
 # The scan.
 
 
-def start_scan(call: Call, host: Companion) -> Handled:
+def start_scan(call: Call, host: Host) -> Handled:
     """VIDEO_START_CAPTURE: start or resume a scan; a second start changes nothing.
 
     Param 2 requests CAMERA_CAPTURE_STATUS at that rate in Hz (0: none) until the scan ends.
@@ -52,12 +75,12 @@ def start_scan(call: Call, host: Companion) -> Handled:
     return _start(call, host, call.param(2, 0.0))
 
 
-def stop_scan(call: Call, host: Companion) -> Handled:
+def stop_scan(call: Call, host: Host) -> Handled:
     """VIDEO_STOP_CAPTURE: close the scan; also accepted when none runs."""
     return _stop(host, host.control.stop_scan)
 
 
-def control_video(call: Call, host: Companion) -> Handled:
+def control_video(call: Call, host: Host) -> Handled:
     """DO_CONTROL_VIDEO, the old command to start (param 4 = 1 or 2) and stop (0) recording."""
     recording = call.param(4, -1.0)
     if recording in (1.0, 2.0):
@@ -67,7 +90,7 @@ def control_video(call: Call, host: Companion) -> Handled:
     return Answer(Result.DENIED, "DO_CONTROL_VIDEO: param 4 must be 0, 1 or 2")
 
 
-def _start(call: Call, host: Companion, status_hz: float = 0.0) -> Handled:
+def _start(call: Call, host: Host, status_hz: float = 0.0) -> Handled:
     """Start a scan unless one takes frames, and stream the camera's status at a rate."""
     is_scanning = host.control.status().phase is Phase.SCANNING
     handled = ACCEPTED if is_scanning else host.control.start_scan()
@@ -76,7 +99,7 @@ def _start(call: Call, host: Companion, status_hz: float = 0.0) -> Handled:
     return handled
 
 
-def _stop(host: Companion, how: Callable[[], Handled]) -> Handled:
+def _stop(host: Host, how: Callable[[], Handled]) -> Handled:
     """End the scan, its retries and the series of photos.
 
     ``how`` is the control's method of stopping. It is called in every state, because a scan may
@@ -87,7 +110,7 @@ def _stop(host: Companion, how: Callable[[], Handled]) -> Handled:
     return handled
 
 
-def set_baseline(call: Call, host: Companion) -> Handled:
+def set_baseline(call: Call, host: Host) -> Handled:
     """DO_SET_CAM_TRIGG_DIST: set the virtual stereo baseline.
 
     Param 1: metres, 0 lets it follow the altitude; param 3 = 1 takes a photo now.
@@ -98,7 +121,7 @@ def set_baseline(call: Call, host: Companion) -> Handled:
     return answer
 
 
-def user(call: Call, host: Companion) -> Handled:
+def user(call: Call, host: Host) -> Handled:
     """USER_1 to the onboard computer: actions without a standard command, by param 1.
 
     1 pause, 2 resume, 3 clear the map, 4 baseline of param 2 metres (0: automatic),
@@ -127,7 +150,7 @@ def user(call: Call, host: Companion) -> Handled:
 # Photos.
 
 
-def start_capture(call: Call, host: Companion) -> Handled:
+def start_capture(call: Call, host: Host) -> Handled:
     """IMAGE_START_CAPTURE: one photo now, or several at an interval.
 
     Param 2: interval in s, param 3: count (0: until stopped), param 4: sequence. A numbered single
@@ -146,14 +169,14 @@ def start_capture(call: Call, host: Companion) -> Handled:
     return host.camera.shoot_every(interval_s, int(count))
 
 
-def stop_capture(call: Call, host: Companion) -> Handled:
+def stop_capture(call: Call, host: Host) -> Handled:
     """IMAGE_STOP_CAPTURE: end a series of photos; also accepted when there is none."""
     host.camera.stop_shooting()
     host.camera.show_status()
     return ACCEPTED
 
 
-def digicam(call: Call, host: Companion) -> Handled:
+def digicam(call: Call, host: Host) -> Handled:
     """DO_DIGICAM_CONTROL: one photo when param 5 = 1 (ArduPilot's CAM1_TYPE=5 sends it).
 
     Zoom, focus and session are ignored.
@@ -165,7 +188,7 @@ def digicam(call: Call, host: Companion) -> Handled:
 # The computer and its storage.
 
 
-def reboot(call: Call, host: Companion) -> Handled | None:
+def reboot(call: Call, host: Host) -> Handled | None:
     """PREFLIGHT_REBOOT_SHUTDOWN of the companion; refused unless the vehicle is disarmed.
 
     Param 2: 1 reboots, 2 shuts down; param 3 = 1 with param 4 = 191 restarts the service.
@@ -178,7 +201,7 @@ def reboot(call: Call, host: Companion) -> Handled | None:
     return host.when_disarmed(action.value, partial(host.control.power, action))
 
 
-def erase(call: Call, host: Companion) -> Handled:
+def erase(call: Call, host: Host) -> Handled:
     """STORAGE_FORMAT: erase the finished scans; refused while scanning or unless disarmed.
 
     Param 1: storage (1, or 0 for all), param 2 = 1 erases, param 3 = 1 resets the count.
@@ -195,14 +218,14 @@ def erase(call: Call, host: Companion) -> Handled:
     return _unless_idle(host, "erase") or host.when_disarmed("erase", act)
 
 
-def _unless_idle(host: Companion, what: str) -> Answer | None:
+def _unless_idle(host: Host, what: str) -> Answer | None:
     """The refusal while a scan runs, waits or is being closed."""
     if host.control.status().phase is Phase.IDLE:
         return None
     return Answer(Result.TEMPORARILY_REJECTED, f"{what} refused while scanning")
 
 
-def reset_settings(call: Call, host: Companion) -> Handled:
+def reset_settings(call: Call, host: Host) -> Handled:
     """RESET_CAMERA_SETTINGS: reset every parameter (param 1 = 1); refused while scanning."""
     if call.param(1, 0.0) != 1.0:
         return Answer(Result.DENIED, "reset refused: param 1 must be 1")
@@ -215,7 +238,7 @@ def reset_settings(call: Call, host: Companion) -> Handled:
 # Queries.
 
 
-def request_message(call: Call, host: Companion) -> Handled | None:
+def request_message(call: Call, host: Host) -> Handled | None:
     """REQUEST_MESSAGE: send the message of a number (param 1) from the addressed component.
 
     UNSUPPORTED when the component has no such message. A broadcast is answered by the first
@@ -233,14 +256,14 @@ CAMERA_MESSAGES = {521: 259, 522: 260, 525: 261, 527: 262, 2504: 269, 2505: 270}
 """Older camera queries of older ground stations: command to message."""
 
 
-def request_camera(call: Call, host: Companion) -> Handled:
+def request_camera(call: Call, host: Host) -> Handled:
     """Send the message that the command requests, whatever its parameter: some ground stations
     set it to 0, which is no request by the protocol."""
     sent = host.send_requested(CAMERA, CAMERA_MESSAGES[call.number], 0, call.link)
     return ACCEPTED if sent else Answer(Result.UNSUPPORTED)
 
 
-def message_interval(call: Call, host: Companion) -> Handled | None:
+def message_interval(call: Call, host: Host) -> Handled | None:
     """SET_MESSAGE_INTERVAL and GET_MESSAGE_INTERVAL for the messages that can be streamed.
 
     Param 1: message, param 2: interval in us, 0 for the default, -1 for never. Of several ground

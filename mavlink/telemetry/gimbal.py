@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from mavlink.telemetry.quaternion import (
     Quaternion,
@@ -26,9 +25,6 @@ from mavlink.telemetry.quaternion import (
     to_rpy,
 )
 from mavlink.telemetry.samples import GimbalFrame
-
-if TYPE_CHECKING:
-    from mavlink.telemetry.history import VehicleHistory
 
 YAW_LOCK = 16
 YAW_IN_VEHICLE_FRAME = 32
@@ -188,8 +184,9 @@ def _largest_angle(a: Sequence[Ends], b: Sequence[Ends]) -> float:
 class FrameWatch:
     """Collects rotations between frames and finds the reference frame of the gimbal."""
 
-    def __init__(self, history: VehicleHistory) -> None:
-        self._history = history
+    def __init__(self, claimed_at: Callable[[int], tuple[Quaternion, Quaternion] | None]) -> None:
+        """``claimed_at(time_ns)`` gives the gimbal's quaternion as sent, and ``q_ned_body``."""
+        self._claimed_at = claimed_at
         self._turns: deque[tuple[int, int, Quaternion]] = deque(maxlen=KEPT)
         self._open: tuple[int, int, Quaternion] | None = None  # a rotation still growing
 
@@ -217,8 +214,8 @@ class FrameWatch:
         bodies: list[Ends] = []
         turns: list[Quaternion] = []
         for first_ns, second_ns, turn in self._turns:
-            first = self._history.claimed_at(first_ns - shift)
-            second = self._history.claimed_at(second_ns - shift)
+            first = self._claimed_at(first_ns - shift)
+            second = self._claimed_at(second_ns - shift)
             if first is not None and second is not None:
                 sent.append((first[0], second[0]))
                 bodies.append((first[1], second[1]))

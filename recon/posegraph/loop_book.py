@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from recon import se3
-from recon.posegraph.records import Loop, PoseGraphConfig, loops_agree
+from recon.posegraph.records import Loop, Node, PoseGraphConfig, loops_agree
 from recon.posegraph.thinning import Marginalised, moved_loops
-
-if TYPE_CHECKING:
-    from recon.posegraph.pose_graph import PoseGraph
+from recon.types import F64
 
 CHI2_LIMIT = 22.5
 """99.9 % of chi-square with six degrees of freedom."""
@@ -22,10 +20,22 @@ MAX_PENDING = 50
 """Loops that wait for one that agrees; older ones are forgotten."""
 
 
+class Track(Protocol):
+    """What loops are held against: the keyframes' poses as the graph has them."""
+
+    def node(self, seq: int) -> Node: ...
+
+    def place(self, seq: int) -> F64: ...
+
+    def scale(self, seq: int) -> float: ...
+
+    def path_m(self, a: int, b: int) -> float: ...
+
+
 class LoopBook:
     """Loops that were offered, and which of them the map rests on."""
 
-    def __init__(self, config: PoseGraphConfig, track: PoseGraph) -> None:
+    def __init__(self, config: PoseGraphConfig, track: Track) -> None:
         self.taken: list[Loop] = []
         self.pending: list[Loop] = []  # none that agrees was found yet
         self.counts: Counter[str] = Counter()

@@ -11,7 +11,7 @@ they take any other: partners lie on one row, and the labels lie about the plane
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,11 +20,9 @@ from numba import njit
 from recon import se3
 from recon.bands import in_bands
 from recon.image_quality import halved, local_variance, stretch
+from recon.stereo.posed_image import View, VirtualStereoConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE, PairDepth, label_at
 from recon.types import F32, F64, U8, Bool, DisparityMap, PolarPair
-
-if TYPE_CHECKING:
-    from recon.stereo.virtual_stereo import View, VirtualStereoConfig
 
 SEAM_GAP_RAD = 0.3
 """A gap between the directions of the pixels that is wider is no part of the image."""

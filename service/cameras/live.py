@@ -31,9 +31,10 @@ import numpy as np
 
 from recon.types import U8
 from service.cameras import open_container, reject_options
+from service.cameras.decoded import frame_bgr
 from service.cameras.lens import same_shape
 from service.cameras.source import CameraFrame, CameraSource, Paced
-from service.cameras.video import decoded_frames, frame_bgr, video_stream
+from service.cameras.video import decoded_frames, video_stream
 from service.errors import InputError, OutsideError
 from service.redaction import without_credentials
 from service.workers import PROCESS, Worker, end_process, open_process

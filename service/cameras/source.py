@@ -7,16 +7,14 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from threading import Event, Lock
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from recon.types import U8
 from service.background import Channel
+from service.cameras.decoded import Decoded
 from service.workers import PROCESS, Worker
-
-if TYPE_CHECKING:
-    from service.cameras.video import Decoded
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,16 +12,13 @@ import logging
 import sys
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-import numpy as np
-
-from recon.types import U8
 from service.cameras import open_container, reject_options
+from service.cameras.decoded import Decoded
 from service.cameras.source import CameraFrame
 from service.errors import InputError
 
@@ -46,25 +43,6 @@ LONGEST_NS = 366 * 86_400 * 1_000_000_000
 
 HEAD_BYTES = 4096
 NS_PER_S = 1_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Decoded:
-    """An image as the decoder gave it, in BGR once that is asked for."""
-
-    frame: av.VideoFrame
-    turned_deg: int  # clockwise
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(H, W, 3) as turned."""
-        stored = int(self.frame.width), int(self.frame.height)
-        W, H = stored[::-1] if self.turned_deg % 180 else stored
-        return H, W, 3
-
-    def __call__(self) -> U8:
-        """(H, W, 3) BGR."""
-        return np.ascontiguousarray(np.rot90(frame_bgr(self.frame), -(self.turned_deg // 90)))
 
 
 class VideoSource:
@@ -378,11 +356,6 @@ def _start_s(stream: av.VideoStream, first: av.VideoFrame) -> Fraction:
     if first.pts is not None and first.time_base is not None:
         return first.pts * first.time_base
     return Fraction(0)
-
-
-def frame_bgr(frame: av.VideoFrame) -> U8:
-    """(H, W, 3) BGR of a decoded image."""
-    return np.ascontiguousarray(frame.to_ndarray(format="bgr24"), dtype=np.uint8)
 
 
 def _by(size_px: tuple[int, int]) -> str:

@@ -23,6 +23,7 @@ from recon.posegraph.trajectory import Placed, Trajectory
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
+from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import (
     DepthFusionConfig,
     PairDepth,
@@ -33,7 +34,6 @@ from recon.stereo.reprojection import (
 )
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.stereo.virtual_stereo import (
-    VirtualStereoConfig,
     at_middle_row,
     drop_unseen,
     plane_relief,

@@ -63,7 +63,7 @@ class TelemetryCheck:
         self._camera = camera
         self.applied_ms = self._wanted_ms()
         self._turns = LatencyWatch()
-        self._frames = None if history is None or self._fixed else FrameWatch(history)
+        self._frames = None if history is None or self._fixed else FrameWatch(history.claimed_at)
         self._last: tuple[int, int, F64] | None = None  # stamp, segment, R_odom_camera
         self._seen_ns: int | None = None
         self._next_ns: int | None = None

@@ -18,7 +18,7 @@ from recon.camera_model import Undistorter
 from recon.posegraph.between_keyframes import FixAverage
 from recon.rolling_shutter import NEAR_S, FrameRows, depth_share, on_image
 from recon.row_errors import turn_shares
-from recon.stereo.virtual_stereo import View
+from recon.stereo.posed_image import View
 from recon.tracking.keyframe_window import (
     OdometryKeyframe,
     landmarks,

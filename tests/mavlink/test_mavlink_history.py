@@ -464,7 +464,7 @@ def test_the_images_decide_between_frames() -> None:
     mount = Rotation.from_euler("Y", -1.2)
     heads = [body * mount for body in bodies]
     noise = [Rotation.from_rotvec(rng.normal(0, 1e-3, 3)) for _ in heads]
-    watch = FrameWatch(history := VehicleHistory())
+    watch = FrameWatch((history := VehicleHistory()).claimed_at)
     assert history.gimbal_frame() is None
     for k, body in enumerate(bodies):
         history.add(AttitudeSample(None, of_scipy(body)), T0 + k * 100 * MS)

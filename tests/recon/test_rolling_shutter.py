@@ -14,7 +14,8 @@ import pytest
 from recon import se3
 from recon.camera_model import project, rays
 from recon.rolling_shutter import RowClock, Rows, RowTrack, depth_share, row_times_s
-from recon.stereo.virtual_stereo import View, VirtualStereoConfig, at_middle_row, rectify
+from recon.stereo.posed_image import View, VirtualStereoConfig
+from recon.stereo.virtual_stereo import at_middle_row, rectify
 from recon.tracking import readout_search
 from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.localisation import OdometryConfig

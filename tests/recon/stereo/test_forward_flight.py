@@ -17,9 +17,8 @@ from recon import se3
 from recon.backends import load_backend
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.polar import reproject_polar
+from recon.stereo.posed_image import View, VirtualStereoConfig
 from recon.stereo.virtual_stereo import (
-    View,
-    VirtualStereoConfig,
     drop_unseen,
     rectify,
 )

@@ -10,9 +10,10 @@ from painted_ground import CAMERA, FOOTPRINT_M, HEIGHT_M, SIZE, K, on_plane, pos
 from recon import se3
 from recon.camera_model import scaled_K
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
+from recon.stereo.posed_image import View, VirtualStereoConfig
 from recon.stereo.reprojection import reproject
 from recon.stereo.upsampling import UpsamplingConfig, upsample
-from recon.stereo.virtual_stereo import View, VirtualStereoConfig, drop_unseen, rectify
+from recon.stereo.virtual_stereo import drop_unseen, rectify
 from recon.types import F64, StereoPair
 
 LARGEST_BIAS = 2e-4

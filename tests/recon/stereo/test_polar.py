@@ -9,8 +9,9 @@ import pytest
 
 from recon import se3
 from recon.stereo.polar import reproject_polar
+from recon.stereo.posed_image import View, VirtualStereoConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX
-from recon.stereo.virtual_stereo import View, VirtualStereoConfig, rectify
+from recon.stereo.virtual_stereo import rectify
 from recon.types import F64, U8, DisparityMap, PolarPair, StereoPair
 
 W, H = 640, 360

@@ -11,8 +11,8 @@ import pytest
 
 from recon import se3
 from recon.backends.cpu import CpuBackend
+from recon.stereo.posed_image import View
 from recon.stereo.reprojection import LABEL_SIGMA_PX, PairDepth, carry, reproject
-from recon.stereo.virtual_stereo import View
 from recon.types import F64, DisparityMap, StereoPair
 from service.compute.backend_choice import FallbackBackend
 from service.flight.stages import Carry, ViewGrid

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.stereo.posed_image import View, VirtualStereoConfig
 from recon.stereo.reprojection import reproject
 from recon.stereo.virtual_stereo import (
-    View,
-    VirtualStereoConfig,
     _homography,
     check_pair,
     drop_unseen,

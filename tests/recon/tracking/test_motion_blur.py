@@ -10,8 +10,9 @@ from painted_ground import painted_ground
 
 from recon import se3
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
+from recon.stereo.posed_image import View, VirtualStereoConfig
 from recon.stereo.reprojection import reproject
-from recon.stereo.virtual_stereo import View, VirtualStereoConfig, drop_unseen, rectify
+from recon.stereo.virtual_stereo import drop_unseen, rectify
 from recon.tracking.motion_blur import ExposureWatch, streak_px
 from recon.tracking.odometry import Odometry
 from recon.types import F64, U8, Camera, PosePrior, StereoPair

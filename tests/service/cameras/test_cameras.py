@@ -21,6 +21,7 @@ from service.cameras import (
     CAMERAS,
     CameraFrame,
     CameraSource,
+    decoded,
     open_camera,
     open_container,
     parse_source,
@@ -116,7 +117,7 @@ def test_an_image_that_is_not_looked_at_is_not_converted(
         looked_at.append(int(frame.pts or 0))
         return np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
 
-    monkeypatch.setattr(video, "frame_bgr", convert)
+    monkeypatch.setattr(decoded, "frame_bgr", convert)
     frames = list(open_camera(str(path)))
     assert [f.size_px for f in frames] == [SIZE_PX] * len(TIMES_MS) and not looked_at
     assert frames[2].image.shape == (*SIZE_PX[::-1], 3) and len(looked_at) == 1
