@@ -9,9 +9,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
+import functools
 import re
 import socket
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
@@ -361,12 +362,15 @@ def parse_baseline(value: float | str) -> tuple[Literal["auto", "metres", "frame
     return "metres", metres, 0
 
 
-def keys() -> Iterator[tuple[str, dataclasses.Field[Any]]]:
+@functools.cache
+def keys() -> tuple[tuple[str, dataclasses.Field[Any]], ...]:
     """(section, field) of every key, in the order of the file."""
-    for section in dataclasses.fields(Config):
-        kind = get_type_hints(Config)[section.name]
-        for field in dataclasses.fields(kind):
-            yield section.name, field
+    kinds = get_type_hints(Config)
+    return tuple(
+        (section.name, field)
+        for section in dataclasses.fields(Config)
+        for field in dataclasses.fields(kinds[section.name])
+    )
 
 
 def _read(path: Path) -> dict[str, Any]:

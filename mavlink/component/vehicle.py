@@ -87,12 +87,16 @@ class VehicleLink:
     """Start it, confirm health regularly, and read ``history``."""
 
     def __init__(
-        self, config: VehicleConfig, control: ScanControl, first: FirstBeats | None = None
+        self,
+        config: VehicleConfig,
+        control: ScanControl,
+        first: FirstBeats | None = None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """``first`` has opened the links of ``config`` already and sends heartbeats on them."""
-        self.config = config
+        self.config, self._clock_ns = config, clock_ns
         links = None if first is None else first.hand_over()
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock_ns()
         self.history = VehicleHistory(config.history, PATIENCE_S)
         self.recorder = TlogRecorder()
         key = None if config.signing_key is None else read_key(config.signing_key)
@@ -112,7 +116,7 @@ class VehicleLink:
             self.history,
             now_ns,
             self._memory.parameters,
-            lambda: (time.monotonic_ns() + self.unix_offset_ns()) // 1000,
+            lambda: (self._clock_ns() + self.unix_offset_ns()) // 1000,
         )
         self._inbox: LinkInbox[tuple[int, Packet, int]] = LinkInbox(BACKLOG)
         self._heard = set(HEARD)  # numbers of handled messages; others are ignored
@@ -152,7 +156,7 @@ class VehicleLink:
 
     def set_health(self, health: Health) -> None:
         """Confirm that the service lives; call it at least every second."""
-        self.presence.confirm(health, time.monotonic_ns())
+        self.presence.confirm(health, self._clock_ns())
 
     def set_load(self, load: ComputerLoad) -> None:
         """Set the companion's load, for the operator."""
@@ -223,7 +227,7 @@ class VehicleLink:
     @property
     def is_serving(self) -> bool:
         """True while the protocol's thread makes progress."""
-        return time.monotonic_ns() - self._alive_ns < STUCK_NS
+        return self._clock_ns() - self._alive_ns < STUCK_NS
 
     def report(self) -> VehicleReport:
         """A snapshot for health pages and ``doctor``."""
@@ -234,12 +238,12 @@ class VehicleLink:
             self.presence.system,
             self.presence.autopilot,
             self.presence.is_certain,
-            None if seen is None else (time.monotonic_ns() - seen) / S,
+            None if seen is None else (self._clock_ns() - seen) / S,
             self.presence.is_armed,
             None if round_trip is None else round_trip * 1e-6,
             0 if self._signing is None else self._signing.refused,
             self._inbox.dropped,
-            self._companion.watch.troubles(time.monotonic_ns()),
+            self._companion.watch.troubles(self._clock_ns()),
         )
 
     # Threads.
@@ -259,10 +263,10 @@ class VehicleLink:
     def _run(self) -> None:
         """The protocol's thread, the only one that uses the companion."""
         every_ns = SAVE_EVERY_NS if self._signing is None else SAVE_SIGNED_NS
-        save_ns = time.monotonic_ns() + every_ns
+        save_ns = self._clock_ns() + every_ns
         while not self._stop.is_set():
             self._serve(TICK_S)
-            now_ns = self._alive_ns = time.monotonic_ns()
+            now_ns = self._alive_ns = self._clock_ns()
             self._guard(partial(self._companion.tick, now_ns))
             self._send(self._companion.take())
             if now_ns >= save_ns or self._is_stale():
@@ -295,16 +299,16 @@ class VehicleLink:
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), BEAT_NICE)
         while not self._stop.is_set():
-            now_ns = time.monotonic_ns()
+            now_ns = self._clock_ns()
             due = self.presence.due(now_ns)
             if now_ns - self._alive_ns < STUCK_NS:  # otherwise nothing would answer: stay silent
                 self._send(due)
-            self._stop.wait(max(0.001, (self.presence.next_timer() - time.monotonic_ns()) / S))
+            self._stop.wait(max(0.001, (self.presence.next_timer() - self._clock_ns()) / S))
 
     def _send(self, messages: list[OutgoingMessage]) -> None:
         if not messages:
             return
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock_ns()
         for data in self._links.send(self.presence.system, messages):
             self.recorder.write(data, now_ns)
 

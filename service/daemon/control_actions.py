@@ -21,6 +21,7 @@ from mavlink.component.control import (
     Work,
 )
 from service.daemon.load_shedding import Level
+from service.daemon.scan_state import Event
 from service.daemon.scanning import Scanning
 from service.daemon.vehicle_config import with_parameter
 from service.errors import InputError, OutsideError, SkyreliefError
@@ -55,15 +56,17 @@ class ControlActions:
         """A snapshot for the operator."""
         scanning = self._scanning
         disk = shutil.disk_usage(existing(Path(scanning.config.scan.folder)))
-        scan = scanning.scan
+        run, scan = scanning.run, scanning.scan
         recorder = scan.recorder if scan is not None else None
         latency = scan.check.latency if scan is not None else None
         phase = scanning.phase
-        recording = phase in (Phase.SCANNING, Phase.PAUSED)
+        recording_s = 0.0
+        if run is not None and phase in (Phase.SCANNING, Phase.PAUSED):
+            recording_s = time.monotonic() - run.started_s
         return ScanStatus(
             phase=phase,
             scan_id=scanning.scan_id,
-            recording_ms=int(1e3 * (time.monotonic() - scanning.started_s)) if recording else 0,
+            recording_ms=int(1e3 * recording_s),
             storage_total_mib=disk.total / 2**20,
             storage_free_mib=disk.free / 2**20,
             speed_m_s=recorder.speed_m_s if recorder is not None else math.nan,
@@ -89,7 +92,7 @@ class ControlActions:
         """Start a scan, once a scan that is being closed permits it."""
         if not self.is_ready:
             return Answer(Result.TEMPORARILY_REJECTED, "still starting")
-        is_closing = self._scanning.is_closing
+        is_closing = self._scanning.life.state.is_closing
         self._scanning.start()
         if is_closing:
             return Answer(text="Scan starts when the previous one is closed")
@@ -97,7 +100,7 @@ class ControlActions:
 
     def stop_scan(self) -> Answer:
         """Close the running scan and drop retries; its files are written after the answer."""
-        self._scanning.stop()
+        self._scanning.handle(Event.STOP)
         return ACCEPTED
 
     def finalise(self) -> Handled:
@@ -106,19 +109,19 @@ class ControlActions:
 
     def pause(self) -> Handled:
         """Take no frames until :meth:`resume`."""
-        is_paused = self._scanning.pause()
-        return ACCEPTED if is_paused else Answer(Result.DENIED, "no scan is running")
+        is_wanted = self._scanning.handle(Event.PAUSE).is_wanted
+        return ACCEPTED if is_wanted else Answer(Result.DENIED, "no scan is running")
 
     def resume(self) -> Handled:
         """Take frames again after a pause."""
-        is_resumed = self._scanning.resume()
-        return ACCEPTED if is_resumed else Answer(Result.DENIED, "the scan is not paused")
+        was_paused = self._scanning.handle(Event.RESUME).is_paused
+        return ACCEPTED if was_paused else Answer(Result.DENIED, "the scan is not paused")
 
     def capture_keyframe(self) -> Handled:
         """Take the next frame as a photo; refused while no scan takes frames."""
         scan, phase = self._scanning.scan, self._scanning.phase
         if phase is not Phase.SCANNING:
-            why = NO_PHOTO[Phase.FINALISING if self._scanning.is_closing else phase]
+            why = NO_PHOTO[Phase.FINALISING if self._scanning.life.state.is_closing else phase]
             return Answer(Result.TEMPORARILY_REJECTED, f"photo refused: {why}")
         if scan is None:
             return Answer(Result.TEMPORARILY_REJECTED, "photo refused: the camera is being opened")
@@ -158,7 +161,8 @@ class ControlActions:
     def parameter_changed(self, name: str, value: float) -> Answer:
         """Apply a new value of a parameter, or refuse it with the reason."""
         try:
-            self._scanning.follow(with_parameter(self._scanning.config, name, value))
+            config = with_parameter(self._scanning.config, name, value)
+            self._scanning.follow(config, self._scanning.level)
         except InputError as error:
             return Answer(Result.DENIED, str(error))
         return ACCEPTED

@@ -2,28 +2,15 @@
 
 :class:`Ladder` turns readings into steps: no clock, no file, no thread. It steps down quickly, one
 step at a time with time to take effect; up slowly, and more slowly when the last step up failed.
-:class:`LoadControl` measures the load of the running scan, queries the ladder, applies its steps
-and reports them.
 """
 
 from __future__ import annotations
 
-import logging
 import math
-import time
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
 
-from mavlink.component.control import Phase
-from mavlink.component.status import CRITICAL, INFO, WARNING
 from service.config import ComputeConfig
-from service.daemon.machine import Machine
-
-if TYPE_CHECKING:
-    from service.daemon.scanning import Scanning
-
-log = logging.getLogger(__name__)
 
 STRIDE = 2
 """From LOWER_RATE on, one of this many frames is tracked."""
@@ -78,6 +65,7 @@ class LadderConfig:
     heat_patience_s: float = 20.0  # the same for heat: cooling is slow
     calm_s: float = 30.0  # without overload before a step up; doubled when that failed
     longest_calm_s: float = 240.0
+    relief: bool = True  # False: always FULL
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +107,9 @@ class Ladder:
 
     def update(self, readings: MachineReadings, now_s: float) -> Move | None:
         """The step to take at ``now_s`` of a monotonic clock, if any."""
+        if not self.config.relief:
+            self.level, self.reason = Level.FULL, ""
+            return None
         found = strain(readings, self.config)
         if found is not None:
             self._calm_since_s = math.nan
@@ -222,89 +213,8 @@ def lowered(compute: ComputeConfig, level: Level) -> ComputeConfig:
     return compute
 
 
-class LoadControl:
-    """The ladder of a scanning service; call :meth:`look` every few seconds."""
-
-    def __init__(self, scanning: Scanning) -> None:
-        self._scanning = scanning
-        self._ladder = Ladder(_ladder_config(scanning.config.compute))
-        self._counted: tuple[str, int, int, int, int] = ("", 0, 0, 0, 0)
-        self._reported_failure = ""
-        self.readings = MachineReadings()
-
-    def look(self, machine: Machine, now_s: float | None = None) -> Move | None:
-        """Measure, and take the resulting step."""
-        now_s = time.monotonic() if now_s is None else now_s
-        compute = self._scanning.config.compute
-        self._ladder.config = _ladder_config(compute)
-        self._report_failure()
-        if not compute.relief:
-            self._set(Level.FULL)
-            return None
-        self.readings = self._measure(machine, now_s)
-        move = self._ladder.update(self.readings, now_s)
-        if move is not None:
-            self._set(move.level)
-            log.log(logging.WARNING if move.reason else logging.INFO, "%s", move.text)
-            self._scanning.vehicle.statustext(move.text, WARNING if move.reason else INFO)
-        return move
-
-    def to_dict(self) -> dict[str, Any]:
-        """Level, its name and reason, and the counts of this scan, for the health page."""
-        gate, scan = self._scanning.gate, self._scanning.scan
-        figures: dict[str, Any] = {
-            "level": int(self._scanning.level),
-            "name": self._scanning.level.label,
-            "reason": self._ladder.reason,
-        }
-        if gate is not None and scan is not None:
-            figures |= {
-                "frame_age_s": round(gate.age_s, 3),
-                "frames_late": gate.late,
-                "views_late": scan.pipeline.dropped,
-                "pictures_kept": gate.kept,
-                "pictures_lost": gate.lost,
-            }
-        return figures
-
-    def _set(self, level: Level) -> None:
-        self._ladder.level = level
-        if level is Level.FULL:
-            self._ladder.reason = ""
-        if self._scanning.level is not level:
-            self._scanning.set_level(level)
-
-    def _measure(self, machine: Machine, now_s: float) -> MachineReadings:
-        """Measure heat and memory; for a running scan also lag since the last check."""
-        fixed = MachineReadings(
-            temperature_c=machine.temperature_c,
-            throttled=machine.throttled,
-            memory_free_mib=machine.memory_left_mib,
-        )
-        scan, gate = self._scanning.scan, self._scanning.gate
-        if scan is None or gate is None or self._scanning.phase is not Phase.SCANNING:
-            return fixed
-        made, dropped = scan.recorder.keyframes, scan.pipeline.dropped
-        counted = (scan.inputs.scan_id, made, dropped, gate.frames, gate.late)
-        before = self._counted if self._counted[0] == counted[0] else (counted[0], 0, 0, 0, 0)
-        self._counted = counted
-        if now_s - self._scanning.started_s < GRACE_S:
-            return fixed
-        made, dropped = made - before[1], dropped - before[2]
-        taken, late = gate.frames - before[3], gate.late - before[4]
-        age_s = gate.age_s if taken else 0.0
-        return replace(
-            fixed, views=made + dropped, late_views=dropped, frames=taken + late, late_frames=late,
-            age_s=age_s,
-        )  # fmt: skip
-
-    def _report_failure(self) -> None:
-        """Report once that the device has failed and the CPU has replaced it."""
-        failure = self._scanning.backend_failure
-        if failure and failure != self._reported_failure:
-            self._scanning.vehicle.statustext(f"Compute device failed: {failure}", CRITICAL)
-        self._reported_failure = failure
-
-
-def _ladder_config(compute: ComputeConfig) -> LadderConfig:
-    return LadderConfig(hottest_c=compute.hottest_c, min_memory_mib=compute.least_memory_mib)
+def ladder_config(compute: ComputeConfig) -> LadderConfig:
+    """The operator's limits."""
+    return LadderConfig(
+        hottest_c=compute.hottest_c, min_memory_mib=compute.least_memory_mib, relief=compute.relief
+    )

@@ -1,7 +1,7 @@
 """The life of the onboard service: heartbeats first, then the heavy imports, then scans.
 
 MAVLink starts first and on its own threads, so that its heartbeat does not wait for the heavy
-imports; the scan runs on one worker thread (:mod:`service.daemon.scanning`).
+imports; the scan runs on one worker thread (:mod:`service.daemon.scan_run`).
 """
 
 from __future__ import annotations
@@ -11,21 +11,22 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from mavlink.component.control import Phase
 from mavlink.component.presence import RECENT_NS, Health
-from mavlink.component.status import CRITICAL, NOTICE, WARNING
+from mavlink.component.status import CRITICAL, INFO, NOTICE, WARNING
 from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.first_beat import FirstBeats
 from service.config import Config, reload
 from service.daemon.control_actions import ControlActions
 from service.daemon.health import HealthServer
-from service.daemon.intent import Landing, LandingWatch
-from service.daemon.load_shedding import LoadControl
-from service.daemon.machine import CoreLoad, computer_load, read_machine
+from service.daemon.load_shedding import Ladder, MachineReadings, ladder_config
+from service.daemon.machine import CoreLoad, Machine, computer_load, read_machine
+from service.daemon.resumption import Landing, LandingWatch
+from service.daemon.scan_state import Event, State
 from service.daemon.scanning import Scanning
 from service.daemon.vehicle_config import TUNABLES, parameters_of, vehicle_config
 from service.errors import InputError, OutsideError, SkyreliefError
@@ -83,7 +84,8 @@ class Daemon:
         self._cores = CoreLoad()
         self._is_silent = False  # no images arrive, and that was reported
         self.scanning = scanning or Scanning(config)
-        self.load_control = LoadControl(self.scanning)
+        self.ladder = Ladder()
+        self._reported_failure = ""  # of the compute device
         self.actions = ControlActions(self.scanning, self.quit)
         self.vehicle = link(vehicle_config(config), self.actions, first)
         self.scanning.vehicle = self.vehicle
@@ -101,7 +103,7 @@ class Daemon:
         http = self._serve_health()
         try:
             if self.config.scan.start == "on-boot":
-                self.scanning.want()  # a stop before it is ready still counts
+                self.scanning.handle(Event.START)  # a stop before it is ready still counts
             self._load(notifier)
             self.actions.is_ready = True
             notifier.ready()
@@ -142,13 +144,13 @@ class Daemon:
                 notifier.alive(self.scanning.phase.value)
 
     def look(self) -> None:
-        """Report to the operator, and follow the vehicle and the intent."""
+        """Report to the operator, and follow the vehicle and the time."""
         self.vehicle.set_health(self._health())
         self._follow_arming()
         self._resume()
         self._report_camera()
         self._close_after_landing()
-        self.scanning.follow_intent()
+        self.scanning.handle(Event.TICK)
 
     def _wait_for_closing(self, notifier: Notifier) -> None:
         """Report once a second that the last scan is being closed, unless that hangs."""
@@ -167,8 +169,9 @@ class Daemon:
     def is_progressing(self) -> bool:
         """False for a hang that only a restart ends; a silent camera is not one."""
         max_s = HUNG_S if self.scanning.is_warm else COMPILING_S
+        run = self.scanning.run
         return (
-            self.scanning.busy_s < max_s
+            (run is None or run.busy_s < max_s)
             and self.scanning.idle_closing_s < self._max_closing_s
             and self.vehicle.is_serving
         )
@@ -191,7 +194,7 @@ class Daemon:
         """The service's state, for /status and /metrics."""
         health, status = self._health(), self.actions.status()
         figures = {"speed_m_s": status.speed_m_s, "distance_m": status.distance_m}
-        scan = self.scanning.scan
+        run, scan, backend = self.scanning.run, self.scanning.scan, self.scanning.backend
         if scan is not None:
             figures |= {
                 "frames": scan.recorder.frames,
@@ -207,9 +210,14 @@ class Daemon:
             "software": software(),
             "scan": status.scan_id,
             "recording_s": status.recording_ms / 1e3,
-            "backend": self.scanning.backend_name,
-            "backend_failure": self.scanning.backend_failure,
-            "load": self.load_control.to_dict(),
+            "backend": "" if backend is None else backend.name,
+            "backend_failure": self._backend_failure(),
+            "load": {
+                "level": int(self.ladder.level),
+                "name": self.ladder.level.label,
+                "reason": self.ladder.reason,
+            }
+            | ({} if run is None else run.lag_figures()),
             "mavlink": self._mavlink(),
             "machine": read_machine(Path(self.config.scan.folder)).to_dict(),
             "workers": running(),
@@ -235,7 +243,7 @@ class Daemon:
         """Apply the live keys of ``wanted``; the others wait for a restart."""
         config, taken, waiting = reload(self.config, wanted, self._wanted)
         self._wanted = wanted
-        self.scanning.follow(config)
+        self.scanning.follow(config, self.scanning.level)
         tuned = parameters_of(config).items()
         self.vehicle.show_parameters({n: v for n, v in tuned if TUNABLES[n].key in taken})
         log.info("configuration: now in force: %s", ", ".join(taken) or "nothing new")
@@ -258,9 +266,44 @@ class Daemon:
         folder, keep_free_mib = Path(self.config.scan.folder), self.config.scan.keep_free_mib
         machine = read_machine(folder)
         self.vehicle.set_load(computer_load(machine, self._cores.percent(), keep_free_mib))
-        self.load_control.look(machine)
+        self.shed_load(machine)
         make_room(folder, keep_free_mib, self.scanning.in_the_making)
         give_back()
+
+    def shed_load(self, machine: Machine, now_s: float | None = None) -> None:
+        """Take the step of the load ladder that heat, memory and the scan's lag ask for."""
+        scanning, ladder = self.scanning, self.ladder
+        self._report_device()
+        run = scanning.run if scanning.life.state is State.SCANNING else None
+        readings = replace(
+            MachineReadings() if run is None else run.lag(),
+            temperature_c=machine.temperature_c,
+            throttled=machine.throttled,
+            memory_free_mib=machine.memory_left_mib,
+        )
+        ladder.config = ladder_config(self.config.compute)
+        move = ladder.update(readings, time.monotonic() if now_s is None else now_s)
+        if scanning.level is not ladder.level:
+            scanning.follow(self.config, ladder.level)
+        if move is not None:
+            log.log(logging.WARNING if move.reason else logging.INFO, "%s", move.text)
+            self.vehicle.statustext(move.text, WARNING if move.reason else INFO)
+
+    def _backend_failure(self) -> str:
+        """Why the CPU replaced the chosen backend; empty when it did not."""
+        if self.scanning.backend is None:
+            return ""
+        from service.compute.backend_choice import FallbackBackend
+
+        backend = self.scanning.backend
+        return (isinstance(backend, FallbackBackend) and backend.failure) or ""
+
+    def _report_device(self) -> None:
+        """Report once that the device has failed and the CPU has replaced it."""
+        failure = self._backend_failure()
+        if failure and failure != self._reported_failure:
+            self.vehicle.statustext(f"Compute device failed: {failure}", CRITICAL)
+        self._reported_failure = failure
 
     def _health(self) -> Health:
         if self.scanning.fault:
@@ -273,8 +316,10 @@ class Daemon:
 
     def _report_camera(self) -> None:
         """Report why the scan does not grow, and when it does again."""
-        for text in self.scanning.camera_news():
-            self.vehicle.statustext(f"Camera: {text}", WARNING)
+        run = self.scanning.run
+        if run is not None and not self.scanning.life.state.is_closing:
+            for text in run.camera_news():
+                self.vehicle.statustext(f"Camera: {text}", WARNING)
         was_silent, self._is_silent = self._is_silent, self.scanning.silent_s > STUCK_S
         if self._is_silent and not was_silent:
             self.vehicle.statustext(f"No images for {STUCK_S:.0f} s: nothing is scanned", CRITICAL)
@@ -304,7 +349,7 @@ class Daemon:
         """Close a commanded scan after landing: the stop command may have been lost."""
         scan, presence, now_ns = self.config.scan, self.vehicle.presence, self._clock_ns()
         landing = self._landing.look(
-            self.scanning.intent.wants_scan and scan.start == "on-command",
+            self.scanning.life.state.is_wanted and scan.start == "on-command",
             presence.is_armed,
             presence.is_disarmed(now_ns - RECENT_NS),
             scan.close_after_landing_s,

@@ -7,7 +7,7 @@ import os
 import threading
 import time
 from contextlib import ExitStack, closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,8 @@ from mavlink.component.camera import KeyframeReport
 from mavlink.component.status import WARNING
 from mavlink.telemetry.clock import agree, computer_offset_ns
 from service.config import Config, change
-from service.daemon.intent import FIRST_RETRY_S, LAST_RETRY_S
+from service.daemon.load_shedding import GRACE_S, Level, MachineReadings, lowered
+from service.daemon.scan_state import FIRST_RETRY_S, LAST_RETRY_S, Event
 from service.errors import OutsideError
 
 if TYPE_CHECKING:
@@ -23,10 +24,11 @@ if TYPE_CHECKING:
 
     from mavlink.component.vehicle import VehicleLink
     from mavlink.telemetry.samples import VehicleState
-    from recon.types import Keyframe
+    from recon.backends import Backend
+    from recon.types import Camera, Keyframe
     from service.cameras.source import CameraSource
     from service.daemon.frame_gate import FrameGate
-    from service.daemon.scanning import Scanning
+    from service.flight.datalink import DaemonLink
     from service.flight.pipeline import Step
     from service.flight.scan import Photo, Scan, ScanInputs
     from service.stream.store import ScanStore
@@ -37,39 +39,53 @@ LATER, PHOTOS = "later", "photos"
 """Subfolders of a scan: images that are only stored, and those that operators asked for."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Equipment:
+    """What an attempt at a scan works with."""
+
+    config: Config
+    vehicle: VehicleLink
+    link: DaemonLink
+    camera: Camera | None  # the model; None before it is loaded
+    backend: Backend | None  # None before it is loaded
+    level: Level
+    paused: threading.Event  # set while no frames are taken
+    made: set[str]  # names of the scans of this process, each from before its store exists
+    report: Callable[[Event], object]  # events of this attempt
+    write_files: Callable[[Path, ScanStore], None]  # of a closed scan
+
+
 class ScanRun:
     """One attempt at a scan, from opening the camera until its files are written."""
 
     def __init__(
         self,
-        host: Scanning,
+        equipment: Equipment,
         is_asked: bool,
         opener: Callable[[str], CameraSource] | None = None,
+        clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """``is_asked``: a command waits for this attempt; it is not a retry. ``opener`` opens
         the camera (default: :func:`service.cameras.open_camera`)."""
         self.stop = threading.Event()
         self.scan: Scan | None = None
         self.gate: FrameGate | None = None
-        self.is_feeding = False  # frames go into the scan
-        self.is_closing = False
-        self.started_s = self.progress_s = time.monotonic()
-        self._host, self._is_asked, self._opener = host, is_asked, opener
         self.store: ScanStore | None = None
         self.thread_id = 0
+        self.started_s = self.progress_s = clock_s()
+        self._with, self._is_asked, self._opener = equipment, is_asked, opener
+        self._config, self._level, self._clock_s = equipment.config, equipment.level, clock_s
+        self._is_feeding = False  # frames go into the scan
+        self._has_grown = False
+        self._counted = MachineReadings()
         self._news_reported = 0  # camera warnings reported so far
         self._photos: set[int] = set()  # times of the frames that were reported as photos
-
-    @property
-    def is_ending(self) -> bool:
-        """True once the scan was stopped or is being closed."""
-        return self.stop.is_set() or self.is_closing
 
     @property
     def busy_s(self) -> float:
         """Seconds spent on the current frame or view; 0 while waiting for the camera."""
         scan, gate = self.scan, self.gate
-        if scan is None or gate is None or not self.is_feeding:
+        if scan is None or gate is None or not self._is_feeding:
             return 0.0
         return max(gate.busy_s, scan.pipeline.busy_s)
 
@@ -81,14 +97,12 @@ class ScanRun:
 
     def alive(self) -> None:
         """Note that a frame was processed."""
-        self.progress_s = time.monotonic()
+        self.progress_s = self._clock_s()
 
     def camera_news(self) -> list[str]:
         """Camera warnings since the last call."""
         gate = self.gate
-        if gate is None or self.is_ending:
-            return []
-        fresh = gate.warnings[self._news_reported :]
+        fresh = [] if gate is None else gate.warnings[self._news_reported :]
         self._news_reported += len(fresh)
         return fresh
 
@@ -96,8 +110,50 @@ class ScanRun:
         """Values that change when closing makes progress: uses of the store, keyframes."""
         scan, store = self.scan, self.store
         if scan is None or store is None:
-            return (self.is_closing,)
-        return (self.is_closing, store.uses(self.thread_id), scan.recorder.keyframes)
+            return ()
+        return (store.uses(self.thread_id), scan.recorder.keyframes)
+
+    def follow(self, config: Config, level: Level) -> None:
+        """Use the live keys of ``config``, reduced to a load level."""
+        self._config, self._level = config, level
+        scan, gate = self.scan, self.gate
+        if scan is not None and gate is not None:
+            scan.pipeline.set_baseline(config.scan)
+            scan.check.set_camera(config.camera)
+            scan.pipeline.set_effort(lowered(config.compute, level))
+            gate.level = level
+
+    def lag(self) -> MachineReadings:
+        """Views and frames since the last call, and how late they were; none at the start."""
+        scan, gate = self.scan, self.gate
+        if scan is None or gate is None:
+            return MachineReadings()
+        before, dropped = self._counted, scan.pipeline.dropped
+        views, frames = scan.recorder.keyframes + dropped, gate.frames + gate.late
+        self._counted = now = MachineReadings(views, dropped, frames, gate.late, gate.age_s)
+        if self._clock_s() - self.started_s < GRACE_S:
+            return MachineReadings()
+        taken = gate.frames - (before.frames - before.late_frames)
+        return MachineReadings(
+            now.views - before.views,
+            now.late_views - before.late_views,
+            now.frames - before.frames,
+            now.late_frames - before.late_frames,
+            now.age_s if taken else 0.0,
+        )
+
+    def lag_figures(self) -> dict[str, float]:
+        """Counts of late frames and views, and of images that were only stored."""
+        scan, gate = self.scan, self.gate
+        if scan is None or gate is None:
+            return {}
+        return {
+            "frame_age_s": round(gate.age_s, 3),
+            "frames_late": gate.late,
+            "views_late": scan.pipeline.dropped,
+            "pictures_kept": gate.kept,
+            "pictures_lost": gate.lost,
+        }
 
     # ---- on the scan's thread ----------------------------------------------------------------
 
@@ -110,7 +166,6 @@ class ScanRun:
                 with closing(source):
                     self._scan(source)
         finally:
-            self.is_closing = True
             self.scan = self.gate = self.store = None
 
     def _open_camera(self) -> CameraSource | None:
@@ -121,12 +176,12 @@ class ScanRun:
         wait_s, is_answer = FIRST_RETRY_S, self._is_asked
         while not self.stop.is_set():
             try:
-                source = (self._opener or open_camera)(self._host.config.camera.source)
+                source = (self._opener or open_camera)(self._config.camera.source)
                 return source if isinstance(source, Paced) else Paced(source)
             except OutsideError as error:
                 log.warning("%s; retry in %.1f s", error, wait_s)
                 text = f"Camera: {error}"
-                self._host.vehicle.statustext(text, WARNING, is_answer=is_answer)
+                self._with.vehicle.statustext(text, WARNING, is_answer=is_answer)
                 is_answer = False
                 self.stop.wait(wait_s)
                 wait_s = min(2 * wait_s, LAST_RETRY_S)
@@ -135,31 +190,29 @@ class ScanRun:
     def _scan(self, source: CameraSource) -> None:
         from service.flight.scan import Scan, create_store
 
-        host = self._host
+        vehicle, link = self._with.vehicle, self._with.link
         inputs, gate = self._inputs(source)
         store = create_store(inputs)
-        for text in inputs.notes:
-            host.vehicle.statustext(text, WARNING)
-        for text in disagreement(inputs.unix_offset_ns):
-            gate.warnings.append(text)
-            host.vehicle.statustext(text, WARNING)
+        clocks = disagreement(inputs.unix_offset_ns)
+        gate.warnings += clocks
+        for text in (*inputs.notes, *clocks):
+            vehicle.statustext(text, WARNING)
         self._news_reported = len(gate.warnings)
-        host.vehicle.record(inputs.folder / "link.tlog", inputs.unix_offset_ns)
-        host.link.take_off(store, host.config, host.vehicle)
+        vehicle.record(inputs.folder / "link.tlog", inputs.unix_offset_ns)
+        link.take_off(store, self._config, vehicle)
         self.store, self.gate, self.scan = store, gate, Scan(inputs, store)
-        host.set_level(host.level)
-        host.vehicle.statustext(f"Scan {inputs.scan_id} started")
+        self.follow(self._config, self._level)
+        vehicle.statustext(f"Scan {inputs.scan_id} started")
         try:
             self._feed(self.scan)
         finally:
             source.close()
-            self.is_closing = True
-            host.vehicle.record(None)
+            vehicle.record(None)
             try:
-                gate.warnings += set_since(inputs.unix_offset_ns, host.vehicle.unix_offset_ns())
+                gate.warnings += set_since(inputs.unix_offset_ns, vehicle.unix_offset_ns())
                 self._close_scan(self.scan, store)
             finally:
-                host.write_files(inputs.folder, store)
+                self._with.write_files(inputs.folder, store)
 
     def _inputs(self, source: CameraSource) -> tuple[ScanInputs, FrameGate]:
         """Inputs of the scan, with its camera behind a gate."""
@@ -169,29 +222,26 @@ class ScanRun:
         from service.daemon.frame_gate import FrameGate
         from service.flight.scan import ScanInputs
 
-        host, vehicle = self._host, self._host.vehicle
-        model, backend = host.equipment()
-        camera, notes = fitted(model, source)
-        config = host.config
-        earlier = measured(Path(host.config.scan.folder), source.description, source.size_px)
+        vehicle, config, backend = self._with.vehicle, self._config, self._with.backend
+        assert self._with.camera is not None and backend is not None
+        camera, notes = fitted(self._with.camera, source)
+        scans = Path(config.scan.folder)
+        earlier = measured(scans, source.description, source.size_px)
         if earlier.shutter is not None and seeks_readout(camera, config.camera):
             camera = replace(camera, shutter=earlier.shutter)
             config = change(config, "camera.readout_ms", "auto")  # sought on from there
         zero_ns, offset_ns = _zero_ns(source), vehicle.unix_offset_ns()
         unix_s = 1e-9 * (time.monotonic_ns() + offset_ns)
-        folder = new_folder(Path(host.config.scan.folder), unix_s)
-        scan_id = folder.name
-        host.made.add(scan_id)
-        gate = FrameGate(
-            source, folder / LATER, zero_ns + offset_ns, self.alive, host.intent.paused
-        )
+        folder = new_folder(scans, unix_s)
+        self._with.made.add(folder.name)
+        gate = FrameGate(source, folder / LATER, zero_ns + offset_ns, self.alive, self._with.paused)
         inputs = ScanInputs(
             gate,
             camera,
             config,
             backend,
             folder,
-            scan_id,
+            folder.name,
             zero_ns,
             unix_offset_ns=offset_ns,
             notes=tuple(notes),
@@ -200,7 +250,7 @@ class ScanRun:
             extra={"backend": backend.name, "source": source.description},
             latency_ms=earlier.latency_ms,
             warn=lambda text: vehicle.statustext(text, WARNING),
-            on_step=odometry_reporter(host.config, vehicle),
+            on_step=odometry_reporter(config, vehicle),
             on_keyframe=self._on_keyframe,
             on_photo=self._on_photo,
         )
@@ -208,12 +258,13 @@ class ScanRun:
 
     def _feed(self, scan: Scan) -> None:
         """Feed frames into the scan until it is stopped or the recording ends."""
-        self.is_feeding = True
+        event, self._is_feeding = Event.INTERRUPTED, True
         try:
-            scan.run(self.stop, self._on_frame, self._host.intent.paused)
+            scan.run(self.stop, self._on_frame, self._with.paused)
+            event = Event.COMPLETED
         finally:
-            self.is_feeding = False
-        self._host.fulfilled(self)
+            self._is_feeding = False
+            self._with.report(event)
 
     def _close_scan(self, scan: Scan, store: ScanStore) -> None:
         """Finish the scan; if the pipeline fails, mark the stored part as interrupted."""
@@ -221,27 +272,26 @@ class ScanRun:
             on_fault.callback(store.finish, {"interrupted": True})
             summary = scan.close()
             on_fault.pop_all()
-        self._host.vehicle.statustext(
+        self._with.vehicle.statustext(
             f"Scan {scan.inputs.scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
         )
 
     def _on_frame(self, scan: Scan) -> None:
         self.alive()
-        if scan.recorder.keyframes:
-            self._host.intent.succeeded()
-        if scan.recorder.keyframes > 1:
-            self._host.is_warm = True
+        if scan.recorder.keyframes > 1 and not self._has_grown:
+            self._has_grown = True
+            self._with.report(Event.GROWN)
 
     def _on_keyframe(self, keyframe: Keyframe) -> None:
         scan = self.scan
         if scan is not None and keyframe.time_ns not in self._photos:
-            report_keyframe(self._host.vehicle, scan, keyframe)
+            report_keyframe(self._with.vehicle, scan, keyframe)
 
     def _on_photo(self, photo: Photo) -> None:
         scan = self.scan
         if scan is not None:
             self._photos.add(photo.time_ns)
-            report_photo(self._host.vehicle, scan, photo)
+            report_photo(self._with.vehicle, scan, photo)
 
 
 def new_folder(scans: Path, unix_s: float) -> Path:

@@ -136,8 +136,9 @@ def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
     service.start()
 
     def progress() -> tuple[object, ...]:
+        run = daemon.scanning.run
         heard = (len(autopilot.of(kind)) for kind in ("COMMAND_ACK", "ODOMETRY", "STATUSTEXT"))
-        return (*heard, daemon.scanning.phase, daemon.scanning.progress_s)
+        return (*heard, daemon.scanning.phase, run and run.progress_s)
 
     def come(done: Callable[[], Any]) -> None:
         until(done, 120.0, progress)  # without a sign of life: kernels may have to be compiled
@@ -152,7 +153,7 @@ def test_a_flight_by_mavlink(tmp_path: Path, autopilot: Autopilot) -> None:
         come(lambda: len(autopilot.of("CAMERA_IMAGE_CAPTURED")) >= 4)
         come(lambda: any(m.file_url for m in autopilot.of("CAMERA_IMAGE_CAPTURED")))
         autopilot.order(2501, 100)
-        come(lambda: not daemon.scanning.is_running)
+        come(lambda: daemon.scanning.run is None)
     finally:
         daemon.quit()
         service.join(timeout=240)

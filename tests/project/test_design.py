@@ -7,6 +7,7 @@ import re
 
 from paths import ROOT
 
+from service.daemon.scan_state import TRANSITIONS
 from service.workers import ROWS
 
 TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
@@ -23,6 +24,14 @@ def test_the_table_of_workers_is_the_code_s() -> None:
         deadline = "" if worker.deadline_s is None else f"{worker.deadline_s:g} s"
         restarts = "yes" if worker.restarts else ""
         table.append(row(str(worker.stop), worker.name, queue, deadline, restarts, worker.does))
+    assert "```text\n" + "\n".join(table) + "\n```" in TEXT
+
+
+def test_the_table_of_a_scan_s_states_is_the_code_s() -> None:
+    table = [f"{'state':<17} {'operator sees':<14} event > next state"]
+    for state, row in TRANSITIONS.items():
+        events = ", ".join(f"{event.value} > {after.value}" for event, after in row.items())
+        table.append(f"{state.value:<17} {state.phase.value:<14} {events}".rstrip())
     assert "```text\n" + "\n".join(table) + "\n```" in TEXT
 
 

@@ -21,9 +21,9 @@ from recon.types import Camera
 from service.cameras.camera_file import load_camera
 from service.cameras.source import CameraFrame, CameraSource
 from service.config import Config, load_config
-from service.daemon.intent import Intent
 from service.daemon.runtime import Daemon
-from service.daemon.scan_run import ScanRun
+from service.daemon.scan_run import Equipment, ScanRun
+from service.daemon.scan_state import ScanLife
 from service.daemon.scanning import Scanning
 from service.flight.scan import Scan, ScanInputs, create_store
 
@@ -75,8 +75,8 @@ class FakeCamera:
 class Scripted(ScanRun):
     """An attempt that does what a test says."""
 
-    def __init__(self, script: Callable[[ScanRun], object], host: Scanning, is_asked: bool) -> None:
-        super().__init__(host, is_asked)
+    def __init__(self, script: Callable[[ScanRun], object], *given: Any, **seams: Any) -> None:
+        super().__init__(*given, **seams)
         self._script = script
 
     def carry_out(self) -> None:
@@ -104,12 +104,14 @@ class Onboard(Daemon):
         outer: dict[str, Any] = {"link": HeardVehicle}
         outer |= {key: seams.pop(key) for key in ("clock_ns", "link") if key in seams}
 
-        def attempt(host: Scanning, is_asked: bool) -> ScanRun:
-            if script is None:
-                return ScanRun(host, is_asked, opener)
-            return Scripted(script, host, is_asked)
+        clock_s = seams.get("clock_s", time.monotonic)
 
-        inner: dict[str, Any] = {"attempt": attempt, "intent": Intent(0.0, 0.0)} | seams
+        def attempt(equipment: Equipment, is_asked: bool) -> ScanRun:
+            if script is None:
+                return ScanRun(equipment, is_asked, opener, clock_s)
+            return Scripted(script, equipment, is_asked, clock_s=clock_s)
+
+        inner: dict[str, Any] = {"attempt": attempt, "life": ScanLife(0.0, 0.0)} | seams
         super().__init__(config, scanning=of(config, **inner), **outer)
 
     def equip(self) -> None:

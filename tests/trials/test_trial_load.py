@@ -231,7 +231,7 @@ def test_gpu_out_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reco
         if daemon.snapshot()["backend"] == "cpu":
             break
     back_s = time.monotonic() - start
-    daemon.load_control.look(read_machine(Path("/")))
+    daemon.shed_load(read_machine(Path("/")))
     assert daemon.snapshot()["backend"] == "cpu"
     daemon.scanning.end()
     record("GPU out of memory (simulated)", 1, "the same scan continues on the CPU", "-", back_s)

@@ -38,8 +38,8 @@ from trial_rig import (
 )
 
 from mavlink.component.control import Phase, Result
-from service.daemon.intent import Intent
 from service.daemon.scan_run import ScanRun
+from service.daemon.scan_state import Event, ScanLife
 from service.errors import OutsideError
 from service.stream.store import ScanStore
 
@@ -367,18 +367,18 @@ def test_a_scan_that_fails_is_started_again(tmp_path: Path, record: Row) -> None
         scanning.append(daemon.scanning.phase)
         run.stop.wait(PATIENCE_S)
 
-    daemon = Onboard(tmp_path, script=carry_out, intent=Intent(0.01))
+    daemon = Onboard(tmp_path, script=carry_out, life=ScanLife(0.01))
     daemon.actions.is_ready = True
     daemon.actions.start_scan()
     deadline = time.monotonic() + PATIENCE_S
     while not scanning and time.monotonic() < deadline:
-        daemon.scanning.follow_intent()
+        daemon.scanning.handle(Event.TICK)
         time.sleep(0.005)
     assert scanning == [Phase.SCANNING]
     assert daemon.scanning.fault == ""
     daemon.actions.stop_scan()
     daemon.scanning.end()
-    daemon.scanning.follow_intent()
+    daemon.scanning.handle(Event.TICK)
     assert daemon.scanning.phase is Phase.IDLE  # stopped by the operator: it stays so
     record("faults of camera, disk and our own code", tried, "scanning again each time")
 
@@ -390,10 +390,10 @@ def test_stopping_ends_the_retries(tmp_path: Path) -> None:
     daemon = Onboard(tmp_path, script=carry_out)
     daemon.actions.is_ready = True
     assert daemon.actions.start_scan().result is Result.ACCEPTED
-    assert until(lambda: not daemon.scanning.is_running, 30.0)
+    assert until(lambda: daemon.scanning.run is None, 30.0)
     assert daemon.scanning.fault == "camera gone"
-    assert daemon.scanning.intent.wants_scan  # waits to try again
+    assert daemon.scanning.life.state.is_wanted  # waits to try again
     daemon.actions.stop_scan()
-    daemon.scanning.follow_intent()
+    daemon.scanning.handle(Event.TICK)
     assert daemon.scanning.phase is Phase.IDLE
     assert daemon.scanning.fault == "camera gone"

@@ -16,6 +16,7 @@ from paths import ROOT
 from mavlink.component.control import Phase
 from service.daemon import runtime
 from service.daemon.scan_run import ScanRun
+from service.daemon.scan_state import Event
 from service.daemon.writing import ClosingWatch, sizes
 from service.memory import give_back, one_pool
 
@@ -52,13 +53,13 @@ class Hung:
     def __init__(self, folder: Path) -> None:
         self.scan = real_scan(folder / "s")
         self.store = self.scan.store
-        self.step, self.end = threading.Event(), threading.Event()
+        self.closing, self.step, self.end = threading.Event(), threading.Event(), threading.Event()
 
     def __call__(self, run: ScanRun) -> None:
         run.thread_id = threading.get_ident()
         run.scan, run.store = self.scan, self.store
         run.stop.wait(60.0)
-        run.is_closing = True
+        self.closing.set()
         self.step.wait(60.0)
         self.store.seqs()
         self.end.wait(60.0)
@@ -77,8 +78,8 @@ def test_a_closing_that_hangs_is_no_progress(tmp_path: Path) -> None:
     scanning.start()
     now_s = 10.0 * limit_s
     assert daemon.is_progressing  # scanning, not closing
-    scanning.stop()
-    until(lambda: scanning.run is not None and scanning.run.is_closing)
+    scanning.handle(Event.STOP)
+    until(hung.closing.is_set)
     assert daemon.is_progressing
     now_s += 0.9 * limit_s
     assert daemon.is_progressing
@@ -90,7 +91,7 @@ def test_a_closing_that_hangs_is_no_progress(tmp_path: Path) -> None:
     now_s += 1.1 * limit_s
     assert not daemon.is_progressing
     hung.end.set()
-    until(lambda: not scanning.is_running)
+    until(lambda: scanning.run is None)
     assert daemon.is_progressing
     hung.close()
 
@@ -129,26 +130,26 @@ def test_an_arming_while_the_last_scan_is_closed_is_followed_then(tmp_path: Path
     assert look(True)
     until(lambda: scanning.scan is not None)
     assert not look(False)
-    assert scanning.is_closing
+    assert scanning.life.state.is_closing
     assert look(True)
     assert reported == ["Scan starts when the previous one is closed"]
     assert not look(False)  # and off again
     hung.step.set()
     assert look(True)
-    scanning.follow_intent()
-    assert scanning.is_closing  # waits
+    scanning.handle(Event.TICK)
+    assert scanning.life.state.is_closing  # waits
     hung.end.set()
-    until(lambda: not scanning.is_running)
+    until(lambda: scanning.run is None)
     hung.end.clear()
-    scanning.follow_intent()
-    until(lambda: scanning.is_running and scanning.phase is Phase.SCANNING)
+    scanning.handle(Event.TICK)
+    until(lambda: scanning.run is not None and scanning.phase is Phase.SCANNING)
     daemon.actions.stop_scan()  # by command, in the air
     assert look(True)
     hung.end.set()
-    until(lambda: not scanning.is_running)
+    until(lambda: scanning.run is None)
     assert look(True)
-    scanning.follow_intent()
-    assert not scanning.is_running  # the operator's stop holds until the next take-off
+    scanning.handle(Event.TICK)
+    assert scanning.run is None  # the operator's stop holds until the next take-off
     hung.close()
 
 

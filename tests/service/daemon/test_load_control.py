@@ -132,14 +132,13 @@ def daemon(tmp_path: Path) -> Onboard:
 
 def test_heat_is_reported_acted_on_and_undone(daemon: Onboard) -> None:
     said = daemon.vehicle.said
-    control = daemon.load_control
     for now_s in range(0, 100, 2):
-        control.look(Machine("m", temperature_c=97.0), float(now_s))
+        daemon.shed_load(Machine("m", temperature_c=97.0), float(now_s))
     assert daemon.scanning.level is Level.RECORD_ONLY
-    assert control.to_dict() == {"level": 4, "name": "record only", "reason": "97 degrees"}
+    assert daemon.snapshot()["load"] == {"level": 4, "name": "record only", "reason": "97 degrees"}
     for now_s in range(100, 400, 2):
-        control.look(Machine("m", temperature_c=60.0), float(now_s))
-    assert control.to_dict()["level"] == Level.FULL
+        daemon.shed_load(Machine("m", temperature_c=60.0), float(now_s))
+    assert daemon.snapshot()["load"]["level"] == Level.FULL
     assert said[0] == "Load: lower rate (97 degrees)"
     assert said[3] == "Load: record only (97 degrees)"
     assert said[-1] == "Load: full quality again"
@@ -150,14 +149,15 @@ def test_heat_is_reported_acted_on_and_undone(daemon: Onboard) -> None:
 def test_relief_can_be_switched_off(daemon: Onboard) -> None:
     said = daemon.vehicle.said
     for now_s in range(0, 60, 2):
-        daemon.load_control.look(Machine("m", temperature_c=97.0), float(now_s))
-    assert daemon.load_control.to_dict()["level"] == Level.LOWER_RESOLUTION
+        daemon.shed_load(Machine("m", temperature_c=97.0), float(now_s))
+    assert daemon.snapshot()["load"]["level"] == Level.LOWER_RESOLUTION
     daemon.reload(load_config(None, ["compute.relief=false"]))
-    daemon.load_control.look(Machine("m", temperature_c=97.0), 60.0)
-    assert daemon.load_control.to_dict() == {"level": 0, "name": "full", "reason": ""}
+    daemon.shed_load(Machine("m", temperature_c=97.0), 60.0)
+    assert daemon.snapshot()["load"] == {"level": 0, "name": "full", "reason": ""}
     heard = len(said)
     for now_s in range(62, 200, 2):
-        assert daemon.load_control.look(Machine("m", temperature_c=97.0), float(now_s)) is None
+        daemon.shed_load(Machine("m", temperature_c=97.0), float(now_s))
+        assert daemon.ladder.level is Level.FULL
     assert len(said) == heard
 
 
@@ -189,7 +189,7 @@ def test_a_device_that_fails_is_reported_once_and_the_cpu_goes_on(daemon: Onboar
     for i in range(4):
         found = backend.belief_propagation(*arguments).px
         np.testing.assert_array_equal(found, truth)
-        daemon.load_control.look(Machine("m"), float(i))
+        daemon.shed_load(Machine("m"), float(i))
         assert len(said) == (i >= 2)
     assert said == ["Compute device failed: CUDA out of memory. Tried to allocate 20 MiB"]
     assert daemon.snapshot()["backend"] == "cpu"

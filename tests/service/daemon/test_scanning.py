@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 import gc
 import os
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from loopback import until
@@ -18,9 +15,10 @@ from onboard import FakeCamera, Onboard, camera_of
 from mavlink.component.control import Phase
 from service.cameras.source import CameraFrame
 from service.daemon.frame_gate import FrameGate
-from service.daemon.intent import MARK, Left, Resumption
+from service.daemon.resumption import MARK, Left, Resumption
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
+from service.daemon.scan_state import Event
 from service.flight.scan import short_collections
 
 
@@ -38,12 +36,12 @@ def test_images_that_the_camera_model_does_not_fit_are_refused(tmp_path: Path) -
     scanning, reported = daemon.scanning, daemon.vehicle.said
     daemon.equip()
     scanning.start()
-    until(lambda: reported and not scanning.is_running)
+    until(lambda: reported and scanning.run is None)
     assert reported == [f"Scan failed: {scanning.fault}"]
     assert "for 1600x1200 images, gimbal has 320x180" in scanning.fault
     assert source.closed.is_set()
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
-    scanning.stop()
+    scanning.handle(Event.STOP)
 
 
 def test_a_camera_model_of_another_size_is_scaled_as_by_a_replay(tmp_path: Path) -> None:
@@ -82,8 +80,8 @@ def test_a_scan_that_was_stopped_counts_as_closing_at_once(tmp_path: Path) -> No
 
 
 def test_a_camera_that_fails_is_reported(tmp_path: Path) -> None:
-    end = threading.Event()
-    daemon = Onboard(tmp_path, script=lambda _: end.wait(60.0))
+    end, now_s = threading.Event(), 0.0
+    daemon = Onboard(tmp_path, script=lambda _: end.wait(60.0), clock_s=lambda: now_s)
     scanning, reported, source = daemon.scanning, daemon.vehicle.said, FakeCamera((64, 48))
     daemon.look()
     scanning.start()
@@ -93,22 +91,21 @@ def test_a_camera_that_fails_is_reported(tmp_path: Path) -> None:
     source.warnings.append("known when it was opened")
     assert run.camera_news() == ["known when it was opened"]
     source.warnings.append("the image is frozen for 8 s")
-    for silent_s in (0.0, 9.0, 11.0, 300.0):
-        run.progress_s = time.monotonic() - silent_s
+    for now_s in (0.0, 9.0, 11.0, 300.0):  # noqa: B007
         daemon.look()
         daemon.look()
-    run.progress_s = time.monotonic()
+    run.alive()
     daemon.look()
     assert reported == [
         "Camera: the image is frozen for 8 s",
         "No images for 10 s: nothing is scanned",
         "Camera images recovered",
     ]
-    run.progress_s = time.monotonic() - 60.0
+    now_s += 60.0
     daemon.look()
-    scanning.stop()
+    scanning.handle(Event.STOP)
     end.set()
-    until(lambda: not scanning.is_running)  # stopped meanwhile
+    until(lambda: scanning.run is None)  # stopped meanwhile
     daemon.look()
     assert reported[3:] == ["No images for 10 s: nothing is scanned"]
 
@@ -154,7 +151,7 @@ def test_a_scan_by_command_goes_on_after_a_fall(
         assert mark.read_text() == "this"
         daemon.actions.stop_scan()
         end.set()
-        until(lambda: not daemon.scanning.is_running)
+        until(lambda: daemon.scanning.run is None)
     if heard:
         assert not mark.exists()  # landed, or stopped
 
@@ -172,12 +169,12 @@ def test_only_a_scan_that_was_not_ended_goes_on(tmp_path: Path) -> None:
     killed = next_life()
     killed.scanning.start()
     assert left(next_life()) is Left.BY_SERVICE
-    killed.scanning.stop()
+    killed.scanning.handle(Event.STOP)
     assert left(next_life()) is Left.NOTHING
     end.set()
-    until(lambda: not killed.scanning.is_running)
+    until(lambda: killed.scanning.run is None)
     killed.scanning.start()  # the recording ends by itself
-    until(lambda: not killed.scanning.is_running)
+    until(lambda: killed.scanning.run is None)
     assert left(next_life()) is Left.NOTHING
     by_itself = next_life("on-boot")
     by_itself.scanning.start()
@@ -185,29 +182,25 @@ def test_only_a_scan_that_was_not_ended_goes_on(tmp_path: Path) -> None:
     (tmp_path / MARK).write_text("of a configuration that was on-command")
     by_itself = next_life("on-boot")
     by_itself.look()
-    assert not by_itself.scanning.is_running
+    assert by_itself.scanning.run is None
 
 
-def test_a_disk_that_goes_away_leaves_the_commands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stat = os.stat
-
-    def away(path: Any, *more: Any, **options: Any) -> os.stat_result:
-        if str(path).startswith(str(tmp_path)):
-            raise OSError(errno.ENOTCONN, "Transport endpoint is not connected", str(path))
-        return stat(path, *more, **options)
-
-    daemon = Onboard(tmp_path, opener=camera_of(FakeCamera((1600, 1200))))
+def test_a_disk_that_goes_away_leaves_the_commands(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    daemon = Onboard(disk / "scans", opener=camera_of(FakeCamera((1600, 1200))))
     scanning = daemon.scanning
     daemon.equip()
-    monkeypatch.setattr(os, "stat", away)
+    disk.rmdir()
+    disk.symlink_to("x" * 300)  # every access fails, not just with "no such file"
+    with pytest.raises(OSError, match="too long"):
+        os.stat(disk)
     assert daemon.actions.status().storage_total_mib > 0
     scanning.start()
-    until(lambda: scanning.fault and not scanning.is_running)
+    until(lambda: scanning.fault and scanning.run is None)
     assert "internal" not in scanning.fault
     assert daemon.snapshot()["state"]
-    scanning.stop()
+    scanning.handle(Event.STOP)
 
 
 def test_a_scan_is_started_once(tmp_path: Path) -> None:
@@ -225,7 +218,7 @@ def test_a_scan_is_started_once(tmp_path: Path) -> None:
         caller.join()
     until(lambda: begun)
     end.set()
-    until(lambda: not daemon.scanning.is_running)
+    until(lambda: daemon.scanning.run is None)
     assert len(begun) == 1
 
 

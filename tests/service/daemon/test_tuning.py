@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 from loopback import until
-from onboard import real_scan
+from onboard import FakeCamera, Onboard, real_scan
 
 from mavlink.component.parameters import PARAMETERS
+from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from service.config import Config, load_config
-from service.daemon.runtime import Daemon
-from service.daemon.scan_run import ScanRun
+from service.daemon.frame_gate import FrameGate
 from service.daemon.vehicle_config import TUNABLES, parameters_of, with_parameter
 from service.errors import InputError
 
@@ -30,12 +30,10 @@ class Operator:
         self._socket.bind(("127.0.0.1", 0))
         self._socket.settimeout(0.05)
         port = self._socket.getsockname()[1]
-        overrides = [
-            f"scan.folder={folder}",
-            "health.http=",
-            f"mavlink.links=udpout:127.0.0.1:{port}",
-        ]
-        self.daemon = Daemon(load_config(None, [*overrides, *settings]))
+        self.daemon = Onboard(
+            folder, f"mavlink.links=udpout:127.0.0.1:{port}", *settings, link=VehicleLink,
+            script=lambda run: run.stop.wait(60.0),
+        )  # fmt: skip
         self.shown: dict[str, list[float]] = {}
         self._framer, self._ear = Framer(), dialect.MAVLink(None)
         self._mouth = dialect.MAVLink(None, 255, 190)
@@ -171,7 +169,10 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
     with scan.store as store:
         assert store.header.configuration["scan"]["resolution_m"] == 0.5
         scanning, link = operator.daemon.scanning, Budget()
-        run = scanning.run = ScanRun(scanning, is_asked=True)
+        scanning.start()
+        run = scanning.run
+        assert run is not None
+        run.gate = FrameGate(FakeCamera((160, 90)), tmp_path, 0, run.alive, scanning.paused)
         run.scan, scanning.link.flying = scan, link  # type: ignore[assignment]
         operator.set("SR_LINK_KBIT_S", 64.0)
         assert link.budgets[-1] == (64.0, operator.config.datalink.share)
@@ -182,5 +183,6 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         assert scan.check.exposed_ns(3 * 10**9) == 3 * 10**9 - 70_000_000
         operator.set("SR_YAW_FRAME", 2.0)
         assert operator.daemon.vehicle.history.config.yaw_frame == "earth"
-        scanning.run = scanning.link.flying = None
+        scanning.link.flying = None
+        scanning.end()
         scan.pipeline.finish()

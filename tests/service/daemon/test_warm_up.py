@@ -6,16 +6,18 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import numpy as np
 import pytest
+from onboard import Onboard, Scripted
 
+from mavlink.component.vehicle import VehicleLink
 from service.background import BackgroundWorker
 from service.cameras import CameraFrame
 from service.config import load_config
 from service.daemon.frame_gate import FrameGate
-from service.daemon.runtime import COMPILING_S, HUNG_S, Daemon
-from service.daemon.scan_run import ScanRun
+from service.daemon.runtime import COMPILING_S, HUNG_S
 from service.daemon.warm_up import SyntheticGround, is_warm, warm_up, warm_up_command
 from service.progress import Progress
 
@@ -87,16 +89,26 @@ def test_a_frame_at_work_is_timed_and_a_silent_camera_is_not(tmp_path: Path) -> 
     assert asked.is_set()
 
 
-class Busy(ScanRun):
+class Busy(Scripted):
     """An attempt that works on one frame for as long as a test says."""
 
     busy_s = 0.0
 
 
 def test_the_watchdog_starves_on_a_hang_only(tmp_path: Path) -> None:
-    daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
-    run = daemon.scanning.run = Busy(daemon.scanning, is_asked=True)
-    run.progress_s -= 1000.0  # no frame for long: the camera's fault, not ours
+    end, now_s, later_ns = Event(), 0.0, 0
+
+    def link(config: Any, control: Any, first: Any) -> VehicleLink:
+        return VehicleLink(config, control, first, lambda: time.monotonic_ns() + later_ns)
+
+    daemon = Onboard(
+        tmp_path, attempt=lambda *given: Busy(lambda _: end.wait(60.0), *given),
+        clock_s=lambda: now_s, link=link,
+    )  # fmt: skip
+    daemon.scanning.start()
+    run = daemon.scanning.run
+    assert isinstance(run, Busy)
+    now_s += 1000.0  # no frame for long: the camera's fault, not ours
     assert daemon.is_progressing
     daemon.scanning.is_warm = False
     run.busy_s = HUNG_S + 1.0
@@ -107,5 +119,7 @@ def test_the_watchdog_starves_on_a_hang_only(tmp_path: Path) -> None:
     assert not daemon.is_progressing
     run.busy_s = 0.0
     assert daemon.is_progressing
-    daemon.vehicle._alive_ns -= 60_000_000_000  # the protocol's thread stands still
+    later_ns = 60_000_000_000  # the protocol's thread stands still
     assert not daemon.is_progressing
+    end.set()
+    daemon.scanning.end()

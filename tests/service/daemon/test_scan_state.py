@@ -25,21 +25,13 @@ from hypothesis.stateful import (
 from loopback import until
 from onboard import FakeCamera, Onboard
 
-from mavlink.component.control import Phase, Result
+from mavlink.component.control import Phase, Result, Work
 from mavlink.component.presence import Health
 from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.dialect import dialect
-from service.daemon.intent import (
-    LAST_RETRY_S,
-    MARK,
-    Intent,
-    Landing,
-    LandingWatch,
-    Left,
-    Resumption,
-    Wanted,
-)
+from service.daemon.resumption import MARK, Landing, LandingWatch, Left, Resumption
 from service.daemon.scan_run import ScanRun
+from service.daemon.scan_state import LAST_RETRY_S, TRANSITIONS, Effect, Event, ScanLife, State
 from service.daemon.scanning import Scanning
 from service.daemon.writing import ClosingWatch
 from service.errors import OutsideError
@@ -167,7 +159,7 @@ class StoppedWhileLoading(Scanning):
     """A stop comes while camera model and backend are loaded."""
 
     def load(self) -> None:
-        self.stop()
+        self.handle(Event.STOP)
 
 
 def test_a_stop_before_the_service_is_ready_holds(tmp_path: Path) -> None:
@@ -205,7 +197,7 @@ def test_a_pause_outlasts_a_fault(tmp_path: Path) -> None:
 
     def script(_: ScanRun) -> None:
         faults[len(paused)].wait(60.0)
-        paused.append(daemon.scanning.intent.paused.is_set())
+        paused.append(daemon.scanning.paused.is_set())
         raise OutsideError("camera gone")
 
     daemon = Onboard(tmp_path, script=script)
@@ -216,10 +208,10 @@ def test_a_pause_outlasts_a_fault(tmp_path: Path) -> None:
         fault.set()
         until(lambda: daemon.scanning.phase is Phase.WAITING)
         if len(paused) < 2:
-            daemon.scanning.follow_intent()
+            daemon.scanning.handle(Event.TICK)
     assert paused == [True, True]
     daemon.actions.resume()
-    assert daemon.scanning.intent.wanted is Wanted.SCAN
+    assert daemon.scanning.life.state is State.WAITING
     daemon.actions.stop_scan()
 
 
@@ -246,9 +238,9 @@ def test_a_refused_photo_says_why(phase: Phase, word: str, tmp_path: Path) -> No
     if phase is not Phase.IDLE:
         scanning.start()
     if phase is Phase.PAUSED:
-        scanning.pause()
+        scanning.handle(Event.PAUSE)
     if phase is Phase.FINALISING:
-        scanning.stop()
+        scanning.handle(Event.STOP)
     until(lambda: scanning.phase is phase)
     answer: Any = daemon.actions.capture_keyframe()
     assert answer.result is Result.TEMPORARILY_REJECTED and word in answer.text
@@ -268,10 +260,10 @@ def test_why_a_start_failed_is_said_each_time_but_not_of_its_retries(tmp_path: P
         daemon.scanning.start()
         for attempt in range(1, 4):
             expected = before + attempt
-            until(lambda: len(said) == expected and not daemon.scanning.is_running)  # noqa: B023
-            daemon.scanning.follow_intent()
-        until(lambda: not daemon.scanning.is_running)
-        daemon.scanning.stop()
+            until(lambda: len(said) == expected and daemon.scanning.run is None)  # noqa: B023
+            daemon.scanning.handle(Event.TICK)
+        until(lambda: daemon.scanning.run is None)
+        daemon.scanning.handle(Event.STOP)
         assert said[before:] == [True, False, False, False]
     assert set(daemon.vehicle.said) == {"Scan failed: camera gone"}
 
@@ -323,18 +315,17 @@ def test_the_heartbeat_stays_active_while_the_last_scan_is_closed(tmp_path: Path
 
 def test_a_scan_that_is_being_closed_is_not_critical(tmp_path: Path) -> None:
     """The camera was silent for long when the stop came."""
-    end = threading.Event()
-    daemon = Onboard(tmp_path, script=lambda _: end.wait(60.0))
+    end, now_s = threading.Event(), 0.0
+    daemon = Onboard(tmp_path, script=lambda _: end.wait(60.0), clock_s=lambda: now_s)
     daemon.actions.is_ready = True
     daemon.actions.start_scan()
-    assert daemon.scanning.run is not None
-    daemon.scanning.run.progress_s -= 300.0
+    now_s = 300.0
     daemon.look()
     daemon.actions.stop_scan()
     daemon.look()
     assert daemon.vehicle.looks == [Health.CRITICAL, Health.ACTIVE]
     end.set()
-    until(lambda: not daemon.scanning.is_running)
+    until(lambda: daemon.scanning.run is None)
 
 
 def test_a_scan_by_command_is_closed_after_landing(tmp_path: Path) -> None:
@@ -387,31 +378,39 @@ def test_only_a_flight_that_ended_closes_a_scan() -> None:
 
 
 class NoWorkers(Workers):
-    """A table whose workers the test runs itself."""
+    """A table whose last worker the test runs itself."""
+
+    last: Worker
 
     def start(self, row: Any, work: Any, *_: object, **__: object) -> Worker:
-        return Worker("scan", row_of("scan"), work)
-
-
-class Offered(Scanning):
-    """Offers no earlier scans."""
-
-    def offer_backlog(self) -> None:
-        pass
+        self.last = Worker("scan", row_of("scan"), work)
+        return self.last
 
 
 class AnyOrder(RuleBasedStateMachine):
-    """Commands, faults and ends of a scan in any order, against what they should come to."""
+    """Commands, faults, ends of a scan, landings and power cuts in any order, against what they
+    should come to."""
 
     def __init__(self) -> None:
         super().__init__()
         self.folder = tempfile.TemporaryDirectory()
-        self.late_s, self.ending = 0.0, "ends"
+        self.boots, self.now_s, self.ending = 0, 0.0, "ends"
+        self.works: list[Work] = []  # acknowledged as in progress
+        self.boot()
+        self.wanted, self.is_left = "nothing", False
+
+    def boot(self) -> None:
+        """The computer starts."""
+        self.boots += 1
+        folder = Path(self.folder.name)
+        (folder / "boot").write_text(str(self.boots))
+        self.workers = NoWorkers()
         self.daemon = Onboard(
-            Path(self.folder.name), script=self.script, of=Offered, workers=NoWorkers(),
-            intent=Intent(), clock_s=lambda: time.monotonic() + self.late_s,
+            folder / "scans", script=self.script, workers=self.workers, life=ScanLife(),
+            clock_s=lambda: self.now_s, clock_ns=lambda: round(1e9 * self.now_s),
+            resumption=Resumption(folder / "scans", folder / "boot"),
         )  # fmt: skip
-        self.scanning, self.wanted = self.daemon.scanning, "nothing"
+        self.scanning = self.daemon.scanning
         self.daemon.actions.is_ready = True
 
     def script(self, _: ScanRun) -> None:
@@ -425,13 +424,16 @@ class AnyOrder(RuleBasedStateMachine):
     @rule()
     def start(self) -> None:
         assert self.daemon.actions.start_scan().result is Result.ACCEPTED
-        self.wanted = "scan"
+        self.wanted, self.is_left = "scan", False
 
     @rule(finalise=st.booleans())
     def stop(self, finalise: bool) -> None:
         actions = self.daemon.actions
-        (actions.finalise if finalise else actions.stop_scan)()
-        self.wanted = "nothing"
+        answer = actions.finalise() if finalise else actions.stop_scan()
+        assert isinstance(answer, Work) == (finalise and self.run is not None)
+        if isinstance(answer, Work):
+            self.works.append(answer)
+        self.wanted, self.is_left = "nothing", False
         assert self.run is None or self.run.stop.is_set()
 
     @rule()
@@ -452,9 +454,8 @@ class AnyOrder(RuleBasedStateMachine):
         run = self.run
         assert run is not None
         was_stopped = run.stop.is_set()
-
         self.ending = how
-        self.scanning.carry_out(run)
+        self.workers.last.work(self.workers.last)
         assert self.run is None
         assert (self.scanning.fault == "") == (how == "ends")
         if how == "ends" and not was_stopped:
@@ -463,26 +464,54 @@ class AnyOrder(RuleBasedStateMachine):
     @rule(late=st.booleans())
     def tick(self, late: bool) -> None:
         if late:
-            self.late_s += 2.0 * LAST_RETRY_S
+            self.now_s += 2.0 * LAST_RETRY_S
         before = self.run
-        self.scanning.follow_intent()
+        self.scanning.handle(Event.TICK)
         if late and before is None:
             assert (self.run is not None) == (self.wanted != "nothing")
         if before is not None:
             assert self.run is before
 
+    @rule(armed=st.sampled_from([True, False, None]), seconds=st.sampled_from([0.1, 70.0]))
+    def fly(self, armed: bool | None, seconds: float) -> None:
+        """A heartbeat of the autopilot is heard, or none."""
+        self.now_s += seconds
+        if armed is not None:
+            self.daemon.vehicle.arm(armed, round(1e9 * self.now_s))
+        heard = self.daemon.vehicle.report()
+        said = len(self.daemon.vehicle.said)
+        self.daemon.look()
+        resumed = self.is_left and heard.is_armed and heard.is_certain
+        assert ("Scan resumed after a restart" in self.daemon.vehicle.said[said:]) == resumed
+        if resumed:
+            self.wanted, self.is_left = "scan", False
+        elif heard.autopilot is not None and heard.is_certain and not heard.is_armed:
+            self.is_left = False
+        if any("closed after landing" in text for text in self.daemon.vehicle.said[said:]):
+            assert self.wanted != "nothing"
+            self.wanted = "nothing"
+
+    @rule()
+    def power_cut(self) -> None:
+        self.is_left |= self.wanted != "nothing"  # the start was acknowledged
+        self.wanted = "nothing"
+        self.works.clear()
+        self.boot()
+
     @invariant()
     def what_is_wanted_is_known(self) -> None:
-        phase, intent = self.scanning.phase, self.scanning.intent
-        assert intent.wanted.value == self.wanted
-        assert intent.paused.is_set() == (self.wanted == "pause")
-        mark = Path(self.folder.name) / MARK
-        assert mark.exists() == (self.wanted != "nothing")
+        phase, state = self.scanning.phase, self.scanning.life.state
+        assert state.is_wanted == (self.wanted != "nothing")
+        assert state.is_paused == self.scanning.paused.is_set() == (self.wanted == "pause")
+        mark = Path(self.folder.name) / "scans" / MARK
+        assert mark.exists() == (self.wanted != "nothing" or self.is_left)
+        assert state.has_run == (self.run is not None)
         if self.run is None:
             assert phase is (Phase.IDLE if self.wanted == "nothing" else Phase.WAITING)
+            assert all(work.answer is not None for work in self.works)
         elif self.run.stop.is_set():
             assert phase is (Phase.FINALISING if self.wanted == "nothing" else Phase.WAITING)
-            assert self.scanning.is_closing
+            assert state.is_closing
         else:
             assert self.wanted != "nothing"
             assert phase is (Phase.PAUSED if self.wanted == "pause" else Phase.SCANNING)
@@ -494,20 +523,90 @@ class AnyOrder(RuleBasedStateMachine):
 def test_any_order_of_commands_and_faults() -> None:
     gc.freeze()  # each end of a scan collects garbage
     try:
-        chosen = settings(max_examples=40, stateful_step_count=30)
+        chosen = settings(max_examples=30, stateful_step_count=30)
         run_state_machine_as_test(AnyOrder, settings=chosen)
     finally:
         gc.unfreeze()
 
 
+class AnyEvents(RuleBasedStateMachine):
+    """The machine alone: any event at any time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.life, self.now_s, self.marked, self.held, self.runs = ScanLife(), 0.0, False, False, 0
+
+    @rule(event=st.sampled_from(Event), seconds=st.sampled_from([0.0, 0.5, 10.0]))
+    def happen(self, event: Event, seconds: float) -> None:
+        before, self.now_s = self.life.state, self.now_s + seconds
+        if event in (Event.DONE, Event.FAILED, Event.GROWN) and not before.has_run:
+            return
+        effects = self.life.handle(event, self.now_s)
+        after = self.life.state
+        self.marked = Effect.MARK in effects or (self.marked and Effect.UNMARK not in effects)
+        self.held = Effect.HOLD in effects or (self.held and Effect.RELEASE not in effects)
+        self.runs += (Effect.OPEN in effects) - (event in (Event.DONE, Event.FAILED))
+        if event in (Event.STOP, Event.END):  # a stop always wins
+            assert not after.is_wanted and Effect.OPEN not in effects
+            assert (Effect.CLOSE in effects) == before.has_run
+        if event is Event.START and before not in (State.ENDING, State.ENDED):
+            assert after.is_wanted and not after.is_paused
+        if event is Event.FAILED and before.is_wanted:  # a fault cancels nothing
+            assert after.is_wanted and after.is_paused == before.is_paused
+        if Effect.OPEN in effects:
+            assert before.is_wanted and event is Event.TICK and self.now_s >= self.life.due_s
+
+    @invariant()
+    def effects_add_up(self) -> None:
+        state = self.life.state
+        assert self.marked == state.is_wanted and self.held == state.is_paused
+        assert self.runs == int(state.has_run)
+
+
+def test_any_events_in_any_order() -> None:
+    chosen = settings(max_examples=100, stateful_step_count=40)
+    run_state_machine_as_test(AnyEvents, settings=chosen)
+
+
+def reached(state: State, *events: Event) -> set[State]:
+    """The states that these events lead to, in any order."""
+    found = [state]
+    for one in found:
+        found += [n for e, n in TRANSITIONS[one].items() if e in events and n not in found]
+    return set(found)
+
+
+@pytest.mark.parametrize("state", State)
+def test_every_state_has_a_way_out(state: State) -> None:
+    assert State.ENDED in reached(state, Event.END, Event.DONE)
+    if state not in (State.ENDING, State.ENDED):
+        assert State.IDLE in reached(state, Event.STOP, Event.FAILED)
+        assert State.SCANNING in reached(state, Event.START, Event.TICK, Event.DONE)
+        assert state in reached(State.IDLE, *Event)
+
+
 def test_retries_slow_down_and_start_over() -> None:
-    intent = Intent()
-    intent.scan(0.0)
-    waits = [intent.failed(0.0) for _ in range(6)]
-    assert waits == [1.0, 2.0, 4.0, 8.0, 8.0, LAST_RETRY_S]
-    assert not intent.is_due(LAST_RETRY_S - 0.1) and intent.is_due(LAST_RETRY_S)
-    intent.scan(0.0)
-    assert intent.is_due(0.0) and intent.failed(0.0) == 1.0
-    intent.end()
-    intent.scan(0.0)
-    assert not intent.is_due(100.0)
+    life, now_s = ScanLife(), 0.0
+
+    def wait() -> float:
+        """Start an attempt that fails; the time until the next one."""
+        life.handle(Event.TICK, now_s)
+        assert life.state is State.SCANNING
+        life.handle(Event.FAILED, now_s)
+        return life.due_s - now_s
+
+    life.handle(Event.START, now_s)
+    for expected in (1.0, 2.0, 4.0, 8.0, 8.0, LAST_RETRY_S):
+        assert wait() == expected
+        assert life.handle(Event.TICK, now_s + expected - 0.1) == ()
+        now_s += expected
+    life.handle(Event.START, now_s)
+    assert life.failures == 0 and wait() == 1.0
+    now_s += 1.0
+    assert life.failures == 1 and wait() == 2.0
+    now_s += 2.0
+    life.handle(Event.GROWN, now_s)  # it has stored data: the next fault is retried soon
+    assert wait() == 1.0
+    life.handle(Event.END, now_s)
+    life.handle(Event.START, now_s)
+    assert life.handle(Event.TICK, now_s + 100.0) == ()

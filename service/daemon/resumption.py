@@ -1,104 +1,20 @@
-"""The intended state: no scan, a scan, or a paused scan.
+"""When a commanded scan begins or ends without a command: after a crash, and after landing.
 
-Commands, arming and the configuration change it; retries follow it. So a stop ends every retry,
-and a pause or a fault does not cancel a requested scan. A small file in the folder of scans marks
-a running commanded scan, so that it resumes after the service or the computer crashed; its text
-identifies the boot of the computer.
+A small file in the folder of scans marks a running commanded scan, so that it resumes after the
+service or the computer crashed; its text identifies the boot of the computer.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import threading
 from enum import Enum, auto
 from pathlib import Path
 
 log = logging.getLogger(__name__)
 
-FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0
-"""Waits between attempts at a scan."""
-
 MARK = ".scanning"
 BOOT = Path("/proc/sys/kernel/random/boot_id")
-
-
-class Wanted(Enum):
-    """The operator's last request."""
-
-    NOTHING = "nothing"
-    SCAN = "scan"
-    PAUSE = "pause"  # a scan that currently takes no frames
-
-
-class Intent:
-    """The intended state, and when to try it next. Its owner guards it against other threads."""
-
-    def __init__(self, first_s: float = FIRST_RETRY_S, last_s: float = LAST_RETRY_S) -> None:
-        """The wait between two attempts grows from ``first_s`` to ``last_s``."""
-        self.wanted = Wanted.NOTHING
-        self.failures = 0  # since the scan was requested
-        self.paused = threading.Event()  # set while a pause is wanted
-        self.is_over = False  # the service ends
-        self._due_s = 0.0
-        self._first_s, self._last_s, self._retry_s = first_s, last_s, first_s
-
-    @property
-    def wants_scan(self) -> bool:
-        """True from start to stop, including pauses and retries."""
-        return self.wanted is not Wanted.NOTHING
-
-    def scan(self, now_s: float) -> None:
-        """Request a scan now; also ends a pause."""
-        self._due_s, self.failures = now_s, 0
-        self._retry_s = self._first_s
-        self._want(Wanted.SCAN)
-
-    def stop(self) -> None:
-        """Request nothing: no scan, no retry, no pause."""
-        self._want(Wanted.NOTHING)
-
-    def pause(self) -> bool:
-        """Take no frames until :meth:`resume`; False when no scan is wanted."""
-        if self.wants_scan:
-            self._want(Wanted.PAUSE)
-        return self.wants_scan
-
-    def resume(self) -> bool:
-        """Take frames again; False unless a pause is wanted."""
-        if self.wanted is not Wanted.PAUSE:
-            return False
-        self._want(Wanted.SCAN)
-        return True
-
-    def end(self) -> None:
-        """Request nothing, permanently: the service ends."""
-        self.stop()
-        self.is_over = True
-
-    def _want(self, wanted: Wanted) -> None:
-        if self.is_over:
-            return
-        self.wanted = wanted
-        if wanted is Wanted.PAUSE:
-            self.paused.set()
-        else:
-            self.paused.clear()
-
-    def is_due(self, now_s: float) -> bool:
-        """True when an attempt at the scan should start now."""
-        return self.wants_scan and now_s >= self._due_s
-
-    def failed(self, now_s: float) -> float:
-        """Note a failed attempt; return the seconds until the next one."""
-        self.failures += 1
-        wait_s, self._retry_s = self._retry_s, min(2 * self._retry_s, self._last_s)
-        self._due_s = now_s + wait_s
-        return wait_s
-
-    def succeeded(self) -> None:
-        """Note that the attempt produces data, so that the next fault is retried soon."""
-        self._retry_s = self._first_s
 
 
 class Left(Enum):

@@ -1,0 +1,200 @@
+"""The life of scans as a state machine: events go in, effects come out.
+
+No clock, file or thread. Commands, arming and the configuration decide whether a scan is wanted;
+attempts at it follow. So a stop ends every retry, and a pause or a fault cancels no wanted scan.
+:class:`service.daemon.scanning.Scanning` performs the effects.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from mavlink.component.control import Phase
+
+FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0
+"""Waits between attempts at a scan."""
+
+
+class State(Enum):
+    """What runs, and what is wanted."""
+
+    IDLE = "idle"
+    WAITING = "waiting"  # for the next attempt at the wanted scan
+    WAITING_PAUSED = "waiting paused"
+    SCANNING = "scanning"
+    PAUSED = "paused"  # takes no frames
+    CLOSING = "closing"  # writes the files of the scan
+    REOPENING = "reopening"  # closes a scan; another follows
+    REOPENING_PAUSED = "reopening paused"
+    ENDING = "ending"  # the service closes its last scan
+    ENDED = "ended"
+
+    @property
+    def phase(self) -> Phase:
+        """The state as the operator sees it."""
+        return _PHASES[self]
+
+    @property
+    def has_run(self) -> bool:
+        """An attempt at a scan runs, or is being closed."""
+        return Event.DONE in TRANSITIONS[self]
+
+    @property
+    def is_closing(self) -> bool:
+        return self.has_run and Event.COMPLETED not in TRANSITIONS[self]
+
+    @property
+    def is_wanted(self) -> bool:
+        """From start to stop, pauses and retries included."""
+        return Event.STOP in TRANSITIONS[self]
+
+    @property
+    def is_paused(self) -> bool:
+        return Event.RESUME in TRANSITIONS[self]
+
+
+_PHASES = {
+    State.IDLE: Phase.IDLE,
+    State.WAITING: Phase.WAITING,
+    State.WAITING_PAUSED: Phase.WAITING,
+    State.SCANNING: Phase.SCANNING,
+    State.PAUSED: Phase.PAUSED,
+    State.CLOSING: Phase.FINALISING,
+    State.REOPENING: Phase.WAITING,
+    State.REOPENING_PAUSED: Phase.WAITING,
+    State.ENDING: Phase.FINALISING,
+    State.ENDED: Phase.IDLE,
+}
+
+
+class Event(Enum):
+    """What happens to a scan."""
+
+    START = "start"  # a scan is wanted now; ends a pause
+    STOP = "stop"
+    PAUSE = "pause"
+    RESUME = "resume"
+    TICK = "due"  # time passes; counts once the next attempt is due
+    GROWN = "grown"  # the attempt has stored data
+    COMPLETED = "completed"  # the recording has ended by itself
+    INTERRUPTED = "interrupted"  # a fault; what is stored is being closed
+    DONE = "done"  # the attempt has ended
+    FAILED = "failed"  # the attempt has ended by a fault
+    END = "end"  # the service ends
+
+
+class Effect(Enum):
+    """What the owner of the machine does, in this order."""
+
+    HOLD = "take no frames"
+    RELEASE = "take frames"
+    MARK = "note on disk that a crash must not end the scan"
+    UNMARK = "remove the note"
+    CLOSE = "stop the attempt"
+    OPEN = "start an attempt"
+    OFFER = "send earlier scans"
+
+
+TRANSITIONS: dict[State, dict[Event, State]] = {
+    State.IDLE: {
+        Event.START: State.WAITING,
+        Event.END: State.ENDED,
+    },
+    State.WAITING: {
+        Event.TICK: State.SCANNING,
+        Event.STOP: State.IDLE,
+        Event.PAUSE: State.WAITING_PAUSED,
+        Event.END: State.ENDED,
+    },
+    State.WAITING_PAUSED: {
+        Event.TICK: State.PAUSED,
+        Event.START: State.WAITING,
+        Event.STOP: State.IDLE,
+        Event.RESUME: State.WAITING,
+        Event.END: State.ENDED,
+    },
+    State.SCANNING: {
+        Event.STOP: State.CLOSING,
+        Event.PAUSE: State.PAUSED,
+        Event.COMPLETED: State.CLOSING,
+        Event.INTERRUPTED: State.REOPENING,
+        Event.DONE: State.IDLE,
+        Event.FAILED: State.WAITING,
+        Event.END: State.ENDING,
+    },
+    State.PAUSED: {
+        Event.START: State.SCANNING,
+        Event.STOP: State.CLOSING,
+        Event.RESUME: State.SCANNING,
+        Event.COMPLETED: State.CLOSING,
+        Event.INTERRUPTED: State.REOPENING_PAUSED,
+        Event.DONE: State.IDLE,
+        Event.FAILED: State.WAITING_PAUSED,
+        Event.END: State.ENDING,
+    },
+    State.CLOSING: {
+        Event.START: State.REOPENING,
+        Event.DONE: State.IDLE,
+        Event.FAILED: State.IDLE,
+        Event.END: State.ENDING,
+    },
+    State.REOPENING: {
+        Event.STOP: State.CLOSING,
+        Event.PAUSE: State.REOPENING_PAUSED,
+        Event.DONE: State.WAITING,
+        Event.FAILED: State.WAITING,
+        Event.END: State.ENDING,
+    },
+    State.REOPENING_PAUSED: {
+        Event.START: State.REOPENING,
+        Event.STOP: State.CLOSING,
+        Event.RESUME: State.REOPENING,
+        Event.DONE: State.WAITING_PAUSED,
+        Event.FAILED: State.WAITING_PAUSED,
+        Event.END: State.ENDING,
+    },
+    State.ENDING: {
+        Event.DONE: State.ENDED,
+        Event.FAILED: State.ENDED,
+    },
+    State.ENDED: {},
+}
+"""The next state; an event that is not listed changes nothing."""
+
+
+class ScanLife:
+    """The state, and when to try again. Its owner guards it against other threads."""
+
+    def __init__(self, first_s: float = FIRST_RETRY_S, last_s: float = LAST_RETRY_S) -> None:
+        """The wait between two attempts grows from ``first_s`` to ``last_s``."""
+        self.state = State.IDLE
+        self.failures = 0  # since the scan was requested
+        self.due_s = 0.0  # the next attempt
+        self._first_s, self._last_s, self._retry_s = first_s, last_s, first_s
+
+    def handle(self, event: Event, now_s: float) -> tuple[Effect, ...]:
+        """Take an event at ``now_s`` of a monotonic clock; what is to be done about it."""
+        if event is Event.TICK and now_s < self.due_s:
+            return ()
+        before = self.state
+        self.state = after = TRANSITIONS[before].get(event, before)
+        if event is Event.START:
+            self.due_s, self.failures, self._retry_s = now_s, 0, self._first_s
+        elif event is Event.GROWN:
+            self._retry_s = self._first_s
+        elif event is Event.FAILED and after.is_wanted:
+            self.failures += 1
+            self.due_s = now_s + self._retry_s
+            self._retry_s = min(2.0 * self._retry_s, self._last_s)
+        is_dropped = before.is_wanted and not after.is_wanted
+        has_opened = after.has_run and not before.has_run
+        found = {
+            Effect.HOLD: after.is_paused and not before.is_paused,
+            Effect.RELEASE: before.is_paused and not after.is_paused,
+            Effect.MARK: after.is_wanted and not before.is_wanted,
+            Effect.UNMARK: event in (Event.STOP, Event.END) or is_dropped,
+            Effect.CLOSE: event in (Event.STOP, Event.END) and before.has_run,
+            Effect.OPEN: has_opened,
+            Effect.OFFER: after is State.IDLE and before.has_run,
+        }
+        return tuple(effect for effect, is_due in found.items() if is_due)
