@@ -27,6 +27,13 @@ def house() -> HouseFlight:
     return HouseFlight()
 
 
+@pytest.fixture(scope="session")
+def mesh_libraries() -> None:
+    """What a mesh needs; imported by the first test that does, as it takes seconds."""
+    pytest.importorskip("open3d", exc_type=ImportError)
+    pytest.importorskip("fast_simplification")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Without a GPU Triton interprets its kernels; it decides so when it is imported."""
     if config.getoption("--device") == "cpu":

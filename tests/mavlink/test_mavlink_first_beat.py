@@ -117,6 +117,7 @@ def test_a_system_that_cannot_be_is_not_remembered(tmp_path: Path, system: objec
     assert Memory(tmp_path).parameters == {"SR_BASELINE_M": 2.0}
 
 
+@pytest.mark.slow
 def test_the_daemon_speaks_before_it_finds_that_it_cannot_work() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
         ear.bind(("127.0.0.1", 0))

@@ -146,6 +146,7 @@ def test_a_gimbal_that_only_trembles_is_enough() -> None:
     assert abs(found.latency_ms - 70.0) < 3.0 * found.sigma_ms < 40.0
 
 
+@pytest.mark.slow
 def test_images_in_step_with_telemetry_do_not_draw_the_latency_between_its_samples() -> None:
     ratios = []
     for seed in range(6):
@@ -171,6 +172,7 @@ def test_attitudes_too_far_apart_say_nothing() -> None:
     assert watch_flight(0.07, 5e-4, 1.0, 30.0).estimate(attitudes(2.0)) is None
 
 
+@pytest.mark.slow
 def test_one_turn_in_a_calm_flight_is_not_enough_for_a_wrong_answer() -> None:
     for seed in range(8):
         rng = np.random.default_rng(seed)

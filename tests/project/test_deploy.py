@@ -192,6 +192,7 @@ def test_failed_upgrade_leaves_what_was(machine: Machine) -> None:
     assert not [name for name in machine.versions if name.endswith(".part")]
 
 
+@pytest.mark.slow
 def test_three_versions_are_kept(machine: Machine) -> None:
     for contents in "abcde":
         machine.release(contents)

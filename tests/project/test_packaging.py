@@ -42,6 +42,7 @@ def test_layers_hold() -> None:
     assert ", 0 broken" in done.stdout
 
 
+@pytest.mark.slow
 def test_recon_touches_nothing_outside() -> None:
     """No clock, file, socket or environment in the mathematics."""
     forbidden = {"time", "datetime", "os", "io", "pathlib", "socket", "subprocess", "random"}

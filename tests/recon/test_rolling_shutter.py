@@ -204,6 +204,7 @@ def height_errors(flown: list[U8], shutter: Shutter) -> F64:
     return np.concatenate(off)
 
 
+@pytest.mark.slow
 def test_the_odometry_sees_level_ground_through_a_rolling_shutter(flown: list[U8]) -> None:
     known = np.median(np.abs(height_errors(flown, Shutter(0.03))))
     ignored = np.median(np.abs(height_errors(flown, Shutter())))
@@ -337,6 +338,7 @@ def test_the_readout_is_found_from_the_images(readout_s: float, frames: int) -> 
     assert found.sigma_s < 5e-4
 
 
+@pytest.mark.slow
 def test_three_keyframes_show_the_readout_first() -> None:
     """Later ones are bent more by what was not known."""
     found, used = searched(0.03, 40)

@@ -21,10 +21,8 @@ import pytest
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 pytest.importorskip("websockets")
-pytest.importorskip("playwright")
 
 from person import Browser, chromium
-from playwright.sync_api import sync_playwright
 
 from service.ground.http import PAGE
 from service.ground.portal import Portal, PortalConfig
@@ -154,5 +152,6 @@ def client(store: Path) -> Iterator[Client]:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     """One Chromium for all tests of a file. It draws in software, so its pixels are coarse."""
-    with sync_playwright() as driver:
+    api = pytest.importorskip("playwright.sync_api")
+    with api.sync_playwright() as driver:
         yield Browser(driver, "--force-device-scale-factor=0.5", "--disable-gpu-rasterization")

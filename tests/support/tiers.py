@@ -10,8 +10,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-SLOW = {"bench", "portal", "trials"}
-"""Folders whose tests are all slow: development's benchmarks, browsers, attacks."""
+SLOW = {"bench", "gpu", "portal", "trials"}
+"""Folders whose tests are all slow: development's benchmarks, GPU kernels, browsers, attacks."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -37,11 +37,22 @@ def reported(nodeid: str) -> tuple[str, str]:
     return ".".join(scope), name + bracket + parameters
 
 
+def is_slow(path: Path, root: Path) -> bool:
+    """Whether the file lies in a slow folder."""
+    return not SLOW.isdisjoint(path.relative_to(root).parts)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """The quick tier imports no slow folder: torch and browsers take seconds in each worker."""
+    quick = config.option.markexpr == "not slow"
+    return True if quick and is_slow(collection_path, config.rootpath) else None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark the slow folders, begin with the trials, which wait, and leave out what has run."""
     for item in items:
-        if SLOW & set(item.path.relative_to(config.rootpath).parts):
+        if is_slow(item.path, config.rootpath):
             item.add_marker("slow")
     items.sort(key=lambda item: "trials" not in item.path.parts)
     report = config.getoption("rest")

@@ -12,9 +12,6 @@ from recon.stereo.exposure import equalised
 from recon.types import U8
 from service.bench.stereo import scene
 
-pytest.importorskip("torch")
-runtime = pytest.importorskip("onnxruntime")
-
 ACCEPT_ALL = {"min_evidence": 0, "min_contrast": 0, "occlusion_tolerance": -1, "speckle_px": 0}
 
 
@@ -31,6 +28,8 @@ def test_labels_are_the_compiled_ones(
     width: int, height: int, labels: int, settings: dict[str, float]
 ) -> None:
     """Odd sizes, levels, other first labels, another smoothness."""
+    pytest.importorskip("torch")
+    runtime = pytest.importorskip("onnxruntime")
     from recon.backends.exported_stereo import export_stereo
 
     config = BeliefPropagationConfig(**{**ACCEPT_ALL, **settings})  # type: ignore[arg-type]

@@ -73,6 +73,7 @@ def true_corners(turn: F64, shift: F64) -> F32:
     return np.asarray(uv.reshape(-1, 2), np.float32)
 
 
+@pytest.mark.slow
 def test_corners_of_a_rendered_board_are_sub_pixel() -> None:
     for turn, shift in board_poses(3):
         corners = find_board(rendered(turn, shift), BOARD)
@@ -243,6 +244,7 @@ def test_whole_sets_are_as_good_as_opencv(
         assert isinstance(report["views"], dict) and len(report["views"]) == 35
 
 
+@pytest.mark.slow
 def test_command_reads_a_video(tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     path = tmp_path / "board.mp4"

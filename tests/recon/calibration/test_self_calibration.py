@@ -192,6 +192,7 @@ def test_an_adjustment_ends_by_itself_where_height_and_focal_length_trade_places
     assert (np.abs(found.camera_step) < 0.02 * np.sqrt(np.diag(found.camera_covariance))).all()
 
 
+@pytest.mark.slow
 def test_two_heights_known_to_centimetres_determine_it() -> None:
     poses = _nadir((60.0, 90.0))
     points, seen = _seen(poses, TRUE)
@@ -201,6 +202,7 @@ def test_two_heights_known_to_centimetres_determine_it() -> None:
     assert not found.why_not and abs(found.camera.K[0, 0] / 960.0 - 1.0) < 0.003
 
 
+@pytest.mark.slow
 def test_a_camera_beyond_belief_and_wild_sightings() -> None:
     poses = _oblique_turn()
     points, seen = _seen(poses, TRUE)
@@ -288,6 +290,7 @@ def test_a_wide_lens_surer_than_an_unknown_one_is_taken_and_its_distortion_stays
     assert [unsure(s) for s in (0.01, 0.014)] == [(), ("distortion",)]
 
 
+@pytest.mark.slow
 def test_landmarks_without_a_place_take_no_part() -> None:
     poses = _oblique_turn()
     points, seen = _seen(poses, TRUE)

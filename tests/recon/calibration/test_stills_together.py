@@ -138,6 +138,7 @@ def test_a_track_that_a_wild_fix_tore_is_seen() -> None:
     assert is_torn(poses, times(), priors)
 
 
+@pytest.mark.slow
 def test_a_global_shutter_is_none() -> None:
     rng = np.random.default_rng(4)
     seen = sighted(CAMERA, rng, 0.3)
@@ -234,6 +235,7 @@ def test_drawn_stills_that_come_late_with_a_slow_log(tmp_path: Path) -> None:
     assert abs(np.degrees(np.mean(rolls))) < 2.0  # hardly shows over flat ground
 
 
+@pytest.mark.slow
 def test_a_global_shutter_keeps_its_odometry(tmp_path: Path) -> None:
     inputs = flown(tmp_path, 0.0, hz=10.0)
     config = change(inputs.config, "camera.readout_ms", "0")

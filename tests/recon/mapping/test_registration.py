@@ -178,6 +178,7 @@ def test_flat_ground_leaves_three_directions_open(sigma_m: float, blur_px: float
         assert sigma[0] > 3 and sigma[1] > 3 and sigma[2] < 0.1
 
 
+@pytest.mark.slow
 def test_a_trench_leaves_one_direction_open() -> None:
     b, a = pair("trench", 0, 0.03)
     guess = start(0, T_A_B)
@@ -231,6 +232,7 @@ def rejected(result: Registration) -> bool:
     return result.verdict == "rejected" and not result.converged
 
 
+@pytest.mark.slow
 def test_what_cannot_be_trusted_is_rejected() -> None:
     b, a = pair("hills", 0, 0.02)
     away = se3.compose(np.eye(3), np.array([500.0, 0.0, 0.0]))

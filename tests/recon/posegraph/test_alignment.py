@@ -178,6 +178,7 @@ def test_without_any_prior_there_is_no_alignment() -> None:
     assert fit([Anchor(T, PosePrior(), None) for T in track()]) is None
 
 
+@pytest.mark.slow
 def test_covariance_of_the_scale_covers_its_error() -> None:
     ratios = []
     for seed in range(40):

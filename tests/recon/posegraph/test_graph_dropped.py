@@ -94,6 +94,7 @@ def test_many_short_segments_keep_to_the_bound_and_near_the_truth(flown: Flown) 
         assert trajectory.publish(trajectory.place(i))[0] >= 1
 
 
+@pytest.mark.slow
 def test_without_fixes_nothing_jumps_when_segments_go() -> None:
     """Dead reckoning over a gap is published once: what stays, stays where it was."""
     trajectory, worst = Trajectory(graph=bounded()), 0.0

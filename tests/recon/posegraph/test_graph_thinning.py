@@ -133,6 +133,7 @@ def test_everything_published_is_corrected_at_the_end_and_counted() -> None:
             assert times >= 2
 
 
+@pytest.mark.slow
 def test_composed_motions_and_moved_loops_have_the_spread_of_many_trials() -> None:
     """Monte Carlo: perturb each motion, look at the composed one and at the moved loop."""
     rng = np.random.default_rng(3)

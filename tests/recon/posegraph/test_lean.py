@@ -163,6 +163,7 @@ def test_a_short_segment_has_the_noise_and_the_height_of_its_flight(broken_at: i
     assert abs(np.mean(z[:broken_at]) - np.mean(z[broken_at:])) < 2.0
 
 
+@pytest.mark.slow
 def test_altitudes_that_drift_lay_no_segment_on_another() -> None:
     trajectory = settled(stills(4, 4.0, turns=True, drift_m=50.0), 38)
     sigma_m = [trajectory.graph.segments.sigma_height_m(segment) for segment in (0, 1)]

@@ -158,6 +158,7 @@ def test_rows_that_repeat_are_found_near_the_features(monkeypatch: pytest.Monkey
     assert np.linalg.norm(miss - [[0.0, 0.0, 40.0]]) < 0.1
 
 
+@pytest.mark.slow
 def test_another_place_is_no_loop() -> None:
     B = camera(3.0, 2.0, 40.0, 0.2)
     guess = se3.inverse(A) @ B

@@ -176,6 +176,7 @@ def test_without_fixes_the_frame_stays_local_and_drift_is_small(use: str) -> Non
         np.testing.assert_allclose(tilt, [0, 0, 1], atol=0.02)
 
 
+@pytest.mark.slow
 def test_the_gauge_is_free() -> None:
     """Moving the world and turning the odometry's frame moves the answer and nothing else."""
     f = flight(60)
@@ -213,6 +214,7 @@ def test_more_accurate_fixes_make_a_more_accurate_track() -> None:
 # ---- wrong readings --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_receiver_is_left_out() -> None:
     f = flight(120)
     for i in range(70, 90):
@@ -224,6 +226,7 @@ def test_a_jump_of_the_receiver_is_left_out() -> None:
     assert rms_m(graph, f) < 0.6
 
 
+@pytest.mark.slow
 def test_a_frozen_receiver_is_rejected() -> None:
     f = flight(120)
     for i in range(60, 100):
@@ -233,6 +236,7 @@ def test_a_frozen_receiver_is_rejected() -> None:
     assert rms_m(graph, f) < 0.9
 
 
+@pytest.mark.slow
 def test_a_compass_that_turns_round_is_left_out() -> None:
     f = flight(120)
     half = se3.so3_exp(np.array([0.0, 0.0, np.pi]))
@@ -247,6 +251,7 @@ def test_a_compass_that_turns_round_is_left_out() -> None:
     assert np.linalg.norm(turn) < 0.03
 
 
+@pytest.mark.slow
 def test_a_compass_wrong_from_the_start_yields_to_the_track() -> None:
     f = flight(120)
     half = se3.so3_exp(np.array([0.0, 0.0, np.pi]))
@@ -413,6 +418,7 @@ def test_false_loops_never_bend_the_map() -> None:
     np.testing.assert_array_equal(after, before)
 
 
+@pytest.mark.slow
 def test_a_step_of_the_barometer_does_not_bend_the_track() -> None:
     f = flight(120)
     f.priors = [
@@ -562,6 +568,7 @@ def test_vision_and_loops_that_contradict_each_other_leave_the_scale_to_the_fixe
     assert umeyama(places, truth, np.ones(130))[0] == pytest.approx(1.0, abs=0.005)
 
 
+@pytest.mark.slow
 def test_a_stretch_whose_scale_no_fix_measures_is_as_high_as_the_flight() -> None:
     """The height is assumed to be 50 m, and 180 m of 60 units; fixes of 60 m say little."""
     f, graph = flight(66, scale=3.0, sigma_gnss_m=1.0), PoseGraph()
@@ -588,6 +595,7 @@ def test_a_loop_that_vision_cannot_have_drifted_is_refused() -> None:
     np.testing.assert_array_equal(graph.poses()[44], before[44])
 
 
+@pytest.mark.slow
 def test_solved_at_once_it_is_the_same_and_tells_its_residuals() -> None:
     f = flight(80)
     graph, _ = fly(f)

@@ -291,6 +291,7 @@ def test_medians_of_chi_squared_agree_with_scipy() -> None:
     np.testing.assert_allclose(CHI_SQUARED_MEDIANS, medians, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_flight_does_without_large_parts_of_scipy() -> None:
     """Each takes 10 MiB of memory and a tenth of a second."""
     parts = "{'scipy.stats', 'scipy.optimize', 'scipy.special', 'scipy.spatial'}"

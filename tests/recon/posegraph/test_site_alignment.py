@@ -50,6 +50,7 @@ def placed(move: ScanSimilarity, wrong: ScanSimilarity, places: F64) -> F64:
     return move.points(wrong.points(places)) - places
 
 
+@pytest.mark.slow
 def test_two_scans_meet_and_share_their_error() -> None:
     rng = np.random.default_rng(1)
     places = rng.uniform(-40, 40, (50, 3)) * [1, 1, 0.05]
@@ -65,6 +66,7 @@ def test_two_scans_meet_and_share_their_error() -> None:
     assert 0.55 < ratio < 0.85  # one over the root of two is 0.71
 
 
+@pytest.mark.slow
 def test_ties_that_disagree_do_not_shrink_the_site() -> None:
     rng = np.random.default_rng(1)
     wrong, ties = [drawn(rng) for _ in range(4)], []
@@ -114,6 +116,7 @@ def between_sigma_m(found: SiteAlignment, own: Sequence[ScanPrior]) -> F64:
     return np.asarray(np.sqrt(np.diag(J @ found.covariance @ J.T)))
 
 
+@pytest.mark.slow
 def test_the_motion_between_scans_is_as_sure_as_it_says() -> None:
     rng = np.random.default_rng(2)
     ratios = []

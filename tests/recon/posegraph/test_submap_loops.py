@@ -147,6 +147,7 @@ def test_a_repeated_texture_is_no_loop_at_the_wrong_place() -> None:
     assert np.abs(held.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.1
 
 
+@pytest.mark.slow
 def test_stored_keyframes_alone_bring_two_oblique_legs_together() -> None:
     """Each keeps a part of its view; the second leg has slipped against the first."""
     truth = _legs()

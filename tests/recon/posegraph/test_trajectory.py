@@ -78,6 +78,7 @@ def flat(seq: int, T: F64) -> Keyframe:
     return Keyframe(seq, 5 + seq, depth, bgr, pose, np.ones((h, w), np.bool_))
 
 
+@pytest.mark.slow
 def test_a_loop_closure_reaches_store_and_ground_alike(tmp_path: Path) -> None:
     truth = legs()
     chain = drifted(truth)

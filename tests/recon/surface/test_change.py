@@ -43,6 +43,7 @@ def surface(
     return Raster(GRID, z.astype(np.float32), sigma, rgb)
 
 
+@pytest.mark.slow
 def test_surfaces_without_change_show_none_in_nineteen_of_twenty() -> None:
     house = [(60, 60, 40, 50, 6.0)]
     shown = 0
@@ -137,6 +138,7 @@ def test_the_largest_of_many_errors_exceeds_the_level_as_often_as_told(places: i
     assert share == pytest.approx(0.05, abs=0.012)
 
 
+@pytest.mark.slow
 def test_volumes_are_right_within_their_sigma() -> None:
     boxes = [(30, 30, 20, 25, 1.2), (120, 120, 15, 15, 0.8)]
     true = (20 * 25 * 1.2, -15 * 15 * 0.8)

@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 from house_flight import HouseFlight
 
-pytest.importorskip("open3d", exc_type=ImportError)
-pytest.importorskip("fast_simplification")
-
 from recon.mapping.cloud_fusion import cloud_of
 from recon.surface.meshing import Mesh
 from recon.surface.raster import Raster, grid_over, rasterise, without_cells
@@ -18,6 +15,8 @@ from recon.surface.volume import volume_mesh
 from recon.types import I64, DepthMap
 
 VOXEL_M = 0.3
+
+pytestmark = pytest.mark.usefixtures("mesh_libraries")
 
 
 def seen(house: HouseFlight) -> tuple[list[DepthMap], Raster]:

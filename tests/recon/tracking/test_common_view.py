@@ -83,6 +83,7 @@ def textured(shared_px: float, own_px: float, own: float) -> list[U8]:
     ]
 
 
+@pytest.mark.slow
 def test_stills_that_share_fine_detail_alone_are_compared_in_fine_detail() -> None:
     a, b = enumerate(textured(shared_px=1.8, own_px=8.0, own=20.0))
     cache = FeatureCache()

@@ -94,6 +94,7 @@ def pose(t_s: float) -> F64:
     return se3.compose(R, np.array([16.0 * t_s - 60.0, 0.0, 60.0]))
 
 
+@pytest.mark.slow
 def test_a_shutter_too_slow_for_the_speed_is_reported_once() -> None:
     ground, exposure_s = painted_ground(), 0.05
     odometry, warnings = Odometry(CAMERA), list[str]()

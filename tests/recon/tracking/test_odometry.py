@@ -143,6 +143,7 @@ def circling(angles_rad: Iterable[float]) -> list[F64]:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step_rad", [0.02, 0.12], ids=["video", "stills"])
 def test_a_camera_that_circles_a_place_moves(ground: U8, step_rad: float) -> None:
     """Its image stays where it is, and no attitude says that it turned."""
@@ -226,6 +227,7 @@ def test_frames_that_hardly_differ_are_skipped_and_cost_no_accuracy(ground: U8) 
     assert drift(track, found) < 0.05
 
 
+@pytest.mark.slow
 def test_no_frame_of_a_fast_turn_or_a_fast_flight_is_skipped(ground: U8) -> None:
     swung = poses(40, step_m=0.2, wobble=0.05)
     fast = poses(40, step_m=1.5, wobble=0.001)
@@ -235,6 +237,7 @@ def test_no_frame_of_a_fast_turn_or_a_fast_flight_is_skipped(ground: U8) -> None
         assert np.mean([f.state == "skipped" for f in found[metric:]]) < 0.15
 
 
+@pytest.mark.slow
 def test_a_turn_that_telemetry_shows_is_followed_by_parts_of_a_keyframes_turn(ground: U8) -> None:
     """A frame turns twice as far as it moves; what telemetry does not show counts as motion."""
     track = poses(90, step_m=0.2, wobble=0.0)

@@ -247,6 +247,7 @@ def test_a_left_and_right_that_disagree_say_so() -> None:
     assert np.trace(unsure.covariance) < 1.1 * np.trace(left.covariance)
 
 
+@pytest.mark.slow
 def test_one_pose_of_both_keyframes_points_is_as_good_as_the_papers_average() -> None:
     apart, together, differ = [], [], []
     for seed in range(30):

@@ -82,6 +82,7 @@ def test_headings_that_are_wrong_do_not_part_the_flight() -> None:
     assert_one_piece(track, flown([still(T) for T in track], sigma_yaw_rad=0.09), 0.02)
 
 
+@pytest.mark.slow
 def test_a_camera_that_climbs_and_sinks_is_followed() -> None:
     heights = [40.0, 42.0, 44.0, 66.0, 68.0, 45.0, 43.0]
     track = [
@@ -91,6 +92,7 @@ def test_a_camera_that_climbs_and_sinks_is_followed() -> None:
     assert_one_piece(track, flown([still(T) for T in track]), 0.03)
 
 
+@pytest.mark.slow
 def test_a_still_that_shows_nothing_does_not_part_the_flight() -> None:
     """The one after it is found in an earlier one than the last keyframe, turned around."""
     track = [pose(0.25 * FOOTPRINT_M * (i - 4), 0.0, seed=i) for i in range(5)]
@@ -161,6 +163,7 @@ def test_frames_that_wait_are_placed_though_features_follow_the_corners_since() 
     assert odometry._early == []
 
 
+@pytest.mark.slow
 def test_rows_of_a_field_are_not_taken_for_one_another(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows every 10 px hide the little that differs between them from a wide search."""
     rng = np.random.default_rng(3)
@@ -179,6 +182,7 @@ def test_rows_of_a_field_are_not_taken_for_one_another(monkeypatch: pytest.Monke
     assert_one_piece(track, found, 0.02)
 
 
+@pytest.mark.slow
 def test_stills_of_other_places_are_not_joined() -> None:
     here = [pose(0.3 * FOOTPRINT_M * i - 90.0, seed=i) for i in range(3)]
     there = [pose(0.3 * FOOTPRINT_M * i + 30.0, seed=5 + i) for i in range(3)]
@@ -219,6 +223,7 @@ def test_the_first_still_of_a_segment_is_placed_and_reconstructed() -> None:
     assert pipeline.refusals().total() == 0
 
 
+@pytest.mark.slow
 def test_corners_without_a_landmark_do_not_choose_the_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two starts the one whose pose explains more landmarks wins, however many corners match."""
     track = [pose(0.3 * FOOTPRINT_M * (i - 3), seed=i) for i in range(6)]

@@ -428,6 +428,7 @@ def test_ffmpeg_pipe_gives_the_images_of_the_file(tmp_path: Path, ffmpeg_output:
         assert y4m or abs(time_ns - ms * 1_000_000) <= 12_000
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/data")
 def test_real_flight_video_has_true_times() -> None:
     source = open_camera(str(SHARED / "caliterra_nadir" / "caliterra_0p5fps.mp4"))

@@ -279,6 +279,7 @@ def test_a_video_is_turned_as_it_asks_players_to(tmp_path: Path) -> None:
     assert all(upper_left(frame.image) for frame in source)
 
 
+@pytest.mark.slow
 def test_replay_takes_the_lens_of_the_tags(tmp_path: Path) -> None:
     for i in range(3):
         write_still(tmp_path / f"{i}.jpg", (320, 240), {41989: 35})

@@ -238,6 +238,7 @@ def test_a_path_that_may_not_be_looked_at_is_refused_in_a_line(
     assert said.startswith("skyrelief: xxx") and "File name too long" in said
 
 
+@pytest.mark.slow
 def test_config_command(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     printed = run_cli("config", "default")

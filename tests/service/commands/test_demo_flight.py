@@ -39,6 +39,7 @@ def test_a_named_flight_alone_counts(tmp_path: Path) -> None:
         demo._flight(tmp_path / "nothing-here")
 
 
+@pytest.mark.slow
 def test_kernels_are_compiled_meanwhile_the_first_time_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

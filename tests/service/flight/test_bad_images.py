@@ -111,6 +111,7 @@ def dark(image: U8) -> U8:
     return np.asarray(image * 0.35, np.uint8)
 
 
+@pytest.mark.slow
 def test_the_clean_flight_gives_the_plane(clean: list[U8]) -> None:
     keyframes, _, _ = fly(clean)
     assert len(keyframes) >= 5
@@ -130,6 +131,7 @@ def test_spoiled_frames_make_no_false_surface(clean: list[U8], spoil: Callable[[
         assert not any(25 <= k.seq < 29 for k in keyframes)
 
 
+@pytest.mark.slow
 def test_frames_that_come_twice_change_nothing(clean: list[U8]) -> None:
     keyframes, _, _ = fly([p for p in clean for _ in (0, 1)])
     assert len(keyframes) >= 5 and all(off_the_plane(k) < 0.002 for k in keyframes)

@@ -90,6 +90,7 @@ def test_a_frozen_receiver_is_reported() -> None:
     assert any("is GNSS frozen" in text for text in heard)
 
 
+@pytest.mark.slow
 def test_a_track_that_the_fixes_contradict_is_reported() -> None:
     """Vision that swings by metres, as a rolling shutter makes it, under a receiver of 5 cm."""
     graph, watch_said = PoseGraph(), list[str]()

@@ -119,6 +119,7 @@ def test_a_clock_that_the_whole_log_does_not_confirm_stays(monkeypatch: pytest.M
     assert check.clock_off_ms() is None and check.clock_off_ms(has_ended=True) is None
 
 
+@pytest.mark.slow
 def test_a_search_that_found_nothing_is_repeated_with_all_frames(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -62,6 +62,7 @@ def said(folder: Path) -> dict[tuple[str, str], dict[str, object]]:
     return {(one["drone"], one["scan"]): one for one in json.loads(text or "{}")["scans"]}
 
 
+@pytest.mark.slow
 def test_two_scans_in_flight_are_shown_in_one_another(tmp_path: Path) -> None:
     one = flying(tmp_path / "a" / "1", NORTH, WRONG)
     two = write_scan(tmp_path / "b" / "2", EAST, finished=False)
@@ -103,6 +104,7 @@ def test_a_scan_in_flight_meets_the_site_on_the_ground(tmp_path: Path) -> None:
     assert ("site", "a-1") in said(one) and ("a", "1") not in said(one)
 
 
+@pytest.mark.slow
 def test_the_last_visit_is_shown_as_an_earlier_date(tmp_path: Path) -> None:
     for name, day in (("april", -60), ("may", -30)):
         scan = write_scan(tmp_path / name / "1", NORTH, day=day)

@@ -113,6 +113,7 @@ def test_scans_that_end_are_aligned(tmp_path: Path, working: tuple[Sites, Worker
     assert document["revision"] == 1
 
 
+@pytest.mark.slow
 def test_a_scan_that_cannot_be_read_stops_no_other(
     tmp_path: Path, working: tuple[Sites, Worker]
 ) -> None:

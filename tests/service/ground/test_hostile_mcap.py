@@ -107,6 +107,7 @@ def test_a_small_file_takes_no_large_memory(tmp_path: Path, how: str) -> None:
     assert int(ended.stdout) < 64  # MiB
 
 
+@pytest.mark.slow
 def test_flipped_recordings_never_end_in_a_traceback(tmp_path: Path, recording: Path) -> None:
     good = recording.read_bytes()
     outcomes = set()

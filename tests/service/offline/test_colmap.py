@@ -118,6 +118,7 @@ def test_without_the_recording_it_is_refused_in_one_line(
         assert not list((tmp_path / "s").glob("*colmap*"))
 
 
+@pytest.mark.slow
 def test_without_the_recording_the_whole_stored_images_serve(tmp_path: Path) -> None:
     scan_dir = made(tmp_path, flown(), size=(240, 180), new_px=4)
     with ScanStore.open(scan_dir / "scan.db") as store:

@@ -15,8 +15,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-pytest.importorskip("open3d", exc_type=ImportError)
-
 from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh
 from service.cameras import CameraFrame
@@ -34,6 +32,8 @@ from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
     from house_flight import HouseFlight
+
+pytestmark = pytest.mark.usefixtures("mesh_libraries")
 
 
 def noting(said: list[str]) -> Progress:
@@ -333,6 +333,7 @@ def test_the_mesh_lies_on_the_globe_as_3d_tiles(tmp_path: Path, house: HouseFlig
         assert up[:, 2].max() == pytest.approx(6.0, abs=0.5)  # the roof
 
 
+@pytest.mark.slow
 def test_the_mesh_as_obj_lies_in_its_utm_zone_with_its_texture(
     tmp_path: Path, house: HouseFlight
 ) -> None:

@@ -313,6 +313,7 @@ def test_out_leaves_the_scan_alone(flight: Flight, tmp_path: Path) -> None:
         refine(flight.scan, RefineOptions(gcp, out=tmp_path / "refined"))
 
 
+@pytest.mark.slow
 def test_a_scan_without_a_place_gets_it_from_three_points(tmp_path: Path) -> None:
     flight = fly(tmp_path, placed=False)
     rows = flight.survey(SPOTS)
@@ -363,6 +364,7 @@ def test_the_command_prints_points_without_heights(flight: Flight) -> None:
     assert "left out" in answer.stdout and "vertical" not in answer.stdout
 
 
+@pytest.mark.slow
 def test_each_control_point_is_distinguished_from_the_others(flight: Flight) -> None:
     """A point that is off by decimetres shows where it is left out, not where it takes part."""
     rows = flight.survey(SPOTS)
@@ -382,6 +384,7 @@ def test_each_control_point_is_distinguished_from_the_others(flight: Flight) -> 
     assert all(p["left_out_m"] is None for p in figures["points"])
 
 
+@pytest.mark.slow
 def test_one_column_less_is_no_fault_and_points_with_heights_still_lift(flight: Flight) -> None:
     rows = [
         {k: v for k, v in row.items() if k != "sigma_v_m"} | ({"alt_amsl_m": ""} if flat else {})
@@ -442,6 +445,7 @@ def test_a_point_two_metres_off_is_distinguished_from_the_others(flight: Flight)
     assert errors(flight).max() < 0.2
 
 
+@pytest.mark.slow
 def test_points_in_one_corner_are_reported(flight: Flight) -> None:
     corner = {"A": (4.0, -6.0), "B": (14.0, -4.0), "D": (12.0, 6.0), "C1": (36.0, 18.0)}
     gcp = write_csv(flight.folder / "points.csv", flight.survey(corner))
@@ -451,6 +455,7 @@ def test_points_in_one_corner_are_reported(flight: Flight) -> None:
     assert refine(flight.scan, RefineOptions(gcp))["notes"] == []
 
 
+@pytest.mark.slow
 def test_check_points_never_take_part(flight: Flight) -> None:
     rows = flight.survey(SPOTS)
     one = refine(

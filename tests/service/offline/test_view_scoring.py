@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -18,10 +19,11 @@ from service.stream.codec import encode
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
-pytestmark = pytest.mark.slow
-
-pytest.importorskip("open3d", exc_type=ImportError)
-pytest.importorskip("skimage")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.usefixtures("mesh_libraries"),
+    pytest.mark.skipif(find_spec("skimage") is None, reason="scikit-image is not installed"),
+]
 
 STEP_M = 2.5
 

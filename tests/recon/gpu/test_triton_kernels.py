@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
-
 pytest.importorskip("torch")
 if find_spec("triton") is None:  # its import would choose between interpreter and compiler
     pytest.skip("triton is not installed", allow_module_level=True)

@@ -25,8 +25,6 @@ torch = pytest.importorskip("torch")
 
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-pytestmark = pytest.mark.slow
-
 WAITS = (
     "_local_scalar_dense", "item", "nonzero", "masked_select", "unique", "nanmedian", "median",
     "equal", "bincount", "histc", "_linalg_eigh", "_linalg_svd", "_linalg_check_errors",

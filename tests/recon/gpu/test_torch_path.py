@@ -28,8 +28,6 @@ from recon.stereo.upsampling import upsample as compiled_upsample
 from recon.stereo.virtual_stereo import drop_unseen as compiled_drop
 from recon.types import F32, U8, Array, DepthMap, DisparityMap, StereoPair
 
-pytestmark = pytest.mark.slow
-
 torch = pytest.importorskip("torch")
 
 SIZE = (96, 54)
@@ -228,7 +226,6 @@ def pairs_for(device: str, guide: int) -> list[StereoPair]:
     return [*pairs, replace(stereo_pair(54, 90, 16, 3, guide), left_seen=None)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("guide", [0, 2])
 def test_the_whole_path_equals_the_stages(device: str, guide: int) -> None:
     """Pairs of several sizes, twice over; the second time nothing is built again."""

@@ -15,8 +15,6 @@ from recon.mapping.registration import DepthSurface, IcpConfig
 from recon.mapping.registration import register_projective as compiled
 from recon.types import F64, DepthMap, Registration
 
-pytestmark = pytest.mark.slow
-
 torch = pytest.importorskip("torch")
 
 K = np.array([[110.0, 0, 79.5], [0, 110.0, 44.5], [0, 0, 1]])
