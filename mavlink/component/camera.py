@@ -178,11 +178,11 @@ class CameraComponent:
         if self._is_recording and not status.is_recording:
             self._end_recording()
         self._is_recording = status.is_recording
-        message = self._capture_status(status)
-        shown = message.image_status, message.video_status, message.image_interval
+        every_s = 0.0 if self._series is None else self._series[0]
+        shown = self._image_status(), int(status.is_recording), every_s
         if shown != self._shown:
             self._shown = shown
-            self._outbox.put(CAMERA, message)
+            self._outbox.put(CAMERA, self._capture_status(status))
 
     def _end_recording(self) -> None:
         """Forget what a recording's operators asked for, however it ended."""
@@ -234,13 +234,15 @@ class CameraComponent:
             b"scans",
         )
 
+    def _image_status(self) -> int:
+        """Idle, one image, between two images of a series, or taking one of them."""
+        return 2 * (self._series is not None) + bool(self._waiting)
+
     def _capture_status(self, status: ScanStatus | None = None) -> Any:
         status = status or self._control.status()
-        busy, series = bool(self._waiting), self._series is not None
-        image_status = (3 if busy else 2) if series else int(busy)
         return dialect.MAVLink_camera_capture_status_message(
             self._boot_ms(),
-            image_status,
+            self._image_status(),
             int(status.is_recording),
             0.0 if self._series is None else self._series[0],
             status.recording_ms & 0xFFFFFFFF,

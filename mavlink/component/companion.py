@@ -61,6 +61,11 @@ HEARD = numbers_of((*READERS, *SERVED)) | {COMMAND_CANCEL}
 """Numbers of the messages that :meth:`Companion.receive` handles."""
 
 
+TICK_S, IDLE_TICK_S = 0.01, 0.04
+FAST_US = 400_000
+"""Streams with a shorter interval, down to 20 ms, need the short pause."""
+
+
 @dataclass(frozen=True, slots=True)
 class CompanionConfig:
     """Settings of the companion."""
@@ -254,6 +259,12 @@ class Companion:
         self.texts.tick(now_ns)
         self.autopilot.tick(now_ns)
         self._watch_links(now_ns)
+
+    @property
+    def pause_s(self) -> float:
+        """Until the next :meth:`tick`, at most; idle, a longer pause spares the processor."""
+        fast = any(0 < stream.interval_us < FAST_US for stream in self.streams.values())
+        return TICK_S if fast or self._is_recording else IDLE_TICK_S
 
     def _watch_links(self, now_ns: int) -> None:
         if now_ns < self._watch_ns:

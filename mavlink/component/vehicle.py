@@ -45,7 +45,6 @@ SAVE_EVERY_NS, SAVE_SIGNED_NS = 30 * S, S  # with a key, what a crash forgets co
 TELEMETRY = numbers_of(READERS)
 BACKLOG = 10_000  # packets queued for the protocol's thread
 STUCK_NS = 10 * S
-TICK_S = 0.01  # the fastest stream has 50 messages a second
 TUNNEL_ROOM = 128
 BEAT_NICE = -10  # needs LimitNICE or root, otherwise the priority stays normal
 
@@ -265,7 +264,7 @@ class VehicleLink:
         every_ns = SAVE_EVERY_NS if self._signing is None else SAVE_SIGNED_NS
         save_ns = self._clock_ns() + every_ns
         while not self._stop.is_set():
-            self._serve(TICK_S)
+            self._serve(self._companion.pause_s)
             now_ns = self._alive_ns = self._clock_ns()
             self._guard(partial(self._companion.tick, now_ns))
             self._send(self._companion.take())
@@ -302,14 +301,16 @@ class VehicleLink:
             now_ns = self._clock_ns()
             due = self.presence.due(now_ns)
             if now_ns - self._alive_ns < STUCK_NS:  # otherwise nothing would answer: stay silent
-                self._send(due)
+                sent = self._links.send(self.presence.system, due)
+                self._inbox.put(partial(self._record, sent, now_ns))  # a disk may keep one waiting
             self._stop.wait(max(0.001, (self.presence.next_timer() - self._clock_ns()) / S))
 
     def _send(self, messages: list[OutgoingMessage]) -> None:
-        if not messages:
-            return
-        now_ns = self._clock_ns()
-        for data in self._links.send(self.presence.system, messages):
+        if messages:
+            self._record(self._links.send(self.presence.system, messages), self._clock_ns())
+
+    def _record(self, sent: list[bytes], now_ns: int) -> None:
+        for data in sent:
             self.recorder.write(data, now_ns)
 
     def _is_stale(self) -> bool:

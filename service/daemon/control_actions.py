@@ -28,6 +28,7 @@ from service.errors import InputError, OutsideError, SkyreliefError
 from service.scans.retention import existing
 from service.workers import PROCESS
 
+DISK_AGE_S = 1.0
 MIN_FREE_MIB = 500.0
 """The self-test fails with less free disk space."""
 
@@ -51,11 +52,12 @@ class ControlActions:
         """``restart`` ends the service; the init system restarts it."""
         self.is_ready = False  # still starting
         self._scanning, self._restart = scanning, restart
+        self._disk_mib, self._disk_at = (0.0, 0.0), -math.inf  # total and free, and when seen
 
     def status(self) -> ScanStatus:
         """A snapshot for the operator."""
         scanning = self._scanning
-        disk = shutil.disk_usage(existing(Path(scanning.config.scan.folder)))
+        total_mib, free_mib = self._disk()
         run, scan = scanning.run, scanning.scan
         recorder = scan.recorder if scan is not None else None
         latency = scan.check.latency if scan is not None else None
@@ -67,14 +69,23 @@ class ControlActions:
             phase=phase,
             scan_id=scanning.scan_id,
             recording_ms=int(1e3 * recording_s),
-            storage_total_mib=disk.total / 2**20,
-            storage_free_mib=disk.free / 2**20,
+            storage_total_mib=total_mib,
+            storage_free_mib=free_mib,
             speed_m_s=recorder.speed_m_s if recorder is not None else math.nan,
             distance_m=recorder.distance_m if recorder is not None else math.nan,
             turn_rate_rad_s=recorder.turn_rate_rad_s if recorder is not None else math.nan,
             camera_latency_ms=latency.latency_ms if latency is not None else math.nan,
             camera_latency_sigma_ms=latency.sigma_ms if latency is not None else math.nan,
         )
+
+    def _disk(self) -> tuple[float, float]:
+        """Total and free MiB of the disk of the scans, at most DISK_AGE_S old: the protocol's
+        thread asks for the status all the time."""
+        now_s = time.monotonic()
+        if now_s - self._disk_at > DISK_AGE_S:
+            disk = shutil.disk_usage(existing(Path(self._scanning.config.scan.folder)))
+            self._disk_mib, self._disk_at = (disk.total / 2**20, disk.free / 2**20), now_s
+        return self._disk_mib
 
     def view(self) -> CameraView:
         """The camera's view by telemetry, which takes a moment to arrive."""

@@ -16,7 +16,7 @@ from rehearsal import RehearsalControl
 from mavlink.component.camera import KeyframeReport
 from mavlink.component.command_desk import Command
 from mavlink.component.commands import COMMANDS
-from mavlink.component.companion import Companion, CompanionConfig
+from mavlink.component.companion import IDLE_TICK_S, TICK_S, Companion, CompanionConfig
 from mavlink.component.control import Answer, CameraView, Phase, Result, Work
 from mavlink.component.metadata import VERSION
 from mavlink.component.parameters import PARAMETERS
@@ -404,6 +404,17 @@ def test_shots_of_any_number_of_senders_take_bounded_memory(ends: Ends) -> None:
         ends.command(511, 100, 262, 1e6, source=(255, component))
     assert len(ends.companion.camera._numbered) <= 16
     assert len(ends.companion.streams[100, 262]._wanted) <= 16
+
+
+def test_only_a_scan_and_fast_streams_need_a_short_pause(ends: Ends) -> None:
+    assert ends.companion.pause_s == IDLE_TICK_S
+    ends.command(511, 100, 262, 1e5)
+    assert ends.companion.pause_s == TICK_S
+    ends.command(511, 100, 262, -1)
+    assert ends.companion.pause_s == IDLE_TICK_S
+    ends.command(2500, 100)
+    ends.pass_time(2.0)
+    assert ends.companion.pause_s == TICK_S
 
 
 @pytest.mark.parametrize(

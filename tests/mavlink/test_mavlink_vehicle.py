@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import socket
+import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -126,6 +128,40 @@ def test_the_last_word_is_said() -> None:
             while True:
                 heard += peer.recv(4096)
         assert b"Service stops" in heard
+
+
+def test_heartbeats_do_not_wait_for_the_disk_of_the_log(tmp_path: Path) -> None:
+    log = tmp_path / "link.tlog"
+    os.mkfifo(log)
+    disk = os.open(log, os.O_RDONLY | os.O_NONBLOCK)  # takes 64 KiB, then nothing
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", 0))
+        peer.settimeout(10.0)
+        with RehearsalVehicle(f"udpout:127.0.0.1:{peer.getsockname()[1]}") as daemon:
+            link = daemon.link
+            link.record(log, 0)
+
+            def fill() -> None:
+                for _ in range(1000):
+                    link.recorder.write(bytes(250), 0)
+
+            fills = threading.Thread(target=fill)
+            fills.start()
+            written = -1
+            while written != (written := link.recorder.packets):
+                time.sleep(0.1)
+            try:
+                assert fills.is_alive()
+                peer.setblocking(False)
+                with contextlib.suppress(BlockingIOError):
+                    while peer.recv(4096):
+                        pass
+                peer.settimeout(10.0)
+                beats = 0
+                while beats < 5:  # of two components
+                    beats += peer.recv(4096)[7:10] == b"\0\0\0"
+            finally:
+                os.close(disk)  # who waits for it gets an error
 
 
 class LogPort:
