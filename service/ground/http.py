@@ -48,6 +48,7 @@ from service.ground.guard import (
 from service.ground.library import ConflictError
 from service.ground.live import serve_live
 from service.ground.map_tiles import map_routes
+from service.ground.products import products_of
 from service.ground.scan_files import file_routes
 from service.ground.sites import align_by_points
 from service.ground.state import KINDS, PortalState, names_of, state_of
@@ -149,6 +150,7 @@ def portal_app(state: PortalState, tokens: Tokens, local: bool) -> ASGIApp:
         Route(one + "/annotations/{number:int}", _erase_annotation, methods=["DELETE"]),
         *file_routes(one),
         *map_routes(),
+        Route(one + "/exports", _products, methods=["GET"]),
         Route(one + "/exports", _export, methods=["POST"]),
         Route(one + "/alignment", _align, methods=["POST"]),
         WebSocketRoute(one + "/live", _live),
@@ -328,6 +330,14 @@ def _erase_annotation(request: Request) -> Response:
     note(request, "erase annotation", scan=f"{drone}/{scan}", number=number)
     state_of(request).library.erase_annotation(drone, scan, number)
     return JSONResponse({})
+
+
+def _products(request: Request) -> Response:
+    """What can be made of a scan: what each is, its file, about its size and time."""
+    library, names = state_of(request).library, names_of(request)
+    entry = library.entry(*names)
+    points = entry.get("counts", {}).get("points")
+    return JSONResponse(products_of(library.folder(*names), points, entry["origin"] is not None))
 
 
 async def _export(request: Request) -> Response:

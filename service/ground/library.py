@@ -83,6 +83,7 @@ FILES: dict[str, str] = {
     "scan.json": "summary",
     "scan.db": "store",
     "preview.jpg": "preview",
+    "thumbnail.webp": "thumbnail",
 }
 """Files of a scan folder that may be downloaded, and what they are."""
 
@@ -135,6 +136,7 @@ class Library:
             "edition": labels.edition,
             "files": _files(folder),
             "preview": is_regular(folder / "preview.jpg"),
+            "thumbnail": is_regular(folder / "thumbnail.webp"),
             "tiles": is_regular(folder / "3dtiles" / "tileset.json"),
             "maps": is_regular(folder / "maps" / "manifest.json"),
             "started_unix_s": None,

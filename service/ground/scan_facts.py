@@ -59,6 +59,12 @@ class MeasuredExtent(msgspec.Struct):
     corners_lat_lon: tuple[Corner, Corner, Corner, Corner]
 
 
+class KnownExtent(msgspec.Struct):
+    """The same, of a scan that may lie nowhere on the globe."""
+
+    corners_lat_lon: tuple[Corner, Corner, Corner, Corner] | None = None
+
+
 class Ground(msgspec.Struct):
     """When a scan was flown, and over which ground."""
 
@@ -86,11 +92,13 @@ class Facts(msgspec.Struct):
     origin: Origin | None = None
     newest: Count | None = None  # keyframe of a scan that has no files yet
     failed: Annotated[dict[str, Note], msgspec.Meta(max_length=100)] = {}
+    coverage: KnownExtent | None = None
 
     def shown(self) -> dict[str, Any]:
         """The entries of the list."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
-        failed = plain.pop("failed")
+        failed, coverage = plain.pop("failed"), plain.pop("coverage")
+        plain["corners_lat_lon"] = coverage and coverage["corners_lat_lon"]
         if failed:
             why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())
             plain["trouble"] = f"could not be made: {why}"[:MAX_TROUBLE]

@@ -63,7 +63,7 @@ def file_routes(one: str) -> list[Route]:
 def _file(request: Request) -> Response:
     """A deliverable; byte ranges are honoured."""
     path = state_of(request).library.file(*names_of(request), request.path_params["name"])
-    if path.name in ("preview.jpg", "mesh.glb"):
+    if path.name in ("preview.jpg", "thumbnail.webp", "mesh.glb"):
         return FileResponse(path)
     if path.name in ("report.html", "change.html"):
         return FileResponse(path, headers=SANDBOX)

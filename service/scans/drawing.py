@@ -19,6 +19,7 @@ import numpy as np
 from recon.surface.raster import Grid, Raster, fill_holes, hillshade, smoothed
 from recon.types import F32, F64, U8, Array, Keyframe
 from service.errors import InputError
+from service.scans.fused_cloud import Box
 from service.stream.store import ScanStore
 
 BACKGROUND = (250, 248, 246)  # BGR
@@ -65,6 +66,29 @@ def draw_preview(
     return _with_lines(both, lines, _growth(colour))
 
 
+def draw_thumbnail(raster: Raster, bounds: Box, largest_px: int = 480) -> U8:
+    """(h, w, 4) BGRA of the colours within ``bounds`` (west, south, east, north in the raster's
+    frame), clear where nothing is known."""
+    west, south, east, north = bounds
+    grid = raster.grid
+    scale = largest_px / max(east - west, north - south)  # pixels a metre
+    cell_px = min(grid.cell_m * scale, 1.0)
+    small = [  # the mean of known cells: unknown ones are black
+        cv2.resize(image, None, fx=cell_px, fy=cell_px, interpolation=cv2.INTER_AREA)
+        for image in (np.where(raster.known[..., None], raster.rgb[..., ::-1], np.uint8(0)),
+                      np.where(raster.known, np.uint8(255), np.uint8(0)))
+    ]  # fmt: skip
+    up = grid.cell_m * scale / cell_px
+    A = np.array(
+        [[up, 0.0, (grid.west_m - west) * scale], [0.0, up, (north - grid.north_m) * scale]]
+    )
+    size = max(round((east - west) * scale), 1), max(round((north - south) * scale), 1)
+    colour, known = (cv2.warpAffine(image, A, size).astype(np.float32) for image in small)
+    colour *= _gain(raster) * 255.0 / np.maximum(known, 1.0)[..., None]
+    out = np.dstack([np.clip(colour, 0.0, 255.0), known])
+    return np.asarray(out, np.uint8)
+
+
 def blank_preview(lines: Sequence[str]) -> U8:
     """The image of a scan without any surface: only its key figures."""
     return _with_lines(np.full((120, MIN_LINE_PX, 3), BACKGROUND, np.uint8), lines)
@@ -79,8 +103,7 @@ def _relief(raster: Raster) -> F32:
 
 def _colours(raster: Raster, shade: F32) -> Callable[[slice], F32]:
     """Paints rows in colour times shading, softened so that the image stays readable."""
-    bright = float(np.percentile(raster.rgb[raster.known], 98)) if raster.known.any() else 255.0
-    gain = float(np.clip(230.0 / max(bright, 1.0), 1.0, 2.0))
+    gain = _gain(raster)
 
     def paint(rows: slice) -> F32:
         lit = np.nan_to_num(shade[rows], nan=1.0)
@@ -90,6 +113,12 @@ def _colours(raster: Raster, shade: F32) -> Callable[[slice], F32]:
         return np.asarray(bgr)
 
     return paint
+
+
+def _gain(raster: Raster) -> float:
+    """What makes a dark scan readable."""
+    bright = float(np.percentile(raster.rgb[raster.known], 98)) if raster.known.any() else 255.0
+    return float(np.clip(230.0 / max(bright, 1.0), 1.0, 2.0))
 
 
 def _heights(raster: Raster, shade: F32) -> Callable[[slice], F32]:

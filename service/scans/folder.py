@@ -1,8 +1,9 @@
 """The files of a finished or growing scan, made from its store alone.
 
 Drone and ground hold the same store, so both make the same files: ``cloud.laz``,
-``trajectory.tum``, ``trajectory.csv``, ``scan.json``, ``preview.jpg``, ``coverage.png``,
-``coverage.json`` and ``report.html``; ``piece-1.laz`` and so on of what is not tied to the rest.
+``trajectory.tum``, ``trajectory.csv``, ``scan.json``, ``preview.jpg``,
+``thumbnail.webp``, ``coverage.png``, ``coverage.json`` and ``report.html``; ``piece-1.laz``
+and so on of what is not tied to the rest.
 Each is written to a temporary file and then renamed, so a reader never sees a partial file.
 """
 
@@ -30,7 +31,13 @@ from service.progress import CancelledError, Progress
 from service.redaction import public_configuration, redacted
 from service.scans.coverage import IMAGE as COVERAGE
 from service.scans.coverage import Coverage, write_coverage_files
-from service.scans.drawing import blank_preview, draw_preview, middle_keyframe, stages
+from service.scans.drawing import (
+    blank_preview,
+    draw_preview,
+    draw_thumbnail,
+    middle_keyframe,
+    stages,
+)
 from service.scans.fused_cloud import (
     DEFAULT_VOXEL_M,
     Box,
@@ -67,6 +74,8 @@ log = logging.getLogger(__name__)
 
 CLOUD, TUM, CSV = "cloud.laz", "trajectory.tum", "trajectory.csv"
 SUMMARY, PREVIEW, REPORT = "scan.json", "preview.jpg", "report.html"
+THUMBNAIL = "thumbnail.webp"
+WEBP = (cv2.IMWRITE_WEBP_QUALITY, 80)
 PREVIEW_CELLS = 6e6
 LONGEST_REASON = 500
 MIN_VOXEL_M, MAX_VOXEL_M = 0.01, 100.0
@@ -271,6 +280,15 @@ class _Files:
         with self.failures.noted(PREVIEW):
             preview = _preview(self._raster, poses, summary, self._left_out)
             write_whole(self._folder / PREVIEW, preview)
+        if self._raster is not None:
+            with self.failures.noted(THUMBNAIL):
+                bounds = (
+                    self._raster.grid.bounds if self._coverage is None else self._coverage.bounds_m
+                )
+                image = draw_thumbnail(self._raster, bounds)
+                write_whole(
+                    self._folder / THUMBNAIL, cv2.imencode(".webp", image, WEBP)[1].tobytes()
+                )
         with self.failures.noted(REPORT):
             shown = _stages(self._folder, self._store)
             cloud, coverage = self._fused.cloud, self._coverage

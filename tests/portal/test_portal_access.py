@@ -66,10 +66,11 @@ def box(browser: Browser, selector: str) -> dict[str, float]:
 def test_on_a_telephone_nothing_is_out_of_reach(browser: Browser, base: str) -> None:
     show(browser, base, PHONE)
     browser.wait("document.querySelectorAll('article').length === 1")
-    for selector in (".import input", ".import button", "article .acts"):
+    browser.run("document.querySelectorAll('details').forEach(d => d.open = true)")
+    for selector in (".import input", ".import button", "article .acts", ".overview .map"):
         assert 0 <= box(browser, selector)["left"] < box(browser, selector)["right"] <= PHONE[0]
     acts = browser.run(
-        "[...document.querySelectorAll('article .acts :is(a, button, select)')]"
+        "[...document.querySelectorAll('article .acts :is(a, button, summary)')]"
         ".map(e => e.getBoundingClientRect().right)"
     )
     card = box(browser, "article")
@@ -106,18 +107,21 @@ def test_no_panel_lies_over_the_time_slider(browser: Browser, base: str) -> None
         assert box(browser, f".side .{name}")["bottom"] <= time["top"]
 
 
-def test_choosing_a_deliverable_by_keyboard_starts_nothing(browser: Browser, base: str) -> None:
-    show(browser, base, (1440, 900))
+def test_a_product_is_made_by_keyboard_once_it_is_asked_for(browser: Browser, base: str) -> None:
+    show(browser, f"{base}/?token={TOKEN}", (1440, 900))
     browser.wait("document.querySelectorAll('article').length === 1")
-    names = browser.run("[...document.querySelector('article select')].map(o => o.textContent)")
-    assert {"all maps", "surface model, GeoTIFF", "orthophoto, KMZ"} < set(names)
-    browser.run(
-        "(() => { const kinds = document.querySelector('article select'); kinds.focus();"
-        " kinds.value = 'ply'; for (const name of ['input', 'change'])"
-        " kinds.dispatchEvent(new Event(name, { bubbles: true })); })()"
-    )
+    browser.run("document.querySelector('[aria-label^=\"Export \"]').focus()")
+    browser.key("Enter")
+    browser.wait("document.querySelectorAll('.product').length > 20")
     jobs = "fetch('/api/scans/drone-1/test-1').then(r => r.json()).then(s => s.jobs.length)"
     assert browser.run(f"new Promise(r => setTimeout(r, 300)).then(() => {jobs})") == 0
+    browser.run("document.querySelector('[aria-label=\"Make Track, KML\"]').focus()")
+    browser.key("Enter")
+    browser.wait("!!document.querySelector('[aria-label=\"Download Track, KML\"]')")
+    browser.key("Escape")
+    browser.wait("!document.querySelector('dialog')")
+    focused = "document.activeElement.getAttribute('aria-label')"
+    assert browser.wait(focused).startswith("Export ")  # back where it was opened
 
 
 @pytest.fixture(scope="module")
@@ -183,6 +187,10 @@ def test_axe_finds_nothing_serious(
     browser.wait("document.querySelector('.jobs li') !== null")
     browser.run("document.querySelectorAll('details').forEach(d => d.open = true)")
     found += axe(browser, "library", tmp_path)
+    browser.click("Export…")
+    browser.wait("document.querySelectorAll('.product').length > 20")
+    found += axe(browser, "export", tmp_path)
+    browser.key("Escape")
     show(browser, f"{busy}/#/view/drone-1/test-1", size)
     browser.wait("document.querySelector('.state').classList.contains('receiving')")
     for name in ("Measure", "Coverage"):

@@ -58,19 +58,22 @@ def test_rename_download_delete_and_bring_back(browser: Browser, portal: Portal)
     browser.open(portal.url)
     browser.wait("document.querySelectorAll('article').length === 1")
     assert browser.run("location.search") == ""  # the token is out of the address
-    browser.dialog = "<img src=x onerror=alert(1)> Hof"
-    browser.click("Rename")
+    browser.click("Rename…")
+    browser.answer("<img src=x onerror=alert(1)> Hof")
     browser.wait("document.querySelector('h2').textContent.startsWith('<img')")
     assert browser.run("document.querySelectorAll('article h2 img').length") == 0
-    browser.dialog = "roof, spring"
-    browser.click("Tags")
+    browser.click("Tags…")
+    browser.answer("roof, spring")
     browser.wait("document.querySelectorAll('.tags span').length === 2")
-    browser.run("document.querySelector('details').open = true")
+    browser.click("Export…")
+    browser.wait("document.querySelectorAll('.product').length > 20")
     size = browser.run(
-        "fetch([...document.querySelectorAll('details a')].find(a => a.textContent ==="
-        " 'cloud.laz').href).then(r => r.arrayBuffer()).then(b => b.byteLength)"
+        "fetch(document.querySelector('[aria-label=\"Download Cloud, LAZ\"]').href)"
+        ".then(r => r.arrayBuffer()).then(b => b.byteLength)"
     )
     assert size > 10_000
+    browser.key("Escape")
+    browser.wait("!document.querySelector('dialog')")
     browser.click("Delete")
     browser.wait("document.querySelectorAll('article').length === 0")
     browser.click("Restore")
@@ -197,9 +200,10 @@ def test_the_buttons_reach_the_vehicle_and_show_its_answer(browser: Browser, sca
             browser.open(one.url)
             browser.wait(VEHICLE_SHOWN, 30)
             browser.click("Start scan")
+            browser.answer()
             browser.wait("document.querySelector('.note').textContent === 'start: accepted'")
-            browser.dialog = "2.5"
             browser.click("Baseline")
+            browser.answer("2.5")
             browser.wait(
                 "[...document.querySelectorAll('.note')].some(n => n.textContent ==="
                 " 'baseline 2.5 m: accepted')",

@@ -420,15 +420,16 @@ def test_of_two_people_renaming_at_once_the_second_is_warned(
     for page in (browser, other):
         page.open(portal.url)
         page.wait("document.querySelectorAll('article').length === 1")
-    other.dialog = "south roof"
-    other.click("Rename")
+    other.click("Rename…")
+    other.answer("south roof")
     other.wait("document.querySelector('article h2').textContent === 'south roof'")
-    browser.dialog = "garden"
-    browser.click("Tags")  # on a list that is no longer so
+    browser.click("Tags…")  # on a list that is no longer so
+    browser.answer("garden")
     browser.wait("document.querySelector('.note').textContent.includes('someone else')")
     browser.wait("document.querySelector('article h2').textContent === 'south roof'")
     assert browser.run("document.querySelectorAll('.tags span').length") == 0
-    browser.click("Tags")  # having looked again
+    browser.click("Tags…")  # having looked again
+    browser.answer("garden")
     browser.wait("document.querySelector('.tags span').textContent === 'garden'")
     assert browser.run("document.querySelector('article h2').textContent") == "south roof"
 
@@ -447,8 +448,10 @@ def test_a_refused_stop_shows_the_companions_own_words(browser: Browser, store: 
             browser.open(one.url)
             browser.wait(VEHICLE_SHOWN, 30)
             browser.click("Start scan")
+            browser.answer()
             browser.wait("document.querySelector('.note').textContent === 'start: accepted'")
             browser.click("Stop scan")
+            browser.answer()
             browser.wait(
                 "[...document.querySelectorAll('.note')].some(n =>"
                 " n.textContent.startsWith('stop denied'))",

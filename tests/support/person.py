@@ -23,14 +23,13 @@ def chromium() -> str:
 
 
 class Page:
-    """One page; dialogs are accepted with :attr:`dialog` as the text."""
+    """One page; the browser's own dialogs are accepted."""
 
     def __init__(self, page: playwright.Page) -> None:
         self.page = page
         self.requests: list[str] = []
-        self.dialog = ""  # what the next prompt is answered with
         page.on("request", lambda request: self.requests.append(request.url))
-        page.on("dialog", lambda dialog: dialog.accept(self.dialog))
+        page.on("dialog", lambda dialog: dialog.accept())
         self._tools = page.context.new_cdp_session(page)
         self._tools.send("Page.enable")
 
@@ -62,6 +61,13 @@ class Page:
         self.wait(f"!!{find} && !{find}.disabled")
         self.run(f"setTimeout(() => {find}.click(), 0)")
         self._run_or_left("new Promise(r => setTimeout(r, 50))")
+
+    def answer(self, text: str | None = None) -> None:
+        """Give the page's dialog a text, or agree to what it asks."""
+        self.wait("!!document.querySelector('dialog.ask[open]')")
+        if text is not None:
+            self.page.fill("dialog.ask input", text)
+        self.page.click("dialog.ask button.on")
 
     def _run_or_left(self, script: str) -> Any:
         """The value of ``script``; None when the page is left meanwhile."""

@@ -25,6 +25,7 @@ from service.ground.http import PAGE
 from service.ground.library import Library
 from service.ground.live import LiveFeed
 from service.ground.portal import Portal, PortalConfig, config_of
+from service.ground.state import KINDS
 from service.ground.vehicle import Vehicle
 from service.listener import parse_address
 from service.stream import codec, plane_coders, planes
@@ -47,6 +48,21 @@ def test_the_list_shows_the_scan(client: Client, store: Path) -> None:
     assert scans[0]["origin"]["lat_deg"] == pytest.approx(47.39)
     assert {"cloud.laz", "scan.json"} <= {f["name"] for f in scans[0]["files"]}
     assert "default-src 'self'" in headers["content-security-policy"]
+
+
+def test_products_are_listed_with_file_size_and_obstacle(client: Client, store: Path) -> None:
+    found = {p["kind"]: p for p in client.ask(ONE + "/exports")[1]}
+    assert set(found) == set(KINDS)
+    assert found["laz"]["bytes"] == (store / "drone-1/test-1/cloud.laz").stat().st_size
+    ortho = found["ortho"]
+    assert (ortho["bytes"], ortho["file"], ortho["impossible"]) == (None, "ortho.tif", None)
+    assert ortho["about_bytes"] > 10_000 and ortho["about_s"] >= 1 and ortho["text"]
+    document = json.loads((store / "drone-1/test-1/scan.json").read_text())
+    document["origin"], document["coverage"]["corners_lat_lon"] = None, None
+    (store / "drone-1/test-1/scan.json").write_text(json.dumps(document))
+    found = {p["kind"]: p for p in client.ask(ONE + "/exports")[1]}
+    assert found["kml"]["impossible"] == "needs a georeference"
+    assert client.ask(ONE)[1]["corners_lat_lon"] is None
 
 
 def test_downloads_and_their_ranges(client: Client, store: Path) -> None:

@@ -21,7 +21,16 @@ from service.errors import OutsideError
 from service.georeference import LocalFrame
 from service.ground.scan_facts import facts_of
 from service.progress import Progress
-from service.scans.folder import CLOUD, CSV, PREVIEW, REPORT, SUMMARY, TUM, write_deliverables
+from service.scans.folder import (
+    CLOUD,
+    CSV,
+    PREVIEW,
+    REPORT,
+    SUMMARY,
+    THUMBNAIL,
+    TUM,
+    write_deliverables,
+)
 from service.scans.fused_cloud import _Extent, fused_cloud, strip_edges
 from service.scans.retention import close_open_scans
 from service.scans.track import latest
@@ -185,6 +194,22 @@ def test_an_empty_scan_still_makes_every_file(tmp_path: Path, house: HouseFlight
     assert len(laspy.read(tmp_path / CLOUD)) == 0
     assert (tmp_path / TUM).read_text() == ""
     assert cv2.imread(str(tmp_path / PREVIEW)) is not None
+
+
+def test_the_thumbnail_shows_the_ground_alone_within_the_extent(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    with house.flown(tmp_path) as store:
+        summary = write_deliverables(tmp_path, store, {})
+    image = cv2.imread(str(tmp_path / THUMBNAIL), cv2.IMREAD_UNCHANGED)
+    assert image is not None and max(image.shape) == 480 and image.shape[2] == 4
+    west, south, east, north = summary["coverage"]["bounds_m"]
+    px_m = 480 / max(east - west, north - south)
+    assert abs(image.shape[1] - (east - west) * px_m) < 1.0
+    red = (image[..., 2] > 150) & (image[..., 1] < 90) & (image[..., 3] > 128)
+    rows, cols = np.nonzero(red)
+    roof = np.array([cols.min() / px_m + west, north - rows.max() / px_m])
+    assert np.abs(roof - (4.0, -2.0)).max() < 0.5  # the house's south-west corner
 
 
 def test_preview_and_report_say_what_limits_the_trust(tmp_path: Path, house: HouseFlight) -> None:

@@ -28,10 +28,13 @@ export interface Scan {
   edition: number;
   files: { name: string; what: string; bytes: number }[];
   preview: boolean;
+  thumbnail: boolean;
   tiles: boolean;
   maps: boolean;
   started_unix_s: number | null;
   origin: Origin | null;
+  /** Latitude and longitude of the corners of what was measured, NW first, clockwise. */
+  corners_lat_lon?: [number, number][] | null;
   finished: boolean;
   growing: boolean;
   trouble: string | null;
@@ -118,6 +121,21 @@ export interface Heights {
 
 export const make = (s: Scan, kind: string, heights?: Heights): Promise<Job> =>
   ask(`${place(s)}/exports`, "POST", { kind, ...heights });
+/** A product that can be made of a scan: what it is, the file that there is, about how large and how long. */
+export interface Product {
+  kind: string;
+  group: string;
+  title: string;
+  text: string;
+  file: string;
+  bytes: number | null;
+  about_bytes: number | null;
+  about_s: number | null;
+  heights: boolean;
+  impossible: string | null;
+}
+
+export const products = (s: { drone: string; scan: string }): Promise<Product[]> => ask(`${place(s)}/exports`);
 export type Triple = [number, number, number];
 
 /** A point in a scan without georeference, and its longitude, latitude, metres above mean sea level. */

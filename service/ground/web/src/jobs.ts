@@ -45,7 +45,8 @@ export function jobList(
 }
 
 function row(job: api.Job, title: string): Row {
-  const what = `${job.kind === "all" ? "all maps" : job.kind} of ${title}`;
+  const kind = job.kind === "all" ? "all maps" : job.kind;
+  const what = `${kind} of ${title}`;
   const bar = el("progress", { max: 100 });
   bar.setAttribute("aria-label", what);
   const words = el("span", { className: "words" });
@@ -53,7 +54,7 @@ function row(job: api.Job, title: string): Row {
   stop.setAttribute("aria-label", `Cancel ${what}`);
   const get = el("a", { className: "button", textContent: "Download", hidden: true, download: "" });
   get.setAttribute("aria-label", `Download ${what}`);
-  const element = el("li", {}, el("strong", { textContent: what }), bar, words, stop, get);
+  const element = el("li", {}, el("strong", {}, kind, el("span", { className: "of", textContent: ` of ${title}` })), bar, words, stop, get);
   const show = (now: api.Job): void => {
     const ended = now.state !== "waiting" && now.state !== "running";
     element.className = now.state;
@@ -80,4 +81,4 @@ function wordsOf(job: api.Job): string {
   return [`${job.percent} %`, ...left, job.doing].filter(Boolean).join(" · ");
 }
 
-const duration = (s: number): string => (s < 90 ? `${s} s` : `${Math.round(s / 60)} min`);
+export const duration = (s: number): string => (s < 90 ? `${s} s` : `${Math.round(s / 60)} min`);

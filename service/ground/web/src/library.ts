@@ -1,35 +1,14 @@
-// The list of scans: look, open, rename, tag, download, make files, delete, bring back.
+// All scans on a map and as cards: look, open, export, rename, tag, delete, bring back.
 
 import * as api from "./api";
-import { count, date, el, notify, size } from "./dom";
+import { count, date, el, notify } from "./dom";
+import { askText } from "./dialog";
+import { homeInDialog, showExports } from "./exports";
 import { jobList } from "./jobs";
+import { nameOf, placeName } from "./names";
+import { keyOf, Overview } from "./overview";
 import * as units from "./units";
 import { vehicleStrip } from "./vehicle";
-
-/** What can be made, as the server and as people call it. */
-const KINDS: [string, string][] = [
-  ["all", "all maps"], ["laz", "cloud, LAZ"], ["copc", "cloud, COPC"],
-  ["ply", "cloud, PLY"], ["dsm", "surface model, GeoTIFF"], ["dtm", "bare ground, GeoTIFF"],
-  ["ortho", "orthophoto, GeoTIFF"], ["contours", "contours, GeoJSON"], ["gpkg", "contours, GeoPackage"],
-  ["dxf", "contours, DXF"], ["coverage", "coverage, GeoTIFF"], ["kmz", "orthophoto, KMZ"],
-  ["stac", "STAC item"], ["glb", "mesh, glTF"], ["obj", "mesh, OBJ"],
-  ["3dtiles", "points, 3D Tiles"], ["3dtiles-mesh", "mesh, 3D Tiles"], ["geojson", "track, GeoJSON"],
-  ["kml", "track, KML"], ["mcap", "recording, Foxglove"], ["ros2", "recording, ROS 2"],
-  ["refine", "refined scan"],
-];
-
-/** Those whose heights can be converted. */
-const WITH_HEIGHTS = new Set(["laz", "copc", "ply", "dsm", "dtm", "contours", "gpkg", "dxf", "coverage", "all", "obj", "3dtiles", "3dtiles-mesh", "geojson"]);
-const DATUMS = ["EGM96", "EGM2008", "ellipsoid"];
-const HEIGHTS: [string, api.Heights][] = [
-  ["heights as flown", { vertical_datum: null, to_datum: null }],
-  ...DATUMS.flatMap((vertical_datum): [string, api.Heights][] => [
-    [`flown above ${vertical_datum}`, { vertical_datum, to_datum: null }],
-    ...DATUMS.filter((to) => to !== vertical_datum).map((to_datum): [string, api.Heights] => [
-      `${vertical_datum} to ${to_datum}`, { vertical_datum, to_datum },
-    ]),
-  ]),
-];
 
 const REFRESH_MS = 3000;
 
@@ -42,8 +21,20 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   bin.setAttribute("aria-label", "bin");
   const again = (): void => void load().catch(notify);
   let scans: api.Scan[] = [];
-  const title = (job: api.Job): string =>
-    scans.find((s) => s.drone === job.drone && s.scan === job.scan)?.title ?? job.scan;
+  const title = (job: api.Job): string => {
+    const found = scans.find((s) => s.drone === job.drone && s.scan === job.scan);
+    return found ? nameOf(found) : job.scan;
+  };
+  const overview = new Overview();
+  let chosen: string[] = []; // on the map; none: all
+  const all = el("button", { textContent: "Show all", onclick: () => (overview.whole(), choose([])) });
+  const which = el("p", { className: "chosen", hidden: true }, el("span", {}), all);
+  which.setAttribute("role", "status");
+  const choose = (some: api.Scan[]): void => {
+    chosen = some.map(keyOf);
+    draw();
+  };
+  overview.onChoose = choose;
   const [upload, line, endUploads] = uploads(again);
   const cut = el("p", { className: "stale", hidden: true });
   cut.setAttribute("role", "status");
@@ -56,7 +47,9 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
     el("header", {}, el("h1", { textContent: "skyrelief" }), search, vehicleStrip(), importForm(again, upload), leave),
     cut,
     line,
-    jobList(title, (job) => cards.get(`${job.drone}/${job.scan}`)?.element.querySelector(".made") ?? null),
+    jobList(title, (job) => homeInDialog(job) ?? cards.get(keyOf(job))?.element.querySelector(".made") ?? null),
+    overview.element,
+    which,
     list,
     bin,
   );
@@ -64,10 +57,15 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   let seen = "";
   const draw = (): void => {
     const wanted = search.value.toLowerCase();
-    const shown = scans.filter((s) =>
-      [s.title, s.scan, s.drone, ...s.tags].join(" ").toLowerCase().includes(wanted),
+    const found = scans.filter((s) =>
+      [nameOf(s), s.scan, s.drone, ...s.tags].join(" ").toLowerCase().includes(wanted),
     );
-    cards = new Map(shown.map((s) => [`${s.drone}/${s.scan}`, kept(cards.get(`${s.drone}/${s.scan}`), s, again)]));
+    chosen = chosen.filter((key) => found.some((s) => keyOf(s) === key));
+    const shown = chosen.length ? found.filter((s) => chosen.includes(keyOf(s))) : found;
+    which.hidden = !chosen.length;
+    which.firstChild!.textContent = `${shown.length} of ${found.length} scans, at the place chosen on the map`;
+    overview.show(found);
+    cards = new Map(shown.map((s) => [keyOf(s), kept(cards.get(keyOf(s)), s, again, overview)]));
     arrange(list, [...cards.values()].map((c) => c.element));
     if (!shown.length) list.replaceChildren(empty(scans.length > 0));
   };
@@ -90,6 +88,7 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
   await load().catch(() => undefined);
   return () => {
     clearInterval(refresh);
+    overview.close();
     endUploads();
   };
 }
@@ -100,22 +99,22 @@ interface Card {
 }
 
 /** The card of a scan: the one there is while nothing of the scan changed. */
-function kept(old: Card | undefined, s: api.Scan, again: () => void): Card {
+function kept(old: Card | undefined, s: api.Scan, again: () => void, overview: Overview): Card {
   const content = JSON.stringify(s);
   if (old?.content === content) return old;
   const element = card(s, again);
+  const mark = (on: boolean) => (): void => overview.mark(on ? s : null);
+  element.onmouseenter = mark(true);
+  element.onmouseleave = mark(false);
+  element.addEventListener("focusin", mark(true));
+  element.addEventListener("focusout", mark(false));
   if (old) leaveAsFound(old.element, element);
   return { content, element };
 }
 
-/** Opens, chooses and focuses in `now` what is open, chosen and focused in `old`. */
+/** Opens and focuses in `now` what is open and focused in `old`. */
 function leaveAsFound(old: HTMLElement, now: HTMLElement): void {
   now.querySelector("details")!.open = old.querySelector("details")!.open;
-  const [before, after] = [old, now].map((e) => [...e.querySelectorAll("select")]) as [HTMLSelectElement[], HTMLSelectElement[]];
-  after.forEach((select, i) => {
-    select.value = before[i]?.value ?? select.value;
-    select.dispatchEvent(new Event("change"));
-  });
   const focused = document.activeElement;
   if (!focused || !old.contains(focused)) return;
   const same = [...now.querySelectorAll<HTMLElement>(focused.tagName)];
@@ -152,10 +151,11 @@ function importForm(again: () => void, upload: (files: FileList | null) => void)
   chosen.onchange = () => upload(chosen.files);
   const send = el("button", {
     textContent: "Upload",
-    title: "or drop on this page: a ZIP of a scan folder, its scan.db, an MCAP, or a video with its flight log",
+    title: "a ZIP of a scan folder, its scan.db, an MCAP, or a video with its flight log",
     onclick: () => chosen.click(),
   });
-  return el("span", { className: "import" }, folder, act, send, chosen);
+  const menu = el("div", { className: "settings" }, el("p", {}, folder, act), el("p", {}, send, "or drop files on this page"), chosen);
+  return el("details", { className: "group import" }, el("summary", { textContent: "Add scans" }), menu);
 }
 
 /** Uploads files that are chosen, or dropped on the page; a video goes with the other files, which
@@ -203,42 +203,65 @@ function uploads(again: () => void): [(files: FileList | null) => void, HTMLElem
 
 function card(s: api.Scan, again: () => void): HTMLElement {
   const open = api.viewAddress(s);
-  const newest = s.newest ?? null;
-  const image = s.preview
-    ? el("img", { src: api.file(s, "preview.jpg"), alt: `preview of ${s.title}`, loading: "lazy" })
-    : newest !== null
-      ? el("img", { src: api.keyframe(s, newest), alt: `newest image of ${s.title}`, loading: "lazy" })
-      : el("div", { className: "blank", textContent: "no preview yet" });
+  const name = nameOf(s);
+  const badge = s.growing ? "badge" : "badge silent";
+  const button = (textContent: string, onclick: () => void): HTMLElement => el("button", { textContent, onclick });
+  const export_ = button("Export…", () => void showExports(s, again).catch(notify));
+  export_.setAttribute("aria-label", `Export ${name}`);
+  const more = el("summary", { textContent: "More", className: "button" });
+  more.setAttribute("aria-label", `more for ${name}`);
+  const go = el("a", { href: open, textContent: "Open", className: "button on" });
+  go.setAttribute("aria-label", `Open ${name}`);
   return el(
     "article",
     {},
-    el("a", { href: open, className: "thumbnail" }, image),
+    el("a", { href: open, className: "thumbnail", tabIndex: -1 }, thumbnail(s, name)),
     el(
       "h2",
       {},
-      el("a", { href: open, textContent: s.title }),
-      s.finished || s.trouble ? null : el("span", { className: s.growing ? "badge" : "badge silent", textContent: s.growing ? "growing" : "not finished" }),
+      el("a", { href: open, textContent: name }),
+      s.finished || s.trouble ? null : el("span", { className: badge, textContent: s.growing ? "growing" : "not finished" }),
     ),
     facts(s),
     s.trouble ? el("p", { className: "trouble", textContent: s.trouble }) : null,
     el("p", { className: "tags" }, ...s.tags.map((t) => el("span", { textContent: t }))),
-    downloads(s),
     el("ul", { className: "jobs made" }),
     el(
       "p",
       { className: "acts" },
+      go,
       s.origin ? el("a", { href: api.mapAddress(s), textContent: "Map", className: "button" }) : null,
-      el("button", { textContent: "Rename", onclick: () => rename(s, again) }),
-      el("button", { textContent: "Tags", onclick: () => retag(s, again) }),
-      el("button", { textContent: "Delete", onclick: () => remove(s, again) }),
-      makeMenu(s, again),
+      export_,
+      el(
+        "details",
+        { className: "more" },
+        more,
+        el(
+          "span",
+          { className: "acts" },
+          button("Rename…", () => void rename(s, again)),
+          button("Tags…", () => void retag(s, again)),
+          button("Delete", () => void api.remove(s).then(() => (notify(`${name} is in the bin`), again()), notify)),
+        ),
+      ),
     ),
   );
 }
 
+/** The scan from above; while it grows its newest image. */
+function thumbnail(s: api.Scan, name: string): HTMLElement {
+  const newest = s.newest ?? null;
+  const kept = s.thumbnail ? "thumbnail.webp" : s.preview ? "preview.jpg" : null;
+  if (kept) return el("img", { src: api.file(s, kept), alt: `${name} from above`, loading: "lazy" });
+  if (newest !== null) return el("img", { src: api.keyframe(s, newest), alt: `newest image of ${name}`, loading: "lazy", className: "whole" });
+  return el("div", { className: "blank", textContent: "no image yet" });
+}
+
 function facts(s: api.Scan): HTMLElement {
-  const rows: [string, string][] = [["Drone", s.drone], ["Flown", date(s.started_unix_s)]];
-  if (s.origin) rows.push(["Place", `${s.origin.lat_deg.toFixed(5)}, ${s.origin.lon_deg.toFixed(5)}`]);
+  const rows: [string, string][] = [["Drone", s.drone]];
+  const isNamed = s.title !== s.scan; // else its name is place and date
+  if (isNamed) rows.push(["Flown", date(s.started_unix_s)]);
+  if (s.origin && isNamed) rows.push(["Place", placeName(s.origin.lat_deg, s.origin.lon_deg)]);
   const { area_m2, sigma_median_m, position_sigma_h_median_m: across, position_sigma_v_median_m: up, trust } = s.quality ?? {};
   const size: string[] = [];
   if (s.counts?.points !== undefined) size.push(`${count(s.counts.points)} points`);
@@ -257,58 +280,16 @@ function facts(s: api.Scan): HTMLElement {
   );
 }
 
-function downloads(s: api.Scan): HTMLElement {
-  const rows = s.files.map((f) =>
-    el(
-      "li",
-      {},
-      el("a", { href: api.file(s, f.name), textContent: f.name, download: "" }),
-      ` ${f.what}, ${size(f.bytes)}`,
-    ),
-  );
-  const maps = el("a", { href: `${api.scanAddress(s)}/maps.zip`, textContent: "maps.zip", download: "" });
-  if (s.maps) rows.push(el("li", {}, maps, " all maps with a manifest"));
-  return el(
-    "details",
-    {},
-    el("summary", { textContent: rows.length === 1 ? "1 file" : `${rows.length} files` }),
-    el("ul", {}, ...rows),
-  );
+async function rename(s: api.Scan, again: () => void): Promise<void> {
+  const title = await askText("Name of this scan", s.title === s.scan ? "" : s.title, `none: ${s.scan}`, { maxLength: 200 });
+  if (title !== null) await api.label(s, { title }).catch(notify).then(again);
 }
 
-/** A kind to choose and a button that makes it. */
-function makeMenu(s: api.Scan, again: () => void): HTMLElement {
-  const kinds = el("select", {}, ...KINDS.map(([value, textContent]) => el("option", { value, textContent })));
-  kinds.setAttribute("aria-label", "deliverable");
-  const heights = el("select", {}, ...HEIGHTS.map(([text], i) => el("option", { value: String(i), textContent: text })));
-  heights.setAttribute("aria-label", "heights");
-  kinds.onchange = () => (heights.hidden = !s.origin || !WITH_HEIGHTS.has(kinds.value));
-  heights.hidden = !s.origin;
-  const chosen = (): api.Heights | undefined => (heights.hidden ? undefined : HEIGHTS[Number(heights.value)]![1]);
-  const act = el("button", { textContent: "Make", onclick: () => void make(s, kinds.value, chosen()).then(again, notify) });
-  act.setAttribute("aria-label", `Make a deliverable of ${s.title}`);
-  return el("span", { className: "group" }, kinds, heights, act);
-}
-
-async function make(s: api.Scan, kind: string, heights?: api.Heights): Promise<void> {
-  await api.make(s, kind, heights);
-  await api.finished(s, kind);
-}
-
-function rename(s: api.Scan, again: () => void): void {
-  const title = prompt("Name of this scan", s.title);
-  if (title !== null) void api.label(s, { title }).catch(notify).then(again);
-}
-
-function retag(s: api.Scan, again: () => void): void {
-  const text = prompt("Tags, separated by commas", s.tags.join(", "));
+async function retag(s: api.Scan, again: () => void): Promise<void> {
+  const text = await askText("Tags", s.tags.join(", "), "separated by commas");
   if (text === null) return;
   const tags = text.split(",").map((t) => t.trim()).filter(Boolean);
-  void api.label(s, { tags }).catch(notify).then(again);
-}
-
-function remove(s: api.Scan, again: () => void): void {
-  if (confirm(`Move “${s.title}” to the bin?`)) void api.remove(s).then(again, notify);
+  await api.label(s, { tags }).catch(notify).then(again);
 }
 
 function binRows(names: string[], again: () => void): HTMLElement[] {

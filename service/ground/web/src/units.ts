@@ -35,7 +35,8 @@ export const round = (m: number): [number, string] => {
   const tens = 10 ** Math.floor(Math.log10(Math.max(m, 1e-6) / unit));
   const value = tens * ([5, 2, 1].find((k) => k * tens * unit <= m) ?? 1);
   const digits = Math.max(0, -Math.floor(Math.log10(value) + 1e-9));
-  return [value * unit, length(value * unit, digits)];
+  const far = unit === 1 && value >= 1000;
+  return [value * unit, far ? `${value / 1000} km` : length(value * unit, digits)];
 };
 
 export const area = (m2: number): string =>

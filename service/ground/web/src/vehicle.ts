@@ -1,6 +1,7 @@
 // The vehicle's figures and the operator's buttons; hidden where no vehicle was named.
 
 import * as api from "./api";
+import { askText, sure } from "./dialog";
 import { el, notify } from "./dom";
 
 /** A strip of figures and buttons that keeps itself up to date while it is in the page. */
@@ -8,9 +9,9 @@ export function vehicleStrip(): HTMLElement {
   const figures = el("span", { className: "state" });
   const none = el("button", { textContent: "No vehicle", onclick: () => notify(none.title) });
   const acts = [
-    el("button", { textContent: "Start scan", onclick: () => give("start") }),
-    el("button", { textContent: "Stop scan", onclick: () => give("stop") }),
-    el("button", { textContent: "Baseline", onclick: baseline }),
+    el("button", { textContent: "Start scan", onclick: () => void give("start") }),
+    el("button", { textContent: "Stop scan", onclick: () => void give("stop") }),
+    el("button", { textContent: "Baseline", onclick: () => void baseline() }),
   ];
   const strip = el("span", { className: "vehicle", hidden: true }, figures, none, ...acts);
   const refresh = async (): Promise<void> => {
@@ -41,13 +42,14 @@ function words(v: api.Vehicle): string {
   return ["vehicle", ...parts].join(" · ");
 }
 
-function give(action: string): void {
-  if (confirm(`${action} the scan on the vehicle?`))
+async function give(action: string): Promise<void> {
+  const words = `${action[0]!.toUpperCase()}${action.slice(1)} the scan`;
+  if (await sure(`${words} on the vehicle?`, words))
     void api.order(action).then((a) => notify(`${action}: ${a.result}`), notify);
 }
 
-function baseline(): void {
-  const text = prompt("Baseline in metres; 0 follows the altitude", "0");
+async function baseline(): Promise<void> {
+  const text = await askText("Baseline in metres", "0", "0 follows the altitude", { inputMode: "decimal" });
   if (text === null) return;
   const metres = Number(text);
   if (!Number.isFinite(metres)) return notify("not a number");

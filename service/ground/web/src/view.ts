@@ -10,6 +10,7 @@ import { jobList } from "./jobs";
 import { LinkState } from "./link";
 import { LiveView, type LastPose, type News } from "./live";
 import { Ruler } from "./measure";
+import { nameOf } from "./names";
 import { Notes } from "./notes";
 import { awaited, placing } from "./place";
 import { Cloud } from "./points";
@@ -53,7 +54,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const learn = (now: api.Scan): void => {
     known = now;
     link.finished ||= now.finished;
-    title.textContent = title.title = now.title;
+    title.textContent = title.title = nameOf(now);
     for (const page of [report, changes]) page.hidden = !now.files.some((f) => page.href.endsWith(`/${f.name}`));
   };
   learn(scan);
@@ -178,7 +179,7 @@ async function newer({ drone, started_unix_s }: api.Scan): Promise<api.Scan | un
 
 function linkTo(link: HTMLAnchorElement, scan: api.Scan): void {
   link.href = api.viewAddress(scan);
-  link.textContent = `back as scan ${scan.title}: open`;
+  link.textContent = `back as scan ${nameOf(scan)}: open`;
   link.hidden = false;
 }
 

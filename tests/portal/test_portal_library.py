@@ -1,0 +1,118 @@
+"""The library's map, cards and export dialog in a real browser."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from house_flight import HouseFlight
+from person import Browser
+from portal_client import NEEDS, browser, flown_store, listing
+
+pytestmark = NEEDS
+__all__ = ["browser"]  # the fixture
+
+CARDS = "document.querySelectorAll('article').length"
+NAMES = "[...document.querySelectorAll('article h2')].map(h => h.textContent)"
+OUTLINES = """[...document.querySelectorAll('.outlines polygon')].map(p => {
+  const box = p.getBoundingClientRect(); return [box.x, box.y, box.width, box.height]; })"""
+THUMBNAIL = """(() => { const i = document.querySelector('.thumbnail img');
+  if (!i.naturalWidth) return null;
+  const c = document.createElement('canvas');
+  [c.width, c.height] = [i.naturalWidth, i.naturalHeight];
+  const g = c.getContext('2d'); g.drawImage(i, 0, 0);
+  const d = g.getImageData(0, 0, c.width, c.height).data;
+  let known = 0, red = 0;
+  for (let p = 0; p < d.length; p += 4) { if (d[p + 3] < 128) continue; known++;
+    if (d[p] > 150 && d[p + 1] < 90) red++; }
+  return [c.width, c.height, known, red]; })()"""
+
+
+@pytest.fixture
+def store(tmp_path: Path, house: HouseFlight) -> Path:
+    """Two scans of one place, and one of another, a tenth of a degree north."""
+    root = flown_store(tmp_path / "scans", house)
+    shutil.copytree(root / "drone-1/test-1", root / "drone-2/test-2")
+    away = Path(shutil.copytree(root / "drone-1/test-1", root / "drone-3/test-3"))
+    summary = json.loads((away / "scan.json").read_text())
+    summary["origin"]["lat_deg"] += 0.1
+    for corner in summary["coverage"]["corners_lat_lon"]:
+        corner[0] += 0.1
+    (away / "scan.json").write_text(json.dumps(summary))
+    return root
+
+
+def test_a_card_names_place_and_date_and_shows_the_ground_alone(
+    browser: Browser, store: Path, house: HouseFlight
+) -> None:
+    with listing(browser, store, 3):
+        lat, lon, _ = house.origin
+        name = browser.run(f"{NAMES}[0]")
+        assert name.startswith(f"{lat:.4f}° N, {lon:.4f}° E, ")
+        assert name.endswith(":00") or ":" in name
+        wide, high, known, red = browser.wait(THUMBNAIL)
+        assert max(wide, high) == 480  # cut to what was measured, and of one image only
+        assert 0.5 < known / (wide * high) <= 1.0 and red > 0.01 * known  # the roof
+
+
+def test_the_map_outlines_scans_and_lists_those_at_a_place(browser: Browser, store: Path) -> None:
+    with listing(browser, store, 3):
+        browser.wait("document.querySelectorAll('.outlines circle').length === 2")  # far apart
+        words = browser.run(
+            "[...document.querySelectorAll('.outlines text')].map(t => t.textContent)"
+        )
+        assert sorted(words)[0] == "2 scans"
+        spots = browser.run(
+            "[...document.querySelectorAll('.outlines circle')].map(c => {"
+            " const b = c.getBoundingClientRect(); return [b.x + 7, b.y + 7] })"
+        )
+        browser.mouse(*max(spots, key=lambda spot: spot[1]))  # the southern one
+        browser.wait(f"{CARDS} === 2")
+        outlines = np.array(browser.wait(f"{OUTLINES}.length === 3 && {OUTLINES}"))
+        outlines = outlines[outlines[:, 1] > 0]  # the third is far north
+        assert np.ptp(outlines, axis=0).max() < 1.0 and outlines[:, 2].min() > 60
+        summary = json.loads((store / "drone-1/test-1/scan.json").read_text())
+        west, south, east, north = summary["coverage"]["bounds_m"]
+        ratio = outlines[0, 2] / outlines[0, 3]
+        assert ratio == pytest.approx((east - west) / (north - south), rel=0.02)
+        assert len(outlines) == 2
+        browser.wait("document.querySelectorAll('.overview .layer img').length === 3")
+        browser.click("Show all")
+        browser.wait(f"{CARDS} === 3")
+        browser.wait("document.querySelectorAll('.outlines circle').length === 2")
+        browser.run("document.querySelector('article a').focus()")
+        browser.wait("document.querySelectorAll('.outlines .marked').length === 1")
+
+
+def test_the_export_dialog_says_what_each_product_is_and_makes_it(
+    browser: Browser, store: Path
+) -> None:
+    shutil.rmtree(store / "drone-2")
+    shutil.rmtree(store / "drone-3")
+    with listing(browser, store, 1):
+        browser.click("Export…")
+        browser.wait("document.querySelectorAll('.product').length > 20")
+        row = (
+            "[...document.querySelectorAll('.product')].find(p => p.innerText.includes('GeoTIFF'))"
+        )
+        words = browser.run(f"{row}.innerText")
+        assert "orthophoto" in words and "about " in words and " s" in words
+        geojson = (
+            "[...document.querySelectorAll('.product')]"
+            ".find(p => p.innerText.includes('Track, GeoJSON'))"
+        )
+        browser.run(f"{geojson}.querySelector('button').click()")
+        browser.wait(f"!!{geojson}.querySelector('.jobs li')")  # its progress is beside it
+        link = f"{geojson}.querySelector('[aria-label=\"Download Track, GeoJSON\"]')"
+        browser.wait(f"!!{link}")
+        with browser.page.expect_download() as download:
+            browser.run(f"{link}.click()")
+        assert download.value.suggested_filename == "test-1-flight.geojson"
+        size = (store / "drone-1/test-1/flight.geojson").stat().st_size
+        assert f"{size / 1000:.0f} kB" in browser.run(f"{geojson}.innerText")
+        browser.key("Escape")
+        browser.wait("!document.querySelector('dialog')")
+        browser.wait("!!document.querySelector('article .made li')")  # and then on the card
