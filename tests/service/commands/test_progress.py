@@ -147,7 +147,9 @@ def test_a_cancelled_export_leaves_nothing_behind(
     ]
 
 
-def test_without_a_terminal_each_step_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_terminal_steps_and_twentieths_are_lines(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     text = io.StringIO()
     monkeypatch.setattr(sys, "stderr", text)
     with showing("mesh") as progress:
@@ -155,7 +157,8 @@ def test_without_a_terminal_each_step_is_a_line(monkeypatch: pytest.MonkeyPatch)
         for _ in progress.over(range(3), 3):
             pass
         progress("texture")
-    assert text.getvalue() == "mesh: fusing\nmesh: texture\n"
+    lines = ["fusing", "fusing, 30 %", "fusing, 65 %", "texture, 65 %"]
+    assert text.getvalue().splitlines() == [f"mesh: {line}" for line in lines]
 
 
 SCRIPT = """
