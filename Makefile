@@ -105,6 +105,7 @@ $(CORE): pyproject.toml constraints.txt hatch_build.py $(PAGE)
 
 $(STAMP): $(CORE)
 	$(BIN)/python -m pip install --no-compile --disable-pip-version-check -qq -c constraints.txt $(PIP_FLAGS) -e '.[$(EXTRAS)]'
+	@$(BIN)/skyrelief warm-up  # else each of the tests' processes compiles the same kernels
 	@touch $(STAMP)
 
 # MAVProxy, a ground station for the tests, in an environment of its own without its graphical
