@@ -8,7 +8,7 @@ set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 python=${PYTHON:-python3}
 platform=$(uname -m)
-version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+version=$("$python" -I -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 extras=logs
 out=$here/dist/bundle
 
@@ -30,8 +30,8 @@ cp -r "$here/deploy" "$here/systemd" "$here/pyproject.toml" "$here/README.md" "$
 # Our own wheel is built in an environment with the pinned build tools only.
 builder=$(mktemp -d)
 trap 'rm -rf "$builder"' EXIT
-"$python" -m venv "$builder"
-pinned() { "$builder/bin/python" -m pip "$@" -qq --disable-pip-version-check --require-hashes --only-binary=:all:; }
+"$python" -I -m venv "$builder"
+pinned() { "$builder/bin/python" -I -m pip "$@" -qq --disable-pip-version-check --require-hashes --only-binary=:all:; }
 builders=(-r "$here/deploy/locked/build.txt")
 if [[ $extras != *ground* ]]; then
   export SKYRELIEF_NO_PORTAL=1
@@ -39,7 +39,7 @@ elif ! command -v npm >/dev/null; then
   builders+=(-r "$here/deploy/locked/node.txt")
 fi
 pinned install "${builders[@]}"
-"$builder/bin/python" -m pip wheel -qq --disable-pip-version-check --no-deps --no-build-isolation \
+"$builder/bin/python" -I -m pip wheel -qq --disable-pip-version-check --no-deps --no-build-isolation \
   -w "$out/wheels" "$here"
 
 tags=()

@@ -57,16 +57,16 @@ live() { [[ -z $root && -d /run/systemd/system ]]; }
 
 check_python() {
   command -v "$python" >/dev/null || die "no $python; apt install python3 python3-venv"
-  "$python" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' ||
+  "$python" -I -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' ||
     die "$python is $("$python" -V 2>&1); Python 3.10 to 3.13 is needed (--python python3.12)"
-  "$python" -c 'import ensurepip' 2>/dev/null || die "no venv module; apt install python3-venv"
+  "$python" -I -c 'import ensurepip' 2>/dev/null || die "no venv module; apt install python3-venv"
 }
 
 # What the packages of version folder $1 load from the system (service/packages.py has the list).
 check_libraries() {
   [[ -z $root ]] || return 0
   local missing
-  mapfile -t missing < <("$1/bin/python" -m service.packages)
+  mapfile -t missing < <("$1/bin/python" -I -m service.packages)
   ((${#missing[@]})) || return 0
   if [[ -z $bundle ]] && command -v apt-get >/dev/null; then
     say "installing ${missing[*]}"
@@ -78,7 +78,7 @@ check_libraries() {
 # NVIDIA's own builds of torch and onnxruntime live in the system's Python on a Jetson; a
 # virtual environment with system packages uses them; PyPI's builds lack the GPU.
 site_packages() {
-  if "$python" - <<'PY' 2>/dev/null
+  if "$python" -I - <<'PY' 2>/dev/null
 import importlib.util, sys
 found = [n for n in ("torch", "onnxruntime", "tensorrt") if importlib.util.find_spec(n)]
 sys.exit(not found)
@@ -99,7 +99,7 @@ wanted_extras() {
   (IFS=,; printf '%s' "${kept[*]:-logs}")
 }
 
-system_has() { "$python" -c "import importlib.util as u, sys; sys.exit(u.find_spec('$1') is None)"; }
+system_has() { "$python" -I -c "import importlib.util as u, sys; sys.exit(u.find_spec('$1') is None)"; }
 
 # Makes $versions/$1 from this clone or the bundle; an unfinished one is deleted.
 build_version() {
@@ -118,13 +118,13 @@ build_version() {
   fi
   say "making $target${site:+ (with the packages of the system)}"
   # shellcheck disable=SC2086  # empty or one word
-  "$python" -m venv $site "$part"
-  "$part/bin/python" -m pip install -qq --disable-pip-version-check --no-index \
+  "$python" -I -m venv $site "$part"
+  "$part/bin/python" -I -m pip install -qq --disable-pip-version-check --no-index \
     --find-links "$from/wheels" --require-hashes -r "$from/requirements.txt"
   # A virtual environment holds its own path in the scripts it writes.
   grep -rlIZ --fixed-strings "$part" "$part/bin" "$part/pyvenv.cfg" |
     xargs -0 -r sed -i "s|$part|${target#"$root"}|g"
-  "$part/bin/python" -c 'import service.cli, recon, mavlink' || die "the new version does not start"
+  "$part/bin/python" -I -c 'import service.cli, recon, mavlink' || die "the new version does not start"
   check_libraries "$part"
   install -D -m 0644 -t "$part/share/skyrelief" "${bundle:-$here}"/systemd/*.service
   mv "$part" "$target"
@@ -173,7 +173,7 @@ install_files() {
   local settings=()
   [[ -n $profile ]] || profile=$(board)
   [[ -z $profile ]] || settings=("$from/deploy/profiles/$profile.toml")
-  "$versions/$1/bin/python" -m service.cli config default "${settings[@]}" >"$etc/skyrelief.toml.new"
+  "$versions/$1/bin/python" -I -m service.cli config default "${settings[@]}" >"$etc/skyrelief.toml.new"
   chmod 0640 "$etc/skyrelief.toml.new"  # it may hold a password; tmpfiles gives it its group
   mv "$etc/skyrelief.toml.new" "$etc/skyrelief.toml"
   say "wrote $etc/skyrelief.toml${profile:+ with the settings of $profile}:" \
@@ -216,7 +216,7 @@ healthy() {
 # True when the configuration has the settings that the service requires.
 is_configured() {
   [[ $unit == skyrelief ]] || return 0
-  "$current/bin/python" - "$etc/skyrelief.toml" <<'PY' 2>/dev/null
+  "$current/bin/python" -I - "$etc/skyrelief.toml" <<'PY' 2>/dev/null
 import sys
 from pathlib import Path
 from service.config import load_config

@@ -22,15 +22,15 @@ needs_systemd = pytest.mark.skipif(
 STAND_IN = """#!/bin/bash
 # Stands in for python3: makes environments of two scripts instead of some hundred megabytes.
 case "$*" in
-  "-m venv "*)
+  "-I -m venv "*)
     mkdir -p "${@: -1}/bin"
     cp "$0" "${@: -1}/bin/python"
     printf '#!%s/bin/python\\n' "${@: -1}" > "${@: -1}/bin/skyrelief"
     chmod +x "${@: -1}/bin/skyrelief"
     printf 'command = %s\\n' "${@: -1}" > "${@: -1}/pyvenv.cfg" ;;
-  "-m pip install"*) exit "${PIP_EXIT:-0}" ;;
-  "-m service.cli config default"*) printf '[camera]\\n# %s\\n' "${@:5}" ;;
-  "-c import service.cli"*) exit 0 ;;
+  "-I -m pip install"*) exit "${PIP_EXIT:-0}" ;;
+  "-I -m service.cli config default"*) printf '[camera]\\n# %s\\n' "${@:6}" ;;
+  "-I -c import service.cli"*) exit 0 ;;
   *) exec REAL "$@" ;;
 esac
 """
@@ -52,10 +52,13 @@ class Machine:
         (self.bundle / "wheels").mkdir()
         (self.bundle / "requirements.txt").touch()
 
-    def install(self, *arguments: str, **more: str) -> subprocess.CompletedProcess[str]:
+    def install(
+        self, *arguments: str, folder: Path | None = None, **more: str
+    ) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [str(self.bundle / "deploy" / "install.sh"), "--bundle", str(self.bundle), *arguments],
             env={**os.environ, "SKYRELIEF_ROOT": str(self.root), "PYTHON": str(self.python)} | more,
+            cwd=folder,
             capture_output=True,
             text=True,
             timeout=60,
@@ -110,6 +113,15 @@ def test_everything_lands_in_its_place(machine: Machine) -> None:
     assert "z /etc/skyrelief/skyrelief.toml 0640 root skyrelief -" in rules
     script = (machine.home / "current" / "bin" / "skyrelief").read_text()
     assert script == f"#!/opt/skyrelief/versions/{machine.current}/bin/python\n"
+
+
+def test_modules_of_the_current_folder_are_not_run(machine: Machine, tmp_path: Path) -> None:
+    card, run = tmp_path / "card", tmp_path / "run"
+    card.mkdir()
+    for name in ("ensurepip", "venv", "pip", "service", "importlib", "recon"):
+        (card / f"{name}.py").write_text(f"open({str(run)!r}, 'w').write({name!r})")
+    assert machine.install(folder=card).returncode == 0
+    assert not run.exists(), run.read_text()
 
 
 @pytest.mark.parametrize(
