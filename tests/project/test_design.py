@@ -28,11 +28,11 @@ def test_the_table_of_workers_is_the_code_s() -> None:
 
 
 def test_the_table_of_a_scan_s_states_is_the_code_s() -> None:
-    table = [f"{'state':<17} {'operator sees':<14} event > next state"]
+    table = ["| state | operator sees | event > next state |", "| --- | --- | --- |"]
     for state, row in TRANSITIONS.items():
         events = ", ".join(f"{event.value} > {after.value}" for event, after in row.items())
-        table.append(f"{state.value:<17} {state.phase.value:<14} {events}".rstrip())
-    assert "```text\n" + "\n".join(table) + "\n```" in TEXT
+        table.append(f"| {state.value} | {state.phase.value} | {events} |")
+    assert "\n".join(["", *table, ""]) in TEXT
 
 
 def test_every_path_in_it_exists() -> None:

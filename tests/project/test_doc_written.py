@@ -25,7 +25,7 @@ from service.config import keys
 
 REPORTS = ROOT / "docs" / "reports"
 ROOMS = ("recon", "mavlink", "service")
-MAX_WORDS, MAX_CHARACTERS = 8200, 140
+MAX_WORDS, MAX_CHARACTERS = 8000, 140
 HASH = re.compile(r"\b(?=[0-9a-f]*[0-9])(?=[0-9a-f]*[a-f])[0-9a-f]{7,40}\b")
 """Seven to forty hexadecimal digits with a number and a letter: a commit."""
 
