@@ -34,6 +34,16 @@ def reduced(vertices: F64, faces: I32, largest_faces: int) -> tuple[F64, I32]:
     return small.astype(np.float64) + middle, triangles.astype(np.int32)
 
 
+def coarser(mesh: Mesh, largest_faces: int) -> Mesh:
+    """An untextured mesh as one of fewer triangles; vertices take what the nearest ones have."""
+    from scipy.spatial import cKDTree
+
+    vertices, faces = reduced(mesh.vertices_m, mesh.faces, largest_faces)
+    near = cKDTree(mesh.vertices_m).query(vertices)[1]
+    rgb, measured = (None if a is None else a[near] for a in (mesh.rgb, mesh.measured))
+    return Mesh(vertices, faces, None, rgb, measured)
+
+
 def used_vertices(vertices: int, faces: I32) -> tuple[Bool, I32]:
     """Which of so many vertices the faces use, and the faces numbered by these alone."""
     used: Bool = np.zeros(vertices, np.bool_)

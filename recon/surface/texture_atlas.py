@@ -19,7 +19,7 @@ from recon.types import F32, F64, I32, I64, U8, Bool
 BORDER_PX = 2
 """Texels around a chart that repeat its colours, for filtering and the first mip levels."""
 
-MAX_SCALE = 2.0
+MAX_SCALE, MIN_SCALE = 2.0, 1 / 64
 CELL_PX = 4
 """Side of the square that holds a triangle which no view sees."""
 
@@ -40,7 +40,8 @@ def lay_out(
     """The atlas of triangles labelled with their view (-1: none), no side above ``largest_px``.
 
     A chart is a connected piece of one label, as the view sees it. Charts are packed in shelves by
-    height; when they do not fit, all are scaled down.
+    height; when they do not fit, all are scaled down, to MIN_SCALE at least: their borders and
+    triangles without a view keep their size, and may need a larger atlas.
     """
     chart = _charts(label, neighbours)
     uv = _seen_uv(mesh, views, label)
@@ -51,7 +52,7 @@ def lay_out(
         columns = max(1, int(np.sqrt(len(lone))))
         block = np.array([[columns, -(-len(lone) // columns)]], np.int64) * CELL_PX
         place, (w, h) = pack(np.concatenate([size, block]))
-        if max(w, h) <= largest_px:
+        if max(w, h) <= largest_px or scale < MIN_SCALE:
             break
         scale *= 0.98 * largest_px / max(w, h)
     out = uv * scale

@@ -21,6 +21,7 @@ from recon.types import F64, I32
 
 BLOCK = 8  # columns along the side of a coarse block
 EDGE = 1e-9  # rays that graze a shared edge must not slip through
+SLACK_M = 1e-6  # nor those whose first step would end on a level surface, but for rounding
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,7 +190,7 @@ def _clip(bounds, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     for axis in range(3):
         o = ox if axis == 0 else (oy if axis == 1 else oz)
         d = dx if axis == 0 else (dy if axis == 1 else dz)
-        low, high = bounds[axis] - 1e-6, bounds[axis + 3] + 1e-6
+        low, high = bounds[axis] - SLACK_M, bounds[axis + 3] + SLACK_M
         if abs(d) < 1e-15:
             if o < low or o > high:
                 return 1.0, 0.0
@@ -246,7 +247,7 @@ def first_hit(grid, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
                 continue
             ui, uj = bi, bj
             if dz < 0.0 and za > block_z[bj, bi, 1]:  # fall to the block's highest point at once
-                t = max(t, (block_z[bj, bi, 1] - oz) / dz)
+                t = max(t, (block_z[bj, bi, 1] + SLACK_M - oz) / dz)
                 za = oz + dz * t
                 i = int(np.floor((ox + dx * t - x0) / cell_m))
                 j = int(np.floor((oy + dy * t - y0) / cell_m))

@@ -41,6 +41,9 @@ SMOOTHINGS = 5
 MIN_PART = 0.01
 """Parts of fewer triangles than this share of the largest one float in the air: noise."""
 
+KEPT_FACES, MIN_FACES = 1 / 6, 5000
+"""Of the zero crossing: voxels are finer than what they hold, and most ground is flat."""
+
 LARGEST_BLOCKS = 120_000
 """Some 6 GB; a tile has about a thousandth of it to a tenth."""
 
@@ -76,8 +79,9 @@ def volume_mesh(depths: Iterable[DepthMap], upper: Raster, largest_faces: int = 
     truncation_m = _truncation(images, volume.voxel_m)
     _vote(volume, upper, images, truncation_m)
     vertices, faces = _extracted(volume)
-    if len(faces) > largest_faces:
-        vertices, faces = reduced(vertices, faces, largest_faces)
+    vertices, faces = reduced(
+        vertices, faces, min(largest_faces, max(MIN_FACES, round(KEPT_FACES * len(faces))))
+    )
     rgb = upper.rgb[upper.grid.cells(vertices[:, :2])]
     return Mesh(vertices, faces, None, rgb, _measured(volume, vertices))
 

@@ -7,13 +7,14 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, cast
 
 import cv2
 import numpy as np
 
-from recon.surface.meshing import Mesh, cut
+from recon.surface.meshing import Mesh, coarser, cut
 from recon.surface.raster import grid_over, rasterise
+from recon.surface.texture_views import TextureView, doubled_area
 from recon.surface.texturing import texture
 from recon.surface.volume import volume_mesh
 from recon.types import F64, U8, Keyframe, PointCloud
@@ -31,12 +32,20 @@ from service.stream.store import ScanStore
 log = logging.getLogger(__name__)
 
 LARGEST_ATLAS_PX = 8192
+MIN_FACES, MIN_TEXTURE_PX = 500, 256
 TILED_ATLAS_PX = 4096
 MARGIN_VOXELS, MARGIN_M = 25, 5.0
 """About a tile's mesh, the larger of the two; it is then cut exactly at the tile's borders."""
 
 TEXTURE_STEPS = 15
 """Reports of :func:`recon.surface.texturing.texture`."""
+
+COARSER_FACES, COARSER_TEXTURE, LEVELS = 8, 4, 3
+"""From one level of detail to the next: triangles, and texels along a side."""
+
+VIEWER_ERROR_PX = 16.0
+"""Viewers take finer tiles where an error spans so many pixels (CesiumJS's default); texels are to
+span one."""
 
 
 LARGEST_FACES = 400_000
@@ -145,6 +154,8 @@ class TilePart:
     mesh: Mesh
     image: U8
     figures: dict[str, Any]
+    coarser: tuple[TilePart, ...] = ()  # the same surface in less detail
+    error_m: float = 0.0  # of the surface in less detail
 
 
 def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None:
@@ -166,8 +177,22 @@ def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None
             return None
         with progress.part(f"{len(mesh.faces)} triangles; reading images", 0.25):
             views = scan_images(keyframes, Path(tile.folder), store.header, job.options, progress)
-    with progress.part("texture"):
-        done = texture(mesh, views, job.largest_texture_px, progress.counting(TEXTURE_STEPS))
+    with progress.part("texture", 0.8):
+        part = _textured(mesh, views, job.largest_texture_px, progress)
+    with progress.part("less detail"):
+        levels = []
+        for n in range(1, LEVELS):
+            few = coarser(mesh, max(MIN_FACES, len(mesh.faces) // COARSER_FACES**n))
+            px = max(MIN_TEXTURE_PX, max(part.image.shape) // COARSER_TEXTURE**n)
+            level = _textured(few, views, px, progress)
+            levels.append(replace(level, error_m=_error(mesh, level)))
+    return replace(part, coarser=tuple(levels))
+
+
+def _textured(
+    mesh: Mesh, views: Sequence[TextureView], largest_px: int, progress: Progress
+) -> TilePart:
+    done = texture(mesh, views, largest_px, progress.counting(TEXTURE_STEPS))
     figures = {
         "faces": len(done.mesh.faces),
         "vertices": len(done.mesh.vertices_m),
@@ -178,6 +203,27 @@ def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None
         "texture_px": [done.image.shape[1], done.image.shape[0]],
     }
     return TilePart(done.mesh, done.image, figures)
+
+
+def _error(fine: Mesh, level: TilePart) -> float:
+    """What a level of detail is off by, in metres of a viewer's screen error: the distance of 95 %
+    of the finest level's vertices, or its texels."""
+    import open3d as o3d
+
+    mesh, core = level.mesh, cast(Any, o3d.core)
+    scene = cast(Any, o3d.t.geometry.RaycastingScene)()
+    scene.add_triangles(
+        core.Tensor(mesh.vertices_m.astype(np.float32)), core.Tensor(mesh.faces.astype(np.uint32))
+    )
+    off_m = scene.compute_distance(core.Tensor(fine.vertices_m.astype(np.float32))).numpy()
+    assert mesh.uv is not None
+    corners = mesh.vertices_m[mesh.faces]
+    uv = mesh.uv[mesh.faces].astype(np.float64) * level.image.shape[1::-1]
+    area_m2 = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    texel_m = float(np.sqrt(area_m2.sum() / max(doubled_area(uv).sum(), 1e-9)))
+    return max(float(np.quantile(off_m, 0.95)), VIEWER_ERROR_PX * texel_m)
 
 
 def _surface(
@@ -303,19 +349,24 @@ SPAN_M = 1000.0
 
 
 def write_mesh_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """A folder with ``tileset.json`` and a glTF for each tile; heights are AMSL metres."""
+    """A folder with ``tileset.json`` and a glTF for each tile's level of detail; heights are AMSL
+    metres."""
     frame = scan.needs_place("3D Tiles")
     parts, _ = mesh_parts(scan, LARGEST_FACES, options)
-    children = []
+    whole = _box([level for part in parts for level in (part, *part.coarser)])
+    size_m = float(np.linalg.norm(np.array(whole[3:]).reshape(3, 3).sum(axis=0)))
     with writing_folder(out) as folder:
+        children = []
         for number, part in enumerate(parts):
-            name = f"{number}.glb"
-            data = glb([(part.mesh, part.image)], mesh_extras(scan))
-            (folder / name).write_bytes(data)
-            box = _box(part.mesh.vertices_m)
-            children.append(_tile(box, 0.0) | {"content": {"uri": name}})
-        whole = _box(np.concatenate([part.mesh.vertices_m for part in parts]))
-        size_m = float(np.linalg.norm(np.array(whole[3:]).reshape(3, 3).sum(axis=0)))
+            box, error_m = _box((part, *part.coarser)), 0.0
+            below: list[dict[str, Any]] = []
+            for level, one in enumerate((part, *part.coarser)):
+                name = f"{number}-{level}.glb"
+                (folder / name).write_bytes(glb([(one.mesh, one.image)], mesh_extras(scan)))
+                error_m = min(max(error_m, one.error_m), size_m)
+                tile = _tile(box, error_m) | {"content": {"uri": name}}
+                below = [tile | ({"children": below} if below else {})]
+            children += below
         transform = on_globe(frame).T.ravel().tolist()  # column by column
         root = _tile(whole, size_m) | {"transform": transform, "children": children}
         tileset = {"asset": {"version": "1.1"}, "geometricError": 2.0 * size_m, "root": root}
@@ -323,12 +374,13 @@ def write_mesh_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 
 def _tile(box: list[float], error_m: float) -> dict[str, Any]:
-    return {"boundingVolume": {"box": box}, "geometricError": error_m, "refine": "ADD"}
+    return {"boundingVolume": {"box": box}, "geometricError": error_m, "refine": "REPLACE"}
 
 
-def _box(vertices_m: F64) -> list[float]:
-    """Middle and the three half axes of the box around (N, 3) vertices."""
-    low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)
+def _box(parts: Sequence[TilePart]) -> list[float]:
+    """Middle and the three half axes of the box around the parts' vertices."""
+    low = np.min([p.mesh.vertices_m.min(axis=0) for p in parts], axis=0)
+    high = np.max([p.mesh.vertices_m.max(axis=0) for p in parts], axis=0)
     half = np.maximum(0.5 * (high - low), 1e-3)
     return [float(v) for v in (*(0.5 * (low + high)), *np.diag(half).ravel())]
 

@@ -91,6 +91,15 @@ def test_rays_along_borders_do_not_slip_through() -> None:
     assert np.isfinite(t).all()
 
 
+def test_rays_straight_down_hit_level_ground_at_any_height() -> None:
+    square = np.array([[0.0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]])
+    sides = np.array([[0, 1, 2], [0, 2, 3]])
+    for height in np.random.default_rng(0).uniform(-1e-7, 300.0, 200):
+        grid = triangle_grid.build(square + np.array([0.0, 0.0, height]), sides)
+        t, _ = grid.cast(np.array([[4.3, 2.1, 412.0]]), np.array([[0.0, 0.0, -1.0]]))
+        assert t[0] == pytest.approx(412.0 - height)
+
+
 def test_normals_and_areas() -> None:
     vertices = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0]], dtype=float)
     grid = triangle_grid.build(vertices, np.array([[0, 1, 2]]))

@@ -320,7 +320,16 @@ def test_the_mesh_lies_on_the_globe_as_3d_tiles(tmp_path: Path, house: HouseFlig
     assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
     assert tileset["geometricError"] > root["geometricError"] > 0.0
     globe = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
-    for tile in root["children"]:
+    levels, tiles = [], root["children"]
+    while tiles:
+        (tile,) = tiles
+        levels.append(tile)
+        tiles = tile.get("children", [])
+    sizes = [(folder / tile["content"]["uri"]).stat().st_size for tile in levels]
+    assert len(levels) == 3 and sizes == sorted(sizes)  # the coarsest first
+    errors = [root["geometricError"], *(tile["geometricError"] for tile in levels)]
+    assert errors == sorted(errors, reverse=True) and errors[-1] == 0.0 < errors[-2]
+    for tile in levels:
         scene = trimesh.load(folder / tile["content"]["uri"])
         xyz = np.concatenate([g.vertices for g in scene.geometry.values()])
         up = np.column_stack([xyz[:, 0], -xyz[:, 2], xyz[:, 1]])
