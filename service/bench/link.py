@@ -279,23 +279,14 @@ def _produce(trial: Trial, drones: Sequence[_Drone], began: float) -> None:
             drone.made["pose", drone.store.add_pose(pose)] = now
 
 
-class BareReceiver(Receiver):
-    """A receiver that writes no deliverables."""
-
-    def write(self, scan: ReceivedScan) -> None:
-        scan.unwritten, scan.is_writing, scan.is_written = False, False, True
-
-
-class _WatchedReceiver(BareReceiver):
-    """A receiver that notes when each item is stored."""
+class _WatchedReceiver(Receiver):
+    """A receiver that notes when each item is stored, and writes no deliverables."""
 
     def __init__(self, config: ReceiverConfig) -> None:
-        super().__init__(config)
+        super().__init__(config, deliver=lambda _: None, opened=self._listen)
         self.came: dict[tuple[str, str, int], float] = {}
 
-    def opened(self, scan: ReceivedScan) -> None:
-        """Listen to the scan's store."""
-
+    def _listen(self, scan: ReceivedScan) -> None:
         def came(kind: str, number: int) -> None:
             self.came.setdefault((scan.drone, kind, number), time.monotonic())
 

@@ -1,6 +1,6 @@
-"""The receiver's worker for one drone: its scans, its queue, its share of the disk.
+"""The scans of one drone at the ground station: messages and events go in, effects come out.
 
-Each drone has a worker, so that none waits for the work of another. A scan is open only while it is
+No socket, thread or clock: the owner's worker performs the effects. A scan is open only while it is
 in use, and has a folder only once its valid header has arrived.
 """
 
@@ -8,35 +8,26 @@ from __future__ import annotations
 
 import logging
 import os
-import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from service.errors import OutsideError, SkyreliefError
-from service.ground.inbox import Batch, Inbox
+from service.ground.inbox import Answered, Batch, Grown, Inbox, Radio, Written
 from service.ground.intake import FINE, SILENCE_S, SMALL, Introduction, ScanIntake
 from service.ground.received import ReceivedScan
-from service.ground.storage import DiskShare
+from service.ground.storage import DiskShare, scan_folder
 from service.stream.messages import Ask, Head, count, pack, unpack
 from service.stream.naming import ROOT
 from service.stream.radio_messages import RADIO_NOTE
 from service.stream.ranges import RangeSet
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
-from service.workers import Worker
-
-if TYPE_CHECKING:
-    from service.ground.receiver import Receiver
 
 log = logging.getLogger(__name__)
 
-TICK_S = 0.1
-MAX_REST_S = 0.5
-"""After each turn a worker rests as long as it computed, at most so long: one drone never
-takes more than half of a core."""
 REPORT_S = 1.0
 REPORT_IDLE_S = 3.0
 BUSY_S = 10.0
@@ -65,57 +56,106 @@ class DroneLimits:
     full_disk_rest_s: float = 10.0  # until a full disk is tried again
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Put:
+    """Publish."""
+
+    key: str
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Get:
+    """Ask the drone; the replies are items of the scan, and their end an event."""
+
+    scan: str
+    key: str
+    payload: bytes
+    answered: Answered | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Write:
+    """Have the scan's deliverables written; :class:`Written` follows."""
+
+    scan: ReceivedScan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Opened:
+    """A scan was opened."""
+
+    scan: ReceivedScan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Align:
+    """Align a finished scan with those that show the same ground."""
+
+    folder: Path
+
+
+Effect = Put | Get | Write | Opened | Align
+
+
 class DroneReceiver:
-    """Receives the scans of one drone, with :meth:`run` on a worker."""
+    """Receives the scans of one drone. Times are the caller's: seconds, monotonic."""
 
-    worker: Worker
-    """Set by the owner that starts it."""
-
-    def __init__(self, drone: str, station: Receiver) -> None:
+    def __init__(
+        self, drone: str, store: Path, station: str, limits: DroneLimits, now: float
+    ) -> None:
+        """Scans go below ``store``; ``station`` is the name that reports give."""
         self.drone = drone
         self.inbox = Inbox()
-        self.heard_at = time.monotonic()
+        self.max_open = limits.open_scans  # scans that may be open now
+        self.heard_at = self.news_at = now  # a message, and something new that was stored
         self.dropped = 0  # messages that were malformed, or of a scan without a header
         self.entries: list[dict[str, Any]] = []
         self.is_known = False  # has, or had, a scan here
-        self._station = station
+        self._store, self._station, self._limits = store, station, limits
         self._scans: OrderedDict[str, ReceivedScan] = OrderedDict()  # open, the last used last
         self._closed: OrderedDict[str, dict[str, Any]] = OrderedDict()
         self._introductions: OrderedDict[str, Introduction] = OrderedDict()
         self._unreadable: OrderedDict[str, float] = OrderedDict()
-        limits = self._limits = station.limits
-        folder = station.folder(drone, "scan").parent
+        folder = self._folder("scan").parent
         self._share = DiskShare(folder, limits.drone_share, limits.reserve_bytes)
-        self._published_at = 0.0
+        self._shown_at = -1e9
+        self._effects: list[Effect] = []
 
     @property
     def scans(self) -> list[ReceivedScan]:
         """Those that are open."""
         return list(self._scans.values())
 
-    def run(self, worker: Worker) -> None:
-        """Take in what arrives until the worker stops."""
-        while not worker.stop.is_set():
-            worker.beat()
-            batch = self.inbox.take(TICK_S)
-            began_s = time.thread_time()
-            self._handle(batch)
-            self._look_after(time.monotonic())
-            self._publish(bool(batch))
-            worker.stop.wait(min(time.thread_time() - began_s, MAX_REST_S))
-        self._publish(True)
+    def _folder(self, name: str) -> Path:
+        return scan_folder(self._store, self.drone, name)
+
+    def handle(self, batch: Batch, now: float) -> list[Effect]:
+        """Take in what has come, and look after the scans; what is to be done about it."""
+        if batch.heads or batch.items:  # events may be of our own
+            self.heard_at = now
+        for name, payload in batch.heads.items():
+            self._on_head(name, payload, now)
+        for name, payload in batch.items:
+            self._on_items(name, payload, now)
+        for event in batch.events:
+            match event:
+                case Radio():
+                    self._on_radio(event, now)
+                case Answered(name, slot, serial) if name in self._scans:
+                    self._scans[name].intake.answered(slot, serial, now)
+                case Written():
+                    self._on_written(event)
+                case Grown():
+                    for scan in self.scans:
+                        self._write(scan)
+        self._look_after(now)
+        if batch or now - self._shown_at >= REPORT_S:
+            self.show(now)
+        effects, self._effects = self._effects, []
+        return effects
 
     # What comes
-
-    def _handle(self, batch: Batch) -> None:
-        if batch.heads or batch.items:  # events may be of our own
-            self.heard_at = time.monotonic()
-        for name, payload in batch.heads.items():
-            self._on_head(name, payload, time.monotonic())
-        for name, payload in batch.items:
-            self._on_items(name, payload, time.monotonic())
-        for event in batch.events:
-            event(time.monotonic())
 
     def _on_head(self, name: str, payload: bytes, now: float) -> None:
         head = unpack(payload, Head)
@@ -150,8 +190,7 @@ class DroneReceiver:
         try:
             self._share.check(len(payload), now)
             if scan.intake.on_items(payload, now):
-                scan.grew()
-                self._station.note_news()
+                self._grew(scan, now)
                 scan.trouble = ""
         except OutsideError as error:
             self._rest(scan, str(error), now)
@@ -173,11 +212,14 @@ class DroneReceiver:
             except OSError as error:
                 log.debug("%s", error)
 
-    def add_radio(
-        self, header: ScanHeader, kind: str, number: int, part: int, data: bytes, now: float
-    ) -> None:
-        """Take in what the narrow radio brought; called by the worker."""
+    def _grew(self, scan: ReceivedScan, now: float) -> None:
+        scan.grew()
+        self.news_at = now
+
+    def _on_radio(self, event: Radio, now: float) -> None:
+        """Take in what the narrow radio brought."""
         self.heard_at = now
+        header, kind, number, part, data = event
         scan = self._scan(header.name, now) or self._create(header, now)
         if scan is None or now < scan.rest_until:
             return
@@ -189,8 +231,7 @@ class DroneReceiver:
                 store.put_header(header)
             if kind != "header" and store.add_radio(kind, number, part, data):
                 scan.radio_messages += 1
-                scan.grew()
-                self._station.note_news()
+                self._grew(scan, now)
         except OutsideError as error:
             self._rest(scan, str(error), now)
 
@@ -231,17 +272,16 @@ class DroneReceiver:
         return self._open(name, now, self._reopen)
 
     def _reopen(self, name: str) -> ScanStore | None:
-        path = self._station.folder(self.drone, name) / "scan.db"
-        return ScanStore.open(path, self._station.limits.scan_bytes) if path.is_file() else None
+        path = self._folder(name) / "scan.db"
+        return ScanStore.open(path, self._limits.scan_bytes) if path.is_file() else None
 
     def _create(self, header: ScanHeader, now: float) -> ReceivedScan | None:
         def create(name: str) -> ScanStore:
             found = self._reopen(name)
             if found is not None:
                 return found
-            path = self._station.folder(self.drone, name) / "scan.db"
             self._share.check(len(header.to_json()), now)
-            return ScanStore.create(path, header, self._station.limits.scan_bytes)
+            return ScanStore.create(self._folder(name) / "scan.db", header, self._limits.scan_bytes)
 
         return self._open(header.name, now, create)
 
@@ -262,7 +302,7 @@ class DroneReceiver:
         self._unreadable.pop(name, None)
         if store is None:
             return None
-        intake = ScanIntake(store, self._station.name)
+        intake = ScanIntake(store, self._station)
         scan = ReceivedScan(self.drone, name, store.path.parent, intake, used_at=now)
         before = self._closed.pop(name, None)
         scan.is_written = before is not None
@@ -270,7 +310,7 @@ class DroneReceiver:
             scan.grew()
         self._scans[name] = scan
         self.is_known = True
-        self._station.opened(scan)
+        self._effects.append(Opened(scan))
         log.info("receiving %s/%s into %s", self.drone, name, scan.folder)
         return scan
 
@@ -280,15 +320,15 @@ class DroneReceiver:
         Those that are coming in just now stay: another scan of this drone waits for its turn.
         """
         for scan in list(self._scans.values()):
-            if len(self._scans) < self._station.max_open:
+            if len(self._scans) < self.max_open:
                 return True
             if now - scan.used_at < BUSY_S and not scan.intake.complete:
                 continue
             if scan.may_close:
                 self._close(scan)
-            elif scan.unwritten:
+            else:
                 self._write(scan)
-        return len(self._scans) < self._station.max_open
+        return len(self._scans) < self.max_open
 
     def _close(self, scan: ReceivedScan) -> None:
         self._closed[scan.name] = scan.progress() | {"open": False}
@@ -305,16 +345,16 @@ class DroneReceiver:
                 del self._closed[scan.name]  # its files are due when it is opened again
 
     def _write(self, scan: ReceivedScan) -> None:
-        """Have a scan's deliverables written, one scan of a drone at a time."""
-        if not any(other.is_writing for other in self._scans.values()):
+        """Have a scan's deliverables written where it grew, one scan of a drone at a time."""
+        if scan.unwritten and not any(other.is_writing for other in self._scans.values()):
             scan.changed, scan.unwritten, scan.is_writing = True, False, True
-            self._station.write(scan)
+            self._effects.append(Write(scan))
 
-    def write_grown(self, _: float) -> None:
-        """Write the deliverables of a scan that has grown since; called by the worker."""
-        for scan in self._scans.values():
-            if scan.unwritten:
-                self._write(scan)
+    def _on_written(self, event: Written) -> None:
+        scan = event.scan
+        scan.is_written, scan.is_writing, scan.trouble = True, False, event.trouble
+        if scan.intake.complete and not scan.trouble:
+            self._effects.append(Align(scan.folder))
 
     # What to say
 
@@ -325,7 +365,7 @@ class DroneReceiver:
                 continue
             wanted = introduction.next_ask(now)
             if wanted is not None:
-                self._get(introduction.name, "header", wanted, Ask(self._station.name), None)
+                self._get(introduction.name, "header", wanted, Ask(self._station), None)
         while sum(scan.intake.held_bytes for scan in self.scans) > self._limits.unfinished_bytes:
             max(self.scans, key=lambda scan: scan.intake.held_bytes).intake.forget_unfinished()
         for scan in list(self._scans.values()):
@@ -335,7 +375,7 @@ class DroneReceiver:
             if now - scan.used_at > limit_s:
                 if scan.may_close:
                     self._close(scan)
-                elif scan.unwritten:
+                else:
                     self._write(scan)
             elif now - scan.intake.head_at <= self._limits.silent_s:
                 self._tend(scan, now)
@@ -345,41 +385,26 @@ class DroneReceiver:
         pause = REPORT_S if scan.changed else REPORT_IDLE_S
         if now - scan.reported_at >= pause:
             scan.reported_at, scan.changed = now, False
-            key = f"{scan.key}/held/{self._station.name}"
-            self._station.put(key, pack(scan.intake.held()))
-        if scan.unwritten and scan.intake.complete and not scan.is_writing:
+            key = f"{scan.key}/held/{self._station}"
+            self._effects.append(Put(key, pack(scan.intake.held())))
+        if scan.intake.complete:
             self._write(scan)
         if now < scan.rest_until:
             return
         for slot in (SMALL, FINE):
             asked = scan.intake.next_ask(slot, now)
             if asked is not None:
-                serial = scan.intake.progress.asked
-                answered = partial(scan.intake.answered, slot, serial)
+                answered = Answered(scan.name, slot, scan.intake.progress.asked)
                 self._get(scan.name, *asked, answered)
 
     def _get(
-        self,
-        name: str,
-        kind: str,
-        numbers: RangeSet,
-        ask: Ask,
-        answered: Callable[[float], None] | None,
+        self, name: str, kind: str, numbers: RangeSet, ask: Ask, answered: Answered | None
     ) -> None:
-        """Ask for items; the replies come to the inbox."""
-
-        def ended() -> None:
-            if answered is not None:
-                self.inbox.put_event(answered)
-
         key = f"{ROOT}/{self.drone}/{name}/item/{kind}/{numbers.text()}"
-        self._station.get(key, pack(ask), partial(self.inbox.put_item, name), ended)
+        self._effects.append(Get(name, key, pack(ask), answered))
 
-    def _publish(self, has_news: bool) -> None:
-        """Show how it goes: at once when there is news, else every second."""
-        now = time.monotonic()
-        if not has_news and now - self._published_at < REPORT_S:
-            return
-        self._published_at = now
-        entries = [scan.progress() for scan in list(self._scans.values())]
+    def show(self, now: float) -> None:
+        """Update :attr:`entries`."""
+        self._shown_at = now
+        entries = [scan.progress() for scan in self.scans]
         self.entries = entries + list(self._closed.values())

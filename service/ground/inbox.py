@@ -6,8 +6,10 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from service.ground.received import ReceivedScan
+from service.stream.records import ScanHeader
 from service.workers import Worker
 
 if TYPE_CHECKING:
@@ -20,7 +22,37 @@ MAX_EVENTS = 2048
 ITEM_BYTES = 200
 """Bytes that a kept message takes beyond its payload."""
 
-Event = Callable[[float], None]
+
+class Radio(NamedTuple):
+    """A message of the narrow radio."""
+
+    header: ScanHeader
+    kind: str
+    number: int
+    part: int
+    data: bytes
+
+
+class Answered(NamedTuple):
+    """The ``serial``-th request of a scan, made in ``slot``, is over."""
+
+    scan: str
+    slot: int
+    serial: int
+
+
+class Written(NamedTuple):
+    """The deliverables of a scan are written, or why they are not."""
+
+    scan: ReceivedScan
+    trouble: str
+
+
+class Grown(NamedTuple):
+    """Deliverables of scans that have grown are due."""
+
+
+Event = Radio | Answered | Written | Grown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,11 +96,10 @@ class Inbox:
             return self._note(has_room, lambda: self._batch.items.append((scan_id, payload)))
 
     def put_event(self, event: Event) -> bool:
-        """Something else to do."""
+        """Something else to do; only the radio's may be too many, as the others are of our own."""
         with self._changed:
-            return self._note(
-                len(self._batch.events) < MAX_EVENTS, lambda: self._batch.events.append(event)
-            )
+            has_room = len(self._batch.events) < MAX_EVENTS or not isinstance(event, Radio)
+            return self._note(has_room, lambda: self._batch.events.append(event))
 
     def take(self, timeout_s: float) -> Batch:
         """All waiting messages; without any, those that arrive within the timeout."""
@@ -94,11 +125,11 @@ MAX_AT_ONCE = 64
 POLL_S = 0.01
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pending:
+class _Pending(NamedTuple):
     replies: zenoh.handlers.Handler[Any]
-    on_message: Callable[[bytes], object]
-    on_end: Callable[[], object]
+    inbox: Inbox
+    scan: str
+    answered: Answered | None
 
 
 class Replies:
@@ -111,11 +142,12 @@ class Replies:
     def add(
         self,
         replies: zenoh.handlers.Handler[Any],
-        on_message: Callable[[bytes], object],
-        on_end: Callable[[], object],
+        inbox: Inbox,
+        scan: str,
+        answered: Answered | None,
     ) -> None:
-        """Have the payloads of ``replies`` and their end reported."""
-        self._pending.append(_Pending(replies, on_message, on_end))
+        """Put the payloads of ``replies`` into the inbox as items of a scan, then their end."""
+        self._pending.append(_Pending(replies, inbox, scan, answered))
         self._news.set()
 
     def run(self, worker: Worker) -> None:
@@ -136,10 +168,10 @@ class Replies:
             pending = self._pending.popleft()
             count, is_over = _take(pending)
             moved = moved or count > 0
-            if is_over:
-                pending.on_end()
-            else:
+            if not is_over:
                 self._pending.append(pending)
+            elif pending.answered is not None:
+                pending.inbox.put_event(pending.answered)
         return moved
 
 
@@ -155,5 +187,5 @@ def _take(pending: _Pending) -> tuple[int, bool]:
         if reply is None:
             return count, False
         if reply.ok is not None:
-            pending.on_message(reply.ok.payload.to_bytes())
+            pending.inbox.put_item(pending.scan, reply.ok.payload.to_bytes())
     return MAX_AT_ONCE, False

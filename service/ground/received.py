@@ -65,11 +65,7 @@ def write_left(folder: Path) -> None:
 
 @dataclass(slots=True, eq=False)
 class ReceivedScan:
-    """One open scan of one drone; used by the drone's worker alone.
-
-    The writer of deliverables sets ``is_written`` and ``is_writing``, and ``trouble`` when it
-    fails.
-    """
+    """One open scan of one drone; used by the drone's worker alone."""
 
     drone: str
     name: str  # on the datalink

@@ -5,7 +5,7 @@ finished scan is complete, and when the receiver closes, the deliverables are wr
 it. Everything may be killed at any time and started again.
 
 Threads, all of the table of workers: one that keeps the session, three that take messages
-from it, one per drone (:mod:`service.ground.drone`), one that writes deliverables, and one that
+from it, one per drone (:mod:`service.ground.drones`), one that writes deliverables, and one that
 aligns finished scans (:mod:`service.ground.sites`). A process aligns those in flight
 (:mod:`service.ground.live_site`).
 """
@@ -25,10 +25,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, SkyreliefError
-from service.ground.drone import DroneLimits
+from service.ground.drone import (
+    Align,
+    DroneLimits,
+    DroneReceiver,
+    Effect,
+    Get,
+    Opened,
+    Put,
+    Write,
+)
 from service.ground.drones import Drones
 from service.ground.front import behind_fronts
-from service.ground.inbox import CHANNEL, Inbox, Replies
+from service.ground.inbox import CHANNEL, Grown, Inbox, Radio, Replies, Written
 from service.ground.live_site import run as run_live_site
 from service.ground.received import (
     ReceivedScan,
@@ -80,10 +89,11 @@ class Receiver:
         config: ReceiverConfig,
         workers: Workers | None = None,
         deliver: Callable[[ReceivedScan], None] = deliver,
+        opened: Callable[[ReceivedScan], None] = lambda _: None,
     ) -> None:
-        """``deliver`` writes the deliverables of a scan."""
+        """``deliver`` writes the deliverables of a scan; ``opened`` gets each that is opened."""
         check_endpoints(config.session)
-        self._config, self._deliver = config, deliver
+        self._config, self._deliver, self._opened_scan = config, deliver, opened
         try:
             config.store.mkdir(parents=True, exist_ok=True)
             self.name = config.name or station_name(config.store)
@@ -91,21 +101,21 @@ class Receiver:
             raise InputError(f"cannot write the store {config.store}: {error.strerror}") from error
         self.limits = config.limits
         self.workers = workers or Workers()
-        self._drones = Drones(self, self.workers)
+        self._drones = Drones(config.store, self.name, config.limits, self.workers, self._perform)
         self._session: zenoh.Session | None = None
         self._replies = Replies()
         self._opened = threading.Event()
         self._failure: SkyreliefError | None = None
         self._radio: deque[bytes] = deque(maxlen=MAX_RADIO_WAITING)
         self._tunnel = TunnelIntake()
-        self._writes: queue.Queue[ReceivedScan | None] = queue.Queue()
+        self._writes: queue.Queue[tuple[ReceivedScan, Inbox | None] | None] = queue.Queue()
         self._sites = Sites(config.store, config.limits)
         self._running: list[Worker] = []
         self._fronts: list[Worker] = []
         self._session_config = config.session
         self._refresh_at = -1e9
         self._dropped = 0
-        self._last_news_at = time.monotonic()
+        self._began_at = time.monotonic()
 
     def start(self) -> None:
         """Begin; returns when the endpoints are open. Raises OutsideError when they cannot."""
@@ -141,7 +151,7 @@ class Receiver:
         scans = self._drones.close()
         for scan in scans:
             if scan.unwritten and not scan.is_writing:
-                self.write(scan)
+                self._writes.put((scan, None))
         self._writes.put(None)
         writer.join()
         for worker in sites:
@@ -168,12 +178,8 @@ class Receiver:
 
     @property
     def last_news_at(self) -> float:
-        """When something new was stored last; monotonic seconds."""
-        return self._last_news_at
-
-    def note_news(self) -> None:
-        """Something new was stored."""
-        self._last_news_at = time.monotonic()
+        """When something new was stored last, or this began; monotonic seconds."""
+        return max(self._began_at, self._drones.news_at)
 
     # The session
 
@@ -263,12 +269,7 @@ class Receiver:
                 if drone is None:
                     self._dropped += 1
                 else:
-                    drone.inbox.put_event(partial(drone.add_radio, *item))
-
-    @property
-    def max_open(self) -> int:
-        """Scans that one drone may have open now."""
-        return self._drones.max_open
+                    drone.inbox.put_event(Radio(*item))
 
     def _refresh(self, now: float) -> None:
         """Write the deliverables of scans that grow, every ``refresh_s``."""
@@ -276,11 +277,25 @@ class Receiver:
             return
         self._refresh_at = now + self._config.refresh_s
         for drone in self._drones.all:
-            drone.inbox.put_event(drone.write_grown)
+            drone.inbox.put_event(Grown())
 
-    # What the drones' workers need
+    # Effects
 
-    def put(self, key: str, payload: bytes) -> None:
+    def _perform(self, drone: DroneReceiver, effect: Effect) -> None:
+        """Carry out what a drone's worker has decided."""
+        match effect:
+            case Put(key, payload):
+                self._put(key, payload)
+            case Get():
+                self._get(drone.inbox, effect)
+            case Write(scan):
+                self._writes.put((scan, drone.inbox))
+            case Opened(scan):
+                self._opened_scan(scan)
+            case Align(folder):
+                self.align(folder)
+
+    def _put(self, key: str, payload: bytes) -> None:
         """Publish; nothing happens while there is no session."""
         import zenoh
 
@@ -298,14 +313,8 @@ class Receiver:
         except zenoh.ZError as error:
             log.debug("report not sent: %s", error)
 
-    def get(
-        self,
-        key: str,
-        payload: bytes,
-        on_message: Callable[[bytes], object],
-        on_end: Callable[[], object],
-    ) -> None:
-        """Ask a drone; both callbacks come from another thread."""
+    def _get(self, inbox: Inbox, effect: Get) -> None:
+        """Ask a drone; what comes, from another thread, goes to its inbox."""
         import zenoh
 
         session = self._session
@@ -313,9 +322,9 @@ class Receiver:
             return
         try:
             replies = session.get(
-                key,
+                effect.key,
                 zenoh.handlers.FifoChannel(CHANNEL),
-                payload=payload,
+                payload=effect.payload,
                 priority=zenoh.Priority.BACKGROUND,
                 congestion_control=zenoh.CongestionControl.DROP,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -324,27 +333,19 @@ class Receiver:
         except zenoh.ZError as error:
             log.debug("request not sent: %s", error)
             return
-        self._replies.add(replies, on_message, on_end)
-
-    def opened(self, scan: ReceivedScan) -> None:
-        """A scan was opened; for those who watch."""
+        self._replies.add(replies, inbox, effect.scan, effect.answered)
 
     def align(self, folder: Path) -> None:
         """Align a finished scan with those that show the same ground, if configured."""
         if self._config.sites:
             self._sites.put(folder)
 
-    def write(self, scan: ReceivedScan) -> None:
-        """Have the scan's deliverables written."""
-        scan.unwritten, scan.is_writing = False, True
-        self._writes.put(scan)
-
     def _write_all(self, worker: Worker) -> None:
         """Write requested deliverables, and in between those that a former process left."""
         left = deque(folders_due(self._config.store))
         while True:
             try:
-                scan = self._writes.get(block=not left)
+                asked = self._writes.get(block=not left)
             except queue.Empty:
                 folder = left.popleft()
                 if worker.stop.is_set():
@@ -352,14 +353,11 @@ class Receiver:
                 else:
                     guarded(f"files of {folder}", partial(write_left, folder))
                 continue
-            if scan is None:
+            if asked is None:
                 return
+            scan, inbox = asked
             begin_files(scan.folder)
-            scan.trouble = guarded(f"deliverables of {scan.folder}", partial(self._deliver, scan))
-            if scan.intake.complete and not scan.trouble:
-                self.align(scan.folder)
+            trouble = guarded(f"deliverables of {scan.folder}", partial(self._deliver, scan))
             end_files(scan.folder)
-            scan.is_written, scan.is_writing = True, False
-            drone = self._drones.present(scan.drone)
-            if drone is not None:
-                drone.inbox.put_event(lambda _: None)  # its state is shown at once
+            if inbox is not None:
+                inbox.put_event(Written(scan, trouble))

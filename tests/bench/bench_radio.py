@@ -29,10 +29,9 @@ from recon import se3
 from recon.posegraph.submap_loops import points_of
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.bench import BenchOptions, BenchResult
-from service.bench.link import BareReceiver
 from service.bench.link_emulator import free_port
 from service.config import DatalinkConfig
-from service.ground.receiver import ReceiverConfig
+from service.ground.receiver import Receiver, ReceiverConfig
 from service.radio import GROUND, TUNNEL, RadioLink, VehicleRadio
 from service.stream import codec
 from service.stream.link import DatalinkSender
@@ -132,7 +131,7 @@ def _fly(folder: Path) -> list[BenchResult]:
     vehicle = VehicleLink(VehicleConfig(links=(radio.names[0],)), NoScans())
     vehicle.start()
     session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",))
-    receiver = BareReceiver(ReceiverConfig(folder / "ground", session))
+    receiver = Receiver(ReceiverConfig(folder / "ground", session), deliver=lambda _: None)
     receiver.start()
 
     def heard(payload: bytes) -> None:

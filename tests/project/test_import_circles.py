@@ -9,9 +9,6 @@ from graphlib import CycleError, TopologicalSorter
 import pytest
 from paths import ROOT
 
-OPEN = ("service.ground",)
-"""Rooms that still have circles inside."""
-
 
 def modules() -> dict[str, ast.Module]:
     """Every module of the product, parsed, by its dotted name."""
@@ -48,7 +45,7 @@ def circle(trees: dict[str, ast.Module]) -> list[str]:
 
 @pytest.mark.slow
 def test_files_do_not_need_each_other() -> None:
-    trees = {n: t for n, t in modules().items() if not n.startswith(OPEN)}
+    trees = modules()
     assert len(trees) > 200 and not circle(trees), " -> ".join(circle(trees))
 
 

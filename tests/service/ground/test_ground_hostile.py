@@ -24,7 +24,6 @@ from paths import ROOT
 from service.config import DatalinkConfig
 from service.ground.drone import DroneLimits
 from service.ground.inbox import MAX_HEADS, MAX_ITEM_BYTES, MAX_ITEMS, Inbox
-from service.ground.intake import ScanIntake
 from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.link import DatalinkSender
@@ -44,12 +43,13 @@ def serving(
     limits: DroneLimits | None = None,
     refresh_s: float = 0.0,
     deliver: Callable[[ReceivedScan], None] = lambda _: None,
+    opened: Callable[[ReceivedScan], None] = lambda _: None,
 ) -> Iterator[tuple[Receiver, str]]:
     """A ground station and where it listens."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     session = SessionConfig(mode="router", listen=(endpoint,))
     config = ReceiverConfig(folder, session, limits or DroneLimits(), "base", refresh_s)
-    ground = Receiver(config, deliver=deliver)
+    ground = Receiver(config, deliver=deliver, opened=opened)
     ground.start()
     try:
         yield ground, endpoint
@@ -116,18 +116,15 @@ def _introduced(ground: Receiver, session: Any, drone: str, scan_id: str) -> boo
     return (drone, scan_id) in places
 
 
-def test_a_fault_of_ours_in_one_drones_work_is_reported_and_stops_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    original = ScanIntake.on_items
-
-    def fails(self: ScanIntake, message: bytes, now: float) -> bool:
-        if self.store.header.drone == "evil":
+def test_a_fault_of_ours_in_one_drones_work_is_reported_and_stops_no_other(tmp_path: Path) -> None:
+    def fails(scan: ReceivedScan) -> None:
+        if scan.drone == "evil":
             raise UnicodeDecodeError("utf-16", b"", 0, 1, "made up")
-        return original(self, message, now)
 
-    monkeypatch.setattr(ScanIntake, "on_items", fails)
-    with serving(tmp_path / "ground") as (ground, endpoint), hostile(endpoint) as session:
+    with (
+        serving(tmp_path / "ground", opened=fails) as (ground, endpoint),
+        hostile(endpoint) as session,
+    ):
 
         def failed() -> bool:
             introduce(session, "evil", "scan-1")
@@ -352,21 +349,6 @@ def test_a_silent_drone_has_no_worker_and_its_scans_stay_listed(tmp_path: Path) 
 
 def _running(ground: Receiver) -> list[dict[str, object]]:
     return [worker for worker in ground.workers.report() if worker["state"] == "running"]
-
-
-def test_unfinished_records_of_all_scans_of_a_drone_share_one_bound(tmp_path: Path) -> None:
-    part = split("k1", 1, bytes(90_000), 60_000)[0].pack()
-    with (
-        serving(tmp_path / "ground", DroneLimits(unfinished_bytes=100_000)) as (ground, endpoint),
-        hostile(endpoint) as session,
-    ):
-        for k in range(4):
-            until(partial(_introduced, ground, session, "evil", f"scan-{k}"))
-            key = f"skyrelief/evil/scan-{k}/item/k1/1"
-            session.put(key, part, congestion_control=zenoh.CongestionControl.BLOCK)
-        (evil,) = ground._drones.all
-        until(lambda: sum(e["received_bytes"] > 45_000 for e in ground.progress()) == 4)
-        until(lambda: sum(scan.intake.held_bytes for scan in evil.scans) <= 100_000)
 
 
 @pytest.mark.timeout(3600 if WHOLE else 300)

@@ -1,0 +1,262 @@
+"""One drone's scans at the ground station, without socket, thread or clock."""
+
+from __future__ import annotations
+
+import tempfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import Phase, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+
+from service.ground.drone import (
+    Align,
+    DroneLimits,
+    DroneReceiver,
+    Effect,
+    Get,
+    Opened,
+    Put,
+    Write,
+)
+from service.ground.inbox import Answered, Batch, Event, Grown, Written
+from service.stream.messages import Head, Held, pack, split, unpack
+from service.stream.naming import place_of
+from service.stream.ranges import RangeSet, ranges_from_text
+from service.stream.records import PoseRecord, ScanHeader
+from service.stream.store import ScanStore
+
+
+class Onboard:
+    """The scan of a drone, and the ground's side of it."""
+
+    def __init__(self, folder: Path, limits: DroneLimits | None = None) -> None:
+        header = ScanHeader("scan-1", "red", 1, run_id="a" * 32)
+        self.store = ScanStore.create(folder / "a.db", header)
+        self.name = header.name
+        self.ground = DroneReceiver("red", folder / "ground", "base", limits or DroneLimits(), 0.0)
+        self.now = 0.0
+        self.asked: list[Get] = []
+        self.writes: list[Write] = []
+        self.held: Held | None = None
+        self.opened = 0
+        self.aligned: list[Path] = []
+
+    def pass_time(self, seconds: float) -> None:
+        self.now += seconds
+        self._hand_on(Batch())
+
+    def head(self) -> None:
+        """The drone says what it has."""
+        payload = pack(Head(self.store.numbers(), {}, self.store.finished))
+        self._hand_on(Batch(heads={self.name: payload}))
+
+    def send(self, kind: str, number: int) -> None:
+        """A record, in one part."""
+        record = self.store.record(kind, number)
+        assert record is not None
+        (part,) = split(kind, number, record, 1 << 16)
+        self._hand_on(Batch(items=[(self.name, part.pack())]))
+
+    def answer(self) -> None:
+        """Send what the oldest request asked for, and say that this was all."""
+        asked = self.asked.pop(0)
+        *_, kind, numbers = asked.key.split("/")
+        ranges = ranges_from_text(numbers)
+        assert ranges
+        for number in ranges:
+            self.send(kind, number)
+        if asked.answered is not None:
+            self.hear(asked.answered)
+
+    def hear(self, *events: Event) -> None:
+        self._hand_on(Batch(events=list(events)))
+
+    def written(self, trouble: str = "") -> None:
+        """The oldest writing of files has ended."""
+        self.hear(Written(self.writes.pop(0).scan, trouble))
+
+    def _hand_on(self, batch: Batch) -> None:
+        for effect in self.ground.handle(batch, self.now):
+            self._perform(effect)
+
+    def _perform(self, effect: Effect) -> None:
+        match effect:
+            case Put(key, payload):
+                assert place_of(key) == ("red", self.name) and key.endswith("/held/base")
+                self.held = unpack(payload, Held)
+            case Get():
+                self.asked.append(effect)
+            case Write():
+                assert not self.writes, "one at a time"
+                self.writes.append(effect)
+            case Opened():
+                self.opened += 1
+            case Align(folder):
+                self.aligned.append(folder)
+
+    def close(self) -> None:
+        self.ground.close_all()
+        self.store.close()
+
+
+@pytest.mark.parametrize("trouble", ["", "no cloud"])
+def test_a_scan_is_asked_for_written_and_aligned(trouble: str, tmp_path: Path) -> None:
+    one = Onboard(tmp_path)
+    one.head()
+    assert not list(tmp_path.glob("ground/**/scan.db"))  # a folder is made for a header only
+    one.answer()
+    one.store.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
+    one.store.finish({"points": 1})
+    one.head()
+    for _ in range(20):
+        one.pass_time(0.5)
+        while one.asked:
+            one.answer()
+    assert one.opened == 1
+    assert one.held is not None and one.held.numbers == one.store.numbers()
+    (entry,) = one.ground.entries
+    assert entry["finished"] and not entry["complete"]  # its files are not written yet
+    one.written(trouble)
+    (entry,) = one.ground.entries
+    assert entry["complete"] and entry["trouble"] == (trouble or None)
+    assert len(one.aligned) == (trouble == "")
+    one.pass_time(5.0)
+    assert one.writes == []
+    one.pass_time(61.0)
+    assert one.ground.scans == [] and one.ground.entries[0]["open"] is False
+    one.close()
+
+
+def test_a_growing_scan_is_written_when_that_is_asked_for(tmp_path: Path) -> None:
+    one = Onboard(tmp_path)
+    one.head()
+    one.answer()
+    one.hear(Grown())
+    assert len(one.writes) == 1
+    one.hear(Grown())
+    assert len(one.writes) == 1  # while it is written, it is not written again
+    number = one.store.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
+    one.send("pose", number)
+    one.written()
+    one.hear(Grown())
+    assert len(one.writes) == 1
+    one.written()
+    one.hear(Grown())
+    assert one.writes == []  # it did not grow
+    one.close()
+
+
+def test_an_answer_to_a_scan_that_was_closed_is_nothing(tmp_path: Path) -> None:
+    one = Onboard(tmp_path)
+    one.hear(Answered("never-seen", 0, 1), Grown())
+    one.head()
+    one.answer()
+    assert [scan.name for scan in one.ground.scans] == [one.name]
+    one.close()
+
+
+def test_unfinished_records_of_all_scans_of_a_drone_share_one_bound(tmp_path: Path) -> None:
+    part = split("k1", 1, bytes(90_000), 60_000)[0].pack()
+    ground = DroneReceiver("evil", tmp_path, "base", DroneLimits(unfinished_bytes=100_000), 0.0)
+    for k in range(4):
+        record = ScanHeader(f"scan-{k}", "evil", 1).to_json()
+        number = zlib.crc32(record)
+        head = pack(Head({"header": RangeSet.of([number])}))
+        ground.handle(Batch(heads={f"scan-{k}": head}), 0.0)
+        (header,) = split("header", number, record, 1 << 16)
+        ground.handle(Batch(items=[(f"scan-{k}", header.pack())]), 0.0)
+        ground.handle(Batch(items=[(f"scan-{k}", part)]), 0.0)
+    ground.show(0.0)
+    assert sum(entry["received_bytes"] > 45_000 for entry in ground.entries) == 4
+    assert sum(scan.intake.held_bytes for scan in ground.scans) <= 100_000
+    ground.close_all()
+
+
+class AnyOrder(RuleBasedStateMachine):
+    """Whatever comes, in any order and however often: the scan arrives whole in the end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = tempfile.TemporaryDirectory()
+        self.one = Onboard(Path(self.folder.name))
+        self.most: dict[str, int] = {}
+
+    @rule()
+    def grow(self) -> None:
+        if not self.one.store.finished:
+            self.one.store.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
+
+    @rule()
+    def finish(self) -> None:
+        if not self.one.store.finished:
+            self.one.store.finish({"points": 1})
+
+    @rule()
+    def announce(self) -> None:
+        self.one.head()
+
+    @rule(data=st.data())
+    def deliver(self, data: st.DataObject) -> None:
+        """An item comes that nobody asked for, perhaps again."""
+        kinds = [(k, n) for k, r in self.one.store.numbers().items() for n in r.newest_first()]
+        self.one.send(*data.draw(st.sampled_from(kinds)))
+
+    @rule(junk=st.binary(max_size=40))
+    def disturb(self, junk: bytes) -> None:
+        self.one.ground.handle(Batch(heads={self.one.name: junk}), self.one.now)
+        self.one.ground.handle(Batch(items=[(self.one.name, junk)]), self.one.now)
+
+    @precondition(lambda self: self.one.asked)
+    @rule(lost=st.booleans())
+    def answer(self, lost: bool) -> None:
+        if lost:
+            self.one.asked.pop(0)
+        else:
+            self.one.answer()
+
+    @precondition(lambda self: self.one.writes)
+    @rule(trouble=st.sampled_from(["", "disk full"]))
+    def written(self, trouble: str) -> None:
+        self.one.written(trouble)
+
+    @rule(seconds=st.sampled_from([0.1, 5.0, 700.0]))
+    def wait(self, seconds: float) -> None:
+        self.one.pass_time(seconds)
+
+    @invariant()
+    def nothing_held_is_lost(self) -> None:
+        for entry in self.one.ground.entries:
+            for kind, count in self.most.items():
+                assert entry["held"][kind] >= count
+            self.most = entry["held"]
+
+    def teardown(self) -> None:
+        one = self.one
+        self.finish()
+        for _ in range(30):
+            one.head()
+            one.pass_time(5.0)
+            while one.asked:
+                one.answer()
+            if one.writes:
+                one.written()
+        (entry,) = one.ground.entries
+        assert entry["complete"] and one.aligned
+        assert one.held is not None and one.held.numbers == one.store.numbers()
+        one.close()
+        self.folder.cleanup()
+
+
+def test_any_order_of_messages_and_events() -> None:
+    chosen = settings(max_examples=6, stateful_step_count=15, phases=(Phase.generate,))
+    run_state_machine_as_test(AnyOrder, settings=chosen)
