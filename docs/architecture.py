@@ -21,7 +21,7 @@ BOXES: dict[str, tuple[int, int, str]] = {
     "mavlink/wire": (195, 30, "MAVLink packets"),
     "mavlink/component": (360, 30, "commands, parameters"),
     "service/daemon": (360, 110, "when to scan"),
-    "service/flight": (195, 210, "pipeline.py = Figure 1"),
+    "service/flight": (195, 210, "a scan: threads, store"),
     "service/stream": (450, 210, "scan.db, datalink"),
     "service/radio.py": (450, 290, "coarse map by radio"),
     "service/ground": (760, 210, "receiver, portal"),
@@ -35,6 +35,7 @@ BOXES: dict[str, tuple[int, int, str]] = {
     "recon/calibration": (40, 485, "camera model"),
     "recon/backends": (205, 485, "CPU, torch, ONNX"),
     "recon/types.py": (370, 485, "records, frames, lens"),
+    "recon/pipeline": (535, 485, "mapper.py = Figure 1"),
     "service/sim": (760, 25, "sim, bench, commands"),
 }
 """Room to the corner of its box and what it holds."""

@@ -1,1 +1,37 @@
-"""Reconstruction mathematics: arrays in, arrays out; no clock, file, socket or environment."""
+"""Reconstruction mathematics: arrays in, arrays out; no clock, file, socket or environment.
+
+``from recon import Camera, Frame, Mapper, PosePrior`` is the library; names load on first use.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
+    from recon.pipeline.mapper import Mapper, MapperConfig
+    from recon.types import Camera, Frame, PointCloud, Pose, PosePrior
+
+__all__ = [
+    "Camera",
+    "Frame",
+    "FramePosed",
+    "KeyframeReady",
+    "Mapper",
+    "MapperConfig",
+    "PointCloud",
+    "Pose",
+    "PosePrior",
+    "PosesChanged",
+]
+
+_ROOMS = ("recon.types", "recon.pipeline.events", "recon.pipeline.mapper")
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        for room in map(import_module, _ROOMS):
+            if hasattr(room, name):
+                return getattr(room, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -112,7 +112,7 @@ class Frame:
     image: U8  # (H, W, 3) BGR
     time_ns: int  # mid-exposure; companion monotonic live, unix nanoseconds in a replay
     seq: int
-    prior: PosePrior
+    prior: PosePrior = PosePrior()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,6 +122,7 @@ class Pose:
     T_world_camera: F64  # (4, 4) m
     covariance: F64  # (6, 6) left perturbation in the world frame: rotation rad, translation m
     sources: tuple[str, ...] = ()  # of "vision", "attitude", "altitude", "gnss"
+    scale: float = 1.0  # metres per unit of the odometry: multiplies depths
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,13 +20,12 @@ KEYFRAME = np.dtype(
     [
         ("seq", np.int64),
         ("segment", np.int32),
-        ("published", np.int32),  # how often its pose was published
+        ("is_published", np.bool_),
         ("odom", np.float64, (3, 4)),  # T_odom_camera in the segment's chain
         ("height", np.float64),  # above the ground that it sees, in odometry units
         ("pose", np.float64, (3, 4)),  # T_world_camera as last published
         ("sigma_m", np.float64),  # of the place, as last published as a node
         ("scale", np.float64),  # metres per odometry unit as last published
-        ("first_scale", np.float64),  # and as published first
     ]
 )
 """A row of the ledger: the data of one keyframe."""
@@ -81,7 +80,7 @@ def screws(twists: F64, shares: F64) -> F64:
 def left(rows: Rows, T_before: F64, scale_before: F64) -> tuple[F64, F64]:
     """(N, 4, 4) poses and (N,) scales of the ledger's rows that no node carries: as published,
     and in the place of the node before them, (N, 4, 4) and (N,), if they never were."""
-    published = rows["published"] > 0
+    published = rows["is_published"]
     poses = np.where(published[:, None, None], whole(rows["pose"]), T_before)
     return poses, np.where(published, rows["scale"], scale_before)
 

@@ -199,7 +199,7 @@ class PoseGraph:
         """The pose of keyframe ``seq`` with its covariance and sources."""
         node = self._nodes[seq]
         T, covariance = self._smoother.state(node.key)
-        return Pose(T, covariance, self.sources(seq))
+        return Pose(T, covariance, self.sources(seq), self.scale(seq))
 
     def scale(self, seq: int) -> float:
         """Metres per unit of the odometry at keyframe ``seq``."""

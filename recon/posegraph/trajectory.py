@@ -10,7 +10,7 @@ from array import array
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,7 +24,8 @@ from recon.posegraph.interpolated import (
 )
 from recon.posegraph.ledger import Ledger, Rows
 from recon.posegraph.pose_graph import PoseGraph
-from recon.types import F64, PosePrior
+from recon.poses import sigma_m
+from recon.types import F64, Pose, PosePrior
 
 REPOSE_M, REPOSE_SIGMAS = 0.05, 0.1
 """In flight a corrected pose is published that moves the keyframe or its ground by more than this,
@@ -39,28 +40,6 @@ SIGMA_SHARE = 0.01
 """A sigma that differs by more is published again at the end."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Placed:
-    """A keyframe in the world."""
-
-    seq: int
-    T_world_camera: F64  # (4, 4)
-    scale: float  # metres per odometry unit: multiplies depths of the chain
-    covariance: F64  # (6, 6) left perturbation in the world
-    sources: tuple[str, ...]
-
-    @property
-    def sigma_m(self) -> float:
-        """Of the place, in all three directions together."""
-        return se3.sigma_at(self.T_world_camera[:3, 3], self.covariance)
-
-    def carry(self, T_key_camera: F64) -> Placed:
-        """A frame in the world by its pose relative to this keyframe (odometry units)."""
-        moved = T_key_camera.copy()
-        moved[:3, 3] *= self.scale
-        return replace(self, T_world_camera=self.T_world_camera @ moved)
-
-
 class Trajectory:
     """Keyframe poses of one scan, segment by segment.
 
@@ -72,7 +51,7 @@ class Trajectory:
         """``graph`` places the keyframes; a :class:`PoseGraph` when left out."""
         self.graph = PoseGraph() if graph is None else graph
         self._ledger = Ledger(KEYFRAME)
-        self._published: dict[int, Placed] = {}  # nodes as they were last published, in order
+        self._published: dict[int, Pose] = {}  # nodes as they were last published, in order
         self._checked = -1  # version of the graph that they were compared with
         self._seqs = array("q")  # numbers of all keyframes, as in the ledger
         self._nodes: list[int] = []  # their numbers, in order
@@ -114,14 +93,13 @@ class Trajectory:
             return self.graph.node(seq).T_odom_camera
         return np.asarray(whole(self._read(self._row(seq))["odom"])[0])
 
-    def place(self, seq: int) -> Placed:
+    def pose(self, seq: int) -> Pose:
         """The keyframe in the world, as known now. Raises KeyError for an unknown keyframe."""
         if seq not in self.graph:
             row, ends = self._row(seq), self._neighbours(seq)
             at = np.array([row]), np.array([0])
             T, scales = interpolated(self._read(row), *at, self._spans([ends]))
-            node = self.place(ends[0])
-            return replace(node, seq=seq, T_world_camera=T[0], scale=float(scales[0]))
+            return replace(self.pose(ends[0]), T_world_camera=T[0], scale=float(scales[0]))
         pose = self.graph.pose(seq)
         frame = self.graph.segments.known(self.graph.node(seq).segment)
         T, covariance = pose.T_world_camera, pose.covariance
@@ -136,24 +114,24 @@ class Trajectory:
             covariance = se3.about(-T[:3, 3], covariance)
         if frame is not None and frame.lean is not None:  # nothing in the graph shows it
             covariance = covariance + frame.lean
-        return Placed(seq, T, self.graph.scale(seq), covariance, pose.sources)
+        return replace(pose, covariance=covariance)
 
     def places(self, seqs: Sequence[int]) -> F64:
         """(N, 4, 4) T_world_camera of keyframes."""
         nodes, graph = self.graph.poses(), self.graph
         found = [
-            nodes[graph.node(seq).key] if seq in graph else self.place(seq).T_world_camera
+            nodes[graph.node(seq).key] if seq in graph else self.pose(seq).T_world_camera
             for seq in seqs
         ]
         return np.array(found).reshape(-1, 4, 4)
 
     def scale(self, seq: int) -> float:
         """Metres per unit of the odometry at a keyframe."""
-        return self.graph.scale(seq) if seq in self.graph else self.place(seq).scale
+        return self.graph.scale(seq) if seq in self.graph else self.pose(seq).scale
 
     def step_between(self, a: int, b: int) -> F64:
         """(4, 4) T_a_b in metres by what the graph holds now."""
-        return np.asarray(se3.inverse(self.place(a).T_world_camera) @ self.place(b).T_world_camera)
+        return np.asarray(se3.inverse(self.pose(a).T_world_camera) @ self.pose(b).T_world_camera)
 
     def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
         """As :meth:`recon.posegraph.pose_graph.PoseGraph.add_loop`; ``a`` need not be a node, and
@@ -173,8 +151,9 @@ class Trajectory:
 
     # ---- publishing ----------------------------------------------------------------------------
 
-    def moved(self, final: bool = False) -> list[Placed]:
-        """Keyframes whose world pose has changed since it was published by more than a threshold.
+    def moved(self, final: bool = False) -> dict[int, Pose]:
+        """Keyframes, by number, whose world pose has changed since it was published by more than a
+        threshold.
 
         In flight a change must exceed REPOSE_M and a tenth of the pose's own sigma, or
         each fix of a poor receiver would move the whole scan; those carried by nodes that moved
@@ -187,11 +166,11 @@ class Trajectory:
         nodes = self._moved_nodes(final)
         if final:
             self._pending = deque(self._nodes[:-1])
-        return nodes + self._moved_interpolated(final)
+        return nodes | self._moved_interpolated(final)
 
-    def _moved_nodes(self, final: bool) -> list[Placed]:
+    def _moved_nodes(self, final: bool) -> dict[int, Pose]:
         if not self._published or (self._checked == self.graph.version and not final):
-            return []
+            return {}
         self._checked = self.graph.version
         before, seqs = list(self._published.values()), list(self._published)
         rows = self._ledger.pick(np.searchsorted(self._seqs, seqs))
@@ -199,20 +178,20 @@ class Trajectory:
         T, scales = self.graph.poses()[keys], self.graph.scales()[keys]
         change, claimed = moved_m(rows, T, scales), rows["sigma_m"]
         if final:
-            now = [self.place(p.seq) for p in before]
-            sigma = np.array([p.sigma_m for p in now])
+            now = [self.pose(seq) for seq in seqs]
+            sigma = np.array([sigma_m(pose) for pose in now])
             stale = (change > 1e-6) | (np.abs(sigma - claimed) > SIGMA_SHARE * claimed)
-            return [now[i] for i in np.flatnonzero(stale)]
+            return {seqs[i]: now[i] for i in np.flatnonzero(stale)}
         moved = np.flatnonzero(change > np.maximum(REPOSE_M, REPOSE_SIGMAS * claimed))
-        self._owe([before[i].seq for i in moved])
+        self._owe([seqs[i] for i in moved])
         # In flight with the sigmas published before: newer readings have only made them smaller.
-        return [
-            replace(
+        return {
+            seqs[i]: replace(
                 before[i], T_world_camera=T[i], scale=float(scales[i]),
-                sources=self.graph.sources(before[i].seq),
+                sources=self.graph.sources(seqs[i]),
             )
             for i in moved
-        ]  # fmt: skip
+        }  # fmt: skip
 
     def _owe(self, seqs: Sequence[int]) -> None:
         """Look at the keyframes on both sides of these nodes soon."""
@@ -224,8 +203,8 @@ class Trajectory:
                     pending.add(self._nodes[k])
                     self._pending.append(self._nodes[k])
 
-    def _moved_interpolated(self, final: bool) -> list[Placed]:
-        out: list[Placed] = []
+    def _moved_interpolated(self, final: bool) -> dict[int, Pose]:
+        out: dict[int, Pose] = {}
         while self._pending:
             spans: list[tuple[int, int]] = []
             count = 0
@@ -235,49 +214,44 @@ class Trajectory:
                 held = self._row(after) - self._row(before) - 1
                 spans += [(before, after)] if held else []
                 count += held
-            out += self._moved_within(spans, final) if spans else []
+            out |= self._moved_within(spans, final) if spans else {}
             if not final:
                 break
         return out
 
-    def _moved_within(self, spans: list[tuple[int, int]], final: bool) -> list[Placed]:
+    def _moved_within(self, spans: list[tuple[int, int]], final: bool) -> dict[int, Pose]:
         """Published keyframes between these pairs of nodes that have moved."""
         numbers = [np.arange(self._row(a) + 1, self._row(b)) for a, b in spans]
         span = np.repeat(np.arange(len(spans)), [len(held) for held in numbers])
         rows = np.concatenate([self._ledger.read(held[0], held[-1] + 1) for held in numbers])
         number = np.concatenate(numbers)
-        published = rows["published"] > 0
+        published = rows["is_published"]
         rows, number, span = rows[published], number[published], span[published]
         T, scales = interpolated(rows, number, span, self._spans(spans))
         known = [
-            self.place(before) if final else self._published.get(before) or self.place(before)
+            self.pose(before) if final else self._published.get(before) or self.pose(before)
             for before, _ in spans
         ]
-        sigma = np.array([one.sigma_m for one in known])[span]
+        sigma = np.array([sigma_m(one) for one in known])[span]
         least = np.maximum(REPOSE_M, REPOSE_SIGMAS * sigma)
         far = moved_m(rows, T, scales) > (1e-6 if final else least)
-        return [
-            replace(known[span[i]], seq=int(rows["seq"][i]), T_world_camera=T[i],
-                    scale=float(scales[i]))
+        return {
+            int(rows["seq"][i]): replace(
+                known[span[i]], T_world_camera=T[i], scale=float(scales[i])
+            )
             for i in np.flatnonzero(far)
-        ]  # fmt: skip
+        }
 
-    def publish(self, placed: Placed) -> tuple[int, float]:
-        """Remember that this pose of the keyframe was published.
-
-        Returns how often it had been published before, and its scale over the first published.
-        """
-        row = self._row(placed.seq)
+    def publish(self, seq: int, pose: Pose) -> None:
+        """Remember that this pose of the keyframe was published."""
+        row = self._row(seq)
         rows = self._read(row)
-        if placed.seq in self.graph:
-            self._published[placed.seq] = placed
-            rows["sigma_m"] = placed.sigma_m
-        rows["published"] += 1
-        rows["pose"], rows["scale"] = placed.T_world_camera[:3], placed.scale
-        if rows["published"][0] == 1:
-            rows["first_scale"] = placed.scale
+        if seq in self.graph:
+            self._published[seq] = pose
+            rows["sigma_m"] = sigma_m(pose)
+        rows["is_published"] = True
+        rows["pose"], rows["scale"] = pose.T_world_camera[:3], pose.scale
         self._ledger.amend(row, rows)
-        return int(rows["published"][0]) - 1, placed.scale / float(rows["first_scale"][0])
 
     # ---- keyframes that are not nodes -----------------------------------------------------------
 

@@ -29,8 +29,8 @@ from service.cameras.rig import Rig, turn_sigma_rad_s
 from service.cameras.source import CameraFrame
 from service.config import change
 from service.errors import InputError
+from service.flight.pipeline import Pipeline
 from service.flight.scan import ScanInputs, check_new
-from service.flight.stages import build_stages
 from service.flight.telemetry_check import TelemetryCheck, differs
 from service.offline.refine.own_camera import sightings
 from service.scans.retention import PAGES
@@ -95,7 +95,9 @@ def _tracked(
     inputs: ScanInputs, source: ImagesSource, history: VehicleHistory
 ) -> tuple[list[Still], LatencyEstimate | None]:
     """The stills by the odometry, and how long before its stamp each was exposed."""
-    stages = build_stages(inputs.camera, inputs.config, inputs.backend, inputs.folder / PAGES)
+    pipeline = Pipeline(
+        inputs.camera, inputs.config, inputs.backend, inputs.folder / PAGES, in_background=False
+    )
     rig = Rig(inputs.config.camera, inputs.config.scan, inputs.config.fusion)
     check = TelemetryCheck(inputs.config.camera, history, log.info)
     out = list[Still]()
@@ -103,8 +105,8 @@ def _tracked(
         time_ns = inputs.epoch_ns + frame.time_ns
         state = history.state_at(check.exposed_ns(time_ns))
         prior = rig.prior(state, frame.geotag)
-        image = stages.undistort(Frame(frame.image, time_ns, frame.seq, prior))
-        tracked = stages.track(image)
+        image = pipeline.undistort(Frame(frame.image, time_ns, frame.seq, prior))
+        tracked = pipeline.follow(image)
         check.add(time_ns, tracked)
         is_tracked = tracked.T_odom_camera is not None
         if tracked.before is not None:

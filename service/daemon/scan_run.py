@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from mavlink.component.vehicle import VehicleLink
     from mavlink.telemetry.samples import VehicleState
     from recon.backends import Backend
+    from recon.pipeline.events import FramePosed
     from recon.types import Camera, Keyframe
     from service.cameras.source import CameraSource
     from service.daemon.frame_gate import FrameGate
     from service.flight.datalink import DaemonLink
-    from service.flight.pipeline import Step
     from service.flight.scan import Photo, Scan, ScanInputs
     from service.stream.store import ScanStore
 
@@ -118,9 +118,9 @@ class ScanRun:
         self._config, self._level = config, level
         scan, gate = self.scan, self.gate
         if scan is not None and gate is not None:
-            scan.pipeline.set_baseline(config.scan)
+            scan.pipeline.configure_baseline(config.scan)
             scan.check.set_camera(config.camera)
-            scan.pipeline.set_effort(lowered(config.compute, level))
+            scan.pipeline.configure_effort(lowered(config.compute, level))
             gate.level = level
 
     def lag(self) -> MachineReadings:
@@ -250,7 +250,7 @@ class ScanRun:
             extra={"backend": backend.name, "source": source.description},
             latency_ms=earlier.latency_ms,
             warn=lambda text: vehicle.statustext(text, WARNING),
-            on_step=odometry_reporter(config, vehicle),
+            on_frame=odometry_reporter(config, vehicle),
             on_keyframe=self._on_keyframe,
             on_photo=self._on_photo,
         )
@@ -312,7 +312,7 @@ def _zero_ns(source: CameraSource) -> int:
 
 def odometry_reporter(
     config: Config, vehicle: VehicleLink
-) -> Callable[[Step, VehicleState | None, int], None] | None:
+) -> Callable[[FramePosed, VehicleState | None], None] | None:
     """Reports our motion to the autopilot, if configured."""
     if not config.mavlink.odometry:
         return None

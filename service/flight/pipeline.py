@@ -1,137 +1,141 @@
-"""Figure 1 of the paper: images and telemetry in, posed depth images out.
-
-:meth:`Pipeline.step` is the upper row of the figure, up to the virtual stereo camera;
-:meth:`Pipeline.reconstruct` is the lower row, from a stereo view to a keyframe. Every box is one
-line with its equation. The stages are built from the configuration by
-:func:`service.flight.stages.build_stages`.
-"""
+"""A scan's :class:`recon.pipeline.mapper.Mapper` by the configuration, on a thread of its own."""
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass, replace
+import math
+from collections import deque
+from collections.abc import Collection
+from functools import partial
+from pathlib import Path
 from threading import Event
 
-from recon.posegraph.trajectory import Placed
-from recon.tracking.odometry import Tracked, Tracking
-from recon.types import Frame, Keyframe, PosePrior
-from service.config import ComputeConfig, ScanConfig
-from service.flight.anchorage import Anchorage
-from service.flight.stages import Stages
-from service.flight.viewpoints import StereoCandidate, UndistortedFrame
-from service.stream.records import Repose
+from recon.backends import Backend
+from recon.bands import limit_threads
+from recon.mapping.voxel_map import VoxelMapConfig
+from recon.pipeline.config import Baseline, MapperConfig
+from recon.pipeline.events import Event as MapperEvent
+from recon.pipeline.keyframe_map import GraphUpdate
+from recon.pipeline.mapper import Mapper, Reconstruct
+from recon.pipeline.views import StereoCandidate
+from recon.tracking.known_track import KnownTrack
+from recon.types import Camera
+from service.background import BackgroundWorker
+from service.cameras.camera_file import seeks_readout, with_shutter
+from service.cameras.lens import SIGMA_K1
+from service.config import ComputeConfig, Config, ScanConfig, parse_baseline
+from service.flight.paged_map import PagedMap
+from service.flight.reports import GraphWatch
+from service.progress import Stopwatch
+
+MAX_WAITING = 3
+"""Views that wait for reconstruction."""
+
+ASSUMED_LENS_SHARE = 0.02
+"""Sigma of depth over depth where a lens without distortion is assumed: lenses of action cameras
+bend surfaces by that much."""
+
+COMMON_FOCAL_SHARE, MAX_FOCAL_SHARE = 0.02, 0.05
+"""Sigma of the focal length that all points share, so that it would only hide how they err against
+each other, and up to which sigma of depth holds the rest: above a tenth would drop all points."""
+
+DenseWorker = BackgroundWorker[StereoCandidate, GraphUpdate]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Step:
-    """Results of one frame."""
-
-    tracked: Tracked
-    placed: Placed | None = None  # the frame in the world; by telemetry alone when vision fails
-    is_view: bool = False  # the frame takes part in stereo and may become a keyframe
-    anchor: Anchorage | None = None  # gives the frame's place again, as it is known later
-    keyframes: tuple[Keyframe, ...] = ()  # finished depth images, oldest first
-    moved: tuple[Repose, ...] = ()  # keyframes published before whose pose is better now
-    late: Step | None = None  # the frame before, which was lost until this one came
+def sigma_lens(assumed: Collection[str], sigma_focal: float) -> float:
+    """Sigma of depth over depth by what is ``assumed`` of the lens, and by its focal length."""
+    by_lens = ASSUMED_LENS_SHARE if "lens" in assumed else 0.0
+    apart = max(min(sigma_focal, MAX_FOCAL_SHARE) ** 2 - COMMON_FOCAL_SHARE**2, 0.0)
+    return math.hypot(by_lens, math.sqrt(apart))
 
 
-class Pipeline:
-    """One scan: feed :meth:`step` every frame in order, then call :meth:`finish`."""
+def mapper_config(
+    camera: Camera, config: Config, assumed: Collection[str] = (), sigma_focal: float = 0.0
+) -> MapperConfig:
+    """The mapper's parameters by the configuration."""
+    compute, scan = config.compute, config.scan
+    return MapperConfig(
+        baseline=Baseline(*parse_baseline(scan.baseline)),
+        pairs=compute.pairs,
+        base_to_height=scan.base_to_height,
+        seeks_readout=seeks_readout(camera, config.camera),
+        guide_width_px=compute.guide_width,
+        stereo_width_px=compute.stereo_width,
+        upsample=compute.upsample,
+        labels=compute.labels,
+        iterations=compute.iterations,
+        loops=config.fusion.loops,
+        loop_views=config.fusion.loop_views,
+        graph_keyframes=config.fusion.graph_keyframes,
+        resolution_m=scan.resolution_m,
+        sigma_lens=sigma_lens(assumed, sigma_focal),
+        sigma_k1=SIGMA_K1 if "distortion" in assumed else 0.0,
+        keeps_debug=scan.keep_debug,
+    )
 
-    def __init__(self, stages: Stages) -> None:
-        self.stages = stages
-        self._background = stages.in_background(self.reconstruct)
-        self._lost: UndistortedFrame | None = None  # the last frame, where it has no pose
 
-    # ---- the figure --------------------------------------------------------------------
+class Pipeline(Mapper):
+    """The mapper of a scan: reconstructs on the worker ``dense``, keeps old surface on disk."""
 
-    def skip(self, time_ns: int, prior: PosePrior) -> Step | None:
-        """The step of a frame that need not be seen; None for one that :meth:`step` must take."""
-        track = self.stages.track  # frames are followed as fast as the image moves
-        if not track.can_skip(time_ns, prior):
-            return None
-        return Step(Tracked(Tracking.SKIPPED, track.segment))
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config,
+        backend: Backend,
+        pages: Path,
+        live: bool = False,
+        assumed: Collection[str] = (),
+        sigma_focal: float = 0.0,
+        known: KnownTrack | None = None,
+        in_background: bool = True,
+    ) -> None:
+        """Raises ValueError for an unusable camera model.
 
-    def step(self, frame: Frame) -> Step:
-        """One frame: where the camera is, and which views have their partners by now.
-
-        Raises ValueError when the image is not of the camera model's size.
+        ``pages`` is a folder, made when it is needed, for the oldest parts of the map. ``live``
+        drops old work when reconstruction cannot keep up. An ``assumed`` lens widens sigmas. A
+        ``known`` track takes the odometry's place.
         """
-        s = self.stages
-        image = s.undistort(frame)  # section 2.1
-        tracked = s.track(image)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
-        late = self._late(image, tracked)
-        anchor, is_view = s.views.take(image, tracked)  # virtual stereo camera, section 2.3
-        if anchor is None:
-            return Step(tracked, s.chain.by_telemetry(image, tracked))
-        for view in s.views.ready():
-            self._background.offer(view)  # to be reconstructed
-        keyframes = self._finished()
-        moved = s.chain.corrections() if keyframes else ()
-        placed = s.chain.follow(image, anchor)
-        return Step(tracked, placed, is_view, anchor, keyframes, moved, late)
+        limit_threads(config.compute.threads)
+        self.stopwatch, self._pages = Stopwatch(), pages
+        self._max_voxels = config.compute.map_voxels
+        self._doubts: deque[str] = deque()  # found on the worker, taken by the operator's thread
+        row = "dense" if in_background and not config.scan.keep_debug else None
+        camera = with_shutter(camera, config.camera)
+        super().__init__(
+            camera,
+            mapper_config(camera, config, assumed, sigma_focal),
+            backend,
+            known,
+            self._paged,
+            partial(self._in_background, row, live),
+            self.stopwatch,
+            keeps_cloud=False,
+        )
+        self.watch = GraphWatch(self.keyframes.graph)
 
-    def _late(self, image: UndistortedFrame, tracked: Tracked) -> Step | None:
-        """The step of the frame before, which begins the segment of this one."""
-        before, self._lost = self._lost, image if tracked.state is Tracking.LOST else None
-        if before is None or tracked.before is None:
-            return None
-        anchor, is_view = self.stages.views.take(before, tracked.before)
-        assert anchor is not None
-        placed = self.stages.chain.follow(before, anchor)
-        return Step(tracked.before, placed, is_view, anchor)
+    def _paged(self, fine: VoxelMapConfig) -> PagedMap:
+        return PagedMap(fine, self._pages, self._max_voxels)
 
-    def reconstruct(self, view: StereoCandidate) -> Keyframe | None:
-        """One view: its depth from all its partners, its pose, and its new surface."""
-        s, depth = self.stages, None
-        grid = s.rectify.grid(view)
-        depths = s.carry(view, grid)  # by images that are matched already
-        pairs = s.rectify(view, depths)  # virtual stereo pairs, section 2.1
-        if pairs:
-            depth = s.stereo.whole_path(pairs.values(), grid)  # Eq. 1-3 at once, where a device can
-        if depth is None and (pairs or depths):
-            for partner, pair in pairs.items():
-                disparity = s.stereo.match(pair)  # belief propagation, Eq. 1
-                disparity = s.stereo.upsample(disparity, pair)  # joint bilateral, Eq. 2
-                depths[partner] = s.stereo.reproject(disparity, pair, grid)  # Eq. 3
-            s.carry.keep(view.seq, depths)
-            depth = s.stereo.fuse([*depths.values()], grid)
-        bgr = s.rectify.colours(view, grid)
-        depth = s.plausible(view, depth, bgr)  # nothing that cannot be
-        s.rectify.learn(depth)  # how far the relief of the next pairs may reach
-        motion = s.register(view, depth)  # ICP onto the keyframe before
-        placed = s.chain.add(view, motion, depth)  # pose graph
-        if depth is None or placed is None:
-            return None
-        sigma_m, fresh = s.map(view, depth, s.chain.map_pose(view.seq))  # map: what is new
-        return s.keyframe(view, depth, bgr, sigma_m, fresh, placed)
+    def _in_background(self, row: str | None, live: bool, work: Reconstruct) -> DenseWorker:
+        self._background = DenseWorker(row, partial(self._watched, work), MAX_WAITING, live)
+        return self._background
 
-    def drain(self) -> Step:
-        """The views still waiting for partners, up to one whose work failed."""
-        s = self.stages
-        s.views.end_stretch()
-        for view in s.views.ready(everything=True):
-            self._background.offer(view)
-        keyframes = self._finished(everything=True)
-        tracked = Tracked(Tracking.LOST, s.track.segment, reason="end of the recording")
-        return Step(tracked, keyframes=keyframes)
+    def _watched(self, work: Reconstruct, view: StereoCandidate) -> GraphUpdate:
+        """Do the work, and examine the graph now and then."""
+        update = work(view)
+        self._doubts.extend(self.watch.look())
+        return update
 
-    def finish(self) -> Step:
-        """The remaining results, and the last corrections. Raises what work raised."""
+    def new_doubts(self) -> list[str]:
+        """Warnings about the telemetry, each once."""
+        return [self._doubts.popleft() for _ in range(len(self._doubts))]
+
+    def finish(self) -> tuple[MapperEvent, ...]:
+        """As :meth:`Mapper.finish`; the pages of the map are gone."""
+        known = self.surface.known
         try:
-            step = self.drain()
+            return super().finish()
         finally:
-            self._background.close()
-        self.stages.map.clear()
-        return replace(step, moved=self.stages.chain.corrections(final=True))
-
-    def _finished(self, everything: bool = False) -> tuple[Keyframe, ...]:
-        """Keyframes that are done, in order."""
-        done = self._background.finished(everything)
-        for view, keyframe in done:
-            self.stages.chain.reconstructed(view, keyframe)
-        self.stages.chain.settle()
-        return tuple(keyframe for _, keyframe in done if keyframe is not None)
+            _close(known)
 
     def end_by(self, stop: Event, patience_s: float) -> None:
         """Drop unfinished reconstructions, at most ``patience_s`` after ``stop`` is set."""
@@ -139,36 +143,21 @@ class Pipeline:
 
     # ---- in flight ---------------------------------------------------------------------
 
-    def set_baseline(self, config: ScanConfig) -> None:
+    def configure_baseline(self, scan: ScanConfig) -> None:
         """Apply a new ``scan.baseline`` from the next frame on."""
-        views = self.stages.views.selection
-        views.set_baseline(config)
-        self.stages.rectify.set_min_base_to_height(views.min_base_to_height)
+        self.set_baseline(Baseline(*parse_baseline(scan.baseline)))
 
-    def set_effort(self, compute: ComputeConfig) -> None:
+    def configure_effort(self, compute: ComputeConfig) -> None:
         """Apply new ``pairs``, ``stereo_width`` and ``upsample`` from the next view on."""
-        self.stages.views.selection.set_partners(compute.pairs)
-        self.stages.rectify.set_effort(compute)
-
-    def take_next(self) -> None:
-        """Make the next frame with a pose a view, whatever the baseline asks for."""
-        self.stages.views.selection.take_next()
+        self.set_effort(compute.pairs, compute.stereo_width, compute.upsample)
 
     def reset_map(self) -> None:
         """Reset the map: all surface counts as unseen."""
-        self.stages.map.clear()
+        known = self.surface.known
+        self.surface.clear()
+        _close(known)
 
     # ---- figures -----------------------------------------------------------------------
-
-    @property
-    def segments(self) -> int:
-        """Number of segments so far."""
-        return self.stages.track.segment + 1
-
-    @property
-    def pairs(self) -> int:
-        """Stereo pairs so far."""
-        return self.stages.rectify.pairs
 
     @property
     def dropped(self) -> int:
@@ -184,8 +173,14 @@ class Pipeline:
     def held(self) -> dict[str, int]:
         """Memory that this scan takes: the map's voxels, its tiles on disk, views for loops,
         and keyframes in the pose graph."""
-        return self.stages.map.held | self.stages.chain.held
+        known = self.surface.known
+        paged = known if isinstance(known, PagedMap) else None
+        return {
+            "map_voxels": 0 if paged is None else len(paged),
+            "map_tiles_on_disk": 0 if paged is None else paged.tiles_on_disk,
+        } | self.keyframes.held
 
-    def refusals(self) -> Counter[str]:
-        """Frames, views and pairs not used, by reason."""
-        return self.stages.refused + self.stages.rejected + self.stages.track.waiting
+
+def _close(known: object) -> None:
+    if isinstance(known, PagedMap):
+        known.close()

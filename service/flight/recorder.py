@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any, TextIO
@@ -13,21 +13,22 @@ from typing import Any, TextIO
 import numpy as np
 
 from mavlink.telemetry.samples import VehicleState
+from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.frame_poses import FallbackPosition
 from recon.posegraph.anchors import GUESSED_SHARE
-from recon.posegraph.trajectory import Placed
+from recon.poses import sigma_m
 from recon.tracking.odometry import Tracking
-from recon.types import F64, Keyframe
+from recon.types import F64, Keyframe, Pose
 from service.cameras.rig import Rig, attitude_of
-from service.flight.anchorage import PublishedFrame, PublishedFrames
-from service.flight.chain import Uncarried
-from service.flight.pipeline import Pipeline, Step
+from service.flight.pipeline import Pipeline
+from service.flight.published_frames import PublishedFrame, PublishedFrames
 from service.flight.reports import FOUND, gnss_over_heights, graph_figures, sigma_of_scale
 from service.scans.drawing import save_debug
 from service.scans.track import cell, seconds_text
 from service.scans.trust import FIRST_TELEMETRY
 from service.stream.codec import encode
 from service.stream.images import IMAGE_SHARE, encode_image
-from service.stream.records import PoseRecord
+from service.stream.records import PoseRecord, Repose
 from service.stream.store import ScanStore
 
 REPUBLISH_M, REPUBLISH_SHARE = 0.05, 0.1
@@ -56,7 +57,9 @@ class Recorder:
         self._on_keyframe = on_keyframe
         self._batch, self._due = batch, list[PoseRecord]()
         self.store, self.pipeline, self._rig = store, pipeline, rig
-        self._chain, self._is_settled = pipeline.stages.chain, pipeline.stages.track.is_settled
+        self._graph = pipeline.keyframes.graph
+        self._first_scale: dict[int, float] = {}  # of keyframes, by number
+        self._revisions: Counter[int] = Counter()  # poses of each, after the first
         self.points = self.keyframes = self.frames = self.chunk_bytes = self.image_bytes = 0
         self.states: Counter[Tracking] = Counter()
         self.distance_m = self.speed_m_s = self.turn_rate_rad_s = 0.0
@@ -65,30 +68,33 @@ class Recorder:
         self._frames = PublishedFrames(store.path.parent)
         self._last: tuple[int, F64] | None = None  # unix ns and T_world_camera of the last pose
         self._origin_written = False
-        self._before: tuple[int, float | None] = 0, None  # time and height of the frame before
+        self._agl_before_m: float | None = None  # of the frame before
 
-    def write(self, step: Step, time_ns: int, agl_m: float | None) -> None:
-        """One step of the pipeline; raises OutsideError when the disk is full."""
-        if step.late is not None:
-            self.states[Tracking.LOST] -= 1
-            self._write_pose(step.late, *self._before)
-        self._before = time_ns, agl_m
+    def write(self, events: Iterable[Event], agl_m: float | None = None) -> None:
+        """The events of one frame; raises OutsideError when the disk is full."""
         self.frames += 1
         self._write_origin()
-        self._write_keyframes(step)
-        self._write_pose(step, time_ns, agl_m)
+        *before, posed = events
+        for event in before:
+            if isinstance(event, FramePosed):  # the frame before, which was lost until now
+                self.states[Tracking.LOST] -= 1
+                self._write_pose(event, self._agl_before_m)
+        self._write_keyframes(before)
+        assert isinstance(posed, FramePosed)
+        self._write_pose(posed, agl_m)
+        self._agl_before_m = agl_m
 
-    def _write_pose(self, step: Step, time_ns: int, agl_m: float | None) -> None:
-        self.states[step.tracked.state] += 1
-        placed = step.placed
-        if placed is None:
+    def _write_pose(self, posed: FramePosed, agl_m: float | None) -> None:
+        self.states[posed.tracked.state] += 1
+        pose = posed.pose
+        if pose is None:
             return
         frame = PublishedFrame(
-            time_ns + self._offset_ns, step.anchor, placed.T_world_camera[:3, 3], placed.sigma_m,
-            agl_m, step.is_view,
+            posed.time_ns + self._offset_ns, posed.reference, pose.T_world_camera[:3, 3],
+            sigma_m(pose), agl_m, posed.is_view,
         )  # fmt: skip
-        self._frames.add(frame, self._is_settled)
-        self.last = self._record(frame, placed)
+        self._frames.add(frame, self.pipeline.follow.is_settled)
+        self.last = self._record(frame, pose)
         self._due.append(self.last)
         if len(self._due) >= self._batch:
             self._write_due()
@@ -104,8 +110,8 @@ class Recorder:
 
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Close the scan, which is flushed; return its summary."""
-        summary = self.summary() | {"graph": graph_figures(self._chain.graph)}
-        left_out = [*self._chain.apart(), *self._chain.refuted()]
+        summary = self.summary() | {"graph": graph_figures(self._graph)}
+        left_out = [*self.pipeline.keyframes.apart(), *self.pipeline.keyframes.refuted()]
         summary["apart"] = [list(ends) for ends in left_out]
         summary |= extra
         self.store.finish(summary)
@@ -128,9 +134,9 @@ class Recorder:
     def _moved(self) -> Iterator[PoseRecord]:
         """The poses that corrections have moved, or whose sigma they have changed."""
         for frame in self._frames.corrigible():
-            assert frame.anchor is not None
-            as_published = Uncarried(frame.position_m, np.full(3, frame.sigma_m / 3**0.5))
-            record = self._record(frame, self._chain.place(frame.anchor, as_published))
+            assert frame.reference is not None
+            published = FallbackPosition(frame.position_m, np.full(3, frame.sigma_m / 3**0.5))
+            record = self._record(frame, self.pipeline.frames.pose(frame.reference, published))
             moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - frame.position_m)
             change = abs(record.sigma_m - frame.sigma_m)
             if moved_m > REPUBLISH_M or change > REPUBLISH_SHARE * record.sigma_m:
@@ -154,10 +160,10 @@ class Recorder:
             "georeference": self._rig.georeference,
             "scale": self._scale(),
             "lean_sigma_deg": self._lean_sigma_deg(),
-            "stage_ms": {k: round(v, 2) for k, v in pipeline.stages.stopwatch.mean_ms().items()},
+            "stage_ms": {k: round(v, 2) for k, v in pipeline.stopwatch.mean_ms().items()},
             "refusals": dict(pipeline.refusals()),
             "drops": self._drops(),
-            "registrations": {v.value: n for v, n in pipeline.stages.register.verdicts.items()},
+            "registrations": {v.value: n for v, n in pipeline.register.verdicts.items()},
         }
 
     def _drops(self) -> dict[str, int]:
@@ -168,7 +174,7 @@ class Recorder:
     def _scale(self) -> dict[str, Any]:
         """Source of the metric scale, its relative sigma, and what contradicts it: of the largest
         segment."""
-        graph = self._chain.graph
+        graph = self._graph
         found = graph.segments.largest()
         if found is None:
             return {"from": FIRST_TELEMETRY, "sigma": None}
@@ -182,7 +188,7 @@ class Recorder:
 
     def _lean_sigma_deg(self) -> float | None:
         """Sigma of what is level, of the largest segment; None where attitudes show it."""
-        found = self._chain.graph.segments.largest()
+        found = self._graph.segments.largest()
         sigma = None if found is None else found.sigma_lean_rad
         return None if sigma is None else round(math.degrees(sigma), 2)
 
@@ -201,30 +207,47 @@ class Recorder:
         )
         self._origin_written = True
 
-    def _write_keyframes(self, step: Step) -> None:
-        if step.keyframes:
+    def _write_keyframes(self, events: Iterable[Event]) -> None:
+        keyframes = [event.keyframe for event in events if isinstance(event, KeyframeReady)]
+        if keyframes:
             self._write_due()
-        for keyframe in step.keyframes:
-            with self.pipeline.stages.stopwatch("encode"):
-                layers = encode(keyframe, keyframe.time_ns + self._offset_ns)
-                self.chunk_bytes += sum(map(len, layers))
-                room = IMAGE_SHARE * self.chunk_bytes - self.image_bytes
-                image = encode_image(keyframe.bgr, room)
-                self.image_bytes += len(image)
-            with self.pipeline.stages.stopwatch("store"):
-                self.store.add_keyframe(keyframe.seq, layers, image)
-            self.keyframes += 1
-            self.points += int((keyframe.fresh & np.isfinite(keyframe.depth.depth_m)).sum())
-            if self._on_keyframe is not None:
-                self._on_keyframe(keyframe)
-        if self.pipeline.stages.debug and step.keyframes:
-            save_debug(self.store.path.parent, step.keyframes[-1].seq, self.pipeline.stages.debug)
-        if step.moved:
-            self.store.add_reposes(step.moved)
+        for keyframe in keyframes:
+            self._write_keyframe(keyframe)
+        if self.pipeline.debug and keyframes:
+            save_debug(self.store.path.parent, keyframes[-1].seq, self.pipeline.debug)
+        reposes = [
+            self._repose(seq, pose)
+            for event in events
+            if isinstance(event, PosesChanged)
+            for seq, pose in event.poses.items()
+        ]
+        if reposes:
+            self.store.add_reposes(reposes)
 
-    def _record(self, frame: PublishedFrame, placed: Placed) -> PoseRecord:
+    def _write_keyframe(self, keyframe: Keyframe) -> None:
+        with self.pipeline.stopwatch("encode"):
+            layers = encode(keyframe, keyframe.time_ns + self._offset_ns)
+            self.chunk_bytes += sum(map(len, layers))
+            room = IMAGE_SHARE * self.chunk_bytes - self.image_bytes
+            image = encode_image(keyframe.bgr, room)
+            self.image_bytes += len(image)
+        with self.pipeline.stopwatch("store"):
+            self.store.add_keyframe(keyframe.seq, layers, image)
+        self._first_scale[keyframe.seq] = keyframe.pose.scale
+        self.keyframes += 1
+        self.points += int((keyframe.fresh & np.isfinite(keyframe.depth.depth_m)).sum())
+        if self._on_keyframe is not None:
+            self._on_keyframe(keyframe)
+
+    def _repose(self, seq: int, pose: Pose) -> Repose:
+        """A keyframe's better pose as it is stored and sent."""
+        self._revisions[seq] += 1
+        growth = pose.scale / self._first_scale[seq]
+        return Repose(seq, self._revisions[seq], pose.T_world_camera, growth, pose.covariance)
+
+    def _record(self, frame: PublishedFrame, pose: Pose) -> PoseRecord:
         """The pose record of a frame, with speed and turn from the one before it."""
-        T = placed.T_world_camera
+        T = pose.T_world_camera
         roll, pitch, yaw = attitude_of(T)
         speed = turn = 0.0
         if self._last is not None and frame.time_ns > self._last[0]:
@@ -241,7 +264,7 @@ class Recorder:
         return PoseRecord(
             time_unix_ns=frame.time_ns,
             T_world_camera=T,
-            covariance=placed.covariance,
+            covariance=pose.covariance,
             lat_deg=lat,
             lon_deg=lon,
             alt_amsl_m=alt,
@@ -252,9 +275,9 @@ class Recorder:
             speed_m_s=speed,
             distance_m=self.distance_m,
             turn_rate_rad_s=turn,
-            sources=placed.sources,
-            sigma_m=placed.sigma_m,
-            keyframe_seq=frame.anchor.seq if frame.is_view and frame.anchor else None,
+            sources=pose.sources,
+            sigma_m=sigma_m(pose),
+            keyframe_seq=frame.reference.seq if frame.is_view and frame.reference else None,
         )
 
 

@@ -19,19 +19,20 @@ from typing import Any
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
+from recon.pipeline.events import Event as MapperEvent
+from recon.pipeline.events import FramePosed
 from recon.posegraph.between_keyframes import Odometer
 from recon.tracking.known_track import KnownTrack
-from recon.types import F64, U8, Camera, Frame, Keyframe, PosePrior, Shutter
+from recon.types import F64, U8, Camera, Frame, Keyframe, Pose, PosePrior, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter
 from service.cameras.lens import MAX_FOCAL
 from service.cameras.rig import ASSUMED_AGL_M, Rig, turn_sigma_rad_s
 from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import Config
 from service.errors import InputError
-from service.flight.pipeline import Pipeline, Step
+from service.flight.pipeline import Pipeline
 from service.flight.recorder import REPLAYED, TAGS_FILE, FrameTags, Recorder
 from service.flight.reports import ShutterWatch, TrackingWatch
-from service.flight.stages import build_stages
 from service.flight.telemetry_check import TelemetryCheck
 from service.redaction import public_configuration, redacted
 from service.scans.coverage import CoverageWriter
@@ -92,7 +93,7 @@ class ScanInputs:
     latency_ms: float | None = None  # the camera's as an earlier scan found it
     known: KnownTrack | None = None  # takes the odometry's place
     warn: Callable[[str], None] = log.warning  # the operator
-    on_step: Callable[[Step, VehicleState | None, int], None] | None = None  # and its exposure
+    on_frame: Callable[[FramePosed, VehicleState | None], None] | None = None
     on_keyframe: Callable[[Keyframe], None] | None = None
     on_photo: Callable[[Photo], None] | None = None
 
@@ -139,17 +140,9 @@ class Scan:
         self.epoch_ns = inputs.epoch_ns
         config, live, pages = inputs.config, inputs.source.is_live, inputs.folder / PAGES
         self.pipeline = Pipeline(
-            build_stages(
-                inputs.camera,
-                config,
-                inputs.backend,
-                pages,
-                live=live,
-                assumed=inputs.assumed,
-                sigma_focal=inputs.sigma_focal,
-                known=inputs.known,
-            )
-        )
+            inputs.camera, config, inputs.backend, pages, live=live, assumed=inputs.assumed,
+            sigma_focal=inputs.sigma_focal, known=inputs.known,
+        )  # fmt: skip
         self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()
         self.recorder = Recorder(
             store,
@@ -163,7 +156,7 @@ class Scan:
             inputs.config.camera, inputs.history, inputs.warn, inputs.latency_ms
         )
         self.tracking = TrackingWatch(inputs.warn)
-        odometry = self.pipeline.stages.track.odometry
+        odometry = self.pipeline.odometry
         coarser = float(inputs.camera.K[0, 0] / odometry.K[0, 0])
         self.shutter = ShutterWatch(odometry.exposure, coarser, inputs.warn)
         self.tags = FrameTags(inputs.folder / TAGS_FILE) if inputs.history is not None else None
@@ -176,7 +169,7 @@ class Scan:
         self._photos.append(None)
         self.pipeline.take_next()
 
-    def feed(self, frame: CameraFrame) -> Step | None:
+    def feed(self, frame: CameraFrame) -> FramePosed | None:
         """One frame through the pipeline; None when its size is not the camera's."""
         inputs = self.inputs
         if frame.size_px != inputs.camera.size_px:
@@ -194,32 +187,36 @@ class Scan:
         self.heights += not prior.is_agl_assumed
         self.attitudes += not prior.is_view_assumed
         prior = self._odometer.take(exposed_ns, prior)
-        if self.pipeline.stages.track.odometry.needs_turn(exposed_ns):
+        if self.pipeline.odometry.needs_turn(exposed_ns):
             prior = self._turning(prior, exposed_ns)
         is_photo = bool(self._photos)
-        step = None if is_photo else self.pipeline.skip(exposed_ns, prior)
-        if step is None:
-            step = self.pipeline.step(Frame(frame.image, exposed_ns, frame.seq, prior))
-        self.check.add(time_ns, step.tracked)
-        self.tracking.look(step.tracked, time_ns)
+        events: tuple[MapperEvent, ...] = ()
+        if not is_photo:
+            events = self.pipeline.skip(frame.seq, exposed_ns, prior)
+        if not events:
+            events = self.pipeline.track(Frame(frame.image, exposed_ns, frame.seq, prior))
+        posed = events[-1]
+        assert isinstance(posed, FramePosed)
+        self.check.add(time_ns, posed.tracked)
+        self.tracking.look(posed.tracked, time_ns)
         self.shutter.look()
-        for doubt in self.pipeline.stages.chain.new_doubts():
+        for doubt in self.pipeline.new_doubts():
             inputs.warn(doubt)
-        self.recorder.write(step, exposed_ns, state.alt_agl_m if state is not None else None)
+        self.recorder.write(events, state.alt_agl_m if state is not None else None)
         if is_photo:
-            self._hand_out(Frame(frame.image, exposed_ns, frame.seq, prior), step, state)
-        if inputs.on_step is not None:
-            inputs.on_step(step, state, exposed_ns)
-        return step
+            self._hand_out(Frame(frame.image, exposed_ns, frame.seq, prior), posed.pose, state)
+        if inputs.on_frame is not None:
+            inputs.on_frame(posed, state)
+        return posed
 
-    def _hand_out(self, frame: Frame, step: Step, state: VehicleState | None) -> None:
+    def _hand_out(self, frame: Frame, pose: Pose | None, state: VehicleState | None) -> None:
         """A photo, by telemetry, or by vision where telemetry does not tell."""
         self._photos.popleft()
-        prior, placed = frame.prior, step.placed
+        prior = frame.prior
         R = None if prior.is_view_assumed else prior.R_world_camera
         position = prior.position_m
-        if placed is not None and (R is None or position is None):
-            R, position = placed.T_world_camera[:3, :3], placed.T_world_camera[:3, 3]
+        if pose is not None and (R is None or position is None):
+            R, position = pose.T_world_camera[:3, :3], pose.T_world_camera[:3, 3]
         agl_m = state.alt_agl_m if state is not None else None
         if self.inputs.on_photo is not None:
             self.inputs.on_photo(Photo(frame.image, frame.time_ns, R, position, agl_m))
@@ -298,7 +295,7 @@ class Scan:
 
     def found_shutter(self) -> Shutter | None:
         """The shutter by the images; None where it was not sought or is not sure."""
-        search = self.pipeline.stages.track.odometry.readout
+        search = self.pipeline.odometry.readout
         found = None if search is None else search.estimate
         if found is None or not found.is_sure:
             return None
@@ -307,7 +304,7 @@ class Scan:
 
     def _focal_off(self) -> float:
         """Share by which the images contradict the focal length; 0 where they do not."""
-        found = self.pipeline.stages.track.odometry.focal.estimate
+        found = self.pipeline.odometry.focal.estimate
         if found is None:
             return 0.0
         sigma = math.hypot(found.sigma, self.inputs.sigma_focal)
@@ -316,7 +313,7 @@ class Scan:
 
     def _focal_by_images(self) -> dict[str, Any] | None:
         """The change of the focal length that the images ask for; None where they show none."""
-        found = self.pipeline.stages.track.odometry.focal.estimate
+        found = self.pipeline.odometry.focal.estimate
         if found is None:
             return None
         return {
@@ -327,7 +324,7 @@ class Scan:
 
     def _readout(self) -> dict[str, Any] | None:
         """The readout by the images; None where it was not sought or does not show."""
-        search = self.pipeline.stages.track.odometry.readout
+        search = self.pipeline.odometry.readout
         found = None if search is None else search.estimate
         if found is None:
             return None
@@ -344,7 +341,7 @@ class Scan:
         out = list(self.inputs.assumed)
         if self.attitudes == 0:
             out.append("view")
-        if self.pipeline.stages.chain.is_levelled:
+        if self.pipeline.keyframes.is_levelled:
             out.append("level")
         if self.heights == 0 and self.rig.georeference == "none":
             out.append("height")
@@ -356,7 +353,7 @@ class Scan:
 
     def _doubts(self) -> list[str]:
         """Notes for the reader of this scan."""
-        out = [*self.check.reported.values(), *self.pipeline.stages.chain.watch.sentences()]
+        out = [*self.check.reported.values(), *self.pipeline.watch.sentences()]
         if self.odd_sized:
             W, H = self.inputs.camera.size_px
             out.append(f"{self.odd_sized} frames were not {W}x{H} like the camera model: left out")
@@ -383,7 +380,7 @@ class Scan:
                 f"no telemetry: the scale assumes {ASSUMED_AGL_M:g} m above ground; "
                 "set scan.assumed_agl_m to the true height"
             )
-        apart = self.pipeline.stages.chain.apart()
+        apart = self.pipeline.keyframes.apart()
         if apart:
             out.append(
                 f"left out of the cloud: {len(apart)} of {self.pipeline.segments} "

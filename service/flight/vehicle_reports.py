@@ -14,10 +14,10 @@ from mavlink.component.status import BodyOdometry
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
+from recon.pipeline.events import FramePosed
 from recon.types import F64, Camera
 from service.cameras.rig import Rig
 from service.config import CameraConfig, FusionConfig, ScanConfig
-from service.flight.pipeline import Step
 from service.georeference import LocalFrame
 
 LONGEST_STEP_S = 0.5  # between two poses that give a velocity
@@ -27,7 +27,7 @@ MIN_DOWN = 0.05  # of the optical axis: closer to the horizon it meets no ground
 
 
 class OdometryReport:
-    """Turns steps of the pipeline into odometry and hands it on.
+    """Turns poses of frames into odometry and hands it on.
 
     Position and attitude are those of the body; the offset from body to camera is neglected. With a
     gimbal, telemetry gives the head's attitude on the body. The reset counter grows when tracking
@@ -44,24 +44,24 @@ class OdometryReport:
         self._velocity: F64 | None = None  # NED, m/s
         self.resets = 0
 
-    def send(self, step: Step, state: VehicleState | None, time_ns: int) -> None:
+    def send(self, posed: FramePosed, state: VehicleState | None) -> None:
         """Hand on the pose of one frame; nothing for a frame without one by vision."""
-        placed = step.placed
-        if placed is None or step.anchor is None:
+        pose, time_ns = posed.pose, posed.time_ns
+        if pose is None or posed.reference is None:
             return
-        position: F64 = np.asarray(R_ENU_NED.T @ placed.T_world_camera[:3, 3])
-        R_ned_head = R_ENU_NED.T @ placed.T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T
+        position: F64 = np.asarray(R_ENU_NED.T @ pose.T_world_camera[:3, 3])
+        R_ned_head = R_ENU_NED.T @ pose.T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T
         R_ned_body: F64 = np.asarray(R_ned_head @ self._body_of_head(state))
-        velocity = self._move(time_ns, step.tracked.segment, position)
+        velocity = self._move(time_ns, posed.tracked.segment, position)
         w, x, y, z = (float(v) for v in se3.quaternion_from_rotation(R_ned_body))
         a, b, c = (float(v) for v in R_ned_body.T @ velocity)
         north, east, down = (float(v) for v in position)
-        quality = round(100.0 * min(1.0, step.tracked.tracks / BEST_TRACKS))
+        quality = round(100.0 * min(1.0, posed.tracked.tracks / BEST_TRACKS))
         odometry = BodyOdometry(
             (north, east, down),
             (w, x, y, z),
             (a, b, c),
-            _covariance(se3.about(placed.T_world_camera[:3, 3], placed.covariance)),
+            _covariance(se3.about(pose.T_world_camera[:3, 3], pose.covariance)),
             self.resets,
             max(1, quality),
         )

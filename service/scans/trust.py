@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from recon.pipeline.config import TWO_ONLY
 from recon.posegraph.level_ground import plane_through
 from recon.types import Array
 
@@ -28,9 +29,6 @@ where positions and heights give scales that differ by more, as after a zoom."""
 
 MIN_PLACED_SHARE = 0.5
 """Share of the frames; below it vision was lost for most of the flight."""
-
-TWO_ONLY = "seen by two views only"
-"""Reason for which views of a stretch of two are dropped."""
 
 REFUSED_SHARE, WRONG_SHARE = 0.2, 0.5
 """Of the measured positions or attitudes, that contradict the track. Above the first, positions are

@@ -11,8 +11,9 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
-from recon.posegraph.trajectory import Placed, Trajectory
-from recon.types import F64, PosePrior
+from recon.posegraph.trajectory import Trajectory
+from recon.poses import carried
+from recon.types import F64, Pose, PosePrior
 from service.bench import BenchOptions, BenchResult
 from service.config import FusionConfig
 from service.flight.scan import short_collections
@@ -79,7 +80,7 @@ class _TimedTrajectory:
     def __init__(self) -> None:
         nodes = PoseGraphConfig(max_nodes=FusionConfig().graph_keyframes)
         self.trajectory = Trajectory(graph=PoseGraph(nodes))
-        self.newest: Placed | None = None  # what tracking reads
+        self.newest: Pose | None = None  # what tracking reads
         self.taken: list[float] = []  # ms of each keyframe: entered, placed, loops, corrections
         self.corrected: list[float] = []  # ms of each taken loop with its corrections
         self.most = 0  # keyframes moved at once
@@ -88,8 +89,8 @@ class _TimedTrajectory:
         """Publish what has moved."""
         moved = self.trajectory.moved(final)
         self.most = max(self.most, len(moved))
-        for placed in moved:
-            self.trajectory.publish(placed)
+        for seq, pose in moved.items():
+            self.trajectory.publish(seq, pose)
 
 
 class _Tracking:
@@ -114,7 +115,7 @@ class _Tracking:
             begun = time.perf_counter()
             time.sleep(1e-3)
             if self._flown.newest is not None:
-                self._flown.newest.carry(np.eye(4))
+                carried(self._flown.newest, np.eye(4))
             self.stops.append(1e3 * (time.perf_counter() - begun) - 1.0)
 
 
@@ -123,13 +124,13 @@ def _keyframe(flight: _Course, i: int, flown: _TimedTrajectory) -> None:
     T, prior, trajectory = flight.odometry[i], flight.priors[i], flown.trajectory
     begun = time.perf_counter()
     trajectory.add(i, 0, T, prior, (HEIGHT_M / 1.3, 0.0), i * 1_000_000_000, flight.covariance)
-    trajectory.publish(trajectory.place(i))
+    trajectory.publish(i, trajectory.pose(i))
     partner, is_taken, before = _opposite(i), False, time.perf_counter()
     if i % LOOP_EVERY == 0 and partner is not None:
         T_a_b = se3.inverse(flight.truth[partner]) @ flight.truth[i]
         is_taken = trajectory.add_loop(partner, i, T_a_b, LOOP_SPREAD)
     flown.correct()
-    flown.newest = trajectory.place(i)
+    flown.newest = trajectory.pose(i)
     now = time.perf_counter()
     flown.taken.append(1e3 * (now - begun))
     if is_taken:

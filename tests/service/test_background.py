@@ -8,11 +8,13 @@ from types import SimpleNamespace
 from typing import Any
 from weakref import WeakSet
 
+import numpy as np
 import pytest
 from loopback import until
 
+from recon.pipeline.mapper import Mapper
+from recon.types import Camera
 from service.background import BackgroundWorker
-from service.flight.pipeline import Pipeline
 
 
 def test_results_come_in_order_and_nothing_is_dropped() -> None:
@@ -114,15 +116,14 @@ def test_a_fault_at_the_end_of_a_scan_leaves_no_thread_behind() -> None:
 
     jobs: list[BackgroundWorker[int, int]] = []
 
-    def in_background(_: object) -> BackgroundWorker[int, int]:
+    def worker(_: object) -> Any:
         jobs.append(BackgroundWorker("dense", work, 2))
         return jobs[-1]
 
-    views = SimpleNamespace(end_stretch=lambda: None, ready=lambda everything: [1, 2, 3])
-    stages: Any = SimpleNamespace(in_background=in_background, views=views)
-    pipeline = Pipeline(stages)
+    mapper: Any = Mapper(Camera(np.diag([60.0, 60.0, 1.0]), np.zeros(5), (80, 60)), worker=worker)
+    mapper.views = SimpleNamespace(end_stretch=lambda: None, ready=lambda everything: [1, 2, 3])
     with pytest.raises(RuntimeError, match="no luck"):
-        pipeline.finish()
+        mapper.finish()
     assert not any(t.name == "dense" for t in threading.enumerate())
 
 

@@ -128,7 +128,7 @@ def test_poses_say_that_all_may_lean() -> None:
     sigma_m = [
         np.sqrt(se3.about(placed.T_world_camera[:3, 3], placed.covariance)[5, 5])
         for k in (0, len(flown.anchors) // 2)
-        if (placed := trajectory.place(k))
+        if (placed := trajectory.pose(k))
     ]
     found = trajectory.graph.segments.known(0)
     assert found is not None and found.sigma_lean_rad is not None
@@ -147,7 +147,7 @@ def test_altitudes_that_drift_by_100_m_level_nothing() -> None:
 def test_the_drift_of_altitudes_does_not_bend_the_track() -> None:
     flown = stills(4, 4.0, turns=True, drift_m=50.0)
     trajectory = settled(flown)
-    z = [trajectory.place(k).T_world_camera[2, 3] for k in range(len(flown.anchors))]
+    z = [trajectory.pose(k).T_world_camera[2, 3] for k in range(len(flown.anchors))]
     assert np.std(z) < 3.0
 
 
@@ -159,7 +159,7 @@ def test_a_short_segment_has_the_noise_and_the_height_of_its_flight(broken_at: i
     trajectory = settled(flown, broken_at)
     sigma_m = [trajectory.graph.segments.sigma_height_m(segment) for segment in (0, 1)]
     assert all(sigma is not None and sigma < 5.0 for sigma in sigma_m)
-    z = np.array([trajectory.place(k).T_world_camera[2, 3] for k in range(len(flown.anchors))])
+    z = np.array([trajectory.pose(k).T_world_camera[2, 3] for k in range(len(flown.anchors))])
     assert abs(np.mean(z[:broken_at]) - np.mean(z[broken_at:])) < 2.0
 
 

@@ -13,6 +13,8 @@ import pytest
 
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
+from recon.pipeline.config import untimed
+from recon.pipeline.keyframe_map import KeyframeMap
 from recon.posegraph.level_ground import (
     ASSUMED_TILT_RAD,
     LEVEL_SIGMA_RAD,
@@ -21,8 +23,6 @@ from recon.posegraph.level_ground import (
 )
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
-from service.flight.chain import Chain
-from service.progress import Stopwatch
 
 
 def looking(pitch_deg: float, yaw_deg: float = 0.0) -> F64:
@@ -75,7 +75,7 @@ def test_ground_without_a_plane_levels_nothing() -> None:
 
 @pytest.mark.parametrize(("steep", "is_levelled"), [(1, False), (2, False), (3, True), (10, True)])
 def test_a_few_steep_views_do_not_doubt_the_mount_of_all(steep: int, is_levelled: bool) -> None:
-    chain: Any = Chain(Trajectory(), None, lambda key: True, Counter(), Stopwatch())
+    keyframes: Any = KeyframeMap(Trajectory(), None, Counter(), untimed)
     for seq in range(10):
         R, T = looking(-40 if seq < steep else -90), np.eye(4)
         T[0, 3] = seq
@@ -83,5 +83,5 @@ def test_a_few_steep_views_do_not_doubt_the_mount_of_all(steep: int, is_levelled
             seq=seq, segment=0, time_ns=seq, prior=NADIR, points=ground_seen(R),
             view=SimpleNamespace(T_odom_camera=T),
         )  # fmt: skip
-        chain.add(view, SimpleNamespace(T_before_camera=None, covariance=np.eye(6)), None)
-    assert chain.is_levelled == is_levelled
+        keyframes.add(view, None, np.eye(6), None)
+    assert keyframes.is_levelled == is_levelled

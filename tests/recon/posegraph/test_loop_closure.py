@@ -13,12 +13,12 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays, scaled_K
+from recon.posegraph import loop_search
 from recon.posegraph.loop_closure import LoopConfig, LoopView, candidates, ground_seen, verify
+from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, DepthMap, PosePrior
-from service.flight import loops
-from service.flight.loops import LoopSearch
 
 SIZE = (640, 360)
 K = np.array([[450.0, 0, 319.5], [0, 450.0, 179.5], [0, 0, 1.0]])
@@ -384,7 +384,7 @@ def test_after_a_loop_the_search_waits_until_the_view_has_moved_on(
 
 def test_the_search_keeps_a_bounded_number_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
     seen, tried = view(A, 1), list[int]()
-    monkeypatch.setattr(loops, "verify", lambda *_: tried.append(1))
+    monkeypatch.setattr(loop_search, "verify", lambda *_: tried.append(1))
     trajectory = Trajectory()
     search = LoopSearch(trajectory, max_views=6)
     rng = np.random.default_rng(4)

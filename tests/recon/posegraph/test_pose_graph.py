@@ -515,7 +515,7 @@ def offset_and_sigma(f: Flight) -> tuple[F64, F64]:
     track = Trajectory(graph=graph)
     off, sigma = [], []
     for i, T in enumerate(f.truth):
-        pose = track.place(i)
+        pose = track.pose(i)
         off.append(pose.T_world_camera[:3, 3] - T[:3, 3])
         own = se3.about(pose.T_world_camera[:3, 3], pose.covariance)
         sigma.append(np.sqrt(np.diag(own)[3:]))

@@ -11,6 +11,7 @@ import pytest
 
 from recon import se3
 from recon.posegraph.trajectory import REPOSE_M, REPOSE_SIGMAS, Trajectory
+from recon.poses import carried, sigma_m
 from recon.types import F64, DepthMap, Keyframe, Pose, PosePrior
 from service.scans.fused_cloud import fused_cloud
 from service.stream import codec
@@ -78,6 +79,11 @@ def flat(seq: int, T: F64) -> Keyframe:
     return Keyframe(seq, 5 + seq, depth, bgr, pose, np.ones((h, w), np.bool_))
 
 
+def publish_all(trajectory: Trajectory, poses: dict[int, Pose]) -> None:
+    for seq, pose in poses.items():
+        trajectory.publish(seq, pose)
+
+
 @pytest.mark.slow
 def test_a_loop_closure_reaches_store_and_ground_alike(tmp_path: Path) -> None:
     truth = legs()
@@ -90,8 +96,8 @@ def test_a_loop_closure_reaches_store_and_ground_alike(tmp_path: Path) -> None:
     ):
         for i, (T, odom) in enumerate(zip(truth, chain, strict=True)):
             trajectory.add(10 * i, 0, odom, prior(T), (HEIGHT_M, 0.0), i * 10**9, COVARIANCE)
-            placed = trajectory.place(10 * i)
-            trajectory.publish(placed)
+            placed = trajectory.pose(10 * i)
+            trajectory.publish(10 * i, placed)
             scales[10 * i] = placed.scale
             keyframe = flat(10 * i, placed.T_world_camera)
             layers = codec.encode(keyframe, keyframe.time_ns)
@@ -100,12 +106,11 @@ def test_a_loop_closure_reaches_store_and_ground_alike(tmp_path: Path) -> None:
         assert any(close_loops(trajectory, truth))
         moved = trajectory.moved()
         assert moved
-        for placed in moved:
-            trajectory.publish(placed)
+        publish_all(trajectory, moved)
         drone.add_reposes(
             [
-                Repose(p.seq, 1, p.T_world_camera, p.scale / scales[p.seq], p.covariance)
-                for p in moved
+                Repose(seq, 1, p.T_world_camera, p.scale / scales[seq], p.covariance)
+                for seq, p in moved.items()
             ]
         )
         for kind, numbers in drone.numbers().items():
@@ -115,17 +120,17 @@ def test_a_loop_closure_reaches_store_and_ground_alike(tmp_path: Path) -> None:
                     assert data is not None and ground.put_record(kind, number, data)
         for keyframe in drone.keyframes():
             there = ground.keyframe(keyframe.seq)
-            placed = trajectory.place(keyframe.seq)
+            placed = trajectory.pose(keyframe.seq)
             assert there is not None
             np.testing.assert_array_equal(there.depth.depth_m, keyframe.depth.depth_m)
             for T in (keyframe.pose.T_world_camera, there.pose.T_world_camera):
-                held_back_m = max(REPOSE_M, REPOSE_SIGMAS * placed.sigma_m)
+                held_back_m = max(REPOSE_M, REPOSE_SIGMAS * sigma_m(placed))
                 assert np.linalg.norm(T[:3, 3] - placed.T_world_camera[:3, 3]) < 1.2 * held_back_m
         here, there_cloud = fused_cloud(drone).cloud, fused_cloud(ground).cloud
         np.testing.assert_array_equal(here.xyz_m, there_cloud.xyz_m)
     # The second leg's ground lay up to 2 m above the first's.
     assert np.ptp(before) > 1.5
-    first, last = trajectory.place(20), trajectory.place(10 * (2 * LEG - 3))
+    first, last = trajectory.pose(20), trajectory.pose(10 * (2 * LEG - 3))
     step = first.T_world_camera[2, 3] - last.T_world_camera[2, 3]
     assert abs(step) < 0.1
 
@@ -134,22 +139,19 @@ def test_a_correction_is_published_once_and_small_ones_only_at_the_end() -> None
     truth = legs()
     trajectory = flown(truth, drifted(truth, 0.0))
     for i in range(len(truth)):
-        trajectory.publish(trajectory.place(10 * i))
-    assert trajectory.moved() == []
+        trajectory.publish(10 * i, trajectory.pose(10 * i))
+    assert trajectory.moved() == {}
     wrong = legs()
     for T in wrong[LEG:]:
         T[2, 3] += 0.3
     assert close_loops(trajectory, wrong)[1:] == [True, True]
     moved = trajectory.moved()
-    assert moved and all(p.scale == pytest.approx(1.0, abs=0.02) for p in moved)
-    assert all("loop" not in p.sources or p.seq >= 10 * LEG for p in moved)
-    for p in moved:
-        trajectory.publish(p)
-    assert trajectory.moved() == []
-    rest = trajectory.moved(final=True)
-    for p in rest:
-        trajectory.publish(p)
-    assert trajectory.moved(final=True) == []
+    assert moved and all(p.scale == pytest.approx(1.0, abs=0.02) for p in moved.values())
+    assert all("loop" not in p.sources or seq >= 10 * LEG for seq, p in moved.items())
+    publish_all(trajectory, moved)
+    assert trajectory.moved() == {}
+    publish_all(trajectory, trajectory.moved(final=True))
+    assert trajectory.moved(final=True) == {}
 
 
 def test_a_frame_rides_on_its_keyframe() -> None:
@@ -157,10 +159,10 @@ def test_a_frame_rides_on_its_keyframe() -> None:
     halved = [se3.compose(T[:3, :3], 0.5 * T[:3, 3]) for T in truth]
     trajectory = flown(truth, halved, 0.5 * HEIGHT_M)
     step = se3.compose(np.eye(3), np.array([0.5, 0.0, 0.0]))
-    key = trajectory.place(50)
-    carried = key.carry(step)
+    key = trajectory.pose(50)
+    frame = carried(key, step)
     assert key.scale == pytest.approx(2.0, rel=0.03)
-    here = se3.inverse(key.T_world_camera) @ carried.T_world_camera
+    here = se3.inverse(key.T_world_camera) @ frame.T_world_camera
     assert here[0, 3] == pytest.approx(0.5 * key.scale)
 
 
@@ -170,23 +172,22 @@ def test_the_end_publishes_each_sigma_as_it_is() -> None:
     trajectory, published = Trajectory(), {}
     for i, T in enumerate(truth):
         trajectory.add(10 * i, 0, T, prior(T), (HEIGHT_M, 0.0), i * 10**9, COVARIANCE)
-        published[10 * i] = trajectory.place(10 * i)
-        trajectory.publish(published[10 * i])
-    assert published[0].sigma_m == pytest.approx(np.sqrt(3.0), rel=1e-3)
-    for p in trajectory.moved(final=True):  # the poses settle, as published in flight
-        trajectory.publish(replace(p, covariance=published[p.seq].covariance))
-    for p in trajectory.moved(final=True):
-        published[p.seq] = p
+        published[10 * i] = trajectory.pose(10 * i)
+        trajectory.publish(10 * i, published[10 * i])
+    assert sigma_m(published[0]) == pytest.approx(np.sqrt(3.0), rel=1e-3)
+    for seq, p in trajectory.moved(final=True).items():  # they settle, as published in flight
+        trajectory.publish(seq, replace(p, covariance=published[seq].covariance))
+    published |= trajectory.moved(final=True)
     for seq, p in published.items():
-        assert p.sigma_m == pytest.approx(trajectory.place(seq).sigma_m, rel=0.02), seq
+        assert sigma_m(p) == pytest.approx(sigma_m(trajectory.pose(seq)), rel=0.02), seq
 
 
 def test_a_keyframe_that_nothing_aligns_is_no_surer_than_the_way_without_vision() -> None:
     trajectory = Trajectory()
     for i, T in enumerate(legs()[:8]):
         trajectory.add(i, 0 if i < 7 else 1, T, PosePrior(), None, i * 10**9, COVARIANCE)
-    assert trajectory.place(6).sigma_m < 2.0
-    assert trajectory.place(7).sigma_m > 5.0
+    assert sigma_m(trajectory.pose(6)) < 2.0
+    assert sigma_m(trajectory.pose(7)) > 5.0
 
 
 def test_a_scan_far_from_its_origin_is_as_sure_of_its_places() -> None:
@@ -197,6 +198,6 @@ def test_a_scan_far_from_its_origin_is_as_sure_of_its_places() -> None:
             fix = T[:3, 3] + [away_m, 0.0, 0.0]
             known = replace(prior(T), position_m=fix, sigma_position_m=np.full(3, 1.0))
             out.add(i, 0, T, known, (HEIGHT_M, 0.0), i * 10**9, COVARIANCE)
-        sigmas.append(out.place(5).sigma_m)
+        sigmas.append(sigma_m(out.pose(5)))
     assert sigmas[1] == pytest.approx(sigmas[0], rel=1e-3)
     assert 1.0 < sigmas[0] < 2.0

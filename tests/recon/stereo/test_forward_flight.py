@@ -12,9 +12,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from mapper_events import keyframes_of
 
 from recon import se3
 from recon.backends import load_backend
+from recon.pipeline import stages
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import View, VirtualStereoConfig
@@ -24,9 +26,7 @@ from recon.stereo.virtual_stereo import (
 )
 from recon.types import F64, U8, Camera, Frame, Keyframe, PolarPair, PosePrior, RectifiedPair
 from service.config import load_config
-from service.flight import stages
 from service.flight.pipeline import Pipeline
-from service.flight.stages import build_stages
 
 K: F64 = np.array([[360.0, 0, 239.5], [0, 360.0, 134.5], [0, 0, 1]])
 CAMERA = Camera(K, np.zeros(5), (480, 270))
@@ -104,14 +104,14 @@ def keyframes(rectified: list[tuple[int, int]]) -> Iterator[list[Keyframe]]:
 def fly() -> list[Keyframe]:
     levels = ground()
     config = load_config(None, ["compute.upsample=false", "camera.readout_ms=0"])
-    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages")))
+    pipeline = Pipeline(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages"))
     out: list[Keyframe] = []
     for i in range(FRAMES):
         T = pose(i)
         prior = PosePrior(T[:3, :3], 0.005, 0.01, T[:3, 3], np.full(3, 0.1), HEIGHT_M, 0.1)
         frame = Frame(photograph(levels, T), i * 100_000_000, i, prior)
-        out += pipeline.step(frame).keyframes
-    return out + list(pipeline.finish().keyframes)
+        out += keyframes_of(pipeline.track(frame))
+    return out + keyframes_of(pipeline.finish())
 
 
 @pytest.mark.slow

@@ -11,12 +11,12 @@ import pytest
 
 from recon import se3
 from recon.backends.cpu import CpuBackend
+from recon.pipeline.config import untimed
+from recon.pipeline.stages import Carry, ViewGrid
 from recon.stereo.posed_image import View
 from recon.stereo.reprojection import LABEL_SIGMA_PX, PairDepth, carry, reproject
 from recon.types import F64, DisparityMap, StereoPair
 from service.compute.backend_choice import FallbackBackend
-from service.flight.stages import Carry, ViewGrid
-from service.progress import Stopwatch
 
 K = np.array([[190.0, 0, 159.5], [0, 190.0, 89.5], [0, 0, 1]])
 BASELINE_M = 4.0
@@ -145,7 +145,7 @@ def test_a_pair_is_matched_once_on_a_backend_that_gives_its_depth() -> None:
     for keeps_pairs, found in ((False, [0]), (True, [])):
         own = CpuBackend()
         own.name, own.keeps_pairs = "onnx", keeps_pairs
-        stage = Carry(FallbackBackend(own), Stopwatch())
+        stage = Carry(FallbackBackend(own), untimed)
         stage.keep(0, {1: PairDepth(depth, 0.01 * depth)})
         assert [*stage(again, ViewGrid(K, (320, 180), T))] == found
 

@@ -11,16 +11,17 @@ import cv2
 import numpy as np
 import painted_ground
 import pytest
+from mapper_events import keyframes_of
 from painted_ground import CAMERA, DOWN, FOOTPRINT_M, HEIGHT_M, SIZE, pose, still
 
 from recon.backends import load_backend
 from recon.camera_model import scaled
+from recon.pipeline.events import Event, FramePosed
 from recon.tracking.localisation import Localiser, Located, Start
 from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.types import F64, U8, Camera, Frame, PosePrior
 from service.config import load_config
 from service.flight.pipeline import Pipeline
-from service.flight.stages import build_stages
 
 PLACED = ("started", "tracked", "keyframe")
 OFF = 0.1
@@ -204,21 +205,22 @@ def test_the_first_still_of_a_segment_is_placed_and_reconstructed() -> None:
     track = [pose(0.3 * FOOTPRINT_M * i - 100.0, seed=i) for i in range(3)]
     track += [pose(0.3 * FOOTPRINT_M * i + 10.0, seed=5 + i) for i in range(3)]
     config = load_config(None, ["compute.upsample=false", "compute.stereo_width=240"])
-    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages")))
-    steps = []
+    pipeline = Pipeline(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages"))
+    events: list[Event] = []
     for i, T in enumerate(track):
         prior = PosePrior(
             DOWN, 0.1, 0.1, T[:3, 3], np.full(3, 0.5), agl_m=HEIGHT_M, sigma_agl_m=2.0
         )
         image = np.repeat(still(T)[..., None], 3, axis=2)
-        steps.append(pipeline.step(Frame(image, i * 2_000_000_000, i, prior)))
-    last = pipeline.finish()
-    assert [n for n, step in enumerate(steps) if step.late is not None] == [4]
-    late = steps[4].late
-    assert steps[3].tracked.state is Tracking.LOST and late is not None and late.is_view
-    assert late.anchor is not None and late.anchor.seq == 3 and late.placed is not None
-    np.testing.assert_allclose(late.placed.T_world_camera[:3, 3], track[3][:3, 3], atol=2.0)
-    keyframes = [k.seq for step in [*steps, last] for k in step.keyframes]
+        events += pipeline.track(Frame(image, i * 2_000_000_000, i, prior))
+    events += pipeline.finish()
+    posed = [event for event in events if isinstance(event, FramePosed)]
+    assert [event.seq for event in posed] == [0, 1, 2, 3, 3, 4, 5]
+    lost, late = posed[3:5]
+    assert lost.tracked.state is Tracking.LOST and late.is_view
+    assert late.reference is not None and late.reference.seq == 3 and late.pose is not None
+    np.testing.assert_allclose(late.pose.T_world_camera[:3, 3], track[3][:3, 3], atol=2.0)
+    keyframes = [keyframe.seq for keyframe in keyframes_of(events)]
     assert keyframes == list(range(6))
     assert pipeline.refusals().total() == 0
 

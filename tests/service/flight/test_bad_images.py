@@ -13,15 +13,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from mapper_events import keyframes_of
 
 from mavlink.telemetry.samples import VehicleState
 from recon import bands, se3
 from recon.backends import load_backend
+from recon.pipeline.events import FramePosed
 from recon.types import F64, U8, Camera, Frame, Keyframe
 from service.cameras.rig import Rig
 from service.config import load_config
 from service.flight.pipeline import Pipeline
-from service.flight.stages import build_stages
 
 K: F64 = np.array([[400.0, 0, 239.5], [0, 400.0, 134.5], [0, 0, 1]])
 CAMERA = Camera(K, np.zeros(5), (480, 270))
@@ -64,14 +65,13 @@ def state(i: int) -> VehicleState:
 
 def fly(images: list[U8]) -> tuple[list[Keyframe], Counter[str], Pipeline]:
     config = load_config(None, ["scan.assumed_agl_m=60", "compute.upsample=false"])
-    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages")))
+    pipeline = Pipeline(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages"))
     rig = Rig(config.camera, config.scan, config.fusion)
     keyframes: list[Keyframe] = []
     for i, image in enumerate(images):
         time_ns, prior = i * 40_000_000, rig.prior(state(i), None)
-        step = pipeline.skip(time_ns, prior) or pipeline.step(Frame(image, time_ns, i, prior))
-        keyframes += step.keyframes
-    keyframes += pipeline.finish().keyframes
+        keyframes += keyframes_of(pipeline.add(Frame(image, time_ns, i, prior)))
+    keyframes += keyframes_of(pipeline.finish())
     return keyframes, pipeline.refusals(), pipeline
 
 
@@ -164,7 +164,7 @@ def test_telemetry_goes_on_where_vision_was_lost() -> None:
     images = [photograph(ground, i) for i in range(80)]
     images += [over_exposed(images[0])] * 16
     config = load_config(None, ["compute.upsample=false"])
-    pipeline = Pipeline(build_stages(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages")))
+    pipeline = Pipeline(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages"))
     rig = Rig(config.camera, config.scan, config.fusion)
     metre_east = 1.0 / (111_319.49 * np.cos(np.radians(47.0)))
     seen: list[tuple[int, F64]] = []
@@ -175,10 +175,10 @@ def test_telemetry_goes_on_where_vision_was_lost() -> None:
             state(i), lat_deg=47.0, lon_deg=8.0 + (STEP_M * i + off_m) * metre_east,
             alt_amsl_m=500.0 + HEIGHT_M, sigma_h_m=1.0, sigma_v_m=1.5, sigma_yaw_rad=0.03,
         )  # fmt: skip
-        step = pipeline.step(Frame(image, i * 40_000_000, i, rig.prior(sensed, None)))
-        if step.placed is not None:
-            kept = seen if step.anchor is not None else lost
-            kept.append((i, step.placed.T_world_camera[:3, 3]))
+        *_, posed = pipeline.track(Frame(image, i * 40_000_000, i, rig.prior(sensed, None)))
+        if isinstance(posed, FramePosed) and posed.pose is not None:
+            kept = seen if posed.reference is not None else lost
+            kept.append((i, posed.pose.T_world_camera[:3, 3]))
     pipeline.finish()
     assert len(seen) > 30 and len(lost) > 8
     (a, before), (b, after) = seen[-1], lost[0]
@@ -190,7 +190,7 @@ def test_no_kernel_takes_more_threads_than_the_configuration_gives() -> None:
     try:
         for given, want in ((1, 1), (0, bands.cores())):
             config = load_config(None, [f"compute.threads={given}"])
-            build_stages(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages"))
+            Pipeline(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages"))
             assert bands.threads() == want
     finally:
         bands.limit_threads(0)

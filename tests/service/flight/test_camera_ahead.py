@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from recon.backends.cpu import CpuBackend
+from recon.pipeline.events import FramePosed
 from recon.tracking.odometry import Tracked, Tracking
 from recon.types import U8, Camera
 from service.cameras.source import CameraFrame, ahead
 from service.config import load_config
-from service.flight.pipeline import Step
 from service.flight.scan import Scan, ScanInputs, create_store
 
 
@@ -87,8 +87,8 @@ def test_a_frame_that_tracking_skips_is_not_looked_at(
         frame = CameraFrame(unseen, 0, 0, None, "frame 0")
         with pytest.raises(AssertionError, match="looked at"):
             scan.feed(frame)
-        skipped = Step(Tracked(Tracking.SKIPPED, 0))
-        monkeypatch.setattr(scan.pipeline, "skip", lambda time_ns, prior: skipped)
+        skipped = FramePosed(0, 0, Tracked(Tracking.SKIPPED, 0))
+        monkeypatch.setattr(scan.pipeline, "skip", lambda seq, time_ns, prior: (skipped,))
         assert scan.feed(frame) is skipped
         assert scan.recorder.states[Tracking.SKIPPED] == 1
         scan.pipeline.finish()

@@ -13,14 +13,14 @@ import pytest
 
 from recon import se3
 from recon.camera_model import scaled_K
+from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.frame_poses import FallbackPosition
 from recon.posegraph.alignment import Scale, Similarity
-from recon.posegraph.trajectory import Placed
 from recon.tracking.odometry import Tracked, Tracking
-from recon.types import DepthMap, Keyframe
+from recon.tracking.relative_pose import RelativePose
+from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.rig import Rig
-from service.flight.anchorage import Anchorage, SettledKey
-from service.flight.chain import Uncarried
-from service.flight.pipeline import Pipeline, Step
+from service.flight.pipeline import Pipeline
 from service.flight.recorder import REPLAYED, Recorder
 from service.stream.images import IMAGE_SHARE
 from service.stream.records import ScanHeader
@@ -30,36 +30,39 @@ if TYPE_CHECKING:
     from house_flight import HouseFlight
 
 
-def placed(seq: int, sigma_m: float) -> Placed:
+def pose(seq: int, of_m: float) -> Pose:
     """A pose of this sigma in all three directions together."""
     T = se3.compose(np.diag([1.0, -1.0, -1.0]), np.array([0.5 * seq, 0.0, 50.0]))
-    covariance = se3.about(-T[:3, 3], np.eye(6) * sigma_m**2 / 3.0)
-    return Placed(seq, T, 1.0, covariance, ())
+    return Pose(T, se3.about(-T[:3, 3], np.eye(6) * of_m**2 / 3.0))
 
 
-def step(seq: int, sigma_m: float = 0.1) -> Step:
-    anchor = Anchorage(seq, SettledKey(0, 0, np.eye(4)), np.eye(4))
-    return Step(Tracked(Tracking.TRACKED, 0), placed(seq, sigma_m), anchor=anchor)
+def posed(seq: int, of_m: float = 0.1) -> FramePosed:
+    tracked = Tracked(Tracking.TRACKED, 0)
+    return FramePosed(
+        seq, 1_000_000 * seq, tracked, pose(seq, of_m), RelativePose(seq, 0, np.eye(4))
+    )
 
 
-def recorder_of(store: ScanStore, batch: int, sigma_m: float) -> Recorder:
-    """A recorder of frames that do not move, and whose sigma is ``sigma_m`` in the end.
+def lost(seq: int) -> FramePosed:
+    return FramePosed(seq, 1_000_000 * seq, Tracked(Tracking.LOST, 0))
+
+
+def recorder_of(store: ScanStore, batch: int, of_m: float) -> Recorder:
+    """A recorder of frames that do not move, and whose sigma is ``of_m`` in the end.
 
     0: that of a frame as it was published.
     """
-    nothing = Step(Tracked(Tracking.LOST, 0))
 
-    def place(anchor: Anchorage, as_published: Uncarried) -> Placed:
-        assert (
-            np.linalg.norm(as_published.place_m - placed(anchor.seq, 1.0).T_world_camera[:3, 3])
-            == 0
-        )
-        return placed(anchor.seq, sigma_m or float(np.linalg.norm(as_published.sigma_m)))
+    def at(frame: RelativePose, published: FallbackPosition) -> Pose:
+        there = pose(frame.seq, 1.0).T_world_camera[:3, 3]
+        assert np.linalg.norm(published.place_m - there) == 0
+        return pose(frame.seq, of_m or float(np.linalg.norm(published.sigma_m)))
 
-    chain = SimpleNamespace(place=place)
-    track = SimpleNamespace(is_settled=lambda _key: False)
-    stages = SimpleNamespace(chain=chain, track=track, debug=None, stopwatch=nullcontext)
-    pipeline = SimpleNamespace(stages=stages, drain=lambda: nothing, finish=lambda: nothing)
+    pipeline = SimpleNamespace(
+        keyframes=SimpleNamespace(graph=None), frames=SimpleNamespace(pose=at), debug=None,
+        follow=SimpleNamespace(is_settled=lambda frame: False), stopwatch=nullcontext,
+        drain=tuple, finish=tuple,
+    )  # fmt: skip
     rig = SimpleNamespace(frame=None, georeference="none")
     return Recorder(store, cast(Pipeline, pipeline), cast(Rig, rig), batch=batch)
 
@@ -78,9 +81,9 @@ def test_poses_of_a_recording_share_transactions(
             return add(poses)
 
         monkeypatch.setattr(store, "add_poses", counted)
-        recorder = recorder_of(store, batch, sigma_m=0.1)
+        recorder = recorder_of(store, batch, 0.1)
         for seq in range(20):
-            recorder.write(step(seq), 1_000_000 * seq, None)
+            recorder.write([posed(seq)])
         recorder.flush()
         assert [pose.time_unix_ns for pose in store.poses()] == [1_000_000 * n for n in range(20)]
         assert len(written) == transactions and sum(written) == 20
@@ -88,10 +91,10 @@ def test_poses_of_a_recording_share_transactions(
 
 def test_a_still_that_the_next_one_places_is_no_longer_lost(tmp_path: Path) -> None:
     with ScanStore.create(tmp_path / "scan.db", ScanHeader("stills", "drone", 0)) as store:
-        recorder = recorder_of(store, 1, sigma_m=0.1)
-        recorder.write(Step(Tracked(Tracking.LOST, 0)), 1_000_000, 30.0)
+        recorder = recorder_of(store, 1, 0.1)
+        recorder.write([lost(1)], 30.0)
         assert recorder.states == {Tracking.LOST: 1}
-        recorder.write(replace(step(2), late=step(1)), 2_000_000, 31.0)
+        recorder.write([posed(1), posed(2)], 31.0)
         recorder.flush()
         assert [(p.time_unix_ns, p.agl_m) for p in store.poses()] == [
             (1_000_000, 30.0),
@@ -102,9 +105,9 @@ def test_a_still_that_the_next_one_places_is_no_longer_lost(tmp_path: Path) -> N
 
 def test_poses_published_before_the_scan_was_placed_get_their_sigma(tmp_path: Path) -> None:
     with ScanStore.create(tmp_path / "scan.db", ScanHeader("rtk", "drone", 0)) as store:
-        recorder = recorder_of(store, 1, sigma_m=0.02)
+        recorder = recorder_of(store, 1, 0.02)
         for seq, sigma_m in enumerate([np.sqrt(3.0), np.sqrt(3.0), 0.021, 0.02]):
-            recorder.write(step(seq, sigma_m), 1_000_000 * seq, None)
+            recorder.write([posed(seq, sigma_m)])
         recorder.flush()
         found = [pose.sigma_m for pose in store.poses()]
         assert found == pytest.approx([0.02, 0.02, 0.021, 0.02], abs=1e-4)
@@ -114,9 +117,9 @@ def test_frames_that_no_keyframe_carries_stay_as_published(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with ScanStore.create(tmp_path / "scan.db", ScanHeader("stills", "drone", 0)) as store:
-        recorder = recorder_of(store, 1, sigma_m=0.0)
+        recorder = recorder_of(store, 1, 0.0)
         for seq in range(4):
-            recorder.write(step(seq, 5.0), 1_000_000 * seq, None)
+            recorder.write([posed(seq, 5.0)])
         corrected: list[int] = []
         monkeypatch.setattr(store, "add_poses", lambda poses: corrected.append(len(poses)))
         recorder.flush()
@@ -141,7 +144,7 @@ def test_the_scale_names_what_measured_it(sources: tuple[str, ...], sigma: float
     segments = SimpleNamespace(largest=lambda: found, largest_scales=lambda: scales)
     graph = SimpleNamespace(segments=segments, largest_growth=lambda: growth[0])
     recorder = Recorder.__new__(Recorder)
-    recorder._chain = cast(Any, SimpleNamespace(graph=graph))
+    recorder._graph = cast(Any, graph)
     assert recorder._scale() == {"from": by, "sigma": sigma}
     scales[:] = Scale(1.2, 0.01), Scale(1.0, 0.03)
     assert recorder._scale()["gnss_over_heights"] == pytest.approx(1.2)
@@ -157,14 +160,28 @@ def test_each_keyframe_has_its_image_within_the_flights_budget(
     """Where little is new the image of what is known still travels, at what the flight saved."""
     rng = np.random.default_rng(3)
     with ScanStore.create(tmp_path / "scan.db", ScanHeader("scan", "drone", 0)) as store:
-        recorder = recorder_of(store, batch=1, sigma_m=0.1)
+        recorder = recorder_of(store, 1, 0.1)
         for seq in range(8):
             one = larger(house.keyframe(seq, 5.0 * seq), 3, rng)
             one = replace(one, fresh=one.fresh & (seq % 2 == 0))
-            recorder.write(replace(step(seq), keyframes=(one,)), seq, None)
+            recorder.write([KeyframeReady(one), posed(seq)])
         images = [store.image(k) or b"" for k in range(8)]
     assert all(images) and sum(map(len, images)) == recorder.image_bytes
     assert recorder.image_bytes <= IMAGE_SHARE * recorder.chunk_bytes
+
+
+def test_corrections_of_a_keyframe_are_numbered_and_grow_from_its_first_scale(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("scan", "drone", 0)) as store:
+        recorder = recorder_of(store, 1, 0.1)
+        one = house.keyframe(7, 0.0)
+        one = replace(one, pose=replace(one.pose, scale=2.0))
+        recorder.write([KeyframeReady(one), posed(7)])
+        for scale in (3.0, 4.0):
+            recorder.write([PosesChanged({7: replace(one.pose, scale=scale)}), posed(8)])
+        found = [store.repose(7, below) for below in (2, 3)]
+    assert [(r.revision, r.scale) for r in found if r is not None] == [(1, 1.5), (2, 2.0)]
 
 
 def larger(one: Keyframe, factor: int, rng: np.random.Generator) -> Keyframe:

@@ -21,14 +21,12 @@ from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
-from recon.posegraph.trajectory import Placed
-from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.pipeline.events import FramePosed
 from recon.tracking.odometry import Tracked, Tracking
-from recon.types import F64, Camera
+from recon.tracking.relative_pose import RelativePose
+from recon.types import F64, Camera, Pose
 from service.config import CameraConfig, load_config
 from service.daemon.runtime import Daemon
-from service.flight.anchorage import Anchorage
-from service.flight.pipeline import Step
 from service.flight.vehicle_reports import OdometryReport, camera_view
 
 S = 1_000_000_000
@@ -41,14 +39,14 @@ def wxyz(R: Rotation) -> F64:
     return np.asarray(R.as_quat()[[3, 0, 1, 2]], np.float64)
 
 
-def step_at(enu: tuple[float, float, float], head: Rotation = HEAD, segment: int = 0) -> Step:
+def posed_at(
+    enu: tuple[float, float, float], time_ns: int, head: Rotation = HEAD, segment: int = 0
+) -> FramePosed:
     R = R_ENU_NED @ head.as_matrix() @ R_GIMBAL_CAMERA
     T = se3.compose(R, np.array(enu))
     tracked = Tracked(Tracking.TRACKED, segment, T, tracks=150)
-    anchor = Anchorage(0, object.__new__(OdometryKeyframe), np.eye(4))
-    return Step(
-        tracked, Placed(0, T, 1.0, se3.about(-T[:3, 3], COVARIANCE), ("vision",)), False, anchor
-    )
+    pose = Pose(T, se3.about(-T[:3, 3], COVARIANCE), ("vision",))
+    return FramePosed(0, time_ns, tracked, pose, RelativePose(0, segment, T))
 
 
 def state() -> VehicleState:
@@ -59,7 +57,7 @@ def test_pose_velocity_and_covariance_are_the_bodys_in_ned() -> None:
     sent: list[tuple[BodyOdometry, int]] = []
     report = OdometryReport(CameraConfig(), lambda o, t: sent.append((o, t)))
     for k in range(3):
-        report.send(step_at((4.0 * k / 10, 1.0, 30.0)), state(), k * S // 10)
+        report.send(posed_at((4.0 * k / 10, 1.0, 30.0), k * S // 10), state())
     odometry, time_ns = sent[-1]
     assert time_ns == 2 * S // 10
     assert odometry.position_ned_m == pytest.approx((1.0, 0.8, -30.0))
@@ -75,7 +73,7 @@ def test_a_fixed_mount_needs_no_gimbal() -> None:
     camera = CameraConfig(mount="fixed", mount_pitch_deg=-60.0, mount_yaw_deg=20.0)
     mount = Rotation.from_euler("ZYX", [20.0, -60.0, 0.0], degrees=True)
     report = OdometryReport(camera, lambda o, t: sent.append(o))
-    report.send(step_at((0.0, 0.0, 30.0), BODY * mount), None, 0)
+    report.send(posed_at((0.0, 0.0, 30.0), 0, BODY * mount), None)
     assert abs(float(np.dot(sent[0].q_ned_body, wxyz(BODY)))) == pytest.approx(1.0, abs=1e-9)
 
 
@@ -84,17 +82,17 @@ def test_resets_are_counted_and_lost_frames_left_out() -> None:
     report = OdometryReport(CameraConfig(), lambda o, t: sent.append(o))
     way = [(k * 1.0, 0.0, 30.0) for k in range(6)]
     for k, place in enumerate(way):  # a fast vehicle: no step of it is a jump
-        report.send(step_at(place), state(), k * S // 10)
+        report.send(posed_at(place, k * S // 10), state())
     assert report.resets == 0
-    report.send(step_at((9.0, 0.0, 30.0)), state(), 6 * S // 10)  # a loop was closed
+    report.send(posed_at((9.0, 0.0, 30.0), 6 * S // 10), state())  # a loop was closed
     assert sent[-1].reset_counter == 1
     assert sent[-1].velocity_frd_m_s == pytest.approx(BODY.inv().apply([0.0, 10.0, 0.0]))
-    report.send(step_at((10.0, 0.0, 30.0)), state(), 7 * S // 10)
+    report.send(posed_at((10.0, 0.0, 30.0), 7 * S // 10), state())
     assert report.resets == 1
-    lost = Step(Tracked(Tracking.LOST, 0))
-    report.send(lost, state(), 8 * S // 10)
+    lost = FramePosed(0, 8 * S // 10, Tracked(Tracking.LOST, 0))
+    report.send(lost, state())
     assert len(sent) == 8
-    report.send(step_at((11.0, 0.0, 30.0), segment=1), state(), 9 * S // 10)
+    report.send(posed_at((11.0, 0.0, 30.0), 9 * S // 10, segment=1), state())
     assert sent[-1].reset_counter == 2
 
 
@@ -115,7 +113,7 @@ def test_it_reaches_the_autopilot_stamped_with_its_clock_only_when_wanted(wanted
             until(lambda: vehicle.link.boot_time_us(0) is not None)
             now_ns = time.monotonic_ns()
             report = OdometryReport(CameraConfig(), vehicle.link.report_odometry)
-            report.send(step_at((1.0, 2.0, 30.0)), state(), now_ns)
+            report.send(posed_at((1.0, 2.0, 30.0), now_ns), state())
             ear, framer = dialect.MAVLink(None), Framer()
             heard: list[Any] = []
             end = time.monotonic() + (5.0 if wanted else 0.5)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mapper_events import keyframes_of
 from scipy.spatial import cKDTree
 from simulated_place import simulated_place
 
@@ -15,7 +16,6 @@ from recon.camera_model import rays
 from recon.types import F64, Frame, Keyframe, PosePrior
 from service.config import load_config
 from service.flight.pipeline import Pipeline
-from service.flight.stages import build_stages
 from service.sim import shapes
 from service.sim.recording import Simulation
 
@@ -58,9 +58,7 @@ def flown(site: Simulation, down_deg: float) -> F64:
     down = np.radians(down_deg)
     ahead = -np.cos(down) * out - np.sin(down) * np.array([0.0, 0.0, 1.0])
     config = load_config(None, ["compute.upsample=false", "camera.readout_ms=0"])
-    pipeline = Pipeline(
-        build_stages(site.options.camera, config, load_backend("cpu"), Path("/dev/null/pages"))
-    )
+    pipeline = Pipeline(site.options.camera, config, load_backend("cpu"), Path("/dev/null/pages"))
     keyframes: list[Keyframe] = []
     for i in range(FRAMES):
         place = wall.mean(axis=0) + STEP_M * (i - FRAMES / 2) * along
@@ -68,8 +66,8 @@ def flown(site: Simulation, down_deg: float) -> F64:
         image = site.renderer.frame(T, i, site.options.look)
         height = float(T[2, 3] - house_of(site)[shapes.BASE])
         prior = PosePrior(T[:3, :3], 0.01, 0.02, T[:3, 3], np.full(3, 0.05), height, 1.0)
-        keyframes += pipeline.step(Frame(image, 400_000_000 * i, i, prior)).keyframes
-    keyframes += pipeline.finish().keyframes
+        keyframes += keyframes_of(pipeline.track(Frame(image, 400_000_000 * i, i, prior)))
+    keyframes += keyframes_of(pipeline.finish())
     return np.vstack([points(keyframe) for keyframe in keyframes])
 
 

@@ -18,12 +18,12 @@ from typer.testing import CliRunner
 from recon.calibration.global_bundle import Sightings
 from recon.calibration.tracks import MIN_COMMON
 from recon.posegraph.alignment import Similarity
+from recon.posegraph.pieces import Pieces
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.records import Loop
 from recon.types import F64, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cli import app
-from service.flight.chain import Pieces
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.refine.by_images import stretches_untied
 from service.offline.tiles import footprints

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.scans.trust import BY_SURVEY, TWO_ONLY, slope_deg, trust_of
+from recon.pipeline.config import TWO_ONLY
+from service.scans.trust import BY_SURVEY, slope_deg, trust_of
 
 SURE: dict[str, Any] = {
     "assumed": [],

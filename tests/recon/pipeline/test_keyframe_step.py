@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.pipeline.config import untimed
+from recon.pipeline.stages import Register
 from recon.types import DepthMap, Registration, Verdict
-from service.flight.stages import Register
-from service.progress import Stopwatch
 
 DEPTH = cast(DepthMap, object())
 STEP = se3.compose(np.eye(3), np.array([4.0, 0.0, 0.0]))
@@ -22,7 +22,7 @@ def step_with_icp(off_m: float) -> float:
     spread = np.diag([1e-3**2] * 3 + [0.02**2] * 3)
     T = se3.compose(np.eye(3), np.array([4.0 + off_m, 0.0, 0.0]))
     found = Registration(T, spread, Verdict.CONVERGED, 0.1, 0.9, 3)
-    register = Register(cast(Any, SimpleNamespace(register=lambda *_: found)), Stopwatch())
+    register = Register(cast(Any, SimpleNamespace(register=lambda *_: found)), untimed)
     for seq, T_odom_camera in enumerate((np.eye(4), STEP)):
         view = SimpleNamespace(
             seq=seq,
@@ -30,9 +30,9 @@ def step_with_icp(off_m: float) -> float:
             earlier={0: np.eye(4)},
             view=SimpleNamespace(T_odom_camera=T_odom_camera),
         )
-        step = register(cast(Any, view), DEPTH)
-    assert step.T_before_camera is not None
-    return float(step.T_before_camera[0, 3] - STEP[0, 3])
+        step, _ = register(cast(Any, view), DEPTH)
+    assert step is not None
+    return float(step[0, 3] - STEP[0, 3])
 
 
 @pytest.mark.parametrize(("off_m", "taken_m"), [(0.03, 0.015), (0.5, 0.0)])

@@ -1,7 +1,7 @@
 """Which frames become views of the virtual stereo camera, and which of them pair up.
 
-Three ways, as the operator sets ``scan.baseline``: "auto" takes the odometry's keyframes,
-spaced by base-to-height; metres takes a frame every so far along the track; "k/m" takes k of
+Three ways, by :class:`recon.pipeline.config.Baseline`: "auto" takes the odometry's keyframes,
+spaced by base-to-height; "metres" takes a frame every so far along the track; "frames" takes k of
 every m frames, evenly, as the paper does (two of every ten).
 """
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import Undistorter
+from recon.pipeline.config import TWO_ONLY, Baseline
 from recon.posegraph.between_keyframes import FixAverage
 from recon.rolling_shutter import NEAR_S, FrameRows, depth_share, on_image
 from recon.row_errors import turn_shares
@@ -28,10 +29,8 @@ from recon.tracking.keyframe_window import (
 from recon.tracking.known_track import AnyTrack
 from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.prediction import inverse_depth_plane
+from recon.tracking.relative_pose import RelativePose
 from recon.types import F32, F64, U8, Camera, PosePrior
-from service.config import ScanConfig, parse_baseline
-from service.flight.anchorage import Anchorage
-from service.scans.trust import TWO_ONLY
 
 KEPT = 6
 MIN_FRAMES_PER_STEP = 6.0
@@ -102,7 +101,7 @@ class Viewpoint:
     colour: Colour | None  # None for one that is only a partner
     gray: U8  # (H, W) undistorted
     key: OdometryKeyframe  # the last one when it was tracked
-    anchor: Anchorage
+    reference: RelativePose
     is_blurred: bool = False  # takes no part in stereo, only in the track
     moving: FrameRows | None = None
 
@@ -113,7 +112,7 @@ class Viewpoint:
     @property
     def T_odom_camera(self) -> F64:
         """(4, 4) as refined by now."""
-        return self.anchor.T_odom_camera
+        return self.reference.T_odom_camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +126,7 @@ class StereoCandidate:
     bgr: U8  # (H, W, 3) of the view
     view: View
     partners: tuple[View, ...]
-    anchor: Anchorage
+    reference: RelativePose
     points: F64  # (N, 3) landmarks in the view's camera
     covariance: F64  # (6, 6) of vision's motion from the view before, left, in the view's camera
     earlier: Mapping[int, F64]  # number to pose (4, 4) of the segment's last few views
@@ -138,7 +137,9 @@ class StereoCandidate:
 class Viewpoints:
     """Selects views from tracked frames and remembers the last few as partners."""
 
-    def __init__(self, config: ScanConfig, partners: int = 4, all_known: bool = False) -> None:
+    def __init__(
+        self, baseline: Baseline | None = None, partners: int = 4, all_known: bool = False
+    ) -> None:
         """At most ``partners`` of the last :data:`KEPT` views pair up with one of them.
 
         ``all_known``: the poses are final, and views wait for those on their far side.
@@ -154,12 +155,14 @@ class Viewpoints:
         self._max_partners = partners
         self._views_of: Counter[int] = Counter()  # views by segment
         self._take_next = False
-        self.set_baseline(config)
+        self.set_baseline(baseline or Baseline())
 
-    def set_baseline(self, config: ScanConfig) -> None:
-        """Follow another ``scan.baseline`` from the next frame on."""
-        self._mode, self._amount, every = parse_baseline(config.baseline)
-        self._stride = frames_apart(int(self._amount), every) if self._mode == "frames" else 0
+    def set_baseline(self, baseline: Baseline) -> None:
+        """Follow another baseline from the next frame on."""
+        self._mode, self._amount = baseline.mode, baseline.amount
+        self._stride = 0
+        if self._mode == "frames":
+            self._stride = frames_apart(int(self._amount), baseline.every)
         self._partners = self._max_partners if self._mode == "auto" else 1
 
     def set_partners(self, most: int) -> None:
@@ -342,30 +345,31 @@ class StereoViews:
         self._segment = odometry.segment
         self._fixes = FixAverage()
         self._waiting: deque[tuple[Viewpoint, PosePrior]] = deque()
-        self._given: deque[Anchorage] = deque(maxlen=8)
+        self._given: deque[RelativePose] = deque(maxlen=8)
         self._latest: Viewpoint | None = None  # the last tracked frame, unless it is a view
-        self._tracked: deque[tuple[int, Anchorage]] = deque(maxlen=TRACKED)  # times and places
+        self._tracked: deque[tuple[int, RelativePose]] = deque(maxlen=TRACKED)  # times and places
 
-    def take(self, image: UndistortedFrame, tracked: Tracked) -> tuple[Anchorage | None, bool]:
-        """The frame's anchor, None without a pose, and whether it is a view."""
+    def take(self, image: UndistortedFrame, tracked: Tracked) -> tuple[RelativePose | None, bool]:
+        """The frame relative to its keyframe, None without a pose, and whether it is a view."""
         if tracked.segment != self._segment:
             self.end_stretch()
             self._segment = tracked.segment
         if tracked.T_odom_camera is None:
             return None, False
         key = next(key for key in reversed(self._odometry.keyframes) if key.seq <= image.seq)
-        anchor = Anchorage(image.seq, key, se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera)
+        T_keyframe_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
+        reference = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
         frame = Viewpoint(
-            image.seq, image.time_ns, image.prior, image.colour, image.gray, key, anchor,
+            image.seq, image.time_ns, image.prior, image.colour, image.gray, key, reference,
             image.is_blurred, tracked.moving,
         )  # fmt: skip
-        self._tracked.append((image.time_ns, anchor))
+        self._tracked.append((image.time_ns, reference))
         is_view = self.selection.offer(frame, tracked)
         self._fixes.take(tracked.T_odom_camera, image.prior)
         if is_view:
             self._wait(frame)
         self._latest = None if is_view else frame
-        return anchor, is_view
+        return reference, is_view
 
     def end_stretch(self) -> None:
         """Make a view of a stretch's last frame: only it shows what the camera saw last."""
@@ -388,7 +392,7 @@ class StereoViews:
                 self._refused["blurred"] += 1
             else:
                 candidate = self._candidate(view, prior)
-                self._given.append(view.anchor)
+                self._given.append(view.reference)
                 yield candidate
 
     def _is_ready(self, view: Viewpoint) -> bool:
@@ -399,7 +403,7 @@ class StereoViews:
 
     def _candidate(self, view: Viewpoint, prior: PosePrior) -> StereoCandidate:
         points = landmarks(view.key)
-        points = se3.transform(se3.inverse(view.anchor.T_key_camera), points)
+        points = se3.transform(se3.inverse(view.reference.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         assert view.colour is not None
         partners, bgr = self.selection.partners(view), view.colour.take()
@@ -411,10 +415,10 @@ class StereoViews:
             bgr,
             replace(self._posed(view, in_odom), bgr=bgr),
             tuple(self._posed(partner, in_odom) for partner in partners),
-            view.anchor,
+            view.reference,
             points,
             self._step_covariance(view),
-            {a.seq: a.T_odom_camera for a in self._given if a.key.segment == view.segment},
+            {a.seq: a.T_odom_camera for a in self._given if a.segment == view.segment},
             self._rows_share(view, partners, points),
         )
 
@@ -441,7 +445,8 @@ class StereoViews:
 
     def _step_covariance(self, view: Viewpoint) -> F64:
         """(6, 6) of the motion since the view given before."""
-        since = self._given[-1].key.seq if self._given else -1
+        last = self._given[-1].keyframe if self._given else None
+        since = -1 if last is None else last.seq
         T_camera_odom = se3.inverse(view.T_odom_camera)
         keys = [k for k in self._odometry.keyframes if since < k.seq <= view.key.seq]
         return step_covariance(keys or [view.key], T_camera_odom)
@@ -467,7 +472,7 @@ class StereoViews:
             return None
         near = [
             (t, at) for t, at in self._tracked
-            if abs(t - view.time_ns) < 1e9 * NEAR_S and at.key.segment == view.segment
+            if abs(t - view.time_ns) < 1e9 * NEAR_S and at.segment == view.segment
         ]  # fmt: skip
         near = [one for one in near if one[0] <= view.time_ns][-2:] + [
             one for one in near if one[0] > view.time_ns

@@ -8,10 +8,10 @@ from typing import Any, cast
 
 import pytest
 
+from recon.pipeline.config import untimed
+from recon.pipeline.stages import Track
 from recon.tracking.odometry import Tracked, Tracking
 from recon.types import F64
-from service.flight.stages import Track
-from service.progress import Stopwatch
 
 POSE = cast(F64, object())
 STARTED, WAITING = (Tracking.STARTED, POSE, ""), (Tracking.WAITING, None, "too little motion")
@@ -34,7 +34,7 @@ def test_waiting_counts_where_it_is_in_vain(states: list[Any], unused: dict[str,
         small=None, seq=0, time_ns=0, prior=None, mask=None, is_blurred=False
     )
     refused: Counter[str] = Counter()
-    track = Track(odometry, cast(Any, None), refused, Stopwatch())
+    track = Track(odometry, cast(Any, None), refused, untimed)
     for _ in states:
         track(image)
     assert refused + track.waiting == unused

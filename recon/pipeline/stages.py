@@ -1,12 +1,10 @@
-"""The boxes of Figure 1 as small objects, and the one place that builds them."""
+"""The boxes of Figure 1 as small objects."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -14,34 +12,30 @@ import numpy as np
 
 from recon import se3
 from recon.backends import Backend, DenseStages
-from recon.bands import limit_threads
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
 from recon.mapping.registration import IcpConfig, agreed_motion
-from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
-from recon.posegraph.trajectory import Placed, Trajectory
-from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.pipeline.config import Timing
+from recon.pipeline.views import Colour, StereoCandidate, UndistortedFrame, Viewpoints
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import (
-    DepthFusionConfig,
     PairDepth,
     carry,
     fuse,
     plausible,
     reproject,
 )
-from recon.stereo.upsampling import UpsamplingConfig
 from recon.stereo.virtual_stereo import (
     at_middle_row,
     drop_unseen,
     plane_relief,
     rectify,
 )
-from recon.tracking.known_track import AnyTrack, KnownTrack
-from recon.tracking.localisation import OdometryConfig
-from recon.tracking.odometry import Odometry, Tracked, Tracking
+from recon.tracking.known_track import AnyTrack
+from recon.tracking.odometry import Tracked, Tracking
+from recon.tracking.relative_pose import RelativePose
 from recon.types import (
     F32,
     F64,
@@ -60,25 +54,8 @@ from recon.types import (
     StereoPair,
     Verdict,
 )
-from service.background import BackgroundWorker
-from service.cameras.camera_file import seeks_readout, with_shutter
-from service.config import ComputeConfig, Config
-from service.flight.anchorage import Key
-from service.flight.chain import Chain, KeyframeStep
-from service.flight.loops import LoopSearch
-from service.flight.surface_map import SurfaceMap
-from service.flight.viewpoints import (
-    Colour,
-    StereoCandidate,
-    StereoViews,
-    UndistortedFrame,
-    Viewpoints,
-)
-from service.progress import Stopwatch
 
 MAX_TRACKING_WIDTH_PX = 1280
-MAX_WAITING = 3
-"""Views that wait for reconstruction."""
 
 
 class ViewGrid(NamedTuple):
@@ -92,10 +69,10 @@ class ViewGrid(NamedTuple):
 class Undistort:
     """Images without distortion: in gray, as the odometry takes them, and views in colour."""
 
-    def __init__(self, camera: Camera, guide_width_px: int, stopwatch: Stopwatch) -> None:
+    def __init__(self, camera: Camera, guide_width_px: int, timing: Timing) -> None:
         """Raises ValueError for an unusable camera model."""
         self._undistorter = Undistorter(_within_width(camera, int(1.3 * guide_width_px)))
-        self._stopwatch, self._blur = stopwatch, BlurWatch()
+        self._timing, self._blur = timing, BlurWatch()
         self.camera, self.valid = self._undistorter.camera, self._undistorter.valid
         self.tracking_camera = _within_width(self.camera, MAX_TRACKING_WIDTH_PX)
         mask = self.valid
@@ -107,7 +84,7 @@ class Undistort:
 
     def __call__(self, frame: Frame) -> UndistortedFrame:
         """Raises ValueError when the image is not of the camera model's size."""
-        with self._stopwatch("undistort"):
+        with self._timing("undistort"):
             image = _resized(frame.image, self.camera.size_px)
             gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
             gray = self._undistorter.image(gray)
@@ -130,10 +107,10 @@ class Track:
         odometry: AnyTrack,
         selection: Viewpoints,
         refused: Counter[str],
-        stopwatch: Stopwatch,
+        timing: Timing,
     ) -> None:
         self.odometry, self._selection = odometry, selection
-        self._refused, self._stopwatch = refused, stopwatch
+        self._refused, self._timing = refused, timing
         self.waiting = Counter[str]()
         """Frames since the segment's first one that wait for its second view, by reason."""
 
@@ -143,7 +120,7 @@ class Track:
 
     def __call__(self, image: UndistortedFrame) -> Tracked:
         """The frame's pose, or why there is none."""
-        with self._stopwatch("track"):
+        with self._timing("track"):
             tracked = self.odometry.track(
                 image.small, image.seq, image.time_ns, image.prior, image.mask, image.is_blurred
             )
@@ -163,10 +140,12 @@ class Track:
     def segment(self) -> int:
         return self.odometry.segment
 
-    def is_settled(self, key: Key) -> bool:
-        """True when the odometry adjusts a keyframe of its no longer."""
-        window = self.odometry.keyframes
-        return key.segment != self.segment or not window or key.seq < window[0].seq
+    def is_settled(self, frame: RelativePose) -> bool:
+        """True when the odometry no longer adjusts the frame's reference keyframe."""
+        key, window = frame.keyframe, self.odometry.keyframes
+        if key is None or key.segment != self.segment or not window:
+            return True
+        return key.seq < window[0].seq
 
 
 class Rectify:
@@ -177,10 +156,10 @@ class Rectify:
         config: VirtualStereoConfig,
         rejected: Counter[str],
         debug: dict[str, Array] | None,
-        stopwatch: Stopwatch,
+        timing: Timing,
     ) -> None:
         self._config, self._rejected, self._debug = config, rejected, debug
-        self._stopwatch = stopwatch
+        self._timing = timing
         self._relief_m = (0.0, 0.0)
         self.pairs = 0
 
@@ -206,7 +185,7 @@ class Rectify:
         for partner in candidate.partners:
             if partner.seq in known:
                 continue
-            with self._stopwatch("rectify"):
+            with self._timing("rectify"):
                 pair = rectify(view, partner, candidate.points, config, self._relief_m)
             if isinstance(pair, str):
                 self._rejected[pair] += 1
@@ -227,9 +206,9 @@ class Rectify:
         """Accept baselines as short as ``minimum`` of the distance."""
         self._config = replace(self._config, min_base_to_height=minimum)
 
-    def set_effort(self, compute: ComputeConfig) -> None:
+    def set_effort(self, width_px: int, upsample: bool) -> None:
         """Reconstruct at another width, with or without upsampling, from the next view on."""
-        self._config = replace(self._config, width_px=compute.stereo_width, guided=compute.upsample)
+        self._config = replace(self._config, width_px=width_px, guided=upsample)
 
 
 class Carry:
@@ -239,8 +218,8 @@ class Carry:
     the depth of pairs to itself matches them all.
     """
 
-    def __init__(self, backend: Backend, stopwatch: Stopwatch) -> None:
-        self._backend, self._stopwatch = backend, stopwatch
+    def __init__(self, backend: Backend, timing: Timing) -> None:
+        self._backend, self._timing = backend, timing
         self._kept: dict[tuple[int, int], PairDepth] = {}  # by view and partner
 
     def __call__(self, candidate: StereoCandidate, grid: ViewGrid) -> dict[int, PairDepth]:
@@ -249,7 +228,7 @@ class Carry:
         for partner in candidate.partners:
             pair = self._kept.get((partner.seq, view.seq))
             if pair is not None and pair.depth_m.shape == grid.size_px[::-1]:
-                with self._stopwatch("carry"):
+                with self._timing("carry"):
                     T = se3.inverse(view.T_odom_camera) @ partner.T_odom_camera
                     found[partner.seq] = carry(pair, grid.K, T)
         return found
@@ -270,24 +249,24 @@ class PairStages:
         backend: Backend,
         config: DenseStages,
         debug: dict[str, Array] | None,
-        stopwatch: Stopwatch,
+        timing: Timing,
     ) -> None:
         self._backend, self._config = backend, config
-        self._debug, self._stopwatch = debug, stopwatch
+        self._debug, self._timing = debug, timing
 
     def whole_path(self, pairs: Collection[RectifiedPair], grid: ViewGrid) -> DepthMap | None:
         """Eq. 1 to 3 without leaving the device; None where the stages must do it."""
         plain = [pair for pair in pairs if isinstance(pair, StereoPair)]  # as devices know them
         if not self._backend.keeps_pairs or len(plain) < len(pairs) or self._debug is not None:
             return None
-        with self._stopwatch("dense path"):
+        with self._timing("dense path"):
             return self._backend.fused_depth(
                 plain, grid.K, grid.size_px, grid.T_odom_camera, self._config
             )
 
     def match(self, pair: RectifiedPair) -> DisparityMap:
         """Labels of the left view by belief propagation, Eq. 1."""
-        with self._stopwatch("belief propagation"):
+        with self._timing("belief propagation"):
             coarse = self._backend.belief_propagation(
                 pair.left, pair.right, pair.labels, self._config.matching
             )
@@ -299,21 +278,21 @@ class PairStages:
         """The labels at the size of the pair's guide, Eq. 2; as they are without one."""
         fine = coarse
         if pair.guide is not None:
-            with self._stopwatch("upsample"):
+            with self._timing("upsample"):
                 fine = self._backend.upsample(coarse, pair.guide, self._config.upsampling)
         self._keep(upsampled=fine.px)
         return fine
 
     def reproject(self, disparity: DisparityMap, pair: RectifiedPair, grid: ViewGrid) -> PairDepth:
         """The pair's depth on the view's grid, Eq. 3."""
-        with self._stopwatch("reproject"):
+        with self._timing("reproject"):
             if isinstance(pair, PolarPair):
                 return reproject_polar(disparity, pair, grid.K, grid.size_px)
             return reproject(disparity, pair, grid.K, grid.size_px)
 
     def fuse(self, depths: Sequence[PairDepth], grid: ViewGrid) -> DepthMap:
         """One depth map of all pairs, in units of the odometry."""
-        with self._stopwatch("fuse"):
+        with self._timing("fuse"):
             return fuse(depths, grid.K, grid.T_odom_camera, self._config.fusion)
 
     def _keep(self, **arrays: Array) -> None:
@@ -347,29 +326,33 @@ class Plausible:
 class Register:
     """ICP of each view's depth onto that of the keyframe before."""
 
-    def __init__(self, backend: Backend, stopwatch: Stopwatch) -> None:
-        self._backend, self._config, self._stopwatch = backend, IcpConfig(), stopwatch
+    def __init__(self, backend: Backend, timing: Timing) -> None:
+        self._backend, self._config, self._timing = backend, IcpConfig(), timing
         self._before: tuple[int, DepthMap | None] | None = None  # number and depth
         self.verdicts: Counter[Verdict] = Counter()
 
-    def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> KeyframeStep:
-        """The step from the keyframe before: vision's and ICP's, weighted by covariance; vision's
-        alone where ICP contradicts it."""
+    def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> tuple[F64 | None, F64]:
+        """The step (4, 4) from the keyframe before, None where its chain begins, and its covariance
+        (6, 6): vision's and ICP's, weighted by covariance; vision's alone where ICP contradicts it.
+
+        Lengths are in units of the odometry, the covariance of a left perturbation in the frame of
+        the camera before; without a step, of the pose itself.
+        """
         covariance = view.covariance + np.diag([1e-4**2] * 3 + [0.005**2] * 3)
         before, self._before = self._before, (view.seq, depth)
         T_before = view.earlier.get(before[0]) if before is not None else None
         if before is None or T_before is None:
-            return KeyframeStep(None, covariance)
+            return None, covariance
         step = se3.inverse(T_before) @ view.view.T_odom_camera
         A = se3.adjoint(step)
         covariance = A @ covariance @ A.T
         if depth is None or before[1] is None:
-            return KeyframeStep(step, covariance)
-        with self._stopwatch("icp"):
+            return step, covariance
+        with self._timing("icp"):
             found = self._backend.register(depth, before[1], step, self._config)
         self.verdicts[found.verdict] += 1
         agreed = agreed_motion(step, covariance, found, self._config)
-        return KeyframeStep(*(agreed or (step, covariance)))
+        return agreed or (step, covariance)
 
 
 class MakeKeyframe:
@@ -379,121 +362,16 @@ class MakeKeyframe:
         self._debug = debug
 
     def __call__(
-        self,
-        view: StereoCandidate,
-        depth: DepthMap,
-        bgr: U8,
-        sigma_m: F32,
-        fresh: Bool,
-        placed: Placed,
+        self, view: StereoCandidate, depth: DepthMap, bgr: U8, sigma_m: F32, fresh: Bool, pose: Pose
     ) -> Keyframe:
         """``depth`` and ``sigma_m`` (h, w) are in units of the odometry."""
-        scale = np.float32(placed.scale)
+        scale = np.float32(pose.scale)
         metric = DepthMap(
-            depth.depth_m * scale, sigma_m * scale, depth.views, depth.K, placed.T_world_camera
+            depth.depth_m * scale, sigma_m * scale, depth.views, depth.K, pose.T_world_camera
         )
         if self._debug is not None:
             self._debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
-        pose = Pose(placed.T_world_camera, placed.covariance, placed.sources)
         return Keyframe(view.seq, view.time_ns, metric, bgr, pose, fresh)
-
-
-DenseWorker = BackgroundWorker[StereoCandidate, Keyframe | None]
-
-
-@dataclass(frozen=True, slots=True)
-class Stages:
-    """One object for each box of the figure, in its order."""
-
-    undistort: Undistort
-    track: Track
-    views: StereoViews
-    carry: Carry
-    rectify: Rectify
-    stereo: PairStages
-    plausible: Plausible
-    register: Register
-    chain: Chain
-    map: SurfaceMap
-    keyframe: MakeKeyframe
-    in_background: Callable[[Callable[[StereoCandidate], Keyframe | None]], DenseWorker]
-    stopwatch: Stopwatch
-    refused: Counter[str]  # frames and views, by reason; written while tracking
-    rejected: Counter[str]  # pairs and keyframes, by reason; written while reconstructing
-    debug: dict[str, Array] | None  # images of the last view's stages; None: not kept
-
-
-def build_stages(
-    camera: Camera,
-    config: Config,
-    backend: Backend,
-    pages: Path,
-    live: bool = False,
-    assumed: Collection[str] = (),
-    sigma_focal: float = 0.0,
-    known: KnownTrack | None = None,
-) -> Stages:
-    """The stages that the configuration asks for. Raises ValueError for an unusable camera model.
-
-    ``pages`` is a folder, made when it is needed, for the oldest parts of the map. ``live`` drops
-    old work when reconstruction cannot keep up. An ``assumed`` lens widens sigmas. A ``known``
-    track takes the odometry's place.
-    """
-    compute, stopwatch = config.compute, Stopwatch()
-    limit_threads(compute.threads)
-    refused, rejected = Counter[str](), Counter[str]()
-    debug: dict[str, Array] | None = {} if config.scan.keep_debug else None
-    row = "dense" if debug is None else None
-    camera = with_shutter(camera, config.camera)
-    undistort = Undistort(camera, compute.guide_width, stopwatch)
-    odometry = known or Odometry(
-        undistort.tracking_camera,
-        OdometryConfig(base_to_height=config.scan.base_to_height),
-        camera,
-        seeks_readout=seeks_readout(camera, config.camera),
-    )
-    selection = Viewpoints(config.scan, compute.pairs, all_known=known is not None)
-    track = Track(odometry, selection, refused, stopwatch)
-    stereo = VirtualStereoConfig(
-        min_base_to_height=selection.min_base_to_height,
-        width_px=compute.stereo_width,
-        guided=compute.upsample,
-        labels=compute.labels,
-    )
-    dense = DenseStages(
-        BeliefPropagationConfig(iterations=compute.iterations),
-        UpsamplingConfig(),
-        DepthFusionConfig(),
-    )
-    views = StereoViews(selection, odometry, undistort.camera, undistort.valid, refused)
-    graph = PoseGraph(PoseGraphConfig(max_nodes=config.fusion.graph_keyframes))
-    trajectory, loops = Trajectory(graph=graph), None
-    if config.fusion.loops:
-        loops = LoopSearch(trajectory, max_views=config.fusion.loop_views)
-    surface = SurfaceMap(
-        pages, compute.map_voxels, config.scan.resolution_m, stopwatch, float(camera.K[0, 0]),
-        assumed,
-        sigma_focal,
-    )  # fmt: skip
-
-    return Stages(
-        undistort=undistort,
-        track=track,
-        views=views,
-        carry=Carry(backend, stopwatch),
-        rectify=Rectify(stereo, rejected, debug, stopwatch),
-        stereo=PairStages(backend, dense, debug, stopwatch),
-        plausible=Plausible(rejected),
-        register=Register(backend, stopwatch),
-        chain=Chain(trajectory, loops, track.is_settled, rejected, stopwatch),
-        map=surface,
-        keyframe=MakeKeyframe(debug),
-        in_background=partial(DenseWorker, row, bound=MAX_WAITING, live=live),
-        stopwatch=stopwatch,
-        refused=refused,
-        rejected=rejected,
-        debug=debug,
-    )
 
 
 def _resized(image: U8, size_px: tuple[int, int]) -> U8:

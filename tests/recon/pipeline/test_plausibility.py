@@ -10,10 +10,10 @@ from typing import cast
 import numpy as np
 
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
+from recon.pipeline.stages import Plausible
+from recon.pipeline.views import StereoCandidate
 from recon.stereo.reprojection import plausible
 from recon.types import F64, U8, DepthMap, PosePrior
-from service.flight.stages import Plausible
-from service.flight.viewpoints import StereoCandidate
 
 K = np.array([[100.0, 0, 59.5], [0, 100.0, 39.5], [0, 0, 1]])
 SHAPE = (80, 120)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
@@ -12,16 +10,16 @@ import pytest
 from recon import se3
 from recon.mapping.disagreement import MIN_FACTOR
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
+from recon.pipeline.surface_map import SurfaceMap
+from recon.pipeline.views import KNOWN_ROWS
 from recon.types import F64, DepthMap
 from service.cameras.lens import SIGMA_K1
-from service.flight.surface_map import MAX_OVER, PagedMap, SurfaceMap
-from service.flight.viewpoints import KNOWN_ROWS, StereoCandidate
-from service.progress import Stopwatch
+from service.flight.paged_map import MAX_OVER, PagedMap
+from service.flight.pipeline import sigma_lens
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
 NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 CONFIG = VoxelMapConfig(voxel_m=0.5)
-NO_PAGES = Path("/dev/null/pages")
 
 
 def view(east_m: float, north_m: float = 0.0, sigma_m: float = 0.2) -> DepthMap:
@@ -123,21 +121,19 @@ def test_an_uncertain_lens_widens_what_is_stored_and_not_the_choice(
     assumed: tuple[str, ...], sigma_focal: float, share: float
 ) -> None:
     """By a share of the depth; a better view still counts as better."""
-    surface = SurfaceMap(NO_PAGES, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], assumed, sigma_focal)
+    surface = SurfaceMap(2.0 * K[0, 0], sigma_lens=sigma_lens(assumed, sigma_focal))
     first, better = (view(0.0, sigma_m=sigma) for sigma in (0.2, 0.05))
-    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=KNOWN_ROWS))
-    sigma, fresh = surface(candidate, first, first.T_world_camera)
+    sigma, fresh = surface(0, first, KNOWN_ROWS, first.T_world_camera)
     np.testing.assert_allclose(sigma, np.hypot(0.2, share * first.depth_m), rtol=1e-4)
     assert fresh.all() and sigma.dtype == np.float32
-    assert surface(candidate, better, better.T_world_camera)[1].all()
+    assert surface(0, better, KNOWN_ROWS, better.T_world_camera)[1].all()
 
 
 def test_an_unknown_distortion_widens_the_sigma_towards_the_corners() -> None:
     """By the change of disparity that k1 of one sigma makes, on average over both axes."""
-    surface = SurfaceMap(NO_PAGES, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0], ("distortion",))
+    surface = SurfaceMap(2.0 * K[0, 0], sigma_k1=SIGMA_K1)
     seen = view(0.0, sigma_m=0.2)
-    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=KNOWN_ROWS))
-    sigma, _ = surface(candidate, seen, seen.T_world_camera)
+    sigma, _ = surface(0, seen, KNOWN_ROWS, seen.T_world_camera)
     h = sigma.shape[0]
     row, column, k1, b = h - 1, 0, SIGMA_K1, 1e-4
     at = np.array([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]])
@@ -152,26 +148,19 @@ def test_an_unknown_distortion_widens_the_sigma_towards_the_corners() -> None:
 
 
 def test_an_unknown_readout_widens_the_sigma_and_gives_way_to_what_is_seen_later() -> None:
-    surface = SurfaceMap(NO_PAGES, 1_000_000, 0.0, Stopwatch(), 2.0 * K[0, 0])
+    surface = SurfaceMap(2.0 * K[0, 0])
     seen = view(0.0, sigma_m=0.05)
-    unsure, sure = (
-        cast(
-            StereoCandidate,
-            SimpleNamespace(segment=0, rows_share=np.full((1, 1), share, np.float32)),
-        )
-        for share in (0.03, 0.0)
-    )
-    sigma, _ = surface(unsure, seen, seen.T_world_camera)
+    unsure, sure = (np.full((1, 1), share, np.float32) for share in (0.03, 0.0))
+    sigma, _ = surface(0, seen, unsure, seen.T_world_camera)
     np.testing.assert_allclose(sigma, np.hypot(0.05, 0.03 * seen.depth_m), rtol=1e-5)
-    sigma, better = surface(sure, seen, seen.T_world_camera)
+    sigma, better = surface(0, seen, sure, seen.T_world_camera)
     np.testing.assert_allclose(sigma, MIN_FACTOR * 0.05, rtol=1e-5)  # the same image agrees wholly
     assert better.all()
 
 
 @pytest.mark.parametrize(("reduced", "expected"), [(1.0, 0.11 / 0.075), (1.2, 0.11 / 0.09), (2, 1)])
 def test_images_that_are_not_reduced_are_noisier(reduced: float, expected: float) -> None:
-    surface = SurfaceMap(NO_PAGES, 1_000_000, 0.0, Stopwatch(), reduced * K[0, 0])
+    surface = SurfaceMap(reduced * K[0, 0])
     seen = view(0.0)
-    candidate = cast(StereoCandidate, SimpleNamespace(segment=0, rows_share=KNOWN_ROWS))
-    sigma, _ = surface(candidate, seen, seen.T_world_camera)
+    sigma, _ = surface(0, seen, KNOWN_ROWS, seen.T_world_camera)
     np.testing.assert_allclose(sigma, expected * 0.2, rtol=1e-5)

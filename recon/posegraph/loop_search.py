@@ -1,4 +1,4 @@
-"""The search for loops after each keyframe, on the thread that reconstructs."""
+"""The search for loops after each keyframe."""
 
 from __future__ import annotations
 

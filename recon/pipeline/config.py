@@ -1,0 +1,52 @@
+"""Parameters of the pipeline, and what it is timed with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from typing import Literal
+
+Timing = Callable[[str], AbstractContextManager[object]]
+"""Gives a stage by name the context that it runs in."""
+
+
+def untimed(stage: str) -> AbstractContextManager[object]:
+    """A context that measures nothing."""
+    return nullcontext()
+
+
+TWO_ONLY = "seen by two views only"
+"""Reason why a view is refused: nothing confirms its one pair."""
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """Which frames become views: "auto", by base to height; "metres", one each ``amount``;
+    "frames", ``amount`` of ``every``, evenly spread, as the paper does."""
+
+    mode: Literal["auto", "metres", "frames"] = "auto"
+    amount: float = 0.0
+    every: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class MapperConfig:
+    """Parameters of a :class:`recon.pipeline.mapper.Mapper`."""
+
+    baseline: Baseline = field(default_factory=Baseline)
+    pairs: int = 4  # partners of a view, at most
+    base_to_height: float = 0.1  # motion between the odometry's keyframes over the distance
+    seeks_readout: bool = False  # the shutter's readout is a start, to be found by the images
+    guide_width_px: int = 1280  # of the images that guide the upsampling
+    stereo_width_px: int = 320
+    upsample: bool = True
+    labels: int = 16  # of disparity, at least
+    iterations: int = 5  # of belief propagation per level
+    loops: bool = True
+    loop_views: int = 400  # keyframes kept for loop detection
+    graph_keyframes: int = 400  # nodes of the pose graph; above that, keyframes are interpolated
+    resolution_m: float = 0.0  # of the map, at least; 0: as fine as the images
+    sigma_lens: float = 0.0  # sigma of depth over depth by a lens that is not known
+    sigma_k1: float = 0.0  # of the lens's first radial coefficient
+    keeps_debug: bool = False  # the images of each view's stages

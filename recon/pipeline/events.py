@@ -1,0 +1,39 @@
+"""What the pipeline has to say: frames and keyframes with their poses, and corrections of both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from recon.tracking.odometry import Tracked
+from recon.tracking.relative_pose import RelativePose
+from recon.types import Keyframe, Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramePosed:
+    """A frame went through tracking. One that was lost comes again where the next one places it."""
+
+    seq: int
+    time_ns: int
+    tracked: Tracked
+    pose: Pose | None = None  # in the world; by telemetry alone when vision fails
+    reference: RelativePose | None = None  # gives its pose again, as it is known later
+    is_view: bool = False  # the frame takes part in stereo and may become a keyframe
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeReady:
+    """A view has its depth."""
+
+    keyframe: Keyframe
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosesChanged:
+    """Keyframes, by number, that came before and whose pose is better now."""
+
+    poses: Mapping[int, Pose]
+
+
+Event = FramePosed | KeyframeReady | PosesChanged

@@ -1,0 +1,144 @@
+"""Poses of all frames in the world, each by the keyframe at or before it."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from recon import se3
+from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
+from recon.pipeline.views import UndistortedFrame
+from recon.posegraph.between_keyframes import carried as carried_by_telemetry
+from recon.poses import carried
+from recon.tracking.odometry import Tracked, Tracking
+from recon.tracking.relative_pose import RelativePose
+from recon.types import F64, Pose, PosePrior
+
+
+class FallbackPosition(NamedTuple):
+    """Where a frame is as long as no keyframe carries it."""
+
+    place_m: F64  # (3,) in the world
+    sigma_m: F64  # (3,)
+    sources: tuple[str, ...] = ("vision",)
+
+
+class FramePoses:
+    """Places frames by the :class:`GraphUpdate` of the newest view, so that they never wait for
+    the graph; by the graph itself after :meth:`finish`."""
+
+    def __init__(self, keyframes: KeyframeMap, is_settled: Callable[[RelativePose], bool]) -> None:
+        """``is_settled`` marks frames whose reference keyframe is no longer adjusted."""
+        self._map, self._is_settled = keyframes, is_settled
+        self._views: list[RelativePose] = []  # reconstructed, in order
+        self._settled = 0  # the first so many no longer change
+        self._fallbacks: dict[int, tuple[F64, FallbackPosition]] = {}
+        # by segment, its last frame with a fix
+        self._seen: tuple[PosePrior, Pose, int] | None = None  # the last frame placed by vision
+        self._newest: Pose | None = None  # of a view; None again once all is done
+        self._aligned = -1  # the newest segment that has a similarity to the world
+
+    def take(self, view: RelativePose, update: GraphUpdate) -> None:
+        """Let a view that is in the graph carry frames from now on."""
+        self._views.append(view)
+        self._newest = update.pose
+        self._aligned = view.segment if update.is_placed else self._aligned
+
+    def settle(self) -> None:
+        """Release the keyframes that no longer change."""
+        for i in range(self._settled, len(self._views)):
+            if not self._is_settled(self._views[i]):
+                return
+            self._views[i] = self._views[i].settled()
+            self._settled += 1
+
+    def finish(self) -> None:
+        """Place frames by the whole graph from now on."""
+        self._newest = None
+
+    def follow(self, prior: PosePrior, frame: RelativePose) -> Pose:
+        """A new frame in the world."""
+        pose = self.pose(frame, self._fallback(prior, frame))
+        self._seen = prior, pose, frame.segment
+        return pose
+
+    def _fallback(self, prior: PosePrior, frame: RelativePose) -> FallbackPosition:
+        """A frame at its fix, or as far from the last one as the odometry has it.
+
+        Heading and scale of the odometry are not known: the sigma grows by the way.
+        """
+        at_m, fix, sigma = frame.T_odom_camera[:3, 3], prior.position_m, prior.sigma_position_m
+        if fix is not None and sigma is not None:
+            self._fallbacks[frame.segment] = at_m, FallbackPosition(fix, sigma, ("gnss",))
+        start = at_m, FallbackPosition(at_m, np.ones(3))
+        from_m, known = self._fallbacks.setdefault(frame.segment, start)
+        way_m = at_m - from_m
+        sigma_m = np.hypot(known.sigma_m, np.linalg.norm(way_m))
+        return FallbackPosition(known.place_m + way_m, sigma_m, known.sources)
+
+    def _has_fix(self, segment: int) -> bool:
+        return segment in self._fallbacks and "gnss" in self._fallbacks[segment][1].sources
+
+    def _is_aligned(self, segment: int) -> bool:
+        """True when the segment has a similarity to the world; in flight, of the newest one."""
+        if self._newest is not None:
+            return segment == self._aligned
+        return self._map.graph.segments.known(segment) is not None
+
+    def pose(self, frame: RelativePose, fallback: FallbackPosition) -> Pose:
+        """A frame in the world, carried by the view at or before it where it can.
+
+        A segment too short to be aligned has no scale and no heading: its frames stay at their
+        fixes.
+        """
+        T_odom_camera, view = frame.T_odom_camera, self._view_of(frame)
+        if view is None or (self._has_fix(frame.segment) and not self._is_aligned(frame.segment)):
+            place_m, sigma_m, sources = fallback
+            T = se3.compose(T_odom_camera[:3, :3], place_m)
+            covariance = se3.about(-place_m, np.diag(np.r_[np.ones(3), np.square(sigma_m)]))
+            return Pose(T, covariance, sources)
+        # In flight no other view than the newest carries a new frame.
+        known = self._newest or self._map.trajectory.pose(view.seq)
+        pose = carried(known, se3.inverse(view.T_odom_camera) @ T_odom_camera)
+        after = self._map.graph.refuted.get(view.seq) if self._newest is None else None
+        return pose if after is None else self._doubted(pose, view.seq, after)
+
+    def _view_of(self, frame: RelativePose) -> RelativePose | None:
+        """The view at or before a frame, or its segment's first; None without any."""
+        after = bisect_right(self._views, frame.seq, key=lambda view: view.seq)
+        for view in self._views[max(after - 1, 0) : after + 1]:
+            if view.segment == frame.segment:
+                return view
+        return None
+
+    def _doubted(self, pose: Pose, before: int, after: int) -> Pose:
+        """A frame between two keyframes where vision is wrong: as unsure as its step is long."""
+        step_m = self._map.trajectory.step_between(before, after)[:3, 3]
+        spread = np.diag(np.r_[np.ones(3), np.full(3, float(step_m @ step_m))])
+        about = se3.about(-pose.T_world_camera[:3, 3], spread)
+        return replace(pose, covariance=pose.covariance + about)
+
+    def by_telemetry(self, image: UndistortedFrame, tracked: Tracked) -> Pose | None:
+        """A lost frame where telemetry alone says the camera is; None without attitude, heading
+        or position.
+
+        Telemetry's error when vision was lost is subtracted, so that the track continues.
+        """
+        prior = image.prior
+        R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
+        if tracked.state is not Tracking.LOST or R is None or position is None or sigma is None:
+            return None
+        if prior.sigma_yaw_rad > 1.0:
+            return None
+        T = se3.compose(R, position)
+        if self._seen is not None:
+            before, seen, segment = self._seen
+            if segment == self._aligned:
+                T = carried_by_telemetry(before, prior, seen.T_world_camera, None, 0.0)
+        tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
+        covariance = se3.about(-T[:3, 3], np.diag(np.square([tilt, tilt, yaw, *sigma])))
+        return Pose(T, covariance, ("attitude", "gnss", "dead reckoning"))

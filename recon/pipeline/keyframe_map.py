@@ -1,0 +1,125 @@
+"""The map of keyframes: the pose graph, loops, and where each view is in it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from recon.pipeline.config import Timing
+from recon.pipeline.views import StereoCandidate
+from recon.posegraph.anchors import height_above, height_below
+from recon.posegraph.level_ground import MAX_LEVELLED_SHARE, levelled
+from recon.posegraph.loop_search import LoopSearch
+from recon.posegraph.pieces import Pieces
+from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.trajectory import Trajectory
+from recon.types import F64, DepthMap, Keyframe, Pose
+
+FARTHEST_M = 1e6
+"""Maximum distance from the scan's origin."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphUpdate:
+    """The answer of the graph once a view is in it; all that tracking needs of it."""
+
+    pose: Pose  # of the view
+    is_placed: bool  # its segment has a similarity to the world
+    is_near: bool = True  # at a possible distance
+    changed: Mapping[int, Pose] = field(default_factory=dict)  # of keyframes published before
+    keyframe: Keyframe | None = None
+
+
+class KeyframeMap:
+    """Places keyframes in the world. It belongs to who reconstructs, until all is done."""
+
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        loops: LoopSearch | None,
+        rejected: Counter[str],
+        timing: Timing,
+    ) -> None:
+        self.trajectory, self._loops = trajectory, loops
+        self.views = self.levelled = 0  # keyframes, and those whose ground is taken as level
+        self._rejected, self._timing = rejected, timing
+        self._pieces = Pieces()
+        self._T_map = np.eye(4)  # of the last keyframe
+
+    @property
+    def graph(self) -> PoseGraph:
+        """That places the keyframes."""
+        return self.trajectory.graph
+
+    @property
+    def is_levelled(self) -> bool:
+        """True when what is level follows from the ground: too many views are off the mount."""
+        return self.levelled > MAX_LEVELLED_SHARE * self.views
+
+    @property
+    def held(self) -> dict[str, int]:
+        """Views that are remembered for loops, and keyframes in the graph."""
+        views = 0 if self._loops is None else len(self._loops)
+        return {"loop_views": views, "graph_keyframes": len(self.graph)}
+
+    def add(
+        self,
+        view: StereoCandidate,
+        step: F64 | None,
+        covariance: F64,
+        depth: DepthMap | None,
+    ) -> GraphUpdate:
+        """Append a view and look for loops.
+
+        ``step`` (4, 4) and ``covariance`` (6, 6) are those of
+        :class:`recon.pipeline.stages.Register`.
+        """
+        T_odom = view.view.T_odom_camera
+        self._T_map = T_odom if step is None else self._T_map @ step
+        up = T_odom[2, :3]
+        below = height_below(depth, up) if depth is not None else None
+        height = (below, 0.0) if below is not None else height_above(view.points, up)
+        prior = levelled(view.prior, view.points)
+        self.views += 1
+        self.levelled += prior is not view.prior
+        self.trajectory.add(
+            view.seq, view.segment, self._T_map, prior, height, view.time_ns, covariance
+        )
+        if depth is not None and self._loops is not None:
+            with self._timing("loops"):
+                self._loops.look(view.seq, view.segment, view.view.gray, view.view.K, depth)
+        pose = self.trajectory.pose(view.seq)
+        is_near = bool(np.abs(pose.T_world_camera[:3, 3]).max() < FARTHEST_M)
+        if depth is not None and is_near:
+            self.trajectory.publish(view.seq, pose)
+        elif depth is not None:
+            self._rejected["placed impossibly far away"] += 1
+        is_placed = self.graph.segments.known(view.segment) is not None
+        return GraphUpdate(pose, is_placed, is_near, self.changed() if depth is not None else {})
+
+    def changed(self, final: bool = False) -> dict[int, Pose]:
+        """Better poses of keyframes published before, which count as published from now on."""
+        found = self.trajectory.moved(final)
+        for seq, pose in found.items():
+            self.trajectory.publish(seq, pose)
+        return found
+
+    def measured(self, view: StereoCandidate, keyframe: Keyframe) -> None:
+        """Count the surface of a view that became a keyframe."""
+        points = int(np.count_nonzero(keyframe.fresh & np.isfinite(keyframe.depth.depth_m)))
+        self._pieces.add(keyframe.seq, view.segment, points, view.prior)
+
+    def map_pose(self, seq: int) -> F64:
+        """(4, 4) T_map_camera of a keyframe in its segment's chain."""
+        return self.trajectory.map_pose(seq)
+
+    def apart(self) -> list[tuple[int, int]]:
+        """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
+        return self._pieces.apart(self.graph)
+
+    def refuted(self) -> list[tuple[int, int]]:
+        """Keyframes between which vision is wrong, so that their depth is, too."""
+        return list(self.graph.refuted.items())

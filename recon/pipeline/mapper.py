@@ -1,0 +1,312 @@
+"""Figure 1 of the paper: images and telemetry in, posed depth images out.
+
+:meth:`Mapper.track` is the upper row of the figure, up to the virtual stereo camera;
+:meth:`Mapper.reconstruct` is the lower row, from a stereo view to a keyframe. Every box is one
+line with its equation.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from recon.backends import Backend, DenseStages
+from recon.backends.cpu import CpuBackend
+from recon.mapping.cloud_fusion import cloud_of, fuse
+from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
+from recon.pipeline.config import Baseline, MapperConfig, Timing, untimed
+from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.frame_poses import FramePoses
+from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
+from recon.pipeline.stages import (
+    Carry,
+    MakeKeyframe,
+    PairStages,
+    Plausible,
+    Rectify,
+    Register,
+    Track,
+    Undistort,
+)
+from recon.pipeline.surface_map import KnownSurface, SurfaceMap
+from recon.pipeline.views import StereoCandidate, StereoViews, UndistortedFrame, Viewpoints
+from recon.posegraph.loop_search import LoopSearch
+from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.trajectory import Trajectory
+from recon.stereo.belief_propagation import BeliefPropagationConfig
+from recon.stereo.posed_image import VirtualStereoConfig
+from recon.stereo.reprojection import DepthFusionConfig
+from recon.stereo.upsampling import UpsamplingConfig
+from recon.tracking.known_track import KnownTrack
+from recon.tracking.localisation import OdometryConfig
+from recon.tracking.odometry import Odometry, Tracked, Tracking
+from recon.types import Array, Camera, Frame, Keyframe, PointCloud, Pose, PosePrior
+
+__all__ = ["Mapper", "MapperConfig"]
+
+Reconstruct = Callable[[StereoCandidate], GraphUpdate]
+
+
+class Worker(Protocol):
+    """Does the work of :meth:`Mapper.reconstruct`, view by view."""
+
+    def offer(self, item: StereoCandidate) -> None: ...
+
+    def finished(self, everything: bool = False) -> list[tuple[StereoCandidate, GraphUpdate]]: ...
+
+    def close(self) -> None: ...
+
+
+class InTurn:
+    """Reconstructs each view before the next frame is looked at."""
+
+    def __init__(self, work: Reconstruct) -> None:
+        self._work, self._done = work, list[tuple[StereoCandidate, GraphUpdate]]()
+
+    def offer(self, item: StereoCandidate) -> None:
+        """Do the work of one view."""
+        self._done.append((item, self._work(item)))
+
+    def finished(self, everything: bool = False) -> list[tuple[StereoCandidate, GraphUpdate]]:
+        """Views with their results, once each."""
+        done, self._done = self._done, []
+        return done
+
+    def close(self) -> None:
+        """Nothing is left to do."""
+
+
+class Mapper:
+    """One scan: :meth:`add` every frame in the order of time, then call :meth:`finish`.
+
+    It has no thread, clock or file of its own. ``worker`` may run :meth:`reconstruct` on another
+    thread, of which ``keyframes``, ``surface`` and the stages of the lower row are then part.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: MapperConfig | None = None,
+        backend: Backend | None = None,
+        known: KnownTrack | None = None,
+        new_map: Callable[[VoxelMapConfig], KnownSurface] = VoxelMap,
+        worker: Callable[[Reconstruct], Worker] = InTurn,
+        timing: Timing = untimed,
+        keeps_cloud: bool = True,
+    ) -> None:
+        """Raises ValueError for an unusable camera model.
+
+        A ``known`` track takes the odometry's place; ``new_map`` makes the map of known surface;
+        ``timing`` measures the stages; ``keeps_cloud`` holds all keyframes for :meth:`cloud`.
+        """
+        self.config = config = config or MapperConfig()
+        backend = backend or CpuBackend()
+        self.refused = Counter[str]()  # frames and views, by reason; written while tracking
+        self.rejected = Counter[str]()  # pairs and keyframes; written while reconstructing
+        self.debug: dict[str, Array] | None = {} if config.keeps_debug else None
+        self._timing = timing
+        self.undistort = Undistort(camera, config.guide_width_px, timing)
+        self.odometry = known or Odometry(
+            self.undistort.tracking_camera,
+            OdometryConfig(base_to_height=config.base_to_height),
+            camera,
+            seeks_readout=config.seeks_readout,
+        )
+        selection = Viewpoints(config.baseline, config.pairs, all_known=known is not None)
+        self.follow = Track(self.odometry, selection, self.refused, timing)
+        self.views = StereoViews(
+            selection, self.odometry, self.undistort.camera, self.undistort.valid, self.refused
+        )
+        stereo = VirtualStereoConfig(
+            min_base_to_height=selection.min_base_to_height, width_px=config.stereo_width_px,
+            guided=config.upsample, labels=config.labels,
+        )  # fmt: skip
+        dense = DenseStages(
+            BeliefPropagationConfig(iterations=config.iterations),
+            UpsamplingConfig(),
+            DepthFusionConfig(),
+        )
+        self.carry = Carry(backend, timing)
+        self.rectify = Rectify(stereo, self.rejected, self.debug, timing)
+        self.stereo = PairStages(backend, dense, self.debug, timing)
+        self.plausible = Plausible(self.rejected)
+        self.register = Register(backend, timing)
+        trajectory = Trajectory(PoseGraph(PoseGraphConfig(max_nodes=config.graph_keyframes)))
+        loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
+        self.keyframes = KeyframeMap(trajectory, loops, self.rejected, timing)
+        self.surface = SurfaceMap(
+            float(camera.K[0, 0]), config.resolution_m, config.sigma_lens, config.sigma_k1, new_map
+        )
+        self.keyframe = MakeKeyframe(self.debug)
+        self.frames = FramePoses(self.keyframes, self.follow.is_settled)
+        self._lost: UndistortedFrame | None = None  # the last frame, where it has no pose
+        self._kept: dict[int, Keyframe] | None = {} if keeps_cloud else None
+        self._worker = worker(self.reconstruct)
+
+    # ---- the figure --------------------------------------------------------------------
+
+    def add(self, frame: Frame) -> tuple[Event, ...]:
+        """One frame of a recording; those that hardly moved are not looked at.
+
+        Raises ValueError when the image is not of the camera model's size.
+        """
+        return self.skip(frame.seq, frame.time_ns, frame.prior) or self.track(frame)
+
+    def skip(self, seq: int, time_ns: int, prior: PosePrior) -> tuple[Event, ...]:
+        """The event of a frame that need not be seen; none for one that :meth:`track` must take."""
+        if not self.follow.can_skip(time_ns, prior):  # frames are followed as fast as images move
+            return ()
+        return (FramePosed(seq, time_ns, Tracked(Tracking.SKIPPED, self.odometry.segment)),)
+
+    def track(self, frame: Frame) -> tuple[Event, ...]:
+        """One frame: where the camera is, and which views have their partners by now.
+
+        Raises ValueError when the image is not of the camera model's size.
+        """
+        image = self.undistort(frame)  # section 2.1
+        tracked = self.follow(image)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
+        late = self._late(image, tracked)
+        reference, is_view = self.views.take(image, tracked)  # virtual stereo camera, section 2.3
+        if reference is None:
+            pose = self.frames.by_telemetry(image, tracked)
+            return (FramePosed(image.seq, image.time_ns, tracked, pose),)
+        for view in self.views.ready():
+            self._worker.offer(view)  # to be reconstructed
+        done = tuple(self._finished())
+        pose = self.frames.follow(image.prior, reference)
+        posed = FramePosed(image.seq, image.time_ns, tracked, pose, reference, is_view)
+        return (*late, *done, posed)
+
+    def _late(self, image: UndistortedFrame, tracked: Tracked) -> tuple[Event, ...]:
+        """The frame before, lost until this one came: it begins this one's segment."""
+        before, self._lost = self._lost, image if tracked.state is Tracking.LOST else None
+        if before is None or tracked.before is None:
+            return ()
+        reference, is_view = self.views.take(before, tracked.before)
+        assert reference is not None
+        pose = self.frames.follow(before.prior, reference)
+        return (FramePosed(before.seq, before.time_ns, tracked.before, pose, reference, is_view),)
+
+    def reconstruct(self, view: StereoCandidate) -> GraphUpdate:
+        """One view: its depth from all its partners, its pose, and its new surface."""
+        depth = None
+        grid = self.rectify.grid(view)
+        depths = self.carry(view, grid)  # by images that are matched already
+        pairs = self.rectify(view, depths)  # virtual stereo pairs, section 2.1
+        if pairs:
+            depth = self.stereo.whole_path(pairs.values(), grid)  # Eq. 1-3 at once, on a device
+        if depth is None and (pairs or depths):
+            for partner, pair in pairs.items():
+                disparity = self.stereo.match(pair)  # belief propagation, Eq. 1
+                disparity = self.stereo.upsample(disparity, pair)  # joint bilateral, Eq. 2
+                depths[partner] = self.stereo.reproject(disparity, pair, grid)  # Eq. 3
+            self.carry.keep(view.seq, depths)
+            depth = self.stereo.fuse([*depths.values()], grid)
+        bgr = self.rectify.colours(view, grid)
+        depth = self.plausible(view, depth, bgr)  # nothing that cannot be
+        self.rectify.learn(depth)  # how far the relief of the next pairs may reach
+        step, covariance = self.register(view, depth)  # ICP onto the keyframe before
+        update = self.keyframes.add(view, step, covariance, depth)  # pose graph
+        if depth is None or not update.is_near:
+            return update
+        with self._timing("map"):  # what is new
+            T_map = self.keyframes.map_pose(view.seq)
+            sigma_m, fresh = self.surface(view.segment, depth, view.rows_share, T_map)
+        keyframe = self.keyframe(view, depth, bgr, sigma_m, fresh, update.pose)
+        self.keyframes.measured(view, keyframe)
+        return replace(update, keyframe=keyframe)
+
+    def drain(self) -> tuple[Event, ...]:
+        """The views still waiting for partners, up to one whose work failed."""
+        self.views.end_stretch()
+        for view in self.views.ready(everything=True):
+            self._worker.offer(view)
+        return tuple(self._finished(everything=True))
+
+    def finish(self) -> tuple[Event, ...]:
+        """The remaining results, and the last corrections. Raises what work raised."""
+        try:
+            events = self.drain()
+        finally:
+            self._worker.close()
+        self.surface.clear()
+        self.frames.finish()
+        return (*events, *self._changed(self.keyframes.changed(final=True)))
+
+    def _finished(self, everything: bool = False) -> Iterator[Event]:
+        """What is done, in order."""
+        for view, update in self._worker.finished(everything):
+            self.frames.take(view.reference, update)
+            if update.keyframe is not None:
+                if self._kept is not None:
+                    self._kept[view.seq] = update.keyframe
+                yield KeyframeReady(update.keyframe)
+            yield from self._changed(update.changed)
+        self.frames.settle()
+
+    def _changed(self, poses: Mapping[int, Pose]) -> Iterator[Event]:
+        if not poses:
+            return
+        if self._kept is not None:
+            self._kept |= {seq: moved(self._kept[seq], pose) for seq, pose in poses.items()}
+        yield PosesChanged(poses)
+
+    # ---- in flight ---------------------------------------------------------------------
+
+    def set_baseline(self, baseline: Baseline) -> None:
+        """Apply a new baseline from the next frame on."""
+        selection = self.views.selection
+        selection.set_baseline(baseline)
+        self.rectify.set_min_base_to_height(selection.min_base_to_height)
+
+    def set_effort(self, pairs: int, stereo_width_px: int, upsample: bool) -> None:
+        """Apply these from the next view on."""
+        self.views.selection.set_partners(pairs)
+        self.rectify.set_effort(stereo_width_px, upsample)
+
+    def take_next(self) -> None:
+        """Make the next frame with a pose a view, whatever the baseline asks for."""
+        self.views.selection.take_next()
+
+    # ---- results -----------------------------------------------------------------------
+
+    def cloud(self, voxel_m: float | None = None) -> PointCloud:
+        """All keyframes fused, in voxels as fine as the images unless ``voxel_m`` is given.
+
+        Raises ValueError for a mapper that does not keep its cloud.
+        """
+        if self._kept is None:
+            raise ValueError("this mapper was made with keeps_cloud=False")
+        apart = self.keyframes.apart()
+        kept = [k for seq, k in self._kept.items() if not any(a <= seq <= b for a, b in apart)]
+        sizes = [size for k in kept if (size := ground_sample_m(k.depth)) is not None]
+        fine = voxel_m or min(sizes, default=1.0)
+        return fuse((cloud_of(k.depth, k.bgr, k.fresh, k.time_ns) for k in kept), fine)
+
+    @property
+    def segments(self) -> int:
+        """Number of segments so far."""
+        return self.odometry.segment + 1
+
+    @property
+    def pairs(self) -> int:
+        """Stereo pairs so far."""
+        return self.rectify.pairs
+
+    def refusals(self) -> Counter[str]:
+        """Frames, views and pairs not used, by reason."""
+        return self.refused + self.rejected + self.follow.waiting
+
+
+def moved(keyframe: Keyframe, pose: Pose) -> Keyframe:
+    """The keyframe at another pose, its depth by the scale there."""
+    growth = np.float32(pose.scale / keyframe.pose.scale)
+    depth = replace(
+        keyframe.depth, depth_m=keyframe.depth.depth_m * growth,
+        sigma_m=keyframe.depth.sigma_m * growth, T_world_camera=pose.T_world_camera,
+    )  # fmt: skip
+    return replace(keyframe, depth=depth, pose=pose)

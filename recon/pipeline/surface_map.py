@@ -1,0 +1,104 @@
+"""The map of known surface: finds the new surface of a view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from recon.mapping.disagreement import Disagreement
+from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig
+from recon.stereo.reprojection import LABEL_SIGMA_PX
+from recon.types import F32, F64, Bool, DepthMap
+
+RECORDED_SIGMA_PX = 0.11
+"""Sigma of a match, in pixels of the recording: where stereo's pixels are as small, its labels are
+no better (docs/reports/simulated-flights.md)."""
+
+
+class KnownSurface(Protocol):
+    """What :class:`recon.mapping.voxel_map.VoxelMap` does."""
+
+    def __len__(self) -> int: ...
+
+    def fresh(self, depth: DepthMap) -> Bool: ...
+
+    def insert(self, depth: DepthMap, mask: Bool | None = None) -> int: ...
+
+
+class SurfaceMap:
+    """Compares each view with the surface known before, and remembers it.
+
+    :meth:`clear` may be called from another thread.
+    """
+
+    def __init__(
+        self,
+        focal_px: float,
+        resolution_m: float = 0.0,
+        sigma_lens: float = 0.0,
+        sigma_k1: float = 0.0,
+        new_map: Callable[[VoxelMapConfig], KnownSurface] = VoxelMap,
+    ) -> None:
+        """``focal_px`` is of the recorded images.
+
+        ``sigma_lens`` of depth over depth and ``sigma_k1`` of the lens's first radial coefficient
+        widen all sigmas; ``new_map`` makes the empty map of a scan.
+        """
+        self._focal_px, self._resolution_m = focal_px, resolution_m
+        self._sigma_lens, self._sigma_k1, self._new_map = sigma_lens, sigma_k1, new_map
+        self.known: KnownSurface | None = None
+        self._disagreement, self._segment = Disagreement(), -1
+
+    def __call__(
+        self, segment: int, depth: DepthMap, rows_share: F32, T_map_camera: F64
+    ) -> tuple[F32, Bool]:
+        """((h, w) sigma, which holds disagreement of views, an unknown readout, an assumed lens;
+        (h, w) surface that is new or better).
+
+        ``rows_share`` (n, m), all over the image, is the sigma of depth over depth by the rows'
+        motion.
+        """
+        if segment != self._segment:
+            self._disagreement.forget()
+            self._segment = segment
+        reduced = self._focal_px / float(depth.K[0, 0])
+        noise = np.float32(max(1.0, RECORDED_SIGMA_PX / LABEL_SIGMA_PX / reduced))
+        share = cv2.resize(rows_share, depth.depth_m.shape[::-1])
+        sigma_m = np.hypot(depth.sigma_m * noise, share * depth.depth_m)
+        in_map = replace(depth, sigma_m=sigma_m, T_world_camera=T_map_camera)
+        factor = np.float32(self._disagreement.take(in_map))
+        in_map = replace(in_map, sigma_m=in_map.sigma_m * factor)
+        known = self.known
+        if known is None:
+            known = self.known = self._empty(depth)
+        fresh = known.fresh(in_map)
+        known.insert(in_map, fresh)
+        return np.hypot(in_map.sigma_m, self._bending(depth) * depth.depth_m), fresh
+
+    def _bending(self, depth: DepthMap) -> F32:
+        """Sigma by the lens over depth, (h, w) or a scalar.
+
+        k1 shifts a point at the radius r (of the focal length) by k1 r^3. A pair that sees it with
+        the baseline b shifts its disparity by b k1 (3 r^2 along it, r^2 across): 2 r^2 on average.
+        """
+        if not self._sigma_k1:
+            return np.asarray(self._sigma_lens, np.float32)
+        h, w = depth.depth_m.shape
+        K = depth.K
+        x, y = (np.arange(w) - K[0, 2]) / K[0, 0], (np.arange(h) - K[1, 2]) / K[1, 1]
+        bent = 2.0 * self._sigma_k1 * np.add.outer(y * y, x * x)
+        return np.asarray(np.hypot(bent, self._sigma_lens), np.float32)
+
+    def _empty(self, depth: DepthMap) -> KnownSurface:
+        """A map as fine as the first view."""
+        ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
+        voxel_m = max(2.0 * ground_m, self._resolution_m, 1e-3)
+        return self._new_map(VoxelMapConfig(voxel_m=voxel_m))
+
+    def clear(self) -> None:
+        """Reset the map: all surface counts as unseen."""
+        self.known = None

@@ -1,0 +1,110 @@
+"""A voxel map with little in memory: parts flown long ago are on disk.
+
+A mission of hours sees more voxels than a companion computer should hold. Tiles that no view
+has touched for longest go to files, and come back before a view looks at their ground again.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, Voxels, tile_of, tiles_under
+from recon.types import I64, Bool, DepthMap
+
+log = logging.getLogger(__name__)
+
+MAX_OVER = 4
+
+
+class PagedMap:
+    """A voxel map (:mod:`recon.mapping.voxel_map`) with about ``max_voxels`` in memory at most.
+
+    The tiles under the view stay, whatever they hold; where they alone have :data:`MAX_OVER`
+    times as many, the half seen longest ago is forgotten, and that surface is sent again.
+
+    ``folder`` is made when the first tile leaves and removed by :meth:`close`. A disk that
+    takes no more pages costs bandwidth, not data: the map then forgets the oldest half when
+    it is full, and that surface is sent again.
+    """
+
+    def __init__(self, config: VoxelMapConfig, folder: Path, max_voxels: int = 2_000_000) -> None:
+        if max_voxels < 1000:
+            raise ValueError(f"max_voxels is {max_voxels}, must be at least 1000")
+        self.folder, self.max_voxels = folder, max_voxels
+        largest = min(config.largest_voxels, MAX_OVER * max_voxels)
+        self._map = VoxelMap(replace(config, largest_voxels=largest))
+        self._margin_m = config.voxel_m * (config.largest_reach_voxels + 1)
+        self._away: set[int] = set()  # tiles that are on disk
+        self._broken = False
+
+    def __len__(self) -> int:
+        """Number of voxels in memory."""
+        return len(self._map)
+
+    @property
+    def tiles_on_disk(self) -> int:
+        """How many tiles are on disk now."""
+        return len(self._away)
+
+    def fresh(self, depth: DepthMap) -> Bool:
+        """(h, w) pixels whose surface is new, or clearly better than what is held."""
+        self._bring_back(self._under(depth))
+        return self._map.fresh(depth)
+
+    def insert(self, depth: DepthMap, mask: Bool | None = None) -> int:
+        """Remember the surface of ``depth`` where ``mask``; how many voxels are new."""
+        here = self._under(depth)
+        self._bring_back(here)
+        new = self._map.insert(depth, mask)
+        if len(self._map) > self.max_voxels and not self._broken:
+            self._send_away(here)
+        return new
+
+    def close(self) -> None:
+        """Remove the files; the map is of no use to anyone but this scan."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self._away.clear()
+
+    def _under(self, depth: DepthMap) -> I64:
+        return tiles_under(depth, self._map.config.voxel_m, self._margin_m)
+
+    def _bring_back(self, tiles: I64) -> None:
+        for tile in self._away.intersection(tiles.tolist()):
+            self._away.discard(tile)
+            path = self._path(tile)
+            try:
+                with np.load(path) as page:
+                    self._map.put(Voxels(page["keys"], page["sigma_m"], page["seen"]))
+                path.unlink()
+            except (OSError, KeyError, ValueError, EOFError) as error:
+                log.warning(
+                    "page %s of the map is lost (%s): its ground counts as new", path, error
+                )
+
+    def _send_away(self, keep: I64) -> None:
+        """Page the oldest tiles out until the map is at about half its limit."""
+        tiles, counts = self._map.oldest_tiles()
+        away = ~np.isin(tiles, keep)
+        tiles, counts = tiles[away], counts[away]
+        surplus = len(self._map) - self.max_voxels // 2
+        tiles = tiles[: int(np.searchsorted(np.cumsum(counts), surplus)) + 1]
+        taken = self._map.take(tiles)
+        home = tile_of(taken.keys)
+        for tile in tiles.tolist():
+            page = taken.where(home == tile)
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                np.savez(self._path(tile), keys=page.keys, sigma_m=page.sigma_m, seen=page.seen)
+                self._away.add(tile)
+            except OSError as error:
+                log.warning("the map cannot be paged to %s: %s", self.folder, error)
+                self._map.put(page)
+                self._broken = True
+
+    def _path(self, tile: int) -> Path:
+        return self.folder / f"{tile}.npz"

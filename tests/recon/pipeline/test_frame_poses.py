@@ -1,0 +1,163 @@
+"""Poses of frames: by the view at or before them, or at their fixes where none carries them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.pipeline.config import untimed
+from recon.pipeline.frame_poses import FallbackPosition, FramePoses
+from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
+from recon.posegraph.alignment import Similarity
+from recon.posegraph.trajectory import Trajectory
+from recon.poses import sigma_m
+from recon.tracking.relative_pose import RelativePose
+from recon.types import F64, Pose, PosePrior
+
+RNG = np.random.default_rng(4)
+
+
+def frame_at(seq: int, north_m: float) -> RelativePose:
+    return RelativePose(seq, 3, se3.compose(np.eye(3), np.array([0.0, north_m, 50.0])))
+
+
+def empty() -> KeyframeMap:
+    return KeyframeMap(Trajectory(), None, Counter(), untimed)
+
+
+def following() -> Any:
+    frames = FramePoses(empty(), lambda frame: True)
+
+    def follow(seq: int, north_m: float, fix: F64 | None = None) -> Pose:
+        sigma = None if fix is None else np.full(3, 5.0)
+        prior = PosePrior(position_m=fix, sigma_position_m=sigma)
+        pose = frames.follow(prior, frame_at(seq, north_m))
+        place_m = pose.T_world_camera[:3, 3]
+        published = FallbackPosition(place_m, np.full(3, sigma_m(pose) / 3**0.5))
+        again = frames.pose(frame_at(seq, north_m), published)
+        np.testing.assert_allclose(again.T_world_camera, pose.T_world_camera)
+        assert sigma_m(again) == pytest.approx(sigma_m(pose))
+        return pose
+
+    return follow
+
+
+def test_a_frame_that_no_keyframe_carries_stands_at_its_fix() -> None:
+    """Stills fly south; without attitude the odometry has them fly north."""
+    follow = following()
+    for seq, north_m in enumerate((28.0, 56.0, 84.0), 1):
+        fix = np.array([3.0, -north_m, 50.0])
+        pose = follow(seq, north_m, fix)
+        np.testing.assert_allclose(pose.T_world_camera[:3, 3], fix)
+        np.testing.assert_allclose(pose.T_world_camera[:3, :3], np.eye(3))
+        assert sigma_m(pose) == pytest.approx(5.0 * 3**0.5)
+        assert pose.sources == ("gnss",)
+
+
+def test_sigma_covers_the_way_from_the_last_fix() -> None:
+    follow = following()
+    follow(1, 28.0, np.array([3.0, -28.0, 50.0]))
+    for seq, north_m in enumerate((56.0, 84.0), 2):
+        pose = follow(seq, north_m)
+        off_m = np.linalg.norm(pose.T_world_camera[:3, 3] - [3.0, -north_m, 50.0])
+        assert off_m == pytest.approx(2.0 * (north_m - 28.0))
+        assert off_m < 2.0 * sigma_m(pose)
+        assert sigma_m(pose) == pytest.approx(3**0.5 * np.hypot(5.0, north_m - 28.0))
+
+
+def test_frames_of_a_flight_without_fixes_stand_where_the_odometry_has_them() -> None:
+    follow = following()
+    for seq, north_m in enumerate((28.0, 56.0), 1):
+        pose = follow(seq, north_m)
+        np.testing.assert_allclose(pose.T_world_camera, frame_at(seq, north_m).T_odom_camera)
+        assert sigma_m(pose) == pytest.approx(3**0.5 * np.hypot(1.0, north_m - 28.0))
+        assert pose.sources == ("vision",)
+
+
+def refined(seq: int, segment: int, T_odom_camera: F64) -> Any:
+    """A keyframe of the odometry that is still adjusted."""
+    return SimpleNamespace(seq=seq, segment=segment, T_odom_camera=T_odom_camera)
+
+
+def some_pose() -> F64:
+    return se3.exp(RNG.normal(size=6))
+
+
+def test_views_keep_their_places_when_they_settle() -> None:
+    keys = [refined(n, n // 50, some_pose()) for n in range(0, 100, 10)]
+    frames = FramePoses(empty(), lambda view: view.keyframe is None or view.keyframe.seq < 70)
+    update = GraphUpdate(Pose(np.eye(4), np.eye(6)), True)
+    for key in keys:
+        frames.take(RelativePose(key.seq, key.segment, some_pose(), key), update)
+    taken = [RelativePose(n, n // 50, some_pose(), keys[n // 10]) for n in range(100)]
+    fallback = FallbackPosition(np.zeros(3), np.ones(3))
+    before = [frames.pose(frame, fallback) for frame in taken]
+    frames.settle()
+    after = [frames.pose(frame, fallback) for frame in taken]
+    for one, other in zip(before, after, strict=True):
+        assert np.array_equal(one.T_world_camera, other.T_world_camera)
+    fixed = [RelativePose(n, n // 50, taken[n].T_odom_camera) for n in (55, 85)]
+    keys[5].T_odom_camera = keys[8].T_odom_camera = some_pose()
+    settled, open_ = (frames.pose(frame, fallback).T_world_camera for frame in fixed)
+    np.testing.assert_array_equal(settled, after[55].T_world_camera)
+    assert not np.allclose(open_, after[85].T_world_camera)  # its view is still adjusted
+    alone = frames.pose(RelativePose(0, 7, np.eye(4)), fallback)
+    np.testing.assert_array_equal(alone.T_world_camera[:3, 3], np.zeros(3))
+
+
+def view_of(reference: RelativePose, prior: PosePrior | None = None) -> Any:
+    """A view without depth."""
+    return SimpleNamespace(
+        seq=reference.seq, segment=reference.segment, time_ns=0, prior=prior or PosePrior(),
+        points=np.zeros((0, 3)), view=SimpleNamespace(T_odom_camera=reference.T_odom_camera),
+    )  # fmt: skip
+
+
+def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None:
+    """The graph is at work then on another thread: nothing asks it, nothing waits for it."""
+    keyframes: Any = empty()
+    frames = FramePoses(keyframes, lambda frame: False)
+    key = refined(3, 0, some_pose())
+    frame, view = (RelativePose(seq, 0, some_pose(), key) for seq in (7, 5))
+    assert frames.follow(PosePrior(), frame).sources == ("vision",)  # nothing is reconstructed yet
+    update = keyframes.add(view_of(view), None, np.eye(6), None)
+    trajectory, known = keyframes.trajectory, keyframes.trajectory.pose(5)
+    keyframes.trajectory = None
+    fallback = FallbackPosition(np.full(3, 9.0), np.ones(3))
+    np.testing.assert_array_equal(frames.pose(frame, fallback).T_world_camera[:3, 3], np.full(3, 9))
+    frames.take(view, update)  # the view is done
+    step = se3.inverse(view.T_odom_camera) @ frame.T_odom_camera
+    step[:3, 3] *= known.scale
+    found = frames.pose(frame, fallback)
+    np.testing.assert_allclose(found.T_world_camera, known.T_world_camera @ step, atol=1e-12)
+    keyframes.trajectory = trajectory
+    assert keyframes.changed(final=True) == {}
+    frames.finish()
+    again = frames.pose(frame, fallback)
+    np.testing.assert_allclose(again.T_world_camera, found.T_world_camera, atol=1e-9)
+
+
+def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> None:
+    """Its keyframe carries them by a scale and a heading that nothing shows."""
+    keyframes: Any = empty()
+    frames = FramePoses(keyframes, lambda frame: False)
+    key, fix = refined(3, 0, np.eye(4)), np.array([20.0, -10.0, 50.0])
+    prior = PosePrior(position_m=fix, sigma_position_m=np.full(3, 5.0))
+    view, frame = (RelativePose(seq, 0, some_pose(), key) for seq in (5, 7))
+    frames.take(view, keyframes.add(view_of(view, prior), None, np.eye(6), None))
+    in_flight = frames.follow(prior, frame)
+    keyframes.changed(final=True)
+    frames.finish()
+    again = frames.pose(frame, FallbackPosition(fix, np.full(3, 5.0)))
+    for pose in (in_flight, again):
+        np.testing.assert_allclose(pose.T_world_camera[:3, 3], fix)
+        assert sigma_m(pose) == pytest.approx(5.0 * 3**0.5)
+    known = Similarity(1.0, np.eye(3), np.zeros(3), np.eye(7))
+    keyframes.graph.segments.known = lambda segment: known
+    carried = frames.pose(frame, FallbackPosition(fix, np.full(3, 5.0)))
+    assert np.linalg.norm(carried.T_world_camera[:3, 3] - fix) > 1.0

@@ -1,0 +1,88 @@
+"""A scan keeps the poses of its frames exactly, in memory that stays small."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon import se3
+from recon.tracking.relative_pose import RelativePose
+from recon.types import F64
+from service.errors import OutsideError
+from service.flight.published_frames import PublishedFrame, PublishedFrames
+
+RNG = np.random.default_rng(4)
+
+
+def refined(seq: int, segment: int, T_odom_camera: F64) -> Any:
+    """A keyframe of the odometry that is still adjusted."""
+    return SimpleNamespace(seq=seq, segment=segment, T_odom_camera=T_odom_camera)
+
+
+def some_pose() -> F64:
+    return se3.exp(RNG.normal(size=6))
+
+
+def before(limit: int) -> Any:
+    """Keyframes before ``limit`` no longer change."""
+
+    def is_settled(frame: RelativePose) -> bool:
+        return frame.keyframe is None or frame.keyframe.seq < limit
+
+    return is_settled
+
+
+def published(seq: int, key: Any, agl_m: float | None = 41.5) -> PublishedFrame:
+    reference = RelativePose(seq, key.segment, some_pose(), key)
+    place_m, is_view = RNG.normal(size=3), seq % 2 == 0
+    return PublishedFrame(10**18 + seq, reference, place_m, 0.5 + seq, agl_m, is_view)
+
+
+def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
+    keys = [refined(n, n // 20, some_pose()) for n in range(0, 40, 10)]
+    frames = [published(seq, keys[seq // 10], None if seq == 3 else 41.5) for seq in range(40)]
+    kept = PublishedFrames(tmp_path)
+    for frame in frames:
+        kept.add(frame, before(20))
+    keys[2].T_odom_camera = some_pose()  # still in the window: the newest pose counts
+    found = list(kept.corrigible())
+    assert not list(tmp_path.iterdir())  # no name: nothing is left behind
+    for one, other in zip(frames, found, strict=True):
+        assert one.reference is not None
+        assert other.reference is not None
+        assert (one.time_ns, one.agl_m, one.is_view) == (other.time_ns, other.agl_m, other.is_view)
+        assert one.sigma_m == other.sigma_m
+        assert np.array_equal(one.position_m, other.position_m)
+        assert np.array_equal(one.reference.T_odom_camera, other.reference.T_odom_camera)
+        assert one.reference.seq == other.reference.seq
+        assert one.reference.segment == other.reference.segment
+    kept.close()
+
+
+def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> None:
+    kept = PublishedFrames(tmp_path)
+    for seq in range(500):
+        key = refined(seq, 0, some_pose())
+        kept.add(published(seq, key), before(seq - 9))
+        kept.add(PublishedFrame(10**18 + seq, None, np.zeros(3), 0.0, None, False), before(seq - 9))
+    assert len(kept._fresh) <= 22
+    assert len(list(kept.corrigible())) == 500
+    kept.close()
+
+
+def test_a_full_disk_is_the_outside_worlds_fault(tmp_path: Path) -> None:
+    kept = PublishedFrames(tmp_path)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(OutsideError):
+            for seq in range(1000):
+                kept.add(published(seq, refined(seq, 0, some_pose())), before(seq))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    kept.close()
