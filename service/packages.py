@@ -16,6 +16,7 @@ EXTRAS = {
     "cryptography": "ground",
     "distributed": "cluster",
     "foxglove": "ground",
+    "gaussforge": "ground",
     "google": "ground",
     "mavsdk": "ground",
     "mcap": "ground",

@@ -75,7 +75,7 @@ def look(
     A view sees a triangle when no surface hides its corners and its middle, it faces the camera,
     and at least half of those four places have colour. ``progress`` receives the share done.
     """
-    reach = _rays(mesh)
+    reach = rays_onto(mesh)
     vertices = np.asarray(mesh.vertices_m, np.float64)
     corners = vertices[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -106,7 +106,7 @@ def look(
     return out
 
 
-def _rays(mesh: Mesh) -> Rays:
+def rays_onto(mesh: Mesh) -> Rays:
     """Exact ray casting against ``mesh``: by Open3D (Embree), else by our own slower grid."""
     try:
         import open3d as o3d

@@ -17,9 +17,11 @@ import numpy as np
 from recon import se3
 from recon.camera_model import Undistorter, rays
 from recon.surface.hole_filling import outlined
+from recon.surface.splats import COVERED, Splats, rendered
 from recon.types import F32, F64, I64, U8, Bool, Camera, Keyframe
 from service.errors import InputError
 from service.offline.exports.images import frames_at
+from service.offline.exports.splats import read_splats
 from service.offline.exports.view import ScanView
 from service.packages import needing
 from service.scans.main_piece import main_keyframes
@@ -119,6 +121,9 @@ def _products(scan: ScanView, keyframes: Sequence[Keyframe], camera: Camera) -> 
     mesh = scan.folder / "mesh.glb"
     if mesh.is_file():
         out["mesh"] = by_rays(read_glb(mesh), camera)
+    gaussians = scan.folder / "splat.ply"
+    if gaussians.is_file():
+        out["splats"] = by_gaussians(read_splats(gaussians), camera)
     return out
 
 
@@ -218,6 +223,16 @@ def by_rays(shown: Triangles, camera: Camera) -> Draw:
         return np.where(covered[..., None], np.rint(bgr), 0).astype(np.uint8), covered
 
     return draw
+
+
+def by_gaussians(splats: Splats, camera: Camera) -> Draw:
+    """Draws Gaussians as viewers do, over black."""
+
+    def view(T: F64) -> tuple[U8, Bool]:
+        rgb, opacity = rendered(splats, camera.K, camera.size_px, T)
+        return np.clip(np.rint(rgb[..., ::-1]), 0, 255).astype(np.uint8), opacity >= COVERED
+
+    return view
 
 
 def draw_points(camera: Camera, T: F64, xyz_m: F64, bgr: F32) -> tuple[U8, Bool]:

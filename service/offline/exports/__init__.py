@@ -59,6 +59,11 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
     ),
     "glb": ("model:write_glb", "mesh.glb", "The textured mesh as binary glTF."),
     "obj": ("model:write_obj", "mesh-obj", "The textured mesh as OBJ, in UTM less an offset."),
+    "splat": (
+        "splats:write_splats",
+        "splat.ply",
+        "The surface as 3D Gaussians, as PLY; or .spz.",
+    ),
     "all": ("maps:write_all", "maps", "laz and the maps in one folder, with a manifest."),
     "mcap": ("recording:write_mcap", "flight.mcap", "The scan as a recording for Foxglove."),
     "ros2": ("ros2:write_ros2", "ros2.mcap", "The scan as ROS 2 messages."),
@@ -79,6 +84,7 @@ PACKAGES = {
 ENDINGS = {
     "contours": {".json": "contours", ".gpkg": "gpkg", ".dxf": "dxf"},
     "laz": {".las": "laz"},
+    "splat": {".spz": "splat"},
 } | {kind: {".tiff": kind} for kind in ("dsm", "dtm", "ortho", "coverage")}
 """Endings of a file besides the usual one, with the kind that writes it."""
 

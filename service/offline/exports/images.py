@@ -14,7 +14,7 @@ import numpy as np
 
 from recon.camera_model import Undistorter, scaled_K
 from recon.surface.texture_views import TextureView
-from recon.types import U8, Array, Camera, Keyframe
+from recon.types import U8, Array, Keyframe
 from service.cameras import open_camera
 from service.cameras.source import CameraSource
 from service.cameras.video import VideoSource
@@ -183,14 +183,16 @@ def video_images(
     found: dict[int, TextureView] = {}
     for n, image in frames_at([k.time_ns for k in keyframes], header, video, epoch_ns, progress):
         bgra = _bgra(undistort.image(image), undistort.valid)
-        found[n] = _view(bgra, camera, keyframes[n].depth.T_world_camera, shrink)
+        whole = TextureView(bgra, camera.K, keyframes[n].depth.T_world_camera)
+        found[n] = resized(whole, shrink)
     return [found.get(n) or stored_images([k])[0] for n, k in enumerate(keyframes)]
 
 
-def _view(bgra: U8, camera: Camera, T_world_camera: np.ndarray, shrink: float) -> TextureView:
+def resized(view: TextureView, shrink: float) -> TextureView:
+    """The same view with its sides ``shrink`` (0 to 1) times as long."""
     if shrink == 1.0:
-        return TextureView(bgra, camera.K, T_world_camera)
-    w, h = (max(2, round(side * shrink)) for side in camera.size_px)
-    small = np.asarray(cv2.resize(bgra, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
-    K = scaled_K(camera.K, w / camera.size_px[0], h / camera.size_px[1])
-    return TextureView(small, K, T_world_camera)
+        return view
+    h, w = view.bgra.shape[:2]
+    size = max(2, round(w * shrink)), max(2, round(h * shrink))
+    small = np.asarray(cv2.resize(view.bgra, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return TextureView(small, scaled_K(view.K, size[0] / w, size[1] / h), view.T_world_camera)

@@ -169,7 +169,10 @@ def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None
             cloud = fused_cloud(store, job.voxel_m, progress, tile.wide).cloud
         try:
             with progress.part("surface", 0.3):
-                mesh = cut(_surface(job, cloud, keyframes, progress), tile.box)
+                mesh = cut(
+                    surface_mesh(cloud, job.voxel_m, keyframes, job.largest_faces, progress),
+                    tile.box,
+                )
         except ValueError as error:
             log.debug("tile %s: %s", tile.box, error)
             return None
@@ -226,18 +229,22 @@ def _error(fine: Mesh, level: TilePart) -> float:
     return max(float(np.quantile(off_m, 0.95)), VIEWER_ERROR_PX * texel_m)
 
 
-def _surface(
-    job: TileJob,
+def surface_mesh(
     cloud: PointCloud,
+    voxel_m: float,
     keyframes: Sequence[Keyframe],
+    largest_faces: int,
     progress: Progress,
 ) -> Mesh:
-    """The untextured mesh, with colours at its vertices."""
+    """The untextured mesh, with colours at its vertices.
+
+    Raises ValueError when there is too little surface.
+    """
     if not len(cloud):
         raise ValueError("no points")
     progress("signed distances")
-    grid = grid_over(cloud.xyz_m[:, :2].astype(np.float64), job.voxel_m, margin_cells=1)
-    return volume_mesh((k.depth for k in keyframes), rasterise(cloud, grid), job.largest_faces)
+    grid = grid_over(cloud.xyz_m[:, :2].astype(np.float64), voxel_m, margin_cells=1)
+    return volume_mesh((k.depth for k in keyframes), rasterise(cloud, grid), largest_faces)
 
 
 def mesh_extras(scan: ScanView) -> dict[str, Any]:

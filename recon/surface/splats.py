@@ -1,0 +1,415 @@
+"""A surface as 3D Gaussians, straight from posed depth images, and views of them.
+
+Each pixel of an image with a depth becomes one Gaussian (Kerbl et al. 2023,
+doi:10.1145/3592433): its place is the pixel's, two axes lie in the surface and are as long as the
+pixel's footprint, the third is as thick as the depth's sigma, and its opacity follows the number
+of views that agree. What no depth image shows is filled from a closed surface. Colours are fitted
+to all images by simultaneous iterative reconstruction (Gilbert 1972,
+doi:10.1016/0022-5193(72)90180-4); nothing else is trained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+
+import numpy as np
+from numba import njit
+
+from recon import se3
+from recon.bands import at_once, threads
+from recon.camera_model import rays
+from recon.mapping.free_space import seen_through, spread
+from recon.surface.meshing import Mesh
+from recon.surface.texture_views import TextureView, rays_onto
+from recon.types import F32, F64, I64, U8, Bool, DepthMap, Keyframe, PointCloud
+
+WIDTH = 0.5
+"""Sigma along the surface, in footprints of a pixel: neighbours meet at 0.37 of their height."""
+
+MAX_SLOPE = 0.03
+"""Depths of one surface differ by less than this share from pixel to pixel."""
+
+NORMAL_PX = 2
+"""A normal is that of the places so far to each side."""
+
+MIN_COSINE = 0.2
+"""A flatter view of the surface stretches no Gaussian further."""
+
+MERGED = 1.0
+"""Of several Gaussians in a cell of so many footprints the one with the least sigma stays."""
+
+MAX_OPACITY, SINGLE = 0.95, 0.85
+"""Opacity of what many views, and of what one view or none has measured."""
+
+COVERED = 0.5
+"""A pixel with less opacity than this shows a hole."""
+
+LOW_PASS_PX2 = 0.3
+"""Variance that viewers add to each Gaussian in the image, as the reference does."""
+
+LARGEST_ALPHA, SMALLEST_ALPHA, DONE = 0.99, 1.0 / 255.0, 1e-3
+REACH = 3.33
+"""Sigmas from a Gaussian's middle to where it is fainter than SMALLEST_ALPHA."""
+
+FITS = 2
+"""Rounds of fitting the colours."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Splats:
+    """3D Gaussians in metres."""
+
+    xyz_m: F32  # (N, 3)
+    q_wxyz: F32  # (N, 4) from each one's axes to the world's
+    sigma_m: F32  # (N, 3) 1 sigma along these axes; the third is across the surface
+    opacity: F32  # (N,)
+    rgb: F32  # (N, 3) 0 to 255
+
+    def __len__(self) -> int:
+        return len(self.xyz_m)
+
+    def at(self, rows: I64 | Bool) -> Splats:
+        """Some of them."""
+        return Splats(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
+def joined(parts: Sequence[Splats]) -> Splats:
+    """All Gaussians of the parts."""
+    return Splats(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Splats)))
+
+
+def splats_of(
+    keyframes: Sequence[Keyframe],
+    views: Sequence[TextureView],
+    surface: Mesh,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Splats:
+    """Gaussians of what the keyframes measured; holes in their views take the closed ``surface``.
+
+    ``views`` are the keyframes' images without distortion, as fine as the Gaussians shall be.
+    ``progress`` is called once per keyframe and :func:`steps` times in all.
+    """
+
+    def measured(keyframe: Keyframe, view: TextureView) -> tuple[Splats, F32]:
+        progress("Gaussians from depth images")
+        return of_depth(keyframe.depth, keyframe.fresh, view)
+
+    found = at_once(*(partial(measured, k, v) for k, v in zip(keyframes, views, strict=True)))
+    splats, sigma = joined([one for one, _ in found]), np.concatenate([s for _, s in found])
+    splats = _merged(splats, sigma, [k.depth for k in keyframes])
+    splats = joined([splats, *_fillings(splats, views, surface, progress)])
+    for _ in range(FITS):
+        splats = _fitted(splats, views, progress)
+    return splats
+
+
+def steps(keyframes: int) -> int:
+    """Reports of :func:`splats_of`."""
+    return keyframes * (2 + FITS)
+
+
+def of_depth(depth: DepthMap, mask: Bool, view: TextureView) -> tuple[Splats, F32]:
+    """A Gaussian for each pixel of ``view`` whose depth is known where ``mask`` (h, w) says so, and
+    (N,) the sigma of its depth, m.
+
+    The view is taken from the depth map's own place; its grid may be finer.
+    """
+    normals = _normals(depth)
+    rows = _pixels(
+        np.ascontiguousarray(depth.depth_m, np.float32), np.ascontiguousarray(depth.sigma_m),
+        np.ascontiguousarray(depth.views), mask, normals, depth.K, view.bgra, view.K,
+    )  # fmt: skip
+    xyz, normal, sigma, opacity, rgb = rows
+    footprint = xyz[:, 2] / np.float32(np.sqrt(view.K[0, 0] * view.K[1, 1]))
+    axes, cosine = _axes(xyz, normal)
+    T = view.T_world_camera
+    sizes = np.column_stack(
+        [WIDTH * footprint / cosine, WIDTH * footprint, np.minimum(sigma, WIDTH * footprint)]
+    )
+    splats = Splats(
+        se3.transform(T, xyz.astype(np.float64)).astype(np.float32),
+        _quaternions(T[:3, :3] @ axes), sizes.astype(np.float32), opacity, rgb,
+    )  # fmt: skip
+    return splats, sigma
+
+
+def _normals(depth: DepthMap) -> F32:
+    """(h, w, 3) of the surface in the camera's axes, towards it; to the camera itself where the
+    neighbours belong to other surfaces."""
+    h, w = depth.depth_m.shape
+    u, v = np.meshgrid(np.arange(w, dtype=np.float64), np.arange(h, dtype=np.float64))
+    ways = rays(depth.K, np.column_stack([u.ravel(), v.ravel()])).reshape(h, w, 3)
+    xyz = np.pad(ways * depth.depth_m[..., None], [(NORMAL_PX,) * 2] * 2 + [(0, 0)],
+                 constant_values=np.nan)  # fmt: skip
+    n = NORMAL_PX
+    right = xyz[n:-n, 2 * n :] - xyz[n:-n, : -2 * n]
+    down = xyz[2 * n :, n:-n] - xyz[: -2 * n, n:-n]
+    limit = 2 * n * MAX_SLOPE * depth.depth_m
+    one = (np.abs(right[..., 2]) < limit) & (np.abs(down[..., 2]) < limit)
+    out = np.where(one[..., None], np.cross(down, right), -ways)
+    return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True), np.float32)
+
+
+@njit(cache=True, nogil=True)
+def _pixels(
+    depth: F32, sigma: F32, views: U8, mask: Bool, normals: F32, K: F64, bgra: U8, K_view: F64
+) -> tuple[F32, F32, F32, F32, F32]:
+    """Place and normal (N, 3) in the camera's axes, sigma (N,) m, opacity (N,) and RGB (N, 3)."""
+    h, w = depth.shape
+    most = bgra.shape[0] * bgra.shape[1]
+    xyz, normal = np.empty((most, 3), np.float32), np.empty((most, 3), np.float32)
+    spread_m, opacity = np.empty(most, np.float32), np.empty(most, np.float32)
+    rgb = np.empty((most, 3), np.float32)
+    n = 0
+    for row in range(bgra.shape[0]):
+        y = (row - K_view[1, 2]) / K_view[1, 1]
+        v = y * K[1, 1] + K[1, 2]
+        at_v = int(np.floor(v + 0.5))
+        if at_v < 0 or at_v >= h:
+            continue
+        v0 = min(max(int(np.floor(v)), 0), max(h - 2, 0))
+        for col in range(bgra.shape[1]):
+            x = (col - K_view[0, 2]) / K_view[0, 0]
+            u = x * K[0, 0] + K[0, 2]
+            at_u = int(np.floor(u + 0.5))
+            if at_u < 0 or at_u >= w or bgra[row, col, 3] == 0 or not mask[at_v, at_u]:
+                continue
+            near = depth[at_v, at_u]
+            if not near > 0.0 or not np.isfinite(sigma[at_v, at_u]):
+                continue
+            u0 = min(max(int(np.floor(u)), 0), max(w - 2, 0))
+            total, weights = 0.0, 0.0
+            for j in range(v0, min(v0 + 2, h)):
+                for i in range(u0, min(u0 + 2, w)):
+                    if abs(depth[j, i] - near) < MAX_SLOPE * near:
+                        weight = max(1.0 - abs(u - i), 0.0) * max(1.0 - abs(v - j), 0.0)
+                        total += weight * depth[j, i]
+                        weights += weight
+            z = total / weights if weights > 0.0 else near
+            xyz[n, 0], xyz[n, 1], xyz[n, 2] = x * z, y * z, z
+            for k in range(3):
+                normal[n, k] = normals[at_v, at_u, k]
+                rgb[n, k] = bgra[row, col, 2 - k]
+            spread_m[n] = sigma[at_v, at_u]
+            agree = max(float(views[at_v, at_u]), 1.0)
+            opacity[n] = MAX_OPACITY - (MAX_OPACITY - SINGLE) / agree
+            n += 1
+    return (
+        xyz[:n].copy(),
+        normal[:n].copy(),
+        spread_m[:n].copy(),
+        opacity[:n].copy(),
+        rgb[:n].copy(),
+    )
+
+
+def _axes(xyz: F32, normal: F32) -> tuple[F64, F64]:
+    """(N, 3, 3) axes as columns: down the view's slope, across it, and the normal; and (N,) the
+    cosine between normal and line of sight."""
+    sight = -xyz.astype(np.float64) / np.linalg.norm(xyz, axis=1, keepdims=True)
+    up = normal.astype(np.float64)
+    along = np.einsum("nk,nk->n", sight, up)
+    slope = sight - along[:, None] * up
+    length = np.linalg.norm(slope, axis=1, keepdims=True)
+    least = np.eye(3)[np.abs(up).argmin(axis=1)]  # where the view is straight, any across
+    slope = np.where(length > 1e-3, slope, np.cross(up, least))
+    slope /= np.linalg.norm(slope, axis=1, keepdims=True)
+    axes = np.stack([slope, np.cross(up, slope), up], axis=2)
+    return axes, np.maximum(np.abs(along), MIN_COSINE)
+
+
+def _quaternions(R: F64) -> F32:
+    """(N, 4) wxyz of (N, 3, 3) rotations."""
+    from scipy.spatial.transform import Rotation
+
+    if not len(R):
+        return np.zeros((0, 4), np.float32)
+    return np.asarray(Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]], np.float32)
+
+
+def _merged(splats: Splats, sigma_m: F32, depths: Sequence[DepthMap]) -> Splats:
+    """Without what other views see through, and one Gaussian where several images show a place."""
+    count = len(splats)
+    seen = np.where(splats.opacity > SINGLE + 1e-3, 2, 1).astype(np.uint8)
+    cloud = PointCloud(splats.xyz_m, splats.rgb.astype(np.uint8), sigma_m, seen)
+    kept = np.flatnonzero(~seen_through(cloud, spread(depths))) if count else np.zeros(0, np.int64)
+    if not len(kept):
+        return splats.at(kept)
+    cell_m = MERGED / WIDTH * float(np.median(splats.sigma_m[kept, 1]))
+    cell = np.floor(splats.xyz_m[kept] / cell_m).astype(np.int64)
+    order = np.lexsort((sigma_m[kept], *cell.T))
+    is_first = np.ones(len(order), np.bool_)
+    is_first[1:] = (np.diff(cell[order], axis=0) != 0).any(axis=1)
+    return splats.at(np.sort(kept[order[is_first]]))
+
+
+def _fillings(
+    splats: Splats, views: Sequence[TextureView], surface: Mesh, progress: Callable[[str], None]
+) -> list[Splats]:
+    """Gaussians on ``surface`` where views show a hole, which no earlier view has filled."""
+    reach = rays_onto(surface)
+    out: list[Splats] = []
+    for view in views:
+        progress("filling holes from the closed surface")
+        h, w = view.bgra.shape[:2]
+        near = joined([splats, *out])
+        hole = (rendered(near, view.K, (w, h), view.T_world_camera)[1] < COVERED) & (
+            view.bgra[..., 3] > 0
+        )
+        if not hole.any():
+            continue
+        # Normals need the surface around a hole, so rays go everywhere.
+        u, v = np.meshgrid(np.arange(w, dtype=np.float64), np.arange(h, dtype=np.float64))
+        ways = rays(view.K, np.column_stack([u.ravel(), v.ravel()]))
+        length = np.linalg.norm(ways, axis=1)
+        T = view.T_world_camera
+        depth_m = reach(T[:3, 3], (ways / length[:, None]) @ T[:3, :3].T) / length
+        depth_m = np.where(np.isfinite(depth_m), depth_m, np.nan).reshape(h, w).astype(np.float32)
+        sigma_m = (depth_m / np.float32(view.K[0, 0])).astype(np.float32)
+        depth = DepthMap(depth_m, sigma_m, np.zeros((h, w), np.uint8), view.K, T)
+        out.append(of_depth(depth, hole, view)[0])
+    return out
+
+
+def _fitted(
+    splats: Splats, views: Sequence[TextureView], progress: Callable[[str], None]
+) -> Splats:
+    """The Gaussians with colours that reproduce the images better: each takes the mean error of the
+    pixels that it colours."""
+    sums = np.zeros((len(splats), 4), np.float32)
+
+    def errors(view: TextureView) -> tuple[I64, F32]:
+        progress("fitting colours")
+        h, w = view.bgra.shape[:2]
+        flat, rows = _in_view(splats, view.K, (w, h), view.T_world_camera)
+        opacity, rgb = splats.opacity[rows], splats.rgb[rows]
+        image, left = _blend(flat, opacity, rgb, w, h)
+        error = view.bgra[..., 2::-1].astype(np.float32) - image
+        error[(view.bgra[..., 3] == 0) | (left > 1.0 - COVERED)] = np.nan
+        return rows, _shared_out(flat, opacity, error)
+
+    for at in range(0, len(views), threads()):
+        for rows, found in at_once(*(partial(errors, v) for v in views[at : at + threads()])):
+            sums[rows] += found
+    rgb = splats.rgb + sums[:, :3] / np.maximum(sums[:, 3:], 0.05)
+    return Splats(splats.xyz_m, splats.q_wxyz, splats.sigma_m, splats.opacity, np.clip(rgb, 0, 255))
+
+
+def rendered(
+    splats: Splats, K: F64, size_px: tuple[int, int], T_world_camera: F64
+) -> tuple[F32, F32]:
+    """(H, W, 3) RGB over black, 0 to 255, and (H, W) opacity of a view of the Gaussians.
+
+    As the reference draws them: projected to first order, sorted by depth, front to back.
+    """
+    w, h = size_px
+    flat, rows = _in_view(splats, K, size_px, T_world_camera)
+    image, left = _blend(flat, splats.opacity[rows], splats.rgb[rows], w, h)
+    return image, 1.0 - left
+
+
+def _in_view(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> tuple[F32, I64]:
+    """(M, 7) the Gaussians in the image, nearest first, and their rows: u, v, depth, the inverse
+    covariance uu, uv, vv in the image, and how many pixels they reach."""
+    flat = np.empty((len(splats), 7), np.float32)
+    T_camera_world = np.ascontiguousarray(se3.inverse(T))
+    _project(splats.xyz_m, splats.q_wxyz, splats.sigma_m, K, T_camera_world, flat)
+    w, h = size_px
+    u, v, z, reach = flat[:, 0], flat[:, 1], flat[:, 2], flat[:, 6]
+    on = (z > 0.1) & (u > -reach) & (u < w + reach) & (v > -reach) & (v < h + reach)
+    rows = np.flatnonzero(on)
+    rows = rows[np.argsort(z[rows], kind="stable")]
+    return flat[rows], rows
+
+
+@njit(cache=True, nogil=True)
+def _project(xyz: F32, q: F32, sigma: F32, K: F64, T: F64, out: F32) -> None:
+    R = np.empty((3, 3))
+    for n in range(xyz.shape[0]):
+        z = T[2, 0] * xyz[n, 0] + T[2, 1] * xyz[n, 1] + T[2, 2] * xyz[n, 2] + T[2, 3]
+        out[n, 2] = z
+        if z <= 0.1:
+            continue
+        x = T[0, 0] * xyz[n, 0] + T[0, 1] * xyz[n, 1] + T[0, 2] * xyz[n, 2] + T[0, 3]
+        y = T[1, 0] * xyz[n, 0] + T[1, 1] * xyz[n, 1] + T[1, 2] * xyz[n, 2] + T[1, 3]
+        w, a, b, c = q[n, 0], q[n, 1], q[n, 2], q[n, 3]
+        R[0, 0], R[1, 1], R[2, 2] = b * b + c * c, a * a + c * c, a * a + b * b
+        R[0, 1], R[0, 2], R[1, 2] = a * b - w * c, a * c + w * b, b * c - w * a
+        R[1, 0], R[2, 0], R[2, 1] = a * b + w * c, a * c - w * b, b * c + w * a
+        for k in range(3):
+            for j in range(3):
+                R[k, j] = 1.0 - 2.0 * R[k, j] if k == j else 2.0 * R[k, j]
+        uu, uv, vv = LOW_PASS_PX2, 0.0, LOW_PASS_PX2
+        for k in range(3):
+            s = sigma[n, k]
+            dx = s * (T[0, 0] * R[0, k] + T[0, 1] * R[1, k] + T[0, 2] * R[2, k])
+            dy = s * (T[1, 0] * R[0, k] + T[1, 1] * R[1, k] + T[1, 2] * R[2, k])
+            dz = s * (T[2, 0] * R[0, k] + T[2, 1] * R[1, k] + T[2, 2] * R[2, k])
+            du, dv = K[0, 0] * (dx - x / z * dz) / z, K[1, 1] * (dy - y / z * dz) / z
+            uu += du * du
+            uv += du * dv
+            vv += dv * dv
+        det = uu * vv - uv * uv
+        out[n, 0], out[n, 1] = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        out[n, 3], out[n, 4], out[n, 5] = vv / det, -uv / det, uu / det
+        out[n, 6] = REACH * np.sqrt(max(uu, vv))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _alpha(flat: F32, n: int, opacity: float, col: int, row: int) -> float:
+    """How much of pixel (col, row) one Gaussian hides; 0 where that is too little to draw."""
+    du, dv = col - flat[n, 0], row - flat[n, 1]
+    e = -0.5 * (flat[n, 3] * du * du + 2.0 * flat[n, 4] * du * dv + flat[n, 5] * dv * dv)
+    if e < -5.6:
+        return 0.0
+    alpha = min(opacity * np.exp(e), LARGEST_ALPHA)
+    return alpha if alpha >= SMALLEST_ALPHA else 0.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _span(middle: float, reach: float, size: int) -> tuple[int, int]:
+    return max(int(np.ceil(middle - reach)), 0), min(int(np.floor(middle + reach)) + 1, size)
+
+
+@njit(cache=True, nogil=True)
+def _blend(flat: F32, opacity: F32, rgb: F32, w: int, h: int) -> tuple[F32, F32]:
+    """(h, w, 3) the image over black, and (h, w) the share of light that comes from behind."""
+    image, left = np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32)
+    for n in range(flat.shape[0]):
+        first_row, last_row = _span(flat[n, 1], flat[n, 6], h)
+        first, last = _span(flat[n, 0], flat[n, 6], w)
+        for row in range(first_row, last_row):
+            for col in range(first, last):
+                if left[row, col] < DONE:
+                    continue
+                alpha = _alpha(flat, n, opacity[n], col, row)
+                share = alpha * left[row, col]
+                for k in range(3):
+                    image[row, col, k] += share * rgb[n, k]
+                left[row, col] -= share
+    return image, left
+
+
+@njit(cache=True, nogil=True)
+def _shared_out(flat: F32, opacity: F32, error: F32) -> F32:
+    """(N, 4) sums of ``error`` (h, w, 3) over the pixels of each Gaussian by its share of them, and
+    of these shares; NaN does not count."""
+    h, w = error.shape[:2]
+    out, left = np.zeros((flat.shape[0], 4), np.float32), np.ones((h, w), np.float32)
+    for n in range(flat.shape[0]):
+        first_row, last_row = _span(flat[n, 1], flat[n, 6], h)
+        first, last = _span(flat[n, 0], flat[n, 6], w)
+        for row in range(first_row, last_row):
+            for col in range(first, last):
+                if left[row, col] < DONE:
+                    continue
+                alpha = _alpha(flat, n, opacity[n], col, row)
+                share = alpha * left[row, col]
+                if share > 0.0 and not np.isnan(error[row, col, 0]):
+                    for k in range(3):
+                        out[n, k] += share * error[row, col, k]
+                    out[n, 3] += share
+                left[row, col] -= share
+    return out

@@ -1,0 +1,154 @@
+"""The surface as 3D Gaussians: PLY in the layout of 3D Gaussian splatting, or SPZ."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from recon.surface.splats import Splats, joined, splats_of, steps
+from recon.types import F32, F64, Bool
+from service.errors import InputError
+from service.offline.exports.clouds import VOXELS_MARGIN_M
+from service.offline.exports.images import resized, scan_images
+from service.offline.exports.model import LARGEST_FACES, surface_mesh
+from service.offline.exports.view import ExportOptions, ScanView, in_parts
+from service.packages import needing
+from service.scans.fused_cloud import EVERYWHERE, Box
+from service.scans.main_piece import main_keyframes
+from service.scans.writing import writing
+
+LARGEST_SPLATS = 6_000_000
+"""Pixels of all views of one tile together; the images of more are made smaller."""
+
+Y_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""ENU to east, down and north, as viewers take a PLY of Gaussians."""
+
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""ENU to east, up and south, the axes of SPZ."""
+
+SPZ_REACH_M = 2048.0
+"""Of SPZ's coordinates: 24 bits, of which 12 are below the metre."""
+
+SH0 = 0.28209479177387814
+"""The spherical harmonic of degree 0; colours are stored as its factor."""
+
+FIELDS = (
+    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1",
+    "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+)  # fmt: skip
+"""Of a vertex, single precision each (Kerbl et al. 2023); the normals are zero."""
+
+LONGEST_HEADER = 4096
+
+
+def write_splats(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """One Gaussian per pixel of the images, in metres from the scan's origin.
+
+    Raises InputError when there is nothing to make it of, or more ground than SPZ can hold.
+    """
+    spz = out.suffix.lower() == ".spz"
+    if spz:
+        with needing("an SPZ file"):
+            import gaussforge
+    splats = joined(list(in_parts(scan, _made, options, VOXELS_MARGIN_M, needs_cell=False)))
+    scan.progress(f"writing {len(splats)} Gaussians")
+    data = ply(turned(splats, Y_UP if spz else Y_DOWN), _origin(scan, options))
+    if spz:
+        if np.abs(splats.xyz_m).max() >= SPZ_REACH_M:
+            raise InputError(f"{out}: SPZ reaches {SPZ_REACH_M:.0f} m from the origin; write .ply")
+        made = gaussforge.GaussForge().convert(data, "ply", "spz")
+        if "data" not in made:
+            raise InputError(f"{out}: gaussforge writes no SPZ: {made.get('error')}")
+        data = made["data"]
+    with writing(out) as part:
+        part.write_bytes(data)
+
+
+def _made(scan: ScanView, options: ExportOptions, box: Box) -> Splats | None:
+    """The Gaussians of one tile, in ENU metres; None without any."""
+    keyframes = list(main_keyframes(scan.store))
+    progress = scan.progress
+    fused = scan.fused
+    try:
+        with progress.part("surface", 0.3):
+            surface = surface_mesh(fused.cloud, fused.voxel_m, keyframes, LARGEST_FACES, progress)
+    except ValueError as error:
+        raise InputError(f"{scan.folder}: {error}") from error
+    with progress.part("reading images", 0.2):
+        views = scan_images(keyframes, scan.folder, scan.store.header, options, progress)
+    pixels = sum(int(np.prod(v.bgra.shape[:2])) * float(k.fresh.mean())
+                 for k, v in zip(keyframes, views, strict=True))  # fmt: skip
+    shrink = min(1.0, float(np.sqrt(LARGEST_SPLATS / max(pixels, 1.0))))
+    coarser = fused.voxel_m / (fused.ground_sample_m or fused.voxel_m)
+    if coarser > 1.05:
+        shrink = min(shrink, keyframes[0].depth.K[0, 0] / (views[0].K[0, 0] * coarser))
+    views = [resized(v, shrink) for v in views]
+    with progress.part("Gaussians"):
+        splats = splats_of(keyframes, views, surface, progress.counting(steps(len(keyframes))))
+    if box != EVERYWHERE:
+        splats = splats.at(_inside(scan, splats, box))
+    return splats if len(splats) else None
+
+
+def _inside(scan: ScanView, splats: Splats, box: Box) -> Bool:
+    """(N,) whether each lies in a box of the map."""
+    xyz_m = splats.xyz_m.astype(np.float64)
+    if scan.frame is not None:
+        xyz_m = scan.frame.to_utm(xyz_m)
+    west, south, east, north = box
+    x, y = xyz_m[:, 0], xyz_m[:, 1]
+    return np.asarray((x >= west) & (x < east) & (y >= south) & (y < north))
+
+
+def turned(splats: Splats, R: F64) -> Splats:
+    """The Gaussians in other axes: R (3, 3) takes the old to the new."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix(R)
+    old = Rotation.from_quat(splats.q_wxyz[:, [1, 2, 3, 0]])
+    q = (turn * old).as_quat()[:, [3, 0, 1, 2]].astype(np.float32)
+    return replace(splats, xyz_m=(splats.xyz_m @ R.T).astype(np.float32), q_wxyz=q)
+
+
+def _origin(scan: ScanView, options: ExportOptions) -> str:
+    """Axes and origin, for the header."""
+    axes = "x east, y down, z north, metres"
+    frame = scan.frame
+    if frame is None:
+        return f"{axes} from the scan's origin"
+    where = f"{frame.lat_deg:.8f} {frame.lon_deg:.8f} {frame.alt_amsl_m:.3f}"
+    return f"{axes} from latitude, longitude, height {where} {scan.above(options)}"
+
+
+def ply(splats: Splats, comment: str) -> bytes:
+    """A binary PLY in the layout of 3D Gaussian splatting; the file's axes are those given."""
+    rows = np.zeros((len(splats), len(FIELDS)), np.float32)
+    rows[:, 0:3] = splats.xyz_m
+    rows[:, 6:9] = (splats.rgb / 255.0 - 0.5) / SH0
+    rows[:, 9] = np.log(splats.opacity / (1.0 - splats.opacity))
+    rows[:, 10:13] = np.log(splats.sigma_m)
+    rows[:, 13:17] = splats.q_wxyz
+    head = ["ply", "format binary_little_endian 1.0", f"comment {comment}"]
+    head += [f"element vertex {len(rows)}", *(f"property float {name}" for name in FIELDS)]
+    return "\n".join([*head, "end_header", ""]).encode("ascii") + rows.astype("<f4").tobytes()
+
+
+def read_splats(path: Path) -> Splats:
+    """The Gaussians of a file as :func:`write_splats` writes it, in ENU metres.
+
+    Raises InputError for any other file.
+    """
+    data = path.read_bytes()
+    end = data.find(b"end_header\n", 0, LONGEST_HEADER)
+    head = data[: max(end, 0)].decode("ascii", "replace").split("\n")
+    names = tuple(line.split()[-1] for line in head if line.startswith("property float "))
+    body = data[end + len(b"end_header\n") :]
+    if end < 0 or names != FIELDS or not body or len(body) % (4 * len(FIELDS)):
+        raise InputError(f"{path} is no PLY of Gaussians as export --to splat writes it")
+    rows: F32 = np.frombuffer(body, "<f4").reshape(-1, len(FIELDS))
+    rgb = np.asarray(255.0 * (SH0 * rows[:, 6:9] + 0.5), np.float32)
+    opacity = np.asarray(1.0 / (1.0 + np.exp(-rows[:, 9])), np.float32)
+    sigma_m = np.asarray(np.exp(rows[:, 10:13]), np.float32)
+    return turned(Splats(rows[:, 0:3], rows[:, 13:17], sigma_m, opacity, rgb), Y_DOWN.T)

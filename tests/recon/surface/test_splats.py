@@ -1,0 +1,157 @@
+"""3D Gaussians from depth images, against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recon import se3
+from recon.surface.meshing import Mesh
+from recon.surface.splats import (
+    COVERED,
+    LOW_PASS_PX2,
+    MAX_OPACITY,
+    SINGLE,
+    WIDTH,
+    Splats,
+    of_depth,
+    rendered,
+    splats_of,
+)
+from recon.surface.texture_views import TextureView
+from recon.types import F64, DepthMap, Keyframe, Pose
+
+pytestmark = pytest.mark.slow  # compiles
+
+K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
+SIZE = (64, 48)
+DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+def expected(splats: Splats, T: F64) -> tuple[F64, F64]:
+    """The image by the formula: covariances through a numerical derivative of the projection."""
+
+    def to_image(xyz: F64) -> F64:
+        x, y, z = se3.transform(se3.inverse(T), xyz[None])[0]
+        return np.array([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]])
+
+    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    image, left = np.zeros((SIZE[1], SIZE[0], 3)), np.ones((SIZE[1], SIZE[0]))
+    xyz = splats.xyz_m.astype(np.float64)
+    depth = se3.transform(se3.inverse(T), xyz)[:, 2]
+    for n in np.argsort(depth):
+        R = Rotation.from_quat(splats.q_wxyz[n, [1, 2, 3, 0]]).as_matrix()
+        steps = 1e-4 * np.eye(3)
+        J = np.stack([(to_image(xyz[n] + s) - to_image(xyz[n] - s)) / 2e-4 for s in steps], axis=1)
+        S = J @ R @ np.diag(splats.sigma_m[n].astype(np.float64) ** 2) @ R.T @ J.T
+        S += LOW_PASS_PX2 * np.eye(2)
+        off = np.stack([u, v], axis=-1) - to_image(xyz[n])
+        power = np.einsum("hwi,ij,hwj->hw", off, np.linalg.inv(S), off)
+        alpha = np.minimum(splats.opacity[n] * np.exp(-0.5 * power), 0.99)
+        alpha[alpha < 1.0 / 255.0] = 0.0
+        image += (alpha * left)[..., None] * splats.rgb[n]
+        left *= 1.0 - alpha
+    return image, 1.0 - left
+
+
+def test_an_image_follows_the_formula() -> None:
+    rng = np.random.default_rng(3)
+    T = se3.compose(DOWN, np.array([0.5, -0.3, 20.0]))
+    splats = Splats(
+        rng.uniform([-6.0, -5.0, -2.0], [6.0, 5.0, 2.0], (12, 3)).astype(np.float32),
+        Rotation.random(12, random_state=1).as_quat()[:, [3, 0, 1, 2]].astype(np.float32),
+        rng.uniform(0.1, 1.2, (12, 3)).astype(np.float32),
+        rng.uniform(0.3, 0.95, 12).astype(np.float32),
+        rng.uniform(0.0, 255.0, (12, 3)).astype(np.float32),
+    )
+    image, opacity = rendered(splats, K, SIZE, T)
+    true, covered = expected(splats, T)
+    assert covered.max() > 0.9
+    # Where little light is left, the rest is not drawn.
+    assert np.abs(image - true).max() < 0.5
+    assert np.abs(opacity - covered).max() < 2e-3
+
+
+def slope(T: F64, up: F64, sigma_m: float = 0.05) -> DepthMap:
+    """The exact view of the plane through the origin with normal ``up``."""
+    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    ways = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], axis=-1)
+    depth = -(T[:3, 3] @ up) / (ways @ (T[:3, :3].T @ up))
+    shape = depth.shape
+    views = np.full(shape, 2, np.uint8)
+    return DepthMap(depth.astype(np.float32), np.full(shape, sigma_m, np.float32), views, K, T)
+
+
+def painted(depth: DepthMap) -> TextureView:
+    """What a camera sees of a plane that is painted in waves of some pixels."""
+    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    z = depth.depth_m.astype(np.float64)
+    local = np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1)
+    x, y, _ = se3.transform(depth.T_world_camera, local.reshape(-1, 3)).T
+    waves = [120 + 90 * np.sin(1.3 * x), 120 + 90 * np.cos(1.1 * y), 120 + 60 * np.sin(x + y)]
+    bgra = np.full((*z.shape, 4), 255, np.uint8)
+    bgra[..., :3] = np.rint(np.stack(waves, axis=-1)).reshape(*z.shape, 3)
+    return TextureView(bgra, K, depth.T_world_camera)
+
+
+def test_axes_lie_in_the_surface_and_sizes_are_those_of_a_pixel() -> None:
+    up = np.array([0.0, np.sin(0.6), np.cos(0.6)])
+    T = se3.compose(DOWN, np.array([0.0, 0.0, 20.0]))
+    depth = slope(T, up)
+    splats, _ = of_depth(depth, np.ones(SIZE[::-1], np.bool_), painted(depth))
+    assert len(splats) == SIZE[0] * SIZE[1]
+    inner = np.abs(splats.xyz_m[:, :2]).max(axis=1) < 4.0
+    R = Rotation.from_quat(splats.q_wxyz[inner][:, [1, 2, 3, 0]]).as_matrix()
+    assert np.abs(splats.xyz_m[inner] @ up).max() < 1e-3
+    assert np.allclose(R[:, :, 2] @ up, 1.0, atol=1e-4)
+    middle = np.argmin(np.linalg.norm(splats.xyz_m, axis=1))
+    pixel_m = 20.0 / 60.0
+    along = pixel_m / np.cos(0.6)
+    assert splats.sigma_m[middle] == pytest.approx([WIDTH * along, WIDTH * pixel_m, 0.05], rel=0.03)
+    assert splats.opacity[middle] == pytest.approx(MAX_OPACITY - (MAX_OPACITY - SINGLE) / 2)
+
+
+def keyframe(seq: int, depth: DepthMap) -> Keyframe:
+    """A keyframe of such a view."""
+    pose = Pose(depth.T_world_camera, np.eye(6) * 1e-4)
+    fresh = np.isfinite(depth.depth_m)
+    return Keyframe(seq, seq, depth, painted(depth).bgra[..., :3].copy(), pose, fresh)
+
+
+def test_a_view_from_elsewhere_shows_the_surface() -> None:
+    """Three images of a painted slope, one with a hole, against the fourth's own view."""
+    up = np.array([0.0, 0.1, 0.995])
+    depths = [
+        slope(se3.compose(DOWN, np.array([x, 0.0, 20.0])), up / np.linalg.norm(up))
+        for x in (-1.5, 0.0, 1.5)
+    ]
+    views = [painted(d) for d in depths]
+    keyframes = [keyframe(n, d) for n, d in enumerate(depths)]
+    hole = np.s_[20:28, 25:40]
+    for one in keyframes:
+        one.depth.depth_m[hole], one.fresh[hole] = np.nan, False
+    corners = np.array([[-30.0, -30.0], [30.0, -30.0], [30.0, 30.0], [-30.0, 30.0]])
+    plane = np.column_stack([corners, -corners[:, 1] * 0.1 / 0.995])
+    surface = Mesh(plane, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+    splats = splats_of(keyframes, views, surface)
+    assert len(splats) < 0.7 * 3 * SIZE[0] * SIZE[1]  # places that several show have one
+    T = se3.compose(DOWN, np.array([0.7, 0.4, 20.0]))
+    image, opacity = rendered(splats, K, SIZE, T)
+    true = painted(slope(T, up / np.linalg.norm(up))).bgra[..., 2::-1].astype(np.float64)
+    inner = np.s_[6:-6, 6:-6]
+    assert (opacity[inner] >= COVERED).all()
+    error = np.sqrt(np.mean((image[inner] - true[inner]) ** 2))
+    assert 20.0 * np.log10(255.0 / error) > 30.0
+
+
+def test_what_other_views_see_through_is_left_out() -> None:
+    up = np.array([0.0, 0.0, 1.0])
+    places = [-1.5, 0.0, 1.5, 3.0]
+    depths = [slope(se3.compose(DOWN, np.array([x, 0.0, 20.0])), up) for x in places]
+    views = [painted(d) for d in depths]
+    depths[0].depth_m[20:26, 30:36] = 12.0  # invented
+    keyframes = [keyframe(n, d) for n, d in enumerate(depths)]
+    corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0]])
+    splats = splats_of(keyframes, views, Mesh(corners, np.array([[0, 1, 2]], np.int32)))
+    assert np.abs(splats.xyz_m[:, 2]).max() < 1.0
