@@ -39,10 +39,14 @@ from service.offline.exports.rasters import open_map
 from service.scans.coverage import Coverage
 from service.scans.folder import SUMMARY
 
-RASTERS = {"ortho": "ortho.tif", "dsm": "dsm.tif", "contours": "dsm.tif"}
+TERRAIN = "terrain"
+"""Heights as colours in the Terrarium encoding: metres are 256 R + G + B / 256 - 32768."""
+
+RASTERS = {"ortho": "ortho.tif", "dsm": "dsm.tif", "contours": "dsm.tif", TERRAIN: "dsm.tif"}
 """The layers that a finished scan may have as rasters."""
 
-LAYERS = (*RASTERS, "coverage")
+LAYERS = ("ortho", "dsm", "contours", "coverage")
+"""Those that are seen as they are."""
 INK = (40, 60, 110)  # BGR of contours
 SMOOTH_PX = 1.5
 CONTOUR_PX = 4.0
@@ -70,8 +74,8 @@ def map_routes() -> list[Route]:
 
 
 def _tile(request: Request) -> Response:
-    """A map tile of a scan: ortho, dsm, contours or coverage; transparent where nothing is
-    known."""
+    """A map tile of a scan: ortho, dsm, contours, coverage or terrain (heights in the Terrarium
+    encoding); transparent where nothing is known."""
     state, folder, layer = _asked(request)
     z, x, y = _place(request)
     image = tile_image(state, folder, layer, (z, x, y))
@@ -89,8 +93,8 @@ def _place(request: Request) -> Tile:
 def _asked(request: Request) -> tuple[PortalState, Path, str]:
     """State, folder and layer of a request; InputError where there is none."""
     state, layer = state_of(request), request.path_params["layer"]
-    if layer not in LAYERS:
-        raise InputError(f"no layer {layer[:40]}; there are {', '.join(LAYERS)}")
+    if layer not in (*LAYERS, TERRAIN):
+        raise InputError(f"no layer {layer[:40]}; there are {', '.join((*LAYERS, TERRAIN))}")
     return state, state.library.folder(*names_of(request)), layer
 
 
@@ -112,7 +116,7 @@ def tile_image(state: PortalState, folder: Path, layer: str, tile: Tile) -> U8:
         parent = tile[0] - up, tile[1] >> up, tile[2] >> up
         cells = live.cells(parent)
     image = _drawn(layer, cells, pixel_m(parent[0], _latitude(tile)))
-    return _enlarged(image, tile, up)
+    return _enlarged(image, tile, up, smooth=layer != TERRAIN)
 
 
 def _clear() -> U8:
@@ -123,7 +127,7 @@ def _latitude(tile: Tile) -> float:
     return degrees(0.5, (tile[2] + 0.5) / (1 << tile[0]))[0]
 
 
-def _enlarged(image: U8, tile: Tile, up: int) -> U8:
+def _enlarged(image: U8, tile: Tile, up: int, smooth: bool = True) -> U8:
     """The part of an ancestor's image, ``up`` zooms above, that a tile shows."""
     if not up:
         return image
@@ -131,7 +135,7 @@ def _enlarged(image: U8, tile: Tile, up: int) -> U8:
     left, top = ((tile[k] & ((1 << up) - 1)) * side for k in (1, 2))
     shift = np.array([[side / SIDE, 0.0, left], [0.0, side / SIDE, top]])
     shift[:, 2] += 0.5 * side / SIDE - 0.5  # centres of pixels
-    flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
+    flags = cv2.WARP_INVERSE_MAP | (cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST)
     return np.asarray(cv2.warpAffine(image, shift, (SIDE, SIDE), flags=flags,
                                      borderMode=cv2.BORDER_REPLICATE), np.uint8)  # fmt: skip
 
@@ -183,6 +187,8 @@ def _drawn(layer: str, cells: Cells, cell_m: float) -> U8:
     if layer == "ortho":
         out[..., :3] = cells.rgb[..., ::-1]
         out[..., 3] = np.where(known, 255, 0)
+    elif layer == TERRAIN:
+        out[...] = _terrarium(cells.height_m)
     elif known.any():
         height = _smooth(cells.height_m)
         if layer == "dsm":
@@ -193,6 +199,14 @@ def _drawn(layer: str, cells: Cells, cell_m: float) -> U8:
             out[lines] = (*INK, 255)
     inner = slice(MARGIN, MARGIN + SIDE)
     return np.ascontiguousarray(out[inner, inner])
+
+
+def _terrarium(height_m: F32) -> U8:
+    """(h, w, 4) BGRA of heights to 4 mm, clear where unknown."""
+    known = np.isfinite(height_m)
+    code = np.where(known, (height_m.astype(np.float64) + 32768.0) * 256.0 + 0.5, 0.0)
+    bytes_ = code.astype(np.uint32)[..., None] >> np.array([0, 8, 16], np.uint32)
+    return np.dstack([bytes_ & 255, np.where(known, 255, 0)]).astype(np.uint8)
 
 
 def _smooth(height_m: F32) -> F32:

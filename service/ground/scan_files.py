@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 import zipfile
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from service.errors import InputError
+from service.ground.live import FlightPath
 from service.ground.state import names_of, state_of
 from service.ground.storage import is_regular
 from service.offline.exports import EXPORTERS
@@ -27,6 +29,7 @@ from service.offline.refine.refly import (
     waypoints_text,
 )
 from service.scans.main_piece import main_track
+from service.scans.track import local_frame
 from service.stream.images import encode_image
 from service.stream.store import ScanStore
 
@@ -57,6 +60,7 @@ def file_routes(one: str) -> list[Route]:
         Route(one + "/coverage.png", _coverage),
         Route(one + "/coverage.json", _coverage),
         Route(one + "/refly.{kind}", _refly),
+        Route(one + "/track.geojson", _track),
     ]
 
 
@@ -152,6 +156,21 @@ def _coverage(request: Request) -> Response:
     if request.scope["path"].endswith(".png"):
         return Response(found.png_bytes(), media_type="image/png")
     return Response(found.json_bytes(), media_type="application/json")
+
+
+def _track(request: Request) -> Response:
+    """The flight path so far as GeoJSON: longitude, latitude and metres above mean sea level."""
+    folder = state_of(request).library.folder(*names_of(request))
+    with ScanStore.peek(folder / "scan.db") as store:
+        frame, path = local_frame(store.header), FlightPath(store)
+        path.grown()
+    if frame is None:
+        raise InputError("no track on a map: the scan has no georeference")
+    places = frame.to_geodetic(np.array(path.places(), np.float64).reshape(-1, 3))
+    line = np.round(places[:, [1, 0, 2]], 8).tolist()
+    geometry = {"type": "LineString", "coordinates": line} if len(line) > 1 else None
+    document = {"type": "Feature", "properties": {}, "geometry": geometry}
+    return Response(json.dumps(document), media_type="application/geo+json")
 
 
 def _refly(request: Request) -> Response:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -104,6 +105,91 @@ def test_layers_lie_over_the_basemap_and_nothing_comes_from_outside(page: Browse
     assert steady(page)["known"] > 0.5 * alone["known"]
     here = page.run("location.origin")
     assert [u for u in page.requests if not u.startswith((here, "data:", "about:"))] == []
+
+
+CURSOR = "document.querySelector('.map > .cursor').value"
+
+
+def height_under(page: Browser, x: float, y: float) -> float:
+    """Height above sea level that the cursor states at a place of the page."""
+    page.page.mouse.move(x + 1, y)
+    page.page.mouse.move(x, y)
+    text = page.wait(f"{CURSOR}.includes('AMSL') && {CURSOR}")
+    return float(text.rpartition("· ")[2].split()[0])
+
+
+def roof(page: Browser) -> tuple[float, float, float]:
+    """Where the middle of the roof is seen, and pixels a metre: it is 12 m wide."""
+    rows = COLOURS.replace("right = 0;", "right = 0, top = 1e9, bottom = 0;").replace(
+        "red++;",
+        "red++; const y = map.y + p / 4 / c.width;"
+        " top = Math.min(top, y); bottom = Math.max(bottom, y);",
+    )
+    found = page.run(rows.replace("{ known, red", "{ top, bottom, known, red"))
+    x, y = (found["left"] + found["right"]) / 2, (found["top"] + found["bottom"]) / 2
+    return x, y, (found["right"] - found["left"]) / 12.0
+
+
+def test_heights_track_and_labels_are_on_the_map_and_it_measures(
+    page: Browser, house: HouseFlight, tmp_path: Path
+) -> None:
+    steady(page)
+    x, y, scale = roof(page)
+    ground_m = house.origin[2]
+    assert height_under(page, x, y) == pytest.approx(ground_m + 6.0, abs=0.1)
+    assert height_under(page, x - 300, y) == pytest.approx(ground_m, abs=0.1)
+    track = "document.querySelector('.track polyline').getBoundingClientRect().toJSON()"
+    flown = page.run(track)
+    assert flown["width"] > 5 * scale and flown["height"] < 5  # from west to east
+    layer(page, "Flown track")
+    assert page.run("document.querySelector('.track polyline')") is None
+    layer(page, "Contours")
+    page.wait("document.querySelectorAll('.heights text').length > 0")
+    labels = page.run("[...document.querySelectorAll('.heights text')].map(t => t.textContent)")
+    assert {float(label.split()[0]) for label in labels} <= {ground_m + k for k in range(7)}
+    layer(page, "Height")
+    low, high = page.run("[...document.querySelectorAll('.ramp span')].map(s => s.textContent)")
+    assert [float(v.split()[0]) for v in (low, high)] == pytest.approx(
+        [ground_m, ground_m + 6.0], abs=0.2
+    )
+    page.click("Measure")
+    for dx, dy in ((-5, -3), (5, -3), (5, 3), (-5, 3)):
+        page.mouse(x + dx * scale, y + dy * scale)
+    figures = dict(
+        page.run(
+            "[...document.querySelectorAll('.measure dt')]"
+            ".map(t => [t.textContent, t.nextSibling.textContent])"
+        )
+    )
+    assert float(figures["Area"].split()[0]) == pytest.approx(60.0, rel=0.05)
+    assert figures["Height"] in ("+0.00 m", "-0.00 m", "+0.01 m", "-0.01 m")
+    page.image(tmp_path / "measured.png")  # to look at
+
+
+def test_two_dates_lie_side_by_side(page: Browser, scans: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(scans / "drone-1/test-1", scans / "drone-1/later"))
+    summary = json.loads((other / "scan.json").read_text())
+    summary["times"]["started_unix_s"] += 30 * 86400.0
+    (other / "scan.json").write_text(json.dumps(summary))
+    page.run("location.reload()")
+    page.wait(SHOWN)
+    choose = (
+        "(s => { s.selectedIndex = 1; s.dispatchEvent(new Event('change')); return s.value })"
+        "(document.querySelector('.compare select'))"
+    )
+    assert page.wait(f"document.querySelector('.compare select').length === 2 && {choose}")
+    tiles = "[...document.querySelectorAll('.layer img')].filter(i => i.src.includes('/later/'))"
+    page.wait(f"{tiles}.length > 0 && {SHOWN}")
+    clips = f"{tiles}[0].parentElement.style.clipPath"
+    assert page.run(clips).startswith("polygon(640px 0")
+    page.run(
+        "(s => { s.value = 25; s.dispatchEvent(new Event('input')) })"
+        "(document.querySelector('.swipe input'))"
+    )
+    assert page.run(clips).startswith("polygon(320px 0")
+    dates = page.run("[...document.querySelectorAll('.swipe span')].map(s => s.textContent)")
+    assert len(set(dates)) == 2
+    page.image(tmp_path / "swipe.png")  # to look at
 
 
 FAILED = "[...document.querySelectorAll('.layer img')].filter(i => i.complete && !i.naturalWidth)"

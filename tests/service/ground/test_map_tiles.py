@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import math
 import os
 from collections.abc import Iterator
@@ -155,6 +156,21 @@ def test_shading_and_contours_show_the_walls_alone(client: Client) -> None:
         x, y = (c - col % 256) * 0.81 + ROOF[0], (row % 256 - r) * 0.81 + ROOF[1]
         outside = max(abs(x - 10.0) - 6.0, abs(y - 2.0) - 4.0)
         assert abs(outside) < 2.5, (x, y)
+
+
+def test_terrain_gives_the_heights_and_the_track_the_way(
+    client: Client, house: HouseFlight
+) -> None:
+    for place, want_m in ((ROOF, 6.0), (GROUND, 0.0)):
+        b, g, r, known = at(client, "terrain", place).astype(np.float64)
+        assert known == 255
+        assert abs(256.0 * r + g + b / 256.0 - 32768.0 - house.origin[2] - want_m) < 0.02
+    assert at(client, "terrain", NOWHERE)[3] == 0
+    status, data, headers = client.ask(ONE + "/track.geojson")
+    assert status == 200 and headers["content-type"] == "application/geo+json"
+    line = np.array(json.loads(data)["geometry"]["coordinates"])
+    places = LocalFrame(*house.origin).to_enu(line[:, [1, 0, 2]])
+    assert np.abs(places[:, 1]).max() < 0.01 and np.abs(places[:, 2] - house.height_m).max() < 0.01
 
 
 def test_coverage_is_a_layer(client: Client) -> None:

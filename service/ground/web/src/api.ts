@@ -174,6 +174,8 @@ export interface Refly {
   }[];
 }
 export const refly = (s: { drone: string; scan: string }): Promise<Refly> => ask(`${place(s)}/refly.geojson`);
+/** The flight path: longitude, latitude, metres above mean sea level. */
+export const track = (s: { drone: string; scan: string }): Promise<{ geometry: { coordinates: Triple[] } | null }> => ask(`${place(s)}/track.geojson`);
 export const annotations = (s: { drone: string; scan: string }): Promise<{ features: Annotation[] }> =>
   ask(`${place(s)}/annotations`);
 export const annotate = (s: { drone: string; scan: string }, coordinates: number[], text: string): Promise<Annotation> =>

@@ -55,6 +55,8 @@ export async function showExports(s: api.Scan, again: () => void): Promise<void>
   await fill().catch((error: unknown) => (notify(error), dialog.close()));
   await closed;
   open = null;
+  const label = `Export ${nameOf(s)}`; // the card may be another one by now
+  if (document.activeElement === document.body) [...document.querySelectorAll<HTMLElement>("[aria-label]")].find((e) => e.ariaLabel === label)?.focus();
 }
 
 function rowOf(s: api.Scan, p: api.Product, heights: () => api.Heights, again: () => void): HTMLElement {

@@ -53,8 +53,17 @@ export class Layer {
   /** `about` is the address of its TileJSON, whose version changes with the tiles. */
   constructor(
     protected readonly address: (z: number, x: number, y: number) => string,
-    private readonly about?: string,
+    readonly about?: string,
   ) {}
+
+  /** Whether it is switched on. */
+  get seen(): boolean {
+    return this.shown;
+  }
+
+  set seen(on: boolean) {
+    this.shown = on;
+  }
 
   async refresh(): Promise<void> {
     if (!this.about || !this.shown) return;
@@ -174,6 +183,11 @@ export class FlatMap {
   add(layer: Layer): void {
     this.host.insertBefore(layer.element, this.layers.at(-1)?.element.nextSibling ?? this.host.firstChild);
     this.layers.push(layer);
+  }
+
+  remove(layer: Layer): void {
+    layer.element.remove();
+    this.layers.splice(this.layers.indexOf(layer), 1);
   }
 
   draw(): void {

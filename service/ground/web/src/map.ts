@@ -1,16 +1,24 @@
-// A scan on a flat map: layers as XYZ tiles over the operator's own basemap; grows while it flies.
+// A scan on a flat map: layers over the operator's own basemap, heights, the track, measuring, two dates
+// side by side; grows while it flies.
 
+import type { Vector3 } from "three";
 import * as api from "./api";
 import { el, notify, short, svg, toScans } from "./dom";
 import { degreesOf, FlatMap, Layer, type Place, placeOf, tileJson } from "./flatmap";
+import { coordinates, placeOf as globeOf, pointOf } from "./globe";
 import { coverageKeys } from "./keys";
+import { Ruler, type Scene } from "./measure";
 import { nameOf } from "./names";
+import { comparison } from "./swipe";
+import { Terrain } from "./terrain";
 import * as units from "./units";
 
 const REFRESH_MS = 2000;
 const COVERAGE = "Coverage";
+const TERRAIN = "terrain";
 const LAYERS: [string, string, boolean][] = [
   ["ortho", "Orthophoto", true],
+  [TERRAIN, "Height", false],
   ["dsm", "Surface (shaded)", false],
   ["coverage", COVERAGE, false],
   ["contours", "Contours", false],
@@ -38,6 +46,12 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     el("a", { href: open, textContent: "3D" }),
     el("a", { href: `${at}/ortho.kml`, textContent: "KML" }),
   );
+  const heights = new Terrain((z, x, y) => `${at}/${TERRAIN}/${z}/${x}/${y}.png`, `${at}/${TERRAIN}.json`);
+  const ramp = el("p", { className: "ramp", hidden: true }, el("span", {}), el("i", {}), el("span", {}));
+  let contours: Layer | null = null;
+  let track: Place[] = [];
+  const way = svg("svg", { class: "overlay track" });
+  const lettering = svg("svg", { class: "overlay heights" });
   const marks = svg("svg", { class: "overlay notes" });
   const again = svg("svg", { class: "overlay refly" });
   const plan = `${api.scanAddress(id)}/refly`;
@@ -46,9 +60,26 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   let notes: { place: Place; text: string }[] = [];
   const captions: (() => void)[] = []; // write what the panel states about layers
   const map = new FlatMap(host);
+  const showsTrack = el("input", { type: "checkbox", checked: true, onchange: () => map.draw() });
+  const ruler = new Ruler(sceneOf(map, heights, scan));
+  const measure = el("button", { textContent: "Measure", title: "click points: distance, height, slope, area, volume, profile", onclick: () => ruler.toggle() });
+  measure.setAttribute("aria-pressed", "false");
+  ruler.changed = () => {
+    measure.classList.toggle("on", ruler.active);
+    measure.setAttribute("aria-pressed", String(ruler.active));
+  };
+  head.insertBefore(measure, state.nextSibling);
+  const twins = comparison(map, scan, ["ortho", TERRAIN, "dsm", "contours"], [way, lettering]);
   if (scan.origin) map.middle = placeOf(scan.origin.lat_deg, scan.origin.lon_deg);
   map.over.push(() => {
     for (const write of captions) write();
+    way.replaceChildren(...(showsTrack.checked && track.length ? [svg("polyline", { points: map.path(track) })] : []));
+    const interval_m = (contours?.seen && contours.intervals_m[Layer.zoomOf(map.zoom)]) || 0;
+    lettering.replaceChildren(...(interval_m > 0 ? heights.labels(interval_m) : []).map(({ place, height_m, turn_deg }) => {
+      const [x, y] = map.seen(place).map((v) => v.toFixed(1)) as [string, string];
+      return svg("text", { x, y, dy: "4", transform: `rotate(${turn_deg.toFixed(0)} ${x} ${y})` }, units.length(height_m, interval_m < 1 ? 1 : 0));
+    }));
+    ruler.draw();
     marks.replaceChildren(
       ...notes.flatMap(({ place, text }) => {
         const [x, y] = map.seen(place);
@@ -62,11 +93,12 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     document.body.dataset["map"] = map.loading ? "loading" : "shown";
   });
   const add = (layer: Layer, title: string, on: boolean): void => {
-    layer.shown = on;
+    layer.seen = on;
     map.add(layer);
     const box = el("input", { type: "checkbox", checked: on });
     box.onchange = () => {
-      layer.shown = box.checked;
+      layer.seen = box.checked;
+      twins.follow();
       document.body.dataset["map"] = "loading"; // until it is drawn
       void layer.refresh().then(() => map.draw(), notify);
     };
@@ -76,13 +108,13 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     const words = el("span", { textContent: ` ${title}` });
     panel.append(el("div", {}, el("label", {}, box, words), share));
     captions.push(() => {
-      const step_m = layer.shown ? layer.intervals_m[Layer.zoomOf(map.zoom)] : undefined;
+      const step_m = layer.seen ? layer.intervals_m[Layer.zoomOf(map.zoom)] : undefined;
       words.textContent = step_m ? ` ${title}, ${units.length(step_m, step_m < 1 ? 1 : 0)}` : ` ${title}`;
     });
-    if (title !== COVERAGE) return;
-    const keys = coverageKeys();
+    const keys = title === COVERAGE ? coverageKeys() : layer === heights ? ramp : null;
+    if (!keys) return;
     panel.append(keys);
-    captions.push(() => (keys.hidden = !layer.shown));
+    captions.push(() => (keys.hidden = !layer.seen));
   };
   const plans = async (): Promise<void> => {
     if (!isPlanned) return;
@@ -99,6 +131,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
       tileJson(`${at}/ortho.json`).then((json) => ((none.hidden = json !== null), json)),
       api.annotations(id).catch(() => ({ features: [] })),
       plans().catch((error) => (lines.textContent = String(error.message ?? error))),
+      api.track(id).then((found) => (track = (found.geometry?.coordinates ?? []).map(([lon, lat]) => placeOf(lat, lon))), () => undefined),
       ...map.layers.map((layer) => layer.refresh()),
     ]);
     if (now.finished) say("finished", "finished");
@@ -120,12 +153,20 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   const refresh = (): Promise<void> => load().catch((error: Error) => say("silent", error.message));
 
   const basemap = await tileJson("/tiles/basemap.json");
-  const side = el("aside", {}, panel);
+  const side = el("aside", { className: "side", tabIndex: 0 }, panel);
   side.setAttribute("aria-label", "layers");
   root.replaceChildren(el("div", { className: "view flat" }, head, host, side));
   if (basemap) add(new Layer((z, x, y) => `/tiles/basemap/${z}/${x}/${y}`), "Basemap", true);
-  for (const [layer, title, on] of LAYERS)
-    add(new Layer((z, x, y) => `${at}/${layer}/${z}/${x}/${y}.png`, `${at}/${layer}.json`), title, on);
+  for (const [layer, title, on] of LAYERS) {
+    const one = layer === TERRAIN ? heights : new Layer((z, x, y) => `${at}/${layer}/${z}/${x}/${y}.png`, `${at}/${layer}.json`);
+    if (layer === "contours") contours = one;
+    add(one, title, on);
+  }
+  heights.ranged = () => {
+    const [low, high] = heights.range!.map((m) => units.length(m, 1));
+    [ramp.firstChild!.textContent, ramp.lastChild!.textContent] = [low!, high!];
+  };
+  panel.append(el("div", {}, el("label", {}, showsTrack, " Flown track")));
   const box = el("input", { type: "checkbox" });
   const lines = el("output", {});
   const files = el(
@@ -142,16 +183,56 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     void refresh();
   };
   panel.append(el("div", { title: "a flight over gaps and weak places" }, el("label", {}, box, " Fly again"), lines), files);
-  host.append(none, again, marks, cursor);
+  panel.append(twins.chooser);
+  host.append(none, way, again, lettering, ruler.overlay, marks, cursor, twins.divider);
+  side.prepend(ruler.panel);
   map.onHover = (place) => {
     const [lat, lon] = degreesOf(place);
-    cursor.value = `${lat.toFixed(7)}, ${lon.toFixed(7)}`;
+    const height_m = heights.heightAt(place);
+    cursor.value = height_m === null || !scan.origin ? `${lat.toFixed(7)}, ${lon.toFixed(7)}` : coordinates(scan.origin, pointOf(scan.origin, [lon, lat, height_m]));
   };
   await refresh();
   const timer = setInterval(() => void (document.hidden || refresh()), REFRESH_MS);
   return () => {
     clearInterval(timer);
     map.close();
+    ruler.close();
     delete document.body.dataset["map"];
+  };
+}
+
+/** The map as what is measured in: places in metres east, north and up of the scan's origin. */
+function sceneOf(map: FlatMap, heights: Terrain, { origin, quality }: api.Scan): Scene {
+  const point = (place: Place, height_m: number) => {
+    const [lat, lon] = degreesOf(place);
+    return pointOf(origin!, [lon, lat, height_m]);
+  };
+  return {
+    canvas: map.host,
+    origin,
+    pick: (x, y) => {
+      const box = map.host.getBoundingClientRect();
+      const place = map.under(x - box.left, y - box.top);
+      const height_m = origin && heights.heightAt(place);
+      return height_m === null ? null : point(place, height_m);
+    },
+    seen: (spot) => {
+      const { lat_deg, lon_deg } = globeOf(origin!, spot);
+      const [x, y] = map.seen(placeOf(lat_deg, lon_deg));
+      return { x, y };
+    },
+    points: (use) => {
+      // By the affine map of three places: over a scan it is exact to far less than a pixel.
+      const { middle } = map;
+      const step = 1e-6;
+      const zero_m = origin!.alt_amsl_m;
+      const [o, a, b] = [middle, { x: middle.x + step, y: middle.y }, { x: middle.x, y: middle.y + step }].map((p) => point(p, zero_m)) as [Vector3, Vector3, Vector3];
+      const [ax, bx] = [a.clone().sub(o).divideScalar(step), b.clone().sub(o).divideScalar(step)];
+      heights.eachHeight(({ x, y }, height_m) => {
+        const [u, v] = [x - middle.x, y - middle.y];
+        use(o.x + u * ax.x + v * bx.x, o.y + u * ax.y + v * bx.y, o.z + u * ax.z + v * bx.z + height_m - zero_m);
+      });
+    },
+    scaleSigma: () => quality?.scale_sigma,
   };
 }

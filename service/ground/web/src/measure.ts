@@ -1,11 +1,10 @@
 // The ruler: clicked places with labels over the scene, their figures, and the way out as GeoJSON.
 
-import * as THREE from "three";
+import { Vector3 } from "three";
 import type { Origin } from "./api";
 import { copy, el, save, svg, notify } from "./dom";
 import { along, area, lastStep, profile, type Points, type Volume, volume } from "./figures";
 import { coordinates, placeOf } from "./globe";
-import { eachPoint, HOVER_POINTS, pick } from "./pick";
 import * as units from "./units";
 
 const CLICK_PX = 5; // a pointer that moved farther turned the view
@@ -13,14 +12,16 @@ const LETTER_PX = 8;
 const LABEL_PX = 18; // height of a label with its outline
 const HOVER_MS = 120;
 
+/** What is measured in: the 3D view, or the map. */
 export interface Scene {
-  camera: THREE.Camera;
-  canvas: HTMLCanvasElement;
-  /** What is looked at: the cloud, tiles or mesh. */
-  target: () => THREE.Object3D;
-  /** The cloud, for volumes and profiles. */
-  cloud: THREE.Object3D;
+  canvas: HTMLElement;
   origin: Origin | null;
+  /** The place at a place of the page; null where nothing is measured. A quick look may miss some. */
+  pick: (x: number, y: number, quick?: boolean) => Vector3 | null;
+  /** Where the canvas shows a place, in CSS pixels; null where it is out of sight. */
+  seen: (place: Vector3) => { x: number; y: number } | null;
+  /** All points, for volumes and profiles. */
+  points: Points;
   /** Relative sigma of the scan's scale; none where nothing states it. */
   scaleSigma: () => number | null | undefined;
 }
@@ -30,22 +31,6 @@ addEventListener("pointerdown", (e) => (down = { x: e.clientX, y: e.clientY }), 
 
 /** Whether the pointer has not moved since it went down: it turned no view. */
 export const wasClick = (e: MouseEvent): boolean => Math.hypot(e.clientX - down.x, e.clientY - down.y) <= CLICK_PX;
-
-/** The place of the scene at a place of the page; null where there is none. */
-export function pickAt({ canvas, camera, target }: Scene, x: number, y: number, limit?: number): THREE.Vector3 | null {
-  const box = canvas.getBoundingClientRect();
-  const pointer = new THREE.Vector2((2 * (x - box.left)) / box.width - 1, 1 - (2 * (y - box.top)) / box.height);
-  return pick(target(), camera, pointer, new THREE.Vector2(box.width, box.height), limit);
-}
-
-/** Where the canvas shows a place, in CSS pixels; null behind the camera. */
-export function onScreen({ canvas, camera }: Scene, place: THREE.Vector3): { x: number; y: number } | null {
-  camera.updateMatrixWorld();
-  const q = place.clone().applyMatrix4(camera.matrixWorldInverse);
-  if (q.z > -1e-3) return null;
-  q.applyMatrix4(camera.projectionMatrix);
-  return { x: (canvas.clientWidth / 2) * (1 + q.x), y: (canvas.clientHeight / 2) * (1 - q.y) };
-}
 
 /** The middle of a label's base line and half its width, CSS pixels. */
 interface Label {
@@ -76,8 +61,8 @@ export class Ruler {
   /** Called when the ruler is switched on or off. */
   changed: () => void = () => undefined;
   /** What the panel offers with the places. */
-  offer: (places: THREE.Vector3[]) => HTMLElement | null = () => null;
-  private readonly places: THREE.Vector3[] = [];
+  offer: (places: Vector3[]) => HTMLElement | null = () => null;
+  private readonly places: Vector3[] = [];
   private volume: Volume | null = null;
   private heights: Float64Array | null = null;
   private hovered = 0;
@@ -105,7 +90,7 @@ export class Ruler {
 
   /** Draws lines and labels where the places are seen now. */
   readonly draw = (): void => {
-    const seen = this.places.map((place) => onScreen(this.scene, place));
+    const seen = this.places.map((place) => this.scene.seen(place));
     const inFront = seen.filter((p) => p !== null);
     const parts: SVGElement[] = [];
     const n = seen.length;
@@ -138,8 +123,8 @@ export class Ruler {
   }
 
   private click(event: MouseEvent): void {
-    if (!wasClick(event)) return;
-    const place = pickAt(this.scene, event.clientX, event.clientY);
+    if (!wasClick(event) || (event.target as HTMLElement).closest("button, input")) return;
+    const place = this.scene.pick(event.clientX, event.clientY);
     this.cursor.value = place ? coordinates(this.scene.origin, place) : "";
     if (!this.active) return;
     if (!place) return notify("nothing was measured there");
@@ -150,7 +135,7 @@ export class Ruler {
   private hover(event: PointerEvent): void {
     if (event.buttons || event.pointerType === "touch" || event.timeStamp - this.hovered < HOVER_MS) return;
     this.hovered = event.timeStamp;
-    const place = pickAt(this.scene, event.clientX, event.clientY, HOVER_POINTS);
+    const place = this.scene.pick(event.clientX, event.clientY, true);
     this.cursor.value = place ? coordinates(this.scene.origin, place) : "";
   }
 
@@ -177,7 +162,7 @@ export class Ruler {
 
   private measure(): void {
     const { places } = this;
-    const points: Points = (use) => eachPoint(this.scene.cloud, use);
+    const { points } = this.scene;
     this.volume = places.length > 2 ? volume(places, points) : null;
     this.heights = places.length > 1 ? profile(places, points) : null;
     this.rewrite();

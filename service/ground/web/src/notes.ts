@@ -4,7 +4,7 @@ import * as THREE from "three";
 import * as api from "./api";
 import { el, notify, short, svg } from "./dom";
 import { pointOf, placeOf } from "./globe";
-import { onScreen, pickAt, type Scene, wasClick } from "./measure";
+import { type Scene, wasClick } from "./measure";
 
 export class Notes {
   active = false;
@@ -31,11 +31,11 @@ export class Notes {
     const middle = el("button", {
       textContent: "Place at the middle",
       title: "where the middle of the view meets the scene",
-      onclick: () => this.place(pickAt(scene, ...middleOf(scene))),
+      onclick: () => this.place(scene.pick(...middleOf(scene))),
     });
     const hint = el("p", { textContent: "Write a note, then click its place." });
     this.panel.append(hint, this.text, el("p", { className: "acts" }, middle), this.list);
-    scene.canvas.addEventListener("click", (e) => this.active && wasClick(e) && this.place(pickAt(scene, e.clientX, e.clientY)));
+    scene.canvas.addEventListener("click", (e) => this.active && wasClick(e) && this.place(scene.pick(e.clientX, e.clientY)));
     addEventListener("keydown", this.press);
     if (scene.origin) void this.refresh();
   }
@@ -57,7 +57,7 @@ export class Notes {
   readonly draw = (): void => {
     const parts: SVGElement[] = [];
     for (const { feature, at } of this.notes) {
-      const spot = onScreen(this.scene, at);
+      const spot = this.scene.seen(at);
       if (!spot) continue;
       const [x, y] = [spot.x.toFixed(1), spot.y.toFixed(1)];
       parts.push(svg("circle", { cx: x, cy: y, r: "5" }), svg("text", { x, y: (spot.y - 10).toFixed(1) }, short(feature.properties.text)));

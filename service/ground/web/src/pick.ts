@@ -86,3 +86,19 @@ export function pick(root: THREE.Object3D, camera: THREE.Camera, pointer: THREE.
   root.traverse((node) => node instanceof THREE.Mesh && meshes.push(node));
   return caster.intersectObjects(meshes, false)[0]?.point ?? null;
 }
+
+/** The point of a scene at a place of the page. */
+export function pickAt(canvas: HTMLElement, camera: THREE.Camera, root: THREE.Object3D, x: number, y: number, limit?: number): THREE.Vector3 | null {
+  const box = canvas.getBoundingClientRect();
+  const pointer = new THREE.Vector2((2 * (x - box.left)) / box.width - 1, 1 - (2 * (y - box.top)) / box.height);
+  return pick(root, camera, pointer, new THREE.Vector2(box.width, box.height), limit);
+}
+
+/** Where a camera sees a place, in CSS pixels of its canvas; null behind it. */
+export function onScreen(canvas: HTMLElement, camera: THREE.Camera, place: THREE.Vector3): { x: number; y: number } | null {
+  camera.updateMatrixWorld();
+  const q = place.clone().applyMatrix4(camera.matrixWorldInverse);
+  if (q.z > -1e-3) return null;
+  q.applyMatrix4(camera.projectionMatrix);
+  return { x: (canvas.clientWidth / 2) * (1 + q.x), y: (canvas.clientHeight / 2) * (1 - q.y) };
+}

@@ -1,6 +1,6 @@
 // One scan in 3D: live cloud, track, cameras, key figures, image of a keyframe.
 
-import { Matrix4 } from "three";
+import { Matrix4, type Object3D } from "three";
 import * as api from "./api";
 import { Cameras } from "./cameras";
 import { compass } from "./compass";
@@ -9,9 +9,10 @@ import { Images, takeView, timeSlider } from "./explore";
 import { jobList } from "./jobs";
 import { LinkState } from "./link";
 import { LiveView, type LastPose, type News } from "./live";
-import { Ruler } from "./measure";
+import { Ruler, type Scene } from "./measure";
 import { nameOf } from "./names";
 import { Notes } from "./notes";
+import { eachPoint, HOVER_POINTS, onScreen, pickAt } from "./pick";
 import { awaited, placing } from "./place";
 import { Cloud } from "./points";
 import { SiteView } from "./site";
@@ -67,11 +68,13 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   }
   const stage = new Stage(host);
   const cameras = new Cameras();
-  const scene = {
-    camera: stage.camera,
-    canvas: stage.renderer.domElement,
-    target: () => (stage.model.children.length ? stage.model : cloud.group),
-    cloud: cloud.group,
+  const canvas = stage.renderer.domElement;
+  const target = (): Object3D => (stage.model.children.length ? stage.model : cloud.group);
+  const scene: Scene = {
+    canvas,
+    pick: (x, y, quick) => pickAt(canvas, stage.camera, target(), x, y, quick ? HOVER_POINTS : undefined),
+    seen: (place) => onScreen(canvas, stage.camera, place),
+    points: (use) => eachPoint(cloud.group, use),
     origin: scan.origin,
     scaleSigma: () => known.quality?.scale_sigma,
   };
