@@ -324,12 +324,30 @@ class ImagesSource:
             return _from_first(spread(local, tags)), min(local)
         if interval_s is None:
             missing = sum(t.local_ns is None and t.name_unix_ns is None for t in tags)
+            order, by = self._order(tagged)
             self._warn(
-                f"{missing} of {len(tags)} images have no time; ordered by name, one per second "
-                "(set it with images:DIR?interval_s=2)"
+                f"{missing} of {len(tags)} images have no time; ordered by {by}, one per second "
+                "(images:DIR?interval_s=2 orders them by name and sets it)"
             )
+            return [order.index(i) * SECOND_NS for i in range(len(tags))], unix[order[0]]
         step_ns = round((interval_s or 1.0) * SECOND_NS)
         return [i * step_ns for i in range(len(tags))], unix[0]
+
+    def _order(self, tagged: list[Still]) -> tuple[list[int], str]:
+        """Indices of stills without times in the order in which they are used, and by what."""
+        from service.cameras import still_order
+        from service.georeference import LocalFrame
+
+        fixes = [(t.geotag.lat_deg, t.geotag.lon_deg, 0.0) for _, t in tagged if t.geotag]
+        places = np.array(fixes, np.float64)  # None is NaN
+        named = list(range(len(tagged)))
+        if len(tagged) > still_order.MOST:
+            order, by = named, "name"
+        elif len(places) == len(tagged) and np.isfinite(places).all():
+            order, by = still_order.by_place(LocalFrame(*places[0]).to_enu(places)), "place"
+        else:
+            order, by = still_order.by_likeness([path for path, _ in tagged]), "likeness"
+        return (named, "name") if order == named else (order, by)
 
     def _warn(self, text: str) -> None:
         """Warn once, however often the stills are read."""
