@@ -38,7 +38,11 @@ def key(default: T, doc: str, live: bool = False) -> T:
 class CameraConfig:
     """[camera]: source of the images and mount of the camera."""
 
-    source: str = key("", "file:V.mp4, images:DIR, pipe:-, rtsp://…, v4l2:/dev/video0, gst:…, sim:")
+    source: str = key(
+        "",
+        "file:V.mp4, images:DIR, pipe:-, rtsp://…, rtmp-listen:1935/live, srt://:9000, "
+        "v4l2:/dev/video0, gst:…, sim:",
+    )
     model: str = key("", "camera model, ROS camera_info YAML as written by 'skyrelief calibrate'")
     mount: Literal["auto", "gimbal", "fixed"] = key(
         "auto", "auto: gimbal attitude if telemetry has it, otherwise fixed to the body"
@@ -81,7 +85,9 @@ class MavlinkConfig:
     """[mavlink]: links to the autopilot and our identity on them."""
 
     links: tuple[str, ...] = key(
-        (), "in pymavlink's notation: serial:/dev/…:921600, udpin:…, tcp:…"
+        (),
+        "in pymavlink's notation: serial:/dev/…:921600, udpin:…, tcp:…; lines:0.0.0.0:10110 for "
+        "NMEA or CSV on UDP",
     )
     system_id: int = key(0, "the vehicle's system id; 0: that of the connected autopilot")
     gimbal_yaw_frame: Literal["auto", "vehicle", "earth", "body", "servo"] = key(

@@ -8,6 +8,7 @@ another worker, and the worker is restarted where its row says so.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import logging
 import os
@@ -312,6 +313,13 @@ def open_process(name: str, command: Sequence[str], **streams: Any) -> subproces
     process = subprocess.Popen(command, start_new_session=True, **streams)
     _PROCESSES.append((name, process))
     return process
+
+
+@atexit.register
+def _end_processes() -> None:
+    """Leave none behind: it would keep its port."""
+    for _, process in _PROCESSES:
+        process.terminate()  # one that has ended is left alone
 
 
 def run_process(worker: Worker, row: str, command: Sequence[str]) -> None:

@@ -27,6 +27,7 @@ Message = Any
 DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
 HDOP_TO_M = 1.5  # range error of one sigma per unit of HDOP
 UNKNOWN_U16 = 65535
+UNKNOWN_I32 = -(1 << 31)  # by our own mavlink.wire.lines
 MAX_SIGMA_M = 1e5  # a receiver that says more says nothing
 UNIX_USEC = 10**15  # a time_usec beyond this is unix time, not time since boot
 TERRAIN_MODEL_SIGMA_M = 5.0
@@ -63,7 +64,10 @@ def _global_position(m: Message) -> Sample | None:
     if not plausible_place(lat, lon):
         return None
     velocity = (m.vx * 0.01, m.vy * 0.01, m.vz * 0.01)
-    return PositionSample(m.time_boot_ms, lat, lon, m.alt * 1e-3, m.relative_alt * 1e-3, velocity)
+    alt_m, above_home_m = (
+        None if mm == UNKNOWN_I32 else mm * 1e-3 for mm in (m.alt, m.relative_alt)
+    )
+    return PositionSample(m.time_boot_ms, lat, lon, alt_m, above_home_m, velocity)
 
 
 def _gps_raw(m: Message) -> Sample | None:

@@ -2,7 +2,8 @@
 
 A link is written as in pymavlink:
 ``serial:/dev/serial/by-id/NAME:921600``, ``udpin:0.0.0.0:14550`` (also ``udp:``),
-``udpout:192.168.1.2:14550``, ``tcp:HOST:PORT``, ``tcpin:0.0.0.0:5760``.
+``udpout:192.168.1.2:14550``, ``tcp:HOST:PORT``, ``tcpin:0.0.0.0:5760``; and ``lines:0.0.0.0:10110``
+for NMEA 0183 or CSV on UDP (:mod:`mavlink.wire.lines`).
 """
 
 from __future__ import annotations
@@ -235,11 +236,34 @@ def _ready(sockets: Sequence[socket.socket]) -> list[socket.socket]:
     return [numbered[number] for number, _ in poll.poll(1e3 * READ_S)]
 
 
+class LinesPort:
+    """Lines of NMEA or CSV on UDP, received as MAVLink; what is sent goes nowhere."""
+
+    is_quick = True
+
+    def __init__(self, spec: LinkSpec) -> None:
+        from mavlink.wire.lines import LineReader  # the dialect is slow to import
+
+        self._port, self._reader = UdpPort(spec), LineReader()
+
+    def read(self) -> bytes:
+        """The packets of the next datagram."""
+        data = self._port.read()
+        return self._reader.packets(data, time.monotonic_ns()) if data else b""
+
+    def write(self, data: bytes) -> None:
+        """Drop it: nothing at the other end reads MAVLink."""
+
+    def close(self) -> None:
+        self._port.close()
+
+
 PORTS: dict[str, Callable[[LinkSpec], Port]] = {
     "serial": SerialPort,
     "udpin": UdpPort,
     "udpout": UdpPort,
     "tcp": TcpPort,
     "tcpin": TcpServerPort,
+    "lines": LinesPort,
 }
 """Kind of link to its port. A new kind is one class and one line."""

@@ -24,6 +24,8 @@ CAMERAS: dict[str, str] = {
     "images": "service.cameras.images:open_images",
     "pipe": "service.cameras.video:open_pipe",
     "rtsp": "service.cameras.live:open_rtsp",
+    "rtmp-listen": "service.cameras.live:open_rtmp_listen",
+    "srt": "service.cameras.live:open_srt",
     "v4l2": "service.cameras.live:open_v4l2",
     "gst": "service.cameras.live:open_gst",
     "stream": "service.cameras.live:open_stream",

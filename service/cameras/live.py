@@ -4,7 +4,8 @@ The stream is reopened, with growing pauses, when it ends, fails, stalls or repe
 Images keep one time axis throughout: ns since the source was opened, on the machine's monotonic
 clock.
 
-``rtsp://…``; ``stream:URL`` for anything else that FFmpeg opens (udp, tcp, srt, http);
+``rtsp://…``; ``stream:URL`` for anything else that FFmpeg opens (udp, tcp, http);
+``rtmp-listen:1935/live`` waits for a controller or OBS to send RTMP, ``srt://:9000`` for SRT;
 ``v4l2:/dev/video0?video_size=1280x720&framerate=30&input_format=mjpeg``;
 ``gst:nvarguscamerasrc ! video/x-raw(memory:NVMM),width=1280 ! nvvidconv`` for CSI cameras and
 hardware decoders of a Jetson. The system's own ``gst-launch-1.0`` runs that pipeline, because
@@ -15,6 +16,9 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
+import re
+import select
 import shlex
 import shutil
 import subprocess
@@ -51,6 +55,15 @@ OPEN_S = 10.0
 
 LIVE_OPTIONS = {"fflags": "nobuffer", "flags": "low_delay", "fpsprobesize": "0"}
 """The last one: open the stream at once, without waiting some twenty images for its rate."""
+
+LISTEN_OPTIONS = {
+    "listen": "1",
+    "flags": "low_delay",
+    "fpsprobesize": "0",
+    "analyzeduration": "300000",
+}
+"""FLV may announce a sound track that never comes: it is waited for this many us, not for 5 s.
+The images of that time are kept: the next one to start from is seconds away."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +174,10 @@ class LiveSource:
                 last_ns = time_ns
 
     def _endless(self) -> Iterator[tuple[U8, int]]:
-        """Every (image, time) of every connection, with pauses that grow between failures."""
+        """Every (image, time) of every connection; the time between two attempts grows while they
+        fail. One that has waited for a sender for longer is followed by the next at once."""
         retry_s = self.config.first_retry_s
+        began_s = time.monotonic()
         while not self._closed.is_set():
             for found in self._images:
                 retry_s = self.config.first_retry_s
@@ -172,8 +187,9 @@ class LiveSource:
             if self._closed.is_set():
                 return
             self.losses += 1
-            self._closed.wait(retry_s)
+            self._closed.wait(max(0.0, began_s + retry_s - time.monotonic()))
             retry_s = min(2.0 * retry_s, self.config.longest_retry_s)
+            began_s = time.monotonic()
             self._images = self._connect()
 
     def _connect(self) -> Generator[tuple[U8, int], None, None]:
@@ -183,7 +199,8 @@ class LiveSource:
         try:
             container = self._open_container(self.config.stall_s)
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            self._warn(f"cannot be opened: {error}")
+            is_silent = isinstance(error, av.error.ExitError)
+            self._warn(f"no stream for {OPEN_S:g} s" if is_silent else f"cannot be opened: {error}")
             return
         try:
             stream = video_stream(container)
@@ -266,6 +283,29 @@ def open_stream(rest: str, options: Mapping[str, str]) -> CameraSource:
     return _live(rest, LIVE_OPTIONS)
 
 
+def open_rtmp_listen(rest: str, options: Mapping[str, str]) -> CameraSource:
+    """What is sent to this machine by RTMP, to ``rest``: ``[HOST:]PORT[/NAME]``."""
+    reject_options("rtmp-listen", options)
+    place = re.fullmatch(r"(?:([^/\s:]+):)?(\d{1,5})(?:/(\S*))?", rest)
+    if place is None or not 0 < int(place[2]) < 65536:
+        raise InputError(f"rtmp-listen:{rest} is not like rtmp-listen:1935/live")
+    return _live(f"rtmp://{place[1] or '0.0.0.0'}:{place[2]}/{place[3] or ''}", LISTEN_OPTIONS)
+
+
+def open_srt(rest: str, options: Mapping[str, str]) -> CameraSource:
+    """MPEG-TS by SRT: without a host it is waited for, ``srt://:9000``, else fetched.
+
+    GStreamer receives it: PyAV from PyPI comes without SRT.
+    """
+    reject_options("srt", options)
+    place = re.fullmatch(r"//([^/\s:?@]*|\[[0-9a-fA-F:]+\]):(\d{1,5})(\?\S*)?", rest)
+    if place is None or not 0 < int(place[2]) < 65536:
+        raise InputError(f"srt:{rest} is not like srt://:9000")
+    source = ["srtsrc", f"uri=srt:{rest}", *([] if place[1] else ["mode=listener"])]
+    description = without_credentials(f"srt:{rest}")
+    return _launched([*source, "!", "fdsink", "fd=1"], description, LISTEN_OPTIONS)
+
+
 def open_v4l2(rest: str, options: Mapping[str, str]) -> CameraSource:
     """The V4L2 device ``rest``; uses the kernel's time stamps."""
     reject_options("v4l2", options, V4L2_OPTIONS)
@@ -300,15 +340,23 @@ def open_gst(rest: str, options: Mapping[str, str]) -> CameraSource:
     The pipeline ends in raw video in system memory. Time stamps are those of arrival.
     """
     reject_options("gst", options)
-    launcher = shutil.which("gst-launch-1.0")
-    if launcher is None:
-        raise OutsideError("gst: gst-launch-1.0 is not installed (apt install gstreamer1.0-tools)")
     try:
-        command = [launcher, "-q", *shlex.split(rest), "!", *shlex.split(TAIL)]
+        elements = [*shlex.split(rest), "!", *shlex.split(TAIL)]
     except ValueError as error:
         raise InputError(f"gst: the pipeline cannot be read: {error}") from error
-    description = without_credentials(f"gst:{rest}")
-    return Paced(LiveSource(lambda stall_s: _open_command(command, stall_s), description))
+    return _launched(elements, without_credentials(f"gst:{rest}"), {})
+
+
+def _launched(elements: list[str], description: str, demuxer: dict[str, str]) -> CameraSource:
+    """Output of a GStreamer pipeline that writes a container to its standard output."""
+    launcher = shutil.which("gst-launch-1.0")
+    if launcher is None:
+        raise OutsideError(
+            f"{description}: gst-launch-1.0 is not installed (apt install gstreamer1.0-tools "
+            "gstreamer1.0-plugins-bad)"
+        )
+    command = [launcher, "-q", *elements]
+    return Paced(LiveSource(lambda stall_s: _open_command(command, stall_s, demuxer), description))
 
 
 class _Complaints:
@@ -333,7 +381,27 @@ class _Complaints:
         return self.first
 
 
-def _open_command(command: list[str], stall_s: float) -> Any:
+OUTPUT_BYTES = 1 << 18
+"""Read at once from a command: raw video is 40 MB/s."""
+
+
+class _Output:
+    """Output of a command as a file; FFmpeg's own pipe waits for a silent command for ever."""
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        self._number = pipe.fileno()
+        self._poll = select.poll()
+        self._poll.register(self._number, select.POLLIN)
+        self.wait_s = OPEN_S
+
+    def read(self, size: int) -> bytes:
+        """The next bytes, empty at the end; TimeoutError after ``wait_s`` without any."""
+        if not self._poll.poll(1e3 * self.wait_s):
+            raise TimeoutError(f"no data for {self.wait_s:g} s")
+        return os.read(self._number, size)
+
+
+def _open_command(command: list[str], stall_s: float, demuxer: dict[str, str]) -> Any:
     """A container with the output of ``command``; closing it ends the command.
 
     Raises OSError with the command's own complaint when it writes no video.
@@ -347,13 +415,15 @@ def _open_command(command: list[str], stall_s: float) -> Any:
     complaints = _Complaints(process.stderr)
     with ExitStack() as on_fault:
         on_fault.callback(_end, process)
+        output = _Output(process.stdout)
         try:
-            container = av.open(f"pipe:{process.stdout.fileno()}", timeout=(OPEN_S, stall_s))
+            container = av.open(output, options=demuxer, buffer_size=OUTPUT_BYTES)
         except (av.error.FFmpegError, OSError) as error:
             on_fault.close()
             if complaint := complaints.wait():
                 raise OSError(complaint) from error
             raise
+        output.wait_s = stall_s
         on_fault.pop_all()
     return _CommandContainer(container, process)
 

@@ -175,15 +175,17 @@ class ScanRun:
 
         wait_s, is_answer = FIRST_RETRY_S, self._is_asked
         while not self.stop.is_set():
+            began_s = time.monotonic()
             try:
                 source = (self._opener or open_camera)(self._config.camera.source)
                 return source if isinstance(source, Paced) else Paced(source)
             except OutsideError as error:
-                log.warning("%s; retry in %.1f s", error, wait_s)
+                log.warning("%s; trying again", error)
                 text = f"Camera: {error}"
                 self._with.vehicle.statustext(text, WARNING, is_answer=is_answer)
                 is_answer = False
-                self.stop.wait(wait_s)
+                # A source that listens for a sender is open again at once.
+                self.stop.wait(max(0.0, began_s + wait_s - time.monotonic()))
                 wait_s = min(2 * wait_s, LAST_RETRY_S)
         return None
 

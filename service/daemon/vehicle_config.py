@@ -3,6 +3,7 @@ as MAVLink parameters."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,6 +51,8 @@ def watch_config(
 ) -> WatchConfig:
     """Messages that the links must carry for this camera, and how long to wait for them."""
     gimbal = {"auto": None, "gimbal": True, "fixed": False}[config.camera.mount]
+    if all(link.startswith("lines:") for link in config.mavlink.links):
+        ground_wait_s = math.inf  # no ground station shares the link
     return WatchConfig(gimbal, wait_s, ground_wait_s)
 
 

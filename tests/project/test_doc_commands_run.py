@@ -44,6 +44,7 @@ ELSEWHERE = {
     "pip install ": "packages: trials/test_trial_boot.py",
     "skyrelief ground --mavlink serial:": "a telemetry radio",
     "skyrelief site ": "test_site.py",
+    "skyrelief run --config drone.toml": "test_cameras_live.py, test_mavlink_lines.py",
     "skyrelief replay flight.mp4 --backend onnx --set compute.model": "test_backend_choice.py",
     "git ": "the shell: test_doc_first_change.py",
     "cd skyrelief": "the shell: test_doc_first_change.py",

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import io
 import itertools
+import os
 import shlex
 import shutil
+import signal
 import socket
 import subprocess
 import threading
@@ -19,9 +22,9 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from loopback import until
+from loopback import free_port, until
 
-from service.cameras import CameraFrame, CameraSource, open_camera
+from service.cameras import CameraFrame, CameraSource, live, open_camera
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
 from service.cameras.source import Paced
 from service.errors import InputError, OutsideError
@@ -287,12 +290,6 @@ def test_wrong_live_sources_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_pa
         open_camera("gst:videotestsrc")
 
 
-def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def send_udp(port: int) -> subprocess.Popen[bytes]:
     """A moving test image in H.264 over MPEG-TS, 20 a second, for ever."""
     return subprocess.Popen(
@@ -307,7 +304,7 @@ def send_udp(port: int) -> subprocess.Popen[bytes]:
 
 @needs_ffmpeg
 def test_stream_survives_the_death_of_its_sender() -> None:
-    port = free_udp_port()
+    port = free_port()
     senders = [send_udp(port)]
     source_lost: list[bool] = []
     frames: list[CameraFrame] = []
@@ -393,6 +390,107 @@ def test_a_gstreamer_decoder_with_padded_images_is_read(tmp_path: Path) -> None:
 def test_what_gstreamer_complains_about_is_reported() -> None:
     with pytest.raises(OutsideError, match='no element "nosuchsource"'):
         open_camera("gst:nosuchsource ! queue")
+
+
+class Sender:
+    """What a controller or OBS does: send a moving test image to ``url``, and try again."""
+
+    def __init__(self, url: str, container: str) -> None:
+        send = (
+            "ffmpeg -v error -re -f lavfi -i testsrc2=size=160x120:rate=20 -c:v libx264 "
+            f"-preset ultrafast -tune zerolatency -g 20 -pix_fmt yuv420p -f {container} {url}"
+        )
+        again = f"until {send}; do sleep 0.2; done"
+        self._process = subprocess.Popen(
+            ["sh", "-c", again],
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+
+    def kill(self) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+
+LISTENING = {
+    "rtmp": ("rtmp-listen:127.0.0.1:{port}/live", "rtmp://127.0.0.1:{port}/live/key", "flv"),
+    "srt": ("srt://:{port}", "srt://127.0.0.1:{port}", "mpegts"),
+}
+
+
+@needs_ffmpeg
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", LISTENING)
+def test_who_sends_is_waited_for_again(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sender comes late, ends, and comes again: one time axis, and no long pause."""
+    if kind == "srt" and not has_gstreamer("srtsrc"):
+        pytest.skip("needs GStreamer's srtsrc")
+    monkeypatch.setattr(live, "OPEN_S", 1.0)  # the first attempts end before anyone sends
+    port = free_port()
+    source, url, container = (text.format(port=port) for text in LISTENING[kind])
+    with pytest.raises(OutsideError, match=r"no (stream|data) for 1 s"):
+        open_camera(source)
+    monkeypatch.setattr(live, "OPEN_S", 10.0)
+    sender = Sender(url, container)
+    frames = []
+    try:
+        camera = open_camera(source)
+        for frame in camera:
+            frames.append(frame)
+            if len(frames) == 20:
+                sender.kill()
+                sender = Sender(url, container)
+            if len(frames) == 40:
+                camera.close()
+    finally:
+        sender.kill()
+    assert [f.seq for f in frames] == list(range(len(frames)))
+    times = np.array([f.time_ns for f in frames])
+    assert (np.diff(times) > 0).all()
+    assert np.diff(times).argmax() in (19, 20, 21)  # the loss
+
+
+def test_an_attempt_that_waited_for_a_sender_is_followed_by_the_next_at_once() -> None:
+    """Otherwise the port is closed to a sender that comes meanwhile."""
+    tries: list[float] = []
+
+    def open_container(stall_s: float) -> Any:
+        if not tries:
+            tries.append(time.monotonic())
+            return RealTime(av.open(io.BytesIO(clip(3))))
+        tries.append(time.monotonic())
+        if len(tries) < 4:
+            time.sleep(0.3)
+            tries.append(time.monotonic())
+            raise OSError("no sender came")
+        return RealTime(av.open(io.BytesIO(clip(9))))
+
+    config = LiveConfig(first_retry_s=0.2, longest_retry_s=0.25)
+    frames = take(LiveSource(open_container, "test", config), 5)
+    assert len(frames) == 5
+    assert tries[3] - tries[2] < 0.1
+
+
+@pytest.mark.parametrize("source", ["rtmp-listen:live", "rtmp-listen:0/live", "srt://", "srt:9000"])
+def test_a_place_to_listen_at_has_a_port(source: str) -> None:
+    with pytest.raises(InputError, match="is not like"):
+        open_camera(source)
+
+
+def test_a_command_that_falls_silent_is_ended(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """FFmpeg's own pipe would wait for it for ever."""
+    launcher = tmp_path / "gst-launch-1.0"
+    (tmp_path / "clip").write_bytes(clip(20))
+    launcher.write_text(f"#!/bin/sh\ncat {tmp_path}/clip\nexec sleep 60\n")
+    launcher.chmod(0o755)
+    opened = live._open_command([str(launcher)], 0.2, {})
+    with pytest.raises(TimeoutError, match=r"no data for 0\.2 s"):
+        list(opened.demux(opened.streams.video[0]))
+    opened.close()
 
 
 @needs_ffmpeg
