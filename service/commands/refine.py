@@ -20,7 +20,7 @@ def refine(
     scan_dir: ScanDir,
     gcp: Annotated[
         Path | None,
-        typer.Option(help="CSV or gcp_list.txt of ground control points (docs/refine.md)"),
+        typer.Option(help="CSV, gcp_list.txt or Metashape XML of control points (docs/refine.md)"),
     ] = None,
     telemetry: Annotated[
         Path | None, typer.Option(help="flight log; default: link.tlog next to the scan, if any")

@@ -2,7 +2,7 @@
 
 A file is a CSV, or a ``gcp_list.txt`` as OpenDroneMap's users have it: the first line is a
 coordinate system, each other one x, y, z of a point, its pixel, and the name of a still and of
-the point. Heights that are all 0 are not surveyed.
+the point. Heights that are all 0 are not surveyed. Or it is the XML of Metashape's markers.
 
 A row of a CSV without ``alt_amsl_m`` is of a point surveyed horizontally only. One row is one
 sighting: ``keyframe_seq``, ``time`` or ``image`` with ``u_px,v_px`` in the camera's own image, or
@@ -12,7 +12,7 @@ sighting: ``keyframe_seq``, ``time`` or ``image`` with ``u_px,v_px`` in the came
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -22,6 +22,7 @@ from msgspec import Meta
 
 from service.errors import InputError
 from service.georeference import system_of
+from service.offline.refine.metashape_file import read_metashape
 from service.small_file import read_small
 
 LARGEST_BYTES = 10_000_000
@@ -59,6 +60,10 @@ class SurveyRow(msgspec.Struct, frozen=True):
                 "give u_px and v_px with one of keyframe_seq, time (unix seconds) and image "
                 "(name of a still), or x, y and z"
             )
+
+
+Row = tuple[int, SurveyRow]
+"""Line number and content."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +104,7 @@ def read_survey(path: Path) -> list[SurveyPoint]:
     except UnicodeDecodeError as error:
         raise InputError(f"{path} cannot be read ({error}); it should be CSV in UTF-8") from error
     lines = text.splitlines()
-    for line, row in (_marks if is_list(lines) else _rows)(path, lines):
+    for line, row in _reader(lines)(path, lines):
         point = _point(line, row)
         before = points.get(point.name)
         if before is None:
@@ -121,12 +126,13 @@ def read_survey(path: Path) -> list[SurveyPoint]:
 def at_times(
     survey: Sequence[SurveyPoint], times_unix_s: Mapping[str, float], path: Path
 ) -> list[SurveyPoint]:
-    """The points with the time of each still that they name.
+    """The points with the time of each still that they name, with or without its extension.
 
     Raises InputError, with the line, for a name that is not among ``times_unix_s``.
     """
+    known = {Path(name).stem: time_s for name, time_s in times_unix_s.items()} | dict(times_unix_s)
     return [
-        replace(point, sightings=tuple(_at_time(s, times_unix_s, path) for s in point.sightings))
+        replace(point, sightings=tuple(_at_time(s, known, path) for s in point.sightings))
         for point in survey
     ]
 
@@ -142,6 +148,24 @@ def _said(p: SurveyPoint) -> tuple[str, float, float, float | None, float, float
     return p.name, p.lat_deg, p.lon_deg, p.alt_amsl_m, p.sigma_h_m, p.sigma_v_m, p.is_check
 
 
+def _reader(lines: Sequence[str]) -> Callable[[Path, Sequence[str]], Iterator[Row]]:
+    if lines and lines[0].lstrip().startswith("<"):
+        return _markers
+    return _marks if is_list(lines) else _rows
+
+
+def _markers(path: Path, lines: Sequence[str]) -> Iterator[Row]:
+    """Line number and content of each mark of Metashape's markers."""
+    try:
+        for line, row in read_metashape("\n".join(lines)):
+            try:
+                yield line, msgspec.convert(row, SurveyRow)
+            except msgspec.ValidationError as error:
+                raise ValueError(f"line {line}: {str(error).replace(' - at `$', ', ')}") from error
+    except ValueError as error:
+        raise InputError(f"{path} {error}") from error
+
+
 LIST_COLUMNS = 6
 
 
@@ -151,7 +175,7 @@ def is_list(lines: Sequence[str]) -> bool:
     return len(next(rows, ())) >= LIST_COLUMNS and "lat" not in lines[0].split(",")
 
 
-def _marks(path: Path, lines: Sequence[str]) -> Iterator[tuple[int, SurveyRow]]:
+def _marks(path: Path, lines: Sequence[str]) -> Iterator[Row]:
     """Line number and content of each row of a ``gcp_list.txt``."""
     try:
         system, datum = system_of(lines[0])
@@ -183,7 +207,7 @@ def _marks(path: Path, lines: Sequence[str]) -> Iterator[tuple[int, SurveyRow]]:
             raise InputError(f"{where}: {str(error).replace(' - at `$', ', ')}") from error
 
 
-def _rows(path: Path, lines: Sequence[str]) -> Iterator[tuple[int, SurveyRow]]:
+def _rows(path: Path, lines: Sequence[str]) -> Iterator[Row]:
     """Line number and content of each row of a CSV."""
     table = csv.reader(lines)
     try:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
+import re
 import struct
 from dataclasses import dataclass, replace
 from functools import cache
@@ -12,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink  # type: ignore[import-untyped]
 from typer.testing import CliRunner
 
@@ -20,9 +24,10 @@ from recon.types import F64, DepthMap, Keyframe, Pose
 from service.cli import app
 from service.errors import InputError
 from service.georeference import LocalFrame
+from service.offline.refine.metashape_file import read_metashape
 from service.offline.refine.refinement import RefineOptions, refine, undo
 from service.offline.refine.revisions import REFINED, Revisions
-from service.offline.refine.survey_file import read_survey
+from service.offline.refine.survey_file import at_times, read_survey
 from service.stream.codec import encode
 from service.stream.records import (
     PoseRecord,
@@ -647,6 +652,83 @@ def test_a_bad_list_is_said_in_one_line(tmp_path: Path, text: str, said: str) ->
     with pytest.raises(InputError) as raised:
         read_survey(path)
     assert said in str(raised.value) and str(path) in str(raised.value)
+
+
+MARKERS = """<?xml version="1.0" encoding="UTF-8"?>
+<document version="1.2.0">
+  <chunk>
+    <cameras>
+      <camera id="0" label="DJI_0001"/>
+      <camera id="7" label="b.JPG"><reference x="1" y="2" z="3"/></camera>
+    </cameras>
+    <markers>
+      <marker id="0" label="GCP &amp; 1">
+        <reference x="465000.5" y="5249000.25" z="410.5" sxy="0.02" sz="0.04" enabled="true"/>
+      </marker>
+      <marker id="1" label="K1"><reference x="465010" y="5249000" z="411" enabled="0"/></marker>
+      <marker id="2" label="tie"/>
+    </markers>
+    <frames>
+      <frame id="0">
+        <markers>
+          <marker marker_id="0">
+            <location camera_id="0" pinned="true" x="13" y="30.5"/>
+            <location camera_id="7" pinned="true" x="80.5" y="7.5"/>
+            <location camera_id="7" pinned="0" valid="0"/>
+          </marker>
+          <marker marker_id="1"><location camera_id="7" pinned="true" x="3.5" y="4.5"/></marker>
+          <marker marker_id="2"><location camera_id="7" pinned="true" x="3" y="4"/></marker>
+        </markers>
+      </frame>
+    </frames>
+    <reference>EPSG:32632</reference>
+  </chunk>
+</document>
+"""
+
+
+def test_markers_of_metashape_are_read_as_a_table_is(tmp_path: Path) -> None:
+    """Its images begin at the corner of the first pixel; a marker without a place is none."""
+    path = tmp_path / "markers.xml"
+    path.write_text(MARKERS)
+    first, second = read_survey(path)
+    assert (first.name, second.name) == ("GCP & 1", "K1")
+    assert (first.is_check, second.is_check) == (False, True)
+    assert (first.alt_amsl_m, first.sigma_h_m, first.sigma_v_m) == (410.5, 0.02, 0.04)
+    assert second.sigma_h_m == 0.03  # not stated
+    assert [s.uv_px for s in first.sightings] == [(12.5, 30.0), (80.0, 7.0)]
+    place = LocalFrame(first.lat_deg, first.lon_deg, 0.0).to_utm(np.zeros((1, 3)))[0]
+    np.testing.assert_allclose(place[:2], (465000.5, 5249000.25), atol=1e-3)
+    times = {"DJI_0001.JPG": 5.0, "b.JPG": 7.0}
+    assert [s.time_unix_s for s in at_times([first], times, path)[0].sightings] == [5.0, 7.0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("EPSG:32632", "", "names no coordinate system"),
+        ("EPSG:32632", "LOCAL_CS[&quot;here&quot;]", "is not a coordinate system"),
+        ("EPSG:32632", "EPSG:4979", "not ellipsoidal"),
+        ("</frames>", "", "not XML: mismatched tag: line 29"),
+        ("<document ", "<!DOCTYPE d [<!ENTITY a 'a'>]><document ", "a document type"),
+        ('camera_id="0"', 'camera_id="3"', "line 19: no '3'"),
+        ('x="13"', 'x="west"', "line 19: could not convert"),
+        ('x="13"', 'x="1e30"', "line 19: Expected"),
+    ],
+)
+def test_bad_markers_are_said_in_one_line(tmp_path: Path, old: str, new: str, said: str) -> None:
+    path = tmp_path / "markers.xml"
+    path.write_text(MARKERS.replace(old, new))
+    with pytest.raises(InputError) as raised:
+        read_survey(path)
+    assert said in str(raised.value) and str(path) in str(raised.value)
+
+
+@given(st.lists(st.sampled_from([*re.findall(r"<[^>]*>|[^<>\\s]+", MARKERS), "<", "&", "\0"])))
+def test_any_markers_are_read_or_refused(parts: list[str]) -> None:
+    with contextlib.suppress(ValueError):
+        for _ in read_metashape("<" + "".join(parts)):
+            pass
 
 
 def test_the_command_reports_and_takes_no_other_video(flight: Flight) -> None:

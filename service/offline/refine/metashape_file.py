@@ -1,0 +1,109 @@
+"""Markers of Agisoft Metashape (*Export markers*, XML): places, and marks in images.
+
+The upper left corner of its images is 0, 0: half a pixel from the centre of the first one. A marker
+whose place Metashape did not use (``enabled``) is a check point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+from xml.parsers import expat
+
+from service.georeference import system_of
+
+Attributes = dict[str, str]
+SYSTEMS = ("reference", "wkt")
+"""Elements whose text may be the coordinate system, as WKT or EPSG:n."""
+
+
+def read_metashape(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Line number and the fields of each mark: those of ``survey_file.SurveyRow``.
+
+    Raises ValueError, which names the line where there is one.
+    """
+    reader = _Reader()
+    parser = reader.parser = expat.ParserCreate("utf-8")
+    parser.buffer_text = True
+    parser.StartElementHandler = reader.start
+    parser.EndElementHandler = reader.end
+    parser.CharacterDataHandler = reader.text
+    parser.StartDoctypeDeclHandler = _refuse
+    try:
+        parser.Parse(text.encode(), True)
+    except expat.ExpatError as error:
+        raise ValueError(f"not XML: {error}") from error
+    yield from reader.rows()
+
+
+def _refuse(*_: object) -> None:
+    raise ValueError("it declares a document type, which Metashape does not")
+
+
+class _Reader:
+    """Collects cameras, markers with their places, and marks."""
+
+    def __init__(self) -> None:
+        self.parser: Any = None
+        self._open: list[str] = []
+        self._cameras: dict[str, str] = {}  # labels by number
+        self._labels: dict[str, str] = {}  # of markers, by number
+        self._places: dict[str, Attributes] = {}
+        self._marks: list[tuple[int, str, Attributes]] = []  # line, number of the marker
+        self._system = self._texts = self._marker = ""
+
+    def start(self, element: str, attributes: Attributes) -> None:
+        self._open.append(element)
+        self._texts = ""
+        number = attributes.get("marker_id", attributes.get("id", ""))
+        if element == "camera" and "label" in attributes:
+            self._cameras[number] = attributes["label"]
+        elif element == "marker":
+            self._marker = number
+            if "label" in attributes:
+                self._labels[number] = attributes["label"]
+        elif element == "reference" and "marker" in self._open and "x" in attributes:
+            self._places[self._marker] = attributes
+        elif element == "location" and attributes.get("valid", "1") in ("1", "true"):
+            self._marks.append((self.parser.CurrentLineNumber, self._marker, attributes))
+
+    def end(self, element: str) -> None:
+        self._open.pop()
+        if element in SYSTEMS and "camera" not in self._open and self._texts.strip():
+            self._system = self._system or self._texts.strip()
+
+    def text(self, text: str) -> None:
+        self._texts += text
+
+    def rows(self) -> Iterator[tuple[int, dict[str, Any]]]:
+        """The marks of markers that have a place."""
+        if not self._system:
+            raise ValueError("it names no coordinate system; export the markers with one")
+        system, datum = system_of(self._system)
+        if datum == "ellipsoid":
+            raise ValueError("heights above mean sea level are needed, not ellipsoidal")
+        for line, marker, mark in self._marks:
+            place = self._places.get(marker)
+            if place is None:
+                continue
+            try:
+                lon, lat = system.transform(float(place["x"]), float(place["y"]))
+                row = {
+                    "name": self._labels.get(marker, f"point {marker}"), "lat": lat, "lon": lon,
+                    "alt_amsl_m": float(place["z"]) if "z" in place else None,
+                    "image": self._cameras[mark["camera_id"]],
+                    "u_px": float(mark["x"]) - 0.5, "v_px": float(mark["y"]) - 0.5,
+                    "role": "control" if _is_enabled(place) else "check",
+                }  # fmt: skip
+                for field, names in (("sigma_h_m", ("sxy", "sx")), ("sigma_v_m", ("sz",))):
+                    stated = [float(place[name]) for name in names if name in place]
+                    row |= {field: stated[0]} if stated and stated[0] > 0.0 else {}
+            except KeyError as error:
+                raise ValueError(f"line {line}: no {error} of a mark or its marker") from error
+            except ValueError as error:
+                raise ValueError(f"line {line}: {error}") from error
+            yield line, row
+
+
+def _is_enabled(place: Attributes) -> bool:
+    return place.get("enabled", "true") in ("1", "true")
