@@ -108,6 +108,17 @@ def fitted(camera: Camera, source: CameraSource) -> tuple[Camera, list[str]]:
     )
 
 
+def check_width(camera: Camera, what: str) -> None:
+    """Raise InputError for a view so narrow that what is made of it lies where it is not."""
+    side = max(camera.size_px)
+    if camera.K[0, 0] > MAX_FOCAL * side:
+        view_deg = 2.0 * math.degrees(math.atan(0.5 * side / camera.K[0, 0]))
+        raise InputError(
+            f"{what}: the view is {view_deg:.1f} degrees wide; below 3 degrees the images cannot "
+            "tell how far the ground is from how the camera turns, so nothing is made of them"
+        )
+
+
 def lens_of(
     photo: Mapping[int, Any], xmp: Mapping[str, str], size_px: tuple[int, int]
 ) -> Lens | None:

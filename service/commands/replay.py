@@ -202,7 +202,7 @@ def _replay(
     is_latency_given: bool,
 ) -> dict[str, Any]:
     from service.cameras import open_camera, parse_source
-    from service.cameras.lens import fitted
+    from service.cameras.lens import check_width, fitted
     from service.commands.all_stills import all_stills
     from service.commands.unstated import (
         start_lens,
@@ -219,6 +219,7 @@ def _replay(
     else:
         start = start_lens(source, log)
         lens = start.camera
+    check_width(lens, source.description)
     lens, config = with_stated_readout(lens, config, video, source, notes)
     epoch_ns = start_of(source, log, video_epoch, notes)
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))

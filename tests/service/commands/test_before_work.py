@@ -7,10 +7,13 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from command_line import skyrelief
 from house_flight import HouseFlight
 
+from recon.types import Camera
+from service.cameras.camera_file import save_camera
 from service.commands import replay
 from service.compute import backend_choice
 from service.offline.exports import EXPORTERS, kind_of
@@ -40,6 +43,25 @@ def test_simulate_refuses_a_folder_in_use_before_it_works(
     out = tmp_path if name != "camera.yaml/a" else tmp_path / name / "below"
     ended = skyrelief("simulate", "--out", out)
     assert ended.returncode == 2 and ended.stderr.count("\n") == 1
+
+
+def test_replay_refuses_a_view_that_is_too_narrow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it would make lies hundreds of metres from where it is."""
+    from PIL import Image
+
+    monkeypatch.setattr(backend_choice, "open_backend", never)
+    (tmp_path / "stills").mkdir()
+    for k in range(2):
+        Image.new("RGB", (640, 480), (90 * k, 90, 90)).save(tmp_path / "stills" / f"{k}.png")
+    K = np.array([[26_000.0, 0.0, 320.0], [0.0, 26_000.0, 240.0], [0.0, 0.0, 1.0]])
+    save_camera(tmp_path / "camera.yaml", Camera(K, np.zeros(5), (640, 480)))
+    out = tmp_path / "scan"
+    model = ("--camera-model", tmp_path / "camera.yaml")
+    ended = skyrelief("replay", tmp_path / "stills", *model, "--out", out)
+    assert ended.returncode == 2 and not out.exists()
+    assert "the view is 1.4 degrees wide" in ended.stderr
 
 
 def test_a_stopped_simulation_leaves_nothing(
