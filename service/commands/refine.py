@@ -22,6 +22,9 @@ def refine(
         Path | None,
         typer.Option(help="CSV, gcp_list.txt or Metashape XML of control points (docs/refine.md)"),
     ] = None,
+    marks: Annotated[
+        Path | None, typer.Option(help="marks of those points as a file of their own, as Pix4D's")
+    ] = None,
     telemetry: Annotated[
         Path | None, typer.Option(help="flight log; default: link.tlog next to the scan, if any")
     ] = None,
@@ -49,6 +52,8 @@ def refine(
     from service.offline.refine.refinement import refine as run
     from service.offline.refine.refinement import undo as run_undo
 
+    if marks and not gcp:
+        raise InputError("--marks needs --gcp with the points")
     if intrinsics and video is None:
         raise InputError("--intrinsics needs --video FILE")
     if intrinsics and video is not None:
@@ -59,12 +64,14 @@ def refine(
         print(json.dumps(figures) if as_json else "\n".join(_camera_lines(figures)))
         return
     if undo:
-        if gcp or telemetry or out or video:
+        if gcp or marks or telemetry or out or video:
             raise InputError("--undo takes nothing else")
         figures = run_undo(scan_dir)
     else:
         with showing("refine") as progress:
-            figures = run(scan_dir, RefineOptions(gcp, telemetry, out, loops, video), progress)
+            figures = run(
+                scan_dir, RefineOptions(gcp, telemetry, out, loops, video, marks), progress
+            )
     print(json.dumps(figures) if as_json else "\n".join(_lines(figures)))
 
 

@@ -98,6 +98,7 @@ class RefineOptions:
     out: Path | None = None
     loops: bool = True
     video: Path | None = None
+    marks: Path | None = None  # of the points in gcp, as Pix4D has them
 
 
 def refine(
@@ -109,7 +110,7 @@ def refine(
     keyframes, and for bad control points.
     """
     if options.gcp is not None:
-        read_survey(options.gcp)  # refused before the work
+        read_survey(options.gcp, options.marks)  # refused before the work
     with _target(folder, options.out) as target:
         with ScanStore.open(target / "scan.db") as store:
             store.hold_decoded()
@@ -299,7 +300,11 @@ class _Refinement:
             return []
         start = self.header.started_unix_ns
         times = own_camera.times_of_stills(video, start) if video is not None else {}
-        survey = at_times(read_survey(path), times, path)
+        marks = self.options.marks
+        survey = at_times(read_survey(path, marks), times, marks or path)
+        if unseen := [point.name for point in survey if not point.sightings]:
+            self.notes.append(f"points without marks are left out: {', '.join(unseen)}")
+            survey = [point for point in survey if point.sightings]
         seen = [f.time_unix_ns for f in self.frames if "vision" in f.sources]
         placed = {_ms(t) for t in [*seen, *(s.time_ns for s in self.states)]}
         lost = {

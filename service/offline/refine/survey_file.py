@@ -2,7 +2,9 @@
 
 A file is a CSV, or a ``gcp_list.txt`` as OpenDroneMap's users have it: the first line is a
 coordinate system, each other one x, y, z of a point, its pixel, and the name of a still and of
-the point. Heights that are all 0 are not surveyed. Or it is the XML of Metashape's markers.
+the point. Heights that are all 0 are not surveyed. Or it is the XML of Metashape's markers. Pix4D
+has places and marks in two files: below the coordinate system rows of name, x, y, z and, where they
+are known, the accuracies across and up; and rows of image, name, u and v.
 
 A row of a CSV without ``alt_amsl_m`` is of a point surveyed horizontally only. One row is one
 sighting: ``keyframe_seq``, ``time`` or ``image`` with ``u_px,v_px`` in the camera's own image, or
@@ -15,7 +17,7 @@ import csv
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -24,6 +26,9 @@ from service.errors import InputError
 from service.georeference import system_of
 from service.offline.refine.metashape_file import read_metashape
 from service.small_file import read_small
+
+if TYPE_CHECKING:
+    from pyproj import Transformer
 
 LARGEST_BYTES = 10_000_000
 
@@ -93,17 +98,15 @@ class SurveyPoint:
     sightings: tuple[Sighting, ...]
 
 
-def read_survey(path: Path) -> list[SurveyPoint]:
-    """The points of a file in order of their first row.
+def read_survey(path: Path, marks: Path | None = None) -> list[SurveyPoint]:
+    """The points of a file in order of their first row; with Pix4D's ``marks`` some have none.
 
     Raises InputError in one line, with the number of the line, for anything that is wrong.
     """
     points: dict[str, SurveyPoint] = {}
-    try:
-        text = read_small(path, LARGEST_BYTES, "file of surveyed points").decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} cannot be read ({error}); it should be CSV in UTF-8") from error
-    lines = text.splitlines()
+    lines = _lines(path)
+    if marks is not None:
+        return _marked(path, lines, _pix4d_marks(marks), marks)
     for line, row in _reader(lines)(path, lines):
         point = _point(line, row)
         before = points.get(point.name)
@@ -121,6 +124,14 @@ def read_survey(path: Path) -> list[SurveyPoint]:
     if not points:
         raise InputError(f"{path}: no points below the first line")
     return list(points.values())
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        data = read_small(path, LARGEST_BYTES, "file of surveyed points")
+        return data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} cannot be read ({error}); it should be CSV in UTF-8") from error
 
 
 def at_times(
@@ -166,6 +177,54 @@ def _markers(path: Path, lines: Sequence[str]) -> Iterator[Row]:
         raise InputError(f"{path} {error}") from error
 
 
+def _pix4d_marks(path: Path) -> dict[str, list[Sighting]]:
+    """The sightings in a file of marks, by the name of their point."""
+    found: dict[str, list[Sighting]] = {}
+    for line, cells in _cells(_lines(path)):
+        try:
+            image, name, u, v = cells[:4]
+            uv_px = msgspec.convert((u, v), tuple[Finite, Finite], strict=False)
+        except (ValueError, msgspec.ValidationError) as error:
+            if line == 1:
+                continue  # names of the columns
+            raise InputError(f"{path} line {line}: image, point, u and v are needed") from error
+        found.setdefault(name, []).append(Sighting(line, image=image, uv_px=uv_px))
+    return found
+
+
+def _marked(
+    path: Path, lines: Sequence[str], seen: dict[str, list[Sighting]], marks: Path
+) -> list[SurveyPoint]:
+    """The points below the coordinate system in ``lines``, with their sightings in ``marks``."""
+    system, points = _system(path, lines), dict[str, SurveyPoint]()
+    for number, cells in _cells(lines[1:], 2):
+        where = f"{path} line {number}"
+        try:
+            name, x, y, z, *sigmas = cells
+            lon, lat = system.transform(float(x), float(y))
+            named = dict(zip(("sigma_h_m", "sigma_v_m"), map(float, sigmas[:2]), strict=False))
+            row = {"name": name, "lat": lat, "lon": lon, "alt_amsl_m": float(z), **named}
+            mark = {"image": "-", "u_px": 0.0, "v_px": 0.0}
+            point = _point(number, msgspec.convert(row | mark, SurveyRow))
+        except (ValueError, msgspec.ValidationError) as error:
+            said = str(error).replace(" - at `$", ", ")
+            raise InputError(f"{where}: name, x, y, z and accuracies: {said}") from error
+        if name in points:
+            raise InputError(f"{where}: {name} is also in line {points[name].line}")
+        points[name] = replace(point, sightings=tuple(seen.get(name, ())))
+    for name in seen.keys() - points.keys():
+        raise InputError(f"{marks} line {seen[name][0].line}: {path} has no point {name!r}")
+    return list(points.values())
+
+
+def _cells(lines: Sequence[str], first: int = 1) -> Iterator[tuple[int, list[str]]]:
+    """Number and cells of each line, between commas, semicolons, tabs or, without one, spaces."""
+    for number, line in enumerate(lines, first):
+        if line.strip() and not line.startswith("#"):
+            mark = next((mark for mark in ",;\t" if mark in line), None)
+            yield number, [cell.strip() for cell in line.split(mark)]
+
+
 LIST_COLUMNS = 6
 
 
@@ -175,14 +234,20 @@ def is_list(lines: Sequence[str]) -> bool:
     return len(next(rows, ())) >= LIST_COLUMNS and "lat" not in lines[0].split(",")
 
 
-def _marks(path: Path, lines: Sequence[str]) -> Iterator[Row]:
-    """Line number and content of each row of a ``gcp_list.txt``."""
+def _system(path: Path, lines: Sequence[str]) -> Transformer:
+    """x and y of the coordinate system in the first line to longitude and latitude."""
     try:
-        system, datum = system_of(lines[0])
+        system, datum = system_of(lines[0] if lines else "")
     except ValueError as error:
         raise InputError(f"{path} line 1: {error}") from error
     if datum == "ellipsoid":
         raise InputError(f"{path} line 1: heights above mean sea level are needed, not ellipsoidal")
+    return system
+
+
+def _marks(path: Path, lines: Sequence[str]) -> Iterator[Row]:
+    """Line number and content of each row of a ``gcp_list.txt``."""
+    system = _system(path, lines)
     table = [(n, s.split()) for n, s in enumerate(lines[1:], 2) if s.strip() and s[0] != "#"]
     is_flat = all(
         cells[2:3] in (["0"], ["0.0"], ["0.00"], ["0.000"], ["NaN"]) for _, cells in table

@@ -654,6 +654,48 @@ def test_a_bad_list_is_said_in_one_line(tmp_path: Path, text: str, said: str) ->
     assert said in str(raised.value) and str(path) in str(raised.value)
 
 
+PLACES = "EPSG:32632\nGCP1,465000.5,5249000.25,410.5,0.02,0.04\nunseen;465010;5249010;411\n"
+PIXELS = "image,label,x,y\na.jpg,GCP1,12.5,30\nb.jpg,GCP1,80,7,0.5\n"
+
+
+def test_places_and_marks_of_pix4d_are_two_files(tmp_path: Path) -> None:
+    """The coordinate system stands above the places; a point without marks keeps its place."""
+    places, marks = tmp_path / "points.csv", tmp_path / "marks.csv"
+    places.write_text(PLACES)
+    marks.write_text(PIXELS)
+    first, second = read_survey(places, marks)
+    assert [(s.image, s.uv_px) for s in first.sightings] == [
+        ("a.jpg", (12.5, 30.0)),
+        ("b.jpg", (80.0, 7.0)),
+    ]
+    assert (first.alt_amsl_m, first.sigma_h_m, first.sigma_v_m) == (410.5, 0.02, 0.04)
+    assert (second.name, second.sightings) == ("unseen", ())
+    place = LocalFrame(first.lat_deg, first.lon_deg, 0.0).to_utm(np.zeros((1, 3)))[0]
+    np.testing.assert_allclose(place[:2], (465000.5, 5249000.25), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("places", "marks", "said"),
+    [
+        (PLACES.replace("EPSG:32632\n", ""), PIXELS, "points.csv line 1: 'GCP1"),
+        (PLACES.replace("410.5", "high"), PIXELS, "points.csv line 2: name, x, y, z"),
+        (PLACES.replace("0.02", "-1"), PIXELS, "points.csv line 2: name, x, y, z"),
+        (PLACES + "GCP1,1,2,3\n", PIXELS, "points.csv line 4: GCP1 is also in line 2"),
+        (PLACES, PIXELS.replace("GCP1", "K1"), "marks.csv line 2: "),
+        (PLACES, PIXELS + "c.jpg,GCP1,left,7\n", "marks.csv line 4: image, point, u and v"),
+        (PLACES, PIXELS + "c.jpg,GCP1\n", "marks.csv line 4: image, point, u and v"),
+    ],
+)
+def test_bad_files_of_pix4d_are_said_in_one_line(
+    tmp_path: Path, places: str, marks: str, said: str
+) -> None:
+    (tmp_path / "points.csv").write_text(places)
+    (tmp_path / "marks.csv").write_text(marks)
+    with pytest.raises(InputError) as raised:
+        read_survey(tmp_path / "points.csv", tmp_path / "marks.csv")
+    assert said in str(raised.value)
+
+
 MARKERS = """<?xml version="1.0" encoding="UTF-8"?>
 <document version="1.2.0">
   <chunk>
