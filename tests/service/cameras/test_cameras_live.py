@@ -454,23 +454,23 @@ def test_who_sends_is_waited_for_again(kind: str, monkeypatch: pytest.MonkeyPatc
 
 def test_an_attempt_that_waited_for_a_sender_is_followed_by_the_next_at_once() -> None:
     """Otherwise the port is closed to a sender that comes meanwhile."""
-    tries: list[float] = []
+    config = LiveConfig(first_retry_s=0.2, longest_retry_s=0.3)
+    source = LiveSource(opener(clip(3), OSError("no sender came"), clip(9)), "test", config)
+    waits: list[float] = []
 
-    def open_container(stall_s: float) -> Any:
-        if not tries:
-            tries.append(time.monotonic())
-            return RealTime(av.open(io.BytesIO(clip(3))))
-        tries.append(time.monotonic())
-        if len(tries) < 4:
-            time.sleep(0.3)
-            tries.append(time.monotonic())
-            raise OSError("no sender came")
-        return RealTime(av.open(io.BytesIO(clip(9))))
+    def connect() -> Iterator[Any]:
+        time.sleep(0.5)  # longer than the pause between attempts that fail at once
+        return connected()
 
-    config = LiveConfig(first_retry_s=0.2, longest_retry_s=0.25)
-    frames = take(LiveSource(open_container, "test", config), 5)
-    assert len(frames) == 5
-    assert tries[3] - tries[2] < 0.1
+    def wait(seconds: float | None = None) -> bool:
+        waits.append(seconds or 0.0)
+        return waited(seconds)
+
+    connected, waited = source._connect, source._closed.wait
+    source._connect = connect  # type: ignore[method-assign, assignment]
+    source._closed.wait = wait  # type: ignore[method-assign]
+    assert len(take(source, 6)) == 6
+    assert waits[1:] == [0.0] * len(waits[1:]) and len(waits) >= 2
 
 
 @pytest.mark.parametrize("source", ["rtmp-listen:live", "rtmp-listen:0/live", "srt://", "srt:9000"])
