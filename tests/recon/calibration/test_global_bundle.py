@@ -105,6 +105,7 @@ def adjusted(camera: Camera, config: SelfCalibrationConfig, noise_px: float = 0.
     return solve(problem, 60, covariances=True)
 
 
+@pytest.mark.slow
 def test_surveyed_points_bring_exact_pixels_to_the_exact_scene() -> None:
     T, points, seen = scene()
     found = adjusted(TRUE, HELD)

@@ -94,6 +94,7 @@ def _guess(points: F64, poses: F64, seed: int = 5) -> tuple[F64, F64]:
 WRONG = Camera(TRUE.K * [[1.02, 1, 1], [1, 1.02, 1], [1, 1, 1]], np.zeros(5), SIZE)
 
 
+@pytest.mark.slow
 def test_a_focal_length_two_percent_off_is_found_on_an_oblique_turn() -> None:
     poses = _oblique_turn()
     points, seen = _seen(poses, TRUE)

@@ -111,6 +111,7 @@ def test_without_fixes_nothing_jumps_when_segments_go() -> None:
     assert worst < 0.01
 
 
+@pytest.mark.slow
 def test_dropped_keyframes_stay_as_published(flown: Flown) -> None:
     before, after = flown.segments
     assert after > before + 1

@@ -95,6 +95,7 @@ def test_nodes_stand_evenly_and_the_newest_all_stay() -> None:
     assert np.diff(seqs).max() <= 5 * COUNT / MOST
 
 
+@pytest.mark.slow
 def test_riders_lie_between_their_nodes_as_vision_saw_them() -> None:
     """By closed form: seen from the node before, the miss at the node after shared out."""
     trajectory, odom = thin(), flight()[1]

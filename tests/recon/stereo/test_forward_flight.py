@@ -133,6 +133,7 @@ def test_the_ground_ahead_is_measured(keyframes: list[Keyframe]) -> None:
         assert np.mean(error > 0.05) < 0.02
 
 
+@pytest.mark.slow
 def test_two_images_are_matched_once(
     keyframes: list[Keyframe], rectified: list[tuple[int, int]]
 ) -> None:

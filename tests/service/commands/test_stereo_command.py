@@ -193,6 +193,7 @@ def test_exported_model_gives_the_same_labels(
     assert run(monkeypatch, "export-model", "--out", tmp_path / "stereo.bin") == 2
 
 
+@pytest.mark.slow
 def test_learned_model_is_checked_and_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: tuple[Path, Path],
     capsys: pytest.CaptureFixture[str],

@@ -52,6 +52,7 @@ def replayed(flight: Path, out: Path, *more: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_a_video_goes_where_its_images_turn_with_the_log(flight: Path, tmp_path: Path) -> None:
     found = replayed(flight, tmp_path / "scan")
     (note,) = (text for text in found["warnings"] if "the time that it states" in text)

@@ -152,6 +152,7 @@ def test_all_maps_come_in_one_zip(portal: Portal, tmp_path: Path) -> None:
         assert {name: found.read(name) for name in found.namelist()} == files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
 def test_all_maps_are_two_clicks_away(
     browser: Browser, portal: Portal, tmp_path: Path, needs: None

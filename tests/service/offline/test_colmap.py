@@ -65,6 +65,7 @@ def test_the_images_are_the_frames_at_full_size(model: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_tracks_name_each_other_and_are_seen_where_the_truth_is(model: Path) -> None:
     images, points = read(model)
     assert len(points) > 500

@@ -90,6 +90,7 @@ def test_flight_is_played_with_its_telemetry(flight: Path, tmp_path: Path) -> No
     np.testing.assert_array_equal(received[-1], sent[-1])
 
 
+@pytest.mark.slow
 def test_live_command_pipes_the_video(flight: Path) -> None:
     command = [
         sys.executable, "-m", "service.cli", "simulate", "--out", str(flight), "--live",
