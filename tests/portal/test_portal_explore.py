@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from house_flight import HouseFlight
@@ -15,6 +18,9 @@ from portal_client import NEEDS, TOKEN, browser, flown_store
 
 from recon.types import F64
 from service.ground.portal import Portal, PortalConfig
+from service.stream.codec import encode
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
 
 pytestmark = NEEDS
 __all__ = ["browser"]  # the fixture
@@ -138,6 +144,41 @@ def test_the_clip_box_cuts_the_scene_and_gives_it_back(page: Browser) -> None:
     )
     settle(page)
     assert page.run(COLOURED) == pytest.approx(before, rel=0.02)
+
+
+def test_the_edge_of_a_mask_hides_nothing_that_is_measured(
+    browser: Browser, tmp_path: Path, house: HouseFlight
+) -> None:
+    """The west is red; another keyframe saw all of it 0.3 m lower, blue, as its noise may be."""
+    folder = tmp_path / "drone-1/test-1"
+    with ScanStore.create(folder / "scan.db", ScanHeader("test-1", "drone-1", 1)) as store:
+        for seq, (bgr, depth_m) in enumerate((((40, 40, 200), 40.0), ((200, 60, 40), 40.3))):
+            one = house.keyframe(seq, 0.0)
+            depth = replace(one.depth, depth_m=np.full_like(one.depth.depth_m, depth_m))
+            fresh = one.fresh & ((np.arange(160) < 80) | (seq == 1))
+            colour = np.broadcast_to(np.array(bgr, np.uint8), one.bgr.shape).copy()
+            store.add_keyframe(
+                seq, encode(replace(one, depth=depth, bgr=colour, fresh=fresh), one.time_ns)
+            )
+        store.finish({})
+    portal = Portal(PortalConfig(tmp_path, port=0, token=TOKEN))
+    portal.start()
+    browser.open("about:blank")
+    browser.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/test-1")
+    browser.wait("document.body.dataset.points === '21600'")
+    browser.click("Whole site")
+    settle(browser)
+    data = browser.run(f"{CANVAS}.toDataURL('image/png').split(',')[1]")
+    browser.open("about:blank")
+    portal.close()
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    row = image[image.shape[0] // 2].astype(int)
+    red = np.flatnonzero(row[:, 2] > 2 * row[:, 0])
+    blue = np.flatnonzero(row[:, 0] > 2 * row[:, 2])
+    left, right = red.min(), blue[blue > red.mean()].max()
+    edge = (red.max() - left) / (right - left)
+    assert edge == pytest.approx(81 / 163, abs=0.006), edge  # two more pixels hide: 83 / 163
 
 
 def test_the_scans_of_a_site_have_colours_of_their_own(page: Browser, tmp_path: Path) -> None:

@@ -84,6 +84,7 @@ def steady(page: Browser) -> dict[str, float]:
 
 def test_layers_lie_over_the_basemap_and_nothing_comes_from_outside(page: Browser) -> None:
     with_base = steady(page)
+    assert page.run("document.querySelector('.map .blank').hidden")  # "No surface yet."
     assert with_base["known"] == pytest.approx(1280 * (800 - 50), rel=0.03)  # the basemap is below
     layer(page, "Basemap")
     alone = steady(page)

@@ -68,7 +68,8 @@ Object.defineProperty(navigator, 'xr', { configurable: true, value: {
 } });
 """
 CHANGED = " field.dispatchEvent(new Event('input', { bubbles: true }))"
-IMAGE = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
+CANVAS = "document.querySelector('.stage canvas')"
+IMAGE = f"{CANVAS}.toDataURL('image/png').split(',')[1]"
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +135,15 @@ def test_settings_change_the_image_and_go_back(browser: Browser, portal: Portal)
         browser.run("new Promise(r => setTimeout(r, 700))")  # the effects are loaded when asked
         assert difference(plain, drawn(browser)) > 0.01, name
         setting(browser, name, "field.click()")
+    setting(browser, "Light scene", "field.click()")
+    light = drawn(browser)
+    setting(browser, "Bloom", "field.click()")
+    browser.run("new Promise(r => setTimeout(r, 700))")
+    both = drawn(browser)
+    site = is_site(plain)
+    assert both[site].mean() < light[site].mean() + 25.0  # a bright sky does not shine over all
+    setting(browser, "Bloom", "field.click()")
+    setting(browser, "Light scene", "field.click()")
     setting(browser, "Field of view", "field.value = 25;" + CHANGED)
     narrow = drawn(browser)
     assert difference(plain, narrow) > 0.1
@@ -193,6 +203,7 @@ def test_the_surface_is_closed_also_while_it_moves(browser: Browser, portal: Por
         browser.page.mouse.move(600 + 10 * k, 400)
         data = np.frombuffer(base64.b64decode(browser.run(IMAGE)), np.uint8)
         moving = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+        moving = np.asarray(cv2.resize(moving, closed.shape[1::-1]), np.uint8)
         assert solid_share(moving, closed) > 0.99
     browser.page.mouse.up()
     browser.screen(1280, 800)
@@ -285,6 +296,43 @@ FRAMES_LATER = """(async () => {
 })()"""
 
 
+LATE_CARD = """
+const given = new WeakMap(), gl = WebGL2RenderingContext.prototype;
+const { fenceSync, clientWaitSync } = gl;
+gl.fenceSync = function (...a) {
+  const sync = fenceSync.apply(this, a);
+  given.set(sync, performance.now());
+  return sync;
+};
+gl.clientWaitSync = function (sync, ...a) {
+  const busy = performance.now() - given.get(sync) < 250;
+  return busy ? this.TIMEOUT_EXPIRED : clientWaitSync.call(this, sync, ...a);
+};
+"""
+"""A graphics card that takes 250 ms or more for each frame."""
+
+
+def test_a_slow_card_draws_fewer_pixels_while_the_view_moves(
+    browser: Browser, portal: Portal
+) -> None:
+    open_scan(browser, portal)
+    browser.click("Surface")
+    drawn(browser)
+    whole = browser.run(f"{CANVAS}.width")
+    browser.run(LATE_CARD + ";0")
+    browser.page.mouse.move(600, 400)
+    browser.page.mouse.down()
+    widths = []
+    for k in range(1, 25):
+        browser.page.mouse.move(600 + 5 * k, 400)
+        browser.run("new Promise(r => setTimeout(r, 100))")
+        widths.append(browser.run(f"{CANVAS}.width"))
+    browser.page.mouse.up()
+    assert min(widths) == pytest.approx(whole / 2, abs=1)
+    drawn(browser)
+    assert browser.run(f"{CANVAS}.width") == whole
+
+
 def test_what_changes_while_the_graphics_card_is_busy_is_drawn(
     browser: Browser, portal: Portal
 ) -> None:
@@ -372,7 +420,7 @@ def test_tone_mapping_and_exposure_change_the_mesh(
 ) -> None:
     pytest.importorskip("open3d", exc_type=ImportError)
     open_scan(browser, portal)
-    browser.click("Mesh")
+    browser.click("Make mesh")
     browser.wait("document.body.dataset.mesh === 'shown'", 60)
     plain = drawn(browser)
     choose = "field.value = [...field.options].find(o => o.text === 'Reinhard').value;"

@@ -12,14 +12,20 @@ const FRAGMENT = /* glsl */ `
   uniform float gain;
   varying vec2 place;
 
-  float far(vec2 at) {
+  uniform float behind;
+
+  float metres(vec2 at) {
     float d = texture2D(depth, at).x;
-    return log2(planes.x * planes.y / (planes.y - d * (planes.y - planes.x)));
+    return planes.x * planes.y / (planes.y - d * (planes.y - planes.x));
+  }
+  float far(vec2 at) {
+    return log2(metres(at));
   }
   void main() {
-    vec3 seen = texture2D(colour, place).rgb;
+    vec4 found = texture2D(colour, place); // alpha: 1 where it is measured
+    vec3 seen = found.rgb;
     if (texture2D(depth, place).x < 1.0) {
-      float here = far(place);
+      float here = log2(max(metres(place) - behind * (1.0 - found.a), planes.x));
       float sum = max(0.0, here - far(place + vec2(pixel.x, 0.0)))
         + max(0.0, here - far(place - vec2(pixel.x, 0.0)))
         + max(0.0, here - far(place + vec2(0.0, pixel.y)))
@@ -39,6 +45,8 @@ export class Dome {
   strength = 1;
   /** What all that is drawn is multiplied with, but for the sky. */
   gain = 1;
+  /** Metres by which what is not measured was drawn behind. */
+  behind = 0;
   private readonly target = new THREE.WebGLRenderTarget(1, 1, {
     type: THREE.HalfFloatType,
     depthTexture: new THREE.DepthTexture(1, 1, THREE.UnsignedIntType),
@@ -50,6 +58,7 @@ export class Dome {
     planes: { value: new THREE.Vector2() },
     strength: { value: 0 },
     gain: { value: 1 },
+    behind: { value: 0 },
   };
   private readonly sheet = new THREE.Mesh(
     new THREE.PlaneGeometry(2, 2),
@@ -82,6 +91,7 @@ export class Dome {
     this.uniforms.planes.value.set(camera.near, camera.far);
     this.uniforms.strength.value = this.strength * STRENGTH;
     this.uniforms.gain.value = this.gain;
+    this.uniforms.behind.value = this.behind;
     renderer.render(this.sheet, this.flat);
   }
 

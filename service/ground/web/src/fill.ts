@@ -2,6 +2,7 @@
 // them, in the colours of the points. So there is no hole where nothing was seen.
 
 import * as THREE from "three";
+import { DRAWN_BEHIND } from "./surface";
 
 const CELLS = 256; // along the longer side
 const MIN_CELL_M = 0.05;
@@ -16,10 +17,11 @@ const BELOW = 1; // cells by which it lies below what is measured
 const VERTEX = /* glsl */ `
   attribute vec4 tint;
   varying vec4 shown;
+  ${DRAWN_BEHIND}
   #include <clipping_planes_pars_vertex>
   void main() {
     vec4 mvPosition = modelViewMatrix * vec4(position, 1.0);
-    gl_Position = projectionMatrix * mvPosition;
+    gl_Position = drawn(mvPosition, 1.0);
     vec3 linear = mix(tint.rgb / 12.92, pow((tint.rgb + 0.055) / 1.055, vec3(2.4)), step(0.04045, tint.rgb));
     shown = vec4(linear, tint.a);
     #include <clipping_planes_vertex>
@@ -32,7 +34,7 @@ const FRAGMENT = /* glsl */ `
     #include <clipping_planes_fragment>
     float noise = fract(52.9829189 * fract(dot(gl_FragCoord.xy, vec2(0.06711056, 0.00583715))));
     if (shown.a <= noise) discard;  // fades without the sky behind taking part in exposure
-    gl_FragColor = vec4(shown.rgb, 1.0);
+    gl_FragColor = vec4(shown.rgb, 0.0); // not measured
     #include <colorspace_fragment>
   }
 `;
@@ -194,8 +196,9 @@ function smooth(z: Float32Array, rgb: Float32Array, known: Uint8Array, alpha: Fl
 export class Ground {
   readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
 
-  constructor() {
+  constructor(behind: THREE.IUniform<number>) {
     const material = new THREE.ShaderMaterial({
+      uniforms: { behind },
       vertexShader: VERTEX, fragmentShader: FRAGMENT, clipping: true, side: THREE.DoubleSide,
     });
     this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), material);

@@ -32,6 +32,7 @@ const UNBUILT = 0.99; // of the frame is shown while some of it is still to be m
 const MIN_POINTS = 20_000;
 const MAX_SLICES = 64; // showing a slice takes its time however few the points
 const SHOWN_FROM = 0.5; // of the points; until then the last, thinned frame with large points stays
+const BLURRED = [1, 0.75, 0.5]; // of the screen's pixels along each side, while surfaces move
 const EFFECTS_TIMES = 3; // of the points drawn while moving, once the view stands still
 
 /** Work given to the graphics card, until it has done it. */
@@ -58,6 +59,8 @@ export class Painter {
   readonly again = new Set<THREE.Object3D>();
   private moving = FIRST_POINTS;
   private slice = FIRST_POINTS;
+  private blur = 0; // in BLURRED
+  private ratio = 0; // pixels of the screen for one of the page, when sharp
   private finer = 0; // share of the surfaces' triangles in the frame
   private work: Work | null = null;
   private settled = false;
@@ -92,10 +95,20 @@ export class Painter {
   }
 
   private frame(now: number, still: boolean, before: readonly (() => void)[]): void {
+    const isSharp = this.sharpen(still);
     for (const call of before) call();
     this.whole(still);
-    this.settled = still || this.shown >= 1;
+    this.settled = still || (isSharp && this.shown >= 1);
     this.give("whole", now);
+  }
+
+  /** Sets how many pixels the frame has; true when it has all. */
+  private sharpen(still: boolean): boolean {
+    this.ratio ||= this.renderer.getPixelRatio();
+    const isWhole = still || this.fullDetail || this.effects !== null || this.renderer.xr.isPresenting || this.gradual?.isAdditive;
+    const share = isWhole ? 1 : BLURRED[this.blur]!;
+    if (this.renderer.getPixelRatio() !== this.ratio * share) this.renderer.setPixelRatio(this.ratio * share);
+    return share === 1;
   }
 
   /** As many points may a frame have as while the view is moved. */
@@ -172,7 +185,10 @@ export class Painter {
     }
     this.frames_per_s = 1000 / ms;
     const most = Math.max(this.gradual?.wanted ?? 0, FIRST_POINTS);
-    const change = Math.min(Math.max((this.times * MOVING_MS) / ms, 0.5), 1.2);
+    const fits = (this.times * MOVING_MS) / ms;
+    const change = Math.min(Math.max(fits, 0.5), 1.2);
+    if (fits < 0.7) this.blur = Math.min(this.blur + 1, BLURRED.length - 1);
+    else if (fits > 3) this.blur = Math.max(this.blur - 1, 0);
     this.moving = Math.min(Math.max(this.moving * change, MIN_POINTS), most);
   }
 }

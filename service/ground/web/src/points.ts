@@ -6,7 +6,7 @@ import { Before, CHANGE } from "./before";
 import { type Chunk, sigmaAt, viewsAt } from "./depth";
 import { Ground, type Samples } from "./fill";
 import type { Gradual } from "./painter";
-import { LEVELS, Surface } from "./surface";
+import { BEHIND, LEVELS, Surface } from "./surface";
 import { length } from "./units";
 
 /** Between the keyframes' numbers of two scans that are drawn together. */
@@ -46,6 +46,7 @@ const SHADE = /* glsl */ `
     return linear(mix(low, vec3(0.99, 0.91, 0.14), max(2.0 * t - 1.0, 0.0)));
   }
   vec3 shade(vec3 world, vec3 rgb, float sigma_m, float views) {
+    if (mode < 0.5) return rgb;
     float gray = pow(max(dot(rgb, vec3(0.21, 0.72, 0.07)), 0.0), 0.4545);
     if (mode > 5.5) {
       float d = change(world, 0.15 + 3.0 * sigma_m);
@@ -56,8 +57,7 @@ const SHADE = /* glsl */ `
     if (mode > 3.5) return ramp(age);
     if (mode > 2.5) return ramp(views / 8.0);
     if (mode > 1.5) return ramp(sigma_m / max(range.y, 0.01));
-    if (mode > 0.5) return ramp((world.z - range.x) / max(range.y - range.x, 0.01));
-    return rgb;
+    return ramp((world.z - range.x) / max(range.y - range.x, 0.01));
   }
 `;
 
@@ -142,13 +142,14 @@ export class Cloud implements Gradual {
     thin: { value: 1 },
     height_px: { value: 400 },
     mode: { value: 0 },
+    behind: { value: 0 },
     range: { value: new THREE.Vector2(0, 1) },
     ...this.before.uniforms,
     ...Object.fromEntries(["higher", "lower", "same", "unseen"].map((name, k) => [name, { value: new THREE.Color(CHANGES[k]![1]) }])),
   };
 
   /** What lies below the surfaces; not measured. */
-  readonly ground = new Ground();
+  readonly ground = new Ground(this.shared.behind);
 
   get total(): number {
     let sum = 0;
@@ -204,6 +205,8 @@ export class Cloud implements Gradual {
     this.place(chunk.seq, held);
     this.groupOf(chunk.seq).add(object, surface.mesh);
     this.expose();
+    const depths = [...this.chunks.values()].filter(({ surface }) => surface.triangles).map(({ surface, scale }) => surface.depth * scale).sort((a, b) => a - b);
+    this.shared.behind.value = BEHIND * (depths[depths.length >> 1] ?? 0);
     this.show(chunk.seq, held);
   }
 
@@ -218,6 +221,11 @@ export class Cloud implements Gradual {
   /** The exposure that the colours are shown with; 1 for those of figures. */
   get gain(): number {
     return this.shared.mode.value ? 1 : this.exposure;
+  }
+
+  /** Metres by which what is not measured is drawn behind. */
+  get behind(): number {
+    return this.shared.behind.value;
   }
 
   /** Shows the keyframes as surfaces or as points. */

@@ -1,11 +1,11 @@
-// A keyframe's depth image as a surface: grids of triangles in four levels of detail, which the
+// A keyframe's depth image as a surface: grids of triangles in levels of detail, which the
 // vertex shader displaces along the rays of its camera.
 
 import * as THREE from "three";
 import { type Chunk, sigmaAt, viewsAt } from "./depth";
 
 /** Pixels of the depth image between two vertices, by level. */
-const STEPS = [1, 2, 4, 8];
+const STEPS = [1, 2, 4, 8, 16];
 export const LEVELS = STEPS.length;
 const FIRST_LEVEL = 2; // made when the keyframe comes
 
@@ -13,16 +13,31 @@ const FIRST_LEVEL = 2; // made when the keyframe comes
 const STEEPEST = 4;
 const SIGMAS = 4;
 /** Vertices by which a mask grows, by level: two keyframes are cut from each other without an overlap. */
-const GROWN = [2, 1, 1, 1];
-const DIP = 0.006; // of depth, by which each of them lies lower, so that it hides nothing that is measured
+const GROWN = [2, 1, 1, 1, 1];
 const AROUND = [[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]] as const;
+const DIP = 0.006; // of depth, by which each of them lies lower: the skirt of a roof is not that of the ground
+/** What is not measured is drawn as if it were farther, so that it hides nothing measured: by this share of the depths
+ * of the images, skirts by half of it. */
+export const BEHIND = 0.08;
+/** GLSL: where a place of the view is drawn when it is to lie behind by a share of `behind`. */
+export const DRAWN_BEHIND = /* glsl */ `
+  uniform float behind;   // m
+  vec4 drawn(vec4 seen, float share) {
+    vec4 place = projectionMatrix * seen;
+    float metres = share * behind * length(modelMatrix[2].xyz);
+    vec4 beyond = projectionMatrix * vec4(seen.xyz * (1.0 + metres / max(length(seen.xyz), 1e-3)), 1.0);
+    place.z = beyond.z / beyond.w * place.w;
+    return place;
+  }
+`;
+const SKIRT = 32768; // of a vertex's column, for one of a skirt
 const OUTSIDE_PX = 16; // grown vertices lie outside the box; attributes have no sign
 const SAME = 0.03; // share of inverse depth by which neighbours of one grown vertex may differ
 const MIN_TRIANGLES = 200; // triangles of a patch that is drawn, of the finest level
 const MIN_COARSE = 8; // of the others
 
 const VERTEX = /* glsl */ `
-  attribute vec4 pixel;   // column, row, code of inverse depth, code of sigma * 256 + views
+  attribute vec4 pixel;   // column (and SKIRT), row, code of inverse depth, code of sigma * 256 + views
   attribute vec2 at;      // in the texture
   uniform vec4 K;
   uniform vec2 inverse;   // of code 0, and its step
@@ -30,13 +45,17 @@ const VERTEX = /* glsl */ `
   varying vec2 place;
   varying vec3 where;
   varying vec2 sure;      // sigma, m, and views
+  varying float measured; // 1, or less for a skirt
+  ${DRAWN_BEHIND}
   #include <clipping_planes_pars_vertex>
   void main() {
     float z = 1.0 / (inverse.x + inverse.y * pixel.z);
-    vec2 p = pixel.xy - float(${OUTSIDE_PX}) + corner;
+    float skirt = step(float(${SKIRT}), pixel.x);
+    vec2 p = pixel.xy - vec2(skirt * float(${SKIRT}), 0.0) - float(${OUTSIDE_PX}) + corner;
     vec4 world = modelMatrix * vec4((p - K.zw) / K.xy * z, z, 1.0);
     vec4 mvPosition = viewMatrix * world;
-    gl_Position = projectionMatrix * mvPosition;
+    measured = 1.0 - 0.5 * skirt;
+    gl_Position = drawn(mvPosition, 1.0 - measured);
     float code = floor(pixel.w / 256.0);
     sure = vec2(code > 0.0 ? 0.001 * exp2((code - 1.0) / 4.0) * length(modelMatrix[2].xyz) : 0.0, pixel.w - 256.0 * code);
     place = at;
@@ -50,11 +69,12 @@ const fragment = (shade: string): string => /* glsl */ `
   varying vec2 place;
   varying vec3 where;
   varying vec2 sure;
+  varying float measured;
   #include <clipping_planes_pars_fragment>
   ${shade}
   void main() {
     #include <clipping_planes_fragment>
-    gl_FragColor = vec4(shade(where, texture2D(image, place).rgb, sure.x, sure.y), 1.0);
+    gl_FragColor = vec4(shade(where, texture2D(image, place).rgb, sure.x, sure.y), measured);
     #include <colorspace_fragment>
   }
 `;
@@ -110,6 +130,11 @@ export class Surface {
     return (this.sphere.center.z * scale * focal_px) / (this.chunk.K[0] * near);
   }
 
+  /** Depth of its middle, in units of its camera's frame. */
+  get depth(): number {
+    return this.sphere.center.z;
+  }
+
   isSeen(frustum: THREE.Frustum): boolean {
     return frustum.intersectsSphere(this.sphere.clone().applyMatrix4(this.mesh.matrixWorld));
   }
@@ -121,7 +146,8 @@ export class Surface {
   /** Draws a level, which is made when `mayMake`, or the next one there is; true when it is that level. */
   show(level: number, mayMake: boolean): boolean {
     const found = this.levels[level] ?? (mayMake ? this.make(level) : undefined);
-    const order = [level, level + 1, level + 2, level + 3, level - 1, level - 2, level - 3];
+    const rank = (k: number): number => (k >= level ? k - level : LEVELS + level - k); // rather coarser than finer
+    const order = STEPS.map((_, k) => k).sort((a, b) => rank(a) - rank(b));
     this.mesh.geometry = found ?? order.map((k) => this.levels[k]).find((g) => g !== undefined)!;
     return found !== undefined;
   }
@@ -197,6 +223,7 @@ export function triangulate(chunk: Chunk, level: number): Grid {
   const [cols, rows] = [Math.ceil(w / side) + 2 * ring, Math.ceil(h / side) + 2 * ring];
   const n = cols * rows;
   const code = new Float32Array(n).fill(-1);
+  const isGrown = new Uint8Array(n);
   const [x, y] = [new Int16Array(n), new Int16Array(n)]; // of the vertex
   const from = new Int32Array(n); // the pixel whose colour and sigma it has
   const half = side >> 1;
@@ -285,30 +312,36 @@ export function triangulate(chunk: Chunk, level: number): Grid {
       }
     for (const [k, c, near] of grown) {
       code[k] = c;
+      isGrown[k] = 1;
       x[k] = ((k % cols) - ring) * side + half;
       y[k] = (Math.floor(k / cols) - ring) * side + half;
       from[k] = from[near]!;
     }
   }
 
-  /** The vertices that triangles have, and their triangles. */
+  /** The vertices that triangles have, and their triangles; those of skirts have vertices of their own. */
   function compact(triangles: Uint32Array): Grid {
-    const number = new Int32Array(n).fill(-1);
-    let used = 0;
-    for (const k of triangles) if (number[k]! < 0) number[k] = used++;
-    const pixel = new Uint16Array(4 * used);
-    const at = new Uint16Array(2 * used);
-    for (let k = 0; k < n; k++) {
-      const v = number[k]!;
-      if (v < 0) continue;
+    const number = new Int32Array(2 * n).fill(-1);
+    const index = new Uint32Array(triangles.length);
+    const used: number[] = [];
+    for (let i = 0; i < triangles.length; i += 3) {
+      const skirt = isGrown[triangles[i]!]! | isGrown[triangles[i + 1]!]! | isGrown[triangles[i + 2]!]!;
+      for (let c = i; c < i + 3; c++) {
+        const k = 2 * triangles[c]! + skirt;
+        if (number[k]! < 0) number[k] = used.push(k) - 1;
+        index[c] = number[k]!;
+      }
+    }
+    const pixel = new Uint16Array(4 * used.length);
+    const at = new Uint16Array(2 * used.length);
+    used.forEach((twice, v) => {
+      const k = twice >> 1;
       const [fx, fy] = [from[k]! % w, (from[k]! / w) | 0];
       const sigma = chunk.sigma[(fy >> 2) * Math.ceil(w / 4) + (fx >> 2)] ?? 0;
-      pixel.set([x[k]! + OUTSIDE_PX, y[k]! + OUTSIDE_PX, Math.round(code[k]!), 256 * sigma + viewsAt(chunk, fx, fy)], 4 * v);
+      pixel.set([x[k]! + OUTSIDE_PX + SKIRT * (twice & 1), y[k]! + OUTSIDE_PX, Math.round(code[k]!), 256 * sigma + viewsAt(chunk, fx, fy)], 4 * v);
       at.set([((fx + 0.5) / w) * 65535, ((fy + 0.5) / h) * 65535], 2 * v);
-    }
-    const small = used <= 65535 ? new Uint16Array(triangles.length) : new Uint32Array(triangles.length);
-    for (let i = 0; i < triangles.length; i++) small[i] = number[triangles[i]!]!;
-    return { pixel, at, index: small };
+    });
+    return { pixel, at, index: used.length <= 65535 ? Uint16Array.from(index) : index };
   }
 }
 

@@ -94,13 +94,14 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   stage.before.push(ruler.draw, notes.draw, () => {
     cloud.screen(stage.camera, stage.renderer.domElement.height / 2);
     stage.painter.dome.gain = cloud.gain;
+    stage.painter.dome.behind = cloud.behind;
   });
   stage.drawGradually(cloud);
   stage.add(cameras.group);
   stage.addAgain(cloud.group);
   stage.add(cloud.ground.mesh);
   host.append(compass(stage));
-  bar.append(toolbar({ ...site, ruler, notes, legend, coverage, time: time.element, finished: () => link.finished }));
+  bar.append(toolbar({ ...site, ruler, notes, legend, coverage, time: time.element, finished: () => link.finished, known: () => known }));
   if (awaited(scan)) ruler.toggle();
 
   let last: LastPose | undefined;
