@@ -355,7 +355,8 @@ HEADERS = (
     (b"cross-origin-resource-policy", b"same-origin"),
     (
         b"content-security-policy",
-        b"default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline';"
+        b"default-src 'self'; script-src 'self' 'wasm-unsafe-eval';"
+        b" img-src 'self' blob: data:; style-src 'self' 'unsafe-inline';"
         b" connect-src 'self' blob:; worker-src 'self' blob:; frame-ancestors 'none'",
     ),
 )

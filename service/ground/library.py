@@ -68,6 +68,7 @@ FILES: dict[str, str] = {
     "coverage.tif": "coverage: views, sigma, height",
     "coverage.png": "coverage, image",
     "mesh.glb": "textured mesh",
+    "splat.ply": "3D Gaussians",
     "trajectory.tum": "trajectory, TUM",
     "trajectory.csv": "trajectory, table",
     "flight.geojson": "flight, GeoJSON",

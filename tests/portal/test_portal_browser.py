@@ -107,8 +107,10 @@ def test_the_mesh_is_made_and_shown(browser: Browser, portal: Portal) -> None:
     browser.wait("document.querySelectorAll('article').length === 1")
     browser.open(f"{base(portal)}/#/view/drone-1/test-1")
     browser.wait("Number(document.body.dataset.points) || 0")
-    browser.click("Mesh")
+    browser.click("Make mesh")
     browser.wait("document.body.dataset.mesh === 'shown'", 60)
+    names = "[...document.querySelectorAll('.tools button')].map(b => b.textContent)"
+    assert "Mesh" in browser.run(names) and "Make tiles" in browser.run(names)
     colour = "document.querySelector('[aria-label=\"colour by\"]').disabled"
     time_shown = "document.querySelector('.time').checkVisibility()"
     assert browser.run(f"[{colour}, {time_shown}]") == [True, False]  # both are of the points
@@ -148,6 +150,53 @@ def test_the_tiles_are_loaded_where_the_cloud_was(
     assert abs(roof_red(browser) - red) < 25  # the same colours, not washed out
     off = json.loads(browser.wait("document.body.dataset.tilesMiddle"))
     assert np.abs(off[:2]).max() < 15.0 and abs(off[2]) < 5.0  # about the scan's own origin
+
+
+SPLAT = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+
+
+def write_splats(folder: Path) -> None:
+    """A Gaussian of 0.1 m at every fourth point of a scan, as PLY with y down."""
+    rows = []
+    with ScanStore.open(folder / "scan.db") as store:
+        for k in store.keyframes():
+            v, u = np.nonzero(k.fresh)
+            v, u = v[::4], u[::4]
+            z = k.depth.depth_m[v, u]
+            rays = np.linalg.solve(k.depth.K, np.stack([u, v, np.ones_like(u)]).astype(float)).T
+            T = k.depth.T_world_camera
+            east, north, up = T[:3, :3] @ (rays * z[:, None]).T + T[:3, 3:]
+            row = np.zeros((len(z), 14), "<f4")
+            row[:, :3] = np.column_stack([east, -up, north])
+            row[:, 3:6] = (k.bgr[v, u, ::-1] / 255.0 - 0.5) / 0.28209479
+            row[:, 6:11] = [5.0, *np.log([0.1, 0.1, 0.1]), 1.0]
+            rows.append(row)
+    data = np.concatenate(rows)
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(data)}"]
+    head += [f"property float {name}" for name in SPLAT.split()]
+    text = "\n".join([*head, "end_header", ""]).encode()
+    (folder / "splat.ply").write_bytes(text + data.tobytes())
+
+
+def test_splats_are_loaded_when_chosen_where_the_surface_was(
+    browser: Browser, portal: Portal, scans: Path
+) -> None:
+    write_splats(scans / "drone-1/test-1")
+    browser.requests.clear()
+    browser.open("about:blank")
+    browser.open(f"{base(portal)}/#/view/drone-1/test-1")
+    browser.wait("document.body.dataset.points === '72000'")
+    browser.click("Whole site")
+    browser.wait("document.body.dataset.still === 'yes'")
+    red = roof_red(browser)
+    assert not [url for url in browser.requests if "splat" in url]
+    browser.click("Splats")
+    browser.wait("document.body.dataset.splats === 'shown'", 60)
+    browser.run("new Promise(r => setTimeout(r, 1500))")
+    browser.wait("document.body.dataset.still === 'yes'")
+    assert abs(roof_red(browser) - red) < 40
+    browser.click("Surface")
+    browser.wait("!document.body.dataset.splats")
 
 
 def test_the_latest_image_is_shown(
@@ -259,6 +308,8 @@ def test_a_scan_in_flight_is_drawn_with_those_it_is_tied_to(
         own = "document.querySelector('.figures').innerText.match(/Images\\n(\\d+)/)?.[1]"
         slider = "document.querySelector('.time input')"
         assert browser.run(f"[{own}, {slider}.max]") == ["4", "4"]  # of this scan alone
+        at = "document.querySelector('.time output').textContent"
+        assert 0 <= int(browser.run(at).removesuffix(" s")) < 100  # of its own flight
         browser.run(f"{slider}.value = 2; {slider}.dispatchEvent(new Event('input'))")
         browser.wait(f"{own} === '2'")
         browser.run(f"{slider}.value = 4; {slider}.dispatchEvent(new Event('input'))")

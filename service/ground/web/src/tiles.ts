@@ -36,7 +36,7 @@ export function showTiles(stage: Stage, address: string, origin: Origin, pointSi
     stage.camera.updateMatrixWorld();
     tiles.update();
     const box = new THREE.Box3();
-    if (!document.body.dataset["tilesMiddle"] && !box.setFromObject(tiles.group).isEmpty())
+    if (!document.body.dataset["tilesMiddle"] && tiles.loadProgress === 1 && !box.setFromObject(tiles.group).isEmpty())
       document.body.dataset["tilesMiddle"] = JSON.stringify(box.getCenter(new THREE.Vector3()).toArray());
   };
   for (const name of ["needs-update", "needs-render", "load-tileset"] as const)

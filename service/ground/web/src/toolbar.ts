@@ -23,6 +23,8 @@ export interface Parts {
   time: HTMLElement;
   finished: () => boolean;
   id: { drone: string; scan: string };
+  /** The scan as last heard of. */
+  known: () => api.Scan;
 }
 
 /** Everything right of the title. */
@@ -142,16 +144,64 @@ function coverageButton({ coverage, id }: Parts): HTMLElement {
   return button;
 }
 
-/** Surface, points, tiles or mesh: one at a time; colours and time are of the keyframes. */
+/** A layer of a file that is made from the scan. */
+interface Product {
+  name: string;
+  kind: string;
+  title: string;
+  has: (scan: api.Scan) => boolean;
+  /** Shows it; gives what removes it. */
+  open: () => Promise<() => void>;
+}
+
+function productsOf({ stage, id, known }: Parts): Product[] {
+  const { origin } = known();
+  const mesh: Product = {
+    name: "Mesh",
+    kind: "glb",
+    title: "the textured mesh",
+    has: (scan) => scan.files.some((f) => f.name === "mesh.glb"),
+    open: async () => {
+      const remove = await stage.load(api.file(id, "mesh.glb"));
+      document.body.dataset["mesh"] = "shown";
+      return () => {
+        remove();
+        delete document.body.dataset["mesh"];
+      };
+    },
+  };
+  const splats: Product = {
+    name: "Splats",
+    kind: "splat",
+    title: "3D Gaussians, as soft as the images",
+    has: (scan) => scan.files.some((f) => f.name === "splat.ply"),
+    open: async () => {
+      const { showSplats } = await import("./splats");
+      return showSplats(stage, api.file(id, "splat.ply"));
+    },
+  };
+  if (!origin) return [mesh, splats]; // tiles lie on the globe
+  const tiles: Product = {
+    name: "Tiles",
+    kind: "3dtiles",
+    title: "3D Tiles: detail where one looks",
+    has: (scan) => scan.tiles,
+    open: async () => {
+      const { showTiles } = await import("./tiles");
+      return showTiles(stage, `${api.scanAddress(id)}/tiles/tileset.json`, origin, () => 2);
+    },
+  };
+  return [tiles, mesh, splats];
+}
+
+/** Surface, points or a product: one at a time; colours and time are of the keyframes. */
 function showGroup(parts: Parts, colour: HTMLSelectElement): HTMLElement[] {
-  const { stage, cloud, id } = parts;
+  const { stage, cloud, known } = parts;
   let close: () => void = () => undefined;
   const surface = el("button", { textContent: "Surface", className: "on", title: "the depth images as they are" });
   const points = el("button", { textContent: "Points" });
-  const tiles = el("button", { textContent: "Tiles", title: "3D Tiles: detail where one looks" });
-  const mesh = el("button", { textContent: "Mesh", title: "the textured mesh" });
   const own = [surface, points];
-  const buttons = [surface, points, tiles, mesh];
+  const buttons = [...own];
   const show = async (chosen: HTMLButtonElement, open: () => Promise<() => void>): Promise<void> => {
     buttons.forEach((b) => (b.disabled = true));
     try {
@@ -177,34 +227,33 @@ function showGroup(parts: Parts, colour: HTMLSelectElement): HTMLElement[] {
     pressed(measured, cloud.measuredOnly);
   };
   for (const one of own) one.onclick = () => void show(one, async () => () => undefined);
-  mesh.onclick = () =>
-    void show(mesh, async () => {
-      await made(id, "glb", "mesh.glb", "There is no mesh yet. Make one now?");
-      const remove = await stage.load(api.file(id, "mesh.glb"));
-      document.body.dataset["mesh"] = "shown";
-      return () => {
-        remove();
-        delete document.body.dataset["mesh"];
-      };
-    });
-  tiles.onclick = () =>
-    void show(tiles, async () => {
-      const scan = await made(id, "3dtiles", "3dtiles", "There are no 3D Tiles yet. Make them now?");
-      if (!scan.origin) throw new Error("this scan is not georeferenced, so it has no tiles");
-      const { showTiles } = await import("./tiles");
-      return showTiles(stage, `${api.scanAddress(id)}/tiles/tileset.json`, scan.origin, () => 2);
-    });
+  for (const product of productsOf(parts)) {
+    const { name, title, has, open } = product;
+    const button = el("button", { textContent: has(known()) ? name : `Make ${name.toLowerCase()}`, title });
+    button.onclick = async () => {
+      button.disabled = true;
+      try {
+        await made(product, parts);
+        button.textContent = name;
+        await show(button, open);
+      } catch (error) {
+        notify(error);
+      }
+      button.disabled = false;
+    };
+    button.hidden = !has(known());
+    if (button.hidden) void api.products(parts.id).then((all) => (button.hidden = !all.some(({ kind }) => kind === product.kind)), notify);
+    buttons.push(button);
+  }
   return [group(...buttons), group(measured)];
 }
 
-/** The scan, once it has a deliverable; makes it when the operator says so. */
-async function made(id: { drone: string; scan: string }, kind: string, name: string, ask: string): Promise<api.Scan> {
-  const has = (s: api.Scan): boolean => (kind === "3dtiles" ? s.tiles : s.files.some((f) => f.name === name));
+/** Makes a product unless it is there. */
+async function made({ kind, has }: Product, { id }: Parts): Promise<void> {
   const scan = await api.scan(id.drone, id.scan);
-  if (has(scan)) return scan;
-  if (!confirm(ask)) throw new Error("not made");
+  if (has(scan)) return;
   await api.make(scan, kind);
-  return api.finished(scan, kind);
+  await api.finished(scan, kind);
 }
 
 function settings({ stage, cloud, ruler }: Parts): HTMLElement {
