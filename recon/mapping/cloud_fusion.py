@@ -28,6 +28,10 @@ ground contradict the image. Where its median is larger, nothing of the image ho
 LONE_NEIGHBOURS = 3
 """A point with fewer occupied voxels than this among the 26 around it stands alone."""
 
+ISLAND_SHIFT, ISLAND_POINTS = 3, 128
+"""Cells of 2**3 voxels a side that touch are one piece of surface; a piece of fewer points than two
+cells have on a plane is an island."""
+
 
 def fuse(clouds: Iterable[PointCloud], voxel_m: float) -> PointCloud:
     """One point per voxel of ``voxel_m``: mean position, colour and sigma, views summed.
@@ -35,8 +39,9 @@ def fuse(clouds: Iterable[PointCloud], voxel_m: float) -> PointCloud:
     Points count by the inverse of their variance. Points of one cloud in one voxel are
     neighbours in one depth image, so together they count as the best of them for sigma and
     views; errors of clouds have :data:`CORRELATION`. A single-view point that
-    stands alone is left out when surface seen more often, above or below it, contradicts it.
-    Order is that of the voxel keys (x first), whatever the order of points in a cloud.
+    stands alone is left out when surface seen more often, above or below it, contradicts it, and so
+    are islands of mostly single-view points above or below such surface. Order is that of the
+    voxel keys (x first), whatever the order of points in a cloud.
     """
     return fuse_strips([lambda: clouds], [-np.inf, np.inf], voxel_m)
 
@@ -64,10 +69,9 @@ def fuse_strips(
     keys, clouds = zip(*at_once(*(partial(fused, *row) for row in rows)), strict=True)
     whole = joined(clouds)
     lone = np.zeros(len(whole), np.bool_)
-    in_bands(
-        _lone_contradicted, len(lone), np.concatenate(keys), whole.xyz_m, whole.sigma_m,
-        whole.views, lone,
-    )  # fmt: skip
+    every = np.concatenate(keys)
+    in_bands(_lone_contradicted, len(lone), every, whole.xyz_m, whole.sigma_m, whole.views, lone)
+    lone |= _islands(every, whole.views)
     return whole if not lone.any() else without(whole, lone)
 
 
@@ -263,6 +267,35 @@ def _lone_contradicted(
                         contradicted |= apart > 3.0 * (sigma[p] + sigma[q])
                     q += 1
         out[p] = contradicted and neighbours < LONE_NEIGHBOURS
+
+
+def _islands(keys: I64, views: U8) -> Bool:
+    """(N,) points of islands that are mostly seen once, where a column of cells at the island
+    or next to it also has surface that is seen more often."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    bits, low = 21, (1 << 21) - 1
+    i, j, k = (((keys >> s) & low) >> ISLAND_SHIFT for s in (2 * bits, bits, 0))
+    cells, cell = np.unique((i << 2 * bits) | (j << bits) | k, return_inverse=True)
+    steps = np.array([(a << 2 * bits) + (b << bits) + c for a, b, c in np.ndindex(3, 3, 3)])
+    steps -= steps[13]
+    pairs = []
+    for step in steps[14:]:
+        n = np.searchsorted(cells, cells + step)
+        held = np.flatnonzero(cells[np.minimum(n, len(cells) - 1)] == cells + step)
+        pairs.append(np.stack([held, n[held]]))
+    ends = np.concatenate(pairs, axis=1)
+    size = (len(cells), len(cells))
+    _, part = connected_components(coo_matrix((np.ones(ends.shape[1], bool), ends), size), False)
+    count, once = np.bincount(part[cell]), np.bincount(part[cell], views <= 1)
+    is_island = (count < ISLAND_POINTS) & (2 * once > count)
+    columns = np.unique(cells[np.unique(cell[(views > 1) & ~is_island[part[cell]]])] >> bits)
+    suspect = np.flatnonzero(is_island[part])
+    around = (steps[1::3] >> bits)[None] + (cells[suspect] >> bits)[:, None]
+    refuted = np.zeros(len(count), np.bool_)
+    refuted[part[suspect[np.isin(around, columns).any(axis=1)]]] = True
+    return np.asarray(refuted[part][cell])
 
 
 def cloud_of(

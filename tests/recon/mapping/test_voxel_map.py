@@ -237,6 +237,26 @@ def test_a_lone_contradicted_point_is_left_out_and_a_lone_mast_is_kept() -> None
     assert len(fused) == 100 + 5 + 1
 
 
+def test_a_small_piece_in_the_air_that_one_pair_shows_is_left_out() -> None:
+    def level(x0: float, z: float, side: int, views: int) -> PointCloud:
+        xyz = [[x0 + i, 10.5 + j, z + 0.5] for i in range(side) for j in range(side)]
+        return cloud(xyz, [0.1] * len(xyz), [views] * len(xyz))
+
+    ground = level(0.0, 0.0, 100, 2)
+    pieces = {
+        "tower": (level(10.0, 30.0, 8, 1), False),
+        "seen twice": (level(40.0, 30.0, 8, 2), True),
+        "roof": (level(60.0, 30.0, 15, 1), True),
+        "car": (level(80.0, 7.0, 8, 1), True),
+        "elsewhere": (level(300.0, 30.0, 8, 1), True),
+    }
+    fused = fuse([ground, *(piece for piece, _ in pieces.values())], 1.0)
+    for name, (piece, stays) in pieces.items():
+        same = (fused.xyz_m[:, None] == piece.xyz_m[None]).all(axis=2).any(axis=0)
+        assert same.all() if stays else not same.any(), name
+    assert len(fused) == len(ground) + sum(len(p) for p, stays in pieces.values() if stays)
+
+
 def test_no_clouds_and_empty_clouds_fuse_to_nothing() -> None:
     assert len(fuse([], 0.5)) == 0
     empty = PointCloud(
