@@ -63,7 +63,7 @@ class PortalPage(BuildHookInterface):  # type: ignore[type-arg]
 def build(web: Path, node_home: Path | None, user: dict[str, Any]) -> None:
     """Build the page in ``web``; ``user`` is passed to the processes."""
     node, npm = _programs(node_home)
-    if not _is_current(web):
+    if not is_current(web):
         _run(web, user, *npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund")
     _run(web, user, node, "node_modules/vite/bin/vite.js", "build")
 
@@ -73,7 +73,7 @@ def build_as_other(web: Path) -> None:
     uid = web.stat().st_uid or int(os.environ.get("SUDO_UID", "0")) or NOBODY
     with tempfile.TemporaryDirectory(prefix="skyrelief-portal-") as folder:
         copy = Path(folder) / "web"
-        shutil.copytree(web, copy, ignore=_built(web), symlinks=True)
+        shutil.copytree(web, copy, ignore=built_names(web), symlinks=True)
         home = _node_home()
         if home is not None:  # pip's build environment is for root alone
             home = Path(shutil.copytree(home, Path(folder) / "node", symlinks=True))
@@ -83,12 +83,12 @@ def build_as_other(web: Path) -> None:
         build(copy, home, user)
         shutil.rmtree(web / "dist", ignore_errors=True)
         shutil.copytree(copy / "dist", web / "dist", symlinks=True)
-        if not _is_current(web):
+        if not is_current(web):
             shutil.rmtree(web / "node_modules", ignore_errors=True)
             shutil.copytree(copy / "node_modules", web / "node_modules", symlinks=True)
 
 
-def _is_current(web: Path) -> bool:
+def is_current(web: Path) -> bool:
     """True when node_modules holds what package-lock.json asks for."""
     installed = web / "node_modules" / ".package-lock.json"
     return installed.is_file() and (
@@ -96,7 +96,7 @@ def _is_current(web: Path) -> bool:
     )
 
 
-def _built(web: Path) -> Callable[[str, list[str]], list[str]]:
+def built_names(web: Path) -> Callable[[str, list[str]], list[str]]:
     """Names to leave out of a copy of ``web``: its own dist, not those of its packages."""
     return lambda folder, _: ["dist"] if Path(folder) == web else []
 

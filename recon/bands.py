@@ -57,7 +57,7 @@ def shares(cells: int) -> int:
 
 
 @cache
-def _pool() -> ThreadPoolExecutor:
+def pool() -> ThreadPoolExecutor:
     """The threads that all callers share; none is started before it is needed."""
     return ThreadPoolExecutor(max(cores(), 1), thread_name_prefix="bands")
 
@@ -99,7 +99,7 @@ def in_bands(
         except Exception as fault:
             faults[first] = fault
 
-    others = {_pool().submit(run, *band): band for band in pairwise(edges[1:])}
+    others = {pool().submit(run, *band): band for band in pairwise(edges[1:])}
     run(edges[0], edges[1])
     for one, band in others.items():
         if one.cancel():

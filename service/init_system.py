@@ -127,7 +127,7 @@ class PublicFormatter(logging.Formatter):
 
 def log_handler() -> logging.Handler:
     """A handler for the journal if it reads our standard error, otherwise for standard error."""
-    if _journal_reads_us() and os.path.exists(SOCKET):
+    if journal_reads_us() and os.path.exists(SOCKET):
         handler: logging.Handler = JournalHandler()
         handler.setFormatter(PublicFormatter("%(message)s"))
         return handler
@@ -136,7 +136,7 @@ def log_handler() -> logging.Handler:
     return handler
 
 
-def _journal_reads_us() -> bool:
+def journal_reads_us() -> bool:
     """True when standard error is the stream that JOURNAL_STREAM names (device:inode)."""
     device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
     try:

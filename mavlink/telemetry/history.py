@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -77,11 +78,18 @@ class VehicleHistory:
     after the frame.
     """
 
-    def __init__(self, config: HistoryConfig | None = None, patience_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        config: HistoryConfig | None = None,
+        patience_s: float = 0.0,
+        wait: Callable[[float], object] | None = None,
+    ) -> None:
+        """``wait`` is called with the seconds left (default: until a sample comes)."""
         self.config = config or HistoryConfig()
         self._patience_s = patience_s
         self._lock = threading.Lock()
         self._news = threading.Condition()
+        self._wait = wait or self._news.wait
         self._waiting = 0  # waiting readers
         self._given_up_ns = 0  # up to here nothing is waited for again
         self._attitude: TimeSeries[AttitudeSample] = TimeSeries()
@@ -260,7 +268,7 @@ class VehicleHistory:
         with self._news:
             self._waiting += 1  # before checking, so that no new sample is missed
             while not self.covers(time_ns, end_s * 1e9) and now_s < end_s:
-                self._news.wait(end_s - now_s)
+                self._wait(end_s - now_s)
                 now_s = time.monotonic()
             self._waiting -= 1
         if now_s >= end_s:  # once for a frame, not for each moment about its exposure

@@ -60,7 +60,7 @@ class DensePath:
             )  # fmt: skip
             for slot, pair in enumerate(pairs):
                 plan = self._plan(pair, size_px)
-                plan.upload(_inputs(pair, K, self.stages.matching.min_disparity), slot)
+                plan.upload(device_inputs(pair, K, self.stages.matching.min_disparity), slot)
                 found[:, slot].copy_(torch.stack(plan.run()))
             depth, sigma, views = read(fusion.run())
         return DepthMap(depth, sigma, views, K, T_world_camera)
@@ -83,7 +83,7 @@ class DensePath:
                 stages=self.stages,
             )  # fmt: skip
             shapes = [space[:2]] * 4 + [(*(fine or (0, 0)), 3), (5,), (15,)]
-            given = _inputs(pair, np.eye(3), self.stages.matching.min_disparity)
+            given = device_inputs(pair, np.eye(3), self.stages.matching.min_disparity)
             parts = [part(a, s) for a, s in zip(given, shapes, strict=True)]
             return Plan(self.device, stage, parts)
 
@@ -111,7 +111,7 @@ def pair_depth(
     return reproject(px, confidence, geometry, sizes, size_px, MIN_REPROJECTED)
 
 
-def _inputs(pair: StereoPair, K: F64, min_disparity: int) -> list[Array]:
+def device_inputs(pair: StereoPair, K: F64, min_disparity: int) -> list[Array]:
     """Inputs on the device: images, masks, guide, true sizes and geometry."""
     h, w = pair.left.shape
     seen = [np.ones((h, w), np.uint8)] * 2

@@ -118,12 +118,12 @@ def _concluded(rows: F64, start: F64, config: IcpConfig) -> Registration:
         return no_overlap(start, int(done[0]))
     equations = Equations(
         H.reshape(6, 6), common.reshape(6, 6), g, sums, centre, float(lever[0]),
-        lambda: _area(lags.reshape(2, 3, AREA_LAGS)),
+        lambda: area_of(lags.reshape(2, 3, AREA_LAGS)),
     )  # fmt: skip
     return conclude(equations, T.reshape(4, 4), start, int(available[0]), int(done[0]), config)
 
 
-def _area(lags: F64) -> float:
+def area_of(lags: F64) -> float:
     """How many neighbours err together, as :func:`recon.mapping.icp_kernels.correlated_area`."""
     area = 1.0
     for products, powers, counts in lags:

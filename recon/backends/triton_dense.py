@@ -77,9 +77,9 @@ def matching_cost(
     c = config.cost
     h, w = left.shape
     words = torch.empty((2, h, w), dtype=torch.int32, device=left.device)
-    _census[(blocks(h * w, PIXELS), 2)](left, right, words, h, w, CENSUS_OFFSETS, PIXELS)
+    census_kernel[(blocks(h * w, PIXELS), 2)](left, right, words, h, w, CENSUS_OFFSETS, PIXELS)
     cost, data = torch.empty((2, h, w, room), dtype=torch.int16, device=left.device)
-    _cost[(blocks(h * w, CELLS),)](
+    cost_kernel[(blocks(h * w, CELLS),)](
         left, right, words, true, cost, data, h, w, config.min_disparity, c.census_truncation,
         round(c.census_weight * COST_UNIT), c.difference_truncation,
         round(c.difference_weight * COST_UNIT), round(c.unseen * COST_UNIT),
@@ -89,7 +89,7 @@ def matching_cost(
 
 
 @triton.jit(do_not_specialize=["height", "width"])
-def _census(left, right, words, height, width, offsets: tl.constexpr, PIXELS: tl.constexpr):
+def census_kernel(left, right, words, height, width, offsets: tl.constexpr, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     image = left
     if tl.program_id(1) == 1:
@@ -119,7 +119,7 @@ def _ones(word):
     do_not_specialize=["height", "width", "first", "max_bits", "bit_weight", "max_gray",
                        "gray_weight", "unseen", "top"],
 )  # fmt: skip
-def _cost(
+def cost_kernel(
     left, right, words, true, cost, data, height, width, first, max_bits, bit_weight, max_gray,
     gray_weight, unseen, top, LABELS: tl.constexpr, CELLS: tl.constexpr,
 ):  # fmt: skip
@@ -160,7 +160,7 @@ def edge_weights(image: Tensor, true: Tensor, config: BeliefPropagationConfig) -
     h, w = image.shape
     edges = torch.empty((2, h, w), dtype=torch.int32, device=image.device)
     fall = (1 - config.edge_floor) / config.edge_contrast
-    _edges[(blocks(h * w, PIXELS),)](
+    edges_kernel[(blocks(h * w, PIXELS),)](
         image, true, edges, h, w, fall, config.edge_floor, FULL_WEIGHT, PIXELS
     )
     return edges
@@ -182,7 +182,7 @@ def _edge(here, there, fall, floor, full):
 
 
 @triton.jit(do_not_specialize=["height", "width", "full"])
-def _edges(image, true, edges, height, width, fall, floor, full, PIXELS: tl.constexpr):
+def edges_kernel(image, true, edges, height, width, fall, floor, full, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     here = at < height * width
     v, u = at // width, at % width
@@ -205,7 +205,7 @@ def coarser(
     size = ((h + 1) // 2, (w + 1) // 2)
     small = torch.empty((*size, room), dtype=torch.int16, device=data.device)
     fewer = torch.empty((2, *size), dtype=torch.int32, device=data.device)
-    _coarser[(blocks(size[0] * size[1], CELLS),)](
+    coarser_kernel[(blocks(size[0] * size[1], CELLS),)](
         data, edges, true, small, fewer, h, w, level, 4 * config.truncation, room, CELLS
     )
     return small, fewer
@@ -220,7 +220,7 @@ def _halved(n, level):
 
 
 @triton.jit(do_not_specialize=["height", "width", "level", "top"])
-def _coarser(
+def coarser_kernel(
     data, edges, true, small, fewer, height, width, level, top, LABELS: tl.constexpr,
     CELLS: tl.constexpr,
 ):  # fmt: skip
@@ -257,14 +257,14 @@ def finer(messages: Tensor, data: Tensor, true: Tensor, level: int) -> Tensor:
     """Messages (4, h, w, L) at the size of ``data``: those of the coarser pixel."""
     h, w, room = data.shape
     out = torch.empty((4, h, w, room), dtype=torch.int16, device=data.device)
-    _finer[(blocks(h * w, CELLS), 4)](
+    finer_kernel[(blocks(h * w, CELLS), 4)](
         messages, out, true, h, w, messages.shape[1], messages.shape[2], level, room, CELLS
     )
     return out
 
 
 @triton.jit(do_not_specialize=["height", "width", "tall", "wide", "level"])
-def _finer(
+def finer_kernel(
     messages, out, true, height, width, tall, wide, level, LABELS: tl.constexpr,
     CELLS: tl.constexpr,
 ):  # fmt: skip
@@ -292,7 +292,7 @@ def sweep(
     less a ramp, up and down the labels.
     """
     h, w, room = data.shape
-    _sweep[(blocks(h * ((w + 1) // 2), SWEPT),)](
+    sweep_kernel[(blocks(h * ((w + 1) // 2), SWEPT),)](
         data, messages, edges, colour, h, w, COST_UNIT, config.truncation, FULL_WEIGHT, room, SWEPT,
         num_warps=SWEEP_WARPS,
     )  # fmt: skip
@@ -318,7 +318,7 @@ def _envelope(rest, weight, unit, truncation, full, label):
 
 
 @triton.jit(do_not_specialize=["colour", "height", "width", "unit", "truncation", "full"])
-def _sweep(
+def sweep_kernel(
     data, messages, edges, colour, height, width, unit, truncation, full, LABELS: tl.constexpr,
     CELLS: tl.constexpr,
 ):  # fmt: skip
@@ -363,7 +363,7 @@ def select(
     h, w, room = data.shape
     px, confidence = torch.empty((2, h, w), device=data.device)
     evidence = config.min_evidence if config.min_evidence > 0 else -math.inf
-    _select[(blocks(h * w, CELLS),)](
+    select_kernel[(blocks(h * w, CELLS),)](
         data, messages, cost, true, px, confidence, h, w, config.min_disparity,
         2.0 * config.truncation, evidence, float(NOISE), SURE_EVIDENCE, RADIUS, room, CELLS,
     )  # fmt: skip
@@ -377,7 +377,7 @@ def _at(values, label, chosen):
 
 
 @triton.jit(do_not_specialize=["height", "width", "first"])
-def _select(
+def select_kernel(
     data, messages, cost, true, px, confidence, height, width, first, full_margin, min_evidence,
     noise, sure_evidence, radius: tl.constexpr, LABELS: tl.constexpr, CELLS: tl.constexpr,
 ):  # fmt: skip
@@ -462,12 +462,12 @@ def contrast(image: Tensor, radius: int) -> Tensor:
     """(h, w) float64 standard deviation of the gray levels (h, w) uint8 in a square window."""
     h, w = image.shape
     out = torch.empty((h, w), dtype=torch.float64, device=image.device)
-    _contrast[(blocks(h * w, PIXELS),)](image, out, h, w, radius, PIXELS)
+    contrast_kernel[(blocks(h * w, PIXELS),)](image, out, h, w, radius, PIXELS)
     return out
 
 
 @triton.jit(do_not_specialize=["height", "width"])
-def _contrast(image, out, height, width, radius: tl.constexpr, PIXELS: tl.constexpr):
+def contrast_kernel(image, out, height, width, radius: tl.constexpr, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     here = at < height * width
     v, u = at // width, at % width
@@ -492,7 +492,7 @@ def hidden(px: Tensor, confidence: Tensor, true: Tensor, config: BeliefPropagati
     nearest = torch.full((h, w), -1, dtype=torch.int32, device=px.device)
     out = torch.empty((h, w), dtype=torch.bool, device=px.device)
     given = (px, confidence, true, nearest, out, h * w, w, config.min_disparity)
-    for kernel in (_project, _compare):
+    for kernel in (project_kernel, compare_kernel):
         kernel[(blocks(h * w, PIXELS),)](*given, float(config.occlusion_tolerance), PIXELS)
     return out
 
@@ -510,7 +510,7 @@ def _partners(px, true, at, here, width, first):
 
 
 @triton.jit(do_not_specialize=["plane", "width", "first"])
-def _project(
+def project_kernel(
     px, confidence, true, nearest, out, plane, width, first, tolerance, PIXELS: tl.constexpr
 ):
     """The largest label at each place of the right image; labels in float32 order as integers."""
@@ -523,7 +523,7 @@ def _project(
 
 
 @triton.jit(do_not_specialize=["plane", "width", "first"])
-def _compare(
+def compare_kernel(
     px, confidence, true, nearest, out, plane, width, first, tolerance, PIXELS: tl.constexpr
 ):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
@@ -540,14 +540,14 @@ def drop_unseen(
     """The labels without those on masked pixels of either image; masks are 0 or 1."""
     h, w = px.shape
     label, trust = torch.empty((2, h, w), device=px.device)
-    _unseen[(blocks(h * w, PIXELS),)](
+    unseen_kernel[(blocks(h * w, PIXELS),)](
         px, confidence, left_seen, right_seen, true, label, trust, h * w, w, PIXELS
     )
     return label, trust
 
 
 @triton.jit(do_not_specialize=["plane", "width"])
-def _unseen(
+def unseen_kernel(
     px, confidence, left_seen, right_seen, true, label, trust, plane, width, PIXELS: tl.constexpr
 ):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
@@ -576,10 +576,10 @@ def speckles(level: Tensor, largest: int, unknown: int) -> Tensor:
     own = torch.arange(h * w, dtype=torch.int32, device=level.device)
     for _ in range(largest):
         least = torch.empty_like(own)
-        _wander[grid](own, level, least, h, w, SPECKLE_STEP, unknown, PIXELS)
+        wander_kernel[grid](own, level, least, h, w, SPECKLE_STEP, unknown, PIXELS)
         own = least
     count = torch.zeros_like(own)
-    _measure[grid](own, level, count, h, w, SPECKLE_STEP, unknown, largest + 1, PIXELS)
+    measure_kernel[grid](own, level, count, h, w, SPECKLE_STEP, unknown, largest + 1, PIXELS)
     return (count[own.long()].view(h, w) <= largest) & (level > unknown)
 
 
@@ -614,7 +614,7 @@ def _extremes(own, level, at, index, inside, height, width, step, unknown):
 
 
 @triton.jit(do_not_specialize=["height", "width", "step", "unknown"])
-def _wander(own, level, out, height, width, step, unknown, PIXELS: tl.constexpr):
+def wander_kernel(own, level, out, height, width, step, unknown, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     inside = at < height * width
     index = tl.load(own + at, mask=inside, other=0)
@@ -623,7 +623,7 @@ def _wander(own, level, out, height, width, step, unknown, PIXELS: tl.constexpr)
 
 
 @triton.jit(do_not_specialize=["height", "width", "step", "unknown", "many"])
-def _measure(own, level, count, height, width, step, unknown, many, PIXELS: tl.constexpr):
+def measure_kernel(own, level, count, height, width, step, unknown, many, PIXELS: tl.constexpr):
     """Add up the pixels of each index; one that is not a whole surface counts as ``many``."""
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     inside = at < height * width
@@ -652,7 +652,7 @@ def bilateral(
     spatial = math.sqrt(0.5 * LOG2_E) / config.spatial_sigma
     layers[:3] *= tonal
     out, sure = torch.empty((2, height, width), device=guide.device)
-    _bilateral[(blocks(height, ROWS), blocks(width, COLUMNS))](
+    bilateral_kernel[(blocks(height, ROWS), blocks(width, COLUMNS))](
         layers, guide.contiguous(), true, out, sure, height, width, h, w, tonal, spatial,
         float(RANGE_FLOOR), config.min_support, config.diameter_px, ROWS, COLUMNS,
     )  # fmt: skip
@@ -668,7 +668,7 @@ def _first_tap(n, taps, fine, diameter: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["height", "width", "tall", "wide"])
-def _bilateral(
+def bilateral_kernel(
     layers, guide, true, out, sure, height, width, tall, wide, tonal_scale, spatial_scale, floor,
     support, diameter: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
@@ -720,7 +720,7 @@ def averaged(guide: Tensor, room: tuple[int, int], true: Tensor) -> Tensor:
     """
     H, W, _ = guide.shape
     out = torch.empty((*room, 3), device=guide.device)
-    _averaged[(blocks(room[0] * room[1], PIXELS),)](guide, true, out, H, W, *room, PIXELS)
+    averaged_kernel[(blocks(room[0] * room[1], PIXELS),)](guide, true, out, H, W, *room, PIXELS)
     return out
 
 
@@ -732,7 +732,7 @@ def _span(n, step, fine):
 
 
 @triton.jit(do_not_specialize=["height", "width", "tall", "wide"])
-def _averaged(guide, true, out, height, width, tall, wide, PIXELS: tl.constexpr):
+def averaged_kernel(guide, true, out, height, width, tall, wide, PIXELS: tl.constexpr):
     at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     here = at < tall * wide
     v, u = at // wide, at % wide
@@ -772,7 +772,7 @@ def reproject(
     """
     width, height = size_px
     depth, sigma = torch.empty((2, height, width), device=px.device)
-    _reproject[(blocks(height * width, PIXELS),)](
+    reproject_kernel[(blocks(height * width, PIXELS),)](
         px.contiguous(), confidence.contiguous(), geometry, true, depth, sigma, height, width,
         px.shape[1], min_confidence, PIXELS,
     )  # fmt: skip
@@ -780,7 +780,7 @@ def reproject(
 
 
 @triton.jit(do_not_specialize=["height", "width", "pitch"])
-def _reproject(
+def reproject_kernel(
     px, confidence, geometry, true, depth, sigma, height, width, pitch, min_confidence,
     PIXELS: tl.constexpr,
 ):  # fmt: skip
@@ -836,17 +836,17 @@ def fuse(depth: Tensor, sigma: Tensor, config: DepthFusionConfig) -> tuple[Tenso
     out, error = torch.empty((2, height, width), device=device)
     views = torch.empty((height, width), dtype=torch.uint8, device=device)
     balance = torch.zeros(1, dtype=torch.int32, device=device)
-    _fuse[(blocks(plane, FUSED_PIXELS),)](
+    fuse_kernel[(blocks(plane, FUSED_PIXELS),)](
         depth.contiguous(), sigma.contiguous(), out, error, views, balance, plane,
         config.agree_sigmas, config.max_sigma_share, config.single_view_sigma,
         config.min_sigma_share, pairs, FUSED_PIXELS,
     )  # fmt: skip
-    _refute[(blocks(plane, FUSED_PIXELS),)](out, error, views, balance, plane, FUSED_PIXELS)
+    refute_kernel[(blocks(plane, FUSED_PIXELS),)](out, error, views, balance, plane, FUSED_PIXELS)
     return out, error, views
 
 
 @triton.jit(do_not_specialize=["plane"])
-def _refute(out, error, views, balance, plane, PIXELS: tl.constexpr):
+def refute_kernel(out, error, views, balance, plane, PIXELS: tl.constexpr):
     """Empty the map where more pixels are contradicted than confirmed."""
     if tl.load(balance) > 0:
         at = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
@@ -870,7 +870,7 @@ def _reading(depth, sigma, at, here, max_share):
 
 
 @triton.jit(do_not_specialize=["plane"])
-def _fuse(
+def fuse_kernel(
     depth, sigma, out, error, out_views, balance, plane, agree, max_share, single, min_share,
     PAIRS: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip

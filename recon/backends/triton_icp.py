@@ -85,13 +85,13 @@ def weigh(
     partial = torch.empty((programs, ROW), dtype=torch.float64, device=T.device)
     h, w = b.elements.shape[:2]
     given = (seen.point, seen.normal, seen.sigma, b.elements, b.intrinsics, T)
-    _residuals[(programs,)](
+    residuals_kernel[(programs,)](
         *given, residual, found, count, h, w, config.gate_share, POINTS, num_warps=1
     )
     every = max(count // MEDIAN_OF, 1)
     scale = scale_of(residual[::every], found[::every])
     sigmas = config.tukey_sigmas if tukey else config.huber_sigmas
-    _normal_equations[(programs,)](
+    normal_equations_kernel[(programs,)](
         *given, a.centre, scale, partial, count, h, w, config.gate_share, sigmas, int(tukey),
         POINTS, ROW, num_warps=1,
     )  # fmt: skip
@@ -118,7 +118,7 @@ def advance(
     and Schulz (Higham, Functions of Matrices, 2008, chapter 5), with matrix products alone.
     """
     T, state = T.clone(), state.clone()
-    _advance[(1,)](
+    advance_kernel[(1,)](
         weighed.H, weighed.common, weighed.g, weighed.partners, weighed.centre, a.lever_m, T,
         state, share, config.weak_slope, SHARED, MIN_PARTNERS, SIGN_ROUNDS,
         num_warps=1,
@@ -130,14 +130,14 @@ def surface_elements(depth: Tensor, sigma: Tensor, intrinsics: Tensor, edge_shar
     """(h, w, 6) float32, a plane fitted to the inverse depth of each window."""
     h, w = depth.shape
     out = torch.empty((h, w, 6), device=depth.device)
-    _surface[(blocks(h * w, POINTS),)](
+    surface_kernel[(blocks(h * w, POINTS),)](
         depth, sigma, intrinsics, out, h, w, edge_share, MIN_PIXELS, REACH, POINTS
     )
     return out
 
 
 @triton.jit(do_not_specialize=["height", "width", "min_pixels"])
-def _surface(
+def surface_kernel(
     depth, sigma, K, out, height, width, edge_share, min_pixels, reach: tl.constexpr,
     PIXELS: tl.constexpr,
 ):  # fmt: skip
@@ -191,14 +191,14 @@ def scale_of(residual: Tensor, found: Tensor) -> Tensor:
     """() standard deviation of the residuals (N,), of any stride, by their median."""
     out = torch.empty((), dtype=torch.float64, device=residual.device)
     count = len(residual)
-    _scale[(1,)](
+    scale_kernel[(1,)](
         residual, found, out, count, residual.stride(0), triton.next_power_of_2(count), num_warps=8
     )
     return out
 
 
 @triton.jit(do_not_specialize=["count", "stride"])
-def _scale(residual, found, out, count, stride, COUNT: tl.constexpr):
+def scale_kernel(residual, found, out, count, stride, COUNT: tl.constexpr):
     """The mean of the two middle sizes: the middle is between ``low`` and ``high``, ever nearer."""
     i = tl.arange(0, COUNT)
     chosen = tl.load(found + i * stride, mask=i < count, other=0.0) > 0
@@ -259,7 +259,7 @@ def _partner(points, normals, sigmas, elements, K, T, i, count, height, width, g
 
 
 @triton.jit(do_not_specialize=["count", "height", "width"])
-def _residuals(
+def residuals_kernel(
     points, normals, sigmas, elements, K, T, residual, found, count, height, width, gate,
     POINTS: tl.constexpr,
 ):  # fmt: skip
@@ -294,7 +294,7 @@ def _products(out, weight, a, b, c, d, e, f, x, y, z, u, v, w):
 
 
 @triton.jit(do_not_specialize=["count", "height", "width", "tukey"])
-def _normal_equations(
+def normal_equations_kernel(
     points, normals, sigmas, elements, K, T, centre, scale, partial, count, height, width, gate,
     limit, tukey, POINTS: tl.constexpr, ROW: tl.constexpr,
 ):  # fmt: skip
@@ -354,7 +354,7 @@ def _inverse(A, r, c):
 
 
 @triton.jit(do_not_specialize=["least", "rounds"])
-def _advance(
+def advance_kernel(
     H, common, g, partners, centre, lever, T, state, share, weak_slope, shared, least,
     rounds,
 ):  # fmt: skip

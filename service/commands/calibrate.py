@@ -61,7 +61,7 @@ def calibrate(
         "K": result.camera.K.tolist(),
         "distortion": result.camera.distortion.tolist(),
     }
-    print(json.dumps(report) if as_json else _text(report))
+    print(json.dumps(report) if as_json else result_text(report))
 
 
 def _board(pattern: str, square_m: float) -> Board:
@@ -93,7 +93,7 @@ def _record(result: Calibration, boards: BoardSet, board: Board) -> dict[str, An
     }
 
 
-def _text(report: dict[str, Any]) -> str:
+def result_text(report: dict[str, Any]) -> str:
     """The report as lines for people."""
     K, d = report["K"], report["distortion"]
     lines = [

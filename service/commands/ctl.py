@@ -43,9 +43,9 @@ def ctl(
         if action == "watch":
             _watch(operator, seconds, as_json)
         elif action == "status":
-            _print(status(operator), as_json)
+            print_result(status(operator), as_json)
         else:
-            _print(order(operator, action, metres), as_json)
+            print_result(order(operator, action, metres), as_json)
 
 
 def _check(action: str, metres: float | None, timeout: float) -> None:
@@ -104,7 +104,7 @@ LINES: dict[str, Callable[[dict[str, Any]], str]] = {
 """Message name to its line on the terminal. The next message is one line."""
 
 
-def _print(result: dict[str, Any], as_json: bool) -> None:
+def print_result(result: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print(json.dumps(_plain(result)))
         return

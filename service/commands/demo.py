@@ -39,13 +39,13 @@ def demo(
     """Replay a small real flight while a ground station receives it over the datalink."""
     from service.bench.link_emulator import free_port
 
-    source = _flight(flight)
+    source = demo_flight(flight)
     _prepare(out)
     began = time.monotonic()
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     has_portal = all(find_spec(package) for package in ("starlette", "uvicorn", "websockets"))
     portal = f"127.0.0.1:{free_port()}" if has_portal else ""
-    compilers = _compile_meanwhile()
+    compilers = compile_meanwhile()
     if compilers:
         _say(1, "compiling kernels in the background: once, a minute or two")
     _say(1, "starting the ground station")
@@ -96,7 +96,7 @@ def compile_kernels() -> None:
     decode(encode(Keyframe(0, 0, DepthMap(depth, *one, K, np.eye(4)), bgr, pose, known), 0))
 
 
-def _compile_meanwhile() -> list[subprocess.Popen[str]]:
+def compile_meanwhile() -> list[subprocess.Popen[str]]:
     """A process that compiles what the replay needs later; none when numba has its kernels."""
     from service.daemon.warm_up import has_kernels
 
@@ -105,7 +105,7 @@ def _compile_meanwhile() -> list[subprocess.Popen[str]]:
     return [subprocess.Popen(python_command(__name__), stdin=subprocess.DEVNULL, text=True)]
 
 
-def _flight(flight: Path | None) -> Path:
+def demo_flight(flight: Path | None) -> Path:
     """The folder with the images and the camera model: of a clone, or as the wheel brings it."""
     homes = (Path(__file__).resolve().parents[2], Path(sys.prefix) / "share" / "skyrelief")
     folders = [flight] if flight else [home / FLIGHT for home in homes]

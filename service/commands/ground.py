@@ -232,7 +232,7 @@ def _ask_for_time(notifier: Notifier, worker: Worker) -> None:
             return
 
 
-def _check(workers: Workers, notifier: Notifier) -> None:
+def feed_watchdog(workers: Workers, notifier: Notifier) -> None:
     """Feed the watchdog while every worker makes progress.
 
     Raises SkyreliefError when one that the station cannot do without has failed for good.
@@ -261,7 +261,7 @@ def _watch(
         entries = receiver.progress()
         if time.monotonic() >= beat_at:
             beat_at = time.monotonic() + NOTIFY_S
-            _check(workers, notifier)
+            feed_watchdog(workers, notifier)
             for radio in radios:
                 radio.beat()
         if given.once and any(entry["complete"] for entry in entries):
@@ -274,10 +274,10 @@ def _watch(
             return
         if sys.stderr.isatty() and time.monotonic() - shown_at > SHOW_S:
             shown_at = time.monotonic()
-            _show_news(entries, shown)
+            show_news(entries, shown)
 
 
-def _show_news(entries: list[dict[str, Any]], shown: dict[str, str]) -> None:
+def show_news(entries: list[dict[str, Any]], shown: dict[str, str]) -> None:
     """Print the scans whose line is not the one in ``shown``, by folder, and keep it there."""
     for entry in entries:
         line = _line(entry)

@@ -103,7 +103,7 @@ def replay(
             video, source, played, camera, find_lens and not realtime, log, video_epoch, out,
             chosen, as_json, is_given(LATENCY, config, overrides),
         )  # fmt: skip
-    _report(summary, as_json)
+    report(summary, as_json)
     is_torch = summary.get("backend") == "torch"
     if is_torch and any(w.row.name == "dense" and not w.is_done for w in PROCESS.table()):
         # Dropped at a stop: torch aborts a process that ends while it computes.
@@ -295,7 +295,7 @@ def _fly(
         if not has_kernels():
             work = f"compiling kernels, once, a minute or two; {work}"
         with progress.part(work, of_rest=0.9):
-            show = _flown(inputs.source, progress)
+            show = show_flown(inputs.source, progress)
             scan.run(stop, show, is_enough=lambda scan: _correction(scan, unsure))
             if not stop.is_set():
                 correction = _correction(scan, unsure, has_ended=True)
@@ -348,7 +348,7 @@ def _correction(scan: Scan, unsure: Collection[str], has_ended: bool = False) ->
     return None if shutter is None else _Correction("readout", with_readout(scan.inputs, shutter))
 
 
-def _flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:
+def show_flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:
     """The bar of a scan, whose figures only a terminal shows."""
     from service.cameras.source import Counted
 
@@ -363,7 +363,7 @@ def _flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:
     return show
 
 
-def _report(summary: dict[str, Any], as_json: bool) -> None:
+def report(summary: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print(json.dumps(summary))
         return

@@ -11,7 +11,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, dataclass, fields
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -112,92 +112,9 @@ class FallbackBackend:
             return operation(self._backend)
 
 
-def choose_backend(name: str = "auto") -> Backend:
-    """The backend called ``name``, or for ``"auto"`` the fastest in a short measured trial.
-
-    Raises InputError for an unknown name and OutsideError, with the reason, when a named
-    backend cannot run here.
-    """
-    chosen = named_backend(name) if name != "auto" else fastest_backend()
-    if chosen.name != "cpu" and chosen.device == "cpu":
-        log.warning(
-            "backend %s found no device but the processor: expect about %d times the duration of "
-            "'--backend cpu'", chosen.name, WITHOUT_DEVICE,
-        )  # fmt: skip
-    return chosen if chosen.name == "cpu" else FallbackBackend(chosen)
-
-
-def engine_folder() -> str | None:
-    """Cache folder for compiled engines of GPU providers and Triton's kernels; None without one."""
-    given = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]  # as systemd sets it
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(given or Path(home) / "skyrelief") / "engines"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        log.info("compiled engines are not cached: %s", error)
-        return None
-    os.environ.setdefault("TRITON_CACHE_DIR", str(folder / "triton"))
-    return str(folder)
-
-
-def fastest_backend() -> Backend:
-    """The fastest working backend in a short measured trial."""
-    engine_folder()
-    working: list[Backend] = []
-    for candidate in BACKENDS:
-        reason = pointless(candidate)
-        if reason:
-            log.info("backend %s: not tried, %s", candidate, reason)
-            continue
-        try:
-            working.append(load_backend(candidate))
-        except (ImportError, RuntimeError, ValueError) as error:
-            log.info("backend %s: cannot run here, %s", candidate, error)
-    if len(working) == 1:
-        log.info("backend %s on %s, the only one", working[0].name, working[0].device)
-        return working[0]
-    timed: list[tuple[float, Backend]] = []
-    for backend in working:
-        try:
-            timed.append((trial(backend), backend))
-        except (RuntimeError, MemoryError) as error:
-            log.info("backend %s: failed its trial, %s", backend.name, error)
-    if not timed:
-        raise OutsideError("no backend runs here; 'skyrelief doctor' says what is missing")
-    seconds, chosen = min(timed, key=lambda entry: entry[0])
-    figures = ", ".join(f"{b.name} {1e3 * s:.1f} ms" for s, b in timed)
-    log.info(
-        "backend %s on %s: %.1f ms a trial, the fastest of %s",
-        chosen.name, chosen.device, 1e3 * seconds, figures,
-    )  # fmt: skip
-    return chosen
-
-
-def named_backend(name: str) -> Backend:
-    """The backend called ``name``, ready to run.
-
-    Raises InputError when there is none of that name, OutsideError when it cannot run here.
-    """
-    if name == "onnx":
-        raise InputError(
-            "backend onnx runs a stereo model: give it with compute.model (stereo: --model); "
-            "'skyrelief export-model' writes one"
-        )
-    if name not in BACKENDS:
-        raise InputError(f"backend {name}: available: auto, {', '.join(BACKENDS)}, onnx")
-    engine_folder()
-    try:
-        backend = load_backend(name)
-    except (ImportError, RuntimeError, ValueError) as error:
-        raise OutsideError(f"backend {name} cannot run here: {error}") from error
-    log.info("backend %s on %s, as configured", backend.name, backend.device)
-    return backend
-
-
-def pointless(name: str) -> str | None:
+def pointless(name: str, is_there: Callable[[str], object] = find_spec) -> str | None:
     """Why ``auto`` skips this backend, or None; imports nothing heavy."""
-    if name == "torch" and find_spec("torch") is None:
+    if name == "torch" and is_there("torch") is None:
         return "torch is not installed"
     if name != "cpu" and not loads("libcuda.so.1"):
         return "there is no CUDA driver, and on a CPU the cpu backend is faster"
@@ -221,7 +138,101 @@ def trial(backend: Backend) -> float:
     return best
 
 
-def open_backend(config: ComputeConfig, image_px: tuple[int, int] | None = None) -> Backend:
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """How a backend is found out: its maker, why ``auto`` skips it, and its time in a trial."""
+
+    load: Callable[[str], Backend] = load_backend
+    pointless: Callable[[str], str | None] = pointless
+    trial: Callable[[Backend], float] = trial
+
+
+def choose_backend(name: str = "auto", by: Choice = Choice()) -> Backend:
+    """The backend called ``name``, or for ``"auto"`` the fastest in a short measured trial.
+
+    Raises InputError for an unknown name and OutsideError, with the reason, when a named
+    backend cannot run here.
+    """
+    chosen = named_backend(name, by) if name != "auto" else fastest_backend(by)
+    if chosen.name != "cpu" and chosen.device == "cpu":
+        log.warning(
+            "backend %s found no device but the processor: expect about %d times the duration of "
+            "'--backend cpu'", chosen.name, WITHOUT_DEVICE,
+        )  # fmt: skip
+    return chosen if chosen.name == "cpu" else FallbackBackend(chosen)
+
+
+def engine_folder() -> str | None:
+    """Cache folder for compiled engines of GPU providers and Triton's kernels; None without one."""
+    given = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]  # as systemd sets it
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(given or Path(home) / "skyrelief") / "engines"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        log.info("compiled engines are not cached: %s", error)
+        return None
+    os.environ.setdefault("TRITON_CACHE_DIR", str(folder / "triton"))
+    return str(folder)
+
+
+def fastest_backend(by: Choice) -> Backend:
+    """The fastest working backend in a short measured trial."""
+    engine_folder()
+    working: list[Backend] = []
+    for candidate in BACKENDS:
+        reason = by.pointless(candidate)
+        if reason:
+            log.info("backend %s: not tried, %s", candidate, reason)
+            continue
+        try:
+            working.append(by.load(candidate))
+        except (ImportError, RuntimeError, ValueError) as error:
+            log.info("backend %s: cannot run here, %s", candidate, error)
+    if len(working) == 1:
+        log.info("backend %s on %s, the only one", working[0].name, working[0].device)
+        return working[0]
+    timed: list[tuple[float, Backend]] = []
+    for backend in working:
+        try:
+            timed.append((by.trial(backend), backend))
+        except (RuntimeError, MemoryError) as error:
+            log.info("backend %s: failed its trial, %s", backend.name, error)
+    if not timed:
+        raise OutsideError("no backend runs here; 'skyrelief doctor' says what is missing")
+    seconds, chosen = min(timed, key=lambda entry: entry[0])
+    figures = ", ".join(f"{b.name} {1e3 * s:.1f} ms" for s, b in timed)
+    log.info(
+        "backend %s on %s: %.1f ms a trial, the fastest of %s",
+        chosen.name, chosen.device, 1e3 * seconds, figures,
+    )  # fmt: skip
+    return chosen
+
+
+def named_backend(name: str, by: Choice) -> Backend:
+    """The backend called ``name``, ready to run.
+
+    Raises InputError when there is none of that name, OutsideError when it cannot run here.
+    """
+    if name == "onnx":
+        raise InputError(
+            "backend onnx runs a stereo model: give it with compute.model (stereo: --model); "
+            "'skyrelief export-model' writes one"
+        )
+    if name not in BACKENDS:
+        raise InputError(f"backend {name}: available: auto, {', '.join(BACKENDS)}, onnx")
+    engine_folder()
+    try:
+        backend = by.load(name)
+    except (ImportError, RuntimeError, ValueError) as error:
+        raise OutsideError(f"backend {name} cannot run here: {error}") from error
+    log.info("backend %s on %s, as configured", backend.name, backend.device)
+    return backend
+
+
+def open_backend(
+    config: ComputeConfig, image_px: tuple[int, int] | None = None, by: Choice = Choice()
+) -> Backend:
     """The backend of ``compute.backend``, ready to run; "auto" is the fastest that works.
 
     With ``compute.model`` it is that learned model on ONNX Runtime; ``image_px`` (W, H) of the
@@ -230,7 +241,7 @@ def open_backend(config: ComputeConfig, image_px: tuple[int, int] | None = None)
     otherwise.
     """
     if not config.model:
-        return choose_backend(config.backend)
+        return choose_backend(config.backend, by)
     if config.backend not in ("auto", "onnx"):
         raise InputError(
             f"compute.model runs on ONNX Runtime: compute.backend must be onnx or auto, "

@@ -33,6 +33,7 @@ from service.scans.retention import existing
 if TYPE_CHECKING:
     from mavlink.wire.messages import LinkReport
     from recon.types import Camera
+    from service.compute.backend_choice import Choice
 
 CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", "eclipse-zenoh")
 DESK = {
@@ -96,7 +97,7 @@ def examine(config: Config, listen_s: float | None) -> Iterator[Finding]:
     datalink, but the packages of the products.
     """
     if listen_s is None:
-        for check in (_software, _products, _clock, lambda: _compute(config)):
+        for check in (_software, _products, _clock, lambda: examine_compute(config)):
             yield from check()
         return
     running = running_service(config.health.http) if config.health.http else None
@@ -105,11 +106,11 @@ def examine(config: Config, listen_s: float | None) -> Iterator[Finding]:
         lambda: _machine(config),
         _clock,
         lambda: _folder(Path(config.scan.folder)),
-        lambda: _compute(config),
+        lambda: examine_compute(config),
         lambda: _camera(config, running),
         lambda: examine_links(config, listen_s, running),
         lambda: _datalink(config),
-        lambda: _certificate(config),
+        lambda: check_certificate(config),
         lambda: _settings(config),
         lambda: _service(running),
     )
@@ -224,12 +225,13 @@ def _folder(folder: Path) -> Iterator[Finding]:
     yield Finding("scans", verdict, f"{folder}: {free / 1024:.1f} GiB free")
 
 
-def _compute(config: Config) -> Iterator[Finding]:
-    from service.compute.backend_choice import open_backend
+def examine_compute(config: Config, by: Choice | None = None) -> Iterator[Finding]:
+    """Whether the configured backend runs; ``by`` finds it (default: as a scan does)."""
+    from service.compute.backend_choice import Choice, open_backend
 
     start = time.monotonic()
     try:
-        backend = open_backend(config.compute)
+        backend = open_backend(config.compute, by=by or Choice())
     except SkyreliefError as error:
         yield Finding("compute", BAD, str(error))
         return
@@ -307,7 +309,7 @@ def _worker(worker: dict[str, Any]) -> Finding:
     return Finding("worker", (NOTE if worker["fault"] else GOOD) if is_well else BAD, text)
 
 
-def _certificate(config: Config) -> Iterator[Finding]:
+def check_certificate(config: Config) -> Iterator[Finding]:
     from service.stream.keys import expiry_unix_s
 
     path = config.datalink.tls_certificate

@@ -71,13 +71,14 @@ class Daemon:
         *,
         scanning: Scanning | None = None,
         link: type[VehicleLink] = VehicleLink,
+        report_fault_s: float = REPORT_FAULT_S,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """``first`` sends heartbeats on the MAVLink links already. With a ``fault`` of the
         configuration, the service only reports it."""
         self._wanted = config  # as last loaded; operators may have tuned it since
         self._quit = threading.Event()
-        self._fault = fault
+        self._fault, self._report_fault_s = fault, report_fault_s
         self._clock_ns = clock_ns
         self._landing = LandingWatch()
         self._was_armed = False
@@ -108,7 +109,7 @@ class Daemon:
             self.actions.is_ready = True
             notifier.ready()
             PROCESS.every("housekeeping", HOUSEKEEPING_S, self._housekeeping)
-            PROCESS.start("recover", lambda _: self._recover())
+            PROCESS.start("recover", lambda _: self.recover())
             self.watch(notifier)
         finally:
             notifier.stopping()
@@ -132,8 +133,8 @@ class Daemon:
                 self.vehicle.set_health(Health.CRITICAL)
                 self.vehicle.statustext(f"Not ready: {error}", CRITICAL)
                 notifier.status(str(error))
-                log.error("%s; restart in %g s", error, REPORT_FAULT_S)
-                self._quit.wait(REPORT_FAULT_S)
+                log.error("%s; restart in %g s", error, self._report_fault_s)
+                self._quit.wait(self._report_fault_s)
             raise
 
     def watch(self, notifier: Notifier) -> None:
@@ -250,7 +251,7 @@ class Daemon:
         if waiting:
             log.warning("configuration: after a restart: %s", ", ".join(waiting))
 
-    def _recover(self) -> None:
+    def recover(self) -> None:
         """Close scans that a crash or a power cut left open; then send what the ground lacks."""
         folder = Path(self.config.scan.folder)
         if self.scanning.claim.take(folder):

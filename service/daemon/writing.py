@@ -40,9 +40,14 @@ class _Writing:
 class Writings:
     """All files being written, of the last scan and of those before it."""
 
-    def __init__(self, report: Callable[[str], None]) -> None:
-        """``report`` gets messages for the operator about files that no scan waited for."""
-        self._report = report
+    def __init__(
+        self,
+        report: Callable[[str], None],
+        write: Callable[[Path, ScanStore, Any], object] | None = None,
+    ) -> None:
+        """``report`` gets messages for the operator about files that no scan waited for;
+        ``write`` writes a scan's files (default: its deliverables)."""
+        self._report, self._write_files = report, write
         self._all: list[_Writing] = []
         self._lock = threading.Lock()  # between the end of writing and the end of waiting
 
@@ -95,7 +100,7 @@ class Writings:
         from service.scans.folder import write_deliverables
 
         name = writing.folder.name
-        write = partial(write_deliverables, writing.folder, writing.store, {})
+        write = partial(self._write_files or write_deliverables, writing.folder, writing.store, {})
         writing.fault = guarded(f"files of {name}", write)
         with self._lock:
             writing.done.set()

@@ -39,14 +39,27 @@ class QuotaError(OutsideError):
     """A drone's share, or the disk without its reserve, is full; nothing was written."""
 
 
+def total_and_free(folder: Path) -> tuple[int, int]:
+    """Bytes of the disk of a folder."""
+    usage = shutil.disk_usage(folder)
+    return usage.total, usage.free
+
+
 class DiskShare:
     """Space that one drone may still use; use from one thread.
 
     Everything in the drone's folder counts: coarse layers, poses and deliverables too.
     """
 
-    def __init__(self, folder: Path, share: float, reserve_bytes: int | None) -> None:
-        self._folder = folder
+    def __init__(
+        self,
+        folder: Path,
+        share: float,
+        reserve_bytes: int | None,
+        usage: Callable[[Path], tuple[int, int]] = total_and_free,
+    ) -> None:
+        """``usage`` looks at the disk of a folder."""
+        self._folder, self._usage = folder, usage
         self._share, self._reserve_bytes = share, reserve_bytes
         self._used_bytes, self._measured_at = 0, -1e9
         self._total_bytes, self._free_bytes, self._looked_at = 0, 0, -1e9
@@ -81,10 +94,10 @@ class DiskShare:
         if now - self._looked_at >= LOOK_S:
             self._looked_at = now
             try:
-                usage = shutil.disk_usage(existing(self._folder))
+                total_bytes, free_bytes = self._usage(existing(self._folder))
             except OSError as error:
                 raise OutsideError(f"cannot read the disk of {self._folder} ({error})") from error
-            self._total_bytes, self._free_bytes = usage.total, usage.free
+            self._total_bytes, self._free_bytes = total_bytes, free_bytes
         if now - self._measured_at >= MEASURE_S:
             self._measured_at = now
             self._used_bytes = folder_bytes(self._folder)

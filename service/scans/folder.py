@@ -416,7 +416,7 @@ def _preview(
     raster: Raster | None, poses: Sequence[PoseRecord], summary: dict[str, Any], left_out: str
 ) -> bytes:
     """preview.jpg; ``left_out`` says what is not in it."""
-    lines = _key_figures(summary) + ([left_out] if left_out else [])
+    lines = key_figures(summary) + ([left_out] if left_out else [])
     if raster is None:
         image = blank_preview(lines)
     else:
@@ -426,7 +426,7 @@ def _preview(
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 
-def _key_figures(summary: dict[str, Any]) -> list[str]:
+def key_figures(summary: dict[str, Any]) -> list[str]:
     """Three lines of text for the preview (ASCII: OpenCV's fonts have no more)."""
     counts, quality, origin = summary["counts"], summary["quality"], summary["origin"]
     place = "no georeference"

@@ -7,7 +7,7 @@ import logging
 import os
 import shutil
 import sqlite3
-from collections.abc import Container
+from collections.abc import Callable, Container
 from pathlib import Path
 
 from service.errors import SkyreliefError
@@ -50,7 +50,17 @@ def close_open_scans(folder: Path, ours: Container[str]) -> list[str]:
     return closed
 
 
-def make_room(folder: Path, keep_free_mib: float, keep: Container[str] = ()) -> list[str]:
+def free_bytes(folder: Path) -> int:
+    """Room on the disk of a folder."""
+    return shutil.disk_usage(folder).free
+
+
+def make_room(
+    folder: Path,
+    keep_free_mib: float,
+    keep: Container[str] = (),
+    free: Callable[[Path], int] = free_bytes,
+) -> list[str]:
     """Delete the oldest finished scans until ``keep_free_mib`` are free; returns their names.
 
     Scans in ``keep`` and open ones stay.
@@ -60,7 +70,7 @@ def make_room(folder: Path, keep_free_mib: float, keep: Container[str] = ()) -> 
         return deleted
     candidates = [path.parent for path in folder.glob("*/scan.db") if path.parent.name not in keep]
     for scan in sorted(candidates, key=lambda p: p.name):  # sorted by name, which is a time
-        if shutil.disk_usage(folder).free >= keep_free_mib * MIB:
+        if free(folder) >= keep_free_mib * MIB:
             break
         if not _finished(scan):
             continue

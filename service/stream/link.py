@@ -82,12 +82,11 @@ class _LinkSession:
     session: zenoh.Session | None = None  # while it is open
     heard_at: float | None = None  # on this session; monotonic s
 
-    @property
-    def is_silent(self) -> bool:
+    def is_silent(self, for_s: float) -> bool:
         """Whether those heard on it are silent. Who is called waits for the others to call."""
         at = self.heard_at
         is_caller = not self.config.listen
-        return is_caller and at is not None and time.monotonic() - at > SILENCE_S
+        return is_caller and at is not None and time.monotonic() - at > for_s
 
 
 class DatalinkSender:
@@ -106,8 +105,10 @@ class DatalinkSender:
         config: DatalinkConfig,
         drone: str = "",
         radio: Carrier | None = None,
+        opener: Callable[[SessionConfig], zenoh.Session] = open_session,
     ) -> None:
-        self._config = config
+        self._config, self._open_session = config, opener
+        self.silence_s = SILENCE_S
         self._drone = check_name(drone if store is None else store.header.drone, "drone")
         self._connections = [_LinkSession(config) for config in _sessions(config)]
         for connection in self._connections:
@@ -253,7 +254,7 @@ class DatalinkSender:
             if attempt % PATIENT_ATTEMPT == 0:  # the link may have become a slower one
                 patience = FIRST_PATIENCE_S
             try:
-                session = open_session(replace(connection.config, open_timeout_s=patience))
+                session = self._open_session(replace(connection.config, open_timeout_s=patience))
             except OutsideError as error:
                 log.log(logging.WARNING if attempt == 1 else logging.DEBUG, "%s", error)
                 pause = max(RETRY_S / 10, RETRY_S - (time.monotonic() - began))
@@ -270,7 +271,7 @@ class DatalinkSender:
                 pumps = self._listen(connection, session)
                 self._begin(connection, session)
                 while not self._stop.wait(LOOK_S) and not session.is_closed():
-                    if connection.is_silent:
+                    if connection.is_silent(self.silence_s):
                         log.info("datalink silent; opening it again")
                         break
             finally:

@@ -523,9 +523,9 @@ def test_a_live_history_does_not_wait_in_vain() -> None:
     assert history.state_at(now) is not None  # a stream that has dried up
 
 
-def test_a_position_that_is_due_later_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    history, waits = VehicleHistory(patience_s=0.3), list[float]()
-    monkeypatch.setattr(history._news, "wait", lambda left_s: waits.append(left_s))
+def test_a_position_that_is_due_later_is_not_waited_for() -> None:
+    waits = list[float]()
+    history = VehicleHistory(patience_s=0.3, wait=waits.append)
     now = time.monotonic_ns()
     history.add(AttitudeSample(None, IDENTITY), now)
     for late_ms in (1400, 400):  # once a second
@@ -546,9 +546,9 @@ def test_a_slow_relay_of_the_gimbal_is_not_waited_for() -> None:
     assert state is not None and state.q_ned_gimbal_wxyz is not None
 
 
-def test_a_live_history_waits_once_for_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    history, waits = VehicleHistory(patience_s=0.03), list[float]()
-    monkeypatch.setattr(history._news, "wait", lambda left_s: waits.append(left_s))
+def test_a_live_history_waits_once_for_a_frame() -> None:
+    waits = list[float]()
+    history = VehicleHistory(patience_s=0.03, wait=waits.append)
     now = time.monotonic_ns()
     history.add(AttitudeSample(None, IDENTITY), now - 500 * MS)
     history.state_at(now)

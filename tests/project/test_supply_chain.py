@@ -195,13 +195,13 @@ def test_a_changed_page_is_built_again(page: Path, monkeypatch: pytest.MonkeyPat
     package.touch()
     (web / "package-lock.json").touch()
     (web / "node_modules" / ".package-lock.json").touch()
-    assert made._is_current(web)
+    assert made.is_current(web)
     copy = page / "copy"
-    shutil.copytree(web, copy, ignore=made._built(web))
+    shutil.copytree(web, copy, ignore=made.built_names(web))
     assert (copy / "node_modules" / "vite" / "dist" / "cli.js").is_file()
-    assert made._is_current(copy)
+    assert made.is_current(copy)
     os.utime(web / "package-lock.json", (2e9, 2e9))
-    assert not made._is_current(web)
+    assert not made.is_current(web)
 
 
 def test_the_bundle_and_the_installer_check_hashes() -> None:

@@ -21,9 +21,9 @@ from recon.types import F64
 def four(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A machine of four cores."""
     monkeypatch.setattr(bands, "cores", lambda: 4)
-    bands._pool.cache_clear()
+    bands.pool.cache_clear()
     yield
-    bands._pool.cache_clear()
+    bands.pool.cache_clear()
 
 
 @given(st.integers(0, 50), st.integers(1, 6))
@@ -76,7 +76,7 @@ def test_each_thread_gets_work_that_is_worth_it(four: None, cells: float, pieces
 def test_a_caller_does_what_no_thread_has_begun(four: None) -> None:
     """A short call ends while a long one of another thread occupies all threads."""
     release, seen = threading.Event(), np.zeros(8, int)
-    busy = [bands._pool().submit(release.wait, 20.0) for _ in range(4)]
+    busy = [bands.pool().submit(release.wait, 20.0) for _ in range(4)]
 
     def note(begin: int, end: int) -> None:
         seen[begin:end] += 1

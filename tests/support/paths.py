@@ -8,3 +8,5 @@ ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "tests" / "data"
 DEMO = ROOT / "demo" / "caliterra"
 SHARED = ROOT.parent / "shared" / "data"  # optional: tests that need it skip by name
+FULL_DISK = Path("/sys/kernel")
+"""A folder of a file system without any room."""

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +15,16 @@ from paths import ROOT
 
 from recon.backends import Backend, load_backend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
-from service.compute import backend_choice
-from service.compute.backend_choice import choose_backend, engine_folder, open_backend
+from service.compute.backend_choice import (
+    Choice,
+    choose_backend,
+    engine_folder,
+    fastest_backend,
+    open_backend,
+    pointless,
+)
 from service.config import ComputeConfig, load_config
-from service.daemon.diagnosis import examine
+from service.daemon.diagnosis import examine_compute
 from service.errors import InputError, OutsideError
 
 GOOD = 'model = "net.onnx"\nheight = 96\nwidth = 192\n'
@@ -50,13 +57,11 @@ def test_onnx_is_for_a_model() -> None:
         open_backend(ComputeConfig(backend="onnx"))
 
 
-def test_auto_says_what_it_took_and_why(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_auto_says_what_it_took_and_why(caplog: pytest.LogCaptureFixture) -> None:
     """One line for each that is left out, and the times of those that were tried."""
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(backend_choice, "find_spec", lambda name: None)
-    assert choose_backend("auto").name == "cpu"
+    without_torch = Choice(pointless=lambda name: pointless(name, lambda _: None))
+    assert choose_backend("auto", without_torch).name == "cpu"
     assert "backend torch: not tried, torch is not installed" in caplog.text
     assert "backend cpu on cpu, the only one" in caplog.text
 
@@ -70,34 +75,30 @@ def test_auto_says_what_it_took_and_why(
             raise RuntimeError("CUDA out of memory")
         return {"cpu": 0.02, "torch": 0.004}[backend.name]
 
-    monkeypatch.setattr(backend_choice, "pointless", lambda name: None)
-    monkeypatch.setattr(
-        backend_choice,
-        "load_backend",
-        lambda name: Gpu() if name == "torch" else load_backend(name),
-    )
-    monkeypatch.setattr(backend_choice, "trial", trial)
+    def load(name: str) -> Any:
+        return Gpu() if name == "torch" else load_backend(name)
+
+    by = Choice(load, lambda name: None, trial)
     is_full = True
-    assert backend_choice.fastest_backend().name == "cpu"
+    assert fastest_backend(by).name == "cpu"
     assert "backend torch: failed its trial, CUDA out of memory" in caplog.text
     is_full = False
-    assert backend_choice.fastest_backend().name == "torch"
+    assert fastest_backend(by).name == "torch"
     assert "torch on cuda: 4.0 ms a trial, the fastest of cpu 20.0 ms, torch 4.0 ms" in caplog.text
 
 
-def test_doctor_explains_a_named_backend_that_cannot_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_explains_a_named_backend_that_cannot_run() -> None:
     """The same reason stops the start."""
 
-    def refuse(name: str) -> None:
+    def refuse(name: str) -> Any:
         raise RuntimeError("CUDA driver is older than this torch")
 
-    monkeypatch.setattr(backend_choice, "load_backend", refuse)
-    config = load_config(None, ["compute.backend=torch"])
-    said = {f.what: f for f in examine(config, 0.0)}["compute"]
-    assert said.verdict == "bad"
+    config, by = load_config(None, ["compute.backend=torch"]), Choice(refuse)
+    (said,) = examine_compute(config, by)
+    assert said.what == "compute" and said.verdict == "bad"
     assert said.text == "backend torch cannot run here: CUDA driver is older than this torch"
     with pytest.raises(OutsideError, match="older than this torch"):
-        open_backend(config.compute)
+        open_backend(config.compute, by=by)
 
 
 def test_tensorrt_keeps_its_engines_and_no_other_provider_is_reported(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from recon.calibration.board import Board, BoardView, calibrate, find_board
 from recon.types import F32, F64, U8
 from service.cameras.camera_file import load_camera
 from service.cli import app
-from service.commands.calibrate import _text
+from service.commands.calibrate import result_text
 from service.errors import InputError
 
 HERE = DATA / "chessboards"
@@ -215,7 +215,7 @@ def test_command_on_real_photographs(tmp_path: Path) -> None:
     assert yaml.safe_load(out.read_text())["calibration"]["rms_px"] == report["rms_px"]
     image = cv2.imread(str(tmp_path / "cam_coverage.png"))
     assert image is not None and image.std() > 10
-    assert f"wrote {out} and {tmp_path / 'cam_coverage.png'}" in _text(report)
+    assert f"wrote {out} and {tmp_path / 'cam_coverage.png'}" in result_text(report)
 
 
 @pytest.mark.parametrize(

@@ -154,13 +154,13 @@ def test_residuals_that_err_together_are_counted_alike(device: str) -> None:
     """White, smooth and holey fields against the compiled sum of autocorrelations."""
     import cv2
 
-    from recon.backends.torch_icp import _area, correlation_sums
+    from recon.backends.torch_icp import area_of, correlation_sums
 
     rng = np.random.default_rng(0)
     none = np.zeros((20, 30))
     assert icp_kernels.correlated_area(none.astype(np.float32), 1.0, 12) == 1.0
     still = torch.from_numpy(none).to(device)
-    assert _area(correlation_sums(still, still == 0, 12).cpu().numpy()) == 1.0
+    assert area_of(correlation_sums(still, still == 0, 12).cpu().numpy()) == 1.0
     for blur in (0.0, 1.5, 3.0):
         field = rng.normal(0, 1, (60, 100))
         if blur:
@@ -171,4 +171,4 @@ def test_residuals_that_err_together_are_counted_alike(device: str) -> None:
         near = np.abs(field) < limit
         size, members = (torch.from_numpy(x).to(device) for x in (np.where(near, field, 0.0), near))
         lags = correlation_sums(size, members, 12).cpu().numpy()
-        assert _area(lags) == pytest.approx(want, rel=1e-4)
+        assert area_of(lags) == pytest.approx(want, rel=1e-4)

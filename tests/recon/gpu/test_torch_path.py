@@ -185,7 +185,7 @@ def test_fusion_equals_the_compiled_one(device: str, count: int) -> None:
 @pytest.mark.parametrize("finer", [1, 3])
 def test_reprojection_equals_the_compiled_one(device: str, finer: int) -> None:
     """Labels at the pair's size and finer, holes, edges and places outside among them."""
-    from recon.backends.torch_depth import _inputs
+    from recon.backends.torch_depth import device_inputs
     from recon.backends.triton_dense import reproject
 
     pair = stereo_pair(50, 90, 16, 1)
@@ -197,7 +197,7 @@ def test_reprojection_equals_the_compiled_one(device: str, finer: int) -> None:
     confidence = rng.uniform(0, 1, px.shape).astype(np.float32)
     pair = replace(pair, noise=1.7)
     want = compiled_reproject(DisparityMap(px, confidence), pair, K, SIZE)
-    geometry = _inputs(pair, K, 0)[-1]
+    geometry = device_inputs(pair, K, 0)[-1]
     true = torch.tensor([50, 90, 50 * finer, 90 * finer], device=device)
     wide = [np.pad(a, ((0, 7), (0, 5)), constant_values=3) for a in (px, confidence)]
     labels, sure, numbers = on(device, *wide, geometry)

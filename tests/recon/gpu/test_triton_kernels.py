@@ -33,40 +33,40 @@ def compiled(kernel, words, warps=4, **constants):
     print(found.name)
 
 sizes = "i32 i32 "
-compiled(dense._census, "*u8 *u8 *i32 " + sizes, offsets=dense.CENSUS_OFFSETS, PIXELS=128)
-compiled(dense._cost, "*u8 *u8 *i32 *i64 *i16 *i16 " + sizes * 4 + "i32", LABELS=16, CELLS=32)
-compiled(dense._edges, "*u8 *i64 *i32 i32 i32 fp32 fp32 i32", PIXELS=128)
-compiled(dense._coarser, "*i16 *i32 *i64 *i16 *i32 " + sizes * 2, LABELS=16, CELLS=32)
-compiled(dense._finer, "*i16 *i16 *i64 i32 " + sizes * 2, LABELS=16, CELLS=32)
-compiled(dense._sweep, "*i16 *i16 *i32 " + sizes * 3, 1, LABELS=16, CELLS=16)
+compiled(dense.census_kernel, "*u8 *u8 *i32 " + sizes, offsets=dense.CENSUS_OFFSETS, PIXELS=128)
+compiled(dense.cost_kernel, "*u8 *u8 *i32 *i64 *i16 *i16 " + sizes * 4 + "i32", LABELS=16, CELLS=32)
+compiled(dense.edges_kernel, "*u8 *i64 *i32 i32 i32 fp32 fp32 i32", PIXELS=128)
+compiled(dense.coarser_kernel, "*i16 *i32 *i64 *i16 *i32 " + sizes * 2, LABELS=16, CELLS=32)
+compiled(dense.finer_kernel, "*i16 *i16 *i64 i32 " + sizes * 2, LABELS=16, CELLS=32)
+compiled(dense.sweep_kernel, "*i16 *i16 *i32 " + sizes * 3, 1, LABELS=16, CELLS=16)
 compiled(
-    dense._select, "*i16 *i16 *i16 *i64 *fp32 *fp32 i32 i32 i32 fp32 fp32 fp32 fp32",
+    dense.select_kernel, "*i16 *i16 *i16 *i64 *fp32 *fp32 i32 i32 i32 fp32 fp32 fp32 fp32",
     radius=3, LABELS=16, CELLS=32,
 )
-compiled(dense._contrast, "*u8 *fp64 " + sizes, radius=3, PIXELS=128)
-compiled(dense._project, "*fp32 *fp32 *i64 *i32 *i1 i32 i32 i32 fp32", PIXELS=128)
-compiled(dense._compare, "*fp32 *fp32 *i64 *i32 *i1 i32 i32 i32 fp32", PIXELS=128)
-compiled(dense._unseen, "*fp32 *fp32 *u8 *u8 *i64 *fp32 *fp32 " + sizes, PIXELS=128)
-compiled(dense._wander, "*i32 *i32 *i32 " + sizes * 2, PIXELS=128)
-compiled(dense._measure, "*i32 *i32 *i32 i32 " + sizes * 2, PIXELS=128)
-compiled(dense._averaged, "*u8 *i64 *fp32 " + sizes * 2, PIXELS=128)
+compiled(dense.contrast_kernel, "*u8 *fp64 " + sizes, radius=3, PIXELS=128)
+compiled(dense.project_kernel, "*fp32 *fp32 *i64 *i32 *i1 i32 i32 i32 fp32", PIXELS=128)
+compiled(dense.compare_kernel, "*fp32 *fp32 *i64 *i32 *i1 i32 i32 i32 fp32", PIXELS=128)
+compiled(dense.unseen_kernel, "*fp32 *fp32 *u8 *u8 *i64 *fp32 *fp32 " + sizes, PIXELS=128)
+compiled(dense.wander_kernel, "*i32 *i32 *i32 " + sizes * 2, PIXELS=128)
+compiled(dense.measure_kernel, "*i32 *i32 *i32 i32 " + sizes * 2, PIXELS=128)
+compiled(dense.averaged_kernel, "*u8 *i64 *fp32 " + sizes * 2, PIXELS=128)
 compiled(
-    dense._bilateral, "*fp32 *u8 *i64 *fp32 *fp32 i32 i32 i32 i32 fp32 fp32 fp32 fp32",
+    dense.bilateral_kernel, "*fp32 *u8 *i64 *fp32 *fp32 i32 i32 i32 i32 fp32 fp32 fp32 fp32",
     diameter=10, ROWS=4, COLUMNS=64,
 )
-compiled(dense._reproject, "*fp32 *fp32 *fp64 *i64 *fp32 *fp32 i32 i32 i32 fp32", PIXELS=128)
+compiled(dense.reproject_kernel, "*fp32 *fp32 *fp64 *i64 *fp32 *fp32 i32 i32 i32 fp32", PIXELS=128)
 fuse = "*fp32 *fp32 *fp32 *fp32 *u8 *i32 i32 fp32 fp32 fp32 fp32"
-compiled(dense._fuse, fuse, PAIRS=4, PIXELS=256)
-compiled(dense._refute, "*fp32 *fp32 *u8 *i32 i32", PIXELS=256)
+compiled(dense.fuse_kernel, fuse, PAIRS=4, PIXELS=256)
+compiled(dense.refute_kernel, "*fp32 *fp32 *u8 *i32 i32", PIXELS=256)
 matched = "*fp64 *fp64 *fp64 *fp32 *fp64 *fp64 "
-compiled(icp._surface, "*fp32 *fp32 *fp64 *fp32 i32 i32 fp32 i32", reach=2, PIXELS=128)
-compiled(icp._residuals, matched + "*fp64 *fp64 i32 i32 i32 fp32", 1, POINTS=128)
-compiled(icp._scale, "*fp64 *fp64 *fp64 " + sizes, 8, COUNT=4096)
+compiled(icp.surface_kernel, "*fp32 *fp32 *fp64 *fp32 i32 i32 fp32 i32", reach=2, PIXELS=128)
+compiled(icp.residuals_kernel, matched + "*fp64 *fp64 i32 i32 i32 fp32", 1, POINTS=128)
+compiled(icp.scale_kernel, "*fp64 *fp64 *fp64 " + sizes, 8, COUNT=4096)
 compiled(
-    icp._normal_equations, matched + "*fp64 *fp64 *fp64 i32 i32 i32 fp32 fp32 i32", 1,
+    icp.normal_equations_kernel, matched + "*fp64 *fp64 *fp64 i32 i32 i32 fp32 fp32 i32", 1,
     POINTS=128, ROW=83,
 )
-compiled(icp._advance, "*fp64 " * 8 + "fp32 fp32 fp32 i32 i32", 1)
+compiled(icp.advance_kernel, "*fp64 " * 8 + "fp32 fp32 fp32 i32 i32", 1)
 """
 
 

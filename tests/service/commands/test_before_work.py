@@ -160,18 +160,16 @@ def test_replay_ends_with_the_verdict(capsys: pytest.CaptureFixture[str]) -> Non
         "segments": 1, "pairs": 3, "clouds_per_second": 1.0, "refusals": {"blurred": 2},
         "quality": {"trust": trust}, "georeference": "none",
     }  # fmt: skip
-    replay._report(summary, as_json=False)
+    replay.report(summary, as_json=False)
     last = capsys.readouterr().out.splitlines()[-1]
     assert last == "trust: doubtful, georeference: none: the lens is assumed; no attitude"
 
 
-def test_a_backend_without_a_device_warns(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_backend_without_a_device_warns(caplog: pytest.LogCaptureFixture) -> None:
     class Slow:
         name, device = "torch", "cpu"
 
-    monkeypatch.setattr(backend_choice, "named_backend", lambda name: Slow())
+    slow: Any = Slow()
     with caplog.at_level(logging.WARNING):
-        backend_choice.choose_backend("torch")
+        backend_choice.choose_backend("torch", backend_choice.Choice(lambda _: slow))
     assert "about 12 times the duration" in caplog.text

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import service.cli
 from recon.backends import BACKENDS
 from service.cli import COMMANDS, app, load_command
-from service.commands.ground import _show_news
+from service.commands.ground import show_news
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.offline.exports import EXPORTERS
 from service.offline.exports.model import LARGEST_FACES
@@ -183,7 +183,7 @@ def test_ground_prints_a_line_only_when_it_has_changed(capsys: pytest.CaptureFix
     shown: dict[str, str] = {}
     for keyframes in (1, 1, 2, 2, 2):
         entry["held"]["k0"] = keyframes
-        _show_news([entry], shown)
+        show_news([entry], shown)
     lines = capsys.readouterr().err.splitlines()
     assert [line.split()[1] for line in lines] == ["1", "2"]
 
@@ -323,9 +323,9 @@ def test_the_smallest_extra_or_package_is_named() -> None:
 
 
 def test_ctl_rounds_what_people_read(capsys: pytest.CaptureFixture[str]) -> None:
-    from service.commands.ctl import _print
+    from service.commands.ctl import print_result
 
     found = {"distance_m": 12.3456789, "lat_deg": 47.123456789, "keyframes": 3, "sigma_m": None}
-    _print(found, as_json=False)
+    print_result(found, as_json=False)
     said = capsys.readouterr().out.splitlines()
     assert said == ["distance m: 12.35", "lat deg: 47.1234568", "keyframes: 3", "sigma m: unknown"]

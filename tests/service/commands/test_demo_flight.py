@@ -27,16 +27,16 @@ def test_an_installed_wheel_brings_the_flight(
     )
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "venv"))
     with pytest.raises(InputError, match="--flight"):
-        demo._flight(None)
+        demo.demo_flight(None)
     brought = make_flight(tmp_path / "venv" / "share" / "skyrelief")
-    assert demo._flight(None) == brought
+    assert demo.demo_flight(None) == brought
     clone = make_flight(tmp_path / "site")
-    assert demo._flight(None) == clone
+    assert demo.demo_flight(None) == clone
 
 
 def test_a_named_flight_alone_counts(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nothing-here contains no frames"):
-        demo._flight(tmp_path / "nothing-here")
+        demo.demo_flight(tmp_path / "nothing-here")
 
 
 @pytest.mark.slow
@@ -44,10 +44,10 @@ def test_kernels_are_compiled_meanwhile_the_first_time_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    (compiler,) = demo._compile_meanwhile()
+    (compiler,) = demo.compile_meanwhile()
     try:
         until(lambda: any(tmp_path.rglob("*.nbi")), 120.0)
-        assert demo._compile_meanwhile() == []
+        assert demo.compile_meanwhile() == []
     finally:
         compiler.kill()
         compiler.wait()

@@ -196,11 +196,11 @@ def test_a_replay_shows_its_share_and_its_figures(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     recorder = SimpleNamespace(frames=2, distance_m=31.4, keyframes=1)
     with progress.part("tracking", of_rest=0.9):
-        show = replay._flown(cast(Any, SimpleNamespace(images=4)), progress)
+        show = replay.show_flown(cast(Any, SimpleNamespace(images=4)), progress)
         for _ in range(4):
             show(cast(Any, SimpleNamespace(recorder=recorder)))
     assert seen[-1] == ("2 images, 31 m flown, 1 keyframes", 0.675)
     assert [share for _, share in seen] == [0.0, 0.0, 0.225, 0.45, 0.675]
     seen.clear()
-    replay._flown(cast(Any, object()), progress)(cast(Any, SimpleNamespace(recorder=recorder)))
+    replay.show_flown(cast(Any, object()), progress)(cast(Any, SimpleNamespace(recorder=recorder)))
     assert seen == [("2 images, 31 m flown, 1 keyframes", 0.9)]  # a pipe: no share

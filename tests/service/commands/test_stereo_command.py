@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,8 +18,7 @@ from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DisparityMap
 from service.bench.stereo import bad_share, semi_global_disparity
 from service.cli import main
-from service.compute import backend_choice
-from service.compute.backend_choice import FallbackBackend, choose_backend
+from service.compute.backend_choice import Choice, FallbackBackend, choose_backend
 from service.compute.rectified_pair import matching_config
 from service.errors import InputError, OutsideError
 
@@ -141,11 +141,9 @@ def test_a_lost_device_falls_back_to_the_cpu(caplog: pytest.LogCaptureFixture) -
     assert "the CPU takes over" in caplog.text
 
 
-def test_auto_takes_the_fastest_that_works(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_takes_the_fastest_that_works() -> None:
     assert choose_backend("auto").name == "cpu"  # no GPU is tried where there is no driver
-    monkeypatch.setattr(backend_choice, "pointless", lambda name: None)
     slow = {"cpu": 0.5, "torch": 0.1}
-    monkeypatch.setattr(backend_choice, "trial", lambda backend: slow[backend.name])
 
     class Named(Broken):
         """A backend of any name."""
@@ -153,19 +151,18 @@ def test_auto_takes_the_fastest_that_works(monkeypatch: pytest.MonkeyPatch) -> N
         def __init__(self, name: str) -> None:
             self.name = name
 
-    monkeypatch.setattr(backend_choice, "load_backend", Named)
-    assert choose_backend("auto").name == "torch"
+    by = Choice(Named, lambda name: None, lambda backend: slow[backend.name])
+    assert choose_backend("auto", by).name == "torch"
     slow["torch"] = 0.9
-    assert choose_backend("auto").name == "cpu"
+    assert choose_backend("auto", by).name == "cpu"
 
 
-def test_named_backend_that_cannot_run_stops(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(name: str) -> None:
+def test_named_backend_that_cannot_run_stops() -> None:
+    def refuse(name: str) -> Any:
         raise ImportError("No module named 'torch'")
 
-    monkeypatch.setattr(backend_choice, "load_backend", refuse)
     with pytest.raises(OutsideError, match="torch cannot run here: No module named"):
-        choose_backend("torch")
+        choose_backend("torch", Choice(refuse))
     with pytest.raises(InputError, match="available: auto"):
         choose_backend("vulkan")
 

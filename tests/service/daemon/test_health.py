@@ -12,8 +12,9 @@ import sys
 import threading
 import urllib.error
 import urllib.request
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
@@ -121,7 +122,6 @@ def test_http_survives_hostile_bytes(hostile: bytes) -> None:
 def test_why_it_cannot_start_is_reported_before_it_is_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.daemon.runtime.REPORT_FAULT_S", 60.0)
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     said: dict[str, Any] = {}
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
@@ -131,7 +131,7 @@ def test_why_it_cannot_start_is_reported_before_it_is_started_again(
             radio.settimeout(30.0)
             link = f"udpout:127.0.0.1:{radio.getsockname()[1]}"
             given = [f"scan.folder={tmp_path}", "health.http=", f"mavlink.links={link}"]
-            daemon = Daemon(load_config(None, given))
+            daemon = Daemon(load_config(None, given), report_fault_s=60.0)
 
             def hear() -> None:
                 heard = dialect.MAVLink(None)
@@ -355,42 +355,35 @@ def test_a_second_service_leaves_the_scans_of_the_first_alone(
     first, second = Claim(), Daemon(load_config(None, [f"scan.folder={tmp_path}"]))
     assert first.take(tmp_path)
     assert not Claim().take(tmp_path)
-    second._recover()
+    second.recover()
     assert "another service" in caplog.text
     with ScanStore.open(running / "scan.db") as store:
         assert not store.finished
     first.give_up()
-    second._recover()
+    second.recover()
     with ScanStore.open(running / "scan.db") as store:
         assert store.finished
     assert Claim().take(tmp_path / "new") and (tmp_path / "new").is_dir()
     assert Claim().take(Path("/proc/no-such-place"))  # nothing makes scans there
 
 
-class Usage(NamedTuple):
-    total: int
-    used: int
-    free: int
-
-
-def test_oldest_finished_scans_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oldest_finished_scans_make_room(tmp_path: Path) -> None:
     names = [f"2026010{i}T000000Z" for i in range(1, 7)]
     for i, name in enumerate(names):
         scan(tmp_path, name, finished=i != 1)
 
-    def usage(_: object) -> Usage:
-        """A disk of 1000 MiB on which every scan takes 150."""
-        taken = 150 * len(list(tmp_path.iterdir()))
-        return Usage(1000 << 20, taken << 20, (1000 - taken) << 20)
+    def free(_: Path) -> int:
+        """Of a disk of 1000 MiB on which every scan takes 150."""
+        return (1000 - 150 * len(list(tmp_path.iterdir()))) << 20
 
-    monkeypatch.setattr("service.scans.retention.shutil.disk_usage", usage)
-    assert make_room(tmp_path, 0.0) == []
-    assert make_room(tmp_path, 50.0) == []
-    assert make_room(tmp_path, 300.0, keep={names[2]}) == [names[0], names[3]]
+    room = partial(make_room, free=free)
+    assert room(tmp_path, 0.0) == []
+    assert room(tmp_path, 50.0) == []
+    assert room(tmp_path, 300.0, keep={names[2]}) == [names[0], names[3]]
     assert (tmp_path / names[1]).is_dir()  # still open
-    assert make_room(tmp_path, 1e6, keep={names[5]}) == [names[2], names[4]]
+    assert room(tmp_path, 1e6, keep={names[5]}) == [names[2], names[4]]
     assert sorted(p.name for p in tmp_path.iterdir()) == [names[1], names[5]]
-    assert make_room(tmp_path / "none", 100.0) == []
+    assert room(tmp_path / "none", 100.0) == []
 
 
 def test_reload_takes_what_may_change_live() -> None:

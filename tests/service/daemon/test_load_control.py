@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from onboard import Onboard
+from paths import FULL_DISK
 
 from recon.backends import load_backend
 from recon.backends.cpu import CpuBackend
@@ -109,13 +109,11 @@ def test_levels_change_while_frames_come(tmp_path: Path) -> None:
     assert gate.kept == 1
 
 
-def test_nothing_is_kept_while_paused_or_without_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_kept_while_paused_or_without_room(tmp_path: Path) -> None:
     gate, _ = gate_over(Film(), tmp_path, Level.RECORD_ONLY, paused=True)
     assert list(gate) == []
     assert (gate.kept, gate.lost) == (0, 0)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(9, 8, 1))
+    (tmp_path / "later").symlink_to(FULL_DISK)
     full, alive = gate_over(Film(), tmp_path, Level.RECORD_ONLY)
     assert list(full) == []
     assert (full.kept, full.lost, len(alive)) == (0, 50, 100)

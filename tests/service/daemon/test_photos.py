@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import threading
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from onboard import Onboard, real_scan
+from paths import FULL_DISK
 
 from mavlink.component.camera import KeyframeReport
 from mavlink.component.control import Result
@@ -18,7 +18,7 @@ from mavlink.telemetry.samples import VehicleState
 from service.cameras.exif import read_tags
 from service.cameras.source import CameraFrame
 from service.daemon.load_shedding import Level
-from service.daemon.scan_run import report_photo
+from service.daemon.scan_run import PHOTOS, report_photo
 from service.daemon.stored_image import image_name, store_image
 from service.flight.scan import Photo, Scan
 
@@ -104,11 +104,9 @@ def test_a_photo_without_telemetry_has_the_place_by_vision_or_none(tmp_path: Pat
     assert tag.alt_amsl_m == pytest.approx(-430.0)
 
 
-def test_a_photo_that_cannot_be_stored_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_photo_that_cannot_be_stored_says_why(tmp_path: Path) -> None:
     scan, operator = photos_in(tmp_path)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(9, 8, 1))
+    (tmp_path / "scan" / PHOTOS).symlink_to(FULL_DISK)
     scan.inputs.on_photo(Photo(IMAGE, S, None, None, None))  # type: ignore[misc]
     assert operator.texts == ["photo failed: the disk is nearly full"]
     assert operator.reports == [KeyframeReport(ok=False)]

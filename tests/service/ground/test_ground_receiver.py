@@ -6,6 +6,7 @@ import json
 import socket
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,6 @@ from service.ground.drone import DroneLimits
 from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream import codec
-from service.stream import link as link_module
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, Repose, ScanHeader
 from service.stream.session import SessionConfig, open_session, zenoh_config
@@ -200,26 +200,23 @@ def test_both_ends_may_restart(tmp_path: Path) -> None:
     onboard.close()
 
 
-def test_a_session_on_which_stations_fell_silent_is_opened_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_session_on_which_stations_fell_silent_is_opened_again(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     opened: list[float] = []
 
-    def counted(config: SessionConfig) -> object:
+    def counted(config: SessionConfig) -> Any:
         opened.append(time.monotonic())
         return open_session(config)
 
-    monkeypatch.setattr(link_module, "open_session", counted)
-    monkeypatch.setattr(link_module, "SILENCE_S", 0.4)  # less than between two reports
     onboard = new_store(tmp_path / "air")
     ground = start_ground(tmp_path / "ground", endpoint)
-    link = DatalinkSender(onboard, fast(endpoint))
+    link = DatalinkSender(onboard, fast(endpoint), opener=counted)
+    link.silence_s = 0.4  # less than between two reports
     try:
         until(lambda: len(opened) >= 3)
         fly(onboard, 0, 5)
         onboard.finish({})
-        monkeypatch.setattr(link_module, "SILENCE_S", 5.0)
+        link.silence_s = 5.0
         assert link.drain(20.0)
     finally:
         link.close()

@@ -14,7 +14,7 @@ import pytest
 from loopback import until
 
 from service.config import DatalinkConfig, load_config
-from service.daemon.diagnosis import BAD, GOOD, NOTE, _certificate
+from service.daemon.diagnosis import BAD, GOOD, NOTE, check_certificate
 from service.errors import InputError, OutsideError
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.stream.keys import (
@@ -202,14 +202,14 @@ def test_doctor_tells_how_long_a_certificate_holds(tmp_path: Path) -> None:
         make_keys(tmp_path / "fleet", {"drone": ["red"]}, days=10, now=now)
         chosen = tmp_path / "fleet" / "drone" / "red" / path
         config = load_config(None, [f"datalink.tls_certificate={chosen}"])
-        (finding,) = _certificate(config)
+        (finding,) = check_certificate(config)
         return finding.verdict, finding.text
 
     assert found(90.5)[0] == GOOD and "is valid for 90 more days" in found(90.5)[1]
     assert found(5.5)[0] == NOTE
     assert found(-5.5)[0] == BAD and "expired" in found(-5.5)[1]
     assert found(90.0, "key.pem")[0] == BAD
-    assert not list(_certificate(load_config(None, [])))
+    assert not list(check_certificate(load_config(None, [])))
 
 
 def test_keys_are_private_and_stay(fleet: Path) -> None:

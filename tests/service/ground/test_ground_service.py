@@ -17,7 +17,7 @@ import pytest
 from loopback import free_port, until
 from paths import ROOT
 
-from service.commands.ground import _check
+from service.commands.ground import feed_watchdog
 from service.errors import SkyreliefError
 from service.init_system import Notifier
 from service.workers import Worker, Workers, row_of
@@ -78,20 +78,20 @@ def test_a_worker_that_hangs_starves_the_watchdog_and_one_that_failed_ends_the_p
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
         listener.bind(str(tmp_path / "notify"))
         notifier = Notifier(str(tmp_path / "notify"))
-        _check(table, notifier)
+        feed_watchdog(table, notifier)
         assert heard() == "WATCHDOG=1"
         worker = table.start(replace(row_of("deliverables"), deadline_s=0.05), hangs)
         until(lambda: table.stalled)
-        _check(table, notifier)
+        feed_watchdog(table, notifier)
         assert heard() == "STATUS=no progress: deliverables"
         hung.set()
         assert worker.join(10.0)
-        _check(table, notifier)
+        feed_watchdog(table, notifier)
         assert heard() == "WATCHDOG=1"
         of_a_drone = table.start("drone red", fails)
         until(lambda: of_a_drone.has_failed)
-        _check(table, notifier)
+        feed_watchdog(table, notifier)
         essential = table.start("receiver", fails)
         until(lambda: essential.has_failed)
         with pytest.raises(SkyreliefError, match="receiver failed too often"):
-            _check(table, notifier)
+            feed_watchdog(table, notifier)

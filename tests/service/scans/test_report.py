@@ -16,7 +16,7 @@ from recon.posegraph.sensor_offsets import AltitudeDatum, Boresight, Constants
 from recon.types import PosePrior
 from service.flight.reports import graph_figures
 from service.scans.coverage import coverage_of
-from service.scans.folder import _key_figures, write_deliverables
+from service.scans.folder import key_figures, write_deliverables
 from service.scans.report import consistency, sensor_constants
 from service.scans.report_map import map_figure
 from service.scans.track import latest
@@ -98,7 +98,7 @@ def test_a_scan_with_a_refinement_shows_it(tmp_path: Path, house: HouseFlight) -
     with house.flown(tmp_path) as store:
         store.finish(SUMMARY["run"])
         summary = write_deliverables(tmp_path, store, {})
-    assert _key_figures(summary)[2] == "georeferenced"  # the preview states it without reasons too
+    assert key_figures(summary)[2] == "georeferenced"  # the preview states it without reasons too
     page = (tmp_path / "report.html").read_text()
     assert "Consistency" in page and "GNSS position" in page
     assert "Surveyed points" not in page and "<script" not in page

@@ -34,14 +34,14 @@ class Slow:
 class Landing:
     """A flight that has ended, and what is asked of it then."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, files: Slow) -> None:
         header = ScanHeader("s", "d", 1, camera={}, configuration={}, software="test")
         self.store = ScanStore.create(folder / "s" / "scan.db", header)
         self.reported: list[str] = []
         self.asked: list[str] = []
         self.work = Work()
         self.in_haste = threading.Event()
-        self.writings = Writings(self.reported.append)
+        self.writings = Writings(self.reported.append, files)
 
     def write(self) -> None:
         self.writings.write(
@@ -66,15 +66,13 @@ class Landing:
 
 
 @pytest.fixture
-def slow(monkeypatch: pytest.MonkeyPatch) -> Slow:
-    files = Slow()
-    monkeypatch.setattr("service.scans.folder.write_deliverables", files)
-    return files
+def slow() -> Slow:
+    return Slow()
 
 
 @pytest.fixture
-def landing(tmp_path: Path) -> Landing:
-    return Landing(tmp_path)
+def landing(tmp_path: Path, slow: Slow) -> Landing:
+    return Landing(tmp_path, slow)
 
 
 def test_the_files_are_waited_for(slow: Slow, landing: Landing) -> None:
