@@ -164,6 +164,10 @@ def map_crs(epsg: int, vertical: str | None = None) -> CRS:
 UTM_NAME = re.compile(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 
 
+SAME_PLACE = 1e-6
+"""Share of a coordinate, some metres, by which a place may miss itself there and back."""
+
+
 def system_of(text: str) -> tuple[Transformer, str]:
     """The horizontal coordinate system in a surveyor's file, and the datum of its heights.
 
@@ -193,6 +197,20 @@ def system_of(text: str) -> tuple[Transformer, str]:
             f"{text.strip()[:80]!r} is not a coordinate system; give EPSG:n, a PROJ string or "
             "WGS84 UTM 32N"
         ) from error
+
+
+def degrees_of(system: Transformer, x: float, y: float) -> tuple[float, float]:
+    """Longitude and latitude of a place in a surveyor's coordinate system.
+
+    ValueError where the system does not reach so far: PROJ's series then give some other place.
+    """
+    lon, lat = system.transform(x, y)
+    back = system.transform(lon, lat, direction="INVERSE")
+    if not all(
+        abs(b - a) <= SAME_PLACE * max(abs(a), 1.0) for a, b in zip((x, y), back, strict=True)
+    ):
+        raise ValueError(f"{x:g}, {y:g} is outside the coordinate system")
+    return float(lon), float(lat)
 
 
 def utm_epsg(lat_deg: float, lon_deg: float) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 from mavlink.telemetry.decode import plausible_place
 from service.cameras.source import GeoTag
 from service.errors import InputError
-from service.georeference import system_of
+from service.georeference import degrees_of, system_of
 from service.small_file import read_small
 
 NAME, IMAGES = "geo.txt", "images"
@@ -50,7 +50,10 @@ def read_geo(path: Path) -> dict[str, GeoTag]:
         numbers = _numbers(cells)
         if len(numbers) < 2:
             raise InputError(f"{path} line {number}: {row[:80]!r}; give name, x, y and z")
-        lon, lat = system.transform(numbers[0], numbers[1])
+        try:
+            lon, lat = degrees_of(system, numbers[0], numbers[1])
+        except ValueError as error:
+            raise InputError(f"{path} line {number}: {error}") from error
         height = numbers[2] if len(numbers) > 2 else None
         if not plausible_place(lat, lon) or abs(height or 0.0) > MAX_HEIGHT_M:
             raise InputError(f"{path} line {number}: {row[:80]!r} is not on the globe")

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 from xml.parsers import expat
 
-from service.georeference import system_of
+from service.georeference import degrees_of, system_of
 
 Attributes = dict[str, str]
 SYSTEMS = ("reference", "wkt")
@@ -87,7 +87,7 @@ class _Reader:
             if place is None:
                 continue
             try:
-                lon, lat = system.transform(float(place["x"]), float(place["y"]))
+                lon, lat = degrees_of(system, float(place["x"]), float(place["y"]))
                 row = {
                     "name": self._labels.get(marker, f"point {marker}"), "lat": lat, "lon": lon,
                     "alt_amsl_m": float(place["z"]) if "z" in place else None,

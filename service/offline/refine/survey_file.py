@@ -23,7 +23,7 @@ import msgspec
 from msgspec import Meta
 
 from service.errors import InputError
-from service.georeference import system_of
+from service.georeference import degrees_of, system_of
 from service.offline.refine.metashape_file import read_metashape
 from service.small_file import read_small
 
@@ -201,7 +201,7 @@ def _marked(
         where = f"{path} line {number}"
         try:
             name, x, y, z, *sigmas = cells
-            lon, lat = system.transform(float(x), float(y))
+            lon, lat = degrees_of(system, float(x), float(y))
             named = dict(zip(("sigma_h_m", "sigma_v_m"), map(float, sigmas[:2]), strict=False))
             row = {"name": name, "lat": lat, "lon": lon, "alt_amsl_m": float(z), **named}
             mark = {"image": "-", "u_px": 0.0, "v_px": 0.0}
@@ -261,7 +261,7 @@ def _marks(path: Path, lines: Sequence[str]) -> Iterator[Row]:
             )
         name = names.setdefault(tuple(cells[:3]), f"point {len(names) + 1}")
         try:
-            lon, lat = system.transform(float(cells[0]), float(cells[1]))
+            lon, lat = degrees_of(system, float(cells[0]), float(cells[1]))
             row = {
                 "name": cells[6] if len(cells) > LIST_COLUMNS else name, "lat": lat, "lon": lon,
                 "alt_amsl_m": None if is_flat else float(cells[2]),

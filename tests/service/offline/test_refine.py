@@ -642,7 +642,8 @@ def test_a_list_of_odm_is_read_as_a_table_is(tmp_path: Path) -> None:
         (LIST.replace("WGS84 UTM 32N", "EPSG:4979"), "not ellipsoidal"),
         (LIST + "1 2 3 4\n", "line 3: 4 columns"),
         (LIST.replace("12.5", "west"), "line 2: could not convert"),
-        (LIST.replace("465000.5", "1e300"), "line 2: Expected"),
+        (LIST.replace("465000.5", "1e300"), "line 2: 1e+300, 5.249e+06 is outside"),
+        (LIST.replace("5249000.25", "524900025"), "is outside the coordinate system"),
         (LIST + "465000.5 5249000.25 410.5 1 2 a.jpg GCP1\n1e5 5e6 4 1 2 b.jpg GCP1\n", "differs"),
     ],
 )
@@ -756,6 +757,7 @@ def test_markers_of_metashape_are_read_as_a_table_is(tmp_path: Path) -> None:
         ('camera_id="0"', 'camera_id="3"', "line 19: no '3'"),
         ('x="13"', 'x="west"', "line 19: could not convert"),
         ('x="13"', 'x="1e30"', "line 19: Expected"),
+        ('y="5249000.25"', 'y="5249000250"', "line 19: 465000, 5.249e+09 is outside"),
     ],
 )
 def test_bad_markers_are_said_in_one_line(tmp_path: Path, old: str, new: str, said: str) -> None:
