@@ -13,7 +13,7 @@ from recon.pipeline.views import StereoCandidate
 from recon.posegraph.anchors import height_above, height_below
 from recon.posegraph.level_ground import MAX_LEVELLED_SHARE, levelled
 from recon.posegraph.loop_search import LoopSearch
-from recon.posegraph.pieces import Pieces
+from recon.posegraph.pieces import apart
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, DepthMap, Keyframe, Pose
@@ -46,7 +46,6 @@ class KeyframeMap:
         self.trajectory, self._loops = trajectory, loops
         self.views = self.levelled = 0  # keyframes, and those whose ground is taken as level
         self._rejected, self._timing = rejected, timing
-        self._pieces = Pieces()
         self._T_map = np.eye(4)  # of the last keyframe
 
     @property
@@ -97,7 +96,7 @@ class KeyframeMap:
             self.trajectory.publish(view.seq, pose)
         elif depth is not None:
             self._rejected["placed impossibly far away"] += 1
-        is_placed = self.graph.segments.known(view.segment) is not None
+        is_placed = self.graph.segments[view.segment].similarity is not None
         return GraphUpdate(pose, is_placed, is_near, self.changed() if depth is not None else {})
 
     def changed(self, final: bool = False) -> dict[int, Pose]:
@@ -110,7 +109,7 @@ class KeyframeMap:
     def measured(self, view: StereoCandidate, keyframe: Keyframe) -> None:
         """Count the surface of a view that became a keyframe."""
         points = int(np.count_nonzero(keyframe.fresh & np.isfinite(keyframe.depth.depth_m)))
-        self._pieces.add(keyframe.seq, view.segment, points, view.prior)
+        self.graph.segments[view.segment].add_surface(view.seq, points, view.prior)
 
     def map_pose(self, seq: int) -> F64:
         """(4, 4) T_map_camera of a keyframe in its segment's chain."""
@@ -118,7 +117,7 @@ class KeyframeMap:
 
     def apart(self) -> list[tuple[int, int]]:
         """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
-        return self._pieces.apart(self.graph)
+        return apart(self.graph.segments, self.graph.loops.taken)
 
     def refuted(self) -> list[tuple[int, int]]:
         """Keyframes between which vision is wrong, so that their depth is, too."""

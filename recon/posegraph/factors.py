@@ -20,7 +20,7 @@ from recon.posegraph.alignment_readings import MIN_FIX_M, ReadingNoise, has_fix
 from recon.posegraph.anchors import Anchor, height_ratio
 from recon.posegraph.between_keyframes import carried
 from recon.posegraph.records import Node, PoseGraphConfig
-from recon.posegraph.segment_frames import SegmentFrames
+from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_noise import wander_s_of
 from recon.posegraph.smoother import NO_SCALE, Smoother, left_covariance
 from recon.types import F64, PosePrior
@@ -238,25 +238,21 @@ class Motions:
         self,
         config: PoseGraphConfig,
         smoother: Smoother,
-        segments: SegmentFrames,
+        segments: Segments,
         counts: Counter[str],
     ) -> None:
         """``counts`` takes in the stretches without vision."""
         self._config, self._smoother = config, smoother
         self._segments, self._counts = segments, counts
         self.scale_of: list[int] = []  # key of each keyframe's scale, or NO_SCALE
-        self._units: dict[int, int] = {}  # key of each segment's first scale
         self.refuted: dict[int, int] = {}  # last keyframe after each refuted step's first
-        self._blocks: dict[int, tuple[int, int, int]] = {}
-        # by segment, its last scale, that scale's first node, and how many keyframes it stands for
-        self._lengths: dict[int, list[float]] = {}  # by segment, relative sigmas of its steps
 
     def first(self, node: Node) -> tuple[F64, F64]:
         """Pose and covariance of the first keyframe: loose where readings will follow.
 
         The gauge that no reading ever fixes is held at the start.
         """
-        frame = self._segments.frame(node.segment)
+        frame = self._segments[node.segment].frame
         T = frame.pose(node.T_odom_camera)
         sigma_t, sigma_r = 0.01, 1.0 if node.prior.R_world_camera is not None else 0.01
         if "gnss" in frame.sources:  # places along a line leave the roll about it free
@@ -289,26 +285,29 @@ class Motions:
 
         A new one begins every twenty keyframes, and where the scale may ``jump`` by that share.
         """
-        key, since, held = self._blocks.get(node.segment, (NO_SCALE, 0, 0))
-        if key == NO_SCALE or node.key - since >= BLOCK or jump:
-            before, since = key, node.key
+        segment = self._segments[node.segment]
+        scales = segment.scales
+        if scales.newest == NO_SCALE or node.key - scales.since >= BLOCK or jump:
+            before = scales.newest
             log = float(self._smoother.logs()[before])
-            known = self._segments.frame(node.segment).sigma_scale
+            known = segment.frame.sigma_scale
             sigma = float(np.clip(known, self._config.sigma_scale, UNKNOWN_SCALE))
             if before != NO_SCALE:
-                walk = self._config.sigma_scale_walk * np.sqrt(max(1.0, held / BLOCK))
+                walk = self._config.sigma_scale_walk * np.sqrt(max(1.0, scales.held / BLOCK))
                 sigma = float(np.hypot(walk, jump))
-            key, held = self._smoother.append_scale(log), 0
-            self._smoother.add_scale("scale", (before, key), 0.0, sigma)
-            self._units.setdefault(node.segment, key)
-        if self.scale_of[node.key] != key:
-            self._blocks[node.segment] = (key, since, held + node.weight)
-        self.scale_of[node.key] = key
-        return key
+            scales.newest, scales.since = self._smoother.append_scale(log), node.key
+            scales.held = 0
+            self._smoother.add_scale("scale", (before, scales.newest), 0.0, sigma)
+            if before == NO_SCALE:
+                scales.unit = scales.newest
+        if self.scale_of[node.key] != scales.newest:
+            scales.held += node.weight
+        self.scale_of[node.key] = scales.newest
+        return scales.newest
 
     def _jump(self, node: Node, last: Node) -> float:
         """Share by which vision's scale may have changed at a step."""
-        lengths = self._lengths.setdefault(node.segment, [])
+        lengths = self._segments[node.segment].scales.lengths
         lengths.append(_length_sigma(node, last))
         usual = float(np.median(lengths))
         return lengths[-1] if lengths[-1] > max(OPEN_LENGTH, OPEN_SHARE * usual) else 0.0
@@ -316,17 +315,18 @@ class Motions:
     def add_loop(self, a: Node, b: Node, T_a_b: F64, covariance: F64) -> None:
         """A motion (4, 4) seen between two nodes, in metres by a's frame, whose lengths grow with
         a's scale; its covariance (6, 6) is of the left perturbation in a's frame."""
-        scale, unit = self.scale_of[a.key], self._units.get(a.segment, NO_SCALE)
+        scale, unit = self.scale_of[a.key], self._segments[a.segment].scales.unit
         # Not robust: two loops agreed, and a late one with a large misclosure would lose weight.
         self._smoother.add_motion("loop", (a.key, b.key), T_a_b, covariance, scale, unit)
 
     def _is_refuted(self, node: Node, last: Node, motion: F64, covariance: F64) -> bool:
         """True where both attitude and positions contradict vision's motion: two sensors do not
         fail at once by chance, and images that smear do."""
-        noise = self._segments.noise(node.segment)
+        segment = self._segments[node.segment]
+        noise = segment.noise
         if noise is None or noise.horizontal is None or noise.vertical is None:
             return False
-        a, b = self._segments.freed(last).prior, self._segments.freed(node).prior
+        a, b = segment.without_biases(last).prior, segment.without_biases(node).prior
         tilt_rad, off_m = _contradiction(a, b, motion)
         passed_s = (node.time_ns - last.time_ns) * 1e-9
         known = (noise.horizontal, noise.horizontal, noise.vertical)
@@ -339,15 +339,15 @@ class Motions:
     def _connect(self, node: Node, last: Node, motion: F64, covariance: F64, is_seen: bool) -> None:
         """The motion between two keyframes; of an aligned segment, with its scale left open."""
         kind, scale, unit = "vision" if is_seen else "link", NO_SCALE, NO_SCALE
-        if node.segment == last.segment and self._segments.known(node.segment) is not None:
+        if node.segment == last.segment and self._segments[node.segment].similarity is not None:
             key = self.scale_key(node, self._jump(node, last))
             if is_seen:
-                scale, unit = key, self._units[node.segment]
+                scale, unit = key, self._segments[node.segment].scales.unit
         self._smoother.add_motion(kind, (last.key, node.key), motion, covariance, scale, unit)
 
     def _seen(self, node: Node, last: Node) -> tuple[F64, F64]:
         """Vision's motion."""
-        frame = self._segments.frame(node.segment)
+        frame = self._segments[node.segment].frame
         motion = se3.inverse(frame.pose(last.T_odom_camera)) @ frame.pose(node.T_odom_camera)
         units = np.array([1.0] * 3 + [frame.scale] * 3)
         covariance = node.covariance * np.outer(units, units) + np.diag([1e-10] * 3 + [1e-6] * 3)
@@ -357,14 +357,15 @@ class Motions:
     def _link(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
         """Dead reckoning where vision was lost: telemetry's motion, else the last one's, wide."""
         passed_s = (node.time_ns - last.time_ns) * 1e-9
-        frame = self._segments.known(node.segment)
+        segment = self._segments[node.segment]
+        frame = segment.similarity
         is_new = node.segment != last.segment
-        if is_new and frame is not None and self._segments.is_tied(node.segment):
+        if is_new and frame is not None and segment.is_tied:
             T = frame.pose(node.T_odom_camera)
         elif node.over is not None:
             T = T_last @ node.over
         else:
-            priors = self._segments.at_camera(last), self._segments.at_camera(node)
+            priors = self._segments[last.segment].at_camera(last), segment.at_camera(node)
             T = carried(*priors, T_last, self._velocity(last, T_last), passed_s)
         prior = node.prior
         is_turn_known = prior.R_world_camera is not None and prior.sigma_yaw_rad < 1.0
@@ -378,7 +379,7 @@ class Motions:
     def _velocity(self, last: Node, T_last: F64) -> F64 | None:
         """(3,) m/s at a segment's keyframe, over a second or more; None at its start, and where
         no aircraft is so fast: a camera about to fail stamps images anyhow."""
-        for node in reversed(self._segments.nodes[last.segment]):
+        for node in reversed(self._segments[last.segment].nodes):
             passed_s = (last.time_ns - node.time_ns) * 1e-9
             if node.key < last.key and passed_s >= VELOCITY_S:
                 velocity = (T_last[:3, 3] - self._smoother.pose(node.key)[:3, 3]) / passed_s

@@ -182,7 +182,7 @@ class LoopSearch:
 
         Where fixes or a loop locate the segment, its place is the better criterion.
         """
-        if self.trajectory.graph.segments.is_tied(new.segment):
+        if self.trajectory.graph.segments[new.segment].is_tied:
             return []
         self._turn += 1
         every = -(-len(seqs) // COMPARED)

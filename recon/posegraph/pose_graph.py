@@ -19,7 +19,7 @@ from recon import bands, se3
 from recon.posegraph.factors import Motions, Readings, is_frozen, sound
 from recon.posegraph.loop_book import LoopBook
 from recon.posegraph.records import Loop, Node, PoseGraphConfig
-from recon.posegraph.segment_frames import SegmentFrames
+from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_offsets import Constants
 from recon.posegraph.smoother import (
     MANY_STEPS,
@@ -56,7 +56,7 @@ class PoseGraph:
         self._thin_at = self.config.max_nodes
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
-        self.segments = SegmentFrames(self.config)
+        self.segments = Segments(self.config)
         self.loops = LoopBook(self.config, self)
         self._built = 0
         self._start()
@@ -95,8 +95,7 @@ class PoseGraph:
         last = self._newest() if self._nodes else None
         self.entered += 1
         self._nodes[node.seq] = node
-        self.segments.keep(node)
-        is_refitted = self.segments.refit(segment, self._smoother.pose)
+        is_refitted = self.segments.refit(self.segments.add(node), self._smoother.pose)
         if len(self) >= self._thin_at:
             self._thin()
         elif is_refitted:
@@ -133,11 +132,11 @@ class PoseGraph:
 
     def solve(self) -> None:
         """Fit every segment's frame to all its telemetry again, and rebuild the graph."""
-        for segment in self.segments.nodes:
-            self.segments.forget(segment)
+        for segment in self.segments:
+            segment.forget()
             self.segments.refit(segment, self._smoother.pose)
-            loops = self.loops.into(segment)
-            if loops and not self.segments.is_tied(segment):
+            loops = self.loops.into(segment.number)
+            if loops and not segment.is_tied:
                 self.rebuild()  # so that the segments before are where they belong
                 for loop in loops:
                     if self._tie(loop):
@@ -167,15 +166,15 @@ class PoseGraph:
 
     def largest_growth(self) -> float:
         """Log of the largest segment's scale by all factors over its scale by its own readings."""
-        segment = self.segments.largest_segment()
+        segment = self.segments.largest()
         if segment is None:
             return 0.0
-        keys = [node.key for node in self.segments.nodes[segment]]
+        keys = [node.key for node in segment.nodes]
         return float(np.median(self._smoother.logs()[self._motions.scale_of][keys]))
 
     def constants(self) -> Constants:
         """Constant errors of the sensors, as known for the newest segment."""
-        return self.segments.constants(self._newest().segment) if self._nodes else Constants()
+        return self.segments[self._newest().segment].constants if self._nodes else Constants()
 
     def node(self, seq: int) -> Node:
         """The record of keyframe ``seq``. Raises KeyError for an unknown one."""
@@ -205,7 +204,7 @@ class PoseGraph:
         """Metres per unit of the odometry at keyframe ``seq``."""
         node = self._nodes[seq]
         log = self._smoother.logs()[self._motions.scale_of[node.key]]
-        return self.segments.frame(node.segment).scale * float(np.exp(log))
+        return self.segments[node.segment].frame.scale * float(np.exp(log))
 
     @property
     def version(self) -> int:
@@ -223,10 +222,7 @@ class PoseGraph:
 
     def scales(self) -> F64:
         """(N,) metres per unit of the odometry, in the order of the keyframes."""
-        frames = [
-            np.full(len(nodes), self.segments.frame(segment).scale)
-            for segment, nodes in self.segments.nodes.items()
-        ]
+        frames = [np.full(len(s.nodes), s.frame.scale) for s in self.segments]
         logs = self._smoother.logs()[self._motions.scale_of]
         return np.asarray(np.concatenate(frames) * np.exp(logs))
 
@@ -242,6 +238,7 @@ class PoseGraph:
     def _start(self) -> None:
         self._built += 1
         self._smoother = Smoother()
+        self.segments.restart()
         self._left_out: Counter[str] = Counter()
         times = [n.time_ns for n in self._nodes.values()]
         span_s = (times[-1] - times[0]) * 1e-9 if times else 0.0
@@ -295,7 +292,7 @@ class PoseGraph:
             for node, used in zip(self._nodes.values(), self._sources, strict=False)
             if node.prior.sigma_position_m is not None
             and "gnss" not in used
-            and self.segments.rests_on_fixes(node.segment)
+            and self.segments[node.segment].rests_on_fixes
         }
 
     def _insert(self, node: Node, last: Node | None) -> None:
@@ -312,11 +309,11 @@ class PoseGraph:
             self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
             spread = spread_last + left_covariance(T_last, covariance)
         self._smoother.append_pose(T, spread)
-        frame = self.segments.known(node.segment)
+        segment = self.segments[node.segment]
+        frame = segment.similarity
         drift_m = None if frame is None else self.config.frame_drift * self._path[node.key]
-        node = self.segments.freed(node)
-        noise = self.segments.noise(node.segment)
-        used = self._readings.add(node, T, spread, drift_m, noise)
+        node = segment.without_biases(node)
+        used = self._readings.add(node, T, spread, drift_m, segment.noise)
         if frame is not None and self._readings.height(
             node, self._motions.scale_key(node), frame.scale
         ):
@@ -335,7 +332,7 @@ class PoseGraph:
     def _tie(self, loop: Loop) -> bool:
         """True when a loop between segments now places the later one, which no fix does."""
         a, b = self._nodes[loop.a], self._nodes[loop.b]
-        if not self.loops.enters(loop, b.segment) or self.segments.is_tied(b.segment):
+        if not self.loops.enters(loop, b.segment) or self.segments[b.segment].is_tied:
             return False
         scale = self.scale(loop.a)
         T = self._smoother.pose(a.key) @ loop.scaled(scale).T_a_b
@@ -346,7 +343,7 @@ class PoseGraph:
 
     def _add_loop_factor(self, loop: Loop) -> None:
         a, b = self._nodes[loop.a], self._nodes[loop.b]
-        metric = loop.scaled(self.segments.frame(a.segment).scale)
+        metric = loop.scaled(self.segments[a.segment].frame.scale)
         self._sources[b.key].add("loop")
         self._motions.add_loop(a, b, metric.T_a_b, metric.covariance)
         self._add_loop_scale(loop, a.key, b.key)
@@ -356,7 +353,7 @@ class PoseGraph:
         keys = self._motions.scale_of[a], self._motions.scale_of[b]
         if keys[0] == keys[1] or NO_SCALE in keys:
             return
-        frames = [self.segments.frame(self._nodes[seq].segment).scale for seq in loop.ends]
+        frames = [self.segments[self._nodes[seq].segment].frame.scale for seq in loop.ends]
         log = float(np.log(loop.ratio * frames[0] / frames[1]))
         self._smoother.add_scale(
             "loop scale", keys, log, self.config.sigma_loop_scale, self.config.huber_sigmas

@@ -101,7 +101,7 @@ class Trajectory:
             T, scales = interpolated(self._read(row), *at, self._spans([ends]))
             return replace(self.pose(ends[0]), T_world_camera=T[0], scale=float(scales[0]))
         pose = self.graph.pose(seq)
-        frame = self.graph.segments.known(self.graph.node(seq).segment)
+        frame = self.graph.segments[self.graph.node(seq).segment].similarity
         T, covariance = pose.T_world_camera, pose.covariance
         if frame is None:  # its scale and heading are not known
             covariance = covariance + se3.about(-T[:3, 3], np.eye(6))

@@ -89,7 +89,8 @@ def sigma_of_scale(graph: PoseGraph) -> float:
     leave it as unsure as they are apart."""
     found, growth = graph.segments.largest(), abs(graph.largest_growth())
     assert found is not None
-    return growth if growth > SIGMAS * found.sigma_scale else found.sigma_scale
+    sigma = found.frame.sigma_scale
+    return growth if growth > SIGMAS * sigma else sigma
 
 
 def gnss_over_heights(graph: PoseGraph) -> float | None:

@@ -19,7 +19,7 @@ from recon.posegraph.alignment import WILD
 from recon.posegraph.factors import BLOCK
 from recon.posegraph.loop_book import CHI2_LIMIT
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
-from recon.posegraph.segment_frames import REFIT_GROWTH, SETTLED_GROWTH
+from recon.posegraph.segments import REFIT_GROWTH, SETTLED_GROWTH
 from recon.posegraph.sensor_noise import PRECISE_TAU_S, TAUS_S
 from service.config import keys
 

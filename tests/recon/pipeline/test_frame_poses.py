@@ -158,6 +158,6 @@ def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> N
         np.testing.assert_allclose(pose.T_world_camera[:3, 3], fix)
         assert sigma_m(pose) == pytest.approx(5.0 * 3**0.5)
     known = Similarity(1.0, np.eye(3), np.zeros(3), np.eye(7))
-    keyframes.graph.segments.known = lambda segment: known
+    keyframes.graph.segments[0].similarity = known
     carried = frames.pose(frame, FallbackPosition(fix, np.full(3, 5.0)))
     assert np.linalg.norm(carried.T_world_camera[:3, 3] - fix) > 1.0

@@ -135,7 +135,7 @@ def test_umeyama_rotates_about_the_vertical_as_scipy_does() -> None:
 def test_all_sensors_give_decimetres() -> None:
     f = flight(150)
     graph, pose = fly(f, altitude_bias_m=4.0)
-    assert graph.segments.rests_on_fixes(0)
+    assert graph.segments[0].rests_on_fixes
     assert graph.scale(len(f.odom) - 1) == pytest.approx(1.3, rel=0.01)
     assert rms_m(graph, f) < 0.4
     assert pose.sources == ("vision", "attitude", "altitude", "gnss")
@@ -165,7 +165,7 @@ def test_without_fixes_the_frame_stays_local_and_drift_is_small(use: str) -> Non
     f = flight(120, scale=1.0)
     f.priors = [blind(p, "attitude" in use) for p in f.priors]
     graph, pose = fly(f)
-    assert not graph.segments.rests_on_fixes(0)
+    assert not graph.segments[0].rests_on_fixes
     assert "gnss" not in pose.sources and "vision" in pose.sources
     moved = se3.inverse(graph.pose(0).T_world_camera) @ pose.T_world_camera
     true = se3.inverse(f.truth[0]) @ f.truth[-1]
@@ -311,11 +311,11 @@ def test_a_stretch_without_vision_is_bridged_and_said() -> None:
         pose = graph.add_keyframe(i, i * 10**9, 1, odom, later.covariance, f.priors[i])
         if i == 56:
             assert "dead reckoning" in pose.sources and "vision" not in pose.sources
-            assert not graph.segments.rests_on_fixes(1)
+            assert not graph.segments[1].rests_on_fixes
             assert np.sqrt(pose.covariance[3, 3]) > 1.0
-            assert graph.segments.largest() is graph.segments.known(0)
-    assert graph.segments.rests_on_fixes(1)
-    assert graph.segments.largest() is graph.segments.known(1)
+            assert graph.segments.largest() is graph.segments[0]
+    assert graph.segments[1].rests_on_fixes
+    assert graph.segments.largest() is graph.segments[1]
     assert graph.scale(119) == pytest.approx(0.6, rel=0.02)
     for i in (20, 49, 60, 80, 119):
         assert np.linalg.norm(graph.place(i)[:3, 3] - f.truth[i][:3, 3]) < 1.2
@@ -533,12 +533,12 @@ def test_a_lost_stretch_is_tied_by_two_loops_in_scale_and_heading() -> None:
         graph.add_keyframe(
             i, (i + 20) * 10**9, 1, turned @ later.odom[i], later.covariance, PosePrior()
         )
-    assert not graph.segments.is_tied(1)
+    assert not graph.segments[1].is_tied
     shrunk = 1.0 / graph.scale(20) * 0.5  # depths of the second stretch, as the first has them
     for a, b in ((3, 15), (5, 18)):
         T_a_b = se3.inverse(f.truth[a]) @ f.truth[b]
         graph.add_loop(a, b, T_a_b, LOOP_COVARIANCE, shrunk)
-    assert graph.segments.is_tied(1)
+    assert graph.segments[1].is_tied
     poses = graph.poses()
     for i in (12, 18, 23):
         moved, true = se3.inverse(poses[4]) @ poses[i], se3.inverse(f.truth[4]) @ f.truth[i]
@@ -580,7 +580,7 @@ def test_a_stretch_whose_scale_no_fix_measures_is_as_high_as_the_flight() -> Non
     graph.solve()
     assert graph.scale(30) == pytest.approx(3.0, rel=0.02)
     assert graph.scale(63) == pytest.approx(3.0, rel=0.3)
-    assert not graph.segments.is_tied(1)
+    assert not graph.segments[1].is_tied
 
 
 def test_a_loop_that_vision_cannot_have_drifted_is_refused() -> None:

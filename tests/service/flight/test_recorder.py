@@ -141,7 +141,8 @@ def test_the_scale_names_what_measured_it(sources: tuple[str, ...], sigma: float
     found = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
     scales: list[Scale | None] = [None, None]
     growth = [-2.0 * sigma]
-    segments = SimpleNamespace(largest=lambda: found, largest_scales=lambda: scales)
+    largest = SimpleNamespace(frame=found)
+    segments = SimpleNamespace(largest=lambda: largest, largest_scales=lambda: scales)
     graph = SimpleNamespace(segments=segments, largest_growth=lambda: growth[0])
     recorder = Recorder.__new__(Recorder)
     recorder._graph = cast(Any, graph)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import laspy
@@ -17,10 +17,11 @@ from typer.testing import CliRunner
 
 from recon.calibration.global_bundle import Sightings
 from recon.calibration.tracks import MIN_COMMON
+from recon.posegraph import pieces
 from recon.posegraph.alignment import Similarity
-from recon.posegraph.pieces import Pieces
-from recon.posegraph.pose_graph import PoseGraph
-from recon.posegraph.records import Loop
+from recon.posegraph.alignment_readings import Heights
+from recon.posegraph.records import Loop, PoseGraphConfig
+from recon.posegraph.segments import Segment, Segments
 from recon.types import F64, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cli import app
@@ -41,41 +42,28 @@ PLACED = PosePrior(np.eye(3), 0.02, 0.1, np.zeros(3), np.ones(3))
 
 @dataclass
 class Ties:
-    """A graph, its loops and its segments, as far as pieces ask them."""
+    """How four segments of three keyframes are tied: 0 to 2, 10 to 12, 20 to 22, 30 to 32."""
 
     taken: list[Loop] = field(default_factory=list)
-    pending: list[Loop] = field(default_factory=list)
     fixed: tuple[int, ...] = ()
     tied: tuple[int, ...] = ()
     sigma_m: float = 1.0  # of the height, whatever it is against
     against_m: float | None = None  # of one segment's against another's
     sigma_scale: dict[int, float] = field(default_factory=dict)  # where it is not 0.01
     main: int = 0  # the largest
-    _found: dict[int, Similarity] = field(default_factory=dict)
 
-    @property
-    def loops(self) -> Ties:
-        return self
-
-    @property
-    def segments(self) -> Ties:
-        return self
-
-    def sigma_height_m(self, segment: int) -> float | None:
-        return self.against_m
-
-    def known(self, segment: int) -> Similarity | None:
-        sources = ("gnss",) if segment in self.fixed else ("altitude",)
-        scale = self.sigma_scale.get(segment, 0.01)
+    def segment(self, segments: Segments, number: int) -> Segment:
+        """A segment with its similarity."""
+        out = segments.opened(number)
+        scale = self.sigma_scale.get(number, 0.01)
         covariance = np.diag([1.0] * 5 + [self.sigma_m**2, scale**2])
-        found = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
-        return self._found.setdefault(segment, found)
-
-    def largest(self) -> Similarity | None:
-        return self.known(self.main)
-
-    def is_tied(self, segment: int) -> bool:
-        return segment in self.tied
+        sources = ("gnss",) if number in self.fixed else ("altitude",)
+        out.similarity = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
+        if self.against_m is not None:
+            heights = Heights(self.against_m / 2**0.5, 0.0, 0.0, 0.0)
+            out.similarity = replace(out.similarity, heights=heights)
+        out.is_tied_by_loop, out.keyframes = number in self.tied, 3 + (number == self.main)
+        return out
 
 
 def loop(a: int, b: int) -> Loop:
@@ -85,20 +73,21 @@ def loop(a: int, b: int) -> Loop:
 def apart(
     ties: Ties, points: tuple[int, ...] = (100, 300, 200, 50), prior: PosePrior = NOWHERE
 ) -> list[tuple[int, int]]:
-    """Four segments of three keyframes: 0 to 2, 10 to 12, 20 to 22, 30 to 32."""
-    pieces = Pieces()
-    for segment, count in enumerate(points):
+    """What is apart of four segments with so many points in each keyframe."""
+    segments = Segments(PoseGraphConfig())
+    for number, count in enumerate(points):
+        segment = ties.segment(segments, number)
         for i in range(3):
-            pieces.add(10 * segment + i, segment, count, prior)
-    return pieces.apart(cast(PoseGraph, ties))
+            segment.add_surface(10 * number + i, count, prior)
+    return pieces.apart(segments, ties.taken)
 
 
 def test_without_ties_the_largest_stays() -> None:
     assert apart(Ties()) == [(0, 2), (20, 22), (30, 32)]
 
 
-def test_loops_make_pieces_and_a_waiting_loop_does_not() -> None:
-    assert apart(Ties([loop(2, 30)], [loop(11, 21)])) == [(0, 2), (20, 22), (30, 32)]
+def test_loops_make_pieces() -> None:
+    assert apart(Ties([loop(2, 30)])) == [(0, 2), (20, 22), (30, 32)]
     assert apart(Ties([loop(2, 21), loop(22, 30)])) == [(10, 12)]
 
 
@@ -114,7 +103,7 @@ def test_fixes_without_a_height_do_not_lay_one_stretch_on_another() -> None:
     high = replace(PLACED, sigma_position_m=np.array([5.0, 5.0, 50.0]))
     coarse = Ties(fixed=every, tied=every, sigma_m=50.0)
     assert apart(coarse, prior=high) == [(0, 2), (20, 22), (30, 32)]
-    assert apart(replace(coarse, against_m=20.0), prior=high) == [(0, 2), (20, 22), (30, 32)]
+    assert apart(replace(coarse, against_m=20.0), prior=high) == [(10, 12), (20, 22), (30, 32)]
     assert apart(replace(coarse, against_m=2.0), prior=high) == []
     tied = replace(coarse, taken=[loop(2, 11)])
     assert apart(tied, prior=high) == [(20, 22), (30, 32)]
@@ -127,12 +116,22 @@ def test_fixes_that_leave_the_size_open_do_not_lay_one_stretch_on_another() -> N
     ties = Ties(fixed=every, tied=every, sigma_scale={1: 0.7, 2: 0.1, 3: 0.3})
     for prior in (NOWHERE, PLACED):
         assert apart(ties, prior=prior) == [(10, 12), (30, 32)]
-        assert apart(replace(ties, main=1, _found={}), prior=prior) == [(30, 32)]
+        assert apart(replace(ties, main=1), prior=prior) == [(30, 32)]
         assert apart(replace(ties, taken=[loop(2, 11)]), prior=prior) == [(30, 32)]
 
 
 def test_a_forgotten_loop_still_ties() -> None:
     assert apart(Ties(tied=(2,))) == [(0, 2), (30, 32)]
+
+
+def test_a_segment_without_nodes_is_tied_as_it_was() -> None:
+    """A long flight drops the nodes of short segments; their keyframes stay as published."""
+    segments = Segments(PoseGraphConfig())
+    for number, count in enumerate((300, 100, 100)):
+        segment = Ties(fixed=(1,)).segment(segments, number)
+        segment.add_surface(10 * number, count, NOWHERE)
+    segments.thin([])
+    assert pieces.apart(segments, []) == [(20, 20)]
 
 
 def replayed(tmp_path: Path, track: list[F64]) -> tuple[dict[str, Any], F64]:

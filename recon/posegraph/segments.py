@@ -1,0 +1,313 @@
+"""Segments of the track: keyframes tracked without interruption, and their place in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from recon import se3
+from recon.posegraph import alignment
+from recon.posegraph.alignment import Scale, Similarity
+from recon.posegraph.alignment_readings import ReadingNoise
+from recon.posegraph.anchors import GUESSED_SHARE, Anchor, guessed_at
+from recon.posegraph.between_keyframes import at_camera
+from recon.posegraph.records import Node, PoseGraphConfig
+from recon.posegraph.sensor_offsets import Constants, Offsets, constants, offsets
+from recon.posegraph.smoother import NO_SCALE
+from recon.types import F64, PosePrior
+
+REFIT_GROWTH, SETTLED_GROWTH = 1.3, 1.6
+"""A segment's similarity is fitted again when its keyframes have grown by so much: at first,
+and once it has settled."""
+
+SETTLED = 100
+"""Keyframes after which a segment's similarity is taken over only when it has changed notably."""
+
+HEADING_KNOWN_RAD, HEIGHT_KNOWN_M = 1.0, 20.0
+"""Sigmas of a heading and of a fix's height below which they place a segment."""
+
+
+@dataclass(slots=True, eq=False)
+class ScaleBlocks:
+    """Keys of a segment's scales in one build of the graph."""
+
+    unit: int = NO_SCALE  # the first one, in which motions are measured
+    newest: int = NO_SCALE
+    since: int = 0  # key of the newest one's first node
+    held: int = 0  # keyframes that the newest one stands for
+    lengths: list[float] = field(default_factory=list)  # relative sigmas of vision's steps
+
+
+@dataclass(slots=True, eq=False)
+class Segment:
+    """Keyframes tracked without interruption: what they share, and where they are in the world.
+
+    Vision gives them a frame and a unit of their own; ``similarity`` brings both to the world.
+    """
+
+    number: int
+    nodes: list[Node] = field(default_factory=list)  # keyframes in the graph, in order
+    keyframes: int = 0  # in the graph or not
+    similarity: Similarity | None = None  # once telemetry or a loop gives it
+    constants: Constants = field(default_factory=Constants)  # errors it was fitted with
+    offsets: Offsets | None = None  # of each sensor from the similarity
+    scales: ScaleBlocks = field(default_factory=ScaleBlocks)
+    is_tied_by_loop: bool = False
+    fitted: int = 0  # keyframes when the similarity was fitted last
+    surface: tuple[int, int] | None = None  # its first and last keyframe with depth
+    points: int = 0  # new surface points of them
+    is_fixed: bool = False  # one of them has a fix of known height, and a heading
+
+    @property
+    def first(self) -> int:
+        """Number of the first keyframe with depth; -1 without any."""
+        return -1 if self.surface is None else self.surface[0]
+
+    @property
+    def frame(self) -> Similarity:
+        """The similarity; until there is one, its own frame turned to the first attitude."""
+        if self.similarity is not None:
+            return self.similarity
+        first = self.nodes[0]
+        R = first.prior.R_world_camera
+        turn = np.eye(3) if R is None else R @ first.T_odom_camera[:3, :3].T
+        return Similarity(1.0, turn, np.zeros(3), np.eye(7))
+
+    @property
+    def noise(self) -> ReadingNoise | None:
+        """How its fixes err; None before they were fitted."""
+        return None if self.similarity is None else self.similarity.noise
+
+    @property
+    def rests_on_fixes(self) -> bool:
+        """True when positions place it."""
+        return self.similarity is not None and "gnss" in self.similarity.sources
+
+    @property
+    def is_tied(self) -> bool:
+        """True when a loop places it, or fixes that measure its scale."""
+        found = self.similarity
+        is_measured = found is not None and "gnss" in found.sources
+        is_scaled = found is not None and found.sigma_scale < GUESSED_SHARE
+        return self.is_tied_by_loop or (is_measured and is_scaled)
+
+    def forget(self) -> None:
+        """Count it as not placed."""
+        self.similarity = self.offsets = None
+        self.constants, self.fitted, self.is_tied_by_loop = Constants(), 0, False
+
+    def without_biases(self, node: Node) -> Node:
+        """A node of it without its sensors' constants, its fix brought to the camera."""
+        prior = self.constants.applied(node.prior)
+        if self.offsets is not None and self.similarity is not None:
+            prior = self.similarity.common.applied(prior, node.time_ns * 1e-9)
+            prior = self.offsets.applied(prior, node.lean)
+        prior = self.at_camera(replace(node, prior=prior))
+        return node if prior is node.prior else replace(node, prior=prior)
+
+    def at_camera(self, node: Node) -> PosePrior:
+        """The prior of a node of it, with its fix brought to where the camera is."""
+        frame = self.frame
+        return at_camera(node.prior, frame.R @ node.T_odom_camera[:3, :3], frame.scale)
+
+    def add_surface(self, seq: int, points: int, prior: PosePrior) -> None:
+        """Count the new points of a keyframe with depth."""
+        self.surface = (seq if self.surface is None else self.surface[0], seq)
+        self.points += points
+        sigma = prior.sigma_position_m
+        has_fix = sigma is not None and sigma[2] < HEIGHT_KNOWN_M
+        self.is_fixed |= has_fix and prior.sigma_yaw_rad < HEADING_KNOWN_RAD
+
+
+class Segments:
+    """The segments of one flight, by number."""
+
+    def __init__(self, config: PoseGraphConfig) -> None:
+        self._all: dict[int, Segment] = {}
+        self._least, self._wander_s = config.min_anchors, (config.fix_s, config.attitude_s)
+
+    def __getitem__(self, number: int) -> Segment:
+        return self._all[number]
+
+    def __iter__(self) -> Iterator[Segment]:
+        """Those that have nodes, in order."""
+        return (segment for segment in self._all.values() if segment.nodes)
+
+    def similarity(self, number: int) -> Similarity | None:
+        """That of a segment; None before telemetry or a loop gives it."""
+        segment = self._all.get(number)
+        return None if segment is None else segment.similarity
+
+    def with_surface(self) -> list[Segment]:
+        """Those that keyframes with depth belong to, in order."""
+        return [segment for segment in self._all.values() if segment.surface is not None]
+
+    def opened(self, number: int) -> Segment:
+        """A segment; made when missing."""
+        return self._all.setdefault(number, Segment(number))
+
+    def add(self, node: Node) -> Segment:
+        """Take a keyframe into its segment, which is returned."""
+        segment = self.opened(node.segment)
+        segment.nodes.append(node)
+        segment.keyframes += 1
+        return segment
+
+    def thin(self, nodes: Iterable[Node]) -> None:
+        """Keep only these nodes, and what is known of their segments."""
+        for segment in self._all.values():
+            segment.nodes = []
+        for node in nodes:
+            self._all[node.segment].nodes.append(node)
+        for segment in self._all.values():
+            if not segment.nodes:
+                is_tied = segment.is_tied
+                segment.forget()
+                segment.keyframes, segment.is_tied_by_loop = 0, is_tied
+
+    def restart(self) -> None:
+        """Begin with no scale in any segment, as the graph is built again."""
+        for segment in self._all.values():
+            segment.scales = ScaleBlocks()
+
+    def _placed(self) -> list[tuple[Segment, Similarity]]:
+        return [(s, s.similarity) for s in self._all.values() if s.similarity is not None]
+
+    def largest(self) -> Segment | None:
+        """The one with the most keyframes, of those that readings place where some do."""
+        size = {s.number: (bool(found.sources), s.keyframes) for s, found in self._placed()}
+        number = max(size, key=size.__getitem__, default=None)
+        return None if number is None else self._all[number]
+
+    def _usual_noise(self) -> ReadingNoise | None:
+        """That of the fixes of the largest segment which shows it."""
+        known = [s for s, found in self._placed() if found.noise and found.noise.horizontal]
+        largest = max(known, key=lambda segment: segment.keyframes, default=None)
+        return None if largest is None else largest.noise
+
+    def sigma_height_m(self, number: int) -> float | None:
+        """Sigma of a segment's height against the largest one of known heights; None without."""
+        known = {s.number: found.heights for s, found in self._placed() if found.heights}
+        if number not in known:
+            return None
+        main = max(known, key=lambda one: self._all[one].keyframes)
+        return 0.0 if number == main else known[number].sigma_to(known[main])
+
+    def tie(self, number: int, scale: float, R: F64, t: F64) -> None:
+        """Place a segment by a loop, for good."""
+        segment = self._all[number]
+        before = segment.similarity
+        covariance = np.eye(7) if before is None else before.covariance
+        placed = Similarity(scale, R, t, covariance, () if before is None else before.sources)
+        known = (found for _, found in self._placed() if found.sigma_fixes is not None)
+        other = next(known, placed)  # one receiver places all that loops join
+        segment.similarity = replace(
+            placed, sigma_fixes=other.sigma_fixes, sigma_counted=other.sigma_counted
+        )
+        segment.is_tied_by_loop = True
+
+    def refit(self, segment: Segment, pose: Callable[[int], F64]) -> bool:
+        """True when the segment's similarity was fitted again, which is due as the segment grows.
+
+        ``pose`` gives the present pose of a key in the graph.
+        """
+        growth = REFIT_GROWTH if segment.fitted < SETTLED else SETTLED_GROWTH
+        due = max(self._least, int(growth * segment.fitted))
+        if segment.keyframes < due or segment.is_tied_by_loop:
+            return False
+        segment.fitted, nodes = segment.keyframes, segment.nodes
+        fresh = self._newest_constants()
+        anchors = self._anchors(segment, fresh)
+        found = alignment.fit(anchors, *self._wander_s, slow_share=fresh.datum.slow_share,
+                              usual=self._usual_noise())  # fmt: skip
+        if found is None:
+            return False
+        found = replace(found, bend_rad=_bend_rad(nodes))
+        if "gnss" not in found.sources and nodes[0].key > 0:
+            found = _kept_in_place(found, nodes[0], pose(nodes[0].key))
+        if found.sigma_fixes is not None:
+            most = np.array([np.inf, np.inf, fresh.datum.sigma_m])
+            found = replace(found, sigma_fixes=np.minimum(found.sigma_fixes, most))
+        before = segment.similarity
+        is_settled = segment.keyframes >= SETTLED and not fresh.differ(segment.constants)
+        if before is not None and is_settled and not _differ(before, found, nodes):
+            return False  # the graph itself follows such small changes
+        segment.similarity, segment.constants = found, fresh
+        freed = [replace(a, prior=found.common.applied(a.prior, a.time_s)) for a in anchors]
+        segment.offsets = offsets(freed, found)
+        return True
+
+    def _newest_constants(self) -> Constants:
+        """By all segments: the sensors stay the same."""
+        nodes = [node for segment in self for node in segment.nodes]
+        span_s = (nodes[-1].time_ns - nodes[0].time_ns) * 1e-9
+        stretches = [
+            ([n.T_odom_camera for n in segment.nodes], [n.prior for n in segment.nodes])
+            for segment in self
+        ]
+        return constants(stretches, span_s, *self._wander_s)
+
+    def altitude_offset(self) -> float | None:
+        """Altitude less world z over all placed keyframes; None without any."""
+        apart = [
+            n.prior.altitude_m - frame.pose(n.T_odom_camera)[2, 3]
+            for segment, frame in self._placed()
+            for n in segment.nodes
+            if n.prior.altitude_m is not None
+        ]
+        return float(np.median(apart)) if apart else None
+
+    def largest_scales(self) -> tuple[Scale | None, Scale | None]:
+        """The largest segment's scale by fixes alone and by heights alone."""
+        segment = self.largest()
+        if segment is None:
+            return None, None
+        return alignment.scales(self._anchors(segment, segment.constants), segment.frame)
+
+    def _anchors(self, segment: Segment, known: Constants) -> list[Anchor]:
+        height_m = self._usual_height_m()
+        return [
+            Anchor(
+                n.T_odom_camera, guessed_at(height_m, known.applied(n.prior)), n.height, n.lean,
+                n.time_ns * 1e-9,
+            )
+            for n in segment.nodes
+        ]  # fmt: skip
+
+    def _usual_height_m(self) -> float | None:
+        """Height above ground of the largest segment, if its scale is measured."""
+        segment = self.largest()
+        if segment is None or segment.frame.sigma_scale >= GUESSED_SHARE:
+            return None
+        heights = [n.height for n in segment.nodes if n.height is not None]
+        return segment.frame.scale * float(np.median(heights)) if heights else None
+
+
+def _bend_rad(nodes: list[Node]) -> float:
+    """Sigma of the turn of a segment's part against its mean, about each axis.
+
+    A random walk of variance v from end to end has v / 6 about its mean.
+    """
+    return float(np.sqrt(sum(np.trace(n.covariance[:3, :3]) for n in nodes[1:]) / 18.0))
+
+
+def _differ(before: Similarity, found: Similarity, nodes: list[Node]) -> bool:
+    """True when two frames place a segment apart by more than half their sigma."""
+    ends = (nodes[0], nodes[len(nodes) // 2], nodes[-1])
+    shift = [before.pose(n.T_odom_camera) - found.pose(n.T_odom_camera) for n in ends]
+    sigma = float(np.sqrt(np.trace(found.covariance[3:6, 3:6])))
+    return max(float(np.linalg.norm(s[:3, 3])) for s in shift) > 0.5 * sigma
+
+
+def _kept_in_place(found: Similarity, first: Node, T: F64) -> Similarity:
+    """A frame without fixes, moved so that its first keyframe stays at ``T``, and turned to the
+    heading there when no compass gives one."""
+    R = found.R
+    if "attitude" not in found.sources:
+        turn = T[:3, :3] @ (R @ first.T_odom_camera[:3, :3]).T
+        yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+        R = se3.so3_exp(np.array([0.0, 0.0, float(yaw)])) @ R
+    t = T[:3, 3] - found.scale * R @ first.T_odom_camera[:3, 3]
+    return replace(found, R=R, t=t)
