@@ -91,9 +91,9 @@ class PosePrior:
     sigma_altitude_m: float = 1.0
     fix_offset: F64 | None = None  # (3,) from the camera to where position_m was, in its frame, in
     # units of the odometry: the mean of several fixes lies off the track
-    above_m: float | None = None  # altitude by the GNSS receiver alone less position_m's
-    above_fixes: int = 0  # whose mean that is
-    above_ns: int = 0  # time of the newest of them
+    gnss_minus_baro_m: float | None = None  # altitude by the GNSS receiver alone less position_m's
+    gnss_minus_baro_fixes: int = 0  # whose mean that is
+    gnss_minus_baro_ns: int = 0  # time of the newest of them
     is_at_rest: bool = False  # the vehicle stands on the ground: its position repeats rightly
     is_agl_measured: bool = True  # False: above the take-off point, or assumed
     is_agl_assumed: bool = False

@@ -100,7 +100,7 @@ class ReceiverAltitude:
     """One fix of the GNSS receiver and the autopilot's altitude at the same time."""
 
     time_ns: int
-    above_m: float  # the receiver's altitude minus the autopilot's
+    gnss_minus_baro_m: float  # the receiver's altitude minus the autopilot's
 
 
 @dataclass(frozen=True, slots=True, eq=False)

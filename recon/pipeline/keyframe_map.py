@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from recon.pipeline.config import Timing
-from recon.pipeline.views import StereoCandidate
+from recon.pipeline.views import StereoView
 from recon.posegraph.anchors import height_above, height_below
 from recon.posegraph.level_ground import MAX_LEVELLED_SHARE, levelled
 from recon.posegraph.loop_search import LoopSearch
@@ -66,7 +66,7 @@ class KeyframeMap:
 
     def add(
         self,
-        view: StereoCandidate,
+        view: StereoView,
         step: F64 | None,
         covariance: F64,
         depth: DepthMap | None,
@@ -106,7 +106,7 @@ class KeyframeMap:
             self.trajectory.publish(seq, pose)
         return found
 
-    def measured(self, view: StereoCandidate, keyframe: Keyframe) -> None:
+    def measured(self, view: StereoView, keyframe: Keyframe) -> None:
         """Count the surface of a view that became a keyframe."""
         points = int(np.count_nonzero(keyframe.fresh & np.isfinite(keyframe.depth.depth_m)))
         self.graph.segments[view.segment].add_surface(view.seq, points, view.prior)

@@ -33,7 +33,7 @@ from recon.pipeline.stages import (
     Undistort,
 )
 from recon.pipeline.surface_map import KnownSurface, SurfaceMap
-from recon.pipeline.views import StereoCandidate, StereoViews, UndistortedFrame, Viewpoints
+from recon.pipeline.views import StereoView, UndistortedFrame, ViewSelection, VirtualStereoCamera
 from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.trajectory import Trajectory
@@ -48,15 +48,15 @@ from recon.types import Array, Camera, Frame, Keyframe, PointCloud, Pose, PosePr
 
 __all__ = ["Mapper", "MapperConfig"]
 
-Reconstruct = Callable[[StereoCandidate], GraphUpdate]
+Reconstruct = Callable[[StereoView], GraphUpdate]
 
 
 class Worker(Protocol):
     """Does the work of :meth:`Mapper.reconstruct`, view by view."""
 
-    def offer(self, item: StereoCandidate) -> None: ...
+    def offer(self, item: StereoView) -> None: ...
 
-    def finished(self, everything: bool = False) -> list[tuple[StereoCandidate, GraphUpdate]]: ...
+    def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]: ...
 
     def close(self) -> None: ...
 
@@ -65,13 +65,13 @@ class InTurn:
     """Reconstructs each view before the next frame is looked at."""
 
     def __init__(self, work: Reconstruct) -> None:
-        self._work, self._done = work, list[tuple[StereoCandidate, GraphUpdate]]()
+        self._work, self._done = work, list[tuple[StereoView, GraphUpdate]]()
 
-    def offer(self, item: StereoCandidate) -> None:
+    def offer(self, item: StereoView) -> None:
         """Do the work of one view."""
         self._done.append((item, self._work(item)))
 
-    def finished(self, everything: bool = False) -> list[tuple[StereoCandidate, GraphUpdate]]:
+    def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]:
         """Views with their results, once each."""
         done, self._done = self._done, []
         return done
@@ -116,9 +116,9 @@ class Mapper:
             camera,
             seeks_readout=config.seeks_readout,
         )
-        selection = Viewpoints(config.baseline, config.pairs, all_known=known is not None)
+        selection = ViewSelection(config.baseline, config.pairs, all_known=known is not None)
         self.follow = Track(self.odometry, selection, self.refused, timing)
-        self.views = StereoViews(
+        self.views = VirtualStereoCamera(
             selection, self.odometry, self.undistort.camera, self.undistort.valid, self.refused
         )
         stereo = VirtualStereoConfig(
@@ -191,7 +191,7 @@ class Mapper:
         pose = self.frames.follow(before.prior, reference)
         return (FramePosed(before.seq, before.time_ns, tracked.before, pose, reference, is_view),)
 
-    def reconstruct(self, view: StereoCandidate) -> GraphUpdate:
+    def reconstruct(self, view: StereoView) -> GraphUpdate:
         """One view: its depth from all its partners, its pose, and its new surface."""
         depth = None
         grid = self.rectify.grid(view)

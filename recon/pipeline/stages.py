@@ -16,7 +16,7 @@ from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
 from recon.mapping.registration import IcpConfig, agreed_motion
 from recon.pipeline.config import Timing
-from recon.pipeline.views import Colour, StereoCandidate, UndistortedFrame, Viewpoints
+from recon.pipeline.views import Colour, StereoView, UndistortedFrame, ViewSelection
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
@@ -105,7 +105,7 @@ class Track:
     def __init__(
         self,
         odometry: AnyTrack,
-        selection: Viewpoints,
+        selection: ViewSelection,
         refused: Counter[str],
         timing: Timing,
     ) -> None:
@@ -163,21 +163,19 @@ class Rectify:
         self._relief_m = (0.0, 0.0)
         self.pairs = 0
 
-    def grid(self, candidate: StereoCandidate) -> ViewGrid:
+    def grid(self, candidate: StereoView) -> ViewGrid:
         """The grid of the view's depth."""
         view, width = candidate.view, self._config.width_px
         H, W = view.gray.shape
         w, h = width, round(width * H / W)
         return ViewGrid(scaled_K(view.K, w / W, h / H), (w, h), view.T_odom_camera)
 
-    def colours(self, candidate: StereoCandidate, grid: ViewGrid) -> U8:
+    def colours(self, candidate: StereoView, grid: ViewGrid) -> U8:
         """(h, w, 3) BGR of the view on the grid."""
         bgr = at_middle_row(candidate.view, candidate.bgr)
         return np.asarray(cv2.resize(bgr, grid.size_px, interpolation=cv2.INTER_AREA), np.uint8)
 
-    def __call__(
-        self, candidate: StereoCandidate, known: Collection[int]
-    ) -> dict[int, RectifiedPair]:
+    def __call__(self, candidate: StereoView, known: Collection[int]) -> dict[int, RectifiedPair]:
         """The pairs that stereo can use by the number of the partner, which is not ``known``."""
         config = self._config  # another thread may set it meanwhile
         view = candidate.view
@@ -222,7 +220,7 @@ class Carry:
         self._backend, self._timing = backend, timing
         self._kept: dict[tuple[int, int], PairDepth] = {}  # by view and partner
 
-    def __call__(self, candidate: StereoCandidate, grid: ViewGrid) -> dict[int, PairDepth]:
+    def __call__(self, candidate: StereoView, grid: ViewGrid) -> dict[int, PairDepth]:
         """Depth on the view's grid by the number of the partner."""
         view, found = candidate.view, dict[int, PairDepth]()
         for partner in candidate.partners:
@@ -310,7 +308,7 @@ class Plausible:
         self._rejected = rejected
         self._balance: Counter[int] = Counter()  # views kept less those refuted, by segment
 
-    def __call__(self, view: StereoCandidate, depth: DepthMap | None, bgr: U8) -> DepthMap | None:
+    def __call__(self, view: StereoView, depth: DepthMap | None, bgr: U8) -> DepthMap | None:
         """The plausible part of ``depth``, which has the colours ``bgr``; None without any."""
         if depth is None:
             return None
@@ -331,7 +329,7 @@ class Register:
         self._before: tuple[int, DepthMap | None] | None = None  # number and depth
         self.verdicts: Counter[Verdict] = Counter()
 
-    def __call__(self, view: StereoCandidate, depth: DepthMap | None) -> tuple[F64 | None, F64]:
+    def __call__(self, view: StereoView, depth: DepthMap | None) -> tuple[F64 | None, F64]:
         """The step (4, 4) from the keyframe before, None where its chain begins, and its covariance
         (6, 6): vision's and ICP's, weighted by covariance; vision's alone where ICP contradicts it.
 
@@ -362,7 +360,7 @@ class MakeKeyframe:
         self._debug = debug
 
     def __call__(
-        self, view: StereoCandidate, depth: DepthMap, bgr: U8, sigma_m: F32, fresh: Bool, pose: Pose
+        self, view: StereoView, depth: DepthMap, bgr: U8, sigma_m: F32, fresh: Bool, pose: Pose
     ) -> Keyframe:
         """``depth`` and ``sigma_m`` (h, w) are in units of the odometry."""
         scale = np.float32(pose.scale)

@@ -19,10 +19,10 @@ from recon.pipeline.config import TWO_ONLY, Baseline
 from recon.posegraph.between_keyframes import FixAverage
 from recon.rolling_shutter import NEAR_S, FrameRows, depth_share, on_image
 from recon.row_errors import turn_shares
-from recon.stereo.posed_image import View
+from recon.stereo.posed_image import PosedImage
 from recon.tracking.keyframe_window import (
     OdometryKeyframe,
-    landmarks,
+    landmark_points,
     median_depth,
     step_covariance,
 )
@@ -52,7 +52,7 @@ TRACKED = 128
 """Tracked frames whose places are remembered."""
 
 HELD = 5
-"""Views that wait at most for the first word on a readout that is not stated: all are among
+"""Views that wait at most for the first estimate of a readout that is not stated: all are among
 those kept."""
 
 KNOWN_ROWS = np.zeros((1, 1), np.float32)
@@ -92,7 +92,7 @@ class UndistortedFrame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Viewpoint:
+class ViewCandidate:
     """A tracked frame that may take part in stereo; its pose follows its odometry keyframe's."""
 
     seq: int
@@ -116,7 +116,7 @@ class Viewpoint:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StereoCandidate:
+class StereoView:
     """A view with everything that its reconstruction needs, poses as they are known now."""
 
     seq: int
@@ -124,8 +124,8 @@ class StereoCandidate:
     segment: int
     prior: PosePrior
     bgr: U8  # (H, W, 3) of the view
-    view: View
-    partners: tuple[View, ...]
+    view: PosedImage
+    partners: tuple[PosedImage, ...]
     reference: RelativePose
     points: F64  # (N, 3) landmarks in the view's camera
     covariance: F64  # (6, 6) of vision's motion from the view before, left, in the view's camera
@@ -134,7 +134,7 @@ class StereoCandidate:
     rows_share: F32 = field(default_factory=KNOWN_ROWS.copy)
 
 
-class Viewpoints:
+class ViewSelection:
     """Selects views from tracked frames and remembers the last few as partners."""
 
     def __init__(
@@ -148,10 +148,14 @@ class Viewpoints:
         become partners too.
         """
         self._all_known = all_known
-        self._kept: deque[Viewpoint] = deque(maxlen=KNOWN_KEPT if all_known else KEPT)
-        self._between: deque[Viewpoint] = deque(maxlen=8 * partners if partners > KEPT - 2 else 0)
-        self._recent: deque[Viewpoint] = deque(maxlen=6)  # a quarter of a step apart
-        self._extra: tuple[Viewpoint, list[Viewpoint]] | None = None  # a last view's partner
+        self._kept: deque[ViewCandidate] = deque(maxlen=KNOWN_KEPT if all_known else KEPT)
+        self._between: deque[ViewCandidate] = deque(
+            maxlen=8 * partners if partners > KEPT - 2 else 0
+        )
+        self._recent: deque[ViewCandidate] = deque(maxlen=6)  # a quarter of a step apart
+        self._extra: tuple[ViewCandidate, list[ViewCandidate]] | None = (
+            None  # a last view's partner
+        )
         self._max_partners = partners
         self._views_of: Counter[int] = Counter()  # views by segment
         self._take_next = False
@@ -186,7 +190,7 @@ class Viewpoints:
         """The shortest baseline that stereo should accept: an operator's choice is kept."""
         return 0.03 if self._mode == "auto" else 0.002
 
-    def offer(self, frame: Viewpoint, tracked: Tracked) -> bool:
+    def offer(self, frame: ViewCandidate, tracked: Tracked) -> bool:
         """True when the frame is to be a view."""
         if self._take_next or self._wants(frame.seq, tracked):
             self._take_next = False
@@ -198,7 +202,7 @@ class Viewpoints:
             self._recent.append(replace(frame, colour=None))
         return False
 
-    def end_stretch(self, frame: Viewpoint | None) -> bool:
+    def end_stretch(self, frame: ViewCandidate | None) -> bool:
         """True when the last frame of a stretch must be a view: it shows more than the last one.
         ``frame`` is that frame unless it is a view already. The newest ground is not in the view
         before; a frame between the two becomes its partner.
@@ -226,7 +230,7 @@ class Viewpoints:
             return None
         return _apart(same[-1], same[-2])
 
-    def _moved_on(self, frame: Viewpoint) -> bool:
+    def _moved_on(self, frame: ViewCandidate) -> bool:
         """True a quarter of a step after the last frame that was remembered."""
         step = self._step(frame.segment)
         if step is None:
@@ -234,7 +238,7 @@ class Viewpoints:
         last = max([self._kept[-1], *self._recent], key=lambda v: v.seq)
         return last.segment == frame.segment and _apart(frame, last) > 0.25 * step
 
-    def _keep(self, view: Viewpoint) -> None:
+    def _keep(self, view: ViewCandidate) -> None:
         self._kept.append(view)
         self._views_of[view.segment] += 1
 
@@ -250,7 +254,7 @@ class Viewpoints:
         moved = tracked.T_odom_camera[:3, 3] - last.T_odom_camera[:3, 3]
         return bool(np.linalg.norm(moved) >= self._amount)
 
-    def ready(self, view: Viewpoint) -> bool:
+    def ready(self, view: ViewCandidate) -> bool:
         """True when the view has two neighbours to pair with, or its segment is over."""
         if not self._kept or self._kept[-1] is view:
             return False
@@ -265,15 +269,15 @@ class Viewpoints:
             return sum(v.seq > view.seq for v in self._kept) >= AHEAD
         return sum(v.segment == view.segment for v in self._kept) >= 3
 
-    def confirmed(self, view: Viewpoint) -> bool:
+    def confirmed(self, view: ViewCandidate) -> bool:
         """False for a stretch of two views: no other view can contradict a single pair.
 
         Clouds in the sky or a false first motion would otherwise become surface. A baseline
-        that the operator fixed pairs each view once and is taken at its word.
+        that the operator fixed pairs each view once and is not checked.
         """
         return self._mode != "auto" or self._views_of[view.segment] >= 3
 
-    def partners(self, view: Viewpoint) -> list[Viewpoint]:
+    def partners(self, view: ViewCandidate) -> list[ViewCandidate]:
         """The views to pair it with, the best first.
 
         Automatic: those nearest to the wanted base-to-height, from both sides; a fixed
@@ -294,13 +298,13 @@ class Viewpoints:
             return [*extra, *others[: self._partners]]
         return self._spread(view, others)
 
-    def _wide(self, view: Viewpoint, others: list[Viewpoint]) -> list[Viewpoint]:
+    def _wide(self, view: ViewCandidate, others: list[ViewCandidate]) -> list[ViewCandidate]:
         """Partners of all baselines that stereo can bridge; the nearest where there are none."""
         widest = WIDEST * median_depth(view.key)
         good = [v for v in others if _apart(v, view) <= widest]
         return _evenly(good, KNOWN_PARTNERS * self._partners) or others[: self._partners]
 
-    def _spread(self, view: Viewpoint, others: list[Viewpoint]) -> list[Viewpoint]:
+    def _spread(self, view: ViewCandidate, others: list[ViewCandidate]) -> list[ViewCandidate]:
         """Partners between half and twice the keyframes' spacing, evenly spread."""
         base = [_apart(v, view) for v in others]
         steps = [b for v, b in zip(others, base, strict=True) if v.colour is not None]
@@ -310,13 +314,13 @@ class Viewpoints:
         return _evenly(good, self._partners)
 
 
-def _evenly(views: list[Viewpoint], count: int) -> list[Viewpoint]:
+def _evenly(views: list[ViewCandidate], count: int) -> list[ViewCandidate]:
     """At most ``count`` of the views, evenly spread over their order."""
     picked = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
     return [views[i] for i in picked] if views else []
 
 
-def _apart(a: Viewpoint, b: Viewpoint) -> float:
+def _apart(a: ViewCandidate, b: ViewCandidate) -> float:
     return float(np.linalg.norm(a.T_odom_camera[:3, 3] - b.T_odom_camera[:3, 3]))
 
 
@@ -328,12 +332,12 @@ def frames_apart(chosen: int, every: int) -> int:
     return max(1, round(every / max(chosen - 1, 1)))
 
 
-class StereoViews:
+class VirtualStereoCamera:
     """The virtual stereo camera: takes every frame, gives each view once its partners have come."""
 
     def __init__(
         self,
-        selection: Viewpoints,
+        selection: ViewSelection,
         odometry: AnyTrack,
         camera: Camera,
         seen: U8,
@@ -344,9 +348,9 @@ class StereoViews:
         self._odometry, self._K, self._seen, self._refused = odometry, camera.K, seen, refused
         self._segment = odometry.segment
         self._fixes = FixAverage()
-        self._waiting: deque[tuple[Viewpoint, PosePrior]] = deque()
+        self._waiting: deque[tuple[ViewCandidate, PosePrior]] = deque()
         self._given: deque[RelativePose] = deque(maxlen=8)
-        self._latest: Viewpoint | None = None  # the last tracked frame, unless it is a view
+        self._latest: ViewCandidate | None = None  # the last tracked frame, unless it is a view
         self._tracked: deque[tuple[int, RelativePose]] = deque(maxlen=TRACKED)  # times and places
 
     def take(self, image: UndistortedFrame, tracked: Tracked) -> tuple[RelativePose | None, bool]:
@@ -359,7 +363,7 @@ class StereoViews:
         key = next(key for key in reversed(self._odometry.keyframes) if key.seq <= image.seq)
         T_keyframe_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
         reference = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
-        frame = Viewpoint(
+        frame = ViewCandidate(
             image.seq, image.time_ns, image.prior, image.colour, image.gray, key, reference,
             image.is_blurred, tracked.moving,
         )  # fmt: skip
@@ -378,11 +382,11 @@ class StereoViews:
         self._fixes.forget()
         self._latest = None
 
-    def _wait(self, view: Viewpoint) -> None:
+    def _wait(self, view: ViewCandidate) -> None:
         """Keep a view until its partners are there; all fixes since the last one are its own."""
         self._waiting.append((view, self._fixes.given(view.T_odom_camera, view.prior)))
 
-    def ready(self, everything: bool = False) -> Iterator[StereoCandidate]:
+    def ready(self, everything: bool = False) -> Iterator[StereoView]:
         """The views whose partners are there, in order."""
         while self._waiting and (everything or self._is_ready(self._waiting[0][0])):
             view, prior = self._waiting.popleft()
@@ -395,19 +399,19 @@ class StereoViews:
                 self._given.append(view.reference)
                 yield candidate
 
-    def _is_ready(self, view: Viewpoint) -> bool:
+    def _is_ready(self, view: ViewCandidate) -> bool:
         """True when its partners are there, and the images could show the readout."""
         search, newest = self._odometry.readout, self._waiting[-1][0].moving
         shows = search is not None and search.is_open and newest is not None and newest.is_measured
         return self.selection.ready(view) and not (shows and len(self._waiting) < HELD)
 
-    def _candidate(self, view: Viewpoint, prior: PosePrior) -> StereoCandidate:
-        points = landmarks(view.key)
+    def _candidate(self, view: ViewCandidate, prior: PosePrior) -> StereoView:
+        points = landmark_points(view.key)
         points = se3.transform(se3.inverse(view.reference.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         assert view.colour is not None
         partners, bgr = self.selection.partners(view), view.colour.take()
-        return StereoCandidate(
+        return StereoView(
             view.seq,
             view.time_ns,
             view.segment,
@@ -422,7 +426,7 @@ class StereoViews:
             self._rows_share(view, partners, points),
         )
 
-    def _rows_share(self, view: Viewpoint, partners: list[Viewpoint], points: F64) -> F32:
+    def _rows_share(self, view: ViewCandidate, partners: list[ViewCandidate], points: F64) -> F32:
         """(n, m) sigma of depth over depth by what is not known of readout and turns.
 
         ``points`` (N, 3) of the view's camera are the ground.
@@ -443,7 +447,7 @@ class StereoViews:
         of_turns = turn_shares(rows, pairs, seen, self._K, view.gray.shape[::-1])
         return np.asarray(np.hypot(of_readout, of_turns), np.float32)
 
-    def _step_covariance(self, view: Viewpoint) -> F64:
+    def _step_covariance(self, view: ViewCandidate) -> F64:
         """(6, 6) of the motion since the view given before."""
         last = self._given[-1].keyframe if self._given else None
         since = -1 if last is None else last.seq
@@ -451,9 +455,9 @@ class StereoViews:
         keys = [k for k in self._odometry.keyframes if since < k.seq <= view.key.seq]
         return step_covariance(keys or [view.key], T_camera_odom)
 
-    def _posed(self, view: Viewpoint, points: F64) -> View:
+    def _posed(self, view: ViewCandidate, points: F64) -> PosedImage:
         """The view in gray with its pose; ``points`` (N, 3) of the odometry are the ground."""
-        posed = View(
+        posed = PosedImage(
             None, view.gray, self._K, view.T_odom_camera, self._seen,
             blur_px=self._blur_px(view, points), seq=view.seq,
         )  # fmt: skip
@@ -464,7 +468,7 @@ class StereoViews:
         scene = inverse_depth_plane(ground[ground[:, 2] > 0])
         return replace(posed, rows=rows.now(), scene=scene)
 
-    def _blur_px(self, view: Viewpoint, points: F64) -> F64 | None:
+    def _blur_px(self, view: ViewCandidate, points: F64) -> F64 | None:
         """(2,) px by which the middle of the image moved during the exposure, by the poses of the
         frames before and after; None where images are sharp or those frames are too far away."""
         exposure_s = self._odometry.exposure.shown_s

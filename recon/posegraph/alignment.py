@@ -30,13 +30,13 @@ from recon.posegraph.alignment_readings import (
 from recon.posegraph.anchors import GUESSED_SHARE, INDEPENDENT_HEIGHTS, Anchor
 from recon.posegraph.level_ground import ASSUMED_TILT_RAD
 from recon.posegraph.sensor_noise import (
+    MIN_BIAS,
     MIN_READINGS,
-    MIN_WANDER,
-    SURE_OF_WANDER,
+    SURE_OF_BIAS,
     Noise,
+    bias_time_constant_s,
     drift_noise,
-    wander_noise,
-    wander_s_of,
+    gauss_markov_noise,
 )
 from recon.types import F64
 
@@ -155,21 +155,21 @@ def fit(
     usable = [a for a in anchors if a.prior.R_world_camera is not None or has_fix(a.prior)]
     if not usable:
         return None
-    wander_s = (fix_s, attitude_s)
-    readings = AlignmentReadings(usable, wander_s=wander_s)
+    bias_tau_s = (fix_s, attitude_s)
+    readings = AlignmentReadings(usable, bias_tau_s=bias_tau_s)
     if _velocities_contradict(readings):
         usable = [replace(a, prior=replace(a.prior, travel=None)) for a in usable]
-        readings = AlignmentReadings(usable, wander_s=wander_s)
+        readings = AlignmentReadings(usable, bias_tau_s=bias_tau_s)
     starts = _starts(usable, readings)
     found = [_solve(readings, start, SETTLED_START) for start in starts]
     best = min(found, key=lambda f: f.cost)
-    noise = _measured(usable, best.at, wander_s, slow_share)
+    noise = _measured(usable, best.at, bias_tau_s, slow_share)
     noise = noise.or_else(usual, readings.claimed)
-    readings = AlignmentReadings(usable, noise, wander_s)
+    readings = AlignmentReadings(usable, noise, bias_tau_s)
     best = _solve(readings, best.at, SETTLED)
     covariance = _covariance(readings, best)
     if readings.is_height_assumed:
-        others = AlignmentReadings([replace(a, height=None) for a in usable], noise, wander_s)
+        others = AlignmentReadings([replace(a, height=None) for a in usable], noise, bias_tau_s)
         measured = _solve(others, best.at, SETTLED)
         known = _covariance(others, measured)
         if known[6, 6] < GUESSED_SHARE**2:  # the assumed height would pull the scale
@@ -208,40 +208,40 @@ def _covariance(readings: AlignmentReadings, found: _Solution) -> F64:
 def _measured(
     anchors: Sequence[Anchor],
     start: AlignmentState,
-    wander_s: tuple[float, float],
+    bias_tau_s: tuple[float, float],
     slow_share: float,
 ) -> ReadingNoise:
-    """The noise of fixes and of velocities, each by its residuals to the track as it alone, with
-    the tilt of the attitudes, has it: a compass that is off would look like a drift."""
+    """The noise of fixes and of velocities, each estimated from residuals against a fit of that
+    sensor and the attitudes' tilt alone: a compass that is off would look like a drift."""
     level = [
         replace(a, height=None, prior=replace(a.prior, sigma_yaw_rad=NO_YAW_RAD)) for a in anchors
     ]
     fixed = [replace(a, prior=replace(a.prior, travel=None)) for a in level]
     moved = [replace(a, prior=replace(a.prior, position_m=None)) for a in level]
-    out, at, fixes = ReadingNoise(), start, AlignmentReadings(fixed, None, wander_s)
+    out, at, fixes = ReadingNoise(), start, AlignmentReadings(fixed, None, bias_tau_s)
     # Altitudes that weigh too little leave a lean, which looks like a wander of theirs. So they
     # begin as if they were as good as places.
     if not fixes.is_height_claimed and len(fixes.fix):
-        alike = Noise(float(np.median(fixes.claimed[:, :2])), 0.0, max(wander_s[0], 1.0))
-        fixes = AlignmentReadings(fixed, ReadingNoise(apart=(alike, alike)), wander_s)
+        alike = Noise(float(np.median(fixes.claimed[:, :2])), 0.0, max(bias_tau_s[0], 1.0))
+        fixes = AlignmentReadings(fixed, ReadingNoise(apart=(alike, alike)), bias_tau_s)
     for _ in range(1 if fixes.is_height_claimed else ROUNDS):
         at = _solve(fixes, at, SETTLED_START).at
-        out = _of_fixes(fixes, at, wander_s, slow_share)
-        fixes = AlignmentReadings(fixed, out, wander_s)
-    ways = AlignmentReadings(moved, None, wander_s)
+        out = _of_fixes(fixes, at, bias_tau_s, slow_share)
+        fixes = AlignmentReadings(fixed, out, bias_tau_s)
+    ways = AlignmentReadings(moved, None, bias_tau_s)
     if len(ways.way) >= MIN_READINGS:
         drift = ways.moved(_solve(ways, start, SETTLED_START).at)
         found = drift_noise(np.cumsum(ways.way_s), np.cumsum(drift, axis=0))
         if found is not None:
             # A steady error along a leg looks like another scale: no residual shows it.
-            hidden = Noise(0.0, found[1], RATE_S).reach(USUAL_RATE_M_S, MIN_WANDER)
+            hidden = Noise(0.0, found[1], RATE_S).reach(USUAL_RATE_M_S, MIN_BIAS)
             walk, rate = max(found[0], MIN_WALK), max(found[1], hidden)
             out = replace(out, walk_m_per_sqrt_s=walk, rate_m_s=rate)
     return out
 
 
 def _of_fixes(
-    fixes: AlignmentReadings, at: AlignmentState, wander_s: tuple[float, float], slow_share: float
+    fixes: AlignmentReadings, at: AlignmentState, bias_tau_s: tuple[float, float], slow_share: float
 ) -> ReadingNoise:
     """The noise of fixes and of assumed views, by their residuals to a track.
 
@@ -250,31 +250,33 @@ def _of_fixes(
     accuracy nothing states wander as they are seen to, and by a share of their drift: none is
     steady.
     """
-    fix_s, attitude_s = wander_s
+    fix_s, attitude_s = bias_tau_s
     if len(fixes.fix) < MIN_READINGS:
         return ReadingNoise()
     tilts = fixes.turned(at)[0][fixes.is_assumed, :2]
-    tilt = wander_noise(fixes.tilt_s, tilts, attitude_s, 1.0)
+    tilt = gauss_markov_noise(fixes.tilt_s, tilts, attitude_s, 1.0)
     if tilt is not None:
         tilt = tilt.scattered(tilts).bounded(
-            ASSUMED_TILT_RAD, attitude_s, MIN_WANDER * ASSUMED_TILT_RAD
+            ASSUMED_TILT_RAD, attitude_s, MIN_BIAS * ASSUMED_TILT_RAD
         )
     apart, is_claimed = fixes.placed(at), fixes.is_height_claimed
-    flat_off, high_off = (wander_noise(fixes.fix_s, apart[:, k], fix_s, 1.0) for k in AXES)
-    across = wander_noise(fixes.fix_s, apart[:, :2], fix_s)
-    along = wander_noise(fixes.fix_s, apart[:, 2:], fix_s, SURE_OF_WANDER if is_claimed else 1.0)
+    flat_off, high_off = (gauss_markov_noise(fixes.fix_s, apart[:, k], fix_s, 1.0) for k in AXES)
+    across = gauss_markov_noise(fixes.fix_s, apart[:, :2], fix_s)
+    along = gauss_markov_noise(
+        fixes.fix_s, apart[:, 2:], fix_s, SURE_OF_BIAS if is_claimed else 1.0
+    )
     if across is None or along is None or flat_off is None or high_off is None:
         return ReadingNoise(tilt=tilt)
     claimed = np.median(fixes.claimed, axis=0)
     flat, high = float(claimed[:2].mean()), float(claimed[2])
-    least = 1.0 if is_claimed else MIN_WANDER
+    least = 1.0 if is_claimed else MIN_BIAS
     reach = across.reach(flat, min(least, slow_share))
     span_s = float(np.ptp(fixes.fix_s))
     most, drift = across.reach(flat, slow_share), high if is_claimed else abs(at.drift)
-    flat_s, high_s = wander_s_of(most, fix_s), wander_s_of(high, fix_s)
-    vertical = along.bounded(high, high_s, MIN_WANDER * drift)
+    flat_s, high_s = bias_time_constant_s(most, fix_s), bias_time_constant_s(high, fix_s)
+    vertical = along.bounded(high, high_s, MIN_BIAS * drift)
     return ReadingNoise(
-        horizontal=across.bounded(most, flat_s, MIN_WANDER * most),
+        horizontal=across.bounded(most, flat_s, MIN_BIAS * most),
         vertical=vertical,
         apart=(
             flat_off.drifting(most, flat_s, span_s),

@@ -15,10 +15,10 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.anchors import GUESSED_SHARE, UNMEASURED_HEIGHTS, Anchor, height_ratios
-from recon.posegraph.sensor_noise import Noise, wander_s_of
+from recon.posegraph.sensor_noise import Noise, bias_time_constant_s
 from recon.types import F64, PosePrior
 
-WANDER_SHARE = 0.6
+BIAS_SHARE = 0.6
 """Share of a fix's sigma that differs between fixes of one flight; the rest is common to all."""
 
 KNOWN_YAW_RAD, NO_YAW_RAD = 1.0, 3.0
@@ -82,11 +82,11 @@ class Heights:
         return float(np.sqrt(self.sigma_m**2 + main.sigma_m**2 + drift_m**2))
 
 
-def _together(times_s: F64 | Sequence[float], wander_s: float) -> float:
+def _together(times_s: F64 | Sequence[float], bias_tau_s: float) -> float:
     """Factor on the sigmas of readings at (n,) times whose errors wander with a time constant."""
     if len(times_s) == 0:
         return 1.0
-    independent = 1.0 + float(np.ptp(times_s)) / (2.0 * max(wander_s, 1e-3))
+    independent = 1.0 + float(np.ptp(times_s)) / (2.0 * max(bias_tau_s, 1e-3))
     return float(np.sqrt(max(1.0, len(times_s) / independent)))
 
 
@@ -109,11 +109,13 @@ class ReadingNoise:
         if self.apart is not None:
             across, along = (replace(n, white=max(n.white, MIN_FIX_M)) for n in self.apart)
             single = np.full_like(claimed, [across.total, across.total, along.total])
-            return single, (across.over(across.total), along.over(along.total))
-        tau_s = wander_s_of(float(np.median(claimed[:, 0])), fix_s) if len(claimed) else fix_s
-        common = (WANDER_SHARE**-2 - 1.0) ** 0.5 if fix_s > 0 else 0.0
+            return single, (across.in_units_of(across.total), along.in_units_of(along.total))
+        tau_s = (
+            bias_time_constant_s(float(np.median(claimed[:, 0])), fix_s) if len(claimed) else fix_s
+        )
+        common = (BIAS_SHARE**-2 - 1.0) ** 0.5 if fix_s > 0 else 0.0
         usual = Noise(1.0, common, max(tau_s, 1.0))
-        return WANDER_SHARE * claimed, (usual, usual)
+        return BIAS_SHARE * claimed, (usual, usual)
 
     def or_else(self, usual: ReadingNoise | None, claimed: F64) -> ReadingNoise:
         """The same with the ``usual`` noise of fixes that claim as much, (m, 3), if their own is
@@ -131,7 +133,7 @@ class ReadingNoise:
         if self.tilt is None:
             return np.asarray(claimed * _together(times_s, attitude_s))
         span_s = float(np.ptp(times_s)) if len(times_s) else 0.0
-        return np.full_like(claimed, self.tilt.of_each(len(claimed), span_s))
+        return np.full_like(claimed, self.tilt.effective_sigma(len(claimed), span_s))
 
     def of_mean(self, claimed: F64, times_s: F64, fix_s: float) -> tuple[F64, F64]:
         """(3,) sigma of the mean error of fixes with (m, 3) claimed sigmas at (m,) times, and what
@@ -141,7 +143,7 @@ class ReadingNoise:
             return usual, usual / np.sqrt(1.0 + span_s / (2.0 * fix_s))
         known = (self.horizontal, self.horizontal, self.vertical)
         mean = [one.of_mean(float(m), span_s) for one, m in zip(known, self.reach_m, strict=True)]
-        counted = [one.of_each(len(claimed), span_s) / len(claimed) ** 0.5 for one in known]
+        counted = [one.effective_sigma(len(claimed), span_s) / len(claimed) ** 0.5 for one in known]
         return np.array(mean), np.array(counted)
 
     def of_travels(self, seconds: F64) -> F64:
@@ -174,13 +176,13 @@ class AlignmentReadings:
         self,
         anchors: Sequence[Anchor],
         noise: ReadingNoise | None = None,
-        wander_s: tuple[float, float] = (60.0, 40.0),
+        bias_tau_s: tuple[float, float] = (60.0, 40.0),
     ) -> None:
         turned = [a for a in anchors if a.prior.R_world_camera is not None]
         fixed = [a for a in anchors if has_fix(a.prior)]
         moved = [(a, b, w) for a, b in pairwise(anchors) if (w := _way(a.prior, b.prior))]
         heights, independent = height_ratios(anchors)
-        noise, (fix_s, attitude_s) = noise or ReadingNoise(), wander_s
+        noise, (fix_s, attitude_s) = noise or ReadingNoise(), bias_tau_s
         self.R_odom = _stack([a.T_odom_camera[:3, :3] for a in turned], (3, 3))
         self.R_prior = _stack([a.prior.R_world_camera for a in turned], (3, 3))
         self.is_assumed = np.array([a.prior.is_view_assumed for a in turned], bool)
@@ -200,7 +202,7 @@ class AlignmentReadings:
         self.claimed = _stack([a.prior.sigma_position_m for a in fixed], (3,))
         self.fix_s = _stack([a.time_s for a in fixed], ())
         self.is_height_claimed = all(a.prior.is_sigma_claimed for a in fixed)  # so without any
-        self.sigma_fix, self.wander = noise.of_fixes(self.claimed, fix_s)
+        self.sigma_fix, self.bias = noise.of_fixes(self.claimed, fix_s)
         self.step = _stack([b.place - a.place for a, b, _ in moved], (3,))
         self.way = _stack([metres for *_, (metres, _) in moved], (3,))
         self.way_s = np.maximum(_stack([s for *_, (_, s) in moved], ()), MIN_WAY_S)
@@ -294,7 +296,7 @@ class AlignmentReadings:
     def information(self, extra: F64) -> list[F64]:
         """(m, m) inverse covariances of whitened fixes, horizontal and vertical, each with an
         ``extra`` (2, m) variance of its own."""
-        return [n.information(self.fix_s, e) for n, e in zip(self.wander, extra, strict=True)]
+        return [n.information(self.fix_s, e) for n, e in zip(self.bias, extra, strict=True)]
 
     def alone(self, r: F64, known: Sequence[F64], extra: F64) -> F64:
         """(m,) whitened residual of each fix against what all others tell about its error."""
@@ -326,7 +328,7 @@ class AlignmentReadings:
         """Whitened rows (3 k, c) times the inverse of their covariance: a velocity's slow error
         adds up. An outlier of a ``weight`` (k,) below 1 gets a variance of its own."""
         sigma = self.sigma_speed[:, None]
-        own = self.sigma_speed**2 / np.maximum(weight, TINY) - self._slow.wander**2
+        own = self.sigma_speed**2 / np.maximum(weight, TINY) - self._slow.bias**2
         ways = sigma * rows.reshape(len(sigma), 3 * rows.shape[1])
         return (sigma * self._slow.weighted(self.way_end_s, own, ways)).reshape(rows.shape)
 

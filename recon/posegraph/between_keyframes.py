@@ -41,8 +41,8 @@ class FixAverage:
         if prior.position_m is not None and prior.sigma_position_m is not None:
             self._places.append(T_odom_camera[:3, 3])
             self._fixes.append(prior.position_m)
-        if prior.above_m is not None and prior.above_ns > self._last_ns:
-            self._above[prior.above_ns] = prior.above_m
+        if prior.gnss_minus_baro_m is not None and prior.gnss_minus_baro_ns > self._last_ns:
+            self._above[prior.gnss_minus_baro_ns] = prior.gnss_minus_baro_m
 
     def given(self, T_odom_camera: F64, prior: PosePrior) -> PosePrior:
         """The prior of a keyframe with all that was taken since the last one, and start again."""
@@ -52,12 +52,12 @@ class FixAverage:
             out = replace(out, position_m=np.mean(self._fixes, axis=0), fix_offset=place[0])
         if self._above:
             out = replace(
-                out, above_m=float(np.mean(list(self._above.values()))),
-                above_fixes=len(self._above),
+                out, gnss_minus_baro_m=float(np.mean(list(self._above.values()))),
+                gnss_minus_baro_fixes=len(self._above),
             )  # fmt: skip
             self._last_ns = max(self._above)
-        elif out.above_m is not None:
-            out = replace(out, above_m=None, above_fixes=0)
+        elif out.gnss_minus_baro_m is not None:
+            out = replace(out, gnss_minus_baro_m=None, gnss_minus_baro_fixes=0)
         self.forget()
         return out
 

@@ -21,7 +21,7 @@ from recon.posegraph.anchors import Anchor, height_ratio
 from recon.posegraph.between_keyframes import carried
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.segments import Segments
-from recon.posegraph.sensor_noise import wander_s_of
+from recon.posegraph.sensor_noise import bias_time_constant_s
 from recon.posegraph.smoother import NO_SCALE, Smoother, left_covariance
 from recon.types import F64, PosePrior
 
@@ -49,7 +49,7 @@ UNKNOWN_SCALE = 1.0
 """Sigma of the logarithm of a scale that no reading measures."""
 
 
-class Readings:
+class ReadingFactors:
     """Adds a keyframe's readings to the smoother, and counts what it leaves out."""
 
     def __init__(
@@ -138,10 +138,12 @@ class Readings:
             return False
         if measured is not None and measured.horizontal and measured.vertical:
             known = (measured.horizontal, measured.horizontal, measured.vertical)
-            each = [one.of_each(self._keyframes, self._span_s) for one in known]
+            each = [one.effective_sigma(self._keyframes, self._span_s) for one in known]
             sigma = np.maximum(each, MIN_FIX_M)
         else:
-            sigma = sigma * self._inflated(wander_s_of(float(sigma[0]), self._config.fix_s))
+            sigma = sigma * self._inflated(
+                bias_time_constant_s(float(sigma[0]), self._config.fix_s)
+            )
         self._smoother.add_place("position", node.key, prior.position_m, sigma, self._huber)
         return True
 
@@ -189,7 +191,7 @@ def sound(prior: PosePrior) -> PosePrior:
         sigma_agl_m=max(prior.sigma_agl_m, MIN_FIX_M),
         altitude_m=prior.altitude_m if has_altitude else None,
         sigma_altitude_m=max(prior.sigma_altitude_m, MIN_FIX_M),
-        above_m=prior.above_m if _are_finite(prior.above_m) else None,
+        gnss_minus_baro_m=prior.gnss_minus_baro_m if _are_finite(prior.gnss_minus_baro_m) else None,
     )
 
 
@@ -231,7 +233,7 @@ def _contradiction(a: PosePrior, b: PosePrior, motion: F64) -> tuple[float, F64]
     return float(np.hypot(up[0], up[1])), np.abs(R_a @ motion[:3, 3] - (to_m - from_m))
 
 
-class Motions:
+class MotionFactors:
     """Adds the motions of one graph to its smoother, and keeps the scale of each keyframe."""
 
     def __init__(
@@ -362,8 +364,8 @@ class Motions:
         is_new = node.segment != last.segment
         if is_new and frame is not None and segment.is_tied:
             T = frame.pose(node.T_odom_camera)
-        elif node.over is not None:
-            T = T_last @ node.over
+        elif node.T_prev_segment is not None:
+            T = T_last @ node.T_prev_segment
         else:
             priors = self._segments[last.segment].at_camera(last), segment.at_camera(node)
             T = carried(*priors, T_last, self._velocity(last, T_last), passed_s)

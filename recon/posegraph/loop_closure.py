@@ -134,7 +134,7 @@ def verify(
 ) -> LoopClosure | None:
     """The motion between two keyframes that may see the same place, or None when they do not.
 
-    ``T_a_b_guess`` (4, 4) is the pose graph's word. Where it is too far off, the features that
+    ``T_a_b_guess`` (4, 4) is the pose graph's estimate. Where it is too far off, the features that
     both images share predict instead.
     """
     config = config or LoopConfig()

@@ -16,8 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from recon import bands, se3
-from recon.posegraph.factors import Motions, Readings, is_frozen, sound
-from recon.posegraph.loop_book import LoopBook
+from recon.posegraph.factors import MotionFactors, ReadingFactors, is_frozen, sound
+from recon.posegraph.loop_verification import LoopVerification
 from recon.posegraph.records import Loop, Node, PoseGraphConfig
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_offsets import Constants
@@ -57,7 +57,7 @@ class PoseGraph:
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
         self.segments = Segments(self.config)
-        self.loops = LoopBook(self.config, self)
+        self.loops = LoopVerification(self.config, self)
         self._built = 0
         self._start()
 
@@ -242,11 +242,11 @@ class PoseGraph:
         self._left_out: Counter[str] = Counter()
         times = [n.time_ns for n in self._nodes.values()]
         span_s = (times[-1] - times[0]) * 1e-9 if times else 0.0
-        self._readings = Readings(
+        self._readings = ReadingFactors(
             self.config, self._smoother, self._left_out, len(times), span_s,
             self.segments.altitude_offset(),
         )  # fmt: skip
-        self._motions = Motions(self.config, self._smoother, self.segments, self._left_out)
+        self._motions = MotionFactors(self.config, self._smoother, self.segments, self._left_out)
         self._sources: list[set[str]] = []
         self._path: list[float] = []  # m flown up to each keyframe
 

@@ -48,7 +48,9 @@ class Node:
     height: float | None = None  # above the ground that it sees, in odometry units
     lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
     weight: int = 1  # keyframes since the node before, this one among them
-    over: F64 | None = None  # (4, 4) m, motion since the node of another segment before it
+    T_prev_segment: F64 | None = (
+        None  # (4, 4) m, motion since the node of another segment before it
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -126,7 +126,7 @@ class Segments:
 
     def __init__(self, config: PoseGraphConfig) -> None:
         self._all: dict[int, Segment] = {}
-        self._least, self._wander_s = config.min_anchors, (config.fix_s, config.attitude_s)
+        self._least, self._bias_tau_s = config.min_anchors, (config.fix_s, config.attitude_s)
 
     def __getitem__(self, number: int) -> Segment:
         return self._all[number]
@@ -220,7 +220,7 @@ class Segments:
         segment.fitted, nodes = segment.keyframes, segment.nodes
         fresh = self._newest_constants()
         anchors = self._anchors(segment, fresh)
-        found = alignment.fit(anchors, *self._wander_s, slow_share=fresh.datum.slow_share,
+        found = alignment.fit(anchors, *self._bias_tau_s, slow_share=fresh.datum.slow_share,
                               usual=self._usual_noise())  # fmt: skip
         if found is None:
             return False
@@ -247,7 +247,7 @@ class Segments:
             ([n.T_odom_camera for n in segment.nodes], [n.prior for n in segment.nodes])
             for segment in self
         ]
-        return constants(stretches, span_s, *self._wander_s)
+        return constants(stretches, span_s, *self._bias_tau_s)
 
     def altitude_offset(self) -> float | None:
         """Altitude less world z over all placed keyframes; None without any."""

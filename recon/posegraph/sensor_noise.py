@@ -24,13 +24,13 @@ TAUS_S = (2.0, 5.0, 10.0, 20.0, 40.0)
 TAUS_SEEN = 2.5
 """Time constants that the longest lag must span, so that the variogram is seen to level off."""
 
-SURE_OF_WANDER = 1.4
+SURE_OF_BIAS = 1.4
 """A wander is accepted when the variogram fits so many times better with it."""
 
 PRECISE_TAU_S = 10.0
 """Time constant of a receiver's wander with RTK or PPK."""
 
-MIN_WANDER = 0.25
+MIN_BIAS = 0.25
 """Share of a receiver's claimed sigma by which it always wanders."""
 
 PRECISE_M = 0.3
@@ -60,17 +60,17 @@ class Noise:
     """Errors of one kind of reading, 1 sigma per axis, in the readings' unit."""
 
     white: float
-    wander: float
+    bias: float
     tau_s: float
     steady: float = 0.0  # drift from the middle of the readings to either end
 
     @property
     def total(self) -> float:
-        return float(np.hypot(self.white, self.wander))
+        return float(np.hypot(self.white, self.bias))
 
     def change(self, passed_s: float) -> float:
         """Sigma of the change from one reading to the next after so many seconds."""
-        wandered = self.wander**2 * (1.0 - np.exp(-passed_s / self.tau_s))
+        wandered = self.bias**2 * (1.0 - np.exp(-passed_s / self.tau_s))
         return float(np.sqrt(2.0 * (self.white**2 + wandered)))
 
     def information(self, times_s: F64, extra: F64) -> F64:
@@ -92,14 +92,14 @@ class Noise:
         variances (D + K)^-1 = D^-1 - D^-1 (K^-1 + D^-1)^-1 D^-1 (Woodbury).
         """
         own = self.white**2 + extra
-        if len(own) < 2 or self.wander == 0.0:
-            return np.asarray(rows / (own + self.wander**2)[:, None])
+        if len(own) < 2 or self.bias == 0.0:
+            return np.asarray(rows / (own + self.bias**2)[:, None])
         keep = np.exp(-np.diff(times_s) / self.tau_s)
-        fresh = 1.0 / (self.wander**2 * np.maximum(1.0 - keep**2, MIN_FRESH))
+        fresh = 1.0 / (self.bias**2 * np.maximum(1.0 - keep**2, MIN_FRESH))
         inner = np.zeros((2, len(own)))
         inner[0, 1:] = -keep * fresh
         inner[1] = 1.0 / own
-        inner[1, 0] += self.wander**-2
+        inner[1, 0] += self.bias**-2
         inner[1, 1:] += fresh
         inner[1, :-1] += keep**2 * fresh
         alone = rows / own[:, None]
@@ -112,9 +112,9 @@ class Noise:
         is always there. What was measured beyond the claim is vision's own drift. In both cases
         the time constant is not the sensor's, and the usual one stands in for it.
         """
-        if least <= self.wander <= claimed or usual_tau_s <= 0:
+        if least <= self.bias <= claimed or usual_tau_s <= 0:
             return self
-        return replace(self, wander=min(max(self.wander, least), claimed), tau_s=usual_tau_s)
+        return replace(self, bias=min(max(self.bias, least), claimed), tau_s=usual_tau_s)
 
     def scattered(self, residuals: F64) -> Noise:
         """The same with a wander as large as (N, axes) ``residuals`` scatter, at least.
@@ -124,10 +124,10 @@ class Noise:
         the variogram shows how fast a sensor wanders (wander^2 / tau).
         """
         seen = float(np.mean(np.square(residuals))) - self.white**2
-        if seen <= self.wander**2:
+        if seen <= self.bias**2:
             return self
-        tau_s = self.tau_s * seen / max(self.wander**2, MIN_FRESH * seen)
-        return replace(self, wander=float(np.sqrt(seen)), tau_s=tau_s)
+        tau_s = self.tau_s * seen / max(self.bias**2, MIN_FRESH * seen)
+        return replace(self, bias=float(np.sqrt(seen)), tau_s=tau_s)
 
     def drifting(self, claimed: float, tau_s: float, span_s: float) -> Noise:
         """The same with the steady drift that a wander as far as :meth:`reach` says may have.
@@ -137,26 +137,26 @@ class Noise:
         """
         if tau_s <= 0:
             return self
-        wander = min(self.wander, claimed)
+        wander = min(self.bias, claimed)
         spans = span_s / tau_s
         # Variance of the slope of a Gauss-Markov error: spans / 5 if short, 2 / spans if long.
         slope = 3.0 * spans / (5.0 + 0.5 * spans**2)
-        far = max(self.reach(claimed, MIN_WANDER) ** 2 - wander**2, 0.0)
-        return replace(self, wander=wander, steady=float(np.sqrt(far * slope)))
+        far = max(self.reach(claimed, MIN_BIAS) ** 2 - wander**2, 0.0)
+        return replace(self, bias=wander, steady=float(np.sqrt(far * slope)))
 
-    def over(self, unit: float) -> Noise:
+    def in_units_of(self, unit: float) -> Noise:
         """The same in another unit."""
         return replace(
-            self, white=self.white / unit, wander=self.wander / unit, steady=self.steady / unit
+            self, white=self.white / unit, bias=self.bias / unit, steady=self.steady / unit
         )
 
-    def of_each(self, count: int, span_s: float) -> float:
+    def effective_sigma(self, count: int, span_s: float) -> float:
         """The sigma of each of ``count`` readings over ``span_s``, as if all were independent.
 
         A wander counts as 1 + span / (2 tau) independent errors.
         """
         independent = min(1.0 + span_s / (2.0 * self.tau_s), count)
-        return float(np.sqrt(self.white**2 + self.wander**2 * count / independent))
+        return float(np.sqrt(self.white**2 + self.bias**2 * count / independent))
 
     def of_mean(self, claimed: float, span_s: float) -> float:
         """The sigma of the mean error over ``span_s``, with a wander as far as the sensor claims.
@@ -165,8 +165,8 @@ class Noise:
         not how far: its mean error is in no residual. Of the claim, only the white part averages
         out.
         """
-        far = max(claimed**2 - self.white**2, (MIN_WANDER * claimed) ** 2)
-        tau_s = self.tau_s * max(1.0, far / max(self.wander**2, 1e-12))
+        far = max(claimed**2 - self.white**2, (MIN_BIAS * claimed) ** 2)
+        tau_s = self.tau_s * max(1.0, far / max(self.bias**2, 1e-12))
         return float(np.sqrt(far / (1.0 + span_s / (2.0 * tau_s))))
 
     def reach(self, sigma: float, min_share: float) -> float:
@@ -177,16 +177,16 @@ class Noise:
         as good as each other in their logarithm make the geometric mean. ``min_share`` of the
         variance stays in any case.
         """
-        return float(sigma * np.sqrt(np.clip(self.wander / max(sigma, 1e-9), min_share, 1.0)))
+        return float(sigma * np.sqrt(np.clip(self.bias / max(sigma, 1e-9), min_share, 1.0)))
 
 
-def wander_s_of(sigma_m: float, usual_s: float) -> float:
+def bias_time_constant_s(sigma_m: float, usual_s: float) -> float:
     """The time constant of a receiver that claims ``sigma_m``; 0 where none wanders."""
     return min(PRECISE_TAU_S, usual_s) if sigma_m < PRECISE_M else usual_s
 
 
-def wander_noise(
-    times_s: F64, residuals: F64, usual_tau_s: float, sure: float = SURE_OF_WANDER
+def gauss_markov_noise(
+    times_s: F64, residuals: F64, usual_tau_s: float, sure: float = SURE_OF_BIAS
 ) -> Noise | None:
     """The noise of readings with (N, axes) ``residuals`` at (N,) times; None for too few.
 
@@ -206,7 +206,7 @@ def wander_noise(
             # Means and filtered positions change less over short lags: as if white^2 < 0.
             own, common = np.sqrt(np.maximum(parts, 0.0))
             best, least = Noise(float(own), float(common), tau_s), error
-            sure = max(sure, SURE_OF_WANDER)
+            sure = max(sure, SURE_OF_BIAS)
     return best
 
 

@@ -80,7 +80,7 @@ class Turns:
         return Turns(odom, reported, sigma)
 
 
-def boresight(stretches: Sequence[Turns], span_s: float, wander_s: float = 40.0) -> Boresight:
+def boresight(stretches: Sequence[Turns], span_s: float, bias_tau_s: float = 40.0) -> Boresight:
     """The boresight by all stretches of a flight of ``span_s``; small where turns are missing.
 
     Vision turns with the camera, telemetry with the gimbal or the body. Between flights' headings
@@ -89,13 +89,13 @@ def boresight(stretches: Sequence[Turns], span_s: float, wander_s: float = 40.0)
     doi:10.1109/70.326576). About the vertical they stay one as long as the camera only turns about
     it: a boresight in heading is then a compass error, which the track of the fixes takes out.
 
-    Attitudes err together over ``wander_s``, so all of them count as
+    Attitudes err together over ``bias_tau_s``, so all of them count as
     1 + span / (2 wander) readings.
     """
     count = sum(len(s.R_odom) for s in stretches)
     if count == 0:
         return Boresight()
-    share = min(1.0, (1.0 + span_s / (2.0 * max(wander_s, 1e-3))) / count)
+    share = min(1.0, (1.0 + span_s / (2.0 * max(bias_tau_s, 1e-3))) / count)
     turn, H, norms = np.zeros(3), np.eye(3), np.zeros(0)
     frames = [_mean_frame(s) for s in stretches]
     for _ in range(ROUNDS):
@@ -172,7 +172,7 @@ class AltitudeDatum:
 
 
 def altitude_datum(
-    priors: Sequence[PosePrior], span_s: float, wander_s: float = 60.0
+    priors: Sequence[PosePrior], span_s: float, bias_tau_s: float = 60.0
 ) -> AltitudeDatum:
     """The datum by all fixes of a flight of ``span_s``, in the order of time.
 
@@ -183,12 +183,14 @@ def altitude_datum(
     on the same receiver, so the receiver's mean is taken over only as far as it is the better one.
     Where the scatter could be all of the sigma, it is taken to be, but for what is seen to wander.
 
-    ``wander_s`` is the time constant of a receiver's wander.
+    ``bias_tau_s`` is the time constant of a receiver's wander.
     """
     rows = [
-        (p.above_m, p.above_fixes, p.sigma_position_m[2])
+        (p.gnss_minus_baro_m, p.gnss_minus_baro_fixes, p.sigma_position_m[2])
         for p in priors
-        if p.above_m is not None and p.above_fixes > 0 and p.sigma_position_m is not None
+        if p.gnss_minus_baro_m is not None
+        and p.gnss_minus_baro_fixes > 0
+        and p.sigma_position_m is not None
     ]
     if len(rows) < MIN_INTERVALS:
         return AltitudeDatum()
@@ -204,7 +206,7 @@ def altitude_datum(
     seen = min(_wandered(above[near], fixes[near], white), sigma**2)
     slow = max(sigma**2 - doubt * white**2, seen, (STEADY_SHARE * sigma) ** 2)
     slow_share = min(slow / sigma**2, 1.0)
-    slow /= 1.0 + max(span_s, 0.0) / (2.0 * max(wander_s, 1e-3))
+    slow /= 1.0 + max(span_s, 0.0) / (2.0 * max(bias_tau_s, 1e-3))
     left = slow + white**2 / float(fixes[near].sum())
     share = max(0.0, 1.0 - 2.0 * left / sigma**2)
     left_m = float(np.sqrt(left)) if share > 0 else sigma

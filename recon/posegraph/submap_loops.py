@@ -54,7 +54,7 @@ def verify_surfaces(
 ) -> LoopClosure | None:
     """The motion between two keyframes that may see the same place, or None when they do not.
 
-    ``T_a_b_guess`` (4, 4) is the track's word. The covariance is of a left perturbation in a's
+    ``T_a_b_guess`` (4, 4) is the track's estimate. The covariance is of a left perturbation in a's
     camera frame.
     """
     config = config or SubmapLoopConfig()

@@ -118,7 +118,7 @@ def over_gaps(nodes: Sequence[Node], poses: Mapping[int, F64]) -> list[Node]:
     out = list(nodes[:1])
     for last, node in pairwise(nodes):
         if node.segment != last.segment and node.seq in poses:
-            node = replace(node, over=se3.inverse(poses[last.seq]) @ poses[node.seq])
+            node = replace(node, T_prev_segment=se3.inverse(poses[last.seq]) @ poses[node.seq])
         out.append(node)
     return out
 
@@ -207,7 +207,12 @@ def _with_fix(node: Node, left: Node) -> PosePrior:
         return one
     share, position_m = left.weight / (left.weight + node.weight), one.position_m
     if position_m is None or one.sigma_position_m is None:
-        one = replace(one, sigma_position_m=other.sigma_position_m, above_m=None, above_fixes=0)
+        one = replace(
+            one,
+            sigma_position_m=other.sigma_position_m,
+            gnss_minus_baro_m=None,
+            gnss_minus_baro_fixes=0,
+        )
         share, position_m = 1.0, other.position_m
     elif np.any(other.sigma_position_m > MAX_WORSE * one.sigma_position_m):
         return one
@@ -228,13 +233,20 @@ def _place_of_fix(node: Node) -> F64:
 
 def _with_altitudes(prior: PosePrior, left: PosePrior) -> PosePrior:
     """The prior with both means of the receiver's own altitude, weighed by their fixes."""
-    if left.above_m is None or left.above_fixes == 0 or left.sigma_position_m is None:
+    if (
+        left.gnss_minus_baro_m is None
+        or left.gnss_minus_baro_fixes == 0
+        or left.sigma_position_m is None
+    ):
         return prior
-    if prior.above_m is None or prior.sigma_position_m is None:
+    if prior.gnss_minus_baro_m is None or prior.sigma_position_m is None:
         return prior
-    fixes = prior.above_fixes + left.above_fixes
-    mean = (prior.above_m * prior.above_fixes + left.above_m * left.above_fixes) / fixes
-    return replace(prior, above_m=mean, above_fixes=fixes)
+    fixes = prior.gnss_minus_baro_fixes + left.gnss_minus_baro_fixes
+    mean = (
+        prior.gnss_minus_baro_m * prior.gnss_minus_baro_fixes
+        + left.gnss_minus_baro_m * left.gnss_minus_baro_fixes
+    ) / fixes
+    return replace(prior, gnss_minus_baro_m=mean, gnss_minus_baro_fixes=fixes)
 
 
 def _spread(loop: Loop) -> float:

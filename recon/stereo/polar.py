@@ -20,7 +20,7 @@ from numba import njit
 from recon import se3
 from recon.bands import in_bands
 from recon.image_quality import halved, local_variance, stretch
-from recon.stereo.posed_image import View, VirtualStereoConfig
+from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE, PairDepth, label_at
 from recon.types import F32, F64, U8, Bool, DisparityMap, PolarPair
 
@@ -190,8 +190,8 @@ def is_usable(rays: F64, plane: F64, baseline: float, px_per_rad: float, share: 
 
 
 def rectify_polar(
-    left: View,
-    right: View,
+    left: PosedImage,
+    right: PosedImage,
     points_m: F64,
     plane: F64,
     config: VirtualStereoConfig,
@@ -249,7 +249,7 @@ def rectify_polar(
     )
 
 
-def view_rays(view: View) -> F64:
+def view_rays(view: PosedImage) -> F64:
     """(N, 3) rays of pixels spread evenly over the view, to its border."""
     H, W = view.gray.shape
     u, v = np.meshgrid(np.linspace(0, W - 1, SAMPLES[0]), np.linspace(0, H - 1, SAMPLES[1]))
@@ -261,7 +261,7 @@ def view_rays(view: View) -> F64:
 class _PolarView:
     """A view on the grid of a pair; the right one as it sees what lies at the plane."""
 
-    view: View
+    view: PosedImage
     R_polar_view: F64
     sampling: Sampling
     nearness: F64  # (3,) plane times baseline: the step towards it; zeros for the left view

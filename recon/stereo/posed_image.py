@@ -41,7 +41,7 @@ class VirtualStereoConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class PosedImage:
     """A posed image without distortion that may become a left or right view."""
 
     bgr: U8 | None  # (H, W, 3); only a left view that guides the upsampling needs it

@@ -19,7 +19,7 @@ from recon import se3
 from recon.camera_model import rays, scaled_K
 from recon.image_quality import halved, stretch
 from recon.stereo.polar import axes_about, rectify_polar, view_rays
-from recon.stereo.posed_image import View, VirtualStereoConfig
+from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX
 from recon.types import (
     F32,
@@ -42,7 +42,9 @@ CELL = 8
 """Pixels between two places where the warp of a rolling shutter is computed."""
 
 
-def check_pair(left: View, right: View, depth_m: float, config: VirtualStereoConfig) -> str | None:
+def check_pair(
+    left: PosedImage, right: PosedImage, depth_m: float, config: VirtualStereoConfig
+) -> str | None:
     """The reason why the views make no stereo pair, or None when they do.
 
     ``depth_m`` is the median distance of what the left view sees.
@@ -62,7 +64,7 @@ def check_pair(left: View, right: View, depth_m: float, config: VirtualStereoCon
     return None
 
 
-def is_along_the_view(left: View, right: View, config: VirtualStereoConfig) -> bool:
+def is_along_the_view(left: PosedImage, right: PosedImage, config: VirtualStereoConfig) -> bool:
     """True where the epipole lies in or near one of the images: no plane holds both rectified."""
     T_left_right = se3.inverse(left.T_odom_camera) @ right.T_odom_camera
     t = T_left_right[:3, 3]
@@ -86,8 +88,8 @@ def _overlap(T_left_right: F64, K: F64, size: tuple[int, int], depth_m: float) -
 
 
 def rectify(
-    left: View,
-    right: View,
+    left: PosedImage,
+    right: PosedImage,
     points_m: F64,
     config: VirtualStereoConfig,
     relief_m: tuple[float, float] = (0.0, 0.0),
@@ -140,7 +142,7 @@ def rectify(
     )
 
 
-def _noise(left: View, right: View, axes: tuple[F64, F64], focal_px: float) -> float:
+def _noise(left: PosedImage, right: PosedImage, axes: tuple[F64, F64], focal_px: float) -> float:
     """Sigma of a label over the usual one, by the views' motion blur.
 
     ``axes`` (..., 2, 2) are the directions of the pair's rows and columns in left and right, and
@@ -164,8 +166,8 @@ def _noise(left: View, right: View, axes: tuple[F64, F64], focal_px: float) -> f
 
 
 def _polar(
-    left: View,
-    right: View,
+    left: PosedImage,
+    right: PosedImage,
     points_m: F64,
     config: VirtualStereoConfig,
     relief_m: tuple[float, float],
@@ -192,7 +194,7 @@ def _polar(
 
 
 def _row_baseline(
-    left: View, right: View, T_left_right: F64, points_m: F64, R_rect_left: F64, K: F64,
+    left: PosedImage, right: PosedImage, T_left_right: F64, points_m: F64, R_rect_left: F64, K: F64,
     plane: F64, base: float,
 ) -> tuple[F64, float]:  # fmt: skip
     """Disparity plane of label 0 and baseline of what two rolling shutters show.
@@ -254,7 +256,7 @@ def _rectifying_rotation(T_left_right: F64) -> F64:
 
 
 def _rectified_intrinsics(
-    left: View, R_rect_left: F64, width_px: int
+    left: PosedImage, R_rect_left: F64, width_px: int
 ) -> tuple[F64, tuple[int, int]]:
     """Intrinsics and (w, h) of a rectified image that holds the whole left view."""
     H, W = left.gray.shape
@@ -314,7 +316,9 @@ def _fit_plane(u: F64, v: F64, d: F64) -> tuple[F64, F64]:
     return np.asarray(plane), np.asarray(d - A @ plane)
 
 
-def _homography(view: View, R_rect_view: F64, K: F64, oversample: float, plane: F64 | None) -> F64:
+def _homography(
+    view: PosedImage, R_rect_view: F64, K: F64, oversample: float, plane: F64 | None
+) -> F64:
     """(3, 3) from a pixel of the rectified image (``oversample`` finer) to one of the view.
 
     The shift by the disparity plane is affine along the rows, so it is part of it.
@@ -328,7 +332,7 @@ def _homography(view: View, R_rect_view: F64, K: F64, oversample: float, plane: 
 
 def _warp(
     image: U8,
-    view: View,
+    view: PosedImage,
     R_rect_view: F64,
     K: F64,
     size: tuple[int, int],
@@ -346,7 +350,9 @@ def _warp(
     return _sampled(halved(image, ratio), view, M, fine, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
 
-def _sampled(image: U8, view: View, M: F64, size: tuple[int, int], flags: int, border: int) -> U8:
+def _sampled(
+    image: U8, view: PosedImage, M: F64, size: tuple[int, int], flags: int, border: int
+) -> U8:
     """The view's ``image``, at any scale, of ``size`` (w, h) by ``M`` (3, 3) to the view's pixels.
 
     A rolling shutter's rows are brought to the middle row's time in the same step.
@@ -364,7 +370,7 @@ def _sampled(image: U8, view: View, M: F64, size: tuple[int, int], flags: int, b
     return np.asarray(cv2.remap(image, x, y, flags, borderMode=border), np.uint8)
 
 
-def _row_field(view: View, M: F64, size: tuple[int, int]) -> F32:
+def _row_field(view: PosedImage, M: F64, size: tuple[int, int]) -> F32:
     """(h, w, 2) pixels of the view's image that show what ``M`` (3, 3) leads to at its middle row.
 
     Computed on a grid of CELL pixels and interpolated: the field is smooth.
@@ -383,7 +389,7 @@ def _row_field(view: View, M: F64, size: tuple[int, int]) -> F32:
     return np.asarray(fine[CELL : CELL + h, CELL : CELL + w])
 
 
-def at_middle_row(view: View, image: U8) -> U8:
+def at_middle_row(view: PosedImage, image: U8) -> U8:
     """The view's ``image`` (H, W, 3) as a pinhole camera sees it at the middle row's time."""
     if view.rows is None:
         return image
@@ -392,7 +398,7 @@ def at_middle_row(view: View, image: U8) -> U8:
 
 
 def _stereo_view(
-    view: View, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None
+    view: PosedImage, R_rect_view: F64, K: F64, size: tuple[int, int], plane: F64 | None
 ) -> tuple[U8, Bool]:
     """Gray rectified view (h, w), averaged down from twice its size, and where it shows something,
     a pixel inside the border."""
@@ -403,7 +409,7 @@ def _stereo_view(
     return stretch(gray, seen), seen
 
 
-def _still(view: View) -> View:
+def _still(view: PosedImage) -> PosedImage:
     """The view as a pinhole camera sees it at the middle row's time."""
     if view.rows is None:
         return view

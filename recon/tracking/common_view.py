@@ -191,14 +191,14 @@ class FeatureCache:
         self._of: dict[tuple[int, int], Features] = {}
 
     def common_view(
-        self, a: tuple[int, U8], b: tuple[int, U8], is_still: bool
+        self, a: tuple[int, U8], b: tuple[int, U8], low_frame_rate: bool
     ) -> CommonView | None:
         """What two images, each by number and pixels (H, W), share, or None.
 
         Stills are compared in finer detail where they need it: they are few and far apart.
         """
         view = common_view(self.of(*a), self.of(*b))
-        return self.fine_view(a, b) if view is None and is_still else view
+        return self.fine_view(a, b) if view is None and low_frame_rate else view
 
     def fine_view(self, a: tuple[int, U8], b: tuple[int, U8]) -> CommonView | None:
         """The same in fine detail."""

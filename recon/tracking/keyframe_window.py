@@ -80,8 +80,8 @@ class OdometryKeyframe:
     prior: PosePrior
     pyramid: matching.Pyramid
     uv: F64  # (N, 2) corners
-    landmark: I64  # (N,) number in ``map``, -1 none yet
-    map: Landmarks  # of its segment, in the odometry's frame
+    landmark: I64  # (N,) number in ``landmarks``, -1 none yet
+    landmarks: Landmarks  # of its segment, in the odometry's frame
     moving: FrameRows  # its corners lie where their own rows saw them
 
     @property
@@ -90,8 +90,8 @@ class OdometryKeyframe:
 
     def known_points(self) -> tuple[Bool, F64]:
         """(N,) which corners have a landmark, and (M, 3) those in its camera, in odometry units."""
-        known = self.map.known(self.landmark)
-        return known, se3.transform(self.T_camera_odom, self.map[self.landmark[known]])
+        known = self.landmarks.known(self.landmark)
+        return known, se3.transform(self.T_camera_odom, self.landmarks[self.landmark[known]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +108,7 @@ class TrackingFrame:
     blurred: bool
 
 
-def landmarks(key: OdometryKeyframe) -> F64:
+def landmark_points(key: OdometryKeyframe) -> F64:
     """(N, 3) points in front of the keyframe's camera, in odometry units."""
     _, P = key.known_points()
     return P[P[:, 2] > 0]
@@ -116,7 +116,7 @@ def landmarks(key: OdometryKeyframe) -> F64:
 
 def median_depth(key: OdometryKeyframe) -> float:
     """Median depth of the keyframe's landmarks, in odometry units; NaN without any."""
-    depth = landmarks(key)[:, 2]
+    depth = landmark_points(key)[:, 2]
     return float(np.median(depth)) if depth.size else float("nan")
 
 
@@ -148,7 +148,7 @@ def triangulate(
     )
     gate_px = max(1.5, 2.0 * float(np.median(error)))
     good = (error < min(gate_px, loose_px)) & (angle > min_parallax_rad)
-    key.landmark[rows[good]] = key.map.add(points[good])
+    key.landmark[rows[good]] = key.landmarks.add(points[good])
     ok[rows[error >= gate_px]] = False
 
 
@@ -177,7 +177,7 @@ def adjust_window(window: list[OdometryKeyframe], K: F64) -> AdjustedWindow:
     """Bundle-adjust the keyframes; the two oldest of them hold the frame and scale."""
     fixed = 1 if len(window) == 2 else 2
     ids, index, camera, uv_px = observations(window, K, 2)
-    base, table = _baseline(window), window[0].map
+    base, table = _baseline(window), window[0].landmarks
     free = np.arange(len(window)) >= fixed
     T_camera_odom = np.stack([k.T_camera_odom for k in window])
     result = bundle.adjust(T_camera_odom, table[ids], camera, index, uv_px, K, free, sigma_px=None)
@@ -209,7 +209,7 @@ def _restore_baseline(window: list[OdometryKeyframe], base: float) -> None:
     """Two views leave the scale open; put it back to where it was."""
     factor = base / max(_baseline(window), 1e-9)
     origin = window[0].T_odom_camera[:3, 3]
-    window[0].map.scale_about(origin, factor)
+    window[0].landmarks.scale_about(origin, factor)
     T = window[1].T_odom_camera
     T[:3, 3] = origin + (T[:3, 3] - origin) * factor
     window[1].T_camera_odom = se3.inverse(T)
@@ -233,4 +233,4 @@ def _drop_outliers(
         key = window[c]
         key.landmark[np.isin(key.landmark, gone)] = -1
     good = np.bincount(index[~bad], minlength=len(ids))
-    window[0].map[ids[good < 2]] = np.nan
+    window[0].landmarks[ids[good < 2]] = np.nan

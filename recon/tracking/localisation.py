@@ -18,7 +18,7 @@ from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
 from recon.tracking.common_view import FEATURE_SHARES, CommonView, FeatureCache
 from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame, median_depth
-from recon.tracking.prediction import Motion
+from recon.tracking.prediction import ConstantVelocity
 from recon.types import F64, I64, Bool, Camera, PosePrior
 
 
@@ -37,7 +37,7 @@ class OdometryConfig:
     max_tilt_error_rad: float = 0.35  # vision against attitude: more is a false solution
     loose_px: float = 6.0  # gate of a second try: a rolling shutter bends images that much
     lost_after: int = 8  # frames in a row without a pose before a new segment starts
-    still_gap_s: float = 0.7  # frames further apart are stills: no motion model holds
+    low_rate_gap_s: float = 0.7  # frames further apart are stills: no motion model holds
     matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
     pnp: pnp.PnpConfig = field(default_factory=pnp.PnpConfig)
 
@@ -99,11 +99,11 @@ class Search:
     @property
     def points(self) -> F64:
         """(M, 3) landmarks of the rows :attr:`known`."""
-        return self.key.map[self.key.landmark[self.known]]
+        return self.key.landmarks[self.key.landmark[self.known]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bridge:
+class TwoViewPose:
     """A frame's pose by what it and one keyframe see; its scale is known otherwise, as by that
     keyframe's depths."""
 
@@ -124,19 +124,19 @@ class Localiser:
         self._features = features
 
     def locate(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], motion: Motion,
-        still: bool, lost: bool,
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], motion: ConstantVelocity,
+        low_frame_rate: bool, lost: bool,
     ) -> Located | str:  # fmt: skip
         """The frame against a recent keyframe, averaged with the one before; or why not.
 
         Args:
             motion: where the camera was last and how it moved.
-            still: too long since the frame before for that motion to hold.
+            low_frame_rate: too long since the frame before for that motion to hold.
             lost: the frame before has no pose.
         """
         reason, best = "no match", None
         least = self.config.min_tracks
-        most = None if still else self.config.tracked_landmarks
+        most = None if low_frame_rate else self.config.tracked_landmarks
         for start in self._starts(new, keyframes, motion, lost):
             key, T_camera_odom = start.key, start.T_camera_odom
             left = keyframes[-2] if len(keyframes) > 1 and key is keyframes[-1] else None
@@ -149,7 +149,7 @@ class Localiser:
                 continue
             if best is None or found.explained > best.explained:
                 best = found
-            if not still or found.found_share > CLEAR_SHARE:
+            if not low_frame_rate or found.found_share > CLEAR_SHARE:
                 break
         return reason if best is None else best
 
@@ -163,24 +163,26 @@ class Localiser:
         located = [self.pose_from(key, new, T, share, least) for key in rest]
         return [other for other in located if not isinstance(other, str)]
 
-    def bridge(self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe]) -> Bridge | None:
+    def by_two_views(
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe]
+    ) -> TwoViewPose | None:
         """The frame by two views alone: little of what it shares with a keyframe has landmarks.
 
         The scale is that of the keyframe's landmarks, or where none is shared of the ground
         that they lie on.
         """
-        for key, view in self._views(new, keyframes, is_still=True):
+        for key, view in self._views(new, keyframes, low_frame_rate=True):
             for share in FEATURE_SHARES:
                 guess = view.predict(key.uv, share * self.camera.size_px[0])
                 uv, ok = _find(key, new, guess, self.config.matching)
-                bridge = self._two_views(new, key, uv, ok)
-                if bridge is not None:
-                    return bridge
+                found = self._two_views(new, key, uv, ok)
+                if found is not None:
+                    return found
             corners = key.uv, key.landmark
             tied = self.with_features(new, key, uv, ok)
-            bridge = None if tied is None else self._two_views(new, key, *tied)
-            if bridge is not None:
-                return bridge
+            found = None if tied is None else self._two_views(new, key, *tied)
+            if found is not None:
+                return found
             key.uv, key.landmark = corners
         return None
 
@@ -207,7 +209,7 @@ class Localiser:
 
     def _two_views(
         self, new: TrackingFrame, key: OdometryKeyframe, uv: F64, ok: Bool
-    ) -> Bridge | None:
+    ) -> TwoViewPose | None:
         """The pose by the keyframe's corners found at ``uv`` (N, 2) where ``ok`` (N,)."""
         if ok.sum() < 2 * self.config.min_tracks:
             return None
@@ -231,56 +233,60 @@ class Localiser:
         step = se3.compose(seen.T_b_a[:3, :3], scale * seen.T_b_a[:3, 3])
         good = np.zeros(len(ok), np.bool_)
         good[rows] = True
-        return Bridge(key, step @ key.T_camera_odom, uv, good)
+        return TwoViewPose(key, step @ key.T_camera_odom, uv, good)
 
     def _starts(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], motion: Motion, lost: bool
+        self,
+        new: TrackingFrame,
+        keyframes: Sequence[OdometryKeyframe],
+        motion: ConstantVelocity,
+        lost: bool,
     ) -> Iterator[Start]:
         """Where the camera may be, most trusted first."""
         key = keyframes[-1]
         T_odom_camera, turn, gap_s = motion.ahead(new.time_ns, new.prior)
-        still = gap_s > self.config.still_gap_s
+        low_frame_rate = gap_s > self.config.low_rate_gap_s
         by_motion = se3.inverse(T_odom_camera)
-        if not still or turn is not None:
-            share = self.config.wide_search_share if still else self.config.search_share
+        if not low_frame_rate or turn is not None:
+            share = self.config.wide_search_share if low_frame_rate else self.config.search_share
             yield Start(key, by_motion, share)
-        if still or lost:
-            yield from self._by_features(new, keyframes, still)
-        if not still or turn is None:
+        if low_frame_rate or lost:
+            yield from self._by_features(new, keyframes, low_frame_rate)
+        if not low_frame_rate or turn is None:
             yield Start(key, by_motion, self.config.wide_search_share)
-        if not (still or lost):
-            yield from self._by_features(new, keyframes, still)
+        if not (low_frame_rate or lost):
+            yield from self._by_features(new, keyframes, low_frame_rate)
 
     def _by_features(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], is_still: bool
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
     ) -> Iterator[Start]:
         """Poses by features that the frame shares with recent keyframes, the most first."""
-        for key, view in self._views(new, keyframes, is_still):
+        for key, view in self._views(new, keyframes, low_frame_rate):
             T_camera_odom = self._pose_by(key, view)
             if T_camera_odom is not None:
                 for share in FEATURE_SHARES:
                     yield Start(key, T_camera_odom, share, by_features=True)
 
     def _views(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], is_still: bool
+        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
     ) -> list[tuple[OdometryKeyframe, CommonView]]:
         """Recent keyframes that share features with the frame, the most first."""
         here, views = (new.seq, new.gray), []
         for key in keyframes[-RECALLED:]:
             there = key.seq, key.pyramid.levels[0]
-            view = self._features.common_view(there, here, is_still)
+            view = self._features.common_view(there, here, low_frame_rate)
             if view is not None:
                 views.append((key, view))
         return sorted(views, key=lambda item: -len(item[1]))
 
     def _pose_by(self, key: OdometryKeyframe, view: CommonView) -> F64 | None:
         """T_camera_odom by the keyframe's landmarks, carried to where ``view`` says."""
-        known = np.flatnonzero(key.map.known(key.landmark))
+        known = np.flatnonzero(key.landmarks.known(key.landmark))
         there = view.carry(key.uv[known])
         inside = np.all((there > 0) & (there < self.camera.size_px), axis=1)
         if inside.sum() < 12:
             return None
-        points = key.map[key.landmark[known[inside]]]
+        points = key.landmarks[key.landmark[known[inside]]]
         return robust_geometry.pose_from_points(
             points, there[inside], self.camera.K, cv2.SOLVEPNP_SQPNP
         )
@@ -335,7 +341,7 @@ class Localiser:
         guess, visible = prediction.on_landmarks(
             key, self.camera.K, self.camera.size_px, T_camera_odom, radius_px
         )
-        mapped = key.map.known(key.landmark)
+        mapped = key.landmarks.known(key.landmark)
         in_view, config = float(visible.mean()), self.config.matching
         if taken is not None:
             visible &= ~np.isin(key.landmark, taken)
@@ -432,14 +438,14 @@ class FirstViews:
         self._drift = np.eye(3)
 
     def match(
-        self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64 | None, still: bool
+        self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64 | None, low_frame_rate: bool
     ) -> tuple[F64, Bool]:
         """(N, 2) pixels and (N,) success of the first frame's corners in a new frame.
 
-        ``R_b_a`` (3, 3) is the turn by telemetry; ``still`` images are far apart in time.
+        ``R_b_a`` (3, 3) is the turn by telemetry; ``low_frame_rate`` images are far apart in time.
         """
         uv, ok = first.uv, np.zeros(len(first.uv), np.bool_)
-        for guess in self._guesses(new, first, R_b_a, still):
+        for guess in self._guesses(new, first, R_b_a, low_frame_rate):
             found = _find(first, new, guess, self._config)
             if found[1].sum() > ok.sum():
                 uv, ok = found
@@ -449,16 +455,16 @@ class FirstViews:
         return uv, ok
 
     def _guesses(
-        self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64 | None, still: bool
+        self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64 | None, low_frame_rate: bool
     ) -> Iterator[prediction.Prediction]:
         """Where the corners went, best first."""
-        if not still:
+        if not low_frame_rate:
             yield prediction.by_homography(self._drift, first.uv, self._radius_px)
         if R_b_a is not None:
             H = self._by_telemetry(new, first, R_b_a)
             yield prediction.by_homography(H, first.uv, self._radius_px)
         images = (first.seq, first.pyramid.levels[0]), (new.seq, new.gray)
-        view = self._features.common_view(*images, still)
+        view = self._features.common_view(*images, low_frame_rate)
         if view is not None:
             for radius_px in self._near_px:
                 yield view.predict(first.uv, radius_px)

@@ -29,10 +29,10 @@ from recon.tracking.keyframe_window import (
     median_depth,
     triangulate,
 )
-from recon.tracking.localisation import Bridge, FirstViews, Localiser, Located, OdometryConfig
+from recon.tracking.localisation import FirstViews, Localiser, Located, OdometryConfig, TwoViewPose
 from recon.tracking.matching import Pyramid, harris_grid
 from recon.tracking.motion_blur import ExposureWatch
-from recon.tracking.prediction import Motion
+from recon.tracking.prediction import ConstantVelocity
 from recon.tracking.readout_search import ReadoutSearch
 from recon.types import F64, I64, U8, Bool, Camera, PosePrior
 
@@ -97,7 +97,7 @@ class Odometry:
         self.segment = -1
         self._lost = 0
         self._missed_still: tuple[TrackingFrame, str] | None = None  # the last frame, and why
-        self._motion: Motion | None = None
+        self._motion: ConstantVelocity | None = None
         features = FeatureCache()
         self.exposure = ExposureWatch()
         self._row_track = RowTrack(lens or camera, seeks_readout)
@@ -156,12 +156,12 @@ class Odometry:
         if not self._is_metric:
             return self._second_view(new)
         found = self._localiser.locate(
-            new, self.keyframes, self._moving, self._still, lost=self._lost > 0
+            new, self.keyframes, self._moving, self._low_frame_rate, lost=self._lost > 0
         )
         if not isinstance(found, str):
             return self._accept(new, found)
-        bridge = self._localiser.bridge(new, self.keyframes) if self._still else None
-        return self._missed(new, found) if bridge is None else self._cross(new, bridge)
+        pair = self._localiser.by_two_views(new, self.keyframes) if self._low_frame_rate else None
+        return self._missed(new, found) if pair is None else self._cross(new, pair)
 
     def _expected(self, time_ns: int, prior: PosePrior) -> F64:
         """(4, 4) T_camera_odom of a new frame, as far as it can be foreseen."""
@@ -176,12 +176,12 @@ class Odometry:
         return len(self.keyframes) > 1
 
     @property
-    def _still(self) -> bool:
+    def _low_frame_rate(self) -> bool:
         """Too long since the frame before for a motion model to hold."""
-        return self._gap_ns > 1e9 * self.config.still_gap_s
+        return self._gap_ns > 1e9 * self.config.low_rate_gap_s
 
     @property
-    def _moving(self) -> Motion:
+    def _moving(self) -> ConstantVelocity:
         """The motion since the segment's first frame."""
         assert self._motion is not None
         return self._motion
@@ -189,7 +189,7 @@ class Odometry:
     def _missed(self, new: TrackingFrame, reason: str) -> Tracked:
         """Count a frame without a pose; after too many, or two stills, begin a new segment."""
         self._lost += 1
-        if self._still and self._missed_still is not None and self._lost >= 2:
+        if self._low_frame_rate and self._missed_still is not None and self._lost >= 2:
             (first, why), self._missed_still = self._missed_still, None
             started = self._start(first)
             if started.state is Tracking.STARTED:
@@ -198,9 +198,9 @@ class Odometry:
                     before = replace(started, state=Tracking.KEYFRAME, reason=why)
                     return replace(second, before=before)
                 return second
-        elif not self._still and self._lost >= self.config.lost_after:
+        elif not self._low_frame_rate and self._lost >= self.config.lost_after:
             self._start(new)
-        self._missed_still = (new, reason) if self._still else None
+        self._missed_still = (new, reason) if self._low_frame_rate else None
         return Tracked(Tracking.LOST, self.segment, reason=reason)
 
     def _start(self, new: TrackingFrame) -> Tracked:
@@ -221,7 +221,7 @@ class Odometry:
         unknown = np.full(len(uv), -1, np.int64)
         self.keyframes = [self._keyframe(new, T_camera_odom, uv, unknown, Landmarks())]
         self._row_track.add(new.moving, T_camera_odom)
-        self._motion = Motion(new.time_ns, T_odom_camera, new.prior)
+        self._motion = ConstantVelocity(new.time_ns, T_odom_camera, new.prior)
         return Tracked(Tracking.STARTED, self.segment, T_odom_camera, moving=new.moving)
 
     def _keyframe(
@@ -244,8 +244,8 @@ class Odometry:
         """Wait until the camera has moved enough, then make the first landmarks."""
         first = self.keyframes[0]
         R_b_a = prediction.relative_rotation(first.prior, new.prior)
-        uv, ok = self._first_views.match(new, first, R_b_a, self._still)
-        if self._still and ok.sum() < 2 * self.config.min_tracks:
+        uv, ok = self._first_views.match(new, first, R_b_a, self._low_frame_rate)
+        if self._low_frame_rate and ok.sum() < 2 * self.config.min_tracks:
             uv, ok = self._localiser.with_features(new, first, uv, ok) or (uv, ok)
         if ok.sum() < 2 * self.config.min_tracks:
             return self._missed(new, "too few matches with the first frame")
@@ -268,7 +268,7 @@ class Odometry:
         scale = self._first_landmarks(view, matched[view.inliers], new.prior)
         self._place_early(first)
         second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
-        return self._cross(new, Bridge(first, second @ first.T_camera_odom, uv, ok))
+        return self._cross(new, TwoViewPose(first, second @ first.T_camera_odom, uv, ok))
 
     def _is_no_turn(self, uv_a: F64, uv_b: F64) -> bool:
         """True where no turn of the camera explains matched pixels (N, 2).
@@ -289,7 +289,7 @@ class Odometry:
         uv_a = first.moving.at_middle(self.K, first.uv[ok], far)
         uv_b = new.moving.at_middle(self.K, uv[ok], far)
         view = two_view.solve(uv_a, uv_b, self.K, R_b_a, turn, up_a)
-        if view is None and R_b_a is not None and self._still:  # tags are often wrong
+        if view is None and R_b_a is not None and self._low_frame_rate:  # tags are often wrong
             view = two_view.solve(uv_a, uv_b, self.K, None, np.pi, up_a)
         return view
 
@@ -299,14 +299,14 @@ class Odometry:
         T_odom_a = first.T_odom_camera
         scale = prediction.metric_scale(view, first.prior, prior, T_odom_a)
         points = se3.transform(T_odom_a, view.points[view.inliers] * scale)
-        first.landmark[rows] = first.map.add(points)
+        first.landmark[rows] = first.landmarks.add(points)
         return scale
 
     def _place_early(self, first: OdometryKeyframe) -> None:
         """Poses of the frames after the first; they say how its rows moved."""
         for moving, uv, ok in self._early:
-            rows = np.flatnonzero(ok & first.map.known(first.landmark[: len(ok)]))
-            points = first.map[first.landmark[rows]]
+            rows = np.flatnonzero(ok & first.landmarks.known(first.landmark[: len(ok)]))
+            points = first.landmarks[first.landmark[rows]]
             depth = se3.transform(first.T_camera_odom, points)[:, 2]
             at = moving.at_middle(self.K, uv[rows], 1.0 / depth)
             found = pnp.solve(points, at, self.K, self.config.pnp, first.T_camera_odom)
@@ -339,7 +339,7 @@ class Odometry:
         whole = self._localiser.pose_from(key, new, T_camera_odom, share, self.config.min_tracks)
         found = found if isinstance(whole, str) else whole
         seen = [found]
-        if self._still:  # little overlap: every keyframe that sees the same ground counts
+        if self._low_frame_rate:  # little overlap: every keyframe that sees the same ground counts
             seen += self._localiser.others(new, self.keyframes, found)
         self._add_keyframe(
             new, found.pose.T_camera_points, [(other.key, other.uv, other.ok) for other in seen]
@@ -354,12 +354,12 @@ class Odometry:
             return np.zeros(2)
         return np.asarray(self.K[0, 0] / gap_s * self._moving.across(T_odom_camera, depth))
 
-    def _cross(self, new: TrackingFrame, bridge: Bridge) -> Tracked:
+    def _cross(self, new: TrackingFrame, found: TwoViewPose) -> Tracked:
         """Make a keyframe of a frame that two views alone place."""
         self._lost = 0
-        self._add_keyframe(new, bridge.T_camera_odom, [(bridge.key, bridge.uv, bridge.ok)])
+        self._add_keyframe(new, found.T_camera_odom, [(found.key, found.uv, found.ok)])
         self._moving.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
-        return self._as_keyframe(new, bridge.ok)
+        return self._as_keyframe(new, found.ok)
 
     def _as_keyframe(self, new: TrackingFrame, ok: Bool) -> Tracked:
         """The newest keyframe's outcome, by the corners that are ``ok``."""
@@ -388,7 +388,7 @@ class Odometry:
         )
         uv = np.vstack([kept, fresh])
         landmark = np.concatenate([landmark, np.full(len(fresh), -1, np.int64)])
-        key_new = self._keyframe(new, T_camera_odom, uv, landmark, seen[0][0].map)
+        key_new = self._keyframe(new, T_camera_odom, uv, landmark, seen[0][0].landmarks)
         self.keyframes.append(key_new)
         self._unsettled = key_new if new.moving.rows is not None else None
         window = self.keyframes[-self.config.window - 2 :]
@@ -420,4 +420,4 @@ class Odometry:
         self.keyframes = window
         seen = np.concatenate([k.landmark for k in window])
         if (seen >= 0).any():
-            window[0].map.forget_before(int(seen[seen >= 0].min()))
+            window[0].landmarks.forget_before(int(seen[seen >= 0].min()))

@@ -124,7 +124,7 @@ points."""
 
 
 def base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:
-    """Motion of the nearer matches in focal lengths, with the turn taken out when known.
+    """ConstantVelocity of the nearer matches in focal lengths, with the turn taken out when known.
 
     Without an attitude the turn about the optical axis and the mean shift that a tilt would
     give cannot be distinguished from motion; the shift is then counted as motion.
@@ -186,11 +186,11 @@ STEADY_S = 0.3
 """Velocities of frames closer than this are averaged with those before."""
 
 
-class Motion:
-    """A camera that goes on as it went, and turns as telemetry says. Odometry's own units."""
+class ConstantVelocity:
+    """Constant-velocity motion model; the turn is telemetry's. In units of the odometry."""
 
     def __init__(self, time_ns: int, T_odom_camera: F64, prior: PosePrior) -> None:
-        """At rest there; ``prior`` is telemetry's word of that moment."""
+        """At rest there, with the pose prior of that moment."""
         self._last = (time_ns, T_odom_camera, prior)
         self._velocity = np.zeros(3)
         self._turn_rad_s = 0.0
@@ -214,7 +214,7 @@ class Motion:
     def shift(self, time_ns: int, prior: PosePrior, depth: float) -> tuple[float, float, float]:
         """How far (rad) the ground at ``depth`` moves in the image from the last frame until then,
         by motion and by the turn that telemetry shows, and the seconds. A turn that it does not
-        show goes on as it was, and counts as motion."""
+        show continues at its last rate, and counts as motion."""
         _, turn, gap_s = self.ahead(time_ns, prior)
         moved = float(np.linalg.norm(self._velocity)) * gap_s / depth
         if turn is None:

@@ -150,7 +150,7 @@ def _cost(window: list[OdometryKeyframe], readout_s: float, K: F64) -> tuple[flo
     """Huber cost, px^2, of the window adjusted with a readout, and its redundancy."""
     ids, index, camera, uv = observations(window, K, 3, readout_s)  # two give way to any readout
     T_camera_odom, free = np.stack([k.T_camera_odom for k in window]), np.arange(len(window)) > 0
-    found = bundle.adjust(T_camera_odom, window[0].map[ids], camera, index, uv, K, free)
+    found = bundle.adjust(T_camera_odom, window[0].landmarks[ids], camera, index, uv, K, free)
     error = np.minimum(found.residual_px, 1e3)
     cost = np.where(error < HUBER_PX, error**2, 2.0 * HUBER_PX * error - HUBER_PX**2)
     return float(cost.sum()), 2 * len(error) - 3 * len(ids) - 6 * (len(window) - 1)

@@ -126,7 +126,12 @@ class Rig:
             prior = replace(prior, velocity_m_s=R_ENU_NED @ state.v_ned_m_s)
         if position is not None and state is not None and state.receiver is not None:
             above = state.receiver
-            prior = replace(prior, above_m=above.above_m, above_fixes=1, above_ns=above.time_ns)
+            prior = replace(
+                prior,
+                gnss_minus_baro_m=above.gnss_minus_baro_m,
+                gnss_minus_baro_fixes=1,
+                gnss_minus_baro_ns=above.time_ns,
+            )
         # A position includes the altitude.
         if position is None and state is not None and self._fusion.altitude:
             altitude = state.alt_amsl_m

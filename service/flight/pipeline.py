@@ -16,7 +16,7 @@ from recon.pipeline.config import Baseline, MapperConfig
 from recon.pipeline.events import Event as MapperEvent
 from recon.pipeline.keyframe_map import GraphUpdate
 from recon.pipeline.mapper import Mapper, Reconstruct
-from recon.pipeline.views import StereoCandidate
+from recon.pipeline.views import StereoView
 from recon.tracking.known_track import KnownTrack
 from recon.types import Camera
 from service.background import BackgroundWorker
@@ -38,7 +38,7 @@ COMMON_FOCAL_SHARE, MAX_FOCAL_SHARE = 0.02, 0.05
 """Sigma of the focal length that all points share, so that it would only hide how they err against
 each other, and up to which sigma of depth holds the rest: above a tenth would drop all points."""
 
-DenseWorker = BackgroundWorker[StereoCandidate, GraphUpdate]
+DenseWorker = BackgroundWorker[StereoView, GraphUpdate]
 
 
 def sigma_lens(assumed: Collection[str], sigma_focal: float) -> float:
@@ -119,7 +119,7 @@ class Pipeline(Mapper):
         self._background = DenseWorker(row, partial(self._watched, work), MAX_WAITING, live)
         return self._background
 
-    def _watched(self, work: Reconstruct, view: StereoCandidate) -> GraphUpdate:
+    def _watched(self, work: Reconstruct, view: StereoView) -> GraphUpdate:
         """Do the work, and examine the graph now and then."""
         update = work(view)
         self._doubts.extend(self.watch.look())

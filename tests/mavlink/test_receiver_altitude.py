@@ -31,10 +31,10 @@ def test_fixes_are_compared_at_their_own_time() -> None:
     state = climbing().state_at(round(1.4 * S))
     assert state is not None and state.receiver is not None
     assert state.receiver.time_ns == round(1.05 * S)
-    assert state.receiver.above_m == pytest.approx(1.5, abs=1e-6)
+    assert state.receiver.gnss_minus_baro_m == pytest.approx(1.5, abs=1e-6)
     prior = Rig(CameraConfig(), ScanConfig(), FusionConfig()).prior(state, None)
-    assert prior.above_m == pytest.approx(1.5, abs=1e-6)
-    assert (prior.above_fixes, prior.above_ns) == (1, round(1.05 * S))
+    assert prior.gnss_minus_baro_m == pytest.approx(1.5, abs=1e-6)
+    assert (prior.gnss_minus_baro_fixes, prior.gnss_minus_baro_ns) == (1, round(1.05 * S))
 
 
 def test_an_accuracy_without_altitude_says_nothing() -> None:

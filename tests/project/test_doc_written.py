@@ -17,7 +17,7 @@ from trial_rig import Table
 from recon.posegraph.alignment import HUBER as MIN_FIT_SIGMAS
 from recon.posegraph.alignment import WILD
 from recon.posegraph.factors import BLOCK
-from recon.posegraph.loop_book import CHI2_LIMIT
+from recon.posegraph.loop_verification import CHI2_LIMIT
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.segments import REFIT_GROWTH, SETTLED_GROWTH
 from recon.posegraph.sensor_noise import PRECISE_TAU_S, TAUS_S

@@ -14,7 +14,7 @@ import pytest
 from recon import se3
 from recon.camera_model import project, rays
 from recon.rolling_shutter import RowClock, Rows, RowTrack, depth_share, row_times_s
-from recon.stereo.posed_image import View, VirtualStereoConfig
+from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.virtual_stereo import at_middle_row, rectify
 from recon.tracking import readout_search
 from recon.tracking.keyframe_window import OdometryKeyframe
@@ -199,7 +199,7 @@ def height_errors(flown: list[U8], shutter: Shutter) -> F64:
         assert odometry.track(image, i, int(i * 1e9 / 15), prior).state != "lost"
     off = []
     for key in odometry.keyframes:
-        points = key.map[key.landmark[key.map.known(key.landmark)]]
+        points = key.landmarks[key.landmark[key.landmarks.known(key.landmark)]]
         off.append(points[:, 2] - np.median(points[:, 2]))
     return np.concatenate(off)
 
@@ -229,7 +229,7 @@ def test_frames_after_the_first_tell_how_its_rows_moved(flown: list[U8]) -> None
     assert np.linalg.norm(off) < 0.7 * np.linalg.norm(late)
 
 
-def pair_of(rolling: bool) -> tuple[View, View, F64]:
+def pair_of(rolling: bool) -> tuple[PosedImage, PosedImage, F64]:
     """Two views 6 m apart and points (N, 3) of rough ground in the left one's camera.
 
     The shutter moves with the flight, from the left to the right.
@@ -242,7 +242,7 @@ def pair_of(rolling: bool) -> tuple[View, View, F64]:
         rows = Rows(clock, derivative(t), np.zeros(6)) if rolling else None
         scene = inverse_depth_plane(se3.transform(swinging(t), world))
         blank = np.zeros((H, W), np.uint8)
-        views.append(View(None, blank, K, se3.inverse(swinging(t)), rows=rows, scene=scene))
+        views.append(PosedImage(None, blank, K, se3.inverse(swinging(t)), rows=rows, scene=scene))
     return views[0], views[1], se3.transform(swinging(0.4), world)
 
 
@@ -287,7 +287,7 @@ def test_the_image_becomes_that_of_the_middle_row() -> None:
     down = corners @ T[:3, :3]
     scene = inverse_depth_plane(corners * (-60.0 / down[:, 2])[:, None])
     image = photograph(ground, 0.5, 0.03)
-    view = View(None, image, K, se3.inverse(T), rows=rows, scene=scene)
+    view = PosedImage(None, image, K, se3.inverse(T), rows=rows, scene=scene)
     middle, pinhole = at_middle_row(view, image), photograph(ground, 0.5, 0.0)
     inside = (slice(8, -8), slice(8, -8))
     images = [

@@ -16,10 +16,10 @@ from recon.camera_model import Undistorter
 from recon.pipeline.config import Baseline
 from recon.pipeline.views import (
     Colour,
-    StereoViews,
     UndistortedFrame,
-    Viewpoint,
-    Viewpoints,
+    ViewCandidate,
+    ViewSelection,
+    VirtualStereoCamera,
     frames_apart,
 )
 from recon.rolling_shutter import FrameRows, RowClock, Rows
@@ -30,7 +30,7 @@ from recon.tracking.relative_pose import RelativePose
 from recon.types import U8, Camera, PosePrior
 
 
-def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Viewpoint:
+def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> ViewCandidate:
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
     key = OdometryKeyframe(
         seq, segment, se3.inverse(T), np.eye(6), PosePrior(), Pyramid(()),
@@ -39,12 +39,12 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> View
     image = np.zeros((32, 32, 3), np.uint8)
     reference = RelativePose(seq, segment, np.eye(4), key)
     colour = Colour(image, Undistorter(Camera(np.diag([30.0, 30.0, 1.0]), np.zeros(5), (32, 32))))
-    return Viewpoint(seq, seq, PosePrior(), colour, image[..., 0], key, reference, blurred)
+    return ViewCandidate(seq, seq, PosePrior(), colour, image[..., 0], key, reference, blurred)
 
 
 def offer(
-    views: Viewpoints, seq: int, x_m: float, state: str, segment: int = 0, blurred: bool = False
-) -> Viewpoint | None:
+    views: ViewSelection, seq: int, x_m: float, state: str, segment: int = 0, blurred: bool = False
+) -> ViewCandidate | None:
     taken = frame(seq, x_m, segment, blurred)
     tracked = Tracked(Tracking(state), segment, taken.T_odom_camera)
     return taken if views.offer(taken, tracked) else None
@@ -71,14 +71,14 @@ def test_colour_is_undistorted_when_it_is_taken_and_not_kept() -> None:
 
 
 def test_automatic_takes_the_odometrys_keyframes() -> None:
-    views = Viewpoints(Baseline())
+    views = ViewSelection(Baseline())
     states = ["started", "tracked", "keyframe", "tracked", "keyframe"]
     taken = [offer(views, i, float(i), s) is not None for i, s in enumerate(states)]
     assert taken == [True, False, True, False, True]
 
 
 def test_partners_are_the_nearest_of_the_same_segment() -> None:
-    views = Viewpoints(Baseline(), partners=2)
+    views = ViewSelection(Baseline(), partners=2)
     offer(views, 0, 100.0, "started", segment=0)
     kept = [offer(views, 1 + i, 5.0 * i, "keyframe", segment=1) for i in range(4)]
     middle = kept[1]
@@ -90,13 +90,13 @@ def test_partners_are_the_nearest_of_the_same_segment() -> None:
 
 
 def test_two_views_alone_confirm_nothing() -> None:
-    views = Viewpoints(Baseline())
+    views = ViewSelection(Baseline())
     first = offer(views, 0, 0.0, "started")
     offer(views, 1, 5.0, "keyframe")
     assert first is not None and not views.ready(first) and not views.confirmed(first)
     offer(views, 2, 10.0, "keyframe")
     assert views.ready(first) and views.confirmed(first)
-    fixed = Viewpoints(Baseline("metres", 2.0))
+    fixed = ViewSelection(Baseline("metres", 2.0))
     left = offer(fixed, 0, 0.0, "started")
     offer(fixed, 1, 2.5, "tracked")
     assert left is not None and fixed.ready(left) and fixed.confirmed(left)
@@ -112,13 +112,13 @@ def test_two_views_alone_confirm_nothing() -> None:
 def test_the_papers_notation_takes_every_so_many_frames(
     baseline: Baseline, seqs: list[int]
 ) -> None:
-    views = Viewpoints(baseline)
+    views = ViewSelection(baseline)
     taken = [i for i in range(31) if offer(views, i, 0.1 * i, "keyframe" if i == 0 else "tracked")]
     assert taken[: len(seqs)] == seqs
 
 
 def test_a_baseline_in_metres_is_kept_and_may_change_in_flight() -> None:
-    views = Viewpoints(Baseline("metres", 2.0))
+    views = ViewSelection(Baseline("metres", 2.0))
     taken = [i for i in range(20) if offer(views, i, 0.5 * i, "keyframe" if i == 0 else "tracked")]
     assert taken == [0, 4, 8, 12, 16]
     views.set_baseline(Baseline("metres", 1.0))
@@ -127,7 +127,7 @@ def test_a_baseline_in_metres_is_kept_and_may_change_in_flight() -> None:
 
 
 def test_the_operator_can_ask_for_the_next_frame() -> None:
-    views = Viewpoints(Baseline())
+    views = ViewSelection(Baseline())
     offer(views, 0, 0.0, "started")
     assert offer(views, 1, 0.1, "tracked") is None
     views.take_next()
@@ -140,7 +140,7 @@ def test_frames_apart() -> None:
 
 
 def test_fewer_partners_from_now_on() -> None:
-    views = Viewpoints(Baseline(), partners=4)
+    views = ViewSelection(Baseline(), partners=4)
     kept = [offer(views, i, 5.0 * i, "started" if i == 0 else "keyframe") for i in range(5)]
     middle = kept[2]
     assert middle is not None
@@ -150,7 +150,7 @@ def test_fewer_partners_from_now_on() -> None:
 
 
 def test_blurred_views_are_no_partners() -> None:
-    views = Viewpoints(Baseline(), partners=2)
+    views = ViewSelection(Baseline(), partners=2)
     kept = [
         offer(views, i, 5.0 * i, "keyframe" if i else "started", blurred=i == 1) for i in range(5)
     ]
@@ -159,7 +159,7 @@ def test_blurred_views_are_no_partners() -> None:
 
 
 def test_the_last_frame_of_a_stretch_becomes_a_view_when_it_shows_more() -> None:
-    views = Viewpoints(Baseline())
+    views = ViewSelection(Baseline())
     for i in range(3):
         for j in range(10):
             state = "tracked" if j else "keyframe" if i else "started"
@@ -169,22 +169,22 @@ def test_the_last_frame_of_a_stretch_becomes_a_view_when_it_shows_more() -> None
     last = frame(28, 14.0)
     assert views.end_stretch(last) and [v.seq for v in views.partners(last)] == [23, 20, 10, 0]
     assert not views.end_stretch(None) and len(views.partners(last)) == 4
-    fixed = Viewpoints(Baseline("metres", 2.0))
+    fixed = ViewSelection(Baseline("metres", 2.0))
     for i in range(3):
         offer(fixed, i, 2.5 * i, "tracked" if i else "started")
     assert not fixed.end_stretch(frame(3, 6.5))
 
 
 def test_all_frames_count_where_the_operator_chose_the_baseline_or_wants_the_next_one() -> None:
-    assert Viewpoints(Baseline("metres", 2.0)).frames_per_step == np.inf
-    assert Viewpoints(Baseline("frames", 2, 10)).frames_per_step == np.inf
-    views = Viewpoints(Baseline())
+    assert ViewSelection(Baseline("metres", 2.0)).frames_per_step == np.inf
+    assert ViewSelection(Baseline("frames", 2, 10)).frames_per_step == np.inf
+    views = ViewSelection(Baseline())
     views.take_next()
     assert views.frames_per_step == np.inf
 
 
 def test_as_many_frames_are_needed_as_pair_up() -> None:
-    few, many = Viewpoints(Baseline(), partners=4), Viewpoints(Baseline(), partners=30)
+    few, many = ViewSelection(Baseline(), partners=4), ViewSelection(Baseline(), partners=30)
     assert np.isfinite(few.frames_per_step)
     steps_with_partners = 2.2 - 0.6  # ahead of the first view
     assert many.frames_per_step * steps_with_partners >= 30
@@ -203,13 +203,13 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
         segment=0, readout=SimpleNamespace(doubt_s=doubt_s), keyframes=keys,
         exposure=SimpleNamespace(shown_s=0.0),
     )  # fmt: skip
-    views = StereoViews(
-        Viewpoints(Baseline()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
+    views = VirtualStereoCamera(
+        ViewSelection(Baseline()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
         np.ones(size, np.uint8), Counter(),
     )  # fmt: skip
     for i in range(3):
         plain = frame(i, 5.0 * i)
-        keys.append(replace(plain.key, uv=corners, landmark=ids, map=ground))
+        keys.append(replace(plain.key, uv=corners, landmark=ids, landmarks=ground))
         turn = np.array([0.0, 2.0 * i, 0.0, 0.0, 0.0, 0.0])
         moving = FrameRows(i, PosePrior(), np.eye(4), Rows(clock, turn, np.zeros(6)))
         image = UndistortedFrame(
@@ -238,8 +238,8 @@ def test_views_wait_for_the_first_word_on_their_readout(
     odometry = SimpleNamespace(
         segment=0, readout=search, keyframes=keys, exposure=SimpleNamespace(shown_s=0.0)
     )
-    views = StereoViews(
-        Viewpoints(Baseline()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
+    views = VirtualStereoCamera(
+        ViewSelection(Baseline()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
         np.ones(size, np.uint8), Counter(),
     )  # fmt: skip
     given, counts = [], []
@@ -268,13 +268,13 @@ def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: f
     odometry = SimpleNamespace(
         segment=0, readout=None, keyframes=keys, exposure=SimpleNamespace(shown_s=exposure_s)
     )
-    views = StereoViews(
-        Viewpoints(Baseline()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
+    views = VirtualStereoCamera(
+        ViewSelection(Baseline()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
         np.ones(size, np.uint8), Counter(),
     )  # fmt: skip
     for i in range(4):
         plain = frame(i, float(i))
-        keys.append(replace(plain.key, uv=corners, landmark=ids, map=ground))
+        keys.append(replace(plain.key, uv=corners, landmark=ids, landmarks=ground))
         image = UndistortedFrame(
             i, i * 10**8, PosePrior(), cast(Colour, plain.colour), plain.gray, plain.gray, None,
             False,

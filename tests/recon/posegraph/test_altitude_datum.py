@@ -17,8 +17,8 @@ SIGMA = np.array([1.0, 1.0, 1.5])
 
 def intervals(above: list[float], fixes: int = 5) -> list[PosePrior]:
     return [
-        PosePrior(None, position_m=np.zeros(3), sigma_position_m=SIGMA, above_m=a,
-                  above_fixes=fixes)
+        PosePrior(None, position_m=np.zeros(3), sigma_position_m=SIGMA, gnss_minus_baro_m=a,
+                  gnss_minus_baro_fixes=fixes)
         for a in above
     ]  # fmt: skip
 
@@ -80,13 +80,13 @@ def test_the_mean_of_an_interval_lies_where_its_fixes_were() -> None:
         at = np.array([4.0 * s, 3.0 * np.sin(s), 0.2 * s])
         T = se3.compose(se3.so3_exp(rng.normal(size=3) * 0.05), at)
         fix = scale * R @ at + t
-        prior = PosePrior(R @ T[:3, :3], 0.01, 0.05, fix, SIGMA, above_m=float(i // 2),
-                          above_fixes=1, above_ns=1 + i // 2)  # fmt: skip
+        prior = PosePrior(R @ T[:3, :3], 0.01, 0.05, fix, SIGMA, gnss_minus_baro_m=float(i // 2),
+                          gnss_minus_baro_fixes=1, gnss_minus_baro_ns=1 + i // 2)  # fmt: skip
         average.take(T, prior)
         if i % 8 == 7:
             given = average.given(T, prior)
-            assert given.above_fixes == 4 and given.fix_offset is not None
-            assert given.above_m == pytest.approx(i // 2 - 1.5)
+            assert given.gnss_minus_baro_fixes == 4 and given.fix_offset is not None
+            assert given.gnss_minus_baro_m == pytest.approx(i // 2 - 1.5)
             anchors.append(Anchor(T, given, None))
     found = fit(anchors)
     assert found is not None and found.scale == pytest.approx(scale, rel=1e-3)

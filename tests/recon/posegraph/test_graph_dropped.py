@@ -147,7 +147,9 @@ def test_segments_go_whole_but_neither_the_first_nor_the_newest() -> None:
     assert [
         one.ends for one in moved_loops(loops, marginalised, gone - marginalised.keys(), 9)
     ] == [(0, 9)]
-    found_over = {n.seq: n.over for n in over_gaps(kept, poses) if n.over is not None}
+    found_over = {
+        n.seq: n.T_prev_segment for n in over_gaps(kept, poses) if n.T_prev_segment is not None
+    }
     assert found_over.keys() == {5, 8, 12, 14, 16}
     np.testing.assert_allclose(found_over[8][:3, 3], [2.0, 0.0, 0.0])  # over the seventh
 

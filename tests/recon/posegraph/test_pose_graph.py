@@ -498,8 +498,9 @@ def test_errors_that_are_new_in_each_fix_average_out() -> None:
         for i, T in enumerate(f.truth):
             scatter = 0.2 * rng.normal(size=3) + [0.0, 0.0, zero]  # and the barometer's zero
             f.priors[i] = replace(
-                f.priors[i], position_m=T[:3, 3] + scatter, above_m=rng.normal() * 0.5 - zero,
-                above_fixes=4, sigma_position_m=np.ones(3),
+                f.priors[i], position_m=T[:3, 3] + scatter,
+                gnss_minus_baro_m=rng.normal() * 0.5 - zero,
+                gnss_minus_baro_fixes=4, sigma_position_m=np.ones(3),
             )  # fmt: skip
         found.append(offset_and_sigma(f))
     off, sigma = np.swapaxes(found, 0, 1)

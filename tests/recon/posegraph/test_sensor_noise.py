@@ -20,10 +20,10 @@ from recon.posegraph.between_keyframes import Odometer
 from recon.posegraph.sensor_noise import (
     CHI_SQUARED_MEDIANS,
     Noise,
+    bias_time_constant_s,
     drift_noise,
+    gauss_markov_noise,
     nonnegative,
-    wander_noise,
-    wander_s_of,
 )
 from recon.types import F64, PosePrior, Travel
 
@@ -52,12 +52,12 @@ def test_a_sensor_errs_as_far_as_its_residuals_scatter() -> None:
     moved = np.where(times < 50.0, -4.0, 4.0)[:, None] + np.zeros(2)
     noise = Noise(0.5, 1.0, 10.0)
     found = noise.scattered(moved)
-    assert found.wander**2 + found.white**2 == pytest.approx(16.0)
-    assert found.wander**2 / found.tau_s == pytest.approx(noise.wander**2 / noise.tau_s)
+    assert found.bias**2 + found.white**2 == pytest.approx(16.0)
+    assert found.bias**2 / found.tau_s == pytest.approx(noise.bias**2 / noise.tau_s)
     assert noise.scattered(0.1 * moved) == noise
     assert Noise(0.5, 0.0, 10.0).scattered(moved).tau_s > 1e6  # nothing moves in a short time
     # As unsure as one reading, in place of a mean of a hundred.
-    assert found.of_each(100, 99.0) / 100**0.5 == pytest.approx(found.wander, rel=0.25)
+    assert found.effective_sigma(100, 99.0) / 100**0.5 == pytest.approx(found.bias, rel=0.25)
 
 
 @pytest.mark.parametrize(
@@ -65,21 +65,21 @@ def test_a_sensor_errs_as_far_as_its_residuals_scatter() -> None:
     [(0.02, 60.0, 10.0), (0.29, 60.0, 10.0), (0.3, 60.0, 60.0), (0.02, 0.0, 0.0), (5.0, 0.0, 0.0)],
 )
 def test_precise_receivers_wander_faster(sigma_m: float, usual_s: float, expected_s: float) -> None:
-    assert wander_s_of(sigma_m, usual_s) == expected_s
+    assert bias_time_constant_s(sigma_m, usual_s) == expected_s
 
 
-@pytest.mark.parametrize(("white", "wander", "tau_s"), [(1.0, 0.0, 60.0), (0.1, 1.5, 5.0)])
-def test_white_noise_and_wander_are_separated(white: float, wander: float, tau_s: float) -> None:
+@pytest.mark.parametrize(("white", "bias", "tau_s"), [(1.0, 0.0, 60.0), (0.1, 1.5, 5.0)])
+def test_white_noise_and_wander_are_separated(white: float, bias: float, tau_s: float) -> None:
     found = []
     for seed in range(10):
         rng = np.random.default_rng(seed)
         times = seconds(300, 2.0)
-        errors = gauss_markov(rng, times, wander, tau_s) + white * rng.normal(size=(300, 2))
-        noise = wander_noise(times, errors, 60.0)
+        errors = gauss_markov(rng, times, bias, tau_s) + white * rng.normal(size=(300, 2))
+        noise = gauss_markov_noise(times, errors, 60.0)
         assert noise is not None
-        found.append((noise.white, noise.wander, noise.of_each(300, 600.0)))
-    each = Noise(white, wander, tau_s).of_each(300, 600.0)
-    assert np.median(found, axis=0) == pytest.approx([white, wander, each], rel=0.2, abs=0.15)
+        found.append((noise.white, noise.bias, noise.effective_sigma(300, 600.0)))
+    each = Noise(white, bias, tau_s).effective_sigma(300, 600.0)
+    assert np.median(found, axis=0) == pytest.approx([white, bias, each], rel=0.2, abs=0.15)
 
 
 @pytest.mark.parametrize("count", [1, 2, 40])
@@ -127,9 +127,9 @@ def test_a_filtered_wander_keeps_its_speed_where_readings_come_fast() -> None:
         fine = seconds(600, 0.1)
         errors = gauss_markov(np.random.default_rng(seed), fine, 0.5, 60.0)[:, :1]
         at = np.r_[0:60:2, 60:540:10, 540:600:2]
-        noise = wander_noise(fine[at], gaussian_filter1d(errors, 5.0, axis=0)[at], 60.0)
+        noise = gauss_markov_noise(fine[at], gaussian_filter1d(errors, 5.0, axis=0)[at], 60.0)
         assert noise is not None
-        found.append(noise.wander / np.sqrt(noise.tau_s) / true)
+        found.append(noise.bias / np.sqrt(noise.tau_s) / true)
     low, middle, high = np.percentile(found, [10, 50, 90])
     assert low > 0.55 and 0.7 < middle < 1.1 and high < 1.3
 
@@ -139,7 +139,7 @@ def test_outliers_do_not_count_as_noise() -> None:
     times = seconds(100)
     errors = 0.5 * rng.normal(size=(100, 2))
     errors[10:90:9] += 40.0
-    noise = wander_noise(times, errors, 60.0)
+    noise = gauss_markov_noise(times, errors, 60.0)
     assert noise is not None and noise.total < 1.0
 
 

@@ -19,7 +19,7 @@ from recon.backends import load_backend
 from recon.pipeline import stages
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.polar import reproject_polar
-from recon.stereo.posed_image import View, VirtualStereoConfig
+from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.virtual_stereo import (
     drop_unseen,
     rectify,
@@ -90,7 +90,7 @@ def rectified() -> list[tuple[int, int]]:
 
 @pytest.fixture(scope="module")
 def keyframes(rectified: list[tuple[int, int]]) -> Iterator[list[Keyframe]]:
-    def noted(left: View, right: View, *rest: Any) -> RectifiedPair | str:
+    def noted(left: PosedImage, right: PosedImage, *rest: Any) -> RectifiedPair | str:
         found = rectify(left, right, *rest)
         if not isinstance(found, str):
             rectified.append((left.seq, right.seq))
@@ -182,7 +182,7 @@ def test_sigma_covers_motion_blur(blurs_px: tuple[float, float]) -> None:
     levels, views = ground(), []
     for i, blur in zip((0, 7), blurs_px, strict=True):
         blurred = np.array([0.0, blur])
-        views.append(View(None, shot(levels, pose(i), blur), K, pose(i), blur_px=blurred))
+        views.append(PosedImage(None, shot(levels, pose(i), blur), K, pose(i), blur_px=blurred))
     left, right = views
     truth = ground_depth(left.T_odom_camera, K, CAMERA.size_px)
     v, u = np.nonzero(truth < 200.0)

@@ -10,7 +10,7 @@ from painted_ground import CAMERA, FOOTPRINT_M, HEIGHT_M, SIZE, K, on_plane, pos
 from recon import se3
 from recon.camera_model import scaled_K
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
-from recon.stereo.posed_image import View, VirtualStereoConfig
+from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import reproject
 from recon.stereo.upsampling import UpsamplingConfig, upsample
 from recon.stereo.virtual_stereo import drop_unseen, rectify
@@ -27,7 +27,7 @@ def heights(width_px: int, upsampled: bool, east_m: float, min_known: float = 0.
     for T in (pose(0.0, 10.0, seed=1), pose(east_m, 10.0, seed=2)):
         T[:3, :3] = se3.so3_exp(np.array([0.1, 0.15, 0.0])) @ T[:3, :3]
         image = still(T)
-        views.append(View(np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)), image, K, T))
+        views.append(PosedImage(np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)), image, K, T))
     left, right = views
     w, h = width_px, round(width_px * SIZE[1] / SIZE[0])
     K_grid = scaled_K(CAMERA.K, w / SIZE[0], h / SIZE[1])

@@ -9,7 +9,7 @@ import pytest
 
 from recon import se3
 from recon.stereo.polar import reproject_polar
-from recon.stereo.posed_image import View, VirtualStereoConfig
+from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX
 from recon.stereo.virtual_stereo import rectify
 from recon.types import F64, U8, DisparityMap, PolarPair, StereoPair
@@ -37,8 +37,8 @@ def ramp(axis: int) -> U8:
     return np.asarray((v, u)[axis].round(), np.uint8)
 
 
-def view(T: F64, axis: int = 1) -> View:
-    return View(None, ramp(axis), K, T)
+def view(T: F64, axis: int = 1) -> PosedImage:
+    return PosedImage(None, ramp(axis), K, T)
 
 
 def on_ground(T: F64, uv: F64, K: F64, height: F64 | float = 0.0) -> F64:
@@ -62,7 +62,9 @@ def projected(T: F64, points: F64, K: F64 = K) -> F64:
     return np.asarray(P[:, :2] / P[:, 2:])
 
 
-def flown(motion: F64, pitch_deg: float, turn: F64, axis: int = 1) -> tuple[View, View, F64]:
+def flown(
+    motion: F64, pitch_deg: float, turn: F64, axis: int = 1
+) -> tuple[PosedImage, PosedImage, F64]:
     left = view(camera(np.array([0.0, 0.0, HEIGHT_M]), pitch_deg), axis)
     right = view(camera(np.array([0.0, 0.0, HEIGHT_M]) + motion, pitch_deg, turn), axis)
     return left, right, landmarks(left.T_odom_camera, np.random.default_rng(0))
@@ -111,7 +113,9 @@ def test_pair_and_depth_agree_with_projection(seed: int, monkeypatch: pytest.Mon
     assert checked > 10
 
 
-def label_of(pair: PolarPair, left: View, right: View, away: float, about: float, at: F64) -> float:
+def label_of(
+    pair: PolarPair, left: PosedImage, right: PosedImage, away: float, about: float, at: F64
+) -> float:
     """The label whose place on the plane the right view sees at the pixel ``at``, by search."""
 
     def off(label: F64) -> F64:

@@ -13,7 +13,7 @@ from recon import se3
 from recon.backends.cpu import CpuBackend
 from recon.pipeline.config import untimed
 from recon.pipeline.stages import Carry, ViewGrid
-from recon.stereo.posed_image import View
+from recon.stereo.posed_image import PosedImage
 from recon.stereo.reprojection import LABEL_SIGMA_PX, PairDepth, carry, reproject
 from recon.types import F64, DisparityMap, StereoPair
 from service.compute.backend_choice import FallbackBackend
@@ -139,7 +139,7 @@ def test_a_pairs_depth_is_carried_to_the_other_view(move_m: tuple[float, float, 
 def test_a_pair_is_matched_once_on_a_backend_that_gives_its_depth() -> None:
     """ONNX Runtime's too, behind the fallback; not on a device that keeps the depth of pairs."""
     gray, T = np.zeros((180, 320), np.uint8), np.eye(4)
-    here, there = (View(None, gray, K, T, seq=seq) for seq in (1, 0))
+    here, there = (PosedImage(None, gray, K, T, seq=seq) for seq in (1, 0))
     again: Any = SimpleNamespace(view=here, partners=(there,))
     depth = np.full((180, 320), 60.0, np.float32)
     for keeps_pairs, found in ((False, [0]), (True, [])):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon import se3
-from recon.stereo.posed_image import View, VirtualStereoConfig
+from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import reproject
 from recon.stereo.virtual_stereo import (
     _homography,
@@ -22,11 +22,13 @@ K = np.array([[500.0, 0, 319.5], [0, 500.0, 179.5], [0, 0, 1]])
 CONFIG = VirtualStereoConfig(width_px=160)
 
 
-def view(seq: int, centre: tuple[float, float, float], turn: tuple[float, float, float]) -> View:
+def view(
+    seq: int, centre: tuple[float, float, float], turn: tuple[float, float, float]
+) -> PosedImage:
     R = se3.so3_exp(np.array(turn)) @ np.diag([1.0, -1, -1])
     rng = np.random.default_rng(seq)
     image: U8 = rng.integers(0, 255, (H, W, 3), dtype=np.uint8)
-    return View(image, image[..., 0].copy(), K, se3.compose(R, np.array(centre)))
+    return PosedImage(image, image[..., 0].copy(), K, se3.compose(R, np.array(centre)))
 
 
 def ground(rng: np.random.Generator, n: int = 500, relief: float = 6.0) -> F64:

@@ -87,8 +87,8 @@ def textured(shared_px: float, own_px: float, own: float) -> list[U8]:
 def test_stills_that_share_fine_detail_alone_are_compared_in_fine_detail() -> None:
     a, b = enumerate(textured(shared_px=1.8, own_px=8.0, own=20.0))
     cache = FeatureCache()
-    assert cache.common_view(a, b, is_still=False) is None
-    view = cache.common_view(a, b, is_still=True)
+    assert cache.common_view(a, b, low_frame_rate=False) is None
+    view = cache.common_view(a, b, low_frame_rate=True)
     assert view is not None
     np.testing.assert_allclose(view.carry(np.array([[640.0, 360.0]])), [[540.0, 360.0]], atol=2.0)
 

@@ -10,7 +10,7 @@ from painted_ground import painted_ground
 
 from recon import se3
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
-from recon.stereo.posed_image import View, VirtualStereoConfig
+from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import reproject
 from recon.stereo.virtual_stereo import drop_unseen, rectify
 from recon.tracking.motion_blur import ExposureWatch, streak_px
@@ -146,7 +146,7 @@ def test_the_sigma_of_stereo_covers_motion_blur(
     for east_m, seed, blur in ((0.0, 1, left_px), (6.0, 2, right_px)):
         T = painted.pose(east_m, seed=seed)
         image, blur_px = shot(T, np.array(blur)), -np.array(blur)
-        views.append(View(None, image, painted.K, T, blur_px=blur_px))
+        views.append(PosedImage(None, image, painted.K, T, blur_px=blur_px))
     left, right = views
     on_plane = painted.on_plane(painted.K, painted.SIZE, left.T_odom_camera)
     config = VirtualStereoConfig(width_px=painted.SIZE[0], guided=False)

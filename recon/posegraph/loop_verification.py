@@ -32,7 +32,7 @@ class Track(Protocol):
     def path_m(self, a: int, b: int) -> float: ...
 
 
-class LoopBook:
+class LoopVerification:
     """Loops that were offered, and which of them the map rests on."""
 
     def __init__(self, config: PoseGraphConfig, track: Track) -> None:
