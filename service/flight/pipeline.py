@@ -97,6 +97,7 @@ class Pipeline(Mapper):
         limit_threads(config.compute.threads)
         self.stopwatch, self._pages = Stopwatch(), pages
         self._max_voxels = config.compute.map_voxels
+        self._known: PagedMap | None = None  # the newest map of known surface
         self._doubts: deque[str] = deque()  # found on the worker, taken by the operator's thread
         row = "dense" if in_background and not config.scan.keep_debug else None
         camera = with_shutter(camera, config.camera)
@@ -113,7 +114,8 @@ class Pipeline(Mapper):
         self.watch = GraphWatch(self.keyframes.graph)
 
     def _paged(self, fine: VoxelMapConfig) -> PagedMap:
-        return PagedMap(fine, self._pages, self._max_voxels)
+        self._known = PagedMap(fine, self._pages, self._max_voxels)
+        return self._known
 
     def _in_background(self, row: str | None, live: bool, work: Reconstruct) -> DenseWorker:
         self._background = DenseWorker(row, partial(self._watched, work), MAX_WAITING, live)
@@ -131,11 +133,10 @@ class Pipeline(Mapper):
 
     def finish(self) -> tuple[MapperEvent, ...]:
         """As :meth:`Mapper.finish`; the pages of the map are gone."""
-        known = self.surface.known
         try:
             return super().finish()
         finally:
-            _close(known)
+            self.reset_map()
 
     def end_by(self, stop: Event, patience_s: float) -> None:
         """Drop unfinished reconstructions, at most ``patience_s`` after ``stop`` is set."""
@@ -153,9 +154,10 @@ class Pipeline(Mapper):
 
     def reset_map(self) -> None:
         """Reset the map: all surface counts as unseen."""
-        known = self.surface.known
+        known, self._known = self._known, None
         self.surface.clear()
-        _close(known)
+        if known is not None:
+            known.close()
 
     # ---- figures -----------------------------------------------------------------------
 
@@ -173,14 +175,8 @@ class Pipeline(Mapper):
     def held(self) -> dict[str, int]:
         """Memory that this scan takes: the map's voxels, its tiles on disk, views for loops,
         and keyframes in the pose graph."""
-        known = self.surface.known
-        paged = known if isinstance(known, PagedMap) else None
+        known = self._known
         return {
-            "map_voxels": 0 if paged is None else len(paged),
-            "map_tiles_on_disk": 0 if paged is None else paged.tiles_on_disk,
+            "map_voxels": 0 if known is None else len(known),
+            "map_tiles_on_disk": 0 if known is None else known.tiles_on_disk,
         } | self.keyframes.held
-
-
-def _close(known: object) -> None:
-    if isinstance(known, PagedMap):
-        known.close()

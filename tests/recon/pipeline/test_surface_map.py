@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from recon import se3
+from recon.backends.cpu import CpuBackend
 from recon.mapping.disagreement import MIN_FACTOR
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from recon.pipeline.surface_map import SurfaceMap
 from recon.pipeline.views import KNOWN_ROWS
-from recon.types import F64, DepthMap
+from recon.types import F64, Camera, DepthMap
 from service.cameras.lens import SIGMA_K1
+from service.config import load_config
 from service.flight.paged_map import MAX_OVER, PagedMap
-from service.flight.pipeline import sigma_lens
+from service.flight.pipeline import Pipeline, sigma_lens
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
 NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -99,6 +101,24 @@ def test_tiles_under_a_view_hold_all_of_its_voxels() -> None:
         np.full((4, 4), np.nan, np.float32), depth.sigma_m, depth.views, K, depth.T_world_camera
     )
     assert len(tiles_under(blind, 0.5, 1.0)) == 0
+
+
+def test_pages_of_a_map_that_begins_at_the_very_end_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a few stills all surface comes when the scan is closed."""
+    pages, config = tmp_path / "pages", load_config(None, ["compute.map_voxels=1000"])
+    pipeline = Pipeline(Camera(K, np.zeros(5), (80, 60)), config, CpuBackend(), pages)
+
+    def drain() -> tuple[()]:
+        for depth in survey()[:40]:
+            pipeline.surface(0, depth, KNOWN_ROWS, depth.T_world_camera)
+        assert pages.exists() and pipeline.held["map_tiles_on_disk"] > 0
+        return ()
+
+    monkeypatch.setattr(pipeline, "drain", drain)
+    pipeline.finish()
+    assert not pages.exists() and pipeline.held["map_voxels"] == 0
 
 
 def test_nonsense_limits_are_refused(tmp_path: Path) -> None:
