@@ -305,11 +305,11 @@ def test_the_image_becomes_that_of_the_middle_row() -> None:
 def test_a_sure_readout_names_a_shutter(readout_s: float, way: str, expected: Shutter) -> None:
     def found(sigma_s: float) -> Shutter | None:
         search = SimpleNamespace(estimate=ReadoutEstimate(readout_s, sigma_s, 3))
-        stages = SimpleNamespace(track=SimpleNamespace(odometry=SimpleNamespace(readout=search)))
+        pipeline = SimpleNamespace(odometry=SimpleNamespace(readout=search))
         config = Config()
         config = replace(config, camera=replace(config.camera, readout_ms="auto"))
         inputs = SimpleNamespace(camera=replace(PLAIN, shutter=Shutter(0.0, way)), config=config)
-        scan = SimpleNamespace(pipeline=SimpleNamespace(stages=stages), inputs=inputs)
+        scan = SimpleNamespace(pipeline=pipeline, inputs=inputs)
         return Scan.found_shutter(cast(Scan, scan))
 
     assert found(0.001) == expected
