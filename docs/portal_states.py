@@ -1,24 +1,30 @@
-"""Screenshots of the portal's states at the sizes of a desktop and a phone.
+"""Screenshots of the portal's states at the sizes of a desktop and a phone, and a sheet of them.
 
-    PYTHONPATH=tests/support python docs/portal_states.py STORE OUT
+    PYTHONPATH=tests/support python docs/portal_states.py STORE OUT [BEFORE]
 
-STORE is a ground station's folder; its newest scan is shown. Needs Chromium, the built page and
-the extras "ground" and "dev". Maps, mesh and report are shown where the scan has them.
+STORE is a ground station's folder; its newest scan is shown. BEFORE is the OUT of another version:
+the sheet then has each state of it beside the present one. Needs Chromium, the built page, Pillow
+and the extras "ground" and "dev". Maps, mesh, report and another date are shown where there are
+such.
 """
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from person import Browser
+from PIL import Image, ImageDraw
 from playwright.sync_api import sync_playwright
 
 from service.ground.portal import Portal, PortalConfig
 
 SIZES = {"desktop": (1440, 900), "phone": (390, 844)}
-WAIT_S = 120.0
+HIGH_PX, GAP_PX, LABEL_PX = 300, 8, 18
+"""A state on the sheet."""
+WAIT_S, STILL_S = 120.0, 20.0
 PRESS = "[...document.querySelectorAll('button')].find(b => b.textContent === '{}').click()"
 COLOUR = (
     "(s => {{ s.value = '{}'; s.dispatchEvent(new Event('change', {{ bubbles: true }})) }})"
@@ -28,9 +34,15 @@ STILL = "new Promise(r => setTimeout(r, 2000)).then(() => document.body.dataset.
 OPEN = (
     "[...document.querySelectorAll('details')].find(d => d.textContent.startsWith('{}')).open = {}"
 )
-FLY_AGAIN = (
-    "[...document.querySelectorAll('.layers label')].find(l => l.textContent.includes('Fly again'))"
+LAYER = (
+    "[...document.querySelectorAll('.layers label')].find(l => l.textContent.includes('{}'))"
     ".querySelector('input').click()"
+)
+MAP = "new Promise(r => setTimeout(r, 1000)).then(() => document.body.dataset.map === 'shown')"
+OTHER_DATE = (
+    "(s => { if (s.length < 2) return false; s.selectedIndex = 1;"
+    " s.dispatchEvent(new Event('change')); return true })"
+    "(document.querySelector('.compare select'))"
 )
 CLICKS = ((0.45, 0.55), (0.58, 0.5), (0.5, 0.62))
 """Places of the scene that are measured, in its widths and heights."""
@@ -88,25 +100,42 @@ def shots(browser: Browser, base: str, scan: Path, out: Path) -> None:
     browser.open(f"{base}/#/")
     browser.wait("document.querySelector('article img')?.complete", WAIT_S)
     shot("library")
-    browser.run("document.querySelectorAll('article details').forEach(d => d.open = true)")
-    shot("library-open")
-    press("Make")(browser)
-    browser.wait("!document.querySelector('.jobs').hidden", WAIT_S)
+    press("Export…")(browser)
+    browser.wait("document.querySelectorAll('.product').length > 0", WAIT_S)
+    shot("library-export")
+    browser.run("document.querySelector('[aria-label^=\"Make Contours, DXF\"]').click()")
+    browser.wait("document.querySelector('.product .jobs li')", WAIT_S)
     shot("library-job")
-    press("Cancel")(browser)
+    browser.key("Escape")
     browser.open(f"{base}/#/view/{where}")
     browser.wait("Number(document.body.dataset.points) > 0", WAIT_S)
     for name, acts in view_states(scan):
         for act in acts:
             act(browser)
-        browser.wait(STILL, WAIT_S)
+        with contextlib.suppress(RuntimeError):  # software rendering of a large scan never rests
+            browser.wait(STILL, STILL_S)
         shot(name)
     browser.open(f"{base}/#/map/{where}")
-    browser.wait("document.body.dataset.map === 'shown'", WAIT_S)
+    browser.wait(MAP, WAIT_S)
     shot("map")
-    browser.run(FLY_AGAIN)
+    browser.run(LAYER.format("Fly again"))
     browser.wait("document.querySelector('.layers output').textContent", WAIT_S)
     shot("map-again")
+    for layer in ("Fly again", "Height", "Contours"):
+        browser.run(LAYER.format(layer))
+    browser.wait(MAP, WAIT_S)
+    press("Measure")(browser)
+    box = browser.page.locator(".map").bounding_box()
+    assert box is not None
+    for x, y in CLICKS:
+        browser.page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+    shot("map-measure")
+    browser.key("Escape")
+    browser.key("Escape")
+    if browser.run(OTHER_DATE):
+        browser.run(LAYER.format("Height"))
+        browser.wait(MAP, WAIT_S)
+        shot("map-dates")
     browser.open(f"{base}/#/view/{scan.parent.name}/no-such-scan")
     browser.wait("document.querySelector('h1').textContent.startsWith('There is no')", WAIT_S)
     shot("unknown")
@@ -116,8 +145,32 @@ def shots(browser: Browser, base: str, scan: Path, out: Path) -> None:
         shot("report")
 
 
-def main(store: Path, out: Path) -> None:
-    """All states into a folder for each size."""
+def sheet(out: Path, before: Path | None) -> None:
+    """Write all states as OUT/sheet.webp, a line each: per size the one before and the present."""
+    folders = [folder / size for size in SIZES for folder in (before, out) if folder is not None]
+    names = sorted({path.stem for folder in folders for path in folder.glob("*.png")})
+    widths = [
+        round(wide / high * HIGH_PX)
+        for wide, high in SIZES.values()
+        for _ in range(len(folders) // 2)
+    ]
+    row = HIGH_PX + LABEL_PX + GAP_PX
+    image = Image.new("RGB", (sum(widths) + GAP_PX * len(widths), row * len(names)), "white")
+    draw = ImageDraw.Draw(image)
+    for k, name in enumerate(names):
+        x = 0
+        for folder, width in zip(folders, widths, strict=True):
+            is_before = before is not None and folder.parent == before
+            draw.text((x, k * row), f"{name}{', before' if is_before else ''}", "black")
+            path = folder / f"{name}.png"
+            if path.is_file():
+                image.paste(Image.open(path).resize((width, HIGH_PX)), (x, k * row + LABEL_PX))
+            x += width + GAP_PX
+    image.save(out / "sheet.webp", quality=70, method=6)
+
+
+def main(store: Path, out: Path, before: Path | None = None) -> None:
+    """All states into a folder for each size, and the sheet."""
     scan = max(store.rglob("scan.db"), key=lambda path: path.stat().st_mtime).parent
     portal = Portal(PortalConfig(store, port=0))
     portal.start()
@@ -134,7 +187,8 @@ def main(store: Path, out: Path) -> None:
         finally:
             browser.close()
             portal.close()
+    sheet(out, before)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(*map(Path, sys.argv[1:4]))

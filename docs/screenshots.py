@@ -17,6 +17,7 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 
 from service.ground.portal import Portal, PortalConfig
+from service.ground.storage import scan_files
 from service.offline.exports.view import ExportOptions, ScanView, export
 
 IMAGES = Path(__file__).resolve().parent / "images"
@@ -28,6 +29,11 @@ LOAD_S = 300.0
 BUTTON = "[...document.querySelectorAll('button')].find(b => b.textContent === '{}').click()"
 WHOLE = "new Promise(r => setTimeout(r, 2000)).then(() => document.body.dataset.still === 'yes')"
 """True once the view has stood still, so that all points are drawn."""
+MAP = "new Promise(r => setTimeout(r, 1000)).then(() => document.body.dataset.map === 'shown')"
+LAYER = (
+    "[...document.querySelectorAll('.layers label')]"
+    ".find(l => l.textContent.startsWith(' {}')).querySelector('input').click()"
+)
 COLOURS = (
     "(s => { s.value = 'height'; s.dispatchEvent(new Event('change')) })"
     "(document.querySelector('select'))"
@@ -46,6 +52,7 @@ def seen(browser: Browser) -> Image.Image:
 
 def shot(browser: Browser, name: str) -> None:
     """Write what the page shows as ``name``.jpg."""
+    browser.page.mouse.move(WIDTH_PX / 2, HEIGHT_PX / 2)
     browser.run("new Promise(r => setTimeout(r, 3000))")  # the controls fade in
     seen(browser).save(IMAGES / f"{name}.jpg", quality=QUALITY)
 
@@ -68,7 +75,7 @@ def growing(browser: Browser) -> None:
 
 def main(output: Path) -> None:
     """All screenshots, from the folder that ``skyrelief demo`` wrote."""
-    (scan,) = (path.parent for path in output.glob("ground/*/*/scan.db"))
+    (scan,) = (path.parent for path in scan_files(output / "ground", "scan.db"))
     if not (scan / "mesh.glb").is_file():
         with ScanView(scan) as view:
             export(view, "glb", None, ExportOptions(stored=True))
@@ -86,13 +93,15 @@ def main(output: Path) -> None:
             browser.open(portal.url)
             browser.wait("document.querySelectorAll('article img').length === 1", LOAD_S)
             shot(browser, "portal-library")
+            browser.run(BUTTON.format("Export…"))
+            browser.wait("document.querySelectorAll('.product').length > 0", LOAD_S)
+            shot(browser, "portal-export")
             base = portal.url.split("/?")[0]
             browser.open(f"{base}/#/view/{scan.parent.name}/{scan.name}")
             browser.wait("Number(document.body.dataset.points) > 0", LOAD_S)
             browser.run(BUTTON.format("Whole site"))
             browser.wait(WHOLE, LOAD_S)
             shot(browser, "portal-view")
-            growing(browser)
             browser.run(COLOURS)
             browser.run(BUTTON.format("Coverage"))
             browser.wait(WHOLE, LOAD_S)
@@ -101,6 +110,18 @@ def main(output: Path) -> None:
             browser.run(BUTTON.format("Mesh"))
             browser.wait("document.body.dataset.mesh === 'shown'", LOAD_S)
             shot(browser, "portal-mesh")
+            browser.open(f"{base}/#/map/{scan.parent.name}/{scan.name}")
+            browser.wait(MAP, LOAD_S)
+            for layer in ("Height", "Contours"):
+                browser.run(LAYER.format(layer))
+                browser.wait(MAP, LOAD_S)
+            shot(browser, "portal-map")
+            browser.open("about:blank")
+            browser.open(f"{base}/#/view/{scan.parent.name}/{scan.name}")
+            browser.wait("Number(document.body.dataset.points) > 0", LOAD_S)
+            browser.run(BUTTON.format("Whole site"))
+            browser.wait(WHOLE, LOAD_S)
+            growing(browser)
             browser.open((scan / "report.html").resolve().as_uri())
             browser.wait("document.readyState === 'complete'", LOAD_S)
             browser.run("document.querySelector('h2').scrollIntoView()")

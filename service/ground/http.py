@@ -56,7 +56,7 @@ from service.ground.upload import Upload, check_parts
 from service.ground.vehicle import BUTTONS
 from service.offline.exports.view import ExportOptions
 from service.offline.site.start import Pair, StartPoints
-from service.scans.annotations import Spot, as_json, read_annotations
+from service.scans.annotations import Line, LineString, Point, Spot, as_json, read_annotations
 
 T = TypeVar("T")
 
@@ -99,10 +99,11 @@ class LabelChange(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class NewAnnotation(msgspec.Struct, forbid_unknown_fields=True):
-    """A place (longitude, latitude, AMSL metres) and its text."""
+    """A place (longitude, latitude, AMSL metres) or the places of a measurement, and the text."""
 
-    coordinates: Spot
     text: str
+    coordinates: Spot | None = None
+    line: Line | None = None
 
 
 class ExportOrder(msgspec.Struct, forbid_unknown_fields=True):
@@ -313,14 +314,17 @@ def _annotations(request: Request) -> Response:
 
 
 async def _annotate(request: Request) -> Response:
-    """Add a place with a text; the feature."""
+    """Add a place with a text, or a named measurement; the feature."""
     drone, scan = names_of(request)
     note(request, "annotate", scan=f"{drone}/{scan}")
     new = await _body(request, NewAnnotation)
     note(request, "annotate", text=new.text)
+    if (new.coordinates is None) == (new.line is None):
+        raise InputError("the request is not valid: it gives coordinates or a line")
+    geometry = LineString(new.line) if new.line else Point(new.coordinates or (0.0, 0.0, 0.0))
     by = str(request.scope[WHO]).partition(".")[0]
     library = state_of(request).library
-    made = await run_in_threadpool(library.annotate, drone, scan, new.coordinates, new.text, by)
+    made = await run_in_threadpool(library.annotate, drone, scan, geometry, new.text, by)
     return JSONResponse(as_json(made), 201)
 
 

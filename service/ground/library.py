@@ -36,7 +36,13 @@ from service.ground.storage import (
     workplace,
 )
 from service.offline.site import SITE
-from service.scans.annotations import Annotation, Spot, add_annotation, delete_annotation
+from service.scans.annotations import (
+    Annotation,
+    LineString,
+    Point,
+    add_annotation,
+    delete_annotation,
+)
 from service.scans.folder import PIECE, SUMMARY, write_deliverables
 from service.scans.writing import write_whole
 from service.stream.records import ScanHeader
@@ -185,11 +191,16 @@ class Library:
             write_whole(folder / LABELS, msgspec.json.encode(new))
         return new
 
-    def annotate(self, drone: str, scan: str, spot: Spot, text: str, by: str) -> Annotation:
-        """Add a place with a text to a scan. Raises InputError for an unfit text, or too many."""
+    def annotate(
+        self, drone: str, scan: str, geometry: Point | LineString, text: str, by: str
+    ) -> Annotation:
+        """Add a place with a text, or a named measurement, to a scan.
+
+        Raises InputError for an unfit text, or too many.
+        """
         folder = self.folder(drone, scan)
         with self._lock:
-            return add_annotation(folder, spot, text, by, time.time())
+            return add_annotation(folder, geometry, text, by, time.time())
 
     def erase_annotation(self, drone: str, scan: str, number: int) -> None:
         """Delete one annotation. Raises InputError when there is none of this number."""

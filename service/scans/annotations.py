@@ -1,4 +1,5 @@
-"""Annotations of a scan: places with a text, kept as GeoJSON in its folder."""
+"""Annotations of a scan: places with a text, and named measurements, kept as GeoJSON in its
+folder."""
 
 from __future__ import annotations
 
@@ -14,6 +15,9 @@ from service.small_file import read_json
 ANNOTATIONS = "annotations.geojson"
 MAX_ANNOTATIONS = 200
 MAX_TEXT = 500
+MAX_PLACES = 50
+"""Of a measurement."""
+
 MAX_BYTES = 1_000_000
 
 Spot = tuple[
@@ -28,11 +32,20 @@ Number = Annotated[int, msgspec.Meta(ge=1, le=2**53)]
 """Of an annotation; never given twice in a scan."""
 
 
-class Point(msgspec.Struct, forbid_unknown_fields=True):
+class Point(msgspec.Struct, forbid_unknown_fields=True, tag_field="type", tag="Point"):
     """A place in GeoJSON."""
 
-    type: Literal["Point"]
     coordinates: Spot
+
+
+Line = Annotated[list[Spot], msgspec.Meta(min_length=2, max_length=MAX_PLACES)]
+"""The places of a measurement, in their order."""
+
+
+class LineString(msgspec.Struct, forbid_unknown_fields=True, tag_field="type", tag="LineString"):
+    """The places of a measurement in GeoJSON."""
+
+    coordinates: Line
 
 
 class About(msgspec.Struct, forbid_unknown_fields=True):
@@ -48,7 +61,7 @@ class Annotation(msgspec.Struct, forbid_unknown_fields=True):
 
     type: Literal["Feature"]
     id: Number
-    geometry: Point
+    geometry: Point | LineString
     properties: About
 
 
@@ -68,7 +81,9 @@ def read_annotations(folder: Path) -> Annotations:
     return read_json(path, Annotations, MAX_BYTES, "GeoJSON")
 
 
-def add_annotation(folder: Path, spot: Spot, text: str, by: str, unix_s: float) -> Annotation:
+def add_annotation(
+    folder: Path, geometry: Point | LineString, text: str, by: str, unix_s: float
+) -> Annotation:
     """Append one and write the file. InputError for an unfit text or when there are too many."""
     found = read_annotations(folder)
     if len(found.features) >= MAX_ANNOTATIONS:
@@ -77,7 +92,7 @@ def add_annotation(folder: Path, spot: Spot, text: str, by: str, unix_s: float) 
     if number > 2**53:
         raise InputError(f"{ANNOTATIONS} has no number left for one more annotation")
     about = About(_text(text), by[:100], round(unix_s, 3))
-    new = Annotation("Feature", number, Point("Point", spot), about)
+    new = Annotation("Feature", number, geometry, about)
     _write(folder, Annotations(features=[*found.features, new], last_id=number))
     return new
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import re
 from collections.abc import Iterator
@@ -166,6 +168,54 @@ def test_clicks_measure_the_house(ruler: Ruler, house: HouseFlight) -> None:
     ruler.page.key("Escape")
     ruler.page.key("Escape")
     assert ruler.page.run("document.querySelector('.measure').hidden")
+
+
+def test_measurements_are_named_kept_and_leave_as_csv_geojson_and_print(
+    ruler: Ruler, house: HouseFlight, tmp_path: Path
+) -> None:
+    page = ruler.page
+    first, last = ruler.pick(*GRID[-1]), ruler.pick(*GRID[-3])
+    ticks = "[...document.querySelectorAll('.profile .up')].map(t => parseFloat(t.textContent))"
+    assert all(abs(v - house.origin[2]) < 7.0 for v in page.run(ticks)) and page.run(ticks)
+    page.open(page.page.url.replace("#/", f"?token={TOKEN}#/"))  # to save needs the token
+    page.wait("document.body.dataset.points > 71000")
+    page.click("Measure")
+    page.click("Whole site")
+    page.wait("document.body.dataset.still === 'yes'")
+    first, last = ruler.pick(*GRID[-1]), ruler.pick(*GRID[-3])
+    page.page.fill("[aria-label='name of this measurement']", 'edge, "north"')
+    page.click("Save")
+    page.wait("document.querySelectorAll('.measure li').length === 1")
+    page.key("Escape")
+    assert len(ruler.spots) == 0
+    page.run("document.querySelector('.measure .note-text').click()")
+    length = float(np.linalg.norm(last - first))
+    assert abs(ruler.number("Distance") - length) < 0.02
+    with page.page.expect_download() as download:
+        page.click("All as CSV")
+    rows = list(csv.DictReader(io.StringIO(download.value.path().read_text())))
+    assert [row["name"] for row in rows] == ['edge, "north"']
+    assert abs(float(rows[0]["length_m"]) - length) < 0.01
+    assert rows[0]["places"].startswith(f"LINESTRING Z ({house.origin[1]:.2f}")
+    with page.page.expect_download() as download:
+        page.click("All as GeoJSON")
+    feature = json.loads(download.value.path().read_text())["features"][0]
+    assert feature["properties"]["name"] == 'edge, "north"'
+    page.run("window.print = () => undefined")
+    page.click("Print or PDF")
+    page.call("Emulation.setEmulatedMedia", media="print")
+    assert "Distance" in page.run("document.querySelector('.sheet').innerText")
+    assert page.run("document.querySelector('#app').checkVisibility()") is False
+    page.image(tmp_path / "print.png")  # to look at
+    page.call("Emulation.setEmulatedMedia", media="")
+    page.run("location.hash = '#/map/drone-1/test-1'")  # they are on the map, too
+    page.wait("document.body.dataset.map === 'shown'")
+    page.click("Measure")
+    page.wait("document.querySelectorAll('.measure li').length === 1")
+    page.run("document.querySelector('.measure .note-text').click()")
+    assert abs(ruler.number("Distance") - length) < 0.02
+    page.run("document.querySelector('.measure li [aria-label]').click()")
+    page.wait("document.querySelectorAll('.measure li').length === 0")
 
 
 def test_the_volume_of_the_house_its_profile_and_the_way_out(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -17,12 +17,12 @@ from recon.surface.ground import BareGround
 from recon.surface.raster import Grid
 from recon.types import F32, F64, Array, Bool
 from service.errors import InputError
-from service.georeference import line_geometry
+from service.georeference import LocalFrame, line_geometry
 from service.offline.exports.rasters import GROUND_MARGIN_M
 from service.offline.exports.surface import bare_ground, surface_model
 from service.offline.exports.view import ExportOptions, ScanView, in_parts
 from service.offline.geopackage import Columns, lines, points, write_layers
-from service.scans.annotations import read_annotations
+from service.scans.annotations import Point, Spot, read_annotations
 from service.scans.fused_cloud import EVERYWHERE, Box
 from service.scans.writing import write_whole
 
@@ -88,7 +88,8 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 
 def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """Contours and annotations as a GeoPackage: a layer each, in the scan's UTM zone."""
+    """Contours, annotations and measurements as a GeoPackage: a layer each, in the scan's UTM
+    zone."""
     frame = scan.needs_place("a contour map")
     found = contours_of(scan, options)
     columns: Columns = {
@@ -98,19 +99,33 @@ def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> No
     }
     layers = [lines("contours", [one.places for one in found], columns)]
     notes = read_annotations(scan.folder).features
-    if notes:
-        spots = np.array([one.geometry.coordinates for one in notes])[:, [1, 0, 2]]
-        if frame.heights is not None:
-            spots = frame.heights(spots)
-        about = {
-            options.height_key: spots[:, 2].tolist(),
-            "text": [one.properties.text for one in notes],
-            "by": [one.properties.by for one in notes],
-            "made_unix_s": [one.properties.made_unix_s for one in notes],
+    shapes = [_in_utm(frame, one.geometry.coordinates) for one in notes]
+    spots = [k for k, one in enumerate(notes) if isinstance(one.geometry, Point)]
+    ways = [k for k in range(len(notes)) if k not in spots]
+
+    def about(which: list[int]) -> Columns:
+        return {
+            "text": [notes[k].properties.text for k in which],
+            "by": [notes[k].properties.by for k in which],
+            "made_unix_s": [notes[k].properties.made_unix_s for k in which],
         }
-        places = frame.to_utm(frame.to_enu(spots))[:, :2]
-        layers.append(points("annotations", places, about))
+
+    if spots:
+        places = np.concatenate([shapes[k] for k in spots])
+        height: Columns = {options.height_key: places[:, 2].tolist()}
+        layers.append(points("annotations", places[:, :2], {**height, **about(spots)}))
+    if ways:
+        layers.append(lines("measurements", [shapes[k] for k in ways], about(ways)))
     write_layers(out, frame.epsg, layers)
+
+
+def _in_utm(frame: LocalFrame, coordinates: Spot | Sequence[Spot]) -> F64:
+    """(N, 3) UTM metres and height of longitudes, latitudes and heights as flown."""
+    spots = np.atleast_2d(np.array(coordinates, np.float64))[:, [1, 0, 2]]
+    if frame.heights is not None:
+        spots = frame.heights(spots)
+    height_m = spots[:, 2]
+    return np.column_stack([frame.to_utm(frame.to_enu(spots))[:, :2], height_m])
 
 
 def write_contours_dxf(scan: ScanView, out: Path, options: ExportOptions) -> None:

@@ -18,6 +18,8 @@ from service.ground.portal import Portal, PortalConfig
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.scans.annotations import (
     ANNOTATIONS,
+    LineString,
+    Point,
     add_annotation,
     delete_annotation,
     read_annotations,
@@ -71,6 +73,11 @@ def test_a_change_needs_the_token_and_is_audited(client: Client, store: Path) ->
         {"coordinates": [0.0, 0.0], "text": "x"},
         {"coordinates": [0.0, 0.0, 1e9], "text": "x"},
         {"coordinates": SPOT, "text": "x", "by": "another"},
+        {"text": "x"},
+        {"coordinates": SPOT, "line": [SPOT, SPOT], "text": "x"},
+        {"line": [SPOT], "text": "x"},
+        {"line": [SPOT] * 51, "text": "x"},
+        {"line": [SPOT, [0.0, 0.0]], "text": "x"},
     ],
 )
 def test_unfit_annotations_are_refused(client: Client, store: Path, body: dict[str, Any]) -> None:
@@ -82,15 +89,15 @@ def test_unfit_annotations_are_refused(client: Client, store: Path, body: dict[s
 def test_their_number_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.scans.annotations.MAX_ANNOTATIONS", 3)
     for _ in range(3):
-        add_annotation(tmp_path, SPOT, "x", "me", 0.0)
+        add_annotation(tmp_path, Point(SPOT), "x", "me", 0.0)
     with pytest.raises(InputError, match="at most 3"):
-        add_annotation(tmp_path, SPOT, "x", "me", 0.0)
+        add_annotation(tmp_path, Point(SPOT), "x", "me", 0.0)
     assert len(read_annotations(tmp_path).features) == 3
 
 
 def test_the_number_of_a_deleted_annotation_is_not_given_again(tmp_path: Path) -> None:
     def add() -> int:
-        return add_annotation(tmp_path, SPOT, "x", "me", 0.0).id
+        return add_annotation(tmp_path, Point(SPOT), "x", "me", 0.0).id
 
     assert [add(), add()] == [1, 2]
     delete_annotation(tmp_path, 2)
@@ -122,7 +129,9 @@ def test_the_geopackage_holds_them_at_their_places(tmp_path: Path, house: HouseF
     frame = LocalFrame(*house.origin)
     enu = np.array([[3.0, -4.0, 0.0], [10.0, 2.0, 6.0]])
     for (lat, lon, alt), text in zip(frame.to_geodetic(enu), ("ground", "roof"), strict=True):
-        add_annotation(tmp_path, (float(lon), float(lat), float(alt)), text, "me", 7.0)
+        add_annotation(tmp_path, Point((float(lon), float(lat), float(alt))), text, "me", 7.0)
+    way = [(float(lon), float(lat), float(alt)) for lat, lon, alt in frame.to_geodetic(enu)]
+    add_annotation(tmp_path, LineString(way), "eaves", "me", 8.0)
     with ScanView(tmp_path) as scan:
         path = export(scan, "gpkg", None, ExportOptions(contour_m=5.0))
     with sqlite3.connect(path) as file:
@@ -130,7 +139,15 @@ def test_the_geopackage_holds_them_at_their_places(tmp_path: Path, house: HouseF
             "SELECT table_name, geometry_type_name, srs_id FROM gpkg_geometry_columns"
         ).fetchall()
         rows = file.execute("SELECT geom, text, by, height_amsl_m FROM annotations").fetchall()
-    assert kinds == [("contours", "LINESTRING", 32632), ("annotations", "POINT", 32632)]
+        line, name = file.execute("SELECT geom, text FROM measurements").fetchone()
+    assert kinds == [
+        ("contours", "LINESTRING", 32632),
+        ("annotations", "POINT", 32632),
+        ("measurements", "LINESTRING", 32632),
+    ]
+    assert name == "eaves" and line[:2] == b"GP"
+    utm = np.frombuffer(line[-48:], "<f8").reshape(2, 3)
+    np.testing.assert_allclose(frame.from_utm(utm), enu, atol=1e-3)
     found = []
     for data, _, by, height_m in rows:
         magic, _, _, srs, order, form, x, y = struct.unpack("<2sBBiBIdd", data)
@@ -162,6 +179,7 @@ def test_a_note_is_written_where_one_clicks(
     browser.wait("document.querySelectorAll('.notes li').length === 1")
     first = read_annotations(folder).features[0]
     shown = browser.run("document.querySelector('.cursor').textContent").split(", ")
+    assert isinstance(first.geometry, Point)
     lon, lat, _ = first.geometry.coordinates
     assert abs(float(shown[0]) - lat) < 1e-7
     assert abs(float(shown[1].split(" ")[0]) - lon) < 1e-7

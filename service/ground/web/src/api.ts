@@ -160,10 +160,10 @@ export async function finished(s: Scan, kind: string): Promise<Scan> {
   }
 }
 
-/** A place (longitude, latitude, metres above mean sea level) with a text. */
+/** A place (longitude, latitude, metres above mean sea level) with a text, or the places of a measurement. */
 export interface Annotation {
   id: number;
-  geometry: { coordinates: [number, number, number] };
+  geometry: { type: "Point"; coordinates: Triple } | { type: "LineString"; coordinates: Triple[] };
   properties: { text: string; by: string; made_unix_s: number };
 }
 
@@ -180,6 +180,9 @@ export const annotations = (s: { drone: string; scan: string }): Promise<{ featu
   ask(`${place(s)}/annotations`);
 export const annotate = (s: { drone: string; scan: string }, coordinates: number[], text: string): Promise<Annotation> =>
   ask(`${place(s)}/annotations`, "POST", { coordinates, text });
+/** Keeps the places of a measurement under a name. */
+export const saveMeasurement = (s: { drone: string; scan: string }, line: Triple[], text: string): Promise<Annotation> =>
+  ask(`${place(s)}/annotations`, "POST", { line, text });
 export const eraseAnnotation = (s: { drone: string; scan: string }, number: number): Promise<unknown> =>
   ask(`${place(s)}/annotations/${number}`, "DELETE");
 

@@ -51,8 +51,8 @@ export function svg<K extends keyof SVGElementTagNameMap>(tag: K, attributes: Re
 }
 
 /** Gives the browser a text as a file to download. */
-export function save(name: string, text: string): void {
-  const href = URL.createObjectURL(new Blob([text], { type: "application/geo+json" }));
+export function save(name: string, text: string, type = "application/geo+json"): void {
+  const href = URL.createObjectURL(new Blob([text], { type }));
   el("a", { href, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(href), 10_000);
 }

@@ -61,7 +61,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   const captions: (() => void)[] = []; // write what the panel states about layers
   const map = new FlatMap(host);
   const showsTrack = el("input", { type: "checkbox", checked: true, onchange: () => map.draw() });
-  const ruler = new Ruler(sceneOf(map, heights, scan));
+  const ruler = new Ruler(sceneOf(map, heights, scan), id, nameOf(scan));
   const measure = el("button", { textContent: "Measure", title: "click points: distance, height, slope, area, volume, profile", onclick: () => ruler.toggle() });
   measure.setAttribute("aria-pressed", "false");
   ruler.changed = () => {
@@ -137,10 +137,9 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     if (now.finished) say("finished", "finished");
     else if (now.growing) say("receiving", "receiving");
     else say("silent", "silent");
-    notes = features.map(({ geometry: { coordinates }, properties }) => ({
-      place: placeOf(coordinates[1], coordinates[0]),
-      text: short(properties.text),
-    }));
+    notes = features.flatMap(({ geometry: g, properties }) =>
+      g.type === "Point" ? [{ place: placeOf(g.coordinates[1], g.coordinates[0]), text: short(properties.text) }] : [],
+    );
     if (found?.bounds && map.isFree) map.frame(found.bounds);
     map.layers.forEach((layer) => layer.retry());
     map.draw();

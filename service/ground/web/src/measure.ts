@@ -1,10 +1,11 @@
-// The ruler: clicked places with labels over the scene, their figures, and the way out as GeoJSON.
+// The ruler: clicked places with labels over the scene, their figures, and the measurements kept with the scan.
 
 import { Vector3 } from "three";
-import type { Origin } from "./api";
-import { copy, el, save, svg, notify } from "./dom";
-import { along, area, lastStep, profile, type Points, type Volume, volume } from "./figures";
-import { coordinates, placeOf } from "./globe";
+import * as api from "./api";
+import { copy, el, notify, save, short, svg } from "./dom";
+import { along, area, type Points } from "./figures";
+import { coordinates, pointOf } from "./globe";
+import { chart, csvOf, geojsonOf, type Measured, measured, type Named, print, spotsOf, wordsOf } from "./measured";
 import * as units from "./units";
 
 const CLICK_PX = 5; // a pointer that moved farther turned the view
@@ -15,7 +16,7 @@ const HOVER_MS = 120;
 /** What is measured in: the 3D view, or the map. */
 export interface Scene {
   canvas: HTMLElement;
-  origin: Origin | null;
+  origin: api.Origin | null;
   /** The place at a place of the page; null where nothing is measured. A quick look may miss some. */
   pick: (x: number, y: number, quick?: boolean) => Vector3 | null;
   /** Where the canvas shows a place, in CSS pixels; null where it is out of sight. */
@@ -63,11 +64,18 @@ export class Ruler {
   /** What the panel offers with the places. */
   offer: (places: Vector3[]) => HTMLElement | null = () => null;
   private readonly places: Vector3[] = [];
-  private volume: Volume | null = null;
-  private heights: Float64Array | null = null;
+  private now: Measured = { places: this.places, volume: null, heights: null };
+  private saved: api.Annotation[] = [];
+  private readonly name = el("input", { type: "text", maxLength: 100, placeholder: "name of this measurement" });
   private hovered = 0;
 
-  constructor(private readonly scene: Scene) {
+  /** Measurements are kept with the scan `id`, which people call `title`. */
+  constructor(
+    private readonly scene: Scene,
+    private readonly id: { drone: string; scan: string },
+    private readonly title: string,
+  ) {
+    this.name.setAttribute("aria-label", "name of this measurement");
     this.panel.setAttribute("aria-label", "measurement");
     this.overlay.setAttribute("aria-hidden", "true");
     const { canvas } = scene;
@@ -86,6 +94,7 @@ export class Ruler {
     this.panel.hidden = !this.active && !this.places.length; // what is measured stays until it is cleared
     this.rewrite();
     this.changed();
+    if (this.active) void this.refresh();
   }
 
   /** Draws lines and labels where the places are seen now. */
@@ -151,7 +160,7 @@ export class Ruler {
   /** Writes the figures again, in the units of now. */
   rewrite(): void {
     const offer = this.offer(this.places);
-    this.panel.replaceChildren(...this.rows(), ...(offer ? [offer] : []));
+    this.panel.replaceChildren(...this.rows(), ...(offer ? [offer] : []), ...this.kept());
     this.draw();
   }
 
@@ -161,10 +170,7 @@ export class Ruler {
   }
 
   private measure(): void {
-    const { places } = this;
-    const { points } = this.scene;
-    this.volume = places.length > 2 ? volume(places, points) : null;
-    this.heights = places.length > 1 ? profile(places, points) : null;
+    this.now = measured(this.places, this.scene.points);
     this.rewrite();
   }
 
@@ -186,87 +192,77 @@ export class Ruler {
       const hint = n ? "Click the next point." : "Click a point. Backspace removes the last one, Esc all.";
       return [el("p", { textContent: hint }), acts];
     }
-    const facts = Object.entries(this.words()).flatMap(([k, v]) => [
+    const { heights } = this.now;
+    const facts = Object.entries(wordsOf(this.now, this.scene.scaleSigma())).flatMap(([k, v]) => [
       el("dt", { textContent: k }),
       el("dd", { textContent: v }),
     ]);
-    return [el("dl", {}, ...facts), ...(this.heights ? [chart(this.heights, this.scene.origin, along(this.places))] : []), acts];
+    const keep = button("Save", "keep this measurement with the scan", homeless, () => this.save());
+    return [
+      el("dl", {}, ...facts),
+      ...(heights ? [chart(heights, this.scene.origin, along(this.places))] : []),
+      acts,
+      ...(homeless ? [] : [el("p", { className: "acts name" }, this.name, keep)]),
+    ];
   }
 
-  /** What the places measure, as a list of names and texts. */
-  private words(): Record<string, string> {
-    const step = lastStep(this.places);
-    const words: Record<string, string> = {
-      Distance: units.length(step.distance_m),
-      Level: units.length(step.level_m),
-      Height: `${step.height_m >= 0 ? "+" : ""}${units.length(step.height_m)}`,
-      Slope: `${step.slope_deg.toFixed(1)}° (${((100 * step.height_m) / step.level_m).toFixed(0)} %)`,
-    };
-    if (this.places.length > 2) {
-      words["Along"] = units.length(along(this.places));
-      words["Area"] = units.area(area(this.places));
-    }
-    if (this.volume) {
-      words["Volume above"] = units.volume(this.volume.above_m3);
-      words["Volume below"] = units.volume(this.volume.below_m3);
-      words["Base"] = "plane of the points";
-      words["Not seen"] = `${(100 * this.volume.unseen).toFixed(1)} % of the area`;
-    }
-    const sigma = this.scene.scaleSigma();
-    if (sigma) {
-      words["Accuracy"] = `±${units.share(sigma)} by the scale${this.volume ? `, ±${units.share(3 * sigma)} of volumes` : ""}`;
-    }
-    return words;
-  }
-
-  /** The places as GeoJSON: longitude, latitude and metres above mean sea level. */
-  private geojson(): string {
-    const origin = this.scene.origin!;
-    const spots = this.places.map((p) => {
-      const { lon_deg, lat_deg, alt_m } = placeOf(origin, p);
-      return [Number(lon_deg.toFixed(9)), Number(lat_deg.toFixed(9)), Number(alt_m.toFixed(3))];
+  /** The measurements that are kept with the scan, and their ways out. */
+  private kept(): HTMLElement[] {
+    if (!this.active || !this.saved.length) return [];
+    const rows = this.saved.map((one) => {
+      const { text, by, made_unix_s } = one.properties;
+      const title = `by ${by}, ${new Date(made_unix_s * 1000).toLocaleString()}; show it`;
+      const show = el("button", { className: "note-text", textContent: text, title, onclick: () => this.show(one) });
+      const erase = el("button", { textContent: "Delete", onclick: () => void api.eraseAnnotation(this.id, one.id).then(() => this.refresh(), notify) });
+      erase.setAttribute("aria-label", `Delete the measurement ${short(text)}`);
+      return el("li", {}, show, erase);
     });
-    const properties: Record<string, number> = {};
-    const put = (name: string, value: number): number => (properties[name] = Number(value.toFixed(3)));
-    if (spots.length > 1) {
-      for (const [name, value] of Object.entries(lastStep(this.places))) put(`last_${name}`, value);
-      put("length_m", along(this.places));
-    }
-    if (spots.length > 2) put("area_m2", area(this.places));
-    if (this.volume) {
-      put("volume_above_m3", this.volume.above_m3);
-      put("volume_below_m3", this.volume.below_m3);
-      put("volume_unseen_share", this.volume.unseen);
-    }
-    const geometry =
-      spots.length === 1
-        ? { type: "Point", coordinates: spots[0] }
-        : spots.length === 2
-          ? { type: "LineString", coordinates: spots }
-          : { type: "Polygon", coordinates: [[...spots, spots[0]]] };
-    const feature = { type: "Feature", properties, geometry };
-    return JSON.stringify({ type: "FeatureCollection", features: [feature] }, null, 1);
+    const origin = this.scene.origin!;
+    const out = (text: string, act: (all: Named[]) => void): HTMLElement => {
+      const all = (): Named[] => this.saved.map((one) => ({ name: one.properties.text, ...measured(this.placesOf(one), this.scene.points) }));
+      return el("button", { textContent: text, title: "all saved measurements", onclick: () => act(all()) });
+    };
+    return [
+      el("h2", { textContent: "Saved" }),
+      el("ul", {}, ...rows),
+      el(
+        "p",
+        { className: "acts" },
+        out("All as CSV", (all) => save("measurements.csv", csvOf(origin, all), "text/csv")),
+        out("All as GeoJSON", (all) => save("measurements.geojson", geojsonOf(origin, all))),
+        out("Print or PDF", (all) => print(this.title, origin, this.scene.scaleSigma(), this.scene.canvas, all)),
+      ),
+    ];
   }
-}
 
-/** The heights along the way as a line, with the lowest and highest value at its side. */
-function chart(heights: Float64Array, origin: Origin | null, length_m: number): HTMLElement {
-  const known = heights.filter((z) => !Number.isNaN(z));
-  if (!known.length) return el("p", { textContent: "No points along the line." });
-  const [low, high] = [known.reduce((a, b) => Math.min(a, b)), known.reduce((a, b) => Math.max(a, b))];
-  const span = Math.max(high - low, 0.1);
-  let path = "";
-  let pen = "M";
-  heights.forEach((z, i) => {
-    if (Number.isNaN(z)) return void (pen = "M");
-    path += `${pen}${((i + 0.5) * 240) / heights.length} ${(4 + (62 * (high - z)) / span).toFixed(1)}`;
-    pen = "L";
-  });
-  const datum = origin?.alt_amsl_m ?? 0;
-  const words = `${units.length(low + datum)} to ${units.length(high + datum)} over ${units.length(length_m, 1)}`;
-  const drawing = svg("svg", { viewBox: "0 0 240 70", role: "img", "aria-label": `height profile: ${words}` });
-  drawing.append(svg("path", { d: path }));
-  const figure = el("figure", { className: "profile" }, el("figcaption", { textContent: `Profile ${words}` }));
-  figure.prepend(drawing);
-  return figure;
+  private placesOf(one: api.Annotation): Vector3[] {
+    const { coordinates } = one.geometry as { coordinates: api.Triple[] };
+    return coordinates.map((spot) => pointOf(this.scene.origin!, spot));
+  }
+
+  private show(one: api.Annotation): void {
+    this.places.splice(0, this.places.length, ...this.placesOf(one));
+    this.measure();
+  }
+
+  private save(): void {
+    const name = this.name.value.trim();
+    if (!name) return void (notify("name it first"), this.name.focus());
+    void api
+      .saveMeasurement(this.id, spotsOf(this.scene.origin!, this.places), name)
+      .then(() => ((this.name.value = ""), this.refresh()))
+      .catch(notify);
+  }
+
+  private async refresh(): Promise<void> {
+    if (!this.scene.origin) return;
+    const found = await api.annotations(this.id).catch((error: unknown) => (notify(error), null));
+    if (!found) return;
+    this.saved = found.features.filter(({ geometry }) => geometry.type === "LineString");
+    this.rewrite();
+  }
+
+  private geojson(): string {
+    return geojsonOf(this.scene.origin!, [{ name: "", ...this.now }]);
+  }
 }

@@ -85,7 +85,9 @@ export class Notes {
   private async refresh(): Promise<void> {
     const found = await api.annotations(this.id).catch((error: unknown) => (notify(error), null));
     if (!found) return;
-    this.notes = found.features.map((feature) => ({ feature, at: pointOf(this.scene.origin!, feature.geometry.coordinates) }));
+    this.notes = found.features.flatMap((feature) =>
+      feature.geometry.type === "Point" ? [{ feature, at: pointOf(this.scene.origin!, feature.geometry.coordinates) }] : [],
+    );
     this.list.replaceChildren(...this.notes.map(({ feature, at }) => this.row(feature, at)));
     this.draw();
   }

@@ -79,7 +79,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     scaleSigma: () => known.quality?.scale_sigma,
   };
   cameras.shows = cloud.shows;
-  const ruler = new Ruler(scene);
+  const ruler = new Ruler(scene, id, nameOf(scan));
   ruler.offer = placing(scan, () => ruler.rewrite());
   const notes = new Notes(scene, id, (point) => stage.lookAt(point));
   const empty = el("p", { className: "blank", textContent: scan.finished ? "This scan has no points." : "No points yet." });
@@ -101,7 +101,8 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   stage.addAgain(cloud.group);
   stage.add(cloud.ground.mesh);
   host.append(compass(stage));
-  bar.append(toolbar({ ...site, ruler, notes, legend, coverage, time: time.element, finished: () => link.finished, known: () => known }));
+  const tools = toolbar({ ...site, ruler, notes, legend, coverage, time: time.element, finished: () => link.finished, known: () => known });
+  bar.append(menuOf(bar, tools), tools);
   if (awaited(scan)) ruler.toggle();
 
   let last: LastPose | undefined;
@@ -173,6 +174,19 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     notes.close();
     stage.close();
   };
+}
+
+/** The button that shows the tools where there is no room for them: on a phone the surface comes first. */
+function menuOf(bar: HTMLElement, tools: HTMLElement): HTMLElement {
+  const button = el("button", { className: "menu", textContent: "Menu" });
+  const show = (on: boolean): void => {
+    bar.classList.toggle("open", on);
+    button.setAttribute("aria-expanded", String(on));
+  };
+  button.onclick = () => show(!bar.classList.contains("open"));
+  tools.addEventListener("click", (event) => (event.target as HTMLElement).matches("button") && show(false));
+  show(false);
+  return button;
 }
 
 /** The scan that the drone of a silent one makes by now. */
