@@ -3,7 +3,7 @@
     PYTHONPATH=tests/support python docs/portal_states.py STORE OUT [BEFORE]
 
 STORE is a ground station's folder; its newest scan is shown. BEFORE is the OUT of another version:
-the sheet then has each state of it beside the present one. Needs Chromium, the built page, Pillow
+the sheet then has each state of it left of the present one. Needs Chromium, the built page, Pillow
 and the extras "ground" and "dev". Maps, mesh, report and another date are shown where there are
 such.
 """

@@ -96,6 +96,7 @@ def main(output: Path) -> None:
             browser.run(BUTTON.format("Export…"))
             browser.wait("document.querySelectorAll('.product').length > 0", LOAD_S)
             shot(browser, "portal-export")
+            browser.key("Escape")
             base = portal.url.split("/?")[0]
             browser.open(f"{base}/#/view/{scan.parent.name}/{scan.name}")
             browser.wait("Number(document.body.dataset.points) > 0", LOAD_S)

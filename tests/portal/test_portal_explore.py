@@ -122,6 +122,38 @@ def test_the_time_slider_shows_the_cloud_as_it_was(page: Browser) -> None:
     page.wait(f"document.body.dataset.image === '4' && {images} === '5'")
 
 
+def test_the_flight_plays_at_its_speed_and_is_dated(page: Browser) -> None:
+    page.run("document.querySelector('.time select').value = '1'")
+    page.run("document.querySelector('.time button').click()")  # from the beginning
+    seen = [page.run("document.querySelector('.time input').value")]
+    page.wait("document.querySelector('.time button').title === 'pause'")
+    page.wait("document.querySelector('.time input').value === '3'", 20)
+    assert seen == ["1"] and "2023" in page.run("document.querySelector('.time .day').textContent")
+    page.wait("document.querySelector('.time button').title === 'play the flight'", 20)
+    assert page.run("document.querySelector('.time input').value") == "5"
+
+
+def test_a_path_of_the_camera_is_saved_as_video(page: Browser, tmp_path: Path) -> None:
+    record = "[...document.querySelectorAll('button')].find(b => b.textContent === 'Record')"
+    assert page.run(f"{record}.disabled")
+    page.run(SET.format("input[type=number]", "1"))
+    page.click("Add view")
+    page.mouse(600, 400, to=(760, 400))  # turned
+    page.click("Add view")
+    with page.page.expect_download(timeout=60_000) as download:
+        page.run(f"{record}.click()")
+    path = tmp_path / download.value.suggested_filename
+    download.value.save_as(path)
+    assert path.stem == "test-1" and path.suffix in (".webm", ".mp4")
+    video = cv2.VideoCapture(str(path))
+    frames = []
+    while (frame := video.read())[0]:
+        frames.append(frame[1])
+    assert len(frames) > 2
+    moved = np.abs(frames[0].astype(int) - frames[-1]).mean()
+    assert moved > 1.0  # the camera has gone round
+
+
 def test_the_clip_box_cuts_the_scene_and_gives_it_back(page: Browser) -> None:
     before = page.run(COLOURED)
     assert before > 0.05

@@ -116,3 +116,7 @@ def test_the_export_dialog_says_what_each_product_is_and_makes_it(
         browser.key("Escape")
         browser.wait("!document.querySelector('dialog')")
         browser.wait("!!document.querySelector('article .made li')")  # and then on the card
+        browser.click("Export…")
+        browser.wait("!!document.querySelector('dialog')")
+        browser.run("location.hash = '#/view/drone-1/test-1'")
+        browser.wait("!document.querySelector('dialog') && !!document.querySelector('.view')")

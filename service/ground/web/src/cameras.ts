@@ -24,6 +24,8 @@ export class Cameras {
     new THREE.MeshBasicMaterial({ side: THREE.DoubleSide, toneMapped: false }),
   );
   private readonly drone = quadcopter();
+  private live: number[] | null = null;
+  private standing: number | null = null; // the keyframe that time is set to
   private reach = 10;
   private stale = false;
   private drawn = 0; // frusta
@@ -71,12 +73,24 @@ export class Cameras {
     return best?.seq ?? null;
   }
 
+  /** Puts the aircraft where a keyframe was taken; null: where it is now. */
+  stand(seq: number | null): void {
+    this.standing = seq;
+    const T = seq === null ? this.live : (this.taken.get(seq)?.toArray() ?? null);
+    if (T) this.place(T);
+  }
+
   /** The aircraft's camera is at T and looks `reach` metres far. */
   aircraft(T: number[], reach: number): void {
+    this.live = T;
     if (Math.abs(reach - this.reach) > 0.2 * this.reach) {
       this.reach = reach;
       this.stale = true;
     }
+    if (this.standing === null) this.place(T);
+  }
+
+  private place(T: number[]): void {
     const s = this.reach / 4;
     this.now.matrix.fromArray(T).scale(new THREE.Vector3(s, s, s));
     this.now.matrixWorldNeedsUpdate = true;

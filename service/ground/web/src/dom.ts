@@ -52,7 +52,11 @@ export function svg<K extends keyof SVGElementTagNameMap>(tag: K, attributes: Re
 
 /** Gives the browser a text as a file to download. */
 export function save(name: string, text: string, type = "application/geo+json"): void {
-  const href = URL.createObjectURL(new Blob([text], { type }));
+  saveBlob(name, new Blob([text], { type }));
+}
+
+export function saveBlob(name: string, blob: Blob): void {
+  const href = URL.createObjectURL(blob);
   el("a", { href, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(href), 10_000);
 }

@@ -12,6 +12,8 @@ const IMAGE_EVERY_MS = 1500;
 const CLICK_PX = 5; // a pointer that moved farther turned the view
 const NEAR_PX = 14;
 const DAY_S = 86400;
+const SPEEDS = [1, 2, 5, 10, 20];
+const LONGEST_WAIT_S = 5; // between two keyframes, or the dates of a site
 
 export interface Site {
   stage: Stage;
@@ -20,21 +22,53 @@ export interface Site {
   id: { drone: string; scan: string };
 }
 
-/** A slider over the keyframes: the cloud as it was when each was taken; at its end it follows. */
-export function timeSlider({ stage, cloud }: Site): { element: HTMLElement; refresh: () => void } {
+/** A slider over the keyframes: all as it was when each was taken, played if one likes; at its end it follows. */
+export function timeSlider({ stage, cloud, cameras }: Site): { element: HTMLElement; refresh: () => void } {
   const input = el("input", { type: "range", min: "1", value: "1", max: "1" });
   input.setAttribute("aria-label", "time of the flight");
   const shown = el("output", {});
-  const element = el("label", { className: "time", hidden: true }, input, shown);
+  const day = el("span", { className: "day" });
+  const play = el("button", { textContent: "▶", title: "play the flight" });
+  const speed = el("select", {}, ...SPEEDS.map((x) => el("option", { value: String(x), textContent: `${x}×`, selected: x === 5 })));
+  speed.setAttribute("aria-label", "speed of playing");
+  const element = el("div", { className: "time", hidden: true }, play, speed, input, shown, day);
+  let timer = 0;
   const show = (): void => {
     const moments = cloud.moments();
     const k = Number(input.value) - 1;
     const last = k >= moments.length - 1;
     cloud.until(last ? Infinity : moments[k]!);
     shown.value = moment(moments[k]!, moments[0]!, moments.at(-1)!);
+    day.textContent = new Date(1000 * moments[k]!).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" });
+    cameras.stand(last ? null : cloud.own.newest);
     stage.touch();
   };
-  input.oninput = show;
+  const stop = (): void => {
+    clearTimeout(timer);
+    timer = 0;
+    [play.textContent, play.title] = ["▶", "play the flight"];
+  };
+  const step = (): void => {
+    const moments = cloud.moments();
+    const k = Number(input.value);
+    if (k >= moments.length || !element.isConnected) return stop();
+    timer = setTimeout(
+      () => {
+        input.value = String(k + 1);
+        show();
+        step();
+      },
+      (1000 * Math.min(moments[k]! - moments[k - 1]!, LONGEST_WAIT_S)) / Number(speed.value),
+    );
+  };
+  play.onclick = () => {
+    if (timer) return stop();
+    if (input.value === input.max) input.value = "1";
+    show();
+    [play.textContent, play.title] = ["❚❚", "pause"];
+    step();
+  };
+  input.oninput = () => (stop(), show());
   const refresh = (): void => {
     const n = cloud.moments().length;
     element.hidden = n < 2;

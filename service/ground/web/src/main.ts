@@ -13,6 +13,7 @@ async function show(): Promise<void> {
   const mine = ++turn;
   close();
   close = () => undefined;
+  for (const dialog of document.querySelectorAll("dialog")) dialog.close(); // they belong to the page that is left
   const [page, drone, scan, place] = location.hash.replace(/^#\//, "").split("/").map(decodeURIComponent);
   let end: () => void;
   if (page === "view" && drone && scan) end = await (await loaded(import("./view"))).showView(root, drone, scan, place);

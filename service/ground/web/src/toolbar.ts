@@ -6,6 +6,7 @@ import type { Cameras } from "./cameras";
 import { el, notify } from "./dom";
 import { clipBox, linkButton } from "./explore";
 import { coverageKeys, key } from "./keys";
+import { filmBox } from "./film";
 import type { Ruler } from "./measure";
 import type { Notes } from "./notes";
 import { COLOURS, type Cloud, type Colour } from "./points";
@@ -52,6 +53,7 @@ export function toolbar(parts: Parts): HTMLElement {
     group(...measure(parts), cameraButton(parts.cameras), coverageButton(parts)),
     ...showGroup(parts, colour),
     clipBox(parts),
+    filmBox(parts),
     settings(parts),
   );
   void stage.vr().then((button) => button && bar.append(button));
