@@ -7,10 +7,14 @@ import subprocess
 import sys
 from typing import Any
 
+import numpy as np
 import pytest
 from paths import DEMO, ROOT
 
 import recon
+from recon import se3
+from recon.pipeline.mapper import Mapper, moved
+from recon.types import Camera, DepthMap, Keyframe, Pose
 
 TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
 
@@ -34,6 +38,29 @@ def test_the_example_makes_a_cloud(
     assert len(cloud) > 50_000
     height_m = 80.0 + cloud.xyz_m[:, 2]  # the first camera is the origin
     assert abs(float(height_m.mean())) < 25.0  # the height above ground is assumed
+
+
+def test_a_cloud_follows_the_corrections_of_its_keyframes() -> None:
+    depth = DepthMap(
+        np.full((2, 3), 10.0, np.float32), np.full((2, 3), 0.5, np.float32),
+        np.full((2, 3), 2, np.uint8), np.eye(3), np.eye(4),
+    )  # fmt: skip
+    bgr, fresh = np.zeros((2, 3, 3), np.uint8), np.ones((2, 3), np.bool_)
+    keyframe = Keyframe(0, 0, depth, bgr, Pose(np.eye(4), np.eye(6), scale=2.0), fresh)
+    there = se3.compose(np.eye(3), np.array([0.0, 5.0, 0.0]))
+    found = moved(keyframe, Pose(there, np.eye(6), scale=3.0))
+    assert found.depth.depth_m[0, 0] == 15.0 and found.depth.sigma_m[0, 0] == 0.75
+    np.testing.assert_array_equal(found.depth.T_world_camera, there)
+    again = moved(found, Pose(there, np.eye(6), scale=2.0))
+    assert again.depth.depth_m[0, 0] == 10.0
+
+
+def test_a_mapper_without_its_keyframes_has_no_cloud() -> None:
+    camera = Camera(np.array([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), np.zeros(5), (80, 60))
+    mapper = Mapper(camera, keeps_cloud=False)
+    with pytest.raises(ValueError, match="keeps_cloud"):
+        mapper.cloud()
+    assert mapper.finish() == () and len(Mapper(camera).finish()) == 0
 
 
 def test_every_name_of_the_library_is_there() -> None:
