@@ -28,6 +28,7 @@ const NEWS_TIMES = 3; // as long for a frame that shows news, while no hand turn
 const SLICE_MS = 90;
 const FIRST_POINTS = 100_000;
 const FINER = 4; // times the triangles of the frame before, once the view rests
+const MAKING_TIMES = 4; // as long as drawing them surfaces are made before they are drawn again
 const UNBUILT = 0.99; // of the frame is shown while some of it is still to be made
 const MIN_POINTS = 20_000;
 const MAX_SLICES = 64; // showing a slice takes its time however few the points
@@ -62,6 +63,8 @@ export class Painter {
   private blur = 0; // in BLURRED
   private ratio = 0; // pixels of the screen for one of the page, when sharp
   private finer = 0; // share of the surfaces' triangles in the frame
+  private finer_ms = 0; // that the last finer frame took
+  private finerAt = 0;
   private work: Work | null = null;
   private settled = false;
 
@@ -138,6 +141,8 @@ export class Painter {
       const share = gradual.isUnbuilt ? Math.max(this.shown, this.finer) : Math.min(1, FINER * Math.max(this.shown, this.finer));
       this.finer = share;
       gradual.range(0, share, true);
+      if (gradual.isUnbuilt && now - this.finerAt < MAKING_TIMES * this.finer_ms) return; // the next tick makes more
+      this.finerAt = now;
       this.dome.render(this.renderer, this.scene, this.camera, true, true);
       this.shown = gradual.isUnbuilt ? Math.min(share, UNBUILT) : share;
       return this.give("finer", now);
@@ -177,7 +182,10 @@ export class Painter {
   /** Fits the number of points to the time that the last ones took. */
   private paced(work: Work, now: number): void {
     const ms = Math.max(now - work.since, 1);
-    if (work.kind === "finer") return;
+    if (work.kind === "finer") {
+      this.finer_ms = ms;
+      return;
+    }
     if (work.kind === "slice") {
       const least = Math.max(MIN_POINTS, (this.gradual?.wanted ?? 0) / MAX_SLICES);
       this.slice = Math.max(least, this.slice * Math.min(Math.max(SLICE_MS / ms, 0.25), 1.2));

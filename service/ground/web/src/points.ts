@@ -24,7 +24,7 @@ const CHANGES: [string, string][] = [["higher", "#d03027"], ["lower", "#2b6fd0"]
 const SIGMA_STEP_M = 0.02;
 const MAX_SIGMA_M = 255 * SIGMA_STEP_M;
 const SHARP_PX = 1.3; // of the screen, between two vertices of a surface
-const BUILD_MS = 25; // for finer surfaces, a frame
+const BUILD_MS = [25, 60] as const; // for finer surfaces, a frame while the view moves, and at rest
 const GROUND_SAMPLES = 400_000; // of the heightfield below
 const GROUND_MS = 1500; // between two of them
 const MAX_TRIANGLES = 12_000_000; // in memory
@@ -431,7 +431,7 @@ export class Cloud implements Gradual {
    * finest levels within the share.
    */
   range(from: number, to: number, whole: boolean): void {
-    if (this.kind === "surface") return this.fit(to);
+    if (this.kind === "surface") return this.fit(to, BUILD_MS[whole ? 1 : 0]);
     const share = Math.min(1, this.budget / Math.max(1, this.shownPoints));
     this.shared.thin.value = 1 / Math.sqrt(Math.max(1e-6, share * (whole ? 1 : to)));
     this.drawn = 0;
@@ -459,12 +459,12 @@ export class Cloud implements Gradual {
     return found;
   }
 
-  private fit(share: number): void {
+  private fit(share: number, build_ms: number): void {
     const seen = this.seen();
     const room = share * cost(seen, 0);
     let coarser = 0;
     while (coarser < LEVELS - 1 && cost(seen, coarser) > 1.01 * room) coarser++;
-    const until = performance.now() + BUILD_MS;
+    const until = performance.now() + build_ms;
     this.unbuilt = false;
     this.drawn = 0;
     for (const [surface, level] of seen) {
