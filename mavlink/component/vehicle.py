@@ -100,7 +100,7 @@ class VehicleLink:
         self.recorder = TlogRecorder()
         key = None if config.signing_key is None else read_key(config.signing_key)
         self._memory = Memory(config.state_dir, "" if key is None else fingerprint(key))
-        self._signing = None if key is None else self._make_signing(key)
+        self.signing = None if key is None else self._make_signing(key)
         self.presence = Presence(
             config.presence,
             secrets.randbits(32) or 1 if first is None else first.token,
@@ -124,7 +124,7 @@ class VehicleLink:
         self._alive_ns = now_ns
         opened = links or [Link(parse_link(text)) for text in config.links]
         sequence = 0 if first is None else first.sequence
-        self._links = Links(opened, self._on_packet, self._signing, sequence)
+        self._links = Links(opened, self._on_packet, self.signing, sequence)
 
     def _make_signing(self, key: bytes) -> Signing:
         ours = self._memory.signing_timestamp + UNIT_PER_S  # a crash forgets what was sent last
@@ -151,7 +151,7 @@ class VehicleLink:
             thread.join(timeout=5.0)
         self._links.stop()
         self.recorder.close()
-        self._save()
+        self.save()
 
     def set_health(self, health: Health) -> None:
         """Confirm that the service lives; call it at least every second."""
@@ -240,7 +240,7 @@ class VehicleLink:
             None if seen is None else (self._clock_ns() - seen) / S,
             self.presence.is_armed,
             None if round_trip is None else round_trip * 1e-6,
-            0 if self._signing is None else self._signing.refused,
+            0 if self.signing is None else self.signing.refused,
             self._inbox.dropped,
             self._companion.watch.troubles(self._clock_ns()),
         )
@@ -255,13 +255,13 @@ class VehicleLink:
             self._inbox.put(partial(self._hear, index, packet, now_ns))
 
     def _hear(self, index: int, packet: Packet, now_ns: int) -> None:
-        if self._signing is not None and not self._signing.accepts(packet):
+        if self.signing is not None and not self.signing.accepts(packet):
             return
         self._companion.receive(index, packet, now_ns)
 
     def _run(self) -> None:
         """The protocol's thread, the only one that uses the companion."""
-        every_ns = SAVE_EVERY_NS if self._signing is None else SAVE_SIGNED_NS
+        every_ns = SAVE_EVERY_NS if self.signing is None else SAVE_SIGNED_NS
         save_ns = self._clock_ns() + every_ns
         while not self._stop.is_set():
             self._serve(self._companion.pause_s)
@@ -270,7 +270,7 @@ class VehicleLink:
             self._send(self._companion.take())
             if now_ns >= save_ns or self._is_stale():
                 save_ns = now_ns + every_ns
-                self._save()
+                self.save()
         self._serve(0.0)
         self._send(self._companion.take())
 
@@ -317,8 +317,9 @@ class VehicleLink:
         revision = self._companion.parameters.revision
         return self._memory.is_stale(revision, self.presence.proven_system)
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Write what a restart needs: parameters, signing times, the vehicle's system id."""
         parameters = self._companion.parameters
-        signing, system = self._signing, self.presence.proven_system
+        signing, system = self.signing, self.presence.proven_system
         timestamp, streams = (0, {}) if signing is None else (signing.timestamp, signing.streams)
         self._memory.save(parameters.kept(), parameters.revision, timestamp, streams, system)

@@ -97,12 +97,12 @@ def examine(config: Config, listen_s: float | None) -> Iterator[Finding]:
     datalink, but the packages of the products.
     """
     if listen_s is None:
-        for check in (_software, _products, _clock, lambda: examine_compute(config)):
+        for check in (examine_software, _products, _clock, lambda: examine_compute(config)):
             yield from check()
         return
     running = running_service(config.health.http) if config.health.http else None
     checks: tuple[Callable[[], Iterator[Finding]], ...] = (
-        _software,
+        examine_software,
         lambda: _machine(config),
         _clock,
         lambda: _folder(Path(config.scan.folder)),
@@ -118,7 +118,15 @@ def examine(config: Config, listen_s: float | None) -> Iterator[Finding]:
         yield from check()
 
 
-def _software() -> Iterator[Finding]:
+def parent_of(package: str) -> str:
+    """The folder that holds a package."""
+    spec = find_spec(package)
+    origin = spec.origin if spec is not None else None
+    return str(Path(origin).resolve().parents[1]) if origin else f"{package} is missing"
+
+
+def examine_software(parent: Callable[[str], str] = parent_of) -> Iterator[Finding]:
+    """Packages: those that are missing, and a stranger's in place of one of ours."""
     found, missing = [], []
     for name in CORE:
         try:
@@ -133,7 +141,7 @@ def _software() -> Iterator[Finding]:
     for name, debian in unusable_packages().items():
         text = f"{name} cannot be loaded; apt install {' '.join(debian)}"
         yield Finding("libraries", NOTE, text)
-    parents = {_parent(name) for name in ("service", "recon", "mavlink")}
+    parents = {parent(name) for name in ("service", "recon", "mavlink")}
     if len(parents) > 1:
         where = ", ".join(sorted(parents))
         yield Finding(
@@ -150,12 +158,6 @@ def _products() -> Iterator[Finding]:
             yield Finding(what, NOTE, f"needs {', '.join(missing)}; {remedy}")
         else:
             yield Finding(what, GOOD, ", ".join(packages))
-
-
-def _parent(name: str) -> str:
-    spec = find_spec(name)
-    origin = spec.origin if spec is not None else None
-    return str(Path(origin).resolve().parents[1]) if origin else f"{name} is missing"
 
 
 def _machine(config: Config) -> Iterator[Finding]:

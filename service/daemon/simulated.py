@@ -12,6 +12,7 @@ import dataclasses
 import logging
 import os
 import socket
+from collections.abc import Callable
 from pathlib import Path
 
 from service.cameras import parse_source, reject_options
@@ -31,7 +32,9 @@ REPORT_EVERY = 25  # frames between two progress lines
 class SimulatedFlight:
     """Camera, autopilot and folder of one simulated flight."""
 
-    def __init__(self, source: str) -> None:
+    def __init__(
+        self, source: str, render: Callable[[Path, dict[str, str]], None] | None = None
+    ) -> None:
         """The flight of a source ``sim:`` with its options, rendered if necessary.
 
         InputError for invalid options.
@@ -45,7 +48,7 @@ class SimulatedFlight:
         given |= options
         self.folder = self._state / "-".join(["sim", *given.values()]).replace("/", "_")
         if not (self.folder / "flight.mp4").exists():
-            _render(self.folder, given)
+            (render or render_flight)(self.folder, given)
         self._ports = free_ports(2)
 
     def configured(self, config: Config) -> Config:
@@ -109,7 +112,7 @@ def free_ports(count: int) -> list[int]:
         return [int(probe.getsockname()[1]) for probe in probes]
 
 
-def _render(folder: Path, given: dict[str, str]) -> None:
+def render_flight(folder: Path, given: dict[str, str]) -> None:
     """Render the flight; an interrupted rendering leaves nothing."""
     from service.sim import recording
     from service.sim.flight import FlightPlan

@@ -95,7 +95,7 @@ class DaemonLink:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self.flying: DatalinkSender | None = None  # the sender of the scan that is flown
-        self._backlog: DatalinkSender | None = None
+        self.backlog: DatalinkSender | None = None
         self._is_wanted = False  # the backlog
         self._serial = 0  # of the last wish for the backlog
         self._radio: VehicleRadio | None = None
@@ -152,7 +152,7 @@ class DaemonLink:
             return
         with self._lock:
             if self._is_wanted and self._serial == serial:
-                self._backlog, sender = sender, None
+                self.backlog, sender = sender, None
         if sender is not None:
             sender.close()
 
@@ -161,7 +161,7 @@ class DaemonLink:
         the rest."""
         with self._lock:
             self._is_wanted = False
-            sender, self._backlog = self._backlog, None
+            sender, self.backlog = self.backlog, None
         if sender is not None:
             if deliver_s:
                 deliver(sender, deliver_s, wait)
@@ -170,6 +170,6 @@ class DaemonLink:
 
     def follow(self, config: Config) -> None:
         """Keep to another budget, also in flight."""
-        for sender in (self.flying, self._backlog):
+        for sender in (self.flying, self.backlog):
             if sender is not None:
                 sender.set_budget(config.datalink.budget_kbit_s, config.datalink.share)

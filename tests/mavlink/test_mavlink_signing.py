@@ -83,15 +83,15 @@ def link_with(key: bytes, folder: Path) -> tuple[VehicleLink, Signing]:
     path.chmod(0o600)
     config = VehicleConfig(signing_key=path, state_dir=folder / "state")
     link = VehicleLink(config, RehearsalControl())
-    assert link._signing is not None
-    return link, link._signing
+    assert link.signing is not None
+    return link, link.signing
 
 
 def test_a_packet_of_the_run_before_is_refused(tmp_path: Path) -> None:
     link, signing = link_with(KEY, tmp_path)
     order = signed(beat(), NOW + 10)
     assert accepts(signing, order)
-    link._save()
+    link.save()
     sent = signing.timestamp
     _, again = link_with(KEY, tmp_path)
     assert not accepts(again, order) and not accepts(again, signed(beat(), NOW + 5))

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from onboard import Onboard
 from paths import DEMO
 from trial_autopilot import aircraft
 from trial_rig import (
@@ -31,9 +32,7 @@ from recon.backends.cpu import CpuBackend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DisparityMap
 from service.compute.backend_choice import FallbackBackend
-from service.config import load_config
 from service.daemon.machine import read_machine
-from service.daemon.runtime import Daemon
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(1800 if WHOLE else 280)]
 
@@ -203,12 +202,10 @@ class OutOfMemory(CpuBackend):
         return super().belief_propagation(left, right, labels, config)
 
 
-def test_gpu_out_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: Row) -> None:
-    given = [f"scan.folder={tmp_path}", "health.http=", f"camera.model={DEMO / 'camera.yaml'}"]
+def test_gpu_out_of_memory(tmp_path: Path, record: Row) -> None:
+    given = [f"camera.model={DEMO / 'camera.yaml'}"]
     given += [f"camera.source=images:{DEMO / 'frames'}?interval_s=0.7", "compute.guide_width=320"]
-    daemon = Daemon(load_config(None, [*given, "compute.backend=cpu"]))
-    heard: list[str] = []
-    monkeypatch.setattr(daemon.vehicle, "statustext", lambda text, *_, **__: heard.append(text))
+    daemon = Onboard(tmp_path, *given, "compute.backend=cpu")
     daemon.scanning.load()
     gpu = OutOfMemory()
     daemon.scanning.backend = FallbackBackend(gpu)
@@ -235,5 +232,5 @@ def test_gpu_out_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reco
     assert daemon.snapshot()["backend"] == "cpu"
     daemon.scanning.end()
     record("GPU out of memory (simulated)", 1, "the same scan continues on the CPU", "-", back_s)
-    assert any("out of memory" in text for text in heard)
+    assert any("out of memory" in text for text in daemon.vehicle.said)
     assert not daemon.scanning.fault

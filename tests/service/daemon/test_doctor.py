@@ -16,7 +16,7 @@ from paths import DEMO
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import load_config
-from service.daemon.diagnosis import BAD, GOOD, NOTE, examine
+from service.daemon.diagnosis import BAD, GOOD, NOTE, examine, examine_software
 
 
 def findings(*overrides: str, listen_s: float = 0.1) -> dict[str, tuple[str, str]]:
@@ -98,9 +98,9 @@ def test_camera_model_of_another_size_is_reported(tmp_path: Path) -> None:
     assert "calibrate at 1600x1200" in found["camera"][1]
 
 
-def test_foreign_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.daemon.diagnosis._parent", lambda name: f"/somewhere/{name}")
-    assert "shadows one of ours" in findings()["packages"][1]
+def test_foreign_package_is_reported() -> None:
+    *_, found = examine_software(lambda name: f"/somewhere/{name}")
+    assert found.what == "packages" and "shadows one of ours" in found.text
 
 
 def test_command_line(tmp_path: Path) -> None:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import socket
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
 from loopback import until
+from onboard import HeardVehicle
 from rehearsal import RehearsalControl
 
+from mavlink.component.control import NoScans
 from mavlink.component.vehicle import VehicleConfig, VehicleLink
 from service.config import Config
 from service.flight.datalink import DaemonLink, open_backlog
@@ -73,15 +74,14 @@ def test_at_the_end_the_ground_gets_the_rest_or_what_it_lacks_is_said(
 @pytest.mark.parametrize("drone", ["red", "r" * 60])
 def test_a_datalink_that_cannot_be_used_stops_no_scan(tmp_path: Path, drone: str) -> None:
     """Its certificates are not there; the names are too long for the radio."""
-    said: list[str] = []
-    vehicle: Any = SimpleNamespace(statustext=lambda text, _: said.append(text), listen=print)
+    vehicle = HeardVehicle(VehicleConfig(), NoScans())
     connect = ("tls/10.0.0.1:7447",) if drone == "red" else ("tcp/127.0.0.1:1",)
     config = dataclasses.replace(Config().datalink, connect=connect, radio="mavlink")
     header = ScanHeader("one", drone, 1, run_id="0" * 32)
     with ScanStore.create(tmp_path / "scan.db", header) as store:
         link = DaemonLink()
         link.take_off(store, dataclasses.replace(Config(), datalink=config), vehicle)
-        assert link.flying is None and said[0].startswith("Scan is only stored: ")
+        assert link.flying is None and vehicle.said[0].startswith("Scan is only stored: ")
         assert not [w for w in running() if w["name"].startswith(("datalink", "radio"))]
 
 
@@ -159,7 +159,7 @@ def test_the_daemon_offers_earlier_scans_between_flights(tmp_path: Path) -> None
         assert complete("one")
         flown = ScanStore.create(scans / "two" / "scan.db", ScanHeader("two", "red", 1))
         link.take_off(flown, config, vehicle)
-        assert link.flying is not None and link._backlog is None
+        assert link.flying is not None and link.backlog is None
         changed = dataclasses.replace(config.datalink, budget_kbit_s=123.0, share=0.5)
         link.follow(dataclasses.replace(config, datalink=changed))
         assert isinstance(link.flying, DatalinkSender)
