@@ -1,9 +1,9 @@
 """True orthophoto: each place of a surface model from the view that looks at it most steeply.
 
-Views that a higher part of the surface hides are left out, and so are those whose colour differs
-from most others (:func:`recon.surface.texture_views.drop_outliers`). The views' exposures are
-levelled, and neighbouring views blend across one cell of the surface model. An object is shown by
-one view as far as that sees it, so that seams run around buildings.
+Views that a higher part of the surface hides, or nearly, are left out, and so are those whose
+colour differs from most others (:func:`recon.surface.texture_views.drop_outliers`). The views'
+exposures are levelled, and neighbouring views blend across one cell of the surface model. An object
+is shown by one view as far as that sees it, so that seams run around buildings.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numba import njit
 from recon.bands import in_bands
 from recon.image_quality import sharpness
 from recon.mapping.free_space import pixel_of
-from recon.surface.raster import Grid, Raster
+from recon.surface.raster import Grid, Raster, highest_lowest
 from recon.surface.texture_atlas import cameras, flat, sample
 from recon.surface.texture_views import TextureView, TriangleViews, drop_outliers, insert
 from recon.surface.texturing import levels
@@ -27,6 +27,10 @@ from recon.types import F32, F64, I32, I64, U8, Bool
 
 CLEAR_M = 0.3
 """A surface this far above the line to a camera hides a place."""
+
+MARGIN_CELLS = 2
+"""So far around a higher part a view is hidden too, as its edge in the image may lie there; not so
+near the place itself, which may stand at a wall."""
 
 STEP_M = 0.5
 """Neighbours whose heights differ by more from the nearest cell's are not interpolated."""
@@ -99,12 +103,13 @@ def _sightings(
     centres = np.array([v.T_world_camera[:3, 3] for v in views]).reshape(-1, 3)
     highest = float(np.nanmax(raster.height_m, initial=-np.inf))
     places, sharp = np.ascontiguousarray(terrain.places_m), _sharpness(views)
+    around = highest_lowest(raster.height_m, MARGIN_CELLS)[0]
     edges = [rows * n // (STEPS - 1) for n in range(STEPS)]
     for first, end in pairwise(edges):
         progress("choosing views for the orthophoto")
         in_bands(
-            _look, end - first, first, places, raster.height_m, highest, eyes, centres, sharp,
-            *images, out.view, out.px_per_m, out.bgr,
+            _look, end - first, first, places, raster.height_m, around, highest, eyes, centres,
+            sharp, *images, out.view, out.px_per_m, out.bgr,
         )  # fmt: skip
     return out
 
@@ -144,9 +149,9 @@ def _sharpness(views: Sequence[TextureView]) -> F64:
 
 @njit(cache=True, nogil=True)
 def _look(
-    begin: int, end: int, first: int, places: F64, height: F32, highest: float, eyes: F64,
-    centres: F64, sharp: F64, K: F64, T: F64, pixels: U8, start: I64, sides: I64, view: I32,
-    px: F32, bgr: F32,
+    begin: int, end: int, first: int, places: F64, height: F32, around: F32, highest: float,
+    eyes: F64, centres: F64, sharp: F64, K: F64, T: F64, pixels: U8, start: I64, sides: I64,
+    view: I32, px: F32, bgr: F32,
 ) -> None:  # fmt: skip
     """Fill the sightings of rows of cells, counted from the row ``first``."""
     cols = height.shape[1]
@@ -164,7 +169,7 @@ def _look(
                     continue
                 if sample(pixels, start[number], h, w, u, v, colour) < 0.99:
                     continue
-                if _is_hidden(height, highest, r, c, eye):
+                if _is_hidden(height, around, highest, r, c, eye):
                     continue
                 n = r * cols + c
                 east, north, up = x - centre[0], y - centre[1], z - centre[2]
@@ -176,7 +181,7 @@ def _look(
 
 @njit(cache=True, nogil=True)
 def _is_hidden(
-    height: F32, highest: float, r: int, c: int, eye: tuple[float, float, float]
+    height: F32, around: F32, highest: float, r: int, c: int, eye: tuple[float, float, float]
 ) -> bool:
     """Whether a surface hides a cell from the eye (column, row, height)."""
     dc, dr = eye[0] - c, eye[1] - r
@@ -187,7 +192,8 @@ def _is_hidden(
         row, col = round(r + share * dr), round(c + share * dc)
         if z > highest or not (0 <= row < height.shape[0] and 0 <= col < height.shape[1]):
             return False
-        if height[row, col] > z + CLEAR_M:
+        top = around[row, col] if s > MARGIN_CELLS else height[row, col]
+        if top > z + CLEAR_M:
             return True
     return False
 

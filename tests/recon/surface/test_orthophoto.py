@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -99,6 +101,18 @@ def test_ground_that_no_view_sees_takes_the_colour_of_the_model() -> None:
     rgb, known = orthophoto(terrain(views), views, FINE)
     hidden = np.s_[110:130, 152:156]  # 15.2 to 15.6 m east, right behind the block
     assert known[hidden].all() and (np.abs(rgb[hidden].astype(int) - 77) < 12).mean() > 0.9
+
+
+def test_a_roof_that_the_model_has_too_narrow_is_not_seen_on_the_ground_behind() -> None:
+    views = [view(2.0, 12.0)]
+    land = terrain(views)
+    height, places = land.raster.height_m.copy(), land.places_m.copy()
+    height[:, 29] = 0.0  # the block's last column, 14.5 to 15 m east
+    places[:, 29, 2] = 0.0
+    narrow = Terrain(replace(land.raster, height_m=height), places, land.eyes_m)
+    rgb, _ = orthophoto(narrow, views, FINE)
+    behind = np.s_[100:140, 155:200]
+    assert not ((rgb[behind][..., 0] > 150) & (rgb[behind][..., 1] < 60)).any()
 
 
 def test_exposures_are_levelled() -> None:
