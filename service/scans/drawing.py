@@ -49,6 +49,18 @@ def draw_preview(
     Each panel's longer side is at most ``largest_px``; ``lines`` are the key figures.
     ``height_of_zero_m`` is added to the labelled heights.
     """
+    colour, height = draw_maps(raster, track_m, largest_px, height_of_zero_m)
+    h, w = colour.shape[:2]
+    stacked = w > 1.3 * h
+    gap = np.full((MARGIN, w, 3) if stacked else (h, MARGIN, 3), BACKGROUND, np.uint8)
+    both = np.concatenate([colour, gap, height], axis=0 if stacked else 1)
+    return _with_lines(both, lines, _growth(colour))
+
+
+def draw_maps(
+    raster: Raster, track_m: F64, largest_px: int = 1400, height_of_zero_m: float = 0.0
+) -> tuple[U8, U8]:
+    """The two panels of :func:`draw_preview`, colour and height."""
     shown = fill_holes(raster)
     shade = _relief(shown)
     colour = _fit(_painted(shown, _colours(shown, shade)), largest_px)
@@ -59,11 +71,7 @@ def draw_preview(
         _draw_scale_bar(panel, raster.grid.cell_m / scale)
         _draw_north(panel)
     _draw_height_legend(height, shown, height_of_zero_m)
-    h, w = colour.shape[:2]
-    stacked = w > 1.3 * h
-    gap = np.full((MARGIN, w, 3) if stacked else (h, MARGIN, 3), BACKGROUND, np.uint8)
-    both = np.concatenate([colour, gap, height], axis=0 if stacked else 1)
-    return _with_lines(both, lines, _growth(colour))
+    return colour, height
 
 
 def draw_thumbnail(raster: Raster, bounds: Box, largest_px: int = 480) -> U8:

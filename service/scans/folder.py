@@ -275,7 +275,7 @@ class _Files:
         """Write the preview and the report; returns the content of scan.json."""
         with self.failures.noted(PREVIEW):
             self._raster = surface(self._fused, self._cell_m)
-        summary, preview = self.summary(extra), b""
+        summary = self.summary(extra)
         poses = main_poses(self._poses, stretches_apart(self._store))
         with self.failures.noted(PREVIEW):
             preview = _preview(self._raster, poses, summary, self._left_out)
@@ -292,7 +292,7 @@ class _Files:
         with self.failures.noted(REPORT):
             shown = _stages(self._folder, self._store)
             cloud, coverage = self._fused.cloud, self._coverage
-            page = report_html(summary, poses, cloud, self._raster, preview, coverage, shown)
+            page = report_html(summary, poses, cloud, self._raster, coverage, shown)
             write_whole(self._folder / REPORT, page)
         return summary
 
@@ -435,7 +435,7 @@ def key_figures(summary: dict[str, Any]) -> list[str]:
     figures = [f"{counts['points']} points from {counts['keyframes']} keyframes"]
     if counts["points"]:
         figures += [
-            f"{quality['area_m2']:.0f} m2",
+            f"{quality['area_m2']:,.0f} m2",
             f"sigma {quality['sigma_median_m']:.2f} m",
             f"voxel {quality['voxel_m']:.2f} m",
         ]

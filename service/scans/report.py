@@ -1,45 +1,47 @@
-"""``report.html``: flight, coverage, accuracy, speeds and faults, in one file.
+"""``report.html``: what a client gets: accuracy, maps, flight, and diagnostics in an appendix.
 
-Images and curves are embedded; the file loads and runs nothing.
+Images and curves are embedded; the file loads and runs nothing. Printed, or saved as PDF by a
+browser, each section begins a page.
 """
 
 from __future__ import annotations
 
-import base64
 import datetime as dt
 import math
 from collections.abc import Sequence
 from html import escape
+from itertools import pairwise
 from typing import Any
 
 import cv2
 import numpy as np
 
-from recon.surface.raster import Raster, grid_over
-from recon.types import F32, U8, PointCloud
+from recon.camera_model import rays
+from recon.surface.raster import Raster
+from recon.types import F64, U8, PointCloud
 from service.scans.coverage import Coverage
-from service.scans.drawing import coloured, round_length
-from service.scans.report_map import loop_pairs, map_figure
+from service.scans.drawing import draw_maps
+from service.scans.report_appendix import appendix
+from service.scans.report_map import map_figure
+from service.scans.report_parts import area, figure, length, table, within
 from service.stream.records import PoseRecord
 
-LARGEST_MAP_PX = 900
-SPEEDS = (
-    "frames", "frames_tracked", "frames_lost", "segments", "pairs", "clouds",
-    "clouds_per_second", "seconds", "backend",
-)  # fmt: skip
-CURVE_PX = (820, 150)
 STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;color:#20252b;max-width:960px;margin:24px auto;"
-    "padding:0 16px}h1{font-size:24px}h2{font-size:18px;margin-top:30px}table{border-collapse:"
-    "collapse;display:block;overflow-x:auto}svg{max-width:100%;height:auto}"
+    "padding:0 16px}h1{font-size:30px;margin-bottom:0}h2{font-size:20px;margin-top:36px}"
+    "h3{font-size:16px;margin-top:26px}table{border-collapse:collapse;display:block;"
+    "overflow-x:auto;margin:12px 0}svg{max-width:100%;height:auto}"
     "td,th{overflow-wrap:break-word;padding:3px 14px 3px 0;text-align:left;"
     "border-bottom:1px solid #e3e7eb}"
     "td+td{font-variant-numeric:tabular-nums}img{max-width:100%;border:1px solid #e3e7eb}"
     "figure{margin:14px 0}figcaption{color:#56606a;font-size:13.5px}text{font-size:11px}"
     "@media(max-width:600px){text{font-size:22px}}"
-    "@page{margin:14mm}@media print{body{margin:0;max-width:none;padding:0;font-size:12px;"
-    "print-color-adjust:exact}figure,table,tr,h2,h3{break-inside:avoid}h2,h3{break-after:avoid}"
-    "img,svg{max-height:110mm;width:auto}}"
+    "@page{margin:16mm 14mm;@bottom-right{content:counter(page);font:9pt system-ui,sans-serif}}"
+    "@media print{body{margin:0;max-width:none;padding:0;font-size:12px;"
+    "print-color-adjust:exact}figure,table,tr,h2,h3,h4{break-inside:avoid}"
+    "h2,h3,h4{break-after:avoid}section{break-before:page}section.first{break-before:auto}"
+    "h2{margin-top:0}img,svg{max-height:110mm;width:auto}.map img{max-height:225mm}"
+    ".first img{max-height:130mm}}"
 )
 
 
@@ -48,49 +50,153 @@ def report_html(
     poses: Sequence[PoseRecord],
     cloud: PointCloud,
     raster: Raster | None,
-    preview_jpg: bytes,
     coverage: Coverage | None = None,
     keyframe_jpg: bytes | None = None,
 ) -> str:
     """The report of a scan whose scan.json holds ``summary``.
 
-    ``keyframe_jpg`` shows the stages of one keyframe.
+    ``raster`` is its upper surface in metres about its origin; ``keyframe_jpg`` shows the stages
+    of one keyframe.
     """
-    run = summary["run"]
-    parts = [
-        f"<h1>{escape(summary['id'])}</h1>",
-        _table(_flown(summary, poses)),
-        _figure(preview_jpg, "image/jpeg", "Colour and height from above, with the track."),
-        "<h2>Coverage and accuracy</h2>",
-        map_figure(summary, poses, coverage),
-        _table([*_covered(coverage), *_accuracy(summary, raster)]),
-        *_maps(cloud, raster),
-        *consistency(summary, poses),
-        "<h2>The flight</h2>",
-        *_curves(poses),
-        *_stages(keyframe_jpg),
-        "<h2>Speeds and faults</h2>",
-        _table(_rows(run, SPEEDS)),
-        _counted("Not used for stereo", run.get("refusals")),
-        _counted("Readings left out of the pose graph", (run.get("graph") or {}).get("left_out")),
-        _counted("Clouds registered", run.get("registrations")),
-        _counted("Milliseconds per call of each stage", run.get("stage_ms")),
-        *(f"<p>Note: {escape(str(note))}</p>" for note in summary["notes"]),
-        f"<p>{escape(summary['software'])}</p>",
-    ]
+    cover, colour, heights = _map_pages(summary, poses, raster)
+    sections = [
+        ("first", [
+            f"<h1>{escape(summary['id'])}</h1>",
+            f"<p>Survey report, {_when(summary['times']['started_unix_s'])}</p>",
+            *cover,
+            table(_cover(summary, coverage, poses)),
+        ]),
+        ("", [
+            "<h2>Accuracy</h2>",
+            *(f"<p>{escape(text)}</p>" for text in accuracy_words(summary)),
+            *surveyed(summary.get("refinement") or {}),
+            "<h2>Flight and camera</h2>",
+            table(_flown(summary, poses)),
+            "<h2>Coverage</h2>",
+            map_figure(summary, poses, coverage),
+            table(_covered(coverage)),
+        ]),
+        *(("map", page) for page in (
+            ["<h2>Orthophoto</h2>", *colour], ["<h2>Surface model</h2>", *heights]
+        ) if colour),
+        ("", ["<h2>Appendix: diagnostics</h2>", *appendix(summary, poses, cloud, raster,
+              keyframe_jpg), *(f"<p>Note: {escape(str(note))}</p>" for note in summary["notes"]),
+              f"<p>{escape(summary['software'])}</p>"]),
+    ]  # fmt: skip
+    body = "".join(
+        f"<section class='{name}'>{''.join(parts)}</section>" for name, parts in sections
+    )
     head = (
         "<!doctype html><html lang=en><meta charset=utf-8>"
         "<meta name=viewport content='width=device-width, initial-scale=1'>"
         f"<title>{escape(summary['id'])}"
     )
-    return f"{head}</title><style>{STYLE}</style><body>{''.join(parts)}</body></html>\n"
+    return f"{head}</title><style>{STYLE}</style><body>{body}</body></html>\n"
 
 
-def _stages(image: bytes | None) -> list[str]:
-    if image is None:
-        return []
-    words = "Stages of a keyframe in the middle; all of them with scan.keep_debug=true."
-    return ["<h2>A keyframe</h2>", _figure(image, "image/jpeg", words)]
+def _map_pages(
+    summary: dict[str, Any], poses: Sequence[PoseRecord], raster: Raster | None
+) -> tuple[list[str], list[str], list[str]]:
+    """A small view from above, the orthophoto and the surface model, with scale and colour bars."""
+    if raster is None:
+        return [], [], []
+    track = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
+    zero_m = summary["origin"]["alt_amsl_m"] if summary["origin"] else 0.0
+    colour, heights = draw_maps(raster, track, height_of_zero_m=zero_m)
+    cell = f"one cell is {length(raster.grid.cell_m)}"
+    half = cv2.resize(colour, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    small = np.asarray(half, np.uint8)
+    pages = (
+        (small, "From above, with the flight path."),
+        (colour, f"From above, with the flight path; {cell}."),
+        (heights, f"Heights in {summary['heights']}, over shaded relief; {cell}."),
+    )
+    cover, ortho, surface = ([figure(_jpeg(i), "image/jpeg", words)] for i, words in pages)
+    return cover, ortho, surface
+
+
+def _jpeg(image: U8) -> bytes:
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
+
+
+def _cover(
+    summary: dict[str, Any], coverage: Coverage | None, poses: Sequence[PoseRecord]
+) -> list[tuple[str, str]]:
+    """What a reader wants to know first."""
+    quality = summary["quality"]
+    rows = [("area mapped", area(quality["area_m2"]))]
+    pixel_m = _pixel_m(summary, poses)
+    if pixel_m is not None:
+        rows.append(("ground sample of the images, median", length(pixel_m)))
+    rows.append(("ground sample of the map", length(quality["voxel_m"])))
+    if coverage is not None:
+        f = coverage.figures()
+        if f["flown_m2"]:
+            share = 1.0 - f["gaps_m2"] / f["flown_m2"]
+            rows.append(("measured of the area flown", f"{100.0 * share:.1f} %"))
+    if quality["sigma_median_m"] is not None:
+        rows.append(("uncertainty of a point, median (1 sigma)", within(quality["sigma_median_m"])))
+    rows.append(("trust", "; ".join([quality["trust"]["level"], *quality["trust"]["reasons"]])))
+    return rows
+
+
+def accuracy_words(summary: dict[str, Any]) -> list[str]:
+    """Paragraphs on how accurate the map is, and what that rests on."""
+    quality, refined = summary["quality"], summary.get("refinement") or {}
+    level, reasons = quality["trust"]["level"], quality["trust"]["reasons"]
+    check, control = refined.get("check"), refined.get("control")
+    out = []
+    if check:
+        out.append(
+            f"{_count(check['count'], 'check point')}, surveyed and not used for the map, "
+            f"{'lies' if check['count'] == 1 else 'lie'} within {_apart(check)} of it (RMS). This "
+            "is an independent measure of its accuracy."
+        )
+    elif control:
+        out.append(
+            f"{_count(control['count'], 'control point')} placed the map; it passes them within "
+            f"{_apart(control)} (RMS). Without check points there is no independent measure."
+        )
+    elif level == "georeferenced":
+        h, v = quality["position_sigma_h_median_m"], quality["position_sigma_v_median_m"]
+        how = (
+            "" if h is None else f": {within(h)} horizontally and {within(v)} vertically (1 sigma)"
+        )
+        out.append(
+            f"No surveyed point was used. The aircraft's own positions place the map{how}. As a "
+            "whole it may be off by as much; distances and height differences within it are better."
+        )
+    else:
+        out.append({
+            "scaled": "The map is to scale but not placed on the earth: measure distances, areas "
+                      "and volumes in it, not positions.",
+            "relative": "The map shows shapes of unknown size: measure nothing in it.",
+        }.get(level, "Even the shape of the map is uncertain: measure nothing in it."))  # fmt: skip
+    if quality["sigma_median_m"] is not None:
+        out.append(
+            f"Within the map half of the points are known to {within(quality['sigma_median_m'])}, "
+            f"90 % to {within(quality['sigma_90_percent_m'])} (1 sigma)."
+        )
+    scale = quality.get("scale_sigma")
+    if scale is not None and level in ("georeferenced", "scaled"):
+        out.append(f"Lengths are to scale within ± {100.0 * scale:.1f} % (1 sigma).")
+    if reasons:
+        out.append(f"Reservations: {'; '.join(reasons)}.")
+    return out
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}" + ("" if number == 1 else "s")
+
+
+def _apart(found: dict[str, Any]) -> str:
+    flat, up = length(found["rms_h_after_m"]), found["rms_v_after_m"]
+    return f"{flat} horizontally" + ("" if up is None else f" and {length(up)} vertically")
+
+
+def surveyed(refined: dict[str, Any]) -> list[str]:
+    """The residuals of control and check points; empty without any."""
+    return ["<h3>Surveyed points</h3>", _survey(refined)] if refined.get("points") else []
 
 
 def _flown(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[str, str]]:
@@ -99,13 +205,14 @@ def _flown(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[s
     if poses:
         seconds = times["last_pose_unix_s"] - times["first_pose_unix_s"]
         rows += [
-            ("duration", f"{seconds:.0f} s"),
-            ("distance", f"{summary['quality']['distance_m']:.0f} m"),
+            ("duration", f"{seconds:,.0f} s"),
+            ("distance", f"{summary['quality']['distance_m']:,.0f} m"),
             ("speed, median", f"{np.median([p.speed_m_s for p in poses]):.1f} m/s"),
         ]
         heights = [p.agl_m for p in poses if p.agl_m is not None]
         if heights:
             rows.append(("height above ground, median", f"{np.median(heights):.1f} m"))
+    rows += _camera(summary, poses)
     if origin is None:
         rows.append(("position", "no georeference: metres about the scan's own origin"))
     else:
@@ -115,44 +222,65 @@ def _flown(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[s
     return rows
 
 
-def _accuracy(summary: dict[str, Any], raster: Raster | None) -> list[tuple[str, str]]:
-    quality, counts = summary["quality"], summary["counts"]
-    trust = quality["trust"]
-    rows = [
-        ("trust", "; ".join([trust["level"], *trust["reasons"]])),
-        ("points", f"{counts['points']} from {counts['keyframes']} keyframes"),
-        ("area of the cloud", f"{quality['area_m2']:.0f} m2"),
-        ("voxel", f"{quality['voxel_m']:.3f} m"),
-    ]
-    for name, key, unit in (
-        ("sigma of the points, median", "sigma_median_m", "m"),
-        ("sigma of the points, 90 %", "sigma_90_percent_m", "m"),
-        ("stereo pairs per point, median", "views_median", ""),
-        ("sigma of the camera's position, horizontal", "position_sigma_h_median_m", "m"),
-        ("sigma of the camera's position, vertical", "position_sigma_v_median_m", "m"),
-    ):
-        if quality[key] is not None:
-            rows.append((name, f"{quality[key]:.3g} {unit}"))
-    if quality["seen_once_share"] is not None:
-        rows.append(("points that one pair sees", f"{100.0 * quality['seen_once_share']:.0f} %"))
-    if raster is not None and quality["area_m2"]:
-        rows.append(("points per m2", f"{counts['points'] / quality['area_m2']:.1f}"))
-    return [*rows, *sensor_constants((summary.get("run") or {}).get("graph") or {})]
-
-
-def sensor_constants(graph: dict[str, Any]) -> list[tuple[str, str]]:
-    """Constant sensor errors found by the pose graph."""
-    rows = []
-    boresight, datum = graph.get("boresight"), graph.get("altitude_datum")
-    if boresight is not None:
-        offsets = ("{:+.2f} +- {:.2f}".format(*pair) for pair in
-                zip(boresight["deg"], boresight["sigma_deg"], strict=True))  # fmt: skip
-        verdict = "corrected" if boresight["sure"] else "uncertain, not applied"
-        name = "boresight about right, down, ahead"
-        rows.append((name, f"{', '.join(offsets)} degrees: {verdict}"))
-    if datum is not None and datum["shift_m"]:
-        rows.append(("altitude raised to the receiver's", f"{datum['shift_m']:+.2f} m"))
+def _camera(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[str, str]]:
+    """Image size, field of view, ground sample and overlap, as far as they are known."""
+    camera = _lens(summary)
+    rows = [("images used for the map", f"{summary['counts']['keyframes']:,} keyframes")]
+    if camera is None:
+        return rows
+    K, (w, h) = camera
+    across = math.degrees(2.0 * math.atan(0.5 * w / K[0, 0]))
+    rows.append(("camera", f"{w:,} x {h:,} pixels, {across:.0f}° wide"))
+    pixel_m = _pixel_m(summary, poses)
+    if pixel_m is not None:
+        rows.append(("ground sample of the images, median", length(pixel_m)))
+    shared = overlaps(K, (w, h), poses)
+    if shared:
+        rows.append(
+            ("overlap of successive keyframes, median", f"{100.0 * np.median(shared):.0f} %")
+        )
     return rows
+
+
+def _lens(summary: dict[str, Any]) -> tuple[F64, tuple[int, int]] | None:
+    """(3, 3) intrinsics and (W, H); None where the scan does not state them."""
+    camera = summary.get("camera") or {}
+    try:
+        K = np.array(camera["K"], np.float64).reshape(3, 3)
+        size = int(camera["width"]), int(camera["height"])
+    except (KeyError, TypeError, ValueError):
+        return None
+    return (K, size) if np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0 else None
+
+
+def _pixel_m(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> float | None:
+    """Median ground sample straight below the camera."""
+    camera = _lens(summary)
+    heights = [p.agl_m for p in poses if p.agl_m is not None]
+    return float(np.median(heights)) / camera[0][0, 0] if camera and heights else None
+
+
+def overlaps(K: F64, size_px: tuple[int, int], poses: Sequence[PoseRecord]) -> list[float]:
+    """Share of the ground in each keyframe's image that the one before shows too, on level ground.
+
+    Images that reach to the horizon are left out.
+    """
+    w, h = size_px
+    corners = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]) - 0.5
+    prints = []
+    for p in poses:
+        if p.keyframe_seq is None or p.agl_m is None:
+            continue
+        ways = rays(K, corners) @ p.T_world_camera[:3, :3].T
+        if (ways[:, 2] < -0.1 * np.linalg.norm(ways, axis=1)).all():
+            places = p.T_world_camera[:3, 3] - ways * (p.agl_m / ways[:, 2])[:, None]
+            prints.append(places[:, :2].astype(np.float32))
+    out = []
+    for before, after in pairwise(prints):
+        middle = after.mean(axis=0)
+        both, _ = cv2.intersectConvexConvex(before - middle, after - middle)
+        out.append(float(both) / max(cv2.contourArea(after - middle), 1e-9))
+    return out
 
 
 def _covered(coverage: Coverage | None) -> list[tuple[str, str]]:
@@ -160,225 +288,16 @@ def _covered(coverage: Coverage | None) -> list[tuple[str, str]]:
         return []
     f = coverage.figures()
     return [
-        ("area flown", f"{f['flown_m2']:.0f} m2"),
-        ("of it without a surface", f"{f['gaps_m2']:.0f} m2"),
-        ("of it weak (skyrelief refly plans a flight over it)", f"{f['weak_m2']:.0f} m2"),
+        ("area flown", area(f["flown_m2"])),
+        ("of it without a surface", area(f["gaps_m2"])),
+        ("of it weak (skyrelief refly plans a flight over it)", area(f["weak_m2"])),
         ("images per place, median", f"{f['views_median']:.0f}"),
     ]
-
-
-def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:
-    """Maps of the number of views and of sigma per cell."""
-    if raster is None:
-        return ["<p>There is no surface.</p>"]
-    cell = raster.grid.cell_m
-    while max(raster.grid.shape) * raster.grid.cell_m / cell > LARGEST_MAP_PX:
-        cell *= 2.0
-    views, sigma = _per_cell(cloud, cell)
-    out = []
-    for title, values, unit, colours in (
-        ("Stereo pairs that agree, maximum per cell:", views, "", cv2.COLORMAP_VIRIDIS),
-        ("Sigma, minimum per cell:", sigma, "m", cv2.COLORMAP_MAGMA),
-    ):
-        panel = coloured(title, values, unit, colours)
-        caption = panel.title.rpartition(",")[0] or panel.title
-        out.append(_figure(_png(panel.image), "image/png", caption + ", dark to light."))
-    return out
-
-
-def _per_cell(cloud: PointCloud, cell_m: float) -> tuple[F32, F32]:
-    """Maximum views and minimum sigma of the points in each cell, NaN where there are none."""
-    xy = cloud.xyz_m[:, :2].astype(np.float64)
-    grid = grid_over(xy, cell_m)
-    at = np.ravel_multi_index(grid.cells(xy), grid.shape)
-    views, sigma = (np.full(grid.shape, far, np.float32) for far in (-np.inf, np.inf))
-    np.maximum.at(views.reshape(-1), at, cloud.views.astype(np.float32))
-    np.minimum.at(sigma.reshape(-1), at, cloud.sigma_m)
-    nan = np.float32(np.nan)
-    return np.where(np.isfinite(views), views, nan), np.where(np.isfinite(sigma), sigma, nan)
-
-
-def _curves(poses: Sequence[PoseRecord]) -> list[str]:
-    if len(poses) < 2:
-        return ["<p>There is no trajectory.</p>"]
-    t = np.array([(p.time_unix_ns - poses[0].time_unix_ns) / 1e9 for p in poses])
-    series = {
-        "height above ground, m": [math.nan if p.agl_m is None else p.agl_m for p in poses],
-        "height of the camera above the origin, m": [p.T_world_camera[2, 3] for p in poses],
-        "speed, m/s": [p.speed_m_s for p in poses],
-        "turn rate, degrees/s": [math.degrees(p.turn_rate_rad_s) for p in poses],
-        "sigma of the position, m": [p.sigma_m for p in poses],
-    }
-    return [_curve(name, t, np.array(values, float)) for name, values in series.items()]
-
-
-def _curve(name: str, t: np.typing.NDArray[Any], values: np.typing.NDArray[Any]) -> str:
-    """One quantity over time as SVG; at most a point per pixel."""
-    known = np.isfinite(values)
-    if known.sum() < 2:
-        return ""
-    t, values = t[known], values[known]
-    step = max(1, len(t) // CURVE_PX[0])
-    low, high = float(values.min()), float(values.max())
-    w, h = CURVE_PX
-    left, bottom, span_s = 56, h - 18, float(t[-1] - t[0])
-    x = left + (w - left - 8) * (t - t[0]) / max(span_s, 1e-9)
-    y = bottom - 6 - (bottom - 12) * (values - low) / max(high - low, 1e-9)
-    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x[::step], y[::step], strict=True))
-    parts = [f'<path fill="none" stroke="#8a949e" d="M{left} 2V{bottom}H{w}"/>']
-    for value in _ticks(low, high, 3):
-        at = float(np.interp(value, [low, high], [bottom - 6, 6]))
-        parts.append(f'<path stroke="#e3e7eb" d="M{left} {at:.1f}H{w}"/>')
-        parts.append(_label(left - 5, at + 4, "end", value))
-    for value in _ticks(0.0, span_s, 4):
-        at = float(np.interp(value, [0.0, span_s], [left, w - 8]))
-        parts.append(_label(at, h - 4, "middle", value, " s"))
-    parts.append(f'<polyline fill="none" stroke="#1a5fd0" points="{points}"/>')
-    caption = f"{escape(name)}: {low:.2f} to {high:.2f}, over {span_s:.0f} s"
-    svg = f'<svg viewBox="0 0 {w} {h}" width="{w}" height="{h}">{"".join(parts)}</svg>'
-    return f"<figure>{svg}<figcaption>{caption}</figcaption></figure>"
-
-
-def _ticks(low: float, high: float, count: int) -> list[float]:
-    """Round values within a range, from ``count`` to 2.5 times as many; its start without width."""
-    if not high - low > 1e-9:
-        return [low]
-    step = round_length((high - low) / count)
-    return [float(k * step) for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
-
-
-def _label(x: float, y: float, anchor: str, value: float, unit: str = "") -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{value:.6g}{unit}</text>'
-
-
-def _rows(values: dict[str, Any], names: Sequence[str]) -> list[tuple[str, str]]:
-    return [(name.replace("_", " "), str(values[name])) for name in names if name in values]
-
-
-def _counted(title: str, values: Any) -> str:
-    """A table of names and numbers; empty without numbers."""
-    if not isinstance(values, dict) or not values:
-        return ""
-    return f"<h3>{escape(title)}</h3>" + _table([(str(k), str(v)) for k, v in values.items()])
-
-
-def _figure(data: bytes, kind: str, caption: str) -> str:
-    code = base64.b64encode(data).decode("ascii")
-    image = f'<img alt="" src="data:{kind};base64,{code}">'
-    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
-def _png(image: U8) -> bytes:
-    return cv2.imencode(".png", image)[1].tobytes()
 
 
 def _when(unix_s: float) -> str:
     when = dt.datetime.fromtimestamp(unix_s, dt.timezone.utc)
     return when.strftime("%Y-%m-%d %H:%M:%S UTC")
-
-
-KINDS = {
-    "vision": "vision and ICP, keyframe to keyframe",
-    "link": "breaks of vision",
-    "attitude": "attitude",
-    "position": "GNSS position",
-    "altitude": "altitude",
-    "height": "height above ground",
-    "scale": "change of scale",
-    "loop": "loops",
-    "placing": "placement in flight",
-    "prior": "start",
-    "survey": "survey of control points",
-    "control": "marks of control points",
-}
-"""Kinds of factors in words."""
-
-
-def consistency(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[str]:
-    """Sections as HTML; those without content are left out."""
-    flown = summary.get("run", {}).get("graph") or {}
-    refined = summary.get("refinement") or {}
-    out = []
-    residuals = _residuals(flown.get("residuals") or {}, refined.get("residuals") or {})
-    if residuals:
-        out += ["<h2>Consistency</h2>", residuals]
-    drift = _drift(summary, poses)
-    if drift:
-        out += ["<h3>Drift</h3>", _table(drift)]
-    out += _loops(summary, flown, refined)
-    if refined.get("points"):
-        out += ["<h3>Surveyed points</h3>", _survey(refined)]
-    return out
-
-
-def _table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
-    """A table, its text escaped; empty without rows."""
-    if not rows:
-        return ""
-    head = "".join(f"<th>{escape(name)}</th>" for name in header)
-    head = f"<tr>{head}</tr>" if header else ""
-    body = "".join(
-        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
-    )
-    return f"<table>{head}{body}</table>"
-
-
-def _residuals(flown: dict[str, Any], refined: dict[str, Any]) -> str:
-    """Whitened residuals by kind of factor, in flight and after refinement."""
-    rows = []
-    for kind, words in KINDS.items():
-        cells = [words]
-        for found in (flown, refined):
-            one = found.get(kind)
-            cells.append("" if one is None else f"{one['rms']:.2f} ({one['count']})")
-        if any(cells[1:]):
-            rows.append(cells if refined else cells[:2])
-    if not rows:
-        return ""
-    header = ["residuals divided by sigma, rms (number)", "in flight", "refined"]
-    note = (
-        "<p>1 agrees with sigma. Values of telemetry are smaller: its sigmas are enlarged, "
-        "because its errors drift slowly and are correlated.</p>"
-    )
-    return _table(rows, header if refined else header[:2]) + note
-
-
-def _drift(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[str, str]]:
-    """Estimated and observed drift of the track."""
-    out = []
-    if len(poses) >= 2:
-        sigma = [float(np.sqrt(np.trace(p.position_covariance))) for p in poses]
-        words = ", ".join(f"{sigma[k]:.2f} m" for k in (0, len(sigma) // 2, -1))
-        out.append(("sigma of the position at start, middle and end", words))
-    scale = summary.get("run", {}).get("scale")
-    if isinstance(scale, dict) and scale.get("sigma") is not None:
-        out.append(("scale by " + str(scale.get("from")), f"1 sigma {100 * scale['sigma']:.2f} %"))
-    refined = summary.get("refinement")
-    if refined:
-        moved, length = refined["moved_m"], summary["quality"]["distance_m"]
-        share = f", {100 * moved['most'] / length:.2f} % of the distance" if length else ""
-        out.append(
-            ("refinement moved keyframes by", f"{moved['median']:.2f} m (max {moved['most']:.2f} m"
-             f"{share})")
-        )  # fmt: skip
-        out.append(("refinement changed the scale by", f"{100 * (refined['scale'] - 1):+.2f} %"))
-    return out
-
-
-def _loops(summary: dict[str, Any], flown: dict[str, Any], refined: dict[str, Any]) -> list[str]:
-    """Loops by status, and their keyframes."""
-    rows = []
-    for name, found in (("in flight", flown.get("loops")), ("refined", refined.get("loops"))):
-        if found:
-            words = [f"{found[k]} {k}" for k in ("used", "waiting", "refused") if k in found]
-            rows.append((f"loops {name}", ", ".join(words)))
-    if not rows:
-        return []
-    used = [f"{a}-{b}" for a, b, counted in loop_pairs(summary) if counted]
-    if used:
-        more = f" and {len(used) - 40} more" if len(used) > 40 else ""
-        rows.append(("between keyframes", ", ".join(used[:40]) + more))
-    return ["<h3>Loops</h3>", _table(rows)]
 
 
 def _survey(refined: dict[str, Any]) -> str:
@@ -393,7 +312,7 @@ def _survey(refined: dict[str, Any]) -> str:
             sums = [_rms(s[f"rms_h_{w}_m"], s[f"rms_v_{w}_m"]) for w in ("before", "after")]
             rows.append([f"rms of {s['count']}", role, "", *sums, "horizontal, vertical"])
     header = ("point", "role", "marks", "map minus survey before: east, north, up, m", "after", "")
-    return _table(rows, header)
+    return table(rows, header)
 
 
 def _offset(values: Sequence[float | None] | None) -> str:

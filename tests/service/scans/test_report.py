@@ -17,8 +17,10 @@ from recon.types import PosePrior
 from service.flight.reports import graph_figures
 from service.scans.coverage import coverage_of
 from service.scans.folder import key_figures, write_deliverables
-from service.scans.report import consistency, sensor_constants
+from service.scans.report import accuracy_words, overlaps, surveyed
+from service.scans.report_appendix import consistency, sensor_constants
 from service.scans.report_map import map_figure
+from service.scans.report_parts import area, length
 from service.scans.track import latest
 from service.stream.records import PoseRecord, unpack_covariance, unpack_motion
 
@@ -83,7 +85,7 @@ def test_ellipses_are_those_of_sampled_poses() -> None:
 
 def test_residuals_loops_drift_and_points_are_reported() -> None:
     pose = PoseRecord(0, np.eye(4), np.eye(6) * 0.01)
-    page = "".join(consistency(SUMMARY, [pose, pose]))
+    page = "".join([*consistency(SUMMARY, [pose, pose]), *surveyed(REFINED)])
     cells = re.findall(r"<td>(.*?)</td>", page)
     assert "1.10 (5)" in cells and "0.90 (4)" in cells
     assert "2 used, 1 waiting" in cells and "1 used, 1 refused" in cells and "0-3" in cells
@@ -94,6 +96,52 @@ def test_residuals_loops_drift_and_points_are_reported() -> None:
     assert consistency({}, []) == []
 
 
+def quality(level: str, **more: Any) -> dict[str, Any]:
+    """A scan's figures of that trust."""
+    return {
+        "quality": {
+            "trust": {"level": level, "reasons": []}, "sigma_median_m": 0.032,
+            "sigma_90_percent_m": 0.11, "scale_sigma": 0.004,
+            "position_sigma_h_median_m": 1.53, "position_sigma_v_median_m": 2.1,
+        }
+    } | more  # fmt: skip
+
+
+def test_accuracy_is_said_by_what_it_rests_on() -> None:
+    found = {"count": 3, "rms_h_after_m": 0.021, "rms_v_after_m": 0.034}
+    refined = {"check": found, "control": found | {"count": 5}}
+    text = " ".join(accuracy_words(quality("georeferenced", refinement=refined)))
+    assert "3 check points" in text and "2.1 cm horizontally and 3.4 cm vertically" in text
+    text = " ".join(accuracy_words(quality("georeferenced", refinement={"control": found})))
+    assert "3 control points" in text and "no independent measure" in text
+    flat = found | {"count": 1, "rms_v_after_m": None}
+    text = " ".join(accuracy_words(quality("georeferenced", refinement={"check": flat})))
+    assert "1 check point, " in text and "vertically" not in text
+    text = " ".join(accuracy_words(quality("georeferenced")))
+    assert "± 1.53 m horizontally and ± 2.10 m vertically" in text and "± 3.2 cm" in text
+    assert "± 0.4 %" in text
+    assert "not positions" in " ".join(accuracy_words(quality("scaled")))
+    doubtful = accuracy_words(quality("doubtful"))
+    assert "measure nothing" in doubtful[0] and not any("scale" in one for one in doubtful)
+
+
+def test_figures_are_written_as_people_do() -> None:
+    assert area(10545.6) == "10,546 m²"
+    assert [length(v) for v in (0.0321, 0.218, 1.526, 7562.3)] == [
+        "3.2 cm", "22 cm", "1.53 m", "7,562 m",
+    ]  # fmt: skip
+
+
+def test_overlap_is_that_of_footprints(house: HouseFlight) -> None:
+    """160 pixels of 140 px focal length cover 45.7 m from 40 m; steps are 5 m."""
+    poses = [replace(house.record(k, 5.0 * k), agl_m=40.0) for k in range(4)]
+    width_m = 160 / 140 * 40
+    assert overlaps(house.K, (160, 90), poses) == pytest.approx([1 - 5 / width_m] * 3, abs=1e-3)
+    assert overlaps(house.K, (160, 90), [replace(p, agl_m=None) for p in poses]) == []
+    level = [replace(p, T_world_camera=np.eye(4)) for p in poses]  # looks up
+    assert overlaps(house.K, (160, 90), level) == []
+
+
 def test_a_scan_with_a_refinement_shows_it(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as store:
         store.finish(SUMMARY["run"])
@@ -101,6 +149,9 @@ def test_a_scan_with_a_refinement_shows_it(tmp_path: Path, house: HouseFlight) -
     assert key_figures(summary)[2] == "georeferenced"  # the preview states it without reasons too
     page = (tmp_path / "report.html").read_text()
     assert "Consistency" in page and "GNSS position" in page
+    for title in ("Accuracy", "Orthophoto", "Surface model", "Appendix: diagnostics"):
+        assert f"<h2>{title}" in page
+    assert "m2" not in re.sub(r"base64,[^\"]*", "", page)
     assert "Surveyed points" not in page and "<script" not in page
 
 
@@ -158,7 +209,7 @@ def test_accepted_loops_come_back_with_motion_and_covariance() -> None:
     }  # fmt: skip
     assert figures["altitude_datum"] == {"shift_m": -0.712, "sigma_m": 0.2}
     rows = dict(sensor_constants(figures))
-    assert "+1.60 +- 0.20, -1.20 +- 0.20" in rows["boresight about right, down, ahead"]
+    assert "+1.60 ± 0.20, -1.20 ± 0.20" in rows["boresight about right, down, ahead"]
     assert rows["altitude raised to the receiver's"] == "-0.71 m"
     found = unpack_motion(motion)
     assert found is not None and np.allclose(found, Fixed.T_a_b, atol=1e-7)

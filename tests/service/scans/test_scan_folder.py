@@ -247,7 +247,7 @@ def test_the_report_says_what_was_flown_and_nothing_runs_in_it(
     assert "too &lt;little&gt; motion" in page
     assert "EPSG:32632" in page and "47.3900000" in page
     assert page.count("data:image/png;base64,") == 3  # two maps and the coverage
-    assert page.count("data:image/jpeg;base64,") == 2  # the preview and a keyframe's stages
+    assert page.count("data:image/jpeg;base64,") == 4  # cover, two maps, a keyframe's stages
     assert page.count("<svg") == 5  # the map; no height above ground was recorded
     _, *curves = re.findall(r"<svg.*?</figure>", page)
     for curve in curves:

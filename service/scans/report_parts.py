@@ -1,0 +1,43 @@
+"""Parts of a report in HTML: tables, figures, and figures as people write them."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+
+
+def area(value_m2: float) -> str:
+    """Such as ``10,546 m²``."""
+    return f"{value_m2:,.0f} m²"
+
+
+def length(value_m: float) -> str:
+    """A short length in the unit that people would use: ``9.3 cm``, ``1.53 m``, ``79 m``."""
+    if abs(value_m) < 0.995:
+        return f"{100.0 * value_m:.{1 if abs(value_m) < 0.0995 else 0}f} cm"
+    return f"{value_m:.2f} m" if abs(value_m) < 10.0 else f"{value_m:,.0f} m"
+
+
+def within(sigma_m: float) -> str:
+    """Such as ``± 3.2 cm``."""
+    return f"± {length(sigma_m)}"
+
+
+def table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
+    """A table, its text escaped; empty without rows."""
+    if not rows:
+        return ""
+    head = "".join(f"<th>{escape(name)}</th>" for name in header)
+    head = f"<tr>{head}</tr>" if header else ""
+    body = "".join(
+        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
+    )
+    return f"<table>{head}{body}</table>"
+
+
+def figure(data: bytes, kind: str, caption: str) -> str:
+    """An embedded image with its caption."""
+    code = base64.b64encode(data).decode("ascii")
+    image = f'<img alt="" src="data:{kind};base64,{code}">'
+    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
