@@ -38,7 +38,7 @@ PRODUCTS: dict[str, tuple[str, str, float, float]] = {
 }
 """Group, title, bytes of a fused point and seconds of a million of them, on two cores."""
 
-REFINED = "Adjusts all poses to each other once more, then makes the scan's files anew."
+REFINED = "Adjusts all poses to each other once more, then makes the scan's files again."
 WITH_HEIGHTS = {
     "laz", "copc", "ply", "dsm", "dtm", "contours", "gpkg", "dxf", "coverage", "all", "obj",
     "3dtiles", "3dtiles-mesh", "geojson",

@@ -162,7 +162,7 @@ export class FlatMap {
   onClick: (place: Place) => void = () => undefined;
   middle: Place = { x: 0.5, y: 0.5 };
   zoom = 18;
-  isFree = true; // until somebody moves it, it shows what it is told to
+  isFree = true; // until somebody moves it, it shows what `frame` gave it
   private readonly bar = svg("svg", { class: "scale", width: "200", height: "30" });
   private readonly resized = new ResizeObserver(() => this.draw());
 

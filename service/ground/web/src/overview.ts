@@ -77,7 +77,7 @@ export class Overview {
     this.map.draw();
   }
 
-  /** Tells the outline of a scan from the others; none: null. */
+  /** Marks the outline of a scan; null: none. */
   mark(scan: api.Scan | null): void {
     this.marked = scan ? keyOf(scan) : "";
     this.draw();
@@ -89,7 +89,7 @@ export class Overview {
     this.shown = "";
   }
 
-  /** Goes to the scans under a place, and tells which they are. */
+  /** Goes to the scans under a place, and gives them to `onChoose`. */
   private choose(place: Place): void {
     const found = this.at(place);
     if (found.length) {
@@ -117,7 +117,7 @@ export class Overview {
   /** Outlines as they are seen; those too small to see are dots, one for all that lie together. */
   private draw(): void {
     if (this.grid.isConnected) this.drawGrid();
-    const pictures: HTMLElement[] = [];
+    const shown: HTMLElement[] = [];
     const parts: SVGElement[] = [];
     const dots: { x: number; y: number; kind: string; scans: api.Scan[] }[] = [];
     for (const { scan, corners, middle } of this.outlines) {
@@ -126,7 +126,7 @@ export class Overview {
       const kind = keyOf(scan) === this.marked ? "marked" : scan.growing ? "growing" : "";
       if (Math.max(w, h) >= MIN_PX) {
         parts.push(svg("polygon", { points: this.map.path(corners), class: kind }));
-        if (scan.thumbnail) pictures.push(this.picture(scan, spots[0]!, w, h));
+        if (scan.thumbnail) shown.push(this.imageOf(scan, spots[0]!, w, h));
         continue;
       }
       const [x, y] = this.map.seen(middle);
@@ -145,15 +145,15 @@ export class Overview {
     const last = parts.findIndex((p) => p.classList.contains("marked"));
     if (last >= 0) parts.push(...parts.splice(last, 1)); // above the others
     this.marks.replaceChildren(...parts);
-    this.images.replaceChildren(...pictures);
+    this.images.replaceChildren(...shown);
   }
 
-  private readonly pictures = new Map<string, HTMLImageElement>();
+  private readonly loaded = new Map<string, HTMLImageElement>();
 
-  private picture(scan: api.Scan, [left, top]: [number, number], w: number, h: number): HTMLImageElement {
+  private imageOf(scan: api.Scan, [left, top]: [number, number], w: number, h: number): HTMLImageElement {
     const src = api.file(scan, "thumbnail.webp");
-    const image = this.pictures.get(src) ?? el("img", { src, alt: "", draggable: false });
-    this.pictures.set(src, image);
+    const image = this.loaded.get(src) ?? el("img", { src, alt: "", draggable: false });
+    this.loaded.set(src, image);
     Object.assign(image.style, { transform: `translate(${left}px, ${top}px)`, width: `${w}px`, height: `${h}px` });
     return image;
   }
