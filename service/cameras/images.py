@@ -329,7 +329,7 @@ class ImagesSource:
                 f"{missing} of {len(tags)} images have no time; ordered by {by}, one per second "
                 "(images:DIR?interval_s=2 orders them by name and sets it)"
             )
-            return [order.index(i) * SECOND_NS for i in range(len(tags))], unix[order[0]]
+            return [int(n) * SECOND_NS for n in np.argsort(order)], unix[order[0]]
         step_ns = round((interval_s or 1.0) * SECOND_NS)
         return [i * step_ns for i in range(len(tags))], unix[0]
 

@@ -100,10 +100,11 @@ def _improved(apart: F64, order: np.ndarray) -> np.ndarray:
 def _signature(path: Path) -> U8:
     """(M, 128) descriptors of a still's largest features; none of one that does not decode."""
     try:
-        gray = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_4)
-    except (OSError, cv2.error):
+        data = np.fromfile(path, np.uint8)
+        gray = cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_4)
+        if gray is None or max(gray.shape) < SIGNATURE_WIDTH_PX:
+            gray = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    except (OSError, cv2.error):  # such as a size that OpenCV refuses
         gray = None
-    if gray is None or max(gray.shape) < SIGNATURE_WIDTH_PX:
-        gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     none = np.zeros((0, 128), np.uint8)
     return none if gray is None else signature(np.asarray(gray, np.uint8))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 
 from service.cameras.images import ImagesSource
-from service.cameras.still_order import shortest_path
+from service.cameras.still_order import by_likeness, shortest_path
 
 N, STEP_PX = 10, 110
 
@@ -93,3 +95,15 @@ def test_the_path_of_a_survey_grid_is_its_legs() -> None:
     order = shortest_path(apart)
     length = apart[order[:-1], order[1:]].sum()
     assert length <= 1.1 * (5 * 45.0 + 4 * 20.0)
+
+
+def test_an_image_of_a_size_that_is_refused_comes_at_an_end(
+    strip: list[np.ndarray], tmp_path: Path
+) -> None:
+    names = [f"{k}.png" for k in range(2, N + 2)]
+    write(tmp_path, strip, names)
+    image = bytearray((tmp_path / "2.png").read_bytes())
+    image[16:24] = struct.pack(">II", 100_000, 100_000)
+    image[29:33] = struct.pack(">I", zlib.crc32(image[12:29]))
+    (tmp_path / "1.png").write_bytes(image)
+    assert 0 in np.array(by_likeness([tmp_path / name for name in ["1.png", *names]]))[[0, -1]]
