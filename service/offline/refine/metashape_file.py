@@ -13,6 +13,9 @@ from xml.parsers import expat
 from service.georeference import degrees_of, system_of
 
 Attributes = dict[str, str]
+DEEPEST = 32
+"""Elements within each other; Metashape has seven."""
+
 SYSTEMS = ("reference", "wkt")
 """Elements whose text may be the coordinate system, as WKT or EPSG:n."""
 
@@ -53,6 +56,9 @@ class _Reader:
         self._system = self._texts = self._marker = ""
 
     def start(self, element: str, attributes: Attributes) -> None:
+        if len(self._open) == DEEPEST:
+            line = self.parser.CurrentLineNumber
+            raise ValueError(f"line {line}: more than {DEEPEST} elements within each other")
         self._open.append(element)
         self._texts = ""
         number = attributes.get("marker_id", attributes.get("id", ""))

@@ -768,6 +768,11 @@ def test_bad_markers_are_said_in_one_line(tmp_path: Path, old: str, new: str, sa
     assert said in str(raised.value) and str(path) in str(raised.value)
 
 
+def test_markers_within_each_other_without_end_are_refused() -> None:
+    with pytest.raises(ValueError, match="line 1: more than 32 elements"):
+        list(read_metashape("<a>" * 40 + "</a>" * 40))
+
+
 @given(st.lists(st.sampled_from([*re.findall(r"<[^>]*>|[^<>\\s]+", MARKERS), "<", "&", "\0"])))
 def test_any_markers_are_read_or_refused(parts: list[str]) -> None:
     with contextlib.suppress(ValueError):
