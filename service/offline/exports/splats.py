@@ -145,9 +145,10 @@ def read_splats(path: Path) -> Splats:
     head = data[: max(end, 0)].decode("ascii", "replace").split("\n")
     names = tuple(line.split()[-1] for line in head if line.startswith("property float "))
     body = data[end + len(b"end_header\n") :]
-    if end < 0 or names != FIELDS or not body or len(body) % (4 * len(FIELDS)):
+    fits = end >= 0 and names == FIELDS and bool(body) and len(body) % (4 * len(FIELDS)) == 0
+    rows: F32 = np.frombuffer(body if fits else b"", "<f4").reshape(-1, len(FIELDS))
+    if not (fits and np.isfinite(rows).all() and rows[:, 13:17].any(axis=1).all()):
         raise InputError(f"{path} is no PLY of Gaussians as export --to splat writes it")
-    rows: F32 = np.frombuffer(body, "<f4").reshape(-1, len(FIELDS))
     rgb = np.asarray(255.0 * (SH0 * rows[:, 6:9] + 0.5), np.float32)
     opacity = np.asarray(1.0 / (1.0 + np.exp(-rows[:, 9])), np.float32)
     sigma_m = np.asarray(np.exp(rows[:, 10:13]), np.float32)

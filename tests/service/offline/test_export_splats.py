@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from house_flight import HouseFlight
 
+from recon.surface.splats import Splats
 from service.errors import InputError
-from service.offline.exports.splats import FIELDS, SH0, read_splats
+from service.offline.exports.splats import FIELDS, SH0, ply, read_splats
 from service.offline.exports.view import ExportOptions, ScanView, export
 
 pytestmark = pytest.mark.slow
@@ -59,6 +60,17 @@ def test_what_is_written_is_read(flown: Path, tmp_path: Path) -> None:
         path.write_bytes(data)
         with pytest.raises(InputError):
             read_splats(path)
+
+
+@pytest.mark.parametrize("q", [0.0, np.nan])
+def test_gaussians_without_an_attitude_are_refused(tmp_path: Path, q: float) -> None:
+    one = np.ones((1, 3), np.float32)
+    turns = np.full((1, 4), q, np.float32)
+    half = np.full(1, 0.5, np.float32)
+    path = tmp_path / "splat.ply"
+    path.write_bytes(ply(Splats(one, turns, one, half, one), "x"))
+    with pytest.raises(InputError, match="no PLY of Gaussians"):
+        read_splats(path)
 
 
 def test_an_ending_that_is_not_of_gaussians_is_refused(flown: Path, tmp_path: Path) -> None:
