@@ -81,14 +81,15 @@ def draw_thumbnail(raster: Raster, bounds: Box, largest_px: int = 480) -> U8:
     grid = raster.grid
     scale = largest_px / max(east - west, north - south)  # pixels a metre
     cell_px = min(grid.cell_m * scale, 1.0)
+    rows, cols = (max(round(cells * cell_px), 1) for cells in grid.shape)
     small = [  # the mean of known cells: unknown ones are black
-        cv2.resize(image, None, fx=cell_px, fy=cell_px, interpolation=cv2.INTER_AREA)
+        cv2.resize(image, (cols, rows), interpolation=cv2.INTER_AREA)
         for image in (np.where(raster.known[..., None], raster.rgb[..., ::-1], np.uint8(0)),
                       np.where(raster.known, np.uint8(255), np.uint8(0)))
     ]  # fmt: skip
-    up = grid.cell_m * scale / cell_px
+    up = grid.cell_m * scale * np.divide(grid.shape, (rows, cols))
     A = np.array(
-        [[up, 0.0, (grid.west_m - west) * scale], [0.0, up, (north - grid.north_m) * scale]]
+        [[up[1], 0.0, (grid.west_m - west) * scale], [0.0, up[0], (north - grid.north_m) * scale]]
     )
     size = max(round((east - west) * scale), 1), max(round((north - south) * scale), 1)
     colour, known = (cv2.warpAffine(image, A, size).astype(np.float32) for image in small)

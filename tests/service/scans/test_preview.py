@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from recon.surface.raster import Grid, Raster
-from service.scans.drawing import BACKGROUND, MARGIN, TRACK, blank_preview, draw_preview
+from service.scans.drawing import (
+    BACKGROUND,
+    MARGIN,
+    TRACK,
+    blank_preview,
+    draw_preview,
+    draw_thumbnail,
+)
 
 
 def raster(rows: int, cols: int, cell_m: float = 1.0) -> Raster:
@@ -35,6 +42,20 @@ def test_any_shape_is_drawn(shape: tuple[int, int]) -> None:
     image = draw_preview(raster(*shape), np.zeros((0, 3)), ["x" * 50], largest_px=300)
     assert image.dtype == np.uint8
     assert image.ndim == 3
+
+
+def test_a_raster_smaller_than_a_pixel_of_the_thumbnail_is_drawn() -> None:
+    image = draw_thumbnail(raster(40, 40, 0.1), (-2396.0, -2302.0, 2604.0, 2698.0))
+    assert image.shape == (480, 480, 4)
+    assert np.count_nonzero(image[..., 3]) <= 4
+
+
+def test_a_thumbnail_shows_the_raster_in_its_place() -> None:
+    image = draw_thumbnail(raster(41, 40), (60.0, 119.0, 180.0, 239.0))
+    rows, cols = np.nonzero(image[..., 3] > 127)
+    assert [cols.min(), cols.max() + 1] == pytest.approx([160, 320], abs=4)
+    assert [rows.min(), rows.max() + 1] == pytest.approx([156, 320], abs=4)
+    assert image[170, 170, 2] > 150 > image[170, 170, 1]  # red in the north-west
 
 
 def test_large_rasters_are_reduced() -> None:
