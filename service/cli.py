@@ -103,6 +103,13 @@ class LazyCommands(typer.core.TyperGroup):
         except KeyboardInterrupt:
             _end(CancelledByUser("cancelled"))
         except Exception as error:
+            cause: BaseException | None = error
+            while isinstance(cause, SystemError):  # numba's, of a signal during a kernel
+                cause = cause.__cause__
+            if isinstance(cause, KeyboardInterrupt):
+                _end(CancelledByUser("cancelled"))
+            if isinstance(cause, SystemExit):
+                raise cause from None
             if hasattr(error, "format_message"):  # wrong usage; the terminal's line is typer's
                 _as_json(str(error.format_message()), InputError.exit_code)
             raise

@@ -90,6 +90,36 @@ def test_a_command_that_is_killed_removes_its_temporary_files(
     assert not list(tmp_path.glob("tmp*"))
 
 
+@pytest.mark.parametrize(
+    "raised, code, said",
+    [(KeyboardInterrupt(), 130, "skyrelief: cancelled\n"), (SystemExit(143), 143, "")],
+)
+def test_a_signal_during_a_kernel_ends_the_command_in_order(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    raised: BaseException,
+    code: int,
+    said: str,
+) -> None:
+    """As numba passes it on: an error of an error of the signal's exception."""
+
+    def kernel() -> None:
+        try:
+            try:
+                raise raised
+            except BaseException as signalled:
+                raise SystemError("unpickling returned a result with an exception") from signalled
+        except SystemError as error:
+            raise SystemError("the kernel returned a result with an exception") from error
+
+    monkeypatch.setitem(COMMANDS, "kernel", (f"{__name__}:kernel", "Work."))
+    monkeypatch.setattr(sys.modules[__name__], "kernel", kernel, raising=False)
+    with pytest.raises(SystemExit) as ended:
+        app(["kernel"], standalone_mode=False)
+    assert ended.value.code == code
+    assert capsys.readouterr().err == said
+
+
 def test_no_command_imports_heavy_packages() -> None:
     code = (
         "import sys\n"
