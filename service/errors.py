@@ -31,3 +31,7 @@ class OutsideError(SkyreliefError):
     """The environment failed: camera, link, disk, a missing optional package."""
 
     exit_code = 3
+
+
+class NoSenderError(OutsideError):
+    """Nothing has come yet at a camera source that waits to be sent images."""

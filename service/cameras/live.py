@@ -39,7 +39,7 @@ from service.cameras.decoded import frame_bgr
 from service.cameras.lens import same_shape
 from service.cameras.source import CameraFrame, CameraSource, Paced
 from service.cameras.video import decoded_frames, video_stream
-from service.errors import InputError, OutsideError
+from service.errors import InputError, NoSenderError, OutsideError
 from service.redaction import without_credentials
 from service.workers import PROCESS, Worker, end_process, open_process
 
@@ -119,10 +119,12 @@ class LiveSource:
         open_container: Callable[[float], av.container.InputContainer],
         description: str,
         config: LiveConfig | None = None,
+        listens: bool = False,
     ) -> None:
         """Open the stream by ``open_container(stall_s)`` and decode its first image.
 
-        Raises OutsideError when the camera gives none now; the constructor does not retry.
+        Raises OutsideError when the camera gives none now, NoSenderError when nothing has come
+        where it ``listens``; the constructor does not retry.
         """
         self.description = description
         self.config = config or LiveConfig()
@@ -137,8 +139,11 @@ class LiveSource:
         self._open_container = open_container
         self._closed = Event()
         self._iterated = False
+        self._is_silent = False  # at the last attempt
         self._images = self._connect()
         first = next(self._images, None)
+        if first is None and listens and self._is_silent:
+            raise NoSenderError(f"{description}: waits for a sender; none came in {OPEN_S:g} s")
         if first is None:
             why = f" ({self.warnings[-1]})" if self.warnings else ""
             raise OutsideError(
@@ -199,8 +204,9 @@ class LiveSource:
         try:
             container = self._open_container(self.config.stall_s)
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            is_silent = isinstance(error, av.error.ExitError)
-            self._warn(f"no stream for {OPEN_S:g} s" if is_silent else f"cannot be opened: {error}")
+            self._is_silent = isinstance(error, (av.error.ExitError, TimeoutError))
+            silent = f"no stream for {OPEN_S:g} s"
+            self._warn(silent if self._is_silent else f"cannot be opened: {error}")
             return
         try:
             stream = video_stream(container)
@@ -289,7 +295,9 @@ def open_rtmp_listen(rest: str, options: Mapping[str, str]) -> CameraSource:
     place = re.fullmatch(r"(?:([^/\s:]+):)?(\d{1,5})(?:/(\S*))?", rest)
     if place is None or not 0 < int(place[2]) < 65536:
         raise InputError(f"rtmp-listen:{rest} is not like rtmp-listen:1935/live")
-    return _live(f"rtmp://{place[1] or '0.0.0.0'}:{place[2]}/{place[3] or ''}", LISTEN_OPTIONS)
+    return _live(
+        f"rtmp://{place[1] or '0.0.0.0'}:{place[2]}/{place[3] or ''}", LISTEN_OPTIONS, listens=True
+    )
 
 
 def open_srt(rest: str, options: Mapping[str, str]) -> CameraSource:
@@ -303,7 +311,8 @@ def open_srt(rest: str, options: Mapping[str, str]) -> CameraSource:
         raise InputError(f"srt:{rest} is not like srt://:9000")
     source = ["srtsrc", f"uri=srt:{rest}", *([] if place[1] else ["mode=listener"])]
     description = without_credentials(f"srt:{rest}")
-    return _launched([*source, "!", "fdsink", "fd=1"], description, LISTEN_OPTIONS)
+    pipeline = [*source, "!", "fdsink", "fd=1"]
+    return _launched(pipeline, description, LISTEN_OPTIONS, listens=not place[1])
 
 
 def open_v4l2(rest: str, options: Mapping[str, str]) -> CameraSource:
@@ -315,7 +324,9 @@ def open_v4l2(rest: str, options: Mapping[str, str]) -> CameraSource:
     return _live(str(device), dict(options), "v4l2")
 
 
-def _live(url: str, demuxer: dict[str, str], format_: str | None = None) -> CameraSource:
+def _live(
+    url: str, demuxer: dict[str, str], format_: str | None = None, listens: bool = False
+) -> CameraSource:
     def opened(stall_s: float) -> av.container.InputContainer:
         timeout = (OPEN_S, stall_s)
         made: av.container.InputContainer = open_container(
@@ -323,7 +334,7 @@ def _live(url: str, demuxer: dict[str, str], format_: str | None = None) -> Came
         )
         return made
 
-    return Paced(LiveSource(opened, without_credentials(url)))
+    return Paced(LiveSource(opened, without_credentials(url), listens=listens))
 
 
 TAIL = (
@@ -347,7 +358,9 @@ def open_gst(rest: str, options: Mapping[str, str]) -> CameraSource:
     return _launched(elements, without_credentials(f"gst:{rest}"), {})
 
 
-def _launched(elements: list[str], description: str, demuxer: dict[str, str]) -> CameraSource:
+def _launched(
+    elements: list[str], description: str, demuxer: dict[str, str], listens: bool = False
+) -> CameraSource:
     """Output of a GStreamer pipeline that writes a container to its standard output."""
     launcher = shutil.which("gst-launch-1.0")
     if launcher is None:
@@ -356,7 +369,11 @@ def _launched(elements: list[str], description: str, demuxer: dict[str, str]) ->
             "gstreamer1.0-plugins-bad)"
         )
     command = [launcher, "-q", *elements]
-    return Paced(LiveSource(lambda stall_s: _open_command(command, stall_s, demuxer), description))
+
+    def opened(stall_s: float) -> Any:
+        return _open_command(command, stall_s, demuxer)
+
+    return Paced(LiveSource(opened, description, listens=listens))
 
 
 class _Complaints:

@@ -26,7 +26,7 @@ from service.daemon.machine import read_machine
 from service.daemon.simulated import is_simulated
 from service.daemon.vehicle_config import vehicle_config, watch_config
 from service.daemon.warm_up import is_warm, warm_up_command
-from service.errors import InputError, SkyreliefError
+from service.errors import InputError, NoSenderError, SkyreliefError
 from service.packages import installs, unusable_packages
 from service.scans.retention import existing
 
@@ -265,6 +265,9 @@ def _camera(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]
         return
     try:
         source = open_camera(config.camera.source)
+    except NoSenderError as error:
+        yield Finding("camera", NOTE, str(error))
+        return
     except SkyreliefError as error:
         yield Finding("camera", BAD, str(error))
         return

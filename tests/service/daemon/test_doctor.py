@@ -86,6 +86,18 @@ def test_what_is_missing_is_reported(tmp_path: Path) -> None:
     assert findings("mavlink.links=modem:1")["mavlink"][0] == BAD
 
 
+def test_a_camera_that_listens_waits_for_a_sender(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.cameras.live.OPEN_S", 0.2)
+    source = f"rtmp-listen:127.0.0.1:{free_port()}/live"
+    verdict, text = findings(f"camera.source={source}")["camera"]
+    assert verdict == NOTE and "waits for a sender" in text
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        source = f"rtmp-listen:127.0.0.1:{taken.getsockname()[1]}/live"
+        assert findings(f"camera.source={source}")["camera"][0] == BAD
+
+
 def test_camera_model_of_another_size_is_reported(tmp_path: Path) -> None:
     model = tmp_path / "camera.yaml"
     model.write_text(
