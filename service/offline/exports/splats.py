@@ -53,11 +53,11 @@ def write_splats(scan: ScanView, out: Path, options: ExportOptions) -> None:
         with needing("an SPZ file"):
             import gaussforge
     splats = joined(list(in_parts(scan, _made, options, VOXELS_MARGIN_M, needs_cell=False)))
+    if spz and np.abs(splats.xyz_m).max() >= SPZ_REACH_M:
+        raise InputError(f"{out}: SPZ reaches {SPZ_REACH_M:.0f} m from the origin; write .ply")
     scan.progress(f"writing {len(splats)} Gaussians")
-    data = ply(turned(splats, Y_UP if spz else Y_DOWN), _origin(scan, options))
+    data = ply(turned(splats, Y_UP if spz else Y_DOWN), origin_words(scan, options))
     if spz:
-        if np.abs(splats.xyz_m).max() >= SPZ_REACH_M:
-            raise InputError(f"{out}: SPZ reaches {SPZ_REACH_M:.0f} m from the origin; write .ply")
         made = gaussforge.GaussForge().convert(data, "ply", "spz")
         if "data" not in made:
             raise InputError(f"{out}: gaussforge writes no SPZ: {made.get('error')}")
@@ -112,13 +112,14 @@ def turned(splats: Splats, R: F64) -> Splats:
     return replace(splats, xyz_m=(splats.xyz_m @ R.T).astype(np.float32), q_wxyz=q)
 
 
-def _origin(scan: ScanView, options: ExportOptions) -> str:
+def origin_words(scan: ScanView, options: ExportOptions) -> str:
     """Axes and origin, for the header."""
     axes = "x east, y down, z north, metres"
     frame = scan.frame
     if frame is None:
         return f"{axes} from the scan's origin"
-    where = f"{frame.lat_deg:.8f} {frame.lon_deg:.8f} {frame.alt_amsl_m:.3f}"
+    lat_deg, lon_deg, height_m = frame.to_geodetic(np.zeros((1, 3)))[0]
+    where = f"{lat_deg:.8f} {lon_deg:.8f} {height_m:.3f}"
     return f"{axes} from latitude, longitude, height {where} {scan.above(options)}"
 
 

@@ -5,15 +5,18 @@ from __future__ import annotations
 import csv
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from house_flight import HouseFlight
+from pyproj import Transformer
 
 from recon.surface.splats import Splats
 from service.errors import InputError
-from service.offline.exports.splats import FIELDS, SH0, ply, read_splats
+from service.georeference import HeightChange
+from service.offline.exports.splats import FIELDS, SH0, origin_words, ply, read_splats
 from service.offline.exports.view import ExportOptions, ScanView, export
 
 pytestmark = pytest.mark.slow
@@ -60,6 +63,18 @@ def test_what_is_written_is_read(flown: Path, tmp_path: Path) -> None:
         path.write_bytes(data)
         with pytest.raises(InputError):
             read_splats(path)
+
+
+def test_the_header_has_the_height_above_the_datum_that_it_names(
+    flown: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lift = Transformer.from_pipeline("+proj=affine +zoff=45")
+    with ScanView(flown) as scan:
+        frame = scan.frame
+        assert frame is not None
+        monkeypatch.setattr(scan, "frame", replace(frame, heights=HeightChange("lift", lift)))
+        words = origin_words(scan, ExportOptions(vertical_datum="EGM96", to_datum="ellipsoid"))
+    assert words.endswith(f" {frame.alt_amsl_m + 45.0:.3f} above ellipsoid")
 
 
 @pytest.mark.parametrize("q", [0.0, np.nan])
