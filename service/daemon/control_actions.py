@@ -173,7 +173,7 @@ class ControlActions:
         """Apply a new value of a parameter, or refuse it with the reason."""
         try:
             config = with_parameter(self._scanning.config, name, value)
-            self._scanning.follow(config, self._scanning.level)
+            self._scanning.follow(config)
         except InputError as error:
             return Answer(Result.DENIED, str(error))
         return ACCEPTED

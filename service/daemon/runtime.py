@@ -244,7 +244,7 @@ class Daemon:
         """Apply the live keys of ``wanted``; the others wait for a restart."""
         config, taken, waiting = reload(self.config, wanted, self._wanted)
         self._wanted = wanted
-        self.scanning.follow(config, self.scanning.level)
+        self.scanning.follow(config)
         tuned = parameters_of(config).items()
         self.vehicle.show_parameters({n: v for n, v in tuned if TUNABLES[n].key in taken})
         log.info("configuration: now in force: %s", ", ".join(taken) or "nothing new")
@@ -285,7 +285,7 @@ class Daemon:
         ladder.config = ladder_config(self.config.compute)
         move = ladder.update(readings, time.monotonic() if now_s is None else now_s)
         if scanning.level is not ladder.level:
-            scanning.follow(self.config, ladder.level)
+            scanning.set_level(ladder.level)
         if move is not None:
             log.log(logging.WARNING if move.reason else logging.INFO, "%s", move.text)
             self.vehicle.statustext(move.text, WARNING if move.reason else INFO)

@@ -69,7 +69,7 @@ class Scanning:
         self.claim = Claim()  # to the folder of scans; its holder manages earlier ones
         self.paused = threading.Event()  # set while no frames are taken
         self._attempt, self._workers, self._clock_s = attempt, workers, clock_s
-        self._lock = threading.RLock()  # guards the life, the run and the work of closing it
+        self._lock = threading.RLock()  # guards life, run, its closing, config and level
         self._worker: Worker | None = None  # of the run
         self._closing: Work | None = None  # ends with the run
         self._writings = Writings(lambda text: self.vehicle.statustext(text, WARNING))
@@ -211,14 +211,20 @@ class Scanning:
 
     # ---- changes in flight --------------------------------------------------------------------
 
-    def follow(self, config: Config, level: Level) -> None:
-        """Use another configuration, and a load level; live keys also change in the running
-        scan."""
-        self.config, self.level = config, level
-        run = self.run
-        if run is not None:
-            run.follow(config, level)
+    def follow(self, config: Config) -> None:
+        """Use another configuration; live keys also change in the running scan."""
+        with self._lock:
+            self.config = config
+            if self.run is not None:
+                self.run.follow(config, self.level)
         self.link.follow(config)
+
+    def set_level(self, level: Level) -> None:
+        """Change the load level, in this scan and in the next."""
+        with self._lock:
+            self.level = level
+            if self.run is not None:
+                self.run.follow(self.config, level)
 
     def offer_backlog(self) -> None:
         """Send earlier scans that the ground lacks while no scan runs."""

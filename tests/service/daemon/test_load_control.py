@@ -19,7 +19,7 @@ from recon.types import U8, DisparityMap
 from service.cameras import CameraFrame, open_camera
 from service.cameras.source import CameraSource
 from service.compute.backend_choice import FallbackBackend
-from service.config import load_config
+from service.config import Config, load_config
 from service.daemon.frame_gate import FrameGate
 from service.daemon.load_shedding import Level
 from service.daemon.machine import Machine
@@ -142,6 +142,26 @@ def test_heat_is_reported_acted_on_and_undone(daemon: Onboard) -> None:
     assert said[-1] == "Load: full quality again"
     assert len(said) == 8
     assert daemon.snapshot()["load"]["level"] == 0
+
+
+class Tuned(Onboard):
+    """A daemon whose operator changes a parameter whenever the configuration has been read."""
+
+    changes = 0
+
+    @property
+    def config(self) -> Config:
+        config, self.changes = super().config, self.changes + 1
+        self.actions.parameter_changed("SR_BASELINE_M", float(self.changes))
+        return config
+
+
+def test_a_load_level_leaves_a_parameter_that_changes_meanwhile(tmp_path: Path) -> None:
+    daemon = Tuned(tmp_path)
+    for now_s in (0.0, 30.0):
+        daemon.shed_load(Machine("m", temperature_c=97.0), now_s)
+    assert daemon.scanning.level is Level.LOWER_RATE
+    assert daemon.scanning.config.scan.baseline == daemon.changes > 0
 
 
 def test_relief_can_be_switched_off(daemon: Onboard) -> None:
