@@ -195,6 +195,6 @@ class ScanLife:
             Effect.UNMARK: event in (Event.STOP, Event.END) or is_dropped,
             Effect.CLOSE: event in (Event.STOP, Event.END) and before.has_run,
             Effect.OPEN: has_opened,
-            Effect.OFFER: after is State.IDLE and before.has_run,
+            Effect.OFFER: after is State.IDLE is not before,
         }
         return tuple(effect for effect, is_due in found.items() if is_due)

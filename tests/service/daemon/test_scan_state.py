@@ -585,6 +585,14 @@ def test_every_state_has_a_way_out(state: State) -> None:
         assert state in reached(State.IDLE, *Event)
 
 
+def test_a_stop_between_two_attempts_sends_earlier_scans() -> None:
+    life = ScanLife()
+    for event in (Event.START, Event.TICK, Event.FAILED):
+        life.handle(event, 0.0)
+    assert Effect.OFFER in life.handle(Event.STOP, 0.0)
+    assert Effect.OFFER not in life.handle(Event.STOP, 0.0)
+
+
 def test_retries_slow_down_and_start_over() -> None:
     life, now_s = ScanLife(), 0.0
 
