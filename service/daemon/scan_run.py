@@ -195,6 +195,10 @@ class ScanRun:
         vehicle, link = self._with.vehicle, self._with.link
         inputs, gate = self._inputs(source)
         store = create_store(inputs)
+        with ExitStack() as on_fault:  # nothing is sent or recorded of a scan that cannot begin
+            on_fault.callback(store.close)
+            scan = Scan(inputs, store)
+            on_fault.pop_all()
         clocks = disagreement(inputs.unix_offset_ns)
         gate.warnings += clocks
         for text in (*inputs.notes, *clocks):
@@ -202,17 +206,17 @@ class ScanRun:
         self._news_reported = len(gate.warnings)
         vehicle.record(inputs.folder / "link.tlog", inputs.unix_offset_ns)
         link.take_off(store, self._config, vehicle)
-        self.store, self.gate, self.scan = store, gate, Scan(inputs, store)
+        self.store, self.gate, self.scan = store, gate, scan
         self.follow(self._config, self._level)
         vehicle.statustext(f"Scan {inputs.scan_id} started")
         try:
-            self._feed(self.scan)
+            self._feed(scan)
         finally:
             source.close()
             vehicle.record(None)
             try:
                 gate.warnings += set_since(inputs.unix_offset_ns, vehicle.unix_offset_ns())
-                self._close_scan(self.scan, store)
+                self._close_scan(scan, store)
             finally:
                 self._with.write_files(inputs.folder, store)
 

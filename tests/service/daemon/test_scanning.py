@@ -44,6 +44,17 @@ def test_images_that_the_camera_model_does_not_fit_are_refused(tmp_path: Path) -
     scanning.handle(Event.STOP)
 
 
+def test_a_scan_that_cannot_begin_is_neither_sent_nor_recorded(tmp_path: Path) -> None:
+    daemon = Onboard(tmp_path, opener=camera_of(FakeCamera((1600, 1200))))
+    daemon.equip()
+    object.__setattr__(daemon.scanning.config.compute, "labels", 1)  # which loading refuses
+    daemon.scanning.start()
+    until(lambda: daemon.scanning.run is None)
+    assert "labels" in daemon.scanning.fault
+    assert [path.name for path in tmp_path.glob("2*/*")] == ["scan.db"]
+    daemon.scanning.handle(Event.STOP)
+
+
 def test_a_camera_model_of_another_size_is_scaled_as_by_a_replay(tmp_path: Path) -> None:
     """A stream that changes from 1600x1200 to 320x240 ended every later scan."""
     daemon = Onboard(tmp_path, opener=camera_of(Silent((320, 240))))
