@@ -119,6 +119,7 @@ class KeyframeMap:
         """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
         return apart(self.graph.segments, self.graph.loops.taken)
 
-    def refuted(self) -> list[tuple[int, int]]:
-        """Keyframes between which vision is wrong, so that their depth is, too."""
-        return list(self.graph.refuted.items())
+    def left_out(self) -> list[tuple[int, int]]:
+        """First and last keyframe of each stretch that is not part of the map: those apart, and
+        those between which vision is wrong, so that their depth is, too."""
+        return [*self.apart(), *self.graph.refuted.items()]

@@ -145,6 +145,7 @@ class Mapper:
         self.frames = FramePoses(self.keyframes, self.follow.is_settled)
         self._lost: UndistortedFrame | None = None  # the last frame, where it has no pose
         self._kept: dict[int, Keyframe] | None = {} if keeps_cloud else None
+        self._ready = set[int]()  # numbers of all keyframes that are given out
         self._worker = worker(self.reconstruct)
 
     # ---- the figure --------------------------------------------------------------------
@@ -242,6 +243,7 @@ class Mapper:
         for view, update in self._worker.finished(everything):
             self.frames.take(view.reference, update)
             if update.keyframe is not None:
+                self._ready.add(view.seq)
                 if self._kept is not None:
                     self._kept[view.seq] = update.keyframe
                 yield KeyframeReady(update.keyframe)
@@ -249,6 +251,8 @@ class Mapper:
         self.frames.settle()
 
     def _changed(self, poses: Mapping[int, Pose]) -> Iterator[Event]:
+        # A view whose work was broken off is in the graph, and no keyframe.
+        poses = {seq: pose for seq, pose in poses.items() if seq in self._ready}
         if not poses:
             return
         if self._kept is not None:
@@ -281,8 +285,8 @@ class Mapper:
         """
         if self._kept is None:
             raise ValueError("this mapper was made with keeps_cloud=False")
-        apart = self.keyframes.apart()
-        kept = [k for seq, k in self._kept.items() if not any(a <= seq <= b for a, b in apart)]
+        out = self.keyframes.left_out()
+        kept = [k for seq, k in self._kept.items() if not any(a <= seq <= b for a, b in out)]
         sizes = [size for k in kept if (size := ground_sample_m(k.depth)) is not None]
         fine = voxel_m or min(sizes, default=1.0)
         return fuse((cloud_of(k.depth, k.bgr, k.fresh, k.time_ns) for k in kept), fine)

@@ -111,8 +111,7 @@ class Recorder:
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Close the scan, which is flushed; return its summary."""
         summary = self.summary() | {"graph": graph_figures(self._graph)}
-        left_out = [*self.pipeline.keyframes.apart(), *self.pipeline.keyframes.refuted()]
-        summary["apart"] = [list(ends) for ends in left_out]
+        summary["apart"] = [list(ends) for ends in self.pipeline.keyframes.left_out()]
         summary |= extra
         self.store.finish(summary)
         return summary

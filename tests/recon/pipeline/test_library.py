@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,14 @@ from paths import DEMO, ROOT
 
 import recon
 from recon import se3
+from recon.pipeline.events import KeyframeReady, PosesChanged
+from recon.pipeline.keyframe_map import GraphUpdate
 from recon.pipeline.mapper import Mapper, moved
+from recon.pipeline.views import StereoView
+from recon.tracking.relative_pose import RelativePose
 from recon.types import Camera, DepthMap, Keyframe, Pose
 
+CAMERA = Camera(np.array([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), np.zeros(5), (80, 60))
 TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
 
 
@@ -40,15 +46,18 @@ def test_the_example_makes_a_cloud(
     assert abs(float(height_m.mean())) < 25.0  # the height above ground is assumed
 
 
-def test_a_cloud_follows_the_corrections_of_its_keyframes() -> None:
+def keyframe(seq: int) -> Keyframe:
     depth = DepthMap(
         np.full((2, 3), 10.0, np.float32), np.full((2, 3), 0.5, np.float32),
         np.full((2, 3), 2, np.uint8), np.eye(3), np.eye(4),
     )  # fmt: skip
     bgr, fresh = np.zeros((2, 3, 3), np.uint8), np.ones((2, 3), np.bool_)
-    keyframe = Keyframe(0, 0, depth, bgr, Pose(np.eye(4), np.eye(6), scale=2.0), fresh)
+    return Keyframe(seq, 0, depth, bgr, Pose(np.eye(4), np.eye(6), scale=2.0), fresh)
+
+
+def test_a_cloud_follows_the_corrections_of_its_keyframes() -> None:
     there = se3.compose(np.eye(3), np.array([0.0, 5.0, 0.0]))
-    found = moved(keyframe, Pose(there, np.eye(6), scale=3.0))
+    found = moved(keyframe(0), Pose(there, np.eye(6), scale=3.0))
     assert found.depth.depth_m[0, 0] == 15.0 and found.depth.sigma_m[0, 0] == 0.75
     np.testing.assert_array_equal(found.depth.T_world_camera, there)
     again = moved(found, Pose(there, np.eye(6), scale=2.0))
@@ -56,11 +65,43 @@ def test_a_cloud_follows_the_corrections_of_its_keyframes() -> None:
 
 
 def test_a_mapper_without_its_keyframes_has_no_cloud() -> None:
-    camera = Camera(np.array([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), np.zeros(5), (80, 60))
-    mapper = Mapper(camera, keeps_cloud=False)
+    mapper = Mapper(CAMERA, keeps_cloud=False)
     with pytest.raises(ValueError, match="keeps_cloud"):
         mapper.cloud()
-    assert mapper.finish() == () and len(Mapper(camera).finish()) == 0
+    assert mapper.finish() == () and len(Mapper(CAMERA).finish()) == 0
+
+
+class BrokenOff:
+    """Gives one view, which corrects a keyframe whose own work was broken off, and itself."""
+
+    def __init__(self, _: object) -> None:
+        self.views = 0
+
+    def offer(self, item: StereoView) -> None: ...
+
+    def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]:
+        self.views += 1
+        view: Any = SimpleNamespace(
+            seq=self.views, reference=RelativePose(self.views, 0, np.eye(4))
+        )
+        poses = dict.fromkeys((7, self.views), Pose(np.eye(4), np.eye(6), scale=3.0))
+        return [(view, GraphUpdate(poses[7], True, True, poses, keyframe(self.views)))]
+
+    def close(self) -> None: ...
+
+
+def test_only_keyframes_that_came_are_corrected() -> None:
+    mapper = Mapper(CAMERA, worker=BrokenOff)
+    first, changed = mapper.drain()
+    assert isinstance(first, KeyframeReady) and isinstance(changed, PosesChanged)
+    assert list(changed.poses) == [1] and len(mapper.cloud()) > 0
+
+
+def test_a_cloud_leaves_out_keyframes_between_which_vision_is_wrong() -> None:
+    mapper = Mapper(CAMERA, worker=BrokenOff)
+    mapper.drain()
+    mapper.keyframes.graph.refuted[1] = 2
+    assert len(mapper.cloud()) == 0
 
 
 def test_every_name_of_the_library_is_there() -> None:
