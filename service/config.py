@@ -191,7 +191,7 @@ class ComputeConfig:
         """Check ranges."""
         _within("compute.threads", self.threads, 0, 1024)
         _within("compute.stereo_width", self.stereo_width, 64, 4096)
-        _within("compute.labels", self.labels, 2, 256)
+        _within("compute.labels", self.labels, 4, 96)
         _within("compute.iterations", self.iterations, 1, 100)
         _within("compute.pairs", self.pairs, 1, 64)
         _within("compute.guide_width", self.guide_width, 64, 8192)
