@@ -150,7 +150,7 @@ class Receiver:
             front.join()
         scans = self._drones.close()
         for scan in scans:
-            if scan.unwritten and not scan.is_writing:
+            if scan.unwritten:  # also one that grew while it was being written
                 self._writes.put((scan, None))
         self._writes.put(None)
         writer.join()

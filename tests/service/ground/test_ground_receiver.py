@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import socket
+import threading
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +97,29 @@ def written() -> list[Path]:
 
 def fast(endpoint: str) -> DatalinkConfig:
     return DatalinkConfig(connect=(endpoint,), budget_kbit_s=100_000.0)
+
+
+def test_what_grows_while_it_is_written_is_written_at_the_end(tmp_path: Path) -> None:
+    endpoint, release = free_endpoint(), threading.Event()
+    seen: list[int] = []
+
+    def deliver(scan: ReceivedScan) -> None:
+        seen.append(len(scan.intake.store.seqs()))
+        release.wait(30.0)
+
+    session = SessionConfig(mode="router", listen=(endpoint,))
+    ground = Receiver(ReceiverConfig(tmp_path / "ground", session, refresh_s=0.1), deliver=deliver)
+    ground.start()
+    store = new_store(tmp_path / "air")
+    fly(store, 0, 1)
+    with closing(DatalinkSender(store, fast(endpoint))):
+        until(lambda: bool(seen), 30.0)
+        fly(store, 1, 2)
+        until(lambda: ground.progress()[0]["held"].get("k0") == 2, 30.0)
+    threading.Timer(0.5, release.set).start()
+    ground.close()
+    store.close()
+    assert len(seen) == 2 and seen[-1] == 2
 
 
 def test_two_runs_of_one_time_stay_two_scans(tmp_path: Path, written: list[Path]) -> None:
