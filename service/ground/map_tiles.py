@@ -202,8 +202,8 @@ def _drawn(layer: str, cells: Cells, cell_m: float) -> U8:
 
 
 def _terrarium(height_m: F32) -> U8:
-    """(h, w, 4) BGRA of heights to 4 mm, clear where unknown."""
-    known = np.isfinite(height_m)
+    """(h, w, 4) BGRA of heights to 4 mm, clear where unknown or beyond the encoding."""
+    known = np.abs(height_m) < 32768.0
     code = np.where(known, (height_m.astype(np.float64) + 32768.0) * 256.0 + 0.5, 0.0)
     bytes_ = code.astype(np.uint32)[..., None] >> np.array([0, 8, 16], np.uint32)
     return np.dstack([bytes_ & 255, np.where(known, 255, 0)]).astype(np.uint8)

@@ -196,6 +196,20 @@ def test_an_exported_orthophoto_is_shown_while_it_is_newer(client: Client, store
     assert np.abs(at(client, "ortho", ROOF)[:3].astype(int) - ROOF_BGR).max() < 12
 
 
+@pytest.mark.parametrize("height_m", [4e4, -3.4e38])
+def test_heights_beyond_the_encoding_are_unknown(
+    client: Client, store: Path, height_m: float
+) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    x, y, _ = FRAME.to_utm(np.array([[-20.0, 25.0, 0.0]]))[0]
+    profile = {"driver": "GTiff", "width": 400, "height": 400, "count": 1, "dtype": "float32",
+               "crs": f"EPSG:{FRAME.epsg}",
+               "transform": rasterio.transform.from_origin(x, y, 0.1, 0.1)}  # fmt: skip
+    with rasterio.open(store / "drone-1/test-1/dsm.tif", "w", **profile) as image:
+        image.write(np.full((1, 400, 400), height_m, np.float32))
+    assert at(client, "terrain", ROOF)[3] == 0
+
+
 KINDS = ["garbage", "another format", "one band", "large block", "flat pixels", "other planet"]
 
 
