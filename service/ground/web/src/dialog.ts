@@ -13,6 +13,7 @@ export function modal(title: string, className: string, ...content: (Node | null
       resolve(dialog.returnValue);
     };
   });
+  dialog.addEventListener("keydown", (e) => e.stopPropagation()); // keys are not for the page below
   document.body.append(dialog);
   dialog.showModal();
   return [dialog, closed];
