@@ -118,9 +118,10 @@ def test_a_product_is_made_by_keyboard_once_it_is_asked_for(browser: Browser, ba
     browser.run("document.querySelector('[aria-label=\"Make Track, KML\"]').focus()")
     browser.key("Enter")
     browser.wait("!!document.querySelector('[aria-label=\"Download Track, KML\"]')")
+    focused = "document.activeElement.getAttribute('aria-label')"
+    assert browser.run(focused) == "Download Track, KML"
     browser.key("Escape")
     browser.wait("!document.querySelector('dialog')")
-    focused = "document.activeElement.getAttribute('aria-label')"
     assert browser.wait(focused).startswith("Export ")  # back where it was opened
 
 

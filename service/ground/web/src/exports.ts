@@ -5,6 +5,7 @@ import { modal } from "./dialog";
 import { el, notify, size } from "./dom";
 import { duration } from "./jobs";
 import { nameOf } from "./names";
+import { keyOf } from "./overview";
 
 const DATUMS = ["EGM96", "EGM2008", "ellipsoid"];
 const HEIGHTS: [string, api.Heights][] = [
@@ -17,7 +18,7 @@ const HEIGHTS: [string, api.Heights][] = [
   ]),
 ];
 
-let open: { of: api.Scan; rows: Map<string, HTMLElement> } | null = null;
+let open: { dialog: HTMLDialogElement; of: api.Scan; rows: Map<string, HTMLElement> } | null = null;
 
 /** Where the open dialog shows a job; null: it is not of its scan. */
 export const homeInDialog = (job: api.Job): Element | null =>
@@ -36,27 +37,33 @@ export async function showExports(s: api.Scan, again: () => void): Promise<void>
     s.origin ? el("label", { className: "heights" }, "Heights ", heights) : null,
     list, el("h3", { textContent: "Files of the scan" }), files,
   );
-  const fill = async (): Promise<void> => {
+  const fill = async (made = ""): Promise<void> => {
     const [products, now] = await Promise.all([api.products(s), api.scan(s.drone, s.scan)]);
+    if (!dialog.open) return; // closed meanwhile: jobs are shown on the card again
     const rows = new Map<string, HTMLElement>();
     const groups = new Map<string, HTMLElement[]>();
     for (const product of products) {
-      const row = rowOf(now, product, () => HEIGHTS[Number(heights.value)]![1], () => void fill().then(again, notify));
+      const row = rowOf(now, product, () => HEIGHTS[Number(heights.value)]![1], () => void fill(product.kind).then(again, notify));
       const jobs = open?.rows.get(product.kind)?.querySelector(".made");
       if (jobs) row.querySelector(".made")!.replaceWith(jobs); // what runs stays in its place
       rows.set(product.kind, row);
       groups.set(product.group, [...(groups.get(product.group) ?? []), row]);
     }
-    open = { of: s, rows };
+    open = { dialog, of: s, rows };
+    const focused = document.activeElement?.ariaLabel;
     list.replaceChildren(...[...groups].flatMap(([group, members]) => [el("h3", { textContent: group }), ...members]));
+    if (document.activeElement === document.body) {
+      const same = [...list.querySelectorAll<HTMLElement>("[aria-label]")].find((e) => e.ariaLabel === focused);
+      (same ?? rows.get(made)?.querySelector<HTMLElement>(".acts > *"))?.focus();
+    }
     const others = now.files.filter((f) => !products.some((p) => p.file === f.name));
     files.replaceChildren(...others.map((f) => el("li", {}, el("a", { href: api.file(s, f.name), textContent: f.name, download: "" }), ` ${f.what}, ${size(f.bytes)}`)));
   };
   await fill().catch((error: unknown) => (notify(error), dialog.close()));
   await closed;
-  open = null;
-  const label = `Export ${nameOf(s)}`; // the card may be another one by now
-  if (document.activeElement === document.body) [...document.querySelectorAll<HTMLElement>("[aria-label]")].find((e) => e.ariaLabel === label)?.focus();
+  if (open?.dialog === dialog) open = null;
+  // The card may be another one by now, and its scan be named otherwise.
+  if (document.activeElement === document.body) document.querySelector<HTMLElement>(`[data-exports="${keyOf(s)}"]`)?.focus();
 }
 
 function rowOf(s: api.Scan, p: api.Product, heights: () => api.Heights, again: () => void): HTMLElement {

@@ -208,6 +208,7 @@ function card(s: api.Scan, again: () => void): HTMLElement {
   const button = (textContent: string, onclick: () => void): HTMLElement => el("button", { textContent, onclick });
   const export_ = button("Export…", () => void showExports(s, again).catch(notify));
   export_.setAttribute("aria-label", `Export ${name}`);
+  export_.dataset["exports"] = keyOf(s);
   const more = el("summary", { textContent: "More", className: "button" });
   more.setAttribute("aria-label", `more for ${name}`);
   const go = el("a", { href: open, textContent: "Open", className: "button on" });
