@@ -56,7 +56,8 @@ async function film(stage: Stage, views: View[], each_s: number): Promise<Blob> 
   if (!type) throw new Error("this browser records no video");
   const from = new THREE.CatmullRomCurve3(views.map((v) => v.from));
   const at = new THREE.CatmullRomCurve3(views.map((v) => v.at));
-  const recorder = new MediaRecorder(stage.renderer.domElement.captureStream(FRAMES_PER_S), { mimeType: type, videoBitsPerSecond: BITS_PER_S });
+  const stream = stage.renderer.domElement.captureStream(FRAMES_PER_S);
+  const recorder = new MediaRecorder(stream, { mimeType: type, videoBitsPerSecond: BITS_PER_S });
   const parts: Blob[] = [];
   recorder.ondataavailable = ({ data }) => data.size && parts.push(data);
   const stopped = new Promise<void>((resolve) => (recorder.onstop = () => resolve()));
@@ -81,5 +82,6 @@ async function film(stage: Stage, views: View[], each_s: number): Promise<Blob> 
   recorder.stop();
   stage.controls.enabled = true;
   await stopped;
+  for (const track of stream.getTracks()) track.stop(); // it would read every later frame too
   return new Blob(parts, { type });
 }

@@ -50,6 +50,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   const ramp = el("p", { className: "ramp", hidden: true }, el("span", {}), el("i", {}), el("span", {}));
   let contours: Layer | null = null;
   let track: Place[] = [];
+  let growing = true; // until it is known
   const way = svg("svg", { class: "overlay track" });
   const lettering = svg("svg", { class: "overlay heights" });
   const marks = svg("svg", { class: "overlay notes" });
@@ -131,9 +132,10 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
       tileJson(`${at}/ortho.json`).then((json) => ((none.hidden = json !== null), json)),
       api.annotations(id).catch(() => ({ features: [] })),
       plans().catch((error) => (lines.textContent = String(error.message ?? error))),
-      api.track(id).then((found) => (track = (found.geometry?.coordinates ?? []).map(([lon, lat]) => placeOf(lat, lon))), () => undefined),
+      growing && api.track(id).then((found) => (track = (found.geometry?.coordinates ?? []).map(([lon, lat]) => placeOf(lat, lon))), () => undefined),
       ...map.layers.map((layer) => layer.refresh()),
     ]);
+    growing = now.growing;
     if (now.finished) say("finished", "finished");
     else if (now.growing) say("receiving", "receiving");
     else say("silent", "silent");

@@ -86,7 +86,7 @@ export class Terrain extends Layer {
     canvas.dataset["state"] = "loading";
     const tile: Tile = { z, x, y, canvas, heights: null };
     this.known.set(`${z}/${x}/${y}/${this.version}`, tile);
-    for (const [name, { canvas: old, heights }] of this.known) if (heights && !old.isConnected) this.known.delete(name);
+    for (const [name, { canvas: old }] of this.known) if (old !== canvas && !old.isConnected) this.known.delete(name);
     const image = new Image();
     image.onload = () => {
       tile.heights = decode(image);
