@@ -116,7 +116,8 @@ export function print(title: string, origin: Origin | null, scaleSigma: number |
   const sheet = el("div", { className: "sheet" }, el("h1", { textContent: title }), el("p", { textContent: new Date().toLocaleString() }), ...image, ...sections);
   document.body.append(sheet);
   addEventListener("afterprint", () => sheet.remove(), { once: true });
-  window.print();
+  // An image that is not decoded yet would be printed blank.
+  void Promise.all(image.map((one) => one.decode().catch(() => undefined))).then(() => window.print());
 }
 
 const [WIDE, HIGH, LEFT, RIGHT, TOP, BOTTOM] = [290, 120, 40, 8, 8, 20];
