@@ -76,7 +76,7 @@ class KeyframeMap:
         ``step`` (4, 4) and ``covariance`` (6, 6) are those of
         :class:`recon.pipeline.stages.Register`.
         """
-        T_odom = view.view.T_odom_camera
+        T_odom = view.image.T_odom_camera
         self._T_map = T_odom if step is None else self._T_map @ step
         up = T_odom[2, :3]
         below = height_below(depth, up) if depth is not None else None
@@ -89,7 +89,7 @@ class KeyframeMap:
         )
         if depth is not None and self._loops is not None:
             with self._timing("loops"):
-                self._loops.look(view.seq, view.segment, view.view.gray, view.view.K, depth)
+                self._loops.look(view.seq, view.segment, view.image.gray, view.image.K, depth)
         pose = self.trajectory.pose(view.seq)
         is_near = bool(np.abs(pose.T_world_camera[:3, 3]).max() < FARTHEST_M)
         if depth is not None and is_near:

@@ -163,35 +163,34 @@ class Rectify:
         self._relief_m = (0.0, 0.0)
         self.pairs = 0
 
-    def grid(self, candidate: StereoView) -> ViewGrid:
+    def grid(self, view: StereoView) -> ViewGrid:
         """The grid of the view's depth."""
-        view, width = candidate.view, self._config.width_px
-        H, W = view.gray.shape
+        image, width = view.image, self._config.width_px
+        H, W = image.gray.shape
         w, h = width, round(width * H / W)
-        return ViewGrid(scaled_K(view.K, w / W, h / H), (w, h), view.T_odom_camera)
+        return ViewGrid(scaled_K(image.K, w / W, h / H), (w, h), image.T_odom_camera)
 
-    def colours(self, candidate: StereoView, grid: ViewGrid) -> U8:
+    def colours(self, view: StereoView, grid: ViewGrid) -> U8:
         """(h, w, 3) BGR of the view on the grid."""
-        bgr = at_middle_row(candidate.view, candidate.bgr)
+        bgr = at_middle_row(view.image, view.bgr)
         return np.asarray(cv2.resize(bgr, grid.size_px, interpolation=cv2.INTER_AREA), np.uint8)
 
-    def __call__(self, candidate: StereoView, known: Collection[int]) -> dict[int, RectifiedPair]:
+    def __call__(self, view: StereoView, known: Collection[int]) -> dict[int, RectifiedPair]:
         """The pairs that stereo can use by the number of the partner, which is not ``known``."""
         config = self._config  # another thread may set it meanwhile
-        view = candidate.view
         pairs: dict[int, RectifiedPair] = {}
-        for partner in candidate.partners:
+        for partner in view.partners:
             if partner.seq in known:
                 continue
             with self._timing("rectify"):
-                pair = rectify(view, partner, candidate.points, config, self._relief_m)
+                pair = rectify(view.image, partner, view.points, config, self._relief_m)
             if isinstance(pair, str):
                 self._rejected[pair] += 1
                 continue
             pairs[partner.seq] = pair
             if self._debug is not None:
                 self._debug.clear()
-                self._debug |= {"raw_left": candidate.bgr, "raw_right": partner.gray}
+                self._debug |= {"raw_left": view.bgr, "raw_right": partner.gray}
         self.pairs += len(pairs) + len(known)
         return pairs
 
@@ -220,14 +219,14 @@ class Carry:
         self._backend, self._timing = backend, timing
         self._kept: dict[tuple[int, int], PairDepth] = {}  # by view and partner
 
-    def __call__(self, candidate: StereoView, grid: ViewGrid) -> dict[int, PairDepth]:
+    def __call__(self, view: StereoView, grid: ViewGrid) -> dict[int, PairDepth]:
         """Depth on the view's grid by the number of the partner."""
-        view, found = candidate.view, dict[int, PairDepth]()
-        for partner in candidate.partners:
+        found = dict[int, PairDepth]()
+        for partner in view.partners:
             pair = self._kept.get((partner.seq, view.seq))
             if pair is not None and pair.depth_m.shape == grid.size_px[::-1]:
                 with self._timing("carry"):
-                    T = se3.inverse(view.T_odom_camera) @ partner.T_odom_camera
+                    T = se3.inverse(view.image.T_odom_camera) @ partner.T_odom_camera
                     found[partner.seq] = carry(pair, grid.K, T)
         return found
 
@@ -341,7 +340,7 @@ class Register:
         T_before = view.earlier.get(before[0]) if before is not None else None
         if before is None or T_before is None:
             return None, covariance
-        step = se3.inverse(T_before) @ view.view.T_odom_camera
+        step = se3.inverse(T_before) @ view.image.T_odom_camera
         A = se3.adjoint(step)
         covariance = A @ covariance @ A.T
         if depth is None or before[1] is None:

@@ -100,14 +100,19 @@ class ViewCandidate:
     prior: PosePrior
     colour: Colour | None  # None for one that is only a partner
     gray: U8  # (H, W) undistorted
-    key: OdometryKeyframe  # the last one when it was tracked
-    reference: RelativePose
+    reference: RelativePose  # to the last keyframe when it was tracked
     is_blurred: bool = False  # takes no part in stereo, only in the track
     moving: FrameRows | None = None
 
     @property
     def segment(self) -> int:
-        return self.key.segment
+        return self.reference.segment
+
+    @property
+    def keyframe(self) -> OdometryKeyframe:
+        """Its reference keyframe."""
+        assert self.reference.keyframe is not None, "a candidate is not settled"
+        return self.reference.keyframe
 
     @property
     def T_odom_camera(self) -> F64:
@@ -123,8 +128,7 @@ class StereoView:
     time_ns: int
     segment: int
     prior: PosePrior
-    bgr: U8  # (H, W, 3) of the view
-    view: PosedImage
+    image: PosedImage  # in colour
     partners: tuple[PosedImage, ...]
     reference: RelativePose
     points: F64  # (N, 3) landmarks in the view's camera
@@ -132,6 +136,12 @@ class StereoView:
     earlier: Mapping[int, F64]  # number to pose (4, 4) of the segment's last few views
     # (n, m), all over the image: sigma of depth over depth by readout and turns that are not sure
     rows_share: F32 = field(default_factory=KNOWN_ROWS.copy)
+
+    @property
+    def bgr(self) -> U8:
+        """(H, W, 3) of the view."""
+        assert self.image.bgr is not None
+        return self.image.bgr
 
 
 class ViewSelection:
@@ -300,7 +310,7 @@ class ViewSelection:
 
     def _wide(self, view: ViewCandidate, others: list[ViewCandidate]) -> list[ViewCandidate]:
         """Partners of all baselines that stereo can bridge; the nearest where there are none."""
-        widest = WIDEST * median_depth(view.key)
+        widest = WIDEST * median_depth(view.keyframe)
         good = [v for v in others if _apart(v, view) <= widest]
         return _evenly(good, KNOWN_PARTNERS * self._partners) or others[: self._partners]
 
@@ -364,7 +374,7 @@ class VirtualStereoCamera:
         T_keyframe_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
         reference = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
         frame = ViewCandidate(
-            image.seq, image.time_ns, image.prior, image.colour, image.gray, key, reference,
+            image.seq, image.time_ns, image.prior, image.colour, image.gray, reference,
             image.is_blurred, tracked.moving,
         )  # fmt: skip
         self._tracked.append((image.time_ns, reference))
@@ -395,9 +405,9 @@ class VirtualStereoCamera:
             elif view.is_blurred:
                 self._refused["blurred"] += 1
             else:
-                candidate = self._candidate(view, prior)
+                found = self._stereo_view(view, prior)
                 self._given.append(view.reference)
-                yield candidate
+                yield found
 
     def _is_ready(self, view: ViewCandidate) -> bool:
         """True when its partners are there, and the images could show the readout."""
@@ -405,8 +415,8 @@ class VirtualStereoCamera:
         shows = search is not None and search.is_open and newest is not None and newest.is_measured
         return self.selection.ready(view) and not (shows and len(self._waiting) < HELD)
 
-    def _candidate(self, view: ViewCandidate, prior: PosePrior) -> StereoView:
-        points = landmark_points(view.key)
+    def _stereo_view(self, view: ViewCandidate, prior: PosePrior) -> StereoView:
+        points = landmark_points(view.keyframe)
         points = se3.transform(se3.inverse(view.reference.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         assert view.colour is not None
@@ -416,7 +426,6 @@ class VirtualStereoCamera:
             view.time_ns,
             view.segment,
             prior,
-            bgr,
             replace(self._posed(view, in_odom), bgr=bgr),
             tuple(self._posed(partner, in_odom) for partner in partners),
             view.reference,
@@ -452,8 +461,8 @@ class VirtualStereoCamera:
         last = self._given[-1].keyframe if self._given else None
         since = -1 if last is None else last.seq
         T_camera_odom = se3.inverse(view.T_odom_camera)
-        keys = [k for k in self._odometry.keyframes if since < k.seq <= view.key.seq]
-        return step_covariance(keys or [view.key], T_camera_odom)
+        keys = [k for k in self._odometry.keyframes if since < k.seq <= view.keyframe.seq]
+        return step_covariance(keys or [view.keyframe], T_camera_odom)
 
     def _posed(self, view: ViewCandidate, points: F64) -> PosedImage:
         """The view in gray with its pose; ``points`` (N, 3) of the odometry are the ground."""

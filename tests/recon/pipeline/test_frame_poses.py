@@ -114,7 +114,7 @@ def view_of(reference: RelativePose, prior: PosePrior | None = None) -> Any:
     """A view without depth."""
     return SimpleNamespace(
         seq=reference.seq, segment=reference.segment, time_ns=0, prior=prior or PosePrior(),
-        points=np.zeros((0, 3)), view=SimpleNamespace(T_odom_camera=reference.T_odom_camera),
+        points=np.zeros((0, 3)), image=SimpleNamespace(T_odom_camera=reference.T_odom_camera),
     )  # fmt: skip
 
 

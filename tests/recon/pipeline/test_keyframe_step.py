@@ -28,7 +28,7 @@ def step_with_icp(off_m: float) -> float:
             seq=seq,
             covariance=spread,
             earlier={0: np.eye(4)},
-            view=SimpleNamespace(T_odom_camera=T_odom_camera),
+            image=SimpleNamespace(T_odom_camera=T_odom_camera),
         )
         step, _ = register(cast(Any, view), DEPTH)
     assert step is not None

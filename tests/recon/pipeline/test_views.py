@@ -39,7 +39,7 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> View
     image = np.zeros((32, 32, 3), np.uint8)
     reference = RelativePose(seq, segment, np.eye(4), key)
     colour = Colour(image, Undistorter(Camera(np.diag([30.0, 30.0, 1.0]), np.zeros(5), (32, 32))))
-    return ViewCandidate(seq, seq, PosePrior(), colour, image[..., 0], key, reference, blurred)
+    return ViewCandidate(seq, seq, PosePrior(), colour, image[..., 0], reference, blurred)
 
 
 def offer(
@@ -209,7 +209,7 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
     )  # fmt: skip
     for i in range(3):
         plain = frame(i, 5.0 * i)
-        keys.append(replace(plain.key, uv=corners, landmark=ids, landmarks=ground))
+        keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))
         turn = np.array([0.0, 2.0 * i, 0.0, 0.0, 0.0, 0.0])
         moving = FrameRows(i, PosePrior(), np.eye(4), Rows(clock, turn, np.zeros(6)))
         image = UndistortedFrame(
@@ -245,7 +245,7 @@ def test_views_wait_for_the_first_word_on_their_readout(
     given, counts = [], []
     for i in range(6):
         plain = frame(i, 5.0 * i)
-        keys.append(plain.key)
+        keys.append(plain.keyframe)
         moving = FrameRows(i, PosePrior(), np.eye(4), is_measured=is_measured)
         image = UndistortedFrame(
             i, i, PosePrior(), cast(Colour, plain.colour), plain.gray, plain.gray, None, False
@@ -274,14 +274,14 @@ def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: f
     )  # fmt: skip
     for i in range(4):
         plain = frame(i, float(i))
-        keys.append(replace(plain.key, uv=corners, landmark=ids, landmarks=ground))
+        keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))
         image = UndistortedFrame(
             i, i * 10**8, PosePrior(), cast(Colour, plain.colour), plain.gray, plain.gray, None,
             False,
         )  # fmt: skip
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
         views.take(image, Tracked(state, 0, plain.T_odom_camera))
-    blurs = [candidate.view.blur_px for candidate in views.ready(everything=True)]
+    blurs = [view.image.blur_px for view in views.ready(everything=True)]
     if not exposure_s:
         assert blurs == [None] * 4
         return

@@ -81,7 +81,7 @@ def test_a_few_steep_views_do_not_doubt_the_mount_of_all(steep: int, is_levelled
         T[0, 3] = seq
         view = SimpleNamespace(
             seq=seq, segment=0, time_ns=seq, prior=NADIR, points=ground_seen(R),
-            view=SimpleNamespace(T_odom_camera=T),
+            image=SimpleNamespace(T_odom_camera=T),
         )  # fmt: skip
         keyframes.add(view, None, np.eye(6), None)
     assert keyframes.is_levelled == is_levelled
