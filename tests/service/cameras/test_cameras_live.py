@@ -27,7 +27,7 @@ from loopback import free_port, until
 from service.cameras import CameraFrame, CameraSource, live, open_camera
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
 from service.cameras.source import Paced
-from service.errors import InputError, OutsideError
+from service.errors import InputError, NoSenderError, OutsideError
 from service.workers import PROCESS, Worker
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the ffmpeg command")
@@ -430,7 +430,7 @@ def test_who_sends_is_waited_for_again(kind: str, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(live, "OPEN_S", 1.0)  # the first attempts end before anyone sends
     port = free_port()
     source, url, container = (text.format(port=port) for text in LISTENING[kind])
-    with pytest.raises(OutsideError, match=r"no (stream|data) for 1 s"):
+    with pytest.raises(NoSenderError, match="waits for a sender; none came in 1 s"):
         open_camera(source)
     monkeypatch.setattr(live, "OPEN_S", 10.0)
     sender = Sender(url, container)
