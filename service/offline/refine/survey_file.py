@@ -172,7 +172,7 @@ def _markers(path: Path, lines: Sequence[str]) -> Iterator[Row]:
             try:
                 yield line, msgspec.convert(row, SurveyRow)
             except msgspec.ValidationError as error:
-                raise ValueError(f"line {line}: {str(error).replace(' - at `$', ', ')}") from error
+                raise ValueError(f"line {line}: {_why(error)}") from error
     except ValueError as error:
         raise InputError(f"{path} {error}") from error
 
@@ -207,13 +207,14 @@ def _marked(
             mark = {"image": "-", "u_px": 0.0, "v_px": 0.0}
             point = _point(number, msgspec.convert(row | mark, SurveyRow))
         except (ValueError, msgspec.ValidationError) as error:
-            said = str(error).replace(" - at `$", ", ")
-            raise InputError(f"{where}: name, x, y, z and accuracies: {said}") from error
+            said = f"name, x, y, z and accuracies: {_why(error)}"
+            raise InputError(f"{where}: {said}") from error
         if name in points:
             raise InputError(f"{where}: {name} is also in line {points[name].line}")
         points[name] = replace(point, sightings=tuple(seen.get(name, ())))
-    for name in seen.keys() - points.keys():
-        raise InputError(f"{marks} line {seen[name][0].line}: {path} has no point {name!r}")
+    for name in seen:
+        if name not in points:
+            raise InputError(f"{marks} line {seen[name][0].line}: {path} has no point {name!r}")
     return list(points.values())
 
 
@@ -269,7 +270,7 @@ def _marks(path: Path, lines: Sequence[str]) -> Iterator[Row]:
             }  # fmt: skip
             yield number, msgspec.convert(row, SurveyRow)
         except (ValueError, msgspec.ValidationError) as error:
-            raise InputError(f"{where}: {str(error).replace(' - at `$', ', ')}") from error
+            raise InputError(f"{where}: {_why(error)}") from error
 
 
 def _rows(path: Path, lines: Sequence[str]) -> Iterator[Row]:
@@ -291,10 +292,14 @@ def _rows(path: Path, lines: Sequence[str]) -> Iterator[Row]:
     except csv.Error as error:
         raise InputError(f"{path} line {table.line_num}: not CSV ({error})") from error
     except msgspec.ValidationError as error:
-        text, _, column = str(error).partition(" - at `$")
-        name = column.strip(".`")
-        where = f"{path} line {table.line_num}: {name + ': ' if name else ''}"
-        raise InputError(where + text) from error
+        raise InputError(f"{path} line {table.line_num}: {_why(error)}") from error
+
+
+def _why(error: Exception) -> str:
+    """Which column is wrong, and how."""
+    text, _, column = str(error).partition(" - at `$")
+    name = column.strip(".`")
+    return f"{name}: {text}" if name else text
 
 
 def _check_header(path: Path, header: list[str]) -> None:

@@ -756,7 +756,7 @@ def test_markers_of_metashape_are_read_as_a_table_is(tmp_path: Path) -> None:
         ("<document ", "<!DOCTYPE d [<!ENTITY a 'a'>]><document ", "a document type"),
         ('camera_id="0"', 'camera_id="3"', "line 19: no '3'"),
         ('x="13"', 'x="west"', "line 19: could not convert"),
-        ('x="13"', 'x="1e30"', "line 19: Expected"),
+        ('x="13"', 'x="1e30"', "line 19: u_px: Expected"),
         ('y="5249000.25"', 'y="5249000250"', "line 19: 465000, 5.249e+09 is outside"),
     ],
 )
