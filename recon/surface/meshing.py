@@ -21,10 +21,13 @@ class Mesh:
 
 
 def reduced(vertices: F64, faces: I32, largest_faces: int) -> tuple[F64, I32]:
-    """About ``largest_faces`` triangles of the same surface: flat parts are merged.
+    """About ``largest_faces`` triangles of the same surface, or all of one with fewer: flat parts
+    are merged.
 
     Quadric error (Garland and Heckbert 1997, doi:10.1145/258734.258849).
     """
+    if len(faces) <= largest_faces:
+        return vertices, faces
     from fast_simplification import simplify
 
     middle = vertices.mean(axis=0)  # single precision counts from there

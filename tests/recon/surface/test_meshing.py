@@ -12,7 +12,7 @@ import pytest
 from sheets import height_mesh
 from typer.testing import CliRunner
 
-from recon.surface.meshing import Mesh, reduced
+from recon.surface.meshing import Mesh, coarser, reduced
 from recon.surface.raster import Grid, Raster, smoothed
 from recon.types import F32
 from service.cli import app
@@ -40,6 +40,15 @@ def test_many_faces_are_merged_without_leaving_the_surface() -> None:
     x, y, z = (vertices - utm).T
     truth = 2.0 * np.sin((x - 10.25) / 0.5 / 20) * np.cos((49.75 - y) / 0.5 / 25)
     assert np.abs(z - truth).max() < 0.1
+
+
+@pytest.mark.parametrize("largest", [2, 500])
+def test_a_mesh_of_few_faces_keeps_them(largest: int) -> None:
+    """As a small scan, or the corner of a tile, has."""
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.3]])
+    mesh = Mesh(corners, np.array([[0, 1, 2], [1, 3, 2]], np.int32), None, None)
+    few = coarser(mesh, largest)
+    assert np.array_equal(few.vertices_m, corners) and np.array_equal(few.faces, mesh.faces)
 
 
 def test_smoothing_takes_noise_and_keeps_steps() -> None:
