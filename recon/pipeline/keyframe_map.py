@@ -111,10 +111,6 @@ class KeyframeMap:
         points = int(np.count_nonzero(keyframe.fresh & np.isfinite(keyframe.depth.depth_m)))
         self.graph.segments[view.segment].add_surface(view.seq, points, view.prior)
 
-    def map_pose(self, seq: int) -> F64:
-        """(4, 4) T_map_camera of a keyframe in its segment's chain."""
-        return self.trajectory.map_pose(seq)
-
     def apart(self) -> list[tuple[int, int]]:
         """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
         return apart(self.graph.segments, self.graph.loops.taken)

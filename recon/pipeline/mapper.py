@@ -215,7 +215,7 @@ class Mapper:
         if depth is None or not update.is_near:
             return update
         with self._timing("map"):  # what is new
-            T_map = self.keyframes.map_pose(view.seq)
+            T_map = self.keyframes.trajectory.map_pose(view.seq)
             sigma_m, fresh = self.surface(view.segment, depth, view.rows_share, T_map)
         keyframe = self.keyframe(view, depth, bgr, sigma_m, fresh, update.pose)
         self.keyframes.measured(view, keyframe)
@@ -234,7 +234,7 @@ class Mapper:
             events = self.drain()
         finally:
             self._worker.close()
-        self.surface.clear()
+            self.reset_map()
         self.frames.finish()
         return (*events, *self._changed(self.keyframes.changed(final=True)))
 
@@ -275,6 +275,10 @@ class Mapper:
     def take_next(self) -> None:
         """Make the next frame with a pose a view, whatever the baseline asks for."""
         self.views.selection.take_next()
+
+    def reset_map(self) -> None:
+        """Reset the map: all surface counts as unseen."""
+        self.surface.clear()
 
     # ---- results -----------------------------------------------------------------------
 

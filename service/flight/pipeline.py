@@ -11,9 +11,7 @@ from threading import Event
 
 from recon.backends import Backend
 from recon.bands import limit_threads
-from recon.mapping.voxel_map import VoxelMapConfig
 from recon.pipeline.config import Baseline, MapperConfig
-from recon.pipeline.events import Event as MapperEvent
 from recon.pipeline.keyframe_map import GraphUpdate
 from recon.pipeline.mapper import Mapper, Reconstruct
 from recon.pipeline.views import StereoView
@@ -95,9 +93,7 @@ class Pipeline(Mapper):
         ``known`` track takes the odometry's place.
         """
         limit_threads(config.compute.threads)
-        self.stopwatch, self._pages = Stopwatch(), pages
-        self._max_voxels = config.compute.map_voxels
-        self._known: PagedMap | None = None  # the newest map of known surface
+        self.stopwatch = Stopwatch()
         self._doubts: deque[str] = deque()  # found on the worker, taken by the operator's thread
         row = "dense" if in_background and not config.scan.keep_debug else None
         camera = with_shutter(camera, config.camera)
@@ -106,16 +102,12 @@ class Pipeline(Mapper):
             mapper_config(camera, config, assumed, sigma_focal),
             backend,
             known,
-            self._paged,
+            partial(PagedMap, folder=pages, max_voxels=config.compute.map_voxels),
             partial(self._in_background, row, live),
             self.stopwatch,
             keeps_cloud=False,
         )
         self.watch = GraphWatch(self.keyframes.graph)
-
-    def _paged(self, fine: VoxelMapConfig) -> PagedMap:
-        self._known = PagedMap(fine, self._pages, self._max_voxels)
-        return self._known
 
     def _in_background(self, row: str | None, live: bool, work: Reconstruct) -> DenseWorker:
         self._background = DenseWorker(row, partial(self._watched, work), MAX_WAITING, live)
@@ -130,13 +122,6 @@ class Pipeline(Mapper):
     def new_doubts(self) -> list[str]:
         """Warnings about the telemetry, each once."""
         return [self._doubts.popleft() for _ in range(len(self._doubts))]
-
-    def finish(self) -> tuple[MapperEvent, ...]:
-        """As :meth:`Mapper.finish`; the pages of the map are gone."""
-        try:
-            return super().finish()
-        finally:
-            self.reset_map()
 
     def end_by(self, stop: Event, patience_s: float) -> None:
         """Drop unfinished reconstructions, at most ``patience_s`` after ``stop`` is set."""
@@ -153,10 +138,10 @@ class Pipeline(Mapper):
         self.set_effort(compute.pairs, compute.stereo_width, compute.upsample)
 
     def reset_map(self) -> None:
-        """Reset the map: all surface counts as unseen."""
-        known, self._known = self._known, None
-        self.surface.clear()
-        if known is not None:
+        """As :meth:`Mapper.reset_map`, and remove the map's pages."""
+        known = self.surface.known
+        super().reset_map()
+        if isinstance(known, PagedMap):
             known.close()
 
     # ---- figures -----------------------------------------------------------------------
@@ -175,8 +160,8 @@ class Pipeline(Mapper):
     def held(self) -> dict[str, int]:
         """Memory that this scan takes: the map's voxels, its tiles on disk, views for loops,
         and keyframes in the pose graph."""
-        known = self._known
+        known = self.surface.known
         return {
             "map_voxels": 0 if known is None else len(known),
-            "map_tiles_on_disk": 0 if known is None else known.tiles_on_disk,
+            "map_tiles_on_disk": known.tiles_on_disk if isinstance(known, PagedMap) else 0,
         } | self.keyframes.held
