@@ -115,7 +115,7 @@ def check_width(camera: Camera, what: str) -> None:
         view_deg = 2.0 * math.degrees(math.atan(0.5 * side / camera.K[0, 0]))
         raise InputError(
             f"{what}: the view is {view_deg:.1f} degrees wide; below 3 degrees the images cannot "
-            "tell how far the ground is from how the camera turns, so nothing is made of them"
+            "show how far the ground is apart from how the camera turns, so nothing is made of them"
         )
 
 

@@ -207,7 +207,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     @rule(data=st.data())
     def deliver(self, data: st.DataObject) -> None:
-        """An item comes that nobody asked for, perhaps again."""
+        """An item comes without a request, perhaps again."""
         kinds = [(k, n) for k, r in self.one.store.numbers().items() for n in r.newest_first()]
         self.one.send(*data.draw(st.sampled_from(kinds)))
 

@@ -30,7 +30,7 @@ export function comparison(map: FlatMap, scan: api.Scan, names: string[], drawin
     const share = Number(slider.value);
     line.style.left = `${share}%`;
     const { clientWidth: w, clientHeight: h } = map.host;
-    // A layer is a point with its tiles beside it: the clip is in pixels of the map.
+    // A layer is a point next to its tiles: the clip is in pixels of the map.
     const box = (from: number, to: number): string => `polygon(${from}px 0, ${to}px 0, ${to}px ${h}px, ${from}px ${h}px)`;
     const at = (w * share) / 100;
     for (const { own, twin } of twins) {
@@ -75,7 +75,7 @@ export function comparison(map: FlatMap, scan: api.Scan, names: string[], drawin
   return { chooser, divider, follow };
 }
 
-/** The date of a scan, which tells it from another of its place. */
+/** The date of a scan, which tells it apart from another of its place. */
 const labelOf = (s: api.Scan): string => (s.title === s.scan ? date(s.started_unix_s) : nameOf(s));
 
 /** Whether the outlines of two scans have ground in common. */
