@@ -29,7 +29,7 @@ class Textured:
 
     mesh: Mesh  # uv set; vertices doubled where charts meet
     image: U8  # (h, w, 3) RGB
-    seen_share: float  # of the triangles
+    seen_share: float  # of the surface's area
     views_used: int
     charts: int
     scale: float  # texels per pixel of the views
@@ -69,9 +69,10 @@ def texture(
     image = paint(mesh, layout, found, label, palette)
     used = np.unique(label[label >= 0])
     charts = len(np.unique(layout.chart[label >= 0]))
-    return Textured(
-        _split(mesh, layout), image, float((label >= 0).mean()), len(used), charts, layout.scale
-    )
+    a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces], 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    seen = float(area[label >= 0].sum() / max(area.sum(), 1e-12))
+    return Textured(_split(mesh, layout), image, seen, len(used), charts, layout.scale)
 
 
 def _split(mesh: Mesh, layout: Layout) -> Mesh:

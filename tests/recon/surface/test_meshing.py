@@ -92,7 +92,7 @@ def test_the_command_meshes_the_house(tmp_path: Path, house: HouseFlight) -> Non
     assert done.exit_code == 0, done.exception
     figures = json.loads(done.stdout.splitlines()[-1])
     assert figures["tiles"] == 1 and 0.5 < figures["measured"] < 1.0
-    assert figures["seen"] > 0.8
+    assert figures["seen"] > 0.75  # straight down no view shows the walls
     mesh = trimesh.load(tmp_path / "mesh.glb", force="mesh")
     x, y, z = mesh.vertices[:, 0], -mesh.vertices[:, 2], mesh.vertices[:, 1]
     from_wall = np.maximum(np.abs(x - 10) - 6.0, np.abs(y - 2) - 4.0)

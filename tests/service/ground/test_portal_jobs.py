@@ -117,22 +117,16 @@ def test_the_datum_is_chosen_on_the_page(browser: Browser, portal: Portal, needs
         return bool(made) and made[-1].kind == kind
 
     portal.jobs.carry_out = carry_out
-    choose = (
-        "(() => {{ const s = document.querySelectorAll('article select')[{}];"
-        " s.value = [...s.options].find(o => o.text === '{}').value;"
-        " s.dispatchEvent(new Event('change')); }})()"
-    )
     browser.open(portal.url)
     browser.wait("document.querySelectorAll('article').length === 1")
-    for kind, words in (("gpkg", "contours, GeoPackage"), ("glb", "mesh, glTF")):
-        browser.run(choose.format(1, "EGM96 to ellipsoid"))
-        browser.run(choose.format(0, words))
-        browser.click("Make")
+    browser.click("Export…")
+    browser.wait("document.querySelectorAll('.product').length > 20")
+    for kind, title in (("gpkg", "Contours, GeoPackage"), ("glb", "Mesh, glTF")):
+        browser.page.select_option("[aria-label=heights]", label="EGM96 to ellipsoid")
+        browser.page.click(f"[aria-label='Make {title}']")
         assert until(partial(has_made, kind))
-        shown = not browser.run("document.querySelectorAll('article select')[1].hidden")
-        assert shown == (kind == "gpkg")  # a mesh in local metres has no datum
     options = [(job.options.vertical_datum, job.options.to_datum) for job in made]
-    assert options == [("EGM96", "ellipsoid"), (None, None)]
+    assert options == [("EGM96", "ellipsoid"), (None, None)]  # a mesh in local metres has no datum
 
 
 def test_all_maps_come_in_one_zip(portal: Portal, tmp_path: Path) -> None:
@@ -167,7 +161,10 @@ def test_all_maps_are_two_clicks_away(
     browser.screen(1280, 800)
     browser.open(portal.url)
     browser.wait("document.querySelectorAll('article').length === 1")
-    browser.click("Make")
+    browser.click("Export…")
+    browser.wait("document.querySelectorAll('.product').length > 20")
+    browser.page.click("[aria-label='Make All maps']")
+    browser.key("Escape")
     done = f"{IN_CARD}?.className === 'done' && !{IN_CARD}.querySelector('a').hidden"
     browser.wait(done)  # where it was asked for
     browser.open("about:blank")
