@@ -192,8 +192,8 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     const height_m = heights.heightAt(place);
     cursor.value = height_m === null || !scan.origin ? `${lat.toFixed(7)}, ${lon.toFixed(7)}` : coordinates(scan.origin, pointOf(scan.origin, [lon, lat, height_m]));
   };
+  const timer = setInterval(() => void (document.hidden || refresh()), REFRESH_MS); // however long the first takes
   await refresh();
-  const timer = setInterval(() => void (document.hidden || refresh()), REFRESH_MS);
   return () => {
     clearInterval(timer);
     map.close();
