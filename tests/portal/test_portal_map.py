@@ -66,6 +66,7 @@ def page(browser: Browser, tmp_path: Path, scans: Path) -> Iterator[Browser]:
 
 
 def layer(page: Page, name: str) -> None:
+    page.wait(f"!!{BOX.format(name)}")  # a map without layers counts as shown
     page.run(f"{BOX.format(name)}.querySelector('input').click()")
     page.run("new Promise(r => setTimeout(r, 100))")
     page.wait(SHOWN)
@@ -278,7 +279,7 @@ def test_a_flight_over_weak_places_is_planned_while_the_scan_grows(
     page = browser.other()
     page.page.clock.install()
     page.open(f"{portal.url.split('/?')[0]}/#/map/drone-1/test-1")
-    page.wait(SHOWN)
+    page.wait(f"{SHOWN} && !!{BOX.format('Fly again')}")
     page.run(f"{BOX.format('Fly again')}.querySelector('input').click()")
     page.wait("document.querySelector('.layers').textContent.includes('nothing large enough')")
 

@@ -47,7 +47,8 @@ def test_ground_holds_what_was_made_onboard(tmp_path: Path) -> None:
     assert "datalink does not open" not in done.stderr  # the ground outlives the flight
     parts = [line for line in done.stderr.splitlines() if line.startswith("replay: ")]
     assert parts[0].endswith("tracking and reconstructing")
-    assert "replay: sending the rest" in parts and parts[-1] == "replay: writing the files"
+    assert any(part.startswith("replay: sending the rest") for part in parts)
+    assert parts[-1].startswith("replay: writing the files")
     assert report["points"] > 10_000
     assert report["points"] == report["ground_points"]
     onboard, ground = Path(report["scan_folder"]), Path(report["ground_folder"])
