@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from typing import Protocol
 from xml.parsers import expat
 
 MAX_BYTES = 1 << 18
@@ -14,8 +15,29 @@ SKYDIO, NED = "drone-skydio", "CameraOrientationNED"
 """Skydio's angles by frame of reference; those of other frames have the same names."""
 
 
-class _RefusedError(Exception):
-    """The packet declares entities, which no camera does."""
+class DocumentTypeError(ValueError):
+    """It declares a document type, whose entities may grow without bound."""
+
+
+class Handler(Protocol):
+    """Takes the elements and texts of a parser."""
+
+    def start(self, element: str, attributes: dict[str, str]) -> None: ...
+
+    def end(self, element: str) -> None: ...
+
+    def text(self, data: str) -> None: ...
+
+
+def parser_of(handler: Handler) -> expat.XMLParserType:
+    """A parser of foreign XML for ``handler``; it raises DocumentTypeError while it parses."""
+    parser = expat.ParserCreate("utf-8")
+    parser.buffer_text = True
+    parser.StartElementHandler = handler.start
+    parser.EndElementHandler = handler.end
+    parser.CharacterDataHandler = handler.text
+    parser.StartDoctypeDeclHandler = _refuse
+    return parser
 
 
 def xmp_values(packet: bytes) -> dict[str, str]:
@@ -25,15 +47,9 @@ def xmp_values(packet: bytes) -> dict[str, str]:
     not read.
     """
     reader = _Reader()
-    parser = expat.ParserCreate("utf-8")
-    parser.buffer_text = True
-    parser.StartElementHandler = reader.start
-    parser.EndElementHandler = reader.end
-    parser.CharacterDataHandler = reader.text
-    parser.StartDoctypeDeclHandler = _refuse
     try:
-        parser.Parse(packet[:MAX_BYTES].decode("utf-8", "replace").encode(), True)
-    except _RefusedError:
+        parser_of(reader).Parse(packet[:MAX_BYTES].decode("utf-8", "replace").encode(), True)
+    except DocumentTypeError:
         return {}
     except expat.ExpatError:
         pass
@@ -41,7 +57,7 @@ def xmp_values(packet: bytes) -> dict[str, str]:
 
 
 def _refuse(*_: object) -> None:
-    raise _RefusedError
+    raise DocumentTypeError
 
 
 class _Reader:
@@ -68,7 +84,7 @@ class _Reader:
         if data.strip():
             self._texts.append(data.strip())
 
-    def end(self, _: str) -> None:
+    def end(self, element: str) -> None:
         self._skydio.pop()
         name = self._open.pop()
         if name is not None and self._texts:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 from xml.parsers import expat
 
+from service.cameras.xmp import DocumentTypeError, parser_of
 from service.georeference import degrees_of, system_of
 
 Attributes = dict[str, str]
@@ -26,21 +27,14 @@ def read_metashape(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
     Raises ValueError, which names the line where there is one.
     """
     reader = _Reader()
-    parser = reader.parser = expat.ParserCreate("utf-8")
-    parser.buffer_text = True
-    parser.StartElementHandler = reader.start
-    parser.EndElementHandler = reader.end
-    parser.CharacterDataHandler = reader.text
-    parser.StartDoctypeDeclHandler = _refuse
+    reader.parser = parser_of(reader)
     try:
-        parser.Parse(text.encode(), True)
+        reader.parser.Parse(text.encode(), True)
+    except DocumentTypeError as error:
+        raise ValueError("it declares a document type, which Metashape does not") from error
     except expat.ExpatError as error:
         raise ValueError(f"not XML: {error}") from error
     yield from reader.rows()
-
-
-def _refuse(*_: object) -> None:
-    raise ValueError("it declares a document type, which Metashape does not")
 
 
 class _Reader:
@@ -78,8 +72,8 @@ class _Reader:
         if element in SYSTEMS and "camera" not in self._open and self._texts.strip():
             self._system = self._system or self._texts.strip()
 
-    def text(self, text: str) -> None:
-        self._texts += text
+    def text(self, data: str) -> None:
+        self._texts += data
 
     def rows(self) -> Iterator[tuple[int, dict[str, Any]]]:
         """The marks of markers that have a place."""
