@@ -105,7 +105,7 @@ def test_the_export_dialog_says_what_each_product_is_and_makes_it(
             ".find(p => p.innerText.includes('Track, GeoJSON'))"
         )
         browser.run(f"{geojson}.querySelector('button').click()")
-        browser.wait(f"!!{geojson}.querySelector('.jobs li')")  # its progress is beside it
+        browser.wait(f"!!{geojson}.querySelector('.jobs li')")  # its progress is in its row
         link = f"{geojson}.querySelector('[aria-label=\"Download Track, GeoJSON\"]')"
         browser.wait(f"!!{link}")
         with browser.page.expect_download() as download:

@@ -75,7 +75,7 @@ export function comparison(map: FlatMap, scan: api.Scan, names: string[], drawin
   return { chooser, divider, follow };
 }
 
-/** The date of a scan, which tells it apart from another of its place. */
+/** The date of a scan, which sets it apart from another of its place. */
 const labelOf = (s: api.Scan): string => (s.title === s.scan ? date(s.started_unix_s) : nameOf(s));
 
 /** Whether the outlines of two scans have ground in common. */
