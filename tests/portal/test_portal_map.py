@@ -66,10 +66,37 @@ def page(browser: Browser, tmp_path: Path, scans: Path) -> Iterator[Browser]:
 
 
 def layer(page: Page, name: str) -> None:
-    page.wait(f"!!{BOX.format(name)}")  # a map without layers counts as shown
     page.run(f"{BOX.format(name)}.querySelector('input').click()")
     page.run("new Promise(r => setTimeout(r, 100))")
     page.wait(SHOWN)
+
+
+SLOW = """(() => {
+  const [whole, asked] = [fetch, { now: 0, most: 0, ended: 0 }];
+  Object.assign(window, { asked, fetch: async (path, init) => {
+    if (!path.endsWith('/annotations')) return whole(path, init);
+    asked.most = Math.max(asked.most, ++asked.now);
+    await new Promise(r => setTimeout(r, 2500));
+    asked.now--; asked.ended++;
+    return whole(path, init);
+  } });
+})()"""
+"""A station that answers later than the page asks again."""
+
+
+def test_a_slow_station_is_not_asked_again_before_it_has_answered(page: Browser) -> None:
+    page.run(SLOW)
+    page.wait("asked.ended >= 3")
+    assert page.run("asked.most") == 1
+
+
+def test_the_page_that_is_left_takes_no_clicks(page: Browser) -> None:
+    left = "document.querySelector('#app > *').inert"
+    page.run(f"addEventListener('hashchange', () => {{ window.left = {left} }})")
+    page.run("location.hash = '#/view/drone-1/test-1'")
+    page.wait("document.body.dataset.points > 0")
+    assert page.run("window.left") is True
+    assert page.run(left) is False
 
 
 def steady(page: Browser) -> dict[str, float]:

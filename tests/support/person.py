@@ -56,8 +56,11 @@ class Page:
         return value
 
     def click(self, text: str) -> None:
-        """Click the button with this text, as an event of its own."""
-        find = f"[...document.querySelectorAll('button')].find(b => b.textContent === '{text}')"
+        """Click the button with this text, as an event of its own; none of a page being left."""
+        find = (
+            "[...document.querySelectorAll('button')]"
+            f".find(b => b.textContent === '{text}' && !b.closest('[inert]'))"
+        )
         self.wait(f"!!{find} && !{find}.disabled")
         self.run(f"setTimeout(() => {find}.click(), 0)")
         self._run_or_left("new Promise(r => setTimeout(r, 50))")

@@ -64,9 +64,12 @@ export class Refused extends Error {
 
 export const NO_ANSWER = "the ground station does not answer";
 
+const PATIENCE_MS = 30_000;
+
 /** The JSON answer; throws Refused when the portal refuses, and NO_ANSWER when nothing comes. */
 export async function ask<T>(path: string, method = "GET", body?: unknown): Promise<T> {
   const init: RequestInit = { method };
+  if (method === "GET") init.signal = AbortSignal.timeout(PATIENCE_MS);
   if (body !== undefined) {
     init.body = JSON.stringify(body);
     init.headers = { "content-type": "application/json" };
@@ -74,9 +77,25 @@ export async function ask<T>(path: string, method = "GET", body?: unknown): Prom
   const answer = await fetch(path, init).catch(() => {
     throw new Error(NO_ANSWER);
   });
-  const content = (await answer.json().catch(() => ({}))) as { error?: string };
+  const content = (await answer.json().catch((error: unknown) => {
+    if (error instanceof SyntaxError) return {}; // no JSON
+    throw new Error(NO_ANSWER); // cut, or too late
+  })) as { error?: string };
   if (!answer.ok) throw new Refused(content.error ?? `the portal answered ${answer.status}`, answer.status);
   return content as T;
+}
+
+/** Does `job` again and again while the page is seen, `wait_ms` after it has ended: a slow station's answers
+ * would queue up, and all other requests behind them. Gives what ends it. */
+export function every(wait_ms: number, job: () => Promise<unknown>): () => void {
+  let [timer, ended] = [0, false];
+  const next = (): void => void (ended || (timer = window.setTimeout(turn, wait_ms)));
+  const turn = (): void => (document.hidden ? next() : void job().then(next, next));
+  next();
+  return () => {
+    ended = true;
+    clearTimeout(timer);
+  };
 }
 
 const place = (s: { drone: string; scan: string }): string =>

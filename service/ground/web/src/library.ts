@@ -84,10 +84,10 @@ export async function showLibrary(root: HTMLElement): Promise<() => void> {
     draw();
     bin.replaceChildren(...binRows(deleted, again));
   }
-  const refresh = setInterval(() => void (document.hidden || load().catch(() => undefined)), REFRESH_MS);
   await load().catch(() => undefined);
+  const end = api.every(REFRESH_MS, load);
   return () => {
-    clearInterval(refresh);
+    end();
     overview.close();
     endUploads();
   };

@@ -14,6 +14,7 @@ async function show(): Promise<void> {
   close();
   close = () => undefined;
   for (const dialog of document.querySelectorAll("dialog")) dialog.close(); // they belong to the page that is left
+  for (const child of root.children) child.toggleAttribute("inert", true); // seen until the next page stands there
   const [page, drone, scan, place] = location.hash.replace(/^#\//, "").split("/").map(decodeURIComponent);
   let end: () => void;
   if (page === "view" && drone && scan) end = await (await loaded(import("./view"))).showView(root, drone, scan, place);

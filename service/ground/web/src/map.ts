@@ -51,6 +51,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   let contours: Layer | null = null;
   let track: Place[] = [];
   let growing = true; // until it is known
+  let hasAnswer = false;
   const way = svg("svg", { class: "overlay track" });
   const lettering = svg("svg", { class: "overlay heights" });
   const marks = svg("svg", { class: "overlay notes" });
@@ -91,7 +92,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     again.replaceChildren(
       ...(isPlanned ? flight : []).map(({ polygon, places }) => svg(polygon ? "polygon" : "polyline", { points: map.path(places) })),
     );
-    document.body.dataset["map"] = map.loading ? "loading" : "shown";
+    document.body.dataset["map"] = map.loading || !hasAnswer ? "loading" : "shown";
   });
   const add = (layer: Layer, title: string, on: boolean): void => {
     layer.seen = on;
@@ -136,6 +137,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
       ...map.layers.map((layer) => layer.refresh()),
     ]);
     growing = now.growing;
+    hasAnswer = true;
     if (now.finished) say("finished", "finished");
     else if (now.growing) say("receiving", "receiving");
     else say("silent", "silent");
@@ -192,10 +194,10 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     const height_m = heights.heightAt(place);
     cursor.value = height_m === null || !scan.origin ? `${lat.toFixed(7)}, ${lon.toFixed(7)}` : coordinates(scan.origin, pointOf(scan.origin, [lon, lat, height_m]));
   };
-  const timer = setInterval(() => void (document.hidden || refresh()), REFRESH_MS); // however long the first takes
   await refresh();
+  const end = api.every(REFRESH_MS, refresh);
   return () => {
-    clearInterval(timer);
+    end();
     map.close();
     ruler.close();
     delete document.body.dataset["map"];

@@ -68,6 +68,7 @@ export class Ruler {
   private saved: api.Annotation[] = [];
   private readonly name = el("input", { type: "text", maxLength: 100, placeholder: "name of this measurement" });
   private hovered = 0;
+  private asked = 0;
 
   /** Measurements are kept with the scan `id`, which people call `title`. */
   constructor(
@@ -256,8 +257,9 @@ export class Ruler {
 
   private async refresh(): Promise<void> {
     if (!this.scene.origin) return;
+    const mine = ++this.asked;
     const found = await api.annotations(this.id).catch((error: unknown) => (notify(error), null));
-    if (!found) return;
+    if (!found || mine !== this.asked) return; // an older answer may come last
     this.saved = found.features.filter(({ geometry }) => geometry.type === "LineString");
     this.rewrite();
   }

@@ -147,11 +147,12 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     news,
     (text) => (link.cut = text),
   );
-  const asking = setInterval(() => {
-    if (link.finished && report.hidden) void api.scan(id.drone, id.scan).then(learn, () => undefined);
-    if (link.isSilent) void newer(known).then((scan) => scan && linkTo(back, scan), () => undefined);
+  const asked = api.every(ASK_EVERY_MS, async () => {
+    if (link.finished && report.hidden) learn(await api.scan(id.drone, id.scan));
+    const scan = link.isSilent && (await newer(known));
+    if (scan) linkTo(back, scan);
     else back.hidden = true;
-  }, ASK_EVERY_MS);
+  });
   const clock = setInterval(() => {
     link.draw();
     figures.classList.toggle("old", link.isSilent);
@@ -166,7 +167,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   }, 300);
   return () => {
     clearInterval(clock);
-    clearInterval(asking);
+    asked();
     images.close();
     live.close();
     others.close();
