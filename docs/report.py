@@ -90,12 +90,12 @@ def section(table: Json) -> Iterator[str]:
         yield grid(table["columns"], table["rows"])
 
 
-def with_origin(table: Json) -> Json:
+def with_origin(table: Json, reports: Path = REPORTS) -> Json:
     """The table with the rows, date, commit and machine of the run that it names."""
     if "bench" in table:
         return bench(table)
     if "trials" in table:
-        run = json.loads((REPORTS / "runs" / table["trials"]).read_text("utf-8"))
+        run = json.loads((reports / "runs" / table["trials"]).read_text("utf-8"))
         days = [line["when"][:10] for line in run["trials"]]
         return table | {
             "columns": ["fault", "outcome"],

@@ -26,14 +26,19 @@ class Progress:
     """The share of some work that is done. One thread works, or several with :meth:`branches`;
     any thread may read and cancel."""
 
-    def __init__(self, show: Callable[[Progress], None] = lambda _: None) -> None:
-        """``show`` is called after every report."""
+    def __init__(
+        self,
+        show: Callable[[Progress], None] = lambda _: None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``show`` is called after every report; ``clock`` tells the seconds."""
         self.text, self.share = "", 0.0
         self._end = 1.0  # of the part that is being done
         self._show = show
         self._is_cancelled = False
         self._may_stop = True
-        self._started = time.monotonic()
+        self._clock = clock
+        self._started = clock()
 
     def __call__(self, text: str) -> None:
         """Set the text of the current step. Raises CancelledError after :meth:`cancel`."""
@@ -100,14 +105,14 @@ class Progress:
     @property
     def left_s(self) -> float | None:
         """Seconds that the rest takes at the pace so far; None while that is unknown."""
-        spent = time.monotonic() - self._started
+        spent = self._clock() - self._started
         if spent < MIN_S or self.share < MIN_SHARE:
             return None
         return spent * (1.0 - self.share) / self.share
 
     def begin(self) -> None:
         """Count the time from now on: the work has waited."""
-        self._started = time.monotonic()
+        self._started = self._clock()
 
     def _report(self) -> None:
         if self._is_cancelled and self._may_stop:

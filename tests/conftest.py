@@ -54,12 +54,11 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     if chosen == "cpu":
         from recon.backends import room, triton_dense, triton_icp
 
-        for module, name in (
-            (triton_dense, "PIXELS"), (triton_dense, "CELLS"), (triton_dense, "FUSED_PIXELS"),
-            (triton_icp, "POINTS"),
+        for module, name, value in (  # few programs: each takes long here
+            (triton_dense, "PIXELS", 512), (triton_dense, "CELLS", 512),
+            (triton_dense, "FUSED_PIXELS", 512), (triton_icp, "POINTS", 512), (room, "ROOM_PX", 4),
         ):  # fmt: skip
-            monkeypatch.setattr(module, name, 512)  # few programs: each takes long here
-        monkeypatch.setattr(room, "ROOM_PX", 4)
+            monkeypatch.setattr(module, name, value)
         # Not SWEPT: a scan takes one element after the other, also those beyond the image.
     return chosen
 

@@ -86,10 +86,14 @@ LENIENT_SINCE = 19
 """The version of PyAV from which tags that are not UTF-8 are read without being asked for it."""
 
 
+def lenient(pyav: str) -> dict[str, str]:
+    """What this version of PyAV is asked for, so that tags that are not UTF-8 raise nothing."""
+    return {"metadata_errors": "replace"} if int(pyav.partition(".")[0]) < LENIENT_SINCE else {}
+
+
 def open_container(source: Any, **options: Any) -> Any:
     """A recording or stream by ``av.open``; tags that are not UTF-8 raise nothing."""
     import av
 
-    if int(av.__version__.partition(".")[0]) < LENIENT_SINCE:
-        options["metadata_errors"] = "replace"
+    options |= lenient(av.__version__)
     return av.open(source, **options)

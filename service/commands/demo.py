@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -105,9 +106,12 @@ def compile_meanwhile() -> list[subprocess.Popen[str]]:
     return [subprocess.Popen(python_command(__name__), stdin=subprocess.DEVNULL, text=True)]
 
 
-def demo_flight(flight: Path | None) -> Path:
-    """The folder with the images and the camera model: of a clone, or as the wheel brings it."""
-    homes = (Path(__file__).resolve().parents[2], Path(sys.prefix) / "share" / "skyrelief")
+HOMES = (Path(__file__).resolve().parents[2], Path(sys.prefix) / "share" / "skyrelief")
+"""Where the included flight lies: in a clone, or as the wheel brings it."""
+
+
+def demo_flight(flight: Path | None, homes: Sequence[Path] = HOMES) -> Path:
+    """The folder with the images and the camera model: ``flight``, or the first one at home."""
     folders = [flight] if flight else [home / FLIGHT for home in homes]
     for folder in folders:
         if (folder / "frames").is_dir() and (folder / "camera.yaml").is_file():

@@ -73,6 +73,8 @@ def fused_cloud(
     voxel_m: float | None = None,
     progress: Progress | None = None,
     box: Box = EVERYWHERE,
+    strip_points: int = STRIP_POINTS,
+    largest_points: int = LARGEST_POINTS,
 ) -> FusedCloud:
     """The main piece of ``store`` fused; voxels of the ground sample distance by default.
 
@@ -83,16 +85,16 @@ def fused_cloud(
     """
     progress = progress or Progress()
     with progress.part("reading the keyframes", 0.2):
-        extents, held = _extents(store, progress, box)
+        extents, held = _extents(store, progress, box, strip_points)
     points = sum(e.points for e in extents)
     sample = float(np.median([e.ground_sample_m for e in extents])) if extents else None
     size = max(voxel_m or sample or DEFAULT_VOXEL_M, SMALLEST_VOXEL_M)
     notes: tuple[str, ...] = ()
-    if points > LARGEST_POINTS:
-        size *= float(np.sqrt(points / LARGEST_POINTS))
+    if points > largest_points:
+        size *= float(np.sqrt(points / largest_points))
         notes = (f"{points} points before fusion: voxels enlarged to {size:.3f} m",)
     share = points // (STRIPS_PER_CORE * threads())
-    edges = strip_edges(extents, min(STRIP_POINTS, max(share, MIN_STRIP_POINTS)))
+    edges = strip_edges(extents, min(strip_points, max(share, MIN_STRIP_POINTS)))
     with progress.part("fusing the cloud", 0.5):
         say = partial(progress.counting(len(extents)), progress.text)
         strips = [_strip(store, extents, held, box, a, b, say) for a, b in pairwise(edges)]
@@ -106,12 +108,11 @@ def fused_cloud(
 
 
 def _extents(
-    store: Keyframes, progress: Progress, box: Box
+    store: Keyframes, progress: Progress, box: Box, room: int
 ) -> tuple[list[_Extent], dict[int, PointCloud]]:
-    """The keyframes of the main piece with points, and the clouds of the first of them."""
+    """The keyframes of the main piece with points, and the clouds of the first ``room`` points."""
     out: list[_Extent] = []
     held: dict[int, PointCloud] = {}
-    room = STRIP_POINTS
     for keyframe in progress.over(main_keyframes(store), len(store.seqs())):
         sample = ground_sample_m(keyframe.depth)
         cloud = _points(keyframe, box)

@@ -152,7 +152,9 @@ class _Open:
 class Assembler:
     """Collects parts in any order and returns each record once it is complete and valid."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_open_bytes: int = MAX_OPEN_BYTES) -> None:
+        """Unfinished records take at most so much memory."""
+        self._max_open_bytes = max_open_bytes
         self._open: dict[tuple[str, int], _Open] = {}
         self.held_bytes = 0  # memory used by unfinished records
 
@@ -196,7 +198,7 @@ class Assembler:
             self.held_bytes -= entry.held_bytes
 
     def _make_room(self, keep: tuple[str, int]) -> None:
-        while len(self._open) > MAX_OPEN_RECORDS or self.held_bytes > MAX_OPEN_BYTES:
+        while len(self._open) > MAX_OPEN_RECORDS or self.held_bytes > self._max_open_bytes:
             stalest: Iterable[tuple[str, int]] = (key for key in self._open if key != keep)
             key = min(stalest, key=lambda k: self._open[k].touched, default=keep)
             self.forget(*key)

@@ -37,10 +37,23 @@ COPY_MB, PRODUCT = 1024, 8192
 """Size of the copy and of the matrix product that give the floor."""
 
 
-def run(options: BenchOptions, device: str = "cuda") -> list[BenchResult]:
+MATCHING = BeliefPropagationConfig()
+ALL_POINTS = IcpConfig(strides=(1,), iterations=(6,))
+
+
+def run(
+    options: BenchOptions,
+    device: str = "cuda",
+    matching: BeliefPropagationConfig = MATCHING,
+    icp: IcpConfig = ALL_POINTS,
+) -> list[BenchResult]:
     """The device itself, every stage on it, and the whole path."""
     floor, results = measure_floor(device, options)
-    found = [*stages(device, flown_pair(GUIDE)), *whole_path(device, flown_pair(DEPTH))]
+    found = [
+        *dense_stages(device, flown_pair(GUIDE), matching),
+        icp_stage(device, icp),
+        *whole_path(device, flown_pair(DEPTH), matching),
+    ]
     return results + [against_floor(stage, floor, options) for stage in found]
 
 
@@ -166,11 +179,6 @@ class Launches(TorchDispatchMode):  # type: ignore[no-untyped-call]
         return func(*args, **(kwargs or {}))
 
 
-def stages(device: str, pair: StereoPair) -> list[Stage]:
-    """Cost and belief propagation, checks of labels, upsampling, depth, fusion, ICP."""
-    return [*dense_stages(device, pair), icp_stage(device)]
-
-
 def staged(
     what: str, device: str, plan: Plan, moved: float, operations: float, note: str = ""
 ) -> Stage:
@@ -195,22 +203,21 @@ def planned(device: str, stage: Callable[..., Any], *arrays: Array) -> Plan:
     return plan
 
 
-def icp_stage(device: str) -> Stage:
-    """Six iterations on all points: surfaces, partners, sums and steps."""
+def icp_stage(device: str, config: IcpConfig) -> Stage:
+    """The iterations on all points: surfaces, partners, sums and steps."""
     icp = DeviceIcp(device)
-    config = IcpConfig(strides=(1,), iterations=(6,))
     icp.register(ground(0.3), ground(0.0), np.eye(4), config)
     points, rounds = SIZE[0] * SIZE[1], config.iterations[0] + 1
     return staged(
-        f"ICP of {points} points, 6 iterations, on the device", device, icp.plan(),
+        f"ICP of {points} points, {rounds - 1} iterations, on the device", device, icp.plan(),
         points * (2 * 8.0 + rounds * 176), points * (2 * 200.0 + rounds * 400),
     )  # fmt: skip
 
 
-def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
+def dense_stages(device: str, pair: StereoPair, matching: BeliefPropagationConfig) -> list[Stage]:
     """From two rectified images to fused depth, one after the other."""
     w, h = SIZE
-    matching, upsampling = BeliefPropagationConfig(), UpsamplingConfig()
+    upsampling = UpsamplingConfig()
     assert pair.guide is not None and pair.left_seen is not None
     H, W = pair.guide.shape[:2]
     own, both = np.array([h, w, LABELS]), np.array([h, w, H, W])
@@ -262,10 +269,10 @@ def dense_stages(device: str, pair: StereoPair) -> list[Stage]:
     ]  # fmt: skip
 
 
-def whole_path(device: str, pair: StereoPair) -> list[Stage]:
+def whole_path(device: str, pair: StereoPair, matching: BeliefPropagationConfig) -> list[Stage]:
     """A cloud of one pair: inputs on the device, then images up and depth down, and four."""
     assert pair.guide is not None
-    stages = DenseStages(BeliefPropagationConfig(), UpsamplingConfig(), DepthFusionConfig())
+    stages = DenseStages(matching, UpsamplingConfig(), DepthFusionConfig())
     path = DensePath(device, stages)
     H, W = pair.guide.shape[:2]
     K = camera((W, H))

@@ -52,9 +52,11 @@ class Drone:
     keyframes: list[list[bytes]]
 
 
-def run(folder: Path, duration_s: float = 100.0) -> list[BenchResult]:
+def run(
+    folder: Path, duration_s: float = 100.0, headings_deg: Sequence[float] = HEADINGS_DEG
+) -> list[BenchResult]:
     """The figures of four drones that fly so long, in ``folder``."""
-    drones = drones_of(duration_s)
+    drones = drones_of(duration_s, headings_deg)
     first = replace(drones[0], poses=drones[0].poses[:2], errors_m=drones[0].errors_m[:2])
     twins = [replace(first, name=drone.name) for drone in drones[:2]]
     _followed(twins, folder / "warm-up")
@@ -65,11 +67,11 @@ def run(folder: Path, duration_s: float = 100.0) -> list[BenchResult]:
     return _live_results(live, apart_m, drones) + _site_results(site.document, drones, folder)
 
 
-def drones_of(duration_s: float) -> list[Drone]:
+def drones_of(duration_s: float, headings_deg: Sequence[float]) -> list[Drone]:
     """Four flights of three legs over the middle of one place."""
     plans = [
         FlightPlan("legs", duration_s, HEIGHT_M, SPEED_M_S, heading, spacing_m=25.0, centred=True)
-        for heading in HEADINGS_DEG
+        for heading in headings_deg
     ]
     simulation = prepare(
         SimulationOptions(

@@ -11,6 +11,7 @@ import json
 import multiprocessing
 import tempfile
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,15 +47,18 @@ WORKERS = (1, 2, 4)
 """Of a Dask cluster, for the first kind."""
 
 
-def run(options: DataOptions) -> list[BenchResult]:
+def run(
+    options: DataOptions, kinds: Sequence[str] = KINDS, cluster: Sequence[int] = WORKERS
+) -> list[BenchResult]:
     """Peak memory and time per tile of each product of a site of ``options.scans`` scans."""
     with tempfile.TemporaryDirectory(prefix="skyrelief-scale-") as name:
         folder = Path(name)
         dates = [_place(date) for date in (1, 2)]
         members = site_of(dates, folder, options.scans)
         results = []
-        for kind in KINDS:
-            results += _results(kind, folder / "site", members, options)
+        for kind in kinds:
+            workers = cluster if kind == kinds[0] else ()
+            results += _results(kind, folder / "site", members, options, workers)
         results.append(_height_error(folder / "site" / "dsm.tif", dates, options.scans))
         results.append(_changes_found(folder / "site" / FOUND, options.scans))
     return results
@@ -153,7 +157,7 @@ def noisy(
 
 
 def _results(
-    kind: str, site: Path, members: list[Member], options: DataOptions
+    kind: str, site: Path, members: list[Member], options: DataOptions, cluster: Sequence[int]
 ) -> list[BenchResult]:
     half = len(members) // 2
     parts = (members[0].first, members[half - 1].last), (members[half].first, members[-1].last)
@@ -165,7 +169,7 @@ def _results(
         BenchResult(f"{kind}: peak memory", alone.peak_mib, "MiB", note=scans),
         BenchResult(what, float(usual), "s", float(high - low), note=scans),
     ]
-    for workers in WORKERS if kind == KINDS[0] else ():
+    for workers in cluster:
         out += _on_workers(kind, site, parts, workers)
     return out
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from importlib import import_module
 from pathlib import Path
@@ -12,12 +11,12 @@ import numpy as np
 import pytest
 from bench_middlebury import not_hidden, seen_by_both
 from bench_run import DEVELOPMENT
+from command_line import skyrelief
 
 from service import bench
 from service.bench import BENCHMARKS, BenchOptions, BenchResult, compare, record, table
 from service.bench.stereo import bad_share, scene, semi_global_disparity
 from service.bench.stereo_scenes import TruePair as Pair
-from service.cli import main
 
 
 def test_every_line_of_the_table_can_be_called() -> None:
@@ -58,28 +57,21 @@ def test_table_and_record_hold_every_figure() -> None:
     assert "cores" in kept["machine"]
 
 
-def test_command_prints_and_keeps(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def run(options: BenchOptions) -> list[BenchResult]:
-        return [BenchResult("figure", float(options.rounds), "ms")]
+def rounds(options: BenchOptions) -> list[BenchResult]:
+    return [BenchResult("figure", float(options.rounds), "ms")]
 
-    monkeypatch.setattr("service.bench.stereo.run", run)
-    words = ["skyrelief", "bench", "stereo", "--rounds", "7", "--keep", str(tmp_path), "--json"]
-    monkeypatch.setattr(sys, "argv", words)
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert not stop.value.code
-    printed = json.loads(capsys.readouterr().out.splitlines()[-1])
+
+def test_command_prints_and_keeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(BENCHMARKS, "stereo", f"{__name__}:rounds")
+    ended = skyrelief("bench", "stereo", "--rounds", "7", "--keep", tmp_path, "--json")
+    assert ended.returncode == 0
+    printed = json.loads(ended.stdout.splitlines()[-1])
     (kept,) = tmp_path.glob("*-stereo.json")
     assert json.loads(kept.read_text()) == printed
     assert printed["results"][0]["value"] == 7
     assert printed["results"][0]["name"] == "stereo"
-    monkeypatch.setattr(sys, "argv", ["skyrelief", "bench", "nothing"])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 2
-    assert "there are stereo" in capsys.readouterr().err
+    ended = skyrelief("bench", "nothing")
+    assert ended.returncode == 2 and "there are stereo" in ended.stderr
 
 
 def test_commit_is_unknown_without_git(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import sys
 
 import pytest
+from command_line import skyrelief
 
 from recon.mapping.registration import IcpConfig
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from service.bench import BenchOptions, gpu
-from service.cli import main
 
 pytest.importorskip("torch")
 pytest.importorskip("triton")
@@ -21,32 +20,21 @@ STAGES = (
 
 
 def test_every_stage_is_compared_with_its_floor(
-    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+    device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Small images here; the figures are those of a GPU."""
     import bench_device
 
-    device = str(request.config.getoption("--device"))
-    for module in (bench_device, gpu):
-        monkeypatch.setattr(module, "SIZE", (20, 12))
-        monkeypatch.setattr(module, "LABELS", 8)
-        monkeypatch.setattr(module, "GUIDE", (40, 24))
-        monkeypatch.setattr(module, "DEPTH", (40, 24))
-    for table in ("COPY_MB", "PRODUCT"):
-        monkeypatch.setattr(bench_device, table, 16)
-    monkeypatch.setattr(bench_device, "PAIRS", 1)
+    small = {"SIZE": (20, 12), "LABELS": 8, "GUIDE": (40, 24), "DEPTH": (40, 24)}
+    few = {"COPY_MB": 16, "PRODUCT": 16, "PAIRS": 1}
+    for module, values in ((gpu, small), (bench_device, small | few)):
+        for name, value in values.items():
+            monkeypatch.setattr(module, name, value)
+    quick = bench_device.MATCHING, bench_device.ALL_POINTS
     if device == "cpu":
-        from recon.backends import room, triton_dense
-
-        monkeypatch.setattr(room, "ROOM_PX", 4)
-        for name in ("PIXELS", "CELLS", "FUSED_PIXELS"):
-            monkeypatch.setattr(triton_dense, name, 512)
-        quick = BeliefPropagationConfig(iterations=1, levels=1, speckle_px=1)
-        monkeypatch.setattr(bench_device, "BeliefPropagationConfig", lambda: quick)
-        monkeypatch.setattr(
-            bench_device, "IcpConfig", lambda **_: IcpConfig(strides=(1,), iterations=(1,))
-        )
-    results = bench_device.run(BenchOptions(rounds=1, warm_up=0), device)
+        matching = BeliefPropagationConfig(iterations=1, levels=1, speckle_px=1)
+        quick = matching, IcpConfig(strides=(1,), iterations=(1,))
+    results = bench_device.run(BenchOptions(rounds=1, warm_up=0), device, *quick)
     on_device = {r.what: r for r in results if r.peer == "floor of the device"}
     for stage in STAGES:
         assert any(what.startswith(stage) for what in on_device), stage
@@ -59,18 +47,13 @@ def test_every_stage_is_compared_with_its_floor(
     assert named.note and named.value > 0
 
 
-def test_without_a_device_a_line_says_so(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_device_a_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     (line,) = gpu.run(BenchOptions(rounds=1, warm_up=0))
     assert line.what == "torch" and math.isnan(line.value)
     assert line.note.startswith("cannot run: torch finds no CUDA device")
-    monkeypatch.setattr(sys, "argv", ["skyrelief", "bench", "gpu"])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert not stop.value.code
-    assert "cannot run" in capsys.readouterr().out
+    ended = skyrelief("bench", "gpu")
+    assert ended.returncode == 0 and "cannot run" in ended.stdout
 
 
 def test_floor_is_the_larger_of_bytes_and_operations() -> None:

@@ -19,10 +19,8 @@ from service.sim.recording import ORIGIN
 rasterio = pytest.importorskip("rasterio")
 
 
-def test_a_site_of_scans_is_measured_by_its_products(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_site_scale, "KINDS", ("dsm", "change"))
-    monkeypatch.setattr(bench_site_scale, "WORKERS", ())
-    results = bench_site.run(DataOptions(scans=4))
+def test_a_site_of_scans_is_measured_by_its_products() -> None:
+    results = bench_site_scale.run(DataOptions(scans=4), ("dsm", "change"), ())
     figures = {result.what: result for result in results}
     peak = figures["dsm: peak memory"]
     assert peak.note == "4 scans, 2 tiles" and 100 < peak.value < 2000
@@ -32,11 +30,8 @@ def test_a_site_of_scans_is_measured_by_its_products(monkeypatch: pytest.MonkeyP
     assert boxes.note == "12 boxes placed" and 6 <= boxes.value <= 12
 
 
-def test_drones_at_once_are_shown_together_and_keep_their_size(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(bench_site_drones, "HEADINGS_DEG", (0.0, 90.0))
-    figures = {result.what: result for result in bench_site_drones.run(tmp_path, 8.0)}
+def test_drones_at_once_are_shown_together_and_keep_their_size(tmp_path: Path) -> None:
+    figures = {result.what: result for result in bench_site_drones.run(tmp_path, 8.0, (0.0, 90.0))}
     assert figures["four drones: shown together, after the first overlap"].note.startswith("1 of 1")
     apart = figures["four drones: shown apart at the end"]
     assert apart.peer_value is not None and apart.value < 0.3 < 1.0 < apart.peer_value

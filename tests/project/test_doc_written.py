@@ -153,16 +153,13 @@ def test_like_faults_share_a_row(report: ModuleType) -> None:
     ]
 
 
-def test_what_the_trials_write_is_a_table_of_the_report(
-    report: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_trials_write_is_a_table_of_the_report(report: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "runs").mkdir()
     table = Table(tmp_path / "runs" / "trials.json")
     table.add("kill", 2, "kept", "0 of 4 chunks", 1.04)
     table.add("cut", 1, "kept")
     table.add("kill", 3, "kept", "0 of 6 chunks", 2.0)  # tried again
-    monkeypatch.setattr(report, "REPORTS", tmp_path)
-    shown = report.with_origin({"title": "Faults", "trials": "trials.json"})
+    shown = report.with_origin({"title": "Faults", "trials": "trials.json"}, tmp_path)
     assert shown["rows"] == [["cut", "kept"], ["3 x kill", "kept (2.0 s)"]]
     assert "cores" in shown["machine"] and shown["date"][:2] == "20"
 

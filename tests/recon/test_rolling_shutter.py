@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
-from typing import cast
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
+from some_views import keyframe_at
 
 from recon import se3
 from recon.camera_model import project, rays
@@ -17,14 +17,13 @@ from recon.rolling_shutter import RowClock, Rows, RowTrack, depth_share, row_tim
 from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.virtual_stereo import at_middle_row, rectify
 from recon.tracking import readout_search
-from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry
 from recon.tracking.prediction import inverse_depth_plane
 from recon.tracking.readout_search import ReadoutEstimate, ReadoutSearch
 from recon.types import DIRECTIONS, F64, U8, Camera, PosePrior, Shutter, StereoPair
 from service.config import Config
-from service.flight.scan import Scan
+from service.flight.scan import Scan, ScanInputs
 
 K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
 W, H = 480, 360
@@ -304,13 +303,12 @@ def test_the_image_becomes_that_of_the_middle_row() -> None:
 ])  # fmt: skip
 def test_a_sure_readout_names_a_shutter(readout_s: float, way: str, expected: Shutter) -> None:
     def found(sigma_s: float) -> Shutter | None:
-        search = SimpleNamespace(estimate=ReadoutEstimate(readout_s, sigma_s, 3))
-        pipeline = SimpleNamespace(odometry=SimpleNamespace(readout=search))
+        scan = Mock(Scan, pipeline=Mock(), inputs=Mock(ScanInputs))
+        scan.pipeline.odometry.readout.estimate = ReadoutEstimate(readout_s, sigma_s, 3)
         config = Config()
-        config = replace(config, camera=replace(config.camera, readout_ms="auto"))
-        inputs = SimpleNamespace(camera=replace(PLAIN, shutter=Shutter(0.0, way)), config=config)
-        scan = SimpleNamespace(pipeline=pipeline, inputs=inputs)
-        return Scan.found_shutter(cast(Scan, scan))
+        scan.inputs.config = replace(config, camera=replace(config.camera, readout_ms="auto"))
+        scan.inputs.camera = replace(PLAIN, shutter=Shutter(0.0, way))
+        return Scan.found_shutter(scan)
 
     assert found(0.001) == expected
     assert found(0.01) is None
@@ -357,10 +355,8 @@ def test_a_known_readout_gives_way_to_sharp_images_alone(
 
     monkeypatch.setattr(readout_search, "_cost", cost)
     search = ReadoutSearch(clock, PLAIN.K)
-    moving = SimpleNamespace(is_measured=True)
     for first in range(0, 40, 10):
-        keys = [SimpleNamespace(seq=first + k, moving=moving) for k in range(5)]
-        search.look(cast("list[OdometryKeyframe]", keys))
+        search.look([keyframe_at(first + k, np.eye(4), is_measured=True) for k in range(5)])
     assert clock.readout_s == pytest.approx(expected)
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 from weakref import WeakSet
 
 import numpy as np
@@ -13,6 +13,7 @@ import pytest
 from loopback import until
 
 from recon.pipeline.mapper import Mapper
+from recon.pipeline.views import VirtualStereoCamera
 from recon.types import Camera
 from service.background import BackgroundWorker
 
@@ -121,7 +122,7 @@ def test_a_fault_at_the_end_of_a_scan_leaves_no_thread_behind() -> None:
         return jobs[-1]
 
     mapper: Any = Mapper(Camera(np.diag([60.0, 60.0, 1.0]), np.zeros(5), (80, 60)), worker=worker)
-    mapper.views = SimpleNamespace(end_stretch=lambda: None, ready=lambda everything: [1, 2, 3])
+    mapper.views = Mock(VirtualStereoCamera, **{"ready.return_value": [1, 2, 3]})
     with pytest.raises(RuntimeError, match="no luck"):
         mapper.finish()
     assert not any(t.name == "dense" for t in threading.enumerate())

@@ -7,6 +7,7 @@ import os
 import socket
 import struct
 import tempfile
+from contextlib import redirect_stderr
 from pathlib import Path
 
 import pytest
@@ -65,9 +66,8 @@ def test_without_a_journal_it_goes_to_standard_error(
 def test_the_journal_is_used_where_it_reads_us(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("JOURNAL_STREAM", raising=False)
     assert isinstance(init_system.log_handler(), logging.StreamHandler)
-    with tempfile.TemporaryFile("w") as stream:
+    with tempfile.TemporaryFile("w") as stream, redirect_stderr(stream):
         found = os.fstat(stream.fileno())
-        monkeypatch.setattr("sys.stderr", stream)
         monkeypatch.setenv("JOURNAL_STREAM", f"{found.st_dev}:{found.st_ino}")
         assert init_system.journal_reads_us()
         monkeypatch.setenv("JOURNAL_STREAM", "1:2")

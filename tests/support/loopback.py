@@ -21,8 +21,9 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
 
 
 def until(
-    done: Callable[[], Any], limit_s: float = 15.0, progress: Callable[[], object] = lambda: None
-) -> Any:
+    done: Callable[[], Any], limit_s: float = 15.0, progress: Callable[[], object] = lambda: None,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Any:  # fmt: skip
     """Return what ``done`` gives once it is true; the test fails when progress stops.
 
     ``limit_s`` is how long ``progress`` may stay the same. It counts pauses between calls of
@@ -32,7 +33,7 @@ def until(
     while not (value := done()):
         if pauses * PAUSE_S >= limit_s:
             pytest.fail(f"no progress in {limit_s} s, last {seen}")
-        time.sleep(PAUSE_S)
+        sleep(PAUSE_S)
         now = progress()
         seen, pauses = now, 0 if now != seen else pauses + 1
     return value

@@ -32,14 +32,13 @@ def painted_ground() -> U8:
     return np.asarray(np.clip(out, 0, 255).astype(np.uint8))
 
 
-def still(T_world_camera: F64) -> U8:
-    """The image of the plane z = 0."""
+def still(T_world_camera: F64, camera: Camera = CAMERA, ground: U8 | None = None) -> U8:
+    """The camera's image of the plane z = 0, painted unless another ground is given."""
     R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
     plane = np.array([[M_PER_PX, 0, -120.0], [0, M_PER_PX, -120.0], [0, 0, 1]])
-    H = K @ R.T @ (np.c_[np.eye(3)[:, :2], -t] @ plane)
-    return np.asarray(
-        cv2.warpPerspective(painted_ground(), H, SIZE, flags=cv2.INTER_AREA), np.uint8
-    )
+    H = camera.K @ R.T @ (np.c_[np.eye(3)[:, :2], -t] @ plane)
+    seen = painted_ground() if ground is None else ground
+    return np.asarray(cv2.warpPerspective(seen, H, camera.size_px, flags=cv2.INTER_AREA), np.uint8)
 
 
 def pose(east_m: float, yaw_deg: float = 0.0, height_m: float = HEIGHT_M, seed: int = 0) -> F64:

@@ -29,9 +29,16 @@ Box = tuple[float, float, float, float, float]
 """West, south, east, north, height above the plain, m."""
 
 
+DUSK = 0
+"""The ground 1 in other light."""
+
+
 @cache
 def texture(seed: int) -> F64:
     """(900, 900) gray values with detail of all sizes."""
+    if seed == DUSK:
+        x = np.linspace(0.0, 40.0, 900)
+        return np.asarray(0.5 * texture(1) + 15.0 * np.sin(x) + 10.0 * np.cos(x)[:, None])
     rng = np.random.default_rng(seed)
     layers = [ndi.gaussian_filter(rng.normal(size=(900, 900)), 1.3 * 2.0**k) for k in range(5)]
     total = np.asarray(sum(2.0**k * layer / layer.std() for k, layer in enumerate(layers)))
@@ -91,7 +98,7 @@ def within(T: F64, ways: F64, z: F64, box: Box) -> Bool:
 
 def view(seq: int, T: F64, boxes: Sequence[Box] = (), ground: int = 1) -> Keyframe:
     """The keyframe at a true pose; noise in gray and depth."""
-    rng = np.random.default_rng(1000 * ground + seq)
+    rng = np.random.default_rng(1000 * (ground or 1) + seq)
     w, h = SIZE
     v, u = np.mgrid[0:h, 0:w].astype(np.float64)
     ways = rays(K, np.column_stack([u.ravel(), v.ravel()])) @ T[:3, :3].T

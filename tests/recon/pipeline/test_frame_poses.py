@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from some_views import keyframe_at, view_at
 
 from recon import se3
 from recon.pipeline.config import untimed
@@ -79,17 +79,12 @@ def test_frames_of_a_flight_without_fixes_stand_where_the_odometry_has_them() ->
         assert pose.sources == ("vision",)
 
 
-def refined(seq: int, segment: int, T_odom_camera: F64) -> Any:
-    """A keyframe of the odometry that is still adjusted."""
-    return SimpleNamespace(seq=seq, segment=segment, T_odom_camera=T_odom_camera)
-
-
 def some_pose() -> F64:
     return se3.exp(RNG.normal(size=6))
 
 
 def test_views_keep_their_places_when_they_settle() -> None:
-    keys = [refined(n, n // 50, some_pose()) for n in range(0, 100, 10)]
+    keys = [keyframe_at(n, some_pose(), n // 50) for n in range(0, 100, 10)]
     frames = FramePoses(empty(), lambda view: view.keyframe is None or view.keyframe.seq < 70)
     update = GraphUpdate(Pose(np.eye(4), np.eye(6)), True)
     for key in keys:
@@ -102,7 +97,7 @@ def test_views_keep_their_places_when_they_settle() -> None:
     for one, other in zip(before, after, strict=True):
         assert np.array_equal(one.T_world_camera, other.T_world_camera)
     fixed = [RelativePose(n, n // 50, taken[n].T_odom_camera) for n in (55, 85)]
-    keys[5].T_odom_camera = keys[8].T_odom_camera = some_pose()
+    keys[5].T_camera_odom = keys[8].T_camera_odom = some_pose()
     settled, open_ = (frames.pose(frame, fallback).T_world_camera for frame in fixed)
     np.testing.assert_array_equal(settled, after[55].T_world_camera)
     assert not np.allclose(open_, after[85].T_world_camera)  # its view is still adjusted
@@ -110,22 +105,14 @@ def test_views_keep_their_places_when_they_settle() -> None:
     np.testing.assert_array_equal(alone.T_world_camera[:3, 3], np.zeros(3))
 
 
-def view_of(reference: RelativePose, prior: PosePrior | None = None) -> Any:
-    """A view without depth."""
-    return SimpleNamespace(
-        seq=reference.seq, segment=reference.segment, time_ns=0, prior=prior or PosePrior(),
-        points=np.zeros((0, 3)), image=SimpleNamespace(T_odom_camera=reference.T_odom_camera),
-    )  # fmt: skip
-
-
 def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None:
     """The graph is at work then on another thread: nothing asks it, nothing waits for it."""
     keyframes: Any = empty()
     frames = FramePoses(keyframes, lambda frame: False)
-    key = refined(3, 0, some_pose())
+    key = keyframe_at(3, some_pose())
     frame, view = (RelativePose(seq, 0, some_pose(), key) for seq in (7, 5))
     assert frames.follow(PosePrior(), frame).sources == ("vision",)  # nothing is reconstructed yet
-    update = keyframes.add(view_of(view), None, np.eye(6), None)
+    update = keyframes.add(view_at(5, view.T_odom_camera), None, np.eye(6), None)
     trajectory, known = keyframes.trajectory, keyframes.trajectory.pose(5)
     keyframes.trajectory = None
     fallback = FallbackPosition(np.full(3, 9.0), np.ones(3))
@@ -146,10 +133,12 @@ def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> N
     """Its keyframe carries them by a scale and a heading that nothing shows."""
     keyframes: Any = empty()
     frames = FramePoses(keyframes, lambda frame: False)
-    key, fix = refined(3, 0, np.eye(4)), np.array([20.0, -10.0, 50.0])
+    key, fix = keyframe_at(3, np.eye(4)), np.array([20.0, -10.0, 50.0])
     prior = PosePrior(position_m=fix, sigma_position_m=np.full(3, 5.0))
     view, frame = (RelativePose(seq, 0, some_pose(), key) for seq in (5, 7))
-    frames.take(view, keyframes.add(view_of(view, prior), None, np.eye(6), None))
+    frames.take(
+        view, keyframes.add(view_at(5, view.T_odom_camera, prior=prior), None, np.eye(6), None)
+    )
     in_flight = frames.follow(prior, frame)
     keyframes.changed(final=True)
     frames.finish()

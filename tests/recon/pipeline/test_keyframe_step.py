@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from some_views import view_at
 
 from recon import se3
+from recon.backends import Backend
 from recon.pipeline.config import untimed
 from recon.pipeline.stages import Register
 from recon.types import DepthMap, Registration, Verdict
@@ -22,15 +24,10 @@ def step_with_icp(off_m: float) -> float:
     spread = np.diag([1e-3**2] * 3 + [0.02**2] * 3)
     T = se3.compose(np.eye(3), np.array([4.0 + off_m, 0.0, 0.0]))
     found = Registration(T, spread, Verdict.CONVERGED, 0.1, 0.9, 3)
-    register = Register(cast(Any, SimpleNamespace(register=lambda *_: found)), untimed)
+    register = Register(cast(Any, Mock(Backend, **{"register.return_value": found})), untimed)
     for seq, T_odom_camera in enumerate((np.eye(4), STEP)):
-        view = SimpleNamespace(
-            seq=seq,
-            covariance=spread,
-            earlier={0: np.eye(4)},
-            image=SimpleNamespace(T_odom_camera=T_odom_camera),
-        )
-        step, _ = register(cast(Any, view), DEPTH)
+        view = view_at(seq, T_odom_camera, covariance=spread, earlier={0: np.eye(4)})
+        step, _ = register(view, DEPTH)
     assert step is not None
     return float(step[0, 3] - STEP[0, 3])
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from paths import DEMO, ROOT
+from some_views import view_at
 
 import recon
 from recon import se3
@@ -18,7 +18,6 @@ from recon.pipeline.events import KeyframeReady, PosesChanged
 from recon.pipeline.keyframe_map import GraphUpdate
 from recon.pipeline.mapper import Mapper, moved
 from recon.pipeline.views import StereoView
-from recon.tracking.relative_pose import RelativePose
 from recon.types import Camera, DepthMap, Keyframe, Pose
 
 CAMERA = Camera(np.array([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), np.zeros(5), (80, 60))
@@ -81,9 +80,7 @@ class BrokenOff:
 
     def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]:
         self.views += 1
-        view: Any = SimpleNamespace(
-            seq=self.views, reference=RelativePose(self.views, 0, np.eye(4))
-        )
+        view = view_at(self.views, np.eye(4))
         poses = dict.fromkeys((7, self.views), Pose(np.eye(4), np.eye(6), scale=3.0))
         return [(view, GraphUpdate(poses[7], True, True, poses, keyframe(self.views)))]
 

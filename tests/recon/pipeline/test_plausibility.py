@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
+from some_views import view_at
 
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
 from recon.pipeline.stages import Plausible
-from recon.pipeline.views import StereoView
 from recon.stereo.reprojection import plausible
 from recon.types import F64, U8, DepthMap, PosePrior
 
@@ -101,9 +99,7 @@ def test_a_stretch_that_was_refuted_needs_more_views_that_agree() -> None:
     stage = Plausible(rejected)
     false, good = surface(np.zeros(SHAPE, np.uint8)), surface(np.full(SHAPE, 2, np.uint8))
     bgr = np.zeros((*SHAPE, 3), np.uint8)
-    first, second = (
-        cast(StereoView, SimpleNamespace(prior=PosePrior(), segment=n)) for n in range(2)
-    )
+    first, second = (view_at(n, np.eye(4), segment=n) for n in range(2))
     assert [stage(first, d, bgr) for d in (false, false, good, good)] == [None] * 4
     assert stage(first, good, bgr) is good
     assert stage(second, None, bgr) is None and stage(second, good, bgr) is good

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import weakref
 from collections import Counter
-from dataclasses import replace
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
 from typing import cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from some_views import keyframe_at
 
 from recon import se3
 from recon.camera_model import Undistorter
@@ -24,22 +25,41 @@ from recon.pipeline.views import (
 )
 from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
-from recon.tracking.matching import Pyramid
+from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry, Tracked, Tracking
+from recon.tracking.readout_search import ReadoutSearch
 from recon.tracking.relative_pose import RelativePose
 from recon.types import U8, Camera, PosePrior
 
 
 def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> ViewCandidate:
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
-    key = OdometryKeyframe(
-        seq, segment, se3.inverse(T), np.eye(6), PosePrior(), Pyramid(()),
-        np.zeros((0, 2)), np.zeros(0, np.int64), Landmarks(), FrameRows(seq, PosePrior(), T),
-    )  # fmt: skip
+    key = keyframe_at(seq, T, segment)
     image = np.zeros((32, 32, 3), np.uint8)
     reference = RelativePose(seq, segment, np.eye(4), key)
     colour = Colour(image, Undistorter(Camera(np.diag([30.0, 30.0, 1.0]), np.zeros(5), (32, 32))))
     return ViewCandidate(seq, seq, PosePrior(), colour, image[..., 0], reference, blurred)
+
+
+@dataclass
+class KnownTrack:
+    """What views ask of an odometry."""
+
+    keyframes: list[OdometryKeyframe]
+    exposure: ExposureWatch
+    readout: ReadoutSearch | None = None
+    segment: int = 0
+
+
+def stereo_camera(
+    keys: list[OdometryKeyframe], readout: ReadoutSearch | None = None, shown_s: float = 0.0
+) -> VirtualStereoCamera:
+    K, size = np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), (32, 32)
+    track = KnownTrack(keys, Mock(ExposureWatch, shown_s=shown_s), readout)
+    return VirtualStereoCamera(
+        ViewSelection(Baseline()), cast(Odometry, track), Camera(K, np.zeros(5), size),
+        np.ones(size, np.uint8), Counter(),
+    )  # fmt: skip
 
 
 def offer(
@@ -199,14 +219,7 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
     corners = np.random.default_rng(0).uniform(-20, 20, (40, 2))
     ids = ground.add(np.c_[corners, np.full(40, 100.0)])
     keys: list[OdometryKeyframe] = []
-    odometry = SimpleNamespace(
-        segment=0, readout=SimpleNamespace(doubt_s=doubt_s), keyframes=keys,
-        exposure=SimpleNamespace(shown_s=0.0),
-    )  # fmt: skip
-    views = VirtualStereoCamera(
-        ViewSelection(Baseline()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
-        np.ones(size, np.uint8), Counter(),
-    )  # fmt: skip
+    views = stereo_camera(keys, Mock(ReadoutSearch, doubt_s=doubt_s))
     for i in range(3):
         plain = frame(i, 5.0 * i)
         keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))
@@ -233,15 +246,8 @@ def test_views_wait_for_the_first_word_on_their_readout(
     is_open: bool, is_measured: bool, expected: list[int]
 ) -> None:
     """Not for stills, which never show it; the sixth view comes with that word."""
-    K, size = np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), (32, 32)
-    search, keys = SimpleNamespace(doubt_s=0.0, is_open=is_open), list[OdometryKeyframe]()
-    odometry = SimpleNamespace(
-        segment=0, readout=search, keyframes=keys, exposure=SimpleNamespace(shown_s=0.0)
-    )
-    views = VirtualStereoCamera(
-        ViewSelection(Baseline()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
-        np.ones(size, np.uint8), Counter(),
-    )  # fmt: skip
+    search, keys = Mock(ReadoutSearch, doubt_s=0.0, is_open=is_open), list[OdometryKeyframe]()
+    views = stereo_camera(keys, search)
     given, counts = [], []
     for i in range(6):
         plain = frame(i, 5.0 * i)
@@ -261,17 +267,10 @@ def test_views_wait_for_the_first_word_on_their_readout(
 @pytest.mark.parametrize("exposure_s", [0.0, 0.05])
 def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: float) -> None:
     """1 m in each tenth of a second, 50 m above points 100 m further on, at 30 px."""
-    K, size = np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), (32, 32)
     ground, keys = Landmarks(), list[OdometryKeyframe]()
     corners = np.random.default_rng(0).uniform(-20, 20, (40, 2))
     ids = ground.add(np.c_[corners, np.full(40, 100.0)])
-    odometry = SimpleNamespace(
-        segment=0, readout=None, keyframes=keys, exposure=SimpleNamespace(shown_s=exposure_s)
-    )
-    views = VirtualStereoCamera(
-        ViewSelection(Baseline()), cast(Odometry, odometry), Camera(K, np.zeros(5), size),
-        np.ones(size, np.uint8), Counter(),
-    )  # fmt: skip
+    views = stereo_camera(keys, shown_s=exposure_s)
     for i in range(4):
         plain = frame(i, float(i))
         keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))

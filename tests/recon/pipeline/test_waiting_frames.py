@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 import pytest
 
 from recon.pipeline.config import untimed
 from recon.pipeline.stages import Track
-from recon.tracking.odometry import Tracked, Tracking
+from recon.pipeline.views import UndistortedFrame
+from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.types import F64
 
 POSE = cast(F64, object())
@@ -29,10 +30,8 @@ KEYFRAME, LOST = (Tracking.KEYFRAME, POSE, ""), (Tracking.LOST, None, "too few m
 )  # fmt: skip
 def test_waiting_counts_where_it_is_in_vain(states: list[Any], unused: dict[str, int]) -> None:
     results = iter([Tracked(state, 0, T, reason=why) for state, T, why in states])
-    odometry: Any = SimpleNamespace(track=lambda *image: next(results))
-    image: Any = SimpleNamespace(
-        small=None, seq=0, time_ns=0, prior=None, mask=None, is_blurred=False
-    )
+    odometry, image = Mock(Odometry), Mock(UndistortedFrame)
+    odometry.track.side_effect = results
     refused: Counter[str] = Counter()
     track = Track(odometry, cast(Any, None), refused, untimed)
     for _ in states:

@@ -90,9 +90,8 @@ def test_a_fit_ends_within_a_hundredth_of_its_sigma(
         moved = replace(p, position_m=p.position_m + np.array([off_m, 0.0, 0.0]))
         some[i] = replace(some[i], prior=moved)
     soon = fit(some)
-    for name in ("SETTLED", "SETTLED_START"):
-        monkeypatch.setattr(alignment, name, 1e-12)
-    monkeypatch.setattr(alignment, "ITERATIONS", 200)
+    for name, value in (("SETTLED", 1e-12), ("SETTLED_START", 1e-12), ("ITERATIONS", 200)):
+        monkeypatch.setattr(alignment, name, value)
     late = fit(some)
     assert soon is not None and late is not None
     step = np.r_[se3.so3_log(soon.R @ late.R.T), soon.t - late.t, np.log(soon.scale / late.scale)]

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
+from some_views import view_at
 
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
@@ -75,13 +74,10 @@ def test_ground_without_a_plane_levels_nothing() -> None:
 
 @pytest.mark.parametrize(("steep", "is_levelled"), [(1, False), (2, False), (3, True), (10, True)])
 def test_a_few_steep_views_do_not_doubt_the_mount_of_all(steep: int, is_levelled: bool) -> None:
-    keyframes: Any = KeyframeMap(Trajectory(), None, Counter(), untimed)
+    keyframes = KeyframeMap(Trajectory(), None, Counter(), untimed)
     for seq in range(10):
         R, T = looking(-40 if seq < steep else -90), np.eye(4)
         T[0, 3] = seq
-        view = SimpleNamespace(
-            seq=seq, segment=0, time_ns=seq, prior=NADIR, points=ground_seen(R),
-            image=SimpleNamespace(T_odom_camera=T),
-        )  # fmt: skip
+        view = view_at(seq, T, prior=NADIR, points=ground_seen(R))
         keyframes.add(view, None, np.eye(6), None)
     assert keyframes.is_levelled == is_levelled

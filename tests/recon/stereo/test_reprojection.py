@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import cv2
 import numpy as np
 import pytest
+from some_views import view_at
 
 from recon import se3
 from recon.backends.cpu import CpuBackend
@@ -140,7 +138,7 @@ def test_a_pair_is_matched_once_on_a_backend_that_gives_its_depth() -> None:
     """ONNX Runtime's too, behind the fallback; not on a device that keeps the depth of pairs."""
     gray, T = np.zeros((180, 320), np.uint8), np.eye(4)
     here, there = (PosedImage(None, gray, K, T, seq=seq) for seq in (1, 0))
-    again: Any = SimpleNamespace(seq=1, image=here, partners=(there,))
+    again = view_at(1, T, image=here, partners=(there,))
     depth = np.full((180, 320), 60.0, np.float32)
     for keeps_pairs, found in ((False, [0]), (True, [])):
         own = CpuBackend()

@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import painted_ground
 import pytest
 from mapper_events import keyframes_of
 from painted_ground import CAMERA, DOWN, FOOTPRINT_M, HEIGHT_M, SIZE, pose, still
@@ -19,7 +18,7 @@ from recon.camera_model import scaled
 from recon.pipeline.events import Event, FramePosed
 from recon.tracking.localisation import Localiser, Located, Start
 from recon.tracking.odometry import Odometry, Tracked, Tracking
-from recon.types import F64, U8, Camera, Frame, PosePrior
+from recon.types import F64, U8, Frame, PosePrior
 from service.config import load_config
 from service.flight.pipeline import Pipeline
 
@@ -113,14 +112,6 @@ def test_two_views_bridge_what_has_no_landmarks() -> None:
     assert_one_piece(track, flown([still(T) for T in track]), 0.03)
 
 
-def larger(width: int, monkeypatch: pytest.MonkeyPatch) -> Camera:
-    """The same camera with images of this width."""
-    camera = scaled(CAMERA, (width, width * 3 // 4))
-    monkeypatch.setattr(painted_ground, "K", camera.K)
-    monkeypatch.setattr(painted_ground, "SIZE", camera.size_px)
-    return camera
-
-
 @pytest.mark.slow
 def test_stills_whose_corners_differ_are_tied_by_their_features(
     monkeypatch: pytest.MonkeyPatch,
@@ -140,13 +131,13 @@ def test_stills_whose_corners_differ_are_tied_by_their_features(
         return again
 
     monkeypatch.setattr(Localiser, "with_features", twice)
-    camera = larger(960, monkeypatch)
+    camera = scaled(CAMERA, (960, 720))
     odometry, prior = Odometry(camera), PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
     track, found = [pose(0.3 * FOOTPRINT_M * (i - 2), seed=i) for i in range(4)], []
     for i, T in enumerate(track):
         noise = np.random.default_rng(i).normal(size=camera.size_px[::-1])
         leaves = np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.7))
-        image = np.clip(still(T) + 20.0 * leaves / leaves.std(), 0, 255).astype(np.uint8)
+        image = np.clip(still(T, camera) + 20.0 * leaves / leaves.std(), 0, 255).astype(np.uint8)
         found.append(odometry.track(image, i, i * 2_000_000_000, prior))
     assert_one_piece(track, found, 0.005)
     assert min(counts) > 80
@@ -165,7 +156,7 @@ def test_frames_that_wait_are_placed_though_features_follow_the_corners_since() 
 
 
 @pytest.mark.slow
-def test_rows_of_a_field_are_not_taken_for_one_another(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_of_a_field_are_not_taken_for_one_another() -> None:
     """Rows every 10 px hide the little that differs between them from a wide search."""
     rng = np.random.default_rng(3)
 
@@ -175,11 +166,13 @@ def test_rows_of_a_field_are_not_taken_for_one_another(monkeypatch: pytest.Monke
 
     rows = np.cos(np.pi / 2 * (np.arange(2400)[:, None] + layer(40)))
     ground = np.clip(128 + 30 * rows + 5 * layer(1200), 0, 255).astype(np.uint8)
-    camera = larger(1280, monkeypatch)
-    monkeypatch.setattr(painted_ground, "painted_ground", lambda: ground)
+    camera = scaled(CAMERA, (1280, 960))
     track = [pose(0.45 * FOOTPRINT_M * i, 3.0 * i, seed=i) for i in range(3)]
     odometry, prior = Odometry(camera), PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
-    found = [odometry.track(still(T), i, i * 2_000_000_000, prior) for i, T in enumerate(track)]
+    found = [
+        odometry.track(still(T, camera, ground), i, i * 2_000_000_000, prior)
+        for i, T in enumerate(track)
+    ]
     assert_one_piece(track, found, 0.02)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
+from unittest.mock import Mock
 
 import av
 import cv2
@@ -186,7 +186,7 @@ def test_a_turned_camera_sees_the_same(clockwise_deg: int) -> None:
 
 def images(size_px: tuple[int, int], turned_deg: int = 0) -> Any:
     """A source of images of this size."""
-    return SimpleNamespace(size_px=size_px, turned_deg=turned_deg, description="gimbal")
+    return Mock(CameraSource, size_px=size_px, turned_deg=turned_deg, description="gimbal")
 
 
 def test_a_model_of_another_size_is_scaled_and_of_another_shape_refused() -> None:
@@ -249,8 +249,7 @@ def test_a_video_without_a_model_has_the_lens_of_its_telemetry(
     focal_35mm: float | None, fx_px: float, of: str
 ) -> None:
     log = TelemetryLog(VehicleHistory(), "video", 0, 1, (), {}, focal_35mm)
-    source = SimpleNamespace(size_px=(1920, 1080))
-    start = start_lens(cast(CameraSource, source), log)
+    start = start_lens(images((1920, 1080)), log)
     assert start.camera.K[0, 0] == pytest.approx(fx_px, rel=1e-4)
     assert start.camera.K[:2, 2] == pytest.approx((959.5, 539.5))
     assert not start.camera.distortion.any() and start.assumed == ("lens",) and of in start.note

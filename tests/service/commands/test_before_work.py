@@ -27,17 +27,11 @@ def scan(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Path:
     return folder
 
 
-def never(*_: Any, **__: Any) -> None:
-    raise AssertionError("work has begun")
-
-
 @pytest.mark.parametrize(
     "name", ["flight.mp4", "truth/params.json", "camera.yaml/a"], ids=["flight", "truth", "file"]
 )
-def test_simulate_refuses_a_folder_in_use_before_it_works(
-    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("service.sim.recording.prepare", never)
+def test_simulate_refuses_a_folder_in_use_before_it_works(tmp_path: Path, name: str) -> None:
+    """Work that has begun says so in a line of its own."""
     (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).touch()
     out = tmp_path if name != "camera.yaml/a" else tmp_path / name / "below"
@@ -45,13 +39,10 @@ def test_simulate_refuses_a_folder_in_use_before_it_works(
     assert ended.returncode == 2 and ended.stderr.count("\n") == 1
 
 
-def test_replay_refuses_a_view_that_is_too_narrow(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_replay_refuses_a_view_that_is_too_narrow(tmp_path: Path) -> None:
     """What it would make lies hundreds of metres from where it is."""
     from PIL import Image
 
-    monkeypatch.setattr(backend_choice, "open_backend", never)
     (tmp_path / "stills").mkdir()
     for k in range(2):
         Image.new("RGB", (640, 480), (90 * k, 90, 90)).save(tmp_path / "stills" / f"{k}.png")
@@ -85,9 +76,9 @@ def test_a_refused_refinement_leaves_no_folder(scan: Path, tmp_path: Path) -> No
 
 
 def test_replay_refuses_a_folder_with_a_scan_before_it_reads_the_log(
-    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scan: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(replay, "_load_telemetry", never)
+    """There is no such log."""
     words = ("replay", tmp_path, "--telemetry", "flight.tlog", "--out", scan)
     ended = skyrelief(*words)
     assert ended.returncode == 2 and "already holds a scan" in ended.stderr
@@ -106,10 +97,7 @@ def test_replay_refuses_a_folder_with_a_scan_before_it_reads_the_log(
         (["inspect", "--out", "x.jpg"], "the image is written as .png"),
     ],
 )
-def test_wrong_usage_is_refused_before_the_work(
-    scan: Path, words: list[str], why: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("service.offline.exports.view.fused_cloud", never)
+def test_wrong_usage_is_refused_before_the_work(scan: Path, words: list[str], why: str) -> None:
     ended = skyrelief(words[0], scan, *words[1:])
     assert ended.returncode == 2 and why in ended.stderr and ended.stderr.count("\n") == 1
 

@@ -8,7 +8,9 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -18,12 +20,14 @@ from typer.testing import CliRunner
 import service.cli
 from recon.backends import BACKENDS
 from service.cli import COMMANDS, app, load_command
+from service.commands import AsJson
 from service.commands.ground import show_news
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.offline.exports import EXPORTERS
 from service.offline.exports.model import LARGEST_FACES
 from service.offline.exports.view import ExportOptions, ScanView
 from service.packages import installs
+from service.progress import Progress
 from service.stream.session import SessionConfig, open_session
 from service.version import software
 
@@ -32,6 +36,14 @@ if TYPE_CHECKING:
 
 HEAVY = ("cv2", "numba", "torch", "open3d", "scipy", "zenoh", "onnxruntime", "av", "pymavlink")
 """Packages that no command may import before it is called: start-up time on the aircraft."""
+
+
+def working(command: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make ``command`` the command "work"."""
+    module = ModuleType("some_work")
+    module.command = command  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(COMMANDS, "work", ("some_work:command", "Work."))
 
 
 def run_cli(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -112,10 +124,9 @@ def test_a_signal_during_a_kernel_ends_the_command_in_order(
         except SystemError as error:
             raise SystemError("the kernel returned a result with an exception") from error
 
-    monkeypatch.setitem(COMMANDS, "kernel", (f"{__name__}:kernel", "Work."))
-    monkeypatch.setattr(sys.modules[__name__], "kernel", kernel, raising=False)
+    working(kernel, monkeypatch)
     with pytest.raises(SystemExit) as ended:
-        app(["kernel"], standalone_mode=False)
+        app(["work"], standalone_mode=False)
     assert ended.value.code == code
     assert capsys.readouterr().err == said
 
@@ -195,14 +206,15 @@ def test_a_mesh_without_its_package_or_video_fails_before_the_work(
     from service.offline.exports import model
 
     house.flown(tmp_path / "scan").close()
-    monkeypatch.setattr(model, "footprints", lambda _: pytest.fail("the work has begun"))
+    reported: list[Progress] = []
     missing = ExportOptions(video=tmp_path / "none.mp4")
-    with ScanView(tmp_path / "scan") as scan:
+    with ScanView(tmp_path / "scan", progress=Progress(reported.append)) as scan:
         with pytest.raises(InputError, match=r"none\.mp4: no such file or folder"):
             model.write_mesh(scan, tmp_path / "mesh.glb", LARGEST_FACES, missing)
         monkeypatch.setitem(sys.modules, "trimesh", None)
         with pytest.raises(OutsideError, match="a mesh file needs the package trimesh; pip"):
             model.write_mesh(scan, tmp_path / "mesh.glb", LARGEST_FACES, ExportOptions())
+    assert not reported  # the work has not begun
 
 
 def test_ground_prints_a_line_only_when_it_has_changed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -244,28 +256,20 @@ def test_exit_codes(
     error: SkyreliefError,
     code: int,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def fail(**_: object) -> None:
+    def fail() -> None:
         raise error
 
-    monkeypatch.setattr(service.cli, "app", fail)
-    with pytest.raises(SystemExit) as caught:
-        service.cli.main()
-    assert caught.value.code == code
-    assert capsys.readouterr().err == f"skyrelief: {error}\n"
+    working(fail, monkeypatch)
+    ended = skyrelief("work")
+    assert (ended.returncode, ended.stderr) == (code, f"skyrelief: {error}\n")
 
 
-def test_a_path_that_may_not_be_looked_at_is_refused_in_a_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_path_that_may_not_be_looked_at_is_refused_in_a_line() -> None:
     name = "x" * 5000  # as a folder without rights, which root would see
-    monkeypatch.setattr(sys, "argv", ["skyrelief", "export", name, "--to", "laz"])
-    with pytest.raises(SystemExit) as caught:
-        service.cli.main()
-    said = capsys.readouterr().err
-    assert caught.value.code == 3 and said.count("\n") == 1
-    assert said.startswith("skyrelief: xxx") and "File name too long" in said
+    ended = skyrelief("export", name, "--to", "laz")
+    assert ended.returncode == 3 and ended.stderr.count("\n") == 1
+    assert ended.stderr.startswith("skyrelief: xxx") and "File name too long" in ended.stderr
 
 
 @pytest.mark.slow
@@ -311,11 +315,11 @@ def test_the_shell_is_offered_values(
 
 
 def test_ctrl_c_ends_a_command_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    def stopped(*_: object) -> None:
+    def stopped(as_json: AsJson = False) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("service.commands.setup.load_config", stopped)
-    ended = skyrelief("config", "show", "--json")
+    working(stopped, monkeypatch)
+    ended = skyrelief("work", "--json")
     assert (ended.returncode, ended.stderr) == (130, "skyrelief: cancelled\n")
     assert json.loads(ended.stdout) == {"error": "cancelled", "exit_code": 130}
 
@@ -334,15 +338,9 @@ def test_errors_are_objects_with_json(words: list[str], code: int, error: str) -
     assert ended.returncode == report["exit_code"] == code and error in report["error"]
 
 
-def test_long_commands_say_at_once_what_they_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stopped(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("service.sim.scoring.read_truth", stopped)
+def test_long_commands_say_at_once_what_they_do(tmp_path: Path) -> None:
+    """Before they read: there is nothing to read here."""
     assert "reading the truth" in skyrelief("score", tmp_path, tmp_path).stderr
-    monkeypatch.setattr("service.cameras.board_images._images", stopped)
     words = ("calibrate", tmp_path, "--pattern", "9x6", "--square-m", "1", "--out", tmp_path / "c")
     assert "looking for the board" in skyrelief(*words).stderr
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 from loopback import until
 
+import service
 from service.commands import demo
 from service.errors import InputError
 
@@ -19,19 +19,16 @@ def make_flight(home: Path) -> Path:
     return folder
 
 
-def test_an_installed_wheel_brings_the_flight(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        demo, "__file__", str(tmp_path / "site" / "service" / "commands" / "demo.py")
-    )
-    monkeypatch.setattr(sys, "prefix", str(tmp_path / "venv"))
+def test_an_installed_wheel_brings_the_flight(tmp_path: Path) -> None:
+    clone, brought = demo.HOMES
+    assert clone == Path(service.__file__).resolve().parents[1] and brought.name == "skyrelief"
+    homes = (tmp_path / "site", tmp_path / "venv" / "share" / "skyrelief")
     with pytest.raises(InputError, match="--flight"):
-        demo.demo_flight(None)
-    brought = make_flight(tmp_path / "venv" / "share" / "skyrelief")
-    assert demo.demo_flight(None) == brought
-    clone = make_flight(tmp_path / "site")
-    assert demo.demo_flight(None) == clone
+        demo.demo_flight(None, homes)
+    brought = make_flight(homes[1])
+    assert demo.demo_flight(None, homes) == brought
+    clone = make_flight(homes[0])
+    assert demo.demo_flight(None, homes) == clone
 
 
 def test_a_named_flight_alone_counts(tmp_path: Path) -> None:

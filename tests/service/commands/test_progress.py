@@ -8,11 +8,12 @@ import pty
 import select
 import subprocess
 import sys
-import time
+from contextlib import redirect_stderr
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
@@ -24,6 +25,8 @@ from service.progress import CancelledError, Progress
 
 if TYPE_CHECKING:
     from house_flight import HouseFlight
+
+    from service.flight.scan import Scan
 
 
 @given(st.recursive(st.integers(0, 5), lambda inner: st.lists(inner, max_size=4), max_leaves=12))
@@ -96,10 +99,9 @@ def test_equal_parts_take_equal_shares() -> None:
     assert ends == pytest.approx([0.25, 0.5, 0.75, 1.0])
 
 
-def test_the_rest_takes_as_long_as_the_pace_so_far_says(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_rest_takes_as_long_as_the_pace_so_far_says() -> None:
     now = [100.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    progress = Progress()
+    progress = Progress(clock=lambda: now[0])
     now[0] = 500.0  # it waited in a queue
     progress.begin()
     for _ in progress.over(range(4), 4):
@@ -147,12 +149,9 @@ def test_a_cancelled_export_leaves_nothing_behind(
     ]
 
 
-def test_without_a_terminal_steps_and_twentieths_are_lines(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_a_terminal_steps_and_twentieths_are_lines() -> None:
     text = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", text)
-    with showing("mesh") as progress:
+    with redirect_stderr(text), showing("mesh") as progress:
         progress("fusing")
         for _ in progress.over(range(3), 3):
             pass
@@ -190,17 +189,35 @@ def test_in_a_terminal_there_is_one_bar_with_percent_and_time_left() -> None:
     assert "export: fusing" in text and "75%" in text and "0:00:0" in text
 
 
-def test_a_replay_shows_its_share_and_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@dataclass
+class Flown:
+    """What the bar of a scan reads of it, and of its recorder."""
+
+    frames: int = 2
+    distance_m: float = 31.4
+    keyframes: int = 1
+
+    @property
+    def recorder(self) -> Flown:
+        return self
+
+
+def test_a_replay_shows_its_share_and_its_figures() -> None:
     seen: list[tuple[str, float]] = []
     progress = Progress(lambda now: seen.append((now.text, round(now.share, 3))))
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    recorder = SimpleNamespace(frames=2, distance_m=31.4, keyframes=1)
-    with progress.part("tracking", of_rest=0.9):
-        show = replay.show_flown(cast(Any, SimpleNamespace(images=4)), progress)
+    scan, images, pipe = cast("Scan", Flown()), Mock(images=4), Mock(spec=[])
+    with redirect_stderr(Terminal()), progress.part("tracking", of_rest=0.9):
+        show = replay.show_flown(images, progress)
         for _ in range(4):
-            show(cast(Any, SimpleNamespace(recorder=recorder)))
+            show(scan)
     assert seen[-1] == ("2 images, 31 m flown, 1 keyframes", 0.675)
     assert [share for _, share in seen] == [0.0, 0.0, 0.225, 0.45, 0.675]
     seen.clear()
-    replay.show_flown(cast(Any, object()), progress)(cast(Any, SimpleNamespace(recorder=recorder)))
-    assert seen == [("2 images, 31 m flown, 1 keyframes", 0.9)]  # a pipe: no share
+    with redirect_stderr(Terminal()):
+        replay.show_flown(pipe, progress)(scan)
+    assert seen == [("2 images, 31 m flown, 1 keyframes", 0.9)]  # no share of a pipe

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 import pytest
 from bench_middlebury import true_pairs
+from command_line import skyrelief
 from paths import SHARED
 
 from recon.backends.cpu import CpuBackend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DisparityMap
 from service.bench.stereo import bad_share, semi_global_disparity
-from service.cli import main
 from service.compute.backend_choice import Choice, FallbackBackend, choose_backend
 from service.compute.rectified_pair import matching_config
 from service.errors import InputError, OutsideError
@@ -25,12 +25,12 @@ from service.errors import InputError, OutsideError
 DATA = SHARED / "stereo_gt_middlebury"
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
-    """Exit code of the command line."""
-    monkeypatch.setattr(sys, "argv", ["skyrelief", *(str(w) for w in words)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
+def run(*words: object) -> int:
+    """Exit code of the command line, whose words are printed on."""
+    ended = skyrelief(*map(str, words))
+    print(ended.stdout, end="")
+    print(ended.stderr, end="", file=sys.stderr)
+    return ended.returncode
 
 
 @pytest.fixture
@@ -48,12 +48,11 @@ def pair(tmp_path: Path) -> tuple[Path, Path]:
 
 @pytest.mark.parametrize(("first", "labels"), [(0, 16), (5, 10), (-3, 20)])
 def test_writes_disparity_in_pixels(
-    pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    pair: tuple[Path, Path], tmp_path: Path,
     capsys: pytest.CaptureFixture[str], first: int, labels: int,
 ) -> None:  # fmt: skip
     out, image = tmp_path / "d.npy", tmp_path / "d.png"
-    code = run(
-        monkeypatch, "stereo", *pair, "--labels", labels, "--min-disparity", first,
+    code = run("stereo", *pair, "--labels", labels, "--min-disparity", first,
         "--out", out, "--image", image, "--backend", "cpu", "--json",
     )  # fmt: skip
     assert code == 0
@@ -83,16 +82,15 @@ def test_bad_usage_is_one_line(
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     options = {"--labels": "16", "--out": "d.npy"} | change
-    assert run(monkeypatch, "stereo", *pair, *(w for item in options.items() for w in item)) == 2
+    assert run("stereo", *pair, *(w for item in options.items() for w in item)) == 2
     error = capsys.readouterr().err.strip()
     assert words in error
     assert len([line for line in error.splitlines() if line.startswith("skyrelief")]) == 1
 
 
 def test_bad_images_are_named(
-    pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     text, empty, small = tmp_path / "notes.png", tmp_path / "empty.png", tmp_path / "small.png"
     text.write_text("not an image")
     empty.touch()
@@ -102,16 +100,16 @@ def test_bad_images_are_named(
         (tmp_path / "gone.png", "no such file"), (tmp_path, "no such file"),
     ):  # fmt: skip
         out = tmp_path / "d.npy"
-        assert run(monkeypatch, "stereo", pair[0], bad, "--labels", 16, "--out", out) == 2
+        assert run("stereo", pair[0], bad, "--labels", 16, "--out", out) == 2
         assert words in capsys.readouterr().err
         assert not out.exists()
 
 
-def test_blank_pair_gives_an_unknown_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blank_pair_gives_an_unknown_map(tmp_path: Path) -> None:
     path = tmp_path / "blank.png"
     cv2.imwrite(str(path), np.full((60, 80, 3), 200, np.uint8))
     out = tmp_path / "d.npy"
-    assert run(monkeypatch, "stereo", path, path, "--labels", 16, "--out", out) == 0
+    assert run("stereo", path, path, "--labels", 16, "--out", out) == 0
     assert np.isnan(np.load(out)).all()
 
 
@@ -169,32 +167,30 @@ def test_named_backend_that_cannot_run_stops() -> None:
 
 @pytest.mark.slow
 def test_exported_model_gives_the_same_labels(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: tuple[Path, Path],
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    tmp_path: Path, pair: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     """``export-model`` writes a model and the declaration that runs it."""
     pytest.importorskip("onnxruntime")
     pytest.importorskip("torch")
     out = tmp_path / "stereo.onnx"
     size = ("--size", "160x80", "--iterations", "1")
-    assert run(monkeypatch, "export-model", *size, "--out", out) == 0
+    assert run("export-model", *size, "--out", out) == 0
     model, found = tmp_path / "stereo.toml", tmp_path / "d.npy"
     words = ("stereo", *pair, "--labels", 16, "--out", found, "--backend", "onnx")
-    assert run(monkeypatch, *words, "--model", model) == 0
+    assert run(*words, "--model", model) == 0
     px = np.load(found)
     assert np.isfinite(px)[:, 24:].mean() > 0.95
     assert abs(np.nanmedian(px) - 9.5) < 0.1
-    assert run(monkeypatch, *words) == 2
+    assert run(*words) == 2
     assert "give it with compute.model" in capsys.readouterr().err
-    assert run(monkeypatch, "export-model", "--size", "160", "--out", out) == 2
-    assert run(monkeypatch, "export-model", "--out", tmp_path / "stereo.bin") == 2
+    assert run("export-model", "--size", "160", "--out", out) == 2
+    assert run("export-model", "--out", tmp_path / "stereo.bin") == 2
 
 
 @pytest.mark.slow
 def test_learned_model_is_checked_and_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: tuple[Path, Path],
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    tmp_path: Path, pair: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     """A model that says 9.5 px everywhere, declared rightly or not."""
     from exported_network import write_network
 
@@ -205,7 +201,7 @@ def test_learned_model_is_checked_and_used(
     declaration.write_text(good)
     out = tmp_path / "d.npy"
     words = ("stereo", *pair, "--labels", 16, "--out", out, "--model", declaration)
-    assert run(monkeypatch, *words) == 0
+    assert run(*words) == 0
     px = np.load(out)
     assert np.nanmedian(px) == pytest.approx(9.5)
     assert np.isnan(px[:, :8]).all()  # their partners lie outside the right image
@@ -219,7 +215,7 @@ def test_learned_model_is_checked_and_used(
         (good.replace("height = 96\n", ""), "height must be given"),
     ):
         declaration.write_text(wrong)
-        assert run(monkeypatch, *words) == 2
+        assert run(*words) == 2
         assert said in capsys.readouterr().err
 
 

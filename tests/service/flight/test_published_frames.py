@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import resource
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from some_views import keyframe_at
 
 from recon import se3
 from recon.tracking.relative_pose import RelativePose
@@ -17,11 +17,6 @@ from service.errors import OutsideError
 from service.flight.published_frames import PublishedFrame, PublishedFrames
 
 RNG = np.random.default_rng(4)
-
-
-def refined(seq: int, segment: int, T_odom_camera: F64) -> Any:
-    """A keyframe of the odometry that is still adjusted."""
-    return SimpleNamespace(seq=seq, segment=segment, T_odom_camera=T_odom_camera)
 
 
 def some_pose() -> F64:
@@ -44,12 +39,12 @@ def published(seq: int, key: Any, agl_m: float | None = 41.5) -> PublishedFrame:
 
 
 def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
-    keys = [refined(n, n // 20, some_pose()) for n in range(0, 40, 10)]
+    keys = [keyframe_at(n, some_pose(), n // 20) for n in range(0, 40, 10)]
     frames = [published(seq, keys[seq // 10], None if seq == 3 else 41.5) for seq in range(40)]
     kept = PublishedFrames(tmp_path)
     for frame in frames:
         kept.add(frame, before(20))
-    keys[2].T_odom_camera = some_pose()  # still in the window: the newest pose counts
+    keys[2].T_camera_odom = some_pose()  # still in the window: the newest pose counts
     found = list(kept.corrigible())
     assert not list(tmp_path.iterdir())  # no name: nothing is left behind
     for one, other in zip(frames, found, strict=True):
@@ -67,7 +62,7 @@ def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
 def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> None:
     kept = PublishedFrames(tmp_path)
     for seq in range(500):
-        key = refined(seq, 0, some_pose())
+        key = keyframe_at(seq, some_pose())
         kept.add(published(seq, key), before(seq - 9))
         kept.add(PublishedFrame(10**18 + seq, None, np.zeros(3), 0.0, None, False), before(seq - 9))
     assert len(kept._fresh) <= 22
@@ -82,7 +77,7 @@ def test_a_full_disk_is_the_outside_worlds_fault(tmp_path: Path) -> None:
     try:
         with pytest.raises(OutsideError):
             for seq in range(1000):
-                kept.add(published(seq, refined(seq, 0, some_pose())), before(seq))
+                kept.add(published(seq, keyframe_at(seq, some_pose())), before(seq))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     kept.close()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -16,14 +16,15 @@ from recon.camera_model import scaled_K
 from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import FallbackPosition
 from recon.posegraph.alignment import Scale, Similarity
+from recon.posegraph.pose_graph import PoseGraph
+from recon.posegraph.segments import Segments
 from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.relative_pose import RelativePose
 from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.rig import Rig
-from service.flight.pipeline import Pipeline
 from service.flight.recorder import REPLAYED, Recorder
 from service.stream.images import IMAGE_SHARE
-from service.stream.records import ScanHeader
+from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
@@ -47,7 +48,17 @@ def lost(seq: int) -> FramePosed:
     return FramePosed(seq, 1_000_000 * seq, Tracked(Tracking.LOST, 0))
 
 
-def recorder_of(store: ScanStore, batch: int, of_m: float) -> Recorder:
+class CountingStore(ScanStore):
+    """Knows how many poses each transaction had."""
+
+    transactions: tuple[int, ...] = ()
+
+    def add_poses(self, poses: Sequence[PoseRecord]) -> int:
+        self.transactions += (len(poses),)
+        return super().add_poses(poses)
+
+
+def recorder_of(store: ScanStore, batch: int, of_m: float, graph: object = None) -> Recorder:
     """A recorder of frames that do not move, and whose sigma is ``of_m`` in the end.
 
     0: that of a frame as it was published.
@@ -58,35 +69,26 @@ def recorder_of(store: ScanStore, batch: int, of_m: float) -> Recorder:
         assert np.linalg.norm(published.place_m - there) == 0
         return pose(frame.seq, of_m or float(np.linalg.norm(published.sigma_m)))
 
-    pipeline = SimpleNamespace(
-        keyframes=SimpleNamespace(graph=None), frames=SimpleNamespace(pose=at), debug=None,
-        follow=SimpleNamespace(is_settled=lambda frame: False), stopwatch=nullcontext,
-        drain=tuple, finish=tuple,
-    )  # fmt: skip
-    rig = SimpleNamespace(frame=None, georeference="none")
-    return Recorder(store, cast(Pipeline, pipeline), cast(Rig, rig), batch=batch)
+    pipeline = MagicMock(debug=None)
+    pipeline.keyframes.graph = graph
+    pipeline.frames.pose = at
+    pipeline.follow.is_settled.return_value = False
+    return Recorder(store, pipeline, Mock(Rig, frame=None, georeference="none"), batch=batch)
 
 
 @pytest.mark.parametrize(("batch", "transactions"), [(1, 20), (REPLAYED, 2)])
 def test_poses_of_a_recording_share_transactions(
-    tmp_path: Path, batch: int, transactions: int, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, batch: int, transactions: int
 ) -> None:
     header = ScanHeader("recorded", "drone", 0)
-    with ScanStore.create(tmp_path / "scan.db", header) as store:
-        written: list[int] = []
-        add = store.add_poses
-
-        def counted(poses: Any) -> int:
-            written.append(len(poses))
-            return add(poses)
-
-        monkeypatch.setattr(store, "add_poses", counted)
+    with CountingStore.create(tmp_path / "scan.db", header) as store:
+        assert isinstance(store, CountingStore)
         recorder = recorder_of(store, batch, 0.1)
         for seq in range(20):
             recorder.write([posed(seq)])
         recorder.flush()
         assert [pose.time_unix_ns for pose in store.poses()] == [1_000_000 * n for n in range(20)]
-        assert len(written) == transactions and sum(written) == 20
+        assert len(store.transactions) == transactions and sum(store.transactions) == 20
 
 
 def test_a_still_that_the_next_one_places_is_no_longer_lost(tmp_path: Path) -> None:
@@ -113,17 +115,13 @@ def test_poses_published_before_the_scan_was_placed_get_their_sigma(tmp_path: Pa
         assert found == pytest.approx([0.02, 0.02, 0.021, 0.02], abs=1e-4)
 
 
-def test_frames_that_no_keyframe_carries_stay_as_published(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with ScanStore.create(tmp_path / "scan.db", ScanHeader("stills", "drone", 0)) as store:
+def test_frames_that_no_keyframe_carries_stay_as_published(tmp_path: Path) -> None:
+    with CountingStore.create(tmp_path / "scan.db", ScanHeader("stills", "drone", 0)) as store:
         recorder = recorder_of(store, 1, 0.0)
         for seq in range(4):
             recorder.write([posed(seq, 5.0)])
-        corrected: list[int] = []
-        monkeypatch.setattr(store, "add_poses", lambda poses: corrected.append(len(poses)))
         recorder.flush()
-        assert corrected == []
+        assert isinstance(store, CountingStore) and store.transactions == (1, 1, 1, 1)
         assert [pose.sigma_m for pose in store.poses()] == pytest.approx([5.0] * 4)
 
 
@@ -136,23 +134,29 @@ def test_frames_that_no_keyframe_carries_stay_as_published(
         ((), 0.5, "an assumed height"),
     ],
 )
-def test_the_scale_names_what_measured_it(sources: tuple[str, ...], sigma: float, by: str) -> None:
+def test_the_scale_names_what_measured_it(
+    sources: tuple[str, ...], sigma: float, by: str, tmp_path: Path
+) -> None:
     covariance = np.diag([0.0] * 6 + [sigma**2])
     found = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
-    scales: list[Scale | None] = [None, None]
-    growth = [-2.0 * sigma]
-    largest = SimpleNamespace(frame=found)
-    segments = SimpleNamespace(largest=lambda: largest, largest_scales=lambda: scales)
-    graph = SimpleNamespace(segments=segments, largest_growth=lambda: growth[0])
-    recorder = Recorder.__new__(Recorder)
-    recorder._graph = cast(Any, graph)
-    assert recorder._scale() == {"from": by, "sigma": sigma}
-    scales[:] = Scale(1.2, 0.01), Scale(1.0, 0.03)
-    assert recorder._scale()["gnss_over_heights"] == pytest.approx(1.2)
-    scales[1] = Scale(1.0, 0.1)
-    assert "gnss_over_heights" not in recorder._scale()
-    growth[0] = -0.1 - 3.0 * sigma
-    assert recorder._scale()["sigma"] == pytest.approx(0.1 + 3.0 * sigma)
+    graph = Mock(PoseGraph, segments=Mock(Segments))
+    graph.segments.largest.return_value.frame = found
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("s", "drone", 0)) as store:
+        recorder = recorder_of(store, 1, 0.1, graph)
+
+        def scale(growth: float, *by_sensor: Scale | None) -> dict[str, Any]:
+            graph.largest_growth.return_value = growth
+            graph.segments.largest_scales.return_value = by_sensor
+            said: dict[str, Any] = recorder.summary()["scale"]
+            return said
+
+        assert scale(-2.0 * sigma, None, None) == {"from": by, "sigma": sigma}
+        apart = scale(-2.0 * sigma, Scale(1.2, 0.01), Scale(1.0, 0.03))
+        assert apart["gnss_over_heights"] == pytest.approx(1.2)
+        alike = scale(-2.0 * sigma, Scale(1.2, 0.01), Scale(1.0, 0.1))
+        assert "gnss_over_heights" not in alike
+        grown = scale(-0.1 - 3.0 * sigma, None, None)
+        assert grown["sigma"] == pytest.approx(0.1 + 3.0 * sigma)
 
 
 def test_each_keyframe_has_its_image_within_the_flights_budget(

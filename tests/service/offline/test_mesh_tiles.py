@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -239,7 +239,7 @@ def test_the_file_names_no_path_of_this_machine(
     corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
     mesh = Mesh(corner, np.array([[0, 1, 2]], np.int32), rgb=np.full((3, 3), 90, np.uint8))
     figures = {"faces": 1, "vertices": 3, "seen": 1.0, "measured": 1.0, "texture_px": [1, 1]}
-    part = SimpleNamespace(mesh=mesh, image=None, figures=figures)
+    part = Mock(mesh=mesh, image=None, figures=figures)
     monkeypatch.setattr(model, "run_tiles", lambda *_: [part])
     monkeypatch.setattr(model, "check_video", lambda *_: None)
     options = ExportOptions(video=tmp_path / "flight.mp4")

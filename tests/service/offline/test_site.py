@@ -220,14 +220,9 @@ def test_what_cannot_be_tied_stays_and_is_named(tmp_path: Path) -> None:
         compare(one, winter, tmp_path / "change")
 
 
-def test_the_same_ground_in_other_light_is_tied(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_same_ground_in_other_light_is_tied(tmp_path: Path) -> None:
     noon = write_scan(tmp_path / "noon", NORTH, WRONG)
-    x = np.linspace(0.0, 40.0, 900)
-    dusk = 0.5 * site_scans.texture(1) + 15.0 * np.sin(x) + 10.0 * np.cos(x)[:, None]
-    monkeypatch.setattr(site_scans, "texture", lambda _: dusk)
-    evening = write_scan(tmp_path / "evening", EAST, day=1)
+    evening = write_scan(tmp_path / "evening", EAST, ground=site_scans.DUSK, day=1)
     document = align_site([noon, evening], tmp_path / "site", deliver=False).document
     assert document["pairs"][0]["ties"] >= 3 and document["notes"] == []
     off = errors_m(tmp_path / "site", [*NORTH, *EAST])

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from recon.types import Array
+from recon.types import Array, DepthMap, Keyframe
 from service.cli import app
 from service.errors import InputError
 from service.scans.drawing import (
@@ -106,12 +106,12 @@ def test_wrong_arrays_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_keyframe_shown_is_one_with_points(tmp_path: Path) -> None:
-    def keyframe(seq: int) -> SimpleNamespace:
+    def keyframe(seq: int) -> Mock:
         depth_m = np.full(30, np.nan)
         depth_m[: seq if seq < 17 else 0] = 40.0
-        return SimpleNamespace(depth=SimpleNamespace(depth_m=depth_m))
+        return Mock(Keyframe, depth=Mock(DepthMap, depth_m=depth_m))
 
-    store = cast(ScanStore, SimpleNamespace(keyframe=keyframe))
+    store = Mock(ScanStore, keyframe=keyframe)
     assert middle_keyframe(tmp_path, store, range(30)) == 16
     assert middle_keyframe(tmp_path, store, range(3)) == 2
     assert middle_keyframe(tmp_path, store, []) is None

@@ -263,14 +263,12 @@ def test_the_report_says_what_was_flown_and_nothing_runs_in_it(
 
 
 def test_a_large_site_is_fused_strip_by_strip_to_the_same_cloud(
-    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, house: HouseFlight
 ) -> None:
     with house.flown(tmp_path) as store:
         whole = fused_cloud(store)
-        monkeypatch.setattr("service.scans.fused_cloud.STRIP_POINTS", 9000)
-        strips = fused_cloud(store)
-        monkeypatch.setattr("service.scans.fused_cloud.LARGEST_POINTS", 18_000)
-        coarse = fused_cloud(store)
+        strips = fused_cloud(store, strip_points=9000)
+        coarse = fused_cloud(store, strip_points=9000, largest_points=18_000)
     for name in ("xyz_m", "rgb", "sigma_m", "views"):
         np.testing.assert_array_equal(getattr(strips.cloud, name), getattr(whole.cloud, name))
     assert coarse.voxel_m == pytest.approx(2 * whole.voxel_m)

@@ -12,7 +12,6 @@ import pytest
 from loopback import free_port, until
 
 from service.config import DatalinkConfig
-from service.stream import messages
 from service.stream.link import DatalinkSender
 from service.stream.messages import (
     HEAD_BYTES,
@@ -125,11 +124,8 @@ def test_parts_are_cut_in_one_way_only() -> None:
     assert list(parse(Part("header", MAX_COUNTED + 1, 0, 1, 0, 0, b"").pack()))
 
 
-def test_small_parts_do_not_take_more_memory_than_they_say(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(messages, "MAX_OPEN_BYTES", 1 << 22)
-    assembler = Assembler()
+def test_small_parts_do_not_take_more_memory_than_they_say() -> None:
+    assembler = Assembler(1 << 22)
     for number in range(6):
         for part in split_in("k1", number, bytes(5_000), 5_000)[:-1]:
             assembler.add(part, float(number))
@@ -203,20 +199,19 @@ def test_the_store_keeps_what_few_stations_hold(onboard: ScanStore) -> None:
 
 
 def test_a_flood_of_reports_is_not_written_and_the_real_station_is_served(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     pytest.importorskip("zenoh")
     writes: list[str] = []
-    set_held = ScanStore.set_held
 
-    def counted(self: ScanStore, peer: str, numbers: dict[str, RangeSet]) -> None:
-        writes.append(peer)
-        set_held(self, peer, numbers)
+    class Noting(ScanStore):
+        def set_held(self, peer: str, numbers: dict[str, RangeSet]) -> None:
+            writes.append(peer)
+            super().set_held(peer, numbers)
 
-    monkeypatch.setattr(ScanStore, "set_held", counted)
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     router = open_session(SessionConfig(mode="router", listen=(endpoint,)))
-    store = ScanStore.create(tmp_path / "scan.db", ScanHeader("scan", "drone", 1))
+    store = Noting.create(tmp_path / "scan.db", ScanHeader("scan", "drone", 1))
     for k in range(20):
         store.add_pose(PoseRecord(k, np.eye(4), np.eye(6)))
     store.finish({})
