@@ -22,6 +22,7 @@ from typing import Any
 from service.errors import InputError, OutsideError
 
 BENCHMARKS: dict[str, str] = {
+    "board": "service.bench.board:run",
     "stereo": "service.bench.stereo:run",
     "upsample": "service.bench.stereo:run_upsampling",
     "gpu": "service.bench.gpu:run",
@@ -109,16 +110,20 @@ def run_benchmarks(
     return results
 
 
-def table(results: list[BenchResult]) -> str:
-    """The results as aligned text, one line a figure."""
-    rows = [("benchmark", "figure", "ours", "spread", "peer", "theirs", "ratio", "note")]
+def table(results: list[BenchResult], before: Mapping[tuple[str, str], float] | None = None) -> str:
+    """The results as aligned text, one line a figure; ``before`` has earlier ones by its names."""
+    rows: list[tuple[str, ...]] = [
+        ("benchmark", "figure", "ours", "spread", "peer", "theirs", "ratio", "before", "note")
+    ]
     for r in results:
+        earlier = (before or {}).get((r.name, r.what))
         theirs = "" if r.peer_value is None else f"{r.peer_value:.3g} {r.unit}"
         ratio = "" if r.ratio is None else f"{r.ratio:.2f}"
         spread = f"{r.spread:.2g}" if r.spread else ""
-        rows.append(
-            (r.name, r.what, f"{r.value:.3g} {r.unit}", spread, r.peer, theirs, ratio, r.note)
-        )
+        ours, then = f"{r.value:.3g} {r.unit}", "" if earlier is None else f"{earlier:.3g}"
+        rows.append((r.name, r.what, ours, spread, r.peer, theirs, ratio, then, r.note))
+    if not before:
+        rows = [(*row[:-2], row[-1]) for row in rows]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
     return "\n".join(line.rstrip() for line in lines)
@@ -148,6 +153,18 @@ def keep(folder: Path, names: Sequence[str], report: dict[str, Any]) -> Path:
     except OSError as error:
         raise OutsideError(f"{path}: cannot be written: {error.strerror}") from error
     return path
+
+
+def last_kept(folder: Path, names: Sequence[str]) -> dict[tuple[str, str], float]:
+    """(benchmark, figure) to its value in the newest result file of these benchmarks there."""
+    files = sorted(folder.glob(f"*-{'-'.join(names)}.json"), key=lambda path: path.stat().st_mtime)
+    if not files:
+        return {}
+    try:
+        kept = json.loads(files[-1].read_bytes())["results"]
+        return {(r["name"], r["what"]): float(r["value"]) for r in kept}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{files[-1]}: no results of a benchmark: {error}") from error
 
 
 def commit() -> str:

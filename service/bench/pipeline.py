@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from recon import se3
+from recon.backends import Backend
 from recon.backends.cpu import CpuBackend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import F32, F64, U8, Camera, DisparityMap
@@ -122,7 +123,7 @@ def fly(
     video: Path,
     folder: Path,
     flags: list[str],
-    backend: CpuBackend,
+    backend: Backend,
     watch: Callable[[Scan], None] | None = None,
 ) -> tuple[dict[str, Any], float]:
     """The summary of one scan, and its seconds."""

@@ -30,6 +30,11 @@ ITERATIONS = 5
 def run(options: BenchOptions) -> list[BenchResult]:
     """Milliseconds for the sizes of flight, then wrong pixels on rendered pairs."""
     backend = choose_backend(options.backend)
+    return speed(options, backend) + accuracy([rendered(name) for name in SCENES], backend)
+
+
+def speed(options: BenchOptions, backend: Backend) -> list[BenchResult]:
+    """Milliseconds for the sizes of flight."""
     results = []
     for width, height, labels in SIZES:
         left, right = scene(width, height, labels)
@@ -45,7 +50,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
                 note=f"{backend.name}, images to checked sub-pixel disparity",
             )
         )
-    return results + accuracy([rendered(name) for name in SCENES], backend)
+    return results
 
 
 def accuracy(pairs: Sequence[TruePair], backend: Backend) -> list[BenchResult]:

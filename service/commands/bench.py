@@ -15,7 +15,9 @@ def bench(
     names: Annotated[list[str] | None, typer.Argument(help="benchmarks; default: all")] = None,
     rounds: Annotated[int, typer.Option(help="timed rounds of each figure", min=1)] = 30,
     backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "cpu",
-    keep: Annotated[Path | None, typer.Option(help="folder for the result (JSON)")] = None,
+    keep: Annotated[
+        Path | None, typer.Option(help="folder for JSON; compares with the last")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Print our figure, the peer's in the same run, and the ratio."""
@@ -23,8 +25,9 @@ def bench(
 
     options = benchmarks.BenchOptions(rounds=rounds, backend=backend)
     chosen = names or list(benchmarks.BENCHMARKS)
+    before = benchmarks.last_kept(keep, chosen) if keep is not None else {}
     results = benchmarks.run_benchmarks(chosen, options)
-    print(benchmarks.table(results))
+    print(benchmarks.table(results, before))
     report = benchmarks.record(results, options)
     if keep is not None:
         print(f"kept in {benchmarks.keep(keep, chosen, report)}")

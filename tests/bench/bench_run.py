@@ -29,7 +29,7 @@ DEVELOPMENT = {
 }
 """Name to ``module:function`` of this folder."""
 
-ASKED_FOR = ("device", "middlebury", "real", "site")
+ASKED_FOR = ("board", "device", "middlebury", "real", "site")
 """Those that need a GPU, data or an hour, and run by name only."""
 
 

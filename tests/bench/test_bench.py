@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -14,9 +15,11 @@ from bench_run import DEVELOPMENT
 from command_line import skyrelief
 
 from service import bench
-from service.bench import BENCHMARKS, BenchOptions, BenchResult, compare, record, table
+from service.bench import BENCHMARKS, BenchOptions, BenchResult, board, compare, record, table
 from service.bench.stereo import bad_share, scene, semi_global_disparity
 from service.bench.stereo_scenes import TruePair as Pair
+from service.daemon.machine import Machine
+from service.errors import InputError
 
 
 def test_every_line_of_the_table_can_be_called() -> None:
@@ -57,6 +60,40 @@ def test_table_and_record_hold_every_figure() -> None:
     assert "cores" in kept["machine"]
 
 
+def test_the_last_kept_figures_stand_in_the_table(tmp_path: Path) -> None:
+    results = [BenchResult("b", 2.0, "ms", name="icp"), BenchResult("new", 7.0, "Hz", name="icp")]
+    assert bench.last_kept(tmp_path, ["icp"]) == {}
+    bench.keep(tmp_path, ["icp"], record([replace(results[0], value=8.0)], BenchOptions()))
+    before = bench.last_kept(tmp_path, ["icp"])
+    assert before == {("icp", "b"): 8.0}
+    head, old, new = table(results, before).splitlines()
+    assert head.split()[-2:] == ["before", "note"] and old.endswith("8") and "8" not in new
+    (tmp_path / "z-icp.json").write_text("[]")
+    with pytest.raises(InputError, match=r"z-icp\.json: no results"):
+        bench.last_kept(tmp_path, ["icp"])
+
+
+def test_a_boards_sheet() -> None:
+    results = board.run(BenchOptions(rounds=1, warm_up=0), widths=(320,))
+    by_name = {result.what: result for result in results}
+    path = by_name["whole path, stereo 320 wide"]
+    assert path.value > 0 and path.peer_value is not None and not path.note.startswith("0 ")
+    assert 50 < by_name["its memory, 320 wide"].value < 4000
+    assert by_name["decode 1280x720"].value > 1
+    assert any("SGBM" in result.peer for result in results if result.unit == "ms")
+
+
+def test_a_sheet_has_what_the_board_states() -> None:
+    cold, hot = Machine("a board", temperature_c=40.0, power_w=5.0), Machine("a board", 80.0, True)
+    found = {r.what: (r.value, r.unit, r.note) for r in board.sheet([cold, hot, cold])}
+    assert found == {
+        "hottest sensor": (80.0, "°C", "a board"),
+        "power, mean": (5.0, "W", "a board"),
+        "throttled": (100.0, "% of the time", "a board"),
+    }
+    assert board.sheet([]) == []
+
+
 def rounds(options: BenchOptions) -> list[BenchResult]:
     return [BenchResult("figure", float(options.rounds), "ms")]
 
@@ -71,7 +108,7 @@ def test_command_prints_and_keeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     assert printed["results"][0]["value"] == 7
     assert printed["results"][0]["name"] == "stereo"
     ended = skyrelief("bench", "nothing")
-    assert ended.returncode == 2 and "there are stereo" in ended.stderr
+    assert ended.returncode == 2 and "there are board" in ended.stderr
 
 
 def test_commit_is_unknown_without_git(monkeypatch: pytest.MonkeyPatch) -> None:
