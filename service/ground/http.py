@@ -6,12 +6,11 @@ is needed for everything and must be given by the operator. Nothing is fetched f
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
 from starlette.applications import Starlette
@@ -26,13 +25,14 @@ from starlette.responses import (
     PlainTextResponse,
     Response,
 )
-from starlette.responses import JSONResponse as StarletteJSONResponse
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
 from service.errors import InputError, OutsideError
+from service.ground.bodies import JSONResponse, body_of
+from service.ground.control import CONTROL_BODIES, control_routes
 from service.ground.guard import (
     CHANGING,
     UPLOAD,
@@ -58,8 +58,6 @@ from service.offline.exports.view import ExportOptions
 from service.offline.site.start import Pair, StartPoints
 from service.scans.annotations import Line, LineString, Point, Spot, as_json, read_annotations
 
-T = TypeVar("T")
-
 PAGE = Path(__file__).parent / "web" / "dist"
 COMPRESSED = [Middleware(GZipMiddleware, compresslevel=5)]
 """For what a slow network is to carry and is no image: the page, and the list, asked for again and
@@ -80,14 +78,6 @@ NO_PAGE = (
     " the npm registry in reach. The interface works: <a href=/api/scans>scans</a>,"
     " <a href=/api/openapi.json>description</a>.</p>"
 )
-
-
-class JSONResponse(StarletteJSONResponse):
-    """JSON in ASCII: any text can be sent, also one with a lone surrogate."""
-
-    def render(self, content: Any) -> bytes:
-        """The body."""
-        return json.dumps(content, allow_nan=False, separators=(",", ":")).encode("ascii")
 
 
 class LabelChange(msgspec.Struct, forbid_unknown_fields=True):
@@ -151,6 +141,7 @@ def portal_app(state: PortalState, tokens: Tokens, local: bool) -> ASGIApp:
         Route(one + "/annotations/{number:int}", _erase_annotation, methods=["DELETE"]),
         *file_routes(one),
         *map_routes(),
+        *control_routes(one),
         Route(one + "/exports", _products, methods=["GET"]),
         Route(one + "/exports", _export, methods=["POST"]),
         Route(one + "/alignment", _align, methods=["POST"]),
@@ -238,16 +229,6 @@ def _refused(request: HTTPConnection, error: Exception) -> Response:
     return JSONResponse({"error": error.detail}, error.status_code, error.headers)
 
 
-async def _body(request: Request, kind: type[T]) -> T:
-    """The JSON object sent; InputError for anything else."""
-    try:
-        return msgspec.json.decode(await request.body(), type=kind)
-    except ClientDisconnect:
-        raise InputError("the request was cancelled") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"the request is not valid: {error}"[:300]) from error
-
-
 def _page(request: Request) -> Response:
     index = PAGE / "index.html"
     return FileResponse(index) if index.is_file() else HTMLResponse(NO_PAGE)
@@ -282,7 +263,7 @@ async def _label(request: Request) -> Response:
     """Rename or tag. With the edition that was seen: 409 when it is no longer the last."""
     drone, scan = names_of(request)
     note(request, "rename", scan=f"{drone}/{scan}")
-    change = await _body(request, LabelChange)
+    change = await body_of(request, LabelChange)
     note(request, "rename", title=change.title, tags=change.tags)
     library = state_of(request).library
     labels = await run_in_threadpool(
@@ -317,7 +298,7 @@ async def _annotate(request: Request) -> Response:
     """Add a place with a text, or a named measurement; the feature."""
     drone, scan = names_of(request)
     note(request, "annotate", scan=f"{drone}/{scan}")
-    new = await _body(request, NewAnnotation)
+    new = await body_of(request, NewAnnotation)
     note(request, "annotate", text=new.text)
     if (new.coordinates is None) == (new.line is None):
         raise InputError("the request is not valid: it gives coordinates or a line")
@@ -348,7 +329,7 @@ async def _export(request: Request) -> Response:
     """Make a deliverable in the background, or refine the scan; the job."""
     state, (drone, scan) = state_of(request), names_of(request)
     note(request, "export", scan=f"{drone}/{scan}")
-    order = await _body(request, ExportOrder)
+    order = await body_of(request, ExportOrder)
     note(request, "export", **msgspec.structs.asdict(order))
     folder = state.library.folder(drone, scan)
     try:
@@ -362,7 +343,7 @@ async def _align(request: Request) -> Response:
     """Place a scan without georeference by points, and align it with another or a site; the job."""
     state, (drone, scan) = state_of(request), names_of(request)
     note(request, "align", scan=f"{drone}/{scan}")
-    order = await _body(request, AlignOrder)
+    order = await body_of(request, AlignOrder)
     note(request, "align", to=f"{order.drone}/{order.scan}", points=len(order.points))
     folder = state.library.folder(drone, scan)
     other = state.library.folder(order.drone, order.scan)
@@ -400,7 +381,7 @@ async def _import(request: Request) -> Response:
     """Copy the known files of a scan folder, or an MCAP, of this machine in; 409 while another
     import runs."""
     note(request, "import")
-    folder = (await _body(request, ImportOrder)).folder
+    folder = (await body_of(request, ImportOrder)).folder
     note(request, "import", folder=folder)
     if not folder or "\0" in folder:
         raise InputError("give the folder or the .mcap to import")
@@ -476,7 +457,7 @@ def _figures(request: Request) -> Response:
 async def _order(request: Request) -> Response:
     """Give an order to the companion; 429 when they come too fast, but for stop."""
     note(request, "order")
-    wanted = await _body(request, VehicleOrder)
+    wanted = await body_of(request, VehicleOrder)
     note(request, wanted.action, metres=wanted.metres)
     vehicle = state_of(request).vehicle
     if vehicle is None:
@@ -535,5 +516,6 @@ BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {
     _align: AlignOrder,
     _import: ImportOrder,
     _order: VehicleOrder,
+    **CONTROL_BODIES,
 }
 """Bodies of the requests that take one."""

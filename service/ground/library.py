@@ -81,6 +81,7 @@ FILES: dict[str, str] = {
     "flight.kml": "flight, KML",
     "flight.mcap": "recording, MCAP",
     "annotations.geojson": "annotations, GeoJSON",
+    "gcp.csv": "control points and their marks",
     "report.html": "report",
     "site.json": "site: its scans, motions, ties",
     "change.html": "change, page",

@@ -96,9 +96,10 @@ def carry_out(job: Job) -> str:
     if job.work is not None:
         return job.work(job.progress)
     if job.kind == REFINE:
+        from service.offline.refine.marking import marked_file
         from service.offline.refine.refinement import RefineOptions, refine
 
-        refine(job.folder, RefineOptions(), job.progress)
+        refine(job.folder, RefineOptions(marked_file(job.folder)), job.progress)
         return "cloud.laz"
     with ScanView(job.folder, progress=job.progress) as scan:
         return export(scan, job.kind, None, job.options).name

@@ -305,6 +305,11 @@ class _Refinement:
         if unseen := [point.name for point in survey if not point.sightings]:
             self.notes.append(f"points without marks are left out: {', '.join(unseen)}")
             survey = [point for point in survey if point.sightings]
+            if not survey:
+                raise InputError(
+                    f"{path}: no point has a mark; mark them on the portal's page Control points, "
+                    "or add keyframe_seq, u_px and v_px"
+                )
         seen = [f.time_unix_ns for f in self.frames if "vision" in f.sources]
         placed = {_ms(t) for t in [*seen, *(s.time_ns for s in self.states)]}
         lost = {

@@ -40,6 +40,9 @@ from service.stream.store import ScanStore
 REFINED = 1_000_000
 """Revisions of refinements begin here; a flight's own stay far below."""
 
+NEWEST = 1 << 32
+"""Above all revisions."""
+
 META = "refinement"
 META_HEADER = "unrefined_header"
 
@@ -54,7 +57,7 @@ class _Note(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeState:
-    """Where a keyframe was before any refinement."""
+    """Where a keyframe is, or was before any refinement."""
 
     seq: int
     time_ns: int
@@ -86,10 +89,12 @@ class Revisions:
         found = None if text is None else header_from_json(text.encode())
         return found or self._store.header
 
-    def keyframe_state(self, seq: int) -> KeyframeState | None:
-        """The unrefined state of a keyframe; None when nothing of it can be read."""
+    def keyframe_state(self, seq: int, below: int = REFINED) -> KeyframeState | None:
+        """The state of a keyframe by revisions ``below``, the unrefined one; None when nothing of
+        it can be read.
+        """
         data = self._store.chunk(seq, 0) or self._store.chunk(seq, 1)
-        base = self._store.repose(seq, below=REFINED)
+        base = self._store.repose(seq, below=below)
         if data is None:
             keyframe = self._store.keyframe(seq)
             if keyframe is None:

@@ -8,7 +8,8 @@ are known, the accuracies across and up; and rows of image, name, u and v.
 
 A row of a CSV without ``alt_amsl_m`` is of a point surveyed horizontally only. One row is one
 sighting: ``keyframe_seq``, ``time`` or ``image`` with ``u_px,v_px`` in the camera's own image, or
-``x,y,z`` in the delivered cloud's coordinates. Rows of one name are one point.
+``x,y,z`` in the delivered cloud's coordinates. A row without these is a point that is not marked.
+Rows of one name are one point.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class SurveyRow(msgspec.Struct, frozen=True):
         pixel, place = [self.u_px, self.v_px], [self.x, self.y, self.z]
         in_image = which == 1 and None not in pixel and place == [None] * 3
         in_map = which == 0 and None not in place and pixel == [None] * 2
-        if not (in_image or in_map):
+        unmarked = which == 0 and pixel == [None] * 2 and place == [None] * 3
+        if not (in_image or in_map or unmarked):
             raise ValueError(
                 "give u_px and v_px with one of keyframe_seq, time (unix seconds) and image "
                 "(name of a still), or x, y and z"
@@ -99,7 +101,7 @@ class SurveyPoint:
 
 
 def read_survey(path: Path, marks: Path | None = None) -> list[SurveyPoint]:
-    """The points of a file in order of their first row; with Pix4D's ``marks`` some have none.
+    """The points of a file in order of their first row; some may have no marks.
 
     Raises InputError in one line, with the number of the line, for anything that is wrong.
     """
@@ -107,6 +109,8 @@ def read_survey(path: Path, marks: Path | None = None) -> list[SurveyPoint]:
     lines = _lines(path)
     if marks is not None:
         return _marked(path, lines, _pix4d_marks(marks), marks)
+    if _is_places(lines):
+        return _marked(path, lines, {}, path)
     for line, row in _reader(lines)(path, lines):
         point = _point(line, row)
         before = points.get(point.name)
@@ -204,8 +208,7 @@ def _marked(
             lon, lat = degrees_of(system, float(x), float(y))
             named = dict(zip(("sigma_h_m", "sigma_v_m"), map(float, sigmas[:2]), strict=False))
             row = {"name": name, "lat": lat, "lon": lon, "alt_amsl_m": float(z), **named}
-            mark = {"image": "-", "u_px": 0.0, "v_px": 0.0}
-            point = _point(number, msgspec.convert(row | mark, SurveyRow))
+            point = _point(number, msgspec.convert(row, SurveyRow))
         except (ValueError, msgspec.ValidationError) as error:
             said = f"name, x, y, z and accuracies: {_why(error)}"
             raise InputError(f"{where}: {said}") from error
@@ -224,6 +227,18 @@ def _cells(lines: Sequence[str], first: int = 1) -> Iterator[tuple[int, list[str
         if line.strip() and not line.startswith("#"):
             mark = next((mark for mark in ",;\t" if mark in line), None)
             yield number, [cell.strip() for cell in line.split(mark)]
+
+
+def _is_places(lines: Sequence[str]) -> bool:
+    """Whether a file is places alone: names with x, y and z below a coordinate system."""
+    row = next((cells for _, cells in _cells(lines[1:])), [])
+    if not 4 <= len(row) < LIST_COLUMNS + 1 or is_list(lines):
+        return False
+    try:
+        system_of(lines[0])
+    except ValueError:
+        return False
+    return True
 
 
 LIST_COLUMNS = 6
@@ -312,13 +327,14 @@ def _check_header(path: Path, header: list[str]) -> None:
 
 
 def _point(line: int, row: SurveyRow) -> SurveyPoint:
-    """The point of one row, with its one sighting."""
+    """The point of one row, with its sighting."""
     mark = Sighting(line, row.keyframe_seq, row.time, row.image)
+    marks: tuple[Sighting, ...] = ()
     if row.u_px is not None and row.v_px is not None:
-        mark = replace(mark, uv_px=(row.u_px, row.v_px))
+        marks = (replace(mark, uv_px=(row.u_px, row.v_px)),)
     elif row.x is not None and row.y is not None and row.z is not None:
-        mark = replace(mark, xyz_m=(row.x, row.y, row.z))
+        marks = (replace(mark, xyz_m=(row.x, row.y, row.z)),)
     return SurveyPoint(
         row.name, row.lat, row.lon, row.alt_amsl_m, row.sigma_h_m, row.sigma_v_m,
-        row.role == "check", line, (mark,),
+        row.role == "check", line, marks,
     )  # fmt: skip

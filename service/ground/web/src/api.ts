@@ -138,7 +138,7 @@ export interface Heights {
   to_datum: string | null;
 }
 
-export const make = (s: Scan, kind: string, heights?: Heights): Promise<Job> =>
+export const make = (s: { drone: string; scan: string }, kind: string, heights?: Heights): Promise<Job> =>
   ask(`${place(s)}/exports`, "POST", { kind, ...heights });
 /** A product that can be made of a scan: what it is, the file that there is, about how large and how long. */
 export interface Product {
@@ -204,6 +204,46 @@ export const saveMeasurement = (s: { drone: string; scan: string }, line: Triple
   ask(`${place(s)}/annotations`, "POST", { line, text });
 export const eraseAnnotation = (s: { drone: string; scan: string }, number: number): Promise<unknown> =>
   ask(`${place(s)}/annotations/${number}`, "DELETE");
+
+export type Px = [number, number];
+
+/** A point in a keyframe's image; null: its place is not known, it is not marked. */
+export interface Sight {
+  keyframe_seq: number;
+  expected_px: Px | null;
+  marked_px: Px | null;
+}
+
+/** A surveyed point: longitude, latitude, metres above mean sea level; how far the map is off: east, north, up. */
+export interface ControlPoint {
+  name: string;
+  role: "control" | "check";
+  place: [number, number, number | null];
+  sigma_m: [number, number];
+  marks: number;
+  off_m: Triple | null;
+  why_not: string;
+  images: Sight[];
+}
+
+export interface ControlPoints {
+  size_px: Px;
+  points: ControlPoint[];
+}
+
+const control = (s: { drone: string; scan: string }): string => `${place(s)}/control-points`;
+export const controlPoints = (s: { drone: string; scan: string }): Promise<ControlPoints> => ask(control(s));
+/** Gives a scan its control points: the text of their file, and of Pix4D's file of marks. */
+export const setControlPoints = (s: { drone: string; scan: string }, text: string, marks?: string): Promise<ControlPoints> =>
+  ask(control(s), "PUT", { text, ...(marks === undefined ? {} : { marks }) });
+/** Marks a point in the image of a keyframe; null takes the mark away. */
+export const mark = (s: { drone: string; scan: string }, name: string, keyframe_seq: number, uv_px: Px | null): Promise<ControlPoints> =>
+  ask(control(s), "POST", { name, keyframe_seq, uv_px });
+/** The image of a keyframe as the camera has it. */
+export const controlImage = (s: { drone: string; scan: string }, seq: number): string => `${control(s)}/images/${seq}.jpg`;
+/** The page of a scan's control points. */
+export const controlAddress = (s: { drone: string; scan: string }): string =>
+  `#/control/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
 
 export const jobs = (): Promise<Job[]> => ask("/api/jobs");
 export const cancel = (number: number): Promise<Job> => ask(`/api/jobs/${number}`, "DELETE");

@@ -240,6 +240,7 @@ function card(s: api.Scan, again: () => void): HTMLElement {
         el(
           "span",
           { className: "acts" },
+          el("a", { href: api.controlAddress(s), textContent: "Control points", className: "button" }),
           button("Rename…", () => void rename(s, again)),
           button("Tags…", () => void retag(s, again)),
           button("Delete", () => void api.remove(s).then(() => (notify(`${name} is in the bin`), again()), notify)),

@@ -1,4 +1,4 @@
-// Three pages behind the address: the list of scans, and one scan in 3D or on a map.
+// The pages behind the address: the list of scans; one scan in 3D, on a map, with its control points.
 
 import "./style.css";
 import * as api from "./api";
@@ -19,6 +19,7 @@ async function show(): Promise<void> {
   let end: () => void;
   if (page === "view" && drone && scan) end = await (await loaded(import("./view"))).showView(root, drone, scan, place);
   else if (page === "map" && drone && scan) end = await (await loaded(import("./map"))).showMap(root, drone, scan);
+  else if (page === "control" && drone && scan) end = await (await loaded(import("./control"))).showControl(root, drone, scan);
   else end = await showLibrary(root);
   document.title = [...new Set([root.querySelector("h1")?.textContent, "skyrelief"])].filter(Boolean).join(" · ");
   if (mine === turn) close = end;

@@ -44,6 +44,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
     el("h1", { textContent: nameOf(scan), title: nameOf(scan) }),
     state,
     el("a", { href: open, textContent: "3D" }),
+    el("a", { href: api.controlAddress(id), textContent: "Control points" }),
     el("a", { href: `${at}/ortho.kml`, textContent: "KML" }),
   );
   const heights = new Terrain((z, x, y) => `${at}/${TERRAIN}/${z}/${x}/${y}.png`, `${at}/${TERRAIN}.json`);

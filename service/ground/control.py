@@ -1,0 +1,161 @@
+"""Control points of a scan over HTTP: their file, the images that show them, marks by hand."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from service.errors import InputError
+from service.ground.bodies import JSONResponse, body_of
+from service.ground.guard import note
+from service.ground.scan_files import SEQ
+from service.ground.state import names_of, state_of
+from service.offline.refine.marking import (
+    GCP,
+    Marked,
+    Marking,
+    image_of,
+    marked,
+    survey_text,
+    without_stills,
+)
+from service.offline.refine.survey_file import SurveyPoint, read_survey
+from service.scans.writing import write_whole
+from service.stream.store import ScanStore
+
+_WRITING = threading.Lock()
+_DECODING = threading.Semaphore(2)
+"""Recordings opened at a time."""
+
+Px = Annotated[float, msgspec.Meta(ge=-1.0, le=100_000.0)]
+
+
+class ControlFile(msgspec.Struct, forbid_unknown_fields=True):
+    """The text of a file of control points, and of Pix4D's file of marks."""
+
+    text: str
+    marks: str | None = None
+
+
+class NewMark(msgspec.Struct, forbid_unknown_fields=True):
+    """Where a keyframe's image shows a point, in the camera's pixels; null: nowhere."""
+
+    name: str
+    keyframe_seq: Annotated[int, msgspec.Meta(ge=0, le=2**31)]
+    uv_px: tuple[Px, Px] | None
+
+
+def control_routes(one: str) -> list[Route]:
+    """The routes below ``one``, the address of a scan."""
+    return [
+        Route(one + "/control-points", _points, methods=["GET"]),
+        Route(one + "/control-points", _replace, methods=["PUT"]),
+        Route(one + "/control-points", _mark, methods=["POST"]),
+        Route(one + "/control-points/images/{seq}.jpg", _image),
+    ]
+
+
+def _points(request: Request) -> Response:
+    """The control points of a scan: the images that show each, where it is expected and marked
+    there, and how far the map is off (map less survey: east, north, up)."""
+    folder = state_of(request).library.folder(*names_of(request))
+    return JSONResponse(_listed(folder, _known(folder)))
+
+
+async def _replace(request: Request) -> Response:
+    """Give a scan its control points, in any form that `refine --gcp` reads; the points. Marks in
+    stills, by file name, are left out."""
+    folder = state_of(request).library.folder(*names_of(request))
+    note(request, "control points", scan="/".join(names_of(request)))
+    given = await body_of(request, ControlFile)
+    return JSONResponse(await run_in_threadpool(_replaced, folder, given))
+
+
+async def _mark(request: Request) -> Response:
+    """Mark a point in a keyframe's image, or take the mark away; the points."""
+    folder = state_of(request).library.folder(*names_of(request))
+    note(request, "mark", scan="/".join(names_of(request)))
+    new = await body_of(request, NewMark)
+    note(request, "mark", point=new.name, keyframe=new.keyframe_seq)
+    return JSONResponse(await run_in_threadpool(_with_mark, folder, new))
+
+
+def _image(request: Request) -> Response:
+    """The image of a keyframe with the lens's distortion: the recording's frame where it is still
+    there, else as the scan stores it."""
+    folder = state_of(request).library.folder(*names_of(request))
+    if not SEQ.fullmatch(request.path_params["seq"]):
+        raise InputError("no such keyframe")
+    with _DECODING, ScanStore.peek(folder / "scan.db") as store:
+        data = image_of(folder, store, int(request.path_params["seq"]))
+    return Response(data, media_type="image/jpeg")
+
+
+def _known(folder: Path) -> list[SurveyPoint]:
+    return read_survey(folder / GCP) if (folder / GCP).exists() else []
+
+
+def _replaced(folder: Path, given: ControlFile) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as place:
+        path, marks = Path(place) / "points", None
+        path.write_text(given.text, encoding="utf-8")
+        if given.marks is not None:
+            marks = Path(place) / "marks"
+            marks.write_text(given.marks, encoding="utf-8")
+        try:
+            survey = without_stills(read_survey(path, marks))
+        except InputError as error:
+            raise InputError(str(error).replace(f"{place}/", "")) from error
+    return _kept(folder, survey)
+
+
+def _with_mark(folder: Path, new: NewMark) -> dict[str, Any]:
+    with _WRITING:
+        return _kept(folder, marked(_known(folder), new.name, new.keyframe_seq, new.uv_px))
+
+
+def _kept(folder: Path, survey: Sequence[SurveyPoint]) -> dict[str, Any]:
+    """The points as they are listed, written once all marks fit the scan."""
+    listed = _listed(folder, survey)
+    write_whole(folder / GCP, survey_text(survey))
+    return listed
+
+
+def _listed(folder: Path, survey: Sequence[SurveyPoint]) -> dict[str, Any]:
+    with ScanStore.peek(folder / "scan.db") as store:
+        marking = Marking(store)
+        return {
+            "size_px": marking.camera.size_px,
+            "points": [_shown(one) for one in marking.of(survey)],
+        }
+
+
+def _shown(one: Marked) -> dict[str, Any]:
+    p = one.point
+    return {
+        "name": p.name,
+        "role": "check" if p.is_check else "control",
+        "place": [p.lon_deg, p.lat_deg, p.alt_amsl_m],
+        "sigma_m": [p.sigma_h_m, p.sigma_v_m],
+        "marks": len(p.sightings),
+        "off_m": one.off_m,
+        "why_not": one.why_not,
+        "images": [asdict(image) for image in one.images],
+    }
+
+
+CONTROL_BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {
+    _replace: ControlFile,
+    _mark: NewMark,
+}
+"""Bodies of the requests that take one."""

@@ -1,0 +1,287 @@
+"""Control points marked by hand: which images show a point, where, and how far the map is off.
+
+Pixels are those of the camera's own image, as in a file of control points; poses are those that
+the scan has now, refined or not.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from recon.camera_model import project, rays, scaled
+from recon.posegraph.site_alignment import ScanSimilarity
+from recon.types import F64, U8, Camera
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.offline.exports.images import frames_at, recording_of
+from service.offline.refine.control_points import (
+    Candidate,
+    ScanImages,
+    candidates_of,
+    place_by_survey,
+    screen,
+)
+from service.offline.refine.revisions import NEWEST, Revisions
+from service.offline.refine.survey_file import (
+    Sighting,
+    SurveyPoint,
+    SurveyRow,
+    read_survey,
+)
+from service.scans.track import camera_of, latest, local_frame
+from service.stream.images import whole_bgr
+from service.stream.store import ScanStore
+
+GCP = "gcp.csv"
+"""A scan's control points, next to its store."""
+
+MAX_IMAGES = 12
+"""Images offered for one point."""
+
+MAX_MARKS, MAX_POINTS = 100, 2000
+"""Of one point; of a scan."""
+
+GROUND_FROM = 5
+"""Keyframes that the height of the ground is taken from."""
+
+JPEG_QUALITY = 90
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A point in one image."""
+
+    keyframe_seq: int
+    expected_px: tuple[float, float] | None  # None: the place of the scan is not known
+    marked_px: tuple[float, float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Marked:
+    """A point, the images that show it, the marked ones among them, and how far the map is off."""
+
+    point: SurveyPoint
+    images: list[Shown]
+    off_m: tuple[float, float, float] | None  # map less survey: east, north, up
+    why_not: str  # what speaks against its marks
+
+
+class Marking:
+    """The control points of an open scan. Raises InputError when it has no keyframes or camera."""
+
+    def __init__(self, store: ScanStore) -> None:
+        revisions = Revisions(store)
+        found = (revisions.keyframe_state(seq, NEWEST) for seq in store.seqs())
+        states = sorted((s for s in found if s is not None), key=lambda s: s.time_ns)
+        if not states:
+            raise InputError("no keyframes yet")
+        self.camera = camera_of(store.header)
+        self._scan = ScanImages(
+            states, latest(store.poses()), store.header, lambda s: store.keyframe(s.seq),
+            local_frame(store.header),
+        )  # fmt: skip
+        self._poses = self._scan.poses
+
+    def of(self, survey: Sequence[SurveyPoint]) -> list[Marked]:
+        """What is known of each point. Raises InputError for marks that the scan cannot have."""
+        if len(survey) > MAX_POINTS:
+            raise InputError(f"{len(survey)} control points; a scan takes {MAX_POINTS} at most")
+        candidates = candidates_of([p for p in survey if p.sightings], self._scan, GCP)
+        frame, to_survey = self._placed(candidates)
+        out, by_name = [], {one.point.name: one for one in candidates}
+        usual = _usual_offset(candidates, to_survey)
+        for point in survey:
+            one = by_name.get(point.name)
+            expected = None if frame is None else self._expected(point, frame, to_survey, usual)
+            off = None
+            if one is not None and one.before_m is not None and one.surveyed_m is not None:
+                off = tuple(one.off_m(to_survey.points(one.before_m)).tolist())
+            out.append(
+                Marked(
+                    point, self._images(point, expected), off, "" if one is None else one.why_not
+                )
+            )
+        return out
+
+    def _placed(self, candidates: Sequence[Candidate]) -> tuple[LocalFrame | None, ScanSimilarity]:
+        """The frame of the survey, and what takes the map there; None while it is not known."""
+        same = ScanSimilarity(np.eye(3), np.zeros(3), 1.0)
+        if self._scan.frame is not None:
+            screen(candidates, self._scan.frame)
+            return self._scan.frame, same
+        try:
+            frame, move = place_by_survey(candidates)
+        except InputError:  # too few yet
+            return None, same
+        for one in candidates:
+            one.surveyed_m = _enu(one.point, frame)
+        return frame, move
+
+    def _expected(
+        self, point: SurveyPoint, frame: LocalFrame, to_survey: ScanSimilarity, usual: F64
+    ) -> F64:
+        """(3,) where the map should have a point, off as the marked ones are."""
+        spot = _enu(point, frame) + usual
+        spot = to_survey.R.T @ (spot - to_survey.t) / to_survey.growth
+        if point.alt_amsl_m is None:
+            spot[2] = self._ground_m(spot)
+        return np.asarray(spot)
+
+    def _ground_m(self, spot: F64) -> float:
+        """Height of the surface in the keyframes nearest to a place."""
+        apart = np.linalg.norm((self._poses[:, :3, 3] - spot)[:, :2], axis=1)
+        heights = []
+        for k in np.argsort(apart)[:GROUND_FROM]:
+            keyframe = self._scan.keyframe(self._scan.states[k])
+            if keyframe is not None and np.isfinite(keyframe.depth.depth_m).any():
+                T, ahead = self._poses[k], float(np.nanmedian(keyframe.depth.depth_m))
+                heights.append(float(T[2, 3] + ahead * T[2, 2]))
+        return float(np.median(heights)) if heights else 0.0
+
+    def _images(self, point: SurveyPoint, expected: F64 | None) -> list[Shown]:
+        """Those marked, and those that see the point best; any where its place is not known."""
+        marked = {s.keyframe_seq: s.uv_px for s in point.sightings if s.keyframe_seq is not None}
+        seqs = [s.seq for s in self._scan.states]
+        uv = np.full((len(seqs), 2), np.nan)
+        if expected is None:
+            step = max(1, len(seqs) // (4 * MAX_IMAGES))
+            best = list(range(0, len(seqs), step))
+        else:
+            uv = self._pixels(expected)
+            W, H = self.camera.size_px
+            away = np.abs((uv + 0.5) / (W, H) - 0.5).max(axis=1)
+            near = np.argsort(np.where(np.isnan(away), np.inf, away), kind="stable")
+            best = [int(k) for k in near[:MAX_IMAGES] if away[k] <= 0.5]
+        best += [k for k, seq in enumerate(seqs) if seq in marked and k not in best]
+        pixel = [None if np.isnan(p).any() else (float(p[0]), float(p[1])) for p in uv]
+        return [Shown(seqs[k], pixel[k], marked.get(seqs[k])) for k in best]
+
+    def _pixels(self, spot: F64) -> F64:
+        """(N, 2) of a place in the image of each keyframe; NaN behind it and far outside."""
+        there = np.einsum("nij,ni->nj", self._poses[:, :3, :3], spot - self._poses[:, :3, 3])
+        flat = there / np.where(there[:, 2:] > 1e-6, there[:, 2:], np.nan)
+        W, H = self.camera.size_px
+        wide = rays(self.camera.K, np.array([[-0.25 * W, -0.25 * H], [1.25 * W, 1.25 * H]]))
+        inside = ((flat > wide[0]) & (flat < wide[1]))[:, :2].all(axis=1)
+        out = np.full((len(flat), 2), np.nan)
+        if inside.any():
+            out[inside] = distorted(self.camera, flat[inside])
+        return out
+
+
+def distorted(camera: Camera, flat: F64) -> F64:
+    """(N, 2) pixels of a camera's own image of rays (N, 3) with z = 1."""
+    found = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), camera.K, camera.distortion)[0]
+    return np.asarray(found[:, 0], np.float64)
+
+
+def image_of(folder: Path, store: ScanStore, seq: int) -> bytes:
+    """A keyframe's image with the lens's distortion, JPEG: the recording's own frame where it
+    still is, else what the scan stores, smaller. Raises InputError for an unknown keyframe.
+    """
+    keyframe = store.keyframe(seq)
+    if keyframe is None:
+        raise InputError("no such keyframe")
+    bgr = _recorded(folder, store, keyframe.time_ns)
+    if bgr is None:
+        whole, K = whole_bgr(keyframe, store.image(seq)), keyframe.depth.K
+        bgr = with_distortion(whole, K, camera_of(store.header))
+    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    return cv2.imencode(".jpg", bgr, quality)[1].tobytes()
+
+
+def _recorded(folder: Path, store: ScanStore, time_ns: int) -> U8 | None:
+    """The recording's frame of a moment; None where it is not there."""
+    video = recording_of(folder, store.header).path
+    if video is None:
+        return None
+    try:
+        return next(iter(frames_at([time_ns], store.header, video, None)))[1]
+    except (InputError, StopIteration):
+        return None
+
+
+def with_distortion(flat: U8, K: F64, camera: Camera) -> U8:
+    """An image (h, w, 3) of a camera ``K`` without distortion, as ``camera`` sees it, in its own
+    size."""
+    h, w = flat.shape[:2]
+    small = scaled(camera, (w, h))
+    v, u = np.mgrid[:h, :w].astype(np.float64)
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+    ways = cv2.undistortPoints(pixels[:, None], small.K, small.distortion)[:, 0]
+    at = project(K, np.column_stack([ways, np.ones(len(ways))])).astype(np.float32)
+    x, y = at.T.reshape(2, h, w)
+    return np.asarray(cv2.remap(flat, x, y, cv2.INTER_LINEAR), np.uint8)
+
+
+def _enu(point: SurveyPoint, frame: LocalFrame) -> F64:
+    alt = frame.alt_amsl_m if point.alt_amsl_m is None else point.alt_amsl_m
+    return np.asarray(frame.to_enu(np.array([[point.lat_deg, point.lon_deg, alt]]))[0])
+
+
+def _usual_offset(candidates: Sequence[Candidate], to_survey: ScanSimilarity) -> F64:
+    """(3,) by which the map has the marked points off, 0 without any."""
+    offsets = [
+        one.off_m(to_survey.points(one.before_m))
+        for one in candidates
+        if one.usable and one.before_m is not None and one.surveyed_m is not None
+    ]
+    return np.asarray(np.median(offsets, axis=0)) if offsets else np.zeros(3)
+
+
+# ---- the file of a scan --------------------------------------------------------------------------
+
+
+def marked_file(folder: Path) -> Path | None:
+    """The control points of a scan folder, where it has any with a mark."""
+    path = folder / GCP
+    return path if path.exists() and any(p.sightings for p in read_survey(path)) else None
+
+
+def without_stills(survey: Sequence[SurveyPoint]) -> list[SurveyPoint]:
+    """The points without marks that name a still: its time is known with the folder only."""
+    return [replace(p, sightings=tuple(s for s in p.sightings if not s.image)) for p in survey]
+
+
+def marked(
+    survey: Sequence[SurveyPoint], name: str, seq: int, uv_px: tuple[float, float] | None
+) -> list[SurveyPoint]:
+    """The points with the one mark of ``name`` in a keyframe set, or taken away.
+
+    Raises InputError for an unknown point, or too many marks of it.
+    """
+    if name not in {p.name for p in survey}:
+        raise InputError(f"no control point {name[:100]!r}")
+    return [_marked(p, seq, uv_px) if p.name == name else p for p in survey]
+
+
+def _marked(point: SurveyPoint, seq: int, uv_px: tuple[float, float] | None) -> SurveyPoint:
+    rest = tuple(s for s in point.sightings if s.keyframe_seq != seq)
+    if uv_px is None:
+        return replace(point, sightings=rest)
+    if len(rest) >= MAX_MARKS:
+        raise InputError(f"{point.name} has {MAX_MARKS} marks; take one away first")
+    return replace(point, sightings=(*rest, Sighting(0, keyframe_seq=seq, uv_px=uv_px)))
+
+
+def survey_text(survey: Sequence[SurveyPoint]) -> str:
+    """The points as a CSV, as :func:`service.offline.refine.survey_file.read_survey` reads it."""
+    out = io.StringIO()
+    table = csv.writer(out, lineterminator="\n")
+    fields = [name for name in SurveyRow.__struct_fields__ if name not in ("name", "image")]
+    table.writerow([*fields, "name"])
+    for p in survey:
+        place = (p.lat_deg, p.lon_deg, p.alt_amsl_m, p.sigma_h_m, p.sigma_v_m)
+        role = "check" if p.is_check else "control"
+        for s in p.sightings or (Sighting(0),):
+            uv, xyz = s.uv_px or (None, None), s.xyz_m or (None, None, None)
+            row = (*place, role, s.keyframe_seq, s.time_unix_s, *uv, *xyz)
+            table.writerow([*("" if v is None else v for v in row), " ".join(p.name.split())])
+    return out.getvalue()
