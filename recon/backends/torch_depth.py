@@ -41,7 +41,7 @@ class DensePath:
 
     def __init__(self, device: str, stages: DenseStages) -> None:
         self.device, self.stages = device, stages
-        self._plans: dict[Any, Plan] = {}
+        self.plans: dict[Any, Plan] = {}
         self._fusions: dict[Any, tuple[Tensor, Plan]] = {}
 
     def depth(
@@ -87,7 +87,7 @@ class DensePath:
             parts = [part(a, s) for a, s in zip(given, shapes, strict=True)]
             return Plan(self.device, stage, parts)
 
-        return kept(self._plans, key, KEPT_PLANS, build)
+        return kept(self.plans, key, KEPT_PLANS, build)
 
 
 def pair_depth(

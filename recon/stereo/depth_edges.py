@@ -67,7 +67,7 @@ def drop_edges(depth: DepthMap, bgr: U8) -> DepthMap:
     )
     nearness = np.where(known, nearness, around)
     noise = np.where(known, middle * depth.sigma_m / (z * z), np.float32(0.0))
-    windows = _windows(nearness, FLAT_RADIUS, False), _windows(nearness, PLANE_RADIUS, True)
+    windows = window_fits(nearness, FLAT_RADIUS, False), window_fits(nearness, PLANE_RADIUS, True)
     mixed, places = known.copy(), np.empty((2, *known.shape), np.float32)
     in_bands(_find_surfaces, len(mixed), nearness, noise, *windows, places, mixed)
     closed = cv2.morphologyEx(mixed.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((CLOSED_PX,) * 2))
@@ -79,7 +79,7 @@ def drop_edges(depth: DepthMap, bgr: U8) -> DepthMap:
     return depth if kept.sum() == known.sum() else known_where(depth, kept)
 
 
-def _windows(x: F32, radius: int, is_slanted: bool) -> Windows:
+def window_fits(x: F32, radius: int, is_slanted: bool) -> Windows:
     """Of the window of ``x`` (h, w) about each pixel."""
     size = 2 * radius + 1
     spread = (size**2 - 1) / 12.0
@@ -107,7 +107,7 @@ def _find_surfaces(
     for v in range(begin, end):
         for n, windows, radius in ((0, flat, FLAT_RADIUS), (1, slanted, PLANE_RADIUS)):
             place = places[n, v]
-            _steadiest(windows, radius, v, least, expected, place)
+            steadiest_windows(windows, radius, v, least, expected, place)
             for u in range(width):
                 off = abs(x[v, u] - expected[u]) - noise[v, u]
                 is_off = off > np.sqrt(max(least[u], np.float32(0)))
@@ -116,7 +116,7 @@ def _find_surfaces(
 
 
 @njit(cache=True, nogil=True)
-def _steadiest(
+def steadiest_windows(
     windows: Windows, radius: int, v: int, least: F32, expected: F32, place: F32
 ) -> None:  # pragma: no cover - compiled
     """The steadiest of the windows that contain each pixel of a row: (w,) variance, value at the
@@ -144,7 +144,7 @@ def _steadiest(
 
 
 @njit(cache=True, nogil=True)
-def _plane(
+def plane_at(
     windows: Windows, radius: int, place: float, u: int, v: int
 ) -> tuple[float, float, float]:  # pragma: no cover - compiled
     """Value at a pixel and slopes along columns and rows of the window at a place."""
@@ -163,9 +163,9 @@ def _keep_spills(
     for v in range(begin, end):
         for u in range(x.shape[1]):
             if spilt[v, u]:
-                plane = _plane(flat, FLAT_RADIUS, places[0, v, u], u, v)
+                plane = plane_at(flat, FLAT_RADIUS, places[0, v, u], u, v)
                 if places[1, v, u] >= 0:
-                    plane = _plane(slanted, PLANE_RADIUS, places[1, v, u], u, v)
+                    plane = plane_at(slanted, PLANE_RADIUS, places[1, v, u], u, v)
                 spilt[v, u] = _is_spilt(u, v, plane, noise[v, u], x, noise, kept, bgr)
 
 

@@ -216,12 +216,12 @@ class LiveSource:
             rate = stream.average_rate  # nominal, not measured
             self.fps = float(rate) if rate else None
             log.info("%s: connected", self.description)
-            yield from self._watch(decoded_frames(container, stream, self._warn, self._damage))
+            yield from self.stamped(decoded_frames(container, stream, self._warn, self._damage))
         finally:
             container.close()
 
-    def _watch(self, frames: Iterator[av.VideoFrame]) -> Iterator[tuple[U8, int]]:
-        """Stamp the images; end when one image is repeated for too long."""
+    def stamped(self, frames: Iterator[av.VideoFrame]) -> Iterator[tuple[U8, int]]:
+        """The (image, time) of decoded frames; ends when one image is repeated for too long."""
         stamps = StampFilter()
         print_of_last, changed_ns = 0, time.monotonic_ns()
         for frame in frames:
@@ -371,7 +371,7 @@ def _launched(
     command = [launcher, "-q", *elements]
 
     def opened(stall_s: float) -> Any:
-        return _open_command(command, stall_s, demuxer)
+        return open_command(command, stall_s, demuxer)
 
     return Paced(LiveSource(opened, description, listens=listens))
 
@@ -418,7 +418,7 @@ class _Output:
         return os.read(self._number, size)
 
 
-def _open_command(command: list[str], stall_s: float, demuxer: dict[str, str]) -> Any:
+def open_command(command: list[str], stall_s: float, demuxer: dict[str, str]) -> Any:
     """A container with the output of ``command``; closing it ends the command.
 
     Raises OSError with the command's own complaint when it writes no video.

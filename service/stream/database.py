@@ -64,8 +64,8 @@ OUTSIDE = (
 class Deadline:
     """Aborts statements of one connection that take too long."""
 
-    def __init__(self, connection: sqlite3.Connection, size_bytes: int) -> None:
-        self._allowed_s = STATEMENT_S + size_bytes / SLOWEST_BYTES_S
+    def __init__(self, connection: sqlite3.Connection, size_bytes: int, statement_s: float) -> None:
+        self._allowed_s = statement_s + size_bytes / SLOWEST_BYTES_S
         self._end_s = time.monotonic() + self._allowed_s
         connection.set_progress_handler(self._is_over, STEPS)
 
@@ -77,7 +77,9 @@ class Deadline:
         return time.monotonic() > self._end_s
 
 
-def connect(path: Path, read_only: bool = False) -> tuple[sqlite3.Connection, Deadline]:
+def connect(
+    path: Path, read_only: bool = False, statement_s: float = STATEMENT_S
+) -> tuple[sqlite3.Connection, Deadline]:
     """A connection that trusts nothing in the file. Raises sqlite3.Error."""
     mode = "ro" if read_only else "rwc"
     try:
@@ -87,7 +89,7 @@ def connect(path: Path, read_only: bool = False) -> tuple[sqlite3.Connection, De
             raise
         connection = _opened(path, "immutable=1")  # a disk that cannot even hold locks
     size_bytes = path.stat().st_size if path.exists() else 0
-    return connection, Deadline(connection, size_bytes)
+    return connection, Deadline(connection, size_bytes, statement_s)
 
 
 def _opened(path: Path, how: str) -> sqlite3.Connection:
@@ -215,13 +217,15 @@ class Database:
     Raises InputError when the file is not such a database, OutsideError when the disk fails.
     """
 
-    def __init__(self, path: Path, read_only: bool = False) -> None:
+    def __init__(
+        self, path: Path, read_only: bool = False, statement_s: float = STATEMENT_S
+    ) -> None:
         self.path = path
         self.uses: Counter[int] = Counter()  # completed queries, by thread
         self.lock = threading.RLock()
         self.read_only = read_only or not can_write(path)
         try:
-            self._connection, self._deadline = connect(path, self.read_only)
+            self._connection, self._deadline = connect(path, self.read_only, statement_s)
         except (sqlite3.Error, OSError) as error:
             raise self._cannot_open(error) from error
         try:

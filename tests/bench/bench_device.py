@@ -277,7 +277,7 @@ def whole_path(device: str, pair: StereoPair, matching: BeliefPropagationConfig)
     H, W = pair.guide.shape[:2]
     K = camera((W, H))
     path.depth([pair], K, (W, H), np.eye(4))
-    plan = next(iter(path._plans.values()))
+    plan = next(iter(path.plans.values()))
     moved, operations = propagation_work(stages.matching, 2)
     moved += (11.0 + 12.0) * W * H
     operations += 20.0 * stages.upsampling.diameter_px**2 * W * H

@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -247,9 +247,14 @@ def _off_fixes(
 
 
 def level_ground(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
+    """:func:`flatness` of the depth images that the cloud is made of."""
+    return flatness(_maps(flight))
+
+
+def flatness(maps: Iterable[DepthMap]) -> Iterator[tuple[str, float, str]]:
     """Robust distance of points on nearly flat ground from one plane, and each keyframe's own."""
     points = []
-    for depth in _maps(flight):
+    for depth in maps:
         known = np.flatnonzero(np.isfinite(depth.depth_m))[::97]
         points.append(se3.transform(depth.T_world_camera, _points(depth, known)))
     if not points:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import bench_real
 import numpy as np
 import pytest
 from bench_options import DataOptions
-from bench_real import ReplayedSet, level_ground, run, shared_ground
+from bench_real import flatness, run, shared_ground
 from paths import DEMO
 
 from recon.types import DepthMap
@@ -57,9 +56,7 @@ def test_a_shifted_surface_shows_as_a_seam() -> None:
     assert np.median(sigma) == pytest.approx(np.sqrt(2) * np.nanmedian(depth.sigma_m), rel=0.1)
 
 
-def test_tilts_between_keyframes_are_told_from_the_bend_of_each(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tilts_between_keyframes_are_told_from_the_bend_of_each() -> None:
     K = np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]])
     level = np.full((90, 120), 80.0, np.float32)
     maps = []
@@ -67,10 +64,7 @@ def test_tilts_between_keyframes_are_told_from_the_bend_of_each(
         T = np.diag([1.0, -1, -1, 1])
         T[:3, 3] = 0.0, 0.0, 80.0 + 2.0 * (n % 2)  # every second keyframe is 2 m too high
         maps.append(DepthMap(level, 0.1 * level, np.ones_like(level, np.uint8), K, T))
-    monkeypatch.setattr(bench_real, "_maps", lambda flight: maps)
-    figures = {
-        what: value for what, value, _ in level_ground(ReplayedSet(tmp_path, "", tmp_path, {}))
-    }
+    figures = {what: value for what, value, _ in flatness(maps)}
     assert figures["flat ground, robust sigma about a plane"] == pytest.approx(1 / 0.6745, rel=0.01)
     assert figures["flat ground, keyframes about their own planes"] == pytest.approx(0.0, abs=1e-6)
     assert figures["flat ground, slope"] == pytest.approx(0.0, abs=1e-6)

@@ -240,7 +240,7 @@ def test_the_whole_path_equals_the_stages(device: str, guide: int) -> None:
         close(got.depth_m, want.depth_m, 1e-3, 0.99, SMALL)
         close(got.sigma_m, want.sigma_m, 1e-2, 0.98, SMALL)
         assert (got.views == want.views).mean() > 0.99
-    assert len(path._plans) == 2
+    assert len(path.plans) == 2
 
 
 def test_the_path_needs_a_pair(device: str) -> None:

@@ -118,17 +118,17 @@ def test_a_row_at_once_finds_the_windows_of_its_pixels(radius: int) -> None:
     rng = np.random.default_rng(3)
     x = rng.normal(0.0, 0.1, (9, 14)).astype(np.float32)
     x[:, 6:] += 1.0
-    windows = depth_edges._windows(x, radius, radius == depth_edges.PLANE_RADIUS)
+    windows = depth_edges.window_fits(x, radius, radius == depth_edges.PLANE_RADIUS)
     shifts = [radius * k for k in (-1, 0, 1)]
     for v in range(9):
         least, expected, place = np.empty((3, 14), np.float32)
-        depth_edges._steadiest(windows, radius, v, least, expected, place)
+        depth_edges.steadiest_windows(windows, radius, v, least, expected, place)
         for u in range(14):
             around = [(v - dv, u - du) for dv in shifts for du in shifts]
             inside = [(i, j) for i, j in around if 0 <= i < 9 and 0 <= j < 14]
             i, j = min(inside, key=lambda at: windows[3][at])
             mean, across, down, variance = (one[i, j] for one in windows)
             value = mean + across * (u - j) + down * (v - i)
-            plane = depth_edges._plane(windows, radius, place[u], u, v)
+            plane = depth_edges.plane_at(windows, radius, place[u], u, v)
             assert least[u] == variance
             assert np.allclose([expected[u], *plane], [value, value, across, down], atol=1e-6)

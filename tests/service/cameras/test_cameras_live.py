@@ -138,8 +138,8 @@ def test_a_image_that_lost_its_time_is_dropped_where_others_have_one() -> None:
             time.sleep(0.02)
             yield frame
 
-    assert len(list(source._watch(images(0, 1, 2, None, None)))) == 2  # the first sets the clock
-    assert len(list(source._watch(images(*[None] * 5)))) == 5
+    assert len(list(source.stamped(images(0, 1, 2, None, None)))) == 2  # the first sets the clock
+    assert len(list(source.stamped(images(*[None] * 5)))) == 5
     source.close()
 
 
@@ -455,7 +455,14 @@ def test_who_sends_is_waited_for_again(kind: str, monkeypatch: pytest.MonkeyPatc
 def test_an_attempt_that_waited_for_a_sender_is_followed_by_the_next_at_once() -> None:
     """Otherwise the port is closed to a sender that comes meanwhile."""
     config = LiveConfig(first_retry_s=0.2, longest_retry_s=0.3)
-    source = LiveSource(opener(clip(20), OSError("no sender came"), clip(20)), "test", config)
+    opened, attempts = opener(clip(20), OSError("no sender came"), clip(20)), itertools.count()
+
+    def late(stall_s: float) -> Any:
+        if next(attempts):
+            time.sleep(0.5)  # longer than the pause between attempts that fail at once
+        return opened(stall_s)
+
+    source = LiveSource(late, "test", config)
     waits: list[float] = []
 
     class Watched(threading.Event):
@@ -463,12 +470,7 @@ def test_an_attempt_that_waited_for_a_sender_is_followed_by_the_next_at_once() -
             waits.append(timeout or 0.0)
             return super().wait(timeout)
 
-    def connect() -> Any:
-        time.sleep(0.5)  # longer than the pause between attempts that fail at once
-        return connected()
-
-    connected, source._closed = source._connect, Watched()
-    source._connect = connect  # type: ignore[method-assign]
+    source._closed = Watched()
     for _ in source:
         if len(waits) >= 3:
             source.close()
@@ -489,7 +491,7 @@ def test_a_command_that_falls_silent_is_ended(
     (tmp_path / "clip").write_bytes(clip(20))
     launcher.write_text(f"#!/bin/sh\ncat {tmp_path}/clip\nexec sleep 60\n")
     launcher.chmod(0o755)
-    opened = live._open_command([str(launcher)], 0.2, {})
+    opened = live.open_command([str(launcher)], 0.2, {})
     with pytest.raises(TimeoutError, match=r"no data for 0\.2 s"):
         list(opened.demux(opened.streams.video[0]))
     opened.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -60,12 +61,15 @@ def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
 
 
 def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> None:
-    kept = PublishedFrames(tmp_path)
+    kept, places = PublishedFrames(tmp_path), []
     for seq in range(500):
-        key = keyframe_at(seq, some_pose())
-        kept.add(published(seq, key), before(seq - 9))
-        kept.add(PublishedFrame(10**18 + seq, None, np.zeros(3), 0.0, None, False), before(seq - 9))
-    assert len(kept._fresh) <= 22
+        carried = published(seq, keyframe_at(seq, some_pose()))
+        alone = PublishedFrame(10**18 + seq, None, np.zeros(3), 0.0, None, False)
+        for frame in (carried, alone):
+            kept.add(frame, before(seq - 9))
+            places.append(weakref.ref(frame.position_m))
+        del carried, alone, frame
+    assert sum(place() is not None for place in places) <= 22
     assert len(list(kept.corrigible())) == 500
     kept.close()
 

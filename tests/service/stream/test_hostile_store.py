@@ -76,9 +76,8 @@ def test_a_newer_schema_asks_for_an_update(path: Path) -> None:
         ScanStore.open(path)
 
 
-def test_a_statement_has_a_deadline(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(database_module, "STATEMENT_S", -1.0)
-    database = Database(path, read_only=True)
+def test_a_statement_has_a_deadline(path: Path) -> None:
+    database = Database(path, read_only=True, statement_s=-1.0)
     with pytest.raises(OutsideError, match="interrupted"):
         database.all(f"{ENDLESS} SELECT COUNT(*) FROM n")
     assert database.one("SELECT COUNT(*) FROM poses") == (5,)  # short ones are let through
