@@ -9,7 +9,7 @@ per view and channel; seams fade over a few triangles instead of a Poisson edit.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -65,6 +65,8 @@ def texture(
     progress("packing the atlas")
     layout = lay_out(mesh, views, label, neighbours, largest_px)
     progress("painting {} x {} texels".format(*layout.size_px))
+    mesh = replace(mesh, rgb=spread_colours(mesh.faces, mesh.rgb, found, slot, gains))
+    assert mesh.rgb is not None
     palette = Palette(views, gains, fade_view, fade_share, mesh.rgb)
     image = paint(mesh, layout, found, label, palette)
     used = np.unique(label[label >= 0])
@@ -90,6 +92,40 @@ def _split(mesh: Mesh, layout: Layout) -> Mesh:
         mesh.rgb[vertex],
         None if mesh.measured is None else mesh.measured[vertex],
     )
+
+
+SPREAD_RINGS = 12
+"""So many rings of vertices around what views show take its colours."""
+
+
+def spread_colours(faces: I32, rgb: U8, found: TriangleViews, slot: I32, gains: F32) -> U8:
+    """(V, 3) colours for triangles without a view: those of the seen ones around them, beyond
+    SPREAD_RINGS the vertices' own ``rgb``.
+
+    A vertex's own colour is that of the upper surface above or below it: a roof's, on a wall.
+    """
+    rows = np.flatnonzero(slot >= 0)
+    view = found.view[rows, slot[rows]]
+    shown = found.bgr[rows, slot[rows]] * gains[view, :, 0] + gains[view, :, 1]
+    corner = np.repeat(np.arange(len(rows)), 3), faces[rows].ravel()
+    ones = np.ones(3 * len(rows), np.float32)
+    total = sparse.csr_matrix((ones, corner), (len(rows), len(rgb))).T @ np.column_stack(
+        [shown[:, ::-1], np.ones(len(rows), np.float32)]
+    )
+    ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    one_way = sparse.csr_matrix((np.ones(faces.size, np.float32), ends), (len(rgb), len(rgb)))
+    around = one_way + one_way.T
+    known = total[:, 3] > 0
+    colour = total[:, :3] / np.maximum(total[:, 3:], 1.0)
+    for _ in range(SPREAD_RINGS):
+        count = np.where(known, 0.0, around @ known.astype(np.float32))
+        new = count > 0
+        if not new.any():
+            break
+        colour[new] = (around[new] @ (colour * known[:, None])) / count[new, None]
+        known |= new
+    out = np.where(known[:, None], np.clip(np.rint(colour), 0, 255), rgb)
+    return np.asarray(out, np.uint8)
 
 
 PENALTY = 0.6

@@ -14,7 +14,16 @@ from recon.surface.meshing import Mesh, cut
 from recon.surface.raster import Grid, Raster
 from recon.surface.texture_atlas import BORDER_PX, lay_out, pack
 from recon.surface.texture_views import TextureView, TriangleViews, consistent, look
-from recon.surface.texturing import PENALTY, choose, face_neighbours, fading, levels, texture
+from recon.surface.texturing import (
+    PENALTY,
+    SPREAD_RINGS,
+    choose,
+    face_neighbours,
+    fading,
+    levels,
+    spread_colours,
+    texture,
+)
 from recon.types import F64, U8, Array
 
 NADIR = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -276,6 +285,24 @@ def test_what_no_view_sees_keeps_the_colours_of_the_vertices() -> None:
     assert (shown(done.mesh, done.image)[1] == 9).all()
     with pytest.raises(ValueError, match="colours at its vertices"):
         texture(Mesh(sheet().vertices_m, sheet().faces), [])
+
+
+def test_triangles_without_a_view_take_the_colours_of_those_around_them() -> None:
+    mesh = sheet(cells=60)
+    assert mesh.rgb is not None
+    middle = mesh.vertices_m[mesh.faces].mean(axis=1)
+    unseen = (np.hypot(middle[:, 0], middle[:, 1]) < 2.0) | (middle[:, 0] > 3.0)
+    slot = np.where(unseen, -1, 0).astype(np.int32)
+    count = len(mesh.faces)
+    found = TriangleViews.none(count)
+    found.view[:, 0] = 0
+    found.bgr[:, 0] = [10.0, 20.0, 30.0]
+    gains = np.array([[[2.0, 1.0]] * 3], np.float32)
+    rgb = spread_colours(mesh.faces, mesh.rgb, found, slot, gains)
+    x = mesh.vertices_m[:, 0]
+    assert (rgb[x < 6.0] == [61, 41, 21]).all()
+    far = x > 4.0 + 0.5 * SPREAD_RINGS
+    assert far.any() and (rgb[far] == mesh.rgb[far]).all()
 
 
 def test_cutting_divides_triangles_at_the_border() -> None:
