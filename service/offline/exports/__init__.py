@@ -16,7 +16,7 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
     "laz": (
         "clouds:write_laz_file",
         "cloud.laz",
-        "The cloud in UTM as LAZ 1.4, with sigma and views.",
+        "The same as LAZ 1.4, with sigma and views.",
     ),
     "copc": ("clouds:write_copc", "cloud.copc.laz", "The same as a cloud-optimised octree."),
     "dsm": (
@@ -24,19 +24,19 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
         "dsm.tif",
         "Heights with buildings and trees, as GeoTIFF.",
     ),
-    "dtm": ("rasters:write_dtm", "dtm.tif", "Heights of the ground without them, as GeoTIFF."),
+    "dtm": ("rasters:write_dtm", "dtm.tif", "Heights of the bare ground, as GeoTIFF."),
     "ortho": ("rasters:write_ortho", "ortho.tif", "The true orthophoto, as GeoTIFF."),
     "contours": (
         "contours:write_contours",
         "contours.geojson",
-        "Contours of the bare ground, as GeoJSON; or .gpkg, .dxf.",
+        "Contours as GeoJSON; or .gpkg, .dxf.",
     ),
     "gpkg": ("contours:write_contours_gpkg", "contours.gpkg", "The same as GeoPackage, in UTM."),
     "dxf": ("contours:write_contours_dxf", "contours.dxf", "The same as DXF for CAD, in UTM."),
     "coverage": (
         "rasters:write_coverage",
         "coverage.tif",
-        "Views, sigma and height of the ground, as GeoTIFF.",
+        "Views and sigma of the ground, as GeoTIFF.",
     ),
     "geojson": (
         "flight:write_geojson",
@@ -58,13 +58,13 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
         "The textured mesh as 3D Tiles.",
     ),
     "glb": ("model:write_glb", "mesh.glb", "The textured mesh as binary glTF."),
-    "obj": ("model:write_obj", "mesh-obj", "The textured mesh as OBJ, in UTM less an offset."),
+    "obj": ("model:write_obj", "mesh-obj", "The mesh as OBJ, in UTM less an offset."),
     "splat": (
         "splats:write_splats",
         "splat.ply",
-        "The surface as 3D Gaussians, as PLY; or .spz.",
+        "3D Gaussians, as PLY; or .spz.",
     ),
-    "all": ("maps:write_all", "maps", "laz and the maps in one folder, with a manifest."),
+    "all": ("maps:write_all", "maps", "laz and all maps, with a manifest."),
     "mcap": ("recording:write_mcap", "flight.mcap", "The scan as a recording for Foxglove."),
     "ros2": ("ros2:write_ros2", "ros2.mcap", "The scan as ROS 2 messages."),
 }

@@ -19,9 +19,10 @@ from service.cameras import open_camera
 from service.cameras.source import CameraSource
 from service.cameras.video import VideoSource
 from service.errors import InputError, SkyreliefError
-from service.offline.exports.view import ExportOptions
+from service.offline.exports.view import ExportOptions, ScanView
 from service.progress import Progress
 from service.scans.folder import SUMMARY
+from service.scans.main_piece import main_keyframes
 from service.scans.track import camera_of
 from service.stream.records import ScanHeader
 
@@ -106,6 +107,22 @@ def scan_images(
     except SkyreliefError as error:
         progress(f"the scan's own images after all: {error}")
         return stored_images(keyframes)
+
+
+def shared_images(scan: ScanView, options: ExportOptions) -> list[TextureView]:
+    """:func:`scan_images` of the main piece's keyframes; read once for all products."""
+
+    def read() -> list[TextureView]:
+        keyframes = list(main_keyframes(scan.store))
+        return scan_images(keyframes, scan.folder, scan.store.header, options, scan.progress)
+
+    return scan.shared(("images", images_key(options)), read)
+
+
+def images_key(options: ExportOptions) -> tuple[Path | None, bool, int | None]:
+    """What of the options decides which images are read."""
+    video = None if options.video is None else options.video.resolve()
+    return video, options.stored, options.video_epoch_ns
 
 
 def check_video(header: ScanHeader, video: Path) -> None:

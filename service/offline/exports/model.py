@@ -17,17 +17,16 @@ from recon.surface.raster import grid_over, rasterise
 from recon.surface.texture_views import TextureView, doubled_area
 from recon.surface.texturing import texture
 from recon.surface.volume import volume_mesh
-from recon.types import F64, U8, Keyframe, PointCloud
+from recon.types import F64, U8
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
-from service.offline.exports.images import check_video, recording_of, scan_images
+from service.offline.exports.images import check_video, images_key, recording_of, shared_images
 from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.tiles import Tile, footprints, run_tiles, tiles_over
 from service.packages import needing
 from service.progress import Progress
-from service.scans.fused_cloud import fused_cloud
+from service.scans.main_piece import main_keyframes
 from service.scans.writing import writing, writing_folder
-from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
 
@@ -73,19 +72,20 @@ def write_mesh(
 
 
 def mesh_parts(
-    scan: ScanView, largest_faces: int, options: ExportOptions
+    scan: ScanView, largest_faces: int, options: ExportOptions, levels: int = 1
 ) -> tuple[list[TilePart], dict[str, Any]]:
-    """The textured tiles of the scan's mesh in ENU metres, and their figures; made once.
+    """The textured tiles of the scan's mesh in ENU metres with ``levels`` of detail, and their
+    figures; made once.
 
     Raises InputError when there is too little surface or the video does not fit, OutsideError when
     a cluster was named and does not answer.
     """
-    key = ("mesh", largest_faces, options.voxel_m, options.video, options.stored)
-    return scan.shared(key, lambda: _mesh_parts(scan, largest_faces, options))
+    key = ("mesh", largest_faces, options.voxel_m, images_key(options), levels)
+    return scan.shared(key, lambda: _mesh_parts(scan, largest_faces, options, levels))
 
 
 def _mesh_parts(
-    scan: ScanView, largest_faces: int, options: ExportOptions
+    scan: ScanView, largest_faces: int, options: ExportOptions, levels: int
 ) -> tuple[list[TilePart], dict[str, Any]]:
     with needing("a mesh file"):
         import fast_simplification  # noqa: F401  # before the long work, not after it
@@ -108,11 +108,14 @@ def _mesh_parts(
             voxel_m,
             max(1000, largest_faces // len(tiles)),
             LARGEST_ATLAS_PX if len(tiles) == 1 else TILED_ATLAS_PX,
+            levels,
             options if options.video is None else replace(options, video=options.video.resolve()),
         )
         for tile in tiles
     ]
-    made = run_tiles(mesh_tile, jobs, options.scheduler, scan.progress)
+    is_here = len(jobs) == 1 and options.scheduler is None  # shares what this view has made
+    make = (lambda job, _: _part(scan, job)) if is_here else mesh_tile
+    made = run_tiles(make, jobs, options.scheduler, scan.progress)
     parts = [part for part in made if part is not None]
     if not parts:
         raise InputError(f"{scan.folder}: cannot be meshed, there is too little surface")
@@ -144,6 +147,7 @@ class TileJob:
     voxel_m: float
     largest_faces: int
     largest_texture_px: int
+    levels: int = 1
     options: ExportOptions = field(default_factory=ExportOptions)  # where images come from
 
 
@@ -160,36 +164,37 @@ class TilePart:
 
 def mesh_tile(job: TileJob, progress: Progress | None = None) -> TilePart | None:
     """The textured mesh of a tile; None when there is too little surface in it."""
-    progress = progress or Progress()
-    tile = job.tile
-    with ScanStore.open(Path(tile.folder) / "scan.db") as store:
-        store.only(tile.seqs)
-        keyframes = list(store.keyframes())
-        with progress.part("fusing the cloud", 0.15):
-            cloud = fused_cloud(store, job.voxel_m, progress, tile.wide).cloud
-        try:
-            with progress.part("surface", 0.3):
-                mesh = cut(
-                    surface_mesh(cloud, job.voxel_m, keyframes, job.largest_faces, progress),
-                    tile.box,
-                )
-        except ValueError as error:
-            log.debug("tile %s: %s", tile.box, error)
-            return None
-        if not len(mesh.faces):
-            return None
-        with progress.part(f"{len(mesh.faces)} triangles; reading images", 0.25):
-            views = scan_images(keyframes, Path(tile.folder), store.header, job.options, progress)
-    with progress.part("texture", 0.8):
-        part = _textured(mesh, views, job.largest_texture_px, progress)
-    with progress.part("less detail"):
-        levels = []
-        for n in range(1, LEVELS):
+    with ScanView(Path(job.tile.folder), job.voxel_m, progress, job.tile) as scan:
+        return _part(scan, job)
+
+
+def _part(scan: ScanView, job: TileJob) -> TilePart | None:
+    progress, box = scan.progress, job.tile.box
+    if not scan.has_points:
+        return None
+    try:
+        mesh = cut(closed_surface(scan, job.largest_faces), box)
+    except ValueError as error:
+        log.debug("tile %s: %s", box, error)
+        return None
+    if not len(mesh.faces):
+        return None
+    with progress.part(f"{len(mesh.faces)} triangles; reading images", 0.25):
+        views = shared_images(scan, job.options)
+
+    def made() -> TilePart:
+        with progress.part("texture", 0.8):
+            return _textured(mesh, views, job.largest_texture_px, progress)
+
+    part = scan.shared(("textured mesh", job.largest_faces, images_key(job.options)), made)
+    coarse = []
+    for n in range(1, job.levels):
+        with progress.part("less detail"):
             few = coarser(mesh, max(MIN_FACES, len(mesh.faces) // COARSER_FACES**n))
             px = max(MIN_TEXTURE_PX, max(part.image.shape) // COARSER_TEXTURE**n)
             level = _textured(few, views, px, progress)
-            levels.append(replace(level, error_m=_error(mesh, level)))
-    return replace(part, coarser=tuple(levels))
+            coarse.append(replace(level, error_m=_error(mesh, level)))
+    return replace(part, coarser=tuple(coarse))
 
 
 def _textured(
@@ -229,22 +234,21 @@ def _error(fine: Mesh, level: TilePart) -> float:
     return max(float(np.quantile(off_m, 0.95)), VIEWER_ERROR_PX * texel_m)
 
 
-def surface_mesh(
-    cloud: PointCloud,
-    voxel_m: float,
-    keyframes: Sequence[Keyframe],
-    largest_faces: int,
-    progress: Progress,
-) -> Mesh:
-    """The untextured mesh, with colours at its vertices.
+def closed_surface(scan: ScanView, largest_faces: int) -> Mesh:
+    """The untextured mesh, with colours at its vertices; made once.
 
     Raises ValueError when there is too little surface.
     """
-    if not len(cloud):
-        raise ValueError("no points")
-    progress("signed distances")
-    grid = grid_over(cloud.xyz_m[:, :2].astype(np.float64), voxel_m, margin_cells=1)
-    return volume_mesh((k.depth for k in keyframes), rasterise(cloud, grid), largest_faces)
+
+    def made() -> Mesh:
+        fused, keyframes = scan.fused, main_keyframes(scan.store)
+        with scan.progress.part("surface", 0.3):
+            scan.progress("signed distances")
+            xy_m = fused.cloud.xyz_m[:, :2].astype(np.float64)
+            raster = rasterise(fused.cloud, grid_over(xy_m, fused.voxel_m, margin_cells=1))
+            return volume_mesh((k.depth for k in keyframes), raster, largest_faces)
+
+    return scan.shared(("closed surface", largest_faces), made)
 
 
 def mesh_extras(scan: ScanView) -> dict[str, Any]:
@@ -359,7 +363,7 @@ def write_mesh_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """A folder with ``tileset.json`` and a glTF for each tile's level of detail; heights are AMSL
     metres."""
     frame = scan.needs_place("3D Tiles")
-    parts, _ = mesh_parts(scan, LARGEST_FACES, options)
+    parts, _ = mesh_parts(scan, LARGEST_FACES, options, LEVELS)
     whole = _box([level for part in parts for level in (part, *part.coarser)])
     size_m = float(np.linalg.norm(np.array(whole[3:]).reshape(3, 3).sum(axis=0)))
     with writing_folder(out) as folder:

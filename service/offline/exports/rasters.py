@@ -22,7 +22,7 @@ from recon.surface.texture_views import TextureView
 from recon.types import Array
 from service.errors import InputError
 from service.georeference import LocalFrame, map_crs
-from service.offline.exports.images import recording_of, scan_images
+from service.offline.exports.images import recording_of, shared_images
 from service.offline.exports.surface import bare_ground, cell_places, complete_model, surface_model
 from service.offline.exports.view import ExportOptions, Make, ScanView, in_parts
 from service.offline.tiles import grown
@@ -92,8 +92,8 @@ def ortho(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
     Cells are as large as pixels of the recording on the ground, rounded down to a round length;
     as those of the stored images where there is no recording.
     """
-    keyframes = [k for k in main_keyframes(scan.store) if np.isfinite(k.depth.depth_m).any()]
-    if not keyframes:
+    keyframes = list(main_keyframes(scan.store))
+    if not any(np.isfinite(k.depth.depth_m).any() for k in keyframes):
         raise InputError(f"{scan.folder} contains no points yet; nothing to export")
     with scan.progress.part("reading the images", 0.6):
         here, there = scan.progress.branches(2)
@@ -101,9 +101,7 @@ def ortho(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
         views: list[TextureView] = []
         at_once(
             lambda: surface.append(complete_model(scan.with_progress(here), None)[0]),
-            lambda: views.extend(
-                scan_images(keyframes, scan.folder, scan.store.header, options, there)
-            ),
+            lambda: views.extend(shared_images(scan.with_progress(there), options)),
         )
     terrain = _terrain(scan, surface[0], views)
     sample_m = [
@@ -132,6 +130,13 @@ def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
     """:func:`ortho` as GeoTIFF."""
     _write(scan, out, options, ortho, GROUND_MARGIN_M)
+    scan.shared(("written ortho", options), lambda: out)
+
+
+def written_ortho(scan: ScanView, options: ExportOptions) -> Path | None:
+    """Where :func:`write_ortho` wrote the orthophoto of this view with these options, if it did."""
+    path: Path | None = scan.shared(("written ortho", options), lambda: None)
+    return path if path is not None and path.is_file() else None
 
 
 def _write(

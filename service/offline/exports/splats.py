@@ -11,8 +11,8 @@ from recon.surface.splats import Splats, joined, splats_of, steps
 from recon.types import F32, F64, Bool
 from service.errors import InputError
 from service.offline.exports.clouds import VOXELS_MARGIN_M
-from service.offline.exports.images import resized, scan_images
-from service.offline.exports.model import LARGEST_FACES, surface_mesh
+from service.offline.exports.images import resized, shared_images
+from service.offline.exports.model import LARGEST_FACES, closed_surface
 from service.offline.exports.view import ExportOptions, ScanView, in_parts
 from service.packages import needing
 from service.scans.fused_cloud import EVERYWHERE, Box
@@ -72,12 +72,11 @@ def _made(scan: ScanView, options: ExportOptions, box: Box) -> Splats | None:
     progress = scan.progress
     fused = scan.fused
     try:
-        with progress.part("surface", 0.3):
-            surface = surface_mesh(fused.cloud, fused.voxel_m, keyframes, LARGEST_FACES, progress)
+        surface = closed_surface(scan, LARGEST_FACES)
     except ValueError as error:
         raise InputError(f"{scan.folder}: {error}") from error
     with progress.part("reading images", 0.2):
-        views = scan_images(keyframes, scan.folder, scan.store.header, options, progress)
+        views = shared_images(scan, options)
     pixels = sum(int(np.prod(v.bgra.shape[:2])) * float(k.fresh.mean())
                  for k, v in zip(keyframes, views, strict=True))  # fmt: skip
     shrink = min(1.0, float(np.sqrt(LARGEST_SPLATS / max(pixels, 1.0))))

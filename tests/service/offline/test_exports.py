@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 from recon.types import F64, Keyframe
 from service.cli import app
+from service.commands.deliverables import product_list
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
 from service.offline.exports import EXPORTERS
@@ -411,6 +412,10 @@ def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
         written(tmp_path, "laz")
 
 
+def test_each_product_has_one_line_of_a_terminal() -> None:
+    assert all(len(line) <= 78 for line in product_list().splitlines())
+
+
 def test_the_orthophoto_of_an_empty_scan_reads_no_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -419,7 +424,7 @@ def test_the_orthophoto_of_an_empty_scan_reads_no_images(
     rasters = pytest.importorskip("service.offline.exports.rasters", exc_type=ImportError)
     ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)).close()
     read = Mock(return_value=[])
-    monkeypatch.setattr(rasters, "scan_images", read)
+    monkeypatch.setattr(rasters, "shared_images", read)
     with pytest.raises(InputError, match="no points"):
         written(tmp_path, "ortho")
     read.assert_not_called()

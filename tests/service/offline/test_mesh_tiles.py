@@ -305,6 +305,36 @@ def test_a_recording_found_by_itself_that_does_not_fit_is_left(
         mesh_tile(replace(job, options=ExportOptions(video=video)), noting(reported))
 
 
+def test_models_share_surface_images_and_texture(
+    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The finest mesh is textured once; only tiles have levels of less detail."""
+    pytest.importorskip("trimesh")
+    house.flown(tmp_path).close()
+    made: list[str] = []
+
+    def counted(module: Any, name: str) -> None:
+        real = getattr(module, name)
+
+        def call(*args: Any) -> Any:
+            made.append(name)
+            return real(*args)
+
+        monkeypatch.setattr(module, name, call)
+
+    counted(model, "volume_mesh")
+    counted(images, "scan_images")
+    counted(model, "texture")
+    options = ExportOptions(voxel_m=0.5, stored=True)
+    with ScanView(tmp_path, 0.5) as scan:
+        export(scan, "splat", None, options)
+        export(scan, "glb", None, options)
+        export(scan, "obj", None, options)
+        assert sorted(made) == ["scan_images", "texture", "volume_mesh"]
+        export(scan, "3dtiles-mesh", None, options)
+    assert sorted(made) == ["scan_images", *["texture"] * model.LEVELS, "volume_mesh"]
+
+
 def test_the_mesh_lies_on_the_globe_as_3d_tiles(tmp_path: Path, house: HouseFlight) -> None:
     """Vertices of the glTF files, turned to z up and placed by the tileset, against PROJ."""
     trimesh = pytest.importorskip("trimesh")
