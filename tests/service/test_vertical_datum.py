@@ -123,6 +123,28 @@ def test_points_and_lines_are_raised_by_the_geoid(
             assert rise == pytest.approx(geoid_m(geoid, lat, lon), abs=0.002)
 
 
+def test_a_track_above_the_ellipsoid_is_lowered_to_the_geoid(
+    scan_dir: Path, house: HouseFlight, geoid: tuple[float, float]
+) -> None:
+    flown = kml_heights(scan_dir, None)[1]
+    mode, lowered = kml_heights(scan_dir, "ellipsoid")
+    assert mode == "absolute"
+    np.testing.assert_allclose(flown - lowered, geoid_m(geoid, *house.origin[:2]), atol=0.01)
+
+
+def test_without_a_grid_a_track_above_the_ellipsoid_lies_on_the_ground(scan_dir: Path) -> None:
+    assert kml_heights(scan_dir, None)[0] == kml_heights(scan_dir, "EGM96")[0] == "absolute"
+    assert kml_heights(scan_dir, "ellipsoid")[0] == "clampToGround"
+
+
+def kml_heights(scan_dir: Path, datum: str | None) -> tuple[str, F64]:
+    """The altitude mode of a track, and (N,) its heights."""
+    with ScanView(scan_dir) as scan:
+        text = export(scan, "kml", None, ExportOptions(vertical_datum=datum)).read_text()
+    (mode,) = re.findall("<altitudeMode>(.*)</altitudeMode>", text)
+    return mode, np.array([float(z) for z in re.findall("<gx:coord>.* (.*?)</gx:coord>", text)])
+
+
 @pytest.mark.parametrize("kind", ["copc", "ply"])
 def test_clouds_are_raised_by_the_geoid(
     scan_dir: Path, house: HouseFlight, geoid: tuple[float, float], kind: str

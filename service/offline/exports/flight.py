@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
@@ -12,10 +13,13 @@ import numpy as np
 
 from recon import se3
 from recon.types import F64
-from service.georeference import LocalFrame, line_geometry
+from service.errors import InputError
+from service.georeference import LocalFrame, height_change, line_geometry
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
 from service.scans.writing import write_whole
+
+KML_DATUM = "EGM96"
 
 
 def _geodetic(scan: ScanView, frame: LocalFrame) -> F64:
@@ -67,16 +71,27 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
 
 def write_kml(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """The track with its times; heights above mean sea level, as KML demands."""
-    geodetic = _geodetic(scan, scan.flown_frame or scan.needs_place("a map of the flight"))
+    """The track with its times; heights above EGM96, as KML demands.
+
+    Heights of another datum that PROJ cannot convert are not shown: the track lies on the ground.
+    """
+    frame = scan.flown_frame or scan.needs_place("a map of the flight")
+    mode, words = "absolute", ""
+    try:
+        flown = options.vertical_datum or KML_DATUM
+        change = height_change(flown, KML_DATUM, frame.lat_deg, frame.lon_deg)
+        geodetic = _geodetic(scan, replace(frame, heights=change))
+    except InputError as error:
+        geodetic, mode = _geodetic(scan, frame), "clampToGround"
+        words = f"<description>Without heights: {escape(str(error))}</description>"
     whens = "".join(f"<when>{iso_time(p.time_unix_ns)}</when>" for p in scan.poses)
     places = "".join(f"<gx:coord>{g[1]:.8f} {g[0]:.8f} {g[2]:.3f}</gx:coord>" for g in geodetic)
     name = escape(scan.store.header.scan_id)
     text = (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">'
-        f"<Document><name>{name}</name><Placemark><name>{name}</name><gx:Track>"
-        f"<altitudeMode>absolute</altitudeMode>{whens}{places}"
+        f"<Document><name>{name}</name><Placemark><name>{name}</name>{words}<gx:Track>"
+        f"<altitudeMode>{mode}</altitudeMode>{whens}{places}"
         "</gx:Track></Placemark></Document></kml>\n"
     )
     write_whole(out, text)

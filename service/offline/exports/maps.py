@@ -7,6 +7,7 @@ import itertools
 import json
 import logging
 import math
+import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,7 +23,7 @@ from service.errors import InputError
 from service.georeference import between_nodes, unwrapped
 from service.offline.exports import EXPORTERS
 from service.offline.exports.flight import iso_time
-from service.offline.exports.rasters import open_map, write_ortho
+from service.offline.exports.rasters import open_map, write_ortho, written_ortho
 from service.offline.exports.view import ExportOptions, ScanView, check, export
 from service.scans.folder import Failures
 from service.scans.track import flown_datum
@@ -34,12 +35,17 @@ JPEG_QUALITY = 85
 
 
 def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """The orthophoto as a ground overlay for Google Earth: doc.kml and a PNG in a zip."""
+    """The orthophoto as a ground overlay for Google Earth: doc.kml and a PNG in a zip.
+
+    One that was written from this view before is used, never an older file.
+    """
     scan.needs_place("a KMZ")
-    path = out.parent / "ortho.tif"
-    if not path.is_file():
-        write_ortho(scan, path, options)
-    image, (west, south, east, north) = _in_degrees(path)
+    with tempfile.TemporaryDirectory(dir=out.parent) as folder:
+        path = written_ortho(scan, options)
+        if path is None:
+            path = Path(folder) / "ortho.tif"
+            write_ortho(scan, path, options)
+        image, (west, south, east, north) = _in_degrees(path)
     _, data = cv2.imencode(".png", image)
     name = escape(scan.store.header.scan_id)
     kml = (

@@ -204,6 +204,15 @@ def test_level_ground_with_a_house_has_no_contours(maps: Path) -> None:
     assert contours_gpkg(maps / "contours.gpkg") == contours_dxf(maps / "contours.dxf") == []
 
 
+def test_an_overlay_is_never_made_of_an_older_orthophoto(maps: Path, tmp_path: Path) -> None:
+    (tmp_path / "ortho.tif").write_bytes(b"of another scan")
+    with ScanView(maps.parent) as scan:
+        out = export(scan, "kmz", tmp_path / "ortho.kmz", ExportOptions(cell_m=0.25))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ortho.kmz", "ortho.tif"]
+    with zipfile.ZipFile(out) as new, zipfile.ZipFile(maps / "ortho.kmz") as made_with_all:
+        assert new.read("ortho.png") == made_with_all.read("ortho.png")
+
+
 def test_the_overlay_shows_the_house_at_its_place(maps: Path, house: HouseFlight) -> None:
     with zipfile.ZipFile(maps / "ortho.kmz") as file:
         box = ElementTree.fromstring(file.read("doc.kml"))
