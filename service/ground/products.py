@@ -29,6 +29,7 @@ PRODUCTS: dict[str, tuple[str, str, float, float]] = {
     "glb": ("Models", "Mesh, glTF", 30.0, 60.0),
     "obj": ("Models", "Mesh, OBJ", 70.0, 80.0),
     "3dtiles-mesh": ("Models", "Mesh, 3D Tiles", 30.0, 100.0),
+    "splat": ("Models", "3D Gaussians, PLY", 320.0, 100.0),
     "geojson": ("Flight", "Track, GeoJSON", 0.04, 1.0),
     "kml": ("Flight", "Track, KML", 0.06, 1.0),
     "mcap": ("Flight", "Recording, Foxglove", 16.0, 3.0),

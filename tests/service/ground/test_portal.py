@@ -53,6 +53,7 @@ def test_the_list_shows_the_scan(client: Client, store: Path) -> None:
 def test_products_are_listed_with_file_size_and_obstacle(client: Client, store: Path) -> None:
     found = {p["kind"]: p for p in client.ask(ONE + "/exports")[1]}
     assert set(found) == set(KINDS)
+    assert {p["group"] for p in found.values()} == {"Cloud", "Maps", "Models", "Flight", "Improve"}
     assert found["laz"]["bytes"] == (store / "drone-1/test-1/cloud.laz").stat().st_size
     ortho = found["ortho"]
     assert (ortho["bytes"], ortho["file"], ortho["impossible"]) == (None, "ortho.tif", None)
