@@ -269,30 +269,43 @@ def _lone_contradicted(
         out[p] = contradicted and neighbours < LONE_NEIGHBOURS
 
 
-def _islands(keys: I64, views: U8) -> Bool:
-    """(N,) points of islands that are mostly seen once, where a column of cells at the island
-    or next to it also has surface that is seen more often."""
+BITS = 21
+"""Of the number of a cell along each axis in its key, x first."""
+
+
+def pieces(cells: I64) -> I64:
+    """(N,) which piece of surface each of the cells, sorted keys, is of: cells that touch."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    bits, low = 21, (1 << 21) - 1
-    i, j, k = (((keys >> s) & low) >> ISLAND_SHIFT for s in (2 * bits, bits, 0))
-    cells, cell = np.unique((i << 2 * bits) | (j << bits) | k, return_inverse=True)
-    steps = np.array([(a << 2 * bits) + (b << bits) + c for a, b, c in np.ndindex(3, 3, 3)])
-    steps -= steps[13]
     pairs = []
-    for step in steps[14:]:
+    for step in _steps()[14:]:
         n = np.searchsorted(cells, cells + step)
         held = np.flatnonzero(cells[np.minimum(n, len(cells) - 1)] == cells + step)
         pairs.append(np.stack([held, n[held]]))
     ends = np.concatenate(pairs, axis=1)
-    size = (len(cells), len(cells))
-    _, part = connected_components(coo_matrix((np.ones(ends.shape[1], bool), ends), size), False)
+    links = coo_matrix((np.ones(ends.shape[1], bool), ends), (len(cells), len(cells)))
+    return np.asarray(connected_components(links, False)[1], np.int64)
+
+
+def _steps() -> I64:
+    """(27,) from a cell's key to those around it."""
+    steps = [(a << 2 * BITS) + (b << BITS) + c for a, b, c in np.ndindex(3, 3, 3)]
+    return np.asarray(np.array(steps) - steps[13], np.int64)
+
+
+def _islands(keys: I64, views: U8) -> Bool:
+    """(N,) points of islands that are mostly seen once, where a column of cells at the island
+    or next to it also has surface that is seen more often."""
+    low = (1 << BITS) - 1
+    i, j, k = (((keys >> s) & low) >> ISLAND_SHIFT for s in (2 * BITS, BITS, 0))
+    cells, cell = np.unique((i << 2 * BITS) | (j << BITS) | k, return_inverse=True)
+    part = pieces(cells)
     count, once = np.bincount(part[cell]), np.bincount(part[cell], views <= 1)
     is_island = (count < ISLAND_POINTS) & (2 * once > count)
-    columns = np.unique(cells[np.unique(cell[(views > 1) & ~is_island[part[cell]]])] >> bits)
+    columns = np.unique(cells[np.unique(cell[(views > 1) & ~is_island[part[cell]]])] >> BITS)
     suspect = np.flatnonzero(is_island[part])
-    around = (steps[1::3] >> bits)[None] + (cells[suspect] >> bits)[:, None]
+    around = (_steps()[1::3] >> BITS)[None] + (cells[suspect] >> BITS)[:, None]
     refuted = np.zeros(len(count), np.bool_)
     refuted[part[suspect[np.isin(around, columns).any(axis=1)]]] = True
     return np.asarray(refuted[part][cell])

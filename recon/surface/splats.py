@@ -20,6 +20,7 @@ from numba import njit
 from recon import se3
 from recon.bands import at_once, threads
 from recon.camera_model import rays
+from recon.mapping.cloud_fusion import BITS, ISLAND_POINTS, ISLAND_SHIFT, pieces
 from recon.mapping.free_space import seen_through, spread
 from recon.surface.meshing import Mesh
 from recon.surface.texture_views import TextureView, rays_onto
@@ -48,6 +49,10 @@ COVERED = 0.5
 
 LOW_PASS_PX2 = 0.3
 """Variance that viewers add to each Gaussian in the image, as the reference does."""
+
+WIDEST = 1.3
+"""Beyond so many half images from the middle a Gaussian is projected as there, as the reference
+does: one beside the camera is not drawn all over the image."""
 
 LARGEST_ALPHA, SMALLEST_ALPHA, DONE = 0.99, 1.0 / 255.0, 1e-3
 REACH = 3.33
@@ -242,7 +247,17 @@ def _merged(splats: Splats, sigma_m: F32, depths: Sequence[DepthMap]) -> Splats:
     order = np.lexsort((sigma_m[kept], *cell.T))
     is_first = np.ones(len(order), np.bool_)
     is_first[1:] = (np.diff(cell[order], axis=0) != 0).any(axis=1)
-    return splats.at(np.sort(kept[order[is_first]]))
+    kept = np.sort(kept[order[is_first]])
+    return splats.at(kept[~_is_lone(splats.xyz_m[kept], cell_m * (1 << ISLAND_SHIFT))])
+
+
+def _is_lone(xyz_m: F32, cell_m: float) -> Bool:
+    """(N,) those in pieces of surface of fewer than ISLAND_POINTS, by cells that touch."""
+    i, j, k = np.floor((xyz_m - xyz_m.min(axis=0)) / cell_m).astype(np.int64).T + 1
+    cells, cell = np.unique((i << 2 * BITS) | (j << BITS) | k, return_inverse=True)
+    part = pieces(cells)[cell]
+    count = np.bincount(part)
+    return np.asarray((count < min(ISLAND_POINTS, count.max()))[part])
 
 
 def _fillings(
@@ -285,10 +300,10 @@ def _fitted(
         h, w = view.bgra.shape[:2]
         flat, rows = _in_view(splats, view.K, (w, h), view.T_world_camera)
         opacity, rgb = splats.opacity[rows], splats.rgb[rows]
-        image, left = _blend(flat, opacity, rgb, w, h)
+        image, left, _ = _blend(flat, opacity, rgb, w, h, NO_ERROR)
         error = view.bgra[..., 2::-1].astype(np.float32) - image
         error[(view.bgra[..., 3] == 0) | (left > 1.0 - COVERED)] = np.nan
-        return rows, _shared_out(flat, opacity, error)
+        return rows, _blend(flat, opacity, rgb, w, h, error)[2]
 
     for at in range(0, len(views), threads()):
         for rows, found in at_once(*(partial(errors, v) for v in views[at : at + threads()])):
@@ -306,7 +321,7 @@ def rendered(
     """
     w, h = size_px
     flat, rows = _in_view(splats, K, size_px, T_world_camera)
-    image, left = _blend(flat, splats.opacity[rows], splats.rgb[rows], w, h)
+    image, left, _ = _blend(flat, splats.opacity[rows], splats.rgb[rows], w, h, NO_ERROR)
     return image, 1.0 - left
 
 
@@ -315,8 +330,12 @@ def _in_view(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> tuple[
     covariance uu, uv, vv in the image, and how many pixels they reach."""
     flat = np.empty((len(splats), 7), np.float32)
     T_camera_world = np.ascontiguousarray(se3.inverse(T))
-    _project(splats.xyz_m, splats.q_wxyz, splats.sigma_m, K, T_camera_world, flat)
     w, h = size_px
+    widest = (
+        WIDEST * max(K[0, 2], w - K[0, 2]) / K[0, 0],
+        WIDEST * max(K[1, 2], h - K[1, 2]) / K[1, 1],
+    )
+    _project(splats.xyz_m, splats.q_wxyz, splats.sigma_m, K, T_camera_world, widest, flat)
     u, v, z, reach = flat[:, 0], flat[:, 1], flat[:, 2], flat[:, 6]
     on = (z > 0.1) & (u > -reach) & (u < w + reach) & (v > -reach) & (v < h + reach)
     rows = np.flatnonzero(on)
@@ -325,7 +344,9 @@ def _in_view(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> tuple[
 
 
 @njit(cache=True, nogil=True)
-def _project(xyz: F32, q: F32, sigma: F32, K: F64, T: F64, out: F32) -> None:
+def _project(
+    xyz: F32, q: F32, sigma: F32, K: F64, T: F64, widest: tuple[float, float], out: F32
+) -> None:
     R = np.empty((3, 3))
     for n in range(xyz.shape[0]):
         z = T[2, 0] * xyz[n, 0] + T[2, 1] * xyz[n, 1] + T[2, 2] * xyz[n, 2] + T[2, 3]
@@ -334,6 +355,8 @@ def _project(xyz: F32, q: F32, sigma: F32, K: F64, T: F64, out: F32) -> None:
             continue
         x = T[0, 0] * xyz[n, 0] + T[0, 1] * xyz[n, 1] + T[0, 2] * xyz[n, 2] + T[0, 3]
         y = T[1, 0] * xyz[n, 0] + T[1, 1] * xyz[n, 1] + T[1, 2] * xyz[n, 2] + T[1, 3]
+        slope_x = min(max(x / z, -widest[0]), widest[0])
+        slope_y = min(max(y / z, -widest[1]), widest[1])
         w, a, b, c = q[n, 0], q[n, 1], q[n, 2], q[n, 3]
         R[0, 0], R[1, 1], R[2, 2] = b * b + c * c, a * a + c * c, a * a + b * b
         R[0, 1], R[0, 2], R[1, 2] = a * b - w * c, a * c + w * b, b * c - w * a
@@ -347,7 +370,7 @@ def _project(xyz: F32, q: F32, sigma: F32, K: F64, T: F64, out: F32) -> None:
             dx = s * (T[0, 0] * R[0, k] + T[0, 1] * R[1, k] + T[0, 2] * R[2, k])
             dy = s * (T[1, 0] * R[0, k] + T[1, 1] * R[1, k] + T[1, 2] * R[2, k])
             dz = s * (T[2, 0] * R[0, k] + T[2, 1] * R[1, k] + T[2, 2] * R[2, k])
-            du, dv = K[0, 0] * (dx - x / z * dz) / z, K[1, 1] * (dy - y / z * dz) / z
+            du, dv = K[0, 0] * (dx - slope_x * dz) / z, K[1, 1] * (dy - slope_y * dz) / z
             uu += du * du
             uv += du * dv
             vv += dv * dv
@@ -373,10 +396,19 @@ def _span(middle: float, reach: float, size: int) -> tuple[int, int]:
     return max(int(np.ceil(middle - reach)), 0), min(int(np.floor(middle + reach)) + 1, size)
 
 
+NO_ERROR = np.zeros((0, 0, 3), np.float32)
+
+
 @njit(cache=True, nogil=True)
-def _blend(flat: F32, opacity: F32, rgb: F32, w: int, h: int) -> tuple[F32, F32]:
-    """(h, w, 3) the image over black, and (h, w) the share of light that comes from behind."""
+def _blend(flat: F32, opacity: F32, rgb: F32, w: int, h: int, error: F32) -> tuple[F32, F32, F32]:
+    """(h, w, 3) the image over black, (h, w) the share of light that comes from behind, and (N, 4)
+    sums of ``error`` (h, w, 3) over the pixels of each Gaussian by its share of them, and of these
+    shares.
+
+    Errors that are NaN, or NO_ERROR, do not count.
+    """
     image, left = np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32)
+    sums, has_error = np.zeros((flat.shape[0], 4), np.float32), error.size > 0
     for n in range(flat.shape[0]):
         first_row, last_row = _span(flat[n, 1], flat[n, 6], h)
         first, last = _span(flat[n, 0], flat[n, 6], w)
@@ -389,27 +421,8 @@ def _blend(flat: F32, opacity: F32, rgb: F32, w: int, h: int) -> tuple[F32, F32]
                 for k in range(3):
                     image[row, col, k] += share * rgb[n, k]
                 left[row, col] -= share
-    return image, left
-
-
-@njit(cache=True, nogil=True)
-def _shared_out(flat: F32, opacity: F32, error: F32) -> F32:
-    """(N, 4) sums of ``error`` (h, w, 3) over the pixels of each Gaussian by its share of them, and
-    of these shares; NaN does not count."""
-    h, w = error.shape[:2]
-    out, left = np.zeros((flat.shape[0], 4), np.float32), np.ones((h, w), np.float32)
-    for n in range(flat.shape[0]):
-        first_row, last_row = _span(flat[n, 1], flat[n, 6], h)
-        first, last = _span(flat[n, 0], flat[n, 6], w)
-        for row in range(first_row, last_row):
-            for col in range(first, last):
-                if left[row, col] < DONE:
-                    continue
-                alpha = _alpha(flat, n, opacity[n], col, row)
-                share = alpha * left[row, col]
-                if share > 0.0 and not np.isnan(error[row, col, 0]):
+                if has_error and share > 0.0 and not np.isnan(error[row, col, 0]):
                     for k in range(3):
-                        out[n, k] += share * error[row, col, k]
-                    out[n, 3] += share
-                left[row, col] -= share
-    return out
+                        sums[n, k] += share * error[row, col, k]
+                    sums[n, 3] += share
+    return image, left, sums

@@ -73,6 +73,18 @@ def test_an_image_follows_the_formula() -> None:
     assert np.abs(opacity - covered).max() < 2e-3
 
 
+def test_a_gaussian_beside_the_camera_is_not_drawn_all_over_the_image() -> None:
+    beside = np.array([[30.0, 10.0, 0.2]], np.float32)
+    splats = Splats(
+        beside,
+        np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
+        np.full((1, 3), 0.1, np.float32),
+        np.full(1, 0.9, np.float32),
+        np.full((1, 3), 200.0, np.float32),
+    )
+    assert rendered(splats, K, SIZE, np.eye(4))[1].max() == 0.0
+
+
 def slope(T: F64, up: F64, sigma_m: float = 0.05) -> DepthMap:
     """The exact view of the plane through the origin with normal ``up``."""
     u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
@@ -154,4 +166,14 @@ def test_what_other_views_see_through_is_left_out() -> None:
     keyframes = [keyframe(n, d) for n, d in enumerate(depths)]
     corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0]])
     splats = splats_of(keyframes, views, Mesh(corners, np.array([[0, 1, 2]], np.int32)))
+    assert np.abs(splats.xyz_m[:, 2]).max() < 1.0
+
+
+def test_nothing_hangs_alone_in_the_air() -> None:
+    depth = slope(se3.compose(DOWN, np.array([0.0, 0.0, 20.0])), np.array([0.0, 0.0, 1.0]))
+    view = painted(depth)
+    depth.depth_m[20:26, 30:36] = 12.0  # invented, and no other view looks there
+    corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0]])
+    surface = Mesh(corners, np.array([[0, 1, 2]], np.int32))
+    splats = splats_of([keyframe(0, depth)], [view], surface)
     assert np.abs(splats.xyz_m[:, 2]).max() < 1.0
