@@ -17,6 +17,7 @@ from recon.surface.raster import (
     highest_lowest,
     inner_doubtful,
     reliable,
+    smoothed,
     standing_height,
     without_cells,
 )
@@ -101,7 +102,7 @@ def complete_model(scan: ScanView, cell_m: float | None) -> tuple[Raster, U8]:
     0 where it is measured, FILLED, or UNCERTAIN.
 
     Uncertain heights are measured ones that :func:`surface_model` leaves out and no keyframe sees
-    through. Other cells are filled from the lower side.
+    through. Other cells are filled from the lower side. Noise is smoothed, steps stay.
     """
     return scan.shared(("complete", cell_m), lambda: _complete_model(scan, cell_m))
 
@@ -117,7 +118,7 @@ def _complete_model(scan: ScanView, cell_m: float | None) -> tuple[Raster, U8]:
         rgb=np.where(kept[..., None], measured.rgb, seen.raster.rgb),
     )
     unsure = kept | seen.is_filled
-    whole = completed(both, bare_ground(scan, cell_m).everywhere_m, inside, unsure)
+    whole = smoothed(completed(both, bare_ground(scan, cell_m).everywhere_m, inside, unsure))
     origin = np.where(known & ~seen.is_filled, 0, FILLED).astype(np.uint8)
     origin[kept] = UNCERTAIN
     return without_cells(whole, ~inside), origin
