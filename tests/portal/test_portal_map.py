@@ -348,14 +348,12 @@ def test_the_map_is_reached_and_within_reach(
     page.run(
         "[...document.querySelectorAll('article a')].find(a => a.textContent === 'Map').click()"
     )
-    page.wait(f"{SHOWN} && !!document.querySelector('.map')")
-    page.run("new Promise(r => setTimeout(r, 300))")
-    page.wait(SHOWN)
+    page.wait(f"{SHOWN} && !!document.querySelector('.flat .map')")
     wide, high = page.run(
         "[document.documentElement.scrollWidth, document.documentElement.scrollHeight]"
     )
     assert wide <= size[0] and high <= size[1]
-    assert page.run("document.querySelector('.map').clientHeight") > 0.5 * size[1]
+    assert page.run("document.querySelector('.flat .map').clientHeight") > 0.5 * size[1]
     page.image(tmp_path / "map.png")  # to look at
 
 

@@ -214,8 +214,8 @@ def test_a_scene_at_rest_asks_for_no_frames(browser: Browser, portal: Portal) ->
     drawn(browser)
     count = "window.requestAnimationFrame = f => (asked++, ask.call(window, f));"
     browser.run(f"window.asked = 0; window.ask = requestAnimationFrame; {count} 0")
-    browser.run("new Promise(r => setTimeout(r, 400))")  # beyond the next turn of the figures
-    assert browser.run("asked") == 0
+    # None for longer than a turn of the figures, once all that comes late has come.
+    browser.wait("(asked = 0, new Promise(r => setTimeout(() => r(asked === 0), 400)))")
     before = drawn(browser)
     browser.page.keyboard.press("d", delay=200)  # flies
     assert difference(before, drawn(browser)) > 0.01

