@@ -216,8 +216,8 @@ class Workers:
         with self._lock:
             failed = [w for w in self._workers if w.has_failed and w.name != name]
             running = [w for w in self._workers if not w.is_done]
+            worker.thread.start()  # a RuntimeError leaves the table as it was
             self._workers = [*failed[-MAX_FAILED:], *running, worker]
-        worker.thread.start()
         return worker
 
     def every(self, row: str, period_s: float, work: Callable[[], None]) -> Worker:

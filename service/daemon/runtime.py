@@ -242,10 +242,16 @@ class Daemon:
 
     def reload(self, wanted: Config) -> None:
         """Apply the live keys of ``wanted``; the others wait for a restart."""
-        config, taken, waiting = reload(self.config, wanted, self._wanted)
-        self._wanted = wanted
-        self.scanning.follow(config)
-        tuned = parameters_of(config).items()
+        taken = waiting = list[str]()
+
+        def change(config: Config) -> Config:
+            nonlocal taken, waiting
+            config, taken, waiting = reload(config, wanted, self._wanted)
+            self._wanted = wanted
+            return config
+
+        self.scanning.follow(change)
+        tuned = parameters_of(self.config).items()
         self.vehicle.show_parameters({n: v for n, v in tuned if TUNABLES[n].key in taken})
         log.info("configuration: now in force: %s", ", ".join(taken) or "nothing new")
         if waiting:

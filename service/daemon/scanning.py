@@ -211,13 +211,16 @@ class Scanning:
 
     # ---- changes in flight --------------------------------------------------------------------
 
-    def follow(self, config: Config) -> None:
-        """Use another configuration; live keys also change in the running scan."""
+    def follow(self, change: Callable[[Config], Config]) -> None:
+        """Change the configuration in one step; live keys also change in the running scan.
+
+        Raises what ``change`` raises; then nothing is changed.
+        """
         with self._lock:
-            self.config = config
+            self.config = config = change(self.config)
             if self.run is not None:
                 self.run.follow(config, self.level)
-        self.link.follow(config)
+            self.link.follow(config)
 
     def set_level(self, level: Level) -> None:
         """Change the load level, in this scan and in the next."""
@@ -240,23 +243,25 @@ class Scanning:
             self.config, self.vehicle, self.link, self.camera, self.backend, self.level,
             self.paused, self.made, self.handle, self._write_files,
         )  # fmt: skip
-        run = self.run = self._attempt(equipment, self.life.failures == 0)
-        self._worker = self._workers.start(
-            "scan", lambda _: self._carry_out(run), lag_s=lambda: run.busy_s
-        )
+        try:
+            run = self.run = self._attempt(equipment, self.life.failures == 0)
+            self._worker = self._workers.start(
+                "scan", lambda _: self._carry_out(run), lag_s=lambda: run.busy_s
+            )
+        except Exception as error:  # such as no room for another thread
+            self._end_run(_fault_of(error))
 
     def _carry_out(self, run: ScanRun) -> None:
         """Carry out the run; a fault is reported, and retried while a scan is wanted."""
         fault = ""
         try:
             run.carry_out()
-        except (SkyreliefError, OSError) as error:
-            fault = str(error)
         except Exception as error:
-            log.exception("the scan ended with an internal fault")
-            first, *_ = str(error).strip().splitlines() or [type(error).__name__]
-            fault = f"internal fault: {first}"
+            fault = _fault_of(error)
         give_back(collect=True)
+        self._end_run(fault)
+
+    def _end_run(self, fault: str) -> None:
         with self._lock:
             if fault:
                 self._report(fault)
@@ -291,3 +296,12 @@ class Scanning:
         with self._lock:
             work, self._closing = self._closing, None
         return work
+
+
+def _fault_of(error: Exception) -> str:
+    """One line for the operator."""
+    if isinstance(error, SkyreliefError | OSError):
+        return str(error)
+    log.error("the scan ended with an internal fault", exc_info=error)
+    first, *_ = str(error).strip().splitlines() or [type(error).__name__]
+    return f"internal fault: {first}"

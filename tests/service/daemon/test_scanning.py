@@ -7,6 +7,7 @@ import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from loopback import until
@@ -18,8 +19,9 @@ from service.daemon.frame_gate import FrameGate
 from service.daemon.resumption import MARK, Left, Resumption
 from service.daemon.runtime import Daemon
 from service.daemon.scan_run import ScanRun
-from service.daemon.scan_state import Event
+from service.daemon.scan_state import Event, State
 from service.flight.scan import short_collections
+from service.workers import Worker, Workers
 
 
 class Silent(FakeCamera):
@@ -88,6 +90,36 @@ def test_a_scan_that_was_stopped_counts_as_closing_at_once(tmp_path: Path) -> No
     assert daemon.actions.status().phase is Phase.FINALISING
     end.set()
     until(lambda: daemon.actions.status().phase is Phase.IDLE)
+
+
+class Crowded(Workers):
+    """A process that may not start another thread, a few times."""
+
+    left = 2
+
+    def start(self, *given: Any, **named: Any) -> Worker:
+        self.left -= 1
+        if self.left >= 0:
+            raise RuntimeError("can't start new thread")
+        return super().start(*given, **named)
+
+
+def test_an_attempt_that_cannot_start_is_reported_and_retried(tmp_path: Path) -> None:
+    """The state stayed at scanning, with no scan: only a stop and a start ended that."""
+    workers = Crowded()
+    daemon = Onboard(tmp_path, script=lambda run: run.stop.wait(60.0), workers=workers)
+    scanning = daemon.scanning
+    scanning.start()
+    assert scanning.run is None
+    assert scanning.life.state is State.WAITING
+    assert scanning.fault == "internal fault: can't start new thread"
+    scanning.handle(Event.TICK)
+    assert scanning.life.failures == 2
+    scanning.handle(Event.TICK)
+    assert scanning.run is not None
+    assert scanning.fault == ""
+    scanning.end()
+    assert scanning.life.state is State.ENDED
 
 
 def test_a_camera_that_fails_is_reported(tmp_path: Path) -> None:

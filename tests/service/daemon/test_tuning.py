@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from mavlink.component.parameters import PARAMETERS
 from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
-from service.config import Config, load_config
+from service.config import Config, change, load_config
 from service.daemon.frame_gate import FrameGate
 from service.daemon.vehicle_config import TUNABLES, parameters_of, with_parameter
 from service.errors import InputError
@@ -186,3 +187,25 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         scanning.link.flying = None
         scanning.end()
         scan.pipeline.finish()
+
+
+def test_a_parameter_that_is_set_during_a_reload_stands(tmp_path: Path) -> None:
+    """The reload took the configuration before, and put it back without the parameter."""
+    daemon = Onboard(tmp_path)
+    scanning, between = daemon.scanning, threading.Event()
+
+    def tune() -> None:
+        between.set()
+        daemon.actions.parameter_changed("SR_RESOLUTION_M", 0.25)
+
+    tuning = threading.Thread(target=tune)
+
+    def slowly(config: Config) -> Config:
+        tuning.start()  # waits for this change
+        between.wait(60.0)
+        return change(config, "datalink.budget_kbit_s", 500)
+
+    scanning.follow(slowly)
+    tuning.join()
+    assert scanning.config.datalink.budget_kbit_s == 500
+    assert scanning.config.scan.resolution_m == 0.25
