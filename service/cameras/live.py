@@ -209,7 +209,7 @@ class LiveSource:
             self._warn(silent if self._is_silent else f"cannot be opened: {error}")
             return
         try:
-            stream = video_stream(container)
+            stream = video_stream(container, is_live=True)
             if stream is None:
                 self._warn("contains no video stream that can be decoded")
                 return

@@ -216,13 +216,24 @@ class VideoSource:
         log.warning("%s: %s", self.description, text)
 
 
-def video_stream(container: av.container.InputContainer) -> av.VideoStream | None:
-    """The first video stream, ready to decode; None without a decodable one."""
+MAX_ONE_CORE_PX = 1920 * 1088
+"""Pixels of the largest images that one core surely decodes as fast as cameras send them."""
+
+
+def video_stream(
+    container: av.container.InputContainer, is_live: bool = False
+) -> av.VideoStream | None:
+    """The first video stream, ready to decode; None without a decodable one.
+
+    An ``is_live`` one of up to :data:`MAX_ONE_CORE_PX` is decoded image by image: threads that
+    decode one image each hold back as many images as there are cores.
+    """
     stream = container.streams.video[0] if container.streams.video else None
     if stream is None or stream.codec_context is None:
         return None
     stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
-    stream.thread_type = "AUTO"
+    px = stream.codec_context.width * stream.codec_context.height
+    stream.thread_type = "SLICE" if is_live and px <= MAX_ONE_CORE_PX else "AUTO"
     return stream
 
 

@@ -146,7 +146,7 @@ def _play_once(video: Path, tlog: Path, options: LiveOptions, player: MavlinkPla
     """
     frames, url = 0, options.video
     try:
-        with av.open(str(video)) as source, av.open(url, "w", format="mpegts") as sink:
+        with av.open(str(video)) as source, _sink(url) as sink:
             stream = sink.add_stream_from_template(source.streams.video[0])
             end_s = (source.duration or 0) / av.time_base
             start_ns = creation_unix_ns(source, source.streams.video[0])
@@ -171,6 +171,11 @@ def _play_once(video: Path, tlog: Path, options: LiveOptions, player: MavlinkPla
     except (av.error.FFmpegError, OSError) as error:
         raise OutsideError(f"video to {url}: {error}") from error
     return frames
+
+
+def _sink(url: str) -> av.container.OutputContainer:
+    """MPEG-TS that states the length of each image: a receiver need not wait for the next one."""
+    return av.open(url, "w", format="mpegts", options={"omit_video_pes_length": "0"})
 
 
 def _wait(start: float, due_s: float, player: MavlinkPlayer) -> None:

@@ -27,6 +27,7 @@ from loopback import free_port, until
 from service.cameras import CameraFrame, CameraSource, live, open_camera
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
 from service.cameras.source import Paced
+from service.cameras.video import decoded_frames, video_stream
 from service.errors import InputError, NoSenderError, OutsideError
 from service.workers import PROCESS, Worker
 
@@ -82,6 +83,49 @@ class RealTime:
     def close(self) -> None:
         self.is_open = False
         self._container.close()
+
+
+class Waiting:
+    """A stream that sends no more for now."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = io.BytesIO(data)
+        self.end = threading.Event()
+
+    def read(self, size: int) -> bytes:
+        found = self._data.read(size)
+        if not found:
+            self.end.wait(60.0)
+        return found
+
+
+def test_an_image_is_not_held_back_until_later_ones_come() -> None:
+    """Threads that decode an image each held back two on two cores, eight on eight."""
+    data = io.BytesIO()
+    options = {"omit_video_pes_length": "0"}
+    with av.open(data, "w", format="mpegts", options=options) as out:
+        stream: Any = out.add_stream("libx264", rate=10, options={"tune": "zerolatency"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for i in range(12):
+            noise = np.random.default_rng(i).integers(0, 256, (48, 64, 3), np.uint8)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(noise, format="bgr24")))
+        out.mux(stream.encode(None))
+    sender, got = Waiting(data.getvalue()), list[av.VideoFrame]()
+
+    def receive() -> None:
+        with av.open(sender, options=dict(live.LIVE_OPTIONS)) as container:
+            stream = video_stream(container, is_live=True)
+            assert stream is not None
+            for frame in decoded_frames(container, stream, print, print):
+                got.append(frame)
+
+    receiver = threading.Thread(target=receive)
+    receiver.start()
+    try:
+        until(lambda: len(got) >= 10)  # that an image is whole shows by the next one's first byte
+    finally:
+        sender.end.set()
+        receiver.join(60.0)
 
 
 def take(source: LiveSource, n: int) -> list[CameraFrame]:

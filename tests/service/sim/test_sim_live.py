@@ -82,6 +82,9 @@ def test_flight_is_played_with_its_telemetry(flight: Path, tmp_path: Path) -> No
     assert all(m.tc1 > 100e9 and m.ts1 > 0 for m in answers)
     offsets = np.array([m.tc1 - m.ts1 for m in answers]) / 1e9
     assert np.ptp(offsets) < 1.0  # one boot clock
+    starts = [out.read_bytes()[at : at + 188] for at in range(0, out.stat().st_size, 188)]
+    lengths = [p[p.index(b"\0\0\1\xe0") + 4 :][:2] for p in starts if b"\0\0\1\xe0" in p]
+    assert len(lengths) == 10 and b"\0\0" not in lengths  # each image ends where it says
     with av.open(str(out)) as container:
         received = [f.to_ndarray() for f in container.decode(video=0)]
     with av.open(str(flight / "flight.mp4")) as container:
