@@ -158,10 +158,12 @@ class Mapper:
         return self.skip(frame.seq, frame.time_ns, frame.prior) or self.track(frame)
 
     def skip(self, seq: int, time_ns: int, prior: PosePrior) -> tuple[Event, ...]:
-        """The event of a frame that need not be seen; none for one that :meth:`track` must take."""
+        """A frame that need not be seen: what is done by now, and the frame's event; nothing for
+        one that :meth:`track` must take."""
         if not self.follow.can_skip(time_ns, prior):  # frames are followed as fast as images move
             return ()
-        return (FramePosed(seq, time_ns, Tracked(Tracking.SKIPPED, self.odometry.segment)),)
+        skipped = FramePosed(seq, time_ns, Tracked(Tracking.SKIPPED, self.odometry.segment))
+        return (*self._finished(), skipped)
 
     def track(self, frame: Frame) -> tuple[Event, ...]:
         """One frame: where the camera is, and which views have their partners by now.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from service.bench.link_emulator import LinkModel, Traffic, _Direction
@@ -57,3 +59,28 @@ def test_keyframes_of_the_bench_are_what_they_say() -> None:
     frame = make_keyframe()
     assert float(frame.depth.depth_m.min()) > 40 and float(frame.depth.depth_m.max()) < 110
     assert 0.18 < float(np.mean(strip((320, 180)))) < 0.26
+
+
+def test_delays_of_a_simulated_flight_are_measured_in_the_whole_system(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("zenoh")
+    from service.bench.latency import PLACES, Trial, fly
+
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    settings = (
+        "compute.backend=cpu", "compute.stereo_width=160", "compute.guide_width=320",
+        "fusion.loops=false",
+    )  # fmt: skip
+    source = "sim:?size=320x180&fps=5&duration_s=15"
+    outcome = fly(Trial(source, 15.0, LinkModel(5000.0, 0.02, 0.01), settings))
+    delays = outcome.delays_s
+    assert all(delays[place] for place in PLACES)
+    assert all(delay_s > 0 for place in PLACES for delay_s in delays[place])
+    # Each passes one place after the other.
+    assert sum(delays["pose at the ground"]) > sum(delays["pose stored on board"])
+    stored, came = delays["depth stored on board"], delays["coarse depth at the ground"]
+    assert len(came) == len(stored) - outcome.missing
+    assert max(came) > min(stored)
+    fine_s = delays["fine depth at the ground"]
+    assert min(fine_s) > min(stored)

@@ -14,11 +14,11 @@ from some_views import view_at
 
 import recon
 from recon import se3
-from recon.pipeline.events import KeyframeReady, PosesChanged
+from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.keyframe_map import GraphUpdate
 from recon.pipeline.mapper import Mapper, moved
 from recon.pipeline.views import StereoView
-from recon.types import Camera, DepthMap, Keyframe, Pose
+from recon.types import Camera, DepthMap, Keyframe, Pose, PosePrior
 
 CAMERA = Camera(np.array([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), np.zeros(5), (80, 60))
 TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
@@ -92,6 +92,16 @@ def test_only_keyframes_that_came_are_corrected() -> None:
     first, changed = mapper.drain()
     assert isinstance(first, KeyframeReady) and isinstance(changed, PosesChanged)
     assert list(changed.poses) == [1] and len(mapper.cloud()) > 0
+
+
+def test_a_keyframe_does_not_wait_for_the_next_frame_that_is_looked_at(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mapper = Mapper(CAMERA, worker=BrokenOff)
+    monkeypatch.setattr(mapper.odometry, "can_skip", lambda *_: True)
+    ready, changed, skipped = mapper.skip(5, 0, PosePrior())
+    assert isinstance(ready, KeyframeReady) and isinstance(changed, PosesChanged)
+    assert isinstance(skipped, FramePosed) and skipped.seq == 5
 
 
 def test_a_cloud_leaves_out_keyframes_between_which_vision_is_wrong() -> None:
