@@ -1,7 +1,7 @@
 """The vehicle as the service uses it: links, two components and history in one object.
 
-Threads: two per link, one for the protocol, one for heartbeats. Every call of the service returns
-at once; ``ScanControl`` is called in the protocol's thread.
+Threads: two per link, one for the protocol, one for heartbeats, one that writes to the disk. Every
+call of the service returns at once; ``ScanControl`` is called in the protocol's thread.
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ SAVE_EVERY_NS, SAVE_SIGNED_NS = 30 * S, S  # with a key, what a crash forgets co
 TELEMETRY = numbers_of(READERS)
 BACKLOG = 10_000  # packets queued for the protocol's thread
 STUCK_NS = 10 * S
+WAIT_S, CLOSE_S = 0.5, 5.0
+"""Of the disk's thread for work, and at most for the end of a log."""
 TUNNEL_ROOM = 128
 BEAT_NICE = -10  # needs LimitNICE or root, otherwise the priority stays normal
 
@@ -118,6 +120,8 @@ class VehicleLink:
             lambda: (self._clock_ns() + self.unix_offset_ns()) // 1000,
         )
         self._inbox: LinkInbox[tuple[int, Packet, int]] = LinkInbox(BACKLOG)
+        self._disk: LinkInbox[None] = LinkInbox(BACKLOG)  # what writes, as a disk may stall
+        self._is_saving = False
         self._heard = set(HEARD)  # numbers of handled messages; others are ignored
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -135,7 +139,7 @@ class VehicleLink:
     def start(self) -> None:
         """Open the links; the first heartbeat is sent before anything else."""
         self._inbox.put(self._companion.announce_kept)
-        for target in (self._beat, self._run):
+        for target in (self._beat, self._run, self._write):
             thread = threading.Thread(
                 target=target, name=f"mavlink {target.__name__.strip('_')}", daemon=True
             )
@@ -150,6 +154,7 @@ class VehicleLink:
         for thread in self._threads:
             thread.join(timeout=5.0)
         self._links.stop()
+        self._flush(0.0)
         self.recorder.close()
         self.save()
 
@@ -207,7 +212,17 @@ class VehicleLink:
         """Write a .tlog of all links to a file from now on, stamped with the monotonic clock plus
         ``unix_offset_ns`` (None: :meth:`unix_offset_ns`); a path of None ends it."""
         if path is None:
-            self.recorder.close()
+            closed = threading.Event()
+
+            def close() -> None:
+                self.recorder.close()
+                closed.set()
+
+            self._disk.put(close)
+            if self._threads:
+                closed.wait(CLOSE_S)
+            else:  # not started
+                self._flush(0.0)
         else:
             offset_ns = self.unix_offset_ns() if unix_offset_ns is None else unix_offset_ns
             self.recorder.open(path, offset_ns)
@@ -248,7 +263,7 @@ class VehicleLink:
     # Threads.
 
     def _on_packet(self, index: int, packet: Packet, now_ns: int) -> None:
-        self.recorder.write(packet.data, now_ns)
+        self._record([packet.data], now_ns)
         if packet.message_id in TELEMETRY:
             self._inbox.gather((index, packet, now_ns))
         elif packet.message_id in self._heard:
@@ -268,9 +283,11 @@ class VehicleLink:
             now_ns = self._alive_ns = self._clock_ns()
             self._guard(partial(self._companion.tick, now_ns))
             self._send(self._companion.take())
-            if now_ns >= save_ns or self._is_stale():
+            if (now_ns >= save_ns or self._is_stale()) and not self._is_saving:
                 save_ns = now_ns + every_ns
-                self.save()
+                self._is_saving = True
+                if not self._disk.put(self._saving()):
+                    self._is_saving = False
         self._serve(0.0)
         self._send(self._companion.take())
 
@@ -301,25 +318,48 @@ class VehicleLink:
             now_ns = self._clock_ns()
             due = self.presence.due(now_ns)
             if now_ns - self._alive_ns < STUCK_NS:  # otherwise nothing would answer: stay silent
-                sent = self._links.send(self.presence.system, due)
-                self._inbox.put(partial(self._record, sent, now_ns))  # a disk may keep one waiting
+                self._record(self._links.send(self.presence.system, due), now_ns)
             self._stop.wait(max(0.001, (self.presence.next_timer() - self._clock_ns()) / S))
 
     def _send(self, messages: list[OutgoingMessage]) -> None:
         if messages:
             self._record(self._links.send(self.presence.system, messages), self._clock_ns())
 
-    def _record(self, sent: list[bytes], now_ns: int) -> None:
-        for data in sent:
-            self.recorder.write(data, now_ns)
+    def _record(self, packets: list[bytes], now_ns: int) -> None:
+        for data in packets:
+            self._disk.put(partial(self.recorder.write, data, now_ns))
+
+    def _write(self) -> None:
+        """The disk's thread. A disk that stalls costs packets of the log, and nothing else."""
+        lost = 0
+        while not self._stop.is_set():
+            self._flush(WAIT_S)
+            before, lost = lost, self._disk.dropped
+            if lost > before:
+                log.warning("the telemetry log lacks %d packets: the disk stalled", lost - before)
 
     def _is_stale(self) -> bool:
         revision = self._companion.parameters.revision
         return self._memory.is_stale(revision, self.presence.proven_system)
 
+    def _flush(self, wait_s: float) -> None:
+        _, jobs = self._disk.take(wait_s)
+        for job in jobs:
+            self._guard(job)
+
     def save(self) -> None:
-        """Write what a restart needs: parameters, signing times, the vehicle's system id."""
+        """Write what a restart needs, on this thread."""
+        self._saving()()
+
+    def _saving(self) -> Job:
+        """Writes what a restart needs: parameters, signing times, the vehicle's system id."""
         parameters = self._companion.parameters
         signing, system = self.signing, self.presence.proven_system
         timestamp, streams = (0, {}) if signing is None else (signing.timestamp, signing.streams)
-        self._memory.save(parameters.kept(), parameters.revision, timestamp, streams, system)
+        kept, revision = parameters.kept(), parameters.revision
+
+        def save() -> None:
+            self._memory.save(kept, revision, timestamp, streams, system)
+            self._is_saving = False
+
+        return save

@@ -130,7 +130,7 @@ def test_the_last_word_is_said() -> None:
         assert b"Service stops" in heard
 
 
-def test_heartbeats_do_not_wait_for_the_disk_of_the_log(tmp_path: Path) -> None:
+def test_neither_heartbeats_nor_answers_wait_for_the_disk_of_the_log(tmp_path: Path) -> None:
     log = tmp_path / "link.tlog"
     os.mkfifo(log)
     disk = os.open(log, os.O_RDONLY | os.O_NONBLOCK)  # takes 64 KiB, then nothing
@@ -159,7 +159,15 @@ def test_heartbeats_do_not_wait_for_the_disk_of_the_log(tmp_path: Path) -> None:
                 peer.settimeout(10.0)
                 beats = 0
                 while beats < 5:  # of two components
-                    beats += peer.recv(4096)[7:10] == b"\0\0\0"
+                    data, us = peer.recvfrom(4096)
+                    beats += data[7:10] == b"\0\0\0"
+                mouth = dialect.MAVLink(None, 255, 190)
+                ask = dialect.MAVLink_param_request_read_message(1, 191, b"SR_BASELINE_M", -1)
+                for _ in range(5):  # each is logged before it is answered
+                    peer.sendto(bytes(ask.pack(mouth)), us)
+                    while peer.recv(4096)[7:10] != b"\x16\0\0":  # PARAM_VALUE
+                        pass
+                assert fills.is_alive()
             finally:
                 os.close(disk)  # who waits for it gets an error
 
