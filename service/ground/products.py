@@ -26,6 +26,7 @@ PRODUCTS: dict[str, tuple[str, str, float, float]] = {
     "coverage": ("Maps", "Coverage, GeoTIFF", 0.2, 2.0),
     "kmz": ("Maps", "Orthophoto, KMZ", 3.0, 2.0),
     "stac": ("Maps", "STAC item", 0.002, 1.0),
+    "report": ("Maps", "Report, HTML", 10.0, 5.0),
     "glb": ("Models", "Mesh, glTF", 30.0, 60.0),
     "obj": ("Models", "Mesh, OBJ", 70.0, 80.0),
     "3dtiles-mesh": ("Models", "Mesh, 3D Tiles", 30.0, 100.0),

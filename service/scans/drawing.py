@@ -58,12 +58,17 @@ def draw_preview(
 
 
 def draw_maps(
-    raster: Raster, track_m: F64, largest_px: int = 1400, height_of_zero_m: float = 0.0
+    raster: Raster,
+    track_m: F64,
+    largest_px: int = 1400,
+    height_of_zero_m: float = 0.0,
+    is_shaded: bool = True,
 ) -> tuple[U8, U8]:
-    """The two panels of :func:`draw_preview`, colour and height."""
+    """The two panels of :func:`draw_preview`, colour (shaded by the relief or not) and height."""
     shown = fill_holes(raster)
     shade = _relief(shown)
-    colour = _fit(_painted(shown, _colours(shown, shade)), largest_px)
+    lit = shade if is_shaded else np.ones_like(shade)
+    colour = _fit(_painted(shown, _colours(shown, lit)), largest_px)
     height = _fit(_painted(shown, _heights(shown, shade)), largest_px)
     scale = _scale(raster.grid.shape, largest_px)
     for panel in (colour, height):

@@ -290,7 +290,7 @@ class _Files:
                     self._folder / THUMBNAIL, cv2.imencode(".webp", image, WEBP)[1].tobytes()
                 )
         with self.failures.noted(REPORT):
-            shown = _stages(self._folder, self._store)
+            shown = stages_jpg(self._folder, self._store)
             cloud, coverage = self._fused.cloud, self._coverage
             page = report_html(summary, poses, cloud, self._raster, coverage, shown)
             write_whole(self._folder / REPORT, page)
@@ -341,7 +341,7 @@ def files_due(folder: Path) -> bool:
     return not isinstance(document, dict) or document.get("files_due") is True
 
 
-def _stages(folder: Path, store: ScanStore) -> bytes | None:
+def stages_jpg(folder: Path, store: ScanStore) -> bytes | None:
     """JPEG of a keyframe's stages for the report; None for a scan without keyframes."""
     seq = middle_keyframe(folder, store, main_seqs(store))
     keyframe = None if seq is None else store.keyframe(seq)

@@ -52,13 +52,15 @@ def report_html(
     raster: Raster | None,
     coverage: Coverage | None = None,
     keyframe_jpg: bytes | None = None,
+    maps: Raster | None = None,
 ) -> str:
     """The report of a scan whose scan.json holds ``summary``.
 
-    ``raster`` is its upper surface in metres about its origin; ``keyframe_jpg`` shows the stages
-    of one keyframe.
+    ``raster`` is its upper surface in metres about its origin, and ``maps`` the same of orthophoto
+    and surface model where they are made; ``keyframe_jpg`` shows the stages of one keyframe.
     """
-    cover, colour, heights = _map_pages(summary, poses, raster)
+    is_shaded = maps is None  # an orthophoto has its own light
+    cover, colour, heights = _map_pages(summary, poses, maps or raster, is_shaded)
     sections = [
         ("first", [
             f"<h1>{escape(summary['id'])}</h1>",
@@ -95,14 +97,14 @@ def report_html(
 
 
 def _map_pages(
-    summary: dict[str, Any], poses: Sequence[PoseRecord], raster: Raster | None
+    summary: dict[str, Any], poses: Sequence[PoseRecord], raster: Raster | None, is_shaded: bool
 ) -> tuple[list[str], list[str], list[str]]:
     """A small view from above, the orthophoto and the surface model, with scale and colour bars."""
     if raster is None:
         return [], [], []
     track = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
     zero_m = summary["origin"]["alt_amsl_m"] if summary["origin"] else 0.0
-    colour, heights = draw_maps(raster, track, height_of_zero_m=zero_m)
+    colour, heights = draw_maps(raster, track, 1400, zero_m, is_shaded)
     cell = f"one cell is {length(raster.grid.cell_m)}"
     half = cv2.resize(colour, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     small = np.asarray(half, np.uint8)

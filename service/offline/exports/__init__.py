@@ -64,6 +64,11 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
         "splat.ply",
         "3D Gaussians, as PLY; or .spz.",
     ),
+    "report": (
+        "report:write_report",
+        "report.html",
+        "The report again, with ortho.tif and dsm.tif.",
+    ),
     "all": ("maps:write_all", "maps", "laz and all maps, with a manifest."),
     "mcap": ("recording:write_mcap", "flight.mcap", "The scan as a recording for Foxglove."),
     "ros2": ("ros2:write_ros2", "ros2.mcap", "The scan as ROS 2 messages."),
@@ -78,7 +83,9 @@ PACKAGES = {
     "3dtiles": ("py3dtiles",),
     "mcap": ("foxglove",),
     "ros2": ("rosbags", "mcap"),
-} | dict.fromkeys(("dsm", "dtm", "ortho", "coverage", "kmz", "stac", "all"), ("rasterio",))
+} | dict.fromkeys(
+    ("dsm", "dtm", "ortho", "coverage", "kmz", "stac", "report", "all"), ("rasterio",)
+)
 """Optional packages of kinds."""
 
 ENDINGS = {

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from recon.bands import at_once
-from recon.types import F32, F64
+from recon.types import F32, F64, Array
 from service.errors import InputError
 from service.georeference import between_nodes, unwrapped
 from service.offline.exports import EXPORTERS
@@ -62,7 +62,6 @@ def write_kmz(scan: ScanView, out: Path, options: ExportOptions) -> None:
 def _in_degrees(path: Path) -> tuple[Any, tuple[float, float, float, float]]:
     """(h, w, 4) BGRA of a raster in longitude and latitude, and its bounds in degrees."""
     from pyproj import Transformer
-    from rasterio.enums import Resampling
 
     with open_map(path, 4) as image:
         west, south, east, north = _box_in_degrees(image)
@@ -70,23 +69,44 @@ def _in_degrees(path: Path) -> tuple[Any, tuple[float, float, float, float]]:
         pixel = math.hypot(east - west, north - south) / math.hypot(image.width, image.height)
         pixel = max(pixel, max(east - west, north - south) / MAX_OVERLAY_PX)
         w, h = max(1, round((east - west) / pixel)), max(1, round((north - south) / pixel))
-        shrink = max(1.0, max(image.width, image.height) / MAX_OVERLAY_PX)
-        size = round(image.height / shrink), round(image.width / shrink)
-        bands = image.read(out_shape=(4, *size), resampling=Resampling.average)
         to_map = Transformer.from_crs("EPSG:4326", image.crs, always_xy=True)
-        from_map = ~(image.transform * image.transform.scale(
-            image.width / size[1], image.height / size[0]
-        ))  # fmt: skip
+        lon = west + (east - west) * (np.arange(w) + 0.5) / w
+        lat = north - (north - south) * (np.arange(h) + 0.5) / h
+        rgba = resampled(image, 4, lon, lat, lambda at: np.array(to_map.transform(*at.T)).T)
+    return np.ascontiguousarray(rgba[..., [2, 1, 0, 3]]), (west, south, east, north)
 
-    def pixels(lon_lat: F64) -> F32:
-        cols, rows = from_map * np.array(to_map.transform(*lon_lat.T))
+
+def resampled(
+    image: Any,
+    bands: int,
+    x: F64,
+    y: F64,
+    to_map: Callable[[F64], F64],
+    unknown: float | None = None,
+) -> Array:
+    """(len(y), len(x), bands) of an open raster, reduced to MAX_OVERLAY_PX where it is larger.
+
+    ``to_map`` takes (N, 2) columns x and y to the raster's own coordinates. Outside stands 0; with
+    a value for ``unknown`` cells that, and nothing is interpolated.
+    """
+    from rasterio.enums import Resampling
+
+    shrink = max(1.0, max(image.width, image.height) / MAX_OVERLAY_PX)
+    size = round(image.height / shrink), round(image.width / shrink)
+    how = Resampling.average if unknown is None else Resampling.nearest
+    data = image.read(list(range(1, bands + 1)), out_shape=(bands, *size), resampling=how)
+    scale = image.transform.scale(image.width / size[1], image.height / size[0])
+    from_map = ~(image.transform * scale)
+
+    def pixels(at: F64) -> F32:
+        cols, rows = from_map * to_map(at).T
         return np.column_stack([cols - 0.5, rows - 0.5]).astype(np.float32)
 
-    lon = west + (east - west) * (np.arange(w) + 0.5) / w
-    lat = north - (north - south) * (np.arange(h) + 0.5) / h
-    x, y = between_nodes(lon, lat, pixels)
-    bgra = np.ascontiguousarray(bands[[2, 1, 0, 3]].transpose(1, 2, 0))
-    return cv2.remap(bgra, x, y, cv2.INTER_LINEAR), (west, south, east, north)
+    u, v = between_nodes(x, y, pixels)
+    flat = np.ascontiguousarray(data.transpose(1, 2, 0))
+    between = cv2.INTER_LINEAR if unknown is None else cv2.INTER_NEAREST
+    found = cv2.remap(flat, u, v, between, borderValue=[unknown or 0.0] * 4)
+    return np.asarray(found).reshape(len(y), len(x), bands)
 
 
 def _box_in_degrees(image: Any) -> tuple[float, float, float, float]:
@@ -173,7 +193,7 @@ MAPS = ("laz", "dsm", "dtm", "ortho", "contours", "gpkg", "dxf", "coverage", "ge
         "kmz", "stac")  # fmt: skip
 FROM_IMAGES = ("ortho", "kmz")
 """Made at the same time as the others, in this order: kmz uses the orthophoto."""
-LAST = ("stac",)
+LAST = ("stac", "report")
 """What describes the others."""
 
 MANIFEST = "manifest.json"

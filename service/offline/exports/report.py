@@ -1,0 +1,89 @@
+"""The report of a scan, with its orthophoto and surface model as maps."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon.surface.raster import Grid, Raster
+from recon.types import F64
+from service.errors import InputError
+from service.georeference import LocalFrame
+from service.offline.exports.maps import resampled
+from service.offline.exports.rasters import NODATA_M, open_map, over
+from service.offline.exports.view import ExportOptions, ScanView
+from service.scans.coverage import coverage_of
+from service.scans.folder import SUMMARY, stages_jpg, surface
+from service.scans.report import report_html
+from service.scans.writing import write_whole
+
+LARGEST_CELLS = 1400
+"""Along a side of the report's maps."""
+
+
+def write_report(scan: ScanView, out: Path, options: ExportOptions) -> None:
+    """``report.html`` again, with ortho.tif and dsm.tif of the scan folder as its maps.
+
+    Files older than scan.json are of an earlier state of the scan, and not used. Raises
+    InputError when scan.json cannot be read.
+    """
+    folder, store = scan.folder, scan.store
+    try:
+        summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+        maps = maps_of(folder, scan.flown_frame, summary["heights"])
+        cloud, raster, coverage = scan.fused.cloud, surface(scan.fused), coverage_of(store)
+        shown = stages_jpg(folder, store)
+        page = report_html(summary, scan.poses, cloud, raster, coverage, shown, maps)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(
+            f"{folder / SUMMARY} cannot be read; make the scan's files again"
+        ) from error
+    write_whole(out, page)
+
+
+def maps_of(folder: Path, frame: LocalFrame | None, heights: str) -> Raster | None:
+    """Colours of the orthophoto and heights of the surface model in the scan's ENU metres.
+
+    None where one of them is missing, older than scan.json, or above another datum than
+    ``heights`` says.
+    """
+    ortho, dsm, made = (folder / name for name in ("ortho.tif", "dsm.tif", SUMMARY))
+    if not (ortho.is_file() and dsm.is_file()):
+        return None
+    if min(p.stat().st_mtime_ns for p in (ortho, dsm)) < made.stat().st_mtime_ns:
+        return None
+    zero_m = 0.0 if frame is None else frame.alt_amsl_m
+
+    def to_map(xy: F64) -> F64:
+        places = np.column_stack([xy, np.zeros(len(xy))])
+        return (places if frame is None else frame.to_utm(places))[:, :2]
+
+    with open_map(dsm, 2) as image, open_map(ortho, 3) as colours:
+        if image.tags().get("HEIGHTS") != heights:
+            return None
+        grid = _in_enu(image, colours, frame)
+        x, y = (np.arange(n, dtype=np.float64) + 0.5 for n in grid.shape[::-1])
+        axes = grid.west_m + x * grid.cell_m, grid.north_m - y * grid.cell_m
+        found = resampled(image, 2, *axes, to_map, NODATA_M)
+        rgb = resampled(colours, 3, *axes, to_map)
+    height, sigma = np.moveaxis(found, 2, 0)
+    known = height != NODATA_M
+    return Raster(
+        grid,
+        np.where(known, height - zero_m, np.nan).astype(np.float32),
+        np.where(known, sigma, np.nan).astype(np.float32),
+        np.where(known[..., None], rgb, 0).astype(np.uint8),
+    )
+
+
+def _in_enu(dsm: Any, ortho: Any, frame: LocalFrame | None) -> Grid:
+    """A grid over the surface model as fine as the orthophoto, or as LARGEST_CELLS allow."""
+    west, south, east, north = dsm.bounds
+    corners = np.array([[x, y, 0.0] for x in (west, east) for y in (south, north)])
+    enu = corners if frame is None else frame.from_utm(corners)
+    (west, south), (east, north) = enu[:, :2].min(axis=0), enu[:, :2].max(axis=0)
+    cell_m = max(ortho.transform.a, max(east - west, north - south) / LARGEST_CELLS)
+    return over((float(west), float(south), float(east), float(north)), float(cell_m))
