@@ -54,11 +54,15 @@ Fits = dict[str, Fit]
 def score_deliverables(scan_folder: Path, truth_folder: Path) -> dict[str, Any]:
     """Figures of each exported file, after the alignments by which the scan is judged."""
     truth = read_truth(truth_folder)
+    return score_files(scan_folder, truth, seen_surface(truth).places, fits_of(scan_folder, truth))
+
+
+def fits_of(scan_folder: Path, truth: Truth) -> Fits:
+    """The alignments to the truth by which the surface of a scan is judged."""
     scan = read_scan(scan_folder, truth.frame)
     at_truth, known = metrics.poses_at(truth.times_s, truth.poses, scan.times_s)
     fits = alignments(scan, truth, at_truth, known)["surface"]
-    chosen = fits if scan.placed else {"similarity": fits["similarity"]}
-    return score_files(scan_folder, truth, seen_surface(truth).places, chosen)
+    return fits if scan.placed else {"similarity": fits["similarity"]}
 
 
 def score_files(folder: Path, truth: Truth, seen: F64, fits: Fits) -> dict[str, Any]:

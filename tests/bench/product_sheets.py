@@ -19,11 +19,11 @@ from typing import Annotated
 import cv2
 import numpy as np
 import typer
-from deliverable_scoring import view_from_above
+from deliverable_scoring import fits_of, view_from_above
 
 from recon import se3
 from recon.camera_model import project
-from recon.surface.metrics import Fit, poses_at
+from recon.surface.metrics import Fit
 from recon.surface.raster import Grid, highest_lowest, hillshade
 from recon.surface.texture_views import TextureView
 from recon.types import F32, F64, U8, Array, Camera
@@ -38,7 +38,6 @@ from service.offline.exports.splats import read_splats
 from service.offline.exports.view import ExportOptions, ScanView
 from service.offline.view_scoring import by_gaussians, by_rays, read_glb, score_views
 from service.scans.folder import Failures
-from service.sim.scoring import alignments, read_scan
 from service.sim.truth import Truth, heights_below, read_truth
 
 KINDS = ("ortho", "dsm", "contours", "glb", "splat")
@@ -93,16 +92,6 @@ def _warped(image: U8, px: F64, grid: Grid) -> U8:
     u, v = (at.reshape(grid.shape).astype(np.float32) for at in px.T)
     whole = np.ascontiguousarray(image)
     return np.asarray(cv2.remap(whole, u, v, cv2.INTER_CUBIC), np.uint8)
-
-
-def truth_of(folder: Path, flight: Path) -> tuple[Truth, Fit] | None:
-    """The truth of a simulated flight, and the rigid motion by which a scan is judged."""
-    if not (flight / "truth").is_dir():
-        return None
-    truth = read_truth(flight / "truth")
-    scan = read_scan(folder, truth.frame)
-    at_truth, known = poses_at(truth.times_s, truth.poses, scan.times_s)
-    return truth, alignments(scan, truth, at_truth, known)["surface"]["rigid"]
 
 
 def _read(path: Path, grid: Grid, bands: int) -> Array:
@@ -237,14 +226,15 @@ def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) ->
     height = _read(folder / "dsm.tif", own, 1)[..., 0]
     height[height == NODATA_M] = np.nan
     low_high_m = np.nanpercentile(height, [1.0, 99.0]).astype(np.float64)
-    truth = truth_of(folder, flight)
+    truth = read_truth(flight / "truth") if (flight / "truth").is_dir() else None
+    fit = None if truth is None else next(iter(fits_of(folder, truth).values()))
     folders = ({"before": before} if before else {}) | {"now": folder}
 
     def rows(grid: Grid) -> dict[str, Images]:
         """The images of each product by when it was made."""
         seen = {when: from_above(one, grid, low_high_m) for when, one in folders.items()}
-        if truth is not None:
-            seen["truth"] = truth_from_above(*truth, grid, low_high_m)
+        if truth is not None and fit is not None:
+            seen["truth"] = truth_from_above(truth, fit, grid, low_high_m)
         return {
             kind: {f"{kind}, {when}": one[kind] for when, one in seen.items() if kind in one}
             for kind in seen["now"]
