@@ -316,7 +316,7 @@ def open_process(name: str, command: Sequence[str], **streams: Any) -> subproces
 
 
 @atexit.register
-def _end_processes() -> None:
+def end_processes() -> None:
     """Leave none behind: it would keep its port."""
     for _, process in _PROCESSES:
         process.terminate()  # one that has ended is left alone

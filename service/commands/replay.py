@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -28,6 +28,7 @@ from service.commands import (
 )
 from service.errors import InputError
 from service.progress import CancelledError, Progress
+from service.workers import PROCESS, Worker, end_processes
 
 if TYPE_CHECKING:
     from mavlink.telemetry.history import HistoryConfig
@@ -38,8 +39,9 @@ if TYPE_CHECKING:
     from service.flight.scan import Scan, ScanInputs
 
 
-PATIENCE_S = 3.0
-"""After a stop: for the keyframe that is in work, and then for the files of the scan."""
+PATIENCE_S, DEVICE_S = 3.0, 4.0
+"""After a stop: for the keyframe that is in work, and then for the files of the scan; and at last
+for a device that still computes."""
 
 LATENCY = "camera.latency_ms"
 WIDTH, STEREO_WIDTH_PX = "compute.stereo_width", 640
@@ -83,7 +85,6 @@ def replay(
     from service.config import is_given, load_config
     from service.flight.scan import check_new
     from service.scans.writing import check_writable
-    from service.workers import PROCESS
 
     overrides = list(set_ or [])
     if backend is not None:
@@ -104,11 +105,22 @@ def replay(
             chosen, as_json, is_given(LATENCY, config, overrides),
         )  # fmt: skip
     report(summary, as_json)
-    is_torch = summary.get("backend") == "torch"
-    if is_torch and any(w.row.name == "dense" and not w.is_done for w in PROCESS.table()):
-        # Dropped at a stop: torch aborts a process that ends while it computes.
+    if summary.get("backend") == "torch":
+        await_dense(PROCESS.table())
+
+
+def await_dense(
+    workers: Iterable[Worker],
+    patience_s: float = DEVICE_S,
+    leave: Callable[[int], object] = os._exit,
+) -> None:
+    """Wait for a keyframe that was dropped at a stop: torch aborts a process that ends while it
+    computes. One that hangs is left, with the process."""
+    dense = [worker for worker in workers if worker.row.name == "dense"]
+    if not all(worker.join(patience_s) for worker in dense):
         sys.stdout.flush()
-        os._exit(0)
+        end_processes()  # which the end of the interpreter would do
+        leave(0)
 
 
 def denser(config: Config, source: CameraSource) -> Config:

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,11 @@ from loopback import until
 from paths import ROOT
 
 from recon.types import Shutter
-from service.commands.replay import own_telemetry
+from service.commands.replay import await_dense, own_telemetry
 from service.config import load_config
 from service.flight.scan import Scan
 from service.stream.store import ScanStore
+from service.workers import Workers
 
 EPOCH = 1777629600  # of the simulated video; a transport stream does not carry it
 
@@ -332,3 +334,18 @@ def test_memory_is_pooled_before_anything_large_is_loaded() -> None:
     root = ROOT
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=root)
     assert run.stdout == "False\n" and "no such file" in run.stderr
+
+
+def test_a_keyframe_that_a_device_still_computes_is_waited_for() -> None:
+    """The process was ended at once, its own at-exit work undone."""
+    workers, release, left = Workers(), threading.Event(), list[int]()
+
+    def compute(_: object) -> None:
+        release.wait(60.0)
+
+    workers.start("dense", compute)
+    await_dense(workers.table(), 0.0, left.append)
+    assert left == [0]
+    release.set()
+    await_dense(workers.table(), 60.0, left.append)
+    assert left == [0] and all(worker.is_done for worker in workers.table())
