@@ -56,6 +56,7 @@ class HistoryConfig:
 
 
 SIGMA_TILT_RAD, SIGMA_YAW_RAD, SIGMA_GIMBAL_RAD = 0.01, 0.05, 0.01
+SIGMA_CAMERA_RAD = 0.03  # of a camera that finds gravity by its own accelerometer
 TURN_RAD_S2, ACCELERATION_M_S2 = 1.5, 1.0
 """Accelerations assumed between two samples: of the angles, and of positions with velocity."""
 
@@ -307,8 +308,11 @@ class VehicleHistory:
             if at is None or q is None:
                 continue
             bend = TURN_RAD_S2 * at.curvature_s2
-            sigma = math.hypot(SIGMA_GIMBAL_RAD, bend)
+            known = at.before.is_yaw_known
+            sigma = math.hypot(SIGMA_GIMBAL_RAD if known else SIGMA_CAMERA_RAD, bend)
             state.set("gimbal", at.age_ms, q_ned_gimbal_wxyz=np.array(q), sigma_gimbal_rad=sigma)
+            if not known:
+                state.set("gimbal", at.age_ms, sigma_yaw_rad=math.pi)
             return
 
     def _gimbal_at(

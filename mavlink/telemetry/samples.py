@@ -86,6 +86,7 @@ class GimbalSample(Sample):
     frame: GimbalFrame
     component: int
     rank: int  # 0 GIMBAL_DEVICE_ATTITUDE_STATUS, 1 MOUNT_ORIENTATION, 2 MOUNT_STATUS
+    is_yaw_known: bool = True  # False: by a camera's own sensors, from an unknown direction
 
 
 OF_AUTOPILOT = (AttitudeSample, PositionSample, AccuracySample)

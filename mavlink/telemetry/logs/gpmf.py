@@ -1,26 +1,39 @@
-"""GoPro's metadata track (GPMF, https://github.com/gopro/gpmf-parser): positions, accuracies.
+"""GoPro's metadata track (GPMF, https://github.com/gopro/gpmf-parser): positions, attitude.
 
 Items are nested: four letters, a type, the size of a structure, their number, and the data, padded
 to four bytes. Read are GPS5 (HERO5 to 10) with GPSF and GPSP, GPS9 (HERO11 and later), and what
 the drone Karma adds: GLPI (the autopilot's position) and GPRI (its receiver). The body's attitude
-is not that of the camera, which a gimbal holds, and is not read. Times are the video's own;
-samples spread over the time of their packet, those of a drone by its own clock.
+is not that of the camera, which a gimbal holds, and is not read. The image's attitude is that of
+CORI (from the start of the recording to the camera), IORI (from the camera to the image, which the
+camera's stabilisation turns) and GRAV (gravity in the camera), of HERO8 and later; its heading
+counts from an unknown direction. Their axes are x right, y down, z ahead. Times are the video's
+own; samples spread over the time of their packet, those of a drone by its own clock.
 """
 
 from __future__ import annotations
 
 import math
 import struct
+from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from pathlib import Path
 from statistics import median
 
 from mavlink.telemetry.decode import HDOP_TO_M, plausible_place, receiver_accuracy
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog, finish
-from mavlink.telemetry.samples import PositionSample, Sample
+from mavlink.telemetry.quaternion import (
+    Quaternion,
+    Vector,
+    conjugate,
+    from_rpy,
+    multiply,
+    normalised,
+)
+from mavlink.telemetry.samples import GimbalFrame, GimbalSample, PositionSample, Sample
 
 Packet = tuple[int, int, bytes]
 """Time and duration in ns, and the bytes."""
@@ -32,13 +45,19 @@ MAX_DEPTH, MAX_ITEMS, MAX_SAMPLES = 4, 4096, 256
 CODES = {ord(letter): code for letter, code in zip("bBsSlLjJfd", "bBhHiIqQfd", strict=True)}
 """GPMF's types as those of the struct module."""
 
-TYPES = {b"GPS5": b"lllll", b"GPS9": b"lllllllSS"}
+TYPES = {
+    b"GPS5": b"lllll", b"GPS9": b"lllllllSS", b"CORI": b"ssss", b"IORI": b"ssss", b"GRAV": b"sss",
+}  # fmt: skip
 """Of structures, where the item itself does not declare them."""
 
 PLACES = (b"GLPI", b"GPS9", b"GPS5")
 """Best first; the first that has one gives them all."""
 
 UNKNOWN_DOP = 99.0
+DRIFT_NS = 2_000_000_000
+"""Gravity is averaged so long before and after: what else accelerates the camera averages out."""
+
+CAMERA = 100  # component id for the image's attitude
 
 
 @dataclass(slots=True)
@@ -64,9 +83,15 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
     """The history in the packets of a metadata track; ValueError where they give none."""
     history, counts = VehicleHistory(config), Counter[str]()
     tracks: dict[bytes, _Track] = {}
+    turned: dict[bytes, dict[int, tuple[float, ...]]] = {b"CORI": {}, b"IORI": {}, b"GRAV": {}}
     for time_ns, duration_ns, data in packets:
         counts["packets"] += 1
         for key, rows, stream in _streams(data):
+            if key in turned:
+                times = (time_ns + i * duration_ns // len(rows) for i in range(len(rows)))
+                turned[key] |= zip(times, rows, strict=True)
+                counts[key.decode("ascii")] += len(rows)
+                continue
             track = tracks.setdefault(key, _Track())
             for i, row in enumerate(rows):
                 own_s, samples = READERS[key](row, stream)
@@ -82,7 +107,60 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
         for time_ns, samples in zip(_times(track), track.samples, strict=True):
             for sample in samples:
                 history.add(sample, time_ns)
+    for time_ns, head in _heads(turned):
+        history.add(GimbalSample(None, head, GimbalFrame.EARTH, CAMERA, 0, False), time_ns)
     return replace(finish(path, history, counts, []), clock="video")
+
+
+def _heads(
+    turned: Mapping[bytes, Mapping[int, tuple[float, ...]]],
+) -> Iterator[tuple[int, Quaternion]]:
+    """Time and ``q_earth_image`` of each sample; north is some direction, the same for all.
+
+    The mean direction of gravity in the axes of the start gives down; that of the seconds around a
+    sample corrects what CORI, the sum of the gyroscope's rates, has drifted.
+    """
+    starts: list[tuple[int, Quaternion, Vector]] = []
+    for time_ns, row in sorted(turned[b"CORI"].items()):
+        camera = _ahead_first(row)
+        image = _ahead_first(turned[b"IORI"].get(time_ns, (1.0, 0.0, 0.0, 0.0)))
+        pull = turned[b"GRAV"].get(time_ns)
+        if camera is None or image is None or pull is None or not 0.9 < math.hypot(*pull) < 1.1:
+            continue
+        x, y, z = pull
+        down = _turned(conjugate(camera), (z, x, y))
+        starts.append((time_ns, multiply(conjugate(camera), conjugate(image)), down))
+    if not starts:
+        return
+    times = [time_ns for time_ns, _, _ in starts]
+    sums = [list(accumulate((d[k] for _, _, d in starts), initial=0.0)) for k in range(3)]
+
+    def mean(first: int, last: int) -> Vector:
+        x, y, z = (one[last] - one[first] for one in sums)
+        return x, y, z
+
+    level = _levelled(mean(0, len(starts)))
+    for time_ns, q_start_image, _ in starts:
+        around = bisect_left(times, time_ns - DRIFT_NS), bisect_right(times, time_ns + DRIFT_NS)
+        drift = _levelled(_turned(level, mean(*around)))
+        yield time_ns, multiply(drift, multiply(level, q_start_image))
+
+
+def _ahead_first(row: tuple[float, ...]) -> Quaternion | None:
+    """A quaternion in the axes ahead, right, down; None where it is not one of unit length."""
+    w, x, y, z = row
+    return normalised((w, z, x, y))
+
+
+def _levelled(down: Vector) -> Quaternion:
+    """The rotation that takes a direction to (0, 0, 1), about horizontal axes."""
+    x, y, z = down
+    return from_rpy(math.atan2(y, z), math.atan2(-x, math.hypot(y, z)), 0.0)
+
+
+def _turned(q: Quaternion, v: Vector) -> Vector:
+    _, x, y, z = multiply(multiply(q, (0.0, *v)), conjugate(q))
+    return x, y, z
 
 
 def _is_placed(samples: list[Sample]) -> bool:
@@ -115,7 +193,7 @@ def _streams(data: bytes) -> Iterator[tuple[bytes, list[tuple[float, ...]], _Str
                 stream.fix, stream.dop = (
                     (value, stream.dop) if key == b"GPSF" else (stream.fix, value / 100.0)
                 )
-        elif key in READERS:
+        elif key in READERS or key in TYPES:
             kinds = stream.kinds or TYPES.get(key, b"")
             rows = _rows(kinds, size, content)
             scales = stream.scale * (len(kinds) if len(stream.scale) == 1 else 1)
