@@ -44,6 +44,11 @@ COLOURS = """(async () => {
   return { known, red, left, right };
 })()"""
 """Pixels of the map with content, and those of the red roof."""
+PAINTED = (
+    "[...document.querySelectorAll('.layer canvas[data-state=shown]')].some(c =>"
+    " c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some(v => v))"
+)
+"""Whether a tile of heights has colours."""
 
 
 @pytest.fixture
@@ -176,7 +181,9 @@ def test_heights_track_and_labels_are_on_the_map_and_it_measures(
     page.wait("document.querySelectorAll('.heights text').length > 0")
     labels = page.run("[...document.querySelectorAll('.heights text')].map(t => t.textContent)")
     assert {float(label.split()[0]) for label in labels} <= {ground_m + k for k in range(7)}
+    assert not page.run(PAINTED)  # for the cursor and the labels heights are enough
     layer(page, "Height")
+    page.wait(PAINTED)
     low, high = page.run("[...document.querySelectorAll('.ramp span')].map(s => s.textContent)")
     assert [float(v.split()[0]) for v in (low, high)] == pytest.approx(
         [ground_m, ground_m + 6.0], abs=0.2

@@ -30,9 +30,9 @@ const FRAGMENT = /* glsl */ `
         + max(0.0, here - far(place - vec2(pixel.x, 0.0)))
         + max(0.0, here - far(place + vec2(0.0, pixel.y)))
         + max(0.0, here - far(place - vec2(0.0, pixel.y)));
-      seen *= gain * max(0.35, exp(-strength * sum));
+      seen *= max(0.35, exp(-strength * sum));
     }
-    gl_FragColor = vec4(seen, 1.0);
+    gl_FragColor = vec4(gain * seen, 1.0);
     #include <tonemapping_fragment>
     #include <colorspace_fragment>
   }
@@ -82,7 +82,9 @@ export class Dome {
     if (size.x !== this.target.width || size.y !== this.target.height) this.target.setSize(size.x, size.y);
     renderer.setRenderTarget(this.target);
     renderer.autoClear = clear;
+    scene.backgroundIntensity = 1 / this.gain; // what leaves no depth, as soft splats, is told from the sky by nothing else
     renderer.render(scene, camera);
+    scene.backgroundIntensity = 1;
     renderer.setRenderTarget(null);
     renderer.autoClear = true;
     if (!show) return;

@@ -98,7 +98,7 @@ const FRAGMENT = /* glsl */ `
 `;
 
 /** What is drawn of the keyframes. */
-export type Layer = "surface" | "points";
+export type Layer = "surface" | "points" | "ground" | "none";
 
 interface Held {
   object: THREE.Points<THREE.BufferGeometry, THREE.ShaderMaterial>;
@@ -228,9 +228,10 @@ export class Cloud implements Gradual {
     return this.shared.behind.value;
   }
 
-  /** Shows the keyframes as surfaces or as points. */
+  /** Shows the keyframes as surfaces or as points, the filled ground alone, or nothing. */
   set layer(kind: Layer) {
     this.kind = kind;
+    this.group.visible = kind === "surface" || kind === "points";
     for (const [seq, held] of this.chunks) this.show(seq, held);
     this.showGround();
   }
@@ -245,14 +246,8 @@ export class Cloud implements Gradual {
     return this.measured;
   }
 
-  /** Shows or hides all of it. */
-  set visible(on: boolean) {
-    this.group.visible = on;
-    this.showGround();
-  }
-
   private showGround(): void {
-    this.ground.mesh.visible = this.group.visible && this.kind === "surface" && !this.measured;
+    this.ground.mesh.visible = (this.kind === "surface" || this.kind === "ground") && !this.measured;
   }
 
   /** An even sample of the points that are shown. */

@@ -49,6 +49,7 @@ export class Stage {
   private moved = 0; // by hand, until then
   private ticking = false;
   private closed = false; // what is still loading may come later
+  private unload: () => void = () => undefined;
   private framed = false; // the view is still that of frame()
   private readonly keys = new Set<string>();
   private last = performance.now();
@@ -116,6 +117,7 @@ export class Stage {
     for (const name of INPUTS) removeEventListener(name, this.input);
     this.tick(false);
     this.closed = true;
+    this.unload();
     this.watcher.disconnect();
     this.controls.dispose();
     this.painter.dome.close();
@@ -206,6 +208,13 @@ export class Stage {
   fieldOfView(degrees: number): void {
     this.camera.fov = degrees;
     this.camera.updateProjectionMatrix();
+  }
+
+  /** Removes the product shown before; `remove` is called when another takes its place, or at the end. */
+  shows(remove: () => void): void {
+    this.unload();
+    this.unload = remove;
+    if (this.closed) remove();
   }
 
   /** Shows a mesh made by skyrelief: glTF with y up, turned back to z up. Returns what removes it. */

@@ -40,7 +40,9 @@ export class Terrain extends Layer {
   }
 
   override set seen(on: boolean) {
+    const shows = on && !this.seen;
     this.element.classList.toggle("unseen", !on);
+    if (shows) this.paintAll();
   }
 
   /** Height above mean sea level at a place; null where unknown. */
@@ -116,12 +118,16 @@ export class Terrain extends Layer {
     const moved = !this.range || Math.abs(low - this.range[0]) + Math.abs(high - this.range[1]) > 0.02 * (high - low);
     if (!moved) return;
     this.range = [low, high];
-    for (const tile of this.known.values()) if (tile.heights) this.paint(tile);
+    this.paintAll();
     this.ranged();
   }
 
+  private paintAll(): void {
+    for (const tile of this.known.values()) this.paint(tile);
+  }
+
   private paint({ canvas, heights, z }: Tile): void {
-    if (!this.range || !heights) return;
+    if (!this.range || !heights || !this.seen) return;
     const context = canvas.getContext("2d")!;
     const image = context.createImageData(SIDE, SIDE);
     const [low, high] = this.range;

@@ -9,7 +9,7 @@ import { coverageKeys, key } from "./keys";
 import { filmBox } from "./film";
 import type { Ruler } from "./measure";
 import type { Notes } from "./notes";
-import { COLOURS, type Cloud, type Colour } from "./points";
+import { COLOURS, type Cloud, type Colour, type Layer } from "./points";
 import type { Stage } from "./stage";
 import * as units from "./units";
 
@@ -151,6 +151,8 @@ interface Product {
   name: string;
   kind: string;
   title: string;
+  /** What of the keyframes lies below it. */
+  below: "ground" | "none";
   has: (scan: api.Scan) => boolean;
   /** Shows it; gives what removes it. */
   open: () => Promise<() => void>;
@@ -162,6 +164,7 @@ function productsOf({ stage, id, known }: Parts): Product[] {
     name: "Mesh",
     kind: "glb",
     title: "the textured mesh",
+    below: "none",
     has: (scan) => scan.files.some((f) => f.name === "mesh.glb"),
     open: async () => {
       const remove = await stage.load(api.file(id, "mesh.glb"));
@@ -176,6 +179,7 @@ function productsOf({ stage, id, known }: Parts): Product[] {
     name: "Splats",
     kind: "splat",
     title: "3D Gaussians, as soft as the images",
+    below: "ground", // they are of what was measured alone
     has: (scan) => scan.files.some((f) => f.name === "splat.ply"),
     open: async () => {
       const { showSplats } = await import("./splats");
@@ -187,6 +191,7 @@ function productsOf({ stage, id, known }: Parts): Product[] {
     name: "Tiles",
     kind: "3dtiles",
     title: "3D Tiles: detail where one looks",
+    below: "none",
     has: (scan) => scan.tiles,
     open: async () => {
       const { showTiles } = await import("./tiles");
@@ -199,22 +204,18 @@ function productsOf({ stage, id, known }: Parts): Product[] {
 /** Surface, points or a product: one at a time; colours and time are of the keyframes. */
 function showGroup(parts: Parts, colour: HTMLSelectElement): HTMLElement[] {
   const { stage, cloud, known } = parts;
-  let close: () => void = () => undefined;
   const surface = el("button", { textContent: "Surface", className: "on", title: "the depth images as they are" });
   const points = el("button", { textContent: "Points" });
   const own = [surface, points];
   const buttons = [...own];
-  const show = async (chosen: HTMLButtonElement, open: () => Promise<() => void>): Promise<void> => {
+  const show = async (chosen: HTMLButtonElement, layer: Layer, open: () => Promise<() => void>): Promise<void> => {
     buttons.forEach((b) => (b.disabled = true));
     try {
-      const next = await open();
-      close();
-      close = next;
+      stage.shows(await open());
       const isOwn = own.includes(chosen);
-      cloud.visible = isOwn;
-      if (isOwn) cloud.layer = chosen === points ? "points" : "surface";
+      cloud.layer = layer;
       colour.disabled = !isOwn;
-      measured.disabled = chosen !== surface;
+      measured.disabled = layer === "points" || layer === "none";
       for (const part of [parts.legend, parts.time]) part.classList.toggle("off", !isOwn);
       stage.touch();
       buttons.forEach((b) => pressed(b, b === chosen));
@@ -228,16 +229,17 @@ function showGroup(parts: Parts, colour: HTMLSelectElement): HTMLElement[] {
     cloud.measuredOnly = !cloud.measuredOnly;
     pressed(measured, cloud.measuredOnly);
   };
-  for (const one of own) one.onclick = () => void show(one, async () => () => undefined);
+  surface.onclick = () => void show(surface, "surface", async () => () => undefined);
+  points.onclick = () => void show(points, "points", async () => () => undefined);
   for (const product of productsOf(parts)) {
-    const { name, title, has, open } = product;
+    const { name, title, below, has, open } = product;
     const button = el("button", { textContent: has(known()) ? name : `Make ${name.toLowerCase()}`, title });
     button.onclick = async () => {
       button.disabled = true;
       try {
         await made(product, parts);
         button.textContent = name;
-        await show(button, open);
+        await show(button, below, open);
       } catch (error) {
         notify(error);
       }
