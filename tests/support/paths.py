@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -10,3 +12,16 @@ DEMO = ROOT / "demo" / "caliterra"
 SHARED = ROOT.parent / "shared" / "data"  # optional: tests that need it skip by name
 FULL_DISK = Path("/sys/kernel")
 """A folder of a file system without any room."""
+
+
+def demo_stretch() -> Path:
+    """A folder with 16 of the demo's stills in a row, IMG_9364 to IMG_9379."""
+    return Path(_stretch().name)
+
+
+@cache
+def _stretch() -> tempfile.TemporaryDirectory[str]:
+    folder = tempfile.TemporaryDirectory()
+    for still in (DEMO / "frames").glob("IMG_93[67]?.jpg"):
+        (Path(folder.name) / still.name).symlink_to(still)
+    return folder

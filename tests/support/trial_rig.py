@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from loopback import free_port
-from paths import DEMO
+from paths import DEMO, demo_stretch
 
 from recon.camera_model import scaled
 from service.cameras.camera_file import load_camera, save_camera
@@ -110,7 +110,7 @@ class Service:
         folder: Path,
         start: str = "on-boot",
         environment: dict[str, str] | None = None,
-        camera: str = f"images:{DEMO / 'frames'}?interval_s=1.0",
+        camera: str = f"images:{demo_stretch()}?interval_s=1.0",
         model: Path = DEMO / "camera.yaml",
         largest_file_bytes: int | None = None,
         scans: Path | None = None,
@@ -244,7 +244,7 @@ def small_model(folder: Path, width: int = 320) -> Path:
 
 def stream_to(port: int, size: str = "320:240", source: str = "") -> subprocess.Popen[bytes]:
     """FFmpeg sending the demo's images, or a video, in a loop by UDP."""
-    given = source or f"-framerate 2 -pattern_type glob -i {DEMO}/frames/*.jpg"
+    given = source or f"-framerate 2 -pattern_type glob -i {demo_stretch()}/*.jpg"
     command = (
         f"ffmpeg -v error -re -stream_loop -1 {given} -vf scale={size} -c:v libx264 "
         f"-preset ultrafast -tune zerolatency -g 2 -f mpegts udp://127.0.0.1:{port}?pkt_size=1316"

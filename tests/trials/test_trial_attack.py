@@ -30,7 +30,7 @@ from hostile_records import (
 from hostile_stores import hostile_stores, numbered
 from house_flight import HouseFlight
 from loopback import free_port
-from paths import DEMO
+from paths import demo_stretch
 from trial_cage import Cage
 from trial_ground import Fleet, Ground, HonestDrone, Watch
 from trial_rig import WHOLE, Row, Service, stored
@@ -373,7 +373,7 @@ def test_hostile_media_is_refused_or_read(
     assert not faults, "\n".join(faults)
 
 
-FRAMES = DEMO / "frames"
+FRAMES = demo_stretch()
 REPLAYED: dict[str, Any] = {
     "video .mp4": lambda path: (path,),
     "images .jpg": lambda path: (path,),

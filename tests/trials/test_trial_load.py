@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from onboard import Onboard
-from paths import DEMO
+from paths import DEMO, demo_stretch
 from trial_autopilot import aircraft
 from trial_rig import (
     BACK_S,
@@ -36,7 +36,7 @@ from service.daemon.machine import read_machine
 
 pytestmark = [pytest.mark.trial, pytest.mark.timeout(1800 if WHOLE else 280)]
 
-STREAMED = "640:480", f"-framerate 8 -pattern_type glob -i {DEMO}/frames/*.jpg"
+STREAMED = "640:480", f"-framerate 8 -pattern_type glob -i {demo_stretch()}/*.jpg"
 MAX_HOGS = 64
 """Per core, before it is said that nothing makes the service late."""
 
@@ -204,7 +204,7 @@ class OutOfMemory(CpuBackend):
 
 def test_gpu_out_of_memory(tmp_path: Path, record: Row) -> None:
     given = [f"camera.model={DEMO / 'camera.yaml'}"]
-    given += [f"camera.source=images:{DEMO / 'frames'}?interval_s=0.7", "compute.guide_width=320"]
+    given += [f"camera.source=images:{demo_stretch()}?interval_s=0.7", "compute.guide_width=320"]
     daemon = Onboard(tmp_path, *given, "compute.backend=cpu")
     daemon.scanning.load()
     gpu = OutOfMemory()

@@ -610,7 +610,7 @@ def test_natural_order() -> None:
 def test_demo_flight_is_tagged() -> None:
     source = open_camera(str(FRAMES))
     frames = list(source)
-    assert len(frames) == 16
+    assert len(frames) == 41
     assert source.size_px == (1600, 1200)
     assert source.epoch_unix_ns == 1_413_742_872_000_000_000  # 13:21:12 local, UTC-5
     assert all(f.geotag is not None for f in frames)
