@@ -155,7 +155,6 @@ def test_the_tiles_are_loaded_where_the_cloud_was(
     assert np.abs(off[:2]).max() < 15.0 and abs(off[2]) < 5.0  # about the scan's own origin
 
 
-MEASURED_ONLY = "[...document.querySelectorAll('button')].find(b => b.title.includes('filled in'))"
 SPLAT = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
 
 
@@ -212,7 +211,8 @@ def look_at_splats(browser: Browser, address: str) -> None:
     browser.click("Splats")
     browser.wait("document.body.dataset.splats === 'shown'", 60)
     until(lambda: shows_red(browser, red), 60.0)
-    browser.wait(f"!{MEASURED_ONLY}.disabled")  # the filled ground lies below
+    browser.click("Measured only")  # without the filled ground below
+    until(lambda: shows_red(browser, red), 60.0)
     browser.click("Surface")
     browser.wait("!document.body.dataset.splats")
     browser.click("Splats")
