@@ -82,7 +82,7 @@ export class Dome {
     if (size.x !== this.target.width || size.y !== this.target.height) this.target.setSize(size.x, size.y);
     renderer.setRenderTarget(this.target);
     renderer.autoClear = clear;
-    scene.backgroundIntensity = 1 / this.gain; // what leaves no depth, as soft splats, is told from the sky by nothing else
+    scene.backgroundIntensity = 1 / this.gain; // soft splats leave no depth that sets them apart from the sky
     renderer.render(scene, camera);
     scene.backgroundIntensity = 1;
     renderer.setRenderTarget(null);
