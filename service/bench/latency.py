@@ -3,7 +3,8 @@
 The whole system over a simulated flight: ``skyrelief run`` and ``skyrelief ground`` in processes
 of their own, the link emulator between them. An image is exposed when the scan dates it, with the
 camera's latency as the scan measures it. Poses are looked for every :data:`LOOK_S`; keyframes have
-the times at which each end stored them.
+the times at which each end stored them. The camera's shutter is stated: otherwise the views of a
+scan's first seconds wait until the images show it.
 """
 
 from __future__ import annotations
@@ -99,7 +100,8 @@ def _fly(trial: Trial, folder: Path, open_now: ExitStack) -> Outcome:
     emulator.start()
     open_now.callback(emulator.close)
     settings = [
-        f"camera.source={trial.source}", "camera.latency=auto", f"scan.folder={onboard}",
+        f"camera.source={trial.source}", "camera.latency=auto", "camera.readout_ms=0",
+        f"scan.folder={onboard}",
         f"health.http=127.0.0.1:{at_status}", f'datalink.connect=["tcp/127.0.0.1:{at_link}"]',
         f"datalink.budget_kbit_s={trial.link.rate_kbit_s}", "datalink.drain_s=0", *trial.settings,
     ]  # fmt: skip

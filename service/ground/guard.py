@@ -46,7 +46,11 @@ SESSION_S = 12 * 3600.0
 
 
 class Tokens:
-    """Tokens by the name of who holds them. A browser's session is signed with its token."""
+    """Tokens by the name of who holds them. A browser's session is signed with its token.
+
+    Not Starlette's sessions: one secret signs them for all holders, so that neither a changed token
+    nor a logout ends them.
+    """
 
     def __init__(self, by_name: Mapping[str, str], clock: Callable[[], float] = time.time) -> None:
         self._by_name = {name: token.encode() for name, token in by_name.items()}
@@ -256,7 +260,10 @@ class _StalledError(Exception):
 
 
 class RequestLimits:
-    """The outermost ASGI layer: bounds every request and marks it as served at the listener."""
+    """The outermost ASGI layer: bounds every request and marks it as served at the listener.
+
+    Starlette's own limit counts bytes only; a body or a reader that is slow without end is ours.
+    """
 
     def __init__(self, app: ASGIApp, listener: BoundedListener) -> None:
         self._app, self._listener = app, listener

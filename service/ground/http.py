@@ -175,7 +175,10 @@ def portal_app(state: PortalState, tokens: Tokens, local: bool) -> ASGIApp:
 
 
 def _description(routes: list[Any]) -> dict[str, Any]:
-    """The routes as an OpenAPI document, from docstrings and bodies."""
+    """The routes as an OpenAPI document, from docstrings and bodies.
+
+    Starlette's generator wants the same once more, as YAML in docstrings.
+    """
     _, schemas = msgspec.json.schema_components(
         BODIES.values(), ref_template="#/components/schemas/{name}"
     )
