@@ -111,7 +111,7 @@ def test_utm_agrees_with_a_direct_projection() -> None:
 
 @pytest.mark.parametrize("lat", [-79.5, 30.0, 66.0])
 def test_zone_is_that_of_the_epsg_registry(lat: float) -> None:
-    for lon in range(-179, 180, 22):
+    for lon in range(-179, 180, 60):  # each look at the registry takes a tenth of a second
         area = AreaOfInterest(lon, lat, lon, lat)
         codes = {int(c.code) for c in query_utm_crs_info("WGS 84", area)}
         assert utm_epsg(lat, lon) in codes

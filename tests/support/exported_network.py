@@ -1,43 +1,42 @@
-"""A small network with weights, exported by torch as a learned stereo model would be."""
+"""A small network with weights, as an exporter writes a learned stereo model."""
 
 from __future__ import annotations
 
-import io
-import warnings
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+onnx: Any = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
-
-
-class Network(torch.nn.Module):  # type: ignore[misc, name-defined]
-    """``value`` everywhere, whatever the images are."""
-
-    def __init__(self, value: float) -> None:
-        super().__init__()
-        self.mix = torch.nn.Conv2d(6, 1, 1)
-        with torch.no_grad():
-            self.mix.weight.fill_(1.0)
-            self.mix.bias.fill_(100.0)
-        self.value = value
-
-    def forward(self, left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:  # type: ignore[name-defined]
-        """(1, 1, h, w) of images (1, 3, h, w)."""
-        return self.value * torch.sigmoid(self.mix(torch.cat([left, right], 1)))
 
 
 def write_network(
     path: Path, value: float, names: tuple[str, str, str] = ("left", "right", "disparity"),
     size: tuple[int, int] = (96, 192),
 ) -> None:  # fmt: skip
-    """Export it with these names of inputs and output."""
-    image, file = torch.zeros((1, 3, *size)), io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            Network(value), (image, image), file, input_names=names[:2], output_names=names[2:],
-            dynamo=False,
-        )  # fmt: skip
-    path.write_bytes(file.getvalue())
+    """A network that gives ``value`` everywhere, with these names of its inputs and its output."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    def image(name: str, channels: int) -> Any:
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, channels, *size])
+
+    left, right, disparity = names
+    nodes = [
+        helper.make_node("Concat", [left, right], ["both"], axis=1),
+        helper.make_node("Conv", ["both", "weight", "bias"], ["mixed"]),
+        helper.make_node("Sigmoid", ["mixed"], ["share"]),
+        helper.make_node("Mul", ["share", "value"], [disparity]),
+    ]
+    weights = {
+        "weight": np.ones((1, 6, 1, 1), np.float32),
+        "bias": np.full(1, 100.0, np.float32),  # the sigmoid is 1
+        "value": np.full(1, value, np.float32),
+    }
+    graph = helper.make_graph(
+        nodes, "network", [image(left, 3), image(right, 3)], [image(disparity, 1)],
+        [numpy_helper.from_array(array, name) for name, array in weights.items()],
+    )  # fmt: skip
+    opset = [helper.make_opsetid("", 17)]
+    onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=8), path)

@@ -40,6 +40,7 @@ def declared(folder: Path, text: str = GOOD) -> Path:
     return declaration
 
 
+@pytest.mark.slow
 def test_torch_without_a_device_runs_and_says_how_slow_it_is(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -191,6 +192,7 @@ def test_a_learned_model_that_does_not_fit_is_refused(
         (AttributeError("at 3:1:\n    area\n'int' object has no attribute 'to'"), "no attribute"),
     ],
 )
+@pytest.mark.slow  # the import of torch takes seconds
 def test_kernels_that_do_not_compile_stop_the_start(
     failure: Exception, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,7 +27,10 @@ ACCEPT_ALL = BeliefPropagationConfig(
 )
 
 
-@pytest.fixture(params=sorted(BACKENDS))
+SLOW = {"torch": [pytest.mark.slow]}  # its import takes seconds
+
+
+@pytest.fixture(params=[pytest.param(n, marks=SLOW.get(n, ())) for n in sorted(BACKENDS)])
 def backend(request: pytest.FixtureRequest) -> Backend:
     """Each backend of the table; torch's kernels have tests of their own for the interpreter."""
     name, device = str(request.param), str(request.config.getoption("--device"))

@@ -46,7 +46,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated nadir flight of 8 s."""
     folder = tmp_path_factory.mktemp("sim") / "flight"
     made = skyrelief(
-        "simulate", "--out", folder, "--size", "480x270", "--fps", "5", "--duration-s", "8",
+        "simulate", "--out", folder, "--size", "320x180", "--fps", "5", "--duration-s", "8",
         "--height-m", "40", "--speed-m-s", "6", "--seed", "3",
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
@@ -244,9 +244,9 @@ def bad_inputs(flight: Path, tmp: Path) -> dict[str, tuple[list[str | Path], str
     (tmp / "empty.mp4").touch()
     (tmp / "text.mp4").write_text("this is not a video\n" * 50)
     model = (flight / "camera.yaml").read_text()
-    (tmp / "small.yaml").write_text(model.replace("image_width: 480", "image_width: 640"))
-    (tmp / "negative.yaml").write_text(model.replace("360.0", "-360.0"))
-    (tmp / "nan.yaml").write_text(model.replace("360.0", ".nan"))
+    (tmp / "small.yaml").write_text(model.replace("image_width: 320", "image_width: 640"))
+    (tmp / "negative.yaml").write_text(model.replace("240.0", "-240.0"))
+    (tmp / "nan.yaml").write_text(model.replace("240.0", ".nan"))
     (tmp / "file").write_text("in the way")
     video, camera = flight / "flight.mp4", flight / "camera.yaml"
     log = flight / "flight.tlog"
@@ -254,7 +254,7 @@ def bad_inputs(flight: Path, tmp: Path) -> dict[str, tuple[list[str | Path], str
         "no such file": (["no-such.mp4"], "no such file"),
         "empty file": ([tmp / "empty.mp4"], "empty"),
         "not a video": ([tmp / "text.mp4"], "text.mp4"),
-        "model of another size": ([video, "--camera-model", tmp / "small.yaml"], "640x270"),
+        "model of another size": ([video, "--camera-model", tmp / "small.yaml"], "640x180"),
         "negative focal length": ([video, "--camera-model", tmp / "negative.yaml"], "positive"),
         "NaN in the model": ([video, "--camera-model", tmp / "nan.yaml"], "finite"),
         "no such log": ([video, "--telemetry", tmp / "none.tlog"], "none.tlog"),
