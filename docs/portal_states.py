@@ -4,8 +4,8 @@
 
 STORE is a ground station's folder; its newest scan is shown. BEFORE is the OUT of another version:
 the sheet then has each state of it left of the present one. Needs Chromium, the built page, Pillow
-and the extras "ground" and "dev". Maps, mesh, report and another date are shown where there are
-such.
+and the extras "ground" and "dev". Maps, splats, mesh, report and another date are shown
+where there are such.
 """
 
 from __future__ import annotations
@@ -65,6 +65,13 @@ def opened(text: str, is_open: bool = True) -> Act:
     return lambda browser: browser.run(OPEN.format(text, str(is_open).lower()))
 
 
+def shown(product: str) -> Act:
+    """Wait until the product is drawn."""
+    return lambda browser: browser.wait(
+        f"document.body.dataset.{product.lower()} === 'shown'", WAIT_S
+    )
+
+
 def click_points(browser: Browser) -> None:
     """Click the places to be measured."""
     stage = browser.page.locator(".stage canvas").bounding_box()
@@ -85,8 +92,9 @@ def view_states(scan: Path) -> Iterator[tuple[str, list[Act]]]:
     yield "view-notes", [press("Measure"), press("Notes")]
     yield "view-clip", [press("Notes"), opened("Clip")]
     yield "view-settings", [opened("Clip", False), opened("Settings")]
-    if (scan / "mesh.glb").is_file():
-        yield "view-mesh", [opened("Settings", False), press("Mesh")]
+    for name, file in (("Splats", "splat.ply"), ("Mesh", "mesh.glb")):
+        if (scan / file).is_file():
+            yield f"view-{name.lower()}", [opened("Settings", False), press(name), shown(name)]
 
 
 def shots(browser: Browser, base: str, scan: Path, out: Path) -> None:
