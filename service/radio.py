@@ -54,11 +54,9 @@ class RadioLink:
         self._link.start()
 
     def close(self) -> None:
-        """Close it."""
         self._link.stop()
 
     def send(self, payload: bytes) -> None:
-        """Send a payload to all."""
         padded = list(payload.ljust(MAX_BYTES, b"\0"))
         self._send(dialect.MAVLink_tunnel_message(0, 0, PAYLOAD_TYPE, len(payload), padded))
 
@@ -100,7 +98,6 @@ class VehicleRadio:
         """Nothing: the vehicle's link sends its own heartbeats."""
 
     def send(self, payload: bytes) -> None:
-        """Send a payload to all."""
         self._vehicle.send_tunnel(PAYLOAD_TYPE, payload)
 
     def close(self) -> None:

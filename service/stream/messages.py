@@ -66,7 +66,6 @@ class Part:
     payload: bytes
 
     def pack(self) -> bytes:
-        """The part as bytes."""
         return (
             _HEAD.pack(
                 MAGIC,

@@ -282,7 +282,6 @@ class Outbox:
         self._live[lane].push(feed.store, kind, number)
 
     def offers(self, scan_id: str) -> bool:
-        """Whether a scan is offered."""
         return scan_id in self._feeds
 
     def serves(self, peer: str) -> bool:

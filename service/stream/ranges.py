@@ -48,11 +48,9 @@ class RangeSet:
 
     @classmethod
     def of(cls, numbers: Iterable[int]) -> RangeSet:
-        """The set of ``numbers``."""
         return cls((n, n) for n in numbers)
 
     def add(self, number: int) -> None:
-        """Add ``number``."""
         at = bisect_right(self._firsts, number)
         if at and self._lasts[at - 1] >= number:
             return

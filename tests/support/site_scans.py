@@ -136,7 +136,7 @@ def header_of(
 
 def layers(
     seq: int, T: F64, errors: Errors | None = None, boxes: Sequence[Box] = (), ground: int = 1,
-    frame: LocalFrame = FRAME, day: int = 0, lift_m: float = 0.0,
+    frame: LocalFrame = FRAME, day: int = 0, lift_m: float = 0.0, truth: LocalFrame = FRAME,
 ) -> list[bytes]:  # fmt: skip
     """The coded keyframe at a true pose, wrongly placed by ``errors`` and ``lift_m`` up."""
     from service.offline.site.gather import between_frames
@@ -145,7 +145,7 @@ def layers(
     d, wrong = one.depth, (errors or Errors()).as_similarity()
     grown = np.float32(wrong.growth)
     lift = se3.compose(np.eye(3), np.array([0.0, 0.0, lift_m]))
-    placed = between_frames(frame, FRAME) @ lift @ wrong.pose(T)
+    placed = between_frames(frame, truth) @ lift @ wrong.pose(T)
     depth = DepthMap(d.depth_m * grown, d.sigma_m * grown, d.views, d.K, placed)
     pose = Pose(placed, one.pose.covariance, one.pose.sources)
     placed_one = Keyframe(seq, one.time_ns, depth, one.bgr, pose, one.fresh)
@@ -155,16 +155,17 @@ def layers(
 def write_scan(
     folder: Path, poses: Sequence[F64], errors: Errors | None = None, boxes: Sequence[Box] = (),
     ground: int = 1, frame: LocalFrame | None = FRAME, day: int = 0, finished: bool = True,
+    truth: LocalFrame = FRAME,
 ) -> Path:  # fmt: skip
     """A scan of the place in ``folder``; its world is ``frame``, wrongly placed by ``errors``.
 
-    The truth is in ENU of FRAME.
+    The truth is in ENU of ``truth``.
     """
     with ScanStore.create(folder / "scan.db", header_of(folder.name, frame, day)) as store:
         for seq, T in enumerate(poses):
             lift = (errors or Errors()).bend_m * (2.0 * seq / max(len(poses) - 1, 1) - 1.0) ** 2
             store.add_keyframe(
-                seq, layers(seq, T, errors, boxes, ground, frame or FRAME, day, lift)
+                seq, layers(seq, T, errors, boxes, ground, frame or FRAME, day, lift, truth)
             )
         if finished:
             store.finish({"frames": len(poses)})

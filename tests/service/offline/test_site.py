@@ -238,13 +238,10 @@ def test_an_alignment_by_few_ties_is_called_uncertain(tmp_path: Path) -> None:
     )
 
 
-def test_scans_of_two_zones_become_one_site(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scans_of_two_zones_become_one_site(tmp_path: Path) -> None:
     west, east = LocalFrame(47.39, 5.9998, 408.0), LocalFrame(47.39, 6.0003, 411.0)
-    monkeypatch.setattr(site_scans, "FRAME", west)  # of the truth
-    one = write_scan(tmp_path / "one", NORTH, Errors((0.5, 0.3, 0.2)), frame=west)
-    two = write_scan(tmp_path / "two", EAST, Errors((-0.5, -0.3, -0.2)), frame=east)
+    one = write_scan(tmp_path / "one", NORTH, Errors((0.5, 0.3, 0.2)), frame=west, truth=west)
+    two = write_scan(tmp_path / "two", EAST, Errors((-0.5, -0.3, -0.2)), frame=east, truth=west)
     document = align_site([one, two], tmp_path / "site", deliver=False).document
     assert document["epsg"] == 32631 and document["pairs"][0]["ties"] >= 3
     assert any("several zones [32631, 32632]" in note for note in document["notes"])
