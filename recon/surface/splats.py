@@ -52,7 +52,7 @@ LOW_PASS_PX2 = 0.3
 
 WIDEST = 1.3
 """Beyond so many half images from the middle a Gaussian is projected as there, as the reference
-does: one beside the camera is not drawn all over the image."""
+does: one next to the camera is not drawn all over the image."""
 
 LARGEST_ALPHA, SMALLEST_ALPHA, DONE = 0.99, 1.0 / 255.0, 1e-3
 REACH = 3.33

@@ -34,6 +34,7 @@ def write_report(scan: ScanView, out: Path, options: ExportOptions) -> None:
     try:
         summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
         maps = maps_of(folder, scan.flown_frame, summary["heights"])
+        scan.progress("maps of the cloud; export ortho and dsm first" if maps is None else "report")
         cloud, raster, coverage = scan.fused.cloud, surface(scan.fused), coverage_of(store)
         shown = stages_jpg(folder, store)
         page = report_html(summary, scan.poses, cloud, raster, coverage, shown, maps)
