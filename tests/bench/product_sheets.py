@@ -227,7 +227,8 @@ def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) ->
     height[height == NODATA_M] = np.nan
     low_high_m = np.nanpercentile(height, [1.0, 99.0]).astype(np.float64)
     truth = read_truth(flight / "truth") if (flight / "truth").is_dir() else None
-    fit = None if truth is None else next(iter(fits_of(folder, truth).values()))
+    fits = {} if truth is None else fits_of(folder, truth)
+    fit = fits.get("rigid") or fits.get("similarity")
     folders = ({"before": before} if before else {}) | {"now": folder}
 
     def rows(grid: Grid) -> dict[str, Images]:
