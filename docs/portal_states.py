@@ -113,6 +113,7 @@ def shots(browser: Browser, base: str, scan: Path, out: Path) -> None:
     shot("library-export")
     browser.run("document.querySelector('[aria-label^=\"Make Contours, DXF\"]').click()")
     browser.wait("document.querySelector('.product .jobs li')", WAIT_S)
+    browser.run("document.querySelector('.product .jobs li').scrollIntoView({ block: 'center' })")
     shot("library-job")
     browser.key("Escape")
     browser.open(f"{base}/#/view/{where}")

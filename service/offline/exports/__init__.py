@@ -16,9 +16,9 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
     "laz": (
         "clouds:write_laz_file",
         "cloud.laz",
-        "The same as LAZ 1.4, with sigma and views.",
+        "The cloud as LAZ 1.4, with sigma and views.",
     ),
-    "copc": ("clouds:write_copc", "cloud.copc.laz", "The same as a cloud-optimised octree."),
+    "copc": ("clouds:write_copc", "cloud.copc.laz", "The cloud as a cloud-optimised octree."),
     "dsm": (
         "rasters:write_dsm",
         "dsm.tif",
@@ -31,8 +31,8 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
         "contours.geojson",
         "Contours as GeoJSON; or .gpkg, .dxf.",
     ),
-    "gpkg": ("contours:write_contours_gpkg", "contours.gpkg", "The same as GeoPackage, in UTM."),
-    "dxf": ("contours:write_contours_dxf", "contours.dxf", "The same as DXF for CAD, in UTM."),
+    "gpkg": ("contours:write_contours_gpkg", "contours.gpkg", "Contours as GeoPackage, in UTM."),
+    "dxf": ("contours:write_contours_dxf", "contours.dxf", "Contours as DXF for CAD, in UTM."),
     "coverage": (
         "rasters:write_coverage",
         "coverage.tif",

@@ -412,6 +412,11 @@ def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
         written(tmp_path, "laz")
 
 
+def test_each_product_is_described_without_another() -> None:
+    """The portal orders them in its own way."""
+    assert not [text for _, _, text in EXPORTERS.values() if "the same" in text.lower()]
+
+
 def test_each_product_has_one_line_of_a_terminal() -> None:
     assert all(len(line) <= 78 for line in product_list().splitlines())
 
