@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from recon import se3
-from recon.posegraph.ledger import Rows
 from recon.posegraph.records import Loop, loops_agree
 from recon.posegraph.site_alignment import ScanSimilarity
 from recon.posegraph.smoother import (
@@ -27,6 +26,7 @@ from recon.posegraph.smoother import (
     left_covariance,
     scale_columns,
 )
+from recon.table import Rows
 from recon.types import F64, Bool, PosePrior
 
 CHI2_LIMIT = 22.5

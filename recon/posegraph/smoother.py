@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from recon import bands, se3
-from recon.posegraph.ledger import Ledger, Rows
+from recon.table import Rows, Table
 from recon.types import F64, I64
 
 MIN_WAIT, POSES_PER_WAIT = 2, 100
@@ -138,7 +138,7 @@ class Factors:
     ) -> None:  # fmt: skip
         """Whitened errors longer than ``huber`` lose weight; by ``cauchy`` they lose all of it."""
         self.form, self.huber, self.cauchy = form, huber, cauchy
-        self.rows = Ledger(dtype)
+        self.table = Table(dtype)
 
     def loss(self, length: F64) -> tuple[F64, F64]:
         """(n,) weights and costs of whitened errors of this length (n,)."""
@@ -150,7 +150,7 @@ class Factors:
 
     def about(self, at: State) -> Linear:
         """All of them about a state."""
-        return self.form(self.rows.read(0, len(self.rows)), at)
+        return self.form(self.table.rows, at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +268,7 @@ class Smoother:
         """A factor of any form; all of one kind share a loss (:class:`Factors`)."""
         if kind not in self._factors:
             self._factors[kind] = Factors(form, dtype, huber, cauchy)
-        self._factors[kind].rows.append(np.array([row], dtype))
+        self._factors[kind].table.append(np.array([row], dtype))
 
     def append_pose(self, T: F64, covariance: F64) -> None:
         """The next pose (4, 4) with its predicted left covariance (6, 6)."""

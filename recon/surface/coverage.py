@@ -19,8 +19,8 @@ import numpy as np
 from numba import njit
 
 from recon.camera_model import rays
-from recon.posegraph.ledger import Ledger, Rows
 from recon.surface.raster import Grid
+from recon.table import Rows, Table
 from recon.types import F32, F64, I64, Array, Bool, DepthMap
 
 TILE = 64
@@ -123,7 +123,7 @@ class CoverageMap:
         self.cell_m = float(cell_m)
         self.refused = 0  # tiles beyond MAX_TILES, and footprints too large to be one
         self._tiles: dict[Tile, _Cells] = {}
-        self._ledger = Ledger(PLACE)  # of keyframes
+        self._table = Table(PLACE)  # of keyframes
         self._seqs, self._rows = array("q"), array("q")  # keyframes in order, and their rows
         self._stale: set[Tile] = set()
         self._first_ns: int | None = None
@@ -133,7 +133,7 @@ class CoverageMap:
 
     def places(self) -> Rows:
         """Rows of :data:`PLACE` of all keyframes, in order of their number."""
-        return self._ledger.pick(np.array(self._rows))
+        return np.asarray(self._table.rows[np.array(self._rows)])
 
     @property
     def tiles(self) -> int:
@@ -152,7 +152,7 @@ class CoverageMap:
         if self._first_ns is None:
             self._first_ns = time_ns
         at = self._row(seq)
-        before = None if at is None else self._ledger.read(at, at + 1)[0]
+        before = None if at is None else self._table.rows[at]
         if before is not None:
             shift_m = np.abs(before["corners_m"] - row["corners_m"][0]).max()
             if not finer and shift_m < 0.25 * self.cell_m:
@@ -180,13 +180,13 @@ class CoverageMap:
 
     def _keep(self, at: int | None, row: Rows) -> None:
         if at is not None:
-            self._ledger.amend(at, row)
+            self._table.rows[at] = row[0]
             return
         seq = int(row["seq"][0])
         i = bisect_left(self._seqs, seq)
         self._seqs.insert(i, seq)
-        self._rows.insert(i, len(self._ledger))
-        self._ledger.append(row)
+        self._rows.insert(i, len(self._table))
+        self._table.append(row)
 
     def _within(self, place: np.void) -> set[Tile]:
         """The tiles where a keyframe may have surface."""
@@ -197,7 +197,7 @@ class CoverageMap:
         """Keyframes whose depth :meth:`refill` needs: they may have surface in a stale tile."""
         if not self._stale:
             return []
-        rows = self._ledger.read(0, len(self._ledger))
+        rows = self._table.rows
         due = np.zeros(len(rows), np.bool_)
         for tile in self._stale:
             due |= np.all((rows["low"] <= tile) & (tile <= rows["high"]), axis=1)
@@ -211,7 +211,7 @@ class CoverageMap:
         for seq, depth in depths:
             at = self._row(seq)
             if at is not None:
-                self._add_surface(self._ledger.read(at, at + 1)[0], depth, self._stale)
+                self._add_surface(self._table.rows[at], depth, self._stale)
         self._stale = set()
 
     def grid(self) -> CoverageGrid | None:
@@ -266,7 +266,7 @@ class CoverageMap:
 
     def _hull(self, grid: Grid) -> tuple[Bool, Bool]:
         """Cells within what was flown, and its core, as CoverageGrid has them."""
-        places = self._ledger.read(0, len(self._ledger))
+        places = self._table.rows
         middles, corners = places["centre_m"], places["corners_m"]
         width = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
         height = np.linalg.norm(corners[:, 2] - corners[:, 1], axis=1)
@@ -424,7 +424,7 @@ PLACE = np.dtype(
         ("high", np.int64, (2,)),
     ]
 )
-"""A row of the ledger: what is kept of a keyframe."""
+"""A row of the table: what is kept of a keyframe."""
 
 
 def footprint(depth: DepthMap) -> Rows | None:

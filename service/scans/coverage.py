@@ -17,8 +17,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.posegraph.ledger import Rows
 from recon.surface.coverage import CoverageGrid, CoverageMap, usual_cell_m
+from recon.table import Rows
 from recon.types import U8, Array, DepthMap
 from service.georeference import LocalFrame
 from service.scans.main_piece import Stretch, main_seqs, stretches_apart

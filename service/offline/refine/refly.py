@@ -16,8 +16,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.posegraph.ledger import Rows
 from recon.surface.raster import Grid
+from recon.table import Rows
 from recon.types import F64, Array, Bool
 from service.errors import InputError
 from service.georeference import LocalFrame

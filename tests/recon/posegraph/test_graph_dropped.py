@@ -12,7 +12,6 @@ from bench_graph import HEIGHT_M, legs
 from flown_track import SPREAD, landed, publish, sensed
 
 from recon import se3
-from recon.posegraph.interpolated import KEYFRAME, left
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.thinning import moved_loops, over_gaps, surplus, thinned
@@ -154,14 +153,16 @@ def test_segments_go_whole_but_neither_the_first_nor_the_newest() -> None:
     np.testing.assert_allclose(found_over[8][:3, 3], [2.0, 0.0, 0.0])  # over the seventh
 
 
-def test_unpublished_keyframes_follow_the_node_before() -> None:
-    rng = np.random.default_rng(5)
-    rows, poses = np.zeros(2, KEYFRAME), np.array([se3.exp(rng.normal(size=6)) for _ in range(2)])
-    rows["pose"], rows["scale"], rows["is_published"] = poses[:, :3], 3.0, [True, False]
-    node = se3.exp(rng.normal(size=6))
-    T, scales = left(rows, node, np.array(2.0))
-    np.testing.assert_array_equal(T, [poses[0], node])
-    assert scales.tolist() == [3.0, 2.0]
+@pytest.mark.slow
+def test_unpublished_keyframes_of_a_dropped_segment_follow_the_node_before() -> None:
+    trajectory, (_, odom, priors) = Trajectory(graph=bounded()), flight()
+    for i in range(2 * MOST):
+        T = se3.inverse(odom[i - i % EACH]) @ odom[i]
+        trajectory.add(i, i // EACH, T, priors[i], None, i * 10**9, SPREAD * UNITS)
+    before, after = next((a, b) for a, b in pairwise(trajectory.graph.seqs) if b - a > EACH)
+    node, found = trajectory.pose(before), trajectory.pose(after - 1)
+    np.testing.assert_array_equal(found.T_world_camera, node.T_world_camera)
+    assert found.scale == node.scale
 
 
 @pytest.mark.parametrize("fixes", [True, False])

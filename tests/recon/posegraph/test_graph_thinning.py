@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 from bench_graph import HEIGHT_M, legs
 from flown_track import SPREAD, landed, publish, sensed
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from recon import se3
-from recon.posegraph.interpolated import screws
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.thinning import moved_loop, surplus, thinned
@@ -96,21 +93,24 @@ def test_nodes_stand_evenly_and_the_newest_all_stay() -> None:
 
 
 @pytest.mark.slow
-def test_riders_lie_between_their_nodes_as_vision_saw_them() -> None:
-    """By closed form: seen from the node before, the miss at the node after shared out."""
+def test_interpolated_keyframes_lie_between_their_nodes_as_vision_saw_them() -> None:
+    """By closed form: as seen from the node before and from the one after, weighed by nearness."""
     trajectory, odom = thin(), flight()[1]
     graph = trajectory.graph
     a, b = next((a, b) for a, b in pairwise(graph.seqs) if b - a >= 4)
-    T_a, T_b = graph.pose(a).T_world_camera, graph.pose(b).T_world_camera
+    T_a = graph.pose(a).T_world_camera
 
-    def by_vision(i: int) -> F64:
-        step = se3.inverse(odom[a]) @ odom[i]
-        step[:3, 3] *= graph.scale(a)
-        return np.asarray(T_a @ step)
+    def by_vision(node: int, i: int) -> F64:
+        step = se3.inverse(odom[node]) @ odom[i]
+        step[:3, 3] *= graph.scale(node)
+        return np.asarray(graph.pose(node).T_world_camera @ step)
 
-    miss = se3.log(T_b @ se3.inverse(by_vision(b)))
     for i in range(a + 1, b):
-        expected = se3.exp((i - a) / (b - a) * miss) @ by_vision(i)
+        one, other, share = by_vision(a, i), by_vision(b, i), (i - a) / (b - a)
+        turn = se3.so3_log(one[:3, :3].T @ other[:3, :3])
+        expected = se3.compose(
+            one[:3, :3] @ se3.so3_exp(share * turn), (1 - share) * one[:3, 3] + share * other[:3, 3]
+        )
         found = trajectory.pose(i)
         np.testing.assert_allclose(found.T_world_camera, expected, atol=1e-9)
         assert min(graph.scale(a), graph.scale(b)) <= found.scale + 1e-12
@@ -178,13 +178,3 @@ def test_ends_of_segments_stay() -> None:
         for segment in {n.segment for n in nodes}:
             seqs = [n.seq for n in nodes if n.segment == segment]
             assert (seqs[0], seqs[-1]) == (7 * segment, 7 * segment + 6)
-
-
-@settings(max_examples=50)
-@given(st.integers(0, 9999), st.sampled_from([0.0, 1e-12, 1e-9, 1e-6, 1e-3, 1.0, 3.0]))
-def test_screws_are_exponentials(seed: int, turn: float) -> None:
-    rng = np.random.default_rng(seed)
-    twists, shares = rng.normal(size=(5, 6)), rng.uniform(-1.0, 2.0, 5)
-    twists[:, :3] *= turn / np.linalg.norm(twists[:, :3], axis=1, keepdims=True)
-    expected = [se3.exp(share * twist) for share, twist in zip(shares, twists, strict=True)]
-    np.testing.assert_allclose(screws(twists, shares), expected, atol=1e-12)
