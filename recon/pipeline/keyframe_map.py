@@ -10,7 +10,7 @@ import numpy as np
 
 from recon.pipeline.config import Timing
 from recon.pipeline.views import StereoView
-from recon.posegraph.anchors import height_above, height_below
+from recon.posegraph.ground_heights import height_above, height_below
 from recon.posegraph.level_ground import MAX_LEVELLED_SHARE, levelled
 from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pieces import apart

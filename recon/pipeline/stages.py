@@ -120,6 +120,7 @@ class Track:
 
     def __call__(self, image: UndistortedFrame) -> Tracked:
         """The frame's pose, or why there is none."""
+        assert image.small is not None
         with self._timing("track"):
             tracked = self.odometry.track(
                 image.small, image.seq, image.time_ns, image.prior, image.mask, image.is_blurred

@@ -79,45 +79,39 @@ class Colour:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UndistortedFrame:
-    """A frame without distortion."""
-
-    seq: int
-    time_ns: int
-    prior: PosePrior
-    colour: Colour
-    gray: U8  # (H, W)
-    small: U8  # (h, w) gray, as the odometry takes it
-    mask: U8 | None  # (h, w) non-zero where the image is valid; None: everywhere
-    is_blurred: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ViewCandidate:
-    """A tracked frame that may take part in stereo; its pose follows its odometry keyframe's."""
+    """A frame without distortion. Once it is tracked it may take part in stereo, as a view or as
+    a view's partner, and its pose follows its odometry keyframe's."""
 
     seq: int
     time_ns: int
     prior: PosePrior
     colour: Colour | None  # None for one that is only a partner
-    gray: U8  # (H, W) undistorted
-    reference: RelativePose  # to the last keyframe when it was tracked
-    is_blurred: bool = False  # takes no part in stereo, only in the track
+    gray: U8  # (H, W)
+    small: U8 | None  # (h, w) gray, as the odometry takes it; None once it is tracked
+    mask: U8 | None  # (h, w) non-zero where the image is valid; None: everywhere
+    is_blurred: bool  # takes no part in stereo, only in the track
+    reference: RelativePose | None = None  # to the last keyframe when it was tracked
     moving: FrameRows | None = None
 
     @property
     def segment(self) -> int:
-        return self.reference.segment
+        return self._reference.segment
 
     @property
     def keyframe(self) -> OdometryKeyframe:
         """Its reference keyframe."""
-        assert self.reference.keyframe is not None, "a candidate is not settled"
-        return self.reference.keyframe
+        assert self._reference.keyframe is not None, "a frame of stereo is not settled"
+        return self._reference.keyframe
 
     @property
     def T_odom_camera(self) -> F64:
         """(4, 4) as refined by now."""
-        return self.reference.T_odom_camera
+        return self._reference.T_odom_camera
+
+    @property
+    def _reference(self) -> RelativePose:
+        assert self.reference is not None, "the frame is not tracked"
+        return self.reference
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,12 +152,12 @@ class ViewSelection:
         become partners too.
         """
         self._all_known = all_known
-        self._kept: deque[ViewCandidate] = deque(maxlen=KNOWN_KEPT if all_known else KEPT)
-        self._between: deque[ViewCandidate] = deque(
+        self._kept: deque[UndistortedFrame] = deque(maxlen=KNOWN_KEPT if all_known else KEPT)
+        self._between: deque[UndistortedFrame] = deque(
             maxlen=8 * partners if partners > KEPT - 2 else 0
         )
-        self._recent: deque[ViewCandidate] = deque(maxlen=6)  # a quarter of a step apart
-        self._extra: tuple[ViewCandidate, list[ViewCandidate]] | None = (
+        self._recent: deque[UndistortedFrame] = deque(maxlen=6)  # a quarter of a step apart
+        self._extra: tuple[UndistortedFrame, list[UndistortedFrame]] | None = (
             None  # a last view's partner
         )
         self._max_partners = partners
@@ -200,7 +194,7 @@ class ViewSelection:
         """The shortest baseline that stereo should accept: an operator's choice is kept."""
         return 0.03 if self._mode == "auto" else 0.002
 
-    def offer(self, frame: ViewCandidate, tracked: Tracked) -> bool:
+    def offer(self, frame: UndistortedFrame, tracked: Tracked) -> bool:
         """True when the frame is to be a view."""
         if self._take_next or self._wants(frame.seq, tracked):
             self._take_next = False
@@ -212,7 +206,7 @@ class ViewSelection:
             self._recent.append(replace(frame, colour=None))
         return False
 
-    def end_stretch(self, frame: ViewCandidate | None) -> bool:
+    def end_stretch(self, frame: UndistortedFrame | None) -> bool:
         """True when the last frame of a stretch must be a view: it shows more than the last one.
         ``frame`` is that frame unless it is a view already. The newest ground is not in the view
         before; a frame between the two becomes its partner.
@@ -240,7 +234,7 @@ class ViewSelection:
             return None
         return _apart(same[-1], same[-2])
 
-    def _moved_on(self, frame: ViewCandidate) -> bool:
+    def _moved_on(self, frame: UndistortedFrame) -> bool:
         """True a quarter of a step after the last frame that was remembered."""
         step = self._step(frame.segment)
         if step is None:
@@ -248,7 +242,7 @@ class ViewSelection:
         last = max([self._kept[-1], *self._recent], key=lambda v: v.seq)
         return last.segment == frame.segment and _apart(frame, last) > 0.25 * step
 
-    def _keep(self, view: ViewCandidate) -> None:
+    def _keep(self, view: UndistortedFrame) -> None:
         self._kept.append(view)
         self._views_of[view.segment] += 1
 
@@ -264,7 +258,7 @@ class ViewSelection:
         moved = tracked.T_odom_camera[:3, 3] - last.T_odom_camera[:3, 3]
         return bool(np.linalg.norm(moved) >= self._amount)
 
-    def ready(self, view: ViewCandidate) -> bool:
+    def ready(self, view: UndistortedFrame) -> bool:
         """True when the view has two neighbours to pair with, or its segment is over."""
         if not self._kept or self._kept[-1] is view:
             return False
@@ -279,7 +273,7 @@ class ViewSelection:
             return sum(v.seq > view.seq for v in self._kept) >= AHEAD
         return sum(v.segment == view.segment for v in self._kept) >= 3
 
-    def confirmed(self, view: ViewCandidate) -> bool:
+    def confirmed(self, view: UndistortedFrame) -> bool:
         """False for a stretch of two views: no other view can contradict a single pair.
 
         Clouds in the sky or a false first motion would otherwise become surface. A baseline
@@ -287,7 +281,7 @@ class ViewSelection:
         """
         return self._mode != "auto" or self._views_of[view.segment] >= 3
 
-    def partners(self, view: ViewCandidate) -> list[ViewCandidate]:
+    def partners(self, view: UndistortedFrame) -> list[UndistortedFrame]:
         """The views to pair it with, the best first.
 
         Automatic: those nearest to the wanted base-to-height, from both sides; a fixed
@@ -308,13 +302,17 @@ class ViewSelection:
             return [*extra, *others[: self._partners]]
         return self._spread(view, others)
 
-    def _wide(self, view: ViewCandidate, others: list[ViewCandidate]) -> list[ViewCandidate]:
+    def _wide(
+        self, view: UndistortedFrame, others: list[UndistortedFrame]
+    ) -> list[UndistortedFrame]:
         """Partners of all baselines that stereo can bridge; the nearest where there are none."""
         widest = WIDEST * median_depth(view.keyframe)
         good = [v for v in others if _apart(v, view) <= widest]
         return _evenly(good, KNOWN_PARTNERS * self._partners) or others[: self._partners]
 
-    def _spread(self, view: ViewCandidate, others: list[ViewCandidate]) -> list[ViewCandidate]:
+    def _spread(
+        self, view: UndistortedFrame, others: list[UndistortedFrame]
+    ) -> list[UndistortedFrame]:
         """Partners between half and twice the keyframes' spacing, evenly spread."""
         base = [_apart(v, view) for v in others]
         steps = [b for v, b in zip(others, base, strict=True) if v.colour is not None]
@@ -324,13 +322,13 @@ class ViewSelection:
         return _evenly(good, self._partners)
 
 
-def _evenly(views: list[ViewCandidate], count: int) -> list[ViewCandidate]:
+def _evenly(views: list[UndistortedFrame], count: int) -> list[UndistortedFrame]:
     """At most ``count`` of the views, evenly spread over their order."""
     picked = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
     return [views[i] for i in picked] if views else []
 
 
-def _apart(a: ViewCandidate, b: ViewCandidate) -> float:
+def _apart(a: UndistortedFrame, b: UndistortedFrame) -> float:
     return float(np.linalg.norm(a.T_odom_camera[:3, 3] - b.T_odom_camera[:3, 3]))
 
 
@@ -358,9 +356,9 @@ class VirtualStereoCamera:
         self._odometry, self._K, self._seen, self._refused = odometry, camera.K, seen, refused
         self._segment = odometry.segment
         self._fixes = FixAverage()
-        self._waiting: deque[tuple[ViewCandidate, PosePrior]] = deque()
+        self._waiting: deque[tuple[UndistortedFrame, PosePrior]] = deque()
         self._given: deque[RelativePose] = deque(maxlen=8)
-        self._latest: ViewCandidate | None = None  # the last tracked frame, unless it is a view
+        self._latest: UndistortedFrame | None = None  # the last tracked frame, unless it is a view
         self._tracked: deque[tuple[int, RelativePose]] = deque(maxlen=TRACKED)  # times and places
 
     def take(self, image: UndistortedFrame, tracked: Tracked) -> tuple[RelativePose | None, bool]:
@@ -373,10 +371,7 @@ class VirtualStereoCamera:
         key = next(key for key in reversed(self._odometry.keyframes) if key.seq <= image.seq)
         T_keyframe_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
         reference = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
-        frame = ViewCandidate(
-            image.seq, image.time_ns, image.prior, image.colour, image.gray, reference,
-            image.is_blurred, tracked.moving,
-        )  # fmt: skip
+        frame = replace(image, small=None, mask=None, reference=reference, moving=tracked.moving)
         self._tracked.append((image.time_ns, reference))
         is_view = self.selection.offer(frame, tracked)
         self._fixes.take(tracked.T_odom_camera, image.prior)
@@ -392,7 +387,7 @@ class VirtualStereoCamera:
         self._fixes.forget()
         self._latest = None
 
-    def _wait(self, view: ViewCandidate) -> None:
+    def _wait(self, view: UndistortedFrame) -> None:
         """Keep a view until its partners are there; all fixes since the last one are its own."""
         self._waiting.append((view, self._fixes.given(view.T_odom_camera, view.prior)))
 
@@ -406,18 +401,19 @@ class VirtualStereoCamera:
                 self._refused["blurred"] += 1
             else:
                 found = self._stereo_view(view, prior)
-                self._given.append(view.reference)
+                self._given.append(found.reference)
                 yield found
 
-    def _is_ready(self, view: ViewCandidate) -> bool:
+    def _is_ready(self, view: UndistortedFrame) -> bool:
         """True when its partners are there, and the images could show the readout."""
         search, newest = self._odometry.readout, self._waiting[-1][0].moving
         shows = search is not None and search.is_open and newest is not None and newest.is_measured
         return self.selection.ready(view) and not (shows and len(self._waiting) < HELD)
 
-    def _stereo_view(self, view: ViewCandidate, prior: PosePrior) -> StereoView:
-        points = landmark_points(view.keyframe)
-        points = se3.transform(se3.inverse(view.reference.T_keyframe_camera), points)
+    def _stereo_view(self, view: UndistortedFrame, prior: PosePrior) -> StereoView:
+        reference, points = view.reference, landmark_points(view.keyframe)
+        assert reference is not None
+        points = se3.transform(se3.inverse(reference.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         assert view.colour is not None
         partners, bgr = self.selection.partners(view), view.colour.take()
@@ -428,14 +424,16 @@ class VirtualStereoCamera:
             prior,
             replace(self._posed(view, in_odom), bgr=bgr),
             tuple(self._posed(partner, in_odom) for partner in partners),
-            view.reference,
+            reference,
             points,
             self._step_covariance(view),
             {a.seq: a.T_odom_camera for a in self._given if a.segment == view.segment},
             self._rows_share(view, partners, points),
         )
 
-    def _rows_share(self, view: ViewCandidate, partners: list[ViewCandidate], points: F64) -> F32:
+    def _rows_share(
+        self, view: UndistortedFrame, partners: list[UndistortedFrame], points: F64
+    ) -> F32:
         """(n, m) sigma of depth over depth by what is not known of readout and turns.
 
         ``points`` (N, 3) of the view's camera are the ground.
@@ -456,7 +454,7 @@ class VirtualStereoCamera:
         of_turns = turn_shares(rows, pairs, seen, self._K, view.gray.shape[::-1])
         return np.asarray(np.hypot(of_readout, of_turns), np.float32)
 
-    def _step_covariance(self, view: ViewCandidate) -> F64:
+    def _step_covariance(self, view: UndistortedFrame) -> F64:
         """(6, 6) of the motion since the view given before."""
         last = self._given[-1].keyframe if self._given else None
         since = -1 if last is None else last.seq
@@ -464,7 +462,7 @@ class VirtualStereoCamera:
         keys = [k for k in self._odometry.keyframes if since < k.seq <= view.keyframe.seq]
         return step_covariance(keys or [view.keyframe], T_camera_odom)
 
-    def _posed(self, view: ViewCandidate, points: F64) -> PosedImage:
+    def _posed(self, view: UndistortedFrame, points: F64) -> PosedImage:
         """The view in gray with its pose; ``points`` (N, 3) of the odometry are the ground."""
         posed = PosedImage(
             None, view.gray, self._K, view.T_odom_camera, self._seen,
@@ -477,7 +475,7 @@ class VirtualStereoCamera:
         scene = inverse_depth_plane(ground[ground[:, 2] > 0])
         return replace(posed, rows=rows.now(), scene=scene)
 
-    def _blur_px(self, view: ViewCandidate, points: F64) -> F64 | None:
+    def _blur_px(self, view: UndistortedFrame, points: F64) -> F64 | None:
         """(2,) px by which the middle of the image moved during the exposure, by the poses of the
         frames before and after; None where images are sharp or those frames are too far away."""
         exposure_s = self._odometry.exposure.shown_s

@@ -27,8 +27,9 @@ from recon.posegraph.alignment_readings import (
     ReadingNoise,
     has_fix,
 )
-from recon.posegraph.anchors import GUESSED_SHARE, INDEPENDENT_HEIGHTS, Anchor
+from recon.posegraph.ground_heights import GUESSED_SHARE, INDEPENDENT_HEIGHTS
 from recon.posegraph.level_ground import ASSUMED_TILT_RAD
+from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import (
     MIN_BIAS,
     MIN_READINGS,
@@ -134,15 +135,15 @@ class Scale:
 
 
 def fit(
-    anchors: Sequence[Anchor],
+    nodes: Sequence[Node],
     fix_s: float = 60.0,
     attitude_s: float = 40.0,
     slow_share: float = 1.0,
     usual: ReadingNoise | None = None,
 ) -> Similarity | None:
-    """The similarity that brings the anchors onto their priors, or None without any prior.
+    """The similarity that brings the nodes onto their priors, or None without any prior.
 
-    The anchors stand in the order of time; ``fix_s`` and ``attitude_s`` are the usual time
+    The nodes stand in the order of time; ``fix_s`` and ``attitude_s`` are the usual time
     constants with which a receiver and assumed views wander. How fixes and velocities err is
     measured by their residuals against the track of a first fit and weighs them in a second one.
     An assumed height takes part only where nothing else measures the scale as well.
@@ -152,7 +153,7 @@ def fit(
     ``slow_share`` is the part of its variance that may wander. Too few fixes to be measured err as
     the ``usual`` ones of the flight.
     """
-    usable = [a for a in anchors if a.prior.R_world_camera is not None or has_fix(a.prior)]
+    usable = [a for a in nodes if a.prior.R_world_camera is not None or has_fix(a.prior)]
     if not usable:
         return None
     bias_tau_s = (fix_s, attitude_s)
@@ -206,7 +207,7 @@ def _covariance(readings: AlignmentReadings, found: _Solution) -> F64:
 
 
 def _measured(
-    anchors: Sequence[Anchor],
+    nodes: Sequence[Node],
     start: AlignmentState,
     bias_tau_s: tuple[float, float],
     slow_share: float,
@@ -214,7 +215,7 @@ def _measured(
     """The noise of fixes and of velocities, each estimated from residuals against a fit of that
     sensor and the attitudes' tilt alone: a compass that is off would look like a drift."""
     level = [
-        replace(a, height=None, prior=replace(a.prior, sigma_yaw_rad=NO_YAW_RAD)) for a in anchors
+        replace(a, height=None, prior=replace(a.prior, sigma_yaw_rad=NO_YAW_RAD)) for a in nodes
     ]
     fixed = [replace(a, prior=replace(a.prior, travel=None)) for a in level]
     moved = [replace(a, prior=replace(a.prior, position_m=None)) for a in level]
@@ -298,12 +299,12 @@ def _velocities_contradict(readings: AlignmentReadings) -> bool:
     return abs(flown - fixed) > slack
 
 
-def scales(anchors: Sequence[Anchor], at: Similarity) -> tuple[Scale | None, Scale | None]:
+def scales(nodes: Sequence[Node], at: Similarity) -> tuple[Scale | None, Scale | None]:
     """The scale by position fixes alone and by measured heights alone, each with its sigma.
 
     None where the track or the readings give none.
     """
-    r = AlignmentReadings(anchors)
+    r = AlignmentReadings(nodes)
     by_fixes = by_heights = None
     if len(r.fix) >= 4:
         x, y = r.x @ at.R.T, r.fix
@@ -383,19 +384,19 @@ def _leave_out(readings: AlignmentReadings, norms: F64, kept: F64) -> bool:
     return not kept.all()
 
 
-def _starts(anchors: Sequence[Anchor], readings: AlignmentReadings) -> list[AlignmentState]:
+def _starts(nodes: Sequence[Node], readings: AlignmentReadings) -> list[AlignmentState]:
     """To begin with: by the attitude, and by the track.
 
     The second matters when the compass is far off or there is none: then only the track of
     the fixes determines the heading.
     """
     R = np.eye(3)
-    for a in anchors:
+    for a in nodes:
         if a.prior.R_world_camera is not None:
             R = a.prior.R_world_camera @ a.T_odom_camera[:3, :3].T
             break
     if not len(readings.fix):
-        return [AlignmentState(R, -R @ anchors[0].T_odom_camera[:3, 3], 0.0)]
+        return [AlignmentState(R, -R @ nodes[0].T_odom_camera[:3, 3], 0.0)]
     x = readings.x @ R.T
     starts = [AlignmentState(R, np.asarray(np.median(readings.fix - x, axis=0)), 0.0)]
     if len(x) >= 4:

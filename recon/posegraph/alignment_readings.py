@@ -14,7 +14,8 @@ from itertools import pairwise
 import numpy as np
 
 from recon import se3
-from recon.posegraph.anchors import GUESSED_SHARE, UNMEASURED_HEIGHTS, Anchor, height_ratios
+from recon.posegraph.ground_heights import GUESSED_SHARE, UNMEASURED_HEIGHTS, height_ratios
+from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import Noise, bias_time_constant_s
 from recon.types import F64, PosePrior
 
@@ -170,18 +171,18 @@ class AlignmentState:
 
 
 class AlignmentReadings:
-    """The anchors' readings as arrays, by kind; rows of one reading form a group."""
+    """The nodes' readings as arrays, by kind; rows of one reading form a group."""
 
     def __init__(
         self,
-        anchors: Sequence[Anchor],
+        nodes: Sequence[Node],
         noise: ReadingNoise | None = None,
         bias_tau_s: tuple[float, float] = (60.0, 40.0),
     ) -> None:
-        turned = [a for a in anchors if a.prior.R_world_camera is not None]
-        fixed = [a for a in anchors if has_fix(a.prior)]
-        moved = [(a, b, w) for a, b in pairwise(anchors) if (w := _way(a.prior, b.prior))]
-        heights, independent = height_ratios(anchors)
+        turned = [a for a in nodes if a.prior.R_world_camera is not None]
+        fixed = [a for a in nodes if has_fix(a.prior)]
+        moved = [(a, b, w) for a, b in pairwise(nodes) if (w := _way(a.prior, b.prior))]
+        heights, independent = height_ratios(nodes)
         noise, (fix_s, attitude_s) = noise or ReadingNoise(), bias_tau_s
         self.R_odom = _stack([a.T_odom_camera[:3, :3] for a in turned], (3, 3))
         self.R_prior = _stack([a.prior.R_world_camera for a in turned], (3, 3))
@@ -241,7 +242,7 @@ class AlignmentReadings:
         self._J[3 * three : -4, 6] = 1.0
         self._J[-4:, 7:] = np.eye(4)
 
-    def _sigma_common(self, turned: Sequence[Anchor]) -> F64:
+    def _sigma_common(self, turned: Sequence[Node]) -> F64:
         """(4,) of the assumed mount and of the altitudes' drift; next to none where there is
         neither."""
         tilts = [a.prior.sigma_tilt_rad for a in turned if a.prior.is_view_assumed]

@@ -17,8 +17,8 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.alignment_readings import MIN_FIX_M, ReadingNoise, has_fix
-from recon.posegraph.anchors import Anchor, height_ratio
 from recon.posegraph.between_keyframes import carried
+from recon.posegraph.ground_heights import height_ratio
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_noise import bias_time_constant_s
@@ -91,7 +91,7 @@ class ReadingFactors:
 
     def height(self, node: Node, scale_key: int, scale: float) -> bool:
         """True when the height above ground was taken as a reading of the scale."""
-        ratio = height_ratio(Anchor(node.T_odom_camera, node.prior, node.height, node.lean))
+        ratio = height_ratio(node)
         if ratio is None or not node.prior.is_agl_measured:
             return False
         if node.lean == 0.0 and abs(ratio[0] - np.log(scale)) > HEIGHT_GATE:

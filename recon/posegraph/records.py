@@ -15,7 +15,7 @@ class PoseGraphConfig:
     sigma_scale: float = 0.1  # of a segment's scale after its alignment, before the readings
     sigma_scale_walk: float = 0.003  # change of the scale per twenty keyframes
     sigma_step: float = 0.002  # of one vision motion, as a share of its length
-    min_anchors: int = 3  # keyframes of a segment before telemetry places it
+    min_keyframes: int = 3  # keyframes of a segment before telemetry places it
     fix_s: float = 60.0  # a receiver's error wanders with this time constant
     attitude_s: float = 40.0  # an attitude's
     altitude_s: float = 120.0  # a barometer's
@@ -48,9 +48,22 @@ class Node:
     height: float | None = None  # above the ground that it sees, in odometry units
     lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is seen
     weight: int = 1  # keyframes since the node before, this one among them
-    T_prev_segment: F64 | None = (
-        None  # (4, 4) m, motion since the node of another segment before it
-    )
+    T_prev_segment: F64 | None = None  # (4, 4) m, since the node before, of another segment
+
+    @property
+    def time_s(self) -> float:
+        return self.time_ns * 1e-9
+
+    @property
+    def place(self) -> F64:
+        """(3,) of the camera, in the odometry."""
+        return np.asarray(self.T_odom_camera[:3, 3])
+
+    @property
+    def place_of_fix(self) -> F64:
+        """(3,) where the prior's position was, in the odometry."""
+        offset, T = self.prior.fix_offset, self.T_odom_camera
+        return T[:3, 3] if offset is None else T[:3, :3] @ offset + T[:3, 3]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,8 +11,8 @@ from recon import se3
 from recon.posegraph import alignment
 from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.alignment_readings import ReadingNoise
-from recon.posegraph.anchors import GUESSED_SHARE, Anchor, guessed_at
 from recon.posegraph.between_keyframes import at_camera
+from recon.posegraph.ground_heights import GUESSED_SHARE, guessed_at
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.sensor_offsets import Constants, Offsets, constants, offsets
 from recon.posegraph.smoother import NO_SCALE
@@ -126,7 +126,7 @@ class Segments:
 
     def __init__(self, config: PoseGraphConfig) -> None:
         self._all: dict[int, Segment] = {}
-        self._least, self._bias_tau_s = config.min_anchors, (config.fix_s, config.attitude_s)
+        self._least, self._bias_tau_s = config.min_keyframes, (config.fix_s, config.attitude_s)
 
     def __getitem__(self, number: int) -> Segment:
         return self._all[number]
@@ -219,8 +219,8 @@ class Segments:
             return False
         segment.fitted, nodes = segment.keyframes, segment.nodes
         fresh = self._newest_constants()
-        anchors = self._anchors(segment, fresh)
-        found = alignment.fit(anchors, *self._bias_tau_s, slow_share=fresh.datum.slow_share,
+        readings = self._without_constants(segment, fresh)
+        found = alignment.fit(readings, *self._bias_tau_s, slow_share=fresh.datum.slow_share,
                               usual=self._usual_noise())  # fmt: skip
         if found is None:
             return False
@@ -235,8 +235,8 @@ class Segments:
         if before is not None and is_settled and not _differ(before, found, nodes):
             return False  # the graph itself follows such small changes
         segment.similarity, segment.constants = found, fresh
-        freed = [replace(a, prior=found.common.applied(a.prior, a.time_s)) for a in anchors]
-        segment.offsets = offsets(freed, found)
+        readings = [replace(n, prior=found.common.applied(n.prior, n.time_s)) for n in readings]
+        segment.offsets = offsets(readings, found)
         return True
 
     def _newest_constants(self) -> Constants:
@@ -264,17 +264,14 @@ class Segments:
         segment = self.largest()
         if segment is None:
             return None, None
-        return alignment.scales(self._anchors(segment, segment.constants), segment.frame)
+        return alignment.scales(self._without_constants(segment, segment.constants), segment.frame)
 
-    def _anchors(self, segment: Segment, known: Constants) -> list[Anchor]:
+    def _without_constants(self, segment: Segment, known: Constants) -> list[Node]:
+        """A segment's nodes without these errors; an assumed height is that of the flight."""
         height_m = self._usual_height_m()
         return [
-            Anchor(
-                n.T_odom_camera, guessed_at(height_m, known.applied(n.prior)), n.height, n.lean,
-                n.time_ns * 1e-9,
-            )
-            for n in segment.nodes
-        ]  # fmt: skip
+            replace(n, prior=guessed_at(height_m, known.applied(n.prior))) for n in segment.nodes
+        ]
 
     def _usual_height_m(self) -> float | None:
         """Height above ground of the largest segment, if its scale is measured."""

@@ -14,7 +14,8 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.alignment import Similarity
-from recon.posegraph.anchors import EXACT_HEIGHTS, Anchor, height_ratios
+from recon.posegraph.ground_heights import EXACT_HEIGHTS, height_ratios
+from recon.posegraph.records import Node
 from recon.types import F64, PosePrior
 
 SIGMA_RAD = np.radians(2.0)
@@ -300,21 +301,21 @@ class Offsets:
         return replace(prior, R_world_camera=R, position_m=position, agl_m=agl)
 
 
-def offsets(anchors: Sequence[Anchor], frame: Similarity) -> Offsets:
-    """The constants of all sensors over the anchors of one segment, robustly."""
-    ratios, independent = height_ratios(anchors)
+def offsets(nodes: Sequence[Node], frame: Similarity) -> Offsets:
+    """The constants of all sensors over the nodes of one segment, robustly."""
+    ratios, independent = height_ratios(nodes)
     is_exact = independent == EXACT_HEIGHTS
     log_height = 0.0
     if ratios:
         mean = np.average([r[0] for r in ratios], weights=[r[1] ** -2 for r in ratios])
         log_height = float(np.log(frame.scale) - mean)
-    return Offsets(_turn(anchors, frame), log_height, *_fixes(anchors, frame), is_exact)
+    return Offsets(_turn(nodes, frame), log_height, *_fixes(nodes, frame), is_exact)
 
 
-def _turn(anchors: Sequence[Anchor], frame: Similarity) -> F64:
+def _turn(nodes: Sequence[Node], frame: Similarity) -> F64:
     """(3,) mean rotation from the attitudes to the frame; its heading only if they have one."""
     turns, sigma = [], []
-    for a in anchors:
+    for a in nodes:
         R = a.prior.R_world_camera
         if R is None:
             continue
@@ -336,12 +337,12 @@ def _turn(anchors: Sequence[Anchor], frame: Similarity) -> F64:
     return turn if np.linalg.norm(turn) < 2.0 * PRIOR_SIGMA else np.zeros(3)
 
 
-def _fixes(anchors: Sequence[Anchor], frame: Similarity) -> tuple[F64, F64, F64, float]:
+def _fixes(nodes: Sequence[Node], frame: Similarity) -> tuple[F64, F64, F64, float]:
     """Centre, shift, warp (3, 3) and reach of the fixes, turned and stretched about the centre."""
     nothing = np.zeros(3), np.zeros(3), np.zeros((3, 3)), 0.0
     rows = [
         (frame.place(a.place_of_fix), a.prior.position_m, a.prior.sigma_position_m)
-        for a in anchors
+        for a in nodes
         if a.prior.position_m is not None and a.prior.sigma_position_m is not None
     ]
     if len(rows) < 3:

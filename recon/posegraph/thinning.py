@@ -216,19 +216,12 @@ def _with_fix(node: Node, left: Node) -> PosePrior:
         share, position_m = 1.0, other.position_m
     elif np.any(other.sigma_position_m > MAX_WORSE * one.sigma_position_m):
         return one
-    places = [_place_of_fix(n) for n in (node, left)]
-    place = places[0] + share * (places[1] - places[0])
+    place = node.place_of_fix + share * (left.place_of_fix - node.place_of_fix)
     return replace(
         one,
         position_m=position_m + share * (other.position_m - position_m),
         fix_offset=se3.transform(se3.inverse(node.T_odom_camera), place[None])[0],
     )
-
-
-def _place_of_fix(node: Node) -> F64:
-    """(3,) in the segment's odometry."""
-    offset = np.zeros(3) if node.prior.fix_offset is None else node.prior.fix_offset
-    return np.asarray(se3.transform(node.T_odom_camera, offset[None])[0])
 
 
 def _with_altitudes(prior: PosePrior, left: PosePrior) -> PosePrior:

@@ -76,9 +76,7 @@ class Trajectory:
     ) -> None:
         """Append a keyframe to its segment.
 
-        ``height`` comes from :func:`recon.posegraph.anchors.height_above`, in odometry units, and
-        ``covariance`` is of the step from the keyframe before, as in
-        :meth:`recon.posegraph.pose_graph.PoseGraph.add_keyframe`.
+        The arguments are those of :meth:`recon.posegraph.pose_graph.PoseGraph.add_keyframe`.
         """
         self.graph.add_keyframe(seq, time_ns, segment, T_map_camera, covariance, prior, height)
         row = np.zeros(1, KEYFRAME)

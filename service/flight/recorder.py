@@ -15,7 +15,7 @@ import numpy as np
 from mavlink.telemetry.samples import VehicleState
 from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import FallbackPosition
-from recon.posegraph.anchors import GUESSED_SHARE
+from recon.posegraph.ground_heights import GUESSED_SHARE
 from recon.poses import sigma_m
 from recon.tracking.odometry import Tracking
 from recon.types import F64, Keyframe, Pose

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from recon import se3
+from recon.posegraph.records import Node
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 
@@ -44,3 +45,12 @@ def landed(trajectory: Trajectory, count: int) -> F64:
     for seq, pose in trajectory.moved(final=True).items():
         trajectory.publish(seq, pose)
     return np.array([trajectory.pose(i).T_world_camera for i in range(count)])
+
+
+def node(
+    T_odom_camera: F64, prior: PosePrior, height: float | None = None, lean: float = 0.0,
+    time_s: float = 0.0,
+) -> Node:  # fmt: skip
+    """A keyframe with its telemetry, of no graph."""
+    time_ns = round(1e9 * time_s)
+    return Node(0, 0, time_ns, 0, T_odom_camera, np.zeros((6, 6)), prior, height, lean)

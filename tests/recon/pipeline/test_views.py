@@ -18,7 +18,6 @@ from recon.pipeline.config import Baseline
 from recon.pipeline.views import (
     Colour,
     UndistortedFrame,
-    ViewCandidate,
     ViewSelection,
     VirtualStereoCamera,
     frames_apart,
@@ -32,13 +31,15 @@ from recon.tracking.relative_pose import RelativePose
 from recon.types import U8, Camera, PosePrior
 
 
-def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> ViewCandidate:
+def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> UndistortedFrame:
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
     key = keyframe_at(seq, T, segment)
     image = np.zeros((32, 32, 3), np.uint8)
     reference = RelativePose(seq, segment, np.eye(4), key)
     colour = Colour(image, Undistorter(Camera(np.diag([30.0, 30.0, 1.0]), np.zeros(5), (32, 32))))
-    return ViewCandidate(seq, seq, PosePrior(), colour, image[..., 0], reference, blurred)
+    return UndistortedFrame(
+        seq, seq, PosePrior(), colour, image[..., 0], None, None, blurred, reference
+    )  # fmt: skip
 
 
 @dataclass
@@ -64,7 +65,7 @@ def stereo_camera(
 
 def offer(
     views: ViewSelection, seq: int, x_m: float, state: str, segment: int = 0, blurred: bool = False
-) -> ViewCandidate | None:
+) -> UndistortedFrame | None:
     taken = frame(seq, x_m, segment, blurred)
     tracked = Tracked(Tracking(state), segment, taken.T_odom_camera)
     return taken if views.offer(taken, tracked) else None
@@ -226,7 +227,7 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
         turn = np.array([0.0, 2.0 * i, 0.0, 0.0, 0.0, 0.0])
         moving = FrameRows(i, PosePrior(), np.eye(4), Rows(clock, turn, np.zeros(6)))
         image = UndistortedFrame(
-            i, i, PosePrior(), cast(Colour, plain.colour), plain.gray, plain.gray, None, False
+            i, i, PosePrior(), plain.colour, plain.gray, plain.gray, None, False
         )
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
         views.take(image, Tracked(state, 0, plain.T_odom_camera, moving=moving))
@@ -254,7 +255,7 @@ def test_views_wait_for_the_first_word_on_their_readout(
         keys.append(plain.keyframe)
         moving = FrameRows(i, PosePrior(), np.eye(4), is_measured=is_measured)
         image = UndistortedFrame(
-            i, i, PosePrior(), cast(Colour, plain.colour), plain.gray, plain.gray, None, False
+            i, i, PosePrior(), plain.colour, plain.gray, plain.gray, None, False
         )
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
         views.take(image, Tracked(state, 0, plain.T_odom_camera, moving=moving))
@@ -275,7 +276,7 @@ def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: f
         plain = frame(i, float(i))
         keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))
         image = UndistortedFrame(
-            i, i * 10**8, PosePrior(), cast(Colour, plain.colour), plain.gray, plain.gray, None,
+            i, i * 10**8, PosePrior(), plain.colour, plain.gray, plain.gray, None,
             False,
         )  # fmt: skip
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME

@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from flown_track import node
 
 from recon import se3
 from recon.camera_model import rays
 from recon.posegraph import alignment
 from recon.posegraph.alignment import fit, scales
-from recon.posegraph.anchors import Anchor, height_above, height_below
+from recon.posegraph.ground_heights import height_above, height_below
+from recon.posegraph.records import Node
 from recon.types import F32, F64, DepthMap, PosePrior, Travel
 
 
@@ -27,7 +29,7 @@ def track(n: int = 30) -> list[F64]:
 
 def anchors(
     R: F64, scale: float, t: F64, seed: int, gnss_m: float = 1.0, yaw_bias: float = 0.0
-) -> list[Anchor]:
+) -> list[Node]:
     """Noisy priors of a track that the odometry sees turned, shrunk and moved."""
     rng = np.random.default_rng(seed)
     out = []
@@ -43,7 +45,7 @@ def anchors(
             60.0 + rng.normal(0, 2.0),
             3.0,
         )
-        out.append(Anchor(odom, prior, 60.0 / scale, time_s=float(i)))
+        out.append(node(odom, prior, 60.0 / scale, time_s=float(i)))
     return out
 
 
@@ -71,7 +73,7 @@ def test_one_wild_fix_does_not_move_the_map() -> None:
         prior.position_m + np.array([30.0, 0, 0]),
         prior.sigma_position_m,
     )
-    wild[10] = Anchor(wild[10].T_odom_camera, moved, None)
+    wild[10] = node(wild[10].T_odom_camera, moved, None)
     a, b = fit(good), fit(wild)
     assert a is not None and b is not None
     shift = a.pose(good[15].T_odom_camera)[:3, 3] - b.pose(good[15].T_odom_camera)[:3, 3]
@@ -105,7 +107,7 @@ def test_heading_comes_from_the_track_when_no_compass_tells_it() -> None:
         p = a.prior
         nominal = np.diag([1.0, -1, -1])
         prior = PosePrior(nominal, 0.1, 3.0, p.position_m, p.sigma_position_m)
-        blind.append(Anchor(a.T_odom_camera, prior, None))
+        blind.append(node(a.T_odom_camera, prior, None))
     found = fit(blind)
     assert found is not None
     assert found.scale == pytest.approx(2.0, rel=0.05)
@@ -119,7 +121,7 @@ def test_scale_rests_on_the_height_without_gnss() -> None:
     for a in anchors(np.eye(3), 3.0, np.zeros(3), seed=4):
         p = a.prior
         prior = PosePrior(p.R_world_camera, 0.01, 0.05, None, None, p.agl_m, 3.0)
-        some.append(Anchor(a.T_odom_camera, prior, a.height))
+        some.append(node(a.T_odom_camera, prior, a.height))
     found = fit(some)
     assert found is not None
     assert found.scale == pytest.approx(3.0, rel=0.03)
@@ -141,7 +143,7 @@ def test_an_assumed_height_has_no_part_in_a_scale_that_is_measured(by: str) -> N
         if by == "velocities":
             travel = Travel(metres, float(i), 0)
             prior = replace(prior, position_m=None, sigma_position_m=None, travel=travel)
-        some.append(Anchor(a.T_odom_camera, prior, 120.0, time_s=float(i)))
+        some.append(node(a.T_odom_camera, prior, 120.0, time_s=float(i)))
     found = fit(some)
     without = fit([replace(a, height=None) for a in some])
     assert found is not None and without is not None
@@ -165,7 +167,7 @@ def test_an_assumed_height_does_not_pull_a_scale_that_fixes_know_to_a_quarter() 
 
 def test_an_assumed_height_is_no_source_of_the_scale() -> None:
     some = [
-        Anchor(a.T_odom_camera, assumed(replace(a.prior, position_m=None)), 120.0)
+        node(a.T_odom_camera, assumed(replace(a.prior, position_m=None)), 120.0)
         for a in anchors(np.eye(3), 1.0, np.zeros(3), seed=7)
     ]
     found = fit(some)
@@ -174,7 +176,7 @@ def test_an_assumed_height_is_no_source_of_the_scale() -> None:
 
 
 def test_without_any_prior_there_is_no_alignment() -> None:
-    assert fit([Anchor(T, PosePrior(), None) for T in track()]) is None
+    assert fit([node(T, PosePrior(), None) for T in track()]) is None
 
 
 @pytest.mark.slow
@@ -297,7 +299,7 @@ def test_heights_exactly_below_count_alone() -> None:
         p = a.prior
         prior = PosePrior(p.R_world_camera, 0.01, 0.05, None, None, 60.0, 2.0)
         lean, error = (0.0, 1.0) if i % 3 == 0 else (0.02, 1.1)
-        some.append(Anchor(a.T_odom_camera, prior, 20.0 * error, lean))
+        some.append(node(a.T_odom_camera, prior, 20.0 * error, lean))
     found = fit(some)
     assert found is not None
     assert found.scale == pytest.approx(3.0, rel=0.001)
@@ -309,7 +311,7 @@ def test_a_rangefinder_that_meets_trees_does_not_move_the_scale() -> None:
     for i, a in enumerate(anchors(np.eye(3), 2.0, np.zeros(3), seed=4)):
         agl_m = 60.0 * (1 + 0.003 * rng.normal()) - (9.0 if i % 4 == 0 else 0.0)
         prior = PosePrior(a.prior.R_world_camera, 0.01, 0.05, None, None, agl_m, 1.8)
-        some.append(Anchor(a.T_odom_camera, prior, 30.0))
+        some.append(node(a.T_odom_camera, prior, 30.0))
     found = fit(some)
     assert found is not None
     assert found.scale == pytest.approx(2.0, rel=0.004)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from flown_track import node
 
 from recon import se3
 from recon.posegraph.alignment import fit
-from recon.posegraph.anchors import Anchor
 from recon.posegraph.between_keyframes import FixAverage
 from recon.posegraph.sensor_offsets import altitude_datum
 from recon.types import PosePrior
@@ -87,7 +87,7 @@ def test_the_mean_of_an_interval_lies_where_its_fixes_were() -> None:
             given = average.given(T, prior)
             assert given.gnss_minus_baro_fixes == 4 and given.fix_offset is not None
             assert given.gnss_minus_baro_m == pytest.approx(i // 2 - 1.5)
-            anchors.append(Anchor(T, given, None))
+            anchors.append(node(T, given, None))
     found = fit(anchors)
     assert found is not None and found.scale == pytest.approx(scale, rel=1e-3)
     np.testing.assert_allclose(found.t, t, atol=0.02)

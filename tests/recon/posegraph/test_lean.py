@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from flown_track import node
 
 from recon import se3
 from recon.posegraph.alignment import Similarity, fit
-from recon.posegraph.anchors import Anchor
 from recon.posegraph.level_ground import ASSUMED_TILT_RAD, LEVEL_SIGMA_RAD
+from recon.posegraph.records import Node
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, PosePrior
 
@@ -22,7 +23,7 @@ STEP_M, STEP_S, STRIP_M, APART_M = 8.0, 6.0, 150.0, 22.0
 class Stills:
     """Stills without attitude, 50 m up, with positions that state no accuracy of the altitude."""
 
-    anchors: list[Anchor]
+    anchors: list[Node]
     level: F64  # (3, 3) world from odometry
 
     def lean_deg(self, found: Similarity) -> float:
@@ -64,7 +65,7 @@ def stills(
             is_sigma_claimed=False, is_view_assumed=True,
         )  # fmt: skip
         odom = se3.compose(level.T @ R, level.T @ p[k])
-        anchors.append(Anchor(odom, prior, None, 0.0, float(t[k])))
+        anchors.append(node(odom, prior, None, 0.0, float(t[k])))
     return Stills(anchors, level)
 
 

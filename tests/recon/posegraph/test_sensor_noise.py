@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from flown_track import node
 from paths import ROOT
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import nnls
@@ -15,8 +16,8 @@ from scipy.stats import chi2
 
 from recon import se3
 from recon.posegraph.alignment import fit, scales
-from recon.posegraph.anchors import Anchor
 from recon.posegraph.between_keyframes import Odometer
+from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import (
     CHI_SQUARED_MEDIANS,
     Noise,
@@ -111,7 +112,7 @@ def wandering(step_s: float, legs: int, seed: int) -> tuple[float, float]:
     fixes = at + error[:, :3] + 0.05 * rng.normal(size=at.shape)
     claimed = np.array([1.0, 1.0, 1.5])
     some = [
-        Anchor(se3.compose(NADIR, p), PosePrior(NADIR, 0.02, 0.1, fix, claimed), None, 0.0, t)
+        node(se3.compose(NADIR, p), PosePrior(NADIR, 0.02, 0.1, fix, claimed), None, 0.0, t)
         for p, fix, t in zip(at, fixes, times, strict=True)
     ]
     found = fit(some)
@@ -160,7 +161,7 @@ def test_a_drift_is_known_after_a_minute(walk: float, rate: float) -> None:
     assert drift_noise(times[:5], drift[:5]) is None
 
 
-def anchors(stretch: float, claimed_m: float, seed: int = 3, travel: bool = True) -> list[Anchor]:
+def anchors(stretch: float, claimed_m: float, seed: int = 3, travel: bool = True) -> list[Node]:
     """30 s along a line at 60 m; fixes drift so that the line seems ``stretch`` times as long."""
     rng, out = np.random.default_rng(seed), []
     for i in range(30):
@@ -170,7 +171,7 @@ def anchors(stretch: float, claimed_m: float, seed: int = 3, travel: bool = True
         prior = PosePrior(
             NADIR, 0.01, 0.05, fix, np.full(3, claimed_m), None, travel=way, is_agl_measured=False
         )
-        out.append(Anchor(se3.compose(NADIR, at / 1.5), prior, 40.0, 0.0, float(i)))
+        out.append(node(se3.compose(NADIR, at / 1.5), prior, 40.0, 0.0, float(i)))
     return out
 
 
@@ -183,7 +184,7 @@ def test_velocity_gives_the_scale_where_fixes_drift() -> None:
     assert abs(np.log(drifting.scale / 1.5)) < 2.0 * drifting.sigma_scale
 
 
-def legs_flown(seed: int, leg_s: float, count: int, rate_m_s: float, tau_s: float) -> list[Anchor]:
+def legs_flown(seed: int, leg_s: float, count: int, rate_m_s: float, tau_s: float) -> list[Node]:
     """A keyframe a second, 60 m up; fixes wander by 1 m (60 s), velocities by ``rate_m_s``."""
     rng, times = np.random.default_rng(seed), seconds(count)
     along = SPEED_M_S * np.abs((times + leg_s) % (2.0 * leg_s) - leg_s)
@@ -192,7 +193,7 @@ def legs_flown(seed: int, leg_s: float, count: int, rate_m_s: float, tau_s: floa
     slow = np.cumsum(gauss_markov(rng, times, rate_m_s, tau_s, 3), axis=0)
     ways = at + slow + np.cumsum(0.02 * rng.normal(size=(count, 3)), axis=0)
     return [
-        Anchor(
+        node(
             se3.compose(NADIR, place / 1.5),
             PosePrior(
                 NADIR, 0.01, 0.05, fix, np.ones(3), None,

@@ -1,12 +1,13 @@
-"""Keyframes of the odometry with their telemetry, and the heights above ground that they give."""
+"""Heights above ground, by vision and by telemetry."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from recon.posegraph.records import Node
 from recon.types import F64, DepthMap, PosePrior
 
 INDEPENDENT_HEIGHTS = 4.0
@@ -32,28 +33,6 @@ MIN_SPREAD = 0.005
 
 EDGE_SHARE = 0.03
 """Depths about the point below that differ by more than this share belong to an edge."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Anchor:
-    """A keyframe of the odometry with its telemetry."""
-
-    T_odom_camera: F64  # (4, 4)
-    prior: PosePrior
-    height: float | None  # of the camera above ground that it sees, in odometry units
-    lean: float = 0.0  # 1 - cosine of how far off the vertical that ground is; 0 is below
-    time_s: float = 0.0
-
-    @property
-    def place(self) -> F64:
-        """(3,) of the camera, in the odometry."""
-        return np.asarray(self.T_odom_camera[:3, 3])
-
-    @property
-    def place_of_fix(self) -> F64:
-        """(3,) where the prior's position was, in the odometry."""
-        offset, T = self.prior.fix_offset, self.T_odom_camera
-        return T[:3, 3] if offset is None else T[:3, :3] @ offset + T[:3, 3]
 
 
 def guessed_at(height_m: float | None, prior: PosePrior) -> PosePrior:
@@ -103,27 +82,27 @@ def height_below(depth: DepthMap, up: F64) -> float | None:
     return float(np.median(known)) / float(down[2])
 
 
-def height_ratio(anchor: Anchor) -> tuple[float, float] | None:
+def height_ratio(node: Node) -> tuple[float, float] | None:
     """Log of height by telemetry over height by vision, and its sigma; None without both."""
-    agl, height = anchor.prior.agl_m, anchor.height
+    agl, height = node.prior.agl_m, node.height
     if agl is None or height is None or not height > 0:
         return None
     # The height is measured straight below; ground seen elsewhere may lie otherwise.
-    sigma = anchor.prior.sigma_agl_m / agl + LEANING_SHARE * anchor.lean
+    sigma = node.prior.sigma_agl_m / agl + LEANING_SHARE * node.lean
     return float(np.log(agl / height)), sigma
 
 
-def height_ratios(anchors: Sequence[Anchor]) -> tuple[list[tuple[float, float]], float]:
-    """:func:`height_ratio` of the anchors that have one, and as how many independent ones they
+def height_ratios(nodes: Sequence[Node]) -> tuple[list[tuple[float, float]], float]:
+    """:func:`height_ratio` of the nodes that have one, and as how many independent ones they
     count.
 
     Measured heights stand in for all others, and heights of the ground exactly below for those.
     """
-    known = [(h, a) for a in anchors if (h := height_ratio(a)) is not None]
-    measured = [(h, a) for h, a in known if a.prior.is_agl_measured]
+    known = [(h, n) for n in nodes if (h := height_ratio(n)) is not None]
+    measured = [(h, n) for h, n in known if n.prior.is_agl_measured]
     if not measured:
         return [h for h, _ in known], UNMEASURED_HEIGHTS
-    exact = [h for h, a in measured if a.lean == 0.0]
+    exact = [h for h, n in measured if n.lean == 0.0]
     if len(exact) < MIN_EXACT:
         return [h for h, _ in measured], INDEPENDENT_HEIGHTS
     # A rangefinder meets a tree where the image sees through it: single ones are far off.
