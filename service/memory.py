@@ -33,7 +33,7 @@ def one_pool() -> bool:
     return bool(libc.mallopt(M_ARENA_MAX, 1) == 1)
 
 
-def give_back(collect: bool = False) -> bool:
+def release_memory(collect: bool = False) -> bool:
     """Return freed memory to the system; True when it did. Takes a millisecond or two.
 
     With ``collect`` reference cycles are freed first, as after a scan; that takes longer.

@@ -52,7 +52,7 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     if find_spec("torch") is None or find_spec("triton") is None:
         pytest.skip("torch or triton is not installed")
     if chosen == "cpu":
-        from recon.backends import room, triton_dense, triton_icp
+        from recon.backends import padding, triton_dense, triton_icp
 
         for module, name, value in (  # few programs: each takes long here
             (triton_dense, "PIXELS", 512), (triton_dense, "CELLS", 512),

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from recon.backends.room import pyramid_levels
+from recon.backends.padding import pyramid_levels
 from recon.stereo.belief_propagation import RADIUS, BeliefPropagationConfig
 from recon.stereo.matching_cost import CENSUS_OFFSETS, CENSUS_REACH, COST_UNIT
 from recon.stereo.message_passing import FULL_WEIGHT

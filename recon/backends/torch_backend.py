@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from recon.backends import DenseStages
-from recon.backends.room import kept, pyramid_levels, room
+from recon.backends.padding import kept, padded, pyramid_levels
 from recon.backends.torch_depth import DensePath, upsampled
 from recon.backends.torch_plan import Plan, compiling, part, read
 from recon.backends.triton_dense import contrast, stereo
@@ -57,7 +57,7 @@ class TorchBackend:
         check_pair(left, right, labels)
         right = equalised(left, right, labels, config.min_disparity)
         h, w = left.shape
-        *space, label_room = room(h, w, labels)
+        *space, label_room = padded(h, w, labels)
         levels = pyramid_levels(h, w, config)
         px, confidence = self._run(
             ("stereo", *space, label_room, levels, config),
@@ -72,7 +72,7 @@ class TorchBackend:
         """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
         check_guide(coarse, guide)
         (h, w), (H, W) = coarse.px.shape, guide.shape[:2]
-        small, large = room(h, w, 1)[:2], room(H, W, 1)[:2]
+        small, large = padded(h, w, 1)[:2], padded(H, W, 1)[:2]
         px, confidence = self._run(
             ("upsample", *small, *large, config),
             partial(upsampled, config=config),

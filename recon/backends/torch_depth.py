@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from recon.backends import DenseStages
-from recon.backends.room import kept, pyramid_levels, room
+from recon.backends.padding import kept, padded, pyramid_levels
 from recon.backends.torch_plan import Plan, part, read
 from recon.backends.triton_dense import (
     averaged,
@@ -72,8 +72,8 @@ class DensePath:
 
     def _plan(self, pair: StereoPair, size_px: tuple[int, int]) -> Plan:
         h, w = pair.left.shape
-        space = room(h, w, pair.labels)
-        fine = None if pair.guide is None else room(pair.guide.shape[0], pair.guide.shape[1], 1)[:2]
+        space = padded(h, w, pair.labels)
+        fine = None if pair.guide is None else padded(*pair.guide.shape[:2], 1)[:2]
         levels = pyramid_levels(h, w, self.stages.matching)
         key = (space, fine, levels, size_px)
 

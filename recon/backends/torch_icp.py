@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.backends.room import kept
+from recon.backends.padding import kept
 from recon.backends.torch_plan import Plan, part, read
 from recon.backends.triton_icp import (
     DeviceSurface,

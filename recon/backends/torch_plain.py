@@ -13,7 +13,7 @@ from torch import Tensor
 from recon.backends import Backend
 from recon.backends.cpu import CpuBackend
 from recon.backends.exported_stereo import FAR, edge_weights, matching_cost, propagate, select
-from recon.backends.room import pyramid_levels
+from recon.backends.padding import pyramid_levels
 from recon.stereo.belief_propagation import (
     NOISE,
     RADIUS,

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.backends.room import place
+from recon.backends.padding import place
 from recon.types import Array
 
 log = logging.getLogger(__name__)

@@ -2,7 +2,7 @@
 
 Each function computes what the compiled one of :mod:`recon.stereo` does, which the tests compare.
 A kernel is compiled once for all sizes. The pairs of a flight differ by a few pixels and labels
-from each other: arrays are a little larger than the pair (see :mod:`recon.backends.room`), and its
+from each other: arrays are a little larger than the pair (:mod:`recon.backends.padding`), and its
 true height, width and number of labels come as a tensor ``true``. What lies beyond them says
 nothing. Costs and messages are (h, w, L) int16, L a power of two: a thread holds labels that lie
 side by side in memory. Sums have 32 bits, so all integers are exact.

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from recon import se3
-from recon.bands import at_once, in_bands
 from recon.calibration.bundle_kernels import (
     CAMERA,
     errors,
@@ -27,6 +26,7 @@ from recon.calibration.bundle_kernels import (
     reduce_points,
     settle_points,
 )
+from recon.parallel import parallel_for, run_parallel
 from recon.rolling_shutter import row_shares
 from recon.types import F64, I64, Camera
 
@@ -164,7 +164,7 @@ def errors_px(
     k, k3 = _vector(camera), float(camera.distortion[4])
     X = np.ascontiguousarray(points)
     T = se3.each_inverse(poses)
-    in_bands(errors, len(pose), T, X, k, k3, pose, seen.landmark, seen.uv_px, out)
+    parallel_for(errors, len(pose), T, X, k, k3, pose, seen.landmark, seen.uv_px, out)
     return np.asarray(np.hypot(out[:, 0], out[:, 1]))
 
 
@@ -307,7 +307,7 @@ class _Bundle:
     def _errors(self, s: _State) -> F64:
         out = np.zeros((len(self._view), 2))
         T, pose = self._of_sightings(s)
-        in_bands(errors, len(out), T, s.X, s.k, self._k3, pose, self._point, self._uv, out)
+        parallel_for(errors, len(out), T, s.X, s.k, self._k3, pose, self._point, self._uv, out)
         return out
 
     def _lengths(self, s: _State) -> F64:
@@ -362,7 +362,7 @@ class _Bundle:
     def _with_settled_points(self, s: _State) -> _State:
         X = s.X.copy()
         T, pose = self._of_sightings(s)
-        in_bands(
+        parallel_for(
             settle_points, len(X), T, pose, X, s.k, self._k3, self._start_of, self._uv, self._sigma,
             self._of.huber_sigmas, self._surveyed, self._sure,
         )  # fmt: skip
@@ -393,7 +393,7 @@ class _Bundle:
         sums = S, g, B, Hk, gk
         parts = [np.zeros((PARTS, *one.shape)) for one in sums]
         ends = np.searchsorted(self._start_of, M * np.arange(1, PARTS) // PARTS)
-        at_once(*(
+        run_parallel(*(
             partial(
                 reduce_points, first, end, T, pose, self._share, s.X, s.k, self._k3, self._view,
                 self._start_of, self._uv, self._sigma, self._of.huber_sigmas, Hp, bp, damping,

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.bands import at_once
 from recon.calibration.global_bundle import RowMotion, Sightings, joint
 from recon.camera_model import project, rays
+from recon.parallel import run_parallel
 from recon.tracking import robust_geometry
 from recon.tracking.common_view import Features, features, mutual
 from recon.tracking.matching import Pyramid, match
@@ -113,7 +113,7 @@ def joined(
     views = sorted(images)
     *starts, total = np.cumsum([0, *(len(images[k].place) for k in views)])
     first, pairs = dict(zip(views, starts, strict=True)), list(pairs)
-    found = at_once(*(partial(matches, images[a], images[b], camera) for a, b in pairs))
+    found = run_parallel(*(partial(matches, images[a], images[b], camera) for a, b in pairs))
     ends = [
         np.column_stack([both[0] + first[a], both[1] + first[b]])
         for (a, b), both in zip(pairs, found, strict=True)
@@ -156,7 +156,7 @@ def sharpened(pyramid: Callable[[int], Pyramid], camera: Camera, seen: Sightings
         at = match(pyramid(a), here, pyramid(b), flat[rows], REACH_PX, warp)
         uv[rows[at.ok]] = at.uv_px[at.ok]
 
-    at_once(*(
+    run_parallel(*(
         partial(sharpen, int(a), int(b), rows)
         for (a, b), rows in zip(views, rows_of, strict=True)
         if a != b and len(rows) >= MIN_SHARED
@@ -234,7 +234,7 @@ def extended(
         return np.full_like(again, b), again, at.uv_px[at.ok].astype(np.float64)
 
     pairs = [(a, b) for a, others in overlap.items() for b in others]
-    more = at_once(*(partial(found_again, a, b) for a, b in pairs))
+    more = run_parallel(*(partial(found_again, a, b) for a, b in pairs))
     if not more:
         return seen
     view, landmark, places = (np.concatenate(parts) for parts in zip(*more, strict=True))

@@ -11,8 +11,8 @@ from functools import partial
 import numpy as np
 from numba import njit
 
-from recon.bands import at_once, in_bands
 from recon.mapping.voxel_map import find_slot, rehash, voxel_key
+from recon.parallel import parallel_for, run_parallel
 from recon.types import F32, F64, I32, I64, U8, Bool, DepthMap, PointCloud
 
 CORRELATION = 0.55
@@ -66,11 +66,13 @@ def fuse_strips(
         return sums.means(_first_of_each(times))
 
     rows = zip(strips, borders[:-1], borders[1:], strict=True)
-    keys, clouds = zip(*at_once(*(partial(fused, *row) for row in rows)), strict=True)
+    keys, clouds = zip(*run_parallel(*(partial(fused, *row) for row in rows)), strict=True)
     whole = joined(clouds)
     lone = np.zeros(len(whole), np.bool_)
     every = np.concatenate(keys)
-    in_bands(_lone_contradicted, len(lone), every, whole.xyz_m, whole.sigma_m, whole.views, lone)
+    parallel_for(
+        _lone_contradicted, len(lone), every, whole.xyz_m, whole.sigma_m, whole.views, lone
+    )
     lone |= _islands(every, whole.views)
     return whole if not lone.any() else without(whole, lone)
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.types import F32, F64, I16, I64, U8, Bool, DepthMap, PointCloud
 
 U32 = npt.NDArray[np.uint32]
@@ -155,7 +155,7 @@ def seen_through(cloud: PointCloud, views: Iterable[DepthMap]) -> Bool:
         slack_m = AGREES_SIGMAS * (largest_m + float(np.nanmax(depth.sigma_m, initial=0.0)))
         reached = tiles.in_view(depth, slack_m)
         if len(reached):
-            in_bands(
+            parallel_for(
                 _vote,
                 len(reached),
                 reached,
@@ -195,7 +195,7 @@ def air_above(
     for depth in views:
         reached = tiles.in_view(depth, AIR_SLACK_M, around)
         if len(reached):
-            in_bands(
+            parallel_for(
                 _look_above,
                 len(reached),
                 reached,

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
-from recon.bands import in_bands
 from recon.camera_model import rays
 from recon.mapping import icp_kernels
+from recon.parallel import parallel_for
 from recon.types import F32, F64, Bool, DepthMap, Registration, Verdict
 
 # Variance that the residuals do not show: edges half seen, errors of the normals; measured.
@@ -75,7 +75,7 @@ class DepthSurface:
         elements = np.zeros((h, w, 6), np.float32)
         inverse = 1.0 / np.where(z > 0, z, np.float32(np.nan)).astype(np.float64)
         chunks = -(-h // icp_kernels.CHUNK)
-        in_bands(
+        parallel_for(
             icp_kernels.surface_elements, chunks, z, inverse, sigma, *intrinsics,
             config.edge_share, elements,
         )  # fmt: skip

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 
 from recon import se3
-from recon.bands import in_bands
 from recon.camera_model import rays
+from recon.parallel import parallel_for
 from recon.types import F32, F64, I32, I64, Bool, DepthMap
 
 EMPTY = np.int64(-1)
@@ -149,7 +149,7 @@ class VoxelMap:
         """(h, w) pixels whose surface is new, or clearly better than what is held."""
         c = self.config
         out = np.zeros(depth.depth_m.shape, np.bool_)
-        in_bands(
+        parallel_for(
             _fresh, len(out), self._keys, self._ids, self._sigma, *_arrays(depth),
             1.0 / c.voxel_m, c.better_ratio, c.reach_sigma, c.largest_reach_voxels, out,
         )  # fmt: skip

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon import bands, se3
+from recon import parallel, se3
 from recon.posegraph.factors import MotionFactors, ReadingFactors, is_frozen, sound
 from recon.posegraph.loop_verification import LoopVerification
 from recon.posegraph.records import Loop, Node, PoseGraphConfig
@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
 
-GIVE_WAY_EVERY = 4
+RELEASE_EVERY = 4
 """Keyframes of a rebuild, in which other threads wait."""
 
 
@@ -255,8 +255,8 @@ class PoseGraph:
         self._start()
         last: Node | None = None
         for count, node in enumerate(self._nodes.values()):
-            if count % GIVE_WAY_EVERY == 0:
-                bands.give_way()
+            if count % RELEASE_EVERY == 0:
+                parallel.release_gil()
             self._insert(node, last)
             last = node
         for loop in self.loops.taken:

@@ -20,7 +20,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from recon import bands, se3
+from recon import parallel, se3
 from recon.table import Rows, Table
 from recon.types import F64, I64
 
@@ -164,7 +164,7 @@ class System:
 
     @staticmethod
     def of(factors: list[Factors], at: State) -> System:
-        bands.give_way()
+        parallel.release_gil()
         count, first_log = 6 * len(at.R) + len(at.logs), 6 * len(at.R)
         held = np.array([first_log + NO_SCALE])
         values, rows, columns, g, cost = [np.ones(1)], [held], [held], np.zeros(count), 0.0

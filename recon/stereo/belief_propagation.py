@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 from numba import njit
 
-from recon.bands import in_bands
 from recon.image_quality import local_variance
+from recon.parallel import parallel_for
 from recon.stereo.exposure import equalised
 from recon.stereo.matching_cost import (
     COST_UNIT,
@@ -171,7 +171,7 @@ def select(
     height, _, width = cost.shape
     px = np.empty((height, width), np.float32)
     confidence = np.empty((height, width), np.float32)
-    in_bands(
+    parallel_for(
         _select, height, data, messages, cost, min_disparity, 2 * truncation, float(min_evidence),
         px, confidence, cells=cost.size,
     )  # fmt: skip

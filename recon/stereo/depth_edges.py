@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.stereo.reprojection import known_where
 from recon.types import F32, F64, U8, Bool, DepthMap
 
@@ -69,12 +69,12 @@ def drop_edges(depth: DepthMap, bgr: U8) -> DepthMap:
     noise = np.where(known, middle * depth.sigma_m / (z * z), np.float32(0.0))
     windows = window_fits(nearness, FLAT_RADIUS, False), window_fits(nearness, PLANE_RADIUS, True)
     mixed, places = known.copy(), np.empty((2, *known.shape), np.float32)
-    in_bands(_find_surfaces, len(mixed), nearness, noise, *windows, places, mixed)
+    parallel_for(_find_surfaces, len(mixed), nearness, noise, *windows, places, mixed)
     closed = cv2.morphologyEx(mixed.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((CLOSED_PX,) * 2))
     kept = known & (closed == 0)
     farthest = cv2.erode(np.where(kept, nearness, np.inf), np.ones((2 * PLANE_RADIUS + 1,) * 2))
     spilt = kept & (nearness - farthest > STEP_SIGMAS * noise)
-    in_bands(_keep_spills, len(spilt), nearness, noise, kept, bgr, *windows, places, spilt)
+    parallel_for(_keep_spills, len(spilt), nearness, noise, kept, bgr, *windows, places, spilt)
     kept &= ~spilt
     return depth if kept.sum() == known.sum() else known_where(depth, kept)
 

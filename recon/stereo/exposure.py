@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.small_matrices import solve_symmetric
 from recon.stereo.matching_cost import CENSUS_REACH, bordered, census_row, plain, popcount
 from recon.types import U8
@@ -48,7 +48,7 @@ def equalised(left: U8, right: U8, labels: int, min_disparity: int = 0) -> U8:
     if rows * columns < MIN_SAMPLES:
         return right
     places = np.full((rows, columns, 2), -1, np.int32)
-    in_bands(
+    parallel_for(
         _match, rows, bordered(left), bordered(right), step, labels, min_disparity, places,
         cells=rows * columns * labels,
     )  # fmt: skip
@@ -63,7 +63,9 @@ def equalised(left: U8, right: U8, labels: int, min_disparity: int = 0) -> U8:
     change = np.empty((TERMS, 1))
     _fit(np.ascontiguousarray(terms), left[v, u] - gray, change)
     out = np.empty_like(right)
-    in_bands(_apply, height, plain(right), change[:, 0].astype(np.float32), out, cells=right.size)
+    parallel_for(
+        _apply, height, plain(right), change[:, 0].astype(np.float32), out, cells=right.size
+    )
     return out
 
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from numba import njit, types
 from numba.extending import intrinsic
 
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.types import I16, U8
 
 U32 = npt.NDArray[np.uint32]
@@ -74,7 +74,7 @@ def matching_cost(
     left, right = plain(left), plain(right)
     height, width = left.shape
     cost = np.empty((height, labels, width), np.int16) if out is None else out
-    in_bands(
+    parallel_for(
         _cost_volume, height, left, right, census(left), census(right), min_disparity,
         round(config.census_weight * COST_UNIT), config.census_truncation,
         round(config.difference_weight * COST_UNIT), config.difference_truncation,
@@ -109,7 +109,7 @@ def census(image: U8) -> U32:
     last row and column.
     """
     words = np.empty(image.shape, np.uint32)
-    in_bands(_census, len(image), bordered(image), words, cells=image.size)
+    parallel_for(_census, len(image), bordered(image), words, cells=image.size)
     return words
 
 

@@ -25,7 +25,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from recon.bands import in_bands, shares
+from recon.parallel import parallel_for, shares
 from recon.stereo.matching_cost import Workspace
 from recon.types import I16, U8
 
@@ -234,13 +234,13 @@ def propagate(
     pyramid = [_space.take("data", (height, 2, labels, cells))]
     shape = (4, height + 2, 2, labels, cells)
     coarse = _Coarse(_space.take_bytes("messages", shape).reshape(-1))
-    in_bands(_split, height, cost, truncation, pyramid[0], cells=cost.size)
+    parallel_for(_split, height, cost, truncation, pyramid[0], cells=cost.size)
     weights = [smoothness.weights(image)]
     while len(pyramid) < levels and min(weights[-1].shape[1:]) >= 8:
         weights.append(_coarser_weights(weights[-1]))
         _, h, w = weights[-1].shape
         pyramid.append(coarse.take((h, 2, labels, cells_of(w)), np.int16))
-        in_bands(_coarser, h, pyramid[-2], w, truncation, pyramid[-1], cells=pyramid[-2].size)
+        parallel_for(_coarser, h, pyramid[-2], w, truncation, pyramid[-1], cells=pyramid[-2].size)
     messages = np.zeros((4, 1, 2, labels, 1), np.uint8)
     for level in range(len(pyramid) - 1, -1, -1):
         data, weight = pyramid[level], weights[level]
@@ -251,7 +251,7 @@ def propagate(
             finer = coarse.take(shape, np.uint8)
         else:
             finer = _space.take_bytes("messages 1" if level else "messages", shape)
-        in_bands(_start, h + 2, messages, w, finer, cells=data.size)
+        parallel_for(_start, h + 2, messages, w, finer, cells=data.size)
         messages = finer
         edges = _edges(weight, cells, smoothness.slope, truncation)
         _sweeps(data, messages, edges, w, iterations)
@@ -472,5 +472,5 @@ def _sweeps(data: I16, messages: U8, edges: Any, width: int, iterations: int) ->
             edge = height * (band + 1) // bands
             _sweep_gap(data, messages, edges, width, iterations, edge)
 
-    in_bands(sweep, bands)
-    in_bands(close, bands - 1)
+    parallel_for(sweep, bands)
+    parallel_for(close, bands - 1)

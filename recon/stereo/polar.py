@@ -18,8 +18,8 @@ import numpy as np
 from numba import njit
 
 from recon import se3
-from recon.bands import in_bands
 from recon.image_quality import halved, local_variance, stretch
+from recon.parallel import parallel_for
 from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX, MIN_CONFIDENCE, PairDepth, label_at
 from recon.types import F32, F64, U8, Bool, DisparityMap, PolarPair
@@ -324,7 +324,7 @@ def reproject_polar(
         pair.px_per_rad, pair.rows_per_rad, pair.first_rad, pair.first_row_rad,
         pair.first_label, pair.baseline_m, *pair.relief, LABEL_SIGMA_PX * pair.noise,
     ]  # fmt: skip
-    in_bands(
+    parallel_for(
         _reproject,
         h,
         disparity.px,

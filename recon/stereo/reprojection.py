@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.types import F32, F64, Bool, DepthMap, DisparityMap, PosePrior, StereoPair
 
 LABEL_SIGMA_PX = 0.075
@@ -49,7 +49,7 @@ def reproject(
     out = PairDepth(np.empty((h, w), np.float32), np.empty((h, w), np.float32))
     to_left = pair.K @ pair.R_left_keyframe @ np.linalg.inv(K)
     finer = np.array(disparity.px.shape, np.float64) / pair.left.shape
-    in_bands(
+    parallel_for(
         _reproject, h, disparity.px, disparity.confidence, np.ascontiguousarray(to_left), finer,
         np.asarray(pair.plane, np.float64), float(pair.slope),
         float(pair.K[0, 0] * pair.baseline_m), LABEL_SIGMA_PX * pair.noise, out.depth_m,
@@ -220,7 +220,7 @@ def fuse(
         np.empty(shape, np.float32), np.empty(shape, np.float32), np.zeros(shape, np.uint8), K,
         T_world_camera,
     )  # fmt: skip
-    in_bands(
+    parallel_for(
         _fuse, shape[0], depth, sigma, config.agree_sigmas, config.single_view_sigma,
         config.max_sigma_share, config.min_sigma_share, out.depth_m, out.sigma_m, out.views,
     )  # fmt: skip

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.stereo.matching_cost import plain
 from recon.types import F32, I32, U8, DisparityMap
 
@@ -77,7 +77,7 @@ def upsample(coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> Dispa
     pad = -shape[1] % TILE
     padded = -config.diameter_px % GROUP
     out, sure = np.empty((2, *shape), np.float32)
-    in_bands(
+    parallel_for(
         _bilateral,
         -(-shape[1] // TILE),
         _taps(coarse, guide, scale),

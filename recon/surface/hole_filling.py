@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.surface.harmonic import between
 from recon.surface.raster import STEP_M, Grid, Raster, rasterise_points, reliable
 from recon.types import F32, F64, U8, Bool
@@ -72,7 +72,7 @@ def filled(
     holes = (near > 0) & ~certain.known
     out = layers.copy()
     rows, rise_m = len(layers), SLOPE * certain.grid.cell_m
-    in_bands(
+    parallel_for(
         _fill, rows, layers, doubtful.astype(np.float32), holes, reach, rise_m, edge_cells, out
     )
     new = np.isfinite(out[..., 0]) & ~certain.known

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numba import njit
 
-from recon.bands import in_bands
 from recon.image_quality import sharpness
 from recon.mapping.free_space import pixel_of
+from recon.parallel import parallel_for
 from recon.surface.raster import Grid, Raster, highest_lowest
 from recon.surface.texture_atlas import cameras, flat, sample
 from recon.surface.texture_views import TextureView, TriangleViews, drop_outliers, insert
@@ -79,7 +79,7 @@ def orthophoto(
         (old.north_m - grid.north_m + 0.5 * grid.cell_m) / old.cell_m - 0.5,
         grid.cell_m / old.cell_m,
     )
-    in_bands(
+    parallel_for(
         _paint, len(rgb), np.ascontiguousarray(terrain.places_m), _axes(terrain.places_m),
         terrain.raster.height_m,
         terrain.raster.rgb, np.ascontiguousarray(label), *lens, levels(found, len(views)),
@@ -107,7 +107,7 @@ def _sightings(
     edges = [rows * n // (STEPS - 1) for n in range(STEPS)]
     for first, end in pairwise(edges):
         progress("choosing views for the orthophoto")
-        in_bands(
+        parallel_for(
             _look, end - first, first, places, raster.height_m, around, highest, eyes, centres,
             sharp, *images, out.view, out.px_per_m, out.bgr,
         )  # fmt: skip

@@ -18,10 +18,10 @@ import numpy as np
 from numba import njit
 
 from recon import se3
-from recon.bands import at_once, threads
 from recon.camera_model import rays
 from recon.mapping.cloud_fusion import BITS, ISLAND_POINTS, ISLAND_SHIFT, pieces
 from recon.mapping.free_space import seen_through, spread
+from recon.parallel import run_parallel, threads
 from recon.surface.meshing import Mesh
 from recon.surface.texture_views import TextureView, rays_onto
 from recon.types import F32, F64, I64, U8, Bool, DepthMap, Keyframe, PointCloud
@@ -101,7 +101,7 @@ def splats_of(
         progress("Gaussians from depth images")
         return of_depth(keyframe.depth, keyframe.fresh, view)
 
-    found = at_once(*(partial(measured, k, v) for k, v in zip(keyframes, views, strict=True)))
+    found = run_parallel(*(partial(measured, k, v) for k, v in zip(keyframes, views, strict=True)))
     splats, sigma = joined([one for one, _ in found]), np.concatenate([s for _, s in found])
     splats = _merged(splats, sigma, [k.depth for k in keyframes])
     splats = joined([splats, *_fillings(splats, views, surface, progress)])
@@ -306,7 +306,7 @@ def _fitted(
         return rows, _blend(flat, opacity, rgb, w, h, error)[2]
 
     for at in range(0, len(views), threads()):
-        for rows, found in at_once(*(partial(errors, v) for v in views[at : at + threads()])):
+        for rows, found in run_parallel(*(partial(errors, v) for v in views[at : at + threads()])):
             sums[rows] += found
     rgb = splats.rgb + sums[:, :3] / np.maximum(sums[:, 3:], 0.05)
     return Splats(splats.xyz_m, splats.q_wxyz, splats.sigma_m, splats.opacity, np.clip(rgb, 0, 255))

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from recon.bands import in_bands
 from recon.camera_model import project
+from recon.parallel import parallel_for
 from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh
 from recon.types import F32, F64, I32, I64, U8, Bool
@@ -140,7 +140,7 @@ def consistent(found: TriangleViews) -> TriangleViews:
     Needs MIN_VOTES views of a triangle at least; the rest of its row moves up.
     """
     view, px, bgr = found.view.copy(), found.px_per_m.copy(), found.bgr.copy()
-    in_bands(drop_outliers, len(view), view, px, bgr)
+    parallel_for(drop_outliers, len(view), view, px, bgr)
     return TriangleViews(view, px, bgr)
 
 

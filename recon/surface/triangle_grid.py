@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.types import F64, I32
 
 BLOCK = 8  # columns along the side of a coarse block
@@ -58,7 +58,7 @@ class TriangleGrid:
         origins = np.require(origins, np.float64, ("C", "W"))  # each layout would be compiled
         t = np.empty(len(directions))
         hit = np.empty(len(directions), np.int32)
-        in_bands(_cast_all, len(directions), self.arrays(), origins, directions, t, hit)
+        parallel_for(_cast_all, len(directions), self.arrays(), origins, directions, t, hit)
         return t, hit
 
     def closest(self, points: F64, max_m: float) -> tuple[F64, F64, I32]:
@@ -71,7 +71,7 @@ class TriangleGrid:
         nearest = np.empty((len(points), 3))
         hit = np.empty(len(points), np.int32)
         found = distance, nearest, hit
-        in_bands(_closest_all, len(points), self.arrays(), points, float(max_m), *found)
+        parallel_for(_closest_all, len(points), self.arrays(), points, float(max_m), *found)
         return distance, nearest, hit
 
     def arrays(self) -> tuple[Any, ...]:

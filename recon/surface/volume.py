@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from recon import se3
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.surface.ground import terrain
 from recon.surface.hole_filling import completed, outline
 from recon.surface.meshing import Mesh, reduced, used_vertices
@@ -139,14 +139,14 @@ def _vote(volume: Volume, upper: Raster, depths: Iterable[DepthMap], truncation_
         T = se3.inverse(one.T_world_camera)
         seen = _in_view(middle, radius, one, T)
         if len(seen):
-            in_bands(
+            parallel_for(
                 _add, len(seen), seen, volume.block, volume.distance,
                 volume.weight, volume.origin_m, volume.voxel_m, truncation_m, one.depth_m,
                 one.sigma_m, one.K, T, cells=SIDE**3 * len(seen),
             )  # fmt: skip
     height = np.ascontiguousarray(upper.height_m[::-1])
     every = np.arange(len(volume.block))
-    in_bands(
+    parallel_for(
         _add_upper, len(every), every, volume.block, volume.distance,
         volume.weight, volume.origin_m, volume.voxel_m, truncation_m, height,
         cells=SIDE**3 * len(every),

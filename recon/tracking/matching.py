@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.small_matrices import solve_symmetric
 from recon.tracking import patch_search
 from recon.types import F32, F64, U8, Bool
@@ -212,7 +212,7 @@ def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> Cor
             side = 2 * margin + 1
             allowed = np.asarray(cv2.erode(mask, np.ones((side, side), np.uint8)), np.uint8)
     cells = np.zeros((config.grid, config.grid, 3), np.float32)
-    in_bands(
+    parallel_for(
         harris_cells, config.grid, np.ascontiguousarray(gray), allowed, config.grid, config.grid,
         margin, config.harris_k, cells,
     )  # fmt: skip
@@ -278,7 +278,7 @@ class _Search:
         """Best places in b within ``reach`` px of ``level`` about ``uv_b`` (full-size px)."""
         N = len(uv_b)
         uv, score, second, contrast = uv_b / 2.0**level, np.empty(N), np.empty(N), np.empty(N)
-        in_bands(
+        parallel_for(
             patch_search.search, -(-N // patch_search.CHUNK), self.a[level], self.b[level],
             self.uv_a / 2.0**level, uv.copy(),
             self.inverse_warp, active, reach, self.config.patch_radius_px,
@@ -290,7 +290,7 @@ class _Search:
         """Sub-pixel places in b from starts within about a pixel."""
         N = len(uv_b)
         uv, score, contrast_a, contrast_b = uv_b.copy(), np.empty(N), np.empty(N), np.empty(N)
-        in_bands(
+        parallel_for(
             patch_search.refine, -(-N // patch_search.CHUNK), self.a[0], self.b[0], self.uv_a,
             self.inverse_warp, active,
             self.config.patch_radius_px, self.config.refine_iterations, uv, score, contrast_a,

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from recon.bands import at_once
+from recon.parallel import run_parallel
 from recon.tracking.common_view import SIGNATURE_WIDTH_PX, alike, signature
 from recon.types import F64, U8
 
@@ -43,7 +43,7 @@ def by_likeness(paths: Sequence[Path]) -> list[int]:
         for j in range(i):
             shared[i, j] = shared[j, i] = alike(signatures[i], signatures[j])
 
-    at_once(*(lambda i=i: compare(i) for i in range(n)))
+    run_parallel(*(lambda i=i: compare(i) for i in range(n)))
     # What two images share falls off exponentially with the way between them.
     return shortest_path(-np.log((np.maximum(shared - CHANCE, 0.0) + 1.0) / (shared.max() + 1.0)))
 

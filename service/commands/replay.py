@@ -215,8 +215,8 @@ def _replay(
 ) -> dict[str, Any]:
     from service.cameras import open_camera, parse_source
     from service.cameras.lens import check_width, fitted
-    from service.commands.all_stills import all_stills
-    from service.commands.unstated import (
+    from service.commands.adjusted_stills import adjusted_stills
+    from service.commands.missing_metadata import (
         start_lens,
         start_of,
         with_own_lens,
@@ -260,7 +260,7 @@ def _replay(
         if start is not None:
             inputs = with_own_lens(inputs, video, start, find_lens, progress)
         if played is source:
-            inputs = all_stills(inputs, is_latency_given, progress)
+            inputs = adjusted_stills(inputs, is_latency_given, progress)
         stop = stop_by_signals()
         found = _fly(inputs, stop, progress, unsure)
         corrected = inputs
@@ -293,7 +293,7 @@ def _fly(
     from service.daemon.warm_up import has_kernels
     from service.flight.datalink import open_datalink
     from service.flight.scan import Scan, create_store
-    from service.memory import give_back
+    from service.memory import release_memory
     from service.scans.folder import write_deliverables
 
     store = create_store(inputs)
@@ -323,7 +323,7 @@ def _fly(
                 progress("sending the rest")
                 summary["datalink_complete"] = link.drain(inputs.config.datalink.drain_s)
                 link.close()
-            give_back(collect=True)
+            release_memory(collect=True)
             try:
                 summary |= write_deliverables(
                     inputs.folder, store, {}, progress=_until_stopped(stop, progress)
@@ -351,7 +351,7 @@ def _until_stopped(stop: Event, progress: Progress) -> Progress:
 
 def _correction(scan: Scan, unsure: Collection[str], has_ended: bool = False) -> _Correction | None:
     """What the images of the scan show by now, of what is ``unsure``; None before they do."""
-    from service.commands.unstated import at_another_time, with_readout
+    from service.commands.missing_metadata import at_another_time, with_readout
 
     off_ms = scan.check.clock_off_ms(has_ended) if "clock" in unsure else None
     if off_ms is not None:

@@ -31,7 +31,7 @@ from service.daemon.scanning import Scanning
 from service.daemon.vehicle_config import TUNABLES, parameters_of, vehicle_config
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.init_system import Notifier
-from service.memory import give_back
+from service.memory import release_memory
 from service.scans.retention import close_open_scans, make_room
 from service.version import software
 from service.workers import PROCESS, row_of, running
@@ -275,7 +275,7 @@ class Daemon:
         self.vehicle.set_load(computer_load(machine, self._cores.percent(), keep_free_mib))
         self.shed_load(machine)
         make_room(folder, keep_free_mib, self.scanning.in_the_making)
-        give_back()
+        release_memory()
 
     def shed_load(self, machine: Machine, now_s: float | None = None) -> None:
         """Take the step of the load ladder that heat, memory and the scan's lag ask for."""

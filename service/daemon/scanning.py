@@ -24,7 +24,7 @@ from service.daemon.warm_up import is_warm
 from service.daemon.writing import ClosingWatch, Writings
 from service.errors import InputError, SkyreliefError
 from service.flight.datalink import DaemonLink
-from service.memory import give_back
+from service.memory import release_memory
 from service.scans.retention import Claim
 from service.workers import PROCESS, Worker, Workers
 

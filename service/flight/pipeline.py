@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Event
 
 from recon.backends import Backend
-from recon.bands import limit_threads
+from recon.parallel import limit_threads
 from recon.pipeline.config import Baseline, MapperConfig
 from recon.pipeline.keyframe_map import GraphUpdate
 from recon.pipeline.mapper import Mapper, Reconstruct

@@ -21,12 +21,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.bands import at_once
 from recon.mapping.cloud_fusion import joined
+from recon.parallel import run_parallel
 from recon.surface.raster import Raster, grid_over, rasterise
 from recon.types import PointCloud
 from service.errors import OutsideError, SkyreliefError
-from service.memory import give_back
+from service.memory import release_memory
 from service.progress import CancelledError, Progress
 from service.redaction import public_configuration, redacted
 from service.scans.coverage import IMAGE as COVERAGE
@@ -123,11 +123,11 @@ def write_deliverables(
     files = _Files(folder, store, tiled)
     files.write_trajectory()
     with progress.part("reading the keyframes", 0.7):
-        at_once(partial(files.fuse, progress), files.cover)
-    give_back()
+        run_parallel(partial(files.fuse, progress), files.cover)
+    release_memory()
     files.write_pieces()
     progress("writing the files")
-    _, summary = at_once(files.write_cloud, partial(files.draw, extra))
+    _, summary = run_parallel(files.write_cloud, partial(files.draw, extra))
     assert summary is not None
     failures = files.failures
     summary["failed"], summary["files_due"] = failures.why, failures.of_the_disk is not None

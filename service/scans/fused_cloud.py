@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from recon.bands import at_once, threads
 from recon.mapping.cloud_fusion import cloud_of, fuse_strips, without
 from recon.mapping.free_space import seen_through, spread
 from recon.mapping.voxel_map import ground_sample_m
+from recon.parallel import run_parallel, threads
 from recon.types import F64, I64, U8, Keyframe, PointCloud
 from service.georeference import LocalFrame, map_crs
 from service.progress import Progress
@@ -129,7 +129,7 @@ def _decoded(store: Keyframes, extents: Sequence[_Extent]) -> Iterator[Keyframe 
     """The keyframes, spread over the flight, decoded by all cores."""
     calls = [partial(store.keyframe, seq) for seq in spread([e.seq for e in extents])]
     for at in range(0, len(calls), threads()):
-        yield from at_once(*calls[at : at + threads()])
+        yield from run_parallel(*calls[at : at + threads()])
 
 
 def _points(keyframe: Keyframe, box: Box) -> PointCloud:

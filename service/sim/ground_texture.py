@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.surface.triangle_grid import first_hit
 from recon.types import F32, F64, U8
 from service.errors import InputError
@@ -74,7 +74,7 @@ def make(scene: Scene, texel_m: float, mosaic: U8 | None = None) -> GroundTextur
     out = np.empty((size[1], size[0], 3), np.uint8)
     base = np.zeros((1, 1, 3), np.uint8) if mosaic is None else _fit(mosaic, size)
     blocks = scene.blocks if len(scene.blocks) else np.zeros((1, shapes.COLUMNS))
-    in_bands(
+    parallel_for(
         _colour, len(out), out, base, cover, which, blocks, light, scene.terrain.z_m,
         scene.area.x0, scene.area.y0, texel_m, scene.terrain.step_m, sun, scene.seed,
     )  # fmt: skip
@@ -130,7 +130,7 @@ def _light(scene: Scene, sun: F64) -> F32:
     z = scene.terrain.height(gx.ravel(), gy.ravel()).reshape(gx.shape)
     out = np.empty(gx.shape, np.float32)
     blocks = scene.blocks if len(scene.blocks) else np.zeros((1, shapes.COLUMNS))
-    in_bands(_shadow, len(gx), scene.grid.arrays(), gx, gy, z, which, blocks, sun, out)
+    parallel_for(_shadow, len(gx), scene.grid.arrays(), gx, gy, z, which, blocks, sun, out)
     return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.7), np.float32)
 
 

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numba import njit
 
-from recon.bands import in_bands
 from recon.camera_model import check_camera
+from recon.parallel import parallel_for
 from recon.surface.triangle_grid import first_hit
 from recon.types import F32, F64, U8, Camera
 from service.sim import shapes
@@ -97,17 +97,17 @@ class Renderer:
         R, c = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
         focal = float(0.5 * (self.camera.K[0, 0] + self.camera.K[1, 1]))
         view = self.rays, R, c, sideways, focal
-        in_bands(_render, H, self._place(), *view, colour, depth, body)
-        in_bands(_smooth_edges, H, self._place(), *view, colour, depth, body)
+        parallel_for(_render, H, self._place(), *view, colour, depth, body)
+        parallel_for(_smooth_edges, H, self._place(), *view, colour, depth, body)
         if look.water_m is not None:
-            in_bands(_flood, H, colour, depth, *view, look.water_m, time_s)
+            parallel_for(_flood, H, colour, depth, *view, look.water_m, time_s)
         return colour
 
     def develop(self, light: F32, index: int, look: Look) -> U8:
         """(H, W, 3) the image that the sensor makes of the light (H, W, 3)."""
         out = np.empty(light.shape, np.uint8)
         camera = look.noise, look.vignette, look.exposure
-        in_bands(_develop, len(out), light, self.rays, *camera, index, out)
+        parallel_for(_develop, len(out), light, self.rays, *camera, index, out)
         return out
 
     def depth(self, T_world_camera: F64, water_m: float | None = None) -> F32:

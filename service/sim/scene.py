@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from recon.bands import in_bands
+from recon.parallel import parallel_for
 from recon.surface import triangle_grid
 from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F64, U8
@@ -393,7 +393,7 @@ def make_terrain(area: Area, relief_m: float, step_m: float, seed: int) -> Heigh
     nx = int(np.ceil(area.size_m[0] / step_m)) + 1
     ny = int(np.ceil(area.size_m[1] / step_m)) + 1
     z = np.empty((ny, nx))
-    in_bands(_heights, ny, z, area.x0, area.y0, step_m, relief_m, seed)
+    parallel_for(_heights, ny, z, area.x0, area.y0, step_m, relief_m, seed)
     terrain = HeightField(area, step_m, z)
     zero = terrain.height(np.zeros(1), np.zeros(1))[0]
     return HeightField(area, step_m, z - zero)

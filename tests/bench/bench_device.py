@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from recon.backends import DenseStages
-from recon.backends.room import pyramid_levels
+from recon.backends.padding import pyramid_levels
 from recon.backends.torch_depth import DensePath, upsampled
 from recon.backends.torch_icp import DeviceIcp
 from recon.backends.torch_plan import Plan, part

@@ -162,7 +162,7 @@ def test_a_worker_outside_the_table_is_refused() -> None:
 
 STARTERS = re.compile(r"\b(?:Thread|Process|Popen|ThreadPoolExecutor|ProcessPoolExecutor|Timer)\(")
 OUTSIDE = {
-    "recon/bands.py": "the rows of one compiled call; recon knows nothing of service",
+    "recon/parallel.py": "the rows of one compiled call; recon knows nothing of service",
     "service/workers.py": "it is the executor",
     "service/bench/": "benchmarks make their own load, peers and links",
     "service/commands/demo.py": "it starts the other commands, as a person would",

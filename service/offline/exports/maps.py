@@ -261,7 +261,7 @@ def _in_two_branches(
 
     if images and rest:
         views = [scan.with_progress(branch) for branch in scan.progress.branches(2)]
-        at_once(lambda: work(views[0], rest), lambda: work(views[1], images))
+        run_parallel(lambda: work(views[0], rest), lambda: work(views[1], images))
     else:
         work(scan, [*images, *rest])
     work(scan, [kind for kind in kinds if kind in LAST])

@@ -14,8 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.bands import at_once, threads
 from recon.mapping.voxel_map import ground_sample_m
+from recon.parallel import run_parallel, threads
 from recon.surface.orthophoto import STEPS, Terrain, orthophoto
 from recon.surface.raster import Grid, Raster, round_cell
 from recon.surface.texture_views import TextureView
@@ -99,7 +99,7 @@ def ortho(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
         here, there = scan.progress.branches(2)
         surface: list[Raster] = []
         views: list[TextureView] = []
-        at_once(
+        run_parallel(
             lambda: surface.append(complete_model(scan.with_progress(here), None)[0]),
             lambda: views.extend(shared_images(scan.with_progress(there), options)),
         )

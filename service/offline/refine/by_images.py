@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from recon import se3
-from recon.bands import at_once
 from recon.calibration.flight import (
     Network,
     SelfCalibrationConfig,
@@ -32,6 +31,7 @@ from recon.calibration.flight import (
 from recon.calibration.global_bundle import Knowledge, Problem, Sightings, dispersion
 from recon.calibration.tracks import pieces, with_distortion, without_distortion
 from recon.camera_model import project, rays
+from recon.parallel import run_parallel
 from recon.posegraph.ground_control import (
     Adjusted,
     ControlPoint,
@@ -206,7 +206,7 @@ def depth_scales(
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
         return float(np.median(ratio)) if len(ratio) >= MIN_DEPTHS else np.nan
 
-    out = np.array(at_once(*(partial(scale, k) for k in range(len(states)))))
+    out = np.array(run_parallel(*(partial(scale, k) for k in range(len(states)))))
     usual = float(np.nanmedian(out)) if np.isfinite(out).any() else 1.0
     return np.where(np.isfinite(out), out, usual)
 

@@ -21,7 +21,6 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.bands import at_once
 from recon.calibration.flight import (
     SelfCalibrated,
     SelfCalibrationConfig,
@@ -41,6 +40,7 @@ from recon.calibration.tracks import (
     sharpened,
 )
 from recon.camera_model import Undistorter, project, rays
+from recon.parallel import run_parallel
 from recon.tracking import matching
 from recon.types import F64, U8, Camera
 from service.cameras.camera_file import save_camera
@@ -153,13 +153,13 @@ def sightings(
     images all that look alike. Raises InputError when nothing ties them together.
     """
     views = sorted(images)
-    described = at_once(*(partial(image_of, images[k], camera) for k in views))
+    described = run_parallel(*(partial(image_of, images[k], camera) for k in views))
     features = dict(zip(views, described, strict=True))
     overlap = _overlapping(views, camera, poses, ground_m)
     pairs = {(min(a, b), max(a, b)) for a, others in overlap.items() for b in others}
     if len(views) <= EXHAUSTIVE:
         some = [pair for pair in combinations(views, 2) if pair not in pairs]
-        alike = at_once(*(partial(are_alike, features[a], features[b]) for a, b in some))
+        alike = run_parallel(*(partial(are_alike, features[a], features[b]) for a, b in some))
         pairs.update(pair for pair, is_alike in zip(some, alike, strict=True) if is_alike)
     seen = joined(features, sorted(pairs), camera)
     if len(seen.view) == 0:

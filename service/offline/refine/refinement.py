@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from recon.bands import at_once
 from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
+from recon.parallel import run_parallel
 from recon.posegraph.ground_control import (
     Adjusted,
     BatchConfig,
@@ -456,7 +456,7 @@ class _Refinement:
     def _ahead_m(self) -> float:
         """Usual distance of the ground; 0 without any surface."""
         few = self.states[:: max(1, len(self.states) // 16)]
-        some = at_once(*(partial(self.keyframe, s) for s in few))
+        some = run_parallel(*(partial(self.keyframe, s) for s in few))
         depths = [one.depth.depth_m for one in some if one is not None]
         known = [float(np.nanmedian(z)) for z in depths if np.isfinite(z).any()]
         return float(np.median(known)) if known else 0.0

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon import bands, se3
+from recon import parallel, se3
 from recon.calibration import flight
 from recon.calibration.flight import (
     SelfCalibrationConfig,
@@ -204,11 +204,11 @@ def test_any_number_of_cores_gives_the_same_result() -> None:
 
 
 def _with_threads(threads: int) -> Solution:
-    bands.limit_threads(threads)
+    parallel.limit_threads(threads)
     try:
         return adjusted(TRUE, FREE, noise_px=0.3)
     finally:
-        bands.limit_threads(0)
+        parallel.limit_threads(0)
 
 
 def test_a_landmark_whose_rays_cross_nowhere_has_no_place() -> None:

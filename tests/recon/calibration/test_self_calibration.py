@@ -19,7 +19,7 @@ from recon.calibration.flight import (
 )
 from recon.calibration.global_bundle import Problem, Sightings, solve
 from recon.types import F64, Camera
-from service.commands.unstated import still_assumed
+from service.commands.missing_metadata import still_assumed
 from service.offline.refine.own_camera import bent, by_tags
 
 SIZE = (1280, 720)

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from recon import bands, se3
+from recon import parallel, se3
 from recon.posegraph.alignment import umeyama
-from recon.posegraph.pose_graph import GIVE_WAY_EVERY, PoseGraph, PoseGraphConfig
+from recon.posegraph.pose_graph import RELEASE_EVERY, PoseGraph, PoseGraphConfig
 from recon.posegraph.smoother import NO_SCALE, Smoother, State, System
 from recon.posegraph.trajectory import Trajectory
 from recon.types import F64, Pose, PosePrior
@@ -619,10 +619,10 @@ def test_solved_at_once_it_is_the_same_and_tells_its_residuals() -> None:
 def test_a_rebuild_gives_way_to_threads_that_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     graph, _ = fly(flight(30))
     given: list[int] = []
-    monkeypatch.setattr(bands, "give_way", lambda: given.append(len(graph._motions.scale_of)))
+    monkeypatch.setattr(parallel, "release_gil", lambda: given.append(len(graph._motions.scale_of)))
     graph.rebuild()
     keyframes, solutions = [n for n in given if n < len(graph)], given.count(len(graph))
-    assert np.diff([0, *keyframes, len(graph)]).max() <= GIVE_WAY_EVERY
+    assert np.diff([0, *keyframes, len(graph)]).max() <= RELEASE_EVERY
     assert solutions > 1
 
 

@@ -9,7 +9,7 @@ import dense_reference as reference
 import numpy as np
 import pytest
 
-from recon import bands
+from recon import parallel
 from recon.stereo import message_passing
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
 from recon.stereo.matching_cost import (
@@ -282,11 +282,11 @@ def test_result_does_not_depend_on_the_number_of_threads() -> None:
     _, *views = box_scene()
     left, right = (np.tile(view, (4, 1)) for view in views)  # tall enough for several bands
     many = belief_propagation(left, right, 20, BeliefPropagationConfig())
-    bands.limit_threads(1)
+    parallel.limit_threads(1)
     try:
         one = belief_propagation(left, right, 20, BeliefPropagationConfig())
     finally:
-        bands.limit_threads(0)
+        parallel.limit_threads(0)
     np.testing.assert_array_equal(many.px, one.px)
     np.testing.assert_array_equal(many.confidence, one.confidence)
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from recon.types import Camera, Shutter
 from service.cameras import open_camera
 from service.cameras.dji_metadata import shutter_of_sample, stated_shutter
-from service.commands.unstated import with_stated_readout
+from service.commands.missing_metadata import with_stated_readout
 from service.config import Config, change
 
 

@@ -24,7 +24,7 @@ from service.cameras.exif import read_tags
 from service.cameras.lens import SIGMA_FOCAL, Lens, by_view, fitted, turned
 from service.cameras.source import CameraSource
 from service.cli import app
-from service.commands.unstated import start_lens
+from service.commands.missing_metadata import start_lens
 from service.errors import InputError
 
 DEWARP = "2020-05-27;3666.66,3665.99,-27.8,30.0,-0.269,0.112,0.0003,-0.0001,-0.033"

@@ -18,7 +18,7 @@ from service.daemon import runtime
 from service.daemon.scan_run import ScanRun
 from service.daemon.scan_state import Event
 from service.daemon.writing import ClosingWatch, sizes
-from service.memory import give_back, one_pool
+from service.memory import one_pool, release_memory
 
 
 def test_only_what_changes_is_progress() -> None:
@@ -177,5 +177,5 @@ def test_large_arrays_stay_out_of_the_pool() -> None:
 
 def test_memory_settings_are_taken_where_the_library_has_them() -> None:
     assert one_pool()
-    assert give_back() in (True, False)
-    assert give_back(collect=True) in (True, False)
+    assert release_memory() in (True, False)
+    assert release_memory(collect=True) in (True, False)

@@ -16,7 +16,7 @@ import pytest
 from mapper_events import keyframes_of
 
 from mavlink.telemetry.samples import VehicleState
-from recon import bands, se3
+from recon import parallel, se3
 from recon.backends import load_backend
 from recon.pipeline.events import FramePosed
 from recon.types import F64, U8, Camera, Frame, Keyframe
@@ -188,9 +188,9 @@ def test_telemetry_goes_on_where_vision_was_lost() -> None:
 def test_no_kernel_takes_more_threads_than_the_configuration_gives() -> None:
     """And the next scan of the process does not inherit the limit."""
     try:
-        for given, want in ((1, 1), (0, bands.cores())):
+        for given, want in ((1, 1), (0, parallel.cores())):
             config = load_config(None, [f"compute.threads={given}"])
             Pipeline(CAMERA, config, load_backend("cpu"), Path("/dev/null/pages"))
-            assert bands.threads() == want
+            assert parallel.threads() == want
     finally:
-        bands.limit_threads(0)
+        parallel.limit_threads(0)

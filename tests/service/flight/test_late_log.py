@@ -13,7 +13,7 @@ from command_line import skyrelief
 
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog
-from service.commands.unstated import HOUR_NS, local_zone_ns
+from service.commands.missing_metadata import HOUR_NS, local_zone_ns
 from service.flight.scan import ScanInputs
 from service.progress import Progress
 from service.stream.store import ScanStore

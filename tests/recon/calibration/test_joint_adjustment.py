@@ -18,13 +18,13 @@ from mavlink.telemetry.samples import AccuracySample, AttitudeSample, PositionSa
 from recon import se3
 from recon.calibration.flight import camera_information, network
 from recon.calibration.global_bundle import Knowledge, Sightings
-from recon.calibration.together import LENS, Turning, together
+from recon.calibration.joint_adjustment import LENS, Turning, adjust_jointly
 from recon.camera_model import project, rays
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.rolling_shutter import row_times_s
 from recon.types import F64, U8, Camera, PosePrior, Shutter
 from service.cameras.images import open_images
-from service.commands.all_stills import all_stills, is_torn
+from service.commands.adjusted_stills import adjusted_stills, is_torn
 from service.compute.backend_choice import open_backend
 from service.config import change, load_config
 from service.flight.scan import Scan, ScanInputs, create_store
@@ -104,7 +104,7 @@ def test_the_readout_is_found_by_the_turns_of_the_rows(readout_s: float) -> None
     rng = np.random.default_rng(4)
     seen = sighted(replace(CAMERA, shutter=Shutter(readout_s)), rng, 0.3)
     poses, known, turning = by_log(rng, 900)
-    found = together(CAMERA, poses, seen, known, turning, seeks_readout=True)
+    found = adjust_jointly(CAMERA, poses, seen, known, turning, seeks_readout=True)
     assert found.sigma_readout_s < 4e-3
     assert abs(found.readout_s - readout_s) < 3.0 * found.sigma_readout_s
     assert found.camera.shutter == Shutter(abs(found.readout_s), "down" if readout_s > 0 else "up")
@@ -124,7 +124,7 @@ def test_a_log_of_a_steady_camera_shows_no_readout(share: float) -> None:
     poses, known, turning = by_log(rng, 900)
     steady = replace(turning, rates=turning.rates * np.repeat([share, 1.0], 3))
     with pytest.raises(ValueError, match="do not show a rolling shutter"):
-        together(CAMERA, poses, seen, known, steady, seeks_readout=True)
+        adjust_jointly(CAMERA, poses, seen, known, steady, seeks_readout=True)
 
 
 def test_a_track_that_a_wild_fix_tore_is_seen() -> None:
@@ -144,7 +144,7 @@ def test_a_global_shutter_is_none() -> None:
     seen = sighted(CAMERA, rng, 0.3)
     poses, known, turning = by_log(rng, 900)
     with pytest.raises(ValueError, match="do not show a rolling shutter"):
-        together(CAMERA, poses, seen, known, turning, seeks_readout=True)
+        adjust_jointly(CAMERA, poses, seen, known, turning, seeks_readout=True)
 
 
 def drawn(t: float, readout_s: float) -> U8:
@@ -220,7 +220,7 @@ def surface(inputs: ScanInputs) -> tuple[F64, int]:
 def test_drawn_stills_that_come_late_with_a_slow_log(tmp_path: Path) -> None:
     """Stamps are 0.2 s late, the log has 4 attitudes a second, and no readout is stated."""
     inputs = flown(tmp_path, READOUT_S, hz=4.0, late_s=0.2)
-    found = all_stills(inputs, is_latency_given=False)
+    found = adjusted_stills(inputs, is_latency_given=False)
     assert abs((inputs.epoch_ns - found.epoch_ns) * 1e-9 - 0.2) < 0.05
     assert abs(found.camera.shutter.readout_s - READOUT_S) < 0.012
     assert found.known is not None
@@ -239,5 +239,5 @@ def test_drawn_stills_that_come_late_with_a_slow_log(tmp_path: Path) -> None:
 def test_a_global_shutter_keeps_its_odometry(tmp_path: Path) -> None:
     inputs = flown(tmp_path, 0.0, hz=10.0)
     config = change(inputs.config, "camera.readout_ms", "0")
-    found = all_stills(replace(inputs, config=config), is_latency_given=False)
+    found = adjusted_stills(replace(inputs, config=config), is_latency_given=False)
     assert found.known is None and found.camera is inputs.camera

@@ -13,7 +13,7 @@ from typing import TypeVar
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import Array
 
-ROOM_PX, ROOM_LABELS = 32, 8
+PAD_PX, PAD_LABELS = 32, 8
 
 Key = TypeVar("Key")
 Built = TypeVar("Built")
@@ -28,10 +28,10 @@ def kept(cache: dict[Key, Built], key: Key, limit: int, build: Callable[[], Buil
     return cache[key]
 
 
-def room(height: int, width: int, labels: int) -> tuple[int, int, int]:
+def padded(height: int, width: int, labels: int) -> tuple[int, int, int]:
     """Height, width and labels of arrays that hold such a pair."""
-    h, w = (-(-n // ROOM_PX) * ROOM_PX for n in (height, width))
-    return h, w, -(-labels // ROOM_LABELS) * ROOM_LABELS
+    h, w = (-(-n // PAD_PX) * PAD_PX for n in (height, width))
+    return h, w, -(-labels // PAD_LABELS) * PAD_LABELS
 
 
 def pyramid_levels(height: int, width: int, config: BeliefPropagationConfig) -> int:

@@ -18,9 +18,9 @@ from numba import config
 
 T = TypeVar("T")
 
-GIVE_WAY_S = 1e-4
+RELEASE_S = 1e-4
 
-BAND_CELLS = 1 << 20
+CELLS_PER_THREAD = 1 << 20
 """Cells of a cost volume that are worth a thread: half a millisecond of simple work."""
 
 _limit = 0  # threads that one call may use; 0: one per core
@@ -42,27 +42,27 @@ def threads() -> int:
     return min(_limit or cores(), cores())
 
 
-def give_way() -> None:
-    """Let threads that wait for the interpreter run; to be called every few ms by long work.
+def release_gil() -> None:
+    """Let threads that wait for the interpreter run; long work calls it every few ms.
 
     Array operations give the interpreter up for an instant and get it back before a waiting thread
     has woken up, so that this thread waits as long as the work lasts.
     """
-    Event().wait(GIVE_WAY_S)
+    Event().wait(RELEASE_S)
 
 
 def shares(cells: int) -> int:
     """How many threads are worth it for work on so many cells."""
-    return max(1, min(threads(), cells // BAND_CELLS))
+    return max(1, min(threads(), cells // CELLS_PER_THREAD))
 
 
 @cache
 def pool() -> ThreadPoolExecutor:
     """The threads that all callers share; none is started before it is needed."""
-    return ThreadPoolExecutor(max(cores(), 1), thread_name_prefix="bands")
+    return ThreadPoolExecutor(max(cores(), 1), thread_name_prefix="parallel")
 
 
-def at_once(*calls: Callable[[], T]) -> list[T]:
+def run_parallel(*calls: Callable[[], T]) -> list[T]:
     """The results of independent calls that run at the same time."""
     results: list[Any] = [None] * len(calls)
 
@@ -70,11 +70,11 @@ def at_once(*calls: Callable[[], T]) -> list[T]:
         for n in range(first, end):
             results[n] = calls[n]()
 
-    in_bands(run, len(calls))
+    parallel_for(run, len(calls))
     return results
 
 
-def in_bands(
+def parallel_for(
     kernel: Callable[..., None], count: int, *arguments: Any, cells: int | None = None
 ) -> None:
     """Call ``kernel(first, end, *arguments)`` so that 0 to ``count`` is covered once.

@@ -57,7 +57,7 @@ class Turning:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Together:
+class JointAdjustment:
     """The adjusted stills."""
 
     camera: Camera  # with its shutter
@@ -72,10 +72,10 @@ class Together:
     sigma_readout_s: float
 
 
-def together(
+def adjust_jointly(
     camera: Camera, poses: F64, seen: Sightings, known: Knowledge, turning: Turning,
     seeks_readout: bool = False,
-) -> Together:  # fmt: skip
+) -> JointAdjustment:  # fmt: skip
     """The stills adjusted to their sightings and to telemetry.
 
     Args:
@@ -134,11 +134,11 @@ class _Adjustment:
         """Take all sightings in a patch of an image for one."""
         self._at = self._at.widened(self._of_patches)
 
-    def result(self, turning: Turning, readout_s: float, sigma_s: float) -> Together:
+    def result(self, turning: Turning, readout_s: float, sigma_s: float) -> JointAdjustment:
         """The stills as they are adjusted now."""
         shutter = self._at.camera.shutter.reading(readout_s)
         rates = np.hstack([self.turns / readout_s, turning.rates[:, 3:]])
-        return Together(
+        return JointAdjustment(
             replace(self._at.camera, shutter=shutter), self._at.poses, self._at.points,
             self._at.seen, rates, turn_covariances(self._at) / readout_s**2,
             step_covariances(self._at), float(self._at.sigma_px[0]), readout_s, sigma_s,

@@ -18,7 +18,7 @@ from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.latency import LatencyEstimate
 from recon import se3
 from recon.calibration.global_bundle import Knowledge
-from recon.calibration.together import Together, Turning, together
+from recon.calibration.joint_adjustment import JointAdjustment, Turning, adjust_jointly
 from recon.calibration.tracks import pieces
 from recon.camera_model import scaled
 from recon.tracking.known_track import KnownTrack, KnownView
@@ -61,7 +61,7 @@ class Still:
     is_tracked: bool  # by the odometry
 
 
-def all_stills(
+def adjusted_stills(
     inputs: ScanInputs, is_latency_given: bool, progress: Callable[[str], None] = log.info
 ) -> ScanInputs:
     """The scan with the stills' latency, lens, shutter and poses, as far as they are found.
@@ -154,7 +154,7 @@ def _adjusted(inputs: ScanInputs, stills: Sequence[Still], history: VehicleHisto
     ground_m = float(np.median(poses[:, 2, 3] - [prior.agl_m or 0.0 for prior in priors]))
     images = {k: still.gray for k, (still, _) in enumerate(known)}
     views = sightings(images, camera, poses, ground_m)
-    found = together(
+    found = adjust_jointly(
         camera, views.poses, views.seen, _knowledge(priors, int(views.seen.landmark.max()) + 1),
         _turning(priors, history), seeks,
     )  # fmt: skip
@@ -217,7 +217,7 @@ def _turning(priors: Sequence[PosePrior], history: VehicleHistory) -> Turning:
     return Turning(rates, turn_sigma_rad_s(gap_s))
 
 
-def _track(found: Together, views: dict[int, int], lens: Camera) -> KnownTrack:
+def _track(found: JointAdjustment, views: dict[int, int], lens: Camera) -> KnownTrack:
     """The track of ``views``: rows of ``found`` by the number of the frame."""
     rows, known = found.seen.view, np.asarray(np.isfinite(found.points).all(axis=1))
     number = np.cumsum(known) - 1
@@ -234,7 +234,7 @@ def _track(found: Together, views: dict[int, int], lens: Camera) -> KnownTrack:
     )  # fmt: skip
 
 
-def _note(before: Camera, lens: Camera, found: Together, was_sought: bool) -> str:
+def _note(before: Camera, lens: Camera, found: JointAdjustment, was_sought: bool) -> str:
     """What the operator learns of the lens and its readout."""
     out = "all stills were adjusted together with the log"
     change_share = lens.K[0, 0] / before.K[0, 0] - 1.0

@@ -13,17 +13,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba import njit
 
-from recon import bands
+from recon import parallel
 from recon.types import F64
 
 
 @pytest.fixture
 def four(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A machine of four cores."""
-    monkeypatch.setattr(bands, "cores", lambda: 4)
-    bands.pool.cache_clear()
+    monkeypatch.setattr(parallel, "cores", lambda: 4)
+    parallel.pool.cache_clear()
     yield
-    bands.pool.cache_clear()
+    parallel.pool.cache_clear()
 
 
 @given(st.integers(0, 50), st.integers(1, 6))
@@ -33,11 +33,11 @@ def test_every_row_is_in_one_band(count: int, threads: int) -> None:
     def note(begin: int, end: int) -> None:
         seen[begin:end] += 1
 
-    bands.limit_threads(threads)
+    parallel.limit_threads(threads)
     try:
-        bands.in_bands(note, count)
+        parallel.parallel_for(note, count)
     finally:
-        bands.limit_threads(0)
+        parallel.limit_threads(0)
     assert (seen == 1).all()
 
 
@@ -47,18 +47,18 @@ def test_bands_run_at_the_same_time(four: None) -> None:
     def meet(begin: int, end: int) -> None:
         together.wait()
 
-    bands.in_bands(meet, 4)
+    parallel.parallel_for(meet, 4)
 
 
 def test_no_call_uses_more_threads_than_the_limit(four: None) -> None:
     calls: list[tuple[int, int]] = []
-    bands.limit_threads(1)
+    parallel.limit_threads(1)
     try:
-        bands.in_bands(lambda begin, end: calls.append((begin, end)), 8)
+        parallel.parallel_for(lambda begin, end: calls.append((begin, end)), 8)
     finally:
-        bands.limit_threads(0)
+        parallel.limit_threads(0)
     assert calls == [(0, 8)]
-    assert bands.threads() == 4
+    assert parallel.threads() == 4
 
 
 @pytest.mark.parametrize("cells, pieces", [(0, 1), (1.9, 1), (2.0, 2), (3.9, 3), (9.0, 4)])
@@ -68,7 +68,7 @@ def test_each_thread_gets_work_that_is_worth_it(four: None, cells: float, pieces
     def note(begin: int, end: int) -> None:
         calls.append((begin, end))
 
-    bands.in_bands(note, 8, cells=int(cells * bands.BAND_CELLS))
+    parallel.parallel_for(note, 8, cells=int(cells * parallel.CELLS_PER_THREAD))
     assert len(calls) == pieces
     assert sum(end - begin for begin, end in calls) == 8
 
@@ -76,13 +76,13 @@ def test_each_thread_gets_work_that_is_worth_it(four: None, cells: float, pieces
 def test_a_caller_does_what_no_thread_has_begun(four: None) -> None:
     """A short call ends while a long one of another thread occupies all threads."""
     release, seen = threading.Event(), np.zeros(8, int)
-    busy = [bands.pool().submit(release.wait, 20.0) for _ in range(4)]
+    busy = [parallel.pool().submit(release.wait, 20.0) for _ in range(4)]
 
     def note(begin: int, end: int) -> None:
         seen[begin:end] += 1
 
     try:
-        bands.in_bands(note, 8)
+        parallel.parallel_for(note, 8)
         assert not any(one.done() for one in busy)
     finally:
         release.set()
@@ -99,7 +99,7 @@ def test_a_fault_is_raised_after_all_bands_have_ended(four: None) -> None:
         ended.append(begin)
 
     with pytest.raises(ValueError, match="row 0"):
-        bands.in_bands(fail, 8)
+        parallel.parallel_for(fail, 8)
     assert sorted(ended) == [2, 6]
 
 
@@ -115,7 +115,7 @@ def test_two_threads_may_call_a_kernel_at_once(four: None) -> None:
 
     def work(out: F64) -> None:
         for _ in range(20):
-            bands.in_bands(_square, len(values), values, out)
+            parallel.parallel_for(_square, len(values), values, out)
 
     workers = [threading.Thread(target=work, args=(out,)) for out in outs]
     for one in workers:
@@ -128,7 +128,7 @@ def test_two_threads_may_call_a_kernel_at_once(four: None) -> None:
 
 def test_calls_at_once_keep_their_order_and_meet(four: None) -> None:
     meet = threading.Barrier(2, timeout=20.0)
-    assert bands.at_once(lambda: meet.wait() >= 0, lambda: (meet.wait(), "second")[1]) == [
+    assert parallel.run_parallel(lambda: meet.wait() >= 0, lambda: (meet.wait(), "second")[1]) == [
         True,
         "second",
     ]
@@ -138,9 +138,9 @@ def test_calls_within_calls_end(four: None) -> None:
     """A call that shares out its own work does not wait for threads that wait for it."""
 
     def inner() -> list[int]:
-        return bands.at_once(*(lambda n=n: n for n in range(5)))
+        return parallel.run_parallel(*(lambda n=n: n for n in range(5)))
 
-    callers = [partial(bands.at_once, inner, inner, inner) for _ in range(4)]
+    callers = [partial(parallel.run_parallel, inner, inner, inner) for _ in range(4)]
     with ThreadPoolExecutor(4) as pool:
         results = [f.result(timeout=30.0) for f in [pool.submit(call) for call in callers]]
     assert results == [[[0, 1, 2, 3, 4]] * 3] * 4
@@ -148,4 +148,4 @@ def test_calls_within_calls_end(four: None) -> None:
 
 def test_an_exception_of_one_call_is_raised() -> None:
     with pytest.raises(ZeroDivisionError):
-        bands.at_once(lambda: 1, lambda: 1 // 0)
+        parallel.run_parallel(lambda: 1, lambda: 1 // 0)
