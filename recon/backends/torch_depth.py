@@ -73,7 +73,9 @@ class DensePath:
     def _plan(self, pair: StereoPair, size_px: tuple[int, int]) -> Plan:
         h, w = pair.left.shape
         space = padded(h, w, pair.labels)
-        fine = None if pair.guide is None else padded(*pair.guide.shape[:2], 1)[:2]
+        fine = None
+        if pair.guide is not None:
+            fine = padded(pair.guide.shape[0], pair.guide.shape[1], 1)[:2]
         levels = pyramid_levels(h, w, self.stages.matching)
         key = (space, fine, levels, size_px)
 

@@ -46,7 +46,7 @@ class KeyframeMap:
         self.trajectory, self._loops = trajectory, loops
         self.views = self.levelled = 0  # keyframes, and those whose ground is taken as level
         self._rejected, self._timing = rejected, timing
-        self._T_map = np.eye(4)  # of the last keyframe
+        self._T_chain = np.eye(4)  # of the last keyframe
 
     @property
     def graph(self) -> PoseGraph:
@@ -77,7 +77,7 @@ class KeyframeMap:
         :class:`recon.pipeline.stages.Register`.
         """
         T_odom = view.image.T_odom_camera
-        self._T_map = T_odom if step is None else self._T_map @ step
+        self._T_chain = T_odom if step is None else self._T_chain @ step
         up = T_odom[2, :3]
         below = height_below(depth, up) if depth is not None else None
         height = (below, 0.0) if below is not None else height_above(view.points, up)
@@ -85,7 +85,7 @@ class KeyframeMap:
         self.views += 1
         self.levelled += prior is not view.prior
         self.trajectory.add(
-            view.seq, view.segment, self._T_map, prior, height, view.time_ns, covariance
+            view.seq, view.segment, self._T_chain, prior, height, view.time_ns, covariance
         )
         if depth is not None and self._loops is not None:
             with self._timing("loops"):

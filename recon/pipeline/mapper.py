@@ -217,8 +217,8 @@ class Mapper:
         if depth is None or not update.is_near:
             return update
         with self._timing("map"):  # what is new
-            T_map = self.keyframes.trajectory.map_pose(view.seq)
-            sigma_m, fresh = self.surface(view.segment, depth, view.rows_share, T_map)
+            T_odom = self.keyframes.trajectory.odom_pose(view.seq)
+            sigma_m, fresh = self.surface(view.segment, depth, view.rows_share, T_odom)
         keyframe = self.keyframe(view, depth, bgr, sigma_m, fresh, update.pose)
         self.keyframes.measured(view, keyframe)
         return replace(update, keyframe=keyframe)

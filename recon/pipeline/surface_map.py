@@ -54,7 +54,7 @@ class SurfaceMap:
         self._disagreement, self._segment = Disagreement(), -1
 
     def __call__(
-        self, segment: int, depth: DepthMap, rows_share: F32, T_map_camera: F64
+        self, segment: int, depth: DepthMap, rows_share: F32, T_odom_camera: F64
     ) -> tuple[F32, Bool]:
         """((h, w) sigma, which holds disagreement of views, an unknown readout, an assumed lens;
         (h, w) surface that is new or better).
@@ -69,15 +69,15 @@ class SurfaceMap:
         noise = np.float32(max(1.0, RECORDED_SIGMA_PX / LABEL_SIGMA_PX / reduced))
         share = cv2.resize(rows_share, depth.depth_m.shape[::-1])
         sigma_m = np.hypot(depth.sigma_m * noise, share * depth.depth_m)
-        in_map = replace(depth, sigma_m=sigma_m, T_world_camera=T_map_camera)
-        factor = np.float32(self._disagreement.take(in_map))
-        in_map = replace(in_map, sigma_m=in_map.sigma_m * factor)
+        in_odom = replace(depth, sigma_m=sigma_m, T_world_camera=T_odom_camera)
+        factor = np.float32(self._disagreement.take(in_odom))
+        in_odom = replace(in_odom, sigma_m=in_odom.sigma_m * factor)
         known = self.known
         if known is None:
             known = self.known = self._empty(depth)
-        fresh = known.fresh(in_map)
-        known.insert(in_map, fresh)
-        return np.hypot(in_map.sigma_m, self._bending(depth) * depth.depth_m), fresh
+        fresh = known.fresh(in_odom)
+        known.insert(in_odom, fresh)
+        return np.hypot(in_odom.sigma_m, self._bending(depth) * depth.depth_m), fresh
 
     def _bending(self, depth: DepthMap) -> F32:
         """Sigma by the lens over depth, (h, w) or a scalar.

@@ -16,7 +16,7 @@ import numpy as np
 from recon import se3
 from recon.camera_model import Undistorter
 from recon.pipeline.config import TWO_ONLY, Baseline
-from recon.posegraph.between_keyframes import FixAverage
+from recon.posegraph.pose_priors import FixAverage
 from recon.rolling_shutter import NEAR_S, FrameRows, depth_share, on_image
 from recon.row_errors import turn_shares
 from recon.stereo.posed_image import PosedImage

@@ -15,6 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.ground_heights import GUESSED_SHARE, UNMEASURED_HEIGHTS, height_ratios
+from recon.posegraph.pose_priors import MIN_FIX_M, has_fix
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import Noise, bias_time_constant_s
 from recon.types import F64, PosePrior
@@ -30,9 +31,6 @@ USUAL_RATE_M_S, RATE_S = 0.05, 20.0
 
 MIN_WAY_S = 1e-3
 """Time that no way by velocity is shorter than."""
-
-MIN_FIX_M = 0.005
-"""Sigma that no fix is better than."""
 
 UNKNOWNS = 11
 """Rotation, shift and log scale; an assumed view's mount and the drift of altitudes."""
@@ -366,10 +364,6 @@ class AlignmentReadings:
         of_up = (seen @ se3.hat(R_prior[:, 2])) * self.is_assumed[:, None, None]
         of_mount = np.stack([-of_up[:, 1], of_up[:, 0], np.zeros((n, 3))], axis=1)
         return np.where(self.heading_known[:, None], turn, tilt), of_mount
-
-
-def has_fix(prior: PosePrior) -> bool:
-    return prior.position_m is not None and prior.sigma_position_m is not None
 
 
 def _way(a: PosePrior, b: PosePrior) -> tuple[F64, float] | None:

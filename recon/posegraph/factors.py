@@ -11,14 +11,13 @@ leaves its scale open, block by block of keyframes.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 
 from recon import se3
-from recon.posegraph.alignment_readings import MIN_FIX_M, ReadingNoise, has_fix
-from recon.posegraph.between_keyframes import carried
+from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.ground_heights import height_ratio
+from recon.posegraph.pose_priors import MIN_FIX_M, carried, has_fix
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_noise import bias_time_constant_s
@@ -27,9 +26,6 @@ from recon.types import F64, PosePrior
 
 HEIGHT_GATE = 0.05
 """Share of a height by which one exactly below may be off, once its constant is out."""
-
-MIN_TURN_RAD = 1e-4
-"""Sigma that no attitude is better than."""
 
 FRAME_SIGMA_RAD = (0.05, 0.05, 0.15)
 """Smallest sigma of a placed segment's tilt and heading."""
@@ -170,40 +166,6 @@ class ReadingFactors:
             return 1.0
         independent = 1.0 + self._span_s / (2.0 * seconds)
         return float(np.sqrt(max(1.0, self._keyframes / independent)))
-
-
-def sound(prior: PosePrior) -> PosePrior:
-    """The prior without readings that are not finite, and no sigma below what a sensor reaches."""
-    R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
-    has_turn = _are_finite(R, prior.sigma_tilt_rad, prior.sigma_yaw_rad)
-    has_agl = _are_finite(prior.agl_m, prior.sigma_agl_m) and (prior.agl_m or 0.0) > 0.0
-    has_altitude = _are_finite(prior.altitude_m, prior.sigma_altitude_m)
-    has_place = _are_finite(position)
-    has_fix = has_place and _are_finite(sigma)
-    return replace(
-        prior,
-        R_world_camera=R if has_turn else None,
-        sigma_tilt_rad=max(prior.sigma_tilt_rad, MIN_TURN_RAD),
-        sigma_yaw_rad=max(prior.sigma_yaw_rad, MIN_TURN_RAD),
-        position_m=position if has_place and (has_fix or sigma is None) else None,
-        sigma_position_m=np.maximum(sigma, MIN_FIX_M) if has_fix and sigma is not None else None,
-        agl_m=prior.agl_m if has_agl else None,
-        sigma_agl_m=max(prior.sigma_agl_m, MIN_FIX_M),
-        altitude_m=prior.altitude_m if has_altitude else None,
-        sigma_altitude_m=max(prior.sigma_altitude_m, MIN_FIX_M),
-        gnss_minus_baro_m=prior.gnss_minus_baro_m if _are_finite(prior.gnss_minus_baro_m) else None,
-    )
-
-
-def _are_finite(*parts: F64 | float | None) -> bool:
-    return all(part is not None and bool(np.isfinite(part).all()) for part in parts)
-
-
-def is_frozen(prior: PosePrior, before: PosePrior) -> bool:
-    """True when the receiver only repeats the position that it gave before."""
-    if prior.position_m is None or before.position_m is None:
-        return False
-    return float(np.abs(before.position_m - prior.position_m).max()) <= 1e-6
 
 
 def _turn(R: F64, R_measured: F64, heading: bool) -> F64:

@@ -150,7 +150,7 @@ class LoopSearch:
         if tied is None or tied.segment != new.segment or new.ordinal - tied.ordinal > PAUSE:
             return False
         distance = float(np.nanmedian(depth.depth_m))
-        step = self.trajectory.map_pose(new.seq) - self.trajectory.map_pose(tied.seq)
+        step = self.trajectory.odom_pose(new.seq) - self.trajectory.odom_pose(tied.seq)
         moved = float(np.linalg.norm(step[:3, 3] + distance * step[:3, 2]))
         return moved < MOVED * distance * float(np.hypot(*new.size_px)) / float(new.K[0, 0])
 

@@ -16,8 +16,9 @@ from dataclasses import replace
 import numpy as np
 
 from recon import parallel, se3
-from recon.posegraph.factors import MotionFactors, ReadingFactors, is_frozen, sound
+from recon.posegraph.factors import MotionFactors, ReadingFactors
 from recon.posegraph.loop_verification import LoopVerification
+from recon.posegraph.pose_priors import is_frozen, sound
 from recon.posegraph.records import Loop, Node, PoseGraphConfig
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_offsets import Constants

@@ -11,8 +11,8 @@ from recon import se3
 from recon.posegraph import alignment
 from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.alignment_readings import ReadingNoise
-from recon.posegraph.between_keyframes import at_camera
 from recon.posegraph.ground_heights import GUESSED_SHARE, guessed_at
+from recon.posegraph.pose_priors import at_camera
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.sensor_offsets import Constants, Offsets, constants, offsets
 from recon.posegraph.smoother import NO_SCALE

@@ -13,7 +13,6 @@ readings and loops are gone.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
@@ -21,18 +20,16 @@ from itertools import groupby, pairwise
 import numpy as np
 
 from recon import se3
+from recon.posegraph.pose_priors import averaged, without_fixes
 from recon.posegraph.records import Loop, Node
 from recon.posegraph.smoother import reversed_motion
-from recon.types import F64, PosePrior
+from recon.types import F64
 
 NEWEST_SHARE = 0.25
 """Share of the newest nodes, which always stay: the next motions and loops start from them."""
 
 GONE_SHARE = 0.25
 """Share of the nodes removed at once, so that rebuilding is rare."""
-
-MAX_WORSE = 2.0
-"""A fix whose sigma is so many times that of another spoils their mean."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +53,7 @@ class Thinned:
 def thin(nodes: Sequence[Node], refused: Collection[int], poses: Mapping[int, F64]) -> Thinned:
     """Thin out a graph in which nodes have these ``poses`` (4, 4) T_world_camera, the newest
     perhaps none yet, and which leaves the fixes of the ``refused`` out."""
-    nodes = without(nodes, refused)
+    nodes = without_fixes(nodes, refused)
     gone = surplus(nodes)
     kept, marginalised = thinned(nodes, gone)
     return Thinned(over_gaps(kept, poses), marginalised, gone - marginalised.keys())
@@ -175,71 +172,15 @@ def _smallest_holes_first(nodes: Sequence[Node], old: int) -> list[list[int]]:
     return sorted(groups[1:], key=lambda group: nodes[group[-1] + 1].seq - nodes[group[0] - 1].seq)
 
 
-def without(nodes: Sequence[Node], refused: Collection[int]) -> list[Node]:
-    """The nodes without the fixes that the graph refused, unless most of a segment's were: among
-    fewer nodes one that is far off would weigh too much."""
-    seen = Counter(n.segment for n in nodes)
-    off = Counter(n.segment for n in nodes if n.seq in refused)
-    return [
-        replace(n, prior=replace(n.prior, sigma_position_m=None))
-        if n.seq in refused and 2 * off[n.segment] <= seen[n.segment]
-        else n
-        for n in nodes
-    ]
-
-
 def _joined(marginalised: Marginalised, left: Node, node: Node) -> Node:
     """The node with the motion over ``left``, which goes, and with the mean of both's fixes."""
     A = se3.adjoint(marginalised.T_node_camera)
     return replace(
         node,
         covariance=left.covariance + A @ node.covariance @ A.T,
-        prior=_with_altitudes(_with_fix(node, left), left.prior),
+        prior=averaged(node, left),
         weight=left.weight + node.weight,
     )
-
-
-def _with_fix(node: Node, left: Node) -> PosePrior:
-    """The node's prior with the mean of both fixes, which is the fix of the mean place; with
-    that of ``left`` where it has none."""
-    one, other = node.prior, left.prior
-    if other.position_m is None or other.sigma_position_m is None:
-        return one
-    share, position_m = left.weight / (left.weight + node.weight), one.position_m
-    if position_m is None or one.sigma_position_m is None:
-        one = replace(
-            one,
-            sigma_position_m=other.sigma_position_m,
-            gnss_minus_baro_m=None,
-            gnss_minus_baro_fixes=0,
-        )
-        share, position_m = 1.0, other.position_m
-    elif np.any(other.sigma_position_m > MAX_WORSE * one.sigma_position_m):
-        return one
-    place = node.place_of_fix + share * (left.place_of_fix - node.place_of_fix)
-    return replace(
-        one,
-        position_m=position_m + share * (other.position_m - position_m),
-        fix_offset=se3.transform(se3.inverse(node.T_odom_camera), place[None])[0],
-    )
-
-
-def _with_altitudes(prior: PosePrior, left: PosePrior) -> PosePrior:
-    """The prior with both means of the receiver's own altitude, weighed by their fixes."""
-    if (
-        left.gnss_minus_baro_m is None
-        or left.gnss_minus_baro_fixes == 0
-        or left.sigma_position_m is None
-    ):
-        return prior
-    if prior.gnss_minus_baro_m is None or prior.sigma_position_m is None:
-        return prior
-    fixes = prior.gnss_minus_baro_fixes + left.gnss_minus_baro_fixes
-    mean = (
-        prior.gnss_minus_baro_m * prior.gnss_minus_baro_fixes
-        + left.gnss_minus_baro_m * left.gnss_minus_baro_fixes
-    ) / fixes
-    return replace(prior, gnss_minus_baro_m=mean, gnss_minus_baro_fixes=fixes)
 
 
 def _spread(loop: Loop) -> float:

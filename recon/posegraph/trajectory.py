@@ -68,7 +68,7 @@ class Trajectory:
         self,
         seq: int,
         segment: int,
-        T_map_camera: F64,
+        T_odom_camera: F64,
         prior: PosePrior,
         height: tuple[float, float] | None,
         time_ns: int,
@@ -78,9 +78,9 @@ class Trajectory:
 
         The arguments are those of :meth:`recon.posegraph.pose_graph.PoseGraph.add_keyframe`.
         """
-        self.graph.add_keyframe(seq, time_ns, segment, T_map_camera, covariance, prior, height)
+        self.graph.add_keyframe(seq, time_ns, segment, T_odom_camera, covariance, prior, height)
         row = np.zeros(1, KEYFRAME)
-        row["seq"], row["segment"], row["T_odom_camera"] = seq, segment, T_map_camera
+        row["seq"], row["segment"], row["T_odom_camera"] = seq, segment, T_odom_camera
         row["height"] = height[0] if height is not None and height[0] else 1.0
         self._table.append(row)
         if self.graph.generation == self._generation:
@@ -100,8 +100,8 @@ class Trajectory:
             raise KeyError(seq)
         return int(np.searchsorted(self._table.rows["seq"], seq))
 
-    def map_pose(self, seq: int) -> F64:
-        """(4, 4) T_map_camera of a keyframe in its segment's chain."""
+    def odom_pose(self, seq: int) -> F64:
+        """(4, 4) T_odom_camera of a keyframe in its segment's chain."""
         return np.array(self._table.rows["T_odom_camera"][self._row(seq)])
 
     # ---- poses ---------------------------------------------------------------------------------

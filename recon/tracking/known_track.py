@@ -63,8 +63,8 @@ class KnownTrack:
             found = ReadoutEstimate(lens.shutter.readout_s, sigma_readout_s, len(views))
             self.readout = KnownReadout(found)
         self.K = lens.K
-        self._views, self._map = views, Landmarks()
-        self._map.add(points)
+        self._views, self._landmarks = views, Landmarks()
+        self._landmarks.add(points)
         self._clock = RowClock(lens) if lens.shutter.readout_s else None
 
     def can_skip(self, time_ns: int, prior: PosePrior, frames_per_step: float) -> bool:
@@ -94,7 +94,7 @@ class KnownTrack:
         moving = FrameRows(time_ns, prior, T_camera_odom, rows, is_measured=True)
         key = OdometryKeyframe(
             seq, 0, T_camera_odom, view.covariance, prior, Pyramid.build(gray, 1),
-            np.zeros((len(view.landmark), 2)), view.landmark, self._map, moving,
+            np.zeros((len(view.landmark), 2)), view.landmark, self._landmarks, moving,
         )  # fmt: skip
         self.keyframes = [*self.keyframes[1 - KEPT :], key]
         return Tracked(state, 0, view.T_odom_camera, len(view.landmark), moving=moving)

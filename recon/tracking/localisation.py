@@ -88,13 +88,13 @@ class Search:
     uv: F64  # (N, 2) of its corners
     ok: Bool  # (N,) found
     searched: Bool  # (N,)
-    mapped: Bool  # (N,) with a landmark
+    has_landmark: Bool  # (N,) with a landmark
     in_view: float  # share of its corners that should be visible
 
     @property
     def known(self) -> I64:
         """Rows of the corners that are found and have a landmark."""
-        return np.flatnonzero(self.ok & self.mapped)
+        return np.flatnonzero(self.ok & self.has_landmark)
 
     @property
     def points(self) -> F64:
@@ -310,14 +310,14 @@ class Localiser:
         amount = most if most is None or left is None else most * 2 // 3
         right = self._search(key, new, T_camera_odom, radius_px, amount)
         if np.count_nonzero(right.searched) < least:
-            return "the view left the map"
+            return "no known landmark is in view"
         parts = [right]
         if most is not None and left is not None:
             taken = key.landmark[right.searched]
             parts.append(self._search(left, new, T_camera_odom, radius_px, most // 3, taken))
         points = np.vstack([part.points for part in parts])
         uv = np.vstack([part.uv[part.known] for part in parts])
-        expected = sum(int((part.searched & part.mapped).sum()) for part in parts)
+        expected = sum(int((part.searched & part.has_landmark).sum()) for part in parts)
         if len(points) < max(least, self.config.min_track_share * expected):
             return "too few matches"
         solved = self._solve(points, uv, T_camera_odom, max(least, len(points) // 2), new.moving)
@@ -341,12 +341,12 @@ class Localiser:
         guess, visible = prediction.on_landmarks(
             key, self.camera.K, self.camera.size_px, T_camera_odom, radius_px
         )
-        mapped = key.landmarks.known(key.landmark)
+        has_landmark = key.landmarks.known(key.landmark)
         in_view, config = float(visible.mean()), self.config.matching
         if taken is not None:
             visible &= ~np.isin(key.landmark, taken)
         if most is not None:
-            rows = np.flatnonzero(visible & mapped)
+            rows = np.flatnonzero(visible & has_landmark)
             visible[:] = False
             visible[rows[:: max(1, len(rows) // most)]] = True
             config = replace(config, max_return_px=np.inf)  # the pose refutes what is wrong
@@ -361,7 +361,7 @@ class Localiser:
         )  # fmt: skip
         ok, uv = np.zeros(len(key.uv), np.bool_), guess.uv.copy()
         ok[index], uv[index] = found.ok, found.uv_px
-        return Search(key, uv, ok, visible, mapped, in_view)
+        return Search(key, uv, ok, visible, has_landmark, in_view)
 
     def _solve(
         self, points: F64, uv: F64, start: F64, least: int, moving: FrameRows

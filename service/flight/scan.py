@@ -21,7 +21,7 @@ from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
 from recon.pipeline.events import Event as MapperEvent
 from recon.pipeline.events import FramePosed
-from recon.posegraph.between_keyframes import Odometer
+from recon.posegraph.pose_priors import Odometer
 from recon.tracking.known_track import KnownTrack
 from recon.types import F64, U8, Camera, Frame, Keyframe, Pose, PosePrior, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter

@@ -8,7 +8,7 @@ from flown_track import node
 
 from recon import se3
 from recon.posegraph.alignment import fit
-from recon.posegraph.between_keyframes import FixAverage
+from recon.posegraph.pose_priors import FixAverage
 from recon.posegraph.sensor_offsets import altitude_datum
 from recon.types import PosePrior
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from recon import se3
-from recon.posegraph.between_keyframes import carried
+from recon.posegraph.pose_priors import carried
 from recon.types import F64, PosePrior
 
 

@@ -114,7 +114,7 @@ def test_interpolated_keyframes_lie_between_their_nodes_as_vision_saw_them() -> 
         found = trajectory.pose(i)
         np.testing.assert_allclose(found.T_world_camera, expected, atol=1e-9)
         assert min(graph.scale(a), graph.scale(b)) <= found.scale + 1e-12
-        np.testing.assert_allclose(trajectory.map_pose(i), odom[i])
+        np.testing.assert_allclose(trajectory.odom_pose(i), odom[i])
     np.testing.assert_allclose(trajectory.places([a, a + 1])[0], T_a)
     with pytest.raises(KeyError):
         trajectory.pose(COUNT)

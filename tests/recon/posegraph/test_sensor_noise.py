@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from recon import se3
 from recon.posegraph.alignment import fit, scales
-from recon.posegraph.between_keyframes import Odometer
+from recon.posegraph.pose_priors import Odometer
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import (
     CHI_SQUARED_MEDIANS,

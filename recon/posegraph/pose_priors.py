@@ -1,0 +1,228 @@
+"""What telemetry says of a keyframe's pose: made sound, averaged between keyframes, carried on.
+
+A keyframe speaks for what came since the one before it: for frames that are no keyframes
+(:class:`FixAverage`), and for keyframes that are no nodes any more (:func:`averaged`). The mean of
+fixes is the fix of the mean place, in whatever frame and scale vision has it, so nothing but the
+track itself is needed to bring them together.
+
+Between two instants of one run the difference of two travels is the displacement, with an error
+that grows with time only. That gives the scale of the odometry better than fixes, whose error
+wanders (:mod:`recon.posegraph.alignment`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from recon import se3
+from recon.posegraph.records import Node
+from recon.types import F64, PosePrior, Travel
+
+MIN_FIX_M = 0.005
+"""Sigma that no fix is better than."""
+
+MIN_TURN_RAD = 1e-4
+"""Sigma that no attitude is better than."""
+
+MAX_WORSE = 2.0
+"""A fix whose sigma is so many times that of another spoils their mean."""
+
+
+def has_fix(prior: PosePrior) -> bool:
+    return prior.position_m is not None and prior.sigma_position_m is not None
+
+
+def sound(prior: PosePrior) -> PosePrior:
+    """The prior without readings that are not finite, and no sigma below what a sensor reaches."""
+    R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
+    has_turn = _are_finite(R, prior.sigma_tilt_rad, prior.sigma_yaw_rad)
+    has_agl = _are_finite(prior.agl_m, prior.sigma_agl_m) and (prior.agl_m or 0.0) > 0.0
+    has_altitude = _are_finite(prior.altitude_m, prior.sigma_altitude_m)
+    has_place = _are_finite(position)
+    has_fix = has_place and _are_finite(sigma)
+    return replace(
+        prior,
+        R_world_camera=R if has_turn else None,
+        sigma_tilt_rad=max(prior.sigma_tilt_rad, MIN_TURN_RAD),
+        sigma_yaw_rad=max(prior.sigma_yaw_rad, MIN_TURN_RAD),
+        position_m=position if has_place and (has_fix or sigma is None) else None,
+        sigma_position_m=np.maximum(sigma, MIN_FIX_M) if has_fix and sigma is not None else None,
+        agl_m=prior.agl_m if has_agl else None,
+        sigma_agl_m=max(prior.sigma_agl_m, MIN_FIX_M),
+        altitude_m=prior.altitude_m if has_altitude else None,
+        sigma_altitude_m=max(prior.sigma_altitude_m, MIN_FIX_M),
+        gnss_minus_baro_m=prior.gnss_minus_baro_m if _are_finite(prior.gnss_minus_baro_m) else None,
+    )
+
+
+def _are_finite(*parts: F64 | float | None) -> bool:
+    return all(part is not None and bool(np.isfinite(part).all()) for part in parts)
+
+
+def is_frozen(prior: PosePrior, before: PosePrior) -> bool:
+    """True when the receiver only repeats the position that it gave before."""
+    if prior.position_m is None or before.position_m is None:
+        return False
+    return float(np.abs(before.position_m - prior.position_m).max()) <= 1e-6
+
+
+def at_camera(prior: PosePrior, R_world_camera: F64, scale: float) -> PosePrior:
+    """The prior with its fix brought to where the camera is, by the track's ``scale``."""
+    if prior.fix_offset is None or prior.position_m is None:
+        return prior
+    off = scale * R_world_camera @ prior.fix_offset
+    return replace(prior, position_m=prior.position_m - off, fix_offset=None)
+
+
+@dataclass(slots=True, eq=False)
+class FixAverage:
+    """Takes every tracked frame; gives a keyframe the mean of what came since the one before."""
+
+    _places: list[F64] = field(default_factory=list)  # (3,) in the segment's odometry
+    _fixes: list[F64] = field(default_factory=list)  # (3,) m
+    _above: dict[int, float] = field(default_factory=dict)  # m by the time of the receiver's fix
+    _last_ns: int = 0
+
+    def take(self, T_odom_camera: F64, prior: PosePrior) -> None:
+        """Add a frame of the track with its telemetry."""
+        if prior.position_m is not None and prior.sigma_position_m is not None:
+            self._places.append(T_odom_camera[:3, 3])
+            self._fixes.append(prior.position_m)
+        if prior.gnss_minus_baro_m is not None and prior.gnss_minus_baro_ns > self._last_ns:
+            self._above[prior.gnss_minus_baro_ns] = prior.gnss_minus_baro_m
+
+    def given(self, T_odom_camera: F64, prior: PosePrior) -> PosePrior:
+        """The prior of a keyframe with all that was taken since the last one, and start again."""
+        out = prior
+        if len(self._fixes) > 1 and prior.position_m is not None:
+            place = se3.transform(se3.inverse(T_odom_camera), np.mean(self._places, axis=0)[None])
+            out = replace(out, position_m=np.mean(self._fixes, axis=0), fix_offset=place[0])
+        if self._above:
+            out = replace(
+                out, gnss_minus_baro_m=float(np.mean(list(self._above.values()))),
+                gnss_minus_baro_fixes=len(self._above),
+            )  # fmt: skip
+            self._last_ns = max(self._above)
+        elif out.gnss_minus_baro_m is not None:
+            out = replace(out, gnss_minus_baro_m=None, gnss_minus_baro_fixes=0)
+        self.forget()
+        return out
+
+    def forget(self) -> None:
+        """Start again, as after a break of the track."""
+        self._places.clear()
+        self._fixes.clear()
+        self._above.clear()
+
+
+def without_fixes(nodes: Sequence[Node], refused: Collection[int]) -> list[Node]:
+    """The nodes without the fixes that the graph refused, unless most of a segment's were: among
+    fewer nodes one that is far off would weigh too much."""
+    seen = Counter(n.segment for n in nodes)
+    off = Counter(n.segment for n in nodes if n.seq in refused)
+    return [
+        replace(n, prior=replace(n.prior, sigma_position_m=None))
+        if n.seq in refused and 2 * off[n.segment] <= seen[n.segment]
+        else n
+        for n in nodes
+    ]
+
+
+def averaged(node: Node, left: Node) -> PosePrior:
+    """The prior of a node that also speaks for the one before it, which is left out."""
+    return _averaged_altitudes(_averaged_fix(node, left), left.prior)
+
+
+def _averaged_fix(node: Node, left: Node) -> PosePrior:
+    """The node's prior with the mean of both fixes, which is the fix of the mean place; with
+    that of ``left`` where it has none."""
+    one, other = node.prior, left.prior
+    if other.position_m is None or other.sigma_position_m is None:
+        return one
+    share, position_m = left.weight / (left.weight + node.weight), one.position_m
+    if position_m is None or one.sigma_position_m is None:
+        one = replace(
+            one,
+            sigma_position_m=other.sigma_position_m,
+            gnss_minus_baro_m=None,
+            gnss_minus_baro_fixes=0,
+        )
+        share, position_m = 1.0, other.position_m
+    elif np.any(other.sigma_position_m > MAX_WORSE * one.sigma_position_m):
+        return one
+    place = node.place_of_fix + share * (left.place_of_fix - node.place_of_fix)
+    return replace(
+        one,
+        position_m=position_m + share * (other.position_m - position_m),
+        fix_offset=se3.transform(se3.inverse(node.T_odom_camera), place[None])[0],
+    )
+
+
+def _averaged_altitudes(prior: PosePrior, left: PosePrior) -> PosePrior:
+    """The prior with both means of the receiver's own altitude, weighed by their fixes."""
+    if (
+        left.gnss_minus_baro_m is None
+        or left.gnss_minus_baro_fixes == 0
+        or left.sigma_position_m is None
+    ):
+        return prior
+    if prior.gnss_minus_baro_m is None or prior.sigma_position_m is None:
+        return prior
+    fixes = prior.gnss_minus_baro_fixes + left.gnss_minus_baro_fixes
+    mean = (
+        prior.gnss_minus_baro_m * prior.gnss_minus_baro_fixes
+        + left.gnss_minus_baro_m * left.gnss_minus_baro_fixes
+    ) / fixes
+    return replace(prior, gnss_minus_baro_m=mean, gnss_minus_baro_fixes=fixes)
+
+
+MAX_GAP_S = 3.0
+"""A longer time without a velocity begins a new run."""
+
+
+class Odometer:
+    """Takes the prior of every frame, in the order of time, and adds the travel to it."""
+
+    def __init__(self) -> None:
+        """Nothing is travelled yet."""
+        self._last: tuple[int, F64] | None = None  # time in ns, (3,) m/s
+        self._travel = Travel(np.zeros(3), 0.0, 0)
+
+    def take(self, time_ns: int, prior: PosePrior) -> PosePrior:
+        """The prior with its travel; as it is when it has no velocity."""
+        velocity = prior.velocity_m_s
+        if velocity is None or not np.isfinite(velocity).all():
+            return prior
+        last, self._last = self._last, (time_ns, velocity)
+        before = self._travel
+        passed_s = 0.0 if last is None else (time_ns - last[0]) * 1e-9
+        if last is None or not 0.0 < passed_s <= MAX_GAP_S:
+            self._travel = Travel(np.zeros(3), 0.0, before.run + 1)
+        else:
+            way = 0.5 * passed_s * (last[1] + velocity)
+            self._travel = Travel(before.metres + way, before.seconds + passed_s, before.run)
+        return replace(prior, travel=self._travel)
+
+
+def carried(
+    before: PosePrior, now: PosePrior, T_before: F64, velocity_m_s: F64 | None, seconds: float
+) -> F64:
+    """(4, 4) pose by telemetry's motion since ``before``, when the camera was at ``T_before``.
+
+    Telemetry's error then is assumed to hold now, so that nothing jumps. Without positions the
+    camera continues at ``velocity_m_s`` (3,) for ``seconds``, if known.
+    """
+    T: F64 = T_before.copy()
+    a, b = before.R_world_camera, now.R_world_camera
+    if b is not None and now.sigma_yaw_rad < 1.0:
+        known = a is not None and before.sigma_yaw_rad < 1.0
+        T[:3, :3] = b @ a.T @ T_before[:3, :3] if a is not None and known else b
+    if before.position_m is not None and now.position_m is not None:
+        T[:3, 3] += now.position_m - before.position_m
+    elif velocity_m_s is not None:
+        T[:3, 3] += velocity_m_s * seconds
+    return T
