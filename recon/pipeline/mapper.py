@@ -24,13 +24,13 @@ from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.pipeline.stages import (
     Carry,
-    MakeKeyframe,
     PairStages,
     Plausible,
     Rectify,
     Register,
     Track,
     Undistort,
+    keyframe_of,
 )
 from recon.pipeline.surface_map import KnownSurface, SurfaceMap
 from recon.pipeline.views import StereoView, UndistortedFrame, ViewSelection, VirtualStereoCamera
@@ -141,7 +141,6 @@ class Mapper:
         self.surface = SurfaceMap(
             float(camera.K[0, 0]), config.resolution_m, config.sigma_lens, config.sigma_k1, new_map
         )
-        self.keyframe = MakeKeyframe(self.debug)
         self.frames = FramePoses(self.keyframes, self.follow.is_settled)
         self._lost: UndistortedFrame | None = None  # the last frame, where it has no pose
         self._kept: dict[int, Keyframe] | None = {} if keeps_cloud else None
@@ -219,7 +218,10 @@ class Mapper:
         with self._timing("map"):  # what is new
             T_odom = self.keyframes.trajectory.odom_pose(view.seq)
             sigma_m, fresh = self.surface(view.segment, depth, view.rows_share, T_odom)
-        keyframe = self.keyframe(view, depth, bgr, sigma_m, fresh, update.pose)
+        keyframe = keyframe_of(view, depth, bgr, sigma_m, fresh, update.pose)
+        if self.debug is not None:
+            metric = keyframe.depth
+            self.debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
         self.keyframes.measured(view, keyframe)
         return replace(update, keyframe=keyframe)
 

@@ -353,23 +353,18 @@ class Register:
         return agreed or (step, covariance)
 
 
-class MakeKeyframe:
-    """The pipeline's output: metric depth in colour, its pose, and the new part of it."""
+def keyframe_of(
+    view: StereoView, depth: DepthMap, bgr: U8, sigma_m: F32, fresh: Bool, pose: Pose
+) -> Keyframe:
+    """The pipeline's output: metric depth in colour, its pose, and the new part of it.
 
-    def __init__(self, debug: dict[str, Array] | None) -> None:
-        self._debug = debug
-
-    def __call__(
-        self, view: StereoView, depth: DepthMap, bgr: U8, sigma_m: F32, fresh: Bool, pose: Pose
-    ) -> Keyframe:
-        """``depth`` and ``sigma_m`` (h, w) are in units of the odometry."""
-        scale = np.float32(pose.scale)
-        metric = DepthMap(
-            depth.depth_m * scale, sigma_m * scale, depth.views, depth.K, pose.T_world_camera
-        )
-        if self._debug is not None:
-            self._debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
-        return Keyframe(view.seq, view.time_ns, metric, bgr, pose, fresh)
+    ``depth`` and ``sigma_m`` (h, w) are in units of the odometry.
+    """
+    scale = np.float32(pose.scale)
+    metric = DepthMap(
+        depth.depth_m * scale, sigma_m * scale, depth.views, depth.K, pose.T_world_camera
+    )
+    return Keyframe(view.seq, view.time_ns, metric, bgr, pose, fresh)
 
 
 def _resized(image: U8, size_px: tuple[int, int]) -> U8:

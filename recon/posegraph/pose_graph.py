@@ -276,12 +276,11 @@ class PoseGraph:
     def _thin(self) -> None:
         """Interpolate some of the older keyframes between their neighbours, and rebuild."""
         poses = dict(zip(self._nodes, self._smoother.poses(), strict=False))  # but the newest
-        done = thin(list(self._nodes.values()), self._refused(), poses)
-        nodes = done.nodes
-        self._kept_counts["keyframe dropped"] += len(done.dropped)
+        nodes, marginalised, dropped = thin(list(self._nodes.values()), self._refused(), poses)
+        self._kept_counts["keyframe dropped"] += len(dropped)
         self._nodes = {node.seq: node for node in nodes}
         self.segments.thin(nodes)
-        self.loops.thin(done.marginalised, done.dropped, len(nodes))
+        self.loops.thin(marginalised, dropped, len(nodes))
         self._thin_at = max(self.config.max_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
         self.generation += 1
         self.rebuild()

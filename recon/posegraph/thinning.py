@@ -41,22 +41,19 @@ class Marginalised:
     covariance: F64  # (6, 6) of that motion, left, in the node's frame
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Thinned:
-    """A graph's nodes after it was thinned out."""
+def thin(
+    nodes: Sequence[Node], refused: Collection[int], poses: Mapping[int, F64]
+) -> tuple[list[Node], dict[int, Marginalised], set[int]]:
+    """The nodes that stay, with keys that follow each other; by number the others that are attached
+    to the node before them; and the numbers of those dropped with their whole segment.
 
-    nodes: list[Node]  # that stay, with keys that follow each other
-    marginalised: dict[int, Marginalised]  # by number, those attached to the node before them
-    dropped: set[int]  # numbers of those dropped with their whole segment
-
-
-def thin(nodes: Sequence[Node], refused: Collection[int], poses: Mapping[int, F64]) -> Thinned:
-    """Thin out a graph in which nodes have these ``poses`` (4, 4) T_world_camera, the newest
-    perhaps none yet, and which leaves the fixes of the ``refused`` out."""
+    The nodes have these ``poses`` (4, 4) T_world_camera, the newest perhaps none yet; the fixes of
+    the ``refused`` are left out.
+    """
     nodes = without_fixes(nodes, refused)
     gone = surplus(nodes)
     kept, marginalised = thinned(nodes, gone)
-    return Thinned(over_gaps(kept, poses), marginalised, gone - marginalised.keys())
+    return over_gaps(kept, poses), marginalised, gone - marginalised.keys()
 
 
 def surplus(nodes: Sequence[Node]) -> set[int]:
