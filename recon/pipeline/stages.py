@@ -56,6 +56,7 @@ from recon.types import (
 )
 
 MAX_TRACKING_WIDTH_PX = 1280
+"""Wider images are made smaller for tracking, whose time grows with their area."""
 
 
 class ViewGrid(NamedTuple):

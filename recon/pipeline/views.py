@@ -33,6 +33,8 @@ from recon.tracking.relative_pose import RelativePose
 from recon.types import F32, F64, U8, Camera, PosePrior
 
 KEPT = 6
+"""Views remembered as partners; those further back see the ground from too far aside."""
+
 MIN_FRAMES_PER_STEP = 6.0
 """A keyframe may be late by one part in so many."""
 

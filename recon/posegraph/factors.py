@@ -33,8 +33,9 @@ FRAME_SIGMA_RAD = (0.05, 0.05, 0.15)
 BLOCK = 20
 """Keyframes that share one scale and one altitude bias."""
 
-VELOCITY_S = 1.0
-FASTEST_M_S = 100.0
+VELOCITY_S, FASTEST_M_S = 1.0, 100.0
+"""A speed is taken over this time at least, as errors of two poses would be most of a shorter step;
+a faster one is of a wrong pose: no drone with a camera flies so."""
 
 OPEN_LENGTH, OPEN_SHARE = 0.005, 3.0
 """Relative sigma of the length of a step, and that over the segment's usual one, from which on

@@ -23,6 +23,7 @@ MAX_LEVELLED_SHARE = 0.2
 """Of the views; fewer see a slope, or are placed badly, and the assumed mount levels the flight."""
 
 MIN_POINTS = 30
+"""Landmarks that a plane needs, as single trees lie off it."""
 
 MAX_THICKNESS = 0.2
 """Spread across a plane over its width; thicker ground has no normal."""

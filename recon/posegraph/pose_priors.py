@@ -1,4 +1,4 @@
-"""What telemetry says of a keyframe's pose: made sound, averaged between keyframes, carried on.
+"""Priors on a keyframe's pose by telemetry: made sound, averaged between keyframes, carried on.
 
 A keyframe speaks for what came since the one before it: for frames that are no keyframes
 (:class:`FixAverage`), and for keyframes that are no nodes any more (:func:`averaged`). The mean of

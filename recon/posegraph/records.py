@@ -12,6 +12,8 @@ from recon.types import F64, PosePrior
 
 @dataclass(frozen=True, slots=True)
 class PoseGraphConfig:
+    """Noise and limits of the graph; docs/pose-graph.md says where each enters, and why."""
+
     sigma_scale: float = 0.1  # of a segment's scale after its alignment, before the readings
     sigma_scale_walk: float = 0.003  # change of the scale per twenty keyframes
     sigma_step: float = 0.002  # of one vision motion, as a share of its length

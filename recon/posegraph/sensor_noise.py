@@ -40,6 +40,7 @@ LAG_SHARE = 1.0 / 6.0
 """Longest lag as a share of the span: a fit to the readings hides correlations over longer lags."""
 
 LAGS = 12
+"""Bins of the variogram, in equal ratios, as correlation falls off exponentially."""
 
 CHI_SQUARED_MEDIANS = (0.45493642311957283, 1.3862943611198906, 2.3659738843753377)
 """Of one to three degrees of freedom."""

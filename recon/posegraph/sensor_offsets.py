@@ -37,6 +37,7 @@ SURE = 9.0
 """Squared sigmas by which a boresight must differ from none before attitudes are corrected."""
 
 ROUNDS = 6
+"""Gauss-Newton steps, each with new robust weights."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,6 +17,8 @@ from recon import se3
 from recon.types import F64, Bool
 
 STEPS = 12
+"""Gauss-Newton steps, each with new robust weights."""
+
 CAUCHY_SIGMAS = 2.0
 """Sigmas of a tie's error, per component, beyond which it loses weight."""
 

@@ -31,6 +31,7 @@ NEAR_S = 1e-3
 """A readout further from the one in use starts the search again."""
 
 MAX_READOUT_S = 0.05
+"""Longest readout tried: an image at 20 a second is read by then."""
 
 MIN_SIGMAS = 5.0
 """A readout is taken over when it differs from none by so many sigmas."""
@@ -48,6 +49,7 @@ GLOBAL_S = 5e-4
 """A readout and a sigma below it show a global shutter."""
 
 HUBER_PX = 1.0
+"""Longer errors lose weight: corners err by some tenths of a pixel, mismatches by more."""
 
 USUAL_S = 0.02
 """Sigma of a readout of which nothing is known: cameras of drones read in 0 to 35 ms."""
