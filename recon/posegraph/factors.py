@@ -1,6 +1,6 @@
 """Factors of the pose graph: telemetry of a keyframe, and motions from one keyframe to the next.
 
-Errors of one sensor wander: readings closer in time than the wander's time constant err
+Errors of one sensor wander: readings closer in time than the time constant of that bias err
 together. All readings of a first-order Gauss-Markov error with time constant tau over a time
 T count as 1 + T / (2 tau) of them; each gets the sigma that makes it so.
 

@@ -4,7 +4,7 @@ A pose per keyframe, in the world and in metres. Vision gives the motion between
 segment's frame is brought to the world by one similarity from all its telemetry
 (:mod:`recon.posegraph.alignment`), because a frame with a wrong heading or scale would be sheared
 by single readings. About that similarity the graph bends the track as far as the readings, each
-with its own wander, and the loops outweigh vision.
+with its own bias, and the loops outweigh vision.
 """
 
 from __future__ import annotations

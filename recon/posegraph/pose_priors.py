@@ -84,7 +84,7 @@ class FixAverage:
 
     _places: list[F64] = field(default_factory=list)  # (3,) in the segment's odometry
     _fixes: list[F64] = field(default_factory=list)  # (3,) m
-    _above: dict[int, float] = field(default_factory=dict)  # m by the time of the receiver's fix
+    _gnss_minus_baro: dict[int, float] = field(default_factory=dict)  # m by time of the fix
     _last_ns: int = 0
 
     def take(self, T_odom_camera: F64, prior: PosePrior) -> None:
@@ -93,7 +93,7 @@ class FixAverage:
             self._places.append(T_odom_camera[:3, 3])
             self._fixes.append(prior.position_m)
         if prior.gnss_minus_baro_m is not None and prior.gnss_minus_baro_ns > self._last_ns:
-            self._above[prior.gnss_minus_baro_ns] = prior.gnss_minus_baro_m
+            self._gnss_minus_baro[prior.gnss_minus_baro_ns] = prior.gnss_minus_baro_m
 
     def given(self, T_odom_camera: F64, prior: PosePrior) -> PosePrior:
         """The prior of a keyframe with all that was taken since the last one, and start again."""
@@ -101,12 +101,12 @@ class FixAverage:
         if len(self._fixes) > 1 and prior.position_m is not None:
             place = se3.transform(se3.inverse(T_odom_camera), np.mean(self._places, axis=0)[None])
             out = replace(out, position_m=np.mean(self._fixes, axis=0), fix_offset=place[0])
-        if self._above:
+        if self._gnss_minus_baro:
             out = replace(
-                out, gnss_minus_baro_m=float(np.mean(list(self._above.values()))),
-                gnss_minus_baro_fixes=len(self._above),
+                out, gnss_minus_baro_m=float(np.mean(list(self._gnss_minus_baro.values()))),
+                gnss_minus_baro_fixes=len(self._gnss_minus_baro),
             )  # fmt: skip
-            self._last_ns = max(self._above)
+            self._last_ns = max(self._gnss_minus_baro)
         elif out.gnss_minus_baro_m is not None:
             out = replace(out, gnss_minus_baro_m=None, gnss_minus_baro_fixes=0)
         self.forget()
@@ -116,7 +116,7 @@ class FixAverage:
         """Start again, as after a break of the track."""
         self._places.clear()
         self._fixes.clear()
-        self._above.clear()
+        self._gnss_minus_baro.clear()
 
 
 def without_fixes(nodes: Sequence[Node], refused: Collection[int]) -> list[Node]:

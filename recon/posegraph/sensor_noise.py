@@ -2,7 +2,7 @@
 
 A receiver's error has a part that is new in each reading (white) and a part that wanders
 (first-order Gauss-Markov). The variogram D(h), the mean square of the change of the residual over
-a lag h, separates them: D(h) = 2 white^2 + 2 wander^2 (1 - exp(-h / tau)) (Cressie, Statistics
+a lag h, separates them: D(h) = 2 white^2 + 2 bias^2 (1 - exp(-h / tau)) (Cressie, Statistics
 for Spatial Data, 1993, section 2.3.1). Medians stand for means, so that jumps do not count.
 """
 
@@ -25,10 +25,10 @@ TAUS_SEEN = 2.5
 """Time constants that the longest lag must span, so that the variogram is seen to level off."""
 
 SURE_OF_BIAS = 1.4
-"""A wander is accepted when the variogram fits so many times better with it."""
+"""A bias is accepted when the variogram fits so many times better with it."""
 
 PRECISE_TAU_S = 10.0
-"""Time constant of a receiver's wander with RTK or PPK."""
+"""Time constant of a receiver's bias with RTK or PPK."""
 
 MIN_BIAS = 0.25
 """Share of a receiver's claimed sigma by which it always wanders."""
@@ -50,7 +50,7 @@ MAX_PAIRED = 400
 
 
 MIN_FRESH = 1e-9
-"""Share of a wander's variance that is new in each reading, at least: two at one time."""
+"""Share of a bias's variance that is new in each reading, at least: two at one time."""
 
 FLOOR_SHARE, ROUNDS = 0.05, 4
 """Least share of a model's largest value that gives weight, and times that weights are renewed."""
@@ -71,8 +71,8 @@ class Noise:
 
     def change(self, passed_s: float) -> float:
         """Sigma of the change from one reading to the next after so many seconds."""
-        wandered = self.bias**2 * (1.0 - np.exp(-passed_s / self.tau_s))
-        return float(np.sqrt(2.0 * (self.white**2 + wandered)))
+        change = self.bias**2 * (1.0 - np.exp(-passed_s / self.tau_s))
+        return float(np.sqrt(2.0 * (self.white**2 + change)))
 
     def information(self, times_s: F64, extra: F64) -> F64:
         """(N, N) inverse of the covariance of readings at (N,) times.
@@ -107,7 +107,7 @@ class Noise:
         return np.asarray(alone - solveh_banded(inner, alone) / own[:, None])
 
     def bounded(self, claimed: float, usual_tau_s: float, least: float) -> Noise:
-        """The same with a wander between ``least`` and what the sensor claims.
+        """The same with a bias between ``least`` and what the sensor claims.
 
         A steady drift of the sensor looks like another scale and cannot be measured, so some
         is always there. What was measured beyond the claim is vision's own drift. In both cases
@@ -118,11 +118,11 @@ class Noise:
         return replace(self, bias=min(max(self.bias, least), claimed), tau_s=usual_tau_s)
 
     def scattered(self, residuals: F64) -> Noise:
-        """The same with a wander as large as (N, axes) ``residuals`` scatter, at least.
+        """The same with a bias as large as (N, axes) ``residuals`` scatter, at least.
 
         A variogram looks no farther than a sixth of the span. What changes once on the way, as a
         gimbal that the pilot moves, is in the scatter alone. The time constant grows with it, as
-        the variogram shows how fast a sensor wanders (wander^2 / tau).
+        the variogram shows how fast a sensor wanders (bias^2 / tau).
         """
         seen = float(np.mean(np.square(residuals))) - self.white**2
         if seen <= self.bias**2:
@@ -131,19 +131,19 @@ class Noise:
         return replace(self, bias=float(np.sqrt(seen)), tau_s=tau_s)
 
     def drifting(self, claimed: float, tau_s: float, span_s: float) -> Noise:
-        """The same with the steady drift that a wander as far as :meth:`reach` says may have.
+        """The same with the steady drift that a bias as far as :meth:`reach` says may have.
 
-        Over a track without turns it looks like another scale, so no residual shows it. The wander
+        Over a track without turns it looks like another scale, so no residual shows it. The bias
         is at most as ``claimed``.
         """
         if tau_s <= 0:
             return self
-        wander = min(self.bias, claimed)
+        bias = min(self.bias, claimed)
         spans = span_s / tau_s
         # Variance of the slope of a Gauss-Markov error: spans / 5 if short, 2 / spans if long.
         slope = 3.0 * spans / (5.0 + 0.5 * spans**2)
-        far = max(self.reach(claimed, MIN_BIAS) ** 2 - wander**2, 0.0)
-        return replace(self, bias=wander, steady=float(np.sqrt(far * slope)))
+        far = max(self.reach(claimed, MIN_BIAS) ** 2 - bias**2, 0.0)
+        return replace(self, bias=bias, steady=float(np.sqrt(far * slope)))
 
     def in_units_of(self, unit: float) -> Noise:
         """The same in another unit."""
@@ -154,15 +154,15 @@ class Noise:
     def effective_sigma(self, count: int, span_s: float) -> float:
         """The sigma of each of ``count`` readings over ``span_s``, as if all were independent.
 
-        A wander counts as 1 + span / (2 tau) independent errors.
+        A bias counts as 1 + span / (2 tau) independent errors.
         """
         independent = min(1.0 + span_s / (2.0 * self.tau_s), count)
         return float(np.sqrt(self.white**2 + self.bias**2 * count / independent))
 
     def of_mean(self, claimed: float, span_s: float) -> float:
-        """The sigma of the mean error over ``span_s``, with a wander as far as the sensor claims.
+        """The sigma of the mean error over ``span_s``, with a bias as far as the sensor claims.
 
-        A flight no longer than the time constant shows how fast a sensor wanders (wander^2 / tau),
+        A flight no longer than the time constant shows how fast a sensor wanders (bias^2 / tau),
         not how far: its mean error is in no residual. Of the claim, only the white part averages
         out.
         """
@@ -173,7 +173,7 @@ class Noise:
     def reach(self, sigma: float, min_share: float) -> float:
         """How far the sensor may wander: at most its ``sigma``, less where it wanders slowly.
 
-        The speed of a wander gives its size up to a time constant that is known to a factor of
+        The speed of a bias gives its size up to a time constant that is known to a factor of
         two, and sensors that claim nothing differ as much from the typical one. Two estimates
         as good as each other in their logarithm make the geometric mean. ``min_share`` of the
         variance stays in any case.
@@ -191,7 +191,7 @@ def gauss_markov_noise(
 ) -> Noise | None:
     """The noise of readings with (N, axes) ``residuals`` at (N,) times; None for too few.
 
-    ``usual_tau_s`` is the time constant of a wander too slow to be measured; 0: none wanders.
+    ``usual_tau_s`` is the time constant of a bias too slow to be measured; 0: none wanders.
     """
     lag, change = variogram(times_s, residuals)
     if len(lag) < 3:

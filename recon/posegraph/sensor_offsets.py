@@ -92,7 +92,7 @@ def boresight(stretches: Sequence[Turns], span_s: float, bias_tau_s: float = 40.
     it: a boresight in heading is then a compass error, which the track of the fixes takes out.
 
     Attitudes err together over ``bias_tau_s``, so all of them count as
-    1 + span / (2 wander) readings.
+    1 + span / (2 bias_tau_s) readings.
     """
     count = sum(len(s.R_odom) for s in stretches)
     if count == 0:
@@ -185,7 +185,7 @@ def altitude_datum(
     on the same receiver, so the receiver's mean is taken over only as far as it is the better one.
     Where the scatter could be all of the sigma, it is taken to be, but for what is seen to wander.
 
-    ``bias_tau_s`` is the time constant of a receiver's wander.
+    ``bias_tau_s`` is the time constant of a receiver's bias.
     """
     rows = [
         (p.gnss_minus_baro_m, p.gnss_minus_baro_fixes, p.sigma_position_m[2])

@@ -96,7 +96,7 @@ class Odometry:
         self.keyframes: list[OdometryKeyframe] = []  # of the current segment
         self.segment = -1
         self._lost = 0
-        self._missed_still: tuple[TrackingFrame, str] | None = None  # the last frame, and why
+        self._missed_frame: tuple[TrackingFrame, str] | None = None  # the last frame, and why
         self._motion: ConstantVelocity | None = None
         features = FeatureCache()
         self.exposure = ExposureWatch()
@@ -189,8 +189,8 @@ class Odometry:
     def _missed(self, new: TrackingFrame, reason: str) -> Tracked:
         """Count a frame without a pose; after too many, or two stills, begin a new segment."""
         self._lost += 1
-        if self._low_frame_rate and self._missed_still is not None and self._lost >= 2:
-            (first, why), self._missed_still = self._missed_still, None
+        if self._low_frame_rate and self._missed_frame is not None and self._lost >= 2:
+            (first, why), self._missed_frame = self._missed_frame, None
             started = self._start(first)
             if started.state is Tracking.STARTED:
                 second = self._second_view(new)
@@ -200,7 +200,7 @@ class Odometry:
                 return second
         elif not self._low_frame_rate and self._lost >= self.config.lost_after:
             self._start(new)
-        self._missed_still = (new, reason) if self._low_frame_rate else None
+        self._missed_frame = (new, reason) if self._low_frame_rate else None
         return Tracked(Tracking.LOST, self.segment, reason=reason)
 
     def _start(self, new: TrackingFrame) -> Tracked:

@@ -462,7 +462,7 @@ class _Refinement:
         return float(np.median(known)) if known else 0.0
 
     def _config(self) -> BatchConfig:
-        """How sure the scan's scale is, by its own word."""
+        """How sure the scan's scale is, as the scan states."""
         scale = (self.store.summary or {}).get("scale")
         sigma = scale.get("sigma") if isinstance(scale, dict) else None
         usual = BatchConfig()
