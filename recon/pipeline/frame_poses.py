@@ -11,9 +11,9 @@ import numpy as np
 
 from recon import se3
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
-from recon.pipeline.views import UndistortedFrame
 from recon.posegraph.pose_priors import carried as carried_by_telemetry
 from recon.poses import carried
+from recon.tracking.frame import UndistortedFrame
 from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.relative_pose import RelativePose
 from recon.types import F64, Pose, PosePrior

@@ -33,7 +33,7 @@ from recon.pipeline.stages import (
     keyframe_of,
 )
 from recon.pipeline.surface_map import KnownSurface, SurfaceMap
-from recon.pipeline.views import StereoView, UndistortedFrame, ViewSelection, VirtualStereoCamera
+from recon.pipeline.views import StereoView, ViewSelection, VirtualStereoCamera
 from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.trajectory import Trajectory
@@ -41,6 +41,7 @@ from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
+from recon.tracking.frame import UndistortedFrame
 from recon.tracking.known_track import KnownTrack
 from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry, Tracked, Tracking

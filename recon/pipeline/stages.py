@@ -16,7 +16,7 @@ from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
 from recon.mapping.registration import IcpConfig, agreed_motion
 from recon.pipeline.config import Timing
-from recon.pipeline.views import Colour, StereoView, UndistortedFrame, ViewSelection
+from recon.pipeline.views import StereoView, ViewSelection
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
@@ -33,7 +33,9 @@ from recon.stereo.virtual_stereo import (
     plane_relief,
     rectify,
 )
+from recon.tracking.frame import Colour, UndistortedFrame
 from recon.tracking.known_track import AnyTrack
+from recon.tracking.matching import MatchingConfig, Pyramid
 from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.relative_pose import RelativePose
 from recon.types import (
@@ -95,8 +97,9 @@ class Undistort:
             small = stretch(small, self._seen)
             is_blurred = self._blur.blurred(small)
             colour = Colour(image, self._undistorter)
+            pyramid = Pyramid.build(small, MatchingConfig().search_levels)
             return UndistortedFrame(
-                frame.seq, frame.time_ns, frame.prior, colour, gray, small, self._mask, is_blurred
+                frame.seq, frame.time_ns, frame.prior, colour, gray, pyramid, self._mask, is_blurred
             )
 
 
@@ -121,11 +124,8 @@ class Track:
 
     def __call__(self, image: UndistortedFrame) -> Tracked:
         """The frame's pose, or why there is none."""
-        assert image.small is not None
         with self._timing("track"):
-            tracked = self.odometry.track(
-                image.small, image.seq, image.time_ns, image.prior, image.mask, image.is_blurred
-            )
+            tracked = self.odometry.track(image)
         if tracked.before is not None:
             self._refused -= Counter([tracked.before.reason])
         if tracked.state is Tracking.WAITING:

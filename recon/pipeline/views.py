@@ -14,19 +14,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from recon import se3
-from recon.camera_model import Undistorter
 from recon.pipeline.config import TWO_ONLY, Baseline
 from recon.posegraph.pose_priors import FixAverage
-from recon.rolling_shutter import NEAR_S, FrameRows, depth_share, on_image
+from recon.rolling_shutter import NEAR_S, depth_share, on_image
 from recon.row_errors import turn_shares
 from recon.stereo.posed_image import PosedImage
+from recon.tracking.frame import UndistortedFrame
 from recon.tracking.keyframe_window import (
-    OdometryKeyframe,
     landmark_points,
     median_depth,
     step_covariance,
 )
 from recon.tracking.known_track import AnyTrack
+from recon.tracking.matching import Pyramid
 from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.prediction import inverse_depth_plane
 from recon.tracking.relative_pose import RelativePose
@@ -62,58 +62,6 @@ KNOWN_ROWS = np.zeros((1, 1), np.float32)
 
 LAST_VIEW_SHARE = 0.1
 """A stretch's last frame becomes a view when it is this share of a usual step further on."""
-
-
-class Colour:
-    """A frame's image in colour, until its view takes it."""
-
-    def __init__(self, image: U8, undistorter: Undistorter) -> None:
-        """``image`` (H, W, 3) is distorted."""
-        self._image: U8 | None = image
-        self._undistorter = undistorter
-
-    def take(self) -> U8:
-        """(H, W, 3) without distortion; once, as the image is not kept."""
-        image, self._image = self._image, None
-        assert image is not None, "a view is given once"
-        return self._undistorter.image(image)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class UndistortedFrame:
-    """A frame without distortion. Once it is tracked it may take part in stereo, as a view or as
-    a view's partner, and its pose follows its odometry keyframe's."""
-
-    seq: int
-    time_ns: int
-    prior: PosePrior
-    colour: Colour | None  # None for one that is only a partner
-    gray: U8  # (H, W)
-    small: U8 | None  # (h, w) gray, as the odometry takes it; None once it is tracked
-    mask: U8 | None  # (h, w) non-zero where the image is valid; None: everywhere
-    is_blurred: bool  # takes no part in stereo, only in the track
-    reference: RelativePose | None = None  # to the last keyframe when it was tracked
-    moving: FrameRows | None = None
-
-    @property
-    def segment(self) -> int:
-        return self._reference.segment
-
-    @property
-    def keyframe(self) -> OdometryKeyframe:
-        """Its reference keyframe."""
-        assert self._reference.keyframe is not None, "a frame of stereo is not settled"
-        return self._reference.keyframe
-
-    @property
-    def T_odom_camera(self) -> F64:
-        """(4, 4) as refined by now."""
-        return self._reference.T_odom_camera
-
-    @property
-    def _reference(self) -> RelativePose:
-        assert self.reference is not None, "the frame is not tracked"
-        return self.reference
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -373,7 +321,9 @@ class VirtualStereoCamera:
         key = next(key for key in reversed(self._odometry.keyframes) if key.seq <= image.seq)
         T_keyframe_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
         reference = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
-        frame = replace(image, small=None, mask=None, reference=reference, moving=tracked.moving)
+        frame = replace(
+            image, pyramid=Pyramid(()), mask=None, reference=reference, moving=tracked.moving
+        )
         self._tracked.append((image.time_ns, reference))
         is_view = self.selection.offer(frame, tracked)
         self._fixes.take(tracked.T_odom_camera, image.prior)

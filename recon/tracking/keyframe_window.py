@@ -11,7 +11,7 @@ from recon import se3
 from recon.rolling_shutter import FrameRows
 from recon.tracking import bundle, matching, two_view
 from recon.tracking.focal_watch import AdjustedWindow
-from recon.types import F64, I64, U8, Bool, PosePrior
+from recon.types import F64, I64, Bool, PosePrior
 
 
 class Landmarks:
@@ -92,20 +92,6 @@ class OdometryKeyframe:
         """(N,) which corners have a landmark, and (M, 3) those in its camera, in odometry units."""
         known = self.landmarks.known(self.landmark)
         return known, se3.transform(self.T_camera_odom, self.landmarks[self.landmark[known]])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackingFrame:
-    """A new frame on its way in."""
-
-    gray: U8  # (H, W) undistorted
-    pyramid: matching.Pyramid
-    seq: int
-    time_ns: int
-    prior: PosePrior
-    moving: FrameRows
-    mask: U8 | None  # (H, W) non-zero where the image is valid
-    blurred: bool
 
 
 def landmark_points(key: OdometryKeyframe) -> F64:

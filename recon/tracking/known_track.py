@@ -10,12 +10,12 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.focal_watch import FocalWatch
+from recon.tracking.frame import UndistortedFrame
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
-from recon.tracking.matching import Pyramid
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.tracking.readout_search import ReadoutEstimate
-from recon.types import F64, I64, U8, Camera, PosePrior
+from recon.types import F64, I64, Camera, PosePrior
 
 KEPT = 8
 """Keyframes that are remembered."""
@@ -75,11 +75,9 @@ class KnownTrack:
         """False: the turn of the rows is known."""
         return False
 
-    def track(
-        self, gray: U8, seq: int, time_ns: int, prior: PosePrior, mask: U8 | None = None,
-        blurred: bool = False,
-    ) -> Tracked:  # fmt: skip
-        """The pose of a frame; arguments are those of ``Odometry.track``."""
+    def track(self, frame: UndistortedFrame) -> Tracked:
+        """The pose of a frame."""
+        seq, time_ns, prior = frame.seq, frame.time_ns, frame.prior
         view = self._views.get(seq)
         if view is None:
             return Tracked(Tracking.LOST, self.segment, reason="not tied to other stills")
@@ -93,7 +91,7 @@ class KnownTrack:
             rows = Rows(self._clock, view.rate, np.zeros(6), spread)
         moving = FrameRows(time_ns, prior, T_camera_odom, rows, is_measured=True)
         key = OdometryKeyframe(
-            seq, 0, T_camera_odom, view.covariance, prior, Pyramid.build(gray, 1),
+            seq, 0, T_camera_odom, view.covariance, prior, frame.pyramid,
             np.zeros((len(view.landmark), 2)), view.landmark, self._landmarks, moving,
         )  # fmt: skip
         self.keyframes = [*self.keyframes[1 - KEPT :], key]

@@ -17,7 +17,8 @@ from recon import se3
 from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
 from recon.tracking.common_view import FEATURE_SHARES, CommonView, FeatureCache
-from recon.tracking.keyframe_window import OdometryKeyframe, TrackingFrame, median_depth
+from recon.tracking.frame import UndistortedFrame
+from recon.tracking.keyframe_window import OdometryKeyframe, median_depth
 from recon.tracking.prediction import ConstantVelocity
 from recon.types import F64, I64, Bool, Camera, PosePrior
 
@@ -124,9 +125,13 @@ class Localiser:
         self._features = features
 
     def locate(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], motion: ConstantVelocity,
-        low_frame_rate: bool, lost: bool,
-    ) -> Located | str:  # fmt: skip
+        self,
+        new: UndistortedFrame,
+        keyframes: Sequence[OdometryKeyframe],
+        motion: ConstantVelocity,
+        low_frame_rate: bool,
+        lost: bool,
+    ) -> Located | str:
         """The frame against a recent keyframe, averaged with the one before; or why not.
 
         Args:
@@ -154,7 +159,7 @@ class Localiser:
         return reason if best is None else best
 
     def others(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], found: Located
+        self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe], found: Located
     ) -> list[Located]:
         """The frame against the other recent keyframes that see the same ground."""
         share, least = 0.5 * self.config.search_share, self.config.min_tracks // 3
@@ -164,7 +169,7 @@ class Localiser:
         return [other for other in located if not isinstance(other, str)]
 
     def by_two_views(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe]
+        self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe]
     ) -> TwoViewPose | None:
         """The frame by two views alone: little of what it shares with a keyframe has landmarks.
 
@@ -187,7 +192,7 @@ class Localiser:
         return None
 
     def with_features(
-        self, new: TrackingFrame, key: OdometryKeyframe, uv: F64, ok: Bool
+        self, new: UndistortedFrame, key: OdometryKeyframe, uv: F64, ok: Bool
     ) -> tuple[F64, Bool] | None:
         """Where (N, 2) a keyframe's corners are found, and which (N,), once the features that both
         images share are among them; None where they share none.
@@ -195,7 +200,7 @@ class Localiser:
         Treetops have few corners that look alike from two places. Features follow the corners that
         are there, each place once however often it is found.
         """
-        view = self._features.fine_view((key.seq, key.pyramid.levels[0]), (new.seq, new.gray))
+        view = self._features.fine_view((key.seq, key.pyramid.levels[0]), (new.seq, new.small))
         if view is None:
             return None
         row_of = {tuple(place): row for row, place in enumerate(key.uv.tolist())}
@@ -208,7 +213,7 @@ class Localiser:
         return np.vstack([uv, view.uv_b[fresh]]), np.concatenate([ok, np.ones(count, np.bool_)])
 
     def _two_views(
-        self, new: TrackingFrame, key: OdometryKeyframe, uv: F64, ok: Bool
+        self, new: UndistortedFrame, key: OdometryKeyframe, uv: F64, ok: Bool
     ) -> TwoViewPose | None:
         """The pose by the keyframe's corners found at ``uv`` (N, 2) where ``ok`` (N,)."""
         if ok.sum() < 2 * self.config.min_tracks:
@@ -217,7 +222,7 @@ class Localiser:
         largest = np.pi if turn is None else self.config.max_tilt_error_rad
         up, K = key.T_camera_odom[:3, 2], self.camera.K
         far = np.full(int(ok.sum()), np.nan_to_num(1.0 / median_depth(key)))
-        uv_a, uv_b = key.moving.at_middle(K, key.uv[ok], far), new.moving.at_middle(K, uv[ok], far)
+        uv_a, uv_b = key.moving.at_middle(K, key.uv[ok], far), new.motion.at_middle(K, uv[ok], far)
         seen = two_view.solve(uv_a, uv_b, K, turn, largest, up)
         if seen is None and turn is not None:  # tags are often wrong
             seen = two_view.solve(uv_a, uv_b, K, None, np.pi, up)
@@ -237,7 +242,7 @@ class Localiser:
 
     def _starts(
         self,
-        new: TrackingFrame,
+        new: UndistortedFrame,
         keyframes: Sequence[OdometryKeyframe],
         motion: ConstantVelocity,
         lost: bool,
@@ -258,7 +263,7 @@ class Localiser:
             yield from self._by_features(new, keyframes, low_frame_rate)
 
     def _by_features(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
+        self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
     ) -> Iterator[Start]:
         """Poses by features that the frame shares with recent keyframes, the most first."""
         for key, view in self._views(new, keyframes, low_frame_rate):
@@ -268,10 +273,10 @@ class Localiser:
                     yield Start(key, T_camera_odom, share, by_features=True)
 
     def _views(
-        self, new: TrackingFrame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
+        self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
     ) -> list[tuple[OdometryKeyframe, CommonView]]:
         """Recent keyframes that share features with the frame, the most first."""
-        here, views = (new.seq, new.gray), []
+        here, views = (new.seq, new.small), []
         for key in keyframes[-RECALLED:]:
             there = key.seq, key.pyramid.levels[0]
             view = self._features.common_view(there, here, low_frame_rate)
@@ -294,7 +299,7 @@ class Localiser:
     def pose_from(
         self,
         key: OdometryKeyframe,
-        new: TrackingFrame,
+        new: UndistortedFrame,
         T_camera_odom: F64,
         share: float,
         least: int,
@@ -320,7 +325,7 @@ class Localiser:
         expected = sum(int((part.searched & part.has_landmark).sum()) for part in parts)
         if len(points) < max(least, self.config.min_track_share * expected):
             return "too few matches"
-        solved = self._solve(points, uv, T_camera_odom, max(least, len(points) // 2), new.moving)
+        solved = self._solve(points, uv, T_camera_odom, max(least, len(points) // 2), new.motion)
         if solved is None:
             return "no pose fits the matches"
         known = right.known
@@ -331,7 +336,7 @@ class Localiser:
     def _search(
         self,
         key: OdometryKeyframe,
-        new: TrackingFrame,
+        new: UndistortedFrame,
         T_camera_odom: F64,
         radius_px: float,
         most: int | None,
@@ -410,7 +415,7 @@ class Localiser:
 
 
 def _find(
-    key: OdometryKeyframe, new: TrackingFrame, guess: prediction.Prediction,
+    key: OdometryKeyframe, new: UndistortedFrame, guess: prediction.Prediction,
     config: matching.MatchingConfig,
 ) -> tuple[F64, Bool]:  # fmt: skip
     """Where (N, 2) a keyframe's corners are in a frame, and which (N,) are found."""
@@ -438,7 +443,11 @@ class FirstViews:
         self._drift = np.eye(3)
 
     def match(
-        self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64 | None, low_frame_rate: bool
+        self,
+        new: UndistortedFrame,
+        first: OdometryKeyframe,
+        R_b_a: F64 | None,
+        low_frame_rate: bool,
     ) -> tuple[F64, Bool]:
         """(N, 2) pixels and (N,) success of the first frame's corners in a new frame.
 
@@ -455,7 +464,11 @@ class FirstViews:
         return uv, ok
 
     def _guesses(
-        self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64 | None, low_frame_rate: bool
+        self,
+        new: UndistortedFrame,
+        first: OdometryKeyframe,
+        R_b_a: F64 | None,
+        low_frame_rate: bool,
     ) -> Iterator[prediction.Prediction]:
         """Where the corners went, best first."""
         if not low_frame_rate:
@@ -463,13 +476,13 @@ class FirstViews:
         if R_b_a is not None:
             H = self._by_telemetry(new, first, R_b_a)
             yield prediction.by_homography(H, first.uv, self._radius_px)
-        images = (first.seq, first.pyramid.levels[0]), (new.seq, new.gray)
+        images = (first.seq, first.pyramid.levels[0]), (new.seq, new.small)
         view = self._features.common_view(*images, low_frame_rate)
         if view is not None:
             for radius_px in self._near_px:
                 yield view.predict(first.uv, radius_px)
 
-    def _by_telemetry(self, new: TrackingFrame, first: OdometryKeyframe, R_b_a: F64) -> F64:
+    def _by_telemetry(self, new: UndistortedFrame, first: OdometryKeyframe, R_b_a: F64) -> F64:
         """(3, 3) homography of level ground by attitude, and by position and height if known."""
         a, b = first.prior, new.prior
         height, t = b.agl_m or 0.0, np.zeros(3)

@@ -21,20 +21,20 @@ from recon.rolling_shutter import NEAR_S, FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, two_view
 from recon.tracking.common_view import FeatureCache
 from recon.tracking.focal_watch import FocalWatch
+from recon.tracking.frame import UndistortedFrame
 from recon.tracking.keyframe_window import (
     Landmarks,
     OdometryKeyframe,
-    TrackingFrame,
     adjust_window,
     median_depth,
     triangulate,
 )
 from recon.tracking.localisation import FirstViews, Localiser, Located, OdometryConfig, TwoViewPose
-from recon.tracking.matching import Pyramid, harris_grid
+from recon.tracking.matching import harris_grid
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.prediction import ConstantVelocity
 from recon.tracking.readout_search import ReadoutSearch
-from recon.types import F64, I64, U8, Bool, Camera, PosePrior
+from recon.types import F64, I64, Bool, Camera, PosePrior
 
 MAX_TURN_RAD = 0.25
 """A frame that turned this much since the last keyframe becomes one."""
@@ -96,7 +96,7 @@ class Odometry:
         self.keyframes: list[OdometryKeyframe] = []  # of the current segment
         self.segment = -1
         self._lost = 0
-        self._missed_frame: tuple[TrackingFrame, str] | None = None  # the last frame, and why
+        self._missed_frame: tuple[UndistortedFrame, str] | None = None  # the last frame, and why
         self._motion: ConstantVelocity | None = None
         features = FeatureCache()
         self.exposure = ExposureWatch()
@@ -130,26 +130,12 @@ class Odometry:
         """True where the prior of a frame should hold the camera's angular velocity."""
         return self._row_track.needs_telemetry(time_ns)
 
-    def track(
-        self,
-        gray: U8,
-        seq: int,
-        time_ns: int,
-        prior: PosePrior,
-        mask: U8 | None = None,
-        blurred: bool = False,
-    ) -> Tracked:
-        """Pose of a new frame, or why there is none.
-
-        Args:
-            gray: (H, W) undistorted image.
-            prior: telemetry at this frame; parts may be missing.
-            mask: (H, W) non-zero where the image is valid.
-            blurred: a later frame makes a better keyframe, if it comes soon.
-        """
-        pyramid = Pyramid.build(gray, self.config.matching.search_levels)
+    def track(self, frame: UndistortedFrame) -> Tracked:
+        """Pose of a new frame, or why there is none. Of a blurred one a later frame makes a better
+        keyframe, if it comes soon."""
+        time_ns, prior = frame.time_ns, frame.prior
         moving = self._row_track.expect(time_ns, prior, self._expected(time_ns, prior))
-        new = TrackingFrame(gray, pyramid, seq, time_ns, prior, moving, mask, blurred)
+        new = replace(frame, moving=moving)
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
             return self._start(new)
@@ -186,7 +172,7 @@ class Odometry:
         assert self._motion is not None
         return self._motion
 
-    def _missed(self, new: TrackingFrame, reason: str) -> Tracked:
+    def _missed(self, new: UndistortedFrame, reason: str) -> Tracked:
         """Count a frame without a pose; after too many, or two stills, begin a new segment."""
         self._lost += 1
         if self._low_frame_rate and self._missed_frame is not None and self._lost >= 2:
@@ -203,7 +189,7 @@ class Odometry:
         self._missed_frame = (new, reason) if self._low_frame_rate else None
         return Tracked(Tracking.LOST, self.segment, reason=reason)
 
-    def _start(self, new: TrackingFrame) -> Tracked:
+    def _start(self, new: UndistortedFrame) -> Tracked:
         """Begin a segment at this frame."""
         uv = self._corners(new)
         if len(uv) < 2 * self.config.min_tracks:
@@ -220,27 +206,27 @@ class Odometry:
         T_camera_odom = se3.inverse(T_odom_camera)
         unknown = np.full(len(uv), -1, np.int64)
         self.keyframes = [self._keyframe(new, T_camera_odom, uv, unknown, Landmarks())]
-        self._row_track.add(new.moving, T_camera_odom)
+        self._row_track.add(new.motion, T_camera_odom)
         self._motion = ConstantVelocity(new.time_ns, T_odom_camera, new.prior)
         return Tracked(Tracking.STARTED, self.segment, T_odom_camera, moving=new.moving)
 
     def _keyframe(
-        self, new: TrackingFrame, T_camera_odom: F64, uv: F64, landmark: I64, table: Landmarks
+        self, new: UndistortedFrame, T_camera_odom: F64, uv: F64, landmark: I64, table: Landmarks
     ) -> OdometryKeyframe:
         """The frame as a keyframe with corners ``uv`` (N, 2)."""
         return OdometryKeyframe(
             new.seq, self.segment, T_camera_odom, np.zeros((6, 6)), new.prior, new.pyramid, uv,
-            landmark, table, new.moving,
+            landmark, table, new.motion,
         )  # fmt: skip
 
-    def _corners(self, new: TrackingFrame) -> F64:
+    def _corners(self, new: UndistortedFrame) -> F64:
         """(N, 2) Harris corners of the frame, Eq. 4-5."""
-        found = harris_grid(new.gray, self.config.matching, new.mask)
+        found = harris_grid(new.small, self.config.matching, new.mask)
         return found.uv_px.astype(np.float64)
 
     # ---- the second view --------------------------------------------------------------
 
-    def _second_view(self, new: TrackingFrame) -> Tracked:
+    def _second_view(self, new: UndistortedFrame) -> Tracked:
         """Wait until the camera has moved enough, then make the first landmarks."""
         first = self.keyframes[0]
         R_b_a = prediction.relative_rotation(first.prior, new.prior)
@@ -257,7 +243,7 @@ class Odometry:
             view = self._motion_of_two(new, uv, ok, R_b_a)
         if moved < least and (view is None or view.parallax_rad < least):
             if self._row_track.is_known and len(self._early) < EARLY:
-                self._early.append((new.moving, uv, ok))
+                self._early.append((new.motion, uv, ok))
             return Tracked(
                 Tracking.WAITING, self.segment, tracks=int(ok.sum()), reason="too little motion"
             )
@@ -279,7 +265,7 @@ class Odometry:
         return off_px > 2.0 * two_view.MAX_ERROR_PX
 
     def _motion_of_two(
-        self, new: TrackingFrame, uv: F64, ok: Bool, R_b_a: F64 | None
+        self, new: UndistortedFrame, uv: F64, ok: Bool, R_b_a: F64 | None
     ) -> two_view.TwoView | None:
         """The motion since the first frame, whose corners are at ``uv`` (N, 2) where ``ok``."""
         first = self.keyframes[0]
@@ -287,7 +273,7 @@ class Odometry:
         turn = 0.12 if R_b_a is not None else np.pi
         far = np.full(int(ok.sum()), 1.0 / new.prior.agl_m if new.prior.agl_m else 0.0)
         uv_a = first.moving.at_middle(self.K, first.uv[ok], far)
-        uv_b = new.moving.at_middle(self.K, uv[ok], far)
+        uv_b = new.motion.at_middle(self.K, uv[ok], far)
         view = two_view.solve(uv_a, uv_b, self.K, R_b_a, turn, up_a)
         if view is None and R_b_a is not None and self._low_frame_rate:  # tags are often wrong
             view = two_view.solve(uv_a, uv_b, self.K, None, np.pi, up_a)
@@ -316,7 +302,7 @@ class Odometry:
 
     # ---- keyframes ---------------------------------------------------------------------
 
-    def _accept(self, new: TrackingFrame, found: Located) -> Tracked:
+    def _accept(self, new: UndistortedFrame, found: Located) -> Tracked:
         """Keep the pose; make the frame a keyframe when it has moved enough."""
         key = found.key
         T_camera_odom = found.pose.T_camera_points
@@ -329,12 +315,12 @@ class Odometry:
         px_s = self._px_s(T_odom_camera, depth)
         self._moving.update(new.time_ns, T_odom_camera, new.prior)
         self._lost = 0
-        due = self.config.base_to_height * (OVERDUE if new.blurred else 1.0)
+        due = self.config.base_to_height * (OVERDUE if new.is_blurred else 1.0)
         if base < due and found.share > 0.45 and turned < MAX_TURN_RAD:
-            self._row_track.add(new.moving, T_camera_odom)
+            self._row_track.add(new.motion, T_camera_odom)
             self._settle()
             return Tracked(Tracking.TRACKED, self.segment, T_odom_camera, tracks, moving=new.moving)
-        self.exposure.add(new.gray, px_s, 1e-9 * self._gap_ns)
+        self.exposure.add(new.small, px_s, 1e-9 * self._gap_ns)
         share = 0.5 * self.config.search_share
         whole = self._localiser.pose_from(key, new, T_camera_odom, share, self.config.min_tracks)
         found = found if isinstance(whole, str) else whole
@@ -354,20 +340,23 @@ class Odometry:
             return np.zeros(2)
         return np.asarray(self.K[0, 0] / gap_s * self._moving.across(T_odom_camera, depth))
 
-    def _cross(self, new: TrackingFrame, found: TwoViewPose) -> Tracked:
+    def _cross(self, new: UndistortedFrame, found: TwoViewPose) -> Tracked:
         """Make a keyframe of a frame that two views alone place."""
         self._lost = 0
         self._add_keyframe(new, found.T_camera_odom, [(found.key, found.uv, found.ok)])
         self._moving.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
         return self._as_keyframe(new, found.ok)
 
-    def _as_keyframe(self, new: TrackingFrame, ok: Bool) -> Tracked:
+    def _as_keyframe(self, new: UndistortedFrame, ok: Bool) -> Tracked:
         """The newest keyframe's outcome, by the corners that are ``ok``."""
         T, tracks = self.keyframes[-1].T_odom_camera, int(ok.sum())
         return Tracked(Tracking.KEYFRAME, self.segment, T, tracks, moving=new.moving)
 
     def _add_keyframe(
-        self, new: TrackingFrame, T_camera_odom: F64, seen: list[tuple[OdometryKeyframe, F64, Bool]]
+        self,
+        new: UndistortedFrame,
+        T_camera_odom: F64,
+        seen: list[tuple[OdometryKeyframe, F64, Bool]],
     ) -> None:
         """Append a keyframe: tracked corners, new landmarks, fresh corners; adjust the window.
 
@@ -375,10 +364,10 @@ class Odometry:
         the one that gave the pose first. Of the others only corners with landmarks count.
         """
         least = 0.5 * self.config.min_base_to_height
-        self._row_track.add(new.moving, T_camera_odom)
+        self._row_track.add(new.motion, T_camera_odom)
         kept, landmark = np.zeros((0, 2)), np.zeros(0, np.int64)
         for key, uv, ok in seen:
-            triangulate(key, T_camera_odom, new.moving, uv, ok, self.K, least, self.config.loose_px)
+            triangulate(key, T_camera_odom, new.motion, uv, ok, self.K, least, self.config.loose_px)
             if key is not seen[0][0]:
                 ok = ok & (key.landmark >= 0) & ~np.isin(key.landmark, landmark)
             kept = np.vstack([kept, uv[ok]])
@@ -390,7 +379,7 @@ class Odometry:
         landmark = np.concatenate([landmark, np.full(len(fresh), -1, np.int64)])
         key_new = self._keyframe(new, T_camera_odom, uv, landmark, seen[0][0].landmarks)
         self.keyframes.append(key_new)
-        self._unsettled = key_new if new.moving.rows is not None else None
+        self._unsettled = key_new if new.motion.rows is not None else None
         window = self.keyframes[-self.config.window - 2 :]
         adjusted = adjust_window(window, self.K)
         if len(window) > self.config.window and window[0].seq > self._watched_seq:

@@ -195,7 +195,7 @@ def height_errors(flown: list[U8], shutter: Shutter) -> F64:
             T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 1.0,
             velocity_m_s=np.array([8.0, 1.0, 0.0]), turn_rad_s=turn,
         )  # fmt: skip
-        assert odometry.track(image, i, int(i * 1e9 / 15), prior).state != "lost"
+        assert odometry.track(undistorted(image, i, int(i * 1e9 / 15), prior)).state != "lost"
     off = []
     for key in odometry.keyframes:
         points = key.landmarks[key.landmark[key.landmarks.known(key.landmark)]]
@@ -220,7 +220,7 @@ def test_frames_after_the_first_tell_how_its_rows_moved(flown: list[U8]) -> None
             T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 1.0,
             velocity_m_s=np.array([8.0, 1.0, 0.0]), turn_rad_s=turn, sigma_turn_rad_s=0.2,
         )  # fmt: skip
-        odometry.track(image, i, int(i * 1e9 / 15), prior)
+        odometry.track(undistorted(image, i, int(i * 1e9 / 15), prior))
     first = odometry.keyframes[0].moving
     assert first.time_ns == 0 and first.is_measured and first.rows is not None
     off = first.rows.rate[:3] - derivative(0.0)[:3]
@@ -321,7 +321,9 @@ def searched(readout_s: float, frames: int) -> tuple[ReadoutEstimate, float | No
     for i in range(frames):
         T = se3.inverse(swinging(i / 15))
         prior = PosePrior(T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 1.0)
-        odometry.track(photograph(ground, i / 15, readout_s), i, int(i * 1e9 / 15), prior)
+        odometry.track(
+            undistorted(photograph(ground, i / 15, readout_s), i, int(i * 1e9 / 15), prior)
+        )
     assert odometry.readout is not None and odometry.readout.estimate is not None
     rows = odometry.keyframes[-1].moving.rows
     return odometry.readout.estimate, None if rows is None else rows.clock.readout_s

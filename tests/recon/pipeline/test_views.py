@@ -16,13 +16,12 @@ from recon import se3
 from recon.camera_model import Undistorter
 from recon.pipeline.config import Baseline
 from recon.pipeline.views import (
-    Colour,
-    UndistortedFrame,
     ViewSelection,
     VirtualStereoCamera,
     frames_apart,
 )
 from recon.rolling_shutter import FrameRows, RowClock, Rows
+from recon.tracking.frame import Colour, UndistortedFrame
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry, Tracked, Tracking
@@ -38,7 +37,7 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Undi
     reference = RelativePose(seq, segment, np.eye(4), key)
     colour = Colour(image, Undistorter(Camera(np.diag([30.0, 30.0, 1.0]), np.zeros(5), (32, 32))))
     return UndistortedFrame(
-        seq, seq, PosePrior(), colour, image[..., 0], None, None, blurred, reference
+        seq, seq, PosePrior(), colour, image[..., 0], Pyramid(()), None, blurred, reference
     )  # fmt: skip
 
 
@@ -227,7 +226,7 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
         turn = np.array([0.0, 2.0 * i, 0.0, 0.0, 0.0, 0.0])
         moving = FrameRows(i, PosePrior(), np.eye(4), Rows(clock, turn, np.zeros(6)))
         image = UndistortedFrame(
-            i, i, PosePrior(), plain.colour, plain.gray, plain.gray, None, False
+            i, i, PosePrior(), plain.colour, plain.gray, plain.pyramid, None, False
         )
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
         views.take(image, Tracked(state, 0, plain.T_odom_camera, moving=moving))
@@ -255,7 +254,7 @@ def test_views_wait_for_the_first_word_on_their_readout(
         keys.append(plain.keyframe)
         moving = FrameRows(i, PosePrior(), np.eye(4), is_measured=is_measured)
         image = UndistortedFrame(
-            i, i, PosePrior(), plain.colour, plain.gray, plain.gray, None, False
+            i, i, PosePrior(), plain.colour, plain.gray, plain.pyramid, None, False
         )
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
         views.take(image, Tracked(state, 0, plain.T_odom_camera, moving=moving))
@@ -276,7 +275,7 @@ def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: f
         plain = frame(i, float(i))
         keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))
         image = UndistortedFrame(
-            i, i * 10**8, PosePrior(), plain.colour, plain.gray, plain.gray, None,
+            i, i * 10**8, PosePrior(), plain.colour, plain.gray, plain.pyramid, None,
             False,
         )  # fmt: skip
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME

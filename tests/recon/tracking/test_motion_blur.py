@@ -7,6 +7,7 @@ import numpy as np
 import painted_ground as painted
 import pytest
 from painted_ground import painted_ground
+from tracked_frame import undistorted
 
 from recon import se3
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
@@ -107,7 +108,7 @@ def test_a_shutter_too_slow_for_the_speed_is_reported_once() -> None:
         gray = np.asarray(np.rint(np.mean(shots, axis=0)), np.uint8)
         T = pose(t)
         prior = PosePrior(T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 2.0)
-        odometry.track(gray, i, round(1e9 * t), prior)
+        odometry.track(undistorted(gray, i, round(1e9 * t), prior))
         watch.look()
     (text,) = warnings
     assert text.startswith("Shutter too slow: images blur by ") and len(text) <= 50

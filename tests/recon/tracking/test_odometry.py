@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from tracked_frame import undistorted
 
 from recon import se3
 from recon.tracking import matching
@@ -70,7 +71,7 @@ def fly(
         image = photograph(ground, T)
         image = (images or {}).get(i, image)
         prior = prior_of(T, rng) if telemetry else PosePrior(DOWN, 0.1, 3.0, agl_m=60.0)
-        out.append(odometry.track(image, i, i * 200_000_000, prior))
+        out.append(odometry.track(undistorted(image, i, i * 200_000_000, prior)))
     return odometry, out
 
 
@@ -152,7 +153,7 @@ def test_a_camera_that_circles_a_place_moves(ground: U8, step_rad: float) -> Non
     for i, T in enumerate(track):
         prior = PosePrior(DOWN, 0.4, 3.0, agl_m=60.0)
         time_ns = round(i * step_rad * 1e10)
-        found.append(odometry.track(photograph(ground, T), i, time_ns, prior))
+        found.append(odometry.track(undistorted(photograph(ground, T), i, time_ns, prior)))
     placed = [f.state in ("tracked", "keyframe") for f in found]
     assert odometry.segment == 0 and sum(placed) > 0.6 * len(placed)
     assert drift(track, found) < 0.02 * 60.0
@@ -166,7 +167,9 @@ def test_a_turn_on_the_spot_without_attitude_makes_no_surface(ground: U8, focal_
     for i in range(15):
         R = se3.so3_exp(np.array([0.004 * i, 0.0, 0.1 * i])) @ DOWN
         image = photograph(ground, se3.compose(R, np.array([0.0, 0.0, 60.0])))
-        found = odometry.track(image, i, 200_000_000 * i, PosePrior(DOWN, 0.4, 3.0, agl_m=60.0))
+        found = odometry.track(
+            undistorted(image, i, 200_000_000 * i, PosePrior(DOWN, 0.4, 3.0, agl_m=60.0))
+        )
         assert found.state in ("started", "waiting")
 
 
@@ -189,7 +192,9 @@ def test_noise_is_not_followed() -> None:
     odometry = Odometry(CAMERA)
     states = [
         odometry.track(
-            rng.integers(0, 255, (360, 480), dtype=np.uint8), i, i * 200_000_000, PosePrior()
+            undistorted(
+                rng.integers(0, 255, (360, 480), dtype=np.uint8), i, i * 200_000_000, PosePrior()
+            )
         ).state
         for i in range(12)
     ]
@@ -212,7 +217,7 @@ def skipping(
         if odometry.can_skip(time_ns, prior, frames_per_step=6.0):
             out.append(Tracked(Tracking.SKIPPED, odometry.segment))
         else:
-            out.append(odometry.track(photograph(ground, T), i, time_ns, prior))
+            out.append(odometry.track(undistorted(photograph(ground, T), i, time_ns, prior)))
     return out
 
 
@@ -295,7 +300,9 @@ def test_a_few_landmarks_show_where_the_others_are(
     odometry, rng, out = Odometry(CAMERA, OdometryConfig()), np.random.default_rng(2), []
     for i, T in enumerate(poses(20)):
         searched.append(0)
-        out.append(odometry.track(photograph(ground, T), i, i * 200_000_000, prior_of(T, rng)))
+        out.append(
+            odometry.track(undistorted(photograph(ground, T), i, i * 200_000_000, prior_of(T, rng)))
+        )
     between = [n for n, one in zip(searched, out, strict=True) if one.state is Tracking.TRACKED]
     assert len(between) > 8
     assert max(between) < 300  # of 450, on up to five levels

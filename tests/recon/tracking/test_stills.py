@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from mapper_events import keyframes_of
 from painted_ground import CAMERA, DOWN, FOOTPRINT_M, HEIGHT_M, SIZE, pose, still
+from tracked_frame import undistorted
 
 from recon.backends import load_backend
 from recon.camera_model import scaled
@@ -35,7 +36,9 @@ def flown(
     """
     odometry = Odometry(CAMERA)
     prior = PosePrior(DOWN, 0.1, sigma_yaw_rad, agl_m=HEIGHT_M)
-    return [odometry.track(image, i, i * step_ns, prior) for i, image in enumerate(images)]
+    return [
+        odometry.track(undistorted(image, i, i * step_ns, prior)) for i, image in enumerate(images)
+    ]
 
 
 def off_m(track: list[F64], found: list[Tracked]) -> float:
@@ -145,7 +148,7 @@ def test_stills_whose_corners_differ_are_tied_by_their_features(
 
 def test_frames_that_wait_are_placed_though_features_follow_the_corners_since() -> None:
     odometry, prior = Odometry(CAMERA), PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
-    odometry.track(still(pose(0.0)), 0, 0, prior)
+    odometry.track(undistorted(still(pose(0.0)), 0, 0, prior))
     first = odometry.keyframes[0]
     seen = np.zeros(len(first.uv), np.bool_)
     odometry._early = [(first.moving, first.uv, seen)]

@@ -1,0 +1,78 @@
+"""A frame on its way through tracking and stereo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from recon.camera_model import Undistorter
+from recon.rolling_shutter import FrameRows
+from recon.tracking.keyframe_window import OdometryKeyframe
+from recon.tracking.matching import Pyramid
+from recon.tracking.relative_pose import RelativePose
+from recon.types import F64, U8, PosePrior
+
+
+class Colour:
+    """A frame's image in colour, until its view takes it."""
+
+    def __init__(self, image: U8, undistorter: Undistorter) -> None:
+        """``image`` (H, W, 3) is distorted."""
+        self._image: U8 | None = image
+        self._undistorter = undistorter
+
+    def take(self) -> U8:
+        """(H, W, 3) without distortion; once, as the image is not kept."""
+        image, self._image = self._image, None
+        assert image is not None, "a view is given once"
+        return self._undistorter.image(image)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UndistortedFrame:
+    """A frame without distortion.
+
+    The odometry adds the motion of its rows. Once it has a pose it may take part in stereo, as a
+    view or as a view's partner, and its pose follows its odometry keyframe's.
+    """
+
+    seq: int
+    time_ns: int
+    prior: PosePrior
+    colour: Colour | None  # None for one that is only a partner
+    gray: U8  # (H, W)
+    pyramid: Pyramid  # of (h, w) gray, as the odometry takes it; empty once it is tracked
+    mask: U8 | None  # (h, w) non-zero where the image is valid; None: everywhere
+    is_blurred: bool  # takes no part in stereo, only in the track
+    reference: RelativePose | None = None  # to the last keyframe when it was tracked
+    moving: FrameRows | None = None  # its rows' motion, better once its neighbours are known
+
+    @property
+    def small(self) -> U8:
+        """(h, w) gray, as the odometry takes it."""
+        return self.pyramid.levels[0]
+
+    @property
+    def motion(self) -> FrameRows:
+        """Its rows' motion."""
+        assert self.moving is not None, "the odometry has not seen the frame"
+        return self.moving
+
+    @property
+    def segment(self) -> int:
+        return self._reference.segment
+
+    @property
+    def keyframe(self) -> OdometryKeyframe:
+        """Its reference keyframe."""
+        assert self._reference.keyframe is not None, "a frame of stereo is not settled"
+        return self._reference.keyframe
+
+    @property
+    def T_odom_camera(self) -> F64:
+        """(4, 4) as refined by now."""
+        return self._reference.T_odom_camera
+
+    @property
+    def _reference(self) -> RelativePose:
+        assert self.reference is not None, "the frame is not tracked"
+        return self.reference
