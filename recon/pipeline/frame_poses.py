@@ -5,7 +5,6 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,12 +18,14 @@ from recon.tracking.relative_pose import RelativePose
 from recon.types import F64, Pose, PosePrior
 
 
-class FallbackPosition(NamedTuple):
-    """Where a frame is as long as no keyframe carries it."""
-
-    place_m: F64  # (3,) in the world
-    sigma_m: F64  # (3,)
-    sources: tuple[str, ...] = ("vision",)
+def pose_at(
+    T_odom_camera: F64, place_m: F64, sigma_m: F64, sources: tuple[str, ...] = ("vision",)
+) -> Pose:
+    """A frame at a place (3,) with sigma (3,), turned as the odometry has it, as long as no
+    keyframe carries it."""
+    T = se3.compose(T_odom_camera[:3, :3], place_m)
+    covariance = se3.about(-place_m, np.diag(np.r_[np.ones(3), np.square(sigma_m)]))
+    return Pose(T, covariance, sources)
 
 
 class FramePoses:
@@ -36,8 +37,8 @@ class FramePoses:
         self._map, self._is_settled = keyframes, is_settled
         self._views: list[RelativePose] = []  # reconstructed, in order
         self._settled = 0  # the first so many no longer change
-        self._fallbacks: dict[int, tuple[F64, FallbackPosition]] = {}
-        # by segment, its last frame with a fix
+        # By segment, of its last frame with a fix: place in the odometry, fix, sigma, sources.
+        self._fallbacks: dict[int, tuple[F64, F64, F64, tuple[str, ...]]] = {}
         self._seen: tuple[PosePrior, Pose, int] | None = None  # the last frame placed by vision
         self._newest: Pose | None = None  # of a view; None again once all is done
         self._aligned = -1  # the newest segment that has a similarity to the world
@@ -66,22 +67,22 @@ class FramePoses:
         self._seen = prior, pose, frame.segment
         return pose
 
-    def _fallback(self, prior: PosePrior, frame: RelativePose) -> FallbackPosition:
+    def _fallback(self, prior: PosePrior, frame: RelativePose) -> Pose:
         """A frame at its fix, or as far from the last one as the odometry has it.
 
         Heading and scale of the odometry are not known: the sigma grows by the way.
         """
         at_m, fix, sigma = frame.T_odom_camera[:3, 3], prior.position_m, prior.sigma_position_m
         if fix is not None and sigma is not None:
-            self._fallbacks[frame.segment] = at_m, FallbackPosition(fix, sigma, ("gnss",))
-        start = at_m, FallbackPosition(at_m, np.ones(3))
-        from_m, known = self._fallbacks.setdefault(frame.segment, start)
+            self._fallbacks[frame.segment] = at_m, fix, sigma, ("gnss",)
+        start = at_m, at_m, np.ones(3), ("vision",)
+        from_m, place_m, sigma_m, sources = self._fallbacks.setdefault(frame.segment, start)
         way_m = at_m - from_m
-        sigma_m = np.hypot(known.sigma_m, np.linalg.norm(way_m))
-        return FallbackPosition(known.place_m + way_m, sigma_m, known.sources)
+        sigma_m = np.hypot(sigma_m, np.linalg.norm(way_m))
+        return pose_at(frame.T_odom_camera, place_m + way_m, sigma_m, sources)
 
     def _has_fix(self, segment: int) -> bool:
-        return segment in self._fallbacks and "gnss" in self._fallbacks[segment][1].sources
+        return segment in self._fallbacks and "gnss" in self._fallbacks[segment][3]
 
     def _is_aligned(self, segment: int) -> bool:
         """True when the segment has a similarity to the world; in flight, of the newest one."""
@@ -89,7 +90,7 @@ class FramePoses:
             return segment == self._aligned
         return self._map.graph.segments.similarity(segment) is not None
 
-    def pose(self, frame: RelativePose, fallback: FallbackPosition) -> Pose:
+    def pose(self, frame: RelativePose, fallback: Pose) -> Pose:
         """A frame in the world, carried by the view at or before it where it can.
 
         A segment too short to be aligned has no scale and no heading: its frames stay at their
@@ -97,10 +98,7 @@ class FramePoses:
         """
         T_odom_camera, view = frame.T_odom_camera, self._view_of(frame)
         if view is None or (self._has_fix(frame.segment) and not self._is_aligned(frame.segment)):
-            place_m, sigma_m, sources = fallback
-            T = se3.compose(T_odom_camera[:3, :3], place_m)
-            covariance = se3.about(-place_m, np.diag(np.r_[np.ones(3), np.square(sigma_m)]))
-            return Pose(T, covariance, sources)
+            return fallback
         # In flight no other view than the newest carries a new frame.
         known = self._newest or self._map.trajectory.pose(view.seq)
         pose = carried(known, se3.inverse(view.T_odom_camera) @ T_odom_camera)

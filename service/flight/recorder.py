@@ -14,7 +14,7 @@ import numpy as np
 
 from mavlink.telemetry.samples import VehicleState
 from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
-from recon.pipeline.frame_poses import FallbackPosition
+from recon.pipeline.frame_poses import pose_at
 from recon.posegraph.ground_heights import GUESSED_SHARE
 from recon.poses import sigma_m
 from recon.tracking.odometry import Tracking
@@ -134,7 +134,8 @@ class Recorder:
         """The poses that corrections have moved, or whose sigma they have changed."""
         for frame in self._frames.corrigible():
             assert frame.reference is not None
-            published = FallbackPosition(frame.position_m, np.full(3, frame.sigma_m / 3**0.5))
+            T_odom_camera, sigma = frame.reference.T_odom_camera, np.full(3, frame.sigma_m / 3**0.5)
+            published = pose_at(T_odom_camera, frame.position_m, sigma)
             record = self._record(frame, self.pipeline.frames.pose(frame.reference, published))
             moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - frame.position_m)
             change = abs(record.sigma_m - frame.sigma_m)

@@ -11,7 +11,7 @@ from some_views import keyframe_at, view_at
 
 from recon import se3
 from recon.pipeline.config import untimed
-from recon.pipeline.frame_poses import FallbackPosition, FramePoses
+from recon.pipeline.frame_poses import FramePoses, pose_at
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.posegraph.alignment import Similarity
 from recon.posegraph.trajectory import Trajectory
@@ -38,8 +38,9 @@ def following() -> Any:
         prior = PosePrior(position_m=fix, sigma_position_m=sigma)
         pose = frames.follow(prior, frame_at(seq, north_m))
         place_m = pose.T_world_camera[:3, 3]
-        published = FallbackPosition(place_m, np.full(3, sigma_m(pose) / 3**0.5))
-        again = frames.pose(frame_at(seq, north_m), published)
+        frame = frame_at(seq, north_m)
+        published = pose_at(frame.T_odom_camera, place_m, np.full(3, sigma_m(pose) / 3**0.5))
+        again = frames.pose(frame, published)
         np.testing.assert_allclose(again.T_world_camera, pose.T_world_camera)
         assert sigma_m(again) == pytest.approx(sigma_m(pose))
         return pose
@@ -90,7 +91,7 @@ def test_views_keep_their_places_when_they_settle() -> None:
     for key in keys:
         frames.take(RelativePose(key.seq, key.segment, some_pose(), key), update)
     taken = [RelativePose(n, n // 50, some_pose(), keys[n // 10]) for n in range(100)]
-    fallback = FallbackPosition(np.zeros(3), np.ones(3))
+    fallback = pose_at(np.eye(4), np.zeros(3), np.ones(3))
     before = [frames.pose(frame, fallback) for frame in taken]
     frames.settle()
     after = [frames.pose(frame, fallback) for frame in taken]
@@ -115,7 +116,7 @@ def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None
     update = keyframes.add(view_at(5, view.T_odom_camera), None, np.eye(6), None)
     trajectory, known = keyframes.trajectory, keyframes.trajectory.pose(5)
     keyframes.trajectory = None
-    fallback = FallbackPosition(np.full(3, 9.0), np.ones(3))
+    fallback = pose_at(np.eye(4), np.full(3, 9.0), np.ones(3))
     np.testing.assert_array_equal(frames.pose(frame, fallback).T_world_camera[:3, 3], np.full(3, 9))
     frames.take(view, update)  # the view is done
     step = se3.inverse(view.T_odom_camera) @ frame.T_odom_camera
@@ -142,11 +143,11 @@ def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> N
     in_flight = frames.follow(prior, frame)
     keyframes.changed(final=True)
     frames.finish()
-    again = frames.pose(frame, FallbackPosition(fix, np.full(3, 5.0)))
+    again = frames.pose(frame, pose_at(np.eye(4), fix, np.full(3, 5.0)))
     for pose in (in_flight, again):
         np.testing.assert_allclose(pose.T_world_camera[:3, 3], fix)
         assert sigma_m(pose) == pytest.approx(5.0 * 3**0.5)
     known = Similarity(1.0, np.eye(3), np.zeros(3), np.eye(7))
     keyframes.graph.segments[0].similarity = known
-    carried = frames.pose(frame, FallbackPosition(fix, np.full(3, 5.0)))
+    carried = frames.pose(frame, pose_at(np.eye(4), fix, np.full(3, 5.0)))
     assert np.linalg.norm(carried.T_world_camera[:3, 3] - fix) > 1.0

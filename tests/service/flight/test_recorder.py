@@ -14,7 +14,6 @@ import pytest
 from recon import se3
 from recon.camera_model import scaled_K
 from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
-from recon.pipeline.frame_poses import FallbackPosition
 from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.segments import Segments
@@ -64,10 +63,10 @@ def recorder_of(store: ScanStore, batch: int, of_m: float, graph: object = None)
     0: that of a frame as it was published.
     """
 
-    def at(frame: RelativePose, published: FallbackPosition) -> Pose:
+    def at(frame: RelativePose, published: Pose) -> Pose:
         there = pose(frame.seq, 1.0).T_world_camera[:3, 3]
-        assert np.linalg.norm(published.place_m - there) == 0
-        return pose(frame.seq, of_m or float(np.linalg.norm(published.sigma_m)))
+        assert np.linalg.norm(published.T_world_camera[:3, 3] - there) == 0
+        return pose(frame.seq, of_m or sigma_m(published))
 
     pipeline = MagicMock(debug=None)
     pipeline.keyframes.graph = graph
