@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from recon.tracking.frame import RelativePose
 from recon.tracking.odometry import Tracked
-from recon.tracking.relative_pose import RelativePose
 from recon.types import Keyframe, Pose
 
 

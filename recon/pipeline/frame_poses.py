@@ -12,9 +12,8 @@ from recon import se3
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.posegraph.pose_priors import carried as carried_by_telemetry
 from recon.poses import carried
-from recon.tracking.frame import UndistortedFrame
+from recon.tracking.frame import RelativePose, UndistortedFrame
 from recon.tracking.odometry import Tracked, Tracking
-from recon.tracking.relative_pose import RelativePose
 from recon.types import F64, Pose, PosePrior
 
 

@@ -33,11 +33,10 @@ from recon.stereo.virtual_stereo import (
     plane_relief,
     rectify,
 )
-from recon.tracking.frame import Colour, UndistortedFrame
+from recon.tracking.frame import Colour, RelativePose, UndistortedFrame
 from recon.tracking.known_track import AnyTrack
 from recon.tracking.matching import MatchingConfig, Pyramid
 from recon.tracking.odometry import Tracked, Tracking
-from recon.tracking.relative_pose import RelativePose
 from recon.types import (
     F32,
     F64,

@@ -19,7 +19,7 @@ from recon.posegraph.pose_priors import FixAverage
 from recon.rolling_shutter import NEAR_S, depth_share, on_image
 from recon.row_errors import turn_shares
 from recon.stereo.posed_image import PosedImage
-from recon.tracking.frame import UndistortedFrame
+from recon.tracking.frame import RelativePose, UndistortedFrame
 from recon.tracking.keyframe_window import (
     landmark_points,
     median_depth,
@@ -29,7 +29,6 @@ from recon.tracking.known_track import AnyTrack
 from recon.tracking.matching import Pyramid
 from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.prediction import inverse_depth_plane
-from recon.tracking.relative_pose import RelativePose
 from recon.types import F32, F64, U8, Camera, PosePrior
 
 KEPT = 6

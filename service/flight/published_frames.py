@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.tracking.relative_pose import RelativePose
+from recon.tracking.frame import RelativePose
 from recon.types import F64
 from service.errors import OutsideError
 

@@ -16,7 +16,7 @@ from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.posegraph.alignment import Similarity
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import sigma_m
-from recon.tracking.relative_pose import RelativePose
+from recon.tracking.frame import RelativePose
 from recon.types import F64, Pose, PosePrior
 
 RNG = np.random.default_rng(4)

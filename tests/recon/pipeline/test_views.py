@@ -21,7 +21,7 @@ from recon.pipeline.views import (
     frames_apart,
 )
 from recon.rolling_shutter import FrameRows, RowClock, Rows
-from recon.tracking.frame import Colour, UndistortedFrame
+from recon.tracking.frame import Colour, RelativePose, UndistortedFrame
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry, Tracked, Tracking

@@ -12,7 +12,7 @@ import pytest
 from some_views import keyframe_at
 
 from recon import se3
-from recon.tracking.relative_pose import RelativePose
+from recon.tracking.frame import RelativePose
 from recon.types import F64
 from service.errors import OutsideError
 from service.flight.published_frames import PublishedFrame, PublishedFrames

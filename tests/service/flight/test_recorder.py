@@ -18,7 +18,6 @@ from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.segments import Segments
 from recon.tracking.odometry import Tracked, Tracking
-from recon.tracking.relative_pose import RelativePose
 from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.rig import Rig
 from service.flight.recorder import REPLAYED, Recorder

@@ -22,8 +22,8 @@ from mavlink.wire.framing import Framer
 from recon import se3
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA
 from recon.pipeline.events import FramePosed
+from recon.tracking.frame import RelativePose
 from recon.tracking.odometry import Tracked, Tracking
-from recon.tracking.relative_pose import RelativePose
 from recon.types import F64, Camera, Pose
 from service.config import CameraConfig, load_config
 from service.daemon.runtime import Daemon
