@@ -56,7 +56,8 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 
         for module, name, value in (  # few programs: each takes long here
             (triton_dense, "PIXELS", 512), (triton_dense, "CELLS", 512),
-            (triton_dense, "FUSED_PIXELS", 512), (triton_icp, "POINTS", 512), (room, "ROOM_PX", 4),
+            (triton_dense, "FUSED_PIXELS", 512), (triton_icp, "POINTS", 512),
+            (padding, "PAD_PX", 4),
         ):  # fmt: skip
             monkeypatch.setattr(module, name, value)
         # Not SWEPT: a scan takes one element after the other, also those beyond the image.

@@ -258,7 +258,7 @@ class Scanning:
             run.carry_out()
         except Exception as error:
             fault = _fault_of(error)
-        give_back(collect=True)
+        release_memory(collect=True)
         self._end_run(fault)
 
     def _end_run(self, fault: str) -> None:

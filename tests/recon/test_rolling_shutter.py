@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from some_views import keyframe_at
+from tracked_frame import undistorted
 
 from recon import se3
 from recon.camera_model import project, rays

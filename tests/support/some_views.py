@@ -10,9 +10,9 @@ from recon import se3
 from recon.pipeline.views import StereoView
 from recon.rolling_shutter import FrameRows
 from recon.stereo.posed_image import PosedImage
+from recon.tracking.frame import RelativePose
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.matching import Pyramid
-from recon.tracking.relative_pose import RelativePose
 from recon.types import F64, PosePrior
 
 UNKNOWN, NO_MOTIONS = PosePrior(), dict[int, F64]()

@@ -17,7 +17,7 @@ from xml.sax.saxutils import escape
 import cv2
 import numpy as np
 
-from recon.bands import at_once
+from recon.parallel import run_parallel
 from recon.types import F32, F64, Array
 from service.errors import InputError
 from service.georeference import between_nodes, unwrapped

@@ -23,10 +23,10 @@ from recon.pipeline.views import (
 from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.frame import Colour, RelativePose, UndistortedFrame
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
+from recon.tracking.matching import Pyramid
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.tracking.readout_search import ReadoutSearch
-from recon.tracking.relative_pose import RelativePose
 from recon.types import U8, Camera, PosePrior
 
 

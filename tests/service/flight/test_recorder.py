@@ -17,6 +17,8 @@ from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
 from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.segments import Segments
+from recon.poses import sigma_m
+from recon.tracking.frame import RelativePose
 from recon.tracking.odometry import Tracked, Tracking
 from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.rig import Rig
