@@ -141,7 +141,7 @@ def test_stills_whose_corners_differ_are_tied_by_their_features(
         noise = np.random.default_rng(i).normal(size=camera.size_px[::-1])
         leaves = np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.7))
         image = np.clip(still(T, camera) + 20.0 * leaves / leaves.std(), 0, 255).astype(np.uint8)
-        found.append(odometry.track(image, i, i * 2_000_000_000, prior))
+        found.append(odometry.track(undistorted(image, i, i * 2_000_000_000, prior)))
     assert_one_piece(track, found, 0.005)
     assert min(counts) > 80
 
@@ -173,7 +173,7 @@ def test_rows_of_a_field_are_not_taken_for_one_another() -> None:
     track = [pose(0.45 * FOOTPRINT_M * i, 3.0 * i, seed=i) for i in range(3)]
     odometry, prior = Odometry(camera), PosePrior(DOWN, 0.1, 3.0, agl_m=HEIGHT_M)
     found = [
-        odometry.track(still(T, camera, ground), i, i * 2_000_000_000, prior)
+        odometry.track(undistorted(still(T, camera, ground), i, i * 2_000_000_000, prior))
         for i, T in enumerate(track)
     ]
     assert_one_piece(track, found, 0.02)
