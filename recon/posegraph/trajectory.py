@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
@@ -183,9 +182,8 @@ class Trajectory:
         after = before + 1
         share = (at - self._nodes[before]) / (self._nodes[after] - self._nodes[before])
         T, other = carried(before), carried(after)
-        turn = Rotation.from_matrix(T[:, :3, :3].transpose(0, 2, 1) @ other[:, :3, :3])
-        turned = Rotation.from_rotvec(share[:, None] * turn.as_rotvec()).as_matrix()
-        T[:, :3, :3] = T[:, :3, :3] @ turned
+        turn = se3.each_so3_log(T[:, :3, :3].transpose(0, 2, 1) @ other[:, :3, :3])
+        T[:, :3, :3] = T[:, :3, :3] @ se3.each_so3_exp(share[:, None] * turn)
         T[:, :3, 3] += share[:, None] * (other - T)[:, :3, 3]
         return T, scales[before] * (scales[after] / scales[before]) ** share
 
@@ -229,6 +227,8 @@ class Trajectory:
         elif self._checked == self.graph.version:
             return {}
         at = np.flatnonzero(self._table.rows["is_published"])
+        if not len(at):
+            return {}
         rows, (T, scales) = self._table.rows[at], self._placed(at)
         nodes = self._table.rows["seq"][self._node_before(at)]
         change = moved_m(rows, T, scales)
