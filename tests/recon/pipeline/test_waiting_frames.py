@@ -10,7 +10,7 @@ import pytest
 
 from recon.pipeline.config import untimed
 from recon.pipeline.stages import Track
-from recon.pipeline.views import UndistortedFrame
+from recon.tracking.frame import UndistortedFrame
 from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.types import F64
 
