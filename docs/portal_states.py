@@ -111,7 +111,9 @@ def shots(browser: Browser, base: str, scan: Path, out: Path) -> None:
     press("Export…")(browser)
     browser.wait("document.querySelectorAll('.product').length > 0", WAIT_S)
     shot("library-export")
-    browser.run("document.querySelector('[aria-label^=\"Make Contours, DXF\"]').click()")
+    browser.run(
+        'document.querySelector(\'[aria-label^="Make"][aria-label$="Contours, DXF"]\').click()'
+    )
     browser.wait("document.querySelector('.product .jobs li')", WAIT_S)
     browser.run("document.querySelector('.product .jobs li').scrollIntoView({ block: 'center' })")
     shot("library-job")

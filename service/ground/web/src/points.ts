@@ -218,9 +218,9 @@ export class Cloud implements Gradual {
     this.exposure = Math.min(Math.max(230 / Math.max(top, 1), 1), 2) ** 2.2;
   }
 
-  /** The exposure that the colours are shown with; 1 for those of figures. */
+  /** The exposure that the colours are shown with; 1 for those of figures, where they are seen. */
   get gain(): number {
-    return this.shared.mode.value ? 1 : this.exposure;
+    return this.group.visible && this.shared.mode.value ? 1 : this.exposure;
   }
 
   /** Metres by which what is not measured is drawn behind. */
