@@ -22,13 +22,13 @@ class PublishedFrame:
 
     time_ns: int
     reference: RelativePose | None  # None: by telemetry alone, never corrected
-    position_m: F64  # (3,)
+    T_world_camera: F64  # (4, 4)
     sigma_m: float
     agl_m: float | None
     is_view: bool
 
 
-_ROW = struct.Struct("<qqi?16d3d2d")
+_ROW = struct.Struct("<qqi?16d16d2d")
 
 
 class PublishedFrames:
@@ -77,7 +77,7 @@ def _packed(frame: PublishedFrame, reference: RelativePose) -> bytes:
     agl = np.nan if frame.agl_m is None else frame.agl_m
     return _ROW.pack(
         frame.time_ns, reference.seq, reference.segment, frame.is_view,
-        *reference.T_odom_camera.ravel(), *frame.position_m, frame.sigma_m, agl,
+        *reference.T_odom_camera.ravel(), *frame.T_world_camera.ravel(), frame.sigma_m, agl,
     )  # fmt: skip
 
 
@@ -85,6 +85,7 @@ def _unpacked(row: bytes) -> PublishedFrame:
     time_ns, seq, segment, is_view, *rest = _ROW.unpack(row)
     *rest, sigma_m, agl = rest
     numbers = np.array(rest)
-    agl_m, T_odom_camera = None if np.isnan(agl) else agl, numbers[:16].reshape(4, 4)
+    agl_m = None if np.isnan(agl) else agl
+    T_odom_camera, T_world_camera = numbers.reshape(2, 4, 4)
     reference = RelativePose(seq, segment, T_odom_camera)
-    return PublishedFrame(time_ns, reference, numbers[16:19], sigma_m, agl_m, is_view)
+    return PublishedFrame(time_ns, reference, T_world_camera, sigma_m, agl_m, is_view)

@@ -13,6 +13,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from mavlink.telemetry.samples import VehicleState
+from recon import se3
 from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import pose_at
 from recon.posegraph.ground_heights import GUESSED_SHARE
@@ -31,9 +32,9 @@ from service.stream.images import IMAGE_SHARE, encode_image
 from service.stream.records import PoseRecord, Repose
 from service.stream.store import ScanStore
 
-REPUBLISH_M, REPUBLISH_SHARE = 0.05, 0.1
-"""A frame's pose is written again if by the end it moved by more than this, or its sigma changed by
-more than this share."""
+REPUBLISH_M, REPUBLISH_RAD, REPUBLISH_SHARE = 0.05, 0.001, 0.1
+"""A frame's pose is written again if by the end it moved or turned by more than this (5 cm of the
+ground from 50 m), or its sigma changed by more than this share."""
 
 BATCH, REPLAYED = 256, 16
 """Poses in one transaction, which takes a synchronised write of the disk: those written again in
@@ -90,7 +91,7 @@ class Recorder:
         if pose is None:
             return
         frame = PublishedFrame(
-            posed.time_ns + self._offset_ns, posed.reference, pose.T_world_camera[:3, 3],
+            posed.time_ns + self._offset_ns, posed.reference, pose.T_world_camera,
             sigma_m(pose), agl_m, posed.is_view,
         )  # fmt: skip
         self._frames.add(frame, self.pipeline.follow.is_settled)
@@ -134,12 +135,13 @@ class Recorder:
         """The poses that corrections have moved, or whose sigma they have changed."""
         for frame in self._frames.corrigible():
             assert frame.reference is not None
-            T_odom_camera, sigma = frame.reference.T_odom_camera, np.full(3, frame.sigma_m / 3**0.5)
-            published = pose_at(T_odom_camera, frame.position_m, sigma)
+            T, sigma = frame.T_world_camera, np.full(3, frame.sigma_m / 3**0.5)
+            published = pose_at(T, T[:3, 3], sigma)
             record = self._record(frame, self.pipeline.frames.pose(frame.reference, published))
-            moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - frame.position_m)
-            change = abs(record.sigma_m - frame.sigma_m)
-            if moved_m > REPUBLISH_M or change > REPUBLISH_SHARE * record.sigma_m:
+            moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - T[:3, 3])
+            turned_rad = np.linalg.norm(se3.so3_log(T[:3, :3].T @ record.T_world_camera[:3, :3]))
+            resized = abs(record.sigma_m - frame.sigma_m) > REPUBLISH_SHARE * record.sigma_m
+            if moved_m > REPUBLISH_M or turned_rad > REPUBLISH_RAD or resized:
                 yield record
 
     def summary(self) -> dict[str, Any]:

@@ -35,8 +35,7 @@ def before(limit: int) -> Any:
 
 def published(seq: int, key: Any, agl_m: float | None = 41.5) -> PublishedFrame:
     reference = RelativePose(seq, key.segment, some_pose(), key)
-    place_m, is_view = RNG.normal(size=3), seq % 2 == 0
-    return PublishedFrame(10**18 + seq, reference, place_m, 0.5 + seq, agl_m, is_view)
+    return PublishedFrame(10**18 + seq, reference, some_pose(), 0.5 + seq, agl_m, seq % 2 == 0)
 
 
 def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
@@ -53,7 +52,7 @@ def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
         assert other.reference is not None
         assert (one.time_ns, one.agl_m, one.is_view) == (other.time_ns, other.agl_m, other.is_view)
         assert one.sigma_m == other.sigma_m
-        assert np.array_equal(one.position_m, other.position_m)
+        assert np.array_equal(one.T_world_camera, other.T_world_camera)
         assert np.array_equal(one.reference.T_odom_camera, other.reference.T_odom_camera)
         assert one.reference.seq == other.reference.seq
         assert one.reference.segment == other.reference.segment
@@ -64,10 +63,10 @@ def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> 
     kept, places = PublishedFrames(tmp_path), []
     for seq in range(500):
         carried = published(seq, keyframe_at(seq, some_pose()))
-        alone = PublishedFrame(10**18 + seq, None, np.zeros(3), 0.0, None, False)
+        alone = PublishedFrame(10**18 + seq, None, np.eye(4), 0.0, None, False)
         for frame in (carried, alone):
             kept.add(frame, before(seq - 9))
-            places.append(weakref.ref(frame.position_m))
+            places.append(weakref.ref(frame.T_world_camera))
         del carried, alone, frame
     assert sum(place() is not None for place in places) <= 22
     assert len(list(kept.corrigible())) == 500

@@ -115,6 +115,20 @@ def test_poses_published_before_the_scan_was_placed_get_their_sigma(tmp_path: Pa
         assert found == pytest.approx([0.02, 0.02, 0.021, 0.02], abs=1e-4)
 
 
+def test_a_frame_that_turned_in_its_place_is_written_again(tmp_path: Path) -> None:
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("scan", "drone", 0)) as store:
+        recorder = recorder_of(store, 1, 0.1)
+        for seq, yaw_rad in enumerate([0.0, 0.0009, 0.2]):
+            turned = posed(seq)
+            assert turned.pose is not None
+            T = turned.pose.T_world_camera.copy()
+            T[:3, :3] = se3.so3_exp(np.array([0.0, 0.0, yaw_rad])) @ T[:3, :3]
+            recorder.write([replace(turned, pose=replace(turned.pose, T_world_camera=T))])
+        recorder.flush()
+        yaws = [pose.yaw_rad for pose in store.poses()]
+        assert yaws[0] == yaws[2] and abs(yaws[1] - yaws[0]) == pytest.approx(0.0009)
+
+
 def test_frames_that_no_keyframe_carries_stay_as_published(tmp_path: Path) -> None:
     with CountingStore.create(tmp_path / "scan.db", ScanHeader("stills", "drone", 0)) as store:
         recorder = recorder_of(store, 1, 0.0)
