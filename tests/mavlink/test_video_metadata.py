@@ -263,6 +263,14 @@ KARMA, MAX, APHILL = (
 )
 
 
+@pytest.mark.parametrize("key", sorted(gpmf.COLUMNS))
+def test_an_item_that_declares_too_few_columns_is_not_read(key: bytes) -> None:
+    short = item(b"TYPE", "c", 1, b"l") + item(key, "?", 4, struct.pack(">l", 1))
+    packets = [(k * SECOND_NS, SECOND_NS, gopro(short) + gps5(47.0, 3, 1.4)) for k in range(2)]
+    log = gpmf.of_packets(HERE, packets, HistoryConfig())
+    assert log.counts["GPS5"] == 36 and at(log, 0.5).lat_deg == pytest.approx(47.0005)
+
+
 @settings(max_examples=150)
 @given(
     st.binary(max_size=300),

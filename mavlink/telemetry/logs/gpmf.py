@@ -50,6 +50,11 @@ TYPES = {
 }  # fmt: skip
 """Of structures, where the item itself does not declare them."""
 
+COLUMNS = {
+    b"GPS5": 5, b"GPS9": 9, b"GLPI": 8, b"GPRI": 9, b"CORI": 4, b"IORI": 4, b"GRAV": 3,
+}  # fmt: skip
+"""Of a structure, those that are read; an item that declares fewer is not."""
+
 PLACES = (b"GLPI", b"GPS9", b"GPS5")
 """Best first; the first that has one gives them all."""
 
@@ -193,13 +198,16 @@ def _streams(data: bytes) -> Iterator[tuple[bytes, list[tuple[float, ...]], _Str
                 stream.fix, stream.dop = (
                     (value, stream.dop) if key == b"GPSF" else (stream.fix, value / 100.0)
                 )
-        elif key in READERS or key in TYPES:
+        elif key in COLUMNS:
             kinds = stream.kinds or TYPES.get(key, b"")
+            if len(kinds) < COLUMNS[key]:
+                continue  # damaged
             rows = _rows(kinds, size, content)
             scales = stream.scale * (len(kinds) if len(stream.scale) == 1 else 1)
             if len(scales) == len(kinds) and all(scales):
                 scaled = [tuple(v / s for v, s in zip(r, scales, strict=True)) for r in rows]
-                yield key, [r for r in scaled if all(map(math.isfinite, r))], stream
+                rows = [r[: COLUMNS[key]] for r in scaled if all(map(math.isfinite, r))]
+                yield key, rows, stream
 
 
 def _items(data: bytes) -> Iterator[tuple[bytes, int, int, bytes]]:
