@@ -1,7 +1,8 @@
 """The vehicle as the service uses it: links, two components and history in one object.
 
 Threads: two per link, one for the protocol, one for heartbeats, one that writes to the disk. Every
-call of the service returns at once; ``ScanControl`` is called in the protocol's thread.
+call of the service returns at once, but for the end of a log; ``ScanControl`` is called in the
+protocol's thread.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ class VehicleLink:
             lambda: (self._clock_ns() + self.unix_offset_ns()) // 1000,
         )
         self._inbox: LinkInbox[tuple[int, Packet, int]] = LinkInbox(BACKLOG)
-        self._disk: LinkInbox[None] = LinkInbox(BACKLOG)  # what writes, as a disk may stall
+        self._disk: LinkInbox[tuple[bytes, int]] = LinkInbox(BACKLOG)  # as a disk may stall
         self._is_saving = False
         self._heard = set(HEARD)  # numbers of handled messages; others are ignored
         self._stop = threading.Event()
@@ -150,7 +151,8 @@ class VehicleLink:
     def stop(self) -> None:
         """Send what is queued, then close everything."""
         self._stop.set()
-        self._inbox.put(lambda: None)
+        for inbox in (self._inbox, self._disk):
+            inbox.put(lambda: None)
         for thread in self._threads:
             thread.join(timeout=5.0)
         self._links.stop()
@@ -210,18 +212,15 @@ class VehicleLink:
 
     def record(self, path: Path | None, unix_offset_ns: int | None = None) -> None:
         """Write a .tlog of all links to a file from now on, stamped with the monotonic clock plus
-        ``unix_offset_ns`` (None: :meth:`unix_offset_ns`); a path of None ends it."""
+        ``unix_offset_ns`` (None: :meth:`unix_offset_ns`); a path of None ends it, and waits for
+        what is queued, but not long for a disk that stalls."""
         if path is None:
             closed = threading.Event()
-
-            def close() -> None:
-                self.recorder.close()
-                closed.set()
-
-            self._disk.put(close)
-            if self._threads:
+            self._disk.put(self.recorder.close)
+            self._disk.put(closed.set)
+            if self._threads and not self._stop.is_set():
                 closed.wait(CLOSE_S)
-            else:  # not started
+            else:
                 self._flush(0.0)
         else:
             offset_ns = self.unix_offset_ns() if unix_offset_ns is None else unix_offset_ns
@@ -286,8 +285,7 @@ class VehicleLink:
             if (now_ns >= save_ns or self._is_stale()) and not self._is_saving:
                 save_ns = now_ns + every_ns
                 self._is_saving = True
-                if not self._disk.put(self._saving()):
-                    self._is_saving = False
+                self._disk.put(self._saving())
         self._serve(0.0)
         self._send(self._companion.take())
 
@@ -327,7 +325,7 @@ class VehicleLink:
 
     def _record(self, packets: list[bytes], now_ns: int) -> None:
         for data in packets:
-            self._disk.put(partial(self.recorder.write, data, now_ns))
+            self._disk.gather((data, now_ns))
 
     def _write(self) -> None:
         """The disk's thread. A disk that stalls costs packets of the log, and nothing else."""
@@ -343,7 +341,9 @@ class VehicleLink:
         return self._memory.is_stale(revision, self.presence.proven_system)
 
     def _flush(self, wait_s: float) -> None:
-        _, jobs = self._disk.take(wait_s)
+        packets, jobs = self._disk.take(wait_s)
+        for data, now_ns in packets:  # first: a log ends with what was heard before
+            self._guard(partial(self.recorder.write, data, now_ns))
         for job in jobs:
             self._guard(job)
 
@@ -359,7 +359,9 @@ class VehicleLink:
         kept, revision = parameters.kept(), parameters.revision
 
         def save() -> None:
-            self._memory.save(kept, revision, timestamp, streams, system)
-            self._is_saving = False
+            try:
+                self._memory.save(kept, revision, timestamp, streams, system)
+            finally:
+                self._is_saving = False
 
         return save

@@ -165,15 +165,14 @@ class LinkInbox(Generic[T]):
         self._wake = threading.Condition()
         self.dropped = 0
 
-    def put(self, job: Job) -> bool:
-        """Add a job and wake the consumer; False, and counted, when the queue is full."""
+    def put(self, job: Job) -> None:
+        """Add a job and wake the consumer; dropped and counted when the queue is full."""
         with self._wake:
             if len(self._jobs) >= self._limit:
                 self.dropped += 1
-                return False
+                return
             self._jobs.append(job)
             self._wake.notify()
-            return True
 
     def gather(self, telemetry: T) -> None:
         """Add telemetry, which is taken within a moment; dropped when the queue is full."""

@@ -172,6 +172,45 @@ def test_neither_heartbeats_nor_answers_wait_for_the_disk_of_the_log(tmp_path: P
                 os.close(disk)  # who waits for it gets an error
 
 
+def test_a_log_ends_although_the_disk_had_no_room_for_its_packets(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mavlink.component.vehicle.BACKLOG", 10)
+    monkeypatch.setattr("mavlink.component.vehicle.CLOSE_S", 0.0)
+    port, reached, stall = free_port(), threading.Event(), threading.Event()
+    with (
+        RehearsalVehicle(f"udpin:127.0.0.1:{port}") as daemon,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer,
+    ):
+        recorder = daemon.link.recorder
+        write = recorder.write
+
+        def stalled(packet: bytes, now_ns: int) -> None:
+            reached.set()
+            stall.wait(20.0)
+            write(packet, now_ns)
+
+        monkeypatch.setattr(recorder, "write", stalled)
+        daemon.link.record(tmp_path / "link.tlog", 0)
+        peer.connect(("127.0.0.1", port))
+        mouth = dialect.MAVLink(None, 255, 190)
+        beat = bytes(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(mouth))
+        peer.send(beat)
+        assert reached.wait(20.0)
+        for _ in range(100):
+            peer.send(beat)
+        until(lambda: daemon.link.report().links[0].received_bytes > 100 * len(beat))
+        daemon.link.record(None)
+        stall.set()
+
+        def is_closed() -> bool:
+            before = recorder.packets
+            write(beat, 0)
+            return recorder.packets == before
+
+        until(is_closed)
+
+
 class LogPort:
     """A recorded .tlog as a serial line: replayed at its pace; sent data is discarded."""
 
