@@ -12,10 +12,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 
@@ -25,6 +27,9 @@ from service.bench.stereo import speed
 from service.cameras import open_camera
 from service.compute.backend_choice import choose_backend
 from service.daemon.machine import Machine, read_machine
+from service.errors import OutsideError
+
+T = TypeVar("T")
 
 WIDTHS = (320, 640, 1280)
 EVERY_S = 1.0
@@ -69,11 +74,7 @@ class _Flight(NamedTuple):
 
 def _whole_path(video: Path, width: int, backend: str, flight_s: int) -> list[BenchResult]:
     """Times real time and peak memory, with this backend and with SGBM."""
-    # A fresh interpreter for each, or the peak would be the largest of those before.
-    ours, theirs = (
-        multiprocessing.get_context("spawn").Pool(1).apply(_flown, (video, width, name))
-        for name in (backend, SgbmBackend.name)
-    )
+    ours, theirs = (in_process(_flown, video, width, name) for name in (backend, SgbmBackend.name))
     peer = "with OpenCV SGBM"
     note = f"{ours.keyframes} keyframes of {SIZE[0]}x{SIZE[1]} at {FPS} images/s"
     words, memory = f"whole path, stereo {width} wide", f"its memory, {width} wide"
@@ -84,6 +85,20 @@ def _whole_path(video: Path, width: int, backend: str, flight_s: int) -> list[Be
         ),
         BenchResult(memory, ours.peak_mib, "MiB", peer=peer, peer_value=theirs.peak_mib),
     ]  # fmt: skip
+
+
+def in_process(work: Callable[..., T], *given: object) -> T:
+    """What ``work`` returns in a fresh interpreter, whose peak memory is not that of work before.
+
+    Raises OutsideError when that process is killed, as one that lacks memory is.
+    """
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            return pool.submit(work, *given).result()
+        except BrokenProcessPool as error:
+            raise OutsideError(
+                "bench board: a flight was killed; is there too little memory?"
+            ) from error
 
 
 def _flown(video: Path, width: int, backend: str) -> _Flight:

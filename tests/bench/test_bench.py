@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from dataclasses import replace
 from importlib import import_module
@@ -19,7 +20,7 @@ from service.bench import BENCHMARKS, BenchOptions, BenchResult, board, compare,
 from service.bench.stereo import bad_share, scene, semi_global_disparity
 from service.bench.stereo_scenes import TruePair as Pair
 from service.daemon.machine import Machine
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 
 
 def test_every_line_of_the_table_can_be_called() -> None:
@@ -81,6 +82,11 @@ def test_a_boards_sheet() -> None:
     assert 50 < by_name["its memory, 320 wide"].value < 4000
     assert by_name["decode 1280x720"].value > 1
     assert any("SGBM" in result.peer for result in results if result.unit == "ms")
+
+
+def test_a_flight_that_is_killed_ends_the_sheet() -> None:
+    with pytest.raises(OutsideError, match="too little memory"):
+        board.in_process(os._exit, 9)
 
 
 def test_a_sheet_has_what_the_board_states() -> None:
