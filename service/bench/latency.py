@@ -84,7 +84,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
 
 
 def fly(trial: Trial) -> Outcome:
-    """Watch a flight; OutsideError when a process ends, or no keyframe reaches the ground."""
+    """Watch a flight; OutsideError when a process ends, or no keyframe reaches the portal."""
     with needing("bench latency"):
         import websockets.sync.client  # noqa: F401
         import zenoh  # noqa: F401
@@ -119,7 +119,8 @@ def _fly(trial: Trial, folder: Path, open_now: ExitStack) -> Outcome:
     name = ground.path.parent
     portal = f"ws://127.0.0.1:{at_portal}/api/scans/{name.parent.name}/{name.name}/live"
     threading.Thread(target=watch.listen, args=(portal,), daemon=True).start()
-    watch.until(lambda: bool(watch.shown), PATIENCE_S, ends)
+    if not watch.until(lambda: bool(watch.shown), PATIENCE_S, ends):
+        raise OutsideError(f"bench latency: no keyframe at the portal within {PATIENCE_S:g} s")
     began_ns = time.time_ns()
     watch.until(lambda: False, trial.watched_s, ends)
     ended_ns = time.time_ns()
@@ -181,14 +182,17 @@ class _Watch:
         self.camera_ms = float("nan")
         self.is_over = False
 
-    def until(self, is_there: Callable[[], bool], seconds: float, ends: Ends) -> None:
-        """Watch until something is there, or for so long."""
+    def until(self, is_there: Callable[[], bool], seconds: float, ends: Ends) -> bool:
+        """Watch until something is there, or for so long; whether it is there."""
         deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline and not is_there():
+        while not is_there():
+            if time.monotonic() > deadline:
+                return False
             _check(ends)
             for place in self._stores:
                 self._look(place)
             time.sleep(LOOK_S)
+        return True
 
     def _look(self, place: str) -> None:
         store = self._stores[place]
