@@ -18,7 +18,7 @@ import numpy as np
 from recon.camera_model import project, rays, scaled
 from recon.posegraph.site_alignment import ScanSimilarity
 from recon.types import F64, U8, Camera
-from service.errors import InputError
+from service.errors import InputError, SkyreliefError
 from service.georeference import LocalFrame
 from service.offline.exports.images import frames_at, recording_of
 from service.offline.refine.control_points import (
@@ -204,7 +204,7 @@ def _recorded(folder: Path, store: ScanStore, time_ns: int) -> U8 | None:
         return None
     try:
         return next(iter(frames_at([time_ns], store.header, video, None)))[1]
-    except (InputError, StopIteration):
+    except (SkyreliefError, StopIteration):
         return None
 
 
