@@ -31,7 +31,7 @@ class Progress:
         show: Callable[[Progress], None] = lambda _: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``show`` is called after every report; ``clock`` tells the seconds."""
+        """``show`` is called after every report; ``clock`` gives seconds."""
         self.text, self.share = "", 0.0
         self._end = 1.0  # of the part that is being done
         self._show = show

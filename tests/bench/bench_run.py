@@ -30,7 +30,7 @@ DEVELOPMENT = {
 """Name to ``module:function`` of this folder."""
 
 ASKED_FOR = ("board", "device", "middlebury", "real", "site")
-"""Those that need a GPU, data or an hour, and run by name only."""
+"""Those that need a GPU, data or many minutes, and run by name only."""
 
 
 def main(
