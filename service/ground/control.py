@@ -102,7 +102,15 @@ def _image(request: Request) -> Response:
 
 
 def _known(folder: Path) -> list[SurveyPoint]:
-    return read_survey(folder / GCP) if (folder / GCP).exists() else []
+    """The points kept with a scan; their file may have come from elsewhere."""
+    return _read(folder / GCP) if (folder / GCP).exists() else []
+
+
+def _read(path: Path, marks: Path | None = None) -> list[SurveyPoint]:
+    try:
+        return without_stills(read_survey(path, marks))
+    except InputError as error:  # whose paths are of this machine
+        raise InputError(str(error).replace(f"{path.parent}/", "")) from error
 
 
 def _replaced(folder: Path, given: ControlFile) -> dict[str, Any]:
@@ -112,11 +120,9 @@ def _replaced(folder: Path, given: ControlFile) -> dict[str, Any]:
         if given.marks is not None:
             marks = Path(place) / "marks"
             marks.write_text(given.marks, encoding="utf-8")
-        try:
-            survey = without_stills(read_survey(path, marks))
-        except InputError as error:
-            raise InputError(str(error).replace(f"{place}/", "")) from error
-    return _kept(folder, survey)
+        survey = _read(path, marks)
+    with _WRITING:
+        return _kept(folder, survey)
 
 
 def _with_mark(folder: Path, new: NewMark) -> dict[str, Any]:

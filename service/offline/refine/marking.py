@@ -282,6 +282,6 @@ def survey_text(survey: Sequence[SurveyPoint]) -> str:
         role = "check" if p.is_check else "control"
         for s in p.sightings or (Sighting(0),):
             uv, xyz = s.uv_px or (None, None), s.xyz_m or (None, None, None)
-            row = (*place, role, s.keyframe_seq, s.time_unix_s, *uv, *xyz)
-            table.writerow([*("" if v is None else v for v in row), " ".join(p.name.split())])
+            row = (*place, role, s.keyframe_seq, s.time_unix_s, *uv, *xyz, p.name)
+            table.writerow(["" if v is None else v for v in row])
     return out.getvalue()

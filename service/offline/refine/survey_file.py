@@ -40,7 +40,7 @@ Sigma = Annotated[float, Meta(gt=0.0, le=100.0)]
 class SurveyRow(msgspec.Struct, frozen=True):
     """One row as it is written."""
 
-    name: Annotated[str, Meta(min_length=1)]
+    name: Annotated[str, Meta(min_length=1, pattern=r"\S")]
     lat: Annotated[float, Meta(ge=-90.0, le=90.0)]
     lon: Annotated[float, Meta(ge=-180.0, le=180.0)]
     alt_amsl_m: Annotated[float, Meta(ge=-1000.0, le=10_000.0)] | None = None
@@ -192,7 +192,7 @@ def _pix4d_marks(path: Path) -> dict[str, list[Sighting]]:
             if line == 1:
                 continue  # names of the columns
             raise InputError(f"{path} line {line}: image, point, u and v are needed") from error
-        found.setdefault(name, []).append(Sighting(line, image=image, uv_px=uv_px))
+        found.setdefault(_name(name), []).append(Sighting(line, image=image, uv_px=uv_px))
     return found
 
 
@@ -212,6 +212,7 @@ def _marked(
         except (ValueError, msgspec.ValidationError) as error:
             said = f"name, x, y, z and accuracies: {_why(error)}"
             raise InputError(f"{where}: {said}") from error
+        name = point.name
         if name in points:
             raise InputError(f"{where}: {name} is also in line {points[name].line}")
         points[name] = replace(point, sightings=tuple(seen.get(name, ())))
@@ -310,6 +311,11 @@ def _rows(path: Path, lines: Sequence[str]) -> Iterator[Row]:
         raise InputError(f"{path} line {table.line_num}: {_why(error)}") from error
 
 
+def _name(text: str) -> str:
+    """A point's name on one line, as a file can keep it."""
+    return " ".join(text.split())
+
+
 def _why(error: Exception) -> str:
     """Which column is wrong, and how."""
     text, _, column = str(error).partition(" - at `$")
@@ -335,6 +341,6 @@ def _point(line: int, row: SurveyRow) -> SurveyPoint:
     elif row.x is not None and row.y is not None and row.z is not None:
         marks = (replace(mark, xyz_m=(row.x, row.y, row.z)),)
     return SurveyPoint(
-        row.name, row.lat, row.lon, row.alt_amsl_m, row.sigma_h_m, row.sigma_v_m,
+        _name(row.name), row.lat, row.lon, row.alt_amsl_m, row.sigma_h_m, row.sigma_v_m,
         row.role == "check", line, marks,
     )  # fmt: skip

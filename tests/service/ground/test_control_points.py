@@ -151,6 +151,26 @@ def test_a_mark_is_taken_away_and_bad_ones_change_nothing(
 
 
 @pytest.mark.parametrize("client", [True], indirect=True)
+def test_what_is_kept_can_be_read_again(client: Client, house: HouseFlight, tmp_path: Path) -> None:
+    """Names are one point whatever the spaces within; marks in stills are passed over."""
+    kept = tmp_path / "drone-1" / "test-1" / GCP
+    two = table(house).replace("\nA,", "\nroof  edge,").replace("\nB,", "\nroof edge,")
+    status, answer, _ = client.ask(POINTS, "PUT", {"text": two})
+    assert status == 400 and answer["error"].startswith("points line 3: roof edge differs"), answer
+    kept.write_text(
+        "name,lat,lon,alt_amsl_m,image,u_px,v_px\nA,47.39,8.54,408,still.jpg,5,5\nB,47.39,8.54,408,,,"
+    )
+    status, listed, _ = client.ask(POINTS)
+    assert status == 200 and [p["marks"] for p in listed["points"]] == [0, 0], listed
+    mark(client, house, "A", (1,))
+    assert [len(p.sightings) for p in read_survey(kept)] == [1, 0]
+    kept.write_text("damaged")
+    status, answer, _ = client.ask(POINTS)
+    assert status == 400 and answer["error"].startswith("gcp.csv line 1"), answer
+    assert client.ask(POINTS, "PUT", {"text": table(house)})[0] == 200
+
+
+@pytest.mark.parametrize("client", [True], indirect=True)
 def test_places_alone_in_a_system_of_coordinates(client: Client, house: HouseFlight) -> None:
     frame = LocalFrame(*house.origin)
     x, y, z = frame.to_utm(np.array([[2.0, -6.0, 0.0]]))[0]
