@@ -31,7 +31,7 @@ from service.stream.records import (
     unpack_repose,
 )
 from service.stream.store import ScanStore
-from service.stream.validity import summary_from_json
+from service.stream.validity import MAX_SLOPE, is_pinhole, summary_from_json
 
 HEADER: dict[str, Any] = {"scan_id": "s", "drone": "d", "started_unix_ns": 1}
 
@@ -149,6 +149,23 @@ def test_a_repose_puts_no_surface_out_of_reach(house: HouseFlight) -> None:
 def test_a_header_that_cannot_be_is_refused(more: dict[str, Any]) -> None:
     assert header_from_json(json.dumps(HEADER).encode()) is not None
     assert header_from_json(json.dumps(HEADER | more).encode()) is None
+
+
+@pytest.mark.parametrize(("edge", "outward"), [
+    ((7.5 - 10.0 * MAX_SLOPE, 2.5), (-1.0, 0.0)),  # the last column is the furthest
+    ((-0.5 + 10.0 * MAX_SLOPE, 2.5), (1.0, 0.0)),  # the first column
+    ((3.5, 5.5 - 20.0 * MAX_SLOPE), (0.0, -1.0)),  # the last row
+    ((3.5, -0.5 + 20.0 * MAX_SLOPE), (0.0, 1.0)),  # the first row
+])  # fmt: skip
+def test_no_edge_of_an_image_is_further_than_the_largest_slope(
+    edge: tuple[float, float], outward: tuple[float, float]
+) -> None:
+    def fits(px: float) -> bool:
+        cx, cy = np.add(edge, np.multiply(px, outward)).tolist()
+        return is_pinhole((10.0, 20.0, cx, cy), (8, 6))
+
+    assert fits(-0.1)
+    assert not fits(0.1)
 
 
 @pytest.mark.parametrize("text", [
