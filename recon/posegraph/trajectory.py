@@ -189,18 +189,18 @@ class Trajectory:
 
     def add_loop(self, a: int, b: int, T_a_b: F64, covariance: F64, growth: float = 1.0) -> bool:
         """As :meth:`recon.posegraph.pose_graph.PoseGraph.add_loop`; ``a`` need not be a node, and
-        then the loop is moved to the node before it; False where that is of another
-        segment."""
+        then the loop is moved to the node before it, with vision's covariance on the way there;
+        False where that node is of another segment."""
         if a not in self.graph:
             row = self._row(a)
             if self._is_dropped(np.array([row]))[0]:
                 return False  # no node carries it
             i = int(np.searchsorted(self._nodes, row))
-            rows, seqs = self._nodes[i - 1 : i + 1], self.graph.seqs
-            before, after = seqs[i - 1], self.graph.node(seqs[i])
+            before, after = self.graph.seqs[i - 1], self.graph.node(self.graph.seqs[i])
             T = self.step_between(before, a)
             units = np.array([1.0] * 3 + [self.graph.scale(before)] * 3)
-            step = after.covariance * np.outer(units, units) * ((row - rows[0]) / after.weight)
+            share = (row - self._nodes[i - 1]) / after.weight
+            step = share * after.covariance * np.outer(units, units)
             A = se3.adjoint(T)
             a, T_a_b, covariance = before, T @ T_a_b, step + A @ covariance @ A.T
         return self.graph.add_loop(a, b, T_a_b, covariance, growth)

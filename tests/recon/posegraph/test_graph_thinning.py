@@ -169,6 +169,26 @@ def test_composed_motions_and_moved_loops_have_the_spread_of_many_trials() -> No
     assert back.ends == (0, 0)
 
 
+def test_a_loop_to_an_interpolated_keyframe_is_as_unsure_as_vision_on_the_way_to_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It begins at the node before: the way on to the node after has no part in it."""
+    trajectory, (_, odom, priors) = Trajectory(graph=bounded(8)), flight()
+    for i in range(16):
+        trajectory.add(i, 0, odom[i], priors[i], None, i * 10**9, SPREAD * UNITS)
+    graph = trajectory.graph
+    before, after = next((a, b) for a, b in pairwise(graph.seqs) if b - a >= 3)
+    taken: list[tuple[int, F64]] = []
+    monkeypatch.setattr(graph, "add_loop", lambda a, *loop: taken.append((a, loop[2])))
+    units = np.outer(*[np.array([1.0] * 3 + [graph.scale(before)] * 3)] * 2)
+    for i in (before + 1, before + 2):
+        trajectory.add_loop(i, 15, np.eye(4), np.zeros((6, 6)))
+        node, covariance = taken.pop()
+        share = (i - before) / (after - before)
+        assert node == before
+        np.testing.assert_allclose(covariance, share * units * graph.node(after).covariance)
+
+
 def test_ends_of_segments_stay() -> None:
     nodes = [
         Node(i, i, i, i // 7, np.eye(4), np.eye(6), PosePrior()) for i in range(70)
