@@ -27,7 +27,7 @@ def track(n: int = 30) -> list[F64]:
     return out
 
 
-def anchors(
+def noisy_nodes(
     R: F64, scale: float, t: F64, seed: int, gnss_m: float = 1.0, yaw_bias: float = 0.0
 ) -> list[Node]:
     """Noisy priors of a track that the odometry sees turned, shrunk and moved."""
@@ -54,7 +54,7 @@ def anchors(
 def test_any_turn_and_scale_is_found(scale: float, yaw: float) -> None:
     R = se3.so3_exp(np.array([0.05, -0.03, yaw]))
     t = np.array([10.0, -20.0, 5.0])
-    found = fit(anchors(R, scale, t, seed=1))
+    found = fit(noisy_nodes(R, scale, t, seed=1))
     assert found is not None
     assert found.scale == pytest.approx(scale, rel=0.03)
     assert np.linalg.norm(se3.so3_log(found.R @ R.T)) < 0.03
@@ -62,7 +62,7 @@ def test_any_turn_and_scale_is_found(scale: float, yaw: float) -> None:
 
 
 def test_one_wild_fix_does_not_move_the_map() -> None:
-    good = anchors(np.eye(3), 1.0, np.zeros(3), seed=2)
+    good = noisy_nodes(np.eye(3), 1.0, np.zeros(3), seed=2)
     wild = list(good)
     prior = wild[10].prior
     assert prior.position_m is not None
@@ -85,7 +85,7 @@ def test_a_fit_ends_within_a_hundredth_of_its_sigma(
     monkeypatch: pytest.MonkeyPatch, off_m: float
 ) -> None:
     """Against a fit that goes on until rounding, also with fixes that lose weight."""
-    some = anchors(se3.so3_exp(np.array([0.05, -0.03, 1.2])), 2.0, np.ones(3), seed=6)
+    some = noisy_nodes(se3.so3_exp(np.array([0.05, -0.03, 1.2])), 2.0, np.ones(3), seed=6)
     for i in range(0, 30, 5):
         p = some[i].prior
         assert p.position_m is not None
@@ -103,7 +103,7 @@ def test_a_fit_ends_within_a_hundredth_of_its_sigma(
 def test_heading_comes_from_the_track_when_no_compass_tells_it() -> None:
     R = se3.so3_exp(np.array([0.0, 0.0, 2.5]))
     blind = []
-    for a in anchors(R, 2.0, np.array([1.0, 2.0, 3.0]), seed=3, gnss_m=2.0):
+    for a in noisy_nodes(R, 2.0, np.array([1.0, 2.0, 3.0]), seed=3, gnss_m=2.0):
         p = a.prior
         nominal = np.diag([1.0, -1, -1])
         prior = PosePrior(nominal, 0.1, 3.0, p.position_m, p.sigma_position_m)
@@ -118,7 +118,7 @@ def test_heading_comes_from_the_track_when_no_compass_tells_it() -> None:
 
 def test_scale_rests_on_the_height_without_gnss() -> None:
     some = []
-    for a in anchors(np.eye(3), 3.0, np.zeros(3), seed=4):
+    for a in noisy_nodes(np.eye(3), 3.0, np.zeros(3), seed=4):
         p = a.prior
         prior = PosePrior(p.R_world_camera, 0.01, 0.05, None, None, p.agl_m, 3.0)
         some.append(node(a.T_odom_camera, prior, a.height))
@@ -136,7 +136,7 @@ def assumed(prior: PosePrior) -> PosePrior:
 @pytest.mark.parametrize("by", ["fixes", "velocities"])
 def test_an_assumed_height_has_no_part_in_a_scale_that_is_measured(by: str) -> None:
     some, metres = [], np.zeros(3)
-    flight = anchors(np.eye(3), 1.0, np.zeros(3), seed=6, gnss_m=2.0)
+    flight = noisy_nodes(np.eye(3), 1.0, np.zeros(3), seed=6, gnss_m=2.0)
     for i, (a, T) in enumerate(zip(flight, track(), strict=True)):
         metres = metres + (T[:3, 3] - track()[i - 1][:3, 3] if i else np.zeros(3))
         prior = assumed(a.prior)
@@ -157,7 +157,7 @@ def test_an_assumed_height_does_not_pull_a_scale_that_fixes_know_to_a_quarter() 
     off = []
     for seed in range(8):
         some = []
-        for a in anchors(np.eye(3), 1.0, np.zeros(3), seed, gnss_m=20.0)[::3]:
+        for a in noisy_nodes(np.eye(3), 1.0, np.zeros(3), seed, gnss_m=20.0)[::3]:
             some.append(replace(a, prior=assumed(a.prior), height=1.5))
         found = fit(some)
         assert found is not None and 0.1 < found.sigma_scale < 0.5
@@ -168,7 +168,7 @@ def test_an_assumed_height_does_not_pull_a_scale_that_fixes_know_to_a_quarter() 
 def test_an_assumed_height_is_no_source_of_the_scale() -> None:
     some = [
         node(a.T_odom_camera, assumed(replace(a.prior, position_m=None)), 120.0)
-        for a in anchors(np.eye(3), 1.0, np.zeros(3), seed=7)
+        for a in noisy_nodes(np.eye(3), 1.0, np.zeros(3), seed=7)
     ]
     found = fit(some)
     assert found is not None and found.scale == pytest.approx(50.0 / 120.0, rel=0.01)
@@ -183,7 +183,7 @@ def test_without_any_prior_there_is_no_alignment() -> None:
 def test_covariance_of_the_scale_covers_its_error() -> None:
     ratios = []
     for seed in range(40):
-        found = fit(anchors(np.eye(3), 1.0, np.zeros(3), seed=10 + seed))
+        found = fit(noisy_nodes(np.eye(3), 1.0, np.zeros(3), seed=10 + seed))
         assert found is not None
         ratios.append(abs(math.log(found.scale)) / found.sigma_scale)
     assert np.mean(np.array(ratios) < 1.0) > 0.6
@@ -208,7 +208,7 @@ def test_height_is_that_of_the_ground_max_nearly_below() -> None:
 def test_a_compass_wrong_by_half_a_turn_yields_to_the_fixes() -> None:
     half = se3.so3_exp(np.array([0.0, 0.0, math.pi]))
     wrong = []
-    for a in anchors(np.eye(3), 1.5, np.zeros(3), seed=5):
+    for a in noisy_nodes(np.eye(3), 1.5, np.zeros(3), seed=5):
         p = a.prior
         assert p.R_world_camera is not None
         prior = replace(p, R_world_camera=half @ p.R_world_camera)
@@ -220,7 +220,7 @@ def test_a_compass_wrong_by_half_a_turn_yields_to_the_fixes() -> None:
 
 
 def test_fixes_that_jump_for_a_third_of_the_flight_do_not_shift_it() -> None:
-    good = anchors(np.eye(3), 1.0, np.zeros(3), seed=6)
+    good = noisy_nodes(np.eye(3), 1.0, np.zeros(3), seed=6)
     bad = list(good)
     for i in range(10, 20):
         p = bad[i].prior
@@ -239,7 +239,7 @@ def test_scales_by_fixes_and_by_heights_are_distinguished(wrong: float) -> None:
     """Ten runs each: agreeing readings are within three sigmas, a fifth more height is not."""
     for seed in range(10):
         some = []
-        for a in anchors(np.eye(3), 1.4, np.zeros(3), seed=seed, gnss_m=0.5):
+        for a in noisy_nodes(np.eye(3), 1.4, np.zeros(3), seed=seed, gnss_m=0.5):
             p = a.prior
             assert p.agl_m is not None
             some.append(replace(a, prior=replace(p, agl_m=wrong * p.agl_m, sigma_agl_m=2.0)))
@@ -255,7 +255,7 @@ def test_scales_by_fixes_and_by_heights_are_distinguished(wrong: float) -> None:
 
 def test_the_scale_by_fixes_is_that_of_those_that_agree() -> None:
     """Most fixes jump aside and count for nothing: neither do their places."""
-    some = anchors(np.eye(3), 1.4, np.zeros(3), seed=1, gnss_m=0.2)
+    some = noisy_nodes(np.eye(3), 1.4, np.zeros(3), seed=1, gnss_m=0.2)
     found = fit(some)
     assert found is not None
     off = [
@@ -295,7 +295,7 @@ def test_the_height_exactly_below_is_read_from_the_depth_map() -> None:
 
 def test_heights_exactly_below_count_alone() -> None:
     some = []
-    for i, a in enumerate(anchors(np.eye(3), 3.0, np.zeros(3), seed=4)):
+    for i, a in enumerate(noisy_nodes(np.eye(3), 3.0, np.zeros(3), seed=4)):
         p = a.prior
         prior = PosePrior(p.R_world_camera, 0.01, 0.05, None, None, 60.0, 2.0)
         lean, error = (0.0, 1.0) if i % 3 == 0 else (0.02, 1.1)
@@ -308,7 +308,7 @@ def test_heights_exactly_below_count_alone() -> None:
 def test_a_rangefinder_that_meets_trees_does_not_move_the_scale() -> None:
     rng = np.random.default_rng(3)
     some = []
-    for i, a in enumerate(anchors(np.eye(3), 2.0, np.zeros(3), seed=4)):
+    for i, a in enumerate(noisy_nodes(np.eye(3), 2.0, np.zeros(3), seed=4)):
         agl_m = 60.0 * (1 + 0.003 * rng.normal()) - (9.0 if i % 4 == 0 else 0.0)
         prior = PosePrior(a.prior.R_world_camera, 0.01, 0.05, None, None, agl_m, 1.8)
         some.append(node(a.T_odom_camera, prior, 30.0))

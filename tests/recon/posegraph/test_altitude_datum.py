@@ -74,7 +74,7 @@ def test_the_mean_of_an_interval_lies_where_its_fixes_were() -> None:
     rng = np.random.default_rng(2)
     scale, t = 1.7, np.array([5.0, -3.0, 60.0])
     R = se3.so3_exp(np.array([0.0, 0.0, 0.8]))
-    anchors, average = [], FixAverage()
+    nodes, average = [], FixAverage()
     for i in range(120):
         s = i / 10.0
         at = np.array([4.0 * s, 3.0 * np.sin(s), 0.2 * s])
@@ -87,8 +87,8 @@ def test_the_mean_of_an_interval_lies_where_its_fixes_were() -> None:
             given = average.given(T, prior)
             assert given.gnss_minus_baro_fixes == 4 and given.fix_offset is not None
             assert given.gnss_minus_baro_m == pytest.approx(i // 2 - 1.5)
-            anchors.append(node(T, given, None))
-    found = fit(anchors)
+            nodes.append(node(T, given, None))
+    found = fit(nodes)
     assert found is not None and found.scale == pytest.approx(scale, rel=1e-3)
     np.testing.assert_allclose(found.t, t, atol=0.02)
 

@@ -23,7 +23,7 @@ STEP_M, STEP_S, STRIP_M, APART_M = 8.0, 6.0, 150.0, 22.0
 class Stills:
     """Stills without attitude, 50 m up, with positions that state no accuracy of the altitude."""
 
-    anchors: list[Node]
+    nodes: list[Node]
     level: F64  # (3, 3) world from odometry
 
     def lean_deg(self, found: Similarity) -> float:
@@ -54,7 +54,7 @@ def stills(
     along = (t - t.mean()) / np.ptp(t) * 2.0
     noise = rng.normal(0, (1.5, 1.5, 0.3), p.shape) + np.outer(along * drift_m, [0, 0, 1])
     level = se3.so3_exp(np.array([0.2, -0.3, 0.4]))
-    anchors = []
+    nodes = []
     for k in range(len(p)):
         ahead_deg = mount_deg - (moved_deg if k < len(x) else 0.0)
         mount = se3.so3_exp(np.array([0.0, np.radians(ahead_deg), 0.0]))
@@ -65,8 +65,8 @@ def stills(
             is_sigma_claimed=False, is_view_assumed=True,
         )  # fmt: skip
         odom = se3.compose(level.T @ R, level.T @ p[k])
-        anchors.append(node(odom, prior, None, 0.0, float(t[k])))
-    return Stills(anchors, level)
+        nodes.append(node(odom, prior, None, 0.0, float(t[k])))
+    return Stills(nodes, level)
 
 
 @pytest.mark.parametrize("turns", [False, True])
@@ -74,7 +74,7 @@ def stills(
 def test_altitudes_that_agree_with_vision_level_strips(mount_deg: float, turns: bool) -> None:
     """By the assumed view alone the map leans as far as the camera looks ahead."""
     flown = stills(4, mount_deg, turns)
-    found = fit(flown.anchors)
+    found = fit(flown.nodes)
     assert found is not None and found.sigma_lean_rad is not None
     assert flown.lean_deg(found) < 0.6
     assert np.degrees(found.sigma_lean_rad) < 1.5
@@ -86,7 +86,7 @@ def test_a_camera_that_the_pilot_moves_once_does_not_tilt_the_map(strips: int) -
     """Its change outweighed altitudes as long as only the readings next to each other counted."""
     for seed in range(1, 6):
         flown = stills(strips, 15.0, turns=True, seed=seed, moved_deg=9.0)
-        found = fit(flown.anchors)
+        found = fit(flown.nodes)
         assert found is not None and found.sigma_lean_rad is not None
         assert flown.lean_deg(found) < 1.0
         assert flown.lean_deg(found) < 2.5 * np.degrees(found.sigma_lean_rad)
@@ -94,7 +94,7 @@ def test_a_camera_that_the_pilot_moves_once_does_not_tilt_the_map(strips: int) -
 
 def test_one_strip_does_not_show_whether_it_leans() -> None:
     flown = stills(1, 8.0)
-    found = fit(flown.anchors)
+    found = fit(flown.nodes)
     assert found is not None and found.sigma_lean_rad is not None
     assert flown.lean_deg(found) < 2.0 * np.degrees(found.sigma_lean_rad)
     assert np.degrees(found.sigma_lean_rad) > 3.0
@@ -102,9 +102,9 @@ def test_one_strip_does_not_show_whether_it_leans() -> None:
 
 def test_a_view_levelled_by_its_ground_does_not_show_what_is_level() -> None:
     flown = stills(1, 8.0)
-    one = flown.anchors[5]
+    one = flown.nodes[5]
     steep = replace(one.prior, sigma_tilt_rad=LEVEL_SIGMA_RAD, is_view_assumed=False)
-    found = fit([replace(a, prior=steep) if a is one else a for a in flown.anchors])
+    found = fit([replace(a, prior=steep) if a is one else a for a in flown.nodes])
     assert found is not None and found.sigma_lean_rad is not None
     assert flown.lean_deg(found) < 2.0 * np.degrees(found.sigma_lean_rad)
 
@@ -113,11 +113,11 @@ def settled(flown: Stills, broken_at: int = 10**6, turn_rad: float = 1e-4) -> Tr
     """The track of the stills by its pose graph, whose steps turn by ``turn_rad`` too much; a new
     segment begins at ``broken_at``."""
     trajectory, start = Trajectory(), np.eye(4)
-    for k, anchor in enumerate(flown.anchors):
-        start = se3.inverse(anchor.T_odom_camera) if k == broken_at else start
+    for k, one in enumerate(flown.nodes):
+        start = se3.inverse(one.T_odom_camera) if k == broken_at else start
         trajectory.add(
-            k, int(k >= broken_at), start @ anchor.T_odom_camera, anchor.prior, None,
-            round(anchor.time_s * 1e9), np.diag([turn_rad**2] * 3 + [0.01**2] * 3),
+            k, int(k >= broken_at), start @ one.T_odom_camera, one.prior, None,
+            round(one.time_s * 1e9), np.diag([turn_rad**2] * 3 + [0.01**2] * 3),
         )  # fmt: skip
     trajectory.moved(final=True)
     return trajectory
@@ -128,7 +128,7 @@ def test_poses_say_that_all_may_lean() -> None:
     trajectory = settled(flown)
     sigma_m = [
         np.sqrt(se3.about(placed.T_world_camera[:3, 3], placed.covariance)[5, 5])
-        for k in (0, len(flown.anchors) // 2)
+        for k in (0, len(flown.nodes) // 2)
         if (placed := trajectory.pose(k))
     ]
     found = trajectory.graph.segments.similarity(0)
@@ -140,7 +140,7 @@ def test_poses_say_that_all_may_lean() -> None:
 def test_altitudes_that_drift_by_100_m_level_nothing() -> None:
     """Turns do: the mean of the views is level."""
     flown = stills(4, 4.0, turns=True, drift_m=50.0)
-    found = fit(flown.anchors)
+    found = fit(flown.nodes)
     assert found is not None and flown.lean_deg(found) < 1.5
     assert found.common.drift_m == pytest.approx(50.0, abs=5.0)
 
@@ -148,7 +148,7 @@ def test_altitudes_that_drift_by_100_m_level_nothing() -> None:
 def test_the_drift_of_altitudes_does_not_bend_the_track() -> None:
     flown = stills(4, 4.0, turns=True, drift_m=50.0)
     trajectory = settled(flown)
-    z = [trajectory.pose(k).T_world_camera[2, 3] for k in range(len(flown.anchors))]
+    z = [trajectory.pose(k).T_world_camera[2, 3] for k in range(len(flown.nodes))]
     assert np.std(z) < 3.0
 
 
@@ -160,7 +160,7 @@ def test_a_short_segment_has_the_noise_and_the_height_of_its_flight(broken_at: i
     trajectory = settled(flown, broken_at)
     sigma_m = [trajectory.graph.segments.sigma_height_m(segment) for segment in (0, 1)]
     assert all(sigma is not None and sigma < 5.0 for sigma in sigma_m)
-    z = np.array([trajectory.pose(k).T_world_camera[2, 3] for k in range(len(flown.anchors))])
+    z = np.array([trajectory.pose(k).T_world_camera[2, 3] for k in range(len(flown.nodes))])
     assert abs(np.mean(z[:broken_at]) - np.mean(z[broken_at:])) < 2.0
 
 
@@ -180,5 +180,5 @@ def test_what_is_level_is_as_unsure_as_vision_bends() -> None:
     assert straight is not None and straight.sigma_lean_rad is not None
     assert bent is not None and bent.sigma_lean_rad is not None
     bend_rad = np.sqrt(bent.sigma_lean_rad**2 - straight.sigma_lean_rad**2)
-    walks = np.cumsum(np.random.default_rng(1).normal(0, 1e-3, (500, len(flown.anchors))), axis=1)
+    walks = np.cumsum(np.random.default_rng(1).normal(0, 1e-3, (500, len(flown.nodes))), axis=1)
     assert bend_rad == pytest.approx(np.sqrt(np.mean(np.var(walks, axis=1))), rel=0.1)

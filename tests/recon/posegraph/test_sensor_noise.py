@@ -161,7 +161,9 @@ def test_a_drift_is_known_after_a_minute(walk: float, rate: float) -> None:
     assert drift_noise(times[:5], drift[:5]) is None
 
 
-def anchors(stretch: float, claimed_m: float, seed: int = 3, travel: bool = True) -> list[Node]:
+def drifting_nodes(
+    stretch: float, claimed_m: float, seed: int = 3, travel: bool = True
+) -> list[Node]:
     """30 s along a line at 60 m; fixes drift so that the line seems ``stretch`` times as long."""
     rng, out = np.random.default_rng(seed), []
     for i in range(30):
@@ -176,8 +178,8 @@ def anchors(stretch: float, claimed_m: float, seed: int = 3, travel: bool = True
 
 
 def test_velocity_gives_the_scale_where_fixes_drift() -> None:
-    drifting = fit(anchors(1.006, 2.0))
-    alone = fit(anchors(1.006, 2.0, travel=False))
+    drifting = fit(drifting_nodes(1.006, 2.0))
+    alone = fit(drifting_nodes(1.006, 2.0, travel=False))
     assert drifting is not None and alone is not None
     assert drifting.scale == pytest.approx(1.5, rel=0.003)
     assert alone.scale == pytest.approx(1.5 * 1.006, rel=0.002)
@@ -218,7 +220,7 @@ def test_sigma_of_the_scale_covers_velocities_that_err_slowly(
 
 
 def test_fixes_of_a_precise_receiver_outweigh_velocity() -> None:
-    some = anchors(1.0, 0.02)
+    some = drifting_nodes(1.0, 0.02)
     for i, a in enumerate(some):
         slow = Travel(0.99 * a.T_odom_camera[:3, 3] * 1.5, float(i), 1)
         some[i] = replace(a, prior=replace(a.prior, travel=slow))
@@ -230,7 +232,7 @@ def test_fixes_of_a_precise_receiver_outweigh_velocity() -> None:
 @pytest.mark.parametrize("claimed_m", [1.0, 5.0])
 def test_a_take_off_point_above_the_site_does_not_bend_the_scale(claimed_m: float) -> None:
     some = []
-    for a in anchors(1.0, claimed_m):
+    for a in drifting_nodes(1.0, claimed_m):
         some.append(replace(a, prior=replace(a.prior, agl_m=40.0, sigma_agl_m=10.0)))
     found = fit(some)
     assert found is not None
@@ -242,7 +244,7 @@ def test_a_compass_that_is_off_is_no_drift_of_the_velocity() -> None:
     """Its 3 degrees are 8 m across a line of 150 m, which the velocity does not drift by."""
     off = se3.so3_exp(np.array([0.0, 0.0, np.radians(3.0)]))
     some = []
-    for a in anchors(1.0, 2.0):
+    for a in drifting_nodes(1.0, 2.0):
         assert a.prior.R_world_camera is not None
         some.append(replace(a, prior=replace(a.prior, R_world_camera=off @ a.prior.R_world_camera)))
     found = fit(some)
@@ -254,7 +256,7 @@ def test_a_compass_that_is_off_is_no_drift_of_the_velocity() -> None:
 def test_velocities_that_contradict_the_fixes_are_left_out() -> None:
     standing = [
         replace(a, prior=replace(a.prior, travel=Travel(np.zeros(3), float(i), 1)))
-        for i, a in enumerate(anchors(1.0, 1.0))
+        for i, a in enumerate(drifting_nodes(1.0, 1.0))
     ]
     found = fit(standing)
     assert found is not None
