@@ -19,6 +19,7 @@ from numba import config
 T = TypeVar("T")
 
 RELEASE_S = 1e-4
+"""Long enough for a waiting thread to wake up; work that releases every few ms loses little."""
 
 CELLS_PER_THREAD = 1 << 20
 """Cells of a cost volume that are worth a thread: half a millisecond of simple work."""

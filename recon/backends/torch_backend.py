@@ -57,11 +57,11 @@ class TorchBackend:
         check_pair(left, right, labels)
         right = equalised(left, right, labels, config.min_disparity)
         h, w = left.shape
-        *space, label_room = padded(h, w, labels)
+        *space, label_count = padded(h, w, labels)
         levels = pyramid_levels(h, w, config)
         px, confidence = self._run(
-            ("stereo", *space, label_room, levels, config),
-            lambda a, b, true: stereo(a, b, label_room, levels, true, config),
+            ("stereo", *space, label_count, levels, config),
+            lambda a, b, true: stereo(a, b, label_count, levels, true, config),
             (space, space, (3,)),
             (left, right, np.array([h, w, labels])),
         )
@@ -108,11 +108,12 @@ class TorchBackend:
         self,
         key: Any,
         operation: Callable[..., tuple[Tensor, ...]],
-        rooms: Sequence[Sequence[int]],
+        shapes: Sequence[Sequence[int]],
         arrays: Sequence[Array],
     ) -> list[Array]:
-        """The float32 results of the ``operation`` called ``key`` on ``arrays``, each in a room."""
-        parts = [part(a, tuple(shape)) for a, shape in zip(arrays, rooms, strict=True)]
+        """The float32 results of the ``operation`` called ``key`` on ``arrays`` padded to these
+        ``shapes``."""
+        parts = [part(a, tuple(shape)) for a, shape in zip(arrays, shapes, strict=True)]
         with torch.inference_mode():
             plan = kept(self._plans, key, KEPT_PLANS, lambda: Plan(self.device, operation, parts))
             plan.upload(arrays)

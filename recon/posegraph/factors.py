@@ -1,8 +1,8 @@
 """Factors of the pose graph: telemetry of a keyframe, and motions from one keyframe to the next.
 
-Errors of one sensor wander: readings closer in time than the time constant of that bias err
-together. All readings of a first-order Gauss-Markov error with time constant tau over a time
-T count as 1 + T / (2 tau) of them; each gets the sigma that makes it so.
+Each sensor has a bias that wanders: readings closer in time than its time constant err together.
+All readings of a first-order Gauss-Markov error with time constant tau over a time T count as
+1 + T / (2 tau) of them; each gets the sigma that makes it so.
 
 A motion is vision's, or telemetry's where vision has none. A segment that has a frame in the world
 leaves its scale open, block by block of keyframes.
