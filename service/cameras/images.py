@@ -6,7 +6,7 @@ import logging
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -109,6 +109,13 @@ class ImagesSource:
     def images(self) -> int:
         """Number of stills."""
         return len(self._stills)
+
+    def only_near(self, times_ns: Iterable[int], within_ns: int) -> None:
+        """Yield no other stills than those near ``times_ns``; others are not decoded."""
+        wanted = np.fromiter(times_ns, np.int64)
+        self._stills = [
+            still for still in self._stills if (np.abs(wanted - still[2]) <= within_ns).any()
+        ]
 
     def middle(self, count: int) -> ImagesSource:
         """The same source with ``count`` stills at most, about the middle one."""

@@ -16,6 +16,7 @@ from recon.camera_model import Undistorter, scaled_K
 from recon.surface.texture_views import TextureView
 from recon.types import U8, Array, Keyframe
 from service.cameras import open_camera
+from service.cameras.images import ImagesSource
 from service.cameras.source import CameraSource
 from service.cameras.video import VideoSource
 from service.errors import InputError, SkyreliefError
@@ -163,7 +164,7 @@ def frames_at(
     times = np.array(times_ns, np.int64)
     found = set[int]()
 
-    if isinstance(source, VideoSource):
+    if isinstance(source, VideoSource | ImagesSource):
         source.only_near((times - start).tolist(), SAME_TIME_NS)
     say = (progress or Progress()).counting(len(times))
     with closing(source):

@@ -10,6 +10,7 @@ import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -88,6 +89,7 @@ class Marking:
             local_frame(store.header),
         )  # fmt: skip
         self._poses = self._scan.poses
+        self._ahead_m = cache(self._distance_m)  # many points have the same images nearest
 
     def of(self, survey: Sequence[SurveyPoint]) -> list[Marked]:
         """What is known of each point. Raises InputError for marks that the scan cannot have."""
@@ -139,11 +141,17 @@ class Marking:
         apart = np.linalg.norm((self._poses[:, :3, 3] - spot)[:, :2], axis=1)
         heights = []
         for k in np.argsort(apart)[:GROUND_FROM]:
-            keyframe = self._scan.keyframe(self._scan.states[k])
-            if keyframe is not None and np.isfinite(keyframe.depth.depth_m).any():
-                T, ahead = self._poses[k], float(np.nanmedian(keyframe.depth.depth_m))
-                heights.append(float(T[2, 3] + ahead * T[2, 2]))
+            T, ahead_m = self._poses[k], self._ahead_m(int(k))
+            if ahead_m is not None:
+                heights.append(float(T[2, 3] + ahead_m * T[2, 2]))
         return float(np.median(heights)) if heights else 0.0
+
+    def _distance_m(self, k: int) -> float | None:
+        """Median distance of what a keyframe sees, along its axis."""
+        keyframe = self._scan.keyframe(self._scan.states[k])
+        if keyframe is None or not np.isfinite(keyframe.depth.depth_m).any():
+            return None
+        return float(np.nanmedian(keyframe.depth.depth_m))
 
     def _images(self, point: SurveyPoint, expected: F64 | None) -> list[Shown]:
         """Those marked, and those that see the point best; any where its place is not known."""

@@ -46,7 +46,7 @@ from recon.types import F64, U8, Camera
 from service.cameras.camera_file import save_camera
 from service.cameras.images import open_images
 from service.cameras.lens import SIGMA_K1
-from service.cameras.video import VideoSource, open_file
+from service.cameras.video import open_file
 from service.errors import InputError
 
 FILE = "camera.refined.yaml"
@@ -95,8 +95,7 @@ def images_at(video: Path, start_unix_ns: int, times_ns: Sequence[int]) -> dict[
     found: dict[int, U8] = {}
     opened = open_images if video.is_dir() else open_file
     with closing(opened(str(video), {})) as source:
-        if isinstance(source, VideoSource):
-            source.only_near((wanted - start_unix_ns).tolist(), within_ns)
+        source.only_near((wanted - start_unix_ns).tolist(), within_ns)
         for frame in source:
             if start_unix_ns + frame.time_ns > last_ns:
                 break

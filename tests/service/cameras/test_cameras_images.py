@@ -20,7 +20,7 @@ from PIL.TiffImagePlugin import IFDRational
 from recon.frames import rotation_from_rpy
 from service.cameras import open_camera
 from service.cameras.exif import name_unix_ns, read_tags
-from service.cameras.images import natural_key
+from service.cameras.images import natural_key, open_images
 from service.cameras.rig import Rig
 from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.errors import InputError
@@ -157,6 +157,16 @@ def test_order_is_of_time_not_of_names(tmp_path: Path) -> None:
         write_still(tmp_path / name, f"2024:06:01 12:00:0{i}", offset="+00:00")
     names = [f.name for f in open_camera(str(tmp_path))]
     assert names == ["IMG_9999.jpg", "IMG_0001.jpg", "IMG_0002.jpg"]
+
+
+def test_of_some_moments_no_other_still_is_decoded(tmp_path: Path) -> None:
+    for second, name in enumerate("abc"):
+        write_still(tmp_path / f"{name}.jpg", f"2024:06:01 12:00:0{second}", offset="+00:00")
+    source = open_images(str(tmp_path), {})
+    for name in "ab":
+        (tmp_path / f"{name}.jpg").unlink()
+    source.only_near([2_000_000_000], 5_000_000)
+    assert [f.time_ns for f in source] == [2_000_000_000] and not source.warnings
 
 
 def test_names_order_and_space_stills_without_times(tmp_path: Path) -> None:

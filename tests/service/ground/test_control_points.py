@@ -13,11 +13,11 @@ from house_flight import HouseFlight
 from portal_client import ONE, Client, serving
 
 from recon import se3
-from recon.types import F64
+from recon.types import F64, Keyframe
 from service.georeference import LocalFrame
 from service.ground.state import Job, carry_out
-from service.offline.refine.marking import GCP
-from service.offline.refine.survey_file import read_survey
+from service.offline.refine.marking import GCP, Marking
+from service.offline.refine.survey_file import SurveyPoint, read_survey
 from service.stream.store import ScanStore
 
 POINTS = f"{ONE}/control-points"
@@ -168,6 +168,27 @@ def test_what_is_kept_can_be_read_again(client: Client, house: HouseFlight, tmp_
     status, answer, _ = client.ask(POINTS)
     assert status == 400 and answer["error"].startswith("gcp.csv line 1"), answer
     assert client.ask(POINTS, "PUT", {"text": table(house)})[0] == 200
+
+
+def test_points_without_a_height_read_each_keyframe_once(
+    house: HouseFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown(house, tmp_path, True)
+    lat, lon, _ = house.origin
+    points = [
+        SurveyPoint(f"P{k}", lat, lon + 1e-6 * k, None, 0.03, 0.05, False, k, ()) for k in range(9)
+    ]
+    with ScanStore.peek(tmp_path / "drone-1" / "test-1" / "scan.db") as store:
+        read = list[int]()
+        whole = ScanStore.keyframe
+
+        def counted(store: ScanStore, seq: int) -> Keyframe | None:
+            read.append(seq)
+            return whole(store, seq)
+
+        monkeypatch.setattr(ScanStore, "keyframe", counted)
+        found = Marking(store).of(points)
+    assert len(found) == 9 and sorted(read) == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("client", [True], indirect=True)
