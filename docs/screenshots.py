@@ -125,7 +125,10 @@ def main(output: Path) -> None:
             growing(browser)
             browser.open((scan / "report.html").resolve().as_uri())
             browser.wait("document.readyState === 'complete'", LOAD_S)
-            browser.run("document.querySelector('h2').scrollIntoView()")
+            browser.run(
+                "[...document.querySelectorAll('h2')]"
+                ".find(h => h.textContent === 'Coverage').scrollIntoView()"
+            )
             shot(browser, "report")
         finally:
             browser.close()
