@@ -175,8 +175,9 @@ class Mapper:
         late = self._late(image, tracked)
         reference, is_view = self.views.take(image, tracked)  # virtual stereo camera, section 2.3
         if reference is None:
+            done = tuple(self._finished())  # while vision is lost, too
             pose = self.frames.by_telemetry(image, tracked)
-            return (FramePosed(image.seq, image.time_ns, tracked, pose),)
+            return (*done, FramePosed(image.seq, image.time_ns, tracked, pose))
         for view in self.views.ready():
             self._worker.offer(view)  # to be reconstructed
         done = tuple(self._finished())

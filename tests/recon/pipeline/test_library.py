@@ -18,7 +18,8 @@ from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.keyframe_map import GraphUpdate
 from recon.pipeline.mapper import Mapper, moved
 from recon.pipeline.views import StereoView
-from recon.types import Camera, DepthMap, Keyframe, Pose, PosePrior
+from recon.tracking.odometry import Tracked, Tracking
+from recon.types import Camera, DepthMap, Frame, Keyframe, Pose, PosePrior
 
 CAMERA = Camera(np.array([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), np.zeros(5), (80, 60))
 TEXT = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
@@ -102,6 +103,16 @@ def test_a_keyframe_does_not_wait_for_the_next_frame_that_is_looked_at(
     ready, changed, skipped = mapper.skip(5, 0, PosePrior())
     assert isinstance(ready, KeyframeReady) and isinstance(changed, PosesChanged)
     assert isinstance(skipped, FramePosed) and skipped.seq == 5
+
+
+def test_a_keyframe_does_not_wait_until_the_track_is_found_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mapper = Mapper(CAMERA, worker=BrokenOff)
+    monkeypatch.setattr(mapper.odometry, "track", lambda _: Tracked(Tracking.LOST, 0))
+    ready, changed, lost = mapper.track(Frame(np.zeros((60, 80, 3), np.uint8), 0, 5, PosePrior()))
+    assert isinstance(ready, KeyframeReady) and isinstance(changed, PosesChanged)
+    assert isinstance(lost, FramePosed) and lost.seq == 5
 
 
 def test_a_cloud_leaves_out_keyframes_between_which_vision_is_wrong() -> None:
