@@ -18,13 +18,16 @@ export async function showControl(root: HTMLElement, drone: string, name: string
   let chosen = "";
   let zoom = 4;
   let views: View[] = [];
+  let left = false;
+  let last = { name: "", seq: -1 }; // marked
+  let marking: Promise<void> = Promise.resolve();
 
   const list = el("ul", {});
   const about = el("p", { className: "quiet" });
   const chosenFile = el("input", { type: "file", multiple: true, hidden: true });
   chosenFile.setAttribute("aria-label", "file of control points");
   const load = el("button", { textContent: "Load points…", title: COLUMNS, onclick: () => chosenFile.click() });
-  const refine = el("button", { textContent: "Refine", title: "adjust the scan to the marked points", onclick: () => void api.make(id, "refine").then(follow).catch(notify) });
+  const refine = el("button", { textContent: "Refine", title: "adjust the scan to the marked points", onclick: () => void marking.then(() => api.make(id, "refine")).then(follow).catch(notify) });
   const nearer = el("button", { textContent: "+", onclick: () => zoomBy(1) });
   const wider = el("button", { textContent: "−", onclick: () => zoomBy(-1) });
   nearer.setAttribute("aria-label", "zoom in");
@@ -37,7 +40,16 @@ export async function showControl(root: HTMLElement, drone: string, name: string
   root.replaceChildren(el("div", { className: "view control" }, head, side, images));
 
   const follow = (): Promise<void> => api.finished(scan, "refine").then(() => api.controlPoints(id)).then((now) => learn(now, true));
-  const mark = (seq: number, at: api.Px | null): void => void api.mark(id, chosen, seq, at).then((now) => learn(now), notify);
+  const mark = (seq: number, at: api.Px | null): void => {
+    const mine = { name: chosen, seq };
+    last = mine;
+    const send = async (): Promise<void> => {
+      if (mine !== last && mine.seq === last.seq && mine.name === last.name) return; // moved on
+      known = await api.mark(id, mine.name, seq, at);
+      if (mine === last) learn(known); // else what is drawn is newer
+    };
+    marking = marking.then(send).catch((error: unknown) => (notify(error), draw())); // one after the other, or an older one may win
+  };
   const choose = (name: string): void => {
     chosen = name;
     const point = known.points.find((p) => p.name === name);
@@ -46,6 +58,7 @@ export async function showControl(root: HTMLElement, drone: string, name: string
     draw();
   };
   const draw = (): void => {
+    if (left) return;
     const point = known.points.find((p) => p.name === chosen);
     for (const view of views) view.show(point?.images.find((i) => i.keyframe_seq === view.seq), zoom);
     list.replaceChildren(...known.points.map((p) => row(p, p.name === chosen, () => choose(p.name))));
@@ -72,7 +85,10 @@ export async function showControl(root: HTMLElement, drone: string, name: string
       .finally(() => (chosenFile.value = ""));
   };
   learn(known, true);
-  return () => delete document.body.dataset["control"];
+  return () => {
+    left = true;
+    delete document.body.dataset["control"];
+  };
 }
 
 const blank = (textContent: string): HTMLElement => el("p", { className: "blank", textContent });
@@ -102,6 +118,8 @@ class View {
   private readonly remove = el("button", { textContent: "Remove", hidden: true, onclick: () => this.mark(this.seq, null) });
   private readonly centre: api.Px;
   private at: api.Px | null = null;
+  private image: api.Sight | undefined;
+  private zoom = 1;
 
   constructor(
     id: { drone: string; scan: string },
@@ -135,6 +153,7 @@ class View {
 
   /** Draws what is known of the point in this image. */
   show(image: api.Sight | undefined, zoom: number): void {
+    [this.image, this.zoom] = [image, zoom];
     const [w, h] = this.size;
     const [width, height] = [w / zoom, h / zoom];
     const corner = (middle: number, shown: number, all: number): number => Math.min(Math.max(middle - shown / 2, -0.5), all - shown - 0.5);
@@ -158,6 +177,8 @@ class View {
 
   private set([x, y]: api.Px): void {
     const [w, h] = this.size;
-    this.mark(this.seq, [Math.min(Math.max(x, -0.5), w - 0.5), Math.min(Math.max(y, -0.5), h - 0.5)]);
+    const at: api.Px = [Math.min(Math.max(x, -0.5), w - 0.5), Math.min(Math.max(y, -0.5), h - 0.5)];
+    if (this.image) this.show({ ...this.image, marked_px: at }, this.zoom); // the next step counts from here
+    this.mark(this.seq, at);
   }
 }
