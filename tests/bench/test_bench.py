@@ -7,6 +7,7 @@ import os
 import time
 from dataclasses import replace
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,9 @@ from service.errors import InputError, OutsideError
 
 def test_every_line_of_the_table_can_be_called() -> None:
     assert not set(BENCHMARKS) & set(DEVELOPMENT)
-    for target in (BENCHMARKS | DEVELOPMENT).values():
+    for name, target in (BENCHMARKS | DEVELOPMENT).items():
+        if name == "device" and find_spec("triton") is None:
+            continue  # a gigabyte that is not everywhere
         module, _, function = target.partition(":")
         assert callable(getattr(import_module(module), function))
 
