@@ -15,7 +15,7 @@ from service.georeference import cut_at_180
 from service.offline.exports.view import ExportOptions, ScanView, export
 
 NAME = "barn & <b>field"
-KINDS = ("kmz", "contours", "geojson", "stac")
+KINDS = ("kmz", "ortho", "contours", "geojson", "stac")
 
 
 @pytest.fixture(scope="module")
