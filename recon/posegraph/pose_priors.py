@@ -43,14 +43,14 @@ def sound(prior: PosePrior) -> PosePrior:
     has_agl = _are_finite(prior.agl_m, prior.sigma_agl_m) and (prior.agl_m or 0.0) > 0.0
     has_altitude = _are_finite(prior.altitude_m, prior.sigma_altitude_m)
     has_place = _are_finite(position)
-    has_fix = has_place and _are_finite(sigma)
+    is_fix = has_place and _are_finite(sigma)
     return replace(
         prior,
         R_world_camera=R if has_turn else None,
         sigma_tilt_rad=max(prior.sigma_tilt_rad, MIN_TURN_RAD),
         sigma_yaw_rad=max(prior.sigma_yaw_rad, MIN_TURN_RAD),
-        position_m=position if has_place and (has_fix or sigma is None) else None,
-        sigma_position_m=np.maximum(sigma, MIN_FIX_M) if has_fix and sigma is not None else None,
+        position_m=position if has_place and (is_fix or sigma is None) else None,
+        sigma_position_m=np.maximum(sigma, MIN_FIX_M) if is_fix and sigma is not None else None,
         agl_m=prior.agl_m if has_agl else None,
         sigma_agl_m=max(prior.sigma_agl_m, MIN_FIX_M),
         altitude_m=prior.altitude_m if has_altitude else None,

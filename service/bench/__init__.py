@@ -7,19 +7,24 @@ Ours and the peer's rounds alternate, after a warm-up, so that a busy machine sl
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import platform
 import statistics
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from service.errors import InputError, OutsideError
+
+T = TypeVar("T")
 
 BENCHMARKS: dict[str, str] = {
     "board": "service.bench.board:run",
@@ -154,6 +159,20 @@ def keep(folder: Path, names: Sequence[str], report: dict[str, Any]) -> Path:
     except OSError as error:
         raise OutsideError(f"{path}: cannot be written: {error.strerror}") from error
     return path
+
+
+def in_process(work: Callable[..., T], *given: object) -> T:
+    """What ``work`` returns in a fresh interpreter, whose peak memory is not that of work before.
+
+    Raises OutsideError when that process is killed, as one that lacks memory is.
+    """
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            return pool.submit(work, *given).result()
+        except BrokenProcessPool as error:
+            raise OutsideError(
+                "bench: a process was killed; is there too little memory?"
+            ) from error
 
 
 def last_kept(folder: Path, names: Sequence[str]) -> dict[tuple[str, str], float]:

@@ -6,30 +6,24 @@ the same path with OpenCV's SGBM. A thread reads the board's sensors meanwhile.
 
 from __future__ import annotations
 
-import multiprocessing
 import resource
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import cv2
 
-from service.bench import BenchOptions, BenchResult
+from service.bench import BenchOptions, BenchResult, in_process
 from service.bench.pipeline import FPS, SIZE, SgbmBackend, fly, make_video
 from service.bench.stereo import speed
 from service.cameras import open_camera
 from service.compute.backend_choice import choose_backend
 from service.daemon.machine import Machine, read_machine
-from service.errors import OutsideError
-
-T = TypeVar("T")
 
 WIDTHS = (320, 640, 1280)
 EVERY_S = 1.0
@@ -85,20 +79,6 @@ def _whole_path(video: Path, width: int, backend: str, flight_s: int) -> list[Be
         ),
         BenchResult(memory, ours.peak_mib, "MiB", peer=peer, peer_value=theirs.peak_mib),
     ]  # fmt: skip
-
-
-def in_process(work: Callable[..., T], *given: object) -> T:
-    """What ``work`` returns in a fresh interpreter, whose peak memory is not that of work before.
-
-    Raises OutsideError when that process is killed, as one that lacks memory is.
-    """
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        try:
-            return pool.submit(work, *given).result()
-        except BrokenProcessPool as error:
-            raise OutsideError(
-                "bench board: a flight was killed; is there too little memory?"
-            ) from error
 
 
 def _flown(video: Path, width: int, backend: str) -> _Flight:

@@ -8,11 +8,9 @@ no image is matched. Each product is made by a process of its own, whose peak me
 from __future__ import annotations
 
 import json
-import multiprocessing
 import tempfile
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,7 @@ from bench_options import DataOptions
 from recon import se3
 from recon.camera_model import rays
 from recon.types import F32, F64, U8, DepthMap, Keyframe, Pose
-from service.bench import BenchResult
+from service.bench import BenchResult, in_process
 from service.georeference import LocalFrame
 from service.offline.site.gather import Member, gather
 from service.progress import Progress
@@ -161,7 +159,7 @@ def _results(
 ) -> list[BenchResult]:
     half = len(members) // 2
     parts = (members[0].first, members[half - 1].last), (members[half].first, members[-1].last)
-    alone = _in_a_process(kind, site, parts, None)
+    alone = in_process(made, kind, site, parts, None)
     scans = f"{len(members)} scans, {len(alone.tile_s)} tiles"
     low, usual, high = np.quantile(alone.tile_s, [0.1, 0.5, 0.9])
     what = f"{kind}: processor time of a tile, median"
@@ -188,7 +186,7 @@ def _on_workers(kind: str, site: Path, parts: Any, workers: int) -> list[BenchRe
         ) as cluster,
         Client(cluster) as client,
     ):  # fmt: skip
-        done = _in_a_process(kind, site, parts, cluster.scheduler_address)
+        done = in_process(made, kind, site, parts, cluster.scheduler_address)
         peak = max(client.run(peak_mib).values())
     return [
         BenchResult(f"{kind}: with {workers} worker(s), elapsed", done.elapsed_s, "s",
@@ -203,12 +201,6 @@ class ProductCost:
     peak_mib: float
     elapsed_s: float
     tile_s: list[float]  # processor time of each tile
-
-
-def _in_a_process(kind: str, site: Path, parts: Any, scheduler: str | None) -> ProductCost:
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-        return pool.submit(made, kind, site, parts, scheduler).result()
 
 
 def made(kind: str, site: Path, parts: Any, scheduler: str | None) -> ProductCost:

@@ -89,7 +89,7 @@ def test_a_boards_sheet() -> None:
 
 def test_a_flight_that_is_killed_ends_the_sheet() -> None:
     with pytest.raises(OutsideError, match="too little memory"):
-        board.in_process(os._exit, 9)
+        bench.in_process(os._exit, 9)
 
 
 def test_a_sheet_has_what_the_board_states() -> None:
