@@ -16,12 +16,12 @@ from mavlink.wire.framing import Decoder, Framer, Packet
 CAMERA_INFORMATION, LOAD_STATUS, METADATA = 259, 390, 397
 ARDUPILOT_DROPS = frozenset({LOAD_STATUS, METADATA})
 """Messages whose checksum ArduPilot 4.6 cannot verify."""
-UNSUPPORTED, ACCEPTED = 3, 0
+UNSUPPORTED = 3
 NAK, NOT_FOUND = 129, 10
 
 
 class ForwardingAutopilot:
-    """1/1 with a camera that it has found: it sends the camera's information as its own.
+    """1/1 with a camera that it has found: ``repeat`` sends its information as the autopilot's own.
 
     What is meant for another component goes to the companion alone, broadcasts as well.
     """
@@ -68,6 +68,10 @@ class ForwardingAutopilot:
                 )
                 self._to_companion(packed(ask))
 
+    def repeat(self) -> None:
+        """Send the camera's information, once it is here, as to a ground station that asks."""
+        self._to_ground(packed(self.camera))
+
     def _to_ground(self, data: bytes) -> None:
         with contextlib.suppress(OSError):
             self._outside.sendto(data, self._outer)
@@ -105,15 +109,9 @@ class ForwardingAutopilot:
         kind = message.get_type()
         self.asked.append(message)
         if kind == "COMMAND_LONG":
-            is_camera = message.command == 521 or (
-                message.command == 512 and message.param1 == CAMERA_INFORMATION
-            )
-            if is_camera and self.camera is not None:
-                self._to_ground(packed(self.camera))
-            elif message.target_component == 0:
-                return
-            result = ACCEPTED if is_camera and self.camera is not None else UNSUPPORTED
-            self._to_ground(packed(dialect.MAVLink_command_ack_message(message.command, result)))
+            if message.target_component == 1:
+                ack = dialect.MAVLink_command_ack_message(message.command, UNSUPPORTED)
+                self._to_ground(packed(ack))
         elif kind == "FILE_TRANSFER_PROTOCOL":
             head = bytearray(message.payload)
             head[0:2] = ((head[0] | head[1] << 8) + 1 & 0xFFFF).to_bytes(2, "little")

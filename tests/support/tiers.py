@@ -12,9 +12,6 @@ import pytest
 
 SLOW = {"bench", "gpu", "portal", "trials"}
 """Folders whose tests are all slow: development's benchmarks, GPU kernels, browsers, attacks."""
-TWICE = pytest.mark.flaky(reruns=1)
-"""A browser that renders in software beside other tests is late now and then: its test has a second
-try, which the summary counts."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -57,8 +54,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if is_slow(item.path, config.rootpath):
             item.add_marker("slow")
-        if "portal" in item.path.parts:
-            item.add_marker(TWICE)
     items.sort(key=lambda item: "trials" not in item.path.parts)
     report = config.getoption("rest")
     if report is not None:
