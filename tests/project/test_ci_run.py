@@ -80,7 +80,7 @@ def run(project: Path, core: bool = True, works: bool = True) -> subprocess.Comp
         [str(project / ".ci" / "run")],
         env={
             "PATH": str(tools), "PYTHON": sys.executable, "HOME": os.environ.get("HOME", "/"),
-            "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
+            "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": "pytest_rerunfailures",
         },
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
@@ -99,6 +99,14 @@ def test_what_cannot_be_installed_is_named(machine: Path) -> None:
     done = run(machine)
     assert done.returncode == 0 and "no ffmpeg" in done.stderr
     assert "1 passed, 3 skipped, 1 deselected" in done.stdout.partition("run yet")[2]
+
+
+def test_a_test_that_is_late_has_a_second_try(machine: Path) -> None:
+    late = "tries = []\ndef test_late():\n    tries.append(1)\n    assert tries[1:]\n"
+    (machine / "tests" / "test_late.py").write_text(late)
+    done = run(machine)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1 rerun" in done.stdout.partition("run yet")[0]
 
 
 @pytest.mark.parametrize("broken", ["core", "works"])
