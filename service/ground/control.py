@@ -37,6 +37,9 @@ _WRITING = threading.Lock()
 _DECODING = threading.Semaphore(2)
 """Recordings opened at a time."""
 
+MAX_POINTS, MAX_MARKS = 1000, 20_000
+"""The page asks for all of them again after each mark."""
+
 Px = Annotated[float, msgspec.Meta(ge=-1.0, le=100_000.0)]
 
 
@@ -108,7 +111,10 @@ def _known(folder: Path) -> list[SurveyPoint]:
 
 def _read(path: Path, marks: Path | None = None) -> list[SurveyPoint]:
     try:
-        return without_stills(read_survey(path, marks))
+        points = without_stills(read_survey(path, marks))
+        if len(points) > MAX_POINTS or sum(len(p.sightings) for p in points) > MAX_MARKS:
+            raise InputError(f"{path.name}: more than {MAX_POINTS} points or {MAX_MARKS} marks")
+        return points
     except InputError as error:  # whose paths are of this machine
         raise InputError(str(error).replace(f"{path.parent}/", "")) from error
 

@@ -248,8 +248,11 @@ MAX_PATH = 1000
 MAX_BODY_BYTES = 65_536
 BODY_S = 10.0
 """A request's whole body must arrive within this time."""
-UPLOAD, MAX_UPLOAD_BYTES, MIN_UPLOAD_HZ = "/api/upload", 16 << 30, 20_000
-"""The path whose body may be larger, and take the time that so many bytes a second need."""
+UPLOAD, MAX_UPLOAD_BYTES = "/api/upload", 16 << 30
+SURVEY, MAX_SURVEY_BYTES = "/control-points", 24_000_000
+"""What the paths end with whose bodies may be larger; two files of control points, escaped."""
+MIN_UPLOAD_HZ = 20_000
+"""Bytes a second that a large body comes with at least."""
 STALL_S = 120.0
 """A reader that has received nothing for so long is dropped."""
 CLOSE = {"connection": "close"}
@@ -289,11 +292,19 @@ class RequestLimits:
 
 def _bounds(scope: Scope) -> tuple[int, float]:
     """Bytes and seconds of a request's body at most."""
-    if scope["path"] != UPLOAD:
-        return MAX_BODY_BYTES, BODY_S
+    limit = _most(scope)
+    if limit == MAX_BODY_BYTES:
+        return limit, BODY_S
     length = HTTPConnection(scope).headers.get("content-length", "")
-    most = min(int(length), MAX_UPLOAD_BYTES) if is_length(length) else 0
+    most = min(int(length), limit) if is_length(length) else MAX_BODY_BYTES
     return most, STALL_S + most / MIN_UPLOAD_HZ
+
+
+def _most(scope: Scope) -> int:
+    """Bytes of a body at most, by the request's path."""
+    if scope["path"] == UPLOAD:
+        return MAX_UPLOAD_BYTES
+    return MAX_SURVEY_BYTES if scope["path"].endswith(SURVEY) else MAX_BODY_BYTES
 
 
 def is_length(text: str) -> bool:
@@ -429,8 +440,7 @@ class Guard:
         if len(connection.scope["path"]) > MAX_PATH:
             return 414, "the address is too long"
         length = headers.get("content-length", "0")
-        most = MAX_UPLOAD_BYTES if connection.scope["path"] == UPLOAD else MAX_BODY_BYTES
-        if is_length(length) and int(length) <= most:
+        if is_length(length) and int(length) <= _most(connection.scope):
             return None
         return 413, "the request is too large"
 

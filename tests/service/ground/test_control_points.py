@@ -214,3 +214,18 @@ def test_an_image_is_shown_as_the_camera_has_it(client: Client, house: HouseFlig
     edge = np.flatnonzero(row[:, 2] - row[:, 1] > 60)[0] / scale
     assert abs(edge - u) < 4.0
     assert client.ask(f"{POINTS}/images/99.jpg")[0] == 404
+
+
+def test_a_large_file_is_taken_and_one_with_too_many_points_refused(
+    client: Client, house: HouseFlight
+) -> None:
+    text = table(house)
+    marks = "".join(f"k{n}.jpg,A,{n % 300}.5,90.25\n" for n in range(8000))
+    row = text.splitlines()[1].split(",")
+    places = f"EPSG:4326\nA,{row[2]},{row[1]},{row[3]}\n"
+    status, listed, _ = client.ask(POINTS, "PUT", {"text": places, "marks": marks})
+    assert status == 200 and [p["name"] for p in listed["points"]] == ["A"], listed
+    many = text + "".join(f"p{n},{row[1]},{row[2]},{row[3]}\n" for n in range(1000))
+    status, said, _ = client.ask(POINTS, "PUT", {"text": many})
+    assert status == 400 and "more than 1000 points" in said["error"], said
+    assert [p["name"] for p in client.ask(POINTS)[1]["points"]] == ["A"]
