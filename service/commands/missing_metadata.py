@@ -194,31 +194,38 @@ def with_readout(inputs: ScanInputs, shutter: Shutter) -> dict[str, Any]:
 
 def start_of(
     source: CameraSource, log: TelemetryLog | None, video_epoch: float | None, notes: list[str]
-) -> int:
-    """Unix ns of the source's time 0: as given, the container's, the log's start, or now."""
+) -> tuple[int, int]:
+    """The source's time 0 on the log's clock, and from that clock to unix time, in ns.
+
+    The source's time 0 is as given, the container's, the log's start, or now. A log without a date
+    begins with the source, unless the time that is given is one of the log's own clock.
+    """
+    is_dated = log is None or log.clock == "unix"
     if video_epoch is not None:
-        epoch_ns = round(video_epoch * 1e9) if math.isfinite(video_epoch) else MAX_TIME_NS
-    elif log is not None and log.clock != "unix":  # time 0 of the video, or of the autopilot
-        epoch_ns = 0 if log.clock == "video" else log.first_ns
-        notes.append(f"the log has no date: times count from the start of the {log.clock}")
+        start_ns = round(video_epoch * 1e9) if math.isfinite(video_epoch) else MAX_TIME_NS
     elif source.epoch_unix_ns is not None:
-        epoch_ns = source.epoch_unix_ns - local_zone_ns(source.epoch_unix_ns, log, notes)
-    elif log is not None:
-        epoch_ns = round(log.first_ns / 1e6) * 10**6  # autopilots count whole milliseconds
+        start_ns = source.epoch_unix_ns
+        start_ns -= local_zone_ns(start_ns, log, notes) if is_dated else 0
+    elif log is not None and is_dated:
+        start_ns = round(log.first_ns / 1e6) * 10**6  # autopilots count whole milliseconds
         notes.append("the recording does not say when it began: taken as the start of the log")
     else:
-        epoch_ns = time.time_ns()
+        start_ns = time.time_ns()
         notes.append("the recording does not say when it began: taken as the time of the replay")
-    if not is_time(epoch_ns):
+    if not is_time(start_ns):
         raise InputError(
             "the recording begins outside the years 1970 to 2106; give the right --video-epoch"
         )
-    if log is not None and not _covers(log, epoch_ns):
+    if log is not None and not is_dated and not (video_epoch and _covers(log, start_ns)):
+        zero_ns = 0 if log.clock == "video" else log.first_ns
+        notes.append(f"the log has no date: times count from the start of the {log.clock}")
+        return zero_ns, start_ns - zero_ns
+    if log is not None and not _covers(log, start_ns):
         raise InputError(
             f"the telemetry covers {_utc(log.first_ns)} to {_utc(log.last_ns)}, the video begins "
-            f"at {_utc(epoch_ns)}: they do not overlap; give the right --video-epoch"
+            f"at {_utc(start_ns)}: they do not overlap; give the right --video-epoch"
         )
-    return epoch_ns
+    return start_ns, 0
 
 
 def _covers(log: TelemetryLog, start_ns: int) -> bool:

@@ -233,8 +233,9 @@ def _replay(
         lens = start.camera
     check_width(lens, source.description)
     lens, config = with_stated_readout(lens, config, video, source, notes)
-    epoch_ns = start_of(source, log, video_epoch, notes)
-    scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(epoch_ns / 1e9))
+    epoch_ns, unix_offset_ns = start_of(source, log, video_epoch, notes)
+    start_s = (epoch_ns + unix_offset_ns) / 1e9
+    scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(start_s))
     folder = out or Path(f"scan-{scan_id}")
     chosen = open_backend(config.compute, source.size_px)
     notes += log.warnings if log is not None else ()
@@ -246,6 +247,7 @@ def _replay(
         folder,
         scan_id,
         epoch_ns,
+        unix_offset_ns,
         history=log.history if log is not None else None,
         notes=tuple(notes),
         sigma_focal=lens.sigma_focal,

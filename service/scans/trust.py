@@ -87,8 +87,10 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         doubts.append("no attitude, and not seen from straight above: the ground is taken as level")
     frames, tracked = _number(run, "frames"), _number(run, "frames_tracked")
     in_pairs = _number(run.get("drops"), TWO_ONLY) or 0.0  # frames that nothing confirms
-    if frames and tracked is not None and tracked - in_pairs < MIN_PLACED_SHARE * (frames - 1):
-        doubts.append(f"vision placed only {tracked - in_pairs:.0f} of {frames:.0f} frames")
+    placed = max((tracked or 0.0) - in_pairs, 0.0)
+    is_placed = placed > 0.0 and placed >= MIN_PLACED_SHARE * ((frames or 0.0) - 1)
+    if frames and tracked is not None and not is_placed:
+        doubts.append(f"vision placed only {placed:.0f} of {frames:.0f} frames")
     for why, views in (("tilt off", "attitudes"), ("view off", "assumed view directions")):
         tilted, attitudes = _refused(run, "attitude", why)
         if tilted > WRONG_SHARE * attitudes:

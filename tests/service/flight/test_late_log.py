@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from threading import Event
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import av
 import pytest
@@ -13,7 +14,8 @@ from command_line import skyrelief
 
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog
-from service.commands.missing_metadata import HOUR_NS, local_zone_ns
+from service.cameras.source import CameraSource
+from service.commands.missing_metadata import HOUR_NS, local_zone_ns, start_of
 from service.flight.scan import ScanInputs
 from service.progress import Progress
 from service.stream.store import ScanStore
@@ -116,3 +118,25 @@ def test_local_time_is_taken_where_one_zone_fits(
     notes: list[str] = []
     assert local_zone_ns(round(video_h * HOUR_NS), log, notes) == ahead_h * HOUR_NS
     assert len(notes) == (ahead_h != 0)
+
+
+@pytest.mark.parametrize(
+    ("clock", "given_s", "container_s", "zero_s", "unix_s"),
+    [
+        ("video", None, EPOCH_S, 0.0, EPOCH_S),
+        ("video", EPOCH_S, None, 0.0, EPOCH_S),
+        ("boot", None, EPOCH_S, 80.0, EPOCH_S),
+        ("boot", EPOCH_S, EPOCH_S + 9.0, 80.0, EPOCH_S),
+        ("boot", 95.0, EPOCH_S, 95.0, 95.0),  # a time of the log's own clock
+        ("unix", None, 100.0, 100.0, 100.0),
+        ("unix", None, None, 80.0, 80.0),
+    ],
+)
+def test_a_log_without_a_date_takes_that_of_its_video(
+    clock: str, given_s: float | None, container_s: float | None, zero_s: float, unix_s: float
+) -> None:
+    log = TelemetryLog(VehicleHistory(), clock, round(80e9), round(120e9), (), {})
+    epoch_ns = None if container_s is None else round(container_s * 1e9)
+    source = cast(CameraSource, SimpleNamespace(epoch_unix_ns=epoch_ns))
+    zero_ns, offset_ns = start_of(source, log, given_s, [])
+    assert (zero_ns, zero_ns + offset_ns) == (round(zero_s * 1e9), round(unix_s * 1e9))

@@ -42,6 +42,7 @@ SURE: dict[str, Any] = {
         ({"frames": 101, "frames_tracked": 50}, "gnss", "georeferenced", ""),
         ({"frames_tracked": 60, "drops": {TWO_ONLY: 20}}, "gnss", "doubtful", "40 of 100"),
         ({"frames_tracked": 60, "drops": {TWO_ONLY: 8}}, "gnss", "georeferenced", ""),
+        ({"frames": 1, "frames_tracked": 0, "drops": {TWO_ONLY: 1}}, "gnss", "doubtful", " 0 of 1"),
     ],
 )
 def test_the_weakest_fact_sets_the_level(
