@@ -19,6 +19,9 @@ def untimed(stage: str) -> AbstractContextManager[object]:
 TWO_ONLY = "seen by two views only"
 """Reason why a view is refused: nothing confirms its one pair."""
 
+CONTRADICTED = "pairs contradict each other"
+"""Another: its pairs, or those of most views before it, do not agree on a surface."""
+
 
 @dataclass(frozen=True, slots=True)
 class Baseline:

@@ -15,7 +15,7 @@ from recon.backends import Backend, DenseStages
 from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
 from recon.mapping.registration import IcpConfig, agreed_motion
-from recon.pipeline.config import Timing
+from recon.pipeline.config import CONTRADICTED, Timing
 from recon.pipeline.views import StereoView, ViewSelection
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
@@ -316,8 +316,7 @@ class Plausible:
         self._balance[view.segment] += -1 if kept is None else 1
         if kept is not None and self._balance[view.segment] > 0:
             return kept
-        contradicted = "pairs contradict each other"
-        self._rejected[contradicted if kept is None else f"{contradicted} in earlier views"] += 1
+        self._rejected[CONTRADICTED if kept is None else f"{CONTRADICTED} in earlier views"] += 1
         return None
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.pipeline.config import TWO_ONLY
+from recon.pipeline.config import CONTRADICTED, TWO_ONLY
 from recon.posegraph.level_ground import plane_through
 from recon.types import Array
 
@@ -32,7 +32,8 @@ MIN_PLACED_SHARE = 0.5
 
 REFUSED_SHARE, WRONG_SHARE = 0.2, 0.5
 """Of the measured positions or attitudes, that contradict the track. Above the first, positions are
-less certain than sigma says; above the second, either may be wrong."""
+less certain than sigma says; above the second, either may be wrong. Where depths of more than the
+second contradict each other, those of the other views may agree by chance."""
 
 MAX_REFUTED_SHARE = 0.05
 """Of the steps of the track; where vision is refuted more often, it errs elsewhere by as much as
@@ -59,8 +60,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
 
     Args:
         run: figures of the scan's run: ``assumed``, ``sigma_focal``, ``scale``,
-            ``lean_sigma_deg``, ``frames``, ``frames_tracked``, ``drops``, ``graph``. Missing or
-            malformed ones limit nothing.
+            ``lean_sigma_deg``, ``frames``, ``frames_tracked``, ``keyframes``, ``drops``, ``graph``.
+            Missing or malformed ones limit nothing.
         georeference: of the scan's header; "none" without.
         slope_deg: of the plane through the cloud.
     """
@@ -91,6 +92,10 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     is_placed = placed > 0.0 and placed >= MIN_PLACED_SHARE * ((frames or 0.0) - 1)
     if frames and tracked is not None and not is_placed:
         doubts.append(f"vision placed only {placed:.0f} of {frames:.0f} frames")
+    dropped = _number(run.get("drops"), CONTRADICTED) or 0.0
+    matched = dropped + (_number(run, "keyframes") or 0.0)
+    if dropped > WRONG_SHARE * matched:
+        doubts.append(f"the depths of {dropped:.0f} of {matched:.0f} views contradict each other")
     for why, views in (("tilt off", "attitudes"), ("view off", "assumed view directions")):
         tilted, attitudes = _refused(run, "attitude", why)
         if tilted > WRONG_SHARE * attitudes:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.pipeline.config import TWO_ONLY
+from recon.pipeline.config import CONTRADICTED, TWO_ONLY
 from service.scans.trust import BY_SURVEY, slope_deg, trust_of
 
 SURE: dict[str, Any] = {
@@ -42,6 +42,8 @@ SURE: dict[str, Any] = {
         ({"frames": 101, "frames_tracked": 50}, "gnss", "georeferenced", ""),
         ({"frames_tracked": 60, "drops": {TWO_ONLY: 20}}, "gnss", "doubtful", "40 of 100"),
         ({"frames_tracked": 60, "drops": {TWO_ONLY: 8}}, "gnss", "georeferenced", ""),
+        ({"keyframes": 4, "drops": {CONTRADICTED: 25}}, "gnss", "doubtful", "25 of 29 views"),
+        ({"keyframes": 25, "drops": {CONTRADICTED: 24}}, "gnss", "georeferenced", ""),
         ({"frames": 1, "frames_tracked": 0, "drops": {TWO_ONLY: 1}}, "gnss", "doubtful", " 0 of 1"),
     ],
 )
