@@ -218,7 +218,7 @@ def start_of(
         )
     if log is not None and not is_dated and not (video_epoch and _covers(log, start_ns)):
         zero_ns = 0 if log.clock == "video" else log.first_ns
-        notes.append(f"the log has no date: times count from the start of the {log.clock}")
+        notes.append("the log has no date: it begins with the recording")
         return zero_ns, start_ns - zero_ns
     if log is not None and not _covers(log, start_ns):
         raise InputError(
