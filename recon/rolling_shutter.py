@@ -197,7 +197,6 @@ class RowTrack:
 
     @property
     def is_rolling(self) -> bool:
-        """False for a global shutter."""
         return self.clock is not None
 
     @property

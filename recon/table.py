@@ -27,7 +27,6 @@ class Table:
         return self._array[: self._count]
 
     def append(self, rows: Rows) -> None:
-        """Put rows after the last one."""
         while self._count + len(rows) > len(self._array):
             self._array = np.concatenate([self._array, np.zeros_like(self._array)])
         self._array[self._count : self._count + len(rows)] = rows

@@ -129,7 +129,6 @@ class BackgroundWorker(Generic[In, Out]):
         self._ends, self._patience_s = event, patience_s
 
     def offer(self, item: In) -> None:
-        """Queue one item."""
         if self._ends.is_set():
             self.dropped += 1
             return

@@ -35,11 +35,9 @@ class Notifier:
         return self._socket is not None
 
     def status(self, text: str) -> None:
-        """Set the line of ``systemctl status``."""
         self._send(f"STATUS={text}")
 
     def ready(self) -> None:
-        """Report that the service has started."""
         self._send("READY=1")
 
     def alive(self, status: str = "") -> None:
@@ -51,7 +49,6 @@ class Notifier:
         self._send(f"EXTEND_TIMEOUT_USEC={EXTENSION_US}")
 
     def stopping(self) -> None:
-        """Report that the service is stopping."""
         self._send("STOPPING=1")
 
     def _send(self, text: str) -> None:
@@ -83,7 +80,6 @@ class JournalHandler(logging.Handler):
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Send one record."""
         text = self.format(record)
         try:
             self._socket.sendto(packed(record, text), self._address)
@@ -96,7 +92,6 @@ class JournalHandler(logging.Handler):
 
 
 def packed(record: logging.LogRecord, text: str) -> bytes:
-    """The record as a datagram of the journal."""
     fields = {
         "MESSAGE": text[:MAX_BYTES],
         "PRIORITY": str(next((p for level, p in PRIORITIES if record.levelno >= level), 7)),
@@ -121,7 +116,6 @@ class PublicFormatter(logging.Formatter):
     """Formats a record, including its traceback, with credentials hidden."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The text of one record."""
         return without_credentials(super().format(record))
 
 

@@ -90,17 +90,14 @@ class BoundedListener(socket.socket):
         return connection, address
 
     def begin(self, peer: Peer | None) -> None:
-        """Note that a request of ``peer`` is being served."""
         if peer is not None and (found := self._open.get(peer)):
             found.is_busy = True
 
     def end(self, peer: Peer | None) -> None:
-        """Note that the request of ``peer`` was served; it waits for the next one."""
         if peer is not None and (found := self._open.get(peer)):
             found.is_busy, found.waits_since = False, self._clock()
 
     def drop(self, peer: Peer | None) -> None:
-        """Close the connection of ``peer``."""
         if peer is not None and (found := self._open.pop(peer, None)):
             found.end()
 

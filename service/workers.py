@@ -239,11 +239,9 @@ class Workers:
         return [worker for worker in self.table() if worker.is_stalled]
 
     def report(self) -> list[dict[str, Any]]:
-        """One entry per worker."""
         return [worker.to_dict() for worker in self.table()]
 
     def table(self) -> list[Worker]:
-        """The workers that run, have just ended, or failed."""
         with self._lock:
             return list(self._workers)
 

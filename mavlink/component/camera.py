@@ -121,15 +121,12 @@ class CameraComponent:
         return ACCEPTED
 
     def stop_shooting(self) -> None:
-        """Stop the series."""
         self._series = None
 
     def show_status(self) -> None:
-        """Send CAMERA_CAPTURE_STATUS to everyone, also where it has not changed."""
         self._shown = None
 
     def reset_image_log(self) -> None:
-        """Restart the keyframe count at zero."""
         self._count = 0
         self._kept.clear()
 

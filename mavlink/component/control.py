@@ -55,7 +55,6 @@ class Work:
             self.answer = self.answer or answer
 
     def cancel(self) -> None:
-        """Request an early end."""
         self.cancelled = True
 
 
@@ -120,11 +119,9 @@ class ScanControl(Protocol):
     """The service as commands see it. Every call returns at once; long work is a Work."""
 
     def status(self) -> ScanStatus:
-        """A snapshot."""
         return ScanStatus()
 
     def view(self) -> CameraView:
-        """The camera's view now."""
         return CameraView()
 
     def start_scan(self) -> Handled:
@@ -144,7 +141,6 @@ class ScanControl(Protocol):
         return UNAVAILABLE
 
     def resume(self) -> Handled:
-        """Resume after a pause."""
         return UNAVAILABLE
 
     def clear_map(self) -> Handled:
@@ -156,7 +152,6 @@ class ScanControl(Protocol):
         return UNAVAILABLE
 
     def self_test(self) -> Handled:
-        """Check camera, link, disk and compute."""
         return UNAVAILABLE
 
     def erase_scans(self) -> Handled:

@@ -76,7 +76,6 @@ class FileServer:
         self._last: dict[Address, tuple[FtpRequest, list[bytes]]] = {}  # to repeat lost answers
 
     def answer(self, payload: bytes, source: Address) -> list[bytes]:
-        """The answers to a request; empty for any other payload."""
         request = parse_request(payload)
         if request is None or request.opcode in (0, ACK, NAK):
             return []

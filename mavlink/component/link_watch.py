@@ -82,7 +82,6 @@ class LinkWatch:
         self._announced: frozenset[str] = frozenset()
 
     def hear(self, packet: Packet, message: Any, now_ns: int) -> None:
-        """Process one packet and its message."""
         system = self._presence.system
         if (packet.system, packet.component) == self._presence.autopilot:
             if self._autopilot_ns is None or now_ns - self._autopilot_ns > BREAK_NS:

@@ -104,7 +104,6 @@ class Parameters:
         return self._values[name]
 
     def values(self) -> dict[str, float]:
-        """Every value by name."""
         return dict(self._values)
 
     def kept(self) -> dict[str, float]:
@@ -142,7 +141,6 @@ class Parameters:
         self._send(name)
 
     def reset(self) -> None:
-        """Reset every value to its default."""
         for parameter in self.table:
             self.change(parameter.name, parameter.default)
 

@@ -78,7 +78,6 @@ class Presence:
 
     @property
     def system(self) -> int:
-        """The system id in use."""
         return self.autopilots.system
 
     @property
@@ -95,7 +94,6 @@ class Presence:
 
     @property
     def autopilot_seen_ns(self) -> int | None:
-        """Time of the autopilot's last heartbeat."""
         followed = self.autopilots.followed
         return None if followed is None else followed.seen_ns
 
@@ -106,7 +104,6 @@ class Presence:
 
     @property
     def is_armed(self) -> bool:
-        """True while the autopilot reports it."""
         followed = self.autopilots.followed
         return followed is not None and followed.is_armed
 
@@ -158,7 +155,6 @@ class Presence:
         return self._next_ns
 
     def hear(self, message: Any, now_ns: int) -> None:
-        """Process a heartbeat of any sender."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         if system and is_autopilot(component, message):  # system 0 is everybody
             armed = bool(message.base_mode & ARMED)

@@ -55,7 +55,6 @@ class StatusTexts:
         self.tick(now_ns)
 
     def tick(self, now_ns: int) -> None:
-        """Send the texts that are due."""
         passed = 0 if self._last_ns is None else max(0, now_ns - self._last_ns)
         self._last_ns = now_ns
         self._credit_ns = min(BURST * SPACING_NS, self._credit_ns + passed)
@@ -92,7 +91,6 @@ class ComputerLoad:
 
 
 def computer_status(load: ComputerLoad, unix_us: int, uptime_ms: int) -> Any:
-    """The ONBOARD_COMPUTER_STATUS of a load."""
     u8, u32 = 255, 0xFFFFFFFF
 
     def known(value: int | None) -> int:

@@ -44,10 +44,8 @@ log = logging.getLogger(__name__)
 S = 1_000_000_000
 SAVE_EVERY_NS, SAVE_SIGNED_NS = 30 * S, S  # with a key, what a crash forgets could be replayed
 TELEMETRY = numbers_of(READERS)
-BACKLOG = 10_000  # packets queued for the protocol's thread
 STUCK_NS = 10 * S
-WAIT_S, CLOSE_S = 0.5, 5.0
-"""Of the disk's thread for work, and at most for the end of a log."""
+WAIT_S = 0.5  # of the disk's thread for work
 TUNNEL_ROOM = 128
 BEAT_NICE = -10  # needs LimitNICE or root, otherwise the priority stays normal
 
@@ -63,6 +61,8 @@ class VehicleConfig:
     signing_key: Path | None = None  # 32 bytes, mode 600
     odometry: bool = False  # send our motion estimate to the autopilot
     state_dir: Path | None = None  # keeps parameters, signing time and the vehicle's system id
+    backlog: int = 10_000  # packets queued for the protocol's thread, and for the disk's
+    close_s: float = 5.0  # that the end of a log waits for a disk at most
 
     def __post_init__(self) -> None:
         for link in self.links:
@@ -120,8 +120,8 @@ class VehicleLink:
             self._memory.parameters,
             lambda: (self._clock_ns() + self.unix_offset_ns()) // 1000,
         )
-        self._inbox: LinkInbox[tuple[int, Packet, int]] = LinkInbox(BACKLOG)
-        self._disk: LinkInbox[tuple[bytes, int]] = LinkInbox(BACKLOG)  # as a disk may stall
+        self._inbox: LinkInbox[tuple[int, Packet, int]] = LinkInbox(config.backlog)
+        self._disk: LinkInbox[tuple[bytes, int]] = LinkInbox(config.backlog)  # as a disk may stall
         self._is_saving = False
         self._heard = set(HEARD)  # numbers of handled messages; others are ignored
         self._stop = threading.Event()
@@ -165,7 +165,6 @@ class VehicleLink:
         self.presence.confirm(health, self._clock_ns())
 
     def set_load(self, load: ComputerLoad) -> None:
-        """Set the companion's load, for the operator."""
         self._companion.load = load
 
     def statustext(self, text: str, severity: int = texts.INFO, is_answer: bool = False) -> None:
@@ -199,11 +198,9 @@ class VehicleLink:
         return True
 
     def parameter(self, name: str) -> float:
-        """The value of a parameter."""
         return self._companion.parameters[name]
 
     def parameters(self) -> dict[str, float]:
-        """Every parameter's value by name."""
         return self._companion.parameters.values()
 
     def show_parameters(self, values: Mapping[str, float]) -> None:
@@ -219,7 +216,7 @@ class VehicleLink:
             self._disk.put(self.recorder.close)
             self._disk.put(closed.set)
             if self._threads and not self._stop.is_set():
-                closed.wait(CLOSE_S)
+                closed.wait(self.config.close_s)
             else:
                 self._flush(0.0)
         else:

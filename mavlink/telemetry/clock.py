@@ -168,7 +168,6 @@ class BootClock:
 
     @property
     def reboots(self) -> int:
-        """Number of reboots of the sender."""
         return self._counter.session
 
     def time_of(self, boot_ms: float, received_ns: int) -> int:
@@ -240,7 +239,6 @@ def computer_offset_ns() -> int:
 
 
 def agree(offset_ns: int, other_ns: int) -> bool:
-    """True when clocks with these offsets agree."""
     return abs(offset_ns - other_ns) <= DIFFER_NS
 
 
@@ -307,7 +305,6 @@ class TimesyncFilter:
 
     @property
     def round_trip_ns(self) -> int | None:
-        """The minimum round trip in the recent past."""
         return min(self._rounds, default=None)
 
     def reset(self) -> None:

@@ -111,13 +111,11 @@ class VehicleHistory:
 
     @property
     def first_ns(self) -> int | None:
-        """Time of the oldest attitude or position."""
         times = [t.first_ns for t in (self._attitude, self._position) if t.first_ns is not None]
         return min(times, default=None)
 
     @property
     def last_ns(self) -> int | None:
-        """Time of the newest attitude or position."""
         times = [t.last_ns for t in (self._attitude, self._position) if t.last_ns is not None]
         return max(times, default=None)
 

@@ -65,7 +65,6 @@ class _Turns:
         return len(self.start_s)
 
     def only(self, mask: Bool | slice) -> _Turns:
-        """The subset selected by a mask."""
         return _Turns(self.start_s[mask], self.end_s[mask], self.rate[mask], self.overlap)
 
     def apart(self) -> _Turns:
@@ -168,7 +167,6 @@ class _Fit:
     correlation: float
 
     def span_s(self, seen: _Turns) -> float:
-        """Time that the windows cover together."""
         return float((seen.end_s - seen.start_s)[self.known].sum()) / seen.overlap
 
     def agreement(self, seen: _Turns) -> float:
@@ -308,12 +306,10 @@ class Attitudes:
 
     @property
     def first_s(self) -> float:
-        """Time of the oldest sample."""
         return float(self._grid_s[0])
 
     @property
     def last_s(self) -> float:
-        """Time of the newest sample."""
         return float(self._grid_s[-1])
 
     def _grid(self, times_s: F64) -> F64:

@@ -137,5 +137,4 @@ def rotation_vector(q: Quaternion) -> Vector:
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """The vector product."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

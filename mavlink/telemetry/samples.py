@@ -155,17 +155,14 @@ class Bracket(Generic[S]):
 
     @property
     def nearer(self) -> S:
-        """The sample nearer to the instant."""
         return self.before if self.fraction < 0.5 else self.after
 
     @property
     def nearer_ns(self) -> int:
-        """Time of the nearer sample."""
         return self.before_ns if self.fraction < 0.5 else self.after_ns
 
     @property
     def gap_s(self) -> float:
-        """Seconds between the two samples."""
         return (self.after_ns - self.before_ns) * 1e-9
 
     def mixed(self, name: str) -> float:
@@ -177,7 +174,6 @@ class Bracket(Generic[S]):
 
     @property
     def age_ms(self) -> float:
-        """Milliseconds from the time to the nearer sample."""
         near = min(abs(self.time_ns - self.before_ns), abs(self.after_ns - self.time_ns))
         return near * 1e-6
 
@@ -201,12 +197,10 @@ class TimeSeries(Generic[S]):
 
     @property
     def first_ns(self) -> int | None:
-        """Time of the oldest sample."""
         return self._times[0] if self._times else None
 
     @property
     def last_ns(self) -> int | None:
-        """Time of the newest sample."""
         return self._times[-1] if self._times else None
 
     @property
@@ -218,11 +212,9 @@ class TimeSeries(Generic[S]):
 
     @property
     def last(self) -> S | None:
-        """The newest sample."""
         return self._samples[-1] if self._samples else None
 
     def items(self) -> list[tuple[int, S]]:
-        """All samples, oldest first."""
         return list(zip(self._times, self._samples, strict=True))
 
     def add(self, time_ns: int, sample: S) -> None:
@@ -239,7 +231,6 @@ class TimeSeries(Generic[S]):
             self._samples.insert(i, sample)
 
     def clear(self) -> None:
-        """Discard everything."""
         self._times.clear()
         self._samples.clear()
 

@@ -25,6 +25,5 @@ CRC_EXTRA.setdefault(COMMAND_CANCEL, 14)  # of common.xml; pymavlink's dialect l
 
 
 def numbers_of(names: Iterable[str]) -> frozenset[int]:
-    """The numbers of messages by name; unknown names are ignored."""
     wanted = set(names)
     return frozenset(n for n, kind in dialect.mavlink_map.items() if kind.msgname in wanted)

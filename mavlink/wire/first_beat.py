@@ -74,7 +74,6 @@ class FirstBeats:
         self._thread = threading.Thread(target=self._run, name="first beats", daemon=True)
 
     def start(self) -> None:
-        """Open the links and start the heartbeats."""
         for link in self.links:
             link.start()
         self._thread.start()

@@ -90,7 +90,6 @@ class NumbersMessage:
         self.__dict__ = fields
 
     def get_type(self) -> str:
-        """The message's name."""
         return self._name
 
     def get_srcSystem(self) -> int:
@@ -151,7 +150,6 @@ class Framer:
         self.skipped_bytes = 0
 
     def feed(self, data: bytes) -> list[Packet]:
-        """The packets completed by ``data``, in order."""
         buffer = self._buffer
         if not buffer and packet_length(data, 0) == len(data):  # a datagram, most of the time
             whole = check_packet(data)

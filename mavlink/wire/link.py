@@ -49,7 +49,6 @@ class Link:
 
     @property
     def is_up(self) -> bool:
-        """True while the port is open."""
         return self._port is not None
 
     def start(self) -> None:

@@ -42,7 +42,6 @@ class SendQueue:
         self._waiting: deque[OutgoingMessage] = deque(maxlen=limit)
 
     def put(self, component: int, message: Any, link: int | None = None) -> None:
-        """Queue a message of one of our components."""
         self._waiting.append(OutgoingMessage(component, message, link))
 
     def take(self) -> list[OutgoingMessage]:
@@ -123,7 +122,6 @@ class Stream:
         self._wanted.clear()
 
     def tick(self, now_ns: int) -> None:
-        """Send the message if it is due."""
         interval_us = self.interval_us
         if interval_us > 0 and now_ns >= self._next_ns:
             self._next_ns = now_ns + interval_us * 1000

@@ -85,7 +85,6 @@ class SerialPort:
             raise OSError(*error.args) from error
 
     def read(self) -> bytes:
-        """Received data."""
         try:
             first: bytes = self._line.read(1)
             return first + self._line.read(self._line.in_waiting) if first else b""
@@ -123,7 +122,6 @@ class UdpPort:
             raise
 
     def read(self) -> bytes:
-        """The next datagram."""
         try:
             if self._fixed is not None:
                 return self._socket.recv(LONGEST)
@@ -160,7 +158,6 @@ class TcpPort:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def read(self) -> bytes:
-        """Received data."""
         if not _ready([self._socket]):
             return b""
         data = self._socket.recv(LONGEST)
@@ -206,7 +203,6 @@ class TcpServerPort:
         return data
 
     def write(self, data: bytes) -> None:
-        """Send to every client."""
         for client in list(self._clients):
             try:
                 client.sendall(data)

@@ -79,7 +79,6 @@ class Signing:
 
     @property
     def streams(self) -> StreamTimes:
-        """The newest time of each stream."""
         with self._lock:
             return dict(self._streams)
 
@@ -90,7 +89,6 @@ class Signing:
             return sign(packet, self._key, link, self.timestamp)
 
     def accepts(self, packet: Packet) -> bool:
-        """True when the packet may be trusted."""
         with self._lock:
             if self._verify(packet):
                 return True

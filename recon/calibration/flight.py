@@ -30,9 +30,6 @@ from recon.types import F64, Bool, Camera
 
 MIN_SIGHTINGS = 60
 
-MAX_STEP = 0.3
-"""Of a parameter's sigma, that one more step would move it by."""
-
 LOOSE, PARTS = 0.2, 6
 """Sigma of a focal length that the images alone shall find, and parts of the flight of which one is
 left out at a time."""
@@ -69,6 +66,7 @@ class SelfCalibrationConfig:
     gate_sigmas: float = 6.0  # sightings further off after the first round are left out
     min_sightings: int = 200
     iterations: int = 40
+    max_step: float = 0.3  # in sigmas: a larger last step of the camera has not settled
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,7 +129,7 @@ def self_calibrate(
     why_not = doubt(found.camera, camera, sigmas, config)
     if not why_not and focal > config.max_sigma_focal:
         why_not = TOO_FAR
-    if not why_not and (np.abs(found.camera_step) > MAX_STEP * sigmas).any():
+    if not why_not and (np.abs(found.camera_step) > config.max_step * sigmas).any():
         why_not = "the adjustment of the images does not settle"
     return SelfCalibrated(
         found.camera, focal, (float(sigmas[4]), float(sigmas[5])),

@@ -54,7 +54,6 @@ class Sightings:
 
 
 def joint(a: Sightings, b: Sightings) -> Sightings:
-    """The sightings of both sets."""
     return Sightings(
         np.append(a.view, b.view), np.append(a.landmark, b.landmark),
         np.concatenate([a.uv_px, b.uv_px]),
@@ -76,8 +75,6 @@ class Knowledge:
 
     @classmethod
     def none(cls, poses: int, points: int) -> Knowledge:
-        """Nothing is known."""
-
         def unknown(*shape: int) -> F64:
             return np.full(shape, np.nan)
 
@@ -436,7 +433,6 @@ class _Bundle:
         ).solve
 
     def _add_known(self, s: _State, S: F64, g: F64, Hp: F64, bp: F64) -> None:
-        """Add fixes, attitudes, the placing and surveyed points."""
         known, c = self._of.known, self._of.cauchy_sigmas
         fixes, attitude, placing, points = self._known_errors(s)
         R = s.T[:, :3, :3]
@@ -463,7 +459,6 @@ class _Bundle:
     # ---- result -----------------------------------------------------------------------------
 
     def solution(self, s: _State, covariances: bool) -> Solution:
-        """The result at ``s``."""
         eq = self._equations(s, 0.0)
         spread = np.asarray(np.linalg.inv(eq.Hk), np.float64)
         errors = np.empty(len(self._view))

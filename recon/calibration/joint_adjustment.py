@@ -135,7 +135,6 @@ class _Adjustment:
         self._at = self._at.widened(self._of_patches)
 
     def result(self, turning: Turning, readout_s: float, sigma_s: float) -> JointAdjustment:
-        """The stills as they are adjusted now."""
         shutter = self._at.camera.shutter.reading(readout_s)
         rates = np.hstack([self.turns / readout_s, turning.rates[:, 3:]])
         return JointAdjustment(

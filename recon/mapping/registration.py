@@ -239,7 +239,6 @@ def no_overlap(T: F64, iterations: int) -> Registration:
 def _judged(
     problem: _Problem, T: F64, T_start: F64, available: int, iterations: int, config: IcpConfig
 ) -> Registration:
-    """The registration with its verdict."""
     covariance = _covariance(problem, config)
     sums, depth = problem.equations.sums, float(problem.equations.centre[2])
     rms = float(np.sqrt(sums[3] / max(sums[0], 1e-9)))

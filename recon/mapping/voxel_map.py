@@ -137,12 +137,10 @@ class VoxelMap:
         self._clear()
 
     def __len__(self) -> int:
-        """Number of voxels that hold surface."""
         return self._count
 
     @property
     def nbytes(self) -> int:
-        """Memory held, in bytes."""
         return sum(a.nbytes for a in (self._keys, self._ids, self._sigma, self._seen))
 
     def fresh(self, depth: DepthMap) -> Bool:

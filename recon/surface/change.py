@@ -76,7 +76,6 @@ class Change:
 
     @property
     def compared_m2(self) -> float:
-        """Ground that both surfaces have."""
         return float(np.isfinite(self.height_m).sum()) * self.grid.cell_m**2
 
 
@@ -464,7 +463,6 @@ def _open(unknown: Bool) -> Bool:
 
 
 def _grown(cells: Bool, by: int) -> Bool:
-    """The cells and those within ``by`` cells of them."""
     square = np.ones((2 * by + 1, 2 * by + 1), np.uint8)
     return np.asarray(cv2.dilate(cells.astype(np.uint8), square) > 0)
 

@@ -137,7 +137,6 @@ class CoverageMap:
 
     @property
     def tiles(self) -> int:
-        """How many tiles are held."""
         return len(self._tiles)
 
     def put(self, seq: int, time_ns: int, depth: DepthMap, finer: bool = False) -> None:

@@ -53,7 +53,6 @@ def between(height_m: F32, fixed: Bool, wanted: Bool, cell_m: float) -> F32:
 
 
 def _blocks(values: F32 | Bool, shrink: int) -> F64:
-    """Sums over blocks of cells."""
     rows, cols = values.shape
     padded = np.pad(values.astype(np.float64), ((0, -rows % shrink), (0, -cols % shrink)))
     return np.asarray(

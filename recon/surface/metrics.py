@@ -29,7 +29,6 @@ class Fit:
 
     @staticmethod
     def identity() -> Fit:
-        """The fit that changes nothing."""
         return Fit(1.0, np.eye(3), np.zeros(3))
 
     def points(self, xyz_m: F64) -> F64:

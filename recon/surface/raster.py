@@ -127,7 +127,6 @@ class Raster:
 
     @property
     def area_m2(self) -> float:
-        """Ground area of the cells with a height."""
         return float(self.known.sum()) * self.grid.cell_m**2
 
 

@@ -76,7 +76,6 @@ class Splats:
         return len(self.xyz_m)
 
     def at(self, rows: I64 | Bool) -> Splats:
-        """Some of them."""
         return Splats(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
@@ -111,7 +110,6 @@ def splats_of(
 
 
 def steps(keyframes: int) -> int:
-    """Reports of :func:`splats_of`."""
     return keyframes * (2 + FITS)
 
 

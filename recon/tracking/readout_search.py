@@ -8,6 +8,7 @@ neighbouring frames, which a wrong readout bends, so the search repeats from win
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,12 +79,17 @@ class ReadoutEstimate:
         return is_known and abs(self.readout_s) < GLOBAL_S
 
 
+Cost = Callable[["list[OdometryKeyframe]", float, F64], tuple[float, int]]
+"""(Keyframes, readout in s, K) to :func:`window_cost`."""
+
+
 class ReadoutSearch:
     """Looks at keyframes as they settle, and sets the clock of their rows."""
 
-    def __init__(self, clock: RowClock, K: F64) -> None:
+    def __init__(self, clock: RowClock, K: F64, cost: Cost | None = None) -> None:
+        """``cost`` says how well a window fits a readout; by default :func:`window_cost`."""
         self.estimate: ReadoutEstimate | None = None
-        self._clock, self._K = clock, K
+        self._clock, self._K, self._cost = clock, K, cost or window_cost
         self._last_seq = -1
         self._found: deque[tuple[float, float]] = deque(maxlen=4)  # readout, weight
 
@@ -122,7 +128,7 @@ class ReadoutSearch:
     def _take(self, window: list[OdometryKeyframe]) -> None:
         now = self._clock.readout_s
         tried = now + STEP_S * np.arange(-1.0, 2.0) if self._is_sure else COARSE_S
-        costs = [_cost(window, float(readout_s), self._K) for readout_s in tried]
+        costs = [self._cost(window, float(readout_s), self._K) for readout_s in tried]
         k = int(np.clip(np.argmin([cost for cost, _ in costs]), 1, len(tried) - 2))
         (below, _), (here, redundancy), (above, _) = costs[k - 1 : k + 2]
         spacing = tried[1] - tried[0]
@@ -148,7 +154,7 @@ class ReadoutSearch:
             self._clock.readout_s = float(np.clip(mean, -MAX_READOUT_S, MAX_READOUT_S))
 
 
-def _cost(window: list[OdometryKeyframe], readout_s: float, K: F64) -> tuple[float, int]:
+def window_cost(window: list[OdometryKeyframe], readout_s: float, K: F64) -> tuple[float, int]:
     """Huber cost, px^2, of the window adjusted with a readout, and its redundancy."""
     ids, index, camera, uv = observations(window, K, 3, readout_s)  # two give way to any readout
     T_camera_odom, free = np.stack([k.T_camera_odom for k in window]), np.arange(len(window)) > 0

@@ -91,7 +91,6 @@ def _still(path: Path) -> U8 | None:
 
 
 def _video(path: Path) -> Iterator[tuple[str, U8]]:
-    """Images of a video, a few a second."""
     from service.cameras import open_camera
 
     due_ns = 0

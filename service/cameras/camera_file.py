@@ -147,7 +147,6 @@ def save_camera(
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """The mapping at the top of the YAML file."""
     try:
         text = read_small(path, LARGEST_FILE_BYTES, "camera_info YAML file").decode("utf-8")
         document = yaml.safe_load(text)
@@ -176,6 +175,5 @@ def _check_matrix(K: F64) -> None:
 
 
 def _matrix(M: F64) -> dict[str, Any]:
-    """OpenCV's YAML form of a matrix."""
     rows, cols = M.shape
     return {"rows": rows, "cols": cols, "data": [float(value) for value in M.ravel()]}

@@ -107,7 +107,6 @@ class ImagesSource:
 
     @property
     def images(self) -> int:
-        """Number of stills."""
         return len(self._stills)
 
     def only_near(self, times_ns: Iterable[int], within_ns: int) -> None:
@@ -386,7 +385,6 @@ def open_images(rest: str, options: Mapping[str, str]) -> ImagesSource:
 
 
 def size_of(tags: Tags) -> str:
-    """The image's size in pixels, as in 1600x1200."""
     return "{}x{}".format(*tags.size_px)
 
 

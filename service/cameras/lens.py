@@ -59,7 +59,6 @@ class Lens:
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether the distortion is known."""
         return self.source == CALIBRATED
 
     def camera(self, size_px: tuple[int, int]) -> Camera:

@@ -454,7 +454,6 @@ class _CommandContainer:
         self.streams = container.streams
 
     def demux(self, stream: Any) -> Any:
-        """The packets of ``stream``."""
         return self._container.demux(stream)
 
     def close(self) -> None:

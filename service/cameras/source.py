@@ -151,7 +151,6 @@ class Paced:
 
     @property
     def dropped(self) -> int:
-        """Images that were not fetched in time."""
         return self._queue.dropped
 
     def __iter__(self) -> Iterator[CameraFrame]:

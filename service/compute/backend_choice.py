@@ -57,12 +57,10 @@ class FallbackBackend:
 
     @property
     def name(self) -> str:
-        """Name of the backend in use."""
         return self._backend.name
 
     @property
     def device(self) -> str:
-        """Device of the backend in use."""
         return self._backend.device
 
     @property

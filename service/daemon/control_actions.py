@@ -55,7 +55,6 @@ class ControlActions:
         self._disk_mib, self._disk_at = (0.0, 0.0), -math.inf  # total and free, and when seen
 
     def status(self) -> ScanStatus:
-        """A snapshot for the operator."""
         scanning = self._scanning
         total_mib, free_mib = self._disk()
         run, scan = scanning.run, scanning.scan
@@ -119,12 +118,10 @@ class ControlActions:
         return self._scanning.finalise() or ACCEPTED
 
     def pause(self) -> Handled:
-        """Take no frames until :meth:`resume`."""
         is_wanted = self._scanning.handle(Event.PAUSE).is_wanted
         return ACCEPTED if is_wanted else Answer(Result.DENIED, "no scan is running")
 
     def resume(self) -> Handled:
-        """Take frames again after a pause."""
         was_paused = self._scanning.handle(Event.RESUME).is_paused
         return ACCEPTED if was_paused else Answer(Result.DENIED, "the scan is not paused")
 

@@ -119,7 +119,6 @@ def examine(config: Config, listen_s: float | None) -> Iterator[Finding]:
 
 
 def parent_of(package: str) -> str:
-    """The folder that holds a package."""
     spec = find_spec(package)
     origin = spec.origin if spec is not None else None
     return str(Path(origin).resolve().parents[1]) if origin else f"{package} is missing"

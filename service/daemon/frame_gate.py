@@ -88,7 +88,6 @@ class FrameGate:
         return self._source.dropped if isinstance(self._source, Dropping) else 0
 
     def close(self) -> None:
-        """Close the camera."""
         self._source.close()
 
     def _measure(self, frame: CameraFrame) -> None:

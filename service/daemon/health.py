@@ -47,7 +47,6 @@ class HealthServer:
         self._worker = PROCESS.start("health", lambda _: self._server.serve_forever())
 
     def close(self) -> None:
-        """Stop serving."""
         self._server.shutdown()
         self._server.server_close()
         self._worker.join()

@@ -32,7 +32,6 @@ class Level(IntEnum):
 
     @property
     def label(self) -> str:
-        """Name for the operator."""
         return self.name.lower().replace("_", " ")
 
 
@@ -87,7 +86,6 @@ class Move:
 
     @property
     def text(self) -> str:
-        """Text for the operator."""
         if self.reason:
             return f"Load: {self.level.label} ({self.reason})"
         return f"Load: {self.level.label if self.level else 'full quality'} again"
@@ -214,7 +212,6 @@ def lowered(compute: ComputeConfig, level: Level) -> ComputeConfig:
 
 
 def ladder_config(compute: ComputeConfig) -> LadderConfig:
-    """The operator's limits."""
     return LadderConfig(
         hottest_c=compute.hottest_c, min_memory_mib=compute.least_memory_mib, relief=compute.relief
     )

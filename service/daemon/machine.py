@@ -42,7 +42,6 @@ class Machine:
         return min(known, default=None)
 
     def to_dict(self) -> dict[str, Any]:
-        """The available readings."""
         return {key: value for key, value in asdict(self).items() if value is not None}
 
 
@@ -50,7 +49,6 @@ class CoreLoad:
     """Load of each core since the last call, from the kernel's tick counters."""
 
     def __init__(self, root: Path = Path("/")) -> None:
-        """Take the first reading."""
         self._file = root / "proc/stat"
         self._last = self._read()
 

@@ -93,7 +93,6 @@ class Daemon:
 
     @property
     def config(self) -> Config:
-        """The configuration in force."""
         return self.scanning.config
 
     def run(self, notifier: Notifier | None = None) -> None:

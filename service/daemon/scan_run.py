@@ -96,7 +96,6 @@ class ScanRun:
             scan.source.close()
 
     def alive(self) -> None:
-        """Note that a frame was processed."""
         self.progress_s = self._clock_s()
 
     def camera_news(self) -> list[str]:
@@ -221,7 +220,6 @@ class ScanRun:
                 self._with.write_files(inputs.folder, store)
 
     def _inputs(self, source: CameraSource) -> tuple[ScanInputs, FrameGate]:
-        """Inputs of the scan, with its camera behind a gate."""
         from service.cameras.camera_file import seeks_readout
         from service.cameras.lens import fitted
         from service.daemon.camera_memory import measured

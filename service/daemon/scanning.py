@@ -166,12 +166,10 @@ class Scanning:
 
     @property
     def phase(self) -> Phase:
-        """The state as the operator sees it."""
         return self.life.state.phase
 
     @property
     def scan(self) -> Scan | None:
-        """The running scan."""
         run = self.run
         return None if run is None else run.scan
 
@@ -299,7 +297,6 @@ class Scanning:
 
 
 def _fault_of(error: Exception) -> str:
-    """One line for the operator."""
     if isinstance(error, SkyreliefError | OSError):
         return str(error)
     log.error("the scan ended with an internal fault", exc_info=error)

@@ -89,7 +89,6 @@ class SimulatedFlight:
 
 
 def is_simulated(config: Config) -> bool:
-    """True when the camera is ``sim:``."""
     return config.camera.source.startswith("sim:")
 
 
@@ -102,7 +101,6 @@ def state_folder() -> Path:
 
 
 def free_ports(count: int) -> list[int]:
-    """Unused UDP ports of this machine."""
     with contextlib.ExitStack() as stack:
         probes = []
         for _ in range(count):

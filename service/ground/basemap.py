@@ -106,7 +106,6 @@ class MBTiles:
         return database
 
     def tile(self, zoom: int, x: int, y: int) -> bytes | None:
-        """See :class:`Basemap`."""
         sql = (
             "SELECT tile_data FROM tiles WHERE zoom_level=? AND tile_column=? AND tile_row=?"
             " AND LENGTH(tile_data) <= ?"
@@ -142,7 +141,6 @@ class PMTiles:
         self._directory(*self._root)
 
     def tile(self, zoom: int, x: int, y: int) -> bytes | None:
-        """See :class:`Basemap`."""
         wanted, where = tile_number(zoom, x, y), self._root
         for _ in range(DEEPEST_DIRECTORY):
             entries = self._directory(*where)

@@ -18,7 +18,6 @@ class JSONResponse(StarletteJSONResponse):
     """JSON in ASCII: any text can be sent, also one with a lone surrogate."""
 
     def render(self, content: Any) -> bytes:
-        """The body."""
         return json.dumps(content, allow_nan=False, separators=(",", ":")).encode("ascii")
 
 

@@ -18,7 +18,7 @@ from service.errors import OutsideError, SkyreliefError
 from service.ground.inbox import Answered, Batch, Grown, Inbox, Radio, Written
 from service.ground.intake import FINE, SILENCE_S, SMALL, Introduction, ScanIntake
 from service.ground.received import ReceivedScan
-from service.ground.storage import DiskShare, scan_folder
+from service.ground.storage import DiskShare, scan_folder, total_and_free
 from service.stream.messages import Ask, Head, count, pack, unpack
 from service.stream.naming import ROOT
 from service.stream.radio_messages import RADIO_NOTE
@@ -54,6 +54,8 @@ class DroneLimits:
     silent_s: float = 30.0  # without a message for so long, it is silent
     close_whole_s: float = 60.0  # a whole scan without data for so long is written and closed
     full_disk_rest_s: float = 10.0  # until a full disk is tried again
+    look_s: float = 1.0  # between two looks at the disk
+    usage: Callable[[Path], tuple[int, int]] = total_and_free  # bytes of a folder's disk
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,13 +120,14 @@ class DroneReceiver:
         self._introductions: OrderedDict[str, Introduction] = OrderedDict()
         self._unreadable: OrderedDict[str, float] = OrderedDict()
         folder = self._folder("scan").parent
-        self._share = DiskShare(folder, limits.drone_share, limits.reserve_bytes)
+        self._share = DiskShare(
+            folder, limits.drone_share, limits.reserve_bytes, limits.usage, limits.look_s
+        )
         self._shown_at = -1e9
         self._effects: list[Effect] = []
 
     @property
     def scans(self) -> list[ReceivedScan]:
-        """Those that are open."""
         return list(self._scans.values())
 
     def _folder(self, name: str) -> Path:
@@ -217,7 +220,6 @@ class DroneReceiver:
         self.news_at = now
 
     def _on_radio(self, event: Radio, now: float) -> None:
-        """Take in what the narrow radio brought."""
         self.heard_at = now
         header, kind, number, part, data = event
         scan = self._scan(header.name, now) or self._create(header, now)
@@ -404,7 +406,6 @@ class DroneReceiver:
         self._effects.append(Get(name, key, pack(ask), answered))
 
     def show(self, now: float) -> None:
-        """Update :attr:`entries`."""
         self._shown_at = now
         entries = [scan.progress() for scan in self.scans]
         self.entries = entries + list(self._closed.values())

@@ -91,7 +91,6 @@ class Drones:
 
     @property
     def all(self) -> list[DroneReceiver]:
-        """Those that have a worker."""
         with self._lock:
             return [drone for drone, _ in self._present.values()]
 
@@ -103,12 +102,10 @@ class Drones:
 
     @property
     def entries(self) -> list[dict[str, Any]]:
-        """One entry per scan."""
         return [entry for drone in self._known for entry in drone.entries]
 
     @property
     def dropped(self) -> int:
-        """Messages that were malformed or too many."""
         return self._dropped + sum(_dropped_of(drone) for drone in self.all)
 
     @property

@@ -246,15 +246,11 @@ def _short(value: Any) -> Any:
 MAX_PATH = 1000
 """Letters of an address before its query; the longest of ours has some 300."""
 MAX_BODY_BYTES = 65_536
-BODY_S = 10.0
-"""A request's whole body must arrive within this time."""
 UPLOAD, MAX_UPLOAD_BYTES = "/api/upload", 16 << 30
 SURVEY, MAX_SURVEY_BYTES = "/control-points", 24_000_000
 """What the paths end with whose bodies may be larger; two files of control points, escaped."""
 MIN_UPLOAD_HZ = 20_000
 """Bytes a second that a large body comes with at least."""
-STALL_S = 120.0
-"""A reader that has received nothing for so long is dropped."""
 CLOSE = {"connection": "close"}
 
 
@@ -268,8 +264,12 @@ class RequestLimits:
     Starlette's own limit counts bytes only; a body or a reader that is slow without end is ours.
     """
 
-    def __init__(self, app: ASGIApp, listener: BoundedListener) -> None:
+    def __init__(
+        self, app: ASGIApp, listener: BoundedListener, body_s: float, stall_s: float
+    ) -> None:
+        """A body arrives within ``body_s``; who takes nothing for ``stall_s`` is dropped."""
         self._app, self._listener = app, listener
+        self._body_s, self._stall_s = body_s, stall_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -279,25 +279,54 @@ class RequestLimits:
         self._listener.begin(peer)
         try:
             if scope["type"] == "http":
-                await self._app(scope, bounded_receive(scope, receive), _bounded_send(send))
-            else:
-                await self._app(scope, receive, _bounded_send(send))
+                receive = self._bounded_receive(scope, receive)
+            await self._app(scope, receive, self._bounded_send(send))
         except _StalledError:
             log.debug("%s has stopped reading", peer)
             self._listener.drop(peer)
-            await asyncio.wait_for(_gone(receive), STALL_S)
+            await asyncio.wait_for(_gone(receive), self._stall_s)
         finally:
             self._listener.end(peer)
 
+    def _bounds(self, scope: Scope) -> tuple[int, float]:
+        """Bytes and seconds of a request's body at most."""
+        limit = _most(scope)
+        if limit == MAX_BODY_BYTES:
+            return limit, self._body_s
+        length = HTTPConnection(scope).headers.get("content-length", "")
+        most = min(int(length), limit) if is_length(length) else MAX_BODY_BYTES
+        return most, self._stall_s + most / MIN_UPLOAD_HZ
 
-def _bounds(scope: Scope) -> tuple[int, float]:
-    """Bytes and seconds of a request's body at most."""
-    limit = _most(scope)
-    if limit == MAX_BODY_BYTES:
-        return limit, BODY_S
-    length = HTTPConnection(scope).headers.get("content-length", "")
-    most = min(int(length), limit) if is_length(length) else MAX_BODY_BYTES
-    return most, STALL_S + most / MIN_UPLOAD_HZ
+    def _bounded_receive(self, scope: Scope, receive: Receive) -> Receive:
+        """``receive`` of a request that ends a body too large or too slow with 413 or 408."""
+        max_bytes, seconds = self._bounds(scope)
+        seen, complete, deadline = 0, False, asyncio.get_running_loop().time() + seconds
+
+        async def bounded() -> Message:
+            nonlocal seen, complete
+            if complete:  # what comes now is the end of the connection
+                return await receive()
+            remaining = deadline - asyncio.get_running_loop().time()
+            try:
+                message = await asyncio.wait_for(receive(), min(remaining, self._stall_s))
+            except asyncio.TimeoutError:
+                raise HTTPException(408, "the request's body did not come in time", CLOSE) from None
+            seen += len(message.get("body", b""))
+            complete = not message.get("more_body", False)
+            if seen > max_bytes:
+                raise HTTPException(413, "the request is too large", CLOSE)
+            return message
+
+        return bounded
+
+    def _bounded_send(self, send: Send) -> Callable[[Message], Awaitable[None]]:
+        async def bounded(message: Message) -> None:
+            try:
+                await asyncio.wait_for(send(message), self._stall_s)
+            except asyncio.TimeoutError:
+                raise _StalledError from None
+
+        return bounded
 
 
 def _most(scope: Scope) -> int:
@@ -310,39 +339,6 @@ def _most(scope: Scope) -> int:
 def is_length(text: str) -> bool:
     """Whether it is a number of bytes, written in few digits."""
     return text.isascii() and text.isdigit() and len(text) < 12
-
-
-def bounded_receive(scope: Scope, receive: Receive) -> Receive:
-    """``receive`` of one HTTP request that ends a body too large or too slow with 413 or 408."""
-    max_bytes, seconds = _bounds(scope)
-    seen, complete, deadline = 0, False, asyncio.get_running_loop().time() + seconds
-
-    async def bounded() -> Message:
-        nonlocal seen, complete
-        if complete:  # what comes now is the end of the connection
-            return await receive()
-        remaining = deadline - asyncio.get_running_loop().time()
-        try:
-            message = await asyncio.wait_for(receive(), min(remaining, STALL_S))
-        except asyncio.TimeoutError:
-            raise HTTPException(408, "the request's body did not come in time", CLOSE) from None
-        seen += len(message.get("body", b""))
-        complete = not message.get("more_body", False)
-        if seen > max_bytes:
-            raise HTTPException(413, "the request is too large", CLOSE)
-        return message
-
-    return bounded
-
-
-def _bounded_send(send: Send) -> Callable[[Message], Awaitable[None]]:
-    async def bounded(message: Message) -> None:
-        try:
-            await asyncio.wait_for(send(message), STALL_S)
-        except asyncio.TimeoutError:
-            raise _StalledError from None
-
-    return bounded
 
 
 async def _gone(receive: Receive) -> None:
@@ -426,7 +422,6 @@ class Guard:
     def _refusal(
         self, connection: HTTPConnection, who: str | None, opening: bool
     ) -> tuple[int, str] | None:
-        """Status and reason when the request may not pass."""
         headers = connection.headers
         if self._local and not is_loopback(host_name(headers.get("host", ""))):
             return 421, "this portal answers on this machine's own names only"
@@ -497,7 +492,6 @@ def logged_out(connection: HTTPConnection, tokens: Tokens) -> Response:
 
 
 def where(connection: HTTPConnection) -> str:
-    """The address that a request came from."""
     return connection.client.host if connection.client is not None else ""
 
 

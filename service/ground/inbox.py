@@ -86,7 +86,6 @@ class Inbox:
             )
 
     def put_item(self, scan_id: str, payload: bytes) -> bool:
-        """A message of parts."""
         with self._changed:
             size = len(payload) + ITEM_BYTES
             has_room = (

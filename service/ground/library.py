@@ -133,7 +133,6 @@ class Library:
         return folder
 
     def entry(self, drone: str, scan: str) -> dict[str, Any]:
-        """A scan's entry in the list."""
         folder = self.folder(drone, scan)
         labels = read_labels(folder)
         entry: dict[str, Any] = {

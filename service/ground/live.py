@@ -156,7 +156,6 @@ class LiveFeed:
     _more: bool = True  # the last call left something for the next
 
     def __post_init__(self) -> None:
-        """Begin without any pose."""
         self._track = FlightPath(self.store)
 
     def news(self, max_chunks: int = 20) -> Iterator[str | bytes]:

@@ -32,8 +32,6 @@ EQUATOR_M = 2.0 * math.pi * 6378137.0
 MAX_ZOOM = 24
 HOLE_PX = 4
 MAX_TILES = 150
-READ_S = 2.0
-"""Time that one request spends on keyframes that are new; the rest is for the next."""
 
 Tile = tuple[int, int, int]
 """Zoom, column from west, row from north."""
@@ -112,9 +110,10 @@ class LiveMap:
         east, south = np.nanmax(boxes[:, 2:], axis=0).tolist()
         return west, north, east, south
 
-    def refresh(self) -> None:
-        """Take note of keyframes that are new, finer or moved, for READ_S at most."""
-        until = time.monotonic() + READ_S
+    def refresh(self, read_s: float = 2.0) -> None:
+        """Take note of keyframes that are new, finer or moved, for ``read_s`` at most: the next
+        request reads on."""
+        until = time.monotonic() + read_s
         states = self._store.states()
         for seq in main_seqs(self._store):
             state = states.get(seq, (-1, -1))
@@ -177,7 +176,6 @@ class LiveMap:
         return np.concatenate([place.min(axis=0), place.max(axis=0)])
 
     def _points_of(self, seq: int, state: State) -> _Points:
-        """The points of a keyframe in its ``state``."""
         keyframe = self._store.keyframe(seq)
         if keyframe is None:
             empty = np.zeros(0, np.float32)

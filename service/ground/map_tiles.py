@@ -61,7 +61,6 @@ NOW = {"cache-control": "no-cache"}
 
 
 def map_routes() -> list[Route]:
-    """All routes of maps."""
     one = "/tiles/{drone}/{scan}/{layer}"
     return [
         Route(one + ".json", _tile_json),
@@ -152,7 +151,6 @@ def newer_raster(folder: Path, layer: str) -> Path | None:
 
 
 def _from_raster(path: Path, layer: str, tile: Tile) -> Cells:
-    """A tile and its margin, from a GeoTIFF."""
     from rasterio.enums import Resampling
     from rasterio.transform import from_origin
     from rasterio.vrt import WarpedVRT
@@ -237,7 +235,6 @@ def contour_mask(height_m: F32, step_m: float) -> np.ndarray:
 
 
 def coverage_image(found: Coverage, tile: Tile) -> U8:
-    """The coverage layer on one tile."""
     if found.frame is None:
         raise InputError("no map: the scan has no georeference")
     west, south, east, north = found.bounds_m

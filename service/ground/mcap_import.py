@@ -336,7 +336,6 @@ class _AtMost:
         self._file, self._left = file, size
 
     def read(self, size: int = -1) -> bytes:
-        """As of a file."""
         data = self._file.read(self._left if size < 0 else min(size, self._left))
         self._left -= len(data)
         return data

@@ -77,7 +77,6 @@ class Ack:
 
     @property
     def text(self) -> str:
-        """The result in words."""
         return RESULTS[self.result] if self.result < len(RESULTS) else f"result {self.result}"
 
 
@@ -143,7 +142,6 @@ class Operator:
 
     @property
     def system(self) -> int:
-        """The vehicle's system id."""
         number: int = self._system.get_system_id()
         return number
 
@@ -300,6 +298,5 @@ def status(operator: Operator) -> dict[str, Any]:
 
 
 def _keep(values: dict[str, float], sender: int, fields: dict[str, Any]) -> None:
-    """Take in a figure of the companion's."""
     if sender == ONBOARD:
         values[str(fields.get("name", ""))] = float(fields.get("value", math.nan))

@@ -24,7 +24,8 @@ from service.ground.guard import (
 )
 from service.ground.http import portal_app
 from service.ground.library import Library
-from service.ground.state import Jobs, PortalState
+from service.ground.live_map import LiveMap
+from service.ground.state import Jobs, OpenScans, PortalState
 from service.ground.vehicle import Vehicle
 from service.listener import (
     BoundedListener,
@@ -33,6 +34,7 @@ from service.listener import (
     parse_address,
     raise_descriptor_limit,
 )
+from service.scans.coverage import LiveCoverage
 from service.workers import Worker, Workers
 
 log = logging.getLogger(__name__)
@@ -58,6 +60,10 @@ class PortalConfig:
     tls_key: str = ""
     basemap: Path | None = None  # an MBTiles or PMTiles file
     limits: drone.DroneLimits = field(default_factory=drone.DroneLimits)  # of the disk
+    map_age_s: float = 1.0  # at which the live map of a scan is made again
+    coverage_age_s: float = 2.0  # the same for its coverage
+    body_s: float = 10.0  # a request's whole body must arrive within this time
+    stall_s: float = 120.0  # a reader that has received nothing for so long is dropped
 
     def __post_init__(self) -> None:
         """Raise InputError for an address open to others without a token."""
@@ -72,7 +78,6 @@ class PortalConfig:
 
     @property
     def tls(self) -> bool:
-        """True when the portal speaks HTTPS."""
         return bool(self.tls_certificate)
 
 
@@ -92,10 +97,14 @@ class Portal:
         self.jobs = Jobs(self._workers)
         below = None if config.basemap is None else open_basemap(config.basemap)
         library = Library(config.store)
-        state = PortalState(library, self.jobs, progress or list, vehicle, below, config.limits)
+        state = PortalState(
+            library, self.jobs, progress or list, vehicle, below, config.limits,
+            OpenScans(LiveCoverage, config.coverage_age_s, max_scans=4),
+            OpenScans(LiveMap, config.map_age_s, max_scans=3),
+        )  # fmt: skip
         tokens = parse_tokens(config.token or secrets.token_urlsafe(24))
         self.token = next(iter(tokens.values()))
-        self._app = portal_app(state, Tokens(tokens), is_loopback(config.host))
+        self.app = portal_app(state, Tokens(tokens), is_loopback(config.host))
         self._vehicle = vehicle
         self._listener: BoundedListener | None = None
         self._port = config.port
@@ -136,7 +145,7 @@ class Portal:
             server_log.addFilter(_PacedWarnings())
         return uvicorn.Server(
             uvicorn.Config(
-                RequestLimits(self._app, listener),
+                RequestLimits(self.app, listener, self.config.body_s, self.config.stall_s),
                 http="h11",
                 loop="asyncio",
                 backlog=BACKLOG,
@@ -196,7 +205,6 @@ class _PacedWarnings(logging.Filter):
         self._pace = Pace(WARNINGS_HZ, WARNINGS_AT_ONCE)
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether it is logged."""
         return record.levelno > logging.WARNING or self._pace.take()
 
 

@@ -95,7 +95,6 @@ class Facts(msgspec.Struct):
     coverage: KnownExtent | None = None
 
     def shown(self) -> dict[str, Any]:
-        """The entries of the list."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         failed, coverage = plain.pop("failed"), plain.pop("coverage")
         plain["corners_lat_lon"] = coverage and coverage["corners_lat_lon"]

@@ -92,11 +92,9 @@ class _Pipe(io.RawIOBase):
         self._kept: list[bytes] = []
 
     def writable(self) -> bool:
-        """It is."""
         return True
 
     def write(self, data: Any) -> int:
-        """Keep ``data``."""
         self._kept.append(bytes(data))
         return len(self._kept[-1])
 

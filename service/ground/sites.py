@@ -53,7 +53,6 @@ class Sites:
         self._waiting: queue.Queue[Path] = queue.Queue()
 
     def put(self, folder: Path) -> None:
-        """Align a finished scan with its neighbours when its turn comes."""
         self._waiting.put(folder)
 
     def run(self, worker: Worker) -> None:

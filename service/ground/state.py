@@ -32,9 +32,6 @@ log = logging.getLogger(__name__)
 
 MAX_WAITING_JOBS = 20
 KEPT = 100
-MAP_AGE_S, COVERAGE_AGE_S = 1.0, 2.0
-"""Age at which the live map and the coverage layer of a scan are made again."""
-
 SHOWN_S = 86400.0
 """A job that has ended is listed for so long."""
 
@@ -64,16 +61,13 @@ class Job:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the job has ended, successfully or not."""
         return self.state not in ("waiting", "running")
 
     def end(self, state: str, error: str | None = None) -> None:
-        """It is done, failed or cancelled."""
         self.state, self.error, self.ended_unix_s = state, error, time.time()
         self.work = None  # and the files that it may own
 
     def shown(self) -> dict[str, Any]:
-        """For JSON."""
         left_s = self.progress.left_s if self.state == "running" else None
         return {
             "number": self.number,
@@ -162,7 +156,6 @@ class Jobs:
             return [j.shown() for j in self._jobs if (j.ended_unix_s or since) >= since]
 
     def busy(self, folder: Path) -> bool:
-        """True while a deliverable of this scan is waiting or being made."""
         with self._lock:
             return any(job.folder == folder and not job.has_ended for job in self._jobs)
 
@@ -192,7 +185,6 @@ class Jobs:
             worker.join(CLOSE_S)
 
     def _work(self, _: Worker) -> None:
-        """Make what waits, one after the other."""
         while True:
             with self._lock:
                 job = next((j for j in self._jobs if j.state == "waiting"), None)
@@ -219,9 +211,7 @@ class Jobs:
 class StoreView(Protocol):
     """Something derived from an open store."""
 
-    def refresh(self) -> object:
-        """Follow the store."""
-        ...
+    def refresh(self) -> object: ...
 
 
 V = TypeVar("V", bound=StoreView)
@@ -271,7 +261,6 @@ class OpenScans(Generic[V]):
                 held[1].close()
 
     def close(self) -> None:
-        """Close all stores."""
         for folder in list(self._kept):
             self.forget(folder)
 
@@ -284,21 +273,16 @@ class PortalState:
     jobs: Jobs
     progress: Callable[[], list[dict[str, Any]]]  # one entry per scan being received
     vehicle: Vehicle | None
-    basemap: Basemap | None = None
-    limits: DroneLimits = field(default_factory=DroneLimits)  # of the disk
-    coverages: OpenScans[LiveCoverage] = field(
-        default_factory=lambda: OpenScans(LiveCoverage, COVERAGE_AGE_S, max_scans=4)
-    )
-    maps: OpenScans[LiveMap] = field(
-        default_factory=lambda: OpenScans(LiveMap, MAP_AGE_S, max_scans=3)
-    )
+    basemap: Basemap | None
+    limits: DroneLimits  # of the disk
+    coverages: OpenScans[LiveCoverage]
+    maps: OpenScans[LiveMap]
     live_views: int = 0
     views_without_token: int = 0  # of these
     started: float = field(default_factory=time.monotonic)
 
 
 def state_of(connection: HTTPConnection) -> PortalState:
-    """The state of the portal that serves ``connection``."""
     state: PortalState = connection.app.state.portal
     return state
 

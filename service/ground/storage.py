@@ -32,7 +32,6 @@ log = logging.getLogger(__name__)
 RESERVE_SHARE, MAX_RESERVE_BYTES = 0.05, 2 << 30
 """Free space kept by default: this share of the disk, at most so much."""
 MEASURE_S = 60.0
-LOOK_S = 1.0
 
 
 class QuotaError(OutsideError):
@@ -57,9 +56,10 @@ class DiskShare:
         share: float,
         reserve_bytes: int | None,
         usage: Callable[[Path], tuple[int, int]] = total_and_free,
+        look_s: float = 1.0,
     ) -> None:
-        """``usage`` looks at the disk of a folder."""
-        self._folder, self._usage = folder, usage
+        """``usage`` looks at the disk of a folder, every ``look_s``."""
+        self._folder, self._usage, self._look_s = folder, usage, look_s
         self._share, self._reserve_bytes = share, reserve_bytes
         self._used_bytes, self._measured_at = 0, -1e9
         self._total_bytes, self._free_bytes, self._looked_at = 0, 0, -1e9
@@ -90,8 +90,8 @@ class DiskShare:
         return min(RESERVE_SHARE * self._total_bytes, MAX_RESERVE_BYTES)
 
     def _look(self, now: float) -> None:
-        """Measure the disk every second, and the folder now and then: others write there too."""
-        if now - self._looked_at >= LOOK_S:
+        """Measure the disk, and now and then the folder: others write there too."""
+        if now - self._looked_at >= self._look_s:
             self._looked_at = now
             try:
                 total_bytes, free_bytes = self._usage(existing(self._folder))
@@ -132,7 +132,6 @@ def drone_folder(store: Path, drone: str) -> Path:
 
 
 def site_folders(store: Path) -> Iterator[Path]:
-    """The folders of the sites."""
     return (folder for folder in _within(store / SITES) if is_regular(folder / "scan.db"))
 
 
@@ -275,14 +274,18 @@ TAKING = ".taking-"
 
 
 def take_in(
-    store: Path, folder: Path, deliver: Callable[[Path, ScanStore], None] | None = None
+    store: Path,
+    folder: Path,
+    deliver: Callable[[Path, ScanStore], None] | None = None,
+    room_bytes: int | None = None,
 ) -> list[Path]:
     """The scan folders under ``store`` that now hold what those in ``folder`` hold.
 
     ``folder`` is a scan folder or a folder of them, such as a card's; nothing is written there.
     Items received before by radio or network are kept and completed. A damaged scan is left out
-    where there are others. ``deliver`` writes a scan's files. Raises InputError when there is not a
-    scan, OutsideError when the disk is full.
+    where there are others. ``deliver`` writes a scan's files; ``room_bytes`` bounds each copy, see
+    :func:`copy_files`. Raises InputError when there is not a scan, OutsideError when the disk is
+    full.
     """
     given = Path(os.path.realpath(folder))  # the operator's own link is followed
     paths = [given / STORE_FILES[0], *sorted(given.glob(f"*/{STORE_FILES[0]}"))]
@@ -292,7 +295,7 @@ def take_in(
     taken, faults = [], []
     for path in paths:
         try:
-            taken.append(_take(store, path.parent, deliver or _deliver))
+            taken.append(_take(store, path.parent, deliver or _deliver, room_bytes))
         except InputError as error:
             log.error("%s is not taken: %s", path.parent, error)
             faults.append(error)
@@ -301,9 +304,14 @@ def take_in(
     return taken
 
 
-def _take(store: Path, folder: Path, deliver: Callable[[Path, ScanStore], None]) -> Path:
+def _take(
+    store: Path,
+    folder: Path,
+    deliver: Callable[[Path, ScanStore], None],
+    room_bytes: int | None,
+) -> Path:
     with workplace(store) as place:
-        copy_files(folder, place, STORE_FILES)
+        copy_files(folder, place, STORE_FILES, room_bytes)
         with ScanStore.open(place / STORE_FILES[0]) as source:
             header = source.header
             drone, scan = check_name(header.drone, "drone"), check_name(header.name, "scan")

@@ -50,8 +50,9 @@ BROKEN = (
 """What a damaged, encrypted or hostile archive raises."""
 
 
-def check_parts(library: Library, parts: Sequence[Part]) -> None:
-    """Raise InputError for files that make no scan, OutsideError where the disk has no room."""
+def check_parts(library: Library, parts: Sequence[Part], room_bytes: int | None = None) -> None:
+    """Raise InputError for files that make no scan, OutsideError where they do not fit the disk,
+    or ``room_bytes`` of it."""
     suffixes = sorted(PurePosixPath(name).suffix.lower() for name, _ in parts)
     if not (len(suffixes) == 1 and suffixes[0] in KINDS) and not _is_recording(suffixes):
         names = ", ".join(name[:100] for name, _ in parts[:5])
@@ -63,7 +64,7 @@ def check_parts(library: Library, parts: Sequence[Part]) -> None:
         if not 0 < size <= MAX_UPLOAD_BYTES:
             most = f"{MAX_UPLOAD_BYTES >> 30} GiB"
             raise InputError(f"{name[:100]}: 1 byte to {most} can be uploaded, not {size} bytes")
-    check_room(sum(size for _, size in parts), library.store)
+    check_room(sum(size for _, size in parts), library.store, room_bytes)
 
 
 def _is_recording(suffixes: Sequence[str]) -> bool:
@@ -76,9 +77,11 @@ class Upload:
     """Files on their way into the library, one after the other; close it at the end. Not
     thread-safe."""
 
-    def __init__(self, library: Library, parts: Sequence[Part]) -> None:
+    def __init__(
+        self, library: Library, parts: Sequence[Part], room_bytes: int | None = None
+    ) -> None:
         """Raises what :func:`check_parts` raises, and ConflictError while another import runs."""
-        check_parts(library, parts)
+        check_parts(library, parts, room_bytes)
         self._library = library
         self._waiting = list(parts)
         self._left = 0  # of the file that is being written
@@ -108,7 +111,6 @@ class Upload:
             raise OutsideError(f"the upload cannot be stored ({error.strerror})") from error
 
     def _next(self) -> None:
-        """Begin the next file."""
         if not self._waiting:
             raise InputError("the upload is longer than it said")
         name, self._left = self._waiting.pop(0)
@@ -196,16 +198,16 @@ def _replay(paths: Sequence[Path], out: Path, progress: Progress) -> None:
         raise InputError(OWN_PATH.sub("", fault))
 
 
-def unpack(archive: Path, folder: Path) -> None:
+def unpack(archive: Path, folder: Path, room_bytes: int | None = None) -> None:
     """Unpack the scan in a ZIP into ``folder``: the files beside its only ``scan.db``.
 
     Raises InputError for an archive that is broken or holds no scan or several, OutsideError
-    where the disk has no room for what it claims to hold.
+    where what it claims to hold does not fit the disk, or ``room_bytes`` of it.
     """
     try:
         with open(archive, "rb") as file, zipfile.ZipFile(cast(IO[bytes], _Bounded(file))) as found:
             members = _members(found.infolist())
-            check_room(sum(member.file_size for member in members.values()), folder)
+            check_room(sum(member.file_size for member in members.values()), folder, room_bytes)
             for name, member in members.items():
                 _copy(found, member, folder / name)
     except BROKEN as error:

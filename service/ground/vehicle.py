@@ -49,11 +49,9 @@ class Vehicle:
         self._trouble = "looking for the companion"
 
     def start(self) -> None:
-        """Begin to look."""
         self._searching = self._workers.start("vehicle", self._search)
 
     def close(self) -> None:
-        """Close the link."""
         if self._searching is not None:
             self._searching.join(2 * SEARCH_S)
         with self._one_order, self._one_stop, self._lock:

@@ -71,7 +71,6 @@ def points(table: str, places: F64, columns: Columns) -> Layer:
 
 
 def write_layers(path: Path, epsg: int, layers: Sequence[Layer]) -> None:
-    """Write the layers as one file."""
     from pyproj import CRS
 
     with writing(path) as part, closing(sqlite3.connect(part)) as db:
@@ -92,7 +91,6 @@ def write_layers(path: Path, epsg: int, layers: Sequence[Layer]) -> None:
 
 
 def _put(db: sqlite3.Connection, epsg: int, layer: Layer) -> None:
-    """Put one layer into the file."""
     table, kind, columns = layer.table, layer.kind, layer.columns
     kinds = {n: "TEXT" if v and isinstance(v[0], str) else "DOUBLE" for n, v in columns.items()}
     ends = np.concatenate([*layer.places, np.zeros((0, 2))])

@@ -31,7 +31,6 @@ Job = TypeVar("Job")
 Made = TypeVar("Made")
 
 TILE_POINTS = 20_000_000
-CONNECT_S = 10.0
 POLL_S = 0.2
 
 
@@ -74,7 +73,6 @@ class Tiling:
 
 
 def footprints(store: Keyframes) -> list[KeyframeFootprint]:
-    """The ground covered by each keyframe with points."""
     out = []
     for k in main_keyframes(store):
         sample = ground_sample_m(k.depth)
@@ -135,7 +133,6 @@ def _on_map(
 
 
 def _corners_box(box: F64, move: Callable[[F64], F64] | None) -> Box:
-    """The box around the moved corners of a box."""
     west, south, east, north = (float(v) for v in box)
     if move is None:
         return west, south, east, north
@@ -152,7 +149,6 @@ def _bounds(prints: Sequence[KeyframeFootprint]) -> Box:
 
 
 def grown(box: Box, by_m: float) -> Box:
-    """The box with a margin around it."""
     return box[0] - by_m, box[1] - by_m, box[2] + by_m, box[3] + by_m
 
 
@@ -200,23 +196,26 @@ def _points_in(prints: Sequence[KeyframeFootprint], tile: Box) -> float:
 
 
 def overlap(a: Iterable[float], b: Iterable[float]) -> bool:
-    """True where two boxes have a place in common."""
     (aw, as_, ae, an), (bw, bs, be, bn) = a, b
     return aw <= be and ae >= bw and as_ <= bn and an >= bs
 
 
 def run_tiles(
-    make: Callable[..., Made], jobs: Sequence[Job], scheduler: str | None, progress: Progress
+    make: Callable[..., Made],
+    jobs: Sequence[Job],
+    scheduler: str | None,
+    progress: Progress,
+    connect_s: float = 10.0,
 ) -> Iterator[Made]:
     """``make(job, progress)`` of all jobs, in their order; only the one that is read is held.
 
     With ``scheduler`` (``tcp://HOST:8786``) they are made by a Dask cluster. OutsideError when it
-    cannot be reached. If it disconnects meanwhile, one line reports it and the missing tiles are
-    made here.
+    cannot be reached within ``connect_s``. If it disconnects meanwhile, one line reports it and the
+    missing tiles are made here.
     """
     count = 0
     if scheduler is not None:
-        for made in _on_cluster(make, jobs, scheduler, progress):
+        for made in _on_cluster(make, jobs, scheduler, progress, connect_s):
             count += 1
             progress(f"tile {count} of {len(jobs)} came from the cluster")
             yield made
@@ -227,13 +226,17 @@ def run_tiles(
 
 
 def _on_cluster(
-    make: Callable[..., Made], jobs: Sequence[Job], scheduler: str, progress: Progress
+    make: Callable[..., Made],
+    jobs: Sequence[Job],
+    scheduler: str,
+    progress: Progress,
+    connect_s: float,
 ) -> Iterator[Made]:
     """The first tiles, as many as the cluster delivers before it goes away."""
     with needing("a cluster"):
         from distributed import Client
     try:
-        client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
+        client = Client(scheduler, timeout=connect_s, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise OutsideError(
             f"no Dask scheduler answers at {scheduler} ({type(error).__name__}); start one with "

@@ -86,7 +86,6 @@ class Coverage:
         return [(round(float(r[0]), 8), round(float(r[1]), 8)) for r in rows]
 
     def figures(self) -> dict[str, Any]:
-        """Figures of the layer, for JSON."""
         layer, area = self.layer, self.layer.grid.cell_m**2
         known, inside = layer.known, layer.inside
         sigma, views = layer.sigma_m[known], layer.views[inside]
@@ -134,7 +133,6 @@ class Coverage:
         return cv2.imencode(".png", np.ascontiguousarray(image[::step, ::step]))[1].tobytes()
 
     def json_bytes(self) -> bytes:
-        """:meth:`figures` as JSON."""
         return (json.dumps(self.figures(), indent=2, sort_keys=True) + "\n").encode()
 
 

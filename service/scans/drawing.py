@@ -469,6 +469,5 @@ def _fitted(panel: Panel) -> U8:
 
 
 def _bgr(image: Array) -> U8:
-    """Any 8-bit gray or colour image as BGR."""
     image = np.asarray(image, np.uint8)
     return image if image.ndim == 3 else np.dstack([image] * 3)

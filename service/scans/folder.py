@@ -159,7 +159,6 @@ class _Files:
             write_whole(self._folder / CSV, csv_table(self._poses))
 
     def fuse(self, progress: Progress) -> None:
-        """Make the cloud."""
         with self.failures.noted(CLOUD):
             if self._tiled is None:
                 self._fused = fused_cloud(self._store, self._voxel_m, progress)
@@ -210,7 +209,6 @@ class _Files:
             self._coverage = write_coverage_files(self._folder, self._store)
 
     def summary(self, extra: dict[str, Any]) -> dict[str, Any]:
-        """The content of scan.json."""
         store, frame, fused = self._store, self._frame, self._fused
         header, run = store.header, (store.summary or {}) | extra
         notes, origin = [*header.notes, *fused.notes], None

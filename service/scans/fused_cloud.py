@@ -60,7 +60,7 @@ class FusedCloud:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Extent:
+class Extent:
     seq: int
     points: int
     ground_sample_m: float
@@ -109,23 +109,23 @@ def fused_cloud(
 
 def _extents(
     store: Keyframes, progress: Progress, box: Box, room: int
-) -> tuple[list[_Extent], dict[int, PointCloud]]:
+) -> tuple[list[Extent], dict[int, PointCloud]]:
     """The keyframes of the main piece with points, and the clouds of the first ``room`` points."""
-    out: list[_Extent] = []
+    out: list[Extent] = []
     held: dict[int, PointCloud] = {}
     for keyframe in progress.over(main_keyframes(store), len(store.seqs())):
         sample = ground_sample_m(keyframe.depth)
         cloud = _points(keyframe, box)
         if sample is not None and len(cloud):
             x = cloud.xyz_m[:, 0]
-            out.append(_Extent(keyframe.seq, len(cloud), sample, float(x.min()), float(x.max())))
+            out.append(Extent(keyframe.seq, len(cloud), sample, float(x.min()), float(x.max())))
             room -= len(cloud)
             if room >= 0:
                 held[keyframe.seq] = cloud
     return out, held
 
 
-def _decoded(store: Keyframes, extents: Sequence[_Extent]) -> Iterator[Keyframe | None]:
+def _decoded(store: Keyframes, extents: Sequence[Extent]) -> Iterator[Keyframe | None]:
     """The keyframes, spread over the flight, decoded by all cores."""
     calls = [partial(store.keyframe, seq) for seq in spread([e.seq for e in extents])]
     for at in range(0, len(calls), threads()):
@@ -133,7 +133,6 @@ def _decoded(store: Keyframes, extents: Sequence[_Extent]) -> Iterator[Keyframe 
 
 
 def _points(keyframe: Keyframe, box: Box) -> PointCloud:
-    """The keyframe's points in the box."""
     cloud = cloud_of(keyframe.depth, keyframe.bgr, keyframe.fresh, keyframe.time_ns)
     if box == EVERYWHERE:
         return cloud
@@ -141,7 +140,7 @@ def _points(keyframe: Keyframe, box: Box) -> PointCloud:
     return without(cloud, (x < box[0]) | (x > box[2]) | (y < box[1]) | (y > box[3]))
 
 
-def strip_edges(extents: Iterable[_Extent], max_points: int) -> list[float]:
+def strip_edges(extents: Iterable[Extent], max_points: int) -> list[float]:
     """Edges in x, from -inf to inf, of strips with at most about ``max_points`` each.
 
     A keyframe's points are assumed to be evenly spread over its width.
@@ -160,7 +159,7 @@ def strip_edges(extents: Iterable[_Extent], max_points: int) -> list[float]:
 
 def _strip(
     store: Keyframes,
-    extents: list[_Extent],
+    extents: list[Extent],
     held: dict[int, PointCloud],
     box: Box,
     low_m: float,

@@ -28,7 +28,6 @@ class Piece:
     refinement: dict[str, Any] | None = None
 
     def seqs(self) -> list[int]:
-        """Numbers of its keyframes."""
         return self.own
 
     def keyframe(self, seq: int) -> Keyframe | None:
@@ -63,7 +62,6 @@ def pieces_apart(store: ScanStore) -> list[Piece]:
 
 
 def main_seqs(store: Keyframes) -> list[int]:
-    """Numbers of the main piece's keyframes."""
     apart = stretches_apart(store)
     return [seq for seq in store.seqs() if not is_apart(seq, apart)]
 

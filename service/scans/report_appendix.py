@@ -82,7 +82,6 @@ def _cloud(summary: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def sensor_constants(graph: dict[str, Any]) -> list[tuple[str, str]]:
-    """Constant sensor errors found by the pose graph."""
     rows = []
     boresight, datum = graph.get("boresight"), graph.get("altitude_datum")
     if boresight is not None:
@@ -238,7 +237,6 @@ def _residuals(flown: dict[str, Any], refined: dict[str, Any]) -> str:
 
 
 def _drift(summary: dict[str, Any], poses: Sequence[PoseRecord]) -> list[tuple[str, str]]:
-    """Estimated and observed drift of the track."""
     out = []
     if len(poses) >= 2:
         sigma = [float(np.sqrt(np.trace(p.position_covariance))) for p in poses]

@@ -171,7 +171,6 @@ def _scale_bar(view: _View) -> str:
 
 
 def _caption(coverage: Coverage | None, summary: dict[str, Any], grown: int) -> str:
-    """Legend of the map."""
     times = "" if grown == 1 else f", {grown} times enlarged"
     out = [f"Flight path with error ellipses of {SIGMAS:g} sigma{times}."]
     if coverage is not None:

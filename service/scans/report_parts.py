@@ -37,7 +37,6 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
 
 
 def figure(data: bytes, kind: str, caption: str) -> str:
-    """An embedded image with its caption."""
     code = base64.b64encode(data).decode("ascii")
     image = f'<img alt="" src="data:{kind};base64,{code}">'
     return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -120,7 +120,6 @@ class SimulationOptions:
 
     @property
     def own_seed(self) -> int:
-        """The seed of the motion and the sensors."""
         return self.seed if self.flight_seed is None else self.flight_seed
 
     @property
@@ -134,7 +133,6 @@ class SimulationOptions:
 
     @property
     def frames(self) -> int:
-        """Number of frames in the video."""
         return max(1, round(self.plan.duration_s * self.fps))
 
 
@@ -207,7 +205,6 @@ class Simulation:
         return np.asarray(np.where(np.isfinite(met), met, outside))
 
     def sensors(self) -> Sensors:
-        """The drone's sensors, fresh from their seed."""
         rng = np.random.default_rng(self.options.own_seed + 3)
         return Sensors(self.flight, self.options.noise, rng)
 

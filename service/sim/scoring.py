@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 
 REACH_M = 5.0
 COMPLETE_WITHIN_M = 0.5
-NEAR_TRACK_M = 40.0
 DSM_CELL_M = 0.25
 MAX_POINTS = 300_000
 
@@ -53,8 +52,12 @@ def score(
     scan_folder: Path,
     truth_folder: Path,
     say: Callable[[str], object] = lambda text: None,
+    near_track_m: float = 40.0,
 ) -> dict[str, Any]:
-    """All figures of a scan against the truth, ready for JSON; InputError for missing parts."""
+    """All figures of a scan against the truth, ready for JSON; InputError for missing parts.
+
+    Ground within ``near_track_m`` of the ground track counts apart, too.
+    """
     say("reading the truth and the scan")
     truth = read_truth(truth_folder)
     scan = read_scan(scan_folder, truth.frame)
@@ -89,7 +92,7 @@ def score(
     report["dsm"] = {name: _dsm(scan, truth, fit) for name, fit in chosen.items()}
     say("completeness")
     seen = seen_surface(truth)
-    report["completeness"] = _completeness(scan, truth, seen, fits["surface"][best])
+    report["completeness"] = _completeness(scan, truth, seen, fits["surface"][best], near_track_m)
     for name, fit in fits["surface"].items():
         report["surface"][name]["fit"] = _fit_size(fit, scan.points)
     return report
@@ -193,21 +196,21 @@ def _distance_to(track: F64, points: F64) -> F64:
     return np.asarray(cKDTree(track).query(points)[0])
 
 
-def _completeness(scan: ScanResult, truth: Truth, seen: SeenSurface, fit: Fit) -> dict[str, float]:
-    """Share of the surface that the flight saw and the cloud has: in all, by steepness, and near.
-
-    Near is what lies within NEAR_TRACK_M of the ground track.
-    """
+def _completeness(
+    scan: ScanResult, truth: Truth, seen: SeenSurface, fit: Fit, near_track_m: float
+) -> dict[str, float]:
+    """Share of the seen surface that the cloud has: in all, by steepness, and near the
+    ground track."""
     covered = metrics.share_covered(seen.places, fit.points(scan.points), COMPLETE_WITHIN_M)
     flat = np.abs(seen.normals[:, 2]) > 0.5
-    near = _distance_to(truth.poses[:, :2, 3], seen.places[:, :2]) < NEAR_TRACK_M
+    near = _distance_to(truth.poses[:, :2, 3], seen.places[:, :2]) < near_track_m
     return {
         "share": float(covered.mean()),
         "share_flat": float(covered[flat].mean()) if flat.any() else float("nan"),
         "share_steep": float(covered[~flat].mean()) if (~flat).any() else float("nan"),
         "steep_part": float((~flat).mean()),
         "share_near_track": float(covered[near].mean()) if near.any() else float("nan"),
-        "near_track_m": NEAR_TRACK_M,
+        "near_track_m": near_track_m,
         "seen_m2": seen.area_m2,
         "within_m": COMPLETE_WITHIN_M,
     }

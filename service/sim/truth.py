@@ -108,7 +108,6 @@ def read_tum(path: Path) -> tuple[F64, F64]:
 
 
 def json_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file."""
     with reading(path):
         return dict(json.loads(path.read_text(encoding="utf-8")))
 

@@ -175,11 +175,9 @@ def test_neither_heartbeats_nor_answers_wait_for_the_disk_of_the_log(tmp_path: P
 def test_a_log_ends_although_the_disk_had_no_room_for_its_packets(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mavlink.component.vehicle.BACKLOG", 10)
-    monkeypatch.setattr("mavlink.component.vehicle.CLOSE_S", 0.0)
     port, reached, stall = free_port(), threading.Event(), threading.Event()
     with (
-        RehearsalVehicle(f"udpin:127.0.0.1:{port}") as daemon,
+        RehearsalVehicle(f"udpin:127.0.0.1:{port}", backlog=10, close_s=0.0) as daemon,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer,
     ):
         recorder = daemon.link.recorder

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,6 @@ from person import Browser, Page
 from portal_client import NEEDS, TOKEN, browser, flown_store
 
 from service.georeference import LocalFrame
-from service.ground import state
 from service.ground.portal import Portal, PortalConfig
 from service.offline.refine.refly import WAYPOINT
 from service.stream.codec import encode
@@ -271,13 +271,12 @@ def test_the_map_moves_and_zooms_about_the_pointer(page: Browser) -> None:
 
 @pytest.mark.parametrize("name", ["Orthophoto", "Coverage"])
 def test_a_keyframe_is_on_the_map_after_its_next_round(
-    browser: Browser, scans: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch, name: str
+    browser: Browser, scans: Path, house: HouseFlight, name: str
 ) -> None:
     """The page asks every 2 s, the server looks at the store at most 2 s before: 4 s in all."""
-    for age in ("MAP_AGE_S", "COVERAGE_AGE_S"):
-        assert getattr(state, age) <= 2.0
-        monkeypatch.setattr(state, age, 0.0)
-    portal = Portal(PortalConfig(scans, port=0, token=TOKEN))
+    usual = PortalConfig(scans, port=0, token=TOKEN)
+    assert usual.map_age_s <= 2.0 and usual.coverage_age_s <= 2.0
+    portal = Portal(replace(usual, map_age_s=0.0, coverage_age_s=0.0))
     portal.start()
     page = browser.other()
     page.page.clock.install()  # time passes for the page as the test says
@@ -305,11 +304,10 @@ ENDS = """[...document.querySelectorAll('.refly polyline')].flatMap(l =>
 
 
 def test_a_flight_over_weak_places_is_planned_while_the_scan_grows(
-    browser: Browser, scans: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+    browser: Browser, scans: Path, house: HouseFlight
 ) -> None:
-    monkeypatch.setattr(state, "COVERAGE_AGE_S", 0.0)
     (scans / "drone-1/test-1/scan.json").unlink()  # it is in flight
-    portal = Portal(PortalConfig(scans, port=0, token=TOKEN))
+    portal = Portal(PortalConfig(scans, port=0, token=TOKEN, coverage_age_s=0.0))
     portal.start()
     page = browser.other()
     page.page.clock.install()

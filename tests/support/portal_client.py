@@ -91,9 +91,9 @@ def _finished(house: HouseFlight) -> tempfile.TemporaryDirectory[str]:
 
 
 @contextlib.contextmanager
-def serving(store: Path) -> Iterator[Client]:
-    """A client of a portal on ``store``."""
-    portal = Portal(PortalConfig(store, port=0, token=TOKEN))
+def serving(store: Path, **limits: float) -> Iterator[Client]:
+    """A client of a portal on ``store``; ``limits`` are fields of its configuration."""
+    portal = Portal(PortalConfig(store, port=0, token=TOKEN, **limits))  # type: ignore[arg-type]
     portal.start()
     try:
         yield Client(portal)

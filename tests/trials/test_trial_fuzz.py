@@ -167,16 +167,11 @@ def test_health_page_answers_as_described(tmp_path: Path, record: Row) -> None:
 def test_portal_answers_as_described(tmp_path: Path, record: Row) -> None:
     """Requests made from the served description, right and wrong: never a fault of ours."""
     schemathesis = pytest.importorskip("schemathesis")
-    from service.ground.guard import Tokens
-    from service.ground.http import portal_app
-    from service.ground.library import Library
-    from service.ground.state import Jobs, PortalState
-    from service.workers import Workers
+    from service.ground.portal import Portal, PortalConfig
 
     token, tried = "a-token-of-the-trials", 0
     headers = {"Authorization": f"Bearer {token}", "Host": "127.0.0.1"}
-    state = PortalState(Library(tmp_path), Jobs(Workers()), list, None)
-    app = portal_app(state, Tokens({"trial": token}), True)
+    app = Portal(PortalConfig(tmp_path, port=0, token=f"trial {token}")).app
     schema = schemathesis.openapi.from_asgi("/api/openapi.json", app, headers=headers)
     for operation in schema.get_all_operations():
 

@@ -61,7 +61,6 @@ CAMERA = 100  # component id for the head's attitude
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:
-    """The history in a subtitle file; its clock is ``video``."""
     with path.open(encoding="utf-8", errors="replace") as file:
         return of_cues(path, _cues(file), config)
 

@@ -31,7 +31,6 @@ class _Session:
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:
-    """The history of the one autopilot in a telemetry log."""
     counts: Counter[str] = Counter()
     streams, autopilots = _collect(path, counts)
     warnings: list[str] = []

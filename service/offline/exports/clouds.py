@@ -201,7 +201,6 @@ def _config(
     half: float,
     vertical: str | None,
 ) -> copclib.CopcConfigWriter:
-    """COPC's header for these points."""
     import copclib
 
     extra = _extra_bytes(header)
@@ -307,7 +306,6 @@ def octree(
 
 
 def _nodes(depth: int, node: I64, key: I64, rows: I64) -> Iterator[tuple[Node, I64]]:
-    """The rows of each node of one level."""
     order = np.argsort(key, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0])
     for part in np.split(order, starts[1:]):

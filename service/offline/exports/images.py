@@ -27,9 +27,6 @@ from service.scans.main_piece import main_keyframes
 from service.scans.track import camera_of
 from service.stream.records import ScanHeader
 
-MAX_BYTES = 1_500_000_000
-"""All images of one tile together; more are made smaller."""
-
 SAME_TIME_NS = 5_000_000
 
 
@@ -131,11 +128,13 @@ def check_video(header: ScanHeader, video: Path) -> None:
     _opened(header, video).close()
 
 
-def _opened(header: ScanHeader, video: Path) -> CameraSource:
+def _opened(
+    header: ScanHeader, video: Path, opener: Callable[[str], CameraSource] = open_camera
+) -> CameraSource:
     """The open video; InputError when it is missing or its images have another size."""
     if not video.exists():
         raise InputError(f"{video}: no such file or folder; give the flight's video")
-    camera, source = camera_of(header), open_camera(str(video))
+    camera, source = camera_of(header), opener(str(video))
     if source.size_px != camera.size_px:
         source.close()
         raise InputError(
@@ -151,6 +150,7 @@ def frames_at(
     video: Path,
     epoch_ns: int | None,
     progress: Progress | None = None,
+    opener: Callable[[str], CameraSource] = open_camera,
 ) -> Iterator[tuple[int, U8]]:
     """Place of each time in ``times_ns`` (unix), and the frame of ``video`` taken then.
 
@@ -159,7 +159,7 @@ def frames_at(
     a frame are left out. Raises InputError when the video is of another size, or has no frame of
     these times.
     """
-    source = _opened(header, video)
+    source = _opened(header, video, opener)
     start = header.started_unix_ns if epoch_ns is None else epoch_ns
     times = np.array(times_ns, np.int64)
     found = set[int]()
@@ -190,16 +190,20 @@ def video_images(
     video: Path,
     epoch_ns: int | None,
     progress: Progress | None = None,
+    opener: Callable[[str], CameraSource] = open_camera,
+    max_bytes: int = 1_500_000_000,
 ) -> list[TextureView]:
-    """A view per keyframe by :func:`frames_at`, without distortion.
+    """A view per keyframe by :func:`frames_at`, without distortion; all of them together are no
+    larger than ``max_bytes``.
 
     Keyframes without a frame keep their stored image.
     """
     camera = camera_of(header)
     undistort = Undistorter(camera)
-    shrink = min(1.0, (MAX_BYTES / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
+    shrink = min(1.0, (max_bytes / (4.0 * np.prod(camera.size_px) * len(keyframes))) ** 0.5)
     found: dict[int, TextureView] = {}
-    for n, image in frames_at([k.time_ns for k in keyframes], header, video, epoch_ns, progress):
+    times = [k.time_ns for k in keyframes]
+    for n, image in frames_at(times, header, video, epoch_ns, progress, opener):
         bgra = _bgra(undistort.image(image), undistort.valid)
         whole = TextureView(bgra, camera.K, keyframes[n].depth.T_world_camera)
         found[n] = resized(whole, shrink)

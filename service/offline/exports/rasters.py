@@ -118,17 +118,14 @@ def ortho(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
 
 
 def write_dsm(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """:func:`dsm` as GeoTIFF."""
     _write(scan, out, options, dsm, GROUND_MARGIN_M)
 
 
 def write_dtm(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """:func:`dtm` as GeoTIFF."""
     _write(scan, out, options, dtm, GROUND_MARGIN_M)
 
 
 def write_ortho(scan: ScanView, out: Path, options: ExportOptions) -> None:
-    """:func:`ortho` as GeoTIFF."""
     _write(scan, out, options, ortho, GROUND_MARGIN_M)
     scan.shared(("written ortho", options), lambda: out)
 

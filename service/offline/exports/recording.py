@@ -115,7 +115,6 @@ class _Recording:
             self._say(line, header.started_unix_ns)
 
     def log_summary(self, store: ScanStore) -> None:
-        """How the scan ended."""
         if store.summary is not None:
             self._say(f"finished: {store.summary}", self._last_ns)
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon.mapping.free_space import air_above
 from recon.surface.ground import BareGround, terrain
 from recon.surface.hole_filling import LEVEL_M, completed, filled, outline, outlined
 from recon.surface.raster import (
@@ -23,7 +22,6 @@ from recon.surface.raster import (
 )
 from recon.types import F64, U8, Bool
 from service.offline.exports.view import ScanView
-from service.scans.main_piece import main_keyframes
 
 OPEN_STEP_M = 2
 SIDEWAYS_DEG = 15.0
@@ -152,7 +150,7 @@ def _at_lowest(measured: Raster, certain: Raster) -> Bool:
 def _unrefuted(scan: ScanView, raster: Raster, cells: Bool, free_up_m: Sequence[float]) -> Bool:
     """Those of the ``cells`` (rows, cols) that no keyframe sees through, and above which no surface
     hides the air at these heights from all keyframes that look there."""
-    is_open, behind = _air(scan, _places(scan, raster, cells), (-PROBE_M, *free_up_m))
+    is_open, behind = scan.air_above(_places(scan, raster, cells), (-PROBE_M, *free_up_m))
     out: Bool = cells.copy()
     out[cells] = ~is_open[:, 0] & ~(~is_open & (behind > 0))[:, 1:].any(axis=1)
     return out
@@ -178,7 +176,7 @@ def _open_to_the_sky(scan: ScanView, measured: Raster, raster: Raster) -> Raster
         return raster
     known, reach = raster.known, max(1, round(NEAR_M / raster.grid.cell_m))
     above_m = highest_lowest(measured.height_m, reach)[0] - raster.height_m
-    is_open, _ = _air(scan, cell_places(scan, raster)[known], heights_m.tolist())
+    is_open, _ = scan.air_above(cell_places(scan, raster)[known], heights_m.tolist())
     needed = (heights_m <= usual) | (above_m[known] > OPEN_STEP_M)[:, None]
     hidden = np.zeros(raster.grid.shape, np.bool_)
     hidden[known] = ~(is_open | ~needed).all(axis=1)
@@ -189,10 +187,3 @@ def _places(scan: ScanView, raster: Raster, cells: Bool) -> F64:
     """(N, 3) places of the middles of some of the cells in the scan's frame."""
     places = np.column_stack([raster.grid.centres(*np.nonzero(cells)), raster.height_m[cells]])
     return places if scan.frame is None else scan.frame.from_utm(places)
-
-
-def _air(scan: ScanView, places: F64, up_m: Sequence[float]) -> tuple[Bool, U8]:
-    """:func:`recon.mapping.free_space.air_above` at these heights above or below the places."""
-    keyframes = scan.progress.over(main_keyframes(scan.store), len(scan.store.seqs()))
-    with scan.progress.part("surface that is open to the sky", 0.3):
-        return air_above(places, up_m, (k.depth for k in keyframes))

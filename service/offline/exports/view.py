@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
@@ -14,8 +14,9 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from recon.mapping.free_space import air_above
 from recon.surface.raster import Grid, Raster, grid_over, rasterise_points, round_cell
-from recon.types import F64
+from recon.types import F64, U8, Bool
 from service.errors import InputError
 from service.georeference import LocalFrame, height_change, vertical_code
 from service.offline.exports import EXPORTERS, MAPPED, PACKAGES, kind_of
@@ -73,7 +74,6 @@ class ExportOptions:
 
     @property
     def datum(self) -> str | None:
-        """What the written heights are above, where that is known."""
         return self.to_datum or self.vertical_datum
 
     @property
@@ -230,7 +230,6 @@ class ScanView:
 
     @property
     def has_points(self) -> bool:
-        """Whether there is anything to make a deliverable of."""
         try:
             return bool(len(self.fused.cloud))
         except InputError:
@@ -272,6 +271,12 @@ class ScanView:
             return rasterise_points(self.xyz_m, cloud.rgb, cloud.sigma_m, self.grid(cell_m))
 
         return self.shared(("raster", cell_m), make)
+
+    def air_above(self, places_m: F64, up_m: Sequence[float]) -> tuple[Bool, U8]:
+        """:func:`recon.mapping.free_space.air_above` of all keyframes."""
+        keyframes = self.progress.over(main_keyframes(self.store), len(self.store.seqs()))
+        with self.progress.part("surface that is open to the sky", 0.3):
+            return air_above(places_m, up_m, (k.depth for k in keyframes))
 
     def needs_place(self, what: str) -> LocalFrame:
         """The frame; InputError when the scan has no georeference."""

@@ -226,7 +226,6 @@ class _Refinement:
         self.images: ImageNetwork | None = None
 
     def run(self) -> dict[str, Any]:
-        """Adjust and append; the figures."""
         survey = self._survey()
         places_m = np.array([s.T_world_camera[:3, 3] for s in self.states])
         if self.options.video is not None:
@@ -564,7 +563,6 @@ def _section(kind: type[Section], kept: Any) -> Section:
 
 
 def _ms(time_ns: float) -> int:
-    """A time in whole milliseconds, as the times of stills are known."""
     return round(time_ns / 1e6)
 
 

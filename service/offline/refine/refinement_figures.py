@@ -110,7 +110,6 @@ def _round(value: Any, digits: int = 4) -> float:
 
 
 def in_words(figures: dict[str, Any]) -> str:
-    """One line for the scan's notes."""
     parts = ["its own images" if "images" in figures else f"{figures['loops']['used']} loops"]
     if figures["telemetry"]:
         parts.append("the flight's telemetry")

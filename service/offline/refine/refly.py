@@ -282,7 +282,6 @@ def _behind(line: Line, swath: Swath) -> Line:
 def _first_place(
     coverage: Coverage, frame: LocalFrame, height_m: float | None
 ) -> tuple[float, float, float]:
-    """The ground below the first keyframe."""
     camera = coverage.places["camera_m"][0]
     lat, lon, alt = frame.to_geodetic(camera[None])[0]
     return float(lat), float(lon), float(alt) - (height_m or 0.0)

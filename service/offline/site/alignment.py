@@ -334,7 +334,6 @@ def _document(
     store: ScanStore, members: Sequence[Member], found: SiteAlignment,
     priors: Sequence[ScanPrior], ties: Sequence[Tie], notes: Sequence[str], known: dict[str, Any],
 ) -> dict[str, Any]:  # fmt: skip
-    """The content of site.json."""
     frame = local_frame(store.header)
     assert frame is not None
     pairs = _pairs(members, found, ties)

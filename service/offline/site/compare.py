@@ -354,7 +354,6 @@ def _changed(depth: DepthMap, image: Any, frame: LocalFrame | None) -> Bool:
 
 
 def _document(site: AlignedSite, change: Changes, one: int, two: int) -> dict[str, Any]:
-    """The content of change.json."""
     found = volumes([each.body for each in change.objects], change.alignment_m)
     before, after = site.members[one], site.members[two]
     count = len(change.objects)

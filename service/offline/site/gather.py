@@ -54,7 +54,6 @@ class Member:
 
     @property
     def seqs(self) -> range:
-        """Its keyframes' numbers in the site's store."""
         return range(self.first, self.last + 1)
 
 

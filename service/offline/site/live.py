@@ -188,7 +188,6 @@ class LiveSite:
         self._changed = True
 
     def remove(self, folder: Path) -> None:
-        """Stop to follow a scan."""
         one = self.scans.pop(folder)
         one.store.close()
         self._loops = {
@@ -199,7 +198,6 @@ class LiveSite:
         self._changed = True
 
     def refresh(self, folder: Path) -> None:
-        """Take in what has come of a scan."""
         self._changed |= self.scans[folder].refresh()
 
     def compare(self, folder: Path) -> None:

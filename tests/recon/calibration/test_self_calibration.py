@@ -218,13 +218,12 @@ def test_a_camera_beyond_belief_and_wild_sightings() -> None:
     assert "chessboard" in self_calibrate(far, start, near, seen, fixes, sigma).why_not
 
 
-def test_an_adjustment_that_has_not_settled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_adjustment_that_has_not_settled_is_refused() -> None:
     poses = _oblique_turn()
     points, seen = _seen(poses, TRUE)
     start, near = _guess(points, poses)
     fixes, sigma = poses[:, :3, 3], np.full((len(poses), 3), 0.3)
-    hasty = SelfCalibrationConfig(iterations=1)
-    monkeypatch.setattr("recon.calibration.flight.MAX_STEP", 0.003)
+    hasty = SelfCalibrationConfig(iterations=1, max_step=0.003)
     assert "settle" in self_calibrate(WRONG, start, near, seen, fixes, sigma, hasty).why_not
 
 

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 
 from recon.surface.raster import Grid, Raster, without_cells
 from recon.types import F32, F64, U8, Bool
@@ -41,8 +40,8 @@ class Air:
     unseen: Bool = field(default_factory=NOWHERE.copy)
     hidden: dict[float, Bool] = field(default_factory=dict)
 
-    def __call__(self, scan: Any, places: F64, up_m: Sequence[float]) -> tuple[Bool, U8]:
-        """As ``_air``: no surface is seen through, and the rest of the air is free."""
+    def above(self, places: F64, up_m: Sequence[float]) -> tuple[Bool, U8]:
+        """As a scan's: no surface is seen through, and the rest of the air is free."""
         cols, rows = (places[:, :2] * [1.0, -1.0] / CELL_M).astype(int).T
         behind = np.stack([self.hidden.get(up, NOWHERE)[rows, cols] for up in up_m], axis=1)
         is_free = ~self.unseen[rows, cols][:, None] & ~behind & (np.array(up_m) > 0.0)
@@ -50,7 +49,6 @@ class Air:
 
 
 def modelled(
-    monkeypatch: pytest.MonkeyPatch,
     height: F32,
     missing: Bool,
     air: Air,
@@ -66,54 +64,46 @@ def modelled(
         frame=None,
         off_nadir_deg=np.zeros(3),
         shared=lambda key, make: make(),
+        air_above=air.above,
     )
-    monkeypatch.setattr(surface, "_air", air)
     return surface.surface_model(scan, CELL_M)
 
 
-def test_level_ground_comes_back_as_measured_where_nothing_hides_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_level_ground_comes_back_as_measured_where_nothing_hides_it() -> None:
     """Next to the wall no fill is made, and the air above is not seen."""
     wall = GAP & (COLS == 29)
     height = house() + np.where(wall, np.float32(0.125), np.float32(0.0))
     air = Air(wall, {1: wall & (ROWS >= 28) & (ROWS < 30), 6: wall & (ROWS >= 32)})
-    found = modelled(monkeypatch, height, NOWHERE, air)
+    found = modelled(height, NOWHERE, air)
     is_back = wall & ((ROWS < 28) | (ROWS >= 30) & (ROWS < 32))
     assert (found.raster.height_m[is_back] == 0.125).all() and found.is_filled[is_back].all()
     assert not found.raster.known[wall & ~is_back].any()
 
 
-def test_a_ledge_below_air_that_was_not_seen_does_not_come_back(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_ledge_below_air_that_was_not_seen_does_not_come_back() -> None:
     ledge = (ROWS >= 24) & (ROWS < 36) & (COLS >= 10) & (COLS < 12)
     height = house() + np.where(ledge, np.float32(0.6), np.float32(0.0))
-    assert not modelled(monkeypatch, height, NOWHERE, Air(ledge)).raster.known[ledge].any()
-    assert modelled(monkeypatch, height, NOWHERE, Air()).raster.known[ledge].all()
+    assert not modelled(height, NOWHERE, Air(ledge)).raster.known[ledge].any()
+    assert modelled(height, NOWHERE, Air()).raster.known[ledge].all()
 
 
-def test_holes_are_filled_up_to_six_metres(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_holes_are_filled_up_to_six_metres() -> None:
     for cells, is_filled in ((22, True), (28, False)):
         hole = np.maximum(np.abs(ROWS - 29.5), np.abs(COLS - 29.5)) < cells / 2
-        found = modelled(monkeypatch, np.zeros((SIZE, SIZE), np.float32), hole, Air())
+        found = modelled(np.zeros((SIZE, SIZE), np.float32), hole, Air())
         assert found.raster.known[29, 29] == found.is_filled[29, 29] == is_filled
 
 
-def test_fills_near_something_higher_need_free_air_low_above_them(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_fills_near_something_higher_need_free_air_low_above_them() -> None:
     for up_m in (1, 2, 3):
-        found = modelled(monkeypatch, house(), GAP, Air(hidden={up_m: GAP & (ROWS >= 30)}))
+        found = modelled(house(), GAP, Air(hidden={up_m: GAP & (ROWS >= 30)}))
         near = GAP & (COLS == 28)
         assert found.raster.known[near & (ROWS < 30)].all()
         assert not found.raster.known[near & (ROWS >= 30)].any()
         assert (found.raster.height_m[GAP & (COLS < 28)] == 0.0).all()
 
 
-def test_beyond_the_outline_of_a_whole_scan_nothing_comes_back(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_beyond_the_outline_of_a_whole_scan_nothing_comes_back() -> None:
     """At the rim: level ground below unseen air, a bay without measurements, a narrow roof."""
     survey = (ROWS >= 10) & (ROWS < 50) & (COLS >= 10) & (COLS < 55)
     rim = (ROWS >= 30) & (ROWS < 40) & (COLS == 10)
@@ -121,7 +111,7 @@ def test_beyond_the_outline_of_a_whole_scan_nothing_comes_back(
     height = house()
     height[30:40, 52:] = 6.0
     for is_whole in (True, False):
-        found = modelled(monkeypatch, height, ~survey | bay, Air(rim), is_whole)
+        found = modelled(height, ~survey | bay, Air(rim), is_whole)
         known = found.raster.known
         assert known[rim].all() != is_whole and known[rim].any() != is_whole
         assert known[18, 15:19].any() != is_whole and known[31:39, 53].any() != is_whole

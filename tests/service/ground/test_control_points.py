@@ -171,22 +171,23 @@ def test_what_is_kept_can_be_read_again(client: Client, house: HouseFlight, tmp_
 
 
 def test_points_without_a_height_read_each_keyframe_once(
-    house: HouseFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    house: HouseFlight, tmp_path: Path
 ) -> None:
     flown(house, tmp_path, True)
     lat, lon, _ = house.origin
     points = [
         SurveyPoint(f"P{k}", lat, lon + 1e-6 * k, None, 0.03, 0.05, False, k, ()) for k in range(9)
     ]
-    with ScanStore.peek(tmp_path / "drone-1" / "test-1" / "scan.db") as store:
-        read = list[int]()
-        whole = ScanStore.keyframe
+    read = list[int]()
 
-        def counted(store: ScanStore, seq: int) -> Keyframe | None:
+    class Counted(ScanStore):
+        """Notes which keyframes are read."""
+
+        def keyframe(self, seq: int) -> Keyframe | None:
             read.append(seq)
-            return whole(store, seq)
+            return super().keyframe(seq)
 
-        monkeypatch.setattr(ScanStore, "keyframe", counted)
+    with Counted.peek(tmp_path / "drone-1" / "test-1" / "scan.db") as store:
         found = Marking(store).of(points)
     assert len(found) == 9 and sorted(read) == [0, 1, 2, 3, 4]
 

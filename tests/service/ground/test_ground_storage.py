@@ -17,7 +17,7 @@ from service.errors import InputError, OutsideError
 from service.ground import storage
 from service.ground.guard import kept_token
 from service.ground.library import Library
-from service.ground.storage import scan_files, scan_folder, take_in
+from service.ground.storage import check_room, scan_files, scan_folder, take_in
 from service.stream import codec
 from service.stream.naming import NAME, station_name
 from service.stream.radio_messages import pack_announce, pack_tile, tag_of, unpack_announce
@@ -128,17 +128,17 @@ def test_links_and_devices_on_a_card_are_not_followed(tmp_path: Path, card: Path
 
 
 def test_a_damaged_scan_leaves_the_others_and_no_card_fills_the_disk(
-    tmp_path: Path, card: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, card: Path
 ) -> None:
     (card / "scan-0").mkdir()
     (card / "scan-0" / "scan.db").write_bytes(b"no database")
     (card / "scan-2").symlink_to(tmp_path)
     (tmp_path / "link").symlink_to(card)  # the operator's own
     assert [path.name for path in received(tmp_path / "ground", tmp_path / "link")] == ["scan-1"]
-    nearly_full = shutil.disk_usage(tmp_path)._replace(free=10)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: nearly_full)
     with pytest.raises(OutsideError, match="has room for"):
-        received(tmp_path / "ground", card)
+        received(tmp_path / "ground", card, room_bytes=10)
+    with pytest.raises(OutsideError, match="has room for"):  # some of the disk stays free
+        check_room(shutil.disk_usage(tmp_path).free - 1_000_000, tmp_path)
 
 
 def test_a_station_whose_name_is_damaged_takes_another(tmp_path: Path) -> None:

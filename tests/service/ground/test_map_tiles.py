@@ -14,12 +14,11 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
-from portal_client import ONE, Client, client, flown_store, serving, store
+from portal_client import ONE, Client, flown_store, serving, store
 from pyproj import Transformer
 
 from recon.types import F64, U8
 from service.georeference import LocalFrame
-from service.ground import live_map
 from service.ground.live_map import LiveMap, degrees, mercator, on_map, pixel_m
 from service.ground.map_tiles import contour_mask, interval_m
 from service.ground.state import OpenScans
@@ -30,7 +29,7 @@ from service.stream.store import ScanStore
 if TYPE_CHECKING:
     from house_flight import HouseFlight
 
-__all__ = ["client", "store"]  # the fixtures
+__all__ = ["store"]  # the fixture
 
 FRAME = LocalFrame(47.39, 8.54, 408.0)
 TO_MERCATOR = Transformer.from_crs("EPSG:4326", "EPSG:3857", always_xy=True)
@@ -64,10 +63,11 @@ def tile(client: Client, layer: str, z: int, x: int, y: int) -> U8:
     return image
 
 
-@pytest.fixture(autouse=True)
-def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def client(store: Path) -> Iterator[Client]:
     """The map is looked at again with every request."""
-    monkeypatch.setattr("service.ground.state.MAP_AGE_S", 0.0)
+    with serving(store, map_age_s=0.0) as one:
+        yield one
 
 
 @pytest.mark.parametrize("zoom", [ZOOM - 3, ZOOM, ZOOM + 3])
@@ -107,12 +107,9 @@ def test_a_new_keyframe_and_a_correction_are_on_the_map(
     assert np.abs(at(client, "ortho", ROOF)[:3].astype(int) - ROOF_BGR).max() < 12
 
 
-def test_the_version_of_a_layer_is_that_of_its_tiles(
-    store: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_version_of_a_layer_is_that_of_its_tiles(store: Path, house: HouseFlight) -> None:
     """Else a page that saw the version of now would keep the tile of before."""
-    monkeypatch.setattr("service.ground.state.COVERAGE_AGE_S", 1000.0)
-    with serving(store) as client:
+    with serving(store, map_age_s=0.0, coverage_age_s=1000.0) as client:
 
         def versions() -> tuple[str, str]:
             answers = [client.ask(f"{TILES}/{layer}.json") for layer in ("ortho", "coverage")]
@@ -316,15 +313,12 @@ def test_a_deleted_scan_can_be_deleted_while_its_map_is_open(client: Client) -> 
     assert client.ask(f"{TILES}/ortho.json")[0] == 404
 
 
-def test_a_long_scan_is_read_in_turns(
-    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(live_map, "READ_S", -1.0)
+def test_a_long_scan_is_read_in_turns(tmp_path: Path, house: HouseFlight) -> None:
     folder = flown_store(tmp_path, house) / "drone-1/test-1"
     with ScanStore.open(folder / "scan.db") as scan:
         found = LiveMap(scan)
         for read in range(1, 8):
-            found.refresh()
+            found.refresh(read_s=-1.0)
             assert found.version == min(read, 5)
 
 

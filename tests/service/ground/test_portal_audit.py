@@ -225,7 +225,7 @@ def test_the_session_cookie_is_secure_under_tls(store: Path, scheme: str, secure
     }
 
     async def answer() -> None:
-        await portal._app(scope, receive, send)
+        await portal.app(scope, receive, send)
 
     asyncio.run(answer())
     headers = dict(sent[0]["headers"])

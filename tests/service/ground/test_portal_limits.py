@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from loopback import free_port, until
-from portal_client import ONE, TOKEN, Client, client, store
+from portal_client import ONE, TOKEN, Client, client, serving, store
 
-from service.ground import guard
 from service.ground.portal import Portal, PortalConfig
 from service.stream.session import SessionConfig, open_session
 from service.workers import Workers
@@ -99,33 +98,29 @@ def test_a_body_is_bounded_by_what_is_read(client: Client) -> None:
     assert client.ask(ONE)[1]["title"] == "in chunks"
 
 
-def test_a_body_that_does_not_come_is_given_up(
-    client: Client, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(guard, "BODY_S", 0.2)
-    answer = answer_to(client, f"PATCH {ONE} HTTP/1.1", b"2\r\n{}\r\n")
+def test_a_body_that_does_not_come_is_given_up(store: Path) -> None:
+    with serving(store, body_s=0.2) as client:
+        answer = answer_to(client, f"PATCH {ONE} HTTP/1.1", b"2\r\n{}\r\n")
     assert answer.startswith(b"HTTP/1.1 408 ")
 
 
 def test_a_reader_that_stops_reading_is_dropped(
-    client: Client,
-    store: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    store: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG, "service.ground.guard")
-    monkeypatch.setattr(guard, "STALL_S", 0.2)
     with open(store / "drone-1/test-1/cloud.ply", "wb") as file:
         file.truncate(200_000_000)
-    with socket.create_connection(address_of(client)) as one:
-        one.sendall(f"GET {ONE}/files/cloud.ply HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
-        until(lambda: "has stopped reading" in caplog.text)
+    with serving(store, stall_s=0.2) as client:
         received = 0
-        with contextlib.suppress(ConnectionResetError):
-            while block := one.recv(1 << 20):
-                received += len(block)
-    assert 0 < received < 200_000_000
-    assert client.ask("/api/scans")[0] == 200
+        with socket.create_connection(address_of(client)) as one:
+            head = f"GET {ONE}/files/cloud.ply HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+            one.sendall(head.encode())
+            until(lambda: "has stopped reading" in caplog.text)
+            with contextlib.suppress(ConnectionResetError):
+                while block := one.recv(1 << 20):
+                    received += len(block)
+        assert 0 < received < 200_000_000
+        assert client.ask("/api/scans")[0] == 200
 
 
 def test_views_without_a_token_do_not_lock_the_operator_out(client: Client) -> None:

@@ -15,7 +15,6 @@ from person import Browser
 from portal_client import NEEDS, ONE, TOKEN, Client, browser, client, store
 
 from service.errors import InputError, OutsideError
-from service.ground import upload as upload_module
 from service.ground.guard import MAX_UPLOAD_BYTES
 from service.ground.library import Library
 from service.ground.upload import MAX_LISTING_BYTES, Upload, unpack
@@ -170,21 +169,19 @@ def test_an_upload_is_as_long_as_it_said(store: Path) -> None:
     assert nothing_left(store)
 
 
-def test_an_upload_fits_the_disk(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.ground.storage.KEPT_FREE", 10.0)
-    monkeypatch.setattr("service.ground.storage.KEPT_FREE_BYTES", 1 << 60)
+def test_an_upload_fits_the_disk(store: Path) -> None:
     with pytest.raises(OutsideError, match="room for 0 MB"):
-        Upload(Library(store), [("scan.db", 2)])
+        Upload(Library(store), [("scan.db", 2)], room_bytes=1)
     assert nothing_left(store)
 
 
-def test_hostile_archives(tmp_path: Path, flown: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hostile_archives(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
 
     def refused(archive: Path, said: str, kind: type[Exception] = InputError) -> None:
         with pytest.raises(kind, match=said):
-            unpack(archive, out)
+            unpack(archive, out, room_bytes=40_000_000)
         assert not list(out.iterdir())
 
     none = zipped(tmp_path / "none.zip", ("readme.txt", b"x"))
@@ -199,10 +196,7 @@ def test_hostile_archives(tmp_path: Path, flown: Path, monkeypatch: pytest.Monke
     refused(other, "another method")
     bomb = zipped(tmp_path / "bomb.zip", ("scan.db", bytes(50_000_000)))
     assert bomb.stat().st_size < 100_000
-    monkeypatch.setattr(
-        upload_module, "check_room", lambda size, target: _refuse_more_than(40_000_000, size)
-    )
-    refused(bomb, "no room", OutsideError)
+    refused(bomb, "room for 40 MB", OutsideError)
     lying = bytearray(bomb.read_bytes())
     at = lying.rindex(b"PK\1\2")
     lying[at + 24 : at + 28] = (1000).to_bytes(4, "little")  # its size in the table of contents
@@ -210,11 +204,6 @@ def test_hostile_archives(tmp_path: Path, flown: Path, monkeypatch: pytest.Monke
     with pytest.raises(InputError, match="cannot be read"):
         unpack(tmp_path / "lying.zip", out)
     assert sum(p.stat().st_size for p in out.iterdir()) <= 1000
-
-
-def _refuse_more_than(room: int, size: int) -> None:
-    if size > room:
-        raise OutsideError("no room")
 
 
 DROP = """

@@ -17,17 +17,18 @@ from typer.testing import CliRunner
 
 from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh
+from recon.surface.texture_views import TextureView
 from service.cameras import CameraFrame
 from service.cli import app
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
-from service.offline import tiles
 from service.offline.exports import images, model
 from service.offline.exports.model import TileJob, TilePart, mesh_tile
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.tiles import KeyframeFootprint, Tile, run_tiles, tile_boxes
 from service.progress import Progress
 from service.scans.fused_cloud import EVERYWHERE
+from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
 if TYPE_CHECKING:
@@ -134,7 +135,7 @@ def test_the_same_mesh_comes_from_a_cluster(
 
 @pytest.mark.slow
 def test_a_scheduler_that_goes_away_is_said_and_the_rest_made_here(
-    tmp_path: Path, house: HouseFlight, cluster: Any, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, house: HouseFlight, cluster: Any
 ) -> None:
     house.flown(tmp_path).close()
     here = made(jobs(tmp_path), None, Progress())
@@ -149,14 +150,11 @@ def test_a_scheduler_that_goes_away_is_said_and_the_rest_made_here(
     assert len([t for t in reported if "disconnected" in t]) == 1
 
 
-def test_a_scheduler_that_is_not_there_ends_in_one_line(
-    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scheduler_that_is_not_there_ends_in_one_line(tmp_path: Path, house: HouseFlight) -> None:
     pytest.importorskip("distributed")
     house.flown(tmp_path).close()
-    monkeypatch.setattr(tiles, "CONNECT_S", 0.5)
     with pytest.raises(OutsideError, match="no Dask scheduler answers"):
-        made(jobs(tmp_path), "tcp://127.0.0.1:9", Progress())
+        next(run_tiles(mesh_tile, jobs(tmp_path), "tcp://127.0.0.1:9", Progress(), connect_s=0.5))
 
 
 @pytest.mark.slow
@@ -201,7 +199,7 @@ class FakeVideo:
 
 
 def test_images_come_from_the_video_at_the_keyframes_times(
-    tmp_path: Path, house: HouseFlight, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, house: HouseFlight
 ) -> None:
     with house.flown(tmp_path) as store:
         keyframes = list(store.keyframes())
@@ -209,26 +207,28 @@ def test_images_come_from_the_video_at_the_keyframes_times(
         camera = {"K": K.ravel().tolist(), "distortion": [0.0] * 5, "width": 320, "height": 180}
         header = replace(store.header, camera=camera)
     video = FakeVideo(house)
-    monkeypatch.setattr(images, "open_camera", lambda _: video)
-    views = images.video_images(keyframes, header, tmp_path, None)
+
+    def views_of(header: ScanHeader, epoch_ns: int | None = None, **how: Any) -> list[TextureView]:
+        opener = {"opener": lambda _: video} | how
+        return images.video_images(keyframes, header, tmp_path, epoch_ns, **opener)
+
+    views = views_of(header)
     assert len(views) == 5 and video.closed
     for view, keyframe in zip(views, keyframes, strict=True):
         assert view.bgra.shape == (180, 320, 4) and (view.bgra[..., 3] == 255).all()
         np.testing.assert_array_equal(view.T_world_camera, keyframe.depth.T_world_camera)
         np.testing.assert_allclose(view.K, K)
-    late = images.video_images(keyframes, header, tmp_path, header.started_unix_ns + 3 * 10**9)
+    late = views_of(header, header.started_unix_ns + 3 * 10**9)
     assert [v.bgra.shape[0] for v in late] == [90, 90, 90, 180, 180]  # the rest from the store
-    monkeypatch.setattr(images, "MAX_BYTES", 5 * 4 * 160 * 90)
-    small = images.video_images(keyframes, header, tmp_path, None)
+    small = views_of(header, max_bytes=5 * 4 * 160 * 90)
     assert {v.bgra.shape[:2] for v in small} == {(90, 160)}
     np.testing.assert_allclose(small[0].K[0, 0], 140.0)
     with pytest.raises(InputError, match="--video-epoch"):
-        images.video_images(keyframes, header, tmp_path, 0)
-    monkeypatch.setattr(images, "open_camera", lambda _: FakeVideo(house, (640, 360)))
+        views_of(header, 0)
     with pytest.raises(InputError, match="640x360"):
-        images.video_images(keyframes, header, tmp_path, None)
+        views_of(header, opener=lambda _: FakeVideo(house, (640, 360)))
     with pytest.raises(InputError, match="no camera model"):
-        images.video_images(keyframes, replace(header, camera={}), tmp_path, None)
+        views_of(replace(header, camera={}))
 
 
 def test_the_file_names_no_path_of_this_machine(
@@ -251,8 +251,6 @@ def test_the_file_names_no_path_of_this_machine(
 
 
 def test_an_empty_scan_is_refused(tmp_path: Path) -> None:
-    from service.stream.records import ScanHeader
-
     ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)).close()
     failed = CliRunner().invoke(app, ["mesh", str(tmp_path)])
     assert isinstance(failed.exception, InputError)

@@ -31,7 +31,7 @@ from service.scans.folder import (
     TUM,
     write_deliverables,
 )
-from service.scans.fused_cloud import _Extent, fused_cloud, strip_edges
+from service.scans.fused_cloud import Extent, fused_cloud, strip_edges
 from service.scans.retention import close_open_scans
 from service.scans.track import latest
 from service.stream.records import Repose, ScanHeader
@@ -276,7 +276,7 @@ def test_a_large_site_is_fused_strip_by_strip_to_the_same_cloud(
 
 
 def test_strips_hold_equal_shares() -> None:
-    extents = [_Extent(k, 1000, 0.2, 5.0 * k, 5.0 * k + 40.0) for k in range(100)]
+    extents = [Extent(k, 1000, 0.2, 5.0 * k, 5.0 * k + 40.0) for k in range(100)]
     edges = strip_edges(extents, 9000)
     assert edges[0] == -np.inf and edges[-1] == np.inf
     assert len(edges) == 13

@@ -21,6 +21,7 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.exports.model import glb
 from service.scans.fused_cloud import write_laz
+from service.sim import scoring
 from service.sim.recording import Faults, SimulationOptions
 from service.sim.truth import heights_below, read_surface, read_truth
 
@@ -117,15 +118,12 @@ def test_perfect_scan_scores_perfectly(flight: Path, tmp_path: Path) -> None:
     assert dsm["rms_away_from_steps_m"] < 0.15 and abs(dsm["median_m"]) < 0.02
 
 
-def test_ground_near_the_track_counts_apart(
-    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ground_near_the_track_counts_apart(flight: Path, tmp_path: Path) -> None:
     """A cloud with a gap below the flight is complete elsewhere."""
-    monkeypatch.setattr("service.sim.scoring.NEAR_TRACK_M", 5.0)
     points, track = true_cloud(flight), np.loadtxt(flight / "truth" / "trajectory.tum")[:, 1:3]
     nearby = np.linalg.norm(points[:, None, :2] - track[None], axis=2).min(axis=1) > 6.0
     scan = write_scan(tmp_path / "scan", flight, points[nearby], True, np.eye(3), np.zeros(3), 0.01)
-    complete = score(scan, flight)["completeness"]
+    complete = scoring.score(scan, flight, near_track_m=5.0)["completeness"]
     assert complete["share_near_track"] < 0.15 < 0.5 < complete["share"]
 
 
