@@ -1,10 +1,15 @@
 """Two tiers of tests, by folder or marker: ``make test`` runs the quick one, ``test-all`` both.
 
-A plugin of pytest; ``tests/conftest.py`` names it.
+A plugin of pytest; ``tests/conftest.py`` names it. Called with JUnit reports it prints the table of
+tests and processor seconds by folder and tier.
 """
 
 from __future__ import annotations
 
+import os
+import sys
+from collections import defaultdict
+from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -60,3 +65,57 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         done = has_run(report)
         config.hook.pytest_deselected(items=[i for i in items if reported(i.nodeid) in done])
         items[:] = [item for item in items if reported(item.nodeid) not in done]
+
+
+BEGUN_S = pytest.StashKey[float]()
+
+
+def spent_s() -> float:
+    """Processor time of this process and of its children that have ended."""
+    return sum(os.times()[:4])
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> Generator[None, None, None]:
+    """The test's processor time begins, with that of the fixtures that it is the first to need."""
+    item.stash[BEGUN_S] = spent_s()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Generator[None, None, None]:
+    """For the JUnit report."""
+    try:
+        return (yield)
+    finally:
+        tier = "quick" if item.get_closest_marker("slow") is None else "slow"
+        item.user_properties += [(tier, f"{spent_s() - item.stash[BEGUN_S]:.2f}")]
+
+
+def run_tests(report: Path) -> Iterator[tuple[str, str, float]]:
+    """(module, tier, processor seconds) of the tests that ran."""
+    for case in ElementTree.parse(report).iter("testcase"):
+        if case.find("skipped") is None:
+            for entry in case.iter("property"):
+                module = case.get("classname", "")
+                yield module, entry.get("name", ""), float(entry.get("value", "nan"))
+
+
+def tier_table(tests: Iterable[tuple[str, str, float]]) -> str:
+    """Markdown: tests and processor seconds by folder and tier."""
+    found: defaultdict[str, dict[str, list[float]]]
+    found = defaultdict(lambda: {"quick": [], "slow": []})
+    for module, tier, seconds in tests:
+        folders = [name for name in module.split(".") if not name.startswith(("test_", "Test"))]
+        for folder in ("/".join(folders), "all"):
+            found[folder][tier].append(seconds)
+    head = "| folder | quick tests | s | slow tests | s |\n|---|---|---|---|---|\n"
+    names = sorted(found, key=lambda name: (name == "all", name))
+    cells = ([f"{len(t)} | {sum(t):.0f}" for t in found[name].values()] for name in names)
+    return head + "".join(
+        f"| {name} | {' | '.join(row)} |\n" for name, row in zip(names, cells, strict=True)
+    )
+
+
+if __name__ == "__main__":
+    print(tier_table(one for path in sys.argv[1:] for one in run_tests(Path(path))))
