@@ -228,6 +228,17 @@ def start_of(
     return start_ns, 0
 
 
+def is_start_assumed(
+    source: CameraSource, log: TelemetryLog | None, video_epoch: float | None
+) -> bool:
+    """Whether :func:`start_of` takes the log's start for want of better."""
+    if log is None or log.clock == "video":
+        return False
+    if video_epoch is not None:
+        return log.clock != "unix" and not _covers(log, round(video_epoch * 1e9))
+    return log.clock != "unix" or source.epoch_unix_ns is None
+
+
 def _covers(log: TelemetryLog, start_ns: int) -> bool:
     """True when a video that starts then can be in the log."""
     return log.first_ns - 600e9 < start_ns < log.last_ns

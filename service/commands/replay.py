@@ -217,6 +217,7 @@ def _replay(
     from service.cameras.lens import check_width, fitted
     from service.commands.adjusted_stills import adjusted_stills
     from service.commands.missing_metadata import (
+        is_start_assumed,
         start_lens,
         start_of,
         with_own_lens,
@@ -261,6 +262,8 @@ def _replay(
     with nullcontext(Progress()) if as_json else showing("replay") as progress:
         if start is not None:
             inputs = with_own_lens(inputs, video, start, find_lens, progress)
+        if is_start_assumed(source, log, video_epoch):
+            inputs = replace(inputs, assumed=(*inputs.assumed, "start"))
         if played is source:
             inputs = adjusted_stills(inputs, is_latency_given, progress)
         stop = stop_by_signals()

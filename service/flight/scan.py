@@ -87,7 +87,7 @@ class ScanInputs:
     unix_offset_ns: int = 0  # history's clock to unix time
     history: VehicleHistory | None = None
     notes: tuple[str, ...] = ()
-    assumed: tuple[str, ...] = ()  # of "lens", "distortion"
+    assumed: tuple[str, ...] = ()  # of "lens", "distortion", "start" (on the history's clock)
     sigma_focal: float = 0.0  # of the focal length, as a share; 0: a calibrated camera
     extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
     latency_ms: float | None = None  # the camera's as an earlier scan found it
@@ -336,9 +336,10 @@ class Scan:
         }
 
     def _assumed(self) -> list[str]:
-        """What was assumed in this scan: "lens", "distortion", "view", "level", "height",
-        "altitude", and with a narrow view "turn", as vision alone cannot tell it from distance."""
-        out = list(self.inputs.assumed)
+        """What was assumed in this scan: "lens", "distortion", "start" unless turns confirm it,
+        "view", "level", "height", "altitude", and with a narrow view "turn", as vision alone cannot
+        tell it from distance."""
+        out = [w for w in self.inputs.assumed if w != "start" or not self.check.is_clock_sure]
         if self.attitudes == 0:
             out.append("view")
         if self.pipeline.keyframes.is_levelled:

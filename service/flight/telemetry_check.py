@@ -125,6 +125,11 @@ class TelemetryCheck:
         if self._frames is not None:
             self._frames.add(first_ns, second_ns, q)
 
+    @property
+    def is_clock_sure(self) -> bool:
+        """Whether the images turn with the log."""
+        return self.latency is not None and self.latency.correlation >= SURE_OF_CLOCK
+
     def clock_off_ms(self, has_ended: bool = False) -> float | None:
         """By how much a recording's stamps are surely late, beyond a camera's latency; or None.
 

@@ -112,6 +112,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     if broken > MAX_REFUTED_SHARE * steps:
         doubts.append(f"{refuted}: the images are too poor")
     unsized = []
+    if "start" in assumed:
+        unsized.append("when the recording began is assumed, and no turn confirms it")
     if "height" in assumed:
         unsized.append("the scale comes from an assumed height above ground")
     elif isinstance(scale, Mapping) and scale.get("from") == FIRST_TELEMETRY:

@@ -15,7 +15,7 @@ from command_line import skyrelief
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog
 from service.cameras.source import CameraSource
-from service.commands.missing_metadata import HOUR_NS, local_zone_ns, start_of
+from service.commands.missing_metadata import HOUR_NS, is_start_assumed, local_zone_ns, start_of
 from service.flight.scan import ScanInputs
 from service.progress import Progress
 from service.stream.store import ScanStore
@@ -121,22 +121,28 @@ def test_local_time_is_taken_where_one_zone_fits(
 
 
 @pytest.mark.parametrize(
-    ("clock", "given_s", "container_s", "zero_s", "unix_s"),
+    ("clock", "given_s", "container_s", "zero_s", "unix_s", "is_assumed"),
     [
-        ("video", None, EPOCH_S, 0.0, EPOCH_S),
-        ("video", EPOCH_S, None, 0.0, EPOCH_S),
-        ("boot", None, EPOCH_S, 80.0, EPOCH_S),
-        ("boot", EPOCH_S, EPOCH_S + 9.0, 80.0, EPOCH_S),
-        ("boot", 95.0, EPOCH_S, 95.0, 95.0),  # a time of the log's own clock
-        ("unix", None, 100.0, 100.0, 100.0),
-        ("unix", None, None, 80.0, 80.0),
+        ("video", None, EPOCH_S, 0.0, EPOCH_S, False),
+        ("video", EPOCH_S, None, 0.0, EPOCH_S, False),
+        ("boot", None, EPOCH_S, 80.0, EPOCH_S, True),
+        ("boot", EPOCH_S, EPOCH_S + 9.0, 80.0, EPOCH_S, True),
+        ("boot", 95.0, EPOCH_S, 95.0, 95.0, False),  # a time of the log's own clock
+        ("unix", None, 100.0, 100.0, 100.0, False),
+        ("unix", None, None, 80.0, 80.0, True),
     ],
 )
 def test_a_log_without_a_date_takes_that_of_its_video(
-    clock: str, given_s: float | None, container_s: float | None, zero_s: float, unix_s: float
+    clock: str,
+    given_s: float | None,
+    container_s: float | None,
+    zero_s: float,
+    unix_s: float,
+    is_assumed: bool,
 ) -> None:
     log = TelemetryLog(VehicleHistory(), clock, round(80e9), round(120e9), (), {})
     epoch_ns = None if container_s is None else round(container_s * 1e9)
     source = cast(CameraSource, SimpleNamespace(epoch_unix_ns=epoch_ns))
     zero_ns, offset_ns = start_of(source, log, given_s, [])
     assert (zero_ns, zero_ns + offset_ns) == (round(zero_s * 1e9), round(unix_s * 1e9))
+    assert is_start_assumed(source, log, given_s) == is_assumed

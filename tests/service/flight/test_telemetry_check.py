@@ -90,6 +90,13 @@ def test_the_latency_is_shown_and_not_applied_unless_asked(gimbal: str) -> None:
     assert latency["estimate_ms"] == pytest.approx(70.0, abs=10.0)
     assert abs(latency["estimate_ms"] - 70.0) < 3.0 * latency["sigma_ms"]
     assert len(reported) == 1 and reported[0].endswith("by the images, 0 ms is set")
+    assert check.is_clock_sure
+
+
+def test_a_flight_without_turns_leaves_its_clock_open() -> None:
+    check = TelemetryCheck(CameraConfig(), history_of("none", 0.0))
+    fly(check, 0.0, hz=2.0)
+    assert not check.is_clock_sure
 
 
 @pytest.mark.parametrize(

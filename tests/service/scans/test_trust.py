@@ -24,6 +24,7 @@ SURE: dict[str, Any] = {
         ({}, "gnss", "georeferenced", ""),
         ({}, "none", "scaled", "no positions"),
         ({"assumed": ["height"]}, "none", "relative", "assumed height"),
+        ({"assumed": ["start"]}, "gnss", "relative", "when the recording began"),
         ({"scale": {"sigma": 0.2}}, "gnss", "relative", "20%"),
         ({"scale": {"from": "first telemetry", "sigma": None}}, "exif", "relative", "too few"),
         ({"assumed": ["lens"]}, "gnss", "doubtful", "lens"),
