@@ -338,7 +338,7 @@ class Scan:
     def _assumed(self) -> list[str]:
         """What was assumed in this scan: "lens", "distortion", "start" unless turns confirm it,
         "view", "level", "height", "altitude", and with a narrow view "turn", as vision alone cannot
-        tell it from distance."""
+        separate it from distance."""
         out = [w for w in self.inputs.assumed if w != "start" or not self.check.is_clock_sure]
         if self.attitudes == 0:
             out.append("view")
