@@ -32,6 +32,9 @@ from recon.types import I16, U8
 LANES = 32
 """Cells that are updated together; LLVM spreads them over the registers that there are."""
 
+PARTS = 2
+"""Parts of them whose 16-bit envelopes the registers of AVX2 hold at once."""
+
 _FAR = 16383
 
 
@@ -52,9 +55,9 @@ def update_block(
 
     Addresses of: the data of label 0, the four messages that arrive (from below, above,
     right, left), the four that leave (up, down, left, right), the lanes that exist (-1 or 0)
-    and ``labels * 4 * LANES`` int16 of scratch. ``strides`` are bytes from label to label of the
-    data and of the messages;
-    ``slopes`` and ``cuts`` are the addresses of the smoothness of the four edges.
+    and ``(labels + 1) * 4 * LANES`` int16 of scratch. ``strides`` are bytes from label to label
+    of the data and of the messages; ``slopes`` and ``cuts`` are the addresses of the smoothness
+    of the four edges.
     """
     addresses = types.UniTuple(types.intp, 4)
     one = types.intp
@@ -64,85 +67,108 @@ def update_block(
 
 
 def _code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-    """LLVM of :func:`update_block`: lower envelope up the labels, then down."""
+    """LLVM of :func:`update_block`: lower envelope up the labels, then down.
+
+    Upwards in 16 bits, half the lanes at a time, whose envelopes stay in registers; downwards
+    nothing is above a truncation, so that 8 bits hold it.
+    """
     data, arriving, leaving, mask, scratch, strides, labels, slopes, cuts = args
+    word = data.type
     data_stride, stride = cgutils.unpack_tuple(builder, strides, 2)
-    block = _Block(builder)
     m_from = cgutils.unpack_tuple(builder, arriving, 4)
     m_to = cgutils.unpack_tuple(builder, leaving, 4)
+    slopes, cuts = (cgutils.unpack_tuple(builder, one, 4) for one in (slopes, cuts))
     sources = (m_from[1], m_from[0], m_from[3], m_from[2])  # what each message must leave out
-    exists = block.load(mask)
-    slope = [block.load(a) for a in cgutils.unpack_tuple(builder, slopes, 4)]
-    cut = [block.load(a) for a in cgutils.unpack_tuple(builder, cuts, 4)]
-    row = ir.Constant(data.type, 2 * LANES)
-    envelope = [block.variable(_FAR) for _ in range(4)]
-    lowest = [block.variable(_FAR) for _ in range(4)]
-    with cgutils.for_range(builder, labels) as loop:
-        offset = builder.mul(loop.index, stride)
-        total = block.load(builder.add(data, builder.mul(loop.index, data_stride)))
-        arrived = {a: block.load_message(builder.add(a, offset)) for a in m_from}
-        for message in arrived.values():
-            total = builder.add(total, message)
+    wide, narrow = _Lanes(builder, 16, LANES // PARTS), _Lanes(builder, 8, LANES)
+    whole = _Lanes(builder, 16, LANES)
+
+    def moved(address: Any, bytes_on: int) -> Any:
+        return builder.add(address, ir.Constant(word, bytes_on))
+
+    def place(label: Any, k: int) -> Any:
+        row = builder.add(builder.mul(label, ir.Constant(word, 4)), ir.Constant(word, k))
+        return builder.add(scratch, builder.mul(row, ir.Constant(word, 2 * LANES)))
+
+    lowest = builder.add(scratch, builder.mul(labels, ir.Constant(word, 8 * LANES)))
+    for part in range(PARTS):
+        first = part * LANES // PARTS
+        slope = [wide.load(moved(a, 2 * first)) for a in slopes]
+        envelope, low = ([wide.variable(_FAR) for _ in range(4)] for _ in range(2))
+        with cgutils.for_range(builder, labels) as loop:
+            offset = moved(builder.mul(loop.index, stride), first)
+            at = moved(builder.mul(loop.index, data_stride), 2 * first)
+            total = wide.load(builder.add(data, at))
+            arrived = {a: wide.load(builder.add(a, offset), 8) for a in m_from}
+            for message in arrived.values():
+                total = builder.add(total, message)
+            for k in range(4):
+                rest = builder.sub(total, arrived[sources[k]])
+                builder.store(wide.least(builder.load(low[k]), rest), low[k])
+                step = builder.add(builder.load(envelope[k]), slope[k])
+                best = wide.least(rest, step)
+                builder.store(best, envelope[k])
+                wide.save(best, moved(place(loop.index, k), 2 * first))
         for k in range(4):
-            rest = builder.sub(total, arrived[sources[k]])
-            builder.store(block.least(builder.load(lowest[k]), rest), lowest[k])
-            step = builder.add(builder.load(envelope[k]), slope[k])
-            best = block.least(rest, step)
-            builder.store(best, envelope[k])
-            place = builder.add(builder.mul(loop.index, ir.Constant(data.type, 4)),
-                                ir.Constant(data.type, k))  # fmt: skip
-            block.save(best, builder.add(scratch, builder.mul(place, row)))
-    after = [block.variable(_FAR) for _ in range(4)]
+            wide.save(builder.load(low[k]), moved(lowest, 2 * (k * LANES + first)))
+    exists = builder.trunc(whole.load(mask), narrow.type)
+    slope, cut = ([narrow.cut(whole.load(a)) for a in of] for of in (slopes, cuts))
+    low = [whole.load(moved(lowest, 2 * k * LANES)) for k in range(4)]
+    after = [narrow.variable(255) for _ in range(4)]
     with cgutils.for_range(builder, labels) as loop:
-        label = builder.sub(builder.sub(labels, loop.index), ir.Constant(data.type, 1))
+        label = builder.sub(builder.sub(labels, loop.index), ir.Constant(word, 1))
         offset = builder.mul(label, stride)
         for k in range(4):
-            place = builder.add(builder.mul(label, ir.Constant(data.type, 4)),
-                                ir.Constant(data.type, k))  # fmt: skip
-            best = block.load(builder.add(scratch, builder.mul(place, row)))
-            best = block.least(builder.sub(best, builder.load(lowest[k])), cut[k])
-            best = block.least(best, builder.add(builder.load(after[k]), slope[k]))
+            best = narrow.cut(builder.sub(whole.load(place(label, k)), low[k]))
+            most = narrow.least(narrow.sum(builder.load(after[k]), slope[k]), cut[k])
+            best = narrow.least(best, most)
             builder.store(best, after[k])
-            block.save_message(builder.and_(best, exists), builder.add(m_to[k], offset))
+            narrow.save(builder.and_(best, exists), builder.add(m_to[k], offset))
     return context.get_dummy_value()
 
 
-class _Block:
-    """Builds the instructions on LANES 16-bit integers at once."""
+class _Lanes:
+    """Builds the instructions on some integers at once: signed ones of 16 bits, unsigned of 8."""
 
-    def __init__(self, builder: Any) -> None:
-        self.builder = builder
-        self.type = ir.VectorType(ir.IntType(16), LANES)
-        self.message = ir.VectorType(ir.IntType(8), LANES)
+    def __init__(self, builder: Any, bits: int, count: int) -> None:
+        self.builder, self.bits, self.count = builder, bits, count
+        self.type = ir.VectorType(ir.IntType(bits), count)
 
-    def load(self, address: Any) -> Any:
-        """The lanes at an address, aligned or not."""
-        return self.builder.load(self.builder.inttoptr(address, self.type.as_pointer()), align=2)
+    def load(self, address: Any, bits: int = 0) -> Any:
+        """The lanes at an address, aligned or not; stored as so many ``bits``, if not as here."""
+        stored = ir.VectorType(ir.IntType(bits or self.bits), self.count)
+        lanes = self.builder.load(self.builder.inttoptr(address, stored.as_pointer()), align=1)
+        return lanes if stored == self.type else self.builder.zext(lanes, self.type)
 
     def save(self, value: Any, address: Any) -> None:
         """Put the lanes at an address."""
         pointer = self.builder.inttoptr(address, self.type.as_pointer())
-        self.builder.store(value, pointer, align=2)
+        self.builder.store(value, pointer, align=1)
 
-    def load_message(self, address: Any) -> Any:
-        """The lanes of a message at an address."""
-        pointer = self.builder.inttoptr(address, self.message.as_pointer())
-        return self.builder.zext(self.builder.load(pointer, align=1), self.type)
-
-    def save_message(self, value: Any, address: Any) -> None:
-        """Put the lanes of a message at an address."""
-        pointer = self.builder.inttoptr(address, self.message.as_pointer())
-        self.builder.store(self.builder.trunc(value, self.message), pointer, align=1)
+    def cut(self, wide: Any) -> Any:
+        """The lanes of 16 bits in 8, those above 255 as 255 and those below 0 as 0."""
+        none, most = (ir.Constant(wide.type, [n] * self.count) for n in (0, 255))
+        wide = self.builder.select(self.builder.icmp_signed(">", wide, none), wide, none)
+        wide = self.builder.select(self.builder.icmp_signed("<", wide, most), wide, most)
+        return self.builder.trunc(wide, self.type)
 
     def variable(self, value: int) -> Any:
         """A local variable with this value in all lanes."""
         variable = cgutils.alloca_once(self.builder, self.type)
-        self.builder.store(ir.Constant(self.type, [value] * LANES), variable)
+        self.builder.store(ir.Constant(self.type, [value] * self.count), variable)
         return variable
+
+    def sum(self, a: Any, b: Any) -> Any:
+        """The sum of 8-bit lanes, 255 where it is more."""
+        kind = ir.FunctionType(self.type, (self.type, self.type))
+        name = f"llvm.uadd.sat.v{self.count}i{self.bits}"
+        return self.builder.call(
+            cgutils.get_or_insert_function(self.builder.module, kind, name), (a, b)
+        )
 
     def least(self, a: Any, b: Any) -> Any:
         """The lesser of each lane."""
-        return self.builder.select(self.builder.icmp_signed("<", a, b), a, b)
+        compare = self.builder.icmp_unsigned if self.bits == 8 else self.builder.icmp_signed
+        return self.builder.select(compare("<", a, b), a, b)
 
 
 FULL_WEIGHT = 256
@@ -434,7 +460,7 @@ def _sweep_band(
     """
     height, _, labels, cells = data.shape
     masks = _masks(width, cells)
-    scratch = np.empty(labels * 4 * LANES, np.int16)
+    scratch = np.empty((labels + 1) * 4 * LANES, np.int16)
     first, last = height * band // bands, height * (band + 1) // bands
     for front in range(first, last + iterations):
         for t in range(iterations):
@@ -452,7 +478,7 @@ def _sweep_gap(
     """The messages that the bands on both sides of row ``edge`` left out."""
     labels, cells = data.shape[2], data.shape[3]
     masks = _masks(width, cells)
-    scratch = np.empty(labels * 4 * LANES, np.int16)
+    scratch = np.empty((labels + 1) * 4 * LANES, np.int16)
     for t in range(1, iterations):
         for v in range(edge - t, edge + t):
             _update_row(data, messages, v, t & 1, edges, masks, scratch)
