@@ -119,6 +119,11 @@ class BackgroundWorker(Generic[In, Out]):
             weakref.finalize(self, todo.put, None)  # also when it is never closed
 
     @property
+    def is_idle(self) -> bool:
+        """True when no offered work is left."""
+        return all(future.done() for future in self._offered)
+
+    @property
     def busy_s(self) -> float:
         """Seconds since the current work began; 0 when idle."""
         return _since(self._began_s)

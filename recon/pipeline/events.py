@@ -30,10 +30,18 @@ class KeyframeReady:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FirstDepth:
+    """What the next frames show of a view; :class:`KeyframeReady` replaces it, unless the view is
+    refused."""
+
+    keyframe: Keyframe
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PosesChanged:
     """Keyframes, by number, that came before and whose pose is better now."""
 
     poses: Mapping[int, Pose]
 
 
-Event = FramePosed | KeyframeReady | PosesChanged
+Event = FramePosed | FirstDepth | KeyframeReady | PosesChanged

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from recon import se3
 from recon.pipeline.config import Timing
 from recon.pipeline.views import StereoView
 from recon.posegraph.ground_heights import height_above, height_below
@@ -16,6 +17,7 @@ from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pieces import apart
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Trajectory
+from recon.poses import carried
 from recon.types import F64, DepthMap, Keyframe, Pose
 
 FARTHEST_M = 1e6
@@ -46,7 +48,7 @@ class KeyframeMap:
         self.trajectory, self._loops = trajectory, loops
         self.views = self.levelled = 0  # keyframes, and those whose ground is taken as level
         self._rejected, self._timing = rejected, timing
-        self._T_chain = np.eye(4)  # of the last keyframe
+        self._newest, self._T_chain = -1, np.eye(4)  # the last keyframe
 
     @property
     def graph(self) -> PoseGraph:
@@ -82,6 +84,7 @@ class KeyframeMap:
         below = height_below(depth, up) if depth is not None else None
         height = (below, 0.0) if below is not None else height_above(view.points, up)
         prior = levelled(view.prior, view.points)
+        self._newest = view.seq
         self.views += 1
         self.levelled += prior is not view.prior
         self.trajectory.add(
@@ -98,6 +101,15 @@ class KeyframeMap:
             self._rejected["placed impossibly far away"] += 1
         is_placed = self.graph.segments[view.segment].similarity is not None
         return GraphUpdate(pose, is_placed, is_near, self.changed() if depth is not None else {})
+
+    def ahead(self, view: StereoView) -> tuple[F64, Pose] | None:
+        """A view that is not added yet: T_odom_camera (4, 4) in its segment's chain, and its pose
+        in the world. None without a keyframe before it that has a place there."""
+        T_before = view.earlier.get(self._newest)
+        if T_before is None or self.graph.segments[view.segment].similarity is None:
+            return None
+        step = se3.inverse(T_before) @ view.image.T_odom_camera
+        return self._T_chain @ step, carried(self.trajectory.pose(self._newest), step)
 
     def changed(self, final: bool = False) -> dict[int, Pose]:
         """Better poses of keyframes published before, which count as published from now on."""

@@ -19,7 +19,8 @@ from recon.backends.cpu import CpuBackend
 from recon.mapping.cloud_fusion import cloud_of, fuse
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
 from recon.pipeline.config import Baseline, MapperConfig, Timing, untimed
-from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.events import Event, FirstDepth, FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.first_depth import FirstDepths
 from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.pipeline.stages import (
@@ -51,6 +52,9 @@ __all__ = ["Mapper", "MapperConfig"]
 
 Reconstruct = Callable[[StereoView], GraphUpdate]
 
+NO_POSE = Pose(np.eye(4), np.eye(6))
+"""Of a first depth, which the graph does not have."""
+
 
 class Worker(Protocol):
     """Does the work of :meth:`Mapper.reconstruct`, view by view."""
@@ -58,6 +62,9 @@ class Worker(Protocol):
     def offer(self, item: StereoView) -> None: ...
 
     def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]: ...
+
+    @property
+    def is_idle(self) -> bool: ...
 
     def close(self) -> None: ...
 
@@ -76,6 +83,8 @@ class InTurn:
         """Views with their results, once each."""
         done, self._done = self._done, []
         return done
+
+    is_idle = True
 
     def close(self) -> None:
         """Nothing is left to do."""
@@ -142,6 +151,11 @@ class Mapper:
         self.surface = SurfaceMap(
             float(camera.K[0, 0]), config.resolution_m, config.sigma_lens, config.sigma_k1, new_map
         )
+        self.first_depths = (
+            FirstDepths(backend, stereo, dense, self.keyframes, self.surface, timing)
+            if config.first_depths
+            else None
+        )
         self.frames = FramePoses(self.keyframes, self.follow.is_settled)
         self._lost: UndistortedFrame | None = None  # the last frame, where it has no pose
         self._kept: dict[int, Keyframe] | None = {} if keeps_cloud else None
@@ -180,6 +194,10 @@ class Mapper:
             return (*done, FramePosed(image.seq, image.time_ns, tracked, pose))
         for view in self.views.ready():
             self._worker.offer(view)  # to be reconstructed
+        if self.first_depths is not None and self._worker.is_idle:
+            first = self.views.first()
+            if first is not None:
+                self._worker.offer(first)
         done = tuple(self._finished())
         pose = self.frames.follow(image.prior, reference)
         posed = FramePosed(image.seq, image.time_ns, tracked, pose, reference, is_view)
@@ -197,6 +215,9 @@ class Mapper:
 
     def reconstruct(self, view: StereoView) -> GraphUpdate:
         """One view: its depth from all its partners, its pose, and its new surface."""
+        if view.is_first:
+            assert self.first_depths is not None
+            return GraphUpdate(NO_POSE, False, keyframe=self.first_depths(view))
         depth = None
         grid = self.rectify.grid(view)
         depths = self.carry(view, grid)  # by images that are matched already
@@ -247,6 +268,10 @@ class Mapper:
     def _finished(self, everything: bool = False) -> Iterator[Event]:
         """What is done, in order."""
         for view, update in self._worker.finished(everything):
+            if view.is_first:
+                if update.keyframe is not None:
+                    yield FirstDepth(update.keyframe)
+                continue
             self.frames.take(view.reference, update)
             if update.keyframe is not None:
                 self._ready.add(view.seq)

@@ -65,11 +65,7 @@ class SurfaceMap:
         if segment != self._segment:
             self._disagreement.forget()
             self._segment = segment
-        reduced = self._focal_px / float(depth.K[0, 0])
-        noise = np.float32(max(1.0, RECORDED_SIGMA_PX / LABEL_SIGMA_PX / reduced))
-        share = cv2.resize(rows_share, depth.depth_m.shape[::-1])
-        sigma_m = np.hypot(depth.sigma_m * noise, share * depth.depth_m)
-        in_odom = replace(depth, sigma_m=sigma_m, T_world_camera=T_odom_camera)
+        in_odom = self._in_odom(depth, rows_share, T_odom_camera)
         factor = np.float32(self._disagreement.take(in_odom))
         in_odom = replace(in_odom, sigma_m=in_odom.sigma_m * factor)
         known = self.known
@@ -78,6 +74,20 @@ class SurfaceMap:
         fresh = known.fresh(in_odom)
         known.insert(in_odom, fresh)
         return np.hypot(in_odom.sigma_m, self._bending(depth) * depth.depth_m), fresh
+
+    def peek(self, depth: DepthMap, rows_share: F32, T_odom_camera: F64) -> tuple[F32, Bool]:
+        """As :meth:`__call__`, of a depth that is not remembered and shows no disagreement."""
+        in_odom = self._in_odom(depth, rows_share, T_odom_camera)
+        fresh = np.isfinite(depth.depth_m) if self.known is None else self.known.fresh(in_odom)
+        return np.hypot(in_odom.sigma_m, self._bending(depth) * depth.depth_m), fresh
+
+    def _in_odom(self, depth: DepthMap, rows_share: F32, T_odom_camera: F64) -> DepthMap:
+        """The depth at its place, its sigma widened by what the recording and its rows limit."""
+        reduced = self._focal_px / float(depth.K[0, 0])
+        noise = np.float32(max(1.0, RECORDED_SIGMA_PX / LABEL_SIGMA_PX / reduced))
+        share = cv2.resize(rows_share, depth.depth_m.shape[::-1])
+        sigma_m = np.hypot(depth.sigma_m * noise, share * depth.depth_m)
+        return replace(depth, sigma_m=sigma_m, T_world_camera=T_odom_camera)
 
     def _bending(self, depth: DepthMap) -> F32:
         """Sigma by the lens over depth, (h, w) or a scalar.

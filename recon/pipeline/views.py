@@ -59,6 +59,10 @@ those kept."""
 KNOWN_ROWS = np.zeros((1, 1), np.float32)
 """No uncertain motion of rows adds to the sigma of depth."""
 
+FIRST_SHARE = 0.3
+"""Of a usual step: the first frame that far from a view is the partner of its first depth. Those
+nearer see the ground from too much the same place."""
+
 LAST_VIEW_SHARE = 0.1
 """A stretch's last frame becomes a view when it is this share of a usual step further on."""
 
@@ -79,6 +83,7 @@ class StereoView:
     earlier: Mapping[int, F64]  # number to pose (4, 4) of the segment's last few views
     # (n, m), all over the image: sigma of depth over depth by readout and turns that are not sure
     rows_share: F32 = field(default_factory=KNOWN_ROWS.copy)
+    is_first: bool = False  # it comes again, with all its partners
 
     @property
     def bgr(self) -> U8:
@@ -175,6 +180,14 @@ class ViewSelection:
         near.sort(key=lambda v: abs(_apart(v, last) - 0.65 * step))
         self._extra = (last, near[:1])
         return is_view
+
+    def shows_first(self, frame: UndistortedFrame, view: UndistortedFrame) -> bool:
+        """True when the frame can be the only partner of the newest view."""
+        step = self._step(view.segment)
+        if step is None or frame.segment != view.segment or not self.confirmed(view):
+            return False
+        is_sharp = not (frame.is_blurred or view.is_blurred)
+        return is_sharp and _apart(frame, view) >= FIRST_SHARE * step
 
     def _step(self, segment: int) -> float | None:
         """Distance between the last two views; None unless they are automatic and of it."""
@@ -307,6 +320,7 @@ class VirtualStereoCamera:
         self._fixes = FixAverage()
         self._waiting: deque[tuple[UndistortedFrame, PosePrior]] = deque()
         self._given: deque[RelativePose] = deque(maxlen=8)
+        self._first = -1  # number of the newest view that was given with its first partner
         self._latest: UndistortedFrame | None = None  # the last tracked frame, unless it is a view
         self._tracked: deque[tuple[int, RelativePose]] = deque(maxlen=TRACKED)  # times and places
 
@@ -351,9 +365,23 @@ class VirtualStereoCamera:
             elif view.is_blurred:
                 self._refused["blurred"] += 1
             else:
-                found = self._stereo_view(view, prior)
+                assert view.colour is not None
+                partners = self.selection.partners(view)
+                found = self._stereo_view(view, prior, partners, view.colour.take())
                 self._given.append(found.reference)
                 yield found
+
+    def first(self) -> StereoView | None:
+        """The newest view with the first frame that shows its depth as the only partner; once."""
+        if not self._waiting or self._latest is None:
+            return None
+        (view, prior), partner = self._waiting[-1], self._latest
+        if view.seq == self._first or not self.selection.shows_first(partner, view):
+            return None
+        self._first = view.seq
+        assert view.colour is not None
+        found = self._stereo_view(view, prior, [partner], view.colour.look())
+        return replace(found, is_first=True)
 
     def _is_ready(self, view: UndistortedFrame) -> bool:
         """True when its partners are there, and the images could show the readout."""
@@ -361,13 +389,13 @@ class VirtualStereoCamera:
         shows = search is not None and search.is_open and newest is not None and newest.is_measured
         return self.selection.ready(view) and not (shows and len(self._waiting) < HELD)
 
-    def _stereo_view(self, view: UndistortedFrame, prior: PosePrior) -> StereoView:
+    def _stereo_view(
+        self, view: UndistortedFrame, prior: PosePrior, partners: list[UndistortedFrame], bgr: U8
+    ) -> StereoView:
         reference, points = view.reference, landmark_points(view.keyframe)
         assert reference is not None
         points = se3.transform(se3.inverse(reference.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
-        assert view.colour is not None
-        partners, bgr = self.selection.partners(view), view.colour.take()
         return StereoView(
             view.seq,
             view.time_ns,

@@ -45,11 +45,16 @@ class Colour:
         self._image: U8 | None = image
         self._undistorter = undistorter
 
+    def look(self) -> U8:
+        """(H, W, 3) without distortion."""
+        assert self._image is not None, "a view is given once"
+        return self._undistorter.image(self._image)
+
     def take(self) -> U8:
-        """(H, W, 3) without distortion; once, as the image is not kept."""
-        image, self._image = self._image, None
-        assert image is not None, "a view is given once"
-        return self._undistorter.image(image)
+        """As :meth:`look`, once, as the image is not kept."""
+        bgr = self.look()
+        self._image = None
+        return bgr
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -62,10 +62,12 @@ class Outcome:
 
 PLACES = (
     "pose stored on board", "pose at the ground", "next keyframe exposed",
-    "depth stored on board", "coarse depth at the ground", "fine depth at the ground",
+    "depth stored on board", "first depth at the ground", "coarse depth at the ground",
+    "fine depth at the ground", "first depth at the portal's websocket",
     "depth at the portal's websocket",
 )  # fmt: skip
-"""In the order of the table. A keyframe waits for the next one, as its stereo partner."""
+"""In the order of the table. A keyframe waits for the next one, as its stereo partner; the first
+depth is by a frame between them, or the keyframe's own where that comes before."""
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
@@ -178,7 +180,9 @@ class _Watch:
         self._known = {place: RangeSet() for place in self._stores}
         self._versions = dict.fromkeys(self._stores, (-1, -1))
         self._seen: dict[str, dict[int, int]] = {place: {} for place in self._stores}
-        self.shown: dict[int, int] = {}  # keyframes at the websocket
+        self.firsts: dict[int, int] = {}  # first depths at the ground
+        self.shown: dict[int, int] = {}  # keyframes at the websocket, by a first depth or their own
+        self.replaced: dict[int, int] = {}  # by their own
         self.camera_ms = float("nan")
         self.is_over = False
 
@@ -202,6 +206,8 @@ class _Watch:
         self._versions[place] = version
         new = list(store.poses_beside(self._known[place]))
         now_ns = time.time_ns()
+        for (seq,) in store.database.all("SELECT number FROM radio WHERE kind = 'first'"):
+            self.firsts.setdefault(seq, now_ns)
         for _, pose in new:
             self._seen[place].setdefault(pose.time_unix_ns, now_ns)
 
@@ -215,9 +221,10 @@ class _Watch:
                 for message in socket:
                     if isinstance(message, bytes):
                         (size,) = struct.unpack_from("<I", message)
-                        self.shown.setdefault(
-                            json.loads(message[4 : 4 + size])["seq"], time.time_ns()
-                        )
+                        said = json.loads(message[4 : 4 + size])
+                        self.shown.setdefault(said["seq"], time.time_ns())
+                        if said["layer"] >= 0:
+                            self.replaced.setdefault(said["seq"], time.time_ns())
             time.sleep(LOOK_S)
 
     def outcome(self, began_ns: int, ended_ns: int) -> Outcome:
@@ -245,7 +252,10 @@ class _Watch:
                 note("next keyframe exposed", exposed_ns, following.get(exposed_ns))
                 note("depth stored on board", exposed_ns, at_ns)
                 note("coarse depth at the ground", exposed_ns, came_ns)
-                note("depth at the portal's websocket", exposed_ns, self.shown.get(seq))
+                at_ground = [at for at in (self.firsts.get(seq), came_ns) if at is not None]
+                note("first depth at the ground", exposed_ns, min(at_ground, default=None))
+                note("first depth at the portal's websocket", exposed_ns, self.shown.get(seq))
+                note("depth at the portal's websocket", exposed_ns, self.replaced.get(seq))
                 missing += came_ns is None
             elif layer == 1:
                 note("fine depth at the ground", exposed_ns, came_ns)

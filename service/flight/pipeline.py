@@ -24,6 +24,7 @@ from service.config import ComputeConfig, Config, ScanConfig, parse_baseline
 from service.flight.paged_map import PagedMap
 from service.flight.reports import GraphWatch
 from service.progress import Stopwatch
+from service.stream.outbox import FIRST_BYTES_S
 
 MAX_WAITING = 3
 """Views that wait for reconstruction."""
@@ -47,10 +48,16 @@ def sigma_lens(assumed: Collection[str], sigma_focal: float) -> float:
 
 
 def mapper_config(
-    camera: Camera, config: Config, assumed: Collection[str] = (), sigma_focal: float = 0.0
+    camera: Camera,
+    config: Config,
+    assumed: Collection[str] = (),
+    sigma_focal: float = 0.0,
+    live: bool = False,
 ) -> MapperConfig:
-    """The mapper's parameters by the configuration."""
-    compute, scan = config.compute, config.scan
+    """The mapper's parameters by the configuration; ``live`` for a flight that can be followed."""
+    compute, scan, link = config.compute, config.scan, config.datalink
+    is_sent = live and bool(link.connect or link.listen)
+    is_sent = is_sent and 125.0 * link.budget_kbit_s * link.share >= FIRST_BYTES_S
     return MapperConfig(
         baseline=Baseline(*parse_baseline(scan.baseline)),
         pairs=compute.pairs,
@@ -68,6 +75,7 @@ def mapper_config(
         sigma_lens=sigma_lens(assumed, sigma_focal),
         sigma_k1=SIGMA_K1 if "distortion" in assumed else 0.0,
         keeps_debug=scan.keep_debug,
+        first_depths=is_sent and not scan.keep_debug,
     )
 
 
@@ -99,7 +107,7 @@ class Pipeline(Mapper):
         camera = with_shutter(camera, config.camera)
         super().__init__(
             camera,
-            mapper_config(camera, config, assumed, sigma_focal),
+            mapper_config(camera, config, assumed, sigma_focal, live),
             backend,
             known,
             partial(PagedMap, folder=pages, max_voxels=config.compute.map_voxels),

@@ -14,7 +14,7 @@ import numpy as np
 
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
-from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.events import Event, FirstDepth, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import pose_at
 from recon.posegraph.ground_heights import GUESSED_SHARE
 from recon.poses import sigma_m
@@ -210,6 +210,10 @@ class Recorder:
         self._origin_written = True
 
     def _write_keyframes(self, events: Iterable[Event]) -> None:
+        for event in events:
+            if isinstance(event, FirstDepth):
+                first = encode(event.keyframe, event.keyframe.time_ns + self._offset_ns)[0]
+                self.store.offer_first(event.keyframe.seq, first)
         keyframes = [event.keyframe for event in events if isinstance(event, KeyframeReady)]
         if keyframes:
             self._write_due()

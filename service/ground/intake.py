@@ -189,6 +189,8 @@ class ScanIntake:
 
     def _is_sound(self, kind: str, number: int, record: bytes) -> bool:
         """Whether a layer is the item that its parts named."""
+        if kind == "first":
+            kind = "k0"
         if not kind.startswith("k"):
             return True
         head = codec.peek(record)

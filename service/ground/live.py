@@ -91,6 +91,18 @@ def chunk_message(store: ScanStore, seq: int, layer: int) -> bytes | None:
     return b"".join([struct.pack("<I", len(text)), text, *sections])
 
 
+def withdrawn(seq: int) -> bytes:
+    """The message by which a keyframe shows nothing: its first depth is void."""
+    text = json.dumps(
+        {
+            "type": "chunk", "seq": seq, "layer": -1, "time_unix_s": 0.0, "size": [1, 1],
+            "K": [1.0, 1.0, 0.0, 0.0], "box": [0, 0, 0, 0], "low": 0.0, "step": 1.0,
+            "T": columns(np.eye(4)), "scale": 1.0, "bytes": [0] * 5,
+        }
+    ).encode()  # fmt: skip
+    return struct.pack("<I", len(text)) + text
+
+
 def _codes(section: bytes) -> bytes:
     """The codes of a JPEG-LS section under zlib; empty when it is."""
     size = planes.image_size(section)
@@ -142,7 +154,7 @@ class LiveFeed:
     """Gives what is new in a store since the last call.
 
     One feed serves one browser. Keyframes are sent in their finest layer; a finer one that arrives
-    later is sent again and replaces it.
+    later is sent again and replaces it. A first depth is withdrawn when it is void.
     """
 
     store: ScanStore
@@ -174,6 +186,9 @@ class LiveFeed:
         finest = {
             seq: min(layer, 0) if self.coarse else layer for seq, (layer, _) in states.items()
         }
+        for seq in [seq for seq, layer in self._sent.items() if layer < 0 and seq not in states]:
+            del self._sent[seq]
+            yield withdrawn(seq)
         due = [seq for seq, layer in finest.items() if layer > self._sent.get(seq, -2)]
         self._more = len(due) > max_chunks
         for seq in due[:max_chunks]:

@@ -26,9 +26,10 @@ _HEAD = struct.Struct("<2sBBIHHIII")
 HEAD_BYTES = _HEAD.size
 MAGIC = b"SK"
 PART_VERSION = 1
-MAX_RECORD_BYTES, MAX_SMALL_BYTES = 1 << 24, 1024
+MAX_RECORD_BYTES, MAX_FIRST_BYTES, MAX_SMALL_BYTES = 1 << 24, 1 << 16, 1024
 MAX_BYTES = {
     "image": MAX_IMAGE_BYTES,
+    "first": MAX_FIRST_BYTES,
     "header": MAX_HEADER_BYTES,
     "summary": MAX_SUMMARY_BYTES,
     "pose": MAX_SMALL_BYTES,
@@ -44,7 +45,7 @@ MAX_OPEN_BYTES = 1 << 25
 PIECE_BYTES = 160
 """Memory per part beyond its payload."""
 
-KINDS = {0: "header", 1: "summary", 2: "pose", 3: "repose", 4: "image"} | {
+KINDS = {0: "header", 1: "summary", 2: "pose", 3: "repose", 4: "image", 5: "first"} | {
     16 + k: f"k{k}" for k in range(8)
 }
 """Code of a part to the kind of its record: ``k0`` is the coarsest layer of a keyframe."""

@@ -213,6 +213,8 @@ MAX_ESTIMATES = 256
 HEAD_AFTER_NEWS_S = 0.5
 HEAD_IDLE_S = 2.0
 HEAD_COMPLETE_S = 10.0
+FIRST_BYTES_S = 40_000.0
+"""A link that carries less than this is sent no first depths."""
 POSE_ROOM, COARSE_ROOM, FINE_ROOM = 64, 32, 4
 """Capacity of each live lane; the last one carries image and fine layer of a keyframe."""
 
@@ -278,7 +280,9 @@ class Outbox:
         feed.head_due = min(feed.head_due, max(now, feed.head_sent + HEAD_AFTER_NEWS_S))
         if kind in ("header", "summary") or not self.listened(now):
             return
-        lane = POSE if kind in ("pose", "repose") else COARSE if kind == "k0" else FINE
+        if kind == "first" and self.bucket.rate_bytes_s < FIRST_BYTES_S:
+            return
+        lane = POSE if kind in ("pose", "repose") else COARSE if kind in ("k0", "first") else FINE
         self._live[lane].push(feed.store, kind, number)
 
     def offers(self, scan_id: str) -> bool:

@@ -1,4 +1,5 @@
-"""A keyframe's coarse layer as tiles of the narrow radio, and back; their table in a store."""
+"""A keyframe's coarse layer as tiles of the narrow radio, and back; their table in a store, which
+also holds the newest first depth."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from recon.types import DepthMap, Keyframe, Pose
-from service.stream import planes
+from service.stream import codec, planes
 from service.stream.database import Database, blob
 from service.stream.radio_messages import CELLS, RadioTile, unpack_pose, unpack_tile
 from service.stream.ranges import is_number
@@ -109,8 +110,21 @@ class RadioStore:
             self._db.write([("INSERT OR REPLACE INTO radio VALUES (?, ?, ?, ?)", row)])
             return True
 
+    def put_first(self, seq: int, data: bytes) -> None:
+        """Store a keyframe's first depth, a layer; it replaces the former keyframe's."""
+        drop, row = "DELETE FROM radio WHERE kind = 'first'", ("first", seq, 0, data)
+        self._db.write([(drop, ()), ("INSERT INTO radio VALUES (?, ?, ?, ?)", row)])
+
+    def drop_first(self) -> None:
+        self._db.write([("DELETE FROM radio WHERE kind = 'first'", ())])
+
     def keyframe(self, seq: int) -> Keyframe | None:
-        """The keyframe shown by its tiles; None without any."""
+        """The keyframe of its first depth, or shown by its tiles; None without any."""
+        sql = "SELECT data FROM radio WHERE kind = 'first' AND number = ?"
+        first = self._db.one(sql, (seq,))
+        decoded = None if first is None else codec.decode([blob(first[0])])
+        if decoded is not None and decoded.seq == seq:
+            return decoded
         sql = "SELECT data FROM radio WHERE kind = 'tile' AND number = ? ORDER BY part"
         tiles = [unpack_tile(blob(row[0])) for row in self._db.all(sql, (seq,))]
         return keyframe_of([tile[1] for tile in tiles if tile is not None])

@@ -250,6 +250,10 @@ class Inventory:
     def note(self, kind: str, number: int) -> None:
         """Add an item and notify the listeners."""
         self.of(kind).add(number)
+        self.tell(kind, number)
+
+    def tell(self, kind: str, number: int) -> None:
+        """Notify the listeners."""
         for listener in self._listeners:
             listener(kind, number)
 

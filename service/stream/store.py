@@ -94,6 +94,7 @@ class ScanStore:
         self.chunk_bytes = int(total[0]) if total else 0
         self._inventory = Inventory(self.database)
         self._radio = RadioStore(self.database)
+        self._first = -1, b""  # number and coarse layer of the newest first depth
         self._held: dict[tuple[int, int], Keyframe] = {}  # by number and layer
         self._held_room: int | None = None  # bytes; None: nothing is held
         self._holding = Lock()
@@ -249,6 +250,24 @@ class ScanStore:
             self._inventory.note(chunk_kind(row[1]), row[0])
         return len(fresh)
 
+    def offer_first(self, seq: int, layer: bytes) -> None:
+        """Report a keyframe's first depth, a coarse layer, to the listeners. It is in memory only,
+        until the next one or the keyframe's own layers come."""
+        with self._lock:
+            self._first = seq, layer
+            self._inventory.tell("first", seq)
+
+    def _put_first(self, seq: int, data: bytes) -> bool:
+        """Show a first depth from the other end until its keyframe comes, another first depth, or
+        the end of the scan; False when it is no layer of this keyframe."""
+        head = codec.peek(data)
+        if head is None or head.seq != seq:
+            return False
+        with self._lock:
+            if not self.finished and seq not in self._inventory.of("k0"):
+                self._radio.put_first(seq, data)
+        return True
+
     def chunk(self, seq: int, number: int) -> bytes | None:
         """The coded layer ``number`` of keyframe ``seq``."""
         sql = f"SELECT data FROM chunks WHERE seq = ? AND layer = ? AND {_NOT_TOO_LARGE}"
@@ -263,7 +282,7 @@ class ScanStore:
     def keyframe(self, seq: int) -> Keyframe | None:
         """Keyframe ``seq`` at its finest stored layer, with the newest re-pose applied.
 
-        Without a layer, the tiles of the narrow radio are used.
+        Without a layer, the first depth or the tiles of the narrow radio are used.
         """
         decoded = self.keyframe_as_sent(seq)
         repose = self.repose(seq)
@@ -321,9 +340,9 @@ class ScanStore:
         return sorted(stored | self._radio.seqs())
 
     def states(self) -> dict[int, tuple[int, int]]:
-        """Each keyframe's finest stored layer, -1 for tiles of the narrow radio alone, and the
-        revision of its newest re-pose, -1 without one."""
-        radio = "SELECT number, -1 FROM radio WHERE kind = 'tile'"
+        """Each keyframe's finest stored layer, -1 for a first depth or tiles of the narrow radio
+        alone, and the revision of its newest re-pose, -1 without one."""
+        radio = "SELECT number, -1 FROM radio WHERE kind IN ('tile', 'first')"
         chunks = f"SELECT seq, layer FROM chunks WHERE {_IS_LAYER}"
         finest = f"SELECT seq, MAX(layer) FROM ({chunks} UNION {radio}) WHERE {is_number('seq')}"
         layers = self.database.all(f"{finest} GROUP BY seq ORDER BY seq")
@@ -441,6 +460,9 @@ class ScanStore:
             return data if zlib.crc32(data) == number else None
         if kind.startswith("k"):
             return self.chunk(number, int(kind[1:]))
+        if kind == "first":
+            seq, layer = self._first
+            return layer if seq == number and number not in self._inventory.of("k0") else None
         if kind == "image":
             return self.image(number)
         table = {"pose": "poses", "repose": "reposes"}[kind]
@@ -455,6 +477,8 @@ class ScanStore:
             return self.put_repose(number, data)
         if kind in ("header", "summary"):
             return self._put_whole(kind, number, data)
+        if kind == "first":
+            return self._put_first(number, data)
         return self.add_image(number, data) if kind == "image" else self.add_chunk(data)
 
     def _put_whole(self, kind: str, number: int, data: bytes) -> bool:
@@ -493,6 +517,8 @@ class ScanStore:
 
     def _set_whole(self, kind: str, data: bytes, header: ScanHeader) -> None:
         with self._lock:
+            if kind == "summary":
+                self._radio.drop_first()
             self.database.set(kind, data.decode())
             self._header = header
             self._inventory.note_whole(kind, data)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from some_views import view_at
 
 import recon
 from recon import se3
-from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.events import FirstDepth, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.keyframe_map import GraphUpdate
 from recon.pipeline.mapper import Mapper, moved
 from recon.pipeline.views import StereoView
@@ -85,6 +86,8 @@ class BrokenOff:
         poses = dict.fromkeys((7, self.views), Pose(np.eye(4), np.eye(6), scale=3.0))
         return [(view, GraphUpdate(poses[7], True, True, poses, keyframe(self.views)))]
 
+    is_idle = True
+
     def close(self) -> None: ...
 
 
@@ -134,3 +137,17 @@ def test_the_library_needs_nothing_of_the_service() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
     )
     assert not [name for name in ran.stdout.split() if name.startswith(("service", "mavlink"))]
+
+
+class FirstOnly(BrokenOff):
+    """Gives one first depth."""
+
+    def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]:
+        [(view, update)] = super().finished(everything)
+        return [(replace(view, is_first=True), replace(update, changed={}))]
+
+
+def test_a_first_depth_is_said_and_becomes_no_part_of_the_map() -> None:
+    mapper = Mapper(CAMERA, worker=FirstOnly)
+    assert [type(event) for event in mapper.drain()] == [FirstDepth]
+    assert len(mapper.cloud()) == 0 and not mapper.frames._views

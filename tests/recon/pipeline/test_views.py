@@ -287,3 +287,43 @@ def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: f
     for blur in blurs:
         assert blur is not None
         np.testing.assert_allclose(blur, [-30.0 / 50.0 * 10.0 * exposure_s, 0.0], atol=1e-9)
+
+
+def test_a_view_is_given_once_with_the_first_frame_that_shows_its_depth() -> None:
+    """From the third view of a stretch on, by a sharp frame 0.3 of a step away, whether or not
+    its other partners are there; then it comes again with all of them."""
+    keys = list[OdometryKeyframe]()
+    views = stereo_camera(keys)
+
+    def take(seq: int, x_m: float, blurred: bool = False) -> None:
+        plain = frame(seq, x_m)
+        is_key = seq % 10 == 0
+        if is_key:
+            keys.append(plain.keyframe)
+        image = UndistortedFrame(
+            seq, seq, PosePrior(), plain.colour, plain.gray, plain.pyramid, None, blurred
+        )
+        state = Tracking.TRACKED if not is_key else Tracking.KEYFRAME if seq else Tracking.STARTED
+        views.take(image, Tracked(state, 0, plain.T_odom_camera))
+
+    take(0, 0.0)
+    take(10, 6.0)
+    take(14, 8.5)
+    assert views.first() is None  # two views alone confirm nothing
+    take(20, 12.0)
+    assert views.first() is None
+    take(21, 13.5)
+    assert views.first() is None  # too near
+    take(22, 14.5, blurred=True)
+    assert views.first() is None
+    take(23, 15.0)
+    first = views.first()
+    assert first is not None and first.is_first
+    assert (first.seq, [partner.seq for partner in first.partners]) == (20, [23])
+    take(24, 16.0)
+    assert views.first() is None  # once
+    take(30, 18.0)
+    whole = {view.seq: view for view in views.ready()}
+    assert not any(view.is_first for view in whole.values())
+    assert {partner.seq for partner in whole[20].partners} == {0, 10, 30}
+    np.testing.assert_array_equal(whole[20].bgr, first.bgr)

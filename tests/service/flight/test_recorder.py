@@ -13,7 +13,7 @@ import pytest
 
 from recon import se3
 from recon.camera_model import scaled_K
-from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.events import FirstDepth, FramePosed, KeyframeReady, PosesChanged
 from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.segments import Segments
@@ -201,6 +201,21 @@ def test_corrections_of_a_keyframe_are_numbered_and_grow_from_its_first_scale(
             recorder.write([PosesChanged({7: replace(one.pose, scale=scale)}), posed(8)])
         found = [store.repose(7, below) for below in (2, 3)]
     assert [(r.revision, r.scale) for r in found if r is not None] == [(1, 1.5), (2, 2.0)]
+
+
+def test_a_first_depth_is_offered_and_neither_stored_nor_counted(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("scan", "drone", 0)) as store:
+        news = list[tuple[str, int]]()
+        store.listen(lambda kind, number: news.append((kind, number)))
+        recorder = recorder_of(store, 1, 0.1)
+        one = house.keyframe(7, 0.0)
+        recorder.write([FirstDepth(one), posed(7)])
+        assert news[0] == ("first", 7) and store.record("first", 7) is not None
+        assert store.seqs() == [] and recorder.keyframes == recorder.points == 0
+        recorder.write([KeyframeReady(one), posed(8)])
+        assert store.record("first", 7) is None and store.seqs() == [7]
 
 
 def larger(one: Keyframe, factor: int, rng: np.random.Generator) -> Keyframe:

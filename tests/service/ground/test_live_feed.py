@@ -14,7 +14,7 @@ import pytest
 
 from service.ground.live import LiveFeed
 from service.scans.track import latest
-from service.stream import radio_messages, store
+from service.stream import codec, radio_messages, store
 from service.stream.records import PoseRecord, Repose, ScanHeader, pack_pose
 from service.stream.store import ScanStore
 
@@ -103,6 +103,25 @@ def test_a_long_track_is_thinned_and_ends_at_the_last_pose(
     scan.add_poses([house.record(seq, float(seq)) for seq in range(5, 4002)])
     east, last = track(feed)
     assert east[2:] == [*range(6, 4001, 3), 4001] and last == 4001.0
+
+
+def test_a_first_depth_is_shown_until_it_is_replaced_or_void(
+    scan: ScanStore, feed: LiveFeed, house: HouseFlight
+) -> None:
+    def shown() -> list[tuple[int, int, int]]:
+        """Number, layer and width of the box of each chunk."""
+        found = [m for m in feed.news() if isinstance(m, bytes)]
+        heads = [json.loads(m[4 : 4 + int.from_bytes(m[:4], "little")]) for m in found]
+        return [(head["seq"], head["layer"], head["box"][2]) for head in heads]
+
+    shown()
+    layers = {seq: codec.encode(house.keyframe(seq, 5.0 * seq), 1) for seq in (7, 8)}
+    assert scan.put_record("first", 7, layers[7][0])
+    assert shown() == [(7, -1, 80)] and shown() == []
+    assert scan.put_record("first", 8, layers[8][0])
+    assert shown() == [(7, -1, 0), (8, -1, 80)]
+    scan.add_keyframe(8, layers[8])
+    assert shown() == [(8, 1, 160)]
 
 
 def test_text_in_place_of_numbers_is_left_out(scan: ScanStore, feed: LiveFeed) -> None:

@@ -378,3 +378,56 @@ def test_messages_round_trip() -> None:
     held = unpack(pack(Held({"k0": RangeSet([(0, 5)])}, 77)), Held)
     assert held is not None and held.received_bytes == 77 and len(held.numbers["k0"]) == 6
     assert unpack(pack(Head({}, {}, True)), Head) is not None
+
+
+def test_a_first_depth_shows_a_keyframe_until_its_own_layers_come(tmp_path: Path) -> None:
+    world = World(tmp_path, rate=50_000.0)
+    world.run(2.5)
+    world.onboard.offer_first(5, LAYERS[5][0])
+    world.run(0.5)
+    assert world.store.states() == {5: (-1, -1)} and world.store.seqs() == []
+    shown = world.store.keyframe(5)
+    assert shown is not None and shown.depth.depth_m.shape == (45, 80)
+    assert not world.onboard.states() and "k0" not in world.store.numbers()
+    world.produce(5, 6)
+    world.onboard.finish({})
+    world.run(5.0)
+    whole = world.store.keyframe(5)
+    assert world.store.states() == {5: (1, -1)} and world.ground.complete
+    assert whole is not None and whole.depth.depth_m.shape == (90, 160)
+    assert world.store.numbers() == world.onboard.numbers()
+    assert world.ground.progress.unsound == 0
+
+
+def test_a_first_depth_ends_with_the_next_one_and_with_the_scan(tmp_path: Path) -> None:
+    """A view may be refused once all its partners are there."""
+    world = World(tmp_path, rate=50_000.0)
+    world.run(2.5)
+    for seq in (3, 4):
+        world.onboard.offer_first(seq, LAYERS[seq][0])
+        world.run(0.5)
+        assert list(world.store.states()) == [seq]
+    world.onboard.finish({})
+    world.run(2.0)
+    assert world.store.finished and not world.store.states() and world.store.keyframe(4) is None
+    world.ground.on_items(split("first", 4, LAYERS[4][0], 9000)[0].pack(), world.now)
+    assert not world.store.states()
+
+
+def test_first_depths_are_not_sent_late_or_over_a_slow_link(tmp_path: Path) -> None:
+    world = World(tmp_path, rate=50_000.0)
+    world.run(2.5)
+    world.onboard.offer_first(1, LAYERS[1][0])
+    world.produce(1, 2)  # before a byte of it is sent
+    world.outbox.set_rate(RATE, world.now)
+    world.onboard.offer_first(2, LAYERS[2][0])
+    world.run(3.0)
+    assert not [m.topic for _, m in world.sent if "/first/" in m.topic]
+    assert list(world.store.states()) == [1]
+
+
+def test_a_first_depth_of_another_keyframe_or_layer_is_refused(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    for record in (LAYERS[2][0], LAYERS[1][1], b"junk"):
+        world.ground.on_items(split("first", 1, record, 60_000)[0].pack(), 0.0)
+    assert not world.store.states() and world.ground.progress.unsound == 3

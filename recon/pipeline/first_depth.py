@@ -1,0 +1,68 @@
+"""The first depth of a view: coarse, by one frame that follows soon, until its partners come.
+
+New ground is in no earlier image, so that depth of it takes a later one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+from recon.backends import Backend, DenseStages
+from recon.pipeline.config import Timing, untimed
+from recon.pipeline.keyframe_map import KeyframeMap
+from recon.pipeline.stages import PairStages, Plausible, Rectify, keyframe_of
+from recon.pipeline.surface_map import SurfaceMap
+from recon.pipeline.views import StereoView
+from recon.stereo.posed_image import VirtualStereoConfig
+from recon.types import Keyframe
+
+COARSER = 2
+"""The images are smaller by this factor than those of the view's whole depth."""
+
+MIN_BASE_TO_HEIGHT = 0.02
+
+
+class FirstDepths:
+    """Reconstructs views ahead of time. Changes nothing that their whole depth rests on."""
+
+    def __init__(
+        self,
+        backend: Backend,
+        stereo: VirtualStereoConfig,
+        dense: DenseStages,
+        keyframes: KeyframeMap,
+        surface: SurfaceMap,
+        timing: Timing,
+    ) -> None:
+        stereo = replace(
+            stereo, min_base_to_height=MIN_BASE_TO_HEIGHT, guided=False,
+            width_px=stereo.width_px // COARSER,
+        )  # fmt: skip
+        self._rectify = Rectify(stereo, Counter(), None, untimed)
+        self._stereo = PairStages(backend, dense, None, untimed)
+        self._plausible = Plausible(Counter())
+        self._keyframes, self._surface, self._timing = keyframes, surface, timing
+
+    def __call__(self, view: StereoView) -> Keyframe | None:
+        """The new surface that the view's only partner shows; None where it shows none."""
+        ahead = self._keyframes.ahead(view)
+        if ahead is None:
+            return None
+        with self._timing("first depth"):
+            grid = self._rectify.grid(view)
+            pairs = self._rectify(view, ()).values()
+            if not pairs:
+                return None
+            depth = self._stereo.whole_path(pairs, grid)
+            if depth is None:
+                depths = [self._stereo.reproject(self._stereo.match(p), p, grid) for p in pairs]
+                depth = self._stereo.fuse(depths, grid)
+            bgr = self._rectify.colours(view, grid)
+            depth = self._plausible(view, depth, bgr)
+            self._rectify.learn(depth)
+            if depth is None:
+                return None
+            T_odom, pose = ahead
+            sigma_m, fresh = self._surface.peek(depth, view.rows_share, T_odom)
+            return keyframe_of(view, depth, bgr, sigma_m, fresh, pose)

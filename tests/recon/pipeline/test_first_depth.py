@@ -1,0 +1,77 @@
+"""First depths: new ground before the next keyframe shows it, and no part of the map."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from painted_ground import CAMERA, HEIGHT_M, pose, still
+
+from recon.pipeline.events import Event, FirstDepth, KeyframeReady, PosesChanged
+from recon.pipeline.mapper import Mapper, MapperConfig
+from recon.types import Frame, PosePrior
+from service.config import load_config
+from service.flight.pipeline import mapper_config
+
+FRAMES, STEP_M = 56, 0.5
+"""A keyframe each 4 m."""
+STRIP_PX = 12
+"""Of 160 across: the ground on the right that the keyframe before does not see."""
+
+
+def fly(first_depths: bool) -> list[Event]:
+    config = MapperConfig(upsample=False, first_depths=first_depths)
+    mapper, events = Mapper(CAMERA, config), list[Event]()
+    for i in range(FRAMES):
+        T = pose(STEP_M * i)
+        prior = PosePrior(T[:3, :3], 0.005, 0.01, T[:3, 3], np.full(3, 0.1), HEIGHT_M, 0.1)
+        image = cv2.cvtColor(still(T), cv2.COLOR_GRAY2BGR)
+        events += mapper.track(Frame(np.asarray(image, np.uint8), i * 100_000_000, i, prior))
+    return [*events, *mapper.finish()]
+
+
+@pytest.mark.slow
+def test_a_first_depth_shows_new_ground_early_and_leaves_the_map_as_it_is() -> None:
+    plain, events = fly(False), fly(True)
+    firsts = [event for event in events if isinstance(event, FirstDepth)]
+    rest = [event for event in events if not isinstance(event, FirstDepth)]
+    assert len(rest) == len(plain) and not any(isinstance(e, FirstDepth) for e in plain)
+    for one, other in zip(plain, rest, strict=True):
+        assert type(one) is type(other)
+        if isinstance(one, KeyframeReady) and isinstance(other, KeyframeReady):
+            assert one.keyframe.seq == other.keyframe.seq
+            for name in ("depth_m", "sigma_m", "views", "T_world_camera"):
+                pair = (getattr(e.keyframe.depth, name) for e in (one, other))
+                np.testing.assert_array_equal(*pair)
+            np.testing.assert_array_equal(one.keyframe.fresh, other.keyframe.fresh)
+        if isinstance(one, PosesChanged) and isinstance(other, PosesChanged):
+            assert one.poses.keys() == other.poses.keys()
+            for seq, found in one.poses.items():
+                np.testing.assert_array_equal(found.T_world_camera, other.poses[seq].T_world_camera)
+    whole = {e.keyframe.seq: e.keyframe for e in events if isinstance(e, KeyframeReady)}
+    order = [e.keyframe.seq for e in events if isinstance(e, FirstDepth | KeyframeReady)]
+    assert len(firsts) >= 3
+    for first in (event.keyframe for event in firsts):
+        assert order.index(first.seq) < len(order) - 1 - order[::-1].index(first.seq)
+        shown, final = first.fresh & np.isfinite(first.depth.depth_m), whole[first.seq]
+        coming = final.fresh & np.isfinite(final.depth.depth_m)
+        assert shown[:, -STRIP_PX:-2].mean() > 0.7  # no earlier image has it
+        off = np.abs(first.depth.depth_m[shown] / HEIGHT_M - 1.0)
+        assert np.median(off) < 0.03
+        assert np.median(first.depth.sigma_m[shown]) > np.median(final.depth.sigma_m[coming])
+
+
+@pytest.mark.parametrize(
+    ("live", "settings", "expected"),
+    [
+        (True, ["datalink.connect=['tcp/127.0.0.1:7447']"], True),
+        (False, ["datalink.connect=['tcp/127.0.0.1:7447']"], False),
+        (True, [], False),
+        (True, ["datalink.connect=['tcp/127.0.0.1:7447']", "datalink.budget_kbit_s=300"], False),
+    ],
+)
+def test_first_depths_are_computed_where_a_link_sends_them(
+    live: bool, settings: list[str], expected: bool
+) -> None:
+    config = load_config(None, settings)
+    assert mapper_config(CAMERA, config, live=live).first_depths == expected
