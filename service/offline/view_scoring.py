@@ -7,6 +7,7 @@ that are covered, and PSNR and SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.8198
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -18,9 +19,12 @@ from recon import se3
 from recon.camera_model import Undistorter, rays
 from recon.surface.hole_filling import outlined
 from recon.surface.splats import COVERED, Splats, rendered
+from recon.tracking import pnp
+from recon.tracking.common_view import FINE_MOST, FINE_WIDTH_PX, Features, common_view, features
 from recon.types import F32, F64, I64, U8, Bool, Camera, Keyframe
+from service.cameras.images import ImagesSource
 from service.errors import InputError
-from service.offline.exports.images import frames_at
+from service.offline.exports.images import SAME_TIME_NS, frames_at, opened
 from service.offline.exports.splats import read_splats
 from service.offline.exports.view import ScanView
 from service.packages import needing
@@ -30,6 +34,9 @@ from service.stream.records import PoseRecord
 
 EVERY = 10
 """Of the frames that are no keyframe, the first of so many is drawn."""
+
+NEIGHBOURS = 8
+"""Keyframes that place a frame which the scan does not know."""
 
 MAX_SLOPE = 0.03
 """Four pixels are one surface where their depths differ by less than this share."""
@@ -62,14 +69,10 @@ def score_views(scan: ScanView, video: Path, images: Path | None = None) -> dict
         import open3d  # noqa: F401
         from skimage.metrics import structural_similarity
     keyframes, camera = list(main_keyframes(scan.store)), camera_of(scan.store.header)
-    poses = left_out(scan.poses, {k.time_ns for k in keyframes})
     products = _products(scan, keyframes, camera)
     inside, undistort = _outline(scan), Undistorter(camera)
     sums: dict[str, list[tuple[float, float, float]]] = {name: [] for name in products}
-    times = [p.time_unix_ns for p in poses]
-    frames = frames_at(times, scan.store.header, video, None, scan.progress)
-    for n, frame in frames:
-        T, seen = poses[n].T_world_camera, undistort.image(frame)
+    for n, (T, seen) in enumerate(_seen(scan, keyframes, undistort, video)):
         counts = inside(camera, T) & (undistort.valid > 0)
         if counts.mean() < 0.5:
             continue
@@ -101,6 +104,54 @@ def score_views(scan: ScanView, video: Path, images: Path | None = None) -> dict
         for name, rows in sums.items()
         if rows
     }
+
+
+def _seen(
+    scan: ScanView, keyframes: Sequence[Keyframe], undistort: Undistorter, video: Path
+) -> Iterator[tuple[F64, U8]]:
+    """T_world_camera (4, 4) and image without distortion of each frame that took no part.
+
+    Stills of a folder that the scan does not know are placed by its surface.
+    """
+    header = scan.store.header
+    poses = left_out(scan.poses, {k.time_ns for k in keyframes})
+    if poses:
+        times = [p.time_unix_ns for p in poses]
+        for n, frame in frames_at(times, header, video, None, scan.progress):
+            yield poses[n].T_world_camera, undistort.image(frame)
+    known = np.array([p.time_unix_ns for p in scan.poses])
+    with closing(opened(header, video)) as source:
+        for still in source if isinstance(source, ImagesSource) else ():
+            time_ns = header.started_unix_ns + still.time_ns
+            if np.abs(known - time_ns).min() > SAME_TIME_NS:
+                image = undistort.image(still.image)
+                T = placed(image, time_ns, keyframes, undistort.camera)
+                if T is not None:
+                    yield T, image
+
+
+def placed(image: U8, time_ns: int, keyframes: Sequence[Keyframe], camera: Camera) -> F64 | None:
+    """(4, 4) T_world_camera of ``image`` (H, W, 3), by features that it shares with the keyframes
+    next to it in time, where their depth is known; None where these are too few."""
+    there = _features(image)
+    points, pixels = [np.zeros((0, 3))], [np.zeros((0, 2))]
+    for k in sorted(keyframes, key=lambda k: abs(k.time_ns - time_ns))[:NEIGHBOURS]:
+        shared = common_view(_features(k.bgr), there)
+        if shared is None:
+            continue
+        u, v = np.rint(shared.uv_a).astype(int).T
+        z = np.where(k.fresh, k.depth.depth_m, np.nan)[v, u]
+        known = np.isfinite(z)
+        local = rays(k.depth.K, shared.uv_a[known]) * z[known, None]
+        points.append(se3.transform(k.depth.T_world_camera, local))
+        pixels.append(shared.uv_b[known])
+    found = pnp.solve(np.concatenate(points), np.concatenate(pixels), camera.K)
+    return None if found is None else se3.inverse(found.T_camera_points)
+
+
+def _features(bgr: U8) -> Features:
+    gray = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+    return features(gray, FINE_WIDTH_PX, FINE_MOST, are_strongest=True)
 
 
 def left_out(poses: Sequence[PoseRecord], used_ns: set[int]) -> list[PoseRecord]:

@@ -139,8 +139,8 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     lean_deg = _number(run, "lean_sigma_deg")
     if lean_deg is not None and lean_deg > MAX_LEAN_SIGMA_DEG:
         limits.append(
-            f"the view direction is assumed: all may lean by {lean_deg:.0f} degrees; fly strips "
-            "both ways, several side by side"
+            f"the view direction is assumed: all may lean by {lean_deg:.0f} degrees; control "
+            "points level it, or more strips flown both ways"
         )
     if broken:
         limits.append(f"{refuted}: what they show is left out")

@@ -125,10 +125,10 @@ def images_key(options: ExportOptions) -> tuple[Path | None, bool, int | None]:
 
 def check_video(header: ScanHeader, video: Path) -> None:
     """Raise InputError or OutsideError when ``video`` cannot be that of the scan."""
-    _opened(header, video).close()
+    opened(header, video).close()
 
 
-def _opened(
+def opened(
     header: ScanHeader, video: Path, opener: Callable[[str], CameraSource] = open_camera
 ) -> CameraSource:
     """The open video; InputError when it is missing or its images have another size."""
@@ -159,7 +159,7 @@ def frames_at(
     a frame are left out. Raises InputError when the video is of another size, or has no frame of
     these times.
     """
-    source = _opened(header, video, opener)
+    source = opened(header, video, opener)
     start = header.started_unix_ns if epoch_ns is None else epoch_ns
     times = np.array(times_ns, np.int64)
     found = set[int]()
