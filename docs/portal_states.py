@@ -24,7 +24,7 @@ from service.ground.portal import Portal, PortalConfig
 SIZES = {"desktop": (1440, 900), "phone": (390, 844)}
 HIGH_PX, GAP_PX, LABEL_PX = 300, 8, 18
 """A state on the sheet."""
-WAIT_S, STILL_S = 120.0, 20.0
+WAIT_S, STILL_S = 120.0, 60.0
 PRESS = "[...document.querySelectorAll('button')].find(b => b.textContent === '{}').click()"
 COLOUR = (
     "(s => {{ s.value = '{}'; s.dispatchEvent(new Event('change', {{ bubbles: true }})) }})"
@@ -33,6 +33,10 @@ COLOUR = (
 STILL = "new Promise(r => setTimeout(r, 2000)).then(() => document.body.dataset.still === 'yes')"
 OPEN = (
     "[...document.querySelectorAll('details')].find(d => d.textContent.startsWith('{}')).open = {}"
+)
+MENU = (
+    "(b => { if (b.checkVisibility() && b.ariaExpanded !== 'true') b.click() })"
+    "(document.querySelector('.menu'))"
 )
 LAYER = (
     "[...document.querySelectorAll('.layers label')].find(l => l.textContent.includes('{}'))"
@@ -61,8 +65,13 @@ def colour(name: str) -> Act:
 
 
 def opened(text: str, is_open: bool = True) -> Act:
-    """Open or close the panel with this title."""
-    return lambda browser: browser.run(OPEN.format(text, str(is_open).lower()))
+    """Open or close the panel with this title, which a phone has in its menu."""
+
+    def act(browser: Browser) -> None:
+        browser.run(MENU)
+        browser.run(OPEN.format(text, str(is_open).lower()))
+
+    return act
 
 
 def shown(product: str) -> Act:
@@ -90,7 +99,8 @@ def view_states(scan: Path) -> Iterator[tuple[str, list[Act]]]:
     yield "view-coverage", [colour("colour"), press("Coverage")]
     yield "view-measure", [press("Coverage"), press("Measure"), click_points]
     yield "view-notes", [press("Measure"), press("Notes")]
-    yield "view-clip", [press("Notes"), opened("Clip")]
+    yield "view-menu", [press("Notes"), lambda browser: browser.run(MENU)]
+    yield "view-clip", [opened("Clip")]
     yield "view-settings", [opened("Clip", False), opened("Settings")]
     for name, file in (("Splats", "splat.ply"), ("Mesh", "mesh.glb")):
         if (scan / file).is_file():

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import pytest
 from person import Browser
 from portal_client import NEEDS, ONE, TOKEN, Client, browser, flown_store
@@ -77,16 +78,19 @@ def test_on_a_telephone_nothing_is_out_of_reach(browser: Browser, base: str) -> 
     assert len(acts) >= 7 and max(acts) < card["right"]  # what lies outside is cut off
     assert browser.run("document.documentElement.scrollWidth") <= PHONE[0]
     show(browser, f"{base}/#/view/drone-1/test-1", PHONE)
-    tops = browser.run(
-        "(() => { const [name, state] = document.querySelectorAll('h1, header > .state');"
-        " name.textContent = '20261127T003118Z'; state.textContent = 'finished';"
-        " state.className = 'state finished';"
+    middles = browser.run(
+        "(() => { const state = document.querySelector('header > .state');"
+        " state.textContent = 'finished'; state.className = 'state finished';"
         " for (const a of document.querySelectorAll('header > a'))"
         " a.hidden = a.matches('.newer') || a.href.endsWith('change.html');"
-        " return [...document.querySelectorAll('header > :is(a, h1, .state)')]"
-        ".filter(e => e.checkVisibility()).map(e => e.getBoundingClientRect().top) })()"
+        " return [...document.querySelectorAll('header > :is(a, h1, .menu, .state)')]"
+        ".filter(e => e.checkVisibility()).map(e => e.getBoundingClientRect())"
+        ".map(b => (b.top + b.bottom) / 2).sort((a, b) => a - b) })()"
     )
-    assert len(tops) == 5 and max(tops) - min(tops) < 10  # all in one line
+    upper, lower = middles[:3], middles[3:]  # way back, name, menu; state, map, report
+    assert len(lower) == 3 and max(np.ptp(upper), np.ptp(lower)) < 10
+    name = "document.querySelector('h1')"
+    assert browser.run(f"{name}.scrollHeight <= {name}.clientHeight")  # the whole name is read
     browser.click("Measure")
     assert browser.run("document.documentElement.scrollWidth") <= PHONE[0]
     assert browser.run("document.documentElement.scrollHeight") <= PHONE[1]
@@ -194,6 +198,7 @@ def test_axe_finds_nothing_serious(
     browser.key("Escape")
     show(browser, f"{busy}/#/view/drone-1/test-1", size)
     browser.wait("document.querySelector('.state').classList.contains('receiving')")
+    browser.wait("!!document.querySelector('.side .jobs li')")
     for name in ("Measure", "Coverage"):
         browser.click(name)
     found += axe(browser, "live", tmp_path)
@@ -206,6 +211,10 @@ def test_axe_finds_nothing_serious(
         "(document.querySelector('[aria-label=\"colour by\"]'))"
     )
     browser.wait("!document.querySelector('.legend').hidden")
+    for _ in range(2):
+        with browser.page.expect_response(lambda answer: answer.url.endswith("/api/jobs")):
+            pass
+    assert browser.run("document.querySelector('.side .jobs li')") is None  # is of another scan
     found += axe(browser, "site", tmp_path)
     show(browser, f"{busy}/#/view/drone-1/nothing", size)
     found += axe(browser, "unknown", tmp_path)

@@ -208,6 +208,13 @@ def look_at_splats(browser: Browser, address: str) -> None:
     red = roof_red(browser)
     assert red > 130  # the exposure makes it brighter than in the scan, 100
     assert not [url for url in browser.requests if "splat" in url]
+    effect = "[...document.querySelectorAll('.settings label')].find(l => l.textContent === '{}')"
+    for name in ("Bloom", "Depth of field"):  # have the same exposure
+        browser.run(f"{effect.format(name)}.querySelector('input').click()")
+        browser.wait("document.body.dataset.effects === 'yes'")
+        until(lambda: shows_red(browser, red), 60.0)
+        browser.run(f"{effect.format(name)}.querySelector('input').click()")
+        browser.wait("document.body.dataset.effects === 'no'")
     browser.click("Splats")
     browser.wait("document.body.dataset.splats === 'shown'", 60)
     until(lambda: shows_red(browser, red), 60.0)
@@ -316,6 +323,8 @@ def test_a_scan_in_flight_is_drawn_with_those_it_is_tied_to(
     one = write_scan(tmp_path / "a/1", leg(0.0, 4), Errors((1.1, -0.7, 0.9)), finished=False)
     write_scan(tmp_path / "b/2", leg(np.pi / 2, 4), finished=False)
     follower, written_unix_s = Follower(tmp_path), time.time()
+    errors: list[str] = []
+    browser.page.on("pageerror", lambda error: errors.append(str(error)))
     with listing(browser, tmp_path, 2) as base:
         browser.open(f"{base}/#/view/a/1")
         alone = browser.wait(
@@ -344,6 +353,7 @@ def test_a_scan_in_flight_is_drawn_with_those_it_is_tied_to(
         browser.wait("document.querySelector('.legend').textContent.includes('b/2')")
         browser.image(tmp_path / "tied.png")  # to look at
         (tmp_path / FILE).unlink()
+    assert errors == []
 
 
 def test_what_is_new_since_the_last_visit_has_its_colours(browser: Browser, tmp_path: Path) -> None:

@@ -122,6 +122,22 @@ def test_the_time_slider_shows_the_cloud_as_it_was(page: Browser) -> None:
     page.wait(f"document.body.dataset.image === '4' && {images} === '5'")
 
 
+def test_the_slider_of_several_dates_states_dates_in_their_order(
+    page: Browser, tmp_path: Path, house: HouseFlight
+) -> None:
+    with ScanStore.open(tmp_path / "drone-1/test-1/scan.db") as scan:
+        for seq, days in ((5, 70), (6, -70)):
+            one = house.keyframe(seq, 5.0 * seq)
+            scan.add_keyframe(seq, encode(one, one.time_ns + days * 86_400 * 10**9))
+    page.wait("document.querySelector('.time input').max === '7'")
+    said = []
+    for k in ("1", "2", "7"):
+        page.run(SET.format(".time input", k))
+        said.append(page.run("document.querySelector('.time output').textContent"))
+    assert all(re.fullmatch(r"20\d\d-\d\d-\d\d \d\d:\d\d", one) for one in said), said
+    assert said == sorted(set(said))
+
+
 def test_the_flight_plays_at_its_speed_and_is_dated(page: Browser) -> None:
     page.run("document.querySelector('.time select').value = '1'")
     page.run("document.querySelector('.time button').click()")  # from the beginning

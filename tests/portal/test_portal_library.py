@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from house_flight import HouseFlight
 from person import Browser
 from portal_client import NEEDS, browser, flown_store, listing
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Route
 
 pytestmark = NEEDS
 __all__ = ["browser"]  # the fixture
@@ -116,6 +120,17 @@ def test_the_export_dialog_says_what_each_product_is_and_makes_it(
         browser.key("Escape")
         browser.wait("!document.querySelector('dialog')")
         browser.wait("!!document.querySelector('article .made li')")  # and then on the card
+
+        def an_hour_later(route: Route) -> None:
+            jobs = [job | {"ended_s": 3600.0} for job in route.fetch().json()]
+            route.fulfill(json=jobs)
+
+        browser.page.route("**/api/jobs", an_hour_later)
+        for _ in range(2):
+            with browser.page.expect_response("**/api/jobs"):
+                pass
+        assert browser.run("!!document.querySelector('article .made li')")  # its history
+        browser.page.unroute("**/api/jobs")
         browser.click("Export…")
         browser.wait("!!document.querySelector('dialog')")
         browser.run("location.hash = '#/view/drone-1/test-1'")

@@ -132,13 +132,14 @@ def test_settings_change_the_image_and_go_back(browser: Browser, portal: Portal)
     assert difference(plain, drawn(browser)) == 0.0
     for name in ("Bloom", "Depth of field"):
         setting(browser, name, "field.click()")
-        browser.run("new Promise(r => setTimeout(r, 700))")  # the effects are loaded when asked
+        browser.wait("document.body.dataset.effects === 'yes'")
         assert difference(plain, drawn(browser)) > 0.01, name
         setting(browser, name, "field.click()")
+        browser.wait("document.body.dataset.effects === 'no'")
     setting(browser, "Light scene", "field.click()")
     light = drawn(browser)
     setting(browser, "Bloom", "field.click()")
-    browser.run("new Promise(r => setTimeout(r, 700))")
+    browser.wait("document.body.dataset.effects === 'yes'")
     both = drawn(browser)
     site = is_site(plain)
     assert both[site].mean() < light[site].mean() + 25.0  # a bright sky does not shine over all

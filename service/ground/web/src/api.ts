@@ -98,6 +98,12 @@ export function every(wait_ms: number, job: () => Promise<unknown>): () => void 
   };
 }
 
+/** As `every`, at once and until `element` is taken from the page. */
+export function whileShown(element: Element, wait_ms: number, job: () => Promise<unknown>): void {
+  const end = every(wait_ms, async () => (element.isConnected ? job() : end()));
+  void job();
+}
+
 const place = (s: { drone: string; scan: string }): string =>
   `/api/scans/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`;
 

@@ -2,7 +2,7 @@
 
 import * as api from "./api";
 import { el, notify, svg, toScans } from "./dom";
-import { jobList } from "./jobs";
+import { jobsOf } from "./jobs";
 import { nameOf } from "./names";
 import * as units from "./units";
 
@@ -35,7 +35,7 @@ export async function showControl(root: HTMLElement, drone: string, name: string
   const head = el("header", {}, toScans(), el("h1", { textContent: nameOf(scan), title: nameOf(scan) }), wider, nearer, load, refine, el("a", { href: api.viewAddress(id), textContent: "3D" }), chosenFile);
   const images = el("main", { className: "sights", tabIndex: 0 });
   images.setAttribute("aria-label", "images of the point");
-  const side = el("aside", { className: "side points" }, about, list, jobList());
+  const side = el("aside", { className: "side points" }, about, list, jobsOf(() => scan));
   side.setAttribute("aria-label", "control points");
   root.replaceChildren(el("div", { className: "view control" }, head, side, images));
 

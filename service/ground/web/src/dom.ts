@@ -40,7 +40,7 @@ export function size(bytes: number): string {
 }
 
 export const date = (unix_s: number | null): string =>
-  unix_s === null ? "no date" : new Date(unix_s * 1000).toLocaleString();
+  unix_s === null ? "no date" : new Date(unix_s * 1000).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
 
 /** An element of SVG with its attributes. */
 export function svg<K extends keyof SVGElementTagNameMap>(tag: K, attributes: Record<string, string>, text = ""): SVGElementTagNameMap[K] {

@@ -53,7 +53,7 @@ export class Dome {
   });
   private readonly uniforms = {
     colour: { value: this.target.texture },
-    depth: { value: this.target.depthTexture },
+    depth: { value: this.depth },
     pixel: { value: new THREE.Vector2() },
     planes: { value: new THREE.Vector2() },
     strength: { value: 0 },
@@ -76,8 +76,16 @@ export class Dome {
     this.sheet.frustumCulled = false;
   }
 
-  /** Draws the scene into the target, over what it holds unless `clear`; shows it when `show`. */
-  render(renderer: THREE.WebGLRenderer, scene: THREE.Scene, camera: THREE.PerspectiveCamera, clear: boolean, show: boolean): void {
+  /** Depth of what was drawn last. */
+  get depth(): THREE.DepthTexture {
+    return this.target.depthTexture!;
+  }
+
+  /** Draws the scene, over what was drawn before unless `clear`; shows it when `show`, on the screen or `into` a target. */
+  render(
+    renderer: THREE.WebGLRenderer, scene: THREE.Scene, camera: THREE.PerspectiveCamera,
+    clear: boolean, show: boolean, into: THREE.WebGLRenderTarget | null = null,
+  ): void {
     const size = renderer.getDrawingBufferSize(new THREE.Vector2());
     if (size.x !== this.target.width || size.y !== this.target.height) this.target.setSize(size.x, size.y);
     renderer.setRenderTarget(this.target);
@@ -85,7 +93,7 @@ export class Dome {
     scene.backgroundIntensity = 1 / this.gain; // soft splats leave no depth that sets them apart from the sky
     renderer.render(scene, camera);
     scene.backgroundIntensity = 1;
-    renderer.setRenderTarget(null);
+    renderer.setRenderTarget(into);
     renderer.autoClear = true;
     if (!show) return;
     const radius = RADIUS_PX * renderer.getPixelRatio();

@@ -2,9 +2,9 @@
 
 import * as api from "./api";
 import { el, notify } from "./dom";
+import { nameOf } from "./names";
 
-const BUSY_MS = 500;
-const IDLE_MS = 2000;
+const ASK_EVERY_MS = 1000;
 const ENDED_S = 60;
 
 interface Row {
@@ -12,23 +12,25 @@ interface Row {
   show: (job: api.Job) => void;
 }
 
+/** The jobs of one scan. */
+export const jobsOf = (scan: () => api.Scan): HTMLElement =>
+  jobList((job) => (job.drone === scan().drone && job.scan === scan().scan ? nameOf(scan()) : null));
+
 /**
- * A list that keeps itself up to date while it is in the page; hidden while there is nothing. A job is shown where
- * `homeOf` says, with its history; all others here, until a while after they have ended.
+ * A list that keeps itself up to date while it is in the page; hidden while there is nothing. `title` names a job's
+ * scan; null: it is not shown. A job is shown where `homeOf` says, with its history; all others here, until a while
+ * after they have ended.
  */
-export function jobList(
-  title = (job: api.Job): string => job.scan,
-  homeOf: (job: api.Job) => Element | null = () => null,
-): HTMLElement {
+export function jobList(title: (job: api.Job) => string | null, homeOf: (job: api.Job) => Element | null = () => null): HTMLElement {
   const list = el("ul", {});
   const section = el("section", { className: "panel jobs", hidden: true }, list);
   section.setAttribute("aria-label", "jobs");
   let rows = new Map<number, Row>();
   const refresh = async (): Promise<void> => {
     const all = await api.jobs().catch(() => []);
-    const jobs = all.filter((job) => homeOf(job) || (job.ended_s ?? 0) < ENDED_S);
+    const jobs = all.filter((job) => title(job) !== null && (homeOf(job) || (job.ended_s ?? 0) < ENDED_S));
     const old = rows;
-    rows = new Map(jobs.map((job) => [job.number, old.get(job.number) ?? row(job, title(job))]));
+    rows = new Map(jobs.map((job) => [job.number, old.get(job.number) ?? row(job, title(job)!)]));
     for (const [number, { element }] of old) if (!rows.has(number)) element.remove();
     for (const job of jobs) {
       const { element, show } = rows.get(job.number)!;
@@ -37,10 +39,8 @@ export function jobList(
       if (element.parentElement !== home) home.append(element);
     }
     section.hidden = !list.children.length;
-    const busy = jobs.some((job) => job.state === "running");
-    setTimeout(() => section.isConnected && void refresh(), busy ? BUSY_MS : IDLE_MS);
   };
-  setTimeout(() => void refresh());
+  api.whileShown(section, ASK_EVERY_MS, refresh);
   return section;
 }
 

@@ -188,7 +188,7 @@ export async function showMap(root: HTMLElement, drone: string, name: string): P
   };
   panel.append(el("div", { title: "a flight over gaps and weak places" }, el("label", {}, box, " Fly again"), lines), files);
   panel.append(twins.chooser);
-  host.append(none, way, again, lettering, ruler.overlay, marks, cursor, twins.divider);
+  host.append(none, way, again, lettering, ruler.overlay, marks, twins.divider, cursor);
   side.prepend(ruler.panel);
   map.onHover = (place) => {
     const [lat, lon] = degreesOf(place);

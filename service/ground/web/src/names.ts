@@ -1,6 +1,7 @@
 // What a scan is called: as somebody named it, else by its place and date.
 
 import type { Scan } from "./api";
+import { date } from "./dom";
 
 const half = (value: number, positive: string, negative: string): string => `${Math.abs(value).toFixed(4)}° ${value < 0 ? negative : positive}`;
 
@@ -10,8 +11,5 @@ export const placeName = (lat_deg: number, lon_deg: number): string => `${half(l
 export function nameOf(s: Scan): string {
   if (s.title !== s.scan) return s.title;
   const place = s.origin ? placeName(s.origin.lat_deg, s.origin.lon_deg) : s.drone;
-  if (s.started_unix_s === null) return s.scan;
-  const when = new Date(1000 * s.started_unix_s);
-  const day = when.toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric" });
-  return `${place}, ${day}, ${when.toLocaleTimeString("en-GB", { hour: "2-digit", minute: "2-digit" })}`;
+  return s.started_unix_s === null ? s.scan : `${place}, ${date(s.started_unix_s)}`;
 }

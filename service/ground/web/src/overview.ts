@@ -8,6 +8,7 @@ import { nameOf } from "./names";
 const MIN_PX = 14; // a smaller outline is drawn as a dot
 const NEAR_PX = 12;
 const LETTER_PX = 7;
+const ZOOM_PX = 60; // the buttons at the right border
 const MIN_DEG = 0.0005; // of what is shown, about 50 m
 const GRID_PX = 140; // at least, between lines of the grid
 const STEPS_DEG = [45, 30, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001];
@@ -139,7 +140,7 @@ export class Overview {
       const words = scans.length > 1 ? `${scans.length} scans` : short(nameOf(scans[0]!));
       parts.push(svg("circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: "7", class: kind }));
       const half = (LETTER_PX * words.length) / 2;
-      const at = Math.max(half, Math.min(this.host.clientWidth - half, x));
+      const at = Math.max(half, Math.min(this.host.clientWidth - ZOOM_PX - half, x));
       parts.push(svg("text", { x: at.toFixed(1), y: (y - 12).toFixed(1) }, words));
     }
     const last = parts.findIndex((p) => p.classList.contains("marked"));
@@ -183,11 +184,11 @@ const mean = (values: number[]): number => values.reduce((a, b) => a + b, 0) / v
 function boundsOf(outlines: Outline[]): Bounds {
   const places = outlines.flatMap(({ corners, middle }) => [...corners, middle]).map(degreesOf);
   const [lats, lons] = [places.map((p) => p[0]), places.map((p) => p[1])];
-  const spread = (values: number[]): [number, number] => {
+  const spread = (values: number[], share: number): [number, number] => {
     const [low, high] = [Math.min(...values), Math.max(...values)];
-    const pad = Math.max(0.15 * (high - low), (MIN_DEG - (high - low)) / 2, 0);
+    const pad = Math.max(share * (high - low), (MIN_DEG - (high - low)) / 2, 0);
     return [low - pad, high + pad];
   };
-  const [[south, north], [west, east]] = [spread(lats), spread(lons)];
+  const [[south, north], [west, east]] = [spread(lats, 0.15), spread(lons, 0.3)];
   return [west, south, east, north];
 }

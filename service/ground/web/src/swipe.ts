@@ -69,7 +69,7 @@ export function comparison(map: FlatMap, scan: api.Scan, names: string[], drawin
   map.over.push(cut);
   void api.scans().then((all) => {
     found = all.filter((s) => s.origin && (s.drone !== scan.drone || s.scan !== scan.scan) && overlap(s, scan));
-    others.append(...found.map((s) => el("option", { value: `${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`, textContent: nameOf(s) })));
+    others.append(...found.map((s) => el("option", { value: `${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}`, textContent: labelOf(s) })));
     chooser.hidden = !found.length;
   }, notify);
   return { chooser, divider, follow };

@@ -13,6 +13,8 @@ import { COLOURS, type Cloud, type Colour, type Layer } from "./points";
 import type { Stage } from "./stage";
 import * as units from "./units";
 
+const COVERAGE_EVERY_MS = 5000;
+
 export interface Parts {
   stage: Stage;
   cloud: Cloud;
@@ -133,15 +135,16 @@ function coverageButton({ coverage, id }: Parts): HTMLElement {
   const keys = coverageKeys();
   image.onerror = () => coverage.replaceChildren(none);
   image.onload = () => coverage.replaceChildren(image, keys);
-  const refresh = (): void => {
-    if (coverage.hidden || !coverage.isConnected) return;
+  const refresh = async (): Promise<void> => {
+    if (coverage.hidden) return;
     image.src = `${api.scanAddress(id)}/coverage.png?t=${Date.now()}`;
-    setTimeout(refresh, 5000);
+    await image.decode();
   };
+  api.whileShown(coverage, COVERAGE_EVERY_MS, refresh);
   button.onclick = () => {
     coverage.hidden = !coverage.hidden;
     pressed(button, !coverage.hidden);
-    refresh();
+    void refresh().catch(() => undefined); // which the panel says
   };
   return button;
 }
@@ -324,7 +327,8 @@ async function looks(stage: Stage, bloom: boolean, depthOfField: boolean): Promi
   painter.effects = null;
   if (bloom || depthOfField) {
     const { Look } = await import("./look");
-    painter.effects = new Look(renderer, scene, camera, controls.target, bloom, depthOfField, stage.isLight);
+    painter.effects = new Look(renderer, painter.dome, scene, camera, controls.target, bloom, depthOfField, stage.isLight);
   }
+  document.body.dataset["effects"] = painter.effects ? "yes" : "no";
   stage.touch();
 }

@@ -4,6 +4,8 @@ import * as api from "./api";
 import { askText, sure } from "./dialog";
 import { el, notify } from "./dom";
 
+const ASK_EVERY_MS = 1000;
+
 /** A strip of figures and buttons that keeps itself up to date while it is in the page. */
 export function vehicleStrip(): HTMLElement {
   const figures = el("span", { className: "state" });
@@ -21,10 +23,8 @@ export function vehicleStrip(): HTMLElement {
     none.title = now.trouble ?? "looking for it";
     none.hidden = now.connected === true;
     for (const shown of [figures, ...acts]) shown.hidden = !now.connected;
-    const wait = now.connected === null ? 10000 : 1000;
-    setTimeout(() => strip.isConnected && void refresh(), wait);
   };
-  void refresh();
+  api.whileShown(strip, ASK_EVERY_MS, refresh);
   return strip;
 }
 

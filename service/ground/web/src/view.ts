@@ -6,7 +6,7 @@ import { Cameras } from "./cameras";
 import { compass } from "./compass";
 import { count, el, notify, toScans } from "./dom";
 import { Images, takeView, timeSlider } from "./explore";
-import { jobList } from "./jobs";
+import { jobsOf } from "./jobs";
 import { LinkState } from "./link";
 import { LiveView, type LastPose, type News } from "./live";
 import { Ruler, type Scene } from "./measure";
@@ -44,7 +44,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   const host = el("main", { className: "stage" });
   const legend = el("div", { className: "panel legend", hidden: true });
   const coverage = el("div", { className: "panel coverage", hidden: true });
-  const side = el("aside", { className: "side", tabIndex: 0 }, jobList(), legend, coverage, figures);
+  const side = el("aside", { className: "side", tabIndex: 0 }, jobsOf(() => known), legend, coverage, figures);
   side.setAttribute("aria-label", "figures");
   const page = el("div", { className: "view" }, bar, host, side);
   root.replaceChildren(page);
