@@ -175,3 +175,9 @@ def test_wrong_lines_are_found() -> None:
         + "a " * 71
     )
     assert list(faults(text)) == ["a " * 71, "as of c9297af3"]
+
+
+def test_the_table_of_tests_names_their_folders() -> None:
+    named = re.findall(r"^\| (tests\S*) \|", text_of(ROOT / "CONTRIBUTING.md"), re.MULTILINE)
+    files = (ROOT / "tests").rglob("test_*.py")
+    assert named == sorted({file.parent.relative_to(ROOT).as_posix() for file in files})

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -73,6 +75,18 @@ class HouseFlight:
 
     def flown(self, folder: Path, georeferenced: bool = True) -> ScanStore:
         """A store of five keyframes, open for writing."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "scan.db").write_bytes(self._recorded(georeferenced))
+        return ScanStore.open(folder / "scan.db")
+
+    @cache  # noqa: B019 - a flight lasts as long as the tests
+    def _recorded(self, georeferenced: bool) -> bytes:
+        """The file of that store."""
+        with TemporaryDirectory() as folder:
+            self._record(Path(folder), georeferenced).close()
+            return (Path(folder) / "scan.db").read_bytes()
+
+    def _record(self, folder: Path, georeferenced: bool) -> ScanStore:
         header = ScanHeader(
             "test-1", "drone-1", self.start_ns, camera={"fx": 140.0}, software="0.0"
         )

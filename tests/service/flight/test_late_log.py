@@ -26,13 +26,24 @@ EARLY_S = 30.0  # of the time that the video states
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated flight of two legs; the video states a time that is too early."""
-    folder = tmp_path_factory.mktemp("sim") / "flight"
-    made = skyrelief(
-        "simulate", "--out", folder, "--size", "320x180", "--fps", "6", "--duration-s", "14",
-        "--height-m", "40", "--pattern", "legs", "--legs", "2", "--spacing-m", "8",
-        "--wobble-deg", "3",
+    """A simulated flight of two legs."""
+    return simulated(
+        tmp_path_factory.mktemp("sim") / "flight", "--size", "320x180", "--fps", "6",
+        "--duration-s", "14", "--height-m", "40", "--pattern", "legs", "--legs", "2",
+        "--spacing-m", "8", "--wobble-deg", "3",
     )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A second of a flight, for what does not look at the images."""
+    short = ("--size", "64x64", "--fps", "2", "--duration-s", "1", "--density", "0")
+    return simulated(tmp_path_factory.mktemp("sim") / "flight", *short)
+
+
+def simulated(folder: Path, *arguments: str) -> Path:
+    """A simulated flight whose video states a time that is too early."""
+    made = skyrelief("simulate", "--out", folder, *arguments)
     assert made.returncode == 0, made.stderr
     with av.open(str(folder / "flight.mp4")) as right, av.open(folder / "early.mp4", "w") as early:
         early.metadata["creation_time"] = "2026-05-01T11:59:30.000000Z"  # Swiss summer
@@ -76,7 +87,7 @@ def test_a_video_goes_where_its_images_turn_with_the_log(flight: Path, tmp_path:
     ],
 )
 def test_a_time_that_the_operator_gives_stays(
-    flight: Path,
+    brief: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     options: list[str],
@@ -91,7 +102,7 @@ def test_a_time_that_the_operator_gives_stays(
         return {}
 
     monkeypatch.setattr("service.commands.replay._fly", fly)
-    assert replayed(flight, tmp_path / "scan", *options).keys() == {"scan_folder"}
+    assert replayed(brief, tmp_path / "scan", *options).keys() == {"scan_folder"}
     assert asked == [unsure]
 
 
