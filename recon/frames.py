@@ -54,8 +54,4 @@ def rpy_from_rotation(R: F64) -> tuple[float, float, float]:
     pitch = float(np.arcsin(sp))
     if abs(sp) > 1.0 - 1e-9:
         return 0.0, pitch, float(np.arctan2(-R[0, 1], R[1, 1]))
-    return (
-        float(np.arctan2(R[2, 1], R[2, 2])),
-        pitch,
-        float(np.arctan2(R[1, 0], R[0, 0])),
-    )
+    return (float(np.arctan2(R[2, 1], R[2, 2])), pitch, float(np.arctan2(R[1, 0], R[0, 0])))

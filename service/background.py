@@ -98,11 +98,7 @@ class BackgroundWorker(Generic[In, Out]):
     """
 
     def __init__(
-        self,
-        row: str | None,
-        work: Callable[[In], Out],
-        bound: int,
-        live: bool = False,
+        self, row: str | None, work: Callable[[In], Out], bound: int, live: bool = False
     ) -> None:
         self._work, self._bound, self._live = work, bound, live
         self._offered: dict[Future[Out], In] = {}  # in order; dropped items leave at once

@@ -26,19 +26,13 @@ from service.redaction import without_credentials
 from service.version import software
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": (
-        "service.commands.demo:demo",
-        "Run a recorded flight through both ends.",
-    ),
+    "demo": ("service.commands.demo:demo", "Run a recorded flight through both ends."),
     "replay": ("service.commands.replay:replay", "Reconstruct a recorded video."),
     "run": ("service.commands.run:run", "Run the onboard service."),
     "keys": ("service.commands.setup:keys", "Make certificates for a fleet's datalink."),
     "ctl": ("service.commands.ctl:ctl", "Start, stop, watch and control a scan by MAVLink."),
     "ground": ("service.commands.ground:ground", "Receive scans from drones."),
-    "simulate": (
-        "service.commands.simulate:simulate",
-        "Render a flight with exact ground truth.",
-    ),
+    "simulate": ("service.commands.simulate:simulate", "Render a flight with exact ground truth."),
     "score": ("service.commands.simulate:score", "Compare a scan folder with the ground truth."),
     "export": ("service.commands.deliverables:export", "Export deliverables of a scan folder."),
     "mesh": ("service.commands.deliverables:mesh", "Make a textured mesh of a scan folder."),
@@ -122,11 +116,7 @@ def load_command(name: str) -> Any:
     return typer.main.get_command(single)
 
 
-app = typer.Typer(
-    cls=LazyCommands,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
+app = typer.Typer(cls=LazyCommands, no_args_is_help=True, pretty_exceptions_enable=False)
 
 
 def _print_version(wanted: bool) -> None:
@@ -188,8 +178,6 @@ def main() -> None:
 
 
 class CancelledByUser(SkyreliefError):
-    """Ctrl-C."""
-
     exit_code = 128 + signal.SIGINT
 
 

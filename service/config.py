@@ -55,9 +55,7 @@ class CameraConfig:
     lever_down_m: float = key(0.0, "camera below it, body frame")
     latency_ms: float = key(0.0, "from mid-exposure to the image's time stamp", live=True)
     latency: Literal["fixed", "auto"] = key(
-        "fixed",
-        "fixed: latency_ms; auto: measured in flight, latency_ms until then",
-        live=True,
+        "fixed", "fixed: latency_ms; auto: measured in flight, latency_ms until then", live=True
     )
     readout_ms: float | Literal["model", "auto"] = key(
         "model",
@@ -96,8 +94,7 @@ class MavlinkConfig:
     signing_key: str = key("", "file with the 32-byte key of signed links, mode 600")
     odometry: bool = key(False, "send our motion estimate to the autopilot (ODOMETRY)")
     memory: str = key(
-        "",
-        "folder for tuned parameters, signing time and system id; empty: scan.folder",
+        "", "folder for tuned parameters, signing time and system id; empty: scan.folder"
     )
 
     def __post_init__(self) -> None:
@@ -113,9 +110,7 @@ class ScanConfig:
     drone: str = key("", "name of this aircraft in scans and on the datalink; empty: host name")
     start: Literal["on-command", "on-boot", "on-arm"] = key("on-command", "what starts a scan")
     close_after_landing_s: float = key(
-        60.0,
-        "a commanded scan is closed this long after disarming; 0: never",
-        live=True,
+        60.0, "a commanded scan is closed this long after disarming; 0: never", live=True
     )
     baseline: float | str = key(
         "auto", "auto: by altitude; or metres; or 'n/m' frames as in the paper: '2/10'", live=True

@@ -68,8 +68,6 @@ FAST_US = 400_000
 
 @dataclass(frozen=True, slots=True)
 class CompanionConfig:
-    """Settings of the companion."""
-
     parameters: Mapping[str, float] = field(default_factory=dict)  # this aircraft's defaults
     watch: WatchConfig = field(default_factory=WatchConfig)
     load_every_s: float = 2.0
@@ -115,10 +113,7 @@ class Companion:
         )
         self.texts = StatusTexts(self._outbox)
         self.parameters = Parameters(
-            self._outbox,
-            self._parameter_changed,
-            kept_parameters,
-            with_defaults(config.parameters),
+            self._outbox, self._parameter_changed, kept_parameters, with_defaults(config.parameters)
         )
         table = self.parameters.table
         definition = camera_definition(VENDOR, MODEL, table)

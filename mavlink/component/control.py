@@ -62,8 +62,6 @@ Handled = Answer | Work
 
 
 class Phase(Enum):
-    """State of the scan."""
-
     IDLE = "idle"
     WAITING = "waiting"  # a scan is wanted: it is retried soon, or follows the one being closed
     SCANNING = "scanning"
@@ -72,8 +70,6 @@ class Phase(Enum):
 
 
 class Power(Enum):
-    """Action of a reboot command."""
-
     RESTART_SERVICE = "restart service"
     REBOOT = "reboot"
     SHUT_DOWN = "shut down"

@@ -46,8 +46,6 @@ def file_crc(data: bytes) -> int:
 
 @dataclass(frozen=True, slots=True)
 class FtpRequest:
-    """One request of a client."""
-
     sequence: int
     session: int
     opcode: int

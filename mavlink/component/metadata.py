@@ -50,8 +50,6 @@ class ComponentMetadataMessage(dialect.MAVLink_message):  # type: ignore[misc]
 
 
 class ComponentMetadata:
-    """The onboard computer's metadata."""
-
     def __init__(self, table: Sequence[Parameter]) -> None:
         parameters = _packed(
             {"version": FORMAT, "parameters": [_parameter(parameter) for parameter in table]}

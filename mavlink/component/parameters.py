@@ -27,8 +27,6 @@ YAW_FRAME = "SR_YAW_FRAME"
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One tunable value."""
-
     name: str  # at most 16 characters
     default: float
     low: float

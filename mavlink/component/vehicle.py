@@ -71,8 +71,6 @@ class VehicleConfig:
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
-    """State of the connection to the vehicle."""
-
     links: tuple[LinkReport, ...]
     system: int
     autopilot: tuple[int, int] | None

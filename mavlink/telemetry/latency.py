@@ -39,8 +39,6 @@ OUTLIER = 4.0  # times the median misfit
 
 @dataclass(frozen=True, slots=True)
 class LatencyEstimate:
-    """The latency that fits best."""
-
     latency_ms: float
     sigma_ms: float
     correlation: float  # of visual and telemetry rotation at that latency, 0 to 1

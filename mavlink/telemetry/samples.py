@@ -242,10 +242,7 @@ class TimeSeries(Generic[S]):
             del self._samples[:i]
 
     def around(
-        self,
-        time_ns: int,
-        max_gap_ns: int = MAX_GAP_NS,
-        extrapolate_ns: int = EXTRAPOLATE_NS,
+        self, time_ns: int, max_gap_ns: int = MAX_GAP_NS, extrapolate_ns: int = EXTRAPOLATE_NS
     ) -> Bracket[S] | None:
         """The samples around a time, or None without samples near enough.
 

@@ -26,8 +26,6 @@ BAUD = 57600
 
 @dataclass(frozen=True, slots=True)
 class LinkSpec:
-    """A link's address."""
-
     kind: str
     place: str  # device or host
     number: int  # baud rate or port

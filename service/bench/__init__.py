@@ -44,8 +44,6 @@ BENCHMARKS: dict[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class BenchOptions:
-    """Options of a run of benchmarks."""
-
     rounds: int = 30
     warm_up: int = 3
     backend: str = "cpu"

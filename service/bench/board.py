@@ -59,8 +59,6 @@ def _rate_hz(images: Iterable[object]) -> float:
 
 
 class _Flight(NamedTuple):
-    """One run of the path over the video."""
-
     elapsed_s: float
     keyframes: int
     peak_mib: float  # of its process

@@ -253,9 +253,7 @@ def _switch_on(trial: Trial, folder: Path, number: int, ground_port: int) -> _Dr
     name = f"drone-{number}"
     store = ScanStore.create(folder / name / "scan.db", ScanHeader("scan", name, 1))
     config = DatalinkConfig(
-        connect=(f"tcp/127.0.0.1:{port}",),
-        budget_kbit_s=trial.link.rate_kbit_s,
-        share=SHARE,
+        connect=(f"tcp/127.0.0.1:{port}",), budget_kbit_s=trial.link.rate_kbit_s, share=SHARE
     )
     return _Drone(store, DatalinkSender(store, config), emulator)
 

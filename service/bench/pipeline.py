@@ -102,8 +102,6 @@ def _photograph(ground: U8, T_world_camera: F64) -> U8:
 
 
 class _Flown(NamedTuple):
-    """One run over the video."""
-
     clouds: float  # a second
     fps: float
     rss_mib: float  # of the process at its end

@@ -110,10 +110,7 @@ def seeks_readout(camera: Camera, config: CameraConfig) -> bool:
 
 
 def save_camera(
-    path: str | Path,
-    camera: Camera,
-    name: str = "camera",
-    extra: Mapping[str, Any] | None = None,
+    path: str | Path, camera: Camera, name: str = "camera", extra: Mapping[str, Any] | None = None
 ) -> None:
     """Write ``camera`` as camera_info YAML; ``extra`` keys (plain values) go after the model.
 

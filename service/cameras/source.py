@@ -36,8 +36,6 @@ class GeoTag:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFrame:
-    """One image of a source."""
-
     pixels: U8 | Decoded  # (H, W, 3) BGR; of a video only some are converted
     time_ns: int  # presentation time, ns since the start of the stream
     seq: int  # 0, 1, 2 … of the delivered images

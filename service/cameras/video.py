@@ -49,10 +49,7 @@ class VideoSource:
     """The images of one open PyAV container; its first image is decoded on construction."""
 
     def __init__(
-        self,
-        container: av.container.InputContainer,
-        description: str,
-        follows_turn: bool = False,
+        self, container: av.container.InputContainer, description: str, follows_turn: bool = False
     ) -> None:
         """Take over ``container``; raises InputError when it has no image.
 

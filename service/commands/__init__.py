@@ -42,9 +42,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="one JSON object at the end
 Options = TypeVar("Options")
 
 
-def with_options(
-    of: type[Options],
-) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
+def with_options(of: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
     """Give a command one option for each field of a dataclass, Annotated by ``typer.Option``."""
     hints = get_type_hints(of, include_extras=True)
     options = [

@@ -163,11 +163,7 @@ def _said(ground: subprocess.Popen[str], out: Path, start: str) -> str:
 
 
 def _replay(flight: Path, out: Path, endpoint: str, overrides: list[str]) -> None:
-    settings = [
-        f'datalink.connect=["{endpoint}"]',
-        "datalink.budget_kbit_s=20000",
-        *overrides,
-    ]
+    settings = [f'datalink.connect=["{endpoint}"]', "datalink.budget_kbit_s=20000", *overrides]
     command = _skyrelief(
         "replay",
         str(flight / "frames"),

@@ -146,8 +146,7 @@ def refly(
         int | None, typer.Option(help="a place in fewer images is weak; default 3")
     ] = None,
     sigma_m: Annotated[
-        float | None,
-        typer.Option(help="a place of larger sigma is weak; default: 3 medians"),
+        float | None, typer.Option(help="a place of larger sigma is weak; default: 3 medians")
     ] = None,
     relative: Annotated[
         bool, typer.Option("--relative", help="heights above home instead of sea level")

@@ -62,15 +62,13 @@ def replay(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="scan folder to make")] = None,
     backend: Annotated[
-        str | None,
-        typer.Option(help="auto, cpu, torch or onnx", autocompletion=choices(BACKENDS)),
+        str | None, typer.Option(help="auto, cpu, torch or onnx", autocompletion=choices(BACKENDS))
     ] = None,
     realtime: Annotated[
         bool, typer.Option("--realtime", help="at the video's pace; late frames are dropped")
     ] = False,
     find_lens: Annotated[
-        bool,
-        typer.Option(help="without a camera model: estimate it from 25 of the images first"),
+        bool, typer.Option(help="without a camera model: estimate it from 25 of the images first")
     ] = True,
     config: ConfigFile = None,
     set_: Overrides = None,

@@ -19,10 +19,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def run(
-    config: ConfigFile = None,
-    set_: Overrides = None,
-) -> None:
+def run(config: ConfigFile = None, set_: Overrides = None) -> None:
     """Scan on the operator's commands; end with Ctrl-C or SIGTERM.
 
     SIGHUP reloads the configuration; an invalid one changes nothing.

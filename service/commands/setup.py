@@ -151,11 +151,7 @@ def _say_revoked(member: str, paths: list[Path], as_json: bool) -> None:
         print(f"  {path}")
 
 
-def warm_up(
-    config: ConfigFile = None,
-    set_: Overrides = None,
-    as_json: AsJson = False,
-) -> None:
+def warm_up(config: ConfigFile = None, set_: Overrides = None, as_json: AsJson = False) -> None:
     """Compile all kernels before the first flight, by a scan of synthetic ground.
 
     Run it as the service's user with its NUMBA_CACHE_DIR; the installer does.

@@ -75,8 +75,7 @@ class SimulateOptions:
     photos: Annotated[Path | None, typer.Option(help="Aerial photos as the ground.")] = None
     gps_noise_m: Annotated[float, typer.Option(help="Wander of the GPS.")] = 1.0
     gnss_noise: Annotated[
-        str,
-        typer.Option(help="wander: slow; white: from fix to fix; exact: no sensor errors."),
+        str, typer.Option(help="wander: slow; white: from fix to fix; exact: no sensor errors.")
     ] = "wander"
     boresight_deg: Annotated[
         str, typer.Option(help="RIGHT:UP degrees between camera and gimbal.")
@@ -262,8 +261,7 @@ def score(
         Path, typer.Argument(help="truth/ of simulate; with --views the video or folder of stills.")
     ],
     views: Annotated[
-        bool,
-        typer.Option("--views", help="draw frames that took no part and compare them instead"),
+        bool, typer.Option("--views", help="draw frames that took no part and compare them instead")
     ] = False,
     images: Annotated[
         Path | None, typer.Option(help="with --views: folder for what was seen and drawn")

@@ -28,8 +28,7 @@ def stereo(
     min_disparity: Annotated[int, typer.Option(help="the smallest disparity, px")] = 0,
     iterations: Annotated[int, typer.Option(help="of belief propagation, per level")] = 5,
     backend: Annotated[
-        str,
-        typer.Option(help="auto, cpu, torch or onnx", autocompletion=choices(BACKENDS)),
+        str, typer.Option(help="auto, cpu, torch or onnx", autocompletion=choices(BACKENDS))
     ] = "auto",
     model: Annotated[
         Path | None, typer.Option(help="TOML file of a learned model to use instead")

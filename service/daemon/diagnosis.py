@@ -51,8 +51,6 @@ SOON_DAYS = 30  # a certificate that expires sooner gives a note
 
 
 class Grade(str, Enum):
-    """How grave a finding is."""
-
     GOOD = "good"
     NOTE = "note"  # can fly
     BAD = "bad"
@@ -83,8 +81,6 @@ WORST = {"ground": NOTE}  # it may be switched off
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one check."""
-
     what: str
     verdict: Grade
     text: str

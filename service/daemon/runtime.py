@@ -61,8 +61,6 @@ REPORT_FAULT_S = 10.0
 
 
 class Daemon:
-    """The onboard service."""
-
     def __init__(
         self,
         config: Config,

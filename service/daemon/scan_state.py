@@ -96,10 +96,7 @@ class Effect(Enum):
 
 
 TRANSITIONS: dict[State, dict[Event, State]] = {
-    State.IDLE: {
-        Event.START: State.WAITING,
-        Event.END: State.ENDED,
-    },
+    State.IDLE: {Event.START: State.WAITING, Event.END: State.ENDED},
     State.WAITING: {
         Event.TICK: State.SCANNING,
         Event.STOP: State.IDLE,
@@ -153,10 +150,7 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
         Event.FAILED: State.WAITING_PAUSED,
         Event.END: State.ENDING,
     },
-    State.ENDING: {
-        Event.DONE: State.ENDED,
-        Event.FAILED: State.ENDED,
-    },
+    State.ENDING: {Event.DONE: State.ENDED, Event.FAILED: State.ENDED},
     State.ENDED: {},
 }
 """The next state; an event that is not listed changes nothing."""

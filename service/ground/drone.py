@@ -60,8 +60,6 @@ class DroneLimits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Put:
-    """Publish."""
-
     key: str
     payload: bytes
 
@@ -85,8 +83,6 @@ class Write:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Opened:
-    """A scan was opened."""
-
     scan: ReceivedScan
 
 

@@ -98,8 +98,6 @@ so that neither the round trip nor what is newer waits long."""
 
 @dataclass(slots=True)
 class ReceptionState:
-    """State of a scan's reception."""
-
     received_bytes: int = 0
     duplicates: int = 0  # records that came although held
     unsound: int = 0  # records that are not valid, or not what their parts said

@@ -304,10 +304,7 @@ def _news(feed: LiveFeed, site: SiteNews, link: _LinkNews) -> Iterator[str | byt
 
 
 async def serve_live(
-    socket: WebSocket,
-    library: Path,
-    folder: Path,
-    progress: Callable[[], list[dict[str, Any]]],
+    socket: WebSocket, library: Path, folder: Path, progress: Callable[[], list[dict[str, Any]]]
 ) -> None:
     """Send what is new in the scan of ``folder`` over an accepted socket; close it at the end."""
     store = None

@@ -25,16 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.errors import InputError, SkyreliefError
-from service.ground.drone import (
-    Align,
-    DroneLimits,
-    DroneReceiver,
-    Effect,
-    Get,
-    Opened,
-    Put,
-    Write,
-)
+from service.ground.drone import Align, DroneLimits, DroneReceiver, Effect, Get, Opened, Put, Write
 from service.ground.drones import Drones
 from service.ground.front import behind_fronts
 from service.ground.inbox import CHANNEL, Grown, Inbox, Radio, Replies, Written

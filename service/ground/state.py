@@ -45,8 +45,6 @@ KINDS = (*EXPORTERS, REFINE)
 
 @dataclass(slots=True, eq=False)
 class Job:
-    """One requested deliverable."""
-
     number: int
     folder: Path
     kind: str
@@ -267,8 +265,6 @@ class OpenScans(Generic[V]):
 
 @dataclass(slots=True, eq=False)
 class PortalState:
-    """The parts behind one portal."""
-
     library: Library
     jobs: Jobs
     progress: Callable[[], list[dict[str, Any]]]  # one entry per scan being received

@@ -305,10 +305,7 @@ def take_in(
 
 
 def _take(
-    store: Path,
-    folder: Path,
-    deliver: Callable[[Path, ScanStore], None],
-    room_bytes: int | None,
+    store: Path, folder: Path, deliver: Callable[[Path, ScanStore], None], room_bytes: int | None
 ) -> Path:
     with workplace(store) as place:
         copy_files(folder, place, STORE_FILES, room_bytes)

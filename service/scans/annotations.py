@@ -57,8 +57,6 @@ class About(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Annotation(msgspec.Struct, forbid_unknown_fields=True):
-    """One annotation as a feature of GeoJSON."""
-
     type: Literal["Feature"]
     id: Number
     geometry: Point | LineString

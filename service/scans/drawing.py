@@ -313,8 +313,6 @@ DEBUG_KEYS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panel:
-    """One image with its title."""
-
     title: str
     image: U8  # (h, w, 3) BGR
 

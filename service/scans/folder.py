@@ -48,13 +48,7 @@ from service.scans.fused_cloud import (
     thinned,
     write_laz,
 )
-from service.scans.main_piece import (
-    in_words,
-    main_poses,
-    main_seqs,
-    pieces_apart,
-    stretches_apart,
-)
+from service.scans.main_piece import in_words, main_poses, main_seqs, pieces_apart, stretches_apart
 from service.scans.report import report_html
 from service.scans.track import (
     csv_table,

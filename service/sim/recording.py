@@ -56,8 +56,6 @@ class Faults:
 
 @dataclass(frozen=True, slots=True)
 class SimulationOptions:
-    """Everything that decides a simulated flight."""
-
     plan: FlightPlan = field(default_factory=FlightPlan)
     noise: SensorNoise = field(default_factory=SensorNoise)
     telemetry: TelemetryOptions = field(default_factory=TelemetryOptions)

@@ -117,11 +117,7 @@ def of_cues(path: Path, cues: Iterable[tuple[int, str]], config: HistoryConfig) 
 
 
 def _cue(
-    history: VehicleHistory,
-    counts: Counter[str],
-    focals: list[float],
-    time_ns: int,
-    text: str,
+    history: VehicleHistory, counts: Counter[str], focals: list[float], time_ns: int, text: str
 ) -> None:
     """Add what one cue says to the history, its counts and its focal lengths in mm."""
     counts["cues"] += 1

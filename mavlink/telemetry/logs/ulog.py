@@ -12,12 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mavlink.telemetry.decode import (
-    CLEARANCE_SIGMA_M,
-    DOWNWARD,
-    plausible_place,
-    receiver_accuracy,
-)
+from mavlink.telemetry.decode import CLEARANCE_SIGMA_M, DOWNWARD, plausible_place, receiver_accuracy
 from mavlink.telemetry.gimbal import frame_of_flags
 from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog, finish

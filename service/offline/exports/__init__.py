@@ -13,17 +13,9 @@ from service.errors import InputError
 
 EXPORTERS: dict[str, tuple[str, str, str]] = {
     "ply": ("clouds:write_ply", "cloud.ply", "The cloud in UTM, as binary PLY."),
-    "laz": (
-        "clouds:write_laz_file",
-        "cloud.laz",
-        "The cloud as LAZ 1.4, with sigma and views.",
-    ),
+    "laz": ("clouds:write_laz_file", "cloud.laz", "The cloud as LAZ 1.4, with sigma and views."),
     "copc": ("clouds:write_copc", "cloud.copc.laz", "The cloud as a cloud-optimised octree."),
-    "dsm": (
-        "rasters:write_dsm",
-        "dsm.tif",
-        "Heights with buildings and trees, as GeoTIFF.",
-    ),
+    "dsm": ("rasters:write_dsm", "dsm.tif", "Heights with buildings and trees, as GeoTIFF."),
     "dtm": ("rasters:write_dtm", "dtm.tif", "Heights of the bare ground, as GeoTIFF."),
     "ortho": ("rasters:write_ortho", "ortho.tif", "The true orthophoto, as GeoTIFF."),
     "contours": (
@@ -38,32 +30,16 @@ EXPORTERS: dict[str, tuple[str, str, str]] = {
         "coverage.tif",
         "Views and sigma of the ground, as GeoTIFF.",
     ),
-    "geojson": (
-        "flight:write_geojson",
-        "flight.geojson",
-        "The track and keyframes, as GeoJSON.",
-    ),
+    "geojson": ("flight:write_geojson", "flight.geojson", "The track and keyframes, as GeoJSON."),
     "kmz": ("maps:write_kmz", "ortho.kmz", "The orthophoto for Google Earth."),
     "stac": ("maps:write_stac", "stac.json", "A STAC item of the rasters in its folder."),
     "kml": ("flight:write_kml", "flight.kml", "The track for Google Earth."),
-    "colmap": (
-        "colmap:write_colmap",
-        "colmap",
-        "Frames, poses and tracks for COLMAP.",
-    ),
+    "colmap": ("colmap:write_colmap", "colmap", "Frames, poses and tracks for COLMAP."),
     "3dtiles": ("clouds:write_tiles", "3dtiles", "The cloud as 3D Tiles, for Cesium."),
-    "3dtiles-mesh": (
-        "model:write_mesh_tiles",
-        "3dtiles-mesh",
-        "The textured mesh as 3D Tiles.",
-    ),
+    "3dtiles-mesh": ("model:write_mesh_tiles", "3dtiles-mesh", "The textured mesh as 3D Tiles."),
     "glb": ("model:write_glb", "mesh.glb", "The textured mesh as binary glTF."),
     "obj": ("model:write_obj", "mesh-obj", "The mesh as OBJ, in UTM less an offset."),
-    "splat": (
-        "splats:write_splats",
-        "splat.ply",
-        "3D Gaussians, as PLY; or .spz.",
-    ),
+    "splat": ("splats:write_splats", "splat.ply", "3D Gaussians, as PLY; or .spz."),
     "report": (
         "report:write_report",
         "report.html",

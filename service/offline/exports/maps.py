@@ -142,9 +142,7 @@ def write_stac(scan: ScanView, out: Path, options: ExportOptions) -> None:
     item = {
         "type": "Feature",
         "stac_version": "1.0.0",
-        "stac_extensions": [
-            "https://stac-extensions.github.io/projection/v1.1.0/schema.json",
-        ],
+        "stac_extensions": ["https://stac-extensions.github.io/projection/v1.1.0/schema.json"],
         "id": scan.store.header.scan_id,
         "bbox": bbox,
         "geometry": geometry,

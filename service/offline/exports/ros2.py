@@ -20,13 +20,7 @@ import numpy as np
 
 from recon import se3
 from recon.types import F64, U8, Keyframe
-from service.offline.exports.recording import (
-    JPEG_QUALITY,
-    POINT,
-    in_order,
-    known_points,
-    mcap_file,
-)
+from service.offline.exports.recording import JPEG_QUALITY, POINT, in_order, known_points, mcap_file
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
 from service.scans.writing import writing

@@ -323,11 +323,7 @@ def check(
 
 
 def in_parts(
-    scan: ScanView,
-    make: Make[T],
-    options: ExportOptions,
-    margin_m: float,
-    needs_cell: bool = True,
+    scan: ScanView, make: Make[T], options: ExportOptions, margin_m: float, needs_cell: bool = True
 ) -> Iterator[T]:
     """A product as a whole, or tile by tile where there are more points than one may have.
 

@@ -30,12 +30,7 @@ from service.offline.refine.control_points import (
     screen,
 )
 from service.offline.refine.revisions import NEWEST, Revisions
-from service.offline.refine.survey_file import (
-    Sighting,
-    SurveyPoint,
-    SurveyRow,
-    read_survey,
-)
+from service.offline.refine.survey_file import Sighting, SurveyPoint, SurveyRow, read_survey
 from service.scans.track import camera_of, latest, local_frame
 from service.stream.images import whole_bgr
 from service.stream.store import ScanStore

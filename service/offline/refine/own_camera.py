@@ -31,14 +31,7 @@ from recon.calibration.flight import (
     within,
 )
 from recon.calibration.global_bundle import Sightings
-from recon.calibration.tracks import (
-    are_alike,
-    crossings,
-    extended,
-    image_of,
-    joined,
-    sharpened,
-)
+from recon.calibration.tracks import are_alike, crossings, extended, image_of, joined, sharpened
 from recon.camera_model import Undistorter, project, rays
 from recon.parallel import run_parallel
 from recon.tracking import matching

@@ -67,12 +67,7 @@ from service.scans.folder import write_deliverables
 from service.scans.track import camera_of, local_frame
 from service.scans.trust import BY_SURVEY
 from service.scans.writing import check_writable, filling_folder
-from service.stream.records import (
-    Repose,
-    ScanHeader,
-    unpack_covariance,
-    unpack_motion,
-)
+from service.stream.records import Repose, ScanHeader, unpack_covariance, unpack_motion
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
@@ -201,8 +196,6 @@ def _check_finished(folder: Path) -> None:
 
 
 class _Refinement:
-    """One adjustment of one scan."""
-
     def __init__(
         self,
         folder: Path,

@@ -74,8 +74,6 @@ class MissionItem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refly:
-    """The flight suggested."""
-
     lines: tuple[Line, ...]
     items: tuple[MissionItem, ...]
     home: tuple[float, float, float]  # latitude, longitude, AMSL metres

@@ -38,8 +38,6 @@ Sigma = Annotated[float, Meta(gt=0.0, le=100.0)]
 
 
 class SurveyRow(msgspec.Struct, frozen=True):
-    """One row as it is written."""
-
     name: Annotated[str, Meta(min_length=1, pattern=r"\S")]
     lat: Annotated[float, Meta(ge=-90.0, le=90.0)]
     lon: Annotated[float, Meta(ge=-180.0, le=180.0)]
