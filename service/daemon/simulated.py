@@ -48,7 +48,8 @@ class SimulatedFlight:
         given |= options
         self.folder = self._state / "-".join(["sim", *given.values()]).replace("/", "_")
         if not (self.folder / "flight.mp4").exists():
-            (render or render_flight)(self.folder, given)
+            with writing_folder(self.folder) as part:
+                (render or render_flight)(part, given)
         self._ports = free_ports(2)
 
     def configured(self, config: Config) -> Config:
@@ -111,7 +112,7 @@ def free_ports(count: int) -> list[int]:
 
 
 def render_flight(folder: Path, given: dict[str, str]) -> None:
-    """Render the flight; an interrupted rendering leaves nothing."""
+    """Render the flight into ``folder``."""
     from service.sim import recording
     from service.sim.flight import FlightPlan
 
@@ -135,8 +136,7 @@ def render_flight(folder: Path, given: dict[str, str]) -> None:
             log.info("rendering the simulated flight: frame %d of %d", done, total)
             notifier.closing()  # extends systemd's timeout
 
-    with writing_folder(folder) as part:
-        recording.write(simulation, part, report)
+    recording.write(simulation, folder, report)
 
 
 def _can_write(folder: Path) -> bool:

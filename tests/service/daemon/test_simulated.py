@@ -99,7 +99,7 @@ def test_it_flies_and_ends_with_its_camera(tmp_path: Path, service: type[Service
 
 def test_the_configuration_leads_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    flight = SimulatedFlight(SOURCE, lambda folder, given: folder.mkdir())
+    flight = SimulatedFlight(SOURCE, lambda folder, given: None)
     monkeypatch.setattr(simulated, "_can_write", lambda folder: False)
     config = flight.configured(load_config(None, [f"camera.source={SOURCE}"]))
     assert flight.folder == tmp_path / "sim-320x180-5-4-1"
@@ -125,15 +125,13 @@ def test_options_that_cannot_be_are_refused(
 
 
 def test_a_full_disk_gets_its_room_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(simulation: object, folder: Path, *_: object) -> None:
+    def full(folder: Path, given: object) -> None:
         (folder / "flight.mp4").write_bytes(bytes(100))
         raise OutsideError("No space left on device")
 
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    monkeypatch.setattr("service.sim.recording.prepare", lambda options: None)
-    monkeypatch.setattr("service.sim.recording.write", full)
     with pytest.raises(OutsideError, match="No space"):
-        SimulatedFlight(SOURCE)
+        SimulatedFlight(SOURCE, full)
     assert not list(tmp_path.iterdir())
 
 
