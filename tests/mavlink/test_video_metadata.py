@@ -71,14 +71,15 @@ def gps9(lat: float, fix: int, dop: float) -> bytes:
 
 
 def test_positions_of_a_gopro_spread_over_the_second_of_their_packet() -> None:
-    packets = [(k * SECOND_NS, SECOND_NS, gps5(47.0 + 1e-3 * k, 3, 1.4)) for k in range(3)]
+    torn = b"GPS"  # what remains of an item is left out
+    packets = [(k * SECOND_NS, SECOND_NS, gps5(47.0 + 1e-3 * k, 3, 2.0) + torn) for k in range(3)]
     log = gpmf.of_packets(HERE, packets, HistoryConfig())
     assert log.clock == "video" and log.counts["GPS5"] == 54
     for time_s in (0.0, 0.25, 1.5, 2.9):
         state = at(log, time_s)
         assert state.lat_deg == pytest.approx(47.0 + 1e-3 * time_s, abs=2e-7)
         assert state.lon_deg == pytest.approx(8.5) and state.alt_amsl_m == pytest.approx(412.5)
-        assert state.sigma_h_m == pytest.approx(2.1, rel=0.02) and not state.is_claimed
+        assert state.sigma_h_m == pytest.approx(3.0, rel=0.02) and not state.is_claimed
 
 
 def test_newer_gopros_state_fix_and_accuracy_with_each_position() -> None:
