@@ -3,7 +3,8 @@ some.
 
 Each set is a folder below ``--data``; a set that is not there is left out. No figure needs a
 simulator. Seams compare the surfaces of two visits, targets are surveyed, the log is the
-autopilot's. A flight that cannot be reconstructed has no figure but its trust.
+autopilot's. A flight that cannot be reconstructed has no figure but its trust; one that is refused
+has the reason.
 """
 
 from __future__ import annotations
@@ -85,7 +86,11 @@ def run(options: DataOptions) -> list[BenchResult]:
     results = []
     for one in there:
         with tempfile.TemporaryDirectory(prefix="skyrelief-real-") as folder:
-            flight = _replayed(one, options, Path(folder))
+            try:
+                flight = _replayed(one, options, Path(folder))
+            except InputError as error:
+                results.append(BenchResult(f"{one.name}: refused: {error}", 1.0, ""))
+                continue
             if options.previews is not None:
                 _keep_preview(flight, options.previews, one.name)
             for check in (_placed, seams, *one.checks):
@@ -121,11 +126,14 @@ def _keep_preview(flight: ReplayedSet, folder: Path, name: str) -> None:
 
 
 def skyrelief(*words: str) -> None:
-    """Run a command. Raises OutsideError with its last line when it fails."""
+    """Run a command. Raises InputError with its last line when it refuses its input, OutsideError
+    when it fails."""
     command = [sys.executable, "-m", "service.cli", *words]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no output"])[-1]
+        if done.returncode == InputError.exit_code:
+            raise InputError(last)
         raise OutsideError(f"skyrelief {words[0]} of {words[1]} failed: {last}")
 
 
@@ -351,5 +359,6 @@ SETS = (
     ),
     RealSet("COPR", "copr_kap_gcp/images", checks=(targets,)),
     RealSet("AP Hill", "aphill_orbit_fmv/aphill_240_1fps_crf32.mp4"),
+    RealSet("AP Hill, with its metadata", "aphill_orbit_fmv/aphill_klv_10s.ts"),
     RealSet("Karma", "gopro_karma_clip/karma.mp4"),
 )

@@ -39,6 +39,14 @@ def test_without_a_set_it_says_what_it_needs(tmp_path: Path, data: str | None) -
         run(DataOptions(data=None if data is None else tmp_path))
 
 
+def test_a_set_that_is_refused_has_its_reason(tmp_path: Path) -> None:
+    (tmp_path / "aphill_orbit_fmv").mkdir()
+    (tmp_path / "aphill_orbit_fmv" / "aphill_klv_10s.ts").touch()
+    (refused,) = run(DataOptions(data=tmp_path))
+    assert refused.what.startswith("AP Hill, with its metadata: refused: skyrelief: ")
+    assert refused.what.endswith("copy it from the camera again")
+
+
 def test_a_shifted_surface_shows_as_a_seam() -> None:
     depth = make_keyframe(0).depth
     above = make_keyframe(0).depth
