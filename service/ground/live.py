@@ -91,15 +91,11 @@ def chunk_message(store: ScanStore, seq: int, layer: int) -> bytes | None:
     return b"".join([struct.pack("<I", len(text)), text, *sections])
 
 
-def withdrawn(seq: int) -> bytes:
-    """The message by which a keyframe shows nothing: its first depth is void."""
-    text = json.dumps(
-        {
-            "type": "chunk", "seq": seq, "layer": -1, "time_unix_s": 0.0, "size": [1, 1],
-            "K": [1.0, 1.0, 0.0, 0.0], "box": [0, 0, 0, 0], "low": 0.0, "step": 1.0,
-            "T": columns(np.eye(4)), "scale": 1.0, "bytes": [0] * 5,
-        }
-    ).encode()  # fmt: skip
+def emptied(message: bytes) -> bytes:
+    """A chunk's message without any of its pixels."""
+    (size,) = struct.unpack_from("<I", message)
+    head = json.loads(message[4 : 4 + size]) | {"box": [0] * 4, "bytes": [0] * 5}
+    text = json.dumps(head).encode()
     return struct.pack("<I", len(text)) + text
 
 
@@ -162,6 +158,7 @@ class LiveFeed:
     heard_unix_s: float = 0.0  # when this feed saw the scan grow or change; else its last pose
     _sent: dict[int, int] = field(default_factory=dict)  # keyframe to the layer sent
     _revision: dict[int, int] = field(default_factory=dict)
+    _voids: dict[int, bytes] = field(default_factory=dict)  # messages that withdraw first depths
     _track: FlightPath = field(init=False)
     _finished: bool | None = None
     _version: tuple[int, int] = (-1, -1)
@@ -186,9 +183,9 @@ class LiveFeed:
         finest = {
             seq: min(layer, 0) if self.coarse else layer for seq, (layer, _) in states.items()
         }
-        for seq in [seq for seq, layer in self._sent.items() if layer < 0 and seq not in states]:
+        for seq in self._voids.keys() - states.keys():
             del self._sent[seq]
-            yield withdrawn(seq)
+            yield self._voids.pop(seq)
         due = [seq for seq, layer in finest.items() if layer > self._sent.get(seq, -2)]
         self._more = len(due) > max_chunks
         for seq in due[:max_chunks]:
@@ -197,6 +194,9 @@ class LiveFeed:
             message = chunk_message(self.store, seq, finest[seq])
             if message is not None:
                 self._revision[seq] = -1 if repose is None else repose.revision
+                self._voids.pop(seq, None)
+                if finest[seq] < 0:
+                    self._voids[seq] = emptied(message)
                 yield message
         yield from self._corrections(states)
         if self._track.grown():

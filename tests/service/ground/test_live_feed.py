@@ -109,9 +109,10 @@ def test_a_first_depth_is_shown_until_it_is_replaced_or_void(
     scan: ScanStore, feed: LiveFeed, house: HouseFlight
 ) -> None:
     def shown() -> list[tuple[int, int, int]]:
-        """Number, layer and width of the box of each chunk."""
+        """Number, layer and width of the box of each chunk, in place and time."""
         found = [m for m in feed.news() if isinstance(m, bytes)]
         heads = [json.loads(m[4 : 4 + int.from_bytes(m[:4], "little")]) for m in found]
+        assert all(head["time_unix_s"] and head["T"][12] == 5.0 * head["seq"] for head in heads)
         return [(head["seq"], head["layer"], head["box"][2]) for head in heads]
 
     shown()
