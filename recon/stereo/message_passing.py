@@ -337,28 +337,29 @@ def _coarser(
 ) -> None:  # pragma: no cover - compiled
     """Sum of the costs of 2x2 pixels, less its least, cut again to what can matter."""
     fine_height, _, labels, _ = fine.shape
+    sums, low = np.empty((labels, width), np.int16), np.empty(width, np.int16)
+    top = np.int16(4 * truncation)
     for v in range(begin, end):
-        below = 2 * v + 1 < fine_height
-        top = np.int16(4 * truncation)
-        for parity in range(2):
-            count = (width + 1 - parity) // 2
-            low = np.full(count, np.int16(32767), np.int16)
-            for label in range(labels):
+        low[:] = 32767
+        for label in range(labels):
+            row = sums[label]
+            a, b = fine[2 * v, 0, label, :width], fine[2 * v, 1, label, :width]
+            for u in range(width):
+                row[u] = np.int16(a[u] + b[u])
+            if 2 * v + 1 < fine_height:
+                a, b = fine[2 * v + 1, 0, label, :width], fine[2 * v + 1, 1, label, :width]
+                for u in range(width):
+                    row[u] += np.int16(a[u] + b[u])
+            for u in range(width):
+                low[u] = min(low[u], row[u])
+        for label in range(labels):
+            row = sums[label]
+            for parity in range(2):
                 out = data[v, parity, label]
-                a, b = fine[2 * v, 0, label], fine[2 * v, 1, label]
+                count = (width + 1 - parity) // 2
                 for i in range(count):
-                    out[i] = np.int16(a[2 * i + parity] + b[2 * i + parity])
-                if below:
-                    a, b = fine[2 * v + 1, 0, label], fine[2 * v + 1, 1, label]
-                    for i in range(count):
-                        out[i] += np.int16(a[2 * i + parity] + b[2 * i + parity])
-                for i in range(count):
-                    low[i] = min(low[i], out[i])
+                    out[i] = min(np.int16(row[2 * i + parity] - low[2 * i + parity]), top)
                 out[count:] = 0
-            for label in range(labels):
-                out = data[v, parity, label]
-                for i in range(count):
-                    out[i] = min(np.int16(out[i] - low[i]), top)
 
 
 @njit(cache=True, nogil=True)
