@@ -8,14 +8,16 @@ A free velocity per frame would be degenerate over flat ground (arXiv:2209.08503
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from recon import se3
 from recon.camera_model import rays
-from recon.types import F64, I64, Camera, PosePrior
+from recon.types import F64, Camera, PosePrior
 
 NEAR_S = 0.25
 """Frames further apart do not show the rotation within a readout."""
@@ -163,22 +165,31 @@ class FrameRows:
     time_ns: int
     prior: PosePrior
     T_camera_odom: F64  # (4, 4)
-    rows: Rows | None = None  # None: a global shutter
+    fitted: Rows | None = None  # as asked for last
     is_settled: bool = True  # no frame to come changes it
     is_measured: bool = False  # by neighbouring frames
     off: F64 | None = None  # (6,) by how much one more neighbour would change the rate
+    fit: Callable[[], Rows] | None = None  # by the neighbours known now; None: done
+
+    @property
+    def rows(self) -> Rows | None:
+        """The motion by what is known now, fitted once it is asked for; None: a global shutter."""
+        if self.fit is not None:
+            self.fitted, self.fit = self.fit(), None
+        return self.fitted
 
     @property
     def is_awaited(self) -> bool:
         """True where frames to come still change what a rolling shutter does to this one."""
-        return self.rows is not None and bool(self.rows.clock.readout_s) and not self.is_settled
+        return not self.is_settled and self.rows is not None and bool(self.rows.clock.readout_s)
 
     def at_middle(self, K: F64, uv: F64, inverse_depth: F64, readout_s: float | None = None) -> F64:
         """(N, 2) where the frame's pixels (N, 2) would be at the middle row's time; with another
         readout than the known one if ``readout_s`` is given."""
-        if self.rows is None:
+        rows = self.rows
+        if rows is None:
             return uv
-        rows = self.rows if readout_s is None else self.rows.reading(readout_s)
+        rows = rows if readout_s is None else rows.reading(readout_s)
         return rows.at_middle(K, uv, inverse_depth)
 
 
@@ -239,11 +250,11 @@ class RowTrack:
         for before in list(self._frames)[:-1]:
             if not before.is_settled:
                 self._refresh(before)
-                if before.is_settled and before.off is not None:
+                if before.is_settled and before.rows is not None and before.off is not None:
                     self._offs.append(before.off)
 
     def _refresh(self, frame: FrameRows) -> None:
-        """Fit the motion of its rows to its neighbours and to telemetry."""
+        """From now on the motion of its rows is by its neighbours and by telemetry."""
         if self.clock is None:
             return
         times = np.array([(f.time_ns - frame.time_ns) * 1e-9 for f in self._frames])
@@ -256,34 +267,39 @@ class RowTrack:
         frame.is_settled = since_s >= NEAR_S or (after >= 2 and since_s >= STEADY_S)
         frame.is_measured = near.size >= 2
         if near.size < (1 if frame.prior.turn_rad_s is None else 2):
-            frame.rows = _by_telemetry(frame, self.clock)
+            frame.fit = partial(_by_telemetry, frame, self.clock)
             return
         degree = min(near.size, 2 + min(after, near.size - after, 2))
-        rate, change = self._by_neighbours(frame, times, near, degree)
-        frame.rows = _with_telemetry(
-            frame.prior, Rows(self.clock, rate, change, self._covariance(frame.off))
-        )
-
-    def _by_neighbours(
-        self, frame: FrameRows, times: F64, near: I64, degree: int
-    ) -> tuple[F64, F64]:
-        """(6,) rate and change by the frames ``near``, and what one more would do to the rate."""
-        from_odom = se3.inverse(frame.T_camera_odom)
-        rest = np.setdiff1d(np.flatnonzero(times), near)
+        rest = np.flatnonzero(times)
+        rest = rest[~np.isin(rest, near)]
         more = np.append(near, rest[np.abs(times[rest]).argsort(kind="stable")[:1]])
-        twists = np.array([se3.log(self._frames[n].T_camera_odom @ from_odom) for n in more])
-        rate, change = _polynomial(times[near], twists[: near.size], degree)
-        if rest.size:
-            frame.off = _polynomial(times[more], twists, degree + 1)[0] - rate
-        return rate, change
+        there = [self._frames[n].T_camera_odom for n in more]
+        frame.fit = partial(
+            _by_neighbours, frame, self.clock, times[more], there, near.size, degree,
+            tuple(self._offs),
+        )  # fmt: skip
 
-    def _covariance(self, off: F64 | None) -> F64:
-        """(6, 6) of a rate that one more neighbour changes by ``off`` (6,): half by that, half by
-        the frames before."""
-        before = [np.outer(one, one) for one in self._offs]
-        own = [] if off is None else [np.outer(off, off)]
-        parts = [np.mean(part, axis=0) for part in (own, before) if part]
-        return np.asarray(SHORT**2 * np.mean(parts, axis=0)) if parts else np.zeros((6, 6))
+
+def _by_neighbours(
+    frame: FrameRows, clock: RowClock, times: F64, there: Sequence[F64], near: int, degree: int,
+    offs: Sequence[F64],
+) -> Rows:  # fmt: skip
+    """The motion by the first ``near`` of neighbours (N,) seconds later at poses (4, 4) each, and
+    what one more would do to its rate."""
+    from_odom = se3.inverse(frame.T_camera_odom)
+    twists = np.array([se3.log(T @ from_odom) for T in there])
+    rate, change = _polynomial(times[:near], twists[:near], degree)
+    if times.size > near:
+        frame.off = _polynomial(times, twists, degree + 1)[0] - rate
+    return _with_telemetry(frame.prior, Rows(clock, rate, change, _covariance(frame.off, offs)))
+
+
+def _covariance(off: F64 | None, before: Sequence[F64]) -> F64:
+    """(6, 6) of a rate that one more neighbour changes by ``off`` (6,): half by that, half by the
+    frames ``before``."""
+    own = [] if off is None else [off]
+    parts = [np.transpose(part) @ part / len(part) for part in (own, before) if part]
+    return np.asarray(SHORT**2 * np.mean(parts, axis=0)) if parts else np.zeros((6, 6))
 
 
 def _polynomial(t: F64, twists: F64, degree: int) -> tuple[F64, F64]:

@@ -121,6 +121,23 @@ def test_neighbours_tell_how_the_rows_moved() -> None:
         np.testing.assert_allclose(rows.rate[3:], derivative(i / 15)[3:], atol=0.35)
 
 
+def test_rows_asked_for_late_are_those_of_their_own_segment() -> None:
+    def rates(ends_first: bool) -> list[F64]:
+        track = RowTrack(replace(PLAIN, shutter=Shutter(0.03)))
+        frames = [track.expect(0, PosePrior(), swinging(0.0))]
+        for i in range(6):
+            frames.append(track.expect(int(i * 1e9 / 15), PosePrior(), swinging(i / 15)))
+            track.add(frames[-1], swinging(i / 15))
+        if ends_first:
+            track.begin()
+            track.add(track.expect(int(6e9 / 15), PosePrior(), swinging(9.0)), swinging(9.0))
+        return [frame.rows.rate for frame in frames if frame.rows is not None]
+
+    asked_late, asked_before = rates(ends_first=True), rates(ends_first=False)
+    assert len(asked_late) == 7
+    np.testing.assert_array_equal(asked_late, asked_before)
+
+
 def test_telemetry_speaks_for_frames_far_apart() -> None:
     turn, velocity = np.array([0.1, 0.2, -0.3]), np.array([8.0, 1.0, 0.0])
     prior = PosePrior(velocity_m_s=velocity, turn_rad_s=turn)
