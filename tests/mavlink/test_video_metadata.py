@@ -108,6 +108,17 @@ def test_a_real_karma_gives_its_autopilots_position() -> None:
     assert state.sigma_h_m == pytest.approx(0.25, abs=0.02) and state.v_ned_m_s is not None
 
 
+def test_positions_that_state_their_own_time_lie_at_it() -> None:
+    """The packet of the second one comes late."""
+    packets = []
+    for k, second in enumerate((0.0, 1.3, 2.0)):
+        row = struct.pack(">8f", 10.0 + k, 47.0 + 0.1 * k, 8.5, 400.0, 10.0, 0.0, 0.0, 0.0)
+        stream = item(b"TYPE", "c", 1, b"ffffffff") + item(b"SCAL", "l", 4, struct.pack(">l", 1))
+        packets.append((round(second * SECOND_NS), 0, gopro(stream + item(b"GLPI", "?", 32, row))))
+    log = gpmf.of_packets(HERE, packets, HistoryConfig())
+    assert at(log, 1.0).lat_deg == pytest.approx(47.1, abs=1e-4)
+
+
 def turned(image_to_start: Rotation, stabilised: Rotation, down: np.ndarray) -> bytes:
     """A packet of one frame: the camera's turn since the start, the image's in it, gravity."""
     camera = (image_to_start * stabilised).inv()
