@@ -39,7 +39,6 @@ class ListenerLimits:
     wait_s: float = 10.0  # for a TLS handshake and a request's whole header
 
     def __post_init__(self) -> None:
-        """Check ranges."""
         if not 0 < self.per_address <= self.total or self.wait_s <= 0:
             raise ValueError("listener: 0 < per_address <= total and wait_s > 0 must hold")
 

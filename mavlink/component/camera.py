@@ -163,7 +163,6 @@ class CameraComponent:
             self._series = None
 
     def _fail(self, shots: int, why: str) -> None:
-        """Report the oldest pending shots as failed."""
         if shots:
             self._say(WARNING, f"photo failed: {why}")
         for _ in range(shots):

@@ -170,7 +170,6 @@ class VehicleLink:
         self._inbox.put(lambda: self._companion.say(severity, text, is_answer))
 
     def report_keyframe(self, keyframe: KeyframeReport) -> None:
-        """Report a keyframe to ground stations."""
         self._inbox.put(lambda: self._companion.report(keyframe))
 
     def send_tunnel(self, payload_type: int, payload: bytes) -> None:
@@ -285,7 +284,6 @@ class VehicleLink:
         self._send(self._companion.take())
 
     def _serve(self, wait_s: float) -> None:
-        """Run queued jobs and process telemetry."""
         telemetry, jobs = self._inbox.take(wait_s)
         for job in jobs:  # first: a heartbeat identifies the telemetry that follows
             self._guard(job)

@@ -52,7 +52,6 @@ class Link:
         return self._port is not None
 
     def start(self) -> None:
-        """Start both threads, unless they run."""
         if self._threads:
             return
         for target in (self._read, self._write):

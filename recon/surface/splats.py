@@ -80,7 +80,6 @@ class Splats:
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """All Gaussians of the parts."""
     return Splats(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Splats)))
 
 

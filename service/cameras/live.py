@@ -89,7 +89,6 @@ class StampFilter:
     BACKLOG = 0.25  # share of the step in presentation time: catching up if the offset falls faster
 
     def __init__(self) -> None:
-        """Start with no estimate."""
         self._offset_ns: float | None = None
         self._last_pts_ns = 0
 

@@ -154,7 +154,6 @@ class ControlActions:
         return work
 
     def erase_scans(self) -> Handled:
-        """Delete the finished scans."""
         work = Work()
         PROCESS.start("erase", lambda _: self._erase(work))
         return work

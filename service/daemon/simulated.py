@@ -112,7 +112,6 @@ def free_ports(count: int) -> list[int]:
 
 
 def render_flight(folder: Path, given: dict[str, str]) -> None:
-    """Render the flight into ``folder``."""
     from service.sim import recording
     from service.sim.flight import FlightPlan
 

@@ -56,7 +56,6 @@ class Writings:
 
     @property
     def names(self) -> set[str]:
-        """Names of the scans."""
         return {writing.folder.name for writing in tuple(self._all)}
 
     def marks(self) -> tuple[Any, ...]:

@@ -40,7 +40,6 @@ class Introduction:
         self._ask_at = 0.0
 
     def on_head(self, head: Head, now: float) -> None:
-        """Take the drone's announcement of its items."""
         self.head, self.seen_at = head, now
 
     def next_ask(self, now: float) -> RangeSet | None:
@@ -136,7 +135,6 @@ class ScanIntake:
     # What comes
 
     def on_head(self, head: Head, now: float) -> None:
-        """Take the drone's announcement of its items."""
         for kind, numbers in missing(head.numbers, self.store.numbers()).items():
             if kind.startswith("k"):
                 for number in islice(numbers.newest_first(), TIMED):

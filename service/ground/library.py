@@ -219,7 +219,6 @@ class Library:
         return name
 
     def bin(self) -> list[str]:
-        """Names of the deleted scans."""
         place = self.store / BIN
         return sorted(p.name for p in place.iterdir()) if place.is_dir() else []
 

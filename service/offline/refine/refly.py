@@ -84,7 +84,6 @@ class Refly:
 
     @property
     def length_m(self) -> float:
-        """All lines and the ways between them."""
         ways = sum(float(np.linalg.norm(b.start_m - a.end_m)) for a, b in pairwise(self.lines))
         return sum(line.length_m for line in self.lines) + ways
 

@@ -316,7 +316,6 @@ def _reposes(
     store: ScanStore, members: Sequence[Member], found: SiteAlignment,
     adjusted: dict[int, tuple[F64, F64]],
 ) -> list[Repose]:  # fmt: skip
-    """The keyframes' poses after the alignment."""
     out = []
     for member, move in zip(members, found.moves, strict=True):
         for seq in member.seqs:
