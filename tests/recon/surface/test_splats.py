@@ -169,6 +169,19 @@ def test_what_other_views_see_through_is_left_out() -> None:
     assert np.abs(splats.xyz_m[:, 2]).max() < 1.0
 
 
+def test_a_place_that_two_images_show_has_one_gaussian() -> None:
+    depth = slope(se3.compose(DOWN, np.array([0.0, 0.0, 20.0])), np.array([0.0, 0.0, 1.0]))
+    view, corners = (
+        painted(depth),
+        np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0]]),
+    )
+    surface = Mesh(corners, np.array([[0, 1, 2]], np.int32))
+    one, two = (
+        len(splats_of([keyframe(k, depth) for k in range(n)], [view] * n, surface)) for n in (1, 2)
+    )
+    assert one > 0.9 * depth.depth_m.size and two == pytest.approx(one, rel=0.1)
+
+
 def test_nothing_hangs_alone_in_the_air() -> None:
     depth = slope(se3.compose(DOWN, np.array([0.0, 0.0, 20.0])), np.array([0.0, 0.0, 1.0]))
     view = painted(depth)
