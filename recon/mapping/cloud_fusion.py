@@ -66,14 +66,12 @@ def fuse_strips(
         return sums.means(_first_of_each(times))
 
     rows = zip(strips, borders[:-1], borders[1:], strict=True)
-    keys, clouds = zip(*run_parallel(*(partial(fused, *row) for row in rows)), strict=True)
-    whole = joined(clouds)
+    found = run_parallel(*(partial(fused, *row) for row in rows))
+    keys, whole = np.concatenate([of[0] for of in found]), joined([of[1] for of in found])
+    del found  # as large as the whole
     lone = np.zeros(len(whole), np.bool_)
-    every = np.concatenate(keys)
-    parallel_for(
-        _lone_contradicted, len(lone), every, whole.xyz_m, whole.sigma_m, whole.views, lone
-    )
-    lone |= _islands(every, whole.views)
+    parallel_for(_lone_contradicted, len(lone), keys, whole.xyz_m, whole.sigma_m, whole.views, lone)
+    lone |= _islands(keys, whole.views)
     return whole if not lone.any() else without(whole, lone)
 
 
@@ -299,13 +297,15 @@ def _steps() -> I64:
 def _islands(keys: I64, views: U8) -> Bool:
     """(N,) points of islands that are mostly seen once, where a column of cells at the island
     or next to it also has surface that is seen more often."""
-    low = (1 << BITS) - 1
-    i, j, k = (((keys >> s) & low) >> ISLAND_SHIFT for s in (2 * BITS, BITS, 0))
-    cells, cell = np.unique((i << 2 * BITS) | (j << BITS) | k, return_inverse=True)
+    axis = (1 << BITS - ISLAND_SHIFT) - 1  # a shift moves bits of one axis to the next
+    mask = axis << 2 * BITS | axis << BITS | axis
+    cells, cell = np.unique(keys >> ISLAND_SHIFT & mask, return_inverse=True)
     part = pieces(cells)
-    count, once = np.bincount(part[cell]), np.bincount(part[cell], views <= 1)
+    points = np.bincount(cell)
+    singles = np.bincount(cell[views <= 1], minlength=len(cells))
+    count, once = np.bincount(part, points), np.bincount(part, singles)
     is_island = (count < ISLAND_POINTS) & (2 * once > count)
-    columns = np.unique(cells[np.unique(cell[(views > 1) & ~is_island[part[cell]]])] >> BITS)
+    columns = np.unique(cells[(points > singles) & ~is_island[part]] >> BITS)
     suspect = np.flatnonzero(is_island[part])
     around = (_steps()[1::3] >> BITS)[None] + (cells[suspect] >> BITS)[:, None]
     refuted = np.zeros(len(count), np.bool_)

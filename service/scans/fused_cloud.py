@@ -22,6 +22,7 @@ from recon.mapping.voxel_map import ground_sample_m
 from recon.parallel import run_parallel, threads
 from recon.types import F64, I64, U8, Keyframe, PointCloud
 from service.georeference import LocalFrame, map_crs
+from service.memory import release_memory
 from service.progress import Progress
 from service.scans.main_piece import Keyframes, main_keyframes
 
@@ -100,6 +101,7 @@ def fused_cloud(
         strips = [_strip(store, extents, held, box, a, b, say) for a, b in pairwise(edges)]
         cloud = fuse_strips(strips, edges, size)
         held.clear()
+    release_memory()
     if len(cloud):
         with progress.part("removing points that other images see through"):
             keyframes = progress.over(_decoded(store, extents), len(extents))
