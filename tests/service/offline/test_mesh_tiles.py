@@ -323,8 +323,8 @@ def test_models_share_surface_images_and_texture(
     counted(model, "volume_mesh")
     counted(images, "scan_images")
     counted(model, "texture")
-    options = ExportOptions(voxel_m=0.5, stored=True)
-    with ScanView(tmp_path, 0.5) as scan:
+    options = ExportOptions(voxel_m=1.0, stored=True)
+    with ScanView(tmp_path, 1.0) as scan:
         export(scan, "splat", None, options)
         export(scan, "glb", None, options)
         export(scan, "obj", None, options)
