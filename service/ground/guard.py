@@ -267,7 +267,7 @@ class RequestLimits:
     def __init__(
         self, app: ASGIApp, listener: BoundedListener, body_s: float, stall_s: float
     ) -> None:
-        """A body arrives within ``body_s``; who takes nothing for ``stall_s`` is dropped."""
+        """Bounds: seconds of a whole body, and seconds without progress of a reader."""
         self._app, self._listener = app, listener
         self._body_s, self._stall_s = body_s, stall_s
 
