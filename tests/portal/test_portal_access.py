@@ -198,7 +198,7 @@ def test_axe_finds_nothing_serious(
     browser.key("Escape")
     show(browser, f"{busy}/#/view/drone-1/test-1", size)
     browser.wait("document.querySelector('.state').classList.contains('receiving')")
-    browser.wait("!!document.querySelector('.side .jobs li')")
+    browser.wait("document.querySelector('.side .jobs progress')?.value === 50")
     for name in ("Measure", "Coverage"):
         browser.click(name)
     found += axe(browser, "live", tmp_path)

@@ -130,7 +130,7 @@ def test_the_export_dialog_says_what_each_product_is_and_makes_it(
             with browser.page.expect_response("**/api/jobs"):
                 pass
         assert browser.run("!!document.querySelector('article .made li')")  # its history
-        browser.page.unroute("**/api/jobs")
+        browser.page.unroute_all(behavior="wait")
         browser.click("Export…")
         browser.wait("!!document.querySelector('dialog')")
         browser.run("location.hash = '#/view/drone-1/test-1'")

@@ -167,22 +167,19 @@ function enlarge(image: HTMLImageElement, text: string): void {
 /** The image of the newest keyframe in the corner and in its frustum; a click on a frustum shows its own. */
 export class Images {
   readonly element = el("figure", { className: "panel latest", hidden: true });
-  private readonly timer = setInterval(() => this.refresh(), IMAGE_EVERY_MS);
+  /** Ends it. */
+  readonly close = api.every(IMAGE_EVERY_MS, async () => this.refresh());
   private chosen: number | null = null;
   private shown = -1;
   private version = 0;
   private down: { x: number; y: number } | null = null;
 
   constructor(private readonly site: Site, free: () => boolean) {
-    const { canvas } = { canvas: site.stage.renderer.domElement };
+    const canvas = site.stage.renderer.domElement;
     canvas.addEventListener("pointerdown", (e) => (this.down = { x: e.clientX, y: e.clientY }));
     canvas.addEventListener("click", (e) => {
       if (free() && this.down && Math.hypot(e.clientX - this.down.x, e.clientY - this.down.y) <= CLICK_PX) this.click(e);
     });
-  }
-
-  close(): void {
-    clearInterval(this.timer);
   }
 
   /** A keyframe came, or a finer layer of one: its image is fetched again. */

@@ -24,7 +24,7 @@ export const length = (m: number, digits = 2): string =>
   imperial() ? `${(m / FOOT).toFixed(digits)} ft` : `${m.toFixed(digits)} m`;
 
 /** The accuracy (one sigma) of a length. */
-export const accuracy = (m: number): string => `±${length(m)}`;
+export const accuracy = (m: number): string => `±${length(m, m < 10 ? 2 : 0)}`;
 
 /** The accuracy of a position: horizontal, vertical. */
 export const sigmas = (h_m: number, v_m: number): string => `${accuracy(h_m)} across, ${accuracy(v_m)} up`;
