@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import copy
 from dataclasses import replace
+from itertools import chain, islice
 from pathlib import Path
 from statistics import median
 
@@ -25,6 +26,10 @@ from service.errors import InputError
 log = logging.getLogger(__name__)
 
 SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"))
+
+MOST_BELOW = 2000
+"""Entries of subfolders in which images are sought where a folder has none."""
+
 SECOND_NS = 1_000_000_000
 ZOOM = 0.03
 """Relative tolerance of the focal lengths of one camera."""
@@ -147,7 +152,9 @@ class ImagesSource:
                 why = " ".join(str(error).split())[:120] or type(error).__name__
                 self._warn(f"{path.name} is not a readable image ({why}); skipped")
         if not tagged:
-            raise InputError(f"{folder} contains no images (jpg, png, tif); give their folder")
+            raise InputError(
+                f"{folder} contains no images (jpg, png, tif); give their folder{_inside(folder)}"
+            )
         return tagged
 
     def _one_camera(self, tagged: list[Still], chosen: str) -> list[Still]:
@@ -412,6 +419,13 @@ def widest(cameras: Mapping[str, list[Still]]) -> str:
     if all(focals.values()):
         return min(sharp, key=lambda name: (median(focals[name]), -pixels[name]))
     return max(sharp, key=pixels.__getitem__)
+
+
+def _inside(folder: Path) -> str:
+    """The folders in a folder that hold images, as on a camera's card, as words; few are read."""
+    below = chain(*(islice(folder.glob(pattern), MOST_BELOW) for pattern in ("*/*", "*/*/*")))
+    found = sorted({str(p.parent) for p in below if p.suffix.lower() in SUFFIXES})
+    return f": {', '.join(found[:3])}" if found else ""
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:

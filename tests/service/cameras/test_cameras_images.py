@@ -611,6 +611,14 @@ def test_folders_without_images_are_refused(tmp_path: Path) -> None:
         open_camera(f"images:{tmp_path / 'none'}")
 
 
+def test_a_folder_of_folders_names_those_with_images(tmp_path: Path) -> None:
+    for name in ("100MEDIA", "101MEDIA"):
+        (tmp_path / "DCIM" / name).mkdir(parents=True)
+        (tmp_path / "DCIM" / name / "DJI_0001.JPG").write_bytes(b"image")
+    with pytest.raises(InputError, match=r"give their folder: .*100MEDIA, .*101MEDIA$"):
+        open_camera(f"images:{tmp_path}")
+
+
 def test_natural_order() -> None:
     names = ["b2.jpg", "b10.jpg", "a.jpg", "b1.jpg", "10.jpg", "9.jpg"]
     ordered = sorted((Path(n) for n in names), key=natural_key)
