@@ -115,9 +115,9 @@ class BackgroundWorker(Generic[In, Out]):
             weakref.finalize(self, todo.put, None)  # also when it is never closed
 
     @property
-    def is_idle(self) -> bool:
-        """True when no offered work is left."""
-        return all(future.done() for future in self._offered)
+    def is_free(self) -> bool:
+        """True when no offered work waits to begin."""
+        return all(future.running() or future.done() for future in self._offered)
 
     @property
     def busy_s(self) -> float:

@@ -53,4 +53,4 @@ class MapperConfig:
     sigma_lens: float = 0.0  # sigma of depth over depth by a lens that is not known
     sigma_k1: float = 0.0  # of the lens's first radial coefficient
     keeps_debug: bool = False  # the images of each view's stages
-    first_depths: bool = False  # of views whose partners have not come, while nothing else waits
+    first_depths: bool = False  # of views whose partners have not come, while no work waits

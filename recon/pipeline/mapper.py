@@ -64,7 +64,7 @@ class Worker(Protocol):
     def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]: ...
 
     @property
-    def is_idle(self) -> bool: ...
+    def is_free(self) -> bool: ...
 
     def close(self) -> None: ...
 
@@ -84,7 +84,7 @@ class InTurn:
         done, self._done = self._done, []
         return done
 
-    is_idle = True
+    is_free = True
 
     def close(self) -> None:
         """Nothing is left to do."""
@@ -194,7 +194,7 @@ class Mapper:
             return (*done, FramePosed(image.seq, image.time_ns, tracked, pose))
         for view in self.views.ready():
             self._worker.offer(view)  # to be reconstructed
-        if self.first_depths is not None and self._worker.is_idle:
+        if self.first_depths is not None and self._worker.is_free:
             first = self.views.first()
             if first is not None:
                 self._worker.offer(first)

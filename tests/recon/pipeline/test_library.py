@@ -86,7 +86,7 @@ class BrokenOff:
         poses = dict.fromkeys((7, self.views), Pose(np.eye(4), np.eye(6), scale=3.0))
         return [(view, GraphUpdate(poses[7], True, True, poses, keyframe(self.views)))]
 
-    is_idle = True
+    is_free = True
 
     def close(self) -> None: ...
 
