@@ -308,6 +308,12 @@ def cells_of(width: int) -> int:
 
 
 @njit(cache=True, nogil=True)
+def _blocks(width: int) -> int:  # pragma: no cover - compiled
+    """Blocks of a row of cells that have pixels: all, or all but the last one."""
+    return ((width + 1) // 2 + LANES - 1) // LANES
+
+
+@njit(cache=True, nogil=True)
 def _split(
     begin: int, end: int, cost: Any, truncation: int, data: Any
 ) -> None:  # pragma: no cover - compiled
@@ -371,7 +377,7 @@ def _start(
     Only the colour that the first sweep reads is filled; the sweep writes the other.
     """
     height, labels, cells = messages.shape[1] - 2, messages.shape[3], messages.shape[4]
-    known = coarse.shape[4]
+    known, written = coarse.shape[4], _blocks(width) * LANES
     for r in range(begin, end):
         for direction in range(4):
             if r in (0, height + 1):
@@ -381,6 +387,7 @@ def _start(
             # The cell before the first one of the row's other parity is read as a neighbour.
             messages[direction, r, 1 - parity, labels - 1, cells - 1] = 0
             for label in range(labels):
+                messages[direction, r, 1 - parity, label, written:] = 0
                 out = messages[direction, r, parity, label]
                 if known == 1:
                     out[:] = 0
@@ -395,7 +402,7 @@ def _start(
 
 @njit(cache=True, nogil=True)
 def _update_row(
-    data: Any, messages: Any, v: int, colour: int, edges: Any, masks: Any, scratch: Any
+    data: Any, messages: Any, v: int, colour: int, edges: Any, blocks: int, masks: Any, scratch: Any
 ) -> None:  # pragma: no cover - compiled
     """Messages that leave the pixels of one colour of row ``v``."""
     _, _, labels, cells = data.shape
@@ -408,7 +415,7 @@ def _update_row(
     d = data.ctypes.data + (2 * v + parity) * 2 * row
     line = 2 * cells  # bytes of the edges of one parity of a row
     side = (data.shape[0] + 2) * 2 * line  # from vertical to horizontal edges
-    for block in range(cells // LANES):
+    for block in range(blocks):
         at = 2 * LANES * block
         start = here + LANES * block
         beside = adjacent + LANES * block + parity
@@ -460,7 +467,7 @@ def _sweep_band(
     less at each inner edge per iteration.
     """
     height, _, labels, cells = data.shape
-    masks = _masks(width, cells)
+    masks, blocks = _masks(width, cells), _blocks(width)
     scratch = np.empty((labels + 1) * 4 * LANES, np.int16)
     first, last = height * band // bands, height * (band + 1) // bands
     for front in range(first, last + iterations):
@@ -469,7 +476,7 @@ def _sweep_band(
             begin = first + t if band > 0 else 0
             end = last - t if band < bands - 1 else height
             if begin <= v < end:
-                _update_row(data, messages, v, t & 1, edges, masks, scratch)
+                _update_row(data, messages, v, t & 1, edges, blocks, masks, scratch)
 
 
 @njit(cache=True, nogil=True)
@@ -478,11 +485,11 @@ def _sweep_gap(
 ) -> None:  # pragma: no cover - compiled
     """The messages that the bands on both sides of row ``edge`` left out."""
     labels, cells = data.shape[2], data.shape[3]
-    masks = _masks(width, cells)
+    masks, blocks = _masks(width, cells), _blocks(width)
     scratch = np.empty((labels + 1) * 4 * LANES, np.int16)
     for t in range(1, iterations):
         for v in range(edge - t, edge + t):
-            _update_row(data, messages, v, t & 1, edges, masks, scratch)
+            _update_row(data, messages, v, t & 1, edges, blocks, masks, scratch)
 
 
 def _sweeps(data: I16, messages: U8, edges: Any, width: int, iterations: int) -> None:
