@@ -152,7 +152,7 @@ def sharpened(pyramid: Callable[[int], Pyramid], camera: Camera, seen: Sightings
         found = robust_geometry.homography(here, flat[rows], RELIEF_PX)
         if found is None:
             return
-        warp = by_homography(found[0], here, REACH_PX).warp
+        warp = by_homography(found[0], here)[1]
         at = match(pyramid(a), here, pyramid(b), flat[rows], REACH_PX, warp)
         uv[rows[at.ok]] = at.uv_px[at.ok]
 

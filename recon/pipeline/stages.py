@@ -35,7 +35,7 @@ from recon.stereo.virtual_stereo import (
 )
 from recon.tracking.frame import Colour, RelativePose, UndistortedFrame
 from recon.tracking.known_track import AnyTrack
-from recon.tracking.matching import MatchingConfig, Pyramid
+from recon.tracking.matching import MatchingConfig, build_pyramid
 from recon.tracking.odometry import Tracked, Tracking
 from recon.types import (
     F32,
@@ -96,7 +96,7 @@ class Undistort:
             small = stretch(small, self._seen)
             is_blurred = self._blur.blurred(small)
             colour = Colour(image, self._undistorter)
-            pyramid = Pyramid.build(small, MatchingConfig().search_levels)
+            pyramid = build_pyramid(small, MatchingConfig().search_levels)
             return UndistortedFrame(
                 frame.seq, frame.time_ns, frame.prior, colour, gray, pyramid, self._mask, is_blurred
             )

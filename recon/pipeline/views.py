@@ -26,7 +26,6 @@ from recon.tracking.keyframe_window import (
     step_covariance,
 )
 from recon.tracking.known_track import AnyTrack
-from recon.tracking.matching import Pyramid
 from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.prediction import inverse_depth_plane
 from recon.types import F32, F64, U8, Camera, PosePrior
@@ -334,9 +333,7 @@ class VirtualStereoCamera:
         key = next(key for key in reversed(self._odometry.keyframes) if key.seq <= image.seq)
         T_keyframe_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
         reference = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
-        frame = replace(
-            image, pyramid=Pyramid(()), mask=None, reference=reference, moving=tracked.moving
-        )
+        frame = replace(image, pyramid=(), mask=None, reference=reference, moving=tracked.moving)
         self._tracked.append((image.time_ns, reference))
         is_view = self.selection.offer(frame, tracked)
         self._fixes.take(tracked.T_odom_camera, image.prior)

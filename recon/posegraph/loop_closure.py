@@ -141,7 +141,7 @@ def verify(
     uv, points = landmarks(a, config.matching)
     if len(uv) < config.min_matches:
         return None
-    pyramids = tuple(matching.Pyramid.build(v.gray, config.matching.search_levels) for v in (a, b))
+    pyramids = tuple(matching.build_pyramid(v.gray, config.matching.search_levels) for v in (a, b))
     T_b_a = se3.inverse(T_a_b_guess)
     predicted = project(b.K, se3.transform(T_b_a, points))
     warp = warps(a.K, b.K, T_b_a, uv, points)
@@ -163,9 +163,10 @@ def _by_features(
     view = common_view(features(a.gray), features(b.gray))
     if view is None:
         return None
+    there, warp = view.predict(uv)
     for share in FEATURE_SHARES:
-        there, near = view.predict(uv, share * b.gray.shape[1]), replace(config, search_share=share)
-        solved = _pose(pyramids, uv, points, there.uv, there.warp, b, None, near)
+        near = replace(config, search_share=share)
+        solved = _pose(pyramids, uv, points, there, warp, b, None, near)
         if solved is not None:
             return solved
     return None
@@ -173,7 +174,7 @@ def _by_features(
 
 def landmarks(view: LoopView, config: matching.MatchingConfig) -> tuple[F64, F64]:
     """(N, 2) corners with a known depth and their (N, 3) points in the camera frame."""
-    corners = matching.harris_grid(view.gray, config).uv_px.astype(np.float64)
+    corners = matching.harris_grid(view.gray, config)[:, :2].astype(np.float64)
     h, w = view.depth.depth_m.shape
     H, W = view.gray.shape
     place = np.rint((corners + 0.5) * [w / W, h / H] - 0.5).astype(np.int64)

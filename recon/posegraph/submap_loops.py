@@ -61,7 +61,7 @@ def verify_surfaces(
     uv, points = landmarks(a, config.matching)
     if len(uv) < config.min_matches:
         return None
-    pyramids = [matching.Pyramid.build(v.gray, config.matching.search_levels) for v in (a, b)]
+    pyramids = [matching.build_pyramid(v.gray, config.matching.search_levels) for v in (a, b)]
     T_b_a = se3.inverse(T_a_b_guess)
     predicted = project(b.K, se3.transform(T_b_a, points))
     bent = warps(a.K, b.K, T_b_a, uv, points)

@@ -8,13 +8,13 @@ places seen before. The search for Harris corners makes it exact.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from recon.tracking import robust_geometry
-from recon.tracking.prediction import Prediction, by_homography
+from recon.tracking.prediction import by_homography
 from recon.types import F32, F64, U8
 
 WIDTH_PX = 480
@@ -92,10 +92,10 @@ class CommonView:
         correction = np.median(off[nearest], axis=1)
         return np.asarray(there + correction * is_near[:, None], np.float64)
 
-    def predict(self, uv_px: F64, radius_px: float) -> Prediction:
-        """Where the pixels ``uv_px`` (N, 2) of image a are in image b, to within ``radius_px``."""
-        by_plane = by_homography(self.H, uv_px, radius_px)
-        return replace(by_plane, uv=self.carry(uv_px))
+    def predict(self, uv_px: F64) -> tuple[F64, F64]:
+        """Where (N, 2) the pixels ``uv_px`` (N, 2) of image a are in image b, and the warps
+        (N, 2, 2) of offsets there."""
+        return self.carry(uv_px), by_homography(self.H, uv_px)[1]
 
 
 def features(

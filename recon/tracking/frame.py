@@ -79,7 +79,7 @@ class UndistortedFrame:
     @property
     def small(self) -> U8:
         """(h, w) gray, as the odometry takes it."""
-        return self.pyramid.levels[0]
+        return self.pyramid[0]
 
     @property
     def motion(self) -> FrameRows:

@@ -55,16 +55,6 @@ CLEAR_SHARE = 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Start:
-    """Where the camera may be, and how far from there to search for a keyframe's corners."""
-
-    key: OdometryKeyframe
-    T_camera_odom: F64  # (4, 4)
-    share: float  # radius, of the image's width
-    by_features: bool = False  # which leave no doubt about the heading
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Located:
     """A frame's pose and a keyframe's corners found in it."""
 
@@ -103,15 +93,15 @@ class Search:
         return self.key.landmarks[self.key.landmark[self.known]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TwoViewPose:
-    """A frame's pose by what it and one keyframe see; its scale is known otherwise, as by that
-    keyframe's depths."""
+TwoViewPose = tuple[OdometryKeyframe, F64, F64, Bool]
+"""A frame's pose by what it and one keyframe see, whose depths give the scale: that keyframe,
+T_camera_odom (4, 4), where (N, 2) its corners are found, and which (N,) are."""
 
-    key: OdometryKeyframe
-    T_camera_odom: F64  # (4, 4)
-    uv: F64  # (N, 2) of the keyframe's corners
-    ok: Bool  # (N,)
+
+Start = tuple[OdometryKeyframe, F64, float, bool]
+"""Where the camera may be: a keyframe, T_camera_odom (4, 4), the radius about it, as a share of the
+width, in which to search for the keyframe's corners, and whether features leave no doubt about the
+heading."""
 
 
 class Localiser:
@@ -123,6 +113,8 @@ class Localiser:
         """``features`` finds views that no motion predicts."""
         self.camera, self.config, self._row_track = camera, config, row_track
         self._features = features
+        self._near_px = [share * camera.size_px[0] for share in FEATURE_SHARES]
+        self._drift = np.eye(3)  # from the pixels of a segment's first frame to the last one's
 
     def locate(
         self,
@@ -142,14 +134,13 @@ class Localiser:
         reason, best = "no match", None
         least = self.config.min_tracks
         most = None if low_frame_rate else self.config.tracked_landmarks
-        for start in self._starts(new, keyframes, motion, lost):
-            key, T_camera_odom = start.key, start.T_camera_odom
+        for key, T_camera_odom, share, by_features in self._starts(new, keyframes, motion, lost):
             left = keyframes[-2] if len(keyframes) > 1 and key is keyframes[-1] else None
-            found = self.pose_from(key, new, T_camera_odom, start.share, least, most, left)
+            found = self.pose_from(key, new, T_camera_odom, share, least, most, left)
             if isinstance(found, str):
                 reason = found
                 continue
-            if not self._agrees(found.pose.T_camera_points, new.prior, key, start.by_features):
+            if not self._agrees(found.pose.T_camera_points, new.prior, key, by_features):
                 reason = "vision and attitude disagree"
                 continue
             if best is None or found.explained > best.explained:
@@ -177,9 +168,9 @@ class Localiser:
         that they lie on.
         """
         for key, view in self._views(new, keyframes, low_frame_rate=True):
-            for share in FEATURE_SHARES:
-                guess = view.predict(key.uv, share * self.camera.size_px[0])
-                uv, ok = _find(key, new, guess, self.config.matching)
+            guess = view.predict(key.uv)
+            for radius_px in self._near_px:
+                uv, ok = self._find(key, new, *guess, radius_px)
                 found = self._two_views(new, key, uv, ok)
                 if found is not None:
                     return found
@@ -200,7 +191,7 @@ class Localiser:
         Treetops have few corners that look alike from two places. Features follow the corners that
         are there, each place once however often it is found.
         """
-        view = self._features.fine_view((key.seq, key.pyramid.levels[0]), (new.seq, new.small))
+        view = self._features.fine_view((key.seq, key.pyramid[0]), (new.seq, new.small))
         if view is None:
             return None
         row_of = {tuple(place): row for row, place in enumerate(key.uv.tolist())}
@@ -238,7 +229,7 @@ class Localiser:
         step = se3.compose(seen.T_b_a[:3, :3], scale * seen.T_b_a[:3, 3])
         good = np.zeros(len(ok), np.bool_)
         good[rows] = True
-        return TwoViewPose(key, step @ key.T_camera_odom, uv, good)
+        return key, step @ key.T_camera_odom, uv, good
 
     def _starts(
         self,
@@ -254,11 +245,11 @@ class Localiser:
         by_motion = se3.inverse(T_odom_camera)
         if not low_frame_rate or turn is not None:
             share = self.config.wide_search_share if low_frame_rate else self.config.search_share
-            yield Start(key, by_motion, share)
+            yield key, by_motion, share, False
         if low_frame_rate or lost:
             yield from self._by_features(new, keyframes, low_frame_rate)
         if not low_frame_rate or turn is None:
-            yield Start(key, by_motion, self.config.wide_search_share)
+            yield key, by_motion, self.config.wide_search_share, False
         if not (low_frame_rate or lost):
             yield from self._by_features(new, keyframes, low_frame_rate)
 
@@ -270,7 +261,7 @@ class Localiser:
             T_camera_odom = self._pose_by(key, view)
             if T_camera_odom is not None:
                 for share in FEATURE_SHARES:
-                    yield Start(key, T_camera_odom, share, by_features=True)
+                    yield key, T_camera_odom, share, True
 
     def _views(
         self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
@@ -278,7 +269,7 @@ class Localiser:
         """Recent keyframes that share features with the frame, the most first."""
         here, views = (new.seq, new.small), []
         for key in keyframes[-RECALLED:]:
-            there = key.seq, key.pyramid.levels[0]
+            there = key.seq, key.pyramid[0]
             view = self._features.common_view(there, here, low_frame_rate)
             if view is not None:
                 views.append((key, view))
@@ -343,8 +334,8 @@ class Localiser:
         taken: I64 | None = None,
     ) -> Search:
         """The keyframe's corners in the frame, without the landmarks ``taken`` (M,) elsewhere."""
-        guess, visible = prediction.on_landmarks(
-            key, self.camera.K, self.camera.size_px, T_camera_odom, radius_px
+        uv, warp, visible = prediction.on_landmarks(
+            key, self.camera.K, self.camera.size_px, T_camera_odom
         )
         has_landmark = key.landmarks.known(key.landmark)
         in_view, config = float(visible.mean()), self.config.matching
@@ -361,10 +352,9 @@ class Localiser:
         find = matching.match_led if is_led else matching.match
         found = find(
             key.pyramid, key.uv[index].astype(np.float32), new.pyramid,
-            guess.uv[index].astype(np.float32), guess.radius_px,
-            guess.warp[index].astype(np.float32), config,
+            uv[index].astype(np.float32), radius_px, warp[index].astype(np.float32), config,
         )  # fmt: skip
-        ok, uv = np.zeros(len(key.uv), np.bool_), guess.uv.copy()
+        ok = np.zeros(len(key.uv), np.bool_)
         ok[index], uv[index] = found.ok, found.uv_px
         return Search(key, uv, ok, visible, has_landmark, in_view)
 
@@ -413,49 +403,24 @@ class Localiser:
             off = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         return off < self.config.max_tilt_error_rad
 
-
-def _find(
-    key: OdometryKeyframe, new: UndistortedFrame, guess: prediction.Prediction,
-    config: matching.MatchingConfig,
-) -> tuple[F64, Bool]:  # fmt: skip
-    """Where (N, 2) a keyframe's corners are in a frame, and which (N,) are found."""
-    found = matching.match(
-        key.pyramid, key.uv.astype(np.float32), new.pyramid, guess.uv.astype(np.float32),
-        guess.radius_px, guess.warp.astype(np.float32), config,
-    )  # fmt: skip
-    return found.uv_px.astype(np.float64), found.ok
-
-
-class FirstViews:
-    """Matches the first frame's corners by what is likely: as in the frame before, by
-    telemetry, by the features that both images share."""
-
-    def __init__(self, camera: Camera, config: OdometryConfig, features: FeatureCache) -> None:
-        """The wide radius is searched where motion or telemetry predicts the corners."""
-        self._K, self._config = camera.K, config.matching
-        self._radius_px = config.wide_search_share * camera.size_px[0]
-        self._near_px = [share * camera.size_px[0] for share in FEATURE_SHARES]
-        self._features = features
-        self._drift = np.eye(3)  # from the first frame's pixels to the last one's
+    # ---- a segment's first frame ---------------------------------------------------------------
 
     def begin(self) -> None:
         """Forget the segment before."""
         self._drift = np.eye(3)
 
-    def match(
-        self,
-        new: UndistortedFrame,
-        first: OdometryKeyframe,
-        R_b_a: F64 | None,
+    def match_first(
+        self, new: UndistortedFrame, first: OdometryKeyframe, R_b_a: F64 | None,
         low_frame_rate: bool,
-    ) -> tuple[F64, Bool]:
-        """(N, 2) pixels and (N,) success of the first frame's corners in a new frame.
+    ) -> tuple[F64, Bool]:  # fmt: skip
+        """(N, 2) pixels and (N,) success of the first frame's corners in a new frame, by what is
+        likely: as in the frame before, by telemetry, by the features that both images share.
 
         ``R_b_a`` (3, 3) is the turn by telemetry; ``low_frame_rate`` images are far apart in time.
         """
         uv, ok = first.uv, np.zeros(len(first.uv), np.bool_)
-        for guess in self._guesses(new, first, R_b_a, low_frame_rate):
-            found = _find(first, new, guess, self._config)
+        for there, warp, radius_px in self._guesses(new, first, R_b_a, low_frame_rate):
+            found = self._find(first, new, there, warp, radius_px)
             if found[1].sum() > ok.sum():
                 uv, ok = found
             if ok.sum() > 0.5 * len(first.uv):
@@ -464,23 +429,22 @@ class FirstViews:
         return uv, ok
 
     def _guesses(
-        self,
-        new: UndistortedFrame,
-        first: OdometryKeyframe,
-        R_b_a: F64 | None,
+        self, new: UndistortedFrame, first: OdometryKeyframe, R_b_a: F64 | None,
         low_frame_rate: bool,
-    ) -> Iterator[prediction.Prediction]:
-        """Where the corners went, best first."""
+    ) -> Iterator[tuple[F64, F64, float]]:  # fmt: skip
+        """Where the corners went, with warps and radius in px, best first."""
+        wide_px = self.config.wide_search_share * self.camera.size_px[0]
         if not low_frame_rate:
-            yield prediction.by_homography(self._drift, first.uv, self._radius_px)
+            yield *prediction.by_homography(self._drift, first.uv), wide_px
         if R_b_a is not None:
             H = self._by_telemetry(new, first, R_b_a)
-            yield prediction.by_homography(H, first.uv, self._radius_px)
-        images = (first.seq, first.pyramid.levels[0]), (new.seq, new.small)
+            yield *prediction.by_homography(H, first.uv), wide_px
+        images = (first.seq, first.pyramid[0]), (new.seq, new.small)
         view = self._features.common_view(*images, low_frame_rate)
         if view is not None:
+            guess = view.predict(first.uv)
             for radius_px in self._near_px:
-                yield view.predict(first.uv, radius_px)
+                yield *guess, radius_px
 
     def _by_telemetry(self, new: UndistortedFrame, first: OdometryKeyframe, R_b_a: F64) -> F64:
         """(3, 3) homography of level ground by attitude, and by position and height if known."""
@@ -489,5 +453,15 @@ class FirstViews:
         if b.position_m is not None and a.position_m is not None and height > 0:
             assert a.R_world_camera is not None
             t = R_b_a @ a.R_world_camera.T @ (a.position_m - b.position_m) / height
-        n = first.T_camera_odom[:3, 2]  # up, seen from the camera
-        return np.asarray(self._K @ (R_b_a - np.outer(t, n)) @ np.linalg.inv(self._K))
+        n, K = first.T_camera_odom[:3, 2], self.camera.K  # up, seen from the camera
+        return np.asarray(K @ (R_b_a - np.outer(t, n)) @ np.linalg.inv(K))
+
+    def _find(
+        self, key: OdometryKeyframe, new: UndistortedFrame, uv: F64, warp: F64, radius_px: float
+    ) -> tuple[F64, Bool]:
+        """Where (N, 2) a keyframe's corners are in a frame, about ``uv``, and which are found."""
+        found = matching.match(
+            key.pyramid, key.uv.astype(np.float32), new.pyramid, uv.astype(np.float32),
+            radius_px, warp.astype(np.float32), self.config.matching,
+        )  # fmt: skip
+        return found.uv_px.astype(np.float64), found.ok

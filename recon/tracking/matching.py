@@ -157,17 +157,6 @@ class MatchingConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Corners:
-    """Corners of one image, in no particular order."""
-
-    uv_px: F32  # (N, 2)
-    response: F32  # (N,) R of Eq. 5
-
-    def __len__(self) -> int:
-        return int(self.uv_px.shape[0])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Matches:
     """Where each point of image a was found in image b."""
 
@@ -176,20 +165,17 @@ class Matches:
     ok: Bool  # (N,)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pyramid:
-    """A gray image and its halvings, each (ceil(H / 2^l), ceil(W / 2^l)) uint8."""
+Pyramid = tuple[U8, ...]
+"""A gray image and its halvings, each (ceil(H / 2^l), ceil(W / 2^l)) uint8."""
 
-    levels: tuple[U8, ...]
 
-    @staticmethod
-    def build(gray: U8, levels: int = 5) -> Pyramid:
-        """The pyramid of ``gray`` (H, W) uint8; levels under 40 px are left out."""
-        _check_gray(gray)
-        stack = [np.ascontiguousarray(gray)]
-        while len(stack) < levels and min(stack[-1].shape) >= 80:
-            stack.append(np.asarray(cv2.pyrDown(stack[-1]), dtype=np.uint8))
-        return Pyramid(tuple(stack))
+def build_pyramid(gray: U8, levels: int = 5) -> Pyramid:
+    """The pyramid of ``gray`` (H, W) uint8; levels under 40 px are left out."""
+    _check_gray(gray)
+    stack = [np.ascontiguousarray(gray)]
+    while len(stack) < levels and min(stack[-1].shape) >= 80:
+        stack.append(np.asarray(cv2.pyrDown(stack[-1]), dtype=np.uint8))
+    return tuple(stack)
 
 
 def _check_gray(gray: U8) -> None:
@@ -197,8 +183,8 @@ def _check_gray(gray: U8) -> None:
         raise ValueError(f"image must be (H, W) uint8 of 16 px or more, got {gray.shape}")
 
 
-def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> Corners:
-    """The strongest Harris corner of each grid cell of ``gray`` (H, W), Eq. 4-5.
+def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> F32:
+    """(N, 3) u, v and R of the strongest Harris corner in each cell of ``gray`` (H, W), Eq. 4-5.
 
     ``mask`` (H, W) is zero where the image holds nothing; patches stay clear of it.
     """
@@ -217,8 +203,7 @@ def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> Cor
         margin, config.harris_k, cells,
     )  # fmt: skip
     best = cells.reshape(-1, 3)
-    best = best[best[:, 2] > config.min_response]
-    return Corners(np.ascontiguousarray(best[:, :2]), np.ascontiguousarray(best[:, 2]))
+    return np.asarray(best[best[:, 2] > config.min_response])
 
 
 def checked_points(uv_px: npt.ArrayLike) -> F64:
@@ -255,16 +240,6 @@ class _Found:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Refined:
-    """The answer at the full size, sub-pixel."""
-
-    uv: F64  # (N, 2) px
-    score: F64  # (N,) correlation, NO_SCORE where there is none
-    contrast_a: F64  # (N,) gray levels, of the patch in a
-    contrast_b: F64  # (N,) and where it was found
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Search:
     """One direction of matching: patches about the points of image a, looked for in image b."""
 
@@ -286,8 +261,9 @@ class _Search:
         )  # fmt: skip
         return _Found(uv * 2.0**level, score, second, contrast)
 
-    def refined(self, uv_b: F64, active: Bool) -> _Refined:
-        """Sub-pixel places in b from starts within about a pixel."""
+    def refined(self, uv_b: F64, active: Bool) -> tuple[F64, F64, F64, F64]:
+        """Sub-pixel places (N, 2) in b from starts within about a pixel, their correlation (N,),
+        NO_SCORE where there is none, and contrast (N,) of the patch in a and where it was found."""
         N = len(uv_b)
         uv, score, contrast_a, contrast_b = uv_b.copy(), np.empty(N), np.empty(N), np.empty(N)
         parallel_for(
@@ -296,7 +272,7 @@ class _Search:
             self.config.patch_radius_px, self.config.refine_iterations, uv, score, contrast_a,
             contrast_b,
         )  # fmt: skip
-        return _Refined(uv, score, contrast_a, contrast_b)
+        return uv, score, contrast_a, contrast_b
 
 
 def _consensus(uv: F64, residual: F64, good: Bool, tolerance_px: float) -> F64 | None:
@@ -344,24 +320,21 @@ def match(
     config = config or MatchingConfig()
     a, predicted = checked_points(uv_a), checked_points(uv_b_predicted)
     forward_warp, inverse_warp = checked_warps(warp, len(a))
-    forward = _Search(pyramid_a.levels, pyramid_b.levels, a, inverse_warp, config)
+    forward = _Search(pyramid_a, pyramid_b, a, inverse_warp, config)
     everyone: Bool = np.abs(np.hstack([a, predicted])).max(axis=1, initial=0.0) < FAR
     uv, active, contrast = predicted, everyone, None
     if radius_px > 0:
-        back = _Search(pyramid_b.levels, pyramid_a.levels, predicted, forward_warp, config)
+        back = _Search(pyramid_b, pyramid_a, predicted, forward_warp, config)
         uv, active, contrast = _coarse_to_fine(forward, back, predicted, everyone, radius_px)
-    fine = forward.refined(uv, active)
-    uv = fine.uv
-    ok = active & (2.0 * (1.0 - fine.score) <= config.max_zssd)
-    ok &= fine.contrast_b >= config.min_contrast
+    uv, score, contrast_a, contrast_b = forward.refined(uv, active)
+    ok = active & (2.0 * (1.0 - score) <= config.max_zssd)
+    ok &= contrast_b >= config.min_contrast
     if contrast is not None:
-        ok &= ~_repeats(forward, uv, ok, contrast, fine.contrast_a)
-
+        ok &= ~_repeats(forward, uv, ok, contrast, contrast_a)
     if np.isfinite(config.max_return_px):
-        back = _Search(pyramid_b.levels, pyramid_a.levels, uv, forward_warp, config)
-        home = back.refined(a, ok)
-        ok &= (home.score > 0) & (np.linalg.norm(home.uv - a, axis=1) <= config.max_return_px)
-    score = fine.score
+        back = _Search(pyramid_b, pyramid_a, uv, forward_warp, config)
+        home, alike, *_ = back.refined(a, ok)
+        ok &= (alike > 0) & (np.linalg.norm(home - a, axis=1) <= config.max_return_px)
     uv = np.where(ok[:, None], uv, predicted)
     zssd = np.where(score > patch_search.NO_SCORE, 2.0 * (1.0 - score), 4.0)
     return Matches(uv.astype(np.float32), zssd.astype(np.float32), ok)

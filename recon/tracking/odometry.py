@@ -29,8 +29,7 @@ from recon.tracking.keyframe_window import (
     median_depth,
     triangulate,
 )
-from recon.tracking.localisation import FirstViews, Localiser, Located, OdometryConfig, TwoViewPose
-from recon.tracking.matching import harris_grid
+from recon.tracking.localisation import Localiser, Located, OdometryConfig, TwoViewPose
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.prediction import ConstantVelocity
 from recon.tracking.readout_search import ReadoutSearch
@@ -107,7 +106,6 @@ class Odometry:
         self._unsettled: OdometryKeyframe | None = None  # its rows' motion will be known better
         self._early: list[tuple[FrameRows, F64, Bool]] = []  # frames, the first one's corners there
         self._localiser = Localiser(camera, self.config, features, self._row_track)
-        self._first_views = FirstViews(camera, self.config, features)
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
         self._depth = float("nan")  # median of the last keyframe's landmarks
 
@@ -196,7 +194,7 @@ class Odometry:
             return Tracked(Tracking.LOST, self.segment, reason="too little texture")
         self.segment += 1
         self._lost = 0
-        self._first_views.begin()
+        self._localiser.begin()
         self._row_track.begin()
         self._unsettled, self._early = None, []
         R, t = new.prior.R_world_camera, new.prior.position_m
@@ -221,8 +219,8 @@ class Odometry:
 
     def _corners(self, new: UndistortedFrame) -> F64:
         """(N, 2) Harris corners of the frame, Eq. 4-5."""
-        found = harris_grid(new.small, self.config.matching, new.mask)
-        return found.uv_px.astype(np.float64)
+        found = matching.harris_grid(new.small, self.config.matching, new.mask)
+        return found[:, :2].astype(np.float64)
 
     # ---- the second view --------------------------------------------------------------
 
@@ -230,7 +228,7 @@ class Odometry:
         """Wait until the camera has moved enough, then make the first landmarks."""
         first = self.keyframes[0]
         R_b_a = prediction.relative_rotation(first.prior, new.prior)
-        uv, ok = self._first_views.match(new, first, R_b_a, self._low_frame_rate)
+        uv, ok = self._localiser.match_first(new, first, R_b_a, self._low_frame_rate)
         if self._low_frame_rate and ok.sum() < 2 * self.config.min_tracks:
             uv, ok = self._localiser.with_features(new, first, uv, ok) or (uv, ok)
         if ok.sum() < 2 * self.config.min_tracks:
@@ -254,7 +252,7 @@ class Odometry:
         scale = self._first_landmarks(view, matched[view.inliers], new.prior)
         self._place_early(first)
         second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
-        return self._cross(new, TwoViewPose(first, second @ first.T_camera_odom, uv, ok))
+        return self._cross(new, (first, second @ first.T_camera_odom, uv, ok))
 
     def _is_no_turn(self, uv_a: F64, uv_b: F64) -> bool:
         """True where no turn of the camera explains matched pixels (N, 2).
@@ -343,9 +341,10 @@ class Odometry:
     def _cross(self, new: UndistortedFrame, found: TwoViewPose) -> Tracked:
         """Make a keyframe of a frame that two views alone place."""
         self._lost = 0
-        self._add_keyframe(new, found.T_camera_odom, [(found.key, found.uv, found.ok)])
+        key, T_camera_odom, uv, ok = found
+        self._add_keyframe(new, T_camera_odom, [(key, uv, ok)])
         self._moving.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
-        return self._as_keyframe(new, found.ok)
+        return self._as_keyframe(new, ok)
 
     def _as_keyframe(self, new: UndistortedFrame, ok: Bool) -> Tracked:
         """The newest keyframe's outcome, by the corners that are ``ok``."""
@@ -404,7 +403,7 @@ class Odometry:
         """Drop images and corners that left the window, and landmarks out of sight."""
         window = self.keyframes[-self.config.window - 2 :]
         for old in self.keyframes[: -len(window)]:
-            old.pyramid = matching.Pyramid(())
+            old.pyramid = ()
             old.uv, old.landmark = np.zeros((0, 2)), np.zeros(0, np.int64)
         self.keyframes = window
         seen = np.concatenate([k.landmark for k in window])

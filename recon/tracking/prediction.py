@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numba import njit
@@ -53,16 +51,10 @@ def _robust_plane(P: F64) -> F64:  # pragma: no cover - compiled
     return q[:, 0]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
-    uv: F64  # (N, 2) where the corners should be
-    warp: F64  # (N, 2, 2) or (2, 2) offsets in the keyframe to offsets in the frame
-    radius_px: float
-
-
-def by_homography(H: F64, uv: F64, radius_px: float) -> Prediction:
+def by_homography(H: F64, uv: F64) -> tuple[F64, F64]:
+    """Where (N, 2) pixels ``uv`` go, and the warps (N, 2, 2) of offsets there."""
     there = cv2.perspectiveTransform(uv[:, None], H)[:, 0].astype(np.float64)
-    return Prediction(there, _local_affine(H, uv, there), radius_px)
+    return there, _local_affine(H, uv, there)
 
 
 def common_affine(uv: F64, there: F64) -> F64:
@@ -75,10 +67,11 @@ def common_affine(uv: F64, there: F64) -> F64:
 
 
 def on_landmarks(
-    key: OdometryKeyframe, K: F64, size_px: tuple[int, int], T_camera_odom: F64, radius_px: float
-) -> tuple[Prediction, Bool]:
-    """Where the keyframe's corners fall for a start pose; corners without a landmark
-    are taken to lie on the plane through the landmarks."""
+    key: OdometryKeyframe, K: F64, size_px: tuple[int, int], T_camera_odom: F64
+) -> tuple[F64, F64, Bool]:
+    """Where (N, 2) the keyframe's corners fall for a start pose, the warps (N, 2, 2) of offsets
+    there, and which (N,) are visible. Corners without a landmark are taken to lie on the plane
+    through the landmarks."""
     T_new_key = T_camera_odom @ key.T_odom_camera
     known, P_key = key.known_points()
     plane = inverse_depth_plane(P_key)
@@ -89,7 +82,7 @@ def on_landmarks(
     uv[known] = P_new[:, :2] / P_new[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
     W, Hh = size_px
     visible = np.all((uv > 8) & (uv < [W - 8, Hh - 8]), axis=1) & np.isfinite(uv[:, 0])
-    return Prediction(uv, warp, radius_px), visible
+    return uv, warp, visible
 
 
 def landmark_depths(key: OdometryKeyframe, K: F64, rows: I64) -> F64 | None:

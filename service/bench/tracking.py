@@ -11,7 +11,7 @@ from recon import se3
 from recon.camera_model import rays
 from recon.tracking import pnp
 from recon.tracking.common_view import CommonView, common_view, features
-from recon.tracking.matching import Corners, MatchingConfig, Pyramid, harris_grid, match
+from recon.tracking.matching import MatchingConfig, build_pyramid, harris_grid, match
 from recon.types import F32, F64, U8
 from service.bench import BenchOptions, BenchResult, compare
 
@@ -29,8 +29,8 @@ def run(options: BenchOptions) -> list[BenchResult]:
     """
     a, b = images()
     config = MatchingConfig()
-    corners = harris_grid(a, config)
-    points = corners.uv_px[:, None]
+    corners = np.ascontiguousarray(harris_grid(a, config)[:, :2])
+    points = corners[:, None]
     timed = [
         compare(
             "corners, 1280x720, 30x30 grid", partial(harris_grid, a, config), options,
@@ -79,12 +79,10 @@ def noisy(scene: F64, rng: np.random.Generator) -> U8:
     return np.asarray(np.clip(np.round(seen), 0, 255), np.uint8)
 
 
-def matched(a: U8, b: U8, corners: Corners, config: MatchingConfig) -> tuple[F32, F32]:
+def matched(a: U8, b: U8, corners: F32, config: MatchingConfig) -> tuple[F32, F32]:
     """Pixels in a and b of the corners that ours found."""
-    found = match(
-        Pyramid.build(a), corners.uv_px, Pyramid.build(b), corners.uv_px, RADIUS_PX, None, config
-    )
-    return corners.uv_px[found.ok], found.uv_px[found.ok]
+    found = match(build_pyramid(a), corners, build_pyramid(b), corners, RADIUS_PX, None, config)
+    return corners[found.ok], found.uv_px[found.ok]
 
 
 def tracked(a: U8, b: U8, points: F32) -> tuple[F32, F32]:
@@ -97,11 +95,11 @@ def tracked(a: U8, b: U8, points: F32) -> tuple[F32, F32]:
     return points[good, 0], there[good, 0]
 
 
-def accuracy(a: U8, b: U8, corners: Corners, config: MatchingConfig) -> list[BenchResult]:
+def accuracy(a: U8, b: U8, corners: F32, config: MatchingConfig) -> list[BenchResult]:
     """Root mean square error of the good matches, and the share found."""
     ours = matched(a, b, corners, config)
-    theirs = tracked(a, b, corners.uv_px[:, None])
-    truth = corners.uv_px - SHIFT_PX
+    theirs = tracked(a, b, corners[:, None])
+    truth = corners - SHIFT_PX
     visible = np.all((truth > 12) & (truth < np.array(SIZE[::-1]) - 12), axis=1)
     rms, shares = [], []
     for here, there in (ours, theirs):
@@ -183,12 +181,12 @@ def frame(options: BenchOptions) -> BenchResult:
     """Milliseconds of what every frame costs: pyramid, matches of 900 landmarks, pose."""
     a, b = images()
     config = MatchingConfig()
-    key, uv = Pyramid.build(a), harris_grid(a, config).uv_px.astype(np.float64)
+    key, uv = build_pyramid(a), harris_grid(a, config)[:, :2].astype(np.float64)
     landmarks = rays(K, uv) * 60.0  # flat ground: the shift is a motion along it
     prior = se3.compose(np.eye(3), np.array([0.05, 0.05, 0.02]))
 
     def one() -> None:
-        new = Pyramid.build(b)
+        new = build_pyramid(b)
         found = match(key, uv, new, uv, RADIUS_PX, None, config)
         seen = found.uv_px[found.ok].astype(np.float64)
         if pnp.solve(landmarks[found.ok], seen, K, None, prior) is None:

@@ -12,7 +12,6 @@ from recon.rolling_shutter import FrameRows
 from recon.stereo.posed_image import PosedImage
 from recon.tracking.frame import RelativePose
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
-from recon.tracking.matching import Pyramid
 from recon.types import F64, PosePrior
 
 UNKNOWN, NO_MOTIONS = PosePrior(), dict[int, F64]()
@@ -24,7 +23,7 @@ def keyframe_at(
     """A keyframe of the odometry without corners."""
     moving = FrameRows(seq, UNKNOWN, T_odom_camera, is_measured=is_measured)
     return OdometryKeyframe(
-        seq, segment, se3.inverse(T_odom_camera), np.eye(6), UNKNOWN, Pyramid(()),
+        seq, segment, se3.inverse(T_odom_camera), np.eye(6), UNKNOWN, (),
         np.zeros((0, 2)), np.zeros(0, np.int64), Landmarks(), moving,
     )  # fmt: skip
 

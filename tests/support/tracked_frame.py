@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from recon.tracking.frame import UndistortedFrame
-from recon.tracking.matching import Pyramid
+from recon.tracking.matching import build_pyramid
 from recon.types import U8, PosePrior
 
 
 def undistorted(gray: U8, seq: int, time_ns: int, prior: PosePrior) -> UndistortedFrame:
     """The frame of ``gray`` (H, W), all of it valid."""
     return UndistortedFrame(
-        seq, time_ns, prior, None, gray, Pyramid.build(gray), mask=None, is_blurred=False
+        seq, time_ns, prior, None, gray, build_pyramid(gray), mask=None, is_blurred=False
     )

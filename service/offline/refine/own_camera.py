@@ -157,7 +157,7 @@ def sightings(
     if len(seen.view) == 0:
         raise InputError("no place was found again in another image; is this the video?")
     flat = Undistorter(camera)
-    stack = lru_cache(maxsize=64)(lambda k: matching.Pyramid.build(flat.image(images[k])))
+    stack = lru_cache(maxsize=64)(lambda k: matching.build_pyramid(flat.image(images[k])))
     seen = sharpened(stack, camera, seen)
     known = loosely_placed(poses, seen)
     try:

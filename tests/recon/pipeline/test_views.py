@@ -23,7 +23,6 @@ from recon.pipeline.views import (
 from recon.rolling_shutter import FrameRows, RowClock, Rows
 from recon.tracking.frame import Colour, RelativePose, UndistortedFrame
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
-from recon.tracking.matching import Pyramid
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.tracking.readout_search import ReadoutSearch
@@ -37,7 +36,7 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Undi
     reference = RelativePose(seq, segment, np.eye(4), key)
     colour = Colour(image, Undistorter(Camera(np.diag([30.0, 30.0, 1.0]), np.zeros(5), (32, 32))))
     return UndistortedFrame(
-        seq, seq, PosePrior(), colour, image[..., 0], Pyramid(()), None, blurred, reference
+        seq, seq, PosePrior(), colour, image[..., 0], (), None, blurred, reference
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from paths import SHARED
 
 from recon.tracking.common_view import common_view, features
-from recon.tracking.matching import MatchingConfig, Pyramid, checked_warps, harris_grid, match
+from recon.tracking.matching import MatchingConfig, build_pyramid, checked_warps, harris_grid, match
 from recon.types import F64, U8, Bool
 
 CALITERRA = SHARED / "caliterra_nadir" / "frames"
@@ -74,8 +74,8 @@ def test_corners_are_the_best_of_their_cells() -> None:
     image = gray(view(0, 0))
     corners = harris_grid(image, CONFIG)
     R = naive_response(image, CONFIG.harris_k)
-    u, v = corners.uv_px.astype(int).T
-    np.testing.assert_allclose(corners.response, R[v, u], rtol=1e-3)
+    u, v = corners[:, :2].astype(int).T
+    np.testing.assert_allclose(corners[:, 2], R[v, u], rtol=1e-3)
     H, W = image.shape
     margin = CONFIG.patch_radius_px + 3
     for x, y in zip(u, v, strict=True):
@@ -97,9 +97,9 @@ def test_corners_stay_clear_of_the_mask_and_the_border() -> None:
     mask[:, :200] = 0
     corners = harris_grid(image, CONFIG, mask)
     assert len(corners) > 200
-    assert corners.uv_px[:, 0].min() >= 200 + CONFIG.patch_radius_px
+    assert corners[:, :2][:, 0].min() >= 200 + CONFIG.patch_radius_px
     everywhere = harris_grid(image, CONFIG)
-    assert inside(everywhere.uv_px, image.shape, margin=CONFIG.patch_radius_px).all()
+    assert inside(everywhere[:, :2], image.shape, margin=CONFIG.patch_radius_px).all()
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
@@ -123,10 +123,10 @@ def test_a_straight_edge_is_no_corner() -> None:
 @given(st.floats(-45, 45), st.floats(-45, 45))
 def test_shifts_are_found_to_a_twentieth_of_a_pixel(du: float, dv: float) -> None:
     a, b = gray(view(0, 0)), gray(view(du, dv))
-    corners = harris_grid(a, CONFIG).uv_px
+    corners = harris_grid(a, CONFIG)[:, :2]
     truth = corners - np.array([du, dv])
     radius = max(abs(du), abs(dv)) + 5
-    found = match(Pyramid.build(a), corners, Pyramid.build(b), corners, radius, None, CONFIG)
+    found = match(build_pyramid(a), corners, build_pyramid(b), corners, radius, None, CONFIG)
     seen = inside(truth, a.shape, margin=12)
     assert found.ok[seen].mean() > 0.85
     error = np.linalg.norm(found.uv_px - truth, axis=1)[found.ok]
@@ -141,8 +141,8 @@ def test_noise_and_a_change_of_exposure_cost_a_tenth_of_a_pixel(gain: float, off
     shift = np.array([11.3, -7.6])
     a = gray(view(0, 0) + rng.normal(0, 2.5, (360, 480)))
     b = gray(gain * view(*shift) + offset + rng.normal(0, 2.5 * gain, (360, 480)))
-    corners = harris_grid(a, CONFIG).uv_px
-    found = match(Pyramid.build(a), corners, Pyramid.build(b), corners, 20.0, None, CONFIG)
+    corners = harris_grid(a, CONFIG)[:, :2]
+    found = match(build_pyramid(a), corners, build_pyramid(b), corners, 20.0, None, CONFIG)
     truth = corners - shift
     assert found.ok[inside(truth, a.shape, margin=12)].mean() > 0.85
     error = np.linalg.norm(found.uv_px - truth, axis=1)[found.ok]
@@ -176,11 +176,11 @@ def test_a_known_turn_and_a_large_shift(
     angle: float, scale: float, shift: tuple[float, float], radius: float
 ) -> None:
     a, b, A, t = turned(angle, scale, shift)
-    corners = harris_grid(a, CONFIG).uv_px
+    corners = harris_grid(a, CONFIG)[:, :2]
     truth = corners @ A.T + t
     predicted = truth - np.array(shift) * 0.98
     for warp in (A, np.broadcast_to(A, (len(corners), 2, 2))):
-        found = match(Pyramid.build(a), corners, Pyramid.build(b), predicted, radius, warp, CONFIG)
+        found = match(build_pyramid(a), corners, build_pyramid(b), predicted, radius, warp, CONFIG)
         seen = inside(truth, b.shape, margin=14)
         assert found.ok[seen].mean() > 0.85
         error = np.linalg.norm(found.uv_px - truth, axis=1)[found.ok]
@@ -192,8 +192,8 @@ def test_the_score_is_opencvs_normalised_correlation() -> None:
     rng = np.random.default_rng(5)
     a = gray(view(0, 0))
     b = gray(view(4.0, -3.0) * 0.7 + 20 + rng.normal(0, 6, (360, 480)))
-    corners = harris_grid(a, CONFIG).uv_px[200:260].astype(int)
-    found = match(Pyramid.build(a, 1), corners, Pyramid.build(b, 1), corners, 6.0, None, CONFIG)
+    corners = harris_grid(a, CONFIG)[:, :2][200:260].astype(int)
+    found = match(build_pyramid(a, 1), corners, build_pyramid(b, 1), corners, 6.0, None, CONFIG)
     assert found.ok.sum() > 30
     for (u, v), place, zssd in zip(
         corners[found.ok], found.uv_px[found.ok], found.zssd[found.ok], strict=True
@@ -212,17 +212,17 @@ def test_texture_that_repeats_is_refused() -> None:
     field = 128 + 50 * np.sin(2 * np.pi * u / 14) + 40 * np.sin(2 * np.pi * v / 14)
     rng = np.random.default_rng(2)
     a, b = (gray(field + rng.normal(0, 3, field.shape)) for _ in range(2))
-    corners = harris_grid(a, CONFIG).uv_px
+    corners = harris_grid(a, CONFIG)[:, :2]
     assert len(corners) > 200
-    found = match(Pyramid.build(a), corners, Pyramid.build(b), corners, 40.0, None, CONFIG)
+    found = match(build_pyramid(a), corners, build_pyramid(b), corners, 40.0, None, CONFIG)
     assert found.ok.mean() < 0.05
 
 
 def test_what_is_hidden_in_the_second_image_is_not_found() -> None:
     a, b = gray(view(0, 0)), gray(view(6.0, 2.0))
     b[:, 240:] = gray(ground(360, 240, seed=9))
-    corners = harris_grid(a, CONFIG).uv_px
-    found = match(Pyramid.build(a), corners, Pyramid.build(b), corners, 25.0, None, CONFIG)
+    corners = harris_grid(a, CONFIG)[:, :2]
+    found = match(build_pyramid(a), corners, build_pyramid(b), corners, 25.0, None, CONFIG)
     hidden = corners[:, 0] - 6.0 > 250
     assert found.ok[hidden].mean() < 0.03
     assert found.ok[corners[:, 0] < 220].mean() > 0.85
@@ -230,7 +230,7 @@ def test_what_is_hidden_in_the_second_image_is_not_found() -> None:
 
 def test_hopeless_points_are_not_ok_and_keep_their_prediction() -> None:
     a = gray(view(0, 0))
-    pyramid = Pyramid.build(a)
+    pyramid = build_pyramid(a)
     corners = np.array([[240.0, 180.0], [np.nan, 10.0], [-50.0, 3.0], [5e8, 1.0], [100.0, 100.0]])
     predicted = corners.copy()
     predicted[4] = [np.inf, 0.0]
@@ -245,16 +245,16 @@ def test_hopeless_points_are_not_ok_and_keep_their_prediction() -> None:
 @pytest.mark.parametrize("fill", [0, 255])
 def test_a_blank_second_image_gives_no_match(fill: int) -> None:
     a = gray(view(0, 0))
-    corners = harris_grid(a, CONFIG).uv_px
-    blank = Pyramid.build(np.full(a.shape, fill, np.uint8))
-    assert not match(Pyramid.build(a), corners, blank, corners, 30.0, None, CONFIG).ok.any()
+    corners = harris_grid(a, CONFIG)[:, :2]
+    blank = build_pyramid(np.full(a.shape, fill, np.uint8))
+    assert not match(build_pyramid(a), corners, blank, corners, 30.0, None, CONFIG).ok.any()
 
 
 def test_the_same_call_gives_the_same_answer() -> None:
     a, b = gray(view(0, 0)), gray(view(9.0, 4.0))
-    corners = harris_grid(a, CONFIG).uv_px
+    corners = harris_grid(a, CONFIG)[:, :2]
     first, second = (
-        match(Pyramid.build(a), corners, Pyramid.build(b), corners, 20.0, None, CONFIG)
+        match(build_pyramid(a), corners, build_pyramid(b), corners, 20.0, None, CONFIG)
         for _ in range(2)
     )
     np.testing.assert_array_equal(first.uv_px, second.uv_px)
@@ -263,8 +263,8 @@ def test_the_same_call_gives_the_same_answer() -> None:
 def test_images_of_different_size_and_odd_levels() -> None:
     a = gray(view(0, 0, 351, 477))
     b = gray(view(3.25, 2.5, 300, 401))
-    corners = harris_grid(a, CONFIG).uv_px
-    found = match(Pyramid.build(a), corners, Pyramid.build(b), corners, 30.0, None, CONFIG)
+    corners = harris_grid(a, CONFIG)[:, :2]
+    found = match(build_pyramid(a), corners, build_pyramid(b), corners, 30.0, None, CONFIG)
     truth = corners - np.array([3.25, 2.5])
     assert found.ok[inside(truth, (300, 401), margin=12)].mean() > 0.9
     assert np.abs((found.uv_px - truth)[found.ok]).max() < 0.3
@@ -273,7 +273,7 @@ def test_images_of_different_size_and_odd_levels() -> None:
 def test_wrong_shapes_are_named() -> None:
     a = gray(view(0, 0))
     with pytest.raises(ValueError, match="uint8"):
-        Pyramid.build(np.zeros((40, 40, 3), np.uint8))
+        build_pyramid(np.zeros((40, 40, 3), np.uint8))
     with pytest.raises(ValueError, match="mask"):
         harris_grid(a, CONFIG, np.ones((3, 3), np.uint8))
 
@@ -299,11 +299,9 @@ def test_a_common_view_is_a_start_for_matching() -> None:
     a, b, A, t = turned(100.0, 1.0, (60.0, -40.0))
     view = common_view(features(a), features(b))
     assert view is not None
-    corners = harris_grid(a, CONFIG).uv_px.astype(np.float64)
-    there = view.predict(corners, 8.0)
-    found = match(
-        Pyramid.build(a), corners, Pyramid.build(b), there.uv, there.radius_px, there.warp, CONFIG
-    )
+    corners = harris_grid(a, CONFIG)[:, :2].astype(np.float64)
+    there, warp = view.predict(corners)
+    found = match(build_pyramid(a), corners, build_pyramid(b), there, 8.0, warp, CONFIG)
     truth = corners @ A.T + t
     assert found.ok[inside(truth, b.shape, margin=14)].mean() > 0.7
     assert np.median(np.linalg.norm(found.uv_px - truth, axis=1)[found.ok]) < 0.1
@@ -327,9 +325,9 @@ def test_real_stills_obey_one_epipolar_geometry(first: str, second: str) -> None
     )
     view = common_view(features(a), features(b))
     assert view is not None
-    corners = harris_grid(a, CONFIG).uv_px.astype(np.float64)
-    there = view.predict(corners, 40.0)
-    found = match(Pyramid.build(a), corners, Pyramid.build(b), there.uv, 40.0, there.warp, CONFIG)
+    corners = harris_grid(a, CONFIG)[:, :2].astype(np.float64)
+    there, warp = view.predict(corners)
+    found = match(build_pyramid(a), corners, build_pyramid(b), there, 40.0, warp, CONFIG)
     K = np.array([[1162.0, 0, 799.5], [0, 1162.0, 599.5], [0, 0, 1.0]])
     _, inliers = cv2.findEssentialMat(
         corners[found.ok], found.uv_px[found.ok].astype(np.float64), K, cv2.RANSAC, 0.999, 2.0

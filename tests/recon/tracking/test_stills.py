@@ -230,7 +230,7 @@ def test_corners_without_a_landmark_do_not_choose_the_pose(monkeypatch: pytest.M
 
     def starts(self: Localiser, *arguments: Any) -> Iterator[Start]:
         for start in starts_of(self, *arguments):
-            yield replace(start, share=-1.0)  # marks the first of the two
+            yield (*start[:2], -1.0, start[3])  # marks the first of the two
             yield start
 
     def found(self: Localiser, key: Any, new: Any, T: F64, share: float, *rest: Any) -> Any:
