@@ -20,19 +20,8 @@ from recon.pipeline.views import StereoView, ViewSelection
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
-from recon.stereo.reprojection import (
-    PairDepth,
-    carry,
-    fuse,
-    plausible,
-    reproject,
-)
-from recon.stereo.virtual_stereo import (
-    at_middle_row,
-    drop_unseen,
-    plane_relief,
-    rectify,
-)
+from recon.stereo.reprojection import PairDepth, carry, fuse, plausible, reproject
+from recon.stereo.virtual_stereo import at_middle_row, drop_unseen, plane_relief, rectify
 from recon.tracking.frame import Colour, RelativePose, UndistortedFrame
 from recon.tracking.known_track import AnyTrack
 from recon.tracking.matching import MatchingConfig, build_pyramid
@@ -106,11 +95,7 @@ class Track:
     """The odometry: Harris corners, ZSSD (Eq. 4-5) and EPnP (Eq. 6-7)."""
 
     def __init__(
-        self,
-        odometry: AnyTrack,
-        selection: ViewSelection,
-        refused: Counter[str],
-        timing: Timing,
+        self, odometry: AnyTrack, selection: ViewSelection, refused: Counter[str], timing: Timing
     ) -> None:
         self.odometry, self._selection = odometry, selection
         self._refused, self._timing = refused, timing
@@ -165,7 +150,6 @@ class Rectify:
         self.pairs = 0
 
     def grid(self, view: StereoView) -> ViewGrid:
-        """The grid of the view's depth."""
         image, width = view.image, self._config.width_px
         H, W = image.gray.shape
         w, h = width, round(width * H / W)
@@ -243,11 +227,7 @@ class PairStages:
     """Eq. 1 to 3 and the fusion, each by the backend or on the host."""
 
     def __init__(
-        self,
-        backend: Backend,
-        config: DenseStages,
-        debug: dict[str, Array] | None,
-        timing: Timing,
+        self, backend: Backend, config: DenseStages, debug: dict[str, Array] | None, timing: Timing
     ) -> None:
         self._backend, self._config = backend, config
         self._debug, self._timing = debug, timing

@@ -126,14 +126,6 @@ class Similarity:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Scale:
-    """Metres per unit of the odometry by one kind of reading, with its relative sigma."""
-
-    metres: float
-    sigma: float
-
-
 def fit(
     nodes: Sequence[Node],
     fix_s: float = 60.0,
@@ -299,11 +291,13 @@ def _velocities_contradict(readings: AlignmentReadings) -> bool:
     return abs(flown - fixed) > slack
 
 
-def scales(nodes: Sequence[Node], at: Similarity) -> tuple[Scale | None, Scale | None]:
-    """The scale by position fixes alone and by measured heights alone, each with its sigma.
+Scale = tuple[float, float]
+"""Metres per unit of the odometry by one kind of reading, and its relative sigma."""
 
-    None where the track or the readings give none.
-    """
+
+def scales(nodes: Sequence[Node], at: Similarity) -> tuple[Scale | None, Scale | None]:
+    """The scale by position fixes alone and by measured heights alone; None where the track or the
+    readings give none."""
     r = AlignmentReadings(nodes)
     by_fixes = by_heights = None
     if len(r.fix) >= 4:
@@ -317,10 +311,10 @@ def scales(nodes: Sequence[Node], at: Similarity) -> tuple[Scale | None, Scale |
             scale = float(np.sum(w * x * y)) / power
             # Errors of fixes wander slowly: all of them together count as a few.
             sigma = np.sqrt(max(len(x) / INDEPENDENT_HEIGHTS, 1.0) / power) / max(scale, 1e-9)
-            by_fixes = Scale(scale, float(sigma)) if scale > 0 else None
+            by_fixes = (scale, float(sigma)) if scale > 0 else None
     if r.has_measured_heights:
         spread = 1.0 / float(np.sqrt(np.sum(1.0 / r.sigma_log**2)))
-        by_heights = Scale(float(np.exp(np.median(r.log_ratio))), spread)
+        by_heights = float(np.exp(np.median(r.log_ratio))), spread
     return by_fixes, by_heights
 
 

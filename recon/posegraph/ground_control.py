@@ -274,7 +274,7 @@ def of_marks(rows: Rows, at: State) -> Linear:
     of_scale[:, 2, 0] = -grown * rows["weight"][:, 2]
     J = np.concatenate([to_world @ se3.hat(apart), -to_world, to_world, of_scale], axis=2)
     columns = [columns_of(key, 0, 6), columns_of(point, 3, 6), scale_columns(at, scale)]
-    return Linear(error * rows["weight"], J, np.hstack(columns))
+    return error * rows["weight"], J, np.hstack(columns)
 
 
 class _Batch:

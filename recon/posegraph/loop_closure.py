@@ -49,13 +49,9 @@ class LoopView:
     depth: DepthMap  # metres; of the same camera at any size
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoopClosure:
-    """A verified motion between two keyframes."""
-
-    T_a_b: F64  # (4, 4) m
-    covariance: F64  # (6, 6) left perturbation in a's camera frame
-    growth: float = 1.0  # of b's depths, to fit a's
+LoopClosure = tuple[F64, F64, float]
+"""A verified motion between two keyframes: T_a_b (4, 4) m, its covariance (6, 6) as a left
+perturbation in a's camera frame, and the growth of b's depths that fits a's."""
 
 
 def ground_seen(depth: DepthMap) -> F64:
@@ -249,7 +245,7 @@ def _with_icp(
         return None
     T, covariance = agreed
     covariance = covariance + np.diag([MIN_RAD**2] * 3 + [(MIN_SHARE * sigma) ** 2] * 3)
-    return LoopClosure(T, covariance, growth)
+    return T, covariance, growth
 
 
 def _growth(a: LoopView, b: LoopView, T_a_b: F64) -> float | None:

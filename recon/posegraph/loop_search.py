@@ -138,9 +138,7 @@ class LoopSearch:
             guess = self.trajectory.step_between(seq, new.seq)
             known = self._kept[seq].unpacked(self.trajectory.scale(seq))
             found = verify(known, view, guess, self._config)
-            if found is not None and self.trajectory.add_loop(
-                seq, new.seq, found.T_a_b, found.covariance, found.growth
-            ):
+            if found is not None and self.trajectory.add_loop(seq, new.seq, *found):
                 self._tied = new
                 return
 

@@ -196,13 +196,12 @@ def gauss_markov_noise(
     lag, change = variogram(times_s, residuals)
     if len(lag) < 3:
         return None
-    fitted = _Fitted(lag, change)
     two = np.full(len(lag), 2.0)
-    (white,), least = fitted(two)
+    (white,), least = _fit_variogram(lag, change, two)
     best = Noise(float(np.sqrt(white)), 0.0, max(usual_tau_s, 1.0))
     shorter = [tau for tau in TAUS_S if tau <= lag[-1] / TAUS_SEEN]
     for tau_s in [usual_tau_s, *shorter] if usual_tau_s > 0 else []:
-        parts, error = fitted(two, 2.0 * (1.0 - np.exp(-lag / tau_s)))
+        parts, error = _fit_variogram(lag, change, two, 2.0 * (1.0 - np.exp(-lag / tau_s)))
         if parts[1] > 0.0 and sure * error <= least:
             # Means and filtered positions change less over short lags: as if white^2 < 0.
             own, common = np.sqrt(np.maximum(parts, 0.0))
@@ -211,26 +210,20 @@ def gauss_markov_noise(
     return best
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fitted:
-    """Fits models to a variogram, by relative errors that grow with the root of the lag."""
+def _fit_variogram(lag: F64, change: F64, *columns: F64) -> tuple[F64, float]:
+    """Factors (C,) of ``columns`` (L,) that sum up best to the ``change`` (L,), and the misfit.
 
-    lag: F64  # (L,) s
-    change: F64  # (L,)
-
-    def __call__(self, *columns: F64) -> tuple[F64, float]:
-        """Factors (C,) of ``columns`` (L,) that sum up best to the change, and the misfit.
-
-        Weights follow from the model (Cressie, Math. Geology 17, 1985): by the values themselves,
-        those that are small by chance would count most.
-        """
-        A, model = np.column_stack(columns), np.full(len(self.lag), self.change.mean())
-        for _ in range(ROUNDS):
-            weight = np.sqrt(self.lag[-1] / self.lag) / np.maximum(model, 1e-12)
-            parts = np.linalg.lstsq(A * weight[:, None], self.change * weight, rcond=None)[0]
-            model = A @ parts
-            np.maximum(model, FLOOR_SHARE * model.max(), out=model)
-        return parts, float(np.linalg.norm(weight * (A @ parts - self.change)))
+    Errors are relative and grow with the root of the ``lag`` (L,) s. Weights follow from the model
+    (Cressie, Math. Geology 17, 1985): by the values themselves, those that are small by chance
+    would count most.
+    """
+    A, model = np.column_stack(columns), np.full(len(lag), change.mean())
+    for _ in range(ROUNDS):
+        weight = np.sqrt(lag[-1] / lag) / np.maximum(model, 1e-12)
+        parts = np.linalg.lstsq(A * weight[:, None], change * weight, rcond=None)[0]
+        model = A @ parts
+        np.maximum(model, FLOOR_SHARE * model.max(), out=model)
+    return parts, float(np.linalg.norm(weight * (A @ parts - change)))
 
 
 def drift_noise(times_s: F64, residuals: F64) -> tuple[float, float] | None:

@@ -60,26 +60,22 @@ class Boresight:
         return replace(prior, R_world_camera=R @ se3.so3_exp(self.turn))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Turns:
-    """One segment: the camera's rotations and those by telemetry."""
+Turns = tuple[F64, F64, F64]
+"""Of one segment the camera's rotations (N, 3, 3), those by telemetry, world from camera, and their
+sigmas (N, 3) rad about the world's axes; a heading over 1 rad is not known."""
 
-    R_odom: F64  # (N, 3, 3)
-    R_reported: F64  # (N, 3, 3) world from camera
-    sigma: F64  # (N, 3) rad about the world's axes; a heading over 1 rad is not known
 
-    @staticmethod
-    def of(poses: Sequence[F64], priors: Sequence[PosePrior]) -> Turns | None:
-        """Of poses (4, 4) in one frame and their priors; None of too few attitudes."""
-        rows = [
-            (T[:3, :3], p.R_world_camera, (p.sigma_tilt_rad, p.sigma_tilt_rad, p.sigma_yaw_rad))
-            for T, p in zip(poses, priors, strict=True)
-            if p.R_world_camera is not None and not p.is_view_assumed
-        ]
-        if len(rows) < MIN_ATTITUDES:
-            return None
-        odom, reported, sigma = (np.array(c, np.float64) for c in zip(*rows, strict=True))
-        return Turns(odom, reported, sigma)
+def turns_of(poses: Sequence[F64], priors: Sequence[PosePrior]) -> Turns | None:
+    """Of poses (4, 4) in one frame and their priors; None of too few attitudes."""
+    rows = [
+        (T[:3, :3], p.R_world_camera, (p.sigma_tilt_rad, p.sigma_tilt_rad, p.sigma_yaw_rad))
+        for T, p in zip(poses, priors, strict=True)
+        if p.R_world_camera is not None and not p.is_view_assumed
+    ]
+    if len(rows) < MIN_ATTITUDES:
+        return None
+    odom, reported, sigma = (np.array(c, np.float64) for c in zip(*rows, strict=True))
+    return odom, reported, sigma
 
 
 def boresight(stretches: Sequence[Turns], span_s: float, bias_tau_s: float = 40.0) -> Boresight:
@@ -94,7 +90,7 @@ def boresight(stretches: Sequence[Turns], span_s: float, bias_tau_s: float = 40.
     Attitudes err together over ``bias_tau_s``, so all of them count as
     1 + span / (2 bias_tau_s) readings.
     """
-    count = sum(len(s.R_odom) for s in stretches)
+    count = sum(len(R_odom) for R_odom, *_ in stretches)
     if count == 0:
         return Boresight()
     share = min(1.0, (1.0 + span_s / (2.0 * max(bias_tau_s, 1e-3))) / count)
@@ -120,16 +116,18 @@ def boresight(stretches: Sequence[Turns], span_s: float, bias_tau_s: float = 40.
 
 def _mean_frame(stretch: Turns) -> F64:
     """(3, 3) a first rotation from the stretch's frame to the world."""
-    turns = stretch.R_reported @ stretch.R_odom.transpose(0, 2, 1)
+    R_odom, R_reported, _ = stretch
+    turns = R_reported @ R_odom.transpose(0, 2, 1)
     return se3.project_to_so3(se3.compose(turns.mean(axis=0), np.zeros(3)))[:3, :3]
 
 
 def _stretch(stretch: Turns, frame: F64, turn: F64) -> tuple[F64, F64, F64, F64]:
     """One Gauss-Newton step: the segment's better frame, its contribution to the boresight as
     information (3, 3) and right-hand side (3,), and the whitened residuals (N,)."""
-    Q = stretch.R_reported @ se3.so3_exp(turn)
-    r = se3.each_so3_log(frame @ stretch.R_odom @ Q.transpose(0, 2, 1))
-    info = np.where(stretch.sigma < 1.0, stretch.sigma, np.inf) ** -2.0  # (N, 3)
+    R_odom, R_reported, sigma = stretch
+    Q = R_reported @ se3.so3_exp(turn)
+    r = se3.each_so3_log(frame @ R_odom @ Q.transpose(0, 2, 1))
+    info = np.where(sigma < 1.0, sigma, np.inf) ** -2.0  # (N, 3)
     norms = np.sqrt(np.sum(info * r**2, axis=1))
     info = info * np.minimum(1.0, HUBER / np.maximum(norms, 1e-9))[:, None]
     # r + w - Q b, with the frame's turn w eliminated.
@@ -266,7 +264,7 @@ def constants(
 
     ``fix_s`` and ``attitude_s`` are the time constants with which the sensors wander.
     """
-    turns = [t for poses, priors in stretches if (t := Turns.of(poses, priors)) is not None]
+    turns = [t for poses, priors in stretches if (t := turns_of(poses, priors)) is not None]
     every = [prior for _, priors in stretches for prior in priors]
     return Constants(altitude_datum(every, span_s, fix_s), boresight(turns, span_s, attitude_s))
 

@@ -65,12 +65,9 @@ class State(NamedTuple):
         )
 
 
-class Linear(NamedTuple):
-    """Factors of one kind about a state."""
-
-    error: F64  # (n, d) whitened
-    J: F64  # (n, d, k)
-    columns: I64  # (n, k) unknowns that the Jacobian is of
+Linear = tuple[F64, F64, I64]
+"""Factors of one kind about a state: whitened errors (n, d), their Jacobian (n, d, k), and the
+unknowns (n, k) that it is of."""
 
 
 def _of_motions(rows: Rows, at: State) -> Linear:
@@ -99,18 +96,18 @@ def _of_motions(rows: Rows, at: State) -> Linear:
     of_scales = [scale_columns(at, scale), scale_columns(at, rows["unit"])]
     columns = np.hstack([columns_of(a, 0, 6), columns_of(b, 0, 6), *of_scales])
     error = np.einsum("nij,nj->ni", rows["weight"], error)
-    return Linear(error, rows["weight"] @ J, columns)
+    return error, rows["weight"] @ J, columns
 
 
 def _of_turns(rows: Rows, at: State) -> Linear:
     """Rotation from the measured one, in world axes."""
     error = se3.each_so3_log(at.R[rows["key"]] @ rows["R"].transpose(0, 2, 1)) * rows["weight"]
-    return Linear(error, np.eye(3) * rows["weight"][:, :, None], columns_of(rows["key"], 0, 3))
+    return error, np.eye(3) * rows["weight"][:, :, None], columns_of(rows["key"], 0, 3)
 
 
 def _of_places(rows: Rows, at: State) -> Linear:
     error = (at.t[rows["key"]] - rows["t"]) * rows["weight"]
-    return Linear(error, np.eye(3) * rows["weight"][:, :, None], columns_of(rows["key"], 3, 6))
+    return error, np.eye(3) * rows["weight"][:, :, None], columns_of(rows["key"], 3, 6)
 
 
 def _of_scales(rows: Rows, at: State) -> Linear:
@@ -118,7 +115,7 @@ def _of_scales(rows: Rows, at: State) -> Linear:
     weight = rows["weight"][:, None]
     error = (at.logs[rows["b"]] - at.logs[rows["a"]] - rows["log"])[:, None] * weight
     J = np.stack([np.where(rows["a"][:, None] == NO_SCALE, 0.0, -weight), weight], axis=2)
-    return Linear(error, J, np.hstack([scale_columns(at, rows["a"]), scale_columns(at, rows["b"])]))
+    return error, J, np.hstack([scale_columns(at, rows["a"]), scale_columns(at, rows["b"])])
 
 
 def columns_of(keys: I64, first: int, end: int) -> I64:
@@ -336,7 +333,7 @@ class Smoother:
         """
         if self._waiting:
             return {}
-        return {kind: one.about(self._held.at).error for kind, one in self._factors.items()}
+        return {kind: one.about(self._held.at)[0] for kind, one in self._factors.items()}
 
 
 def left_covariance(T: F64, covariance: F64) -> F64:

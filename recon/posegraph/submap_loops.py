@@ -95,7 +95,7 @@ def _fitted(
         return None
     size = [np.linalg.norm(p[inside] - p[inside].mean(axis=0)) for p in (here, there)]
     covariance = _covariance(T, here, there, sigma, inside)
-    return LoopClosure(T, covariance, float(size[0] / size[1]))
+    return T, covariance, float(size[0] / size[1])
 
 
 def _on_surface(view: LoopView, uv: F64) -> tuple[F64, Bool]:

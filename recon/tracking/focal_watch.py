@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.tracking.bundle import linearise_all
+from recon.tracking.bundle import BundleResult, linearise_all
 from recon.types import F64, I64
 
 HUBER_PX = 1.0
@@ -33,17 +33,6 @@ class FocalEstimate:
     windows: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AdjustedWindow:
-    """Poses and points, and where (M,) cameras saw (M,) of the points, in undistorted pixels."""
-
-    T_camera_world: F64  # (C, 4, 4)
-    points_m: F64  # (N, 3)
-    camera: I64  # (M,)
-    point: I64  # (M,)
-    uv_px: F64  # (M, 2)
-
-
 class FocalWatch:
     """Collects adjusted windows that share no keyframe."""
 
@@ -51,11 +40,12 @@ class FocalWatch:
         self._K = K
         self._cells: list[F64] = []  # (CELLS**2, 2, 3) information and score, of each window
 
-    def add(self, seen: AdjustedWindow) -> None:
-        """Add a window after its adjustment; one without finite sightings says nothing."""
-        every = seen.T_camera_world, seen.points_m, seen.uv_px
-        if len(seen.uv_px) and all(np.isfinite(one).all() for one in every):
-            self._cells.append(_evidence(seen, self._K))
+    def add(self, window: BundleResult, camera: I64, point: I64, uv_px: F64) -> None:
+        """Add an adjusted window, whose (M,) cameras saw (M,) of its points at (M, 2) undistorted
+        pixels; one without finite sightings says nothing."""
+        every = window.T_camera_world, window.points_m, uv_px
+        if len(uv_px) and all(np.isfinite(one).all() for one in every):
+            self._cells.append(_evidence(window, camera, point, uv_px, self._K))
 
     @property
     def estimate(self) -> FocalEstimate | None:
@@ -78,18 +68,17 @@ class FocalWatch:
         return FocalEstimate(float(step[0]), float(np.sqrt(squares)), count)
 
 
-def _evidence(seen: AdjustedWindow, K: F64) -> F64:
+def _evidence(window: BundleResult, cam: I64, point: I64, uv_px: F64, K: F64) -> F64:
     """(CELLS**2, 2, 3) information and score by cells: of the logarithm of the focal length, and of
     radial distortion in shares at the image's corner."""
-    cam, point, M = seen.camera, seen.point, len(seen.uv_px)
-    C, N = len(seen.T_camera_world), len(seen.points_m)
+    M, C, N = len(uv_px), len(window.T_camera_world), len(window.points_m)
     by_pose, by_point = np.zeros((M, 2, 6)), np.zeros((M, 2, 3))
     error, weight = np.zeros((M, 2)), np.zeros(M)
     linearise_all(
-        seen.T_camera_world, seen.points_m, cam, point, seen.uv_px,
+        window.T_camera_world, window.points_m, cam, point, uv_px,
         np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), HUBER_PX, by_pose, by_point, error, weight,
     )  # fmt: skip
-    by_focal = error + seen.uv_px - K[:2, 2]
+    by_focal = error + uv_px - K[:2, 2]
     square = np.sum(by_focal**2, axis=1, keepdims=True)
     corner = float(K[0, 2] ** 2 + K[1, 2] ** 2)  # one unit in all windows, as their sums share it
     by_lens = np.stack([by_focal, by_focal * square / corner], axis=-1)

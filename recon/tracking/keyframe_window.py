@@ -10,7 +10,6 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import FrameRows
 from recon.tracking import bundle, matching, two_view
-from recon.tracking.focal_watch import AdjustedWindow
 from recon.types import F64, I64, Bool, PosePrior
 
 
@@ -159,8 +158,11 @@ def observations(
     return ids, index.astype(np.int64), np.concatenate(cam)[use], np.concatenate(uv)[use]
 
 
-def adjust_window(window: list[OdometryKeyframe], K: F64) -> AdjustedWindow:
-    """Bundle-adjust the keyframes; the two oldest of them hold the frame and scale."""
+def adjust_window(
+    window: list[OdometryKeyframe], K: F64
+) -> tuple[bundle.BundleResult, I64, I64, F64]:
+    """Bundle-adjust the keyframes; the two oldest of them hold the frame and scale. The result,
+    and of each of M sightings the keyframe, the landmark and the pixel (M, 2)."""
     fixed = 1 if len(window) == 2 else 2
     ids, index, camera, uv_px = observations(window, K, 2)
     base, table = _baseline(window), window[0].landmarks
@@ -174,7 +176,7 @@ def adjust_window(window: list[OdometryKeyframe], K: F64) -> AdjustedWindow:
     _drop_outliers(window, ids, index, camera, result.residual_px)
     if len(window) == 2:
         _restore_baseline(window, base)
-    return AdjustedWindow(result.T_camera_world, result.points_m, camera, index, uv_px)
+    return result, camera, index, uv_px
 
 
 def step_covariance(keys: Sequence[OdometryKeyframe], T_camera_odom: F64) -> F64:

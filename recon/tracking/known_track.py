@@ -14,7 +14,7 @@ from recon.tracking.frame import UndistortedFrame
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry, Tracked, Tracking
-from recon.tracking.readout_search import ReadoutEstimate
+from recon.tracking.readout_search import ReadoutEstimate, ReadoutSearch
 from recon.types import F64, I64, Camera, PosePrior
 
 KEPT = 8
@@ -32,19 +32,6 @@ class KnownView:
     landmark: I64  # (n,) which of the points it shows
 
 
-@dataclass(frozen=True, slots=True)
-class KnownReadout:
-    """What :class:`recon.tracking.readout_search.ReadoutSearch` says once it is done."""
-
-    estimate: ReadoutEstimate
-    is_open: bool = False
-
-    @property
-    def doubt_s(self) -> float:
-        """Sigma of the readout in use."""
-        return self.estimate.sigma_s
-
-
 class KnownTrack:
     """Takes frames as :class:`recon.tracking.odometry.Odometry` does, and says what is known."""
 
@@ -58,14 +45,15 @@ class KnownTrack:
         """
         self.segment, self.keyframes = -1, list[OdometryKeyframe]()
         self.exposure, self.focal = ExposureWatch(), FocalWatch(lens.K)  # no window is adjusted
-        self.readout = None
-        if sigma_readout_s:
-            found = ReadoutEstimate(lens.shutter.readout_s, sigma_readout_s, len(views))
-            self.readout = KnownReadout(found)
+        clock = RowClock(lens)
+        self.readout = ReadoutSearch(clock, lens.K) if sigma_readout_s else None
+        if self.readout is not None:  # and its search is over
+            known = lens.shutter.readout_s, sigma_readout_s, len(views)
+            self.readout.estimate = ReadoutEstimate(*known)
         self.K = lens.K
         self._views, self._landmarks = views, Landmarks()
         self._landmarks.add(points)
-        self._clock = RowClock(lens) if lens.shutter.readout_s else None
+        self._clock = clock if lens.shutter.readout_s else None
 
     def can_skip(self, time_ns: int, prior: PosePrior, frames_per_step: float) -> bool:
         """False: every still counts."""

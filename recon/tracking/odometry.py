@@ -383,7 +383,7 @@ class Odometry:
         adjusted = adjust_window(window, self.K)
         if len(window) > self.config.window and window[0].seq > self._watched_seq:
             self._watched_seq = new.seq
-            self.focal.add(adjusted)
+            self.focal.add(*adjusted)
         self._depth = median_depth(key_new)
         self._forget()
 

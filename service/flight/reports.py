@@ -98,8 +98,9 @@ def gnss_over_heights(graph: PoseGraph) -> float | None:
     by_fixes, by_heights = graph.segments.largest_scales()
     if by_fixes is None or by_heights is None:
         return None
-    ratio = by_fixes.metres / by_heights.metres
-    limit = max(SIGMAS * math.hypot(by_fixes.sigma, by_heights.sigma), MIN_SHARE)
+    (fixes_m, sigma_fixes), (heights_m, sigma_heights) = by_fixes, by_heights
+    ratio = fixes_m / heights_m
+    limit = max(SIGMAS * math.hypot(sigma_fixes, sigma_heights), MIN_SHARE)
     return ratio if abs(math.log(ratio)) > limit else None
 
 

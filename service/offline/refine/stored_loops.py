@@ -89,7 +89,8 @@ def verified(
     found = verify_surfaces(views[0], views[1], guess, config)
     if found is None:
         return None
-    return Loop(a, b, found.T_a_b, loose(found.T_a_b, found.covariance), found.growth)
+    T_a_b, covariance, growth = found
+    return Loop(a, b, T_a_b, loose(T_a_b, covariance), growth)
 
 
 class StoredLoops:

@@ -111,10 +111,11 @@ def test_opposite_oblique_views_agree_within_their_covariance(off_m: float) -> N
     guess = se3.exp(np.array([0.004, -0.003, 0.006, off_m, -0.6 * off_m, 0.3])) @ truth
     loop = verify_surfaces(_view(a), _view(b), guess)
     assert loop is not None
-    error = se3.log(loop.T_a_b @ se3.inverse(truth))
-    assert error @ np.linalg.solve(loop.covariance, error) < 22.5
+    T_a_b, covariance, _ = loop
+    error = se3.log(T_a_b @ se3.inverse(truth))
+    assert error @ np.linalg.solve(covariance, error) < 22.5
     ahead = np.array([[0.0, 0.0, 66.0]])
-    miss = se3.transform(loop.T_a_b, ahead) - se3.transform(truth, ahead)
+    miss = se3.transform(T_a_b, ahead) - se3.transform(truth, ahead)
     assert np.linalg.norm(miss) < 0.15
 
 
@@ -139,7 +140,7 @@ def test_a_repeated_texture_is_no_loop_at_the_wrong_place() -> None:
         guess = se3.inverse(poses[a]) @ slip @ poses[b]
         found = verify_surfaces(one, two, guess)
         if found is not None:
-            loops.append(Loop(a, b, found.T_a_b, found.covariance))
+            loops.append(Loop(a, b, *found[:2]))
     truth: F64 = np.array(poses)
     spread = np.array([np.diag([0.01**2] * 3 + [0.3**2] * 3)] * 10)
     track = KeyframeTrack(truth, np.linspace(0.0, 45.0, 10), spread, (), supported(loops, truth))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,8 @@ from command_line import skyrelief
 
 from recon import se3
 from recon.tracking import bundle
-from recon.tracking.focal_watch import AdjustedWindow, FocalEstimate, FocalWatch
-from recon.types import F64
+from recon.tracking.focal_watch import FocalEstimate, FocalWatch
+from recon.types import F64, I64
 
 K = np.array([[480.0, 0.0, 320.0], [0.0, 480.0, 180.0], [0.0, 0.0, 1.0]])
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -21,7 +22,7 @@ VIEWS, NOISE_PX = 8, 0.2
 
 def window(
     pitch_deg: float, wobble_deg: float, longer: float, seed: int, bent: float = 0.0
-) -> AdjustedWindow:
+) -> tuple[bundle.BundleResult, I64, I64, F64]:
     """Eight views 4 m apart over ground 40 m below, adjusted with a focal length ``longer``.
 
     The lens moves corners of the image outwards by the share ``bent`` that the model lacks.
@@ -55,7 +56,7 @@ def window(
     model[:2, 2] = K[:2, 2]
     poses = np.stack(T)
     done = bundle.adjust(poses, X[ids], camera, index, at, model, free, iterations=20)
-    return AdjustedWindow(done.T_camera_world, done.points_m, camera, index, at)
+    return done, camera, index, at
 
 
 def estimate(
@@ -65,7 +66,7 @@ def estimate(
     model[:2, 2] = K[:2, 2]
     watch = FocalWatch(model)
     for seed in range(windows):
-        watch.add(window(pitch_deg, wobble_deg, longer, seed, bent))
+        watch.add(*window(pitch_deg, wobble_deg, longer, seed, bent))
     found = watch.estimate
     assert found is not None and found.windows == windows
     return found
@@ -106,18 +107,18 @@ def test_one_window_has_a_sigma_of_its_own() -> None:
 @pytest.mark.parametrize("broken", ["empty", "pixel", "point", "pose"])
 def test_a_window_without_finite_sightings_shows_nothing(broken: str) -> None:
     """The adjustment survives such a window, and so does the flight."""
-    seen = window(-60.0, 3.0, 1.0, 0)
+    done, camera, point, uv_px = window(-60.0, 3.0, 1.0, 0)
     if broken == "empty":
-        no = seen.camera[:0]
-        seen = AdjustedWindow(seen.T_camera_world, seen.points_m[:0], no, no, seen.uv_px[:0])
+        done, camera = replace(done, points_m=done.points_m[:0]), camera[:0]
+        point, uv_px = point[:0], uv_px[:0]
     elif broken == "pixel":
-        seen.uv_px[5] = np.nan
+        uv_px[5] = np.nan
     elif broken == "point":
-        seen.points_m[3] = np.inf
+        done.points_m[3] = np.inf
     else:
-        seen.T_camera_world[4] = np.nan
+        done.T_camera_world[4] = np.nan
     watch = FocalWatch(K)
-    watch.add(seen)
+    watch.add(done, camera, point, uv_px)
     assert watch.estimate is None
 
 

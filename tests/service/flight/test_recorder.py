@@ -165,9 +165,9 @@ def test_the_scale_names_what_measured_it(
             return said
 
         assert scale(-2.0 * sigma, None, None) == {"from": by, "sigma": sigma}
-        apart = scale(-2.0 * sigma, Scale(1.2, 0.01), Scale(1.0, 0.03))
+        apart = scale(-2.0 * sigma, (1.2, 0.01), (1.0, 0.03))
         assert apart["gnss_over_heights"] == pytest.approx(1.2)
-        alike = scale(-2.0 * sigma, Scale(1.2, 0.01), Scale(1.0, 0.1))
+        alike = scale(-2.0 * sigma, (1.2, 0.01), (1.0, 0.1))
         assert "gnss_over_heights" not in alike
         grown = scale(-0.1 - 3.0 * sigma, None, None)
         assert grown["sigma"] == pytest.approx(0.1 + 3.0 * sigma)
