@@ -12,7 +12,6 @@ Timing = Callable[[str], AbstractContextManager[object]]
 
 
 def untimed(stage: str) -> AbstractContextManager[object]:
-    """A context that measures nothing."""
     return nullcontext()
 
 

@@ -52,7 +52,6 @@ class KeyframeMap:
 
     @property
     def graph(self) -> PoseGraph:
-        """That places the keyframes."""
         return self.trajectory.graph
 
     @property

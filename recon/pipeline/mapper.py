@@ -76,11 +76,9 @@ class InTurn:
         self._work, self._done = work, list[tuple[StereoView, GraphUpdate]]()
 
     def offer(self, item: StereoView) -> None:
-        """Do the work of one view."""
         self._done.append((item, self._work(item)))
 
     def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]:
-        """Views with their results, once each."""
         done, self._done = self._done, []
         return done
 
@@ -266,7 +264,6 @@ class Mapper:
         return (*events, *self._changed(self.keyframes.changed(final=True)))
 
     def _finished(self, everything: bool = False) -> Iterator[Event]:
-        """What is done, in order."""
         for view, update in self._worker.finished(everything):
             if view.is_first:
                 if update.keyframe is not None:
@@ -328,12 +325,10 @@ class Mapper:
 
     @property
     def segments(self) -> int:
-        """Number of segments so far."""
         return self.odometry.segment + 1
 
     @property
     def pairs(self) -> int:
-        """Stereo pairs so far."""
         return self.rectify.pairs
 
     def refusals(self) -> Counter[str]:

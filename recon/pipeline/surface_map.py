@@ -110,5 +110,4 @@ class SurfaceMap:
         return self._new_map(VoxelMapConfig(voxel_m=voxel_m))
 
     def clear(self) -> None:
-        """Reset the map: all surface counts as unseen."""
         self.known = None

@@ -17,7 +17,7 @@ from recon import se3
 from recon.posegraph.ground_heights import GUESSED_SHARE, UNMEASURED_HEIGHTS, height_ratios
 from recon.posegraph.pose_priors import MIN_FIX_M, has_fix
 from recon.posegraph.records import Node
-from recon.posegraph.sensor_noise import Noise, bias_time_constant_s
+from recon.posegraph.sensor_noise import Noise, bias_time_constant_s, inflation
 from recon.types import F64, PosePrior
 
 BIAS_SHARE = 0.6
@@ -81,14 +81,6 @@ class Heights:
         return float(np.sqrt(self.sigma_m**2 + main.sigma_m**2 + drift_m**2))
 
 
-def _together(times_s: F64 | Sequence[float], bias_tau_s: float) -> float:
-    """Factor on the sigmas of readings at (n,) times whose errors wander with a time constant."""
-    if len(times_s) == 0:
-        return 1.0
-    independent = 1.0 + float(np.ptp(times_s)) / (2.0 * max(bias_tau_s, 1e-3))
-    return float(np.sqrt(max(1.0, len(times_s) / independent)))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingNoise:
     """How fixes and velocities err along one flight, 1 sigma per axis."""
@@ -101,6 +93,13 @@ class ReadingNoise:
     claimed: F64 | None = None  # (3,) m as the fixes claim it
     walk_m_per_sqrt_s: float = 0.1  # of the integrated velocity
     rate_m_s: float = USUAL_RATE_M_S  # of the velocity, which errs so for RATE_S
+
+    @property
+    def by_axis(self) -> tuple[Noise, Noise, Noise] | None:
+        """Of a fix along each axis; None where it errs as it claims."""
+        if self.horizontal is None or self.vertical is None:
+            return None
+        return self.horizontal, self.horizontal, self.vertical
 
     def of_fixes(self, claimed: F64, fix_s: float) -> tuple[F64, tuple[Noise, Noise]]:
         """(m, 3) sigma of a fix alone, and how such errors, in units of it, go along the track:
@@ -129,18 +128,17 @@ class ReadingNoise:
 
     def of_tilts(self, claimed: F64, times_s: F64, attitude_s: float) -> F64:
         """(n, 2) sigma with which assumed views weigh, of (n, 2) claimed ones at (n,) times."""
-        if self.tilt is None:
-            return np.asarray(claimed * _together(times_s, attitude_s))
         span_s = float(np.ptp(times_s)) if len(times_s) else 0.0
+        if self.tilt is None:
+            return np.asarray(claimed * inflation(len(claimed), span_s, attitude_s))
         return np.full_like(claimed, self.tilt.effective_sigma(len(claimed), span_s))
 
     def of_mean(self, claimed: F64, times_s: F64, fix_s: float) -> tuple[F64, F64]:
         """(3,) sigma of the mean error of fixes with (m, 3) claimed sigmas at (m,) times, and what
         the readings in a graph count for it."""
         usual, span_s = np.median(claimed, axis=0), float(np.ptp(times_s))
-        if self.horizontal is None or self.vertical is None or self.reach_m is None:
+        if (known := self.by_axis) is None or self.reach_m is None:
             return usual, usual / np.sqrt(1.0 + span_s / (2.0 * fix_s))
-        known = (self.horizontal, self.horizontal, self.vertical)
         mean = [one.of_mean(float(m), span_s) for one, m in zip(known, self.reach_m, strict=True)]
         counted = [one.effective_sigma(len(claimed), span_s) / len(claimed) ** 0.5 for one in known]
         return np.array(mean), np.array(counted)
@@ -190,9 +188,9 @@ class AlignmentReadings:
         )
         self.heading_known = self.sigma_turn[:, 2] < KNOWN_YAW_RAD
         self.tilt_s = _stack([a.time_s for a in turned if a.prior.is_view_assumed], ())
-        self.sigma_turn[~self.is_assumed] *= _together(
-            [a.time_s for a in turned if not a.prior.is_view_assumed], attitude_s
-        )
+        known_s = [a.time_s for a in turned if not a.prior.is_view_assumed]
+        span_s = float(np.ptp(known_s)) if known_s else 0.0
+        self.sigma_turn[~self.is_assumed] *= inflation(len(known_s), span_s, attitude_s)
         self.sigma_turn[self.is_assumed, :2] = noise.of_tilts(
             self.sigma_turn[self.is_assumed, :2], self.tilt_s, attitude_s
         )
@@ -250,7 +248,6 @@ class AlignmentReadings:
 
     @cached_property
     def spanned(self) -> Common:
-        """The times of the fixes."""
         if len(self.fix_s) == 0:
             return Common()
         first, last = float(self.fix_s[0]), float(self.fix_s[-1])
@@ -273,7 +270,6 @@ class AlignmentReadings:
         return Heights(sigma_m, time_s, at.drift / half_s, sigma_drift_m / half_s)
 
     def common(self, at: AlignmentState) -> Common:
-        """What the readings have in common."""
         return replace(self.spanned, mount_rad=at.mount, drift_m=at.drift)
 
     def linearised(self, at: AlignmentState) -> tuple[F64, F64]:

@@ -11,6 +11,7 @@ leaves its scale open, block by block of keyframes.
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from recon.posegraph.ground_heights import height_ratio
 from recon.posegraph.pose_priors import MIN_FIX_M, carried, has_fix
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.segments import Segments
-from recon.posegraph.sensor_noise import bias_time_constant_s
+from recon.posegraph.sensor_noise import bias_time_constant_s, inflation
 from recon.posegraph.smoother import NO_SCALE, Smoother, left_covariance
 from recon.types import F64, PosePrior
 
@@ -63,6 +64,7 @@ class ReadingFactors:
         self._config, self._smoother, self._counts = config, smoother, counts
         self._huber = config.huber_sigmas
         self._keyframes, self._span_s = max(keyframes, 1), max(span_s, 1.0)
+        self._inflation = partial(inflation, self._keyframes, self._span_s)
         self._offset_m = altitude_offset_m
 
     def add(
@@ -116,7 +118,7 @@ class ReadingFactors:
             self._counts["view off" if prior.is_view_assumed else "tilt off"] += 1
             return False
         R = se3.so3_exp(turn) @ T[:3, :3]
-        sigma = sigma * self._inflated(self._config.attitude_s)
+        sigma = sigma * self._inflation(self._config.attitude_s)
         self._smoother.add_turn("attitude", node.key, R, sigma, self._huber)
         return True
 
@@ -133,14 +135,12 @@ class ReadingFactors:
         if np.any(apart > self._config.gate_sigmas * np.sqrt(sure + sigma**2)):
             self._counts["position off"] += 1
             return False
-        if measured is not None and measured.horizontal and measured.vertical:
-            known = (measured.horizontal, measured.horizontal, measured.vertical)
+        if measured is not None and (known := measured.by_axis):
             each = [one.effective_sigma(self._keyframes, self._span_s) for one in known]
             sigma = np.maximum(each, MIN_FIX_M)
         else:
-            sigma = sigma * self._inflated(
-                bias_time_constant_s(float(sigma[0]), self._config.fix_s)
-            )
+            tau_s = bias_time_constant_s(float(sigma[0]), self._config.fix_s)
+            sigma = sigma * self._inflation(tau_s)
         self._smoother.add_place("position", node.key, prior.position_m, sigma, self._huber)
         return True
 
@@ -156,17 +156,10 @@ class ReadingFactors:
             self._counts["altitude off"] += 1
             self._offset_m = prior.altitude_m - T[2, 3]
             return False
-        sigma = np.array([np.inf, np.inf, one * self._inflated(self._config.altitude_s)])
+        sigma = np.array([np.inf, np.inf, one * self._inflation(self._config.altitude_s)])
         place = np.array([0.0, 0.0, z])
         self._smoother.add_place("altitude", node.key, place, sigma, self._huber)
         return True
-
-    def _inflated(self, seconds: float) -> float:
-        """Factor on a sigma whose error wanders with the time constant ``seconds``."""
-        if seconds <= 0:
-            return 1.0
-        independent = 1.0 + self._span_s / (2.0 * seconds)
-        return float(np.sqrt(max(1.0, self._keyframes / independent)))
 
 
 def _turn(R: F64, R_measured: F64, heading: bool) -> F64:
@@ -288,13 +281,12 @@ class MotionFactors:
         """True where both attitude and positions contradict vision's motion: two sensors do not
         fail at once by chance, and images that smear do."""
         segment = self._segments[node.segment]
-        noise = segment.noise
-        if noise is None or noise.horizontal is None or noise.vertical is None:
+        known = None if segment.noise is None else segment.noise.by_axis
+        if known is None:
             return False
         a, b = segment.without_biases(last).prior, segment.without_biases(node).prior
         tilt_rad, off_m = _contradiction(a, b, motion)
         passed_s = (node.time_ns - last.time_ns) * 1e-9
-        known = (noise.horizontal, noise.horizontal, noise.vertical)
         changed = np.square([one.change(passed_s) for one in known])
         sigma_m = np.sqrt(changed + np.trace(covariance[3:, 3:]) / 3.0)
         sigma_rad = float(np.sqrt(np.trace(covariance[:3, :3]) / 3.0 + b.sigma_tilt_rad**2))
@@ -311,7 +303,6 @@ class MotionFactors:
         self._smoother.add_motion(kind, (last.key, node.key), motion, covariance, scale, unit)
 
     def _seen(self, node: Node, last: Node) -> tuple[F64, F64]:
-        """Vision's motion."""
         frame = self._segments[node.segment].frame
         motion = se3.inverse(frame.pose(last.T_odom_camera)) @ frame.pose(node.T_odom_camera)
         units = np.array([1.0] * 3 + [frame.scale] * 3)

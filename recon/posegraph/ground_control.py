@@ -80,8 +80,6 @@ class Mark:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ControlPoint:
-    """A surveyed point in the world."""
-
     position_m: F64  # (3,)
     sigma_m: F64  # (3,)
 
@@ -355,7 +353,6 @@ class _Batch:
             self._smoother.add_motion("placing", (n, key), T, n * (spread + floor))
 
     def _add_telemetry(self) -> None:
-        """Attitudes and fixes."""
         self._hold(0, self._track.poses[0], 2.0, 1e4)
         known = self._track.readings()
         for key in range(len(self._track.poses)):

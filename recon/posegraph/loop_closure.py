@@ -29,8 +29,6 @@ __all__ = ["LoopClosure", "LoopConfig", "LoopView"]
 
 @dataclass(frozen=True, slots=True)
 class LoopConfig:
-    """Parameters of the search for loops."""
-
     min_gap: int = 10  # keyframes between the two ends of a loop
     min_overlap: float = 0.35  # of the later view in the earlier one
     search_share: float = 0.12  # of the image's width, about the predicted places

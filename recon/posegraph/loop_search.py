@@ -197,6 +197,5 @@ class LoopSearch:
         return gap >= self._config.min_gap or one.segment != two.segment
 
     def _thin(self) -> None:
-        """Forget every second keyframe of the older half."""
         for seq in list(self._kept)[: len(self._kept) // 2 : 2]:
             del self._kept[seq]

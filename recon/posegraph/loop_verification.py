@@ -10,7 +10,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.records import Loop, Node, PoseGraphConfig, loops_agree
-from recon.posegraph.thinning import Marginalised, moved_loops
+from recon.posegraph.thinning import moved_loops
 from recon.types import F64
 
 CHI2_LIMIT = 22.5
@@ -56,16 +56,13 @@ class LoopVerification:
         self.taken += fresh
         return fresh
 
-    def thin(
-        self, marginalised: Mapping[int, Marginalised], dropped: Collection[int], most: int
-    ) -> None:
+    def thin(self, marginalised: Mapping[int, Loop], dropped: Collection[int], most: int) -> None:
         """Move ends that were marginalised; drop loops of dropped keyframes; at most ``most``
         stay."""
         self.taken = moved_loops(self.taken, marginalised, dropped, most)
         self.pending = moved_loops(self.pending, marginalised, dropped, most)
 
     def into(self, segment: int) -> list[Loop]:
-        """Accepted loops from an earlier segment into this one."""
         return [loop for loop in self.taken if self.enters(loop, segment)]
 
     def enters(self, loop: Loop, segment: int) -> bool:

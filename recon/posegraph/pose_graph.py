@@ -162,7 +162,6 @@ class PoseGraph:
         return self._motions.refuted
 
     def metric_loops(self) -> list[Loop]:
-        """Accepted loops with lengths in metres, by the scale known now."""
         return [loop.scaled(self.scale(loop.a)) for loop in self.loops.taken]
 
     def largest_growth(self) -> float:

@@ -188,7 +188,6 @@ class Odometer:
     """Takes the prior of every frame, in the order of time, and adds the travel to it."""
 
     def __init__(self) -> None:
-        """Nothing is travelled yet."""
         self._last: tuple[int, F64] | None = None  # time in ns, (3,) m/s
         self._travel = Travel(np.zeros(3), 0.0, 0)
 

@@ -70,7 +70,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loop:
-    """A motion seen between two keyframes that are far apart in time.
+    """A motion between two keyframes: seen, where they are far apart in time, or composed.
 
     Lengths of a pose graph's loops are in units of the odometry at ``a``, so that a better scale
     moves them too; those between finished keyframes are in metres.

@@ -82,7 +82,6 @@ class Segment:
 
     @property
     def rests_on_fixes(self) -> bool:
-        """True when positions place it."""
         return self.similarity is not None and "gnss" in self.similarity.sources
 
     @property
@@ -94,7 +93,6 @@ class Segment:
         return self.is_tied_by_loop or (is_measured and is_scaled)
 
     def forget(self) -> None:
-        """Count it as not placed."""
         self.similarity = self.offsets = None
         self.constants, self.fitted, self.is_tied_by_loop = Constants(), 0, False
 
@@ -145,11 +143,9 @@ class Segments:
         return [segment for segment in self._all.values() if segment.surface is not None]
 
     def opened(self, number: int) -> Segment:
-        """A segment; made when missing."""
         return self._all.setdefault(number, Segment(number))
 
     def add(self, node: Node) -> Segment:
-        """Take a keyframe into its segment, which is returned."""
         segment = self.opened(node.segment)
         segment.nodes.append(node)
         segment.keyframes += 1

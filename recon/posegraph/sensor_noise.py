@@ -181,6 +181,14 @@ class Noise:
         return float(sigma * np.sqrt(np.clip(self.bias / max(sigma, 1e-9), min_share, 1.0)))
 
 
+def inflation(count: int, span_s: float, tau_s: float) -> float:
+    """Factor on the sigmas of so many readings, whose errors wander with a time constant, as if all
+    were independent; 1 where none wanders."""
+    if tau_s <= 0:
+        return 1.0
+    return float(np.sqrt(max(1.0, count / (1.0 + span_s / (2.0 * tau_s)))))
+
+
 def bias_time_constant_s(sigma_m: float, usual_s: float) -> float:
     """The time constant of a receiver that claims ``sigma_m``; 0 where none wanders."""
     return min(PRECISE_TAU_S, usual_s) if sigma_m < PRECISE_M else usual_s

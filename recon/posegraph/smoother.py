@@ -49,8 +49,6 @@ SCALE = np.dtype([("a", int), ("b", int), ("log", float), ("weight", float)])
 
 
 class State(NamedTuple):
-    """Poses and logarithms of scales."""
-
     R: F64  # (N, 3, 3)
     t: F64  # (N, 3) m
     logs: F64  # (M,)
@@ -146,7 +144,6 @@ class Factors:
         return weight, weight * length * (length - 0.5 * weight * length)
 
     def about(self, at: State) -> Linear:
-        """All of them about a state."""
         return self.form(self.table.rows, at)
 
 

@@ -14,7 +14,7 @@ readings and loops are gone.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby, pairwise
 
 import numpy as np
@@ -32,20 +32,12 @@ GONE_SHARE = 0.25
 """Share of the nodes removed at once, so that rebuilding is rare."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Marginalised:
-    """A keyframe attached to the node before it."""
-
-    node: int  # number of that node
-    T_node_camera: F64  # (4, 4) in units of the odometry
-    covariance: F64  # (6, 6) of that motion, left, in the node's frame
-
-
 def thin(
     nodes: Sequence[Node], refused: Collection[int], poses: Mapping[int, F64]
-) -> tuple[list[Node], dict[int, Marginalised], set[int]]:
-    """The nodes that stay, with keys that follow each other; by number the others that are attached
-    to the node before them; and the numbers of those dropped with their whole segment.
+) -> tuple[list[Node], dict[int, Loop], set[int]]:
+    """The nodes that stay, with keys that follow each other; by number the motions to the others,
+    which are marginalised, from the nodes before them; and the numbers of those dropped with their
+    whole segment.
 
     The nodes have these ``poses`` (4, 4) T_world_camera, the newest perhaps none yet; the fixes of
     the ``refused`` are left out.
@@ -82,13 +74,11 @@ def surplus(nodes: Sequence[Node]) -> set[int]:
     return {nodes[i].seq for i in gone}
 
 
-def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int, Marginalised]]:
-    """The nodes that stay, with keys that follow each other, and where the others are attached.
-
-    Those of segments of which nothing stays are attached to nothing.
-    """
+def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int, Loop]]:
+    """The nodes that stay, with keys that follow each other, and by number the motions to the
+    others; none to those of segments of which nothing stays."""
     kept: list[Node] = []
-    marginalised: dict[int, Marginalised] = {}
+    marginalised: dict[int, Loop] = {}
     left: Node | None = None
     for node in nodes:
         if node.seq in gone:
@@ -96,11 +86,17 @@ def thinned(nodes: Sequence[Node], gone: set[int]) -> tuple[list[Node], dict[int
             if node.segment != last.segment:
                 continue
             T = se3.inverse(last.T_odom_camera) @ node.T_odom_camera
-            marginalised[node.seq] = Marginalised(last.seq, T, node.covariance)
+            marginalised[node.seq] = Loop(last.seq, node.seq, T, node.covariance)
             left = node
             continue
         if left is not None:
-            node = _joined(marginalised[left.seq], left, node)
+            A = se3.adjoint(marginalised[left.seq].T_a_b)
+            node = replace(
+                node,
+                covariance=left.covariance + A @ node.covariance @ A.T,
+                prior=averaged(node, left),
+                weight=left.weight + node.weight,
+            )
         kept.append(replace(node, key=len(kept)))
         left = None
     return kept, marginalised
@@ -119,12 +115,12 @@ def over_gaps(nodes: Sequence[Node], poses: Mapping[int, F64]) -> list[Node]:
 
 def moved_loops(
     loops: Sequence[Loop],
-    marginalised: Mapping[int, Marginalised],
+    marginalised: Mapping[int, Loop],
     dropped: Collection[int],
     most: int,
 ) -> list[Loop]:
-    """Loops between nodes that stay or have others attached: the surest of several between the
-    same two, and of more than ``most`` every second of the older half."""
+    """Loops between nodes that stay: the surest of several between the same two, and of more than
+    ``most`` every second of the older half."""
     best: dict[tuple[int, int], Loop] = {}
     for loop in loops:
         if loop.a in dropped or loop.b in dropped:
@@ -142,21 +138,19 @@ def moved_loops(
     return out
 
 
-def moved_loop(loop: Loop, marginalised: Mapping[int, Marginalised]) -> Loop:
-    """The loop with its ends at the nodes that they are attached to."""
+def moved_loop(loop: Loop, marginalised: Mapping[int, Loop]) -> Loop:
+    """The loop with its ends at the nodes before those that are marginalised."""
     if (one := marginalised.get(loop.a)) is not None:
-        A = se3.adjoint(one.T_node_camera)
+        A = se3.adjoint(one.T_a_b)
         covariance = one.covariance + A @ loop.covariance @ A.T
-        loop = replace(
-            loop, a=one.node, T_a_b=one.T_node_camera @ loop.T_a_b, covariance=covariance
-        )
+        loop = replace(loop, a=one.a, T_a_b=one.T_a_b @ loop.T_a_b, covariance=covariance)
     if (other := marginalised.get(loop.b)) is not None:
         units = np.array([1.0] * 3 + [loop.ratio] * 3)
-        T, covariance = reversed_motion(other.T_node_camera, other.covariance)
+        T, covariance = reversed_motion(other.T_a_b, other.covariance)
         T[:3, 3] *= loop.ratio
         A = se3.adjoint(loop.T_a_b)
         covariance = loop.covariance + A @ (covariance * np.outer(units, units)) @ A.T
-        loop = replace(loop, b=other.node, T_a_b=loop.T_a_b @ T, covariance=covariance)
+        loop = replace(loop, b=other.a, T_a_b=loop.T_a_b @ T, covariance=covariance)
     return loop
 
 
@@ -167,17 +161,6 @@ def _smallest_holes_first(nodes: Sequence[Node], old: int) -> list[list[int]]:
     if groups and nodes[old].segment == nodes[old - 1].segment:
         groups.pop()
     return sorted(groups[1:], key=lambda group: nodes[group[-1] + 1].seq - nodes[group[0] - 1].seq)
-
-
-def _joined(marginalised: Marginalised, left: Node, node: Node) -> Node:
-    """The node with the motion over ``left``, which goes, and with the mean of both's fixes."""
-    A = se3.adjoint(marginalised.T_node_camera)
-    return replace(
-        node,
-        covariance=left.covariance + A @ node.covariance @ A.T,
-        prior=averaged(node, left),
-        weight=left.weight + node.weight,
-    )
 
 
 def _spread(loop: Loop) -> float:

@@ -83,7 +83,6 @@ class UndistortedFrame:
 
     @property
     def motion(self) -> FrameRows:
-        """Its rows' motion."""
         assert self.moving is not None, "the odometry has not seen the frame"
         return self.moving
 
@@ -93,7 +92,6 @@ class UndistortedFrame:
 
     @property
     def keyframe(self) -> OdometryKeyframe:
-        """Its reference keyframe."""
         assert self._reference.keyframe is not None, "a frame of stereo is not settled"
         return self._reference.keyframe
 

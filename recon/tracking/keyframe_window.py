@@ -25,7 +25,6 @@ class Landmarks:
         self._end = 0
 
     def __len__(self) -> int:
-        """How many are held, dropped ones included."""
         return self._end - self._first
 
     def add(self, points: F64) -> I64:

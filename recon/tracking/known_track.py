@@ -56,15 +56,12 @@ class KnownTrack:
         self._clock = clock if lens.shutter.readout_s else None
 
     def can_skip(self, time_ns: int, prior: PosePrior, frames_per_step: float) -> bool:
-        """False: every still counts."""
         return False
 
     def needs_turn(self, time_ns: int) -> bool:
-        """False: the turn of the rows is known."""
         return False
 
     def track(self, frame: UndistortedFrame) -> Tracked:
-        """The pose of a frame."""
         seq, time_ns, prior = frame.seq, frame.time_ns, frame.prior
         view = self._views.get(seq)
         if view is None:

@@ -406,7 +406,6 @@ class Localiser:
     # ---- a segment's first frame ---------------------------------------------------------------
 
     def begin(self) -> None:
-        """Forget the segment before."""
         self._drift = np.eye(3)
 
     def match_first(

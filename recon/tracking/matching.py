@@ -141,8 +141,6 @@ FAR = 1e6
 
 @dataclass(frozen=True, slots=True)
 class MatchingConfig:
-    """Parameters of corner detection and matching."""
-
     grid: int = 30  # cells along each side; one corner per cell (paper: 30 x 30)
     harris_k: float = 0.04  # k of Eq. 5
     min_response: float = 4.0  # threshold of R, gray levels to the fourth

@@ -51,8 +51,6 @@ EARLY = 4
 
 
 class Tracking(str, Enum):
-    """How the odometry took a frame."""
-
     STARTED = "started"  # first of a segment
     WAITING = "waiting"  # the camera has not moved enough for a second view
     TRACKED = "tracked"
@@ -63,8 +61,6 @@ class Tracking(str, Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
-    """The outcome of one frame."""
-
     state: Tracking
     segment: int
     T_odom_camera: F64 | None = None  # (4, 4)
@@ -188,7 +184,6 @@ class Odometry:
         return Tracked(Tracking.LOST, self.segment, reason=reason)
 
     def _start(self, new: UndistortedFrame) -> Tracked:
-        """Begin a segment at this frame."""
         uv = self._corners(new)
         if len(uv) < 2 * self.config.min_tracks:
             return Tracked(Tracking.LOST, self.segment, reason="too little texture")

@@ -23,8 +23,6 @@ from recon.types import F64, Bool
 
 @dataclass(frozen=True, slots=True)
 class PnpConfig:
-    """Parameters of the pose from points."""
-
     threshold_px: float = 2.0  # largest reprojection error of an inlier
     iterations: int = 200  # RANSAC draws, at most
     confidence: float = 0.9999  # RANSAC stops early at this chance of a clean draw

@@ -95,7 +95,6 @@ class ReadoutSearch:
 
     @property
     def is_open(self) -> bool:
-        """True while nothing is known of the readout."""
         return self.estimate is None and self._clock.readout_s == 0.0
 
     @property
