@@ -33,7 +33,7 @@ from recon.pipeline.stages import (
     Undistort,
     keyframe_of,
 )
-from recon.pipeline.surface_map import KnownSurface, SurfaceMap
+from recon.pipeline.surface_map import SurfaceMap
 from recon.pipeline.views import StereoView, ViewSelection, VirtualStereoCamera
 from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
@@ -101,7 +101,7 @@ class Mapper:
         config: MapperConfig | None = None,
         backend: Backend | None = None,
         known: KnownTrack | None = None,
-        new_map: Callable[[VoxelMapConfig], KnownSurface] = VoxelMap,
+        new_map: Callable[[VoxelMapConfig], VoxelMap] = VoxelMap,
         worker: Callable[[Reconstruct], Worker] = InTurn,
         timing: Timing = untimed,
         keeps_cloud: bool = True,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -19,16 +18,6 @@ RECORDED_SIGMA_PX = 0.11
 no better (docs/reports/simulated-flights.md)."""
 
 
-class KnownSurface(Protocol):
-    """What :class:`recon.mapping.voxel_map.VoxelMap` does."""
-
-    def __len__(self) -> int: ...
-
-    def fresh(self, depth: DepthMap) -> Bool: ...
-
-    def insert(self, depth: DepthMap, mask: Bool | None = None) -> int: ...
-
-
 class SurfaceMap:
     """Compares each view with the surface known before, and remembers it.
 
@@ -41,7 +30,7 @@ class SurfaceMap:
         resolution_m: float = 0.0,
         sigma_lens: float = 0.0,
         sigma_k1: float = 0.0,
-        new_map: Callable[[VoxelMapConfig], KnownSurface] = VoxelMap,
+        new_map: Callable[[VoxelMapConfig], VoxelMap] = VoxelMap,
     ) -> None:
         """``focal_px`` is of the recorded images.
 
@@ -50,7 +39,7 @@ class SurfaceMap:
         """
         self._focal_px, self._resolution_m = focal_px, resolution_m
         self._sigma_lens, self._sigma_k1, self._new_map = sigma_lens, sigma_k1, new_map
-        self.known: KnownSurface | None = None
+        self.known: VoxelMap | None = None
         self._disagreement, self._segment = Disagreement(), -1
 
     def __call__(
@@ -103,7 +92,7 @@ class SurfaceMap:
         bent = 2.0 * self._sigma_k1 * np.add.outer(y * y, x * x)
         return np.asarray(np.hypot(bent, self._sigma_lens), np.float32)
 
-    def _empty(self, depth: DepthMap) -> KnownSurface:
+    def _empty(self, depth: DepthMap) -> VoxelMap:
         """A map as fine as the first view."""
         ground_m = float(np.nanmedian(depth.depth_m)) / depth.K[0, 0]
         voxel_m = max(2.0 * ground_m, self._resolution_m, 1e-3)

@@ -21,8 +21,8 @@ log = logging.getLogger(__name__)
 MAX_OVER = 4
 
 
-class PagedMap:
-    """A voxel map (:mod:`recon.mapping.voxel_map`) with about ``max_voxels`` in memory at most.
+class PagedMap(VoxelMap):
+    """A voxel map with about ``max_voxels`` in memory at most.
 
     The tiles under the view stay, whatever they hold; where they alone have :data:`MAX_OVER`
     times as many, the half seen longest ago is forgotten, and that surface is sent again.
@@ -37,14 +37,10 @@ class PagedMap:
             raise ValueError(f"max_voxels is {max_voxels}, must be at least 1000")
         self.folder, self.max_voxels = folder, max_voxels
         largest = min(config.largest_voxels, MAX_OVER * max_voxels)
-        self._map = VoxelMap(replace(config, largest_voxels=largest))
+        super().__init__(replace(config, largest_voxels=largest))
         self._margin_m = config.voxel_m * (config.largest_reach_voxels + 1)
         self._away: set[int] = set()  # tiles that are on disk
         self._broken = False
-
-    def __len__(self) -> int:
-        """Number of voxels in memory."""
-        return len(self._map)
 
     @property
     def tiles_on_disk(self) -> int:
@@ -54,14 +50,14 @@ class PagedMap:
     def fresh(self, depth: DepthMap) -> Bool:
         """(h, w) pixels whose surface is new, or clearly better than what is held."""
         self._bring_back(self._under(depth))
-        return self._map.fresh(depth)
+        return super().fresh(depth)
 
     def insert(self, depth: DepthMap, mask: Bool | None = None) -> int:
         """Remember the surface of ``depth`` where ``mask``; how many voxels are new."""
         here = self._under(depth)
         self._bring_back(here)
-        new = self._map.insert(depth, mask)
-        if len(self._map) > self.max_voxels and not self._broken:
+        new = super().insert(depth, mask)
+        if len(self) > self.max_voxels and not self._broken:
             self._send_away(here)
         return new
 
@@ -71,7 +67,7 @@ class PagedMap:
         self._away.clear()
 
     def _under(self, depth: DepthMap) -> I64:
-        return tiles_under(depth, self._map.config.voxel_m, self._margin_m)
+        return tiles_under(depth, self.config.voxel_m, self._margin_m)
 
     def _bring_back(self, tiles: I64) -> None:
         for tile in self._away.intersection(tiles.tolist()):
@@ -79,7 +75,7 @@ class PagedMap:
             path = self._path(tile)
             try:
                 with np.load(path) as page:
-                    self._map.put(Voxels(page["keys"], page["sigma_m"], page["seen"]))
+                    self.put(Voxels(page["keys"], page["sigma_m"], page["seen"]))
                 path.unlink()
             except (OSError, KeyError, ValueError, EOFError) as error:
                 log.warning(
@@ -88,12 +84,12 @@ class PagedMap:
 
     def _send_away(self, keep: I64) -> None:
         """Page the oldest tiles out until the map is at about half its limit."""
-        tiles, counts = self._map.oldest_tiles()
+        tiles, counts = self.oldest_tiles()
         away = ~np.isin(tiles, keep)
         tiles, counts = tiles[away], counts[away]
-        surplus = len(self._map) - self.max_voxels // 2
+        surplus = len(self) - self.max_voxels // 2
         tiles = tiles[: int(np.searchsorted(np.cumsum(counts), surplus)) + 1]
-        taken = self._map.take(tiles)
+        taken = self.take(tiles)
         home = tile_of(taken.keys)
         for tile in tiles.tolist():
             page = taken.where(home == tile)
@@ -103,7 +99,7 @@ class PagedMap:
                 self._away.add(tile)
             except OSError as error:
                 log.warning("the map cannot be paged to %s: %s", self.folder, error)
-                self._map.put(page)
+                self.put(page)
                 self._broken = True
 
     def _path(self, tile: int) -> Path:
