@@ -66,11 +66,7 @@ class KeyframeMap:
         return {"loop_views": views, "graph_keyframes": len(self.graph)}
 
     def add(
-        self,
-        view: StereoView,
-        step: F64 | None,
-        covariance: F64,
-        depth: DepthMap | None,
+        self, view: StereoView, step: F64 | None, covariance: F64, depth: DepthMap | None
     ) -> GraphUpdate:
         """Append a view and look for loops.
 

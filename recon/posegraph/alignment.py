@@ -199,10 +199,7 @@ def _covariance(readings: AlignmentReadings, found: _Solution) -> F64:
 
 
 def _measured(
-    nodes: Sequence[Node],
-    start: AlignmentState,
-    bias_tau_s: tuple[float, float],
-    slow_share: float,
+    nodes: Sequence[Node], start: AlignmentState, bias_tau_s: tuple[float, float], slow_share: float
 ) -> ReadingNoise:
     """The noise of fixes and of velocities, each estimated from residuals against a fit of that
     sensor and the attitudes' tilt alone: a compass that is off would look like a drift."""

@@ -193,11 +193,7 @@ class MotionFactors:
     """Adds the motions of one graph to its smoother, and keeps the scale of each keyframe."""
 
     def __init__(
-        self,
-        config: PoseGraphConfig,
-        smoother: Smoother,
-        segments: Segments,
-        counts: Counter[str],
+        self, config: PoseGraphConfig, smoother: Smoother, segments: Segments, counts: Counter[str]
     ) -> None:
         """``counts`` takes in the stretches without vision."""
         self._config, self._smoother = config, smoother

@@ -10,13 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera_model import scaled_K
-from recon.posegraph.loop_closure import (
-    LoopConfig,
-    LoopView,
-    candidates,
-    ground_seen,
-    verify,
-)
+from recon.posegraph.loop_closure import LoopConfig, LoopView, candidates, ground_seen, verify
 from recon.posegraph.trajectory import Trajectory
 from recon.tracking.common_view import alike, signature
 from recon.types import F64, U8, DepthMap
@@ -100,10 +94,7 @@ class LoopSearch:
     """Keeps keyframes, finds earlier ones that see the same, and adds loops to the trajectory."""
 
     def __init__(
-        self,
-        trajectory: Trajectory,
-        config: LoopConfig | None = None,
-        max_views: int = 400,
+        self, trajectory: Trajectory, config: LoopConfig | None = None, max_views: int = 400
     ) -> None:
         """Of more than ``max_views`` keyframes, about 0.1 MB each, every second of the older half
         is forgotten.

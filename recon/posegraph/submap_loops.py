@@ -18,14 +18,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import project, rays
-from recon.posegraph.loop_closure import (
-    MIN_RAD,
-    MIN_SHARE,
-    LoopClosure,
-    LoopView,
-    landmarks,
-    warps,
-)
+from recon.posegraph.loop_closure import MIN_RAD, MIN_SHARE, LoopClosure, LoopView, landmarks, warps
 from recon.tracking import matching
 from recon.types import F32, F64, I64, Bool, DepthMap, Keyframe
 

@@ -114,10 +114,7 @@ def over_gaps(nodes: Sequence[Node], poses: Mapping[int, F64]) -> list[Node]:
 
 
 def moved_loops(
-    loops: Sequence[Loop],
-    marginalised: Mapping[int, Loop],
-    dropped: Collection[int],
-    most: int,
+    loops: Sequence[Loop], marginalised: Mapping[int, Loop], dropped: Collection[int], most: int
 ) -> list[Loop]:
     """Loops between nodes that stay: the surest of several between the same two, and of more than
     ``most`` every second of the older half."""

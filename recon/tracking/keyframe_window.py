@@ -207,11 +207,7 @@ def _restore_baseline(window: list[OdometryKeyframe], base: float) -> None:
 
 
 def _drop_outliers(
-    window: list[OdometryKeyframe],
-    ids: I64,
-    index: I64,
-    cam: I64,
-    residual_px: F64,
+    window: list[OdometryKeyframe], ids: I64, index: I64, cam: I64, residual_px: F64
 ) -> None:
     """Remove observations far off; a landmark left with one view is dropped."""
     bad = residual_px > max(2.5, 4.0 * float(np.median(residual_px)))

@@ -131,12 +131,7 @@ def ground_normal(points: F64) -> F64:
 
 
 def solve(
-    uv_a: F64,
-    uv_b: F64,
-    K: F64,
-    R_b_a: F64 | None,
-    max_turn_rad: float,
-    up_a: F64,
+    uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None, max_turn_rad: float, up_a: F64
 ) -> TwoView | None:
     """The relative pose of two frames and their points, or None when it is not certain.
 
