@@ -85,16 +85,6 @@ class ControlPoint:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TrackReadings:
-    """Telemetry of N keyframes, with sigmas as of independent readings; NaN where there is none."""
-
-    fixes: F64  # (N, 3) m
-    sigma_fixes: F64  # (N, 3) m
-    attitudes: F64  # (N, 3, 3) R_world_camera
-    sigma_attitudes: F64  # (N, 3) rad about the axes of the world
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class KeyframeTrack:
     """The keyframes as they are before."""
 
@@ -104,22 +94,25 @@ class KeyframeTrack:
     priors: Sequence[PosePrior] = ()  # of each keyframe; without them the poses are the prior
     loops: Sequence[Loop] = ()  # between places in the list, in metres
 
-    def readings(self) -> TrackReadings:
-        """Fixes and attitudes; their sigmas grow as errors wander (cf. factors.py)."""
+    def readings(self) -> tuple[F64, F64, F64, F64]:
+        """Fixes (N, 3) m and attitudes (N, 3, 3), each followed by its sigmas (N, 3) m and rad
+        about the axes of the world, as of independent readings: they grow as errors wander (cf.
+        factors.py). NaN where there is none."""
         shapes = (3,), (3,), (3, 3), (3,)
-        out = TrackReadings(*(np.full((len(self.poses), *shape), np.nan) for shape in shapes))
+        out = tuple(np.full((len(self.poses), *shape), np.nan) for shape in shapes)
+        fixes, sigma_fixes, attitudes, sigma_attitudes = out
         gap_s = max(float(np.median(np.diff(self.times_s))), 1e-3)
-        fixes, attitudes = np.sqrt(np.maximum(1.0, 2.0 * np.array([FIX_S, ATTITUDE_S]) / gap_s))
+        more = np.sqrt(np.maximum(1.0, 2.0 * np.array([FIX_S, ATTITUDE_S]) / gap_s))
         for k, prior in enumerate(self.priors):
             if prior.position_m is not None and prior.sigma_position_m is not None:
-                out.fixes[k] = prior.position_m
-                out.sigma_fixes[k] = fixes * np.maximum(prior.sigma_position_m, 0.005)
+                fixes[k] = prior.position_m
+                sigma_fixes[k] = more[0] * np.maximum(prior.sigma_position_m, 0.005)
             if prior.R_world_camera is not None:
                 tilt = prior.sigma_tilt_rad
                 yaw = prior.sigma_yaw_rad if prior.sigma_yaw_rad < 1.0 else 10.0
-                out.attitudes[k] = prior.R_world_camera
-                out.sigma_attitudes[k] = attitudes * np.array([tilt, tilt, yaw])
-        return out
+                attitudes[k] = prior.R_world_camera
+                sigma_attitudes[k] = more[1] * np.array([tilt, tilt, yaw])
+        return fixes, sigma_fixes, attitudes, sigma_attitudes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -354,14 +347,12 @@ class _Batch:
 
     def _add_telemetry(self) -> None:
         self._hold(0, self._track.poses[0], 2.0, 1e4)
-        known = self._track.readings()
-        for key in range(len(self._track.poses)):
-            R, place = known.attitudes[key], known.fixes[key]
+        readings = zip(*self._track.readings(), strict=True)
+        for key, (place, sigma_m, R, sigma_rad) in enumerate(readings):
             if np.isfinite(R).all():
-                self._smoother.add_turn("attitude", key, R, known.sigma_attitudes[key], 1.5)
+                self._smoother.add_turn("attitude", key, R, sigma_rad, 1.5)
             if np.isfinite(place).all():
-                sigma = known.sigma_fixes[key]
-                self._smoother.add_place("position", key, place, sigma, cauchy=2.0)
+                self._smoother.add_place("position", key, place, sigma_m, cauchy=2.0)
 
     def _add_points(self, points: Sequence[ControlPoint], marks: Sequence[Mark]) -> None:
         """The world at key N, and the points that images see behind it."""

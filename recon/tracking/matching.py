@@ -224,20 +224,6 @@ def checked_warps(warp: npt.ArrayLike | None, count: int) -> tuple[F64, F64]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Found:
-    """The answer of one search on one level."""
-
-    uv: F64  # (N, 2) full-size px
-    score: F64  # (N,) correlation, NO_SCORE where nothing could be compared
-    second: F64  # (N,) correlation of the next separate peak
-    contrast: F64  # (N,) of the patch of a, gray levels
-
-    def distinct(self, ratio: float) -> Bool:
-        """(N,) True where the best place is that much better than any other."""
-        return np.asarray(1.0 - self.score <= ratio * (1.0 - self.second))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Search:
     """One direction of matching: patches about the points of image a, looked for in image b."""
 
@@ -247,8 +233,12 @@ class _Search:
     inverse_warp: F64
     config: MatchingConfig
 
-    def at(self, level: int, uv_b: F64, active: Bool, reach: int) -> _Found:
-        """Best places in b within ``reach`` px of ``level`` about ``uv_b`` (full-size px)."""
+    def at(self, level: int, uv_b: F64, active: Bool, reach: int) -> tuple[F64, F64, F64, F64]:
+        """Best places (N, 2) in b within ``reach`` px of ``level`` about ``uv_b``, in full-size px.
+
+        And (N,) their correlation, NO_SCORE where nothing could be compared, that of the next
+        separate peak, and the contrast of the patch of a in gray levels.
+        """
         N = len(uv_b)
         uv, score, second, contrast = uv_b / 2.0**level, np.empty(N), np.empty(N), np.empty(N)
         parallel_for(
@@ -257,7 +247,7 @@ class _Search:
             self.inverse_warp, active, reach, self.config.patch_radius_px,
             self.config.min_contrast, uv, score, second, contrast,
         )  # fmt: skip
-        return _Found(uv * 2.0**level, score, second, contrast)
+        return uv * 2.0**level, score, second, contrast
 
     def refined(self, uv_b: F64, active: Bool) -> tuple[F64, F64, F64, F64]:
         """Sub-pixel places (N, 2) in b from starts within about a pixel, their correlation (N,),
@@ -374,12 +364,11 @@ def _coarse_to_fine(
     where the search began; None where that is the finest."""
     a, config = forward.uv_a, forward.config
     level, reach = start_level(radius_px, min(len(forward.a), len(forward.b)), config)
-    coarse = forward.at(level, predicted, everyone, reach)
-    uv = coarse.uv
+    uv, score, second, contrast = forward.at(level, predicted, everyone, reach)
     # A coarse pixel blurs; the fine patches have the last word on likeness.
-    active = coarse.distinct(config.ambiguity) & (1.0 - coarse.score <= config.max_zssd)
-    doubtful = active & ~coarse.distinct(0.4 * config.ambiguity)
-    returned = replace(back, uv_a=uv).at(level, a, doubtful, min(reach, 4)).uv
+    active = _distinct(score, second, config.ambiguity) & (1.0 - score <= config.max_zssd)
+    doubtful = active & ~_distinct(score, second, 0.4 * config.ambiguity)
+    returned, *_ = replace(back, uv_a=uv).at(level, a, doubtful, min(reach, 4))
     active &= np.abs(returned - a).max(axis=1, initial=0.0) <= 1.6 * 2**level
     if level == 0:
         return uv, active, None
@@ -387,10 +376,14 @@ def _coarse_to_fine(
     uv, active = _follow_others(a, uv, predicted, active, everyone, 2.0 * 2**level, stray_px)
     while level > 1:
         finer = max(level - 2, 1)
-        found = forward.at(finer, uv, active, 1 + level - finer)
-        uv, level = found.uv, finer
-        active = active & (found.score > 0)
-    return uv, active, coarse.contrast
+        uv, score, *_ = forward.at(finer, uv, active, 1 + level - finer)
+        level, active = finer, active & (score > 0)
+    return uv, active, contrast
+
+
+def _distinct(score: F64, second: F64, ratio: float) -> Bool:
+    """(N,) True where the best place is that much better than any other."""
+    return np.asarray(1.0 - score <= ratio * (1.0 - second))
 
 
 def _follow_others(
@@ -418,4 +411,5 @@ def _repeats(search: _Search, uv: F64, ok: Bool, coarse: F64, fine: F64) -> Bool
     vague = ok & (coarse < 0.3 * fine)
     if not vague.any():
         return vague
-    return np.asarray(vague & ~search.at(1, uv, vague, 8).distinct(search.config.ambiguity))
+    _, score, second, _ = search.at(1, uv, vague, 8)
+    return np.asarray(vague & ~_distinct(score, second, search.config.ambiguity))

@@ -262,8 +262,7 @@ def _known(
         return out
     out.placing[0] = first_held(track.poses)[0] * 1e-4
     log = track.readings()
-    out.fixes[:n], out.sigma_fixes[:n] = log.fixes, log.sigma_fixes
-    out.attitudes[:n], out.sigma_attitudes[:n] = log.attitudes, log.sigma_attitudes
+    out.fixes[:n], out.sigma_fixes[:n], out.attitudes[:n], out.sigma_attitudes[:n] = log
     return out
 
 

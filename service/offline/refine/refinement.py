@@ -251,7 +251,7 @@ class _Refinement:
         figures = figures_of(seqs, track, found, candidates, verified, self._ahead_m(), places_m)
         if self.images is not None:
             figures["images"] = self.images.figures()
-            fixed = np.asarray(np.isfinite(track.readings().fixes).all(axis=1))
+            fixed = np.asarray(np.isfinite(track.readings()[0]).all(axis=1))
             figures["apart"] = stretches_untied(seqs, self.images.seen, fixed)
         alone = self._left_out(track, candidates)
         for point in figures["points"]:
@@ -274,9 +274,9 @@ class _Refinement:
         self.progress(f"matching {len(images)} images, and fitting the camera")
         ahead = track.poses[:, :3, 2] * self._ahead_m()
         ground_m = float(np.median(track.poses[:, 2, 3] + ahead[:, 2]))
-        log = track.readings()
+        fixes, sigma_fixes, *_ = track.readings()
         found = own_camera.found_camera(
-            images, given, track.poses, ground_m, log.fixes, log.sigma_fixes, config
+            images, given, track.poses, ground_m, fixes, sigma_fixes, config
         )
         return found, given
 

@@ -174,12 +174,12 @@ def test_readings_are_known_where_telemetry_is_and_count_as_independent_ones() -
     sigma = np.array([0.5, 0.5, 0.8])
     priors = [PosePrior() for _ in range(40)]
     priors[7] = PosePrior(DOWN, 0.01, 2.0, np.array([1.0, 2.0, 3.0]), sigma)
-    found = KeyframeTrack(true_poses(), TIMES, loose(40), priors).readings()
-    rows = (found.fixes, found.sigma_fixes, found.attitudes, found.sigma_attitudes)
+    rows = KeyframeTrack(true_poses(), TIMES, loose(40), priors).readings()
+    _, sigma_fixes, _, sigma_attitudes = rows
     assert all(np.flatnonzero(np.isfinite(r).reshape(40, -1).any(axis=1)) == [7] for r in rows)
-    assert found.sigma_fixes[7] == pytest.approx(sigma * np.sqrt(120.0))
+    assert sigma_fixes[7] == pytest.approx(sigma * np.sqrt(120.0))
     turn = np.array([0.01, 0.01, 10.0])
-    assert found.sigma_attitudes[7] == pytest.approx(turn * np.sqrt(80.0))
+    assert sigma_attitudes[7] == pytest.approx(turn * np.sqrt(80.0))
 
 
 def test_the_derivatives_of_a_mark_are_those_of_differences() -> None:
