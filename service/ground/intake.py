@@ -149,7 +149,7 @@ class ScanIntake:
         self.head, self.head_at = head, now
 
     def on_items(self, message: bytes, now: float) -> bool:
-        """Parts of records; True when something new was stored.
+        """Parts of records; True when something new was stored that is part of the scan.
 
         Raises OutsideError when the disk is full; the records will be asked for again.
         """
@@ -164,7 +164,8 @@ class ScanIntake:
                     request.news_at, request.moved = now, True
             record = self._assembler.add(part, now)
             if record is not None:
-                news = self._store(part.kind, part.number, record, now) or news
+                is_new = self._store(part.kind, part.number, record, now)
+                news = news or (is_new and part.kind != "first")  # no file shows a first depth
         return news
 
     def _store(self, kind: str, number: int, record: bytes, now: float) -> bool:

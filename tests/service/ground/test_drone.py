@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hostile_records import sound_layers
 from hypothesis import Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -29,6 +30,7 @@ from service.ground.drone import (
     Write,
 )
 from service.ground.inbox import Answered, Batch, Event, Grown, Written
+from service.stream import codec
 from service.stream.messages import Head, Held, pack, split, unpack
 from service.stream.naming import place_of
 from service.stream.ranges import RangeSet, ranges_from_text
@@ -153,6 +155,24 @@ def test_a_growing_scan_is_written_when_that_is_asked_for(tmp_path: Path) -> Non
     one.written()
     one.hear(Grown())
     assert one.writes == []  # it did not grow
+    one.close()
+
+
+def test_a_first_depth_is_no_growth_of_the_files(tmp_path: Path) -> None:
+    layer = sound_layers()[0]
+    head = codec.peek(layer)
+    assert head is not None
+    one = Onboard(tmp_path)
+    one.head()
+    one.answer()
+    one.hear(Grown())
+    one.written()
+    one.store.offer_first(head.seq, layer)
+    one.send("first", head.seq)
+    (scan,) = one.ground.scans
+    assert list(scan.intake.store.states()) == [head.seq]
+    one.hear(Grown())
+    assert one.writes == []
     one.close()
 
 
