@@ -131,7 +131,7 @@ class BackgroundWorker(Generic[In, Out]):
 
     def offer(self, item: In) -> None:
         if self._ends.is_set():
-            self.dropped += 1
+            self.drop(item)
             return
         future: Future[Out] = Future()
         self._offered[future] = item
@@ -145,8 +145,11 @@ class BackgroundWorker(Generic[In, Out]):
         if not self._live:
             self._wait(waiting[0])
         elif (late := next((one for one in waiting[1:] if one.cancel()), None)) is not None:
-            del self._offered[late]
-            self.dropped += 1
+            self.drop(self._offered.pop(late))
+
+    def drop(self, item: In) -> None:
+        """Count an item that no result comes of."""
+        self.dropped += 1
 
     def finished(self, everything: bool = False) -> list[tuple[In, Out]]:
         """Finished work, in order; ``everything`` waits for the rest.
@@ -157,8 +160,7 @@ class BackgroundWorker(Generic[In, Out]):
         while self._offered:
             future = next(iter(self._offered))
             if everything and not self._wait(future):
-                del self._offered[future]
-                self.dropped += 1
+                self.drop(self._offered.pop(future))
                 continue
             if not future.done() or (future.exception() is not None and out):
                 break

@@ -37,7 +37,13 @@ COMMON_FOCAL_SHARE, MAX_FOCAL_SHARE = 0.02, 0.05
 """Sigma of the focal length that all points share, so that it would only hide how they err against
 each other, and up to which sigma of depth holds the rest: above a tenth would drop all points."""
 
-DenseWorker = BackgroundWorker[StereoView, GraphUpdate]
+
+class DenseWorker(BackgroundWorker[StereoView, GraphUpdate]):
+    """Of views: one that comes again is not lost when its first depth is."""
+
+    def drop(self, item: StereoView) -> None:
+        if not item.is_first:
+            super().drop(item)
 
 
 def sigma_lens(assumed: Collection[str], sigma_focal: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from typing import Any
 from unittest.mock import Mock
 from weakref import WeakSet
@@ -11,11 +12,14 @@ from weakref import WeakSet
 import numpy as np
 import pytest
 from loopback import until
+from some_views import view_at
 
-from recon.pipeline.mapper import Mapper
-from recon.pipeline.views import VirtualStereoCamera
+from recon.pipeline.keyframe_map import GraphUpdate
+from recon.pipeline.mapper import NO_POSE, Mapper
+from recon.pipeline.views import StereoView, VirtualStereoCamera
 from recon.types import Camera
 from service.background import BackgroundWorker
+from service.flight.pipeline import DenseWorker
 
 
 def test_results_come_in_order_and_nothing_is_dropped() -> None:
@@ -47,6 +51,27 @@ def test_live_the_oldest_that_has_not_begun_gives_way() -> None:
     kept = [n for n, _ in jobs.finished(everything=True)]
     jobs.close()
     assert kept[0] == 0 and kept[-1] == 9 and len(kept) == 3 and jobs.dropped == 7
+
+
+def test_a_first_depth_that_gives_way_is_no_lost_view() -> None:
+    gate = threading.Event()
+
+    def work(view: StereoView) -> GraphUpdate:
+        gate.wait(5)
+        return GraphUpdate(NO_POSE, False)
+
+    jobs = DenseWorker("dense", work, 2, live=True)
+    views = [view_at(seq, np.eye(4)) for seq in range(4)]
+    first = replace(views[2], is_first=True)
+    for view in (views[0], first, *views[1:3]):  # no more than the queue takes but for the first
+        jobs.offer(view)
+    assert jobs.dropped == 0
+    jobs.offer(views[3])
+    assert jobs.dropped == 1
+    gate.set()
+    kept = [view.seq for view, _ in jobs.finished(everything=True)]
+    jobs.close()
+    assert kept == [0, 2, 3]
 
 
 def test_live_what_gave_way_is_forgotten_while_the_work_at_hand_hangs() -> None:
