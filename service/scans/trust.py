@@ -93,8 +93,9 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
     if frames and tracked is not None and not is_placed:
         doubts.append(f"vision placed only {placed:.0f} of {frames:.0f} frames")
     dropped = _number(run.get("drops"), CONTRADICTED) or 0.0
-    matched = dropped + (_number(run, "keyframes") or 0.0)
-    if dropped > WRONG_SHARE * matched:
+    keyframes = _number(run, "keyframes")
+    matched = dropped + (keyframes or 0.0)
+    if keyframes is not None and dropped > WRONG_SHARE * matched:
         doubts.append(f"the depths of {dropped:.0f} of {matched:.0f} views contradict each other")
     for why, views in (("tilt off", "attitudes"), ("view off", "assumed view directions")):
         tilted, attitudes = _refused(run, "attitude", why)

@@ -131,7 +131,12 @@ def test_the_slope_of_a_site_is_found_in_spite_of_towers(angle: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "run", [{}, {"assumed": 3, "scale": [], "frames": "x", "graph": {"residuals": 1}}]
+    "run",
+    [
+        {},
+        {"assumed": 3, "scale": [], "frames": "x", "graph": {"residuals": 1}},
+        {"drops": {CONTRADICTED: 1}},
+    ],
 )
 def test_a_run_that_notes_nothing_limits_nothing(run: dict[str, Any]) -> None:
     assert trust_of(run, "gnss")["level"] == "georeferenced"
