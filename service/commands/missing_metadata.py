@@ -216,7 +216,8 @@ def start_of(
         raise InputError(
             "the recording begins outside the years 1970 to 2106; give the right --video-epoch"
         )
-    if log is not None and not is_dated and not (video_epoch and _covers(log, start_ns)):
+    is_of_log = video_epoch is not None and log is not None and _covers(log, start_ns)
+    if log is not None and not is_dated and not is_of_log:
         zero_ns = 0 if log.clock == "video" else log.first_ns
         notes.append("the log has no date: it begins with the recording")
         return zero_ns, start_ns - zero_ns
@@ -265,10 +266,19 @@ def _utc(time_ns: int) -> str:
 
 
 def at_another_time(inputs: ScanInputs, off_ms: float) -> dict[str, Any]:
-    """Inputs of the scan of a video whose stamps are late by ``off_ms``."""
+    """Inputs of the scan of a video whose stamps are late by ``off_ms``.
+
+    Where the log has no date, the video keeps its own.
+    """
+    off_ns, offset_ns = round(1e6 * off_ms), inputs.unix_offset_ns
     word = "before" if off_ms > 0 else "after"
+    of = "start that was assumed" if "start" in inputs.assumed else "time that it states"
     note = (
-        f"the video begins {1e-3 * abs(off_ms):.2f} s {word} the time that it states, as its "
-        "images turn with the log: applied"
+        f"the video begins {1e-3 * abs(off_ms):.2f} s {word} the {of}, as its images turn with the "
+        "log: applied"
     )
-    return {"epoch_ns": inputs.epoch_ns - round(1e6 * off_ms), "notes": (*inputs.notes, note)}
+    return {
+        "epoch_ns": inputs.epoch_ns - off_ns,
+        "unix_offset_ns": offset_ns and offset_ns + off_ns,
+        "notes": (*inputs.notes, note),
+    }

@@ -252,15 +252,16 @@ def _replay(
         sigma_focal=lens.sigma_focal,
         extra={"backend": chosen.name, "source": source.description},
     )
+    is_assumed = is_start_assumed(source, log, video_epoch)
     unsure: set[str] = set()  # what the images may correct: then the scan begins again
     if played is source and parse_source(video)[0] == "file":
-        is_clock_given = video_epoch is not None or is_latency_given
+        is_clock_given = is_latency_given or (video_epoch is not None and not is_assumed)
         is_clock_sure = log is None or log.clock == "video" or is_clock_given
         unsure = {"readout"} if is_clock_sure else {"readout", "clock"}
     with nullcontext(Progress()) if as_json else showing("replay") as progress:
         if start is not None:
             inputs = with_own_lens(inputs, video, start, find_lens, progress)
-        if is_start_assumed(source, log, video_epoch):
+        if is_assumed:
             inputs = replace(inputs, assumed=(*inputs.assumed, "start"))
         if played is source:
             inputs = adjusted_stills(inputs, is_latency_given, progress)

@@ -15,7 +15,14 @@ from command_line import skyrelief
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog
 from service.cameras.source import CameraSource
-from service.commands.missing_metadata import HOUR_NS, is_start_assumed, local_zone_ns, start_of
+from service.commands import replay
+from service.commands.missing_metadata import (
+    HOUR_NS,
+    at_another_time,
+    is_start_assumed,
+    local_zone_ns,
+    start_of,
+)
 from service.flight.scan import ScanInputs
 from service.progress import Progress
 from service.stream.store import ScanStore
@@ -106,6 +113,47 @@ def test_a_time_that_the_operator_gives_stays(
     assert asked == [unsure]
 
 
+def test_a_date_for_a_log_without_one_leaves_its_clock_open(
+    brief: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = TelemetryLog(VehicleHistory(), "boot", round(80e9), round(120e9), (), {})
+    asked: list[tuple[int, set[str]]] = []
+
+    def fly(
+        inputs: ScanInputs, stop: Event, progress: Progress, unsure: set[str]
+    ) -> dict[str, Any]:
+        asked.append((inputs.epoch_ns, set(unsure)))
+        return {}
+
+    monkeypatch.setattr(replay, "_load_telemetry", lambda path, config: log)
+    monkeypatch.setattr(replay, "_fly", fly)
+    replayed(brief, tmp_path / "scan", "--video-epoch", str(EPOCH_S))
+    assert asked == [(round(80e9), {"readout", "clock"})]
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "assumed", "starts_s", "said"),
+    [
+        (0.0, (), EPOCH_S - 3.0, "3.00 s before the time that it states"),
+        (0.0, ("start",), EPOCH_S - 3.0, "3.00 s before the start that was assumed"),
+        (EPOCH_S - 80.0, ("start",), EPOCH_S, "3.00 s before the start that was assumed"),
+    ],
+)
+def test_a_video_keeps_its_date_where_the_log_has_none(
+    offset_s: float, assumed: tuple[str, ...], starts_s: float, said: str
+) -> None:
+    inputs = SimpleNamespace(
+        epoch_ns=round((EPOCH_S - offset_s) * 1e9),
+        unix_offset_ns=round(offset_s * 1e9),
+        assumed=assumed,
+        notes=(),
+    )
+    found = at_another_time(cast(ScanInputs, inputs), 3000.0)
+    assert found["epoch_ns"] == inputs.epoch_ns - round(3e9)
+    assert found["epoch_ns"] + found["unix_offset_ns"] == round(starts_s * 1e9)
+    assert said in found["notes"][0]
+
+
 @pytest.mark.parametrize(
     ("video_h", "minutes", "ahead_h"),
     [
@@ -139,6 +187,7 @@ def test_local_time_is_taken_where_one_zone_fits(
         ("boot", None, EPOCH_S, 80.0, EPOCH_S, True),
         ("boot", EPOCH_S, EPOCH_S + 9.0, 80.0, EPOCH_S, True),
         ("boot", 95.0, EPOCH_S, 95.0, 95.0, False),  # a time of the log's own clock
+        ("boot", 0.0, EPOCH_S, 0.0, 0.0, False),
         ("unix", None, 100.0, 100.0, 100.0, False),
         ("unix", None, None, 80.0, 80.0, True),
     ],
