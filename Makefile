@@ -106,7 +106,7 @@ $(CORE): pyproject.toml constraints.txt hatch_build.py $(PAGE)
 $(STAMP): $(CORE)
 	$(BIN)/python -m pip install --no-compile --disable-pip-version-check -qq -c constraints.txt $(PIP_FLAGS) -e '.[$(EXTRAS)]'
 	@$(BIN)/skyrelief warm-up  # else each of the tests' processes compiles the same kernels
-	@$(BIN)/python -m pytest -qq --collect-only -m "not slow" >/dev/null || true  # and the same modules
+	@PYTEST_ADDOPTS= $(BIN)/python -m pytest -qq --collect-only -m "not slow" >/dev/null || true  # and the same modules
 	@touch $(STAMP)
 
 # MAVProxy, a ground station for the tests, in an environment of its own without its graphical

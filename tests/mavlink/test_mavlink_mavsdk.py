@@ -212,7 +212,7 @@ def test_behind_an_autopilot_mavsdk_reads_the_settings(
         assert copy == "mftp://[;comp=100]camera.xml"  # for whoever asks the autopilot
         assert cameras() == {100}
         until(lambda: cameras() == {1, 100}, progress=autopilot.repeat)
-        assert settings(100) == SETTINGS
+        until(lambda: settings(100) == SETTINGS)
 
 
 def test_behind_a_router_that_knows_it_mavsdk_reads_the_metadata(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -106,7 +107,8 @@ def test_a_test_that_is_late_has_a_second_try(machine: Path) -> None:
     (machine / "tests" / "test_late.py").write_text(late)
     done = run(machine)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "1 rerun" in done.stdout.partition("run yet")[0]
+    first, _, rest = done.stdout.partition("run yet")
+    assert "1 rerun" in first and re.search(r"^\| all \| 5 \| \d+ \| 1 \|", rest, re.MULTILINE)
 
 
 @pytest.mark.parametrize("broken", ["core", "works"])
