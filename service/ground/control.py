@@ -111,10 +111,7 @@ def _known(folder: Path) -> list[SurveyPoint]:
 
 def _read(path: Path, marks: Path | None = None) -> list[SurveyPoint]:
     try:
-        points = without_stills(read_survey(path, marks))
-        if len(points) > MAX_POINTS or sum(len(p.sightings) for p in points) > MAX_MARKS:
-            raise InputError(f"{path.name}: more than {MAX_POINTS} points or {MAX_MARKS} marks")
-        return points
+        return without_stills(read_survey(path, marks))
     except InputError as error:  # whose paths are of this machine
         raise InputError(str(error).replace(f"{path.parent}/", "")) from error
 
@@ -144,6 +141,8 @@ def _kept(folder: Path, survey: Sequence[SurveyPoint]) -> dict[str, Any]:
 
 
 def _listed(folder: Path, survey: Sequence[SurveyPoint]) -> dict[str, Any]:
+    if len(survey) > MAX_POINTS or sum(len(p.sightings) for p in survey) > MAX_MARKS:
+        raise InputError(f"more than {MAX_POINTS} points or {MAX_MARKS} marks")
     with ScanStore.peek(folder / "scan.db") as store:
         marking = Marking(store)
         return {

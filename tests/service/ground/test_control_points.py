@@ -15,9 +15,10 @@ from portal_client import ONE, Client, serving
 from recon import se3
 from recon.types import F64, Keyframe
 from service.georeference import LocalFrame
+from service.ground.control import MAX_MARKS, MAX_POINTS
 from service.ground.state import Job, carry_out
-from service.offline.refine.marking import GCP, Marking
-from service.offline.refine.survey_file import SurveyPoint, read_survey
+from service.offline.refine.marking import GCP, Marking, survey_text
+from service.offline.refine.survey_file import Sighting, SurveyPoint, read_survey
 from service.stream.store import ScanStore
 
 POINTS = f"{ONE}/control-points"
@@ -230,3 +231,21 @@ def test_a_large_file_is_taken_and_one_with_too_many_points_refused(
     status, said, _ = client.ask(POINTS, "PUT", {"text": many})
     assert status == 400 and "more than 1000 points" in said["error"], said
     assert [p["name"] for p in client.ask(POINTS)[1]["points"]] == ["A"]
+
+
+def test_a_mark_too_many_leaves_the_points_as_they_are(house: HouseFlight, tmp_path: Path) -> None:
+    """Else none could be listed, and no mark taken away."""
+    lat, lon, alt = house.origin
+    marks = tuple(Sighting(0, keyframe_seq=seq, uv_px=(9.0, 9.0)) for seq in range(10, 30))
+    survey = [
+        SurveyPoint(f"P{k}", lat, lon, alt, 0.03, 0.05, False, k, marks) for k in range(MAX_POINTS)
+    ]
+    assert sum(len(p.sightings) for p in survey) == MAX_MARKS
+    flown(house, tmp_path, True)
+    kept = tmp_path / "drone-1" / "test-1" / GCP
+    kept.write_text(survey_text(survey))
+    with serving(tmp_path) as client:
+        one_more = {"name": "P0", "keyframe_seq": 1, "uv_px": [9.0, 9.0]}
+        status, said, _ = client.ask(POINTS, "POST", one_more)
+    assert status == 400 and f"{MAX_MARKS} marks" in said["error"], said
+    assert kept.read_text() == survey_text(survey)
