@@ -38,6 +38,10 @@ EVERY = 10
 NEIGHBOURS = 8
 """Keyframes that place a frame which the scan does not know."""
 
+OWN_SHARE = 0.9
+"""Share of the keyframes that a folder of stills must hold for its others to be those that took no
+part: times are counted from its first one."""
+
 MAX_SLOPE = 0.03
 """Four pixels are one surface where their depths differ by less than this share."""
 
@@ -113,18 +117,29 @@ def _seen(
 
     Stills of a folder that the scan does not know are placed by its surface.
     """
-    header = scan.store.header
+    header, start_ns = scan.store.header, scan.store.header.started_unix_ns
     poses = left_out(scan.poses, {k.time_ns for k in keyframes})
     if poses:
         times = [p.time_unix_ns for p in poses]
         for n, frame in frames_at(times, header, video, None, scan.progress):
             yield poses[n].T_world_camera, undistort.image(frame)
-    known = np.array([p.time_unix_ns for p in scan.poses])
+    known = np.array([*(k.time_ns for k in keyframes), *(p.time_unix_ns for p in scan.poses)])
+
+    def took_part(time_ns: int) -> bool:
+        return bool(np.abs(known - start_ns - time_ns).min() <= SAME_TIME_NS)
+
     with closing(opened(header, video)) as source:
-        for still in source if isinstance(source, ImagesSource) else ():
-            time_ns = header.started_unix_ns + still.time_ns
-            if np.abs(known - time_ns).min() > SAME_TIME_NS:
-                image = undistort.image(still.image)
+        if not isinstance(source, ImagesSource):
+            return
+        own = sum(took_part(time_ns) for time_ns in source.times.values())
+        if own < OWN_SHARE * len(keyframes):
+            raise InputError(
+                f"{video}: its stills are not of the scan's times, so that which took part cannot "
+                "be told; give the folder that was flown"
+            )
+        for still in source:
+            if not took_part(still.time_ns):
+                image, time_ns = undistort.image(still.image), start_ns + still.time_ns
                 T = placed(image, time_ns, keyframes, undistort.camera)
                 if T is not None:
                     yield T, image

@@ -28,13 +28,13 @@ pytestmark = [
 STEP_M = 2.5
 
 
-def flown(folder: Path, house: HouseFlight, off_m: float | None = 0.0) -> Path:
+def flown(folder: Path, house: HouseFlight, off_m: float | None = 0.0, late_ns: int = 0) -> Path:
     """Nine stills a second apart, every other a keyframe; poses of the others err by ``off_m``,
-    or are not known."""
+    or are not known. The scan began ``late_ns`` after the first of them."""
     camera = {"width": 160, "height": 90, "K": house.K.ravel().tolist(), "distortion": [0.0] * 5}
     lat, lon, alt = house.origin
     header = ScanHeader(
-        "test-1", "drone-1", house.start_ns, camera=camera, origin_lat_deg=lat,
+        "test-1", "drone-1", house.start_ns + late_ns, camera=camera, origin_lat_deg=lat,
         origin_lon_deg=lon, origin_alt_amsl_m=alt, georeference="gnss",
     )  # fmt: skip
     (folder / "stills").mkdir(parents=True)
@@ -104,3 +104,12 @@ def test_stills_that_the_scan_does_not_know_are_placed_by_its_surface(
     for name, figures in placed.items():
         assert abs(figures["covered"] - known[name]["covered"]) < 0.1
         assert figures["psnr_db"] > known[name]["psnr_db"] - 1.5, name
+
+
+def test_stills_whose_times_count_from_another_first_one_are_not_said_to_take_no_part(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    scan = flown(tmp_path, house, None, late_ns=400_000_000)
+    command = ["score", str(scan), str(tmp_path / "stills"), "--views"]
+    done = CliRunner().invoke(app, command)
+    assert isinstance(done.exception, InputError) and "that was flown" in str(done.exception)
