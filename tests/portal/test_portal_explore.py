@@ -353,3 +353,30 @@ def test_the_list_follows_a_dark_desktop(browser: Browser, base: str) -> None:
         assert max(shown) < 60 < min(int(v) for v in re.findall(r"\d+", light))
     finally:
         browser.call("Emulation.setEmulatedMedia", features=[])
+
+
+def test_a_keyframe_whose_first_depth_is_void_is_gone(
+    browser: Browser, tmp_path: Path, house: HouseFlight
+) -> None:
+    """Its points, its step of the time slider, and its camera."""
+    folder = tmp_path / "drone-1/test-1"
+    portal = Portal(PortalConfig(tmp_path, port=0, token=TOKEN))
+    with ScanStore.create(folder / "scan.db", ScanHeader("test-1", "drone-1", 1)) as store:
+        layers = {k: encode(house.keyframe(k, 5.0 * k), house.start_ns + k) for k in range(4)}
+        for seq in (0, 1):
+            store.add_keyframe(seq, layers[seq])
+        portal.start()
+        browser.open("about:blank")
+        browser.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/test-1")
+        browser.wait("document.body.dataset.points === '28800'")
+        for seq in (2, 3):
+            assert store.put_record("first", seq, layers[seq][0])
+            browser.wait(f"document.body.dataset.chunk.startsWith('{seq} ')")
+            browser.wait("document.body.dataset.points === '32400'")
+            assert browser.run("document.querySelector('.time input').max") == "3"
+        store.finish({})
+        browser.wait("document.body.dataset.points === '28800'")
+        assert browser.run("document.querySelector('.time input').max") == "2"
+        browser.wait("document.body.dataset.image === '1'")
+        browser.open("about:blank")
+        portal.close()

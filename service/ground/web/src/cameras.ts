@@ -50,9 +50,10 @@ export class Cameras {
     this.all.visible = !this.all.visible;
   }
 
-  /** A keyframe taken, or moved, at T (16 numbers, column by column). */
-  put(seq: number, T: number[]): void {
-    this.taken.set(seq, new THREE.Matrix4().fromArray(T));
+  /** A keyframe taken, or moved, at T (16 numbers, column by column); null: it is withdrawn. */
+  put(seq: number, T: number[] | null): void {
+    if (T) this.taken.set(seq, new THREE.Matrix4().fromArray(T));
+    else this.taken.delete(seq);
     this.stale = true;
   }
 

@@ -28,6 +28,9 @@ export interface Chunk extends Head {
   colour: ImageBitmap | null;
 }
 
+/** True for a keyframe that is withdrawn: all it had was a first depth, now void. */
+export const isVoid = (chunk: Head): boolean => chunk.layer < 0 && !chunk.box[2];
+
 const MARGIN = 3;
 const CONTEXT = [[0, -1], [0, -2], [0, -3], [-1, -2], [-1, -1], [-1, 0], [-1, 1], [-1, 2], [-2, -1], [-2, 0], [-2, 1], [-3, 0]];
 const NEIGHBOURS = [[-1, 0], [-1, -1], [-1, 1], [0, -2], [-2, 0], [-2, -1], [-2, 1], [-1, 2], [-1, -2]];

@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import type { Part } from "./api";
 import { Before, CHANGE } from "./before";
-import { type Chunk, sigmaAt, viewsAt } from "./depth";
+import { type Chunk, isVoid, sigmaAt, viewsAt } from "./depth";
 import { Ground, type Samples } from "./fill";
 import type { Gradual } from "./painter";
 import { BEHIND, LEVELS, Surface } from "./surface";
@@ -180,9 +180,11 @@ export class Cloud implements Gradual {
   /** Whether a keyframe of this scan is shown. */
   readonly shows = (seq: number): boolean => this.chunks.get(seq)?.shown ?? true;
 
-  /** Adds a keyframe, in place of the one with the same number. */
+  /** Adds a keyframe, in place of the one with the same number; of one that is withdrawn nothing stays. */
   add(chunk: Chunk): void {
     this.remove(chunk.seq);
+    this.groundStale = true;
+    if (isVoid(chunk)) return;
     const { xyz, rgb, sigma, views, unit_m } = pointsOf(chunk);
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.BufferAttribute(xyz, 3, false));

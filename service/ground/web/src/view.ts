@@ -4,6 +4,7 @@ import { Matrix4, type Object3D } from "three";
 import * as api from "./api";
 import { Cameras } from "./cameras";
 import { compass } from "./compass";
+import { isVoid } from "./depth";
 import { count, el, notify, toScans } from "./dom";
 import { Images, takeView, timeSlider } from "./explore";
 import { jobsOf } from "./jobs";
@@ -136,7 +137,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
     (chunk) => {
       cloud.add(chunk);
       stage.touch();
-      cameras.put(chunk.seq, chunk.T);
+      cameras.put(chunk.seq, isVoid(chunk) ? null : chunk.T);
       images.arrived(chunk.seq);
       link.grew();
       time.refresh();
