@@ -130,6 +130,11 @@ def test_settings_change_the_image_and_go_back(browser: Browser, portal: Portal)
     sky = np.broadcast_to(plain[:, :1], plain.shape).copy()
     assert difference(plain, sky) > 0.05  # the site is there
     assert difference(plain, drawn(browser)) == 0.0
+    setting(browser, "Bloom", "field.click(); field.click()")  # off before its code is here
+    browser.wait("performance.getEntriesByType('resource').some(e => e.name.includes('/look-'))")
+    browser.wait("document.body.dataset.effects === 'no'")
+    assert difference(plain, drawn(browser)) == 0.0
+    assert browser.run("document.body.dataset.effects") == "no"
     for name in ("Bloom", "Depth of field"):
         setting(browser, name, "field.click()")
         browser.wait("document.body.dataset.effects === 'yes'")

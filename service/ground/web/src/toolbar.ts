@@ -293,7 +293,7 @@ function settings({ stage, cloud, ruler }: Parts): HTMLElement {
   panel.append(el("label", {}, el("span", { textContent: "Tone" }), tone));
   const bloom = el("input", { type: "checkbox" });
   const blur = el("input", { type: "checkbox" });
-  bloom.onchange = blur.onchange = () => void looks(stage, bloom.checked, blur.checked).catch(notify);
+  bloom.onchange = blur.onchange = () => void looks(stage, bloom, blur).catch(notify);
   const full = el("input", { type: "checkbox" });
   full.onchange = () => (stage.painter.fullDetail = full.checked);
   const feet = el("input", { type: "checkbox", checked: units.imperial() });
@@ -321,14 +321,12 @@ function settings({ stage, cloud, ruler }: Parts): HTMLElement {
   return box;
 }
 
-async function looks(stage: Stage, bloom: boolean, depthOfField: boolean): Promise<void> {
+async function looks(stage: Stage, bloom: HTMLInputElement, blur: HTMLInputElement): Promise<void> {
+  const { Look } = await import("./look");
   const { painter, renderer, scene, camera, controls } = stage;
   painter.effects?.close();
-  painter.effects = null;
-  if (bloom || depthOfField) {
-    const { Look } = await import("./look");
-    painter.effects = new Look(renderer, painter.dome, scene, camera, controls.target, bloom, depthOfField, stage.isLight);
-  }
-  document.body.dataset["effects"] = painter.effects ? "yes" : "no";
+  const wanted = bloom.checked || blur.checked; // by now
+  painter.effects = wanted ? new Look(renderer, painter.dome, scene, camera, controls.target, bloom.checked, blur.checked, stage.isLight) : null;
+  document.body.dataset["effects"] = wanted ? "yes" : "no";
   stage.touch();
 }
