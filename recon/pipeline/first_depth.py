@@ -44,6 +44,10 @@ class FirstDepths:
         self._plausible = Plausible(Counter())
         self._keyframes, self._surface, self._timing = keyframes, surface, timing
 
+    def set_width(self, width_px: int) -> None:
+        """Follow the width of whole depths."""
+        self._rectify.set_effort(width_px // COARSER, upsample=False)
+
     def __call__(self, view: StereoView) -> Keyframe | None:
         """The new surface that the view's only partner shows; None where it shows none."""
         ahead = self._keyframes.ahead(view)

@@ -299,6 +299,8 @@ class Mapper:
         """Apply these from the next view on."""
         self.views.selection.set_partners(pairs)
         self.rectify.set_effort(stereo_width_px, upsample)
+        if self.first_depths is not None:
+            self.first_depths.set_width(stereo_width_px)
 
     def take_next(self) -> None:
         """Make the next frame with a pose a view, whatever the baseline asks for."""

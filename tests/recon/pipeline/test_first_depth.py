@@ -19,9 +19,10 @@ STRIP_PX = 12
 """Of 160 across: the ground on the right that the keyframe before does not see."""
 
 
-def fly(first_depths: bool) -> list[Event]:
+def fly(first_depths: bool, width_px: int = 320) -> list[Event]:
     config = MapperConfig(upsample=False, first_depths=first_depths)
     mapper, events = Mapper(CAMERA, config), list[Event]()
+    mapper.set_effort(config.pairs, width_px, upsample=False)
     for i in range(FRAMES):
         T = pose(STEP_M * i)
         prior = PosePrior(T[:3, :3], 0.005, 0.01, T[:3, 3], np.full(3, 0.1), HEIGHT_M, 0.1)
@@ -59,6 +60,13 @@ def test_a_first_depth_shows_new_ground_early_and_leaves_the_map_as_it_is() -> N
         off = np.abs(first.depth.depth_m[shown] / HEIGHT_M - 1.0)
         assert np.median(off) < 0.03
         assert np.median(first.depth.sigma_m[shown]) > np.median(final.depth.sigma_m[coming])
+
+
+@pytest.mark.slow
+def test_first_depths_are_coarser_than_whole_ones_of_another_effort() -> None:
+    events = [e for e in fly(True, 160) if isinstance(e, FirstDepth | KeyframeReady)]
+    widths = {(type(event), event.keyframe.depth.depth_m.shape[1]) for event in events}
+    assert widths == {(KeyframeReady, 160), (FirstDepth, 80)}
 
 
 @pytest.mark.parametrize(
