@@ -91,6 +91,18 @@ def test_the_map_outlines_scans_and_lists_those_at_a_place(browser: Browser, sto
         browser.wait("document.querySelectorAll('.outlines .marked').length === 1")
 
 
+GONE = """(() => {
+  window.gone = 0;
+  const look = () => (window.gone += !document.querySelector('article .made li'));
+  new MutationObserver(look).observe(document.body, { childList: true, subtree: true });
+})()"""
+RENAMED = """fetch('/api/scans').then((all) => all.json()).then(([scan]) =>
+  fetch('/api/scans/drone-1/test-1', {
+    method: 'PATCH', headers: { 'content-type': 'application/json' },
+    body: JSON.stringify({ title: 'renamed', edition: scan.edition }),
+  })).then((answer) => answer.status)"""
+
+
 def test_the_export_dialog_says_what_each_product_is_and_makes_it(
     browser: Browser, store: Path
 ) -> None:
@@ -131,6 +143,10 @@ def test_the_export_dialog_says_what_each_product_is_and_makes_it(
                 pass
         assert browser.run("!!document.querySelector('article .made li')")  # its history
         browser.page.unroute_all(behavior="wait")
+        browser.run(GONE)  # also while the card is drawn again
+        assert browser.run(RENAMED) == 200
+        browser.wait("document.querySelector('article').innerText.includes('renamed')")
+        assert browser.run("window.gone") == 0
         browser.click("Export…")
         browser.wait("!!document.querySelector('dialog')")
         browser.run("location.hash = '#/view/drone-1/test-1'")

@@ -112,11 +112,12 @@ function kept(old: Card | undefined, s: api.Scan, again: () => void, overview: O
   return { content, element };
 }
 
-/** Opens and focuses in `now` what is open and focused in `old`. */
+/** Opens and focuses in `now` what is open and focused in `old`, and takes over its jobs. */
 function leaveAsFound(old: HTMLElement, now: HTMLElement): void {
   now.querySelector("details")!.open = old.querySelector("details")!.open;
-  const focused = document.activeElement;
-  if (!focused || !old.contains(focused)) return;
+  const focused = old.contains(document.activeElement) ? document.activeElement : null;
+  now.querySelector(".made")!.replaceWith(old.querySelector(".made")!);
+  if (!focused) return;
   const same = [...now.querySelectorAll<HTMLElement>(focused.tagName)];
   queueMicrotask(() => same.find((e) => e.textContent === focused.textContent)?.focus());
 }
