@@ -101,13 +101,18 @@ class RadioStore:
         self._db = database
 
     def add(self, kind: str, number: int, part: int, data: bytes) -> bool:
-        """Store a message ("tile" or "pose"), the newest of its number; False if already known."""
+        """Store a message ("tile" or "pose"), the newest of its number; False if already known.
+
+        A tile is of a keyframe that is done: it ends a first depth up to that one.
+        """
         with self._db.lock:
             sql = "SELECT 1 FROM radio WHERE kind = ? AND number = ? AND part = ? AND data = ?"
             if self._db.one(sql, (kind, number, part, data)) is not None:
                 return False
             row = (kind, number, part, data)
-            self._db.write([("INSERT OR REPLACE INTO radio VALUES (?, ?, ?, ?)", row)])
+            drop = "DELETE FROM radio WHERE kind = 'first' AND ? = 'tile' AND number <= ?"
+            put = "INSERT OR REPLACE INTO radio VALUES (?, ?, ?, ?)"
+            self._db.write([(drop, (kind, number)), (put, row)])
             return True
 
     def put_first(self, seq: int, data: bytes) -> None:
@@ -119,15 +124,16 @@ class RadioStore:
         self._db.write([("DELETE FROM radio WHERE kind = 'first'", ())])
 
     def keyframe(self, seq: int) -> Keyframe | None:
-        """The keyframe of its first depth, or shown by its tiles; None without any."""
+        """The keyframe shown by its tiles, else by its first depth; None without any."""
+        sql = "SELECT data FROM radio WHERE kind = 'tile' AND number = ? ORDER BY part"
+        tiles = [unpack_tile(blob(row[0])) for row in self._db.all(sql, (seq,))]
+        found = keyframe_of([tile[1] for tile in tiles if tile is not None])
+        if found is not None:
+            return found
         sql = "SELECT data FROM radio WHERE kind = 'first' AND number = ?"
         first = self._db.one(sql, (seq,))
         decoded = None if first is None else codec.decode([blob(first[0])])
-        if decoded is not None and decoded.seq == seq:
-            return decoded
-        sql = "SELECT data FROM radio WHERE kind = 'tile' AND number = ? ORDER BY part"
-        tiles = [unpack_tile(blob(row[0])) for row in self._db.all(sql, (seq,))]
-        return keyframe_of([tile[1] for tile in tiles if tile is not None])
+        return decoded if decoded is not None and decoded.seq == seq else None
 
     def seqs(self) -> set[int]:
         """Numbers of the keyframes that have tiles."""

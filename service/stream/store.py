@@ -282,7 +282,7 @@ class ScanStore:
     def keyframe(self, seq: int) -> Keyframe | None:
         """Keyframe ``seq`` at its finest stored layer, with the newest re-pose applied.
 
-        Without a layer, the first depth or the tiles of the narrow radio are used.
+        Without a layer, the tiles of the narrow radio or the first depth are used.
         """
         decoded = self.keyframe_as_sent(seq)
         repose = self.repose(seq)

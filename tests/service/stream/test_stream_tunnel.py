@@ -137,6 +137,31 @@ def test_announcement_and_pose_round_trip() -> None:
         pack_announce(ScanHeader("s" * 60, "d" * 60, 0))
 
 
+def test_tiles_replace_the_first_depth_of_their_keyframe_and_end_earlier_ones(
+    tmp_path: Path,
+) -> None:
+    """The datalink was lost after them; the narrow radio brings keyframes that are done."""
+
+    def first(seq: int) -> None:
+        assert store.put_record("first", seq, codec.encode(keyframe(seq, 0.0), 0)[0])
+
+    def tiles(seq: int) -> None:
+        for tile in tiles_of(coarse(keyframe(seq, 0.0))):
+            store.add_radio("tile", seq, tile.index, pack_tile(77, tile))
+
+    with ScanStore.create(tmp_path / "a.db", HEADER) as store:
+        for order in ((first, tiles), (tiles, first)):
+            for add in order:
+                add(1)
+            shown = store.keyframe(1)
+            assert shown is not None and shown.depth.depth_m.shape == (23, 40)
+        first(2)
+        tiles(1)
+        assert list(store.states()) == [1, 2]
+        tiles(3)  # the view 2 was refused
+        assert list(store.states()) == store.seqs() == [1, 3] and store.keyframe(2) is None
+
+
 @settings(max_examples=300)
 @given(st.binary(max_size=128), st.sampled_from([0x11, 0x12, 0x13]))
 def test_any_bytes_never_raise(data: bytes, kind: int) -> None:
