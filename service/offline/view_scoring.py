@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from recon import se3
-from recon.camera_model import Undistorter, rays
+from recon.camera_model import Undistorter, rays, scaled
 from recon.surface.hole_filling import outlined
 from recon.surface.splats import COVERED, Splats, rendered
 from recon.tracking import pnp
@@ -148,7 +148,11 @@ def _seen(
 def placed(image: U8, time_ns: int, keyframes: Sequence[Keyframe], camera: Camera) -> F64 | None:
     """(4, 4) T_world_camera of ``image`` (H, W, 3), by features that it shares with the keyframes
     next to it in time, where their depth is known; None where these are too few."""
-    there = _features(image)
+    w = min(camera.size_px[0], 2 * keyframes[0].bgr.shape[1])  # features of much finer ones differ
+    small = scaled(camera, (w, round(w * camera.size_px[1] / camera.size_px[0])))
+    there = _features(
+        np.asarray(cv2.resize(image, small.size_px, interpolation=cv2.INTER_AREA), np.uint8)
+    )
     points, pixels = [np.zeros((0, 3))], [np.zeros((0, 2))]
     for k in sorted(keyframes, key=lambda k: abs(k.time_ns - time_ns))[:NEIGHBOURS]:
         shared = common_view(_features(k.bgr), there)
@@ -160,7 +164,7 @@ def placed(image: U8, time_ns: int, keyframes: Sequence[Keyframe], camera: Camer
         local = rays(k.depth.K, shared.uv_a[known]) * z[known, None]
         points.append(se3.transform(k.depth.T_world_camera, local))
         pixels.append(shared.uv_b[known])
-    found = pnp.solve(np.concatenate(points), np.concatenate(pixels), camera.K)
+    found = pnp.solve(np.concatenate(points), np.concatenate(pixels), small.K)
     return None if found is None else se3.inverse(found.T_camera_points)
 
 

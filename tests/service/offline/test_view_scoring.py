@@ -13,8 +13,11 @@ import pytest
 from house_flight import HouseFlight
 from typer.testing import CliRunner
 
+from recon.camera_model import scaled
+from recon.types import Camera
 from service.cli import app
 from service.errors import InputError
+from service.offline.view_scoring import placed
 from service.stream.codec import encode
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -113,3 +116,18 @@ def test_stills_whose_times_count_from_another_first_one_are_not_said_to_take_no
     command = ["score", str(scan), str(tmp_path / "stills"), "--views"]
     done = CliRunner().invoke(app, command)
     assert isinstance(done.exception, InputError) and "that was flown" in str(done.exception)
+
+
+@pytest.mark.parametrize("finer", [1, 9])  # a mapping camera's stills: 5472 px, keyframes 640
+def test_a_still_is_placed_however_much_finer_than_the_keyframes_it_is(
+    house: HouseFlight, finer: int
+) -> None:
+    keyframes = [house.keyframe(k, STEP_M * k) for k in range(0, 9, 2)]
+    seen = house.keyframe(3, STEP_M * 3)
+    h, w = seen.bgr.shape[:2]
+    camera = scaled(Camera(house.K, np.zeros(5), (w, h)), (finer * w, finer * h))
+    image = cv2.resize(seen.bgr, camera.size_px, interpolation=cv2.INTER_CUBIC)
+    T = placed(np.asarray(image, np.uint8), seen.time_ns, keyframes, camera)
+    assert T is not None
+    off_m = np.linalg.norm(T[:3, 3] - seen.depth.T_world_camera[:3, 3])
+    assert off_m < 0.01 * float(np.nanmedian(seen.depth.depth_m))
