@@ -134,8 +134,8 @@ def _seen(
         own = sum(took_part(time_ns) for time_ns in source.times.values())
         if own < OWN_SHARE * len(keyframes):
             raise InputError(
-                f"{video}: its stills are not of the scan's times, so that which took part cannot "
-                "be told; give the folder that was flown"
+                f"{video}: times of its stills do not say which took part; give the folder that "
+                "was flown"
             )
         for still in source:
             if not took_part(still.time_ns):
