@@ -12,9 +12,12 @@ interface Row {
   show: (job: api.Job) => void;
 }
 
-/** The jobs of one scan. */
+/** The jobs of one scan, and alignments: the last clicks of one are made in the other scan's view. */
 export const jobsOf = (scan: () => api.Scan): HTMLElement =>
-  jobList((job) => (job.drone === scan().drone && job.scan === scan().scan ? nameOf(scan()) : null));
+  jobList((job) => {
+    if (job.drone === scan().drone && job.scan === scan().scan) return nameOf(scan());
+    return job.kind === "align" ? job.scan : null;
+  });
 
 /**
  * A list that keeps itself up to date while it is in the page; hidden while there is nothing. `title` names a job's
