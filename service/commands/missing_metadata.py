@@ -194,13 +194,15 @@ def with_readout(inputs: ScanInputs, shutter: Shutter) -> dict[str, Any]:
 
 def start_of(
     source: CameraSource, log: TelemetryLog | None, video_epoch: float | None, notes: list[str]
-) -> tuple[int, int]:
-    """The source's time 0 on the log's clock, and from that clock to unix time, in ns.
+) -> tuple[int, int, bool]:
+    """The source's time 0 on the log's clock, from that clock to unix time, in ns, and whether the
+    start of a log with a clock of its own is taken for want of better.
 
     The source's time 0 is as given, the container's, the log's start, or now. A log without a date
     begins with the source, unless the time that is given is one of the log's own clock.
     """
     is_dated = log is None or log.clock == "unix"
+    is_assumed = False
     if video_epoch is not None:
         start_ns = round(video_epoch * 1e9) if math.isfinite(video_epoch) else MAX_TIME_NS
     elif source.epoch_unix_ns is not None:
@@ -208,6 +210,7 @@ def start_of(
         start_ns -= local_zone_ns(start_ns, log, notes) if is_dated else 0
     elif log is not None and is_dated:
         start_ns = round(log.first_ns / 1e6) * 10**6  # autopilots count whole milliseconds
+        is_assumed = True
         notes.append("the recording does not say when it began: taken as the start of the log")
     else:
         start_ns = time.time_ns()
@@ -220,24 +223,13 @@ def start_of(
     if log is not None and not is_dated and not is_of_log:
         zero_ns = 0 if log.clock == "video" else log.first_ns
         notes.append("the log has no date: it begins with the recording")
-        return zero_ns, start_ns - zero_ns
+        return zero_ns, start_ns - zero_ns, log.clock != "video"
     if log is not None and not _covers(log, start_ns):
         raise InputError(
             f"the telemetry covers {_utc(log.first_ns)} to {_utc(log.last_ns)}, the video begins "
             f"at {_utc(start_ns)}: they do not overlap; give the right --video-epoch"
         )
-    return start_ns, 0
-
-
-def is_start_assumed(
-    source: CameraSource, log: TelemetryLog | None, video_epoch: float | None
-) -> bool:
-    """Whether :func:`start_of` takes the log's start for want of better."""
-    if log is None or log.clock == "video":
-        return False
-    if video_epoch is not None:
-        return log.clock != "unix" and not _covers(log, round(video_epoch * 1e9))
-    return log.clock != "unix" or source.epoch_unix_ns is None
+    return start_ns, 0, is_assumed
 
 
 def _covers(log: TelemetryLog, start_ns: int) -> bool:

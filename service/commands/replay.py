@@ -215,7 +215,6 @@ def _replay(
     from service.cameras.lens import check_width, fitted
     from service.commands.adjusted_stills import adjusted_stills
     from service.commands.missing_metadata import (
-        is_start_assumed,
         start_lens,
         start_of,
         with_own_lens,
@@ -232,7 +231,7 @@ def _replay(
         lens = start.camera
     check_width(lens, source.description)
     lens, config = with_stated_readout(lens, config, video, source, notes)
-    epoch_ns, unix_offset_ns = start_of(source, log, video_epoch, notes)
+    epoch_ns, unix_offset_ns, is_assumed = start_of(source, log, video_epoch, notes)
     start_s = (epoch_ns + unix_offset_ns) / 1e9
     scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(start_s))
     folder = out or Path(f"scan-{scan_id}")
@@ -252,7 +251,6 @@ def _replay(
         sigma_focal=lens.sigma_focal,
         extra={"backend": chosen.name, "source": source.description},
     )
-    is_assumed = is_start_assumed(source, log, video_epoch)
     unsure: set[str] = set()  # what the images may correct: then the scan begins again
     if played is source and parse_source(video)[0] == "file":
         is_clock_given = is_latency_given or (video_epoch is not None and not is_assumed)

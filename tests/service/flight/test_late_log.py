@@ -19,7 +19,6 @@ from service.commands import replay
 from service.commands.missing_metadata import (
     HOUR_NS,
     at_another_time,
-    is_start_assumed,
     local_zone_ns,
     start_of,
 )
@@ -203,6 +202,6 @@ def test_a_log_without_a_date_takes_that_of_its_video(
     log = TelemetryLog(VehicleHistory(), clock, round(80e9), round(120e9), (), {})
     epoch_ns = None if container_s is None else round(container_s * 1e9)
     source = cast(CameraSource, SimpleNamespace(epoch_unix_ns=epoch_ns))
-    zero_ns, offset_ns = start_of(source, log, given_s, [])
+    zero_ns, offset_ns, found = start_of(source, log, given_s, [])
     assert (zero_ns, zero_ns + offset_ns) == (round(zero_s * 1e9), round(unix_s * 1e9))
-    assert is_start_assumed(source, log, given_s) == is_assumed
+    assert found == is_assumed
