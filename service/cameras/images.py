@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"))
 
-MOST_BELOW = 2000
+MAX_ENTRIES = 2000
 """Entries of subfolders in which images are sought where a folder has none."""
 
 SECOND_NS = 1_000_000_000
@@ -423,7 +423,7 @@ def widest(cameras: Mapping[str, list[Still]]) -> str:
 
 def _inside(folder: Path) -> str:
     """The folders in a folder that hold images, as on a camera's card, as words; few are read."""
-    below = chain(*(islice(folder.glob(pattern), MOST_BELOW) for pattern in ("*/*", "*/*/*")))
+    below = chain(*(islice(folder.glob(pattern), MAX_ENTRIES) for pattern in ("*/*", "*/*/*")))
     found = sorted({str(p.parent) for p in below if p.suffix.lower() in SUFFIXES})
     return f": {', '.join(found[:3])}" if found else ""
 
