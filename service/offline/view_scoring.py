@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -137,17 +138,29 @@ def _seen(
                 f"{video}: times of its stills do not say which took part; give the folder that "
                 "was flown"
             )
+        # Stills come in the order of time: the next one is near most of the same keyframes.
+        shown = lru_cache(maxsize=2 * NEIGHBOURS)(keyframe_features)
         for still in source:
             if not took_part(still.time_ns):
                 image, time_ns = undistort.image(still.image), start_ns + still.time_ns
-                T = placed(image, time_ns, keyframes, undistort.camera)
+                T = placed(image, time_ns, keyframes, undistort.camera, shown)
                 if T is not None:
                     yield T, image
 
 
-def placed(image: U8, time_ns: int, keyframes: Sequence[Keyframe], camera: Camera) -> F64 | None:
+def keyframe_features(keyframe: Keyframe) -> Features:
+    return _features(keyframe.bgr)
+
+
+def placed(
+    image: U8, time_ns: int, keyframes: Sequence[Keyframe], camera: Camera,
+    features_of: Callable[[Keyframe], Features] = keyframe_features,
+) -> F64 | None:  # fmt: skip
     """(4, 4) T_world_camera of ``image`` (H, W, 3), by features that it shares with the keyframes
-    next to it in time, where their depth is known; None where these are too few."""
+    next to it in time, where their depth is known; None where these are too few.
+
+    ``features_of`` gives those of a keyframe's image.
+    """
     w = min(camera.size_px[0], 2 * keyframes[0].bgr.shape[1])  # features of much finer ones differ
     small = scaled(camera, (w, round(w * camera.size_px[1] / camera.size_px[0])))
     there = _features(
@@ -155,7 +168,7 @@ def placed(image: U8, time_ns: int, keyframes: Sequence[Keyframe], camera: Camer
     )
     points, pixels = [np.zeros((0, 3))], [np.zeros((0, 2))]
     for k in sorted(keyframes, key=lambda k: abs(k.time_ns - time_ns))[:NEIGHBOURS]:
-        shared = common_view(_features(k.bgr), there)
+        shared = common_view(features_of(k), there)
         if shared is None:
             continue
         u, v = np.rint(shared.uv_a).astype(int).T
