@@ -317,6 +317,7 @@ def test_a_silent_drone_that_brought_min_makes_way_for_another(tmp_path: Path) -
         assert len({entry["drone"] for entry in ground.progress()}) == 4
 
 
+@pytest.mark.slow
 def test_a_silent_drone_has_no_worker_and_its_scans_stay_listed(tmp_path: Path) -> None:
     written: list[str] = []
     limits = DroneLimits(silent_s=0.5, close_whole_s=0.0)

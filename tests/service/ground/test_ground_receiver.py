@@ -225,6 +225,7 @@ def test_both_ends_may_restart(tmp_path: Path) -> None:
     onboard.close()
 
 
+@pytest.mark.slow
 def test_a_session_on_which_stations_fell_silent_is_opened_again(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     opened: list[float] = []
@@ -250,6 +251,7 @@ def test_a_session_on_which_stations_fell_silent_is_opened_again(tmp_path: Path)
     onboard.close()
 
 
+@pytest.mark.slow
 def test_a_router_between_them_may_restart(tmp_path: Path) -> None:
     """Drone and ground are both clients of a fleet's router, which dies in mid-flight."""
     endpoint = free_endpoint()

@@ -230,6 +230,7 @@ def test_rights_name_every_member_and_deny_the_rest(fleet: Path) -> None:
     assert {"drone.red", "drone.blue", "ground.base", "viewer.eye"} <= names
 
 
+@pytest.mark.slow
 def test_a_revoked_drone_has_no_rights_and_its_successor_has(tmp_path: Path) -> None:
     fleet, stolen = tmp_path / "fleet", tmp_path / "stolen"
     make_keys(fleet, {"drone": ["red", "blue"], "ground": ["base"]})

@@ -61,6 +61,7 @@ class GroundEnd(threading.Thread):
                 self.socket.sendto(bytes(request.pack(sender)), peer)
 
 
+@pytest.mark.slow
 def test_flight_is_played_with_its_telemetry(flight: Path, tmp_path: Path) -> None:
     ground = GroundEnd()
     ground.start()
