@@ -37,7 +37,6 @@ BENCHMARKS: dict[str, str] = {
     "pipeline": "service.bench.pipeline:run",
     "codec": "service.bench.codec:run",
     "link": "service.bench.link:run",
-    "latency": "service.bench.latency:run",
 }
 """Name to ``module:function``; imported when it runs."""
 

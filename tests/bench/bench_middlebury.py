@@ -7,11 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 from bench_options import DataOptions
+from bench_scenes import accuracy
+from stereo_scenes import TruePair
 
 from recon.types import F32, Bool
 from service.bench import BenchResult
-from service.bench.stereo import accuracy
-from service.bench.stereo_scenes import TruePair
 from service.compute.backend_choice import choose_backend
 from service.compute.rectified_pair import read_gray
 from service.errors import InputError

@@ -18,12 +18,14 @@ from service.errors import InputError, OutsideError
 DEVELOPMENT = {
     "device": "bench_device:run",
     "graph": "bench_graph:run",
+    "latency": "bench_latency:run",
     "map": "bench_map:run",
     "mavlink": "bench_mavlink:run",
     "memory": "bench_memory:run",
     "portal": "bench_portal:run",
     "radio": "bench_radio:run",
     "middlebury": "bench_middlebury:run",
+    "scenes": "bench_scenes:run",
     "real": "bench_real:run",
     "site": "bench_site:run",
 }

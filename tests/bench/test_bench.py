@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from bench_middlebury import not_hidden, seen_by_both
 from bench_run import DEVELOPMENT
+from bench_scenes import bad_share, semi_global_disparity
 from command_line import skyrelief
+from stereo_scenes import TruePair as Pair
 
 from service import bench
 from service.bench import BENCHMARKS, BenchOptions, BenchResult, board, compare, record, table
-from service.bench.stereo import bad_share, scene, semi_global_disparity
-from service.bench.stereo_scenes import TruePair as Pair
+from service.bench.stereo import scene
 from service.daemon.machine import Machine
 from service.errors import InputError, OutsideError
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from bench_scenes import accuracy
+from stereo_scenes import NOISE, rendered
 
 from recon.backends import load_backend
-from service.bench import stereo
-from service.bench.stereo_scenes import NOISE, rendered
 
 
 def test_both_views_agree_where_the_truth_says_so() -> None:
@@ -28,7 +28,7 @@ def test_both_views_agree_where_the_truth_says_so() -> None:
 @pytest.mark.parametrize("name", ["pale", "rows"])
 def test_fewer_wrong_pixels_than_the_semi_global_matcher(name: str) -> None:
     """In weak texture and repeated structure, also where the exposures differ."""
-    results = stereo.accuracy([rendered(name)], load_backend("cpu"))
+    results = accuracy([rendered(name)], load_backend("cpu"))
     assert [r.what for r in results] == [
         f"{name}, bad-1.0", "mean, bad-1.0",
         f"{name}, exposures differ, bad-1.0", "mean, exposures differ, bad-1.0",

@@ -65,7 +65,7 @@ def test_delays_of_a_simulated_flight_are_measured_in_the_whole_system(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("zenoh")
-    from service.bench.latency import PLACES, Trial, fly
+    from bench_latency import PLACES, Trial, fly
 
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     settings = (

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 import pytest
 from bench_middlebury import true_pairs
+from bench_scenes import bad_share, semi_global_disparity
 from command_line import skyrelief
 from paths import SHARED
 
 from recon.backends.cpu import CpuBackend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DisparityMap
-from service.bench.stereo import bad_share, semi_global_disparity
 from service.compute.backend_choice import Choice, FallbackBackend, choose_backend
 from service.compute.rectified_pair import matching_config
 from service.errors import InputError, OutsideError

@@ -1,4 +1,4 @@
-"""``skyrelief bench latency``: from the exposure of an image to the ground and its portal.
+"""``make bench ARGS=latency``: from the exposure of an image to the ground and its portal.
 
 The whole system over a simulated flight: ``skyrelief run`` and ``skyrelief ground`` in processes
 of their own, the link emulator between them. An image is exposed when the scan dates it, with the
