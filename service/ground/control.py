@@ -34,9 +34,6 @@ from service.scans.writing import write_whole
 from service.stream.store import ScanStore
 
 _WRITING = threading.Lock()
-_DECODING = threading.Semaphore(2)
-"""Recordings opened at a time."""
-
 MAX_POINTS, MAX_MARKS = 1000, 20_000
 """The page asks for all of them again after each mark."""
 
@@ -93,15 +90,21 @@ async def _mark(request: Request) -> Response:
     return JSONResponse(await run_in_threadpool(_with_mark, folder, new))
 
 
-def _image(request: Request) -> Response:
-    """The image of a keyframe with the lens's distortion: the recording's frame where it is still
-    there, else as the scan stores it."""
-    folder = state_of(request).library.folder(*names_of(request))
+async def _image(request: Request) -> Response:
+    """The image of a keyframe with the lens's distortion: the frame of a recording in the scan's
+    folder, else as the scan stores it."""
+    state = state_of(request)
+    folder = state.library.folder(*names_of(request))
     if not SEQ.fullmatch(request.path_params["seq"]):
         raise InputError("no such keyframe")
-    with _DECODING, ScanStore.peek(folder / "scan.db") as store:
-        data = image_of(folder, store, int(request.path_params["seq"]))
+    async with state.decoding:
+        data = await run_in_threadpool(_decoded, folder, int(request.path_params["seq"]))
     return Response(data, media_type="image/jpeg")
+
+
+def _decoded(folder: Path, seq: int) -> bytes:
+    with ScanStore.peek(folder / "scan.db") as store:
+        return image_of(folder, store, seq)
 
 
 def _known(folder: Path) -> list[SurveyPoint]:

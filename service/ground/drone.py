@@ -34,6 +34,8 @@ BUSY_S = 10.0
 """A scan of which something was heard so lately, and that lacks something, stays open."""
 CLOSE_AFTER_S = 600.0
 """A scan without data for so long is written and closed; a whole one sooner."""
+REWRITE_S = 60.0
+"""Deliverables that the disk refused are written again after so long."""
 MAX_INTRODUCTIONS = 32
 """Scans without a folder whose header is waited for; a drone offers 21 at once."""
 MAX_CLOSED = 200
@@ -144,10 +146,10 @@ class DroneReceiver:
                 case Answered(name, slot, serial) if name in self._scans:
                     self._scans[name].intake.answered(slot, serial, now)
                 case Written():
-                    self._on_written(event)
+                    self._on_written(event, now)
                 case Grown():
                     for scan in self.scans:
-                        self._write(scan)
+                        self._write(scan, now)
         self._look_after(now)
         if batch or now - self._shown_at >= REPORT_S:
             self.show(now)
@@ -325,7 +327,7 @@ class DroneReceiver:
             if scan.may_close:
                 self._close(scan)
             else:
-                self._write(scan)
+                self._write(scan, now)
         return len(self._scans) < self.max_open
 
     def _close(self, scan: ReceivedScan) -> None:
@@ -342,15 +344,18 @@ class DroneReceiver:
             if not scan.may_close:
                 del self._closed[scan.name]  # its files are due when it is opened again
 
-    def _write(self, scan: ReceivedScan) -> None:
+    def _write(self, scan: ReceivedScan, now: float) -> None:
         """Have a scan's deliverables written where it grew, one scan of a drone at a time."""
-        if scan.unwritten and not any(other.is_writing for other in self._scans.values()):
+        is_due = scan.unwritten and now >= scan.write_at
+        if is_due and not any(other.is_writing for other in self._scans.values()):
             scan.changed, scan.unwritten, scan.is_writing = True, False, True
             self._effects.append(Write(scan))
 
-    def _on_written(self, event: Written) -> None:
+    def _on_written(self, event: Written, now: float) -> None:
         scan = event.scan
         scan.is_written, scan.is_writing, scan.trouble = True, False, event.trouble
+        if event.is_due and event.trouble:
+            scan.unwritten, scan.write_at = True, now + REWRITE_S
         if scan.intake.complete and not scan.trouble:
             self._effects.append(Align(scan.folder))
 
@@ -374,7 +379,7 @@ class DroneReceiver:
                 if scan.may_close:
                     self._close(scan)
                 else:
-                    self._write(scan)
+                    self._write(scan, now)
             elif now - scan.intake.head_at <= self._limits.silent_s:
                 self._tend(scan, now)
 
@@ -386,7 +391,7 @@ class DroneReceiver:
             key = f"{scan.key}/held/{self._station}"
             self._effects.append(Put(key, pack(scan.intake.held())))
         if scan.intake.complete:
-            self._write(scan)
+            self._write(scan, now)
         if now < scan.rest_until:
             return
         for slot in (SMALL, FINE):

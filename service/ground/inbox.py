@@ -46,6 +46,7 @@ class Written(NamedTuple):
 
     scan: ReceivedScan
     trouble: str
+    is_due: bool = False  # the disk refused a file
 
 
 class Grown(NamedTuple):

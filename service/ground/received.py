@@ -41,10 +41,12 @@ def begin_files(folder: Path) -> None:
         log.debug("%s: %s", folder, error)
 
 
-def end_files(folder: Path) -> None:
-    """Writing has ended; the mark stays where the disk refused a file."""
-    if not files_due(folder):
+def end_files(folder: Path) -> bool:
+    """Writing has ended; True, and the mark stays, where the disk refused a file."""
+    is_due = files_due(folder)
+    if not is_due:
         (folder / BEGUN).unlink(missing_ok=True)
+    return is_due
 
 
 def folders_due(store: Path) -> list[Path]:
@@ -76,6 +78,7 @@ class ReceivedScan:
     changed: bool = True  # since the last report
     unwritten: bool = False  # since the last deliverables
     rest_until: float = 0.0
+    write_at: float = 0.0  # deliverables, not before
     is_writing: bool = False
     is_written: bool = False
     radio_messages: int = 0

@@ -349,6 +349,6 @@ class Receiver:
             scan, inbox = asked
             begin_files(scan.folder)
             trouble = guarded(f"deliverables of {scan.folder}", partial(self._deliver, scan))
-            end_files(scan.folder)
+            is_due = end_files(scan.folder)
             if inbox is not None:
-                inbox.put_event(Written(scan, trouble))
+                inbox.put_event(Written(scan, trouble, is_due))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 import threading
@@ -275,6 +276,8 @@ class PortalState:
     maps: OpenScans[LiveMap]
     live_views: int = 0
     views_without_token: int = 0  # of these
+    decoding: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+    """Recordings opened at a time; who waits holds no thread."""
     started: float = field(default_factory=time.monotonic)
 
 

@@ -54,12 +54,16 @@ class Recording:
 
 
 def recording_of(
-    folder: Path, header: ScanHeader, opener: Callable[[str], CameraSource] = open_camera
+    folder: Path,
+    header: ScanHeader,
+    opener: Callable[[str], CameraSource] = open_camera,
+    within: Path | None = None,
 ) -> Recording:
     """The video or folder of stills that a scan was made from, when it still is where it was.
 
     ``scan.json`` names it (``run.source``). A relative path is tried from the working directory,
-    the scan folder and its parent. Never raises.
+    the scan folder and its parent. ``within`` bounds it to a folder: the scan may be a stranger's.
+    Never raises.
     """
     stored = "textures from the scan's own images, at the depth's resolution"
     try:
@@ -68,6 +72,9 @@ def recording_of(
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return Recording(None, f"{stored}: the scan does not name a recording; give --video")
     places = [path, folder / path, folder.parent / path]
+    if within is not None:
+        bound = os.path.realpath(within)
+        places = [p for p in places if bound in map(str, Path(os.path.realpath(p)).parents)]
     found = next((p for p in places if os.path.isfile(p) or os.path.isdir(p)), None)
     if found is None:
         return Recording(None, f"{stored}: {named} is not there; give the flight's --video")

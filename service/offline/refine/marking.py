@@ -186,8 +186,8 @@ def distorted(camera: Camera, flat: F64) -> F64:
 
 
 def image_of(folder: Path, store: ScanStore, seq: int) -> bytes:
-    """A keyframe's image with the lens's distortion, JPEG: the recording's own frame where it
-    still is, else what the scan stores, smaller. Raises InputError for an unknown keyframe.
+    """A keyframe's image with the lens's distortion, JPEG: the frame of a recording in the scan's
+    folder, else what the scan stores, smaller. Raises InputError for an unknown keyframe.
     """
     keyframe = store.keyframe(seq)
     if keyframe is None:
@@ -202,7 +202,7 @@ def image_of(folder: Path, store: ScanStore, seq: int) -> bytes:
 
 def _recorded(folder: Path, store: ScanStore, time_ns: int) -> U8 | None:
     """The recording's frame of a moment; None where it is not there."""
-    video = recording_of(folder, store.header).path
+    video = recording_of(folder, store.header, within=folder).path
     if video is None:
         return None
     try:

@@ -20,6 +20,7 @@ from hypothesis.stateful import (
 )
 
 from service.ground.drone import (
+    REWRITE_S,
     Align,
     DroneLimits,
     DroneReceiver,
@@ -83,9 +84,9 @@ class Onboard:
     def hear(self, *events: Event) -> None:
         self._hand_on(Batch(events=list(events)))
 
-    def written(self, trouble: str = "") -> None:
+    def written(self, trouble: str = "", is_due: bool = False) -> None:
         """The oldest writing of files has ended."""
-        self.hear(Written(self.writes.pop(0).scan, trouble))
+        self.hear(Written(self.writes.pop(0).scan, trouble, is_due))
 
     def _hand_on(self, batch: Batch) -> None:
         for effect in self.ground.handle(batch, self.now):
@@ -136,6 +137,31 @@ def test_a_scan_is_asked_for_written_and_aligned(trouble: str, tmp_path: Path) -
     assert one.writes == []
     one.pass_time(61.0)
     assert one.ground.scans == [] and one.ground.entries[0]["open"] is False
+    one.close()
+
+
+def test_files_that_a_full_disk_refused_are_written_again(tmp_path: Path) -> None:
+    one = Onboard(tmp_path)
+    one.head()
+    one.answer()
+    one.store.finish({"points": 1})
+    one.head()
+    for _ in range(20):
+        one.pass_time(0.5)
+        while one.asked:
+            one.answer()
+    for _ in range(2):
+        one.written("disk full", is_due=True)
+        one.pass_time(REWRITE_S - 1.0)
+        assert one.writes == [] and one.ground.scans  # it rests, and stays open
+        one.head()
+        one.pass_time(2.0)
+        assert len(one.writes) == 1
+    one.written()
+    (entry,) = one.ground.entries
+    assert entry["complete"] and entry["trouble"] is None and len(one.aligned) == 1
+    one.pass_time(REWRITE_S + 10.0)
+    assert one.writes == []
     one.close()
 
 
@@ -245,9 +271,9 @@ class AnyOrder(RuleBasedStateMachine):
             self.one.answer()
 
     @precondition(lambda self: self.one.writes)
-    @rule(trouble=st.sampled_from(["", "disk full"]))
+    @rule(trouble=st.sampled_from(["", "no cloud", "disk full"]))
     def written(self, trouble: str) -> None:
-        self.one.written(trouble)
+        self.one.written(trouble, is_due=trouble == "disk full")
 
     @rule(seconds=st.sampled_from([0.1, 5.0, 700.0]))
     def wait(self, seconds: float) -> None:

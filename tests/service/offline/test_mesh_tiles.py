@@ -277,6 +277,17 @@ def test_the_recording_that_a_scan_names_is_found(tmp_path: Path, house: HouseFl
     video.touch()
     assert name("flight.mp4").path == video  # next to the scan folder
     assert name(str(video)).path == video
+    for source in ("flight.mp4", str(video), "../flight.mp4"):
+        name(source)
+        bounded = images.recording_of(folder, header, lambda _: FakeVideo(house, video_px), folder)
+        assert bounded.path is None and "is not there" in bounded.words
+    (folder / "link.mp4").symlink_to(video)
+    name("link.mp4")
+    assert images.recording_of(folder, header, within=folder).path is None
+    (folder / "own.mp4").touch()
+    name("own.mp4")
+    bounded = images.recording_of(folder, header, lambda _: FakeVideo(house, video_px), folder)
+    assert bounded.path == folder / "own.mp4"
     for unfit in (None, 7, ["x"]):
         assert "does not name" in name(unfit).words
     assert "is not there" in name("x" * 5000).words
