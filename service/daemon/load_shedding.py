@@ -69,8 +69,6 @@ class LadderConfig:
 
 @dataclass(frozen=True, slots=True)
 class Strain:
-    """A cause of overload."""
-
     reason: str
     patience_s: float
     lowest: Level  # lowest level for this cause
@@ -79,8 +77,6 @@ class Strain:
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A step taken."""
-
     level: Level
     reason: str  # of a step down; empty on the way up
 

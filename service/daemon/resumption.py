@@ -79,8 +79,6 @@ class Resumption:
 
 
 class Landing(Enum):
-    """Action after a check."""
-
     NOTHING = auto()
     LANDED = auto()  # announce the landing
     CLOSE = auto()  # close the scan

@@ -10,11 +10,9 @@ from __future__ import annotations
 import sqlite3
 import struct
 import zlib
-from collections.abc import Callable
 from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol
 
 from service.errors import InputError
 from service.stream.planes import image_size
@@ -32,21 +30,9 @@ MAX_STEPS = 20_000_000
 FAULTS = (sqlite3.Error, OSError, ValueError, struct.error, zlib.error)
 
 
-class Basemap(Protocol):
-    """Raster tiles of a file."""
-
-    media_type: str
-    max_zoom: int
-    about: dict[str, Any]
-
-    def tile(self, zoom: int, x: int, y: int) -> bytes | None:
-        """The image of a tile, rows counted from the north; None where there is none."""
-        ...
-
-
 def open_basemap(path: Path) -> Basemap:
     """The basemap in ``path``. Raises InputError, in one line, when it cannot be used."""
-    kinds: dict[str, Callable[[Path], Basemap]] = {".mbtiles": MBTiles, ".pmtiles": PMTiles}
+    kinds: dict[str, type[Basemap]] = {".mbtiles": MBTiles, ".pmtiles": PMTiles}
     if path.suffix.lower() not in kinds:
         raise InputError(f"basemap {path}: name it .mbtiles or .pmtiles")
     if not path.is_file():
@@ -58,7 +44,8 @@ def open_basemap(path: Path) -> Basemap:
 
 
 def tile_of(basemap: Basemap, zoom: int, x: int, y: int) -> bytes | None:
-    """A tile of a basemap; InputError where the file is damaged."""
+    """The image of a tile, rows counted from the north; None where there is none. Raises
+    InputError where the file is damaged."""
     try:
         return basemap.tile(zoom, x, y)
     except FAULTS as error:
@@ -216,3 +203,6 @@ def tile_number(zoom: int, x: int, y: int) -> int:
             x, y = y, x
         half //= 2
     return number
+
+
+Basemap = MBTiles | PMTiles

@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from service.errors import OutsideError, SkyreliefError
 from service.ground.inbox import Answered, Batch, Grown, Inbox, Radio, Written
@@ -60,14 +60,12 @@ class DroneLimits:
     usage: Callable[[Path], tuple[int, int]] = total_and_free  # bytes of a folder's disk
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Put:
+class Put(NamedTuple):
     key: str
     payload: bytes
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Get:
+class Get(NamedTuple):
     """Ask the drone; the replies are items of the scan, and their end an event."""
 
     scan: str
@@ -76,20 +74,17 @@ class Get:
     answered: Answered | None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Write:
+class Write(NamedTuple):
     """Have the scan's deliverables written; :class:`Written` follows."""
 
     scan: ReceivedScan
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Opened:
+class Opened(NamedTuple):
     scan: ReceivedScan
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Align:
+class Align(NamedTuple):
     """Align a finished scan with those that show the same ground."""
 
     folder: Path
@@ -388,7 +383,7 @@ class DroneReceiver:
         pause = REPORT_S if scan.changed else REPORT_IDLE_S
         if now - scan.reported_at >= pause:
             scan.reported_at, scan.changed = now, False
-            key = f"{scan.key}/held/{self._station}"
+            key = f"{ROOT}/{self.drone}/{scan.name}/held/{self._station}"
             self._effects.append(Put(key, pack(scan.intake.held())))
         if scan.intake.complete:
             self._write(scan, now)
@@ -397,7 +392,7 @@ class DroneReceiver:
         for slot in (SMALL, FINE):
             asked = scan.intake.next_ask(slot, now)
             if asked is not None:
-                answered = Answered(scan.name, slot, scan.intake.progress.asked)
+                answered = Answered(scan.name, slot, scan.intake.asked)
                 self._get(scan.name, *asked, answered)
 
     def _get(

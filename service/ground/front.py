@@ -81,7 +81,6 @@ class Front:
             self._listener.close()
 
     def run(self, worker: Worker) -> None:
-        """Serve until the worker's stop."""
         listener, self._listener = self._listener or self._listen(), None
         try:
             asyncio.run(self._serve(worker, listener))

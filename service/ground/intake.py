@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 
 from service.stream import codec
@@ -96,15 +96,6 @@ so that neither the round trip nor what is newer waits long."""
 
 
 @dataclass(slots=True)
-class ReceptionState:
-    received_bytes: int = 0
-    duplicates: int = 0  # records that came although held
-    unsound: int = 0  # records that are not valid, or not what their parts said
-    lag_s: dict[str, deque[float]] = field(default_factory=dict)  # by kind, the last 200
-    asked: int = 0  # requests made
-
-
-@dataclass(slots=True)
 class _Request:
     kind: str
     numbers: RangeSet
@@ -120,7 +111,11 @@ class ScanIntake:
 
     def __init__(self, store: ScanStore, peer: str) -> None:
         self.store = store
-        self.progress = ReceptionState()
+        self.received_bytes = 0
+        self.duplicates = 0  # records that came although held
+        self.unsound = 0  # records that are not valid, or not what their parts said
+        self.lag_s: dict[str, deque[float]] = {}  # by kind, the last 200
+        self.asked = 0  # requests made
         self.head: Head | None = None
         self.head_at = -1e9
         self._peer = peer
@@ -153,11 +148,11 @@ class ScanIntake:
 
         Raises OutsideError when the disk is full; the records will be asked for again.
         """
-        self.progress.received_bytes += len(message)
+        self.received_bytes += len(message)
         news = False
         for part in parse(message):
             if part.number in self.store.numbers_of(part.kind):
-                self.progress.duplicates += part.index == 0
+                self.duplicates += part.index == 0
                 continue
             for request in self._requests.values():
                 if request.kind == part.kind:
@@ -176,7 +171,7 @@ class ScanIntake:
             if self.store.refused > refused:
                 log.warning("quota reached: %s %d of %s is not kept", kind, number, self.store.path)
             else:
-                self.progress.unsound += 1
+                self.unsound += 1
             self._give_up(kind, number)
             return False
         for request in self._requests.values():
@@ -206,14 +201,14 @@ class ScanIntake:
         is_named = self.head is not None and number in self.head.numbers.get(kind, RangeSet())
         if seen is None and is_named:
             return
-        lags_s = self.progress.lag_s.setdefault(kind, deque(maxlen=200))
+        lags_s = self.lag_s.setdefault(kind, deque(maxlen=200))
         lags_s.append(0.0 if seen is None else now - seen)
 
     # What to say
 
     def held(self) -> Held:
         """The report for the drone."""
-        return Held(self.store.numbers(), self.progress.received_bytes)
+        return Held(self.store.numbers(), self.received_bytes)
 
     def missing(self) -> Numbers:
         """Items that the drone has and this side lacks, as far as they can be had."""
@@ -251,8 +246,8 @@ class ScanIntake:
             if parts:
                 numbers = RangeSet([(first, first)])
                 ask = Ask(self._peer, RangeSet.of(parts), count)
-            self.progress.asked += 1
-            self._requests[slot] = _Request(kind, numbers, self.progress.asked, now, now)
+            self.asked += 1
+            self._requests[slot] = _Request(kind, numbers, self.asked, now, now)
             return kind, numbers, ask
         return None
 

@@ -100,10 +100,6 @@ class ConflictError(InputError):
     """Somebody else was faster, or is at it."""
 
 
-class StaleError(ConflictError):
-    """A change to labels that someone else has changed meanwhile."""
-
-
 class Library:
     """The scans below one folder. Safe for several threads."""
 
@@ -174,7 +170,7 @@ class Library:
     ) -> Labels:
         """Rename or tag a scan; what is None stays. Raises InputError for unfit values.
 
-        ``edition`` is that of the labels the change was made on: StaleError when they have
+        ``edition`` is that of the labels the change was made on: ConflictError when they have
         changed since, and nothing is written. Without it the last of two changes holds.
         """
         folder = self.folder(drone, scan)
@@ -182,7 +178,9 @@ class Library:
             old = read_labels(folder)
             if edition is not None and edition != old.edition:
                 name = old.title or scan
-                raise StaleError(f"someone else has just changed “{name}”; look again, then change")
+                raise ConflictError(
+                    f"someone else has just changed “{name}”; look again, then change"
+                )
             new = Labels(
                 old.title if title is None else _title(title),
                 old.tags if tags is None else _tags(tags),

@@ -17,7 +17,6 @@ from service.errors import InputError
 from service.ground.intake import ScanIntake
 from service.ground.storage import is_regular, scan_files
 from service.scans.folder import files_due, write_deliverables
-from service.stream.naming import ROOT
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
@@ -26,7 +25,6 @@ MARK, BEGUN = ".files-due", ".files-begun"
 
 
 def mark_due(folder: Path) -> None:
-    """The scan in ``folder`` has grown."""
     try:
         (folder / MARK).touch()
     except OSError as error:  # a full disk is reported where the scan itself is written
@@ -84,11 +82,6 @@ class ReceivedScan:
     radio_messages: int = 0
     trouble: str = ""  # why it does not grow, or has no deliverables
 
-    @property
-    def key(self) -> str:
-        """File of its messages."""
-        return f"{ROOT}/{self.drone}/{self.name}"
-
     def grew(self) -> None:
         """Something new was stored: its files are due, also for the next process."""
         if not self.unwritten:
@@ -106,7 +99,7 @@ class ReceivedScan:
         held = intake.store.numbers()
         lags = {
             kind: round(median(lags), 3)
-            for kind, lags in intake.progress.lag_s.items()
+            for kind, lags in intake.lag_s.items()
             if lags and kind.startswith("k")
         }
         return {
@@ -118,9 +111,9 @@ class ReceivedScan:
             "missing": {kind: len(n) for kind, n in intake.missing().items()},
             "finished": "summary" in held,
             "complete": intake.complete and self.is_written and not self.is_writing,
-            "received_bytes": intake.progress.received_bytes,
-            "duplicates": intake.progress.duplicates,
-            "unsound": intake.progress.unsound,
+            "received_bytes": intake.received_bytes,
+            "duplicates": intake.duplicates,
+            "unsound": intake.unsound,
             "refused": intake.store.refused,
             "radio_messages": self.radio_messages,
             "lag_s": lags,

@@ -39,7 +39,6 @@ from service.ground.received import (
     write_left,
 )
 from service.ground.sites import Sites
-from service.ground.storage import scan_folder
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.tunnel import TunnelIntake
@@ -149,10 +148,6 @@ class Receiver:
             worker.join()
         for scan in scans:
             scan.intake.store.close()
-
-    def folder(self, drone: str, name: str) -> Path:
-        """Folder of a scan by its name on the datalink."""
-        return scan_folder(self._config.store, drone, name)
 
     def add_radio(self, payload: bytes) -> None:
         """Take in a message of the narrow radio; from any thread."""

@@ -28,22 +28,16 @@ Note = Annotated[str, msgspec.Meta(max_length=4000)]
 
 
 class Origin(msgspec.Struct):
-    """Origin of a scan's own coordinates."""
-
     lat_deg: Annotated[float, msgspec.Meta(ge=-90, le=90)]
     lon_deg: Annotated[float, msgspec.Meta(ge=-180, le=180)]
     alt_amsl_m: Annotated[float, msgspec.Meta(ge=-1e5, le=1e7)]
 
 
 class Times(msgspec.Struct):
-    """When a scan was made."""
-
     started_unix_s: UnixTime
 
 
 class TrustFacts(msgspec.Struct):
-    """Trust in a scan, with the reasons."""
-
     level: Annotated[str, msgspec.Meta(max_length=40)]
     reasons: Annotated[list[Note], msgspec.Meta(max_length=100)]
 
@@ -54,8 +48,6 @@ Corner = tuple[
 
 
 class MeasuredExtent(msgspec.Struct):
-    """The extent of what a scan measured."""
-
     corners_lat_lon: tuple[Corner, Corner, Corner, Corner]
 
 

@@ -35,11 +35,11 @@ class Vehicle:
     def __init__(
         self,
         endpoint: str,
-        connect: Callable[[str], Operator] | None = None,
+        connect: Callable[[str], Operator] = lambda at: Operator(at, None, SEARCH_S),
         workers: Workers | None = None,
     ) -> None:
         self.endpoint = endpoint
-        self._connect = connect or _operator
+        self._connect = connect
         self._operator: Operator | None = None
         self._lock = threading.Lock()  # of the operator's link
         self._one_order, self._one_stop = threading.Lock(), threading.Lock()
@@ -126,10 +126,6 @@ class Vehicle:
         at, fields = self._heard.get(name, (0.0, {}))
         fresh = name == "HOME_POSITION" or time.monotonic() - at < STALE_S
         return fields if fresh else {}
-
-
-def _operator(endpoint: str) -> Operator:
-    return Operator(endpoint, None, SEARCH_S)
 
 
 def _number(fields: dict[str, Any], name: str) -> float | None:

@@ -30,11 +30,9 @@ class TokenBucket:
 
     @property
     def rate_bytes_s(self) -> float:
-        """Bytes per second allowed."""
         return self._rate
 
     def set_rate(self, rate_bytes_s: float, now: float) -> None:
-        """Change the rate from now on."""
         self._refill(now)
         self._rate = rate_bytes_s
 

@@ -293,7 +293,6 @@ class Database:
         return None if row is None else str(row[0])
 
     def set(self, key: str, value: str) -> None:
-        """Write a text of the meta table."""
         self.write([("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))])
 
     def close(self) -> None:

@@ -192,7 +192,6 @@ class Assembler:
         return -math.inf if entry is None else entry.touched
 
     def forget(self, kind: str, number: int) -> None:
-        """Discard the parts of a record."""
         entry = self._open.pop((kind, number), None)
         if entry is not None:
             self.held_bytes -= entry.held_bytes
@@ -298,5 +297,4 @@ def missing(wanted: Numbers, held: Numbers) -> Numbers:
 
 
 def count(numbers: Numbers) -> int:
-    """Total number of items."""
     return sum(len(ranges) for ranges in numbers.values())

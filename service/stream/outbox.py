@@ -262,7 +262,6 @@ class Outbox:
         self._feeds[store.header.name] = _Feed(store, head_due=now)
 
     def remove(self, scan_id: str) -> None:
-        """Stop offering a scan."""
         self._feeds.pop(scan_id, None)
 
     @property
@@ -289,7 +288,6 @@ class Outbox:
         return scan_id in self._feeds
 
     def serves(self, peer: str) -> bool:
-        """Whether a ground station is served."""
         return peer in self._heard
 
     def held(self, scan_id: str, peer: str, report: Held, now: float) -> bool:

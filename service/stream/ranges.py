@@ -130,7 +130,6 @@ class RangeSet:
         return out
 
     def _put(self, first: int, last: int) -> None:
-        """Put a range after all others."""
         self._firsts.append(first)
         self._lasts.append(last)
 
@@ -140,7 +139,6 @@ class RangeSet:
         return self._lasts[-1] if self._lasts else -1
 
     def copy(self) -> RangeSet:
-        """An independent copy."""
         same = RangeSet()
         same._firsts, same._lasts = self._firsts[:], self._lasts[:]
         return same
@@ -204,9 +202,9 @@ class Inventory:
 
     def __init__(self, database: Database) -> None:
         self._lock = database.lock
-        self._listeners: list[Listener] = []
+        self.listeners: list[Listener] = []
         self._numbers: dict[str, RangeSet] = {}
-        self._reposes = RangeSet()
+        self.reposes = RangeSet()  # stored, in force or not
         self._database = database
         self._version = database.version()[0]
         self._load(database)
@@ -224,7 +222,7 @@ class Inventory:
     def _load(self, database: Database) -> None:
         self._numbers["pose"] = _ids(database, "poses")
         self._numbers["repose"] = RangeSet.of(row[0] for row in database.all(_IN_FORCE))
-        self._reposes = _ids(database, "reposes")
+        self.reposes = _ids(database, "reposes")
         for kind in ("header", "summary"):
             text = database.get(kind)
             if text is not None:
@@ -243,18 +241,13 @@ class Inventory:
         """The numbers of one kind; do not modify."""
         return self._numbers.setdefault(kind, RangeSet())
 
-    def has_repose(self, number: int) -> bool:
-        """Whether this re-pose is stored, in force or not."""
-        return number in self._reposes
-
     def note(self, kind: str, number: int) -> None:
         """Add an item and notify the listeners."""
         self.of(kind).add(number)
         self.tell(kind, number)
 
     def tell(self, kind: str, number: int) -> None:
-        """Notify the listeners."""
-        for listener in self._listeners:
+        for listener in self.listeners:
             listener(kind, number)
 
     def note_whole(self, kind: str, data: bytes) -> None:
@@ -264,7 +257,7 @@ class Inventory:
 
     def note_repose(self, number: int, seq: int, revision: int) -> None:
         """Add a stored re-pose; the highest revision, then the highest number, is in force."""
-        self._reposes.add(number)
+        self.reposes.add(number)
         sql = "SELECT revision, id FROM reposes WHERE seq = ? AND id != ? ORDER BY 1 DESC, 2 DESC"
         before = self._database.one(f"{sql} LIMIT 1", (seq, number))
         if before is not None:
@@ -272,16 +265,6 @@ class Inventory:
                 return
             self.of("repose").discard(before[1])
         self.note("repose", number)
-
-    def listen(self, listener: Listener) -> None:
-        """Call ``listener(kind, number)`` after each new item, on the writing thread."""
-        with self._lock:
-            self._listeners.append(listener)
-
-    def unlisten(self, listener: Listener) -> None:
-        """Remove a listener."""
-        with self._lock:
-            self._listeners.remove(listener)
 
 
 def _ids(database: Database, table: str) -> RangeSet:

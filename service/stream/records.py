@@ -57,7 +57,6 @@ class ScanHeader:
         return self.drone, self.scan_id, self.run_id
 
     def to_json(self) -> bytes:
-        """The header as a JSON object."""
         return msgspec.json.encode(self)
 
 
@@ -144,7 +143,6 @@ def source_bits(sources: Sequence[str]) -> int:
 
 
 def sources_of(bits: int) -> tuple[str, ...]:
-    """The names in the byte ``bits``."""
     return tuple(name for k, name in enumerate(SOURCES) if bits >> k & 1)
 
 

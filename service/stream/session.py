@@ -44,7 +44,6 @@ class SessionConfig:
 
 
 def is_encrypted(endpoint: str) -> bool:
-    """Whether an endpoint uses TLS."""
     return endpoint.partition("/")[0] in _ENCRYPTED
 
 

@@ -159,7 +159,6 @@ class ScanStore:
 
     @property
     def header(self) -> ScanHeader:
-        """The scan's header."""
         return self._header
 
     def update_header(self, **fields: Any) -> None:
@@ -167,7 +166,6 @@ class ScanStore:
         self.put_header(replace(self._header, **fields))
 
     def put_header(self, header: ScanHeader) -> None:
-        """Replace the whole header."""
         with self._lock:
             self._set_whole("header", header.to_json(), header)
 
@@ -429,7 +427,7 @@ class ScanStore:
         if repose is None:
             return False
         with self._lock:
-            if self._inventory.has_repose(number):
+            if number in self._inventory.reposes:
                 return False
             row = (number, repose.seq, repose.revision, data)
             self.database.write([("INSERT INTO reposes VALUES (?, ?, ?, ?)", row)])
@@ -509,11 +507,12 @@ class ScanStore:
 
     def listen(self, listener: Listener) -> None:
         """Call ``listener(kind, number)`` after each new item, on the writing thread."""
-        self._inventory.listen(listener)
+        with self._lock:
+            self._inventory.listeners.append(listener)
 
     def unlisten(self, listener: Listener) -> None:
-        """Remove a listener."""
-        self._inventory.unlisten(listener)
+        with self._lock:
+            self._inventory.listeners.remove(listener)
 
     def _set_whole(self, kind: str, data: bytes, header: ScanHeader) -> None:
         with self._lock:

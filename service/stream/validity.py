@@ -67,8 +67,6 @@ class _CameraJson(msgspec.Struct):
 
 
 class _ScaleJson(msgspec.Struct):
-    """Origin of the metric scale."""
-
     sigma: float | None = None
 
 
@@ -148,12 +146,10 @@ def is_rotation(quaternion: F64) -> bool:
 
 
 def is_time(time_unix_ns: int) -> bool:
-    """Whether the time of an exposure is plausible."""
     return MIN_TIME_NS <= time_unix_ns < MAX_TIME_NS
 
 
 def is_scale(scale: float) -> bool:
-    """Whether the scale of a re-pose is plausible."""
     return MIN_SCALE <= scale <= MAX_SCALE
 
 

@@ -20,7 +20,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import Config, load_config, reload
-from service.daemon.health import STATUS, HealthServer, metrics_text
+from service.daemon.health import DESCRIPTION, HealthServer, metrics_text
 from service.daemon.machine import CoreLoad, Machine, computer_load, read_machine
 from service.daemon.runtime import Daemon
 from service.errors import InputError, OutsideError
@@ -90,13 +90,15 @@ def test_the_description_holds_for_what_the_daemon_says(tmp_path: Path) -> None:
     daemon = Daemon(load_config(None, [f"scan.folder={tmp_path}", "health.http="]))
     found = daemon.snapshot()
     kinds = {"string": str, "boolean": bool, "integer": int, "object": dict, "array": list}
-    worker = STATUS["properties"]["workers"]["items"]
+    described = json.loads(DESCRIPTION.read_text(encoding="utf-8"))["paths"]["/status"]["get"]
+    status = described["responses"]["200"]["content"]["application/json"]["schema"]
+    worker = status["properties"]["workers"]["items"]
     waiting = Workers()
     waiting.every("coverage", 60.0, lambda: None)
     entry = next(entry for entry in running() if entry["name"] == "coverage")
     waiting.stop()
     assert set(worker["required"]) <= set(entry) == set(worker["properties"])
-    for schema, value in ((STATUS, found), (STATUS["properties"]["load"], found["load"])):
+    for schema, value in ((status, found), (status["properties"]["load"], found["load"])):
         assert set(schema["required"]) <= set(value) <= set(schema["properties"])
         for name, given in value.items():
             kind = schema["properties"][name]["type"]

@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from service.errors import InputError, OutsideError
 from service.ground.drone import DroneLimits
 from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
+from service.ground.storage import scan_folder
 from service.stream import codec
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, Repose, ScanHeader
@@ -150,11 +152,11 @@ def test_two_runs_of_one_time_stay_two_scans(tmp_path: Path, written: list[Path]
         assert_equal(store, by_run[store.header.run_id] / "scan.db")
         store.close()
     # The receiver that is started again finds each run's folder.
-    again = Receiver(ReceiverConfig(tmp_path / "ground"), deliver=note)
+    place = partial(scan_folder, tmp_path / "ground", "drone-a")
     for store in runs:
-        assert again.folder("drone-a", store.header.name) == by_run[store.header.run_id]
-    assert again.folder("drone-a", "scan-1." + "2" * 32).name == "scan-1-3"
-    assert again.folder("drone-a", "scan-1").name == "scan-1-3"  # of a drone that gives no run
+        assert place(store.header.name) == by_run[store.header.run_id]
+    assert place("scan-1." + "2" * 32).name == "scan-1-3"
+    assert place("scan-1").name == "scan-1-3"  # of a drone that gives no run
 
 
 def test_a_scan_arrives_whole_with_its_corrections(tmp_path: Path, written: list[Path]) -> None:
@@ -168,7 +170,7 @@ def test_a_scan_arrives_whole_with_its_corrections(tmp_path: Path, written: list
         onboard.add_reposes([Repose(3, 1, se3.exp(np.full(6, 0.1)), 1.01, np.eye(6))])
         onboard.finish({"points": 12})
         assert link.drain(20.0)
-        folder = ground.folder("drone-a", "scan-1")
+        folder = scan_folder(tmp_path / "ground", "drone-a", "scan-1")
         until(lambda: folder in written)
         until(lambda: all(entry["complete"] for entry in ground.progress()))
         (entry,) = ground.progress()
@@ -247,7 +249,7 @@ def test_a_session_on_which_stations_fell_silent_is_opened_again(tmp_path: Path)
     finally:
         link.close()
         ground.close()
-    assert_equal(onboard, ground.folder("drone-a", "scan-1") / "scan.db")
+    assert_equal(onboard, scan_folder(tmp_path / "ground", "drone-a", "scan-1") / "scan.db")
     onboard.close()
 
 
@@ -277,7 +279,7 @@ def test_a_router_between_them_may_restart(tmp_path: Path) -> None:
         link.close()
         ground.close()
         router.close()
-    assert_equal(onboard, ground.folder("drone-a", "scan-1") / "scan.db")
+    assert_equal(onboard, scan_folder(tmp_path / "ground", "drone-a", "scan-1") / "scan.db")
     onboard.close()
 
 
@@ -300,7 +302,7 @@ def test_clocks_hours_apart_change_nothing(tmp_path: Path) -> None:
     finally:
         link.close()
         ground.close()
-    assert_equal(onboard, ground.folder("drone-a", "scan-1") / "scan.db")
+    assert_equal(onboard, scan_folder(tmp_path / "ground", "drone-a", "scan-1") / "scan.db")
     onboard.close()
 
 

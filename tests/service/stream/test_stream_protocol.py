@@ -130,7 +130,7 @@ class World:
         again = unpack(pack(ask), Ask)
         assert again is not None
         token = next(self._count)
-        self._tokens[token] = slot, self.ground.progress.asked
+        self._tokens[token] = slot, self.ground.asked
         self.carry(self._later(self.outbox.ask, "scan", kind, numbers, again, token))
 
     def produce(self, first: int, last: int) -> None:
@@ -172,7 +172,7 @@ def test_everything_arrives_over_a_bad_link_and_within_the_budget(
     assert world.store.summary == {"points": 1}
     assert world.busiest_second() <= 1.05 * RATE
     if loss == 0.0:
-        assert world.ground.progress.duplicates == 0
+        assert world.ground.duplicates == 0
 
 
 def test_live_order_is_status_pose_coarse_fine_newest_first(tmp_path: Path) -> None:
@@ -226,7 +226,7 @@ def test_a_station_that_is_back_gets_the_newest_coarse_layers_at_once(tmp_path: 
             ended[message.topic] = at
     assert list(ended)[:10] == [f"item/k0/{seq}" for seq in range(11, 1, -1)]
     assert ended["item/k0/2"] - began < 3.0
-    assert world.ground.progress.duplicates == 0
+    assert world.ground.duplicates == 0
 
 
 def test_detail_that_does_not_fit_waits_on_disk(tmp_path: Path) -> None:
@@ -396,7 +396,7 @@ def test_a_first_depth_shows_a_keyframe_until_its_own_layers_come(tmp_path: Path
     assert world.store.states() == {5: (1, -1)} and world.ground.complete
     assert whole is not None and whole.depth.depth_m.shape == (90, 160)
     assert world.store.numbers() == world.onboard.numbers()
-    assert world.ground.progress.unsound == 0
+    assert world.ground.unsound == 0
 
 
 def test_a_first_depth_ends_with_the_next_one_and_with_the_scan(tmp_path: Path) -> None:
@@ -430,4 +430,4 @@ def test_a_first_depth_of_another_keyframe_or_layer_is_refused(tmp_path: Path) -
     world = World(tmp_path)
     for record in (LAYERS[2][0], LAYERS[1][1], b"junk"):
         world.ground.on_items(split("first", 1, record, 60_000)[0].pack(), 0.0)
-    assert not world.store.states() and world.ground.progress.unsound == 3
+    assert not world.store.states() and world.ground.unsound == 3
