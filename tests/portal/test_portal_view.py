@@ -98,15 +98,16 @@ def open_scan(page: Page, portal: Portal) -> None:
     page.wait("Number(document.body.dataset.points) > 1000")
     page.click("Points")
     page.wait("document.body.dataset.image === '4'")
+    follow = "[...document.querySelectorAll('button')].find(b => b.textContent === 'Follow')"
+    page.wait(f"{follow}.ariaPressed === 'false'")  # the end is known, and with it the first view
     page.wait("document.body.dataset.drawn === document.body.dataset.points")
     page.wait("document.body.dataset.still === 'yes'")
 
 
 def drawn(page: Page) -> U8:
     """The image on the stage, once it stands still."""
-    page.run("new Promise(r => setTimeout(r, 100))")
-    page.wait("document.body.dataset.still === 'yes'")
-    data = np.frombuffer(base64.b64decode(page.run(IMAGE)), np.uint8)
+    image = page.wait(f"document.body.dataset.still === 'yes' && {IMAGE}")
+    data = np.frombuffer(base64.b64decode(image), np.uint8)
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
 
 
@@ -119,6 +120,11 @@ def setting(page: Page, name: str, act: str) -> None:
     )
 
 
+def colour_by(page: Page, name: str) -> None:
+    """Choose what the colours show."""
+    page.page.select_option('[aria-label="colour by"]', name)
+
+
 def difference(a: U8, b: U8) -> float:
     """Share of the pixels that are not the same."""
     return float((cv2.absdiff(a, b).max(axis=2) > 4).mean())
@@ -126,6 +132,8 @@ def difference(a: U8, b: U8) -> float:
 
 def test_settings_change_the_image_and_go_back(browser: Browser, portal: Portal) -> None:
     open_scan(browser, portal)
+    # Slices, as large as the machine is fast, decide which of two points in one place is in front.
+    setting(browser, "Full detail", "field.click()")
     plain = drawn(browser)
     sky = np.broadcast_to(plain[:, :1], plain.shape).copy()
     assert difference(plain, sky) > 0.05  # the site is there
@@ -135,12 +143,17 @@ def test_settings_change_the_image_and_go_back(browser: Browser, portal: Portal)
     browser.wait("document.body.dataset.effects === 'no'")
     assert difference(plain, drawn(browser)) == 0.0
     assert browser.run("document.body.dataset.effects") == "no"
+    colour_by(browser, "height")  # what is high shines
+    bright = drawn(browser)
     for name in ("Bloom", "Depth of field"):
         setting(browser, name, "field.click()")
         browser.wait("document.body.dataset.effects === 'yes'")
-        assert difference(plain, drawn(browser)) > 0.01, name
+        assert difference(bright, drawn(browser)) > 0.01, name
         setting(browser, name, "field.click()")
         browser.wait("document.body.dataset.effects === 'no'")
+        assert difference(bright, drawn(browser)) == 0.0
+    colour_by(browser, "colour")
+    assert difference(plain, drawn(browser)) == 0.0
     setting(browser, "Light scene", "field.click()")
     light = drawn(browser)
     setting(browser, "Bloom", "field.click()")
@@ -149,13 +162,14 @@ def test_settings_change_the_image_and_go_back(browser: Browser, portal: Portal)
     site = is_site(plain)
     assert both[site].mean() < light[site].mean() + 25.0  # a bright sky does not shine over all
     setting(browser, "Bloom", "field.click()")
+    browser.wait("document.body.dataset.effects === 'no'")
     setting(browser, "Light scene", "field.click()")
     setting(browser, "Field of view", "field.value = 25;" + CHANGED)
     narrow = drawn(browser)
     assert difference(plain, narrow) > 0.1
     assert is_site(narrow).mean() > 1.5 * is_site(plain).mean()  # nearer, so larger
     setting(browser, "Field of view", "field.value = 60;" + CHANGED)
-    assert difference(plain, drawn(browser)) < 0.05  # points in one place hide each other by turns
+    assert difference(plain, drawn(browser)) == 0.0
 
 
 def is_site(image: U8, sky_of: U8 | None = None) -> Bool:
@@ -412,10 +426,7 @@ def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, s
 
 def test_the_colours_of_sigma_span_what_is_there(browser: Browser, portal: Portal) -> None:
     open_scan(browser, portal)
-    browser.run(
-        "(s => { s.value = 'sigma'; s.dispatchEvent(new Event('change', { bubbles: true })) })"
-        "(document.querySelector('[aria-label=\"colour by\"]'))"
-    )
+    colour_by(browser, "sigma")
     words = browser.wait("document.querySelector('.legend:not([hidden])')?.textContent")
     found = re.search(r"([\d.]+) m and more", words)
     assert found is not None and 0.03 < float(found.group(1)) < 0.1  # 0.05 m in the flight
