@@ -186,7 +186,7 @@ class LiveFeed:
         for seq in self._voids.keys() - states.keys():
             del self._sent[seq]
             yield self._voids.pop(seq)
-        due = [seq for seq, layer in finest.items() if layer > self._sent.get(seq, -2)]
+        due = [seq for seq, layer in finest.items() if layer > self._sent.get(seq, -3)]
         self._more = len(due) > max_chunks
         for seq in due[:max_chunks]:
             self._sent[seq] = finest[seq]
@@ -206,7 +206,8 @@ class LiveFeed:
         state = self.store.finished
         if state != self._finished and not self._more:
             self._finished = state
-            yield json.dumps({"type": "state", "finished": state, "keyframes": len(states)})
+            keyframes = len(self.store.seqs())
+            yield json.dumps({"type": "state", "finished": state, "keyframes": keyframes})
 
     def _corrections(self, states: dict[int, tuple[int, int]]) -> Iterator[str]:
         """Re-poses newer than the pose that a chunk was sent with."""

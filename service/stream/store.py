@@ -338,9 +338,10 @@ class ScanStore:
         return sorted(stored | self._radio.seqs())
 
     def states(self) -> dict[int, tuple[int, int]]:
-        """Each keyframe's finest stored layer, -1 for a first depth or tiles of the narrow radio
-        alone, and the revision of its newest re-pose, -1 without one."""
-        radio = "SELECT number, -1 FROM radio WHERE kind IN ('tile', 'first')"
+        """Each keyframe's finest stored layer, -1 for tiles of the narrow radio alone, -2 for a
+        first depth alone, and the revision of its newest re-pose, -1 without one."""
+        tiles = "SELECT number, -1 FROM radio WHERE kind = 'tile'"
+        radio = f"{tiles} UNION SELECT number, -2 FROM radio WHERE kind = 'first'"
         chunks = f"SELECT seq, layer FROM chunks WHERE {_IS_LAYER}"
         finest = f"SELECT seq, MAX(layer) FROM ({chunks} UNION {radio}) WHERE {is_number('seq')}"
         layers = self.database.all(f"{finest} GROUP BY seq ORDER BY seq")

@@ -374,6 +374,7 @@ def test_a_keyframe_whose_first_depth_is_void_is_gone(
             browser.wait(f"document.body.dataset.chunk.startsWith('{seq} ')")
             browser.wait("document.body.dataset.points === '32400'")
             assert browser.run("document.querySelector('.time input').max") == "3"
+            browser.wait("document.querySelector('.figures').innerText.includes('Images\\n2')")
         store.finish({})
         browser.wait("document.body.dataset.points === '28800'")
         assert browser.run("document.querySelector('.time input').max") == "2"

@@ -118,9 +118,11 @@ def test_a_first_depth_is_shown_until_it_is_replaced_or_void(
     shown()
     layers = {seq: codec.encode(house.keyframe(seq, 5.0 * seq), 1) for seq in (7, 8)}
     assert scan.put_record("first", 7, layers[7][0])
-    assert shown() == [(7, -1, 80)] and shown() == []
+    assert shown() == [(7, -2, 80)] and shown() == []
+    state = json.loads(list(LiveFeed(scan).news())[-1])
+    assert state == {"type": "state", "finished": False, "keyframes": 5}  # 7 is none yet
     assert scan.put_record("first", 8, layers[8][0])
-    assert shown() == [(7, -1, 0), (8, -1, 80)]
+    assert shown() == [(7, -2, 0), (8, -2, 80)]
     scan.add_keyframe(8, layers[8])
     assert shown() == [(8, 1, 160)]
 

@@ -385,7 +385,7 @@ def test_a_first_depth_shows_a_keyframe_until_its_own_layers_come(tmp_path: Path
     world.run(2.5)
     world.onboard.offer_first(5, LAYERS[5][0])
     world.run(0.5)
-    assert world.store.states() == {5: (-1, -1)} and world.store.seqs() == []
+    assert world.store.states() == {5: (-2, -1)} and world.store.seqs() == []
     shown = world.store.keyframe(5)
     assert shown is not None and shown.depth.depth_m.shape == (45, 80)
     assert not world.onboard.states() and "k0" not in world.store.numbers()

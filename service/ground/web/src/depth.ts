@@ -3,6 +3,7 @@
 /** The head of a binary message, as service/ground/live.py describes it. */
 export interface Head {
   seq: number;
+  /** -1: tiles of the narrow radio; FIRST. */
   layer: number;
   time_unix_s: number;
   size: [number, number];
@@ -27,6 +28,9 @@ export interface Chunk extends Head {
   views: Uint8Array;
   colour: ImageBitmap | null;
 }
+
+/** The layer of a first depth, of a keyframe that is still to come. */
+export const FIRST = -2;
 
 /** True for a keyframe that is withdrawn: all it had was a first depth, now void. */
 export const isVoid = (chunk: Head): boolean => chunk.layer < 0 && !chunk.box[2];

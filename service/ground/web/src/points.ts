@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import type { Part } from "./api";
 import { Before, CHANGE } from "./before";
-import { type Chunk, isVoid, sigmaAt, viewsAt } from "./depth";
+import { type Chunk, FIRST, isVoid, sigmaAt, viewsAt } from "./depth";
 import { Ground, type Samples } from "./fill";
 import type { Gradual } from "./painter";
 import { BEHIND, LEVELS, Surface } from "./surface";
@@ -106,6 +106,7 @@ interface Held {
   shown: boolean;
   unit_m: number;
   points: number;
+  layer: number;
   bright: Uint8Array; // of 200 points
   time: number;
   T: number[];
@@ -170,7 +171,7 @@ export class Cloud implements Gradual {
     let time = -Infinity;
     for (const [seq, held] of this.chunks) {
       if (seq >= STRIDE || !held.shown) continue;
-      out.keyframes += 1;
+      out.keyframes += held.layer > FIRST ? 1 : 0;
       out.points += held.points;
       if (held.time >= time) [time, out.newest] = [held.time, seq];
     }
@@ -202,7 +203,7 @@ export class Cloud implements Gradual {
     object.matrixAutoUpdate = false;
     const surface = new Surface(chunk, { ...this.shared, ...own }, SHADE);
     const bright = rgb.slice(0, 600).sort();
-    const held: Held = { object, surface, shown: true, unit_m, points: sigma.length, bright, time: chunk.time_unix_s, T: chunk.T, scale: chunk.scale };
+    const held: Held = { object, surface, shown: true, unit_m, points: sigma.length, layer: chunk.layer, bright, time: chunk.time_unix_s, T: chunk.T, scale: chunk.scale };
     this.chunks.set(chunk.seq, held);
     this.place(chunk.seq, held);
     this.groupOf(chunk.seq).add(object, surface.mesh);
@@ -290,7 +291,7 @@ export class Cloud implements Gradual {
 
   /** Takes what has come into the ground, and into the earlier date when that is shown; true when it is news. */
   refresh(): boolean {
-    const grew = this.groundStale && performance.now() - this.groundAt > GROUND_MS;
+    const grew = this.groundStale && this.ground.mesh.visible && performance.now() - this.groundAt > GROUND_MS;
     if (grew) {
       this.groundStale = false;
       this.ground.build(this.samples);

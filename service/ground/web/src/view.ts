@@ -143,7 +143,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
       time.refresh();
       empty.hidden = true;
       document.body.dataset["chunk"] = `${chunk.seq} ${Date.now()}`;
-      if (cloud.own.keyframes === 1 && !framed) stage.frame();
+      if (cloud.own.keyframes <= 1 && !framed) stage.frame();
     },
     news,
     (text) => (link.cut = text),
