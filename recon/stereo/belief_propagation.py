@@ -149,9 +149,8 @@ SURE_EVIDENCE = 0.6
 FILLED_CONFIDENCE = 0.05
 """Confidence of a pixel that only its neighbours speak for."""
 
-LABEL_BITS = 10
-LABEL_MASK = (1 << LABEL_BITS) - 1
-"""Bits of the label in a number that holds belief and label."""
+FAR = np.int16(16384)
+"""Above any belief."""
 
 NOISE = 0.2 * COST_UNIT
 """Mean cost below which a window is taken for plain."""
@@ -166,7 +165,8 @@ def select(
     (h, L, w). Evidence is how far the winner's cost lies below the mean over the labels that
     are seen, relative to that mean: about 0.1 for unrelated images, 0.6 for texture. Not
     accepted are winners with less than ``min_evidence`` and those that tie with another
-    label. NaN are those whose partner lies outside the right image.
+    label. NaN are those whose partner lies outside the right image. Sums of 7x7 costs fit 16 bits:
+    no cost is above 668.
     """
     height, _, width = cost.shape
     px = np.empty((height, width), np.float32)
@@ -192,38 +192,40 @@ def _add_row(cost: Any, v: int, sign: Any, sums: Any) -> None:  # pragma: no cov
 
 @njit(cache=True, nogil=True)
 def _window_costs(
-    sums: Any, min_disparity: int, box: Any, mean: Any
+    sums: Any, min_disparity: int, box: Any, total: Any, mean: Any
 ) -> None:  # pragma: no cover - compiled
     """Summed cost (L, w) of a row, and its mean over the labels that each pixel sees."""
     labels, width = box.shape
-    mean[:] = np.float32(0)
+    total[:] = 0
     for label in range(labels):
         row, out = sums[label], box[label]
         a, b, c, d = row[:width], row[1:][:width], row[2:][:width], row[3:][:width]
         e, f, g = row[4:][:width], row[5:][:width], row[6:][:width]
         for u in range(width):
-            left = np.int32(np.int32(a[u]) + np.int32(b[u]) + np.int32(c[u]))
-            right = np.int32(np.int32(e[u]) + np.int32(f[u]) + np.int32(g[u]))
-            out[u] = np.int32(left + np.int32(d[u]) + right)
+            left = np.int16(np.int16(a[u] + b[u]) + c[u])
+            right = np.int16(np.int16(e[u] + f[u]) + g[u])
+            out[u] = np.int16(np.int16(left + d[u]) + right)
         shift = label + min_disparity
         first, last = max(0, min(shift, width)), max(0, min(width, width + shift))
-        total, part = mean[first:last], out[first:last]
-        for u in range(total.shape[0]):
-            total[u] += np.float32(part[u])
+        seen, part = total[first:last], out[first:last]
+        for u in range(seen.shape[0]):
+            seen[u] += np.int32(part[u])
     for u in range(width):
-        seen = min(labels - 1, u - min_disparity) - max(0, u - min_disparity - width + 1) + 1
-        mean[u] /= np.float32(max(seen, 1))
+        seen_labels = min(labels - 1, u - min_disparity) - max(0, u - min_disparity - width + 1) + 1
+        mean[u] = np.float32(total[u]) / np.float32(max(seen_labels, 1))
 
 
 @njit(cache=True, nogil=True)
 def _best_labels(
-    data: Any, messages: Any, v: int, parity: int, belief: Any, best: Any, second: Any
-) -> None:  # pragma: no cover - compiled
-    """Of one parity of a row: the least of belief and label as one number, and the least belief of
-    the labels not adjacent to it. Only without a branch do vector registers take the cells."""
+    data: Any, messages: Any, v: int, parity: int, belief: Any, best: Any, label_of: Any,
+    second: Any,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Of one parity of a row: the least belief, its label, and the least belief of the labels not
+    adjacent to it. Only without a branch do vector registers take the cells."""
     _, _, labels, cells = data.shape
     count = cells - 1
-    best[:] = 2**31 - 1
+    best[:] = 32767
+    label_of[:] = 0
     for label in range(labels):
         b = belief[label, :count]
         d = data[v, parity, label, :count]
@@ -236,29 +238,33 @@ def _best_labels(
         m3 = messages[3, v + 1, 1 - parity, label, : after.shape[0]]
         for i in range(after.shape[0]):
             after[i] += np.int16(m3[i])
+        here = np.int16(label)
         for i in range(count):
-            best[i] = min(best[i], np.int32(np.int32(b[i]) << LABEL_BITS | np.int32(label)))
-    second[:] = 2**31 - 1
+            belief_here, least, label_before = b[i], best[i], label_of[i]
+            label_of[i] = here if belief_here < least else label_before
+            best[i] = min(belief_here, least)
+    second[:] = 32767
     for label in range(labels):
-        b = belief[label, :count]
+        b, here = belief[label, :count], np.int16(label)
         for i in range(count):
-            apart = np.int32((best[i] & np.int32(LABEL_MASK)) - np.int32(label))
-            adjacent = np.int32(1 << 30) if (apart <= 1) & (apart >= -1) else np.int32(0)
-            second[i] = min(second[i], np.int32(np.int32(b[i]) + adjacent))
+            apart = np.int16(abs(np.int16(label_of[i] - here)))
+            adjacent = FAR if apart <= np.int16(1) else np.int16(0)
+            second[i] = min(second[i], np.int16(b[i] + adjacent))
 
 
 @njit(cache=True, nogil=True)
 def _note_winners(
-    best: Any, second: Any, box: Any, parity: int, winner: Any, around: Any, lead: Any
-) -> None:  # pragma: no cover - compiled
+    best: Any, label_of: Any, second: Any, box: Any, parity: int, winner: Any, around: Any,
+    lead: Any,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
     """Of each pixel of one parity of a row: the winner, its cost and that of the labels below and
     above it, and by how much it leads. An outermost label has no such neighbours."""
     labels, width = box.shape
     for i in range((width + 1 - parity) // 2):
-        u, label = 2 * i + parity, np.int64(best[i] & LABEL_MASK)
+        u, label = 2 * i + parity, np.int64(label_of[i])
         inner = 0 < label < labels - 1
         winner[u] = label
-        lead[u] = second[i] - (best[i] >> LABEL_BITS)
+        lead[u] = np.int32(second[i]) - np.int32(best[i])
         around[0, u] = box[label - 1, u] if inner else box[label, u]
         around[1, u] = box[label, u]
         around[2, u] = box[label + 1, u] if inner else box[label, u]
@@ -309,11 +315,11 @@ def _select(
     _, labels, width = cost.shape
     cells = data.shape[3]
     sums = np.zeros((labels, width + 2 * RADIUS), np.int16)
-    box = np.empty((labels, width), np.int32)
-    mean = np.empty(width, np.float32)
+    box = np.empty((labels, width), np.int16)
+    total, mean = np.empty(width, np.int32), np.empty(width, np.float32)
     belief = np.empty((labels, cells), np.int16)
-    best = np.empty(cells, np.int32)  # each on its own: rows of one array lose their layout
-    second = np.empty(cells, np.int32)
+    best = np.empty(cells, np.int16)  # each on its own: rows of one array lose their layout
+    label_of, second = np.empty(cells, np.int16), np.empty(cells, np.int16)
     winner = np.empty(width, np.int32)
     lead = np.empty(width, np.int32)
     around = np.empty((3, width), np.int32)
@@ -321,11 +327,11 @@ def _select(
         _add_row(cost, v, 1, sums)
     for v in range(begin, end):
         _add_row(cost, v + RADIUS, 1, sums)
-        _window_costs(sums, min_disparity, box, mean)
+        _window_costs(sums, min_disparity, box, total, mean)
         _add_row(cost, v - RADIUS, -1, sums)
         for parity in range(2):
-            _best_labels(data, messages, v, parity, belief, best, second)
-            _note_winners(best, second, box, parity, winner, around, lead)
+            _best_labels(data, messages, v, parity, belief, best, label_of, second)
+            _note_winners(best, label_of, second, box, parity, winner, around, lead)
         _place_winners(
             winner, around, lead, mean, min_disparity, sure_lead, min_evidence, px[v], confidence[v]
         )

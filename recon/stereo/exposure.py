@@ -47,41 +47,56 @@ def equalised(left: U8, right: U8, labels: int, min_disparity: int = 0) -> U8:
     rows, columns = height // step, width // step
     if rows * columns < MIN_SAMPLES:
         return right
-    places = np.full((rows, columns, 2), -1, np.int32)
+    left, right = plain(left), plain(right)
+    partners = np.empty((rows, columns), np.int32)
     parallel_for(
-        _match, rows, bordered(left), bordered(right), step, labels, min_disparity, places,
+        _match, rows, bordered(left), bordered(right), step, labels, min_disparity, partners,
         cells=rows * columns * labels,
     )  # fmt: skip
-    row, column = np.nonzero(places[:, :, 1] >= 0)
-    if len(row) < MIN_SAMPLES:
+    clear = np.count_nonzero(partners >= 0)
+    if clear < MIN_SAMPLES:
         return right
-    row, column = (indices[:: len(row) // FITTED + 1] for indices in (row, column))
-    v, (u, partner) = row * step + step // 2, places[row, column].T
-    gray = right[v, partner].astype(np.float64)
-    g, x, y = gray / 255, 2 * partner / width - 1, 2 * v / height - 1
-    terms = np.stack([np.ones_like(g), g, g * g, g * x, g * y, g * x * x, g * x * y, g * y * y], 1)
     change = np.empty((TERMS, 1))
-    _fit(np.ascontiguousarray(terms), left[v, u] - gray, change)
+    _fit(left, right, partners, step, clear // FITTED + 1, change)
     out = np.empty_like(right)
-    parallel_for(
-        _apply, height, plain(right), change[:, 0].astype(np.float32), out, cells=right.size
-    )
+    parallel_for(_apply, height, right, change[:, 0].astype(np.float32), out, cells=right.size)
     return out
 
 
 @njit(cache=True, nogil=True)
-def _fit(terms: Any, change: Any, solution: Any) -> None:  # pragma: no cover - compiled
-    """Coefficients of the terms (n, TERMS), by reweighted least squares: towards the least sum of
-    absolutes, then with Tukey's weights."""
-    count = len(change)
+def _fit(
+    left: Any, right: Any, partners: Any, step: int, every: int, solution: Any
+) -> None:  # pragma: no cover - compiled
+    """Coefficients of the terms (TERMS, 1), by reweighted least squares: towards the least sum of
+    absolutes, then with Tukey's weights. Of the clear matches one of ``every`` counts."""
+    rows, columns = partners.shape
+    height, width = left.shape
+    terms, change = np.empty((rows * columns, TERMS)), np.empty(rows * columns)
+    clear = used = 0
+    for n in range(rows):
+        for k in range(columns):
+            if partners[n, k] < 0:
+                continue
+            clear += 1
+            if (clear - 1) % every:
+                continue
+            v, u, partner = n * step + step // 2, k * step + step // 2, partners[n, k]
+            gray = float(right[v, partner])
+            g, x, y = gray / 255, 2 * partner / width - 1, 2 * v / height - 1
+            row = terms[used]
+            row[0], row[1], row[2], row[3] = 1.0, g, g * g, g * x
+            row[4], row[5], row[6], row[7] = g * y, g * x * x, g * x * y, g * y * y
+            change[used] = left[v, u] - gray
+            used += 1
+    terms, change = terms[:used], change[:used]
     off = np.abs(change)
     normal = np.empty((TERMS, TERMS))
-    for step in range(STEPS):
+    for turn in range(STEPS):
         scale = max(1.5 * np.median(off), 1.0)
         normal[:] = 0
         solution[:] = 0
-        for n in range(count):
-            if step < STEPS // 2:
+        for n in range(used):
+            if turn < STEPS // 2:
                 weight = min(1.0, scale / max(off[n], 1e-9))
             else:
                 weight = max(1 - (off[n] / (4 * scale)) ** 2, 0.0) ** 2
@@ -93,28 +108,39 @@ def _fit(terms: Any, change: Any, solution: Any) -> None:  # pragma: no cover - 
         for i in range(TERMS):
             normal[i, i] += PRIOR
         solve_symmetric(normal, solution)  # reads the lower half
-        for n in range(count):
-            left = change[n]
+        for n in range(used):
+            rest = change[n]
             for i in range(TERMS):
-                left -= terms[n, i] * solution[i, 0]
-            off[n] = abs(left)
+                rest -= terms[n, i] * solution[i, 0]
+            off[n] = abs(rest)
+
+
+@njit(cache=True, nogil=True)
+def _join(parts: Any, words: Any) -> None:  # pragma: no cover - compiled
+    """Four bytes (4, w) as a word each (w,)."""
+    for u in range(words.shape[0]):
+        word = np.uint32(0)
+        for k in range(4):
+            word = np.uint32(word << np.uint32(8)) | np.uint32(parts[k, u])
+        words[u] = word
 
 
 @njit(cache=True, nogil=True)
 def _match(
     begin: int, end: int, left: Any, right: Any, step: int, labels: int, min_disparity: int,
-    places: Any,
+    partners: Any,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
-    """Column of each sample of a row, and of its clear match in the right image."""
+    """Column in the right image of each sample's clear match; -1 without one."""
     width = left.shape[1] - 2 * CENSUS_REACH
     here, there = np.empty(width, np.uint32), np.empty(width, np.uint32)
     parts = np.empty((4, width), np.uint8)
     differ = np.empty(labels, np.int32)
     for n in range(begin, end):
         v = n * step + step // 2
-        census_row(left, v, parts, here)
-        census_row(right, v, parts, there)
-        for k in range(places.shape[1]):
+        for image, words in ((left, here), (right, there)):
+            census_row(image, v, parts)
+            _join(parts, words)
+        for k in range(partners.shape[1]):
             u = k * step + step // 2
             first = max(0, u - min_disparity - width + 1)
             last = min(labels, u - min_disparity + 1)
@@ -126,8 +152,7 @@ def _match(
             clear = least <= MAX_BITS
             for label in range(first, last):
                 clear &= abs(label - best) <= 1 or differ[label] >= least + MARGIN
-            if clear:
-                places[n, k, 0], places[n, k, 1] = u, u - best - min_disparity
+            partners[n, k] = u - best - min_disparity if clear else -1
 
 
 @njit(cache=True, nogil=True)

@@ -15,14 +15,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
-from numba import njit, types
+from numba import njit
 from numba.extending import intrinsic
 
 from recon.parallel import parallel_for
 from recon.types import I16, U8
-
-U32 = npt.NDArray[np.uint32]
 
 COST_UNIT = 100
 """Integer cost of a disparity step of one label between neighbours."""
@@ -71,11 +68,10 @@ def matching_cost(
     is given. Raises ValueError for bad shapes.
     """
     check_pair(left, right, labels)
-    left, right = plain(left), plain(right)
     height, width = left.shape
     cost = np.empty((height, labels, width), np.int16) if out is None else out
     parallel_for(
-        _cost_volume, height, left, right, census(left), census(right), min_disparity,
+        _cost_volume, height, bordered(left), bordered(right), min_disparity,
         round(config.census_weight * COST_UNIT), config.census_truncation,
         round(config.difference_weight * COST_UNIT), config.difference_truncation,
         round(config.unseen * COST_UNIT), cost, cells=cost.size,
@@ -102,17 +98,6 @@ def check_pair(left: U8, right: U8, labels: int) -> None:
         raise ValueError(f"labels must be 2 to 1024, not {labels}")
 
 
-def census(image: U8) -> U32:
-    """Census word of every pixel, (h, w) uint32: bit set where a neighbour is darker.
-
-    The first of :data:`CENSUS_OFFSETS` is the highest bit; beyond the border the image repeats its
-    last row and column.
-    """
-    words = np.empty(image.shape, np.uint32)
-    parallel_for(_census, len(image), bordered(image), words, cells=image.size)
-    return words
-
-
 def bordered(image: U8) -> Any:
     """The image and, as far as census reaches beyond it, its last row and column again."""
     reach = CENSUS_REACH
@@ -120,17 +105,13 @@ def bordered(image: U8) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _census(begin: int, end: int, padded: Any, words: Any) -> None:  # pragma: no cover - compiled
-    parts = np.empty((4, words.shape[1]), np.uint8)
-    for v in range(begin, end):
-        census_row(padded, v, parts, words[v])
+def census_row(padded: Any, v: int, parts: Any) -> None:  # pragma: no cover - compiled
+    """Census of a row's pixels: a bit is set where a neighbour is darker.
 
-
-@njit(cache=True, nogil=True)
-def census_row(padded: Any, v: int, parts: Any, words: Any) -> None:  # pragma: no cover - compiled
-    """Words of a row; eight comparisons at a time in bytes, of which a vector register holds the
-    most. ``parts`` is memory, (4, w)."""
-    width = words.shape[0]
+    ``padded`` is a :func:`bordered` image. ``parts`` (4, w) uint8 holds eight neighbours each, the
+    first of :data:`CENSUS_OFFSETS` in the highest bit: of bytes a vector register holds the most.
+    """
+    width = parts.shape[1]
     centre = padded[v + CENSUS_REACH, CENSUS_REACH : CENSUS_REACH + width]
     for bit, (dv, du) in enumerate(CENSUS_OFFSETS):
         start = CENSUS_REACH + du
@@ -138,21 +119,45 @@ def census_row(padded: Any, v: int, parts: Any, words: Any) -> None:  # pragma: 
         row = parts[bit // 8]
         for u in range(width):
             row[u] = np.uint8(row[u] << 1) | np.uint8(shifted[u] < centre[u])
-    for u in range(width):
-        word = np.uint32(0)
-        for k in range(4):
-            word = np.uint32(word << np.uint32(8)) | np.uint32(parts[k, u])
-        words[u] = word
 
 
 @intrinsic
 def popcount(typingctx: Any, word: Any) -> Any:
-    """How many bits of a 32-bit word are set: one instruction, or a few on vector registers."""
+    """How many bits of an integer are set, as one of its type."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.ctpop(args[0])
 
-    return types.uint32(types.uint32), codegen
+    return word(word), codegen
+
+
+@njit(cache=True, nogil=True)
+def _count_bits(
+    a: Any, b: Any, first: int, shift: int, bits: Any
+) -> None:  # pragma: no cover - compiled
+    """Bits of census (4, w) of the left row ``a`` from column ``first`` on that differ from the
+    right row's, ``shift`` columns further left."""
+    count = bits.shape[0]
+    for k in (0, 2):
+        a0, b0 = a[k, first : first + count], b[k, first - shift : first - shift + count]
+        a1, b1 = a[k + 1, first : first + count], b[k + 1, first - shift : first - shift + count]
+        for i in range(count):
+            differ = popcount(np.uint8(a0[i] ^ b0[i])) + popcount(np.uint8(a1[i] ^ b1[i]))
+            bits[i] = np.uint8(differ + (bits[i] if k else np.uint8(0)))
+
+
+@njit(cache=True, nogil=True)
+def _add_up(
+    bits: Any, a: Any, b: Any, weights: Any, cost: Any, low: Any
+) -> None:  # pragma: no cover - compiled
+    """Cost of pixels by the bits that differ and the gray levels; and the least so far."""
+    per_bit, max_bits, per_level, max_levels = weights
+    for i in range(cost.shape[0]):
+        apart = np.int16(abs(np.int16(a[i]) - np.int16(b[i])))
+        value = np.int16(min(np.int16(bits[i]), max_bits) * per_bit)
+        value = np.int16(value + np.int16(min(apart, max_levels) * per_level))
+        cost[i] = value
+        low[i] = min(low[i], value)
 
 
 @njit(cache=True, nogil=True)
@@ -161,8 +166,6 @@ def _cost_volume(
     end: int,
     left: Any,
     right: Any,
-    census_left: Any,
-    census_right: Any,
     min_disparity: int,
     census_weight: int,
     census_truncation: int,
@@ -172,26 +175,31 @@ def _cost_volume(
     cost: Any,
 ) -> None:  # pragma: no cover - compiled
     _, labels, width = cost.shape
+    parts_left, parts_right = np.empty((4, width), np.uint8), np.empty((4, width), np.uint8)
+    bits = np.empty(width, np.uint8)
+    best = np.empty(width, np.int16)
+    weights = (
+        np.int16(census_weight),
+        np.int16(census_truncation),
+        np.int16(difference_weight),
+        np.int16(difference_truncation),
+    )
     for v in range(begin, end):
-        best = np.full(width, np.int16(32767), np.int16)
+        census_row(left, v, parts_left)
+        census_row(right, v, parts_right)
+        gray_left = left[v + CENSUS_REACH, CENSUS_REACH : CENSUS_REACH + width]
+        gray_right = right[v + CENSUS_REACH, CENSUS_REACH : CENSUS_REACH + width]
+        best[:] = 32767
         for label in range(labels):
             shift = label + min_disparity
             first = min(max(0, shift), width)
-            last = max(min(width, width + shift), first)
-            count = last - first
-            row = cost[v, label, first:last]
-            a = left[v, first:last]
-            b = right[v, first - shift : last - shift]
-            ca = census_left[v, first:last]
-            cb = census_right[v, first - shift : last - shift]
-            low = best[first:last]
-            for i in range(count):
-                differ = np.int32(popcount(np.uint32(ca[i] ^ cb[i])))
-                bits = min(differ, np.int32(census_truncation))
-                gray = min(abs(np.int32(a[i]) - np.int32(b[i])), np.int32(difference_truncation))
-                value = np.int16(bits * census_weight + gray * difference_weight)
-                row[i] = value
-                low[i] = min(low[i], value)
+            count = max(min(width, width + shift) - first, 0)
+            differ = bits[:count]
+            _count_bits(parts_left, parts_right, first, shift, differ)
+            row, low = cost[v, label, first : first + count], best[first : first + count]
+            a = gray_left[first : first + count]
+            b = gray_right[first - shift : first - shift + count]
+            _add_up(differ, a, b, weights, row, low)
         for u in range(width):
             best[u] = np.int16(best[u] + unseen) if best[u] < 32767 else np.int16(0)
         for label in range(labels):

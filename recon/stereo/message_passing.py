@@ -171,6 +171,7 @@ class _Lanes:
         return self.builder.select(compare("<", a, b), a, b)
 
 
+WEIGHT_BITS = np.int32(8)
 FULL_WEIGHT = 256
 
 UP, DOWN, LEFT, RIGHT = 0, 1, 2, 3
@@ -236,12 +237,16 @@ def _edges(
     """
     _, height, width = weights.shape
     edges = np.zeros((2, 2, height + 2, 2, cells), np.int16)
+    per_label, most = np.int32(slope), np.int32(truncation)
     for kind in range(2):
         for v in range(height):
-            for u in range(width):
-                w = np.int32(weights[kind, v, u])
-                edges[0, kind, v + 1, u & 1, u // 2] = slope * w // FULL_WEIGHT
-                edges[1, kind, v + 1, u & 1, u // 2] = truncation * w // FULL_WEIGHT
+            row = weights[kind, v]
+            for parity in range(2):
+                slopes, cuts = edges[0, kind, v + 1, parity], edges[1, kind, v + 1, parity]
+                for i in range((width + 1 - parity) // 2):
+                    w = np.int32(row[2 * i + parity])
+                    slopes[i] = np.int16(np.int32(per_label * w) >> WEIGHT_BITS)
+                    cuts[i] = np.int16(np.int32(most * w) >> WEIGHT_BITS)
     return edges
 
 

@@ -17,7 +17,8 @@ from recon.stereo.matching_cost import (
     COST_UNIT,
     MatchingCostConfig,
     Workspace,
-    census,
+    bordered,
+    census_row,
     matching_cost,
 )
 from recon.stereo.message_passing import propagate
@@ -109,6 +110,15 @@ def test_one_row_finds_the_exact_minimum_of_the_energy() -> None:
         path.append(int(back[path[-1]]))
     np.testing.assert_array_equal(belief[0].argmin(axis=1), path[::-1])
     np.testing.assert_array_equal(beliefs_of(data, messages, width)[0].argmin(axis=1), path[::-1])
+
+
+def census(image: U8) -> Array:
+    """(h, w) words of 32 bits from the compiled rows, the first neighbour in the highest bit."""
+    parts = np.empty((len(image), 4, image.shape[1]), np.uint8)
+    for v, row in enumerate(parts):
+        census_row(bordered(image), v, row)
+    first, second, third, fourth = np.moveaxis(parts.astype(np.int64), 1, 0)
+    return np.asarray(first << 24 | second << 16 | third << 8 | fourth)
 
 
 def test_census_against_its_definition() -> None:
