@@ -43,7 +43,7 @@ from service.ground.guard import (
 from service.ground.library import ConflictError
 from service.ground.live import serve_live
 from service.ground.map_tiles import map_routes
-from service.ground.products import products_of
+from service.ground.products import job_title, products_of
 from service.ground.scan_files import file_routes
 from service.ground.sites import align_by_points
 from service.ground.state import KINDS, PortalState, names_of, state_of
@@ -351,8 +351,9 @@ async def _align(request: Request) -> Response:
 
 
 def _jobs(request: Request) -> Response:
-    """Jobs that wait, run or have just ended: percent, what is being done, seconds left."""
-    return JSONResponse(state_of(request).jobs.listed())
+    """Jobs that wait, run or have just ended: title, percent, what is being done, seconds left."""
+    jobs = state_of(request).jobs.listed()
+    return JSONResponse([job | {"title": job_title(job["kind"])} for job in jobs])
 
 
 def _cancel(request: Request) -> Response:

@@ -40,6 +40,9 @@ PRODUCTS: dict[str, tuple[str, str, float, float]] = {
 }
 """Group, title, bytes of a fused point and seconds of a million of them, on two cores."""
 
+OTHER_JOBS = {"align": "Alignment", "scan": "Replay"}
+"""Titles of the jobs that make no product; an upload is replayed to a scan."""
+
 REFINED = "Adjusts all poses to each other once more, then makes the scan's files again."
 WITH_HEIGHTS = {
     "laz", "copc", "ply", "dsm", "dtm", "contours", "gpkg", "dxf", "coverage", "all", "obj",
@@ -59,6 +62,12 @@ def products_of(folder: Path, points: int | None, is_placed: bool) -> list[dict[
         _product(folder, kind, points, is_placed)
         for kind in (*known, *(kind for kind in KINDS if kind not in PRODUCTS))
     ]
+
+
+def job_title(kind: str) -> str:
+    """What a job of this kind makes, in the words of the page."""
+    found = PRODUCTS.get(kind)
+    return OTHER_JOBS.get(kind, kind) if found is None else found[1]
 
 
 def _product(folder: Path, kind: str, points: int | None, is_placed: bool) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from site_scans import FRAME, Errors, leg, write_scan
 from recon.posegraph.site_alignment import ScanSimilarity
 from recon.types import F64, Keyframe
 from service.georeference import LocalFrame
+from service.ground.library import LABELS
 from service.ground.portal import Portal, PortalConfig
 
 pytestmark = NEEDS
@@ -300,6 +301,7 @@ def test_a_scan_without_georeference_is_placed_by_clicks_in_two_scans(
     wrong = Errors((310.0, -120.0, 35.0), (0.05, -0.02, 2.0), 0.4)  # where vision alone has it
     write_scan(tmp_path / "drone-1/placed", leg(0.0))
     write_scan(tmp_path / "drone-1/nowhere", leg(np.pi / 2), wrong, frame=None)
+    (tmp_path / "drone-1/nowhere" / LABELS).write_text('{"title": "North field"}')
     with listing(browser, tmp_path, 2) as base:
         ruler = Ruler(browser, FRAME)
         browser.open(f"{base}/#/view/drone-1/nowhere")
@@ -309,13 +311,14 @@ def test_a_scan_without_georeference_is_placed_by_clicks_in_two_scans(
         browser.click("Place")
         browser.wait("location.hash.endsWith('/placed')")
         panel = "document.querySelector('.measure')"
-        browser.wait(f"{panel}.textContent.includes('point 1 of 3 of nowhere')")
+        browser.wait(f"{panel}.textContent.includes('point 1 of 3 of North field')")
         browser.image(tmp_path / "placing.png")  # to look at
         assert browser.run(f"{panel}.querySelector('.acts + .acts button').disabled")  # Align
         click_spots(ruler, Errors().as_similarity(), None)
         browser.click("Align")
         ended = "document.querySelector('.jobs li.done, .jobs li.failed')?.textContent"
-        assert "done" in browser.wait(ended, 120)
+        words = browser.wait(ended, 120)
+        assert "done" in words and words.startswith("Alignment of North field")
     document = json.loads((tmp_path / "site/drone-1-nowhere/site.json").read_text())
     assert [(s["name"], s["placed"]) for s in document["scans"]] == [
         ("placed", "aligned"), ("nowhere", "aligned"),

@@ -197,7 +197,7 @@ def test_a_job_shows_its_percent_and_is_cancelled_by_its_button(
     assert Client(portal).ask(ONE + "/exports", "POST", {"kind": "dsm"})[0] == 202
     browser.wait(f"{ROW} && {ROW}.textContent.includes('75 %')")
     assert browser.run(f"{ROW}.querySelector('progress').value") == 75
-    assert "dsm of " in browser.run(f"{ROW}.textContent")
+    assert "Surface model, GeoTIFF of " in browser.run(f"{ROW}.textContent")
     browser.click("Cancel")
     browser.wait(f"{ROW}.className === 'cancelled'")
     assert browser.run(f"{ROW}.querySelector('button').hidden")

@@ -11,6 +11,7 @@ export interface Job {
   drone: string;
   scan: string;
   kind: string;
+  title: string;
   state: "waiting" | "running" | "done" | "failed" | "cancelled";
   doing: string;
   percent: number;

@@ -13,27 +13,34 @@ interface Row {
 }
 
 /** The jobs of one scan, and alignments: the last clicks of one are made in the other scan's view. */
-export const jobsOf = (scan: () => api.Scan): HTMLElement =>
-  jobList((job) => {
+export function jobsOf(scan: () => api.Scan): HTMLElement {
+  const others = new Map<number, Promise<string>>();
+  return jobList((job) => {
     if (job.drone === scan().drone && job.scan === scan().scan) return nameOf(scan());
-    return job.kind === "align" ? job.scan : null;
+    if (job.kind !== "align") return null;
+    const name = others.get(job.number) ?? api.scan(job.drone, job.scan).then(nameOf, () => job.scan);
+    others.set(job.number, name);
+    return name;
   });
+}
+
+/** What a job's scan is called; null: the job is not shown. */
+type NameOf = (job: api.Job) => string | Promise<string> | null;
 
 /**
- * A list that keeps itself up to date while it is in the page; hidden while there is nothing. `title` names a job's
- * scan; null: it is not shown. A job is shown where `homeOf` says, with its history; all others here, until a while
+ * A list that keeps itself up to date while it is in the page; hidden while there is nothing. A job is shown where `homeOf` says, with its history; all others here, until a while
  * after they have ended.
  */
-export function jobList(title: (job: api.Job) => string | null, homeOf: (job: api.Job) => Element | null = () => null): HTMLElement {
+export function jobList(name: NameOf, homeOf: (job: api.Job) => Element | null = () => null): HTMLElement {
   const list = el("ul", {});
   const section = el("section", { className: "panel jobs", hidden: true }, list);
   section.setAttribute("aria-label", "jobs");
   let rows = new Map<number, Row>();
   const refresh = async (): Promise<void> => {
     const all = await api.jobs().catch(() => []);
-    const jobs = all.filter((job) => title(job) !== null && (homeOf(job) || (job.ended_s ?? 0) < ENDED_S));
+    const jobs = all.filter((job) => name(job) !== null && (homeOf(job) || (job.ended_s ?? 0) < ENDED_S));
     const old = rows;
-    rows = new Map(jobs.map((job) => [job.number, old.get(job.number) ?? row(job, title(job)!)]));
+    rows = new Map(await Promise.all(jobs.map(async (job) => [job.number, old.get(job.number) ?? row(job, (await name(job))!)] as const)));
     for (const [number, { element }] of old) if (!rows.has(number)) element.remove();
     for (const job of jobs) {
       const { element, show } = rows.get(job.number)!;
@@ -47,9 +54,8 @@ export function jobList(title: (job: api.Job) => string | null, homeOf: (job: ap
   return section;
 }
 
-function row(job: api.Job, title: string): Row {
-  const kind = job.kind === "all" ? "all maps" : job.kind;
-  const what = `${kind} of ${title}`;
+function row(job: api.Job, name: string): Row {
+  const what = `${job.title} of ${name}`;
   const bar = el("progress", { max: 100 });
   bar.setAttribute("aria-label", what);
   const words = el("span", { className: "words" });
@@ -57,7 +63,7 @@ function row(job: api.Job, title: string): Row {
   stop.setAttribute("aria-label", `Cancel ${what}`);
   const get = el("a", { className: "button", textContent: "Download", hidden: true, download: "" });
   get.setAttribute("aria-label", `Download ${what}`);
-  const element = el("li", {}, el("strong", {}, kind, el("span", { className: "of", textContent: ` of ${title}` })), bar, words, stop, get);
+  const element = el("li", {}, el("strong", {}, job.title, el("span", { className: "of", textContent: ` of ${name}` })), bar, words, stop, get);
   const show = (now: api.Job): void => {
     const ended = now.state !== "waiting" && now.state !== "running";
     element.className = now.state;

@@ -4,6 +4,7 @@ import type { Vector3 } from "three";
 import * as api from "./api";
 import { el, notify } from "./dom";
 import { placeOf } from "./globe";
+import { nameOf } from "./names";
 
 const MIN_POINTS = 3;
 
@@ -23,7 +24,7 @@ export function placing(scan: api.Scan, again: () => void): (places: Vector3[]) 
 
 async function fill(others: HTMLSelectElement): Promise<void> {
   const found = (await api.scans()).filter((s) => s.origin && s.finished);
-  others.append(...found.map((s) => el("option", { value: api.viewAddress(s), textContent: `${s.drone}/${s.title}` })));
+  others.append(...found.map((s) => el("option", { value: api.viewAddress(s), textContent: nameOf(s) })));
 }
 
 function begin(scan: api.Scan, others: HTMLSelectElement, places: Vector3[]): HTMLElement | null {
@@ -49,8 +50,8 @@ function end(scan: api.Scan, origin: api.Origin, places: Vector3[], again: () =>
   const missing = points.length - places.length;
   const words =
     missing > 0
-      ? `Click point ${places.length + 1} of ${points.length} of ${from.title}, in the same order.`
-      : missing < 0 ? `Remove ${-missing} point(s).` : `All points of ${from.title} are placed.`;
+      ? `Click point ${places.length + 1} of ${points.length} of ${nameOf(from)}, in the same order.`
+      : missing < 0 ? `Remove ${-missing} point(s).` : `All points of ${nameOf(from)} are placed.`;
   return el(
     "p",
     { className: "acts" },
