@@ -67,14 +67,10 @@ class Tokens:
         """A cookie's value for a new browser of ``name``; it does not hold the token."""
         return self._session(f"{name}.{secrets.token_hex(4)}")
 
-    def holder_of(self, session: str) -> str | None:
-        """NAME.BROWSER of a cookie's value; None when we did not make it, or it has ended."""
-        return self._holder(session, 0.0)
-
     def renewed(self, session: str) -> str | None:
         """The same browser's next value; None while this one has half of its time left."""
-        holder = self._holder(session, 0.0)
-        is_due = holder is not None and self._holder(session, SESSION_S / 2) is None
+        holder = self.holder_of(session)
+        is_due = holder is not None and self.holder_of(session, SESSION_S / 2) is None
         return self._session(holder) if is_due and holder is not None else None
 
     def end_session(self, session: str) -> None:
@@ -88,8 +84,8 @@ class Tokens:
         body = f"{holder}.{int(self._clock() + SESSION_S)}"
         return f"{body}.{self._signature(holder.partition('.')[0], body)}"
 
-    def _holder(self, session: str, left_s: float) -> str | None:
-        """NAME.BROWSER of a value that is valid for so much longer."""
+    def holder_of(self, session: str, left_s: float = 0.0) -> str | None:
+        """NAME.BROWSER of a cookie's value; None when we did not make it, or it ends so soon."""
         body, _, signature = session.rpartition(".")
         holder, _, end = body.rpartition(".")
         name = holder.partition(".")[0]
@@ -175,7 +171,8 @@ NOTED = "skyrelief.change"
 class AuditLog:
     """Appends lines of JSON to ``audit.jsonl`` (mode 600); the file before it is ``.1``.
 
-    A full disk stops no order; the line is logged instead.
+    A full disk stops no order; the line is logged instead. Not the standard library's rotating
+    handler: it follows links, and its file is readable by others.
     """
 
     def __init__(self, folder: Path, max_bytes: int = MAX_AUDIT_BYTES) -> None:
@@ -377,7 +374,11 @@ HEADERS = (
 
 
 class Guard:
-    """Lets through who may come in, and puts the safety headers on every answer."""
+    """Lets through who may come in, and puts the safety headers on every answer.
+
+    Not Starlette's layers for hosts and users: one does not read IPv6 addresses, the other refuses
+    by the route and not by the method, and neither leaves a line in the audit log.
+    """
 
     def __init__(self, app: ASGIApp, tokens: Tokens, local: bool, audit: AuditLog) -> None:
         self._app, self._tokens, self._local, self._audit = app, tokens, local, audit

@@ -43,7 +43,7 @@ from service.scans.annotations import (
     add_annotation,
     delete_annotation,
 )
-from service.scans.folder import PIECE, SUMMARY, write_deliverables
+from service.scans.folder import PIECE, write_deliverables
 from service.scans.writing import write_whole
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -148,7 +148,7 @@ class Library:
             "trouble": None,
         }
         try:
-            entry |= _facts(folder)
+            entry |= facts_of(folder)
         except UNREADABLE as error:
             entry["trouble"] = str(error)[:300] or type(error).__name__
         return entry
@@ -327,14 +327,6 @@ def read_labels(folder: Path) -> Labels:
         return Labels(_title(found.title), _tags(found.tags), found.edition)
     except InputError:
         return Labels()
-
-
-def _facts(folder: Path) -> dict[str, Any]:
-    """From scan.json when it is there, else from the store's header."""
-    if (folder / SUMMARY).exists():
-        return facts_of(folder / SUMMARY)
-    with ScanStore.peek(folder / "scan.db") as store:
-        return facts_of(store)
 
 
 def _files(folder: Path) -> list[dict[str, Any]]:

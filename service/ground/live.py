@@ -30,6 +30,7 @@ import time
 import zlib
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -278,30 +279,20 @@ POLL_S = 0.25
 LINK_S = 1.0
 
 
-@dataclass(slots=True, eq=False)
-class _LinkNews:
-    """The state of a scan's reception, every LINK_S."""
-
-    folder: Path
-    progress: Callable[[], list[dict[str, Any]]]
-    _due: float = 0.0
-
-    def messages(self, heard_unix_s: float) -> Iterator[str]:
-        """One message when it is due."""
-        if time.monotonic() >= self._due:
-            self._due = time.monotonic() + LINK_S
-            yield link_message(_entry(self.folder, self.progress()), heard_unix_s)
-
-
-def _news(feed: LiveFeed, site: SiteNews, link: _LinkNews) -> Iterator[str | bytes]:
-    """What is new; the state of the link also between two chunks."""
-    for message in feed.news():
-        yield message
-        yield from link.messages(feed.heard_unix_s)
-    placed = site.message()
-    if placed is not None:
-        yield placed
-    yield from link.messages(feed.heard_unix_s)
+def _news(
+    feed: LiveFeed, site: SiteNews, entry: Callable[[], dict[str, Any]]
+) -> Iterator[str | bytes | None]:
+    """What is new, then None, again and again; every LINK_S, also between two chunks, the state of
+    the link by the receiver's ``entry``."""
+    due = 0.0
+    while True:
+        for message in chain(feed.news(), map(SiteNews.message, (site,))):
+            if message is not None:
+                yield message
+            if time.monotonic() >= due:
+                due = time.monotonic() + LINK_S
+                yield link_message(entry(), feed.heard_unix_s)
+        yield None
 
 
 async def serve_live(
@@ -314,11 +305,14 @@ async def serve_live(
         store = await run_in_threadpool(ScanStore.open, folder / "scan.db")
         feed = LiveFeed(store, socket.query_params.get("layer") == "0")
         gone = asyncio.create_task(_until_gone(socket))
-        site, link = SiteNews(library, folder), _LinkNews(folder, progress)
-        while not gone.done():
-            async for message in iterate_in_threadpool(_news(feed, site, link)):
+        news = _news(feed, SiteNews(library, folder), lambda: _entry(folder, progress()))
+        async for message in iterate_in_threadpool(news):
+            if message is not None:
                 await _send(socket, message)  # before the next one is made
-            await asyncio.wait({gone}, timeout=POLL_S)
+            elif not gone.done():
+                await asyncio.wait({gone}, timeout=POLL_S)
+            if gone.done():
+                break
     except (SkyreliefError, WebSocketDisconnect, RuntimeError) as error:
         log.debug("live view of %s ended: %s", folder, error)
         if isinstance(error, SkyreliefError):

@@ -13,6 +13,7 @@ import msgspec
 
 from service.errors import InputError
 from service.ground.storage import is_regular
+from service.scans.folder import SUMMARY
 from service.small_file import read_json
 from service.stream.store import ScanStore
 
@@ -113,12 +114,15 @@ def labels_in(path: Path) -> Labels:
     return _decoded(path, Labels)
 
 
-def facts_of(source: Path | ScanStore) -> dict[str, Any]:
-    """A scan's entry in the list, from its ``scan.json`` or its open store.
+def facts_of(folder: Path) -> dict[str, Any]:
+    """A scan's entry in the list, from its ``scan.json`` or else its store.
 
     Raises InputError for a file that cannot be read, ValueError for an unfit store.
     """
-    return (_of_summary(source, Facts) if isinstance(source, Path) else _from_store(source)).shown()
+    if (folder / SUMMARY).exists():
+        return _of_summary(folder / SUMMARY, Facts).shown()
+    with ScanStore.peek(folder / "scan.db") as store:
+        return _from_store(store).shown()
 
 
 def ground_in(path: Path) -> Ground:

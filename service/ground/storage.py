@@ -19,12 +19,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from service.errors import InputError, OutsideError
 from service.offline.site import DRONE
+from service.scans.folder import write_deliverables
 from service.scans.retention import Claim, existing
 from service.stream.naming import check_name, split_scan_name
-from service.stream.records import ScanHeader
 from service.stream.store import ScanStore, header_of
 
 log = logging.getLogger(__name__)
@@ -276,7 +277,7 @@ TAKING = ".taking-"
 def take_in(
     store: Path,
     folder: Path,
-    deliver: Callable[[Path, ScanStore], None] | None = None,
+    deliver: Callable[[Path, ScanStore, dict[str, Any]], object] = write_deliverables,
     room_bytes: int | None = None,
 ) -> list[Path]:
     """The scan folders under ``store`` that now hold what those in ``folder`` hold.
@@ -295,7 +296,7 @@ def take_in(
     taken, faults = [], []
     for path in paths:
         try:
-            taken.append(_take(store, path.parent, deliver or _deliver, room_bytes))
+            taken.append(_take(store, path.parent, deliver, room_bytes))
         except InputError as error:
             log.error("%s is not taken: %s", path.parent, error)
             faults.append(error)
@@ -305,7 +306,7 @@ def take_in(
 
 
 def _take(
-    store: Path, folder: Path, deliver: Callable[[Path, ScanStore], None], room_bytes: int | None
+    store: Path, folder: Path, deliver: Callable[..., object], room_bytes: int | None
 ) -> Path:
     with workplace(store) as place:
         copy_files(folder, place, STORE_FILES, room_bytes)
@@ -313,9 +314,10 @@ def _take(
             header = source.header
             drone, scan = check_name(header.drone, "drone"), check_name(header.name, "scan")
             path = scan_folder(store, drone, scan) / STORE_FILES[0]
-            with _open(path, header) as target:
+            is_known = path.exists()
+            with ScanStore.open(path) if is_known else ScanStore.create(path, header) as target:
                 news = merge(source, target)
-                deliver(path.parent, target)
+                deliver(path.parent, target, {})
     log.info("%s/%s: %d records from %s", drone, scan, news, folder)
     return path.parent
 
@@ -350,10 +352,6 @@ def clear_leftovers(store: Path) -> int:
     return cleared
 
 
-def _open(path: Path, header: ScanHeader) -> ScanStore:
-    return ScanStore.open(path) if path.exists() else ScanStore.create(path, header)
-
-
 def merge(source: ScanStore, target: ScanStore) -> int:
     """Put every record of ``source`` that ``target`` lacks into it; how many there were."""
     news = 0
@@ -362,9 +360,3 @@ def merge(source: ScanStore, target: ScanStore) -> int:
             record = source.record(kind, number)
             news += record is not None and target.put_record(kind, number, record)
     return news
-
-
-def _deliver(folder: Path, store: ScanStore) -> None:
-    from service.scans.folder import write_deliverables
-
-    write_deliverables(folder, store, {})

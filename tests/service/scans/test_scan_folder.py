@@ -296,7 +296,7 @@ def test_a_file_that_cannot_be_made_costs_itself_only(
     with house.flown(tmp_path) as store:
         summary = write_deliverables(tmp_path, store, {})
     why = {CLOUD: "OverflowError: cannot convert float infinity to integer"}
-    trouble = facts_of(tmp_path / SUMMARY)["trouble"]  # what the portal's list shows
+    trouble = facts_of(tmp_path)["trouble"]  # what the portal's list shows
     assert trouble == f"could not be made: {CLOUD} ({why[CLOUD]})"
     assert summary["failed"] == json.loads((tmp_path / SUMMARY).read_text())["failed"] == why
     assert not (tmp_path / CLOUD).exists()
