@@ -23,10 +23,7 @@ NOISE_M = 0.05
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
-    """Milliseconds and centimetres from the same depth maps and starts, preparation included.
-
-    The second figure of error has noise that neighbouring pixels share, as stereo has it.
-    """
+    """Milliseconds from the same depth maps and start, preparation included."""
     source, target, T = pair(0, 0.0)
     guess = start(0, T)
     config = IcpConfig()
@@ -36,8 +33,6 @@ def run(options: BenchOptions) -> list[BenchResult]:
     for peer, other in peers().items():
         theirs = partial(other, source, target, guess)
         results.append(compare(what, ours, options, peer, theirs))
-    for blur_px, words in ((0.0, "error, noise of each pixel"), (2.0, "error, noise of patches")):
-        results += errors(words, blur_px, config)
     return results
 
 
@@ -149,23 +144,3 @@ def by_small_gicp(source: DepthMap, target: DepthMap, guess: F64) -> F64:
         downsampling_resolution=1.0, num_threads=2,
     )  # fmt: skip
     return np.asarray(found.T_target_source, np.float64)
-
-
-def errors(what: str, blur_px: float, config: IcpConfig) -> list[BenchResult]:
-    """Mean error of the ground below the camera over several scenes, ours and each peer's."""
-    off: dict[str, list[float]] = {}
-    below = np.array([[0.0, 0.0, 60.0]])
-    for seed in range(SCENES):
-        source, target, T = pair(seed, blur_px)
-        guess = start(seed, T)
-        result = register_projective(source, target, guess, config)
-        answers = {"": result.T_target_source}
-        answers |= {name: other(source, target, guess) for name, other in peers().items()}
-        for name, answer in answers.items():
-            miss = se3.transform(answer, below) - se3.transform(T, below)
-            off.setdefault(name, []).append(100 * float(np.linalg.norm(miss)))
-    ours = float(np.mean(off.pop("")))
-    return [
-        BenchResult(what, ours, "cm", 0.0, name, float(np.mean(values)))
-        for name, values in off.items()
-    ]

@@ -22,7 +22,7 @@ NOISE = 2.0  # gray levels
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
-    """Milliseconds for 900 corners and their matches, and how far the matches are off.
+    """Milliseconds for 900 corners and their matches.
 
     The peers are OpenCV's corner detector and its pyramidal Lucas-Kanade tracker run forward
     and backward, with windows and levels that reach as far.
@@ -31,7 +31,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
     config = MatchingConfig()
     corners = np.ascontiguousarray(harris_grid(a, config)[:, :2])
     points = corners[:, None]
-    timed = [
+    return [
         compare(
             "corners, 1280x720, 30x30 grid", partial(harris_grid, a, config), options,
             "OpenCV goodFeaturesToTrack",
@@ -47,7 +47,6 @@ def run(options: BenchOptions) -> list[BenchResult]:
             "common view without a prior", partial(shared, a, b), options
         ),
     ]  # fmt: skip
-    return timed + accuracy(a, b, corners, config)
 
 
 def shared(a: U8, b: U8) -> CommonView | None:
@@ -95,33 +94,11 @@ def tracked(a: U8, b: U8, points: F32) -> tuple[F32, F32]:
     return points[good, 0], there[good, 0]
 
 
-def accuracy(a: U8, b: U8, corners: F32, config: MatchingConfig) -> list[BenchResult]:
-    """Root mean square error of the good matches, and the share found."""
-    ours = matched(a, b, corners, config)
-    theirs = tracked(a, b, corners[:, None])
-    truth = corners - SHIFT_PX
-    visible = np.all((truth > 12) & (truth < np.array(SIZE[::-1]) - 12), axis=1)
-    rms, shares = [], []
-    for here, there in (ours, theirs):
-        error = np.linalg.norm(there - (here - SHIFT_PX), axis=1)
-        good = error < 1.0
-        rms.append(float(np.sqrt(np.mean(error[good] ** 2) / 2)))
-        shares.append(100 * float(good.sum() / visible.sum()))
-    peer = "OpenCV PyrLK both ways"
-    return [
-        BenchResult("error of a coordinate", rms[0], "px", 0.0, peer, rms[1]),
-        BenchResult(
-            "found within 1 px, of the visible", shares[0], "%", 0.0, peer, shares[1],
-            note="more is better",
-        ),
-    ]  # fmt: skip
-
-
 K: F64 = np.array([[930.0, 0, 639.5], [0, 930.0, 359.5], [0, 0, 1.0]])
 
 
 def run_pose(options: BenchOptions) -> list[BenchResult]:
-    """Milliseconds and centimetres of EPnP in RANSAC with refinement, ours and OpenCV's."""
+    """Milliseconds of EPnP in RANSAC with refinement, ours and OpenCV's, and of a frame."""
     points, uv, T = scene(0)
     prior = se3.exp(np.array([0.002, -0.003, 0.004, 0.2, -0.3, 0.1])) @ T
     return [
@@ -130,7 +107,6 @@ def run_pose(options: BenchOptions) -> list[BenchResult]:
             options, "OpenCV RANSAC EPnP + LM", partial(by_opencv, points, uv),
             note="ours with covariance",
         ),
-        position_error(),
         frame(options),
     ]  # fmt: skip
 
@@ -158,23 +134,6 @@ def by_opencv(points: F64, uv: F64) -> F64:
     rvec, tvec = cv2.solvePnPRefineLM(points[kept], uv[kept], K, None, rvec, tvec)
     R = np.asarray(cv2.Rodrigues(rvec)[0], np.float64)
     return se3.compose(R, np.asarray(tvec, np.float64).ravel())
-
-
-def position_error() -> BenchResult:
-    """Mean error of the camera's place over twenty scenes."""
-    ours, theirs = [], []
-    for seed in range(20):
-        points, uv, T = scene(seed)
-        result = pnp.solve(points, uv, K)
-        truth = se3.inverse(T)[:3, 3]
-        if result is not None:
-            ours.append(se3.inverse(result.T_camera_points)[:3, 3] - truth)
-        theirs.append(se3.inverse(by_opencv(points, uv))[:3, 3] - truth)
-    mean = [100 * float(np.linalg.norm(e, axis=1).mean()) for e in (ours, theirs)]
-    return BenchResult(
-        "place of the camera, mean of 20", mean[0], "cm", 0.0, "OpenCV RANSAC EPnP + LM",
-        mean[1], note=f"{len(ours)} of 20 solved",
-    )  # fmt: skip
 
 
 def frame(options: BenchOptions) -> BenchResult:

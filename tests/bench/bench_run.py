@@ -16,6 +16,7 @@ from service.bench import BENCHMARKS, keep, record, run_benchmarks, table
 from service.errors import InputError, OutsideError
 
 DEVELOPMENT = {
+    "codecs": "bench_codecs:run",
     "device": "bench_device:run",
     "graph": "bench_graph:run",
     "latency": "bench_latency:run",
@@ -28,6 +29,7 @@ DEVELOPMENT = {
     "scenes": "bench_scenes:run",
     "real": "bench_real:run",
     "site": "bench_site:run",
+    "truth": "bench_truth:run",
 }
 """Name to ``module:function`` of this folder."""
 
