@@ -106,7 +106,7 @@ def test_what_a_killed_process_left_is_deleted_at_the_start(tmp_path: Path, card
     ground = tmp_path / "ground"
     script = (
         "import os, sys\nfrom pathlib import Path\nfrom service.ground import storage\n"
-        "storage.merge = lambda *_: os.kill(os.getpid(), 9)\n"
+        "storage.scan_folder = lambda *_: os.kill(os.getpid(), 9)\n"
         "storage.take_in(Path(sys.argv[1]), Path(sys.argv[2]))\n"
     )
     ended = subprocess.run([sys.executable, "-c", script, str(ground), str(card)])
