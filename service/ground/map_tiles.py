@@ -260,11 +260,12 @@ def _bounds(live: LiveMap) -> tuple[float, float, float, float]:
 
 
 def _tile_json(request: Request) -> Response:
-    """A layer of a scan as TileJSON 3.0; ``version`` changes with the map."""
+    """A layer of a scan as TileJSON 3.0. ``version`` changes with the map; the portal shows the
+    orthophoto's colours times ``exposure``."""
     state, folder, layer = _asked(request)
     with state.maps.lock:
         live = state.maps.view(folder)
-        bounds, version = _bounds(live), live.version
+        bounds, version, exposure = _bounds(live), live.version, live.exposure
     if layer == "coverage" and (found := state.coverages.view(folder).found) is not None:
         version = zlib.crc32(found.image().tobytes())
     raster = newer_raster(folder, layer)
@@ -277,6 +278,8 @@ def _tile_json(request: Request) -> Response:
         "maxzoom": MAX_ZOOM,
         "version": f"{version}.0.{0 if raster is None else int(raster.stat().st_mtime)}",
     }
+    if layer == "ortho":
+        document["exposure"] = round(exposure, 3)
     if layer == "contours":
         latitude = 0.5 * (bounds[1] + bounds[3])
         finest = MAX_ZOOM if raster is not None or live.zoom is None else live.zoom

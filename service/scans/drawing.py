@@ -130,8 +130,16 @@ def _colours(raster: Raster, shade: F32) -> Callable[[slice], F32]:
 
 
 def _gain(raster: Raster) -> float:
-    """What makes a dark scan readable."""
-    bright = float(np.percentile(raster.rgb[raster.known], 98)) if raster.known.any() else 255.0
+    return exposure(brightest(raster.rgb[raster.known]))
+
+
+def brightest(rgb: U8) -> float:
+    """What 2 % of the values of (N, 3) colours exceed; 255 without any."""
+    return float(np.percentile(rgb, 98)) if rgb.size else 255.0
+
+
+def exposure(bright: float) -> float:
+    """What makes the colours of a dark scan, whose :func:`brightest` are these, readable."""
     return float(np.clip(230.0 / max(bright, 1.0), 1.0, 2.0))
 
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from basemaps import TILES, mbtiles
@@ -142,6 +143,15 @@ def test_layers_lie_over_the_basemap_and_nothing_comes_from_outside(page: Browse
 
 
 CURSOR = "document.querySelector('.map > .cursor').value"
+
+
+def test_the_orthophoto_is_as_bright_as_the_3d_view(page: Browser) -> None:
+    steady(page)
+    seen = np.frombuffer(page.page.locator(".map").screenshot(), np.uint8)
+    image = np.asarray(cv2.imdecode(seen, cv2.IMREAD_COLOR), np.uint8)
+    red = image[image[..., 2] > 2.0 * image[..., 1]]
+    # As the roof in test_the_surface_is_closed_also_while_it_moves; its images have (40, 40, 200).
+    assert np.abs(np.median(red, axis=0) - (46, 46, 230)).max() < 12
 
 
 def height_under(page: Browser, x: float, y: float) -> float:

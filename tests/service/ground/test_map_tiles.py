@@ -249,6 +249,9 @@ def test_tilejson_and_kml_say_where_the_tiles_are(client: Client) -> None:
     assert document["tilejson"] == "3.0.0"
     assert document["tiles"] == [f"{client.base}{TILES}/dsm/{{z}}/{{x}}/{{y}}.png"]
     assert "intervals_m" not in document
+    assert "exposure" not in document  # it is shaded
+    exposure = client.ask(f"{TILES}/ortho.json")[1]["exposure"]
+    assert exposure == pytest.approx(230 / 200, abs=0.01)  # the roof is the brightest
     intervals = client.ask(f"{TILES}/contours.json")[1]["intervals_m"]
     assert intervals[ZOOM] == interval_m(pixel_m(ZOOM, 47.4))
     assert intervals[24] == intervals[23]  # tiles beyond the finest are enlarged

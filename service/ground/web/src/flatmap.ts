@@ -24,6 +24,8 @@ export interface TileJson {
   version?: string;
   /** Of contours, by zoom. */
   intervals_m?: number[];
+  /** What colours are multiplied with. */
+  exposure?: number;
 }
 
 export function placeOf(lat_deg: number, lon_deg: number): Place {
@@ -67,8 +69,9 @@ export class Layer {
 
   async refresh(): Promise<void> {
     if (!this.about || !this.shown) return;
-    const { version = "", intervals_m = [] } = (await tileJson(this.about)) ?? {};
+    const { version = "", intervals_m = [], exposure = 1 } = (await tileJson(this.about)) ?? {};
     Object.assign(this, { version, intervals_m });
+    this.element.style.filter = exposure === 1 ? "" : `brightness(${exposure})`;
   }
 
   opacity(share: number): void {
