@@ -16,7 +16,7 @@ import resource
 import socket
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from service.errors import InputError
@@ -164,6 +164,14 @@ def host_name(header: str) -> str:
     """The name or address in a ``Host`` header, without port and brackets."""
     found = re.fullmatch(r"\[([^\]]*)\](?::\d*)?|([^:\[\]]*)(?::\d*)?", header.strip())
     return "" if found is None else (found[1] or found[2] or "").lower()
+
+
+def fitting(limits: ListenerLimits, share: int) -> ListenerLimits:
+    """``limits``, but at most one connection for every ``share`` descriptors of this process."""
+    total = max(1, min(limits.total, raise_descriptor_limit() // share))
+    if total < limits.total:
+        log.warning("few descriptors: a port takes %d connections; raise ulimit -n", total)
+    return replace(limits, total=total, per_address=min(limits.per_address, total))
 
 
 def raise_descriptor_limit(wanted: int = DESCRIPTORS) -> int:

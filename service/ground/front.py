@@ -22,8 +22,8 @@ from service.listener import (
     BoundedListener,
     ListenerLimits,
     Peer,
+    fitting,
     network_of,
-    raise_descriptor_limit,
 )
 from service.stream.session import ENDPOINT, SessionConfig
 from service.workers import Worker
@@ -65,7 +65,8 @@ class Front:
 
     def _listen(self) -> BoundedListener:
         try:
-            listener = BoundedListener(self._host, self._port, _limits())
+            limits = fitting(LIMITS, 8)  # a connection takes two descriptors
+            listener = BoundedListener(self._host, self._port, limits)
         except OSError as error:
             raise OutsideError(
                 f"datalink does not open at {self.endpoint}: {error.strerror}; another program may "
@@ -199,12 +200,6 @@ async def _exchange(
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-
-
-def _limits() -> ListenerLimits:
-    """LIMITS, but at most a quarter of the descriptors; a connection takes two."""
-    total = max(1, min(LIMITS.total, raise_descriptor_limit() // 8))
-    return replace(LIMITS, total=total, per_address=min(LIMITS.per_address, total))
 
 
 def _is_closed(connection: socket.socket) -> bool:

@@ -30,9 +30,9 @@ from service.ground.vehicle import Vehicle
 from service.listener import (
     BoundedListener,
     ListenerLimits,
+    fitting,
     is_loopback,
     parse_address,
-    raise_descriptor_limit,
 )
 from service.scans.coverage import LiveCoverage
 from service.workers import Worker, Workers
@@ -131,7 +131,8 @@ class Portal:
     def _listen(self, port: int) -> BoundedListener:
         host = self.config.host
         try:
-            return BoundedListener(host, port, listener_limits())
+            # A quarter of the descriptors, so that the datalink has some.
+            return BoundedListener(host, port, fitting(ListenerLimits(), 4))
         except OSError as error:
             raise OutsideError(
                 f"portal: cannot listen on {host}:{port} ({error.strerror}); choose another address"
@@ -206,23 +207,6 @@ class _PacedWarnings(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         return record.levelno > logging.WARNING or self._pace.take()
-
-
-def listener_limits() -> ListenerLimits:
-    """The portal's limits: at most a quarter of the descriptors, so that the datalink has some.
-
-    A connection takes two at most, itself and a file.
-    """
-    descriptors = raise_descriptor_limit()
-    default = ListenerLimits()
-    total = max(min(default.total, descriptors // 4), 1)
-    if total < default.total:
-        log.warning(
-            "only %d descriptors may be open: the portal takes %d connections; raise ulimit -n",
-            descriptors,
-            total,
-        )
-    return ListenerLimits(total, min(default.per_address, total), default.wait_s)
 
 
 def config_of(

@@ -49,7 +49,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MAX_RADIO_WAITING = 2000
 ASK_TIMEOUT_S = 120.0
 RETRY_S = 1.0
 LOOK_AROUND_S = 3.0
@@ -96,8 +95,7 @@ class Receiver:
         self._replies = Replies()
         self._opened = threading.Event()
         self._failure: SkyreliefError | None = None
-        self._radio: deque[bytes] = deque(maxlen=MAX_RADIO_WAITING)
-        self._tunnel = TunnelIntake()
+        self._tunnel, self._tunnelled = TunnelIntake(), threading.Lock()
         self._writes: queue.Queue[tuple[ReceivedScan, Inbox | None] | None] = queue.Queue()
         self._sites = Sites(config.store, config.limits)
         self._running: list[Worker] = []
@@ -151,7 +149,14 @@ class Receiver:
 
     def add_radio(self, payload: bytes) -> None:
         """Take in a message of the narrow radio; from any thread."""
-        self._radio.append(payload)
+        with self._tunnelled:
+            items = self._tunnel.receive(payload)
+        for item in items:
+            drone = self._drones.get(item[0].drone)
+            if drone is None:
+                self._dropped += 1
+            else:
+                drone.inbox.put_event(Radio(*item))
 
     def progress(self) -> list[dict[str, Any]]:
         """One entry per scan: drone, scan, items held and missing, bytes, lags, folder."""
@@ -215,7 +220,6 @@ class Receiver:
                 if now >= look_at:
                     self._look_around(session, now)
                     look_at = now + LOOK_AROUND_S
-                self._take_radio()
                 self._drones.retire(now)
                 self._refresh(now)
         finally:
@@ -247,15 +251,6 @@ class Receiver:
             return
         with contextlib.suppress(zenoh.ZError):
             session.get(f"{ROOT}/*/*/head", zenoh.handlers.RingChannel(1), timeout=LOOK_AROUND_S)
-
-    def _take_radio(self) -> None:
-        for _ in range(len(self._radio)):
-            for item in self._tunnel.receive(self._radio.popleft()):
-                drone = self._drones.get(item[0].drone)
-                if drone is None:
-                    self._dropped += 1
-                else:
-                    drone.inbox.put_event(Radio(*item))
 
     def _refresh(self, now: float) -> None:
         """Write the deliverables of scans that grow, every ``refresh_s``."""
