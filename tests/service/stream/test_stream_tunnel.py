@@ -258,6 +258,43 @@ def test_a_late_origin_and_corrections_reach_the_ground(tmp_path: Path) -> None:
         assert ratio == pytest.approx(1.1, abs=0.02)
 
 
+@pytest.mark.parametrize(
+    ("moved_m", "scale", "resent"), [(0.0, 1.05, True), (0.6, 1.0, True), (0.1, 1.001, False)]
+)
+def test_a_correction_beyond_the_tiles_resolution_resends_them(
+    tmp_path: Path, moved_m: float, scale: float, resent: bool
+) -> None:
+    with ScanStore.create(tmp_path / "a.db", HEADER) as store:
+        sender = TunnelSender(store, TunnelConfig(radio_bytes_s=50_000), 0.0)
+        store.listen(sender.news)
+        frame = keyframe(0, 0.0)
+        store.add_keyframe(0, codec.encode(frame, 0))
+        drain(sender, 0.0, 5.0)
+        T = frame.depth.T_world_camera.copy()
+        T[0, 3] += moved_m
+        store.add_reposes([Repose(0, 1, T, scale, np.eye(6))])
+        assert sender.all_sent is not resent
+
+
+def test_poses_take_a_message_a_second_and_the_share_counts_what_wraps_it(tmp_path: Path) -> None:
+    with ScanStore.create(tmp_path / "a.db", HEADER) as store:
+        sender = TunnelSender(store, TunnelConfig(radio_bytes_s=1000, share=0.5), 0.0)
+        store.listen(sender.news)
+        T, sent, poses, now = keyframe(0, 0.0).pose.T_world_camera, 0, 0, 0.0
+        for seq in range(4):
+            store.add_keyframe(seq, codec.encode(keyframe(seq, 8.0 * seq), 0))
+        while now < 10.0:
+            store.add_pose(PoseRecord(round(now * 1e9), T, np.eye(6)))
+            todo = sender.next(now)
+            if isinstance(todo, bytes):
+                sent += len(todo) + 17
+                poses += unpack_pose(todo) is not None
+            else:
+                now += min(todo, 0.05)
+        assert 0.8 * 500 * 10 < sent < 1.1 * 500 * 10
+        assert 5 <= poses <= 11
+
+
 def test_a_full_radio_buffer_slows_it_down_and_an_empty_one_speeds_it_up(tmp_path: Path) -> None:
     with ScanStore.create(tmp_path / "a.db", HEADER) as store:
         sender = TunnelSender(store, TunnelConfig(), 0.0)
