@@ -215,13 +215,6 @@ def _quaternion(R: F64) -> tuple[float, ...]:
     return tuple(part / length for part in q)
 
 
-def slerp(q0_wxyz: F64, q1_wxyz: F64, share: float) -> F64:
-    """(4,) quaternion at ``share`` of the shorter way from q0 to q1."""
-    R0 = rotation_from_quaternion(q0_wxyz)
-    R1 = rotation_from_quaternion(q1_wxyz)
-    return quaternion_from_rotation(R0 @ so3_exp(share * so3_log(R0.T @ R1)))
-
-
 def disagreement(T_a: F64, covariance_a: F64, T_b: F64, covariance_b: F64) -> float:
     """Chi-square per degree of freedom of the difference of two estimates of one motion.
 

@@ -194,9 +194,6 @@ class VehicleLink:
         self._inbox.put(lambda: self._companion.send(odometry_message(odometry, boot_us)))
         return True
 
-    def parameter(self, name: str) -> float:
-        return self._companion.parameters[name]
-
     def parameters(self) -> dict[str, float]:
         return self._companion.parameters.values()
 

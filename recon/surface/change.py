@@ -74,10 +74,6 @@ class Change:
     bodies: tuple[Body, ...]
     alignment_m: float  # sigma of the height that the cells of an object share
 
-    @property
-    def compared_m2(self) -> float:
-        return float(np.isfinite(self.height_m).sum()) * self.grid.cell_m**2
-
 
 def mean_surface(xyz_m: F64, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
     """Mean height of the points (N, 3) in each cell, each by the inverse of its variance.

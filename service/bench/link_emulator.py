@@ -131,11 +131,6 @@ class LinkEmulator:
         """From the side that calls."""
         return self._up.traffic
 
-    @property
-    def down(self) -> Traffic:
-        """From the side that is called."""
-        return self._down.traffic
-
     def take_off(self, now: float) -> None:
         """Count the times of the cuts from now on, and forget the traffic so far."""
         self.started = self._up.started = self._down.started = now

@@ -65,7 +65,6 @@ class LinkProgress:
     listened: bool  # a ground station was heard recently
     items: int  # items in the stores: poses, layers …
     lacking: dict[str, int] = field(default_factory=dict)  # by kind, at the best ground station
-    sent_bytes: int = 0
     rate_kbit_s: float = 0.0  # allowed now; below the budget when less comes through
 
     @property
@@ -164,14 +163,6 @@ class DatalinkSender:
         self._stores.append((store, news))
         self._wake.set()
 
-    def remove(self, store: ScanStore) -> None:
-        """Stop offering a scan; the store stays open."""
-        with self._lock:
-            self._outbox.remove(store.header.name)
-        for entry in [entry for entry in self._stores if entry[0] is store]:
-            store.unlisten(entry[1])
-            self._stores.remove(entry)
-
     def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
         """Change the link's rate, in flight."""
         rate = _rate(budget_kbit_s, self._config.share if share is None else share)
@@ -187,14 +178,9 @@ class DatalinkSender:
                 items += sum(map(len, store.numbers().values()))
                 for kind, numbers in self._outbox.lacking(store.header.name).items():
                     lacking[kind] = lacking.get(kind, 0) + len(numbers)
-            return LinkProgress(
-                bool(self._open_sessions),
-                self._outbox.listened(time.monotonic()),
-                items,
-                lacking,
-                self._outbox.sent_bytes,
-                self._outbox.bucket.rate_bytes_s / 125,
-            )
+            listened = self._outbox.listened(time.monotonic())
+            rate_kbit_s = self._outbox.bucket.rate_bytes_s / 125
+            return LinkProgress(bool(self._open_sessions), listened, items, lacking, rate_kbit_s)
 
     def drain(self, timeout_s: float) -> bool:
         """Wait until a ground station holds everything; False when the time is up.

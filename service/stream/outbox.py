@@ -244,7 +244,6 @@ class Outbox:
 
     def __init__(self, rate_bytes_s: float, now: float) -> None:
         self.bucket = TokenBucket(rate_bytes_s, now)
-        self.sent_bytes = 0  # on the wire, as counted by the bucket
         self._feeds: dict[str, _Feed] = {}
         self._live = {
             POSE: LiveLane(POSE_ROOM),
@@ -260,9 +259,6 @@ class Outbox:
     def add(self, store: ScanStore, now: float) -> None:
         """Offer a scan; it replaces a scan of the same id."""
         self._feeds[store.header.name] = _Feed(store, head_due=now)
-
-    def remove(self, scan_id: str) -> None:
-        self._feeds.pop(scan_id, None)
 
     @property
     def skipped(self) -> int:
@@ -409,7 +405,6 @@ class Outbox:
                 return wait
             size *= sessions if message.token is None else 1
             self.bucket.take(size, now)
-            self.sent_bytes += size
             if number != STATUS and message.scan_id in self._feeds:
                 self._feeds[message.scan_id].count(message)
             self._pop(number)

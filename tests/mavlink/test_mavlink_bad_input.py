@@ -166,7 +166,7 @@ def test_bad_bytes_change_nothing(peer: Peer, name: str, caplog: pytest.LogCaptu
     peer.works()
     peer.works()  # twice is once
     assert peer.vehicle.control.asked.count("start_scan") == 1
-    assert peer.vehicle.link.parameter("SR_BASELINE_M") == 0.0
+    assert peer.vehicle.link.parameters()["SR_BASELINE_M"] == 0.0
     answers = ("refused", "unknown action")  # one for each order
     others = [count for text, count in peer.texts.items() if not any(a in text for a in answers)]
     assert all(count == 1 for count in others), peer.texts

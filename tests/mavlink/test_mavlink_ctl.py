@@ -37,7 +37,7 @@ def test_ctl_steers_a_scan() -> None:
         answer = json.loads(started.stdout.splitlines()[-1])
         assert answer == {"action": "start", "result": "accepted", "system": 1, "component": 100}
         assert run_ctl(port, "baseline", "2.5").returncode == 0
-        assert daemon.link.parameter("SR_BASELINE_M") == 2.5
+        assert daemon.link.parameters()["SR_BASELINE_M"] == 2.5
         state = daemon.control.state
         daemon.control.state = replace(
             state, distance_m=112.5, camera_latency_ms=70.8, camera_latency_sigma_ms=2.1

@@ -132,11 +132,11 @@ def test_mavsdk_sets_parameters_and_reads_texts(
         param.select_component(191, ProtocolVersion.V1)
     assert param.get_param_float("SR_LINK_KBIT_S") == pytest.approx(1000.0)
     param.set_param_float("SR_BASELINE_M", 2.5)
-    assert daemon.link.parameter("SR_BASELINE_M") == 2.5
+    assert daemon.link.parameters()["SR_BASELINE_M"] == 2.5
     assert {p.name for p in param.get_all_params().float_params} >= {"SR_BASELINE_M"}
     with pytest.raises(ParamError):
         param.set_param_float("SR_BASELINE_M", 1e6)
-    assert daemon.link.parameter("SR_BASELINE_M") == 2.5
+    assert daemon.link.parameters()["SR_BASELINE_M"] == 2.5
     daemon.link.statustext("Scan 7 written, 312 keyframes")
     until(lambda: "Scan 7 written, 312 keyframes" in texts)
     assert any("SR_BASELINE_M refused" in text for text in texts)
@@ -168,11 +168,11 @@ def test_mavsdk_downloads_the_definition_and_sets_settings(
         camera.set_setting(100, Setting("SR_YAW_FRAME", "", Option("3", ""), False))
         assert daemon.link.history.config.yaw_frame == "body"
         camera.set_setting(100, Setting("SR_BASELINE_M", "", Option("2.5", ""), True))
-        assert daemon.link.parameter("SR_BASELINE_M") == 2.5
+        assert daemon.link.parameters()["SR_BASELINE_M"] == 2.5
         mode = dialect.MAVLink_camera_settings_message(0, 1)
         daemon.link._inbox.put(lambda: daemon.link._companion._outbox.put(CAMERA, mode))
         camera.set_setting(100, Setting("SR_BASELINE_M", "", Option("2.0", ""), True))
-        assert daemon.link.parameter("SR_BASELINE_M") == 2.0
+        assert daemon.link.parameters()["SR_BASELINE_M"] == 2.0
     said = capfd.readouterr()
     assert "Unknown setting" not in said.out + said.err  # its word for a missing CAM_MODE
 

@@ -36,13 +36,13 @@ def test_parameters_are_kept_over_a_restart(tmp_path: Path) -> None:
         ):
             peer.connect(("127.0.0.1", port))
             if value == 4.0:
-                assert daemon.link.parameter("SR_BASELINE_M") == 2.5
+                assert daemon.link.parameters()["SR_BASELINE_M"] == 2.5
             message = dialect.MAVLink_param_set_message(1, 191, b"SR_BASELINE_M", value, 9)
             peer.send(bytes(message.pack(dialect.MAVLink(None, 255, 190))))
-            until(lambda: daemon.link.parameter("SR_BASELINE_M") == value)  # noqa: B023
+            until(lambda: daemon.link.parameters()["SR_BASELINE_M"] == value)  # noqa: B023
     (tmp_path / "mavlink.json").write_text("{ torn")
     with RehearsalVehicle(state_dir=tmp_path) as daemon:
-        assert daemon.link.parameter("SR_BASELINE_M") == 0.0
+        assert daemon.link.parameters()["SR_BASELINE_M"] == 0.0
 
 
 def test_a_fault_in_the_service_does_not_cost_the_link(caplog: pytest.LogCaptureFixture) -> None:

@@ -287,7 +287,7 @@ def test_the_buttons_reach_the_vehicle_and_show_its_answer(browser: Browser, sca
                 " 'baseline 2.5 m: accepted')",
                 30,
             )
-            assert daemon.link.parameter("SR_BASELINE_M") == 2.5
+            assert daemon.link.parameters()["SR_BASELINE_M"] == 2.5
     finally:
         one.close()
 

@@ -118,17 +118,6 @@ def test_a_quaternion_without_direction_is_refused(q: F64) -> None:
         se3.rotation_from_quaternion(q)
 
 
-@given(quaternions, quaternions, st.floats(0, 1))
-def test_slerp_takes_the_short_way_at_even_speed(q0: F64, q1: F64, share: float) -> None:
-    R0, R1 = se3.rotation_from_quaternion(q0), se3.rotation_from_quaternion(q1)
-    whole = np.linalg.norm(se3.so3_log(R0.T @ R1))
-    if whole > 3.1:
-        return
-    R = se3.rotation_from_quaternion(se3.slerp(q0, q1, share))
-    assert np.linalg.norm(se3.so3_log(R0.T @ R)) == pytest.approx(share * whole, abs=1e-6)
-    assert np.linalg.norm(se3.so3_log(R.T @ R1)) == pytest.approx((1 - share) * whole, abs=1e-6)
-
-
 def test_the_nearest_rotation_is_that_of_scipy_and_never_a_mirror() -> None:
     rng = np.random.default_rng(4)
     for mirror in (1.0, -1.0):

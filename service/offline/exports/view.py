@@ -32,9 +32,6 @@ from service.stream.store import ScanStore
 
 T = TypeVar("T")
 
-OBLIQUE_SHARE = 0.25
-"""Share of the keyframes looking sideways above which a scan counts as oblique."""
-
 FUSING = 0.6
 """Share of an export that fusing the cloud takes."""
 
@@ -203,12 +200,6 @@ class ScanView:
     def poses(self) -> list[PoseRecord]:
         """The main piece's trajectory in order of time."""
         return main_track(self.store)
-
-    @cached_property
-    def oblique(self) -> bool:
-        """True when many keyframes look more than 30 degrees off straight down."""
-        off = self.off_nadir_deg
-        return bool(len(off)) and float((off > 30.0).mean()) > OBLIQUE_SHARE
 
     @cached_property
     def off_nadir_deg(self) -> F64:

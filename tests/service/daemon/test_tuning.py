@@ -109,7 +109,7 @@ def test_a_parameter_is_set_refused_out_of_range_and_kept(tmp_path: Path, name: 
             assert value_of(operator.config, key) == expected
     with Operator(tmp_path) as again:
         until(lambda: value_of(again.config, key) == expected)
-        assert again.daemon.vehicle.parameter(name) == pytest.approx(value)
+        assert again.daemon.vehicle.parameters()[name] == pytest.approx(value)
 
 
 def test_nothing_is_written_where_nothing_was_tuned(tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_parameters_begin_as_the_file_says_and_follow_it(tmp_path: Path) -> None
     # What was not tuned follows the file.
     with Operator(tmp_path, "scan.resolution_m=0.3", "scan.baseline=2/10") as operator:
         until(lambda: operator.config.camera.latency_ms == 80.0)
-        assert operator.daemon.vehicle.parameter("SR_RESOLUTION_M") == pytest.approx(0.3)
+        assert operator.daemon.vehicle.parameters()["SR_RESOLUTION_M"] == pytest.approx(0.3)
         assert "SR_BASELINE_M" not in parameters_of(operator.config)
         assert operator.config.scan.baseline == "2/10"
 
