@@ -12,9 +12,10 @@ them by PROJ's grids, which are not part of this package.
 
 from __future__ import annotations
 
+import json
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -145,6 +146,15 @@ def line_geometry(places: F64) -> dict[str, Any]:
     if len(parts) == 1:
         return {"type": "LineString", "coordinates": parts[0].tolist()}
     return {"type": "MultiLineString", "coordinates": [part.tolist() for part in parts]}
+
+
+Feature = tuple[dict[str, Any], dict[str, Any]]
+"""Properties and geometry in GeoJSON."""
+
+
+def geojson_of(features: Iterable[Feature]) -> str:
+    found = [{"type": "Feature", "properties": p, "geometry": g} for p, g in features]
+    return json.dumps({"type": "FeatureCollection", "features": found})
 
 
 def map_crs(epsg: int, vertical: str | None = None) -> CRS:

@@ -13,6 +13,7 @@ from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Decoder, Framer
 from mavlink.wire.link import Link, parse_link
+from mavlink.wire.messages import OutgoingMessage, Packer
 from service.errors import InputError
 from service.stream.radio_messages import MAX_BYTES, PAYLOAD_TYPE
 
@@ -38,8 +39,8 @@ class RadioLink:
             self._link = Link(parse_link(endpoint), self._receive)
         except ValueError as error:
             raise InputError(f"MAVLink {error}") from error
-        system, component, self._kind = identity
-        self._encoder = dialect.MAVLink(None, system, component)
+        self._system, self._component, self._kind = identity
+        self._packer = Packer(0)
         self._on_payload = on_payload
         self._on_status: Callable[[int], None] = lambda _: None
         self._framer = Framer()
@@ -65,9 +66,9 @@ class RadioLink:
         self._send(dialect.MAVLink_heartbeat_message(self._kind, 8, 0, 0, 4, 3))
 
     def _send(self, message: Any) -> None:
-        data = bytes(message.pack(self._encoder))
-        self._encoder.seq = (self._encoder.seq + 1) % 256
-        self._link.write(data)
+        data = self._packer.pack(self._system, OutgoingMessage(self._component, message), 0)
+        if data is not None:
+            self._link.write(data)
 
     def _receive(self, data: bytes, _: int) -> None:
         for packet in self._framer.feed(data):

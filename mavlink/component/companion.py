@@ -18,7 +18,7 @@ from mavlink.component.command_desk import CommandDesk, decode_call
 from mavlink.component.commands import COMMANDS, is_stop
 from mavlink.component.control import Answer, Handled, Result, ScanControl, Work
 from mavlink.component.ftp import FileServer
-from mavlink.component.link_watch import LinkWatch, WatchConfig
+from mavlink.component.link_watch import TO_ONE, LinkWatch, WatchConfig
 from mavlink.component.metadata import (
     DEFINITION,
     MODEL,
@@ -43,21 +43,7 @@ S = 1_000_000_000
 MS = 1_000_000
 COMPONENTS = (ONBOARD, CAMERA)
 LOAD_STATUS, MOTION = 390, 251
-SERVED = (
-    "HEARTBEAT",
-    "SYSTEM_TIME",
-    "COMMAND_LONG",
-    "COMMAND_INT",
-    "FILE_TRANSFER_PROTOCOL",
-    "TIMESYNC",
-    "PARAM_REQUEST_READ",
-    "PARAM_REQUEST_LIST",
-    "PARAM_SET",
-    "PARAM_EXT_REQUEST_READ",
-    "PARAM_EXT_REQUEST_LIST",
-    "PARAM_EXT_SET",
-)
-HEARD = numbers_of((*READERS, *SERVED)) | {COMMAND_CANCEL}
+HEARD = numbers_of((*READERS, "HEARTBEAT", "SYSTEM_TIME", "TIMESYNC")) | TO_ONE | {COMMAND_CANCEL}
 """Numbers of the messages that :meth:`Companion.receive` handles."""
 
 

@@ -32,7 +32,7 @@ TO_ONE = numbers_of(
         "PARAM_EXT_SET",
     )
 )
-"""Messages that name their target component."""
+"""Messages to us that name their target component."""
 ASK_WAIT_S = 60.0
 BREAK_NS = 5 * S  # of the autopilot: afterwards its messages are waited for again
 PX4 = 12  # MAV_AUTOPILOT

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from recon.surface.ground import BareGround
 from recon.surface.raster import Grid
 from recon.types import F32, F64, Array, Bool
 from service.errors import InputError
-from service.georeference import LocalFrame, line_geometry
+from service.georeference import LocalFrame, geojson_of, line_geometry
 from service.offline.exports.rasters import GROUND_MARGIN_M
 from service.offline.exports.surface import bare_ground, surface_model
 from service.offline.exports.view import ExportOptions, ScanView, in_parts
@@ -72,19 +71,12 @@ def write_contours(scan: ScanView, out: Path, options: ExportOptions) -> None:
     ends = np.cumsum([len(one.line) for one in found])[:-1]
     utm = np.concatenate([np.zeros((0, 3)), *(one.places for one in found)])
     whole = frame.to_geodetic(frame.from_utm(utm))[:, [1, 0, 2]]
-    features = [
-        {
-            "type": "Feature",
-            "properties": {
-                options.height_key: round(one.height_m, 3),
-                "index": one.is_index,
-                "label": one.label,
-            },
-            "geometry": line_geometry(line),
-        }
-        for one, line in zip(found, np.split(whole, ends), strict=bool(found))
-    ]
-    write_whole(out, json.dumps({"type": "FeatureCollection", "features": features}))
+    key = options.height_key
+    features = (
+        ({key: round(o.height_m, 3), "index": o.is_index, "label": o.label}, line_geometry(line))
+        for o, line in zip(found, np.split(whole, ends), strict=bool(found))
+    )
+    write_whole(out, geojson_of(features))
 
 
 def write_contours_gpkg(scan: ScanView, out: Path, options: ExportOptions) -> None:

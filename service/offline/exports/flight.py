@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import datetime as dt
-import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -14,7 +12,7 @@ import numpy as np
 from recon import se3
 from recon.types import F64
 from service.errors import InputError
-from service.georeference import LocalFrame, height_change, line_geometry
+from service.georeference import Feature, LocalFrame, geojson_of, height_change, line_geometry
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.main_piece import main_keyframes
 from service.scans.writing import write_whole
@@ -40,34 +38,22 @@ def write_geojson(scan: ScanView, out: Path, options: ExportOptions) -> None:
     frame = scan.needs_place("a map of the flight")
     geodetic = _geodetic(scan, frame)
     header = scan.store.header
-    features: list[dict[str, Any]] = []
+    features: list[Feature] = []
     if len(geodetic) > 1:
-        features.append(
-            {
-                "type": "Feature",
-                "properties": {"scan": header.scan_id, "drone": header.drone},
-                "geometry": line_geometry(geodetic[:, [1, 0, 2]]),
-            }
-        )
+        flown = {"scan": header.scan_id, "drone": header.drone}
+        features.append((flown, line_geometry(geodetic[:, [1, 0, 2]])))
     for one in main_keyframes(scan.store):
         place_m = one.depth.T_world_camera[:3, 3]
         lat, lon, alt = frame.to_geodetic(place_m[None])[0]
-        features.append(
-            {
-                "type": "Feature",
-                "properties": {
-                    "keyframe": one.seq,
-                    "time": iso_time(one.time_ns),
-                    "points": int(one.fresh.sum()),
-                    "sigma_m": round(se3.sigma_at(place_m, one.pose.covariance), 4),
-                },
-                "geometry": {
-                    "type": "Point",
-                    "coordinates": [round(lon, 8), round(lat, 8), round(alt, 3)],
-                },
-            }
-        )
-    write_whole(out, json.dumps({"type": "FeatureCollection", "features": features}))
+        properties = {
+            "keyframe": one.seq,
+            "time": iso_time(one.time_ns),
+            "points": int(one.fresh.sum()),
+            "sigma_m": round(se3.sigma_at(place_m, one.pose.covariance), 4),
+        }
+        place = [round(lon, 8), round(lat, 8), round(alt, 3)]
+        features.append((properties, {"type": "Point", "coordinates": place}))
+    write_whole(out, geojson_of(features))
 
 
 def write_kml(scan: ScanView, out: Path, options: ExportOptions) -> None:

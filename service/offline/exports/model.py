@@ -123,20 +123,18 @@ def _mesh_parts(
         "tiles": len(parts),
         "faces": sum(p.figures["faces"] for p in parts),
         "vertices": sum(p.figures["vertices"] for p in parts),
-        "seen": float(
-            np.average(
-                [p.figures["seen"] for p in parts], weights=[p.figures["faces"] for p in parts]
-            )
-        ),
-        "measured": float(
-            np.average(
-                [p.figures["measured"] for p in parts], weights=[p.figures["faces"] for p in parts]
-            )
-        ),
+        "seen": _share("seen", parts),
+        "measured": _share("measured", parts),
         "pictures": "store" if video is None else str(video),
         "texture_px": [p.figures["texture_px"] for p in parts],
     }
     return parts, figures
+
+
+def _share(name: str, parts: Sequence[TilePart]) -> float:
+    """Of all triangles."""
+    weights = [p.figures["faces"] for p in parts]
+    return float(np.average([p.figures[name] for p in parts], weights=weights))
 
 
 @dataclass(frozen=True, slots=True)

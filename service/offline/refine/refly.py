@@ -20,7 +20,7 @@ from recon.surface.raster import Grid
 from recon.table import Rows
 from recon.types import F64, Array, Bool
 from service.errors import InputError
-from service.georeference import LocalFrame
+from service.georeference import Feature, LocalFrame, geojson_of
 from service.scans.coverage import Coverage
 from service.stream.records import PoseRecord
 
@@ -317,7 +317,7 @@ def _items(
 
 def geojson(refly: Refly | None, frame: LocalFrame) -> str:
     """Each line, and the ground that its images cover, as GeoJSON; no features without a flight."""
-    features = []
+    features: list[Feature] = []
     for number, line in enumerate(refly.lines if refly else (), 1):
         assert refly is not None
         swath = refly.swath
@@ -332,8 +332,8 @@ def geojson(refly: Refly | None, frame: LocalFrame) -> str:
             {"type": "LineString", "coordinates": route},
         ):
             facts = {"line": number, "altitude_amsl_m": round(swath.altitude_amsl_m, 1)}
-            features.append({"type": "Feature", "properties": facts, "geometry": geometry})
-    return json.dumps({"type": "FeatureCollection", "features": features})
+            features.append((facts, geometry))
+    return geojson_of(features)
 
 
 def _lon_lat(places_m: Sequence[F64], frame: LocalFrame) -> list[list[float]]:
