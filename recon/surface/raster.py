@@ -29,8 +29,6 @@ EDGE_PRECISION = 1.25
 SPARSE_CELLS = 8
 SPARSE_SHARE = 0.5
 
-INNER_GAPS = 2
-
 ALIKE = 3.0
 """Sigmas within such a factor (5 to 95 % of the points) are mostly a part that neighbours share, as
 that of an uncertain lens: stereo's own differ by more than twice the factor."""
@@ -281,16 +279,6 @@ def _spills(height_m: F32, sigma_m: F32) -> Bool:
     mean = cv2.boxFilter(precision, -1, window, normalize=False) / np.maximum(count, 1.0)
     above = height_m - highest_lowest(height_m, EDGE_CELLS)[1] > STEP_M
     return np.asarray(above & (precision < EDGE_PRECISION * mean))
-
-
-def inner_doubtful(measured: Raster, sure: Raster) -> Bool:
-    """(rows, cols) cells that :func:`reliable` leaves out, but no step of STEP_M is next to, nor
-    more than INNER_GAPS unknown cells."""
-    known = measured.known
-    high, low = highest_lowest(measured.height_m, 1)
-    is_level = (high - measured.height_m <= STEP_M) & (measured.height_m - low <= STEP_M)
-    around = cv2.boxFilter(known.astype(np.uint8), -1, (3, 3), normalize=False)
-    return np.asarray(known & ~sure.known & is_level & (around >= 9 - INNER_GAPS))
 
 
 def without_cells(raster: Raster, unknown: Bool) -> Raster:

@@ -12,9 +12,8 @@ import numpy as np
 
 from recon import se3
 from recon.surface import metrics
-from recon.surface.hole_filling import surface_model
 from recon.surface.metrics import Fit
-from recon.surface.raster import Grid, grid_over, rasterise_points
+from recon.surface.raster import Grid, grid_over, rasterise_points, reliable
 from recon.types import F32, F64
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -137,15 +136,15 @@ def _surface_part(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, Any]:
 
 
 def _dsm(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, float]:
-    """The surface model of the cloud against the truth's height at each cell's middle.
+    """The certain surface of the cloud against the truth's height at each cell's middle.
 
     ``known_share`` is that of the cells with any point; a step is a metre within a cell.
     """
     points = fit.points(scan.points)
     sigma = np.full(len(points), 0.1, np.float32) if scan.sigma_m is None else scan.sigma_m
     grid = grid_over(points[:, :2], DSM_CELL_M, margin_cells=1)
-    model = surface_model(points, np.zeros((len(points), 3), np.uint8), sigma, grid)
-    hit = rasterise_points(points, np.zeros((len(points), 3), np.uint8), sigma, grid).known
+    measured = rasterise_points(points, np.zeros((len(points), 3), np.uint8), sigma, grid)
+    model = reliable(measured)
     height = _truth_heights(truth, grid)
     error = (model.height_m - height)[model.known & np.isfinite(height)]
     if not len(error):
@@ -155,7 +154,7 @@ def _dsm(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, float]:
     return {
         "cell_m": DSM_CELL_M,
         "cells": len(error),
-        "known_share": float((model.known & hit).sum() / hit.sum()),
+        "known_share": float(model.known.sum() / measured.known.sum()),
         "rms_m": float(np.sqrt(np.mean(error**2))),
         "median_m": float(np.median(error)),
         "nmad_m": float(1.4826 * np.median(np.abs(error - np.median(error)))),

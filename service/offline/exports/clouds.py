@@ -18,7 +18,7 @@ from recon.mapping.cloud_fusion import without
 from recon.types import F64, I64, U8, Array, PointCloud
 from service.georeference import map_crs
 from service.offline.exports.rasters import GROUND_MARGIN_M
-from service.offline.exports.surface import bare_ground, surface_model
+from service.offline.exports.surface import bare_ground
 from service.offline.exports.view import ExportOptions, ScanView, in_parts
 from service.scans.fused_cloud import (
     CHUNK_POINTS,
@@ -124,9 +124,8 @@ GROUND_WITHIN_M = 0.3
 
 def classes(scan: ScanView) -> U8:
     """(N,) class of each point of the fused cloud after LAS 1.4: bare ground, or unclassified."""
-    raster = surface_model(scan, None).raster
     height = bare_ground(scan, None).everywhere_m
-    below = height[raster.grid.cells(scan.xyz_m[:, :2])]
+    below = height[scan.grid(None).cells(scan.xyz_m[:, :2])]
     is_ground = np.abs(scan.xyz_m[:, 2] - below) <= GROUND_WITHIN_M
     return np.where(is_ground, GROUND, UNCLASSIFIED).astype(np.uint8)
 

@@ -18,7 +18,7 @@ from recon.types import F32, F64, Array, Bool
 from service.errors import InputError
 from service.georeference import LocalFrame, geojson_of, line_geometry
 from service.offline.exports.rasters import GROUND_MARGIN_M
-from service.offline.exports.surface import bare_ground, surface_model
+from service.offline.exports.surface import bare_ground
 from service.offline.exports.view import ExportOptions, ScanView, in_parts
 from service.offline.geopackage import Columns, lines, points, write_layers
 from service.scans.annotations import Point, Spot, read_annotations
@@ -164,7 +164,7 @@ def contours_of(scan: ScanView, options: ExportOptions) -> list[Contour]:
 
 
 def _contours(scan: ScanView, options: ExportOptions, box: Box) -> list[Contour]:
-    grid = surface_model(scan, options.cell_m).raster.grid
+    grid = scan.grid(options.cell_m)
     return list(contour_lines(bare_ground(scan, options.cell_m), grid, options.contour_m, box))
 
 

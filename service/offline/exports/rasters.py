@@ -67,7 +67,7 @@ def dsm(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
     """Heights in metres (float32, -9999 where unknown), their sigma, and 1 where filled, 2 where
     measured but uncertain."""
     if options.strict:
-        raster = surface_model(scan, options.cell_m, strict=True).raster
+        raster = surface_model(scan, options.cell_m)
         origin = np.zeros(raster.grid.shape, np.uint8)
     else:
         raster, origin = complete_model(scan, options.cell_m)
@@ -79,7 +79,7 @@ def dsm(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
 
 def dtm(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
     """Heights of the bare ground (float32, -9999 where unknown), and 1 where they are bridged."""
-    raster, found = surface_model(scan, options.cell_m).raster, bare_ground(scan, options.cell_m)
+    raster, found = surface_model(scan, options.cell_m), bare_ground(scan, options.cell_m)
     bands = np.stack([found.everywhere_m, found.is_bridged])
     image = np.where(found.is_inside, bands, NODATA_M).astype(np.float32)
     names = (f"ground {scan.above(options)}, m", "bridged")

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from recon.surface.ground import BareGround, terrain
-from recon.surface.hole_filling import LEVEL_M, completed, filled, outline, outlined
+from recon.surface.hole_filling import completed, outline
 from recon.surface.raster import (
     STEP_M,
     Raster,
     highest_lowest,
-    inner_doubtful,
     reliable,
     smoothed,
     standing_height,
     without_cells,
 )
-from recon.types import F64, U8, Bool
+from recon.types import F32, F64, U8, Bool
 from service.offline.exports.view import ScanView
 
 OPEN_STEP_M = 2
@@ -33,20 +31,11 @@ below them."""
 NEAR_M = 1.0
 """So near to something higher, free air is required up to MAX_OPEN_SIDEWAYS_M in any case."""
 
-FILLED_UP_M = (4, 6, 8)
-"""Above a filled cell no surface may hide the air at these heights from all that look there: what
-hangs over the ground hides it at the same time."""
+OBJECT_REACH_M = 3.0
+"""So far from the known part of an object a cell may lie below it."""
 
-FILLED_REACH_M = 3.0
-"""Holes of twice this width are filled: on one side of the flight a roof or a crown of 8 m hides
-so much ground from all images."""
-
-FILLED_EDGE_CELLS = 1
-"""Cells may be filled closer to something higher than without keyframes that contradict."""
-
-NEAR_UP_M, NEAR_CELLS = (1, 2, 3), 2
-"""So near to something higher, a filled cell needs free air at these heights as well: the edges of
-crowns that matching has lost lie low."""
+BENEATH_M = 0.5
+"""Air so far below the top of an object is looked at."""
 
 PROBE_M = 1.0
 """A surface is no surface where a keyframe sees through the place so far below it."""
@@ -55,39 +44,30 @@ PROBE_M = 1.0
 FILLED, UNCERTAIN = 1, 2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SurfaceHeights:
-    """Heights of the upper surface, and (rows, cols) those that are no certain measurements."""
+def surface_model(scan: ScanView, cell_m: float | None) -> Raster:
+    """The surface where it is certain and the air above it was seen.
 
-    raster: Raster
-    is_filled: Bool
-
-
-def surface_model(scan: ScanView, cell_m: float | None, strict: bool = False) -> SurfaceHeights:
-    """The surface where it is certain and the air above it was seen, its holes filled.
-
-    ``strict`` leaves the holes unknown. :func:`recon.surface.raster.reliable` removes uncertain
-    cells. Those of them that some keyframe ends at and none sees through come back as filled, and
-    so does level ground below air that was not seen, if nothing is known to hide it.
-    :func:`recon.surface.hole_filling.filled` fills the rest, where no keyframe contradicts it.
-    Beyond the outline of the certain cells there are no holes, only guesses; a tile of a scan does
-    not know this outline.
+    :func:`recon.surface.raster.reliable` removes uncertain cells.
     """
-    key = ("surface", cell_m, strict)
-    return scan.shared(key, lambda: _surface_model(scan, cell_m, strict))
+
+    def made() -> Raster:
+        measured = scan.raster(cell_m)
+        return _open_to_the_sky(scan, measured, reliable(measured))
+
+    return scan.shared(("surface", cell_m), made)
 
 
 def bare_ground(scan: ScanView, cell_m: float | None) -> BareGround:
     """The bare ground below the surface model, within the outline of the survey."""
 
     def made() -> BareGround:
-        return terrain(surface_model(scan, cell_m).raster, _inside(scan, cell_m))
+        return terrain(surface_model(scan, cell_m), _inside(scan, cell_m))
 
     return scan.shared(("ground", cell_m), made)
 
 
 def _inside(scan: ScanView, cell_m: float | None) -> Bool:
-    measured, sure = scan.raster(cell_m), surface_model(scan, cell_m).raster
+    measured, sure = scan.raster(cell_m), surface_model(scan, cell_m)
 
     def made() -> Bool:
         return outline(measured.known, sure.known, measured.grid.cell_m)
@@ -100,59 +80,64 @@ def complete_model(scan: ScanView, cell_m: float | None) -> tuple[Raster, U8]:
     0 where it is measured, FILLED, or UNCERTAIN.
 
     Uncertain heights are measured ones that :func:`surface_model` leaves out and no keyframe sees
-    through. Other cells are filled from the lower side. Noise is smoothed, steps stay.
+    through. Other cells are filled: below an object as high as that, else from the lower side.
+    Noise is smoothed, steps stay.
     """
     return scan.shared(("complete", cell_m), lambda: _complete_model(scan, cell_m))
 
 
 def _complete_model(scan: ScanView, cell_m: float | None) -> tuple[Raster, U8]:
-    measured, seen, inside = scan.raster(cell_m), surface_model(scan, cell_m), _inside(scan, cell_m)
-    known = seen.raster.known
-    kept = _unrefuted(scan, measured, inside & measured.known & ~known, ())
-    both = replace(
-        seen.raster,
-        height_m=np.where(kept, measured.height_m, seen.raster.height_m),
-        sigma_m=np.where(kept, measured.sigma_m, seen.raster.sigma_m),
-        rgb=np.where(kept[..., None], measured.rgb, seen.raster.rgb),
-    )
-    unsure = kept | seen.is_filled
-    whole = smoothed(completed(both, bare_ground(scan, cell_m).everywhere_m, inside, unsure))
-    origin = np.where(known & ~seen.is_filled, 0, FILLED).astype(np.uint8)
-    origin[kept] = UNCERTAIN
+    measured, sure, inside = scan.raster(cell_m), surface_model(scan, cell_m), _inside(scan, cell_m)
+    low_m = bare_ground(scan, cell_m).everywhere_m
+    kept = _not_seen_through(scan, measured, inside & measured.known & ~sure.known)
+    raised, below = _below_objects(scan, measured, low_m, kept)
+    both = without_cells(raised, ~(sure.known | kept))
+    whole = smoothed(completed(both, low_m, inside, kept))
+    origin = np.where(sure.known, 0, FILLED).astype(np.uint8)
+    origin[kept & ~below] = UNCERTAIN
     return without_cells(whole, ~inside), origin
 
 
-def _surface_model(scan: ScanView, cell_m: float | None, strict: bool) -> SurfaceHeights:
-    measured = scan.raster(cell_m)
-    sure = reliable(measured)
-    certain = _open_to_the_sky(scan, measured, sure)
-    if strict:
-        return SurfaceHeights(certain, np.zeros(certain.grid.shape, np.bool_))
-    holes = ~certain.known & (outlined(certain.known) if scan.is_whole else True)
-    held = _unrefuted(scan, measured, holes & inner_doubtful(measured, sure), ())
-    level = sure.known & _at_lowest(measured, certain)
-    held |= _unrefuted(scan, measured, holes & level, (*NEAR_UP_M, *FILLED_UP_M))
-    known = without_cells(measured, ~(certain.known | held))
-    raster, new = filled(known, measured, FILLED_REACH_M, FILLED_EDGE_CELLS)
-    top_m = highest_lowest(measured.height_m, NEAR_CELLS)[0]
-    right = _unrefuted(scan, raster, new & holes, FILLED_UP_M)
-    below = right & (top_m - raster.height_m > STEP_M)
-    right &= ~below | _unrefuted(scan, raster, below, NEAR_UP_M)
-    return SurfaceHeights(without_cells(raster, new & ~right), right | held)
+def _below_objects(
+    scan: ScanView, measured: Raster, low_m: F32, cells: Bool
+) -> tuple[Raster, Bool]:
+    """``measured`` where of the ``cells`` (rows, cols) those below a crown or an eave are as high
+    as the nearest object, and which these are.
+
+    Looking sideways one sees the ground below an object. No keyframe sees through the air below
+    its top there, and one sees a surface in front of that air.
+    """
+    from scipy import ndimage
+
+    is_object = measured.known & (measured.height_m - low_m > STEP_M)
+    below = np.zeros_like(cells)
+    if not is_object.any():
+        return measured, below
+    far, near = ndimage.distance_transform_edt(~is_object, return_indices=True)
+    top_m = measured.height_m[tuple(near)]
+    up_m = top_m - measured.height_m
+    below = cells & (up_m > OPEN_STEP_M) & (far * measured.grid.cell_m < OBJECT_REACH_M)
+    is_open, is_hidden = np.zeros((2, int(below.sum())), np.bool_)
+    for down_m in (BENEATH_M, 0.25 * up_m):
+        places = _places(scan, replace(measured, height_m=top_m - down_m), below)
+        free, behind = scan.air_above(places, (0.0,))
+        is_open |= free[:, 0]
+        is_hidden |= behind[:, 0] > 0
+    below[below] = is_hidden & ~is_open
+    raised = replace(
+        measured,
+        height_m=np.where(below, top_m, measured.height_m),
+        sigma_m=np.where(below, 2.0 * measured.sigma_m[tuple(near)], measured.sigma_m),
+        rgb=np.where(below[..., None], measured.rgb[tuple(near)], measured.rgb),
+    )
+    return raised, below
 
 
-def _at_lowest(measured: Raster, certain: Raster) -> Bool:
-    """(rows, cols) cells of ``measured`` level with the lowest certain one next to them."""
-    lowest_m = highest_lowest(certain.height_m, 1)[1]
-    return np.asarray(np.abs(measured.height_m - lowest_m) <= LEVEL_M)
-
-
-def _unrefuted(scan: ScanView, raster: Raster, cells: Bool, free_up_m: Sequence[float]) -> Bool:
-    """Those of the ``cells`` (rows, cols) that no keyframe sees through, and above which no surface
-    hides the air at these heights from all keyframes that look there."""
-    is_open, behind = scan.air_above(_places(scan, raster, cells), (-PROBE_M, *free_up_m))
+def _not_seen_through(scan: ScanView, measured: Raster, cells: Bool) -> Bool:
+    """Those of the ``cells`` (rows, cols) whose surface no keyframe sees through."""
+    is_open, _ = scan.air_above(_places(scan, measured, cells), (-PROBE_M,))
     out: Bool = cells.copy()
-    out[cells] = ~is_open[:, 0] & ~(~is_open & (behind > 0))[:, 1:].any(axis=1)
+    out[cells] = ~is_open[:, 0]
     return out
 
 

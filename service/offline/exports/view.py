@@ -148,10 +148,6 @@ class ScanView:
     ) -> None:
         self.store.close()
 
-    @property
-    def is_whole(self) -> bool:
-        return self._box is EVERYWHERE
-
     def with_progress(self, progress: Progress) -> ScanView:
         """The same view for another thread, which shares what deliverables are made from."""
         other = copy.copy(self)

@@ -82,13 +82,13 @@ def test_the_maps_share_what_they_are_made_from(
         monkeypatch.setattr(module, name, call)
 
     counted(view, "fused_cloud")
-    counted(surface, "_surface_model")
+    counted(surface, "_open_to_the_sky")
     counted(surface, "terrain")
     counted(contours, "contour_lines")
     house.flown(tmp_path / "scan").close()
     with ScanView(tmp_path / "scan") as scan:
         export(scan, "all", None, ExportOptions())
-    assert sorted(made) == ["_surface_model", "contour_lines", "fused_cloud", "terrain"]
+    assert sorted(made) == ["_open_to_the_sky", "contour_lines", "fused_cloud", "terrain"]
 
 
 def test_each_keyframe_is_decoded_once_and_stays_as_it_is(

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from recon.types import F64, Array, Bool
-from service.offline.exports.surface import SurfaceHeights, cell_places, surface_model
+from recon.surface.raster import Raster
+from recon.types import F64, U8, Array, Bool
+from service.offline.exports.surface import UNCERTAIN, cell_places, complete_model
 from service.offline.exports.view import ScanView
 from service.stream.codec import encode
 from service.stream.records import ScanHeader
@@ -38,12 +39,12 @@ def flown(folder: Path, house: HouseFlight, change: Callable[[F64, Array], Array
 
 
 def model(
-    folder: Path, house: HouseFlight, change: Callable[[F64, Array], Array], strict: bool = False
-) -> tuple[SurfaceHeights, F64]:
-    """The model of such a scan, and (rows, cols, 3) places of its cells."""
+    folder: Path, house: HouseFlight, change: Callable[[F64, Array], Array]
+) -> tuple[Raster, U8, F64]:
+    """The model of such a scan, what it rests on, and (rows, cols, 3) places of its cells."""
     with ScanView(flown(folder, house, change)) as scan:
-        found = surface_model(scan, CELL_M, strict)
-        return found, cell_places(scan, found.raster)
+        found, origin = complete_model(scan, CELL_M)
+        return found, origin, cell_places(scan, found)
 
 
 def on_roof(places: F64, margin_m: float) -> Bool:
@@ -61,18 +62,15 @@ def test_no_ground_is_filled_in_below_what_hides_the_air(
         depth[(depth < house.height_m - 3.0) & (x > 14.5)] = np.nan
         return depth
 
-    found, places = model(tmp_path, house, change)
-    inside = on_roof(places, 0.5) & found.raster.known
-    assert (found.raster.height_m[inside] > 5.0).all() and inside.sum() > 400
+    found, _, places = model(tmp_path, house, change)
+    inside = on_roof(places, 0.75) & found.known
+    assert (found.height_m[inside] > 5.0).all() and inside.sum() > 400
 
 
 def test_doubtful_edges_of_a_roof_that_keyframes_confirm_are_marked(
     tmp_path: Path, house: HouseFlight
 ) -> None:
-    strict, places = model(tmp_path / "strict", house, lambda x, depth: depth, strict=True)
-    found, _ = model(tmp_path / "filled", house, lambda x, depth: depth)
-    edge = on_roof(places, 0.25) & ~on_roof(places, 1.0)
-    more = edge & found.raster.known & ~strict.raster.known
-    assert more.sum() > 0.2 * edge.sum() and found.is_filled[more].all()
-    assert (np.abs(found.raster.height_m[edge & found.raster.known] - 6.0) < 0.3).all()
-    assert not strict.is_filled.any()
+    found, origin, places = model(tmp_path, house, lambda x, depth: depth)
+    edge = on_roof(places, 0.5) & ~on_roof(places, 1.0) & found.known
+    assert (origin[edge] == UNCERTAIN).sum() > 0.2 * edge.sum()
+    assert (np.abs(found.height_m[edge] - 6.0) < 0.3).all()
