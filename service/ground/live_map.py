@@ -11,7 +11,6 @@ import time
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import lru_cache
-from statistics import median
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from recon.surface.raster import Grid, Raster, fill_holes
 from recon.types import F32, F64, U8, Array, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.scans.drawing import brightest, exposure
+from service.scans.drawing import exposure, values
 from service.scans.main_piece import main_seqs
 from service.scans.track import local_frame
 from service.stream.store import ScanStore
@@ -34,8 +33,6 @@ EQUATOR_M = 2.0 * math.pi * 6378137.0
 MAX_ZOOM = 24
 HOLE_PX = 4
 MAX_TILES = 150
-BRIGHT_STEP = 16
-"""Of so many points one says how bright a keyframe is."""
 
 Tile = tuple[int, int, int]
 """Zoom, column from west, row from north."""
@@ -101,7 +98,7 @@ class LiveMap:
         self.version = 0  # counts the keyframes that came or changed
         self._states: dict[int, State] = {}  # of the keyframes that were read
         self._boxes: dict[int, F64] = {}
-        self._bright: dict[int, float] = {}
+        self._values: dict[int, Array] = {}  # of the colours
         self._tiles: OrderedDict[Tile, _Drawn] = OrderedDict()
         self._points = lru_cache(maxsize=64)(self._points_of)
 
@@ -118,7 +115,7 @@ class LiveMap:
     @property
     def exposure(self) -> float:
         """What the colours are multiplied with where they are looked at, as in the 3D view."""
-        return exposure(median(self._bright.values()) if self._bright else 255.0)
+        return exposure(np.sum([np.zeros(256), *self._values.values()], axis=0))
 
     def refresh(self, read_s: float = 2.0) -> None:
         """Take note of keyframes that are new, finer or moved, for ``read_s`` at most: the next
@@ -184,7 +181,7 @@ class LiveMap:
         place = points.place
         if not len(place):
             return np.full(4, np.nan)
-        self._bright[seq] = brightest(points.rgb[::BRIGHT_STEP])
+        self._values[seq] = values(points.rgb)
         return np.concatenate([place.min(axis=0), place.max(axis=0)])
 
     def _points_of(self, seq: int, state: State) -> _Points:

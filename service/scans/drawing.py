@@ -130,17 +130,18 @@ def _colours(raster: Raster, shade: F32) -> Callable[[slice], F32]:
 
 
 def _gain(raster: Raster) -> float:
-    return exposure(brightest(raster.rgb[raster.known]))
+    return exposure(values(raster.rgb[raster.known]))
 
 
-def brightest(rgb: U8) -> float:
-    """What 2 % of the values of (N, 3) colours exceed; 255 without any."""
-    return float(np.percentile(rgb, 98)) if rgb.size else 255.0
+def values(rgb: U8) -> Array:
+    """(256,) how often each value occurs in colours."""
+    return np.bincount(rgb.ravel(), minlength=256)
 
 
-def exposure(bright: float) -> float:
-    """What makes the colours of a dark scan, whose :func:`brightest` are these, readable."""
-    return float(np.clip(230.0 / max(bright, 1.0), 1.0, 2.0))
+def exposure(counts: Array) -> float:
+    """What makes the colours of a dark scan, with so many of each value, readable."""
+    bright = int(np.searchsorted(np.cumsum(counts), 0.98 * counts.sum())) if counts.any() else 255
+    return float(np.clip(230.0 / max(bright, 1), 1.0, 2.0))
 
 
 def _heights(raster: Raster, shade: F32) -> Callable[[slice], F32]:

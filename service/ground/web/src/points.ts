@@ -107,7 +107,7 @@ interface Held {
   unit_m: number;
   points: number;
   layer: number;
-  bright: Uint8Array; // of 200 points
+  values: Uint8Array; // of the colours of 200 points
   time: number;
   T: number[];
   scale: number;
@@ -135,6 +135,7 @@ export class Cloud implements Gradual {
   private camera: THREE.PerspectiveCamera | null = null;
   private unbuilt = false;
   private exposure = 1;
+  private readonly counts = new Float64Array(256); // of each value of colours
   private measured = false;
   private groundStale = false;
   private groundAt = -Infinity;
@@ -202,23 +203,23 @@ export class Cloud implements Gradual {
     const object = new THREE.Points(geometry, material);
     object.matrixAutoUpdate = false;
     const surface = new Surface(chunk, { ...this.shared, ...own }, SHADE);
-    const bright = rgb.slice(0, 600).sort();
-    const held: Held = { object, surface, shown: true, unit_m, points: sigma.length, layer: chunk.layer, bright, time: chunk.time_unix_s, T: chunk.T, scale: chunk.scale };
+    const held: Held = { object, surface, shown: true, unit_m, points: sigma.length, layer: chunk.layer, values: rgb.slice(0, 600), time: chunk.time_unix_s, T: chunk.T, scale: chunk.scale };
     this.chunks.set(chunk.seq, held);
     this.place(chunk.seq, held);
     this.groupOf(chunk.seq).add(object, surface.mesh);
-    this.expose();
+    this.expose(held, 1);
     const depths = [...this.chunks.values()].filter(({ surface }) => surface.triangles).map(({ surface, scale }) => surface.depth * scale).sort((a, b) => a - b);
     this.shared.behind.value = BEHIND * (depths[depths.length >> 1] ?? 0);
     this.show(chunk.seq, held);
   }
 
-  /** As bright as the day: of the brightest tenths of the keyframes' colours, as in the preview. */
-  private expose(): void {
-    const tops = [...this.chunks.values()].filter(({ bright }) => bright.length).map(({ bright }) => bright[Math.floor(0.98 * bright.length)]!);
-    tops.sort((a, b) => a - b);
-    const top = tops[tops.length >> 1] ?? 230;
-    this.exposure = Math.min(Math.max(230 / Math.max(top, 1), 1), 2) ** 2.2;
+  /** Takes in a keyframe's colours, or out: as bright as the day, by the rule of preview and map. */
+  private expose({ values, points }: Held, sign: 1 | -1): void {
+    for (const value of values) this.counts[value]! += sign * points;
+    const total = this.counts.reduce((sum, count) => sum + count, 0);
+    let [top, sum] = [0, this.counts[0]!];
+    while (top < 255 && sum < 0.98 * total) sum += this.counts[++top]!;
+    this.exposure = total ? Math.min(Math.max(230 / Math.max(top, 1), 1), 2) ** 2.2 : 1;
   }
 
   /** The exposure that the colours are shown with; 1 for those of figures, where they are seen. */
@@ -530,6 +531,7 @@ export class Cloud implements Gradual {
     held.object.material.dispose();
     held.surface.close();
     this.chunks.delete(seq);
+    this.expose(held, -1);
   }
 }
 
