@@ -23,16 +23,13 @@ from mavlink.component.control import (
 from service.daemon.load_shedding import Level
 from service.daemon.scan_state import Event
 from service.daemon.scanning import Scanning
+from service.daemon.stored_image import MIN_FREE_MIB
 from service.daemon.vehicle_config import with_parameter
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.scans.retention import existing
 from service.workers import PROCESS
 
 DISK_AGE_S = 1.0
-MIN_FREE_MIB = 500.0
-"""The self-test fails with less free disk space."""
-
-
 VIEW_AGES_NS = (200_000_000, 1_200_000_000)
 """Ages of the camera's view: by positions of 5 and of 1 Hz."""
 

@@ -18,21 +18,19 @@ FIRST_RETRY_S, LAST_RETRY_S = 1.0, 8.0
 class State(Enum):
     """What runs, and what is wanted."""
 
-    IDLE = "idle"
-    WAITING = "waiting"  # for the next attempt at the wanted scan
-    WAITING_PAUSED = "waiting paused"
-    SCANNING = "scanning"
-    PAUSED = "paused"  # takes no frames
-    CLOSING = "closing"  # writes the files of the scan
-    REOPENING = "reopening"  # closes a scan; another follows
-    REOPENING_PAUSED = "reopening paused"
-    ENDING = "ending"  # the service closes its last scan
-    ENDED = "ended"
+    IDLE = "idle", Phase.IDLE
+    WAITING = "waiting", Phase.WAITING  # for the next attempt at the wanted scan
+    WAITING_PAUSED = "waiting paused", Phase.WAITING
+    SCANNING = "scanning", Phase.SCANNING
+    PAUSED = "paused", Phase.PAUSED  # takes no frames
+    CLOSING = "closing", Phase.FINALISING  # writes the files of the scan
+    REOPENING = "reopening", Phase.WAITING  # closes a scan; another follows
+    REOPENING_PAUSED = "reopening paused", Phase.WAITING
+    ENDING = "ending", Phase.FINALISING  # the service closes its last scan
+    ENDED = "ended", Phase.IDLE
 
-    @property
-    def phase(self) -> Phase:
-        """The state as the operator sees it."""
-        return _PHASES[self]
+    def __init__(self, text: str, phase: Phase) -> None:
+        self.text, self.phase = text, phase  # and as the operator sees it
 
     @property
     def has_run(self) -> bool:
@@ -51,20 +49,6 @@ class State(Enum):
     @property
     def is_paused(self) -> bool:
         return Event.RESUME in TRANSITIONS[self]
-
-
-_PHASES = {
-    State.IDLE: Phase.IDLE,
-    State.WAITING: Phase.WAITING,
-    State.WAITING_PAUSED: Phase.WAITING,
-    State.SCANNING: Phase.SCANNING,
-    State.PAUSED: Phase.PAUSED,
-    State.CLOSING: Phase.FINALISING,
-    State.REOPENING: Phase.WAITING,
-    State.REOPENING_PAUSED: Phase.WAITING,
-    State.ENDING: Phase.FINALISING,
-    State.ENDED: Phase.IDLE,
-}
 
 
 class Event(Enum):

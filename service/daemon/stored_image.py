@@ -12,7 +12,7 @@ from mavlink.component.camera import KeyframeReport
 from recon.types import U8
 
 QUALITY = 90
-MIN_FREE_MIB = 500.0
+MIN_FREE_MIB = 500.0  # no image is stored with less, and the self-test fails
 GPS = 0x8825  # EXIF's directory of the position
 BELOW_SEA = b"\1"
 

@@ -30,8 +30,8 @@ def test_the_table_of_workers_is_the_code_s() -> None:
 def test_the_table_of_a_scan_s_states_is_the_code_s() -> None:
     table = ["| state | operator sees | event > next state |", "| --- | --- | --- |"]
     for state, row in TRANSITIONS.items():
-        events = ", ".join(f"{event.value} > {after.value}" for event, after in row.items())
-        table.append(f"| {state.value} | {state.phase.value} | {events} |")
+        events = ", ".join(f"{event.value} > {after.text}" for event, after in row.items())
+        table.append(f"| {state.text} | {state.phase.value} | {events} |")
     assert "\n".join(["", *table, ""]) in TEXT
 
 
