@@ -50,10 +50,10 @@ from recon.types import Array, Camera, Frame, Keyframe, PointCloud, Pose, PosePr
 
 __all__ = ["Mapper", "MapperConfig"]
 
-Reconstruct = Callable[[StereoView], GraphUpdate]
+Reconstructed = GraphUpdate | FirstDepth | None
+"""Of a view that is in the graph now, or of one that comes again; None where that shows nothing."""
 
-NO_POSE = Pose(np.eye(4), np.eye(6))
-"""Of a first depth, which the graph does not have."""
+Reconstruct = Callable[[StereoView], Reconstructed]
 
 
 class Worker(Protocol):
@@ -61,7 +61,7 @@ class Worker(Protocol):
 
     def offer(self, item: StereoView) -> None: ...
 
-    def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]: ...
+    def finished(self, everything: bool = False) -> list[tuple[StereoView, Reconstructed]]: ...
 
     @property
     def is_free(self) -> bool: ...
@@ -73,12 +73,12 @@ class InTurn:
     """Reconstructs each view before the next frame is looked at."""
 
     def __init__(self, work: Reconstruct) -> None:
-        self._work, self._done = work, list[tuple[StereoView, GraphUpdate]]()
+        self._work, self._done = work, list[tuple[StereoView, Reconstructed]]()
 
     def offer(self, item: StereoView) -> None:
         self._done.append((item, self._work(item)))
 
-    def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]:
+    def finished(self, everything: bool = False) -> list[tuple[StereoView, Reconstructed]]:
         done, self._done = self._done, []
         return done
 
@@ -211,11 +211,11 @@ class Mapper:
         pose = self.frames.follow(before.prior, reference)
         return (FramePosed(before.seq, before.time_ns, tracked.before, pose, reference, is_view),)
 
-    def reconstruct(self, view: StereoView) -> GraphUpdate:
+    def reconstruct(self, view: StereoView) -> Reconstructed:
         """One view: its depth from all its partners, its pose, and its new surface."""
         if view.is_first:
             assert self.first_depths is not None
-            return GraphUpdate(NO_POSE, False, keyframe=self.first_depths(view))
+            return self.first_depths(view)
         depth = None
         grid = self.rectify.grid(view)
         depths = self.carry(view, grid)  # by images that are matched already
@@ -265,9 +265,9 @@ class Mapper:
 
     def _finished(self, everything: bool = False) -> Iterator[Event]:
         for view, update in self._worker.finished(everything):
-            if view.is_first:
-                if update.keyframe is not None:
-                    yield FirstDepth(update.keyframe)
+            if not isinstance(update, GraphUpdate):
+                if update is not None:
+                    yield update
                 continue
             self.frames.take(view.reference, update)
             if update.keyframe is not None:

@@ -286,15 +286,17 @@ class Plausible:
 
     def __init__(self, rejected: Counter[str]) -> None:
         self._rejected = rejected
-        self._balance: Counter[int] = Counter()  # views kept less those refuted, by segment
+        self._segment, self._balance = -1, 0  # of its views, those kept less those refuted
 
     def __call__(self, view: StereoView, depth: DepthMap | None, bgr: U8) -> DepthMap | None:
         """The plausible part of ``depth``, which has the colours ``bgr``; None without any."""
         if depth is None:
             return None
         kept = plausible(drop_edges(depth, bgr), view.prior)
-        self._balance[view.segment] += -1 if kept is None else 1
-        if kept is not None and self._balance[view.segment] > 0:
+        if view.segment != self._segment:
+            self._segment, self._balance = view.segment, 0
+        self._balance += -1 if kept is None else 1
+        if kept is not None and self._balance > 0:
             return kept
         self._rejected[CONTRADICTED if kept is None else f"{CONTRADICTED} in earlier views"] += 1
         return None

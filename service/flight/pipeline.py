@@ -12,8 +12,7 @@ from threading import Event
 from recon.backends import Backend
 from recon.parallel import limit_threads
 from recon.pipeline.config import Baseline, MapperConfig
-from recon.pipeline.keyframe_map import GraphUpdate
-from recon.pipeline.mapper import Mapper, Reconstruct
+from recon.pipeline.mapper import Mapper, Reconstruct, Reconstructed
 from recon.pipeline.views import StereoView
 from recon.tracking.known_track import KnownTrack
 from recon.types import Camera
@@ -38,7 +37,7 @@ COMMON_FOCAL_SHARE, MAX_FOCAL_SHARE = 0.02, 0.05
 each other, and up to which sigma of depth holds the rest: above a tenth would drop all points."""
 
 
-class DenseWorker(BackgroundWorker[StereoView, GraphUpdate]):
+class DenseWorker(BackgroundWorker[StereoView, Reconstructed]):
     """Of views: one that comes again is not lost when its first depth is."""
 
     def drop(self, item: StereoView) -> None:
@@ -127,7 +126,7 @@ class Pipeline(Mapper):
         self._background = DenseWorker(row, partial(self._watched, work), MAX_WAITING, live)
         return self._background
 
-    def _watched(self, work: Reconstruct, view: StereoView) -> GraphUpdate:
+    def _watched(self, work: Reconstruct, view: StereoView) -> Reconstructed:
         """Do the work, and examine the graph now and then."""
         update = work(view)
         self._doubts.extend(self.watch.look())

@@ -14,8 +14,7 @@ import pytest
 from loopback import until
 from some_views import view_at
 
-from recon.pipeline.keyframe_map import GraphUpdate
-from recon.pipeline.mapper import NO_POSE, Mapper
+from recon.pipeline.mapper import Mapper
 from recon.pipeline.views import StereoView, VirtualStereoCamera
 from recon.types import Camera
 from service.background import BackgroundWorker
@@ -56,9 +55,8 @@ def test_live_the_oldest_that_has_not_begun_gives_way() -> None:
 def test_a_first_depth_that_gives_way_is_no_lost_view() -> None:
     gate = threading.Event()
 
-    def work(view: StereoView) -> GraphUpdate:
+    def work(view: StereoView) -> None:
         gate.wait(5)
-        return GraphUpdate(NO_POSE, False)
 
     jobs = DenseWorker("dense", work, 2, live=True)
     views = [view_at(seq, np.eye(4)) for seq in range(4)]

@@ -17,7 +17,7 @@ import recon
 from recon import se3
 from recon.pipeline.events import FirstDepth, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.keyframe_map import GraphUpdate
-from recon.pipeline.mapper import Mapper, moved
+from recon.pipeline.mapper import Mapper, Reconstructed, moved
 from recon.pipeline.views import StereoView
 from recon.tracking.odometry import Tracked, Tracking
 from recon.types import Camera, DepthMap, Frame, Keyframe, Pose, PosePrior
@@ -80,7 +80,7 @@ class BrokenOff:
 
     def offer(self, item: StereoView) -> None: ...
 
-    def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]:
+    def finished(self, everything: bool = False) -> list[tuple[StereoView, Reconstructed]]:
         self.views += 1
         view = view_at(self.views, np.eye(4))
         poses = dict.fromkeys((7, self.views), Pose(np.eye(4), np.eye(6), scale=3.0))
@@ -142,9 +142,10 @@ def test_the_library_needs_nothing_of_the_service() -> None:
 class FirstOnly(BrokenOff):
     """Gives one first depth."""
 
-    def finished(self, everything: bool = False) -> list[tuple[StereoView, GraphUpdate]]:
-        [(view, update)] = super().finished(everything)
-        return [(replace(view, is_first=True), replace(update, changed={}))]
+    def finished(self, everything: bool = False) -> list[tuple[StereoView, Reconstructed]]:
+        self.views += 1
+        view = view_at(self.views, np.eye(4))
+        return [(replace(view, is_first=True), FirstDepth(keyframe(self.views)))]
 
 
 def test_a_first_depth_is_said_and_becomes_no_part_of_the_map() -> None:
