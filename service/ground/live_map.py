@@ -179,9 +179,9 @@ class LiveMap:
         """(4,) bounds of a keyframe's points; NaN without any."""
         points = self._points(seq, state)
         place = points.place
+        self._values[seq] = values(points.rgb)
         if not len(place):
             return np.full(4, np.nan)
-        self._values[seq] = values(points.rgb)
         return np.concatenate([place.min(axis=0), place.max(axis=0)])
 
     def _points_of(self, seq: int, state: State) -> _Points:

@@ -7,6 +7,7 @@ import json
 import math
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
@@ -338,6 +339,25 @@ def test_a_map_gets_the_fine_layer_that_the_receiver_stores_later(
         receiver.add_chunk(fine)
         assert maps.view(folder).version == 7
     maps.close()
+
+
+def test_what_has_no_surface_any_more_has_no_part_in_the_exposure(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    white = house.keyframe(9, 30.0)
+    white = replace(white, bgr=np.full_like(white.bgr, 255))
+    unknown = np.full_like(white.depth.depth_m, np.nan)
+    bare = replace(white, depth=replace(white.depth, depth_m=unknown))
+    with house.flown(tmp_path / "scan") as scan:
+        found = LiveMap(scan)
+        found.refresh(read_s=math.inf)
+        before = found.exposure
+        scan.add_chunk(encode(white, white.time_ns)[0])
+        found.refresh(read_s=math.inf)
+        assert found.exposure == 1.0 < before
+        scan.add_chunk(encode(bare, bare.time_ns)[1])
+        found.refresh(read_s=math.inf)
+        assert found.version == 7 and found.exposure == before
 
 
 def enu(n: int) -> F64:
