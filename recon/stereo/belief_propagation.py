@@ -165,8 +165,7 @@ def select(
     (h, L, w). Evidence is how far the winner's cost lies below the mean over the labels that
     are seen, relative to that mean: about 0.1 for unrelated images, 0.6 for texture. Not
     accepted are winners with less than ``min_evidence`` and those that tie with another
-    label. NaN are those whose partner lies outside the right image. Sums of 7x7 costs fit 16 bits:
-    no cost is above 668.
+    label. NaN are those whose partner lies outside the right image.
     """
     height, _, width = cost.shape
     px = np.empty((height, width), np.float32)

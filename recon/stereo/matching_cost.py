@@ -30,6 +30,9 @@ CENSUS_OFFSETS = tuple(_NEAR + _FAR)
 """Row and column of the neighbours that a pixel is compared with: 5x5, and eight on a ring around
 them, which tell weak texture from noise. They fill one 32-bit word."""
 
+MAX_COST = 668
+"""The sum over a window of 7x7 fits 16 bits."""
+
 CENSUS_REACH = 3
 """The farthest row or column of a neighbour."""
 
@@ -42,7 +45,7 @@ class MatchingCostConfig:
     """Weights of the data term, in units of one label of smoothness.
 
     A census bit adds ``census_weight``, a gray level of difference ``difference_weight``;
-    each part stops growing at its truncation.
+    each part stops growing at its truncation. Raises ValueError where they exceed MAX_COST.
     """
 
     census_weight: float = 0.08
@@ -50,6 +53,15 @@ class MatchingCostConfig:
     difference_weight: float = 0.04
     difference_truncation: int = 20  # gray levels
     unseen: float = 1.0  # of a label whose partner is outside the image, above the best one
+
+    def __post_init__(self) -> None:
+        most = (
+            round(self.census_weight * COST_UNIT) * self.census_truncation
+            + round(self.difference_weight * COST_UNIT) * self.difference_truncation
+            + round(self.unseen * COST_UNIT)
+        )
+        if most > MAX_COST:
+            raise ValueError(f"costs of up to {most} are too large, at most {MAX_COST}")
 
 
 def matching_cost(

@@ -131,6 +131,12 @@ def test_census_against_its_definition() -> None:
         assert int(words[v, u]) == int("".join("1" if b else "0" for b in bits), 2)
 
 
+def test_costs_whose_sums_do_not_fit_are_refused() -> None:
+    assert MatchingCostConfig(difference_truncation=110).difference_truncation == 110
+    with pytest.raises(ValueError, match="costs of up to 672 are too large, at most 668"):
+        MatchingCostConfig(difference_truncation=111)
+
+
 @pytest.mark.parametrize("min_disparity", [0, 3, -4, 40, -40])
 def test_matching_cost_against_its_definition(min_disparity: int) -> None:
     rng = np.random.default_rng(2)
