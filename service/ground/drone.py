@@ -349,7 +349,7 @@ class DroneReceiver:
     def _on_written(self, event: Written, now: float) -> None:
         scan = event.scan
         scan.is_written, scan.is_writing, scan.trouble = True, False, event.trouble
-        if event.is_due and event.trouble:
+        if event.is_due:
             scan.unwritten, scan.write_at = True, now + REWRITE_S
         if scan.intake.complete and not scan.trouble:
             self._effects.append(Align(scan.folder))

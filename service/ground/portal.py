@@ -97,14 +97,14 @@ class Portal:
         self.jobs = Jobs(self._workers)
         below = None if config.basemap is None else open_basemap(config.basemap)
         library = Library(config.store)
-        state = PortalState(
+        self.state = PortalState(
             library, self.jobs, progress or list, vehicle, below, config.limits,
             OpenScans(LiveCoverage, config.coverage_age_s, max_scans=4),
             OpenScans(LiveMap, config.map_age_s, max_scans=3),
         )  # fmt: skip
         tokens = parse_tokens(config.token or secrets.token_urlsafe(24))
         self.token = next(iter(tokens.values()))
-        self.app = portal_app(state, Tokens(tokens), is_loopback(config.host))
+        self.app = portal_app(self.state, Tokens(tokens), is_loopback(config.host))
         self._vehicle = vehicle
         self._listener: BoundedListener | None = None
         self._port = config.port
@@ -167,6 +167,7 @@ class Portal:
             self._listener.close()
             self._listener = self._listen(self._port)
             self._server = self._new_server(self._listener)
+        self.state.decoding = asyncio.Semaphore(2)  # each loop has its own
         asyncio.run(self._serve(worker))
 
     async def _serve(self, worker: Worker) -> None:

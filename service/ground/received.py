@@ -39,12 +39,10 @@ def begin_files(folder: Path) -> None:
         log.debug("%s: %s", folder, error)
 
 
-def end_files(folder: Path) -> bool:
-    """Writing has ended; True, and the mark stays, where the disk refused a file."""
-    is_due = files_due(folder)
-    if not is_due:
+def end_files(folder: Path) -> None:
+    """Writing has ended; the mark stays where the disk refused a file."""
+    if not files_due(folder):
         (folder / BEGUN).unlink(missing_ok=True)
-    return is_due
 
 
 def folders_due(store: Path) -> list[Path]:

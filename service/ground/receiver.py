@@ -24,7 +24,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.errors import InputError, SkyreliefError
+from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.drone import Align, DroneLimits, DroneReceiver, Effect, Get, Opened, Put, Write
 from service.ground.drones import Drones
 from service.ground.front import behind_fronts
@@ -337,8 +337,26 @@ class Receiver:
             if asked is None:
                 return
             scan, inbox = asked
-            begin_files(scan.folder)
-            trouble = guarded(f"deliverables of {scan.folder}", partial(self._deliver, scan))
-            is_due = end_files(scan.folder)
+            written = written_files(scan, self._deliver)
             if inbox is not None:
-                inbox.put_event(Written(scan, trouble, is_due))
+                inbox.put_event(written)
+
+
+def written_files(scan: ReceivedScan, deliver: Callable[[ReceivedScan], None]) -> Written:
+    """Have ``deliver`` write a scan's files. What the disk refuses stays due, whatever an earlier
+    ``scan.json`` says; a fault in the scan itself would only come again."""
+    is_refused = False
+
+    def work() -> None:
+        nonlocal is_refused
+        try:
+            deliver(scan)
+        except (OutsideError, OSError):
+            is_refused = True
+            raise
+
+    begin_files(scan.folder)
+    trouble = guarded(f"deliverables of {scan.folder}", work)
+    if not is_refused:
+        end_files(scan.folder)
+    return Written(scan, trouble, is_refused)

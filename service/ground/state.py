@@ -276,7 +276,7 @@ class PortalState:
     maps: OpenScans[LiveMap]
     live_views: int = 0
     views_without_token: int = 0  # of these
-    decoding: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+    decoding: asyncio.Semaphore = field(init=False)
     """Recordings opened at a time; who waits holds no thread."""
     started: float = field(default_factory=time.monotonic)
 

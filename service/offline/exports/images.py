@@ -62,8 +62,8 @@ def recording_of(
     """The video or folder of stills that a scan was made from, when it still is where it was.
 
     ``scan.json`` names it (``run.source``). A relative path is tried from the working directory,
-    the scan folder and its parent. ``within`` bounds it to a folder: the scan may be a stranger's.
-    Never raises.
+    the scan folder and its parent. The scan may be a stranger's: only what has that name in the
+    folder ``within``, and is no link, is taken where that is given. Never raises.
     """
     stored = "textures from the scan's own images, at the depth's resolution"
     try:
@@ -73,8 +73,8 @@ def recording_of(
         return Recording(None, f"{stored}: the scan does not name a recording; give --video")
     places = [path, folder / path, folder.parent / path]
     if within is not None:
-        bound = os.path.realpath(within)
-        places = [p for p in places if bound in map(str, Path(os.path.realpath(p)).parents)]
+        own = within / path.name
+        places = [own] if path.name not in ("", "..") and not os.path.islink(own) else []
     found = next((p for p in places if os.path.isfile(p) or os.path.isdir(p)), None)
     if found is None:
         return Recording(None, f"{stored}: {named} is not there; give the flight's --video")

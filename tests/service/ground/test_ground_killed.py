@@ -15,8 +15,17 @@ import pytest
 from house_flight import HouseFlight
 from paths import ROOT
 
-from service.ground.received import begin_files, end_files, folders_due, mark_due, write_left
-from service.ground.receiver import Receiver, ReceiverConfig
+from service.errors import OutsideError
+from service.ground.intake import ScanIntake
+from service.ground.received import (
+    ReceivedScan,
+    begin_files,
+    end_files,
+    folders_due,
+    mark_due,
+    write_left,
+)
+from service.ground.receiver import Receiver, ReceiverConfig, written_files
 from service.scans.folder import CLOUD, CSV, PREVIEW, TUM, write_deliverables
 from service.stream.session import SessionConfig
 from service.stream.store import ScanStore
@@ -164,3 +173,24 @@ def test_what_comes_while_files_are_written_is_due_again(
     assert folders_due(tmp_path) == [folder]
     write_left(folder)
     assert folders_due(tmp_path) == []
+
+
+@pytest.mark.parametrize("error", [OutsideError("disk full"), OSError("disk full"), ValueError()])
+def test_only_files_that_the_disk_refused_are_written_again(
+    error: Exception, tmp_path: Path, house: HouseFlight
+) -> None:
+    """Also where scan.json is of an earlier state; a fault of the scan would come at each time."""
+
+    def fail(_: ReceivedScan) -> None:
+        raise error
+
+    folder = tmp_path / "drone-1" / "test-1"
+    with house.flown(folder) as store:
+        scan = ReceivedScan("drone-1", "test-1", folder, ScanIntake(store, "here"))
+        for is_written in (False, True):
+            if is_written:
+                write_deliverables(folder, store, {})
+            mark_due(folder)
+            written = written_files(scan, fail)
+            assert written.trouble and written.is_due == (not isinstance(error, ValueError))
+            assert (folders_due(tmp_path) == [folder]) == (written.is_due or not is_written)

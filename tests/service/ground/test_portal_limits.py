@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import logging
@@ -147,7 +148,12 @@ def test_a_portal_that_fails_starts_again_at_its_address(
 
     serve, failed = uvicorn.Server.serve, threading.Event()
 
+    async def decode() -> None:
+        async with portal.state.decoding:
+            await asyncio.sleep(0)
+
     async def fails_once(server: uvicorn.Server, sockets: Any = None) -> None:
+        await asyncio.gather(*(decode() for _ in range(5)))  # some wait
         if failed.is_set():
             await serve(server, sockets)
         failed.set()

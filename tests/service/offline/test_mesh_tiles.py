@@ -285,9 +285,13 @@ def test_the_recording_that_a_scan_names_is_found(tmp_path: Path, house: HouseFl
     name("link.mp4")
     assert images.recording_of(folder, header, within=folder).path is None
     (folder / "own.mp4").touch()
-    name("own.mp4")
-    bounded = images.recording_of(folder, header, lambda _: FakeVideo(house, video_px), folder)
-    assert bounded.path == folder / "own.mp4"
+    for source in ("own.mp4", "flights/own.mp4", "/gone/own.mp4"):
+        name(source)
+        bounded = images.recording_of(folder, header, lambda _: FakeVideo(house, video_px), folder)
+        assert bounded.path == folder / "own.mp4"
+    for source in ("", ".", "..", "/", "link.mp4/..", "a\0b"):
+        name(source)
+        assert images.recording_of(folder, header, within=folder).path is None
     for unfit in (None, 7, ["x"]):
         assert "does not name" in name(unfit).words
     assert "is not there" in name("x" * 5000).words
