@@ -6,7 +6,7 @@ that are covered, and PSNR and SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.8198
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
@@ -64,19 +64,36 @@ class Triangles:
     texture: U8 | None = None  # (h, w, 3) BGR
 
 
-def score_views(scan: ScanView, video: Path, images: Path | None = None) -> dict[str, Any]:
-    """Figures of each product at the frames of ``video`` that took no part.
+def score_views(
+    scan: ScanView, video: Path, images: Path | None = None, others: Mapping[str, Draw] = {}
+) -> dict[str, Any]:
+    """Figures of each product, and of ``others``, at the frames of ``video`` that took no part.
 
     ``images`` is a folder for each frame beside what was drawn of it, as PNG. Raises InputError
     when the video is not the scan's, or has no such frame.
     """
+    return {
+        name: {
+            "frames": len(rows),
+            "covered": round(float(np.mean([r[0] for r in rows])), 4),
+            "psnr_db": round(float(np.mean([r[1] for r in rows])), 2),
+            "ssim": round(float(np.mean([r[2] for r in rows])), 4),
+        }
+        for name, rows in frame_scores(scan, video, images, others).items()
+    }
+
+
+def frame_scores(
+    scan: ScanView, video: Path, images: Path | None = None, others: Mapping[str, Draw] = {}
+) -> dict[str, list[tuple[float, float, float]]]:
+    """Share covered, PSNR in dB and SSIM of each frame, by product; as ``score_views`` else."""
     with needing("score --views"):
         import open3d  # noqa: F401
         from skimage.metrics import structural_similarity
     keyframes, camera = list(main_keyframes(scan.store)), camera_of(scan.store.header)
-    products = _products(scan, keyframes, camera)
+    products = {**_products(scan, keyframes, camera), **others}
     inside, undistort = _outline(scan), Undistorter(camera)
-    sums: dict[str, list[tuple[float, float, float]]] = {name: [] for name in products}
+    scores: dict[str, list[tuple[float, float, float]]] = {name: [] for name in products}
     for n, (T, seen) in enumerate(_seen(scan, keyframes, undistort, video)):
         counts = inside(camera, T) & (undistort.valid > 0)
         if counts.mean() < 0.5:
@@ -92,23 +109,14 @@ def score_views(scan: ScanView, video: Path, images: Path | None = None) -> dict
                 error = float(np.mean((seen[covered].astype(np.float64) - drawn[covered]) ** 2))
                 psnr = min(10.0 * float(np.log10(255.0**2 / max(error, 1e-9))), FLOOR_DB)
                 share = float(covered.sum() / counts.sum())
-                sums[name].append((share, psnr, float(likeness[covered].mean())))
+                scores[name].append((share, psnr, float(likeness[covered].mean())))
             row.append(drawn)
         if images is not None:
             images.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(images / f"view_{n:04d}.png"), np.hstack(row))
-    if not any(sums.values()):
+    if not any(scores.values()):
         raise InputError(f"{video}: none of its frames that took no part shows the map")
-    return {
-        name: {
-            "frames": len(rows),
-            "covered": round(float(np.mean([r[0] for r in rows])), 4),
-            "psnr_db": round(float(np.mean([r[1] for r in rows])), 2),
-            "ssim": round(float(np.mean([r[2] for r in rows])), 4),
-        }
-        for name, rows in sums.items()
-        if rows
-    }
+    return {name: rows for name, rows in scores.items() if rows}
 
 
 def _seen(

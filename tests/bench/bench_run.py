@@ -1,6 +1,7 @@
 """``make bench ARGS="NAME ..."``: the benchmarks of development, and those of the command.
 
 make bench ARGS="real --data ../shared/data"
+make bench ARGS="screen --scan SCAN --flight FLIGHT --keep FOLDER"
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ DEVELOPMENT = {
     "middlebury": "bench_middlebury:run",
     "scenes": "bench_scenes:run",
     "real": "bench_real:run",
+    "screen": "bench_screen:run",
     "site": "bench_site:run",
     "truth": "bench_truth:run",
 }
 """Name to ``module:function`` of this folder."""
 
-ASKED_FOR = ("board", "device", "middlebury", "real", "site")
+ASKED_FOR = ("board", "device", "middlebury", "real", "screen", "site")
 """Those that need a GPU, data or many minutes, and run by name only."""
 
 
@@ -43,12 +45,14 @@ def main(
     backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "cpu",
     data: Annotated[Path | None, typer.Option(help="folder of the real sets")] = None,
     scans: Annotated[int, typer.Option(min=0, help="site: tiles of a site of so many scans")] = 0,
+    scan: Annotated[Path | None, typer.Option(help="screen: folder of a scan")] = None,
+    flight: Annotated[Path | None, typer.Option(help="screen: its recording or stills")] = None,
     kept: Annotated[
         Path | None, typer.Option("--keep", help="folder for result (JSON) and previews")
     ] = None,
 ) -> None:
     """Print our figure, the peer's in the same run, and the ratio."""
-    options = DataOptions(rounds, 3, backend, scans, data, kept)
+    options = DataOptions(rounds, 3, backend, scans, data, kept, scan, flight)
     known = BENCHMARKS | DEVELOPMENT
     chosen = names or [name for name in known if name not in ASKED_FOR]
     try:
