@@ -314,6 +314,20 @@ def test_a_click_on_a_camera_shows_its_image(
     browser.wait("document.body.dataset.image === '4'")
 
 
+def test_the_drone_does_not_hide_what_is_seen_from_its_place(
+    browser: Browser, base: str, house: HouseFlight
+) -> None:
+    def from_beside(aside_m: float) -> float:
+        x, y, z = house.pose(20.0)[:3, 3] + [0.0, aside_m, 0.9]  # within the drone's body
+        browser.open("about:blank")
+        browser.open(f"{base}#/view/drone-1/test-1/{x},{y},{z},{x},{y + 0.1},0")
+        browser.wait("document.body.dataset.points > 71000")
+        settle(browser)
+        return float(browser.run(COLOURED))
+
+    assert from_beside(0.0) > 0.8 * from_beside(3.0) > 0.2
+
+
 def projected(page: Browser, where: F64, point: F64) -> tuple[float, float]:
     """CSS pixels at which the view (6,) shows a point (3,)."""
     left, top, w, h = page.run(

@@ -103,6 +103,14 @@ export class Cameras {
     this.drone.visible = true;
   }
 
+  /** From within the length of its frustum the aircraft would hide what is looked at: it is not drawn. */
+  seenFrom(eye: THREE.Vector3): void {
+    for (const object of [this.now, this.image, this.drone]) {
+      const isNear = eye.distanceTo(new THREE.Vector3().setFromMatrixPosition(object.matrixWorld)) < this.reach / 4;
+      object.traverse((part) => (isNear ? part.layers.disable(0) : part.layers.enable(0)));
+    }
+  }
+
   /** Moves all cameras as a whole. */
   move(T: THREE.Matrix4): void {
     T.decompose(this.group.position, this.group.quaternion, this.group.scale);

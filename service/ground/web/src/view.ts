@@ -99,6 +99,7 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   });
   stage.drawGradually(cloud);
   stage.add(cameras.group);
+  stage.before.push(() => cameras.seenFrom(stage.camera.position));
   stage.addAgain(cloud.group);
   stage.add(cloud.ground.mesh);
   host.append(compass(stage));
