@@ -9,6 +9,7 @@ import zipfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from house_flight import HouseFlight
@@ -20,6 +21,9 @@ from service.ground.drone import DroneLimits
 from service.ground.portal import Portal, PortalConfig
 from service.ground.state import Job
 from service.stream.store import ScanStore
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Route
 
 __all__ = ["browser"]  # the fixture
 
@@ -201,3 +205,41 @@ def test_a_job_shows_its_percent_and_is_cancelled_by_its_button(
     browser.click("Cancel")
     browser.wait(f"{ROW}.className === 'cancelled'")
     assert browser.run(f"{ROW}.querySelector('button').hidden")
+
+
+@pytest.mark.parametrize("needs", [pytest.param(None, marks=NEEDS)])
+@pytest.mark.slow
+def test_a_job_has_one_row_however_late_the_name_of_its_scan_comes(
+    browser: Browser, portal: Portal, needs: None
+) -> None:
+    asked: list[Route] = []
+    held: list[Route] = []
+    job = {
+        "number": 1, "drone": "drone-2", "scan": "late", "kind": "align", "title": "Alignment",
+        "state": "running", "percent": 5, "left_s": None, "doing": "", "ended_s": None,
+        "error": None, "file": None,
+    }  # fmt: skip
+
+    def jobs(route: Route) -> None:
+        asked.append(route)
+        route.fulfill(json=[job])
+
+    def name(route: Route) -> None:
+        held.append(route)
+
+    browser.open(portal.url)
+    browser.wait("document.querySelectorAll('article').length === 1")
+    browser.page.route("**/api/jobs", jobs)
+    browser.page.route("**/api/scans/drone-2/late", name)
+    browser.open(portal.url.split("/?")[0] + "/#/view/drone-1/test-1")
+    meanwhile = partial(until, limit_s=60.0, sleep=lambda s: browser.page.wait_for_timeout(1e3 * s))
+    meanwhile(lambda: held)
+    seen = len(asked)
+    meanwhile(lambda: len(asked) > seen)  # by the next turn
+    browser.page.wait_for_timeout(500.0)  # it has its answer, and waits for the name too
+    held[0].fulfill(status=404)
+    browser.wait(f"{ROW}?.textContent.startsWith('Alignment of late')")
+    seen = len(asked)
+    meanwhile(lambda: len(asked) >= seen + 2)
+    assert browser.run("document.querySelectorAll('.jobs li').length") == 1
+    browser.page.unroute_all(behavior="wait")

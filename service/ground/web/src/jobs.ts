@@ -28,8 +28,8 @@ export function jobsOf(scan: () => api.Scan): HTMLElement {
 type NameOf = (job: api.Job) => string | Promise<string> | null;
 
 /**
- * A list that keeps itself up to date while it is in the page; hidden while there is nothing. A job is shown where `homeOf` says, with its history; all others here, until a while
- * after they have ended.
+ * A list that keeps itself up to date while it is in the page; hidden while there is nothing. A job is shown where
+ * `homeOf` says, with its history; all others here, until a while after they have ended.
  */
 export function jobList(name: NameOf, homeOf: (job: api.Job) => Element | null = () => null): HTMLElement {
   const list = el("ul", {});
@@ -39,8 +39,9 @@ export function jobList(name: NameOf, homeOf: (job: api.Job) => Element | null =
   const refresh = async (): Promise<void> => {
     const all = await api.jobs().catch(() => []);
     const jobs = all.filter((job) => name(job) !== null && (homeOf(job) || (job.ended_s ?? 0) < ENDED_S));
-    const old = rows;
-    rows = new Map(await Promise.all(jobs.map(async (job) => [job.number, old.get(job.number) ?? row(job, (await name(job))!)] as const)));
+    const names = await Promise.all(jobs.map(name));
+    const old = rows; // not before: another turn may have drawn them meanwhile
+    rows = new Map(jobs.map((job, k) => [job.number, old.get(job.number) ?? row(job, names[k]!)]));
     for (const [number, { element }] of old) if (!rows.has(number)) element.remove();
     for (const job of jobs) {
       const { element, show } = rows.get(job.number)!;
