@@ -14,6 +14,6 @@ class DataOptions(BenchOptions):
 
     scans: int = 0  # of the benchmark site: that many instead of two
     data: Path | None = None  # folder with real sets
-    previews: Path | None = None  # folder for the previews of real flights, and for pictures
+    previews: Path | None = None  # folder for the previews of real flights, and for images
     scan: Path | None = None  # folder of the scan that ``screen`` shows
     flight: Path | None = None  # its recording, or the folder of its stills

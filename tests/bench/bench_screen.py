@@ -38,7 +38,7 @@ from service.scans.track import camera_of
 AWAY_M = 40.0  # from the eye to the place looked at
 ASIDE_M = 0.05  # which never lies straight below: there a view without roll has no heading
 SAME = 2  # a pixel that differs by more under another sky shows the sky
-DARK, BRIGHT = 8, 250  # colours between these tell the brightness
+DARK, BRIGHT = 8, 250  # colours between these give the brightness
 IMAGE = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
 SETTING = """(() => {
   const label = [...document.querySelectorAll('.settings label')]
@@ -68,9 +68,9 @@ def run(options: DataOptions) -> list[BenchResult]:
         raise OutsideError("bench screen needs the portal's page; see CONTRIBUTING.md")
     kept = options.previews
     with ScanView(options.scan) as scan, _screen(scan) as screen:
-        pictures = None if kept is None else kept / "views"
+        views = None if kept is None else kept / "views"
         others = {"screen": screen.shaded, "screen without shading": screen.unshaded}
-        scores = frame_scores(scan, options.flight, pictures, others)
+        scores = frame_scores(scan, options.flight, views, others)
     if kept is not None:
         (kept / "frames.json").write_text(json.dumps(scores, indent=1))
     middle = {
@@ -156,7 +156,7 @@ class Screen:
 
     def _fit(self) -> None:
         """Makes the page so large that the scene has the camera's pixels."""
-        for _ in range(TRIES):  # what stands beside the scene may take its room later
+        for _ in range(TRIES):  # what stands next to the scene may take its room later
             has = self.browser.run(SIDE)
             if has == [self.side_px, self.side_px]:
                 return
@@ -181,13 +181,13 @@ class Screen:
         size = (keyframe.bgr.shape[1], keyframe.bgr.shape[0])
         shown = cv2.resize(images[1], size, interpolation=cv2.INTER_AREA)
         there = cv2.resize(covered.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        told = there & keyframe.fresh
+        shared = there & keyframe.fresh
         for image in (shown, keyframe.bgr):
-            told &= (image.min(axis=2) >= DARK) & (image.max(axis=2) <= BRIGHT)
-        if not told.any():
+            shared &= (image.min(axis=2) >= DARK) & (image.max(axis=2) <= BRIGHT)
+        if not shared.any():
             raise InputError("bench screen: the portal shows nothing of the middle keyframe")
         self.last = None
-        return float(np.median(_linear(shown[told]) / _linear(keyframe.bgr[told])))
+        return float(np.median(_linear(shown[shared]) / _linear(keyframe.bgr[shared])))
 
 
 def to_camera(camera: Camera, T: F64, eye: F64, aim: F64, degrees: float, side_px: int) -> F64:
