@@ -18,7 +18,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mavlink.wire.dialect import dialect
-from mavlink.wire.messages import OutgoingMessage, Packer
 
 MAX_LINES, LONGEST_LINE = 64, 512
 """Of a datagram; the rest is dropped."""
@@ -46,7 +45,7 @@ class LineReader:
 
     def __init__(self) -> None:
         self._columns: Sequence[str] = ()
-        self._packer = Packer(0)
+        self._encoders = {n: dialect.MAVLink(None, SYSTEM, n) for n in (AUTOPILOT, GIMBAL)}
         self._beat_ns: int | None = None
         self._sigma: Values = {}  # of the last GST
         self._day_s = self._of_day_s = 0.0
@@ -61,7 +60,7 @@ class LineReader:
         if packets and (self._beat_ns is None or now_ns - self._beat_ns >= BEAT_NS):
             self._beat_ns = now_ns
             beat = dialect.MAVLink_heartbeat_message(2, 0, 0, 0, 4, 3)  # a multicopter, disarmed
-            packets = self._pack([(AUTOPILOT, beat)]) + packets
+            packets = self._pack(AUTOPILOT, beat) + packets
         return packets
 
     def _values(self, line: str) -> Values:
@@ -123,7 +122,7 @@ class LineReader:
             roll, yaw = values.get("gimbal_roll_deg", 0.0), yaw % 360.0 or 360.0  # 0: not given
             message = dialect.MAVLink_mount_orientation_message(time_ms, roll, pitch, yaw, yaw)
             found.append((GIMBAL, message))
-        return self._pack(found)
+        return b"".join(self._pack(component, message) for component, message in found)
 
     def _position(self, values: Mapping[str, float], time_s: float, time_ms: int) -> list[Any]:
         """The messages of a position; none without one."""
@@ -168,9 +167,11 @@ class LineReader:
             else (0.0, 0.0, 0.0)
         )
 
-    def _pack(self, messages: Sequence[tuple[int, Any]]) -> bytes:
-        packed = (self._packer.pack(SYSTEM, OutgoingMessage(*one), 0) for one in messages)
-        return b"".join(packet for packet in packed if packet is not None)
+    def _pack(self, component: int, message: Any) -> bytes:
+        encoder = self._encoders[component]
+        data = bytes(message.pack(encoder))
+        encoder.seq = (encoder.seq + 1) % 256
+        return data
 
 
 def _number(text: str) -> float:
