@@ -28,7 +28,7 @@ LAZ = "LAZ 1 cm"
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
-    """Milliseconds to encode a keyframe and what is new of it, and to decode it."""
+    """Milliseconds to encode a keyframe and its fresh part, and to decode it."""
     whole = make_keyframe(0, SIZE_PX, seed=1)
     part = replace(whole, fresh=strip(SIZE_PX, 20))
     coded, xyz, rgb = codec.encode(whole, 0), *points(whole)
@@ -43,7 +43,7 @@ def run(options: BenchOptions) -> list[BenchResult]:
     what = "encode 320x180, both layers, one core"
     return [
         BenchResult(what, ours, "ms", peer=LAZ, peer_value=theirs),
-        BenchResult("encode what is new of it at 80 % overlap", new, "ms"),
+        BenchResult("encode its fresh part at 80 % overlap", new, "ms"),
         BenchResult("decode a whole keyframe", decoded, "ms"),
     ]
 

@@ -107,6 +107,15 @@ class Onboard:
             case Align(folder):
                 self.aligned.append(folder)
 
+    def finish(self) -> None:
+        """The scan ends, and all of it arrives."""
+        self.store.finish({"points": 1})
+        self.head()
+        for _ in range(20):
+            self.pass_time(0.5)
+            while self.asked:
+                self.answer()
+
     def close(self) -> None:
         self.ground.close_all()
         self.store.close()
@@ -119,12 +128,7 @@ def test_a_scan_is_asked_for_written_and_aligned(trouble: str, tmp_path: Path) -
     assert not list(tmp_path.glob("ground/**/scan.db"))  # a folder is made for a header only
     one.answer()
     one.store.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
-    one.store.finish({"points": 1})
-    one.head()
-    for _ in range(20):
-        one.pass_time(0.5)
-        while one.asked:
-            one.answer()
+    one.finish()
     assert one.opened == 1
     assert one.held is not None and one.held.numbers == one.store.numbers()
     (entry,) = one.ground.entries
@@ -144,12 +148,7 @@ def test_files_that_a_full_disk_refused_are_written_again(tmp_path: Path) -> Non
     one = Onboard(tmp_path)
     one.head()
     one.answer()
-    one.store.finish({"points": 1})
-    one.head()
-    for _ in range(20):
-        one.pass_time(0.5)
-        while one.asked:
-            one.answer()
+    one.finish()
     for _ in range(2):
         one.written("disk full", is_due=True)
         one.pass_time(REWRITE_S - 1.0)
