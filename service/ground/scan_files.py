@@ -10,11 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from recon.types import Keyframe
 from service.errors import InputError
 from service.ground.live import FlightPath
 from service.ground.state import names_of, state_of
@@ -30,7 +32,8 @@ from service.offline.refine.refly import (
 )
 from service.scans.main_piece import main_track
 from service.scans.track import local_frame
-from service.stream.images import encode_image
+from service.stream.images import whole_bgr
+from service.stream.planes import image_size
 from service.stream.store import ScanStore
 
 TILE = re.compile(r"[A-Za-z0-9_]{1,80}\.(json|pnts|b3dm|glb)")
@@ -44,6 +47,7 @@ SEQ = re.compile(r"[0-9]{1,9}")
 
 DARK = (45, 38, 32)
 """Where an image shows nothing, BGR."""
+QUALITY = 85  # of JPEG, 1 to 100
 SANDBOX = {
     "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline';"
     " img-src data:"
@@ -129,20 +133,29 @@ def _tile(request: Request) -> Response:
 
 
 def _image(request: Request) -> Response:
-    """The JPEG of a whole keyframe; of an older scan only what was new in it."""
+    """The JPEG of a whole keyframe, finest where it is new; of an older scan only what was new."""
     folder = state_of(request).library.folder(*names_of(request))
     if not SEQ.fullmatch(request.path_params["seq"]):
         raise InputError("no such keyframe")
     seq = int(request.path_params["seq"])
     with ScanStore.peek(folder / "scan.db") as store:
-        data = store.image(seq)
-        keyframe = store.keyframe(seq) if data is None else None
+        data, keyframe = store.image(seq), store.keyframe(seq)
+    if keyframe is not None:
+        data = _jpeg(keyframe, data)
     if data is None:
-        if keyframe is None:
-            raise InputError("no such keyframe")
-        dark = np.array(DARK, np.uint8)
-        data = encode_image(np.where(keyframe.fresh[..., None], keyframe.bgr, dark))
+        raise InputError("no such keyframe")
     return Response(data, media_type="image/jpeg")
+
+
+def _jpeg(keyframe: Keyframe, image: bytes | None) -> bytes:
+    """The keyframe's ``image``, with its own colours where they are new and no coarser."""
+    if image is None:
+        shown = np.where(keyframe.fresh[..., None], keyframe.bgr, np.array(DARK, np.uint8))
+    elif keyframe.bgr.shape[1] >= (image_size(image) or (0,))[0]:
+        shown = whole_bgr(keyframe, image)
+    else:
+        return image
+    return cv2.imencode(".jpg", shown, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))[1].tobytes()
 
 
 def _coverage(request: Request) -> Response:
