@@ -306,7 +306,10 @@ def metadata(path: Path, marks: Sequence[bytes]) -> Iterator[tuple[int, int, byt
 
 def _packets(path: Path, kind: str) -> Iterator[tuple[int, int, Any]]:
     """(ns since the video's start, duration in ns, packet) of streams of a kind; of subtitles the
-    first stream."""
+    first stream.
+
+    A packet without a time, as MPEG-TS has them, is of the image before it in the file.
+    """
     import av.error
 
     try:
@@ -317,14 +320,20 @@ def _packets(path: Path, kind: str) -> Iterator[tuple[int, int, Any]]:
                 return
             video = container.streams.video[0]
             start_s = (video.start_time or 0) * (video.time_base or Fraction(0))
+            wanted = [*streams, video] if container.format.name == "mpegts" else streams
             for other in container.streams:
-                if other not in streams and hasattr(other, "discard"):  # since PyAV 18
+                if other not in wanted and hasattr(other, "discard"):  # since PyAV 18
                     other.discard = type(other.discard).all  # most of the file is not read
-            for packet in container.demux(streams):
-                base = packet.time_base
-                if packet.pts is not None and base is not None and packet.size:
-                    time_ns = round((packet.pts * base - start_s) * NS_PER_S)
-                    yield time_ns, round((packet.duration or 0) * base * NS_PER_S), packet
+            before_s = Fraction(0)
+            for packet in container.demux(wanted):
+                base = packet.time_base or Fraction(0)
+                time_s = before_s if packet.pts is None else packet.pts * base - start_s
+                if packet.stream in streams:
+                    if packet.size:
+                        duration_ns = round((packet.duration or 0) * base * NS_PER_S)
+                        yield round(time_s * NS_PER_S), duration_ns, packet
+                else:
+                    before_s = max(before_s, time_s)  # images are stored out of order
     except (av.error.FFmpegError, OSError, ValueError) as error:
         log.debug("%s: its %s ends: %s", path, kind, error)
 

@@ -198,13 +198,16 @@ def start_of(
     """The source's time 0 on the log's clock, from that clock to unix time, in ns, and whether the
     start of a log with a clock of its own is taken for want of better.
 
-    The source's time 0 is as given, the container's, the log's start, or now. A log without a date
-    begins with the source, unless the time that is given is one of the log's own clock.
+    The source's time 0 is as given, the date of the log in it, the container's, the log's start, or
+    now. A log without a date begins with the source, unless the time that is given is one of the
+    log's own clock.
     """
     is_dated = log is None or log.clock == "unix"
     is_assumed = False
     if video_epoch is not None:
         start_ns = round(video_epoch * 1e9) if math.isfinite(video_epoch) else MAX_TIME_NS
+    elif log is not None and log.start_unix_ns is not None:
+        start_ns = log.start_unix_ns
     elif source.epoch_unix_ns is not None:
         start_ns = source.epoch_unix_ns
         start_ns -= local_zone_ns(start_ns, log, notes) if is_dated else 0
@@ -222,7 +225,8 @@ def start_of(
     is_of_log = video_epoch is not None and log is not None and _covers(log, start_ns)
     if log is not None and not is_dated and not is_of_log:
         zero_ns = 0 if log.clock == "video" else log.first_ns
-        notes.append("the log has no date: it begins with the recording")
+        if log.start_unix_ns is None:
+            notes.append("the log has no date: it begins with the recording")
         return zero_ns, start_ns - zero_ns, log.clock != "video"
     if log is not None and not _covers(log, start_ns):
         raise InputError(

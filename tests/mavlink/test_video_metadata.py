@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from paths import DATA, SHARED
+from pyproj import Geod
 from scipy.spatial.transform import Rotation
 
 from mavlink.telemetry.history import HistoryConfig
@@ -224,6 +229,94 @@ def test_a_real_universal_set_looks_at_its_frame_centre() -> None:
     there = np.array([north, east, 1984.6])
     assert log.hfov_deg == pytest.approx(0.8)
     assert math.degrees(math.acos(looks_at(state) @ there / np.linalg.norm(there))) < 2.0
+
+
+def cheyenne() -> list[bytes]:
+    """Sets of a real turret, two seconds apart."""
+    data = (REAL / "cheyenne.klv").read_bytes()
+    return [klv.LOCAL_SET + part for part in data.split(klv.LOCAL_SET)[1:]]
+
+
+HEAD = 18  # bytes of its key and length
+
+
+def items(content: bytes) -> Iterator[tuple[int, bytes]]:
+    while content:
+        end = 2 + content[1]
+        yield content[0], content[2:end]
+        content = content[end:]
+
+
+def test_a_real_local_set_looks_at_its_frame_centre() -> None:
+    log = klv.of_packets(
+        HERE, [(2 * k * SECOND_NS, 0, data) for k, data in enumerate(cheyenne())], HistoryConfig()
+    )
+    assert log.start_unix_ns is not None
+    for data in cheyenne():
+        at_ = dict(items(data[HEAD:]))
+        lat, lon = (
+            span * int.from_bytes(at_[tag], "big", signed=True) / (2**31 - 1)
+            for tag, span in ((23, 90.0), (24, 180.0))
+        )
+        ground_m = 19_900 * int.from_bytes(at_[25], "big") / 65_535 - 900
+        stamp_ns = 1000 * int.from_bytes(at_[2], "big")
+        state = at(log, 1e-9 * (stamp_ns - log.start_unix_ns))
+        assert state.lat_deg is not None and state.lon_deg is not None and state.alt_amsl_m
+        east = Geod(ellps="WGS84").inv(state.lon_deg, state.lat_deg, lon, lat)
+        north, across = (east[2] * f(math.radians(east[0])) for f in (math.cos, math.sin))
+        there = np.array([north, across, state.alt_amsl_m - ground_m])
+        assert math.degrees(math.acos(looks_at(state) @ there / np.linalg.norm(there))) < 1.0
+
+
+def test_sets_that_arrive_late_lie_at_their_own_times_and_date_the_video() -> None:
+    late_ns = [0, 300, 0, 200, 0]
+    packets = [
+        (2 * k * SECOND_NS + late * 10**6, 0, data)
+        for k, (data, late) in enumerate(zip(cheyenne(), late_ns, strict=True))
+    ]
+    stamps_ns = [1000 * int.from_bytes(data[HEAD + 2 : HEAD + 10], "big") for data in cheyenne()]
+    log = klv.of_packets(HERE, packets, HistoryConfig())
+    assert log.start_unix_ns is not None
+    assert log.start_unix_ns == pytest.approx(1_348_087_244_105_300_000, abs=0.3e9)
+    found = [log.first_ns + stamp - stamps_ns[0] for stamp in stamps_ns]
+    assert log.last_ns == found[-1] == stamps_ns[-1] - log.start_unix_ns
+
+
+def stream(path: Path, sets: Sequence[bytes]) -> None:
+    """MPEG-TS of ten black images and a set after each second one; the sets' packets have no time,
+    as in a private stream (MISB ST 1402, asynchronous)."""
+    with av.open(str(path), "w", format="mpegts") as out:
+        video = out.add_stream("mpeg2video", rate=5, options={"bf": "0"})
+        video.width, video.height, video.pix_fmt = 64, 48, "yuv420p"
+        metadata = out.add_data_stream("klv")
+        for k in range(10):
+            image = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="bgr24")
+            out.mux(video.encode(image))
+            if k % 2:
+                packet = av.Packet(sets[k // 2])
+                packet.stream, packet.time_base = metadata, Fraction(1, 90_000)
+                packet.pts = packet.dts = 18_000 * k
+                out.mux(packet)
+        out.mux(video.encode(None))
+    data = bytearray(path.read_bytes())
+    for found in re.finditer(rb"\x00\x00\x01[\xbd\xfc]", bytes(data)):  # of a packet's head
+        flags = found.start() + 7
+        data[flags] &= 0x3F  # neither PTS nor DTS
+        data[flags + 2 : flags + 2 + data[flags + 1]] = b"\xff" * data[flags + 1]
+    path.write_bytes(data)
+
+
+def test_metadata_without_times_is_of_the_images_before_it(tmp_path: Path) -> None:
+    path = tmp_path / "async.ts"
+    stream(path, cheyenne())
+    with av.open(str(path)) as container:
+        sets = [packet.pts for packet in container.demux(data=0) if packet.size]
+    assert sets == [None] * 5  # the file is what the test is about
+    log, where = telemetry_inside(path, HistoryConfig()) or (None, "")
+    assert log is not None and "KLV" in where and log.counts["PositionSample"] == 5
+    assert -SECOND_NS < log.first_ns < SECOND_NS
+    state = at(log, 1e-9 * log.first_ns)
+    assert (state.lat_deg, state.lon_deg) == pytest.approx((41.1438, -104.8056), abs=1e-4)
 
 
 def local_set(values: dict[int, tuple[int, bool, float]]) -> bytes:

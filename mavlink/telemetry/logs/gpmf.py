@@ -20,11 +20,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
-from statistics import median
 
 from mavlink.telemetry.decode import HDOP_TO_M, plausible_place, receiver_accuracy
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, finish
+from mavlink.telemetry.logs import TelemetryLog, by_own_clock, finish
 from mavlink.telemetry.quaternion import (
     Quaternion,
     Vector,
@@ -58,7 +57,7 @@ COLUMNS = {
 PLACES = (b"GLPI", b"GPS9", b"GPS5")
 """Best first; the first that has one gives them all."""
 
-UNKNOWN_DOP = 99.0
+UNKNOWN_DOP, MAX_OWN_S = 99.0, 1e9
 DRIFT_NS = 2_000_000_000
 """Gravity is averaged so long before and after: what else accelerates the camera averages out."""
 
@@ -80,7 +79,7 @@ class _Track:
     """Samples of one item, at times in ns, and at those of their own clock where they have one."""
 
     times_ns: list[int] = field(default_factory=list)
-    own_s: list[float | None] = field(default_factory=list)
+    own_ns: list[int | None] = field(default_factory=list)
     samples: list[list[Sample]] = field(default_factory=list)
 
 
@@ -101,7 +100,8 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
             for i, row in enumerate(rows):
                 own_s, samples = READERS[key](row, stream)
                 track.times_ns.append(time_ns + i * duration_ns // len(rows))
-                track.own_s.append(own_s)
+                known_s = math.inf if own_s is None else own_s
+                track.own_ns.append(round(1e9 * known_s) if abs(known_s) < MAX_OWN_S else None)
                 track.samples.append(samples)
                 counts[key.decode("ascii")] += 1
     used = next(
@@ -109,7 +109,8 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
     )
     for name in (used, b"GPRI") if used == b"GLPI" else (used,):
         track = tracks.get(name or b"", _Track())
-        for time_ns, samples in zip(_times(track), track.samples, strict=True):
+        times_ns, _ = by_own_clock(track.times_ns, track.own_ns)
+        for time_ns, samples in zip(times_ns, track.samples, strict=True):
             for sample in samples:
                 history.add(sample, time_ns)
     for time_ns, head in _heads(turned):
@@ -170,17 +171,6 @@ def _turned(q: Quaternion, v: Vector) -> Vector:
 
 def _is_placed(samples: list[Sample]) -> bool:
     return any(isinstance(sample, PositionSample) for sample in samples)
-
-
-def _times(track: _Track) -> list[int]:
-    """By the samples' own clock, whose offset is the median one, where all state it."""
-    own_ns = [round(1e9 * own) for own in track.own_s if own is not None]
-    if len(own_ns) < len(track.times_ns) or not own_ns:
-        return track.times_ns
-    offset = round(median(at - own for at, own in zip(track.times_ns, own_ns, strict=True)))
-    times = [own + offset for own in own_ns]
-    apart = max(abs(a - b) for a, b in zip(times, track.times_ns, strict=True))
-    return times if apart < 2_000_000_000 and min(times) >= 0 else track.times_ns
 
 
 def _streams(data: bytes) -> Iterator[tuple[bytes, list[tuple[float, ...]], _Stream]]:

@@ -3,7 +3,8 @@
 A set is a key of 16 bytes, a BER length, and items of key, length, value: of the local set a tag
 and an integer over the item's range, of the universal set 16 bytes and a float. Read are the
 sensor's place, the platform's attitude, the sensor's direction, and the slant range, which gives
-the height above the ground that it sees. The times are those of the packets in the video.
+the height above the ground that it sees. Of asynchronous metadata, whose packets have no time, the
+order in the file gives one; the sets' own time stamps space them evenly, and date the video.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from statistics import median
 
 from mavlink.telemetry.decode import plausible_place
 from mavlink.telemetry.history import MAX_AGL_M, HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, finish
+from mavlink.telemetry.logs import TelemetryLog, by_own_clock, finish
 from mavlink.telemetry.logs.gpmf import Packet
 from mavlink.telemetry.quaternion import from_rpy, multiply
 from mavlink.telemetry.samples import (
@@ -33,7 +34,8 @@ from mavlink.telemetry.samples import (
 MARK = bytes.fromhex("060e2b34")
 LOCAL_SET = bytes.fromhex("060e2b34020b01010e01030101000000")
 UNIVERSAL_SET = bytes.fromhex("060e2b34020101010e01010201010000")
-MAX_ITEMS, CHECKSUM = 256, 1
+MAX_ITEMS, CHECKSUM, STAMP = 256, 1, 2
+DATED_NS = 946_684_800 * 10**9  # 2000: a clock that was never set counts from 1970
 
 CAMERA = 100  # component id for the head's attitude
 SAME_VIEW = 0.02
@@ -62,6 +64,7 @@ LOCAL: dict[int, tuple[str, float, float]] = {
 UNIVERSAL: dict[bytes, str] = {
     bytes.fromhex(key): name
     for key, name in {
+        "0702010101050000": "time_us",
         "0701020102040200": "lat",
         "0701020102060200": "lon",
         "0701020102020000": "alt",
@@ -74,18 +77,25 @@ UNIVERSAL: dict[bytes, str] = {
         "0420020101080000": "hfov",
     }.items()
 }
-"""Second half of the key to name; degrees and metres."""
+"""Second half of the key to name; degrees, metres, and unix microseconds in an integer."""
 
 
 def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> TelemetryLog:
     """The history in the packets of a metadata stream; ValueError where they give none."""
     history, counts, views = VehicleHistory(config), Counter[str](), list[float]()
+    arrived_ns, stamps_ns, sets = list[int](), list[int | None](), list[list[Sample]]()
     for time_ns, _, data in packets:
         counts["packets"] += 1
         found = fields_of(data)
         views += [found["hfov"]] if 0.0 < found.get("hfov", 0.0) < 180.0 else []
-        for sample in samples_of(found):
-            counts[type(sample).__name__] += 1
+        if samples := samples_of(found):
+            arrived_ns.append(time_ns)
+            stamps_ns.append(1000 * round(found["time_us"]) if "time_us" in found else None)
+            sets.append(samples)
+            counts.update(type(sample).__name__ for sample in samples)
+    times_ns, start_ns = by_own_clock(arrived_ns, stamps_ns)
+    for time_ns, samples in zip(times_ns, sets, strict=True):
+        for sample in samples:
             history.add(sample, time_ns)
     warnings = []
     if views and max(views) > (1.0 + SAME_VIEW) * min(views):
@@ -94,14 +104,15 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
             "used for all, so shapes and scale are wrong"
         )
     log = replace(finish(path, history, counts, warnings), clock="video")
-    return replace(log, hfov_deg=median(views) if views else None)
+    view = median(views) if views else None
+    return replace(log, hfov_deg=view, start_unix_ns=start_ns if start_ns > DATED_NS else None)
 
 
 def fields_of(data: bytes) -> dict[str, float]:
     """Values by name in the first set of a packet; empty for any other bytes."""
     key, (content, _) = data[:16], _value(data, 16)
     if key == UNIVERSAL_SET:
-        pairs = ((UNIVERSAL.get(name[8:]), _float(value)) for name, value in _items(content, 16))
+        pairs = (_universal(name[8:], value) for name, value in _items(content, 16))
     elif key == LOCAL_SET and _is_sound(data, content):
         pairs = (_local(name, value) for name, value in _items(content, 1))
     else:
@@ -143,14 +154,18 @@ def _value(data: bytes, at: int) -> tuple[bytes, int]:
     return (data[at:end], end) if end <= len(data) else (b"", -1)
 
 
-def _float(value: bytes) -> float | None:
-    code = {4: ">f", 8: ">d"}.get(len(value))
+def _universal(key: bytes, value: bytes) -> tuple[str | None, float | None]:
+    name, code = UNIVERSAL.get(key), {4: ">f", 8: ">d"}.get(len(value))
     number = struct.unpack(code, value)[0] if code else math.nan
-    return float(number) if math.isfinite(number) else None
+    if name == "time_us" and code:
+        number = int.from_bytes(value, "big")
+    return name, float(number) if math.isfinite(number) else None
 
 
 def _local(key: bytes, value: bytes) -> tuple[str | None, float | None]:
     """Of an integer over its range; its lowest value, where it has a sign, says unknown."""
+    if key[0] == STAMP and len(value) == 8:
+        return "time_us", float(int.from_bytes(value, "big"))
     name, low, high = LOCAL.get(key[0], ("", 0.0, 0.0))
     if not name or len(value) not in (2, 4):
         return None, None

@@ -205,3 +205,16 @@ def test_a_log_without_a_date_takes_that_of_its_video(
     zero_ns, offset_ns, found = start_of(source, log, given_s, [])
     assert (zero_ns, zero_ns + offset_ns) == (round(zero_s * 1e9), round(unix_s * 1e9))
     assert found == is_assumed
+
+
+@pytest.mark.parametrize("given_s", [None, EPOCH_S + 9.0])
+def test_a_date_of_the_telemetry_in_a_video_is_that_of_the_video(given_s: float | None) -> None:
+    """The container's may be local time; one that is given counts before both."""
+    log = TelemetryLog(
+        VehicleHistory(), "video", 0, round(40e9), (), {}, start_unix_ns=round(EPOCH_S * 1e9)
+    )
+    source = cast(CameraSource, SimpleNamespace(epoch_unix_ns=round((EPOCH_S - 7200) * 1e9)))
+    notes = list[str]()
+    zero_ns, offset_ns, is_assumed = start_of(source, log, given_s, notes)
+    assert zero_ns == 0 and offset_ns == round((given_s or EPOCH_S) * 1e9)
+    assert not is_assumed and not notes
