@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Protocol
 
-from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.reprojection import DepthFusionConfig
-from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 
 if TYPE_CHECKING:
     from recon.mapping.registration import IcpConfig
+    from recon.stereo.belief_propagation import BeliefPropagationConfig
+    from recon.stereo.reprojection import DepthFusionConfig
+    from recon.stereo.upsampling import UpsamplingConfig
 
 
 @dataclass(frozen=True, slots=True)

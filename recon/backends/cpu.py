@@ -1,4 +1,8 @@
-"""The heavy operations on the processor's cores, compiled by numba."""
+"""The heavy operations on the processor's cores, compiled by numba.
+
+Each operation imports its kernels when it first runs: an idle service holds a backend, but not the
+60 MB of the compiler.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
-from recon.stereo.upsampling import UpsamplingConfig, upsample
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 
 if TYPE_CHECKING:
     from recon.backends import DenseStages
     from recon.mapping.registration import IcpConfig
+    from recon.stereo.belief_propagation import BeliefPropagationConfig
+    from recon.stereo.upsampling import UpsamplingConfig
 
 
 class CpuBackend:
@@ -27,10 +31,14 @@ class CpuBackend:
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
     ) -> DisparityMap:
         """Labels of the left view, (h, w); Eq. 1."""
+        from recon.stereo.belief_propagation import belief_propagation
+
         return belief_propagation(left, right, labels, config)
 
     def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
         """``coarse`` (h, w) at the size of ``guide`` (H, W, 3), values unscaled; Eq. 2."""
+        from recon.stereo.upsampling import upsample
+
         return upsample(coarse, guide, config)
 
     def register(
@@ -55,6 +63,8 @@ class CpuBackend:
 def warm_up() -> None:
     """Compile every kernel, or load it from numba's cache on disk; seconds once, then less."""
     from recon.mapping.registration import IcpConfig
+    from recon.stereo.belief_propagation import BeliefPropagationConfig
+    from recon.stereo.upsampling import UpsamplingConfig
 
     rng = np.random.default_rng(0)
     guide = rng.integers(0, 256, (180, 320, 3), np.uint8)  # rows enough for several threads

@@ -20,8 +20,6 @@ import msgspec
 import numpy as np
 
 from recon.backends import BACKENDS, Backend, DenseStages, load_backend
-from recon.stereo.belief_propagation import BeliefPropagationConfig
-from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
 from service.config import ComputeConfig
 from service.errors import InputError, OutsideError
@@ -30,6 +28,8 @@ from service.packages import loads, needing
 if TYPE_CHECKING:
     from recon.backends.onnx_backend import LearnedStereoBackend
     from recon.mapping.registration import IcpConfig
+    from recon.stereo.belief_propagation import BeliefPropagationConfig
+    from recon.stereo.upsampling import UpsamplingConfig
 
 Result = TypeVar("Result")
 
@@ -121,6 +121,9 @@ def pointless(name: str, is_there: Callable[[str], object] = find_spec) -> str |
 
 def trial(backend: Backend) -> float:
     """Minimum seconds from an image pair to upsampled disparity, after a warm-up round."""
+    from recon.stereo.belief_propagation import BeliefPropagationConfig
+    from recon.stereo.upsampling import UpsamplingConfig
+
     rng = np.random.default_rng(0)
     height, width = TRIAL_SIZE
     guide = rng.integers(0, 256, (2 * height, 2 * width, 3), np.uint8)

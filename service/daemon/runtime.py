@@ -29,6 +29,7 @@ from service.daemon.resumption import Landing, LandingWatch
 from service.daemon.scan_state import Event, State
 from service.daemon.scanning import Scanning
 from service.daemon.vehicle_config import TUNABLES, parameters_of, vehicle_config
+from service.daemon.warm_up import load_kernels
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.init_system import Notifier
 from service.memory import release_memory
@@ -264,9 +265,11 @@ class Daemon:
         self.scanning.offer_backlog()
 
     def _housekeeping(self) -> None:
-        """Monitor the machine, shed load, and keep free space on the disk."""
+        """Monitor the machine, shed load, keep free space on the disk, and prepare for a scan."""
         if self._quit.is_set():
             return
+        if self._was_armed and self.scanning.is_warm:
+            load_kernels()
         folder, keep_free_mib = Path(self.config.scan.folder), self.config.scan.keep_free_mib
         machine = read_machine(folder)
         self.vehicle.set_load(computer_load(machine, self._cores.percent(), keep_free_mib))

@@ -11,6 +11,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event
@@ -106,6 +107,16 @@ def warm_up(config: Config, progress: Progress) -> tuple[float, int]:
         store.close()
     _mark()
     return time.monotonic() - start, int(summary["keyframes"])
+
+
+@cache
+def load_kernels() -> None:
+    """Load what a scan runs, which takes a second or more. Done at arming: an idle service does not
+    hold it, and the first image does not wait for it."""
+    import service.flight.scan  # noqa: F401
+    from recon.backends.cpu import warm_up as warm_up_backend
+
+    warm_up_backend()
 
 
 def has_kernels() -> bool:

@@ -37,7 +37,7 @@ from service.ground.live_map import (
 from service.ground.state import PortalState, names_of, state_of
 from service.offline.exports.rasters import open_map
 from service.scans.coverage import Coverage
-from service.scans.folder import SUMMARY
+from service.scans.writing import SUMMARY
 
 TERRAIN = "terrain"
 """Heights as colours in the Terrarium encoding: metres are 256 R + G + B / 256 - 32768."""

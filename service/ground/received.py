@@ -16,7 +16,8 @@ from typing import Any
 from service.errors import InputError
 from service.ground.intake import ScanIntake
 from service.ground.storage import is_regular, scan_files
-from service.scans.folder import files_due, write_deliverables
+from service.scans.folder import write_deliverables
+from service.scans.writing import files_due
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)

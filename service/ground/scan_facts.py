@@ -13,7 +13,7 @@ import msgspec
 
 from service.errors import InputError
 from service.ground.storage import is_regular
-from service.scans.folder import SUMMARY
+from service.scans.writing import SUMMARY
 from service.small_file import read_json
 from service.stream.store import ScanStore
 

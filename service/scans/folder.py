@@ -60,14 +60,14 @@ from service.scans.track import (
     tum_lines,
 )
 from service.scans.trust import scale_sigma, slope_deg, trust_of
-from service.scans.writing import write_whole, writing
+from service.scans.writing import SUMMARY, write_whole, writing
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
 
 CLOUD, TUM, CSV = "cloud.laz", "trajectory.tum", "trajectory.csv"
-SUMMARY, PREVIEW, REPORT = "scan.json", "preview.jpg", "report.html"
+PREVIEW, REPORT = "preview.jpg", "report.html"
 THUMBNAIL = "thumbnail.webp"
 WEBP = (cv2.IMWRITE_WEBP_QUALITY, 80)
 PREVIEW_CELLS = 6e6
@@ -319,18 +319,6 @@ class Failures:
             self.why.setdefault(name, why[:LONGEST_REASON])
             level = self._level if known else logging.ERROR
             log.log(level, "%s is not written: %s", self._folder / name, why, exc_info=not known)
-
-
-def files_due(folder: Path) -> bool:
-    """Whether the files of a finished scan must still be written, or retried.
-
-    scan.json is written last; it records whether the disk refused another file.
-    """
-    try:
-        document = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return True
-    return not isinstance(document, dict) or document.get("files_due") is True
 
 
 def stages_jpg(folder: Path, store: ScanStore) -> bytes | None:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Container
 from pathlib import Path
 
 from service.errors import SkyreliefError
+from service.scans.writing import files_due
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +28,6 @@ def close_open_scans(folder: Path, ours: Container[str]) -> list[str]:
     power cut may have reset it. The stored data is kept and the files are written, with
     ``interrupted`` in the summary. An unreadable scan stays as it is, with a warning.
     """
-    from service.scans.folder import files_due, write_deliverables
     from service.stream.store import ScanStore
 
     closed = []
@@ -41,6 +41,8 @@ def close_open_scans(folder: Path, ours: Container[str]) -> list[str]:
                 shutil.rmtree(path.parent / PAGES, ignore_errors=True)
                 if not store.finished:
                     store.finish({"interrupted": True})
+                from service.scans.folder import write_deliverables  # heavy, and seldom needed
+
                 write_deliverables(path.parent, store, {})
         except (SkyreliefError, ValueError, OSError, sqlite3.Error) as error:
             log.warning("%s cannot be closed: %s", path.parent, error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import json
 import os
 import re
 import shutil
@@ -12,6 +13,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from service.errors import InputError, OutsideError
+
+SUMMARY = "scan.json"
 
 
 @contextmanager
@@ -122,3 +125,15 @@ def _remove(part: Path) -> None:
         shutil.rmtree(part)
     else:
         part.unlink(missing_ok=True)
+
+
+def files_due(folder: Path) -> bool:
+    """Whether the files of a finished scan must still be written, or retried.
+
+    scan.json is written last; it records whether the disk refused another file.
+    """
+    try:
+        document = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return True
+    return not isinstance(document, dict) or document.get("files_due") is True

@@ -19,7 +19,7 @@ import numpy as np
 
 from recon.camera_model import scaled_K
 from recon.types import F64, DepthMap, Keyframe, Pose
-from service.stream import plane_coders, planes
+from service.stream import planes
 from service.stream.records import PLACE_BYTES, pack_place, source_bits, sources_of, unpack_place
 from service.stream.validity import MAX_DEPTH_M, MIN_DEPTH_M, is_inverse_depth, is_pinhole, is_time
 
@@ -239,6 +239,8 @@ def _layer(
 ) -> bytes:
     """One coded layer; ``place`` is its number, how many there are, and its factor; ``pose``
     is that of the keyframe, packed."""
+    from service.stream import plane_coders
+
     layer, layers, factor = place
     box = planes.bounding_box(full.known)
     low = 0.0

@@ -1,7 +1,8 @@
 """The planes of a keyframe (mask, depth, sigma, views, colour) as coded sections, and back.
 
 Decoders return None for malformed data. They check the size in an embedded image's header before
-decoding it, so that they allocate no more than the caller's grid needs.
+decoding it, so that they allocate no more than the caller's grid needs. Compiled code is imported
+where it runs, so that opening a store loads no compiler.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import cv2
 import numpy as np
 
 from recon.types import F32, U8, U16, Array, Bool, DepthMap
-from service.stream import plane_coders, plane_kernels
 
 METHOD_JPEG_LS = 1
 METHOD_PREDICTION = 2
@@ -69,6 +69,8 @@ def bounding_box(known: Bool) -> tuple[int, int, int, int]:
 
 def reduce(full: Planes, factor: int) -> Planes:
     """``full`` at 1/factor of its size; a block is known when a quarter of it is."""
+    from service.stream import plane_kernels
+
     depth, sigma, views, bgr, known = plane_kernels.reduce(
         full.depth_m, full.sigma_m, full.views, full.bgr, full.known, factor, SPREAD
     )
@@ -90,11 +92,15 @@ def _fill_back(values: Array, known: Bool) -> Array:
 
 def encode_mask(known: Bool) -> bytes:
     """The section that says which pixels of the box are known; empty when all are."""
+    from service.stream import plane_coders
+
     return b"" if known.all() else plane_coders.encode_mask(known)
 
 
 def decode_mask(data: bytes, w: int, h: int) -> Bool:
     """(h, w) known pixels; accepts any bytes."""
+    from service.stream import plane_coders
+
     return plane_coders.decode_mask(data, w, h) if data else np.ones((h, w), np.bool_)
 
 
@@ -121,6 +127,8 @@ def quantise(planes: Planes, step: float) -> tuple[U16, float, float]:
 
 def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float) -> F32 | None:
     """(h, w) depth in metres; arbitrary where unknown."""
+    from service.stream import plane_coders
+
     h, w = known.shape
     codes: Array | None = None
     if method == METHOD_PREDICTION:
@@ -184,6 +192,8 @@ def decode_views(data: bytes, w: int, h: int) -> U8 | None:
 
 def encode_colour(planes: Planes, quality: int) -> bytes:
     """The box as a JPEG; blocks without known pixels are flat and cost little."""
+    from service.stream import plane_kernels
+
     image = np.ascontiguousarray(planes.bgr)
     if not planes.known.all():
         image = plane_kernels.calm(image, np.ascontiguousarray(planes.known), MCU_PX)

@@ -29,7 +29,7 @@ from service.cameras.camera_file import save_camera
 from service.cameras.exif import read_tags
 from service.config import load_config
 from service.daemon.runtime import Daemon
-from service.scans.folder import SUMMARY
+from service.scans.writing import SUMMARY
 
 AGL_M, FOCAL_PX, SIZE = 50.0, 300.0, (320, 240)
 SPEED_M_S, INTERVAL_S = 5.0, 0.1

@@ -22,9 +22,9 @@ from service.cameras.video import VideoSource
 from service.errors import InputError, SkyreliefError
 from service.offline.exports.view import ExportOptions, ScanView
 from service.progress import Progress
-from service.scans.folder import SUMMARY
 from service.scans.main_piece import main_keyframes
 from service.scans.track import camera_of
+from service.scans.writing import SUMMARY
 from service.stream.records import ScanHeader
 
 SAME_TIME_NS = 5_000_000

@@ -16,9 +16,9 @@ from service.offline.exports.maps import resampled
 from service.offline.exports.rasters import NODATA_M, open_map, over
 from service.offline.exports.view import ExportOptions, ScanView
 from service.scans.coverage import coverage_of
-from service.scans.folder import SUMMARY, stages_jpg, surface
+from service.scans.folder import stages_jpg, surface
 from service.scans.report import report_html
-from service.scans.writing import write_whole
+from service.scans.writing import SUMMARY, write_whole
 
 LARGEST_CELLS = 1400
 """Along a side of the report's maps."""

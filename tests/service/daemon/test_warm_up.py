@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from onboard import Onboard, Scripted
+from onboard import MODEL, Onboard, Scripted
+from paths import ROOT
 
 from mavlink.component.vehicle import VehicleLink
 from service.background import BackgroundWorker
@@ -20,6 +23,9 @@ from service.daemon.frame_gate import FrameGate
 from service.daemon.runtime import COMPILING_S, HUNG_S
 from service.daemon.warm_up import SyntheticGround, is_warm, warm_up, warm_up_command
 from service.progress import Progress
+from service.scans.writing import SUMMARY
+from service.stream.records import ScanHeader
+from service.stream.store import ScanStore
 
 
 @pytest.mark.slow
@@ -35,6 +41,54 @@ def test_made_up_ground_is_scanned_and_marked(
     assert not is_warm("another version")
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     assert not is_warm()
+
+
+IDLE = """
+import sys, threading, time
+sys.path.insert(0, sys.argv[1])
+from autopilot import AUTOPILOT, beat, packed
+from loopback import until
+from mavlink.wire.dialect import dialect
+from service.config import load_config
+from service.daemon.runtime import Daemon
+from service.daemon.warm_up import load_kernels
+
+def hear_armed():
+    (message,) = dialect.MAVLink(None).parse_buffer(packed(beat(armed=True), AUTOPILOT))
+    daemon.vehicle.presence.hear(message, time.monotonic_ns())
+    return load_kernels.cache_info().currsize
+
+daemon = Daemon(load_config(None, sys.argv[2:]))
+running = threading.Thread(target=daemon.run)
+running.start()
+until(lambda: daemon.actions.is_ready, 120)
+daemon.recover()
+import service.stream.link, service.stream.reports  # of scans that the ground lacks
+daemon.snapshot()
+print(*sorted({"numba", "llvmlite", "scipy", "torch"} & sys.modules.keys()))
+daemon.scanning.is_warm = True
+until(hear_armed, 120)
+print(*sorted({"numba", "service.flight.scan"} & sys.modules.keys()))
+daemon.quit()
+running.join()
+"""
+
+
+@pytest.mark.slow
+def test_an_idle_service_holds_no_compiler_and_an_armed_one_is_prepared(tmp_path: Path) -> None:
+    scan = tmp_path / "scans" / "20260101T000000Z"
+    with ScanStore.create(scan / "scan.db", ScanHeader("1", "drone", 1)) as store:
+        store.finish({})
+    (scan / SUMMARY).write_text("{}")
+    settings = [
+        f"camera.source={tmp_path}", f"camera.model={MODEL}", f"scan.folder={scan.parent}",
+        "health.http=", "mavlink.links=[]", "mavlink.system_id=1", "compute.backend=cpu",
+    ]  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", IDLE, str(ROOT / "tests" / "support"), *settings],
+        cwd=ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, "\nnumba service.flight.scan\n"), done.stderr
 
 
 def test_the_command_fits_the_installation() -> None:

@@ -26,7 +26,6 @@ from service.scans.folder import (
     CSV,
     PREVIEW,
     REPORT,
-    SUMMARY,
     THUMBNAIL,
     TUM,
     write_deliverables,
@@ -34,6 +33,7 @@ from service.scans.folder import (
 from service.scans.fused_cloud import Extent, fused_cloud, strip_edges
 from service.scans.retention import close_open_scans
 from service.scans.track import latest
+from service.scans.writing import SUMMARY
 from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore
 
