@@ -47,6 +47,11 @@ AGREEMENT = 0.1
 programs that shrink images keep such tags unchanged."""
 
 
+LONGEST_MM = 200.0
+"""A longer focal length is one in pixels: of a telephoto lens no drone carries, or 200 px, which
+would be a view of half the sphere."""
+
+
 @dataclass(frozen=True, slots=True)
 class Lens:
     """A pinhole camera with distortion, in units of the longer side of the image."""
@@ -125,7 +130,12 @@ def lens_of(
 
     ``size_px`` (W, H) is the still's current size, which may be smaller than the original.
     """
-    found = [_maker(photo, xmp, size_px), _pix4d(photo, xmp, size_px), _focal(photo, size_px)]
+    found = [
+        _maker(photo, xmp, size_px),
+        _pix4d(photo, xmp, size_px),
+        _view(xmp, size_px),
+        _focal(photo, size_px),
+    ]
     sound = [lens for lens in found if lens is not None and _is_sound(lens, size_px)]
     coarse = _full_frame(photo, size_px)
     if coarse is None or not _is_sound(coarse, size_px):
@@ -167,11 +177,14 @@ def _maker(
 def _pix4d(
     photo: Mapping[int, Any], xmp: Mapping[str, str], size_px: tuple[int, int]
 ) -> Lens | None:
-    """Pix4D's names, as Parrot, senseFly and MicaSense write them: millimetres."""
+    """Pix4D's names, as Parrot, senseFly and MicaSense write them: millimetres, a focal length of
+    older RedEdges pixels."""
     focal = _number(xmp.get("PerspectiveFocalLength"))
     per_mm = _pixels_per_mm(photo)
     if focal is None or per_mm is None:
         return None
+    if focal > LONGEST_MM:
+        focal /= per_mm
     side = _taken_side(photo, size_px)
     W, H = (side * n / max(size_px) for n in size_px)
     point = _numbers(xmp.get("PrincipalPoint", ""), 2)
@@ -183,6 +196,14 @@ def _pix4d(
         return Lens(focal * per_mm / side, middle, source=FOCAL_ALONE)
     k1, k2, k3, p1, p2 = bent
     return Lens(focal * per_mm / side, middle, (k1, k2, p1, p2, k3), CALIBRATED)
+
+
+def _view(xmp: Mapping[str, str], size_px: tuple[int, int]) -> Lens | None:
+    """By the field of view, as Teal writes it."""
+    view_deg = _number(xmp.get("CameraHorizontalFOV"))
+    if view_deg is None or not 1.0 < view_deg < 180.0:
+        return None
+    return replace(by_view(view_deg, size_px), source="the field of view in XMP")
 
 
 def _focal(photo: Mapping[int, Any], size_px: tuple[int, int]) -> Lens | None:
@@ -260,9 +281,10 @@ def finite_numbers(values: Any, count: int) -> list[float] | None:
 
 
 def finite_number(value: Any) -> float | None:
-    """The finite number of an EXIF rational or a text; None for x/0 and the like."""
+    """The finite number of an EXIF rational or a text, "3/2" too; None for x/0 and the like."""
     try:
-        number = float(value)
+        above, _, below = value.partition("/") if isinstance(value, str) else (value, "", "")
+        number = float(above) / float(below or 1.0)
     except (TypeError, ValueError, ZeroDivisionError):
         return None
     return number if math.isfinite(number) else None

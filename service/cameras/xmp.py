@@ -8,8 +8,20 @@ from xml.parsers import expat
 MAX_BYTES = 1 << 18
 """Of a packet that is read; those of DJI have 10 KiB."""
 
-PREFIXES = frozenset(("drone-dji", "drone-parrot", "drone", "Camera"))
+PREFIXES = frozenset(("drone-dji", "drone-parrot", "drone"))
 """Autel's names are those of DJI with the prefix drone."""
+
+TEAL = {
+    "exif:CameraYaw": "GimbalYawDegree",
+    "exif:CameraPitch": "GimbalPitchDegree",
+    "exif:CameraRoll": "GimbalRollDegree",
+    "exif:PlatformYaw": "FlightYawDegree",
+    "exif:CameraHorizontalFOV": "CameraHorizontalFOV",
+}
+"""Teal's names, to the name that a value is stored by; their values are rationals."""
+
+CAMERA, PIX4D = "Camera", "pix4d.com"
+"""A prefix of several makers: a Disco's angles by it are its body's, a phone's values others."""
 
 SKYDIO, NED = "drone-skydio", "CameraOrientationNED"
 """Skydio's angles by frame of reference; those of other frames have the same names."""
@@ -68,14 +80,17 @@ class _Reader:
         self._open: list[str | None] = []  # names of the elements, None where it is not read
         self._texts: list[str] = []  # since the last one that is read
         self._skydio: list[bool] = [False]
+        self._is_pix4d = True  # what the prefix Camera stands for
 
     def start(self, element: str, attributes: dict[str, str]) -> None:
         is_ned = self._skydio[-1] or element == f"{SKYDIO}:{NED}"
         self._skydio.append(is_ned)
+        if (namespace := attributes.get(f"xmlns:{CAMERA}")) is not None:
+            self._is_pix4d = PIX4D in namespace
         for attribute, value in attributes.items():
-            if (name := _name(attribute, is_ned)) is not None:
+            if (name := self._name(attribute, is_ned)) is not None:
                 self.values[name] = value
-        name = _name(element, is_ned)
+        name = self._name(element, is_ned)
         self._open.append(name)
         if name is not None:
             self._texts.clear()
@@ -91,10 +106,11 @@ class _Reader:
             self.values[name] = ",".join(self._texts)
             self._texts.clear()
 
-
-def _name(qualified: str, is_ned: bool) -> str | None:
-    """The name that a value is stored by; None where it is not read."""
-    prefix, _, name = qualified.partition(":")
-    if prefix in PREFIXES:
-        return name
-    return f"Gimbal{name}Degree" if is_ned and prefix == SKYDIO and name != NED else None
+    def _name(self, qualified: str, is_ned: bool) -> str | None:
+        """The name that a value is stored by; None where it is not read."""
+        prefix, _, name = qualified.partition(":")
+        if prefix in PREFIXES or (prefix == CAMERA and self._is_pix4d):
+            return name
+        if is_ned and prefix == SKYDIO and name != NED:
+            return f"Gimbal{name}Degree"
+        return TEAL.get(qualified)

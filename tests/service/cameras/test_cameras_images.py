@@ -239,6 +239,9 @@ def test_dji_xmp_gives_attitude_height_and_accuracy(tmp_path: Path) -> None:
         "<drone-skydio:Yaw>146.5</drone-skydio:Yaw></drone-skydio:CameraOrientationNED>"
         '<drone-skydio:CameraOrientationFLU rdf:parseType="Resource">'
         "<drone-skydio:Yaw>9</drone-skydio:Yaw></drone-skydio:CameraOrientationFLU>",
+        # Teal 2: rationals
+        "<exif:CameraPitch>-78400/1000</exif:CameraPitch><exif:CameraRoll>-3/10</exif:CameraRoll>"
+        "<exif:CameraYaw>293/2</exif:CameraYaw><exif:PlatformYaw>31901593/100000</exif:PlatformYaw>",
     ],
 )
 def test_other_makers_state_the_attitude_too(tmp_path: Path, block: str) -> None:
@@ -247,6 +250,25 @@ def test_other_makers_state_the_attitude_too(tmp_path: Path, block: str) -> None
     write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
     tag = read_tags(path).geotag
     assert tag is not None and tag.ypr_deg == (146.5, -78.4, -0.3)
+
+
+@pytest.mark.parametrize(
+    ("namespace", "is_read"),
+    [("http://pix4d.com/camera/1.0", True), ("http://pix4d.com/1.0", True), ("Camera/", False)],
+    ids=["Sequoia", "RedEdge", "Disco, whose angles are its body's"],
+)
+def test_angles_of_the_prefix_camera_are_read_where_it_is_pix4ds(
+    tmp_path: Path, namespace: str, is_read: bool
+) -> None:
+    xmp = (
+        f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description xmlns:Camera="{namespace}" '
+        'Camera:Yaw="18.678" Camera:Pitch="2.054" Camera:Roll="-2.392"/></x:xmpmeta>'
+    )
+    path = tmp_path / "0001.jpg"
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
+    tag = read_tags(path).geotag
+    assert tag is not None and tag.lat_deg is not None
+    assert (tag.ypr_deg is not None) == is_read
 
 
 def test_gimbal_angles_that_are_all_zero_are_unknown(tmp_path: Path) -> None:

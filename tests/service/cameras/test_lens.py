@@ -51,7 +51,8 @@ def write_still(
 
 def xmp_of(names: dict[str, str], space: str = "drone-dji") -> str:
     values = " ".join(f'{space}:{name}="{value}"' for name, value in names.items())
-    return f'<x:xmpmeta><rdf:Description xmlns:{space}="x" {values}/></x:xmpmeta>'
+    namespace = "http://pix4d.com/1.0" if space == "Camera" else "x"
+    return f'<x:xmpmeta><rdf:Description xmlns:{space}="{namespace}" {values}/></x:xmpmeta>'
 
 
 @pytest.mark.parametrize(
@@ -81,6 +82,14 @@ def xmp_of(names: dict[str, str], space: str = "drone-dji") -> str:
             10.0 * 330.0 / 4608 * 1600,
             "maker",
         ),
+        (  # an older RedEdge: pixels, with the principal point in millimetres
+            {37386: 5.5, 41486: 266.667, 41488: 4, 40962: 1280, 40963: 960},
+            xmp_of({"PerspectiveFocalLength": "1449.358", "PrincipalPoint": "2.35363,1.79947"},
+                   "Camera"),
+            1449.358 / 1280 * 1600,
+            "maker",
+        ),
+        ({}, xmp_of({"CameraHorizontalFOV": "60/1"}, "exif"), 800 * 3**0.5, "field of view"),
     ],
 )  # fmt: skip
 def test_the_focal_length_is_read(
