@@ -3,7 +3,8 @@
 Descriptors are shared by the whole process: thousands of connections to a web page would stop
 the datalink too. So a listener has a limit in total and one per address, and a connection that
 waits too long for its request is closed. At a limit the connection that has waited longest is
-closed, so that half-open connections lock no operator out.
+closed, so that half-open connections lock no operator out. uvicorn's limit counts requests of all
+addresses together and answers what exceeds it, so one address can take them all.
 """
 
 from __future__ import annotations

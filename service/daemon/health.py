@@ -1,6 +1,7 @@
 """The state of the service over HTTP, for this machine.
 
-Uses only the standard library's HTTP server.
+Uses only the standard library's HTTP server: an aircraft has none of the ground's packages. The
+figures are one dict; Prometheus' client, which registers each by name, would not shorten them.
 """
 
 from __future__ import annotations

@@ -205,7 +205,10 @@ class AuditLog:
 
 
 class Pace:
-    """A token bucket: ``burst`` at once, then ``rate_hz`` a second."""
+    """A token bucket: ``burst`` at once, then ``rate_hz`` a second.
+
+    Not slowapi: it limits routes by address, not orders, refusals and warnings in the log.
+    """
 
     def __init__(
         self, rate_hz: float, burst: int, clock: Callable[[], float] = time.monotonic
@@ -371,6 +374,7 @@ HEADERS = (
         b" connect-src 'self' blob:; worker-src 'self' blob:; frame-ancestors 'none'",
     ),
 )
+"""On every answer, refusals too. Starlette has no layer for them, and a package only the values."""
 
 
 class Guard:

@@ -467,7 +467,10 @@ async def _order(request: Request) -> Response:
 
 
 def _metrics(request: Request) -> Response:
-    """The receiver's figures in the text form of Prometheus."""
+    """The receiver's figures in the text form of Prometheus.
+
+    Not prometheus_client: two figures that another thread counts take as many lines with it.
+    """
     lines = ["# TYPE skyrelief_received_bytes counter", "# TYPE skyrelief_keyframes gauge"]
     for entry in state_of(request).progress():
         labels = f'{{drone="{_quoted(entry["drone"])}",scan="{_quoted(entry["scan"])}"}}'

@@ -30,7 +30,6 @@ import time
 import zlib
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -279,20 +278,11 @@ POLL_S = 0.25
 LINK_S = 1.0
 
 
-def _news(
-    feed: LiveFeed, site: SiteNews, entry: Callable[[], dict[str, Any]]
-) -> Iterator[str | bytes | None]:
-    """What is new, then None, again and again; every LINK_S, also between two chunks, the state of
-    the link by the receiver's ``entry``."""
-    due = 0.0
+def _news(feed: LiveFeed, site: SiteNews) -> Iterator[str | bytes | None]:
+    """What is new, again and again; None where there is no more for now."""
     while True:
-        for message in chain(feed.news(), map(SiteNews.message, (site,))):
-            if message is not None:
-                yield message
-            if time.monotonic() >= due:
-                due = time.monotonic() + LINK_S
-                yield link_message(entry(), feed.heard_unix_s)
-        yield None
+        yield from feed.news()
+        yield site.message()
 
 
 async def serve_live(
@@ -305,12 +295,15 @@ async def serve_live(
         store = await run_in_threadpool(ScanStore.open, folder / "scan.db")
         feed = LiveFeed(store, socket.query_params.get("layer") == "0")
         gone = asyncio.create_task(_until_gone(socket))
-        news = _news(feed, SiteNews(library, folder), lambda: _entry(folder, progress()))
-        async for message in iterate_in_threadpool(news):
+        link_at = 0.0
+        async for message in iterate_in_threadpool(_news(feed, SiteNews(library, folder))):
             if message is not None:
                 await _send(socket, message)  # before the next one is made
             elif not gone.done():
                 await asyncio.wait({gone}, timeout=POLL_S)
+            if time.monotonic() >= link_at and not gone.done():
+                link_at = time.monotonic() + LINK_S
+                await _send(socket, link_message(_entry(folder, progress()), feed.heard_unix_s))
             if gone.done():
                 break
     except (SkyreliefError, WebSocketDisconnect, RuntimeError) as error:

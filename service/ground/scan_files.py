@@ -89,7 +89,8 @@ def _maps(request: Request) -> Response:
 
 
 class _Pipe(io.RawIOBase):
-    """Keeps what is written until it is taken."""
+    """Keeps what is written until it is taken: zipfile needs a file, and a package for streaming
+    (zipstream-ng) would replace these lines only."""
 
     def __init__(self) -> None:
         super().__init__()
