@@ -254,8 +254,8 @@ def _replay(
     unsure: set[str] = set()  # what the images may correct: then the scan begins again
     if played is source and parse_source(video)[0] == "file":
         is_clock_given = is_latency_given or (video_epoch is not None and not is_assumed)
-        is_of_camera = log is not None and log.clock == "video" and log.start_unix_ns is None
-        is_clock_sure = log is None or is_of_camera or is_clock_given
+        is_of_camera = log is None or (log.clock == "video" and not log.may_lag)
+        is_clock_sure = is_of_camera or is_clock_given
         unsure = {"readout"} if is_clock_sure else {"readout", "clock"}
     with nullcontext(Progress()) if as_json else showing("replay") as progress:
         if start is not None:

@@ -6,6 +6,7 @@ import math
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from datetime import datetime, timezone
 from fractions import Fraction
 from pathlib import Path
 
@@ -111,6 +112,22 @@ def test_a_real_karma_gives_its_autopilots_position() -> None:
     assert state.lon_deg == pytest.approx(-117.33108, abs=2e-5)
     assert state.alt_amsl_m == pytest.approx(15.6, abs=0.2)
     assert state.sigma_h_m == pytest.approx(0.25, abs=0.02) and state.v_ned_m_s is not None
+
+
+def test_a_real_hero11_states_time_fix_and_accuracy_with_each_position() -> None:
+    packets = [
+        (k * 1001 * 10**6, 1001 * 10**6, (REAL / f"hero11_{k}.gpmf").read_bytes()) for k in (0, 1)
+    ]
+    log = gpmf.of_packets(HERE, packets, HistoryConfig())
+    assert log.counts["GPS9"] == 21 and log.counts["CORI"] == 52
+    assert log.last_ns - log.first_ns == pytest.approx(2.0e9, abs=2e6)  # by their own clock
+    state = at(log, 1.0)
+    assert (state.lat_deg, state.lon_deg) == pytest.approx((42.42615, -8.64998), abs=2e-5)
+    assert state.alt_amsl_m == pytest.approx(34.1, abs=0.3)
+    assert state.sigma_h_m is not None and 2.0 < state.sigma_h_m < 4.5
+    assert log.start_unix_ns is not None
+    began = datetime.fromtimestamp(log.start_unix_ns / 1e9, timezone.utc)
+    assert abs(began - datetime(2022, 9, 20, 13, 29, 38, tzinfo=timezone.utc)).total_seconds() < 2
 
 
 def test_positions_that_state_their_own_time_lie_at_it() -> None:
@@ -363,8 +380,9 @@ def test_a_value_that_says_unknown_is_left_out() -> None:
     assert "lat" not in found and found["lon"] == pytest.approx(-8.5)
 
 
-KARMA, MAX, APHILL = (
-    (REAL / name).read_bytes() for name in ("karma_0.gpmf", "max_0.gpmf", "aphill.klv")
+KARMA, MAX, HERO11, APHILL = (
+    (REAL / name).read_bytes()
+    for name in ("karma_0.gpmf", "max_0.gpmf", "hero11_0.gpmf", "aphill.klv")
 )
 
 
@@ -380,7 +398,7 @@ def test_an_item_that_declares_too_few_columns_is_not_read(key: bytes) -> None:
 @given(
     st.binary(max_size=300),
     st.integers(0, 8000),
-    st.sampled_from([KARMA, MAX, APHILL, local_set(LEVEL), gps9(1, 3, 1)]),
+    st.sampled_from([KARMA, MAX, HERO11, APHILL, cheyenne()[0], local_set(LEVEL), gps9(1, 3, 1)]),
 )
 @example(b"DEVC\0\xff\xff\xff" * 30, 0, b"")
 @example(klv.LOCAL_SET + b"\xff" * 200, 0, b"")

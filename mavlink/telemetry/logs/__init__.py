@@ -33,6 +33,7 @@ class TelemetryLog:
     focal_35mm: float | None = None  # the camera's, as the 35 mm equivalent in mm
     hfov_deg: float | None = None  # the camera's field of view from side to side
     start_unix_ns: int | None = None  # of the video, by the log's own date
+    may_lag: bool = False  # its times come from another device than the images
 
 
 def load_telemetry(path: str | Path, config: HistoryConfig | None = None) -> TelemetryLog:

@@ -7,7 +7,8 @@ is not that of the camera, which a gimbal holds, and is not read. The image's at
 CORI (from the start of the recording to the camera), IORI (from the camera to the image, which the
 camera's stabilisation turns) and GRAV (gravity in the camera), of HERO8 and later; its heading
 counts from an unknown direction. Their axes are x right, y down, z ahead. Times are the video's
-own; samples spread over the time of their packet, those of a drone by its own clock.
+own; samples spread over the time of their packet, those of GPS9 and a drone by their own clock.
+GPSU dates the recording, whose container has local time.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
 from itertools import accumulate
 from pathlib import Path
+from statistics import median_low
 
 from mavlink.telemetry.decode import HDOP_TO_M, plausible_place, receiver_accuracy
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
@@ -57,7 +60,7 @@ COLUMNS = {
 PLACES = (b"GLPI", b"GPS9", b"GPS5")
 """Best first; the first that has one gives them all."""
 
-UNKNOWN_DOP, MAX_OWN_S = 99.0, 1e9
+UNKNOWN_DOP, MAX_OWN_S = 99.0, 1e10
 DRIFT_NS = 2_000_000_000
 """Gravity is averaged so long before and after: what else accelerates the camera averages out."""
 
@@ -72,6 +75,7 @@ class _Stream:
     kinds: bytes = b""
     fix: float = 3.0
     dop: float = math.nan
+    utc_ns: int | None = None
 
 
 @dataclass(slots=True)
@@ -88,9 +92,12 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
     history, counts = VehicleHistory(config), Counter[str]()
     tracks: dict[bytes, _Track] = {}
     turned: dict[bytes, dict[int, tuple[float, ...]]] = {b"CORI": {}, b"IORI": {}, b"GRAV": {}}
+    dates_ns = list[int]()
     for time_ns, duration_ns, data in packets:
         counts["packets"] += 1
         for key, rows, stream in _streams(data):
+            if stream.utc_ns is not None and stream.fix >= 2.0:
+                dates_ns.append(stream.utc_ns - time_ns)
             if key in turned:
                 times = (time_ns + i * duration_ns // len(rows) for i in range(len(rows)))
                 turned[key] |= zip(times, rows, strict=True)
@@ -115,7 +122,8 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
                 history.add(sample, time_ns)
     for time_ns, head in _heads(turned):
         history.add(GimbalSample(None, head, GimbalFrame.EARTH, CAMERA, 0, False), time_ns)
-    return replace(finish(path, history, counts, []), clock="video")
+    start_ns = median_low(dates_ns) if dates_ns else None
+    return replace(finish(path, history, counts, []), clock="video", start_unix_ns=start_ns)
 
 
 def _heads(
@@ -183,6 +191,8 @@ def _streams(data: bytes) -> Iterator[tuple[bytes, list[tuple[float, ...]], _Str
             stream.scale = tuple(v for row in _rows(bytes([kind]), size, content) for v in row)
         elif key == b"TYPE":
             stream.kinds = content[:64]
+        elif key == b"GPSU":
+            stream.utc_ns = _utc_ns(content)
         elif key in (b"GPSF", b"GPSP"):
             for (value,) in _rows(bytes([kind]), size, content)[:1]:
                 stream.fix, stream.dop = (
@@ -198,6 +208,15 @@ def _streams(data: bytes) -> Iterator[tuple[bytes, list[tuple[float, ...]], _Str
                 scaled = [tuple(v / s for v, s in zip(r, scales, strict=True)) for r in rows]
                 rows = [r[: COLUMNS[key]] for r in scaled if all(map(math.isfinite, r))]
                 yield key, rows, stream
+
+
+def _utc_ns(text: bytes) -> int | None:
+    """Unix time of a date such as b"220920132938.299"."""
+    try:
+        moment = datetime.strptime(text[:16].decode("ascii"), "%y%m%d%H%M%S.%f")
+    except ValueError:
+        return None
+    return round(moment.replace(tzinfo=timezone.utc).timestamp() * 1e3) * 10**6
 
 
 def _items(data: bytes) -> Iterator[tuple[bytes, int, int, bytes]]:
@@ -238,9 +257,9 @@ def _gps5(row: tuple[float, ...], stream: _Stream) -> tuple[None, list[Sample]]:
     return None, _fix(lat, lon, alt, stream.fix, stream.dop)
 
 
-def _gps9(row: tuple[float, ...], _: _Stream) -> tuple[None, list[Sample]]:
-    (lat, lon, alt), (dop, fix) = row[:3], row[7:9]
-    return None, _fix(lat, lon, alt, fix, dop)
+def _gps9(row: tuple[float, ...], _: _Stream) -> tuple[float, list[Sample]]:
+    (lat, lon, alt), (days, second, dop, fix) = row[:3], row[5:9]
+    return 86_400.0 * days + second, _fix(lat, lon, alt, fix, dop)
 
 
 def _fix(lat: float, lon: float, alt: float, fix: float, dop: float) -> list[Sample]:

@@ -105,7 +105,8 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
         )
     log = replace(finish(path, history, counts, warnings), clock="video")
     view = median(views) if views else None
-    return replace(log, hfov_deg=view, start_unix_ns=start_ns if start_ns > DATED_NS else None)
+    dated_ns = start_ns if start_ns > DATED_NS else None
+    return replace(log, hfov_deg=view, start_unix_ns=dated_ns, may_lag=True)
 
 
 def fields_of(data: bytes) -> dict[str, float]:
