@@ -12,10 +12,12 @@ from recon.backends import Backend, DenseStages
 from recon.pipeline.config import Timing, untimed
 from recon.pipeline.events import FirstDepth
 from recon.pipeline.keyframe_map import KeyframeMap
-from recon.pipeline.stages import PairStages, Plausible, Rectify, keyframe_of
+from recon.pipeline.stages import PairStages, Rectify, keyframe_of
 from recon.pipeline.surface_map import SurfaceMap
 from recon.pipeline.views import StereoView
+from recon.stereo.depth_edges import drop_edges
 from recon.stereo.posed_image import VirtualStereoConfig
+from recon.stereo.reprojection import plausible
 
 COARSER = 2
 """The images are smaller by this factor than those of the view's whole depth."""
@@ -41,7 +43,6 @@ class FirstDepths:
         )  # fmt: skip
         self._rectify = Rectify(stereo, Counter(), None, untimed)
         self._stereo = PairStages(backend, dense, None, untimed)
-        self._plausible = Plausible(Counter())
         self._keyframes, self._surface, self._timing = keyframes, surface, timing
 
     def set_width(self, width_px: int) -> None:
@@ -63,9 +64,10 @@ class FirstDepths:
                 depths = [self._stereo.reproject(self._stereo.match(p), p, grid) for p in pairs]
                 depth = self._stereo.fuse(depths, grid)
             bgr = self._rectify.colours(view, grid)
-            depth = self._plausible(view, depth, bgr)
+            if depth is not None:
+                depth = plausible(drop_edges(depth, bgr), view.prior)
             self._rectify.learn(depth)
-            if depth is None:
+            if depth is None or self._keyframes.graph.segments[view.segment].agreement < 0:
                 return None
             T_odom, pose = ahead
             sigma_m, fresh = self._surface.peek(depth, view.rows_share, T_odom)

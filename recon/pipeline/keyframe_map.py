@@ -124,5 +124,6 @@ class KeyframeMap:
 
     def left_out(self) -> list[tuple[int, int]]:
         """First and last keyframe of each stretch that is not part of the map: those apart, and
-        those between which vision is wrong, so that their depth is, too."""
-        return [*self.apart(), *self.graph.refuted.items()]
+        those of false depth, each by itself or with the next one, as they are no piece of a map."""
+        false = self.graph.segments.false_keyframes()
+        return [*self.apart(), *self.graph.refuted.items(), *zip(false, false, strict=True)]

@@ -141,9 +141,10 @@ class Mapper:
         self.carry = Carry(backend, timing)
         self.rectify = Rectify(stereo, self.rejected, self.debug, timing)
         self.stereo = PairStages(backend, dense, self.debug, timing)
-        self.plausible = Plausible(self.rejected)
         self.register = Register(backend, timing)
-        trajectory = Trajectory(PoseGraph(PoseGraphConfig(max_nodes=config.graph_keyframes)))
+        graph = PoseGraph(PoseGraphConfig(max_nodes=config.graph_keyframes))
+        self.plausible = Plausible(graph.segments, self.rejected)
+        trajectory = Trajectory(graph)
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
         self.keyframes = KeyframeMap(trajectory, loops, self.rejected, timing)
         self.surface = SurfaceMap(

@@ -17,6 +17,7 @@ from recon.image_quality import BlurWatch, stretch
 from recon.mapping.registration import IcpConfig, agreed_motion
 from recon.pipeline.config import CONTRADICTED, Timing
 from recon.pipeline.views import StereoView, ViewSelection
+from recon.posegraph.segments import Segments
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
@@ -279,24 +280,19 @@ class PairStages:
 
 
 class Plausible:
-    """Drops the depth that a view cannot have seen.
+    """Drops the depth that a view cannot have seen, and all of a segment whose motion is false."""
 
-    The views of a stretch share one motion: where as many were refuted as not, it is false.
-    """
-
-    def __init__(self, rejected: Counter[str]) -> None:
-        self._rejected = rejected
-        self._segment, self._balance = -1, 0  # of its views, those kept less those refuted
+    def __init__(self, segments: Segments, rejected: Counter[str]) -> None:
+        self._segments, self._rejected = segments, rejected
 
     def __call__(self, view: StereoView, depth: DepthMap | None, bgr: U8) -> DepthMap | None:
         """The plausible part of ``depth``, which has the colours ``bgr``; None without any."""
         if depth is None:
             return None
         kept = plausible(drop_edges(depth, bgr), view.prior)
-        if view.segment != self._segment:
-            self._segment, self._balance = view.segment, 0
-        self._balance += -1 if kept is None else 1
-        if kept is not None and self._balance > 0:
+        segment = self._segments.opened(view.segment)
+        segment.agreement += -1 if kept is None else 1
+        if kept is not None and not segment.is_false:
             return kept
         self._rejected[CONTRADICTED if kept is None else f"{CONTRADICTED} in earlier views"] += 1
         return None

@@ -24,7 +24,7 @@ def apart(segments: Segments, loops: Sequence[Loop]) -> list[tuple[int, int]]:
 
     The main piece is the one that fixes place; without fixes, that with most points.
     """
-    known = segments.with_surface()
+    known = [segment for segment in segments.with_surface() if not segment.is_false]
     piece = {segment.number: segment.number for segment in known}
     looped: set[int] = set()
     for loop in loops:
@@ -54,18 +54,17 @@ def apart(segments: Segments, loops: Sequence[Loop]) -> list[tuple[int, int]]:
             sizes[piece[segment.number]] += segment.points
         main = sizes.most_common(1)[0][0] if sizes else -1
     return [
-        segment.surface
+        (segment.surface[0], segment.surface[-1])
         for segment in known
         # A long flight forgets loops, and not which segments they tied.
-        if segment.surface is not None
-        and piece[segment.number] != main
+        if piece[segment.number] != main
         and (segment.number in looped or segment.number in loose or not segment.is_tied)
     ]
 
 
 def _segment_of(known: Sequence[Segment], seq: int) -> int | None:
     at = bisect_right(known, seq, key=lambda one: one.first) - 1
-    return known[at].number if at >= 0 else None
+    return known[at].number if at >= 0 and seq <= known[at].surface[-1] else None
 
 
 def _sigma_height_m(segment: Segment) -> float | None:

@@ -56,14 +56,20 @@ class Segment:
     scales: ScaleBlocks = field(default_factory=ScaleBlocks)
     is_tied_by_loop: bool = False
     fitted: int = 0  # keyframes when the similarity was fitted last
-    surface: tuple[int, int] | None = None  # its first and last keyframe with depth
+    surface: list[int] = field(default_factory=list)  # its keyframes with depth
+    agreement: int = 0  # views whose depth is plausible, less those whose pairs contradict
     points: int = 0  # new surface points of them
     is_fixed: bool = False  # one of them has a fix of known height, and a heading
 
     @property
     def first(self) -> int:
         """Number of the first keyframe with depth; -1 without any."""
-        return -1 if self.surface is None else self.surface[0]
+        return self.surface[0] if self.surface else -1
+
+    @property
+    def is_false(self) -> bool:
+        """True where as many of its views contradict themselves as not: all share one motion."""
+        return self.agreement <= 0
 
     @property
     def frame(self) -> Similarity:
@@ -112,7 +118,7 @@ class Segment:
 
     def add_surface(self, seq: int, points: int, prior: PosePrior) -> None:
         """Count the new points of a keyframe with depth."""
-        self.surface = (seq if self.surface is None else self.surface[0], seq)
+        self.surface.append(seq)
         self.points += points
         sigma = prior.sigma_position_m
         has_fix = sigma is not None and sigma[2] < HEIGHT_KNOWN_M
@@ -140,7 +146,11 @@ class Segments:
 
     def with_surface(self) -> list[Segment]:
         """Those that keyframes with depth belong to, in order."""
-        return [segment for segment in self._all.values() if segment.surface is not None]
+        return [segment for segment in self._all.values() if segment.surface]
+
+    def false_keyframes(self) -> list[int]:
+        """Those with depth of segments whose motion is false."""
+        return [seq for one in self.with_surface() if one.is_false for seq in one.surface]
 
     def opened(self, number: int) -> Segment:
         return self._all.setdefault(number, Segment(number))

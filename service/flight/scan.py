@@ -388,7 +388,13 @@ class Scan:
                 "segments of the flight, which neither loops nor fixes of known height and scale "
                 "tie to the rest; fly with more overlap, or with GNSS that states its accuracy"
             )
-        if frames and self.recorder.keyframes == 0:
+        false = len(self.pipeline.keyframes.graph.segments.false_keyframes())
+        if false:
+            out.append(
+                f"left out of the cloud: {false} of {self.recorder.keyframes} keyframes, as the "
+                "depths of most views of the same segment contradict each other"
+            )
+        if frames and self.recorder.keyframes == false:
             top = self.pipeline.refusals().most_common(2)
             why = "; ".join(f"{reason} ({n})" for reason, n in top) or "too few frames"
             out.append(f"nothing was reconstructed: {why}")

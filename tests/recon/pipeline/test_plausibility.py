@@ -10,6 +10,8 @@ from some_views import view_at
 
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
 from recon.pipeline.stages import Plausible
+from recon.posegraph.records import PoseGraphConfig
+from recon.posegraph.segments import Segments
 from recon.stereo.reprojection import plausible
 from recon.types import F64, U8, DepthMap, PosePrior
 
@@ -93,10 +95,10 @@ def test_nothing_left_is_no_depth() -> None:
     assert plausible(surface(np.ones(SHAPE, np.uint8)), PosePrior(looking(60.0), 0.0)) is None
 
 
-def test_a_stretch_that_was_refuted_needs_more_views_that_agree() -> None:
+def test_a_segment_that_was_refuted_needs_more_views_that_agree() -> None:
     """Two views of a false motion contradict themselves; a third that does not stays out."""
-    rejected: Counter[str] = Counter()
-    stage = Plausible(rejected)
+    rejected, segments = Counter[str](), Segments(PoseGraphConfig())
+    stage = Plausible(segments, rejected)
     false, good = surface(np.zeros(SHAPE, np.uint8)), surface(np.full(SHAPE, 2, np.uint8))
     bgr = np.zeros((*SHAPE, 3), np.uint8)
     first, second = (view_at(n, np.eye(4), segment=n) for n in range(2))
@@ -104,3 +106,7 @@ def test_a_stretch_that_was_refuted_needs_more_views_that_agree() -> None:
     assert stage(first, good, bgr) is good
     assert stage(second, None, bgr) is None and stage(second, good, bgr) is good
     assert sum(rejected.values()) == 4
+    assert not segments[0].is_false and not segments[1].is_false
+    segments[1].add_surface(7, 100, second.prior)
+    assert stage(second, false, bgr) is None and segments[1].is_false
+    assert segments.false_keyframes() == [7]  # it was kept before its segment was known to be false

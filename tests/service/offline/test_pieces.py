@@ -25,6 +25,7 @@ from recon.posegraph.segments import Segment, Segments
 from recon.types import F64, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cli import app
+from service.errors import InputError
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.offline.refine.by_images import stretches_untied
 from service.offline.tiles import footprints
@@ -51,6 +52,7 @@ class Ties:
     against_m: float | None = None  # of one segment's against another's
     sigma_scale: dict[int, float] = field(default_factory=dict)  # where it is not 0.01
     main: int = 0  # the largest
+    false: tuple[int, ...] = ()  # as many of its views contradict themselves as not
 
     def segment(self, segments: Segments, number: int) -> Segment:
         """A segment with its similarity."""
@@ -62,6 +64,7 @@ class Ties:
         if self.against_m is not None:
             heights = Heights(self.against_m / 2**0.5, 0.0, 0.0, 0.0)
             out.similarity = replace(out.similarity, heights=heights)
+        out.agreement = 0 if number in self.false else 3
         out.is_tied_by_loop, out.keyframes = number in self.tied, 3 + (number == self.main)
         return out
 
@@ -118,6 +121,11 @@ def test_fixes_that_leave_the_size_open_do_not_lay_one_stretch_on_another() -> N
         assert apart(ties, prior=prior) == [(10, 12), (30, 32)]
         assert apart(replace(ties, main=1), prior=prior) == [(30, 32)]
         assert apart(replace(ties, taken=[loop(2, 11)]), prior=prior) == [(30, 32)]
+
+
+def test_what_is_false_is_no_piece_and_ties_none() -> None:
+    assert apart(Ties(false=(1,))) == [(0, 2), (30, 32)]
+    assert apart(Ties([loop(2, 11), loop(11, 21)], fixed=(0,), false=(1,))) == [(20, 22), (30, 32)]
 
 
 def test_a_forgotten_loop_still_ties() -> None:
@@ -198,6 +206,18 @@ def test_no_deliverable_shows_what_is_apart(tmp_path: Path, house: HouseFlight) 
     features = json.loads(east[1].read_text())["features"]
     assert [f["properties"].get("keyframe") for f in features[1:]] == [0, 1, 2]
     assert len(features[0]["geometry"]["coordinates"]) == 3
+
+
+def test_a_scan_of_false_depth_alone_shows_none(tmp_path: Path, house: HouseFlight) -> None:
+    with finished(house.flown(tmp_path), [[seq, seq] for seq in range(5)]) as store:
+        summary = write_deliverables(tmp_path, store, {})
+    assert summary["counts"]["points"] == 0 and not summary["failed"]
+    assert any("5 of 5 keyframes" in note for note in summary["notes"])
+    assert not list(tmp_path.glob("piece-*")) and len(laspy.read(tmp_path / "cloud.laz")) == 0
+    with ScanView(tmp_path) as view:
+        for kind in ("dsm", "mesh", "las"):
+            with pytest.raises(InputError):
+                export(view, kind, None, ExportOptions())
 
 
 def test_a_piece_that_nothing_ties_is_a_cloud_of_its_own(
