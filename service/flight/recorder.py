@@ -80,9 +80,9 @@ class Recorder:
             if isinstance(event, FramePosed):  # the frame before, which was lost until now
                 self.states[Tracking.LOST] -= 1
                 self._write_pose(event, self._agl_before_m)
-        self._write_keyframes(before)
         assert isinstance(posed, FramePosed)
-        self._write_pose(posed, agl_m)
+        self._write_pose(posed, agl_m)  # first: keyframes take ten times as long to code and store
+        self._write_keyframes(before)
         self._agl_before_m = agl_m
 
     def _write_pose(self, posed: FramePosed, agl_m: float | None) -> None:

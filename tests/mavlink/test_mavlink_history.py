@@ -509,6 +509,21 @@ def test_a_live_history_waits_for_the_far_side_of_a_frame() -> None:
     assert angle(state.q_ned_body_wxyz, quaternion.from_rpy(0.0, 0.0, 0.18)) < 1e-6
 
 
+def test_a_live_history_waits_for_no_sample_beyond_one_just_before_the_frame() -> None:
+    waits = list[float]()
+    history = VehicleHistory(patience_s=5.0, wait=waits.append)
+    now = time.monotonic_ns()
+    for k in range(10):  # 0.01 rad in 20 ms; the newest is 10 ms older than the frame
+        turned = AttitudeSample(None, quaternion.from_rpy(0.0, 0.0, 0.01 * k))
+        history.add(turned, now - (190 - 20 * k) * MS)
+    history.add(position(50.0, 8.0, 580.0, (0.0, 0.0, 0.0)), now - 101 * MS)
+    history.add(position(50.0, 8.0, 580.0, (0.0, 0.0, 0.0)), now - 1 * MS)  # the next: in 99 ms
+    state = history.state_at(now)
+    assert not waits
+    assert state is not None and state.q_ned_body_wxyz is not None and state.lat_deg is not None
+    assert angle(state.q_ned_body_wxyz, quaternion.from_rpy(0.0, 0.0, 0.095)) < 1e-6
+
+
 def test_a_live_history_does_not_wait_in_vain() -> None:
     impatient = VehicleHistory(patience_s=0.01)
     now = time.monotonic_ns()
