@@ -37,6 +37,7 @@ from service.scans.track import camera_of
 
 AWAY_M = 40.0  # from the eye to the place looked at
 ASIDE_M = 0.05  # which never lies straight below: there a view without roll has no heading
+DARKER_EV = -2  # the darkest that the page has: hardly a value is clipped then
 SAME = 2  # a pixel that differs by more under another sky shows the sky
 DARK, BRIGHT = 8, 250  # colours between these give the brightness
 IMAGE = "document.querySelector('.stage canvas').toDataURL('image/png').split(',')[1]"
@@ -153,6 +154,7 @@ class Screen:
         self.browser.wait(ALL_SHOWN % self.keyframes, WAIT_S)
         self._fit()
         self._set("Field of view", f"field.value = {self.degrees};")
+        self._set("Exposure", f"field.value = {DARKER_EV};")
 
     def _fit(self) -> None:
         """Makes the page so large that the scene has the camera's pixels."""

@@ -457,6 +457,11 @@ def test_tone_mapping_and_exposure_change_the_mesh(
     setting(browser, "Exposure", "field.value = 1.5;" + CHANGED)
     brighter = drawn(browser)
     assert brighter.mean() > reinhard.mean() + 3.0
+    setting(browser, "Tone", "field.selectedIndex = 0;" + CHANGED.replace("input", "change"))
+    site = is_site(plain)
+    assert drawn(browser)[site].mean() > plain[site].mean() + 20.0
+    setting(browser, "Exposure", "field.value = 0;" + CHANGED)
+    assert difference(plain, drawn(browser)) == 0.0
     browser.click("Points")
 
 

@@ -9,6 +9,7 @@ const FRAGMENT = /* glsl */ `
   uniform vec2 pixel;
   uniform vec2 planes;
   uniform float strength;
+  uniform float shading;
   uniform float gain;
   varying vec2 place;
 
@@ -30,7 +31,7 @@ const FRAGMENT = /* glsl */ `
         + max(0.0, here - far(place - vec2(pixel.x, 0.0)))
         + max(0.0, here - far(place + vec2(0.0, pixel.y)))
         + max(0.0, here - far(place - vec2(0.0, pixel.y)));
-      seen *= max(0.35, exp(-strength * sum));
+      seen *= mix(1.0, max(0.35, exp(-strength * sum)), shading);
     }
     gl_FragColor = vec4(gain * seen, 1.0);
     #include <tonemapping_fragment>
@@ -43,6 +44,8 @@ const STRENGTH = 12;
 export class Dome {
   /** 1 is usual, 0 switches it off. */
   strength = 1;
+  /** Share of it that the present colours get. */
+  shading = 1;
   /** What all that is drawn is multiplied with, but for the sky. */
   gain = 1;
   /** Metres by which what is not measured was drawn behind. */
@@ -57,6 +60,7 @@ export class Dome {
     pixel: { value: new THREE.Vector2() },
     planes: { value: new THREE.Vector2() },
     strength: { value: 0 },
+    shading: { value: 1 },
     gain: { value: 1 },
     behind: { value: 0 },
   };
@@ -100,6 +104,7 @@ export class Dome {
     this.uniforms.pixel.value.set(radius / size.x, radius / size.y);
     this.uniforms.planes.value.set(camera.near, camera.far);
     this.uniforms.strength.value = this.strength * STRENGTH;
+    this.uniforms.shading.value = this.shading;
     this.uniforms.gain.value = this.gain;
     this.uniforms.behind.value = this.behind;
     renderer.render(this.sheet, this.flat);

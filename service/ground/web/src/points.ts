@@ -23,6 +23,7 @@ const CHANGES: [string, string][] = [["higher", "#d03027"], ["lower", "#2b6fd0"]
 
 const SIGMA_STEP_M = 0.02;
 const MAX_SIGMA_M = 255 * SIGMA_STEP_M;
+const PHOTOGRAPHED = 0.3; // share of the shading
 const SHARP_PX = 1.3; // of the screen, between two vertices of a surface
 const BUILD_MS = [25, 60] as const; // for finer surfaces, a frame while the view moves, and at rest
 const GROUND_SAMPLES = 400_000; // of the heightfield below
@@ -222,9 +223,21 @@ export class Cloud implements Gradual {
     this.exposure = total ? Math.min(Math.max(230 / Math.max(top, 1), 1), 2) ** 2.2 : 1;
   }
 
-  /** The exposure that the colours are shown with; 1 for those of figures, where they are seen. */
+  /** By which somebody wants it brighter than the day. */
+  brightness = 1;
+
+  private get showsFigures(): boolean {
+    return this.group.visible && this.shared.mode.value > 0;
+  }
+
+  /** What colours are shown with: the exposure, but for those of figures. */
   get gain(): number {
-    return this.group.visible && this.shared.mode.value ? 1 : this.exposure;
+    return this.brightness * (this.showsFigures ? 1 : this.exposure);
+  }
+
+  /** Share of the usual shading by relief: photographs of a closed surface have shade of their own. */
+  get shading(): number {
+    return this.kind === "points" || this.showsFigures ? 1 : PHOTOGRAPHED;
   }
 
   /** Metres by which what is not measured is drawn behind. */

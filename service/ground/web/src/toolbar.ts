@@ -280,7 +280,7 @@ function settings({ stage, cloud, ruler }: Parts): HTMLElement {
   slide("Shading", 0, 3, 0.1, 1, (v) => (stage.painter.dome.strength = v), (v) => v.toFixed(1));
   slide("Points drawn", 5, 8, 0.1, 6.5, (v) => (cloud.budget = 10 ** v), (v) => `${(10 ** (v - 6)).toFixed(1)} M`);
   slide("Field of view", 20, 100, 1, 60, (v) => stage.fieldOfView(v), (v) => `${v}°`);
-  slide("Exposure", -2, 2, 0.1, 0, (v) => (stage.renderer.toneMappingExposure = 2 ** v), (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} EV`);
+  slide("Exposure", -2, 2, 0.1, 0, (v) => (cloud.brightness = 2 ** v), (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} EV`);
   const tone = el("select", {});
   const tones: [string, THREE.ToneMapping][] = [
     ["none", THREE.NoToneMapping],

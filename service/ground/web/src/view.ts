@@ -94,8 +94,8 @@ function view(root: HTMLElement, scan: api.Scan, parts: api.Part[], place?: stri
   host.append(time.element);
   stage.before.push(ruler.draw, notes.draw, () => {
     cloud.screen(stage.camera, stage.renderer.domElement.height / 2);
-    stage.painter.dome.gain = cloud.gain;
-    stage.painter.dome.behind = cloud.behind;
+    const { gain, shading, behind } = cloud;
+    Object.assign(stage.painter.dome, { gain, shading, behind });
   });
   stage.drawGradually(cloud);
   stage.add(cameras.group);
