@@ -9,13 +9,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from recon.pipeline.events import FirstDepth, FramePosed, KeyframeReady, PosesChanged
+    from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
     from recon.pipeline.mapper import Mapper, MapperConfig
     from recon.types import Camera, Frame, PointCloud, Pose, PosePrior
 
 __all__ = [
     "Camera",
-    "FirstDepth",
     "Frame",
     "FramePosed",
     "KeyframeReady",

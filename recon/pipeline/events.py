@@ -24,17 +24,11 @@ class FramePosed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeReady:
-    """A view has its depth."""
+    """A view has its depth, or ``is_first`` what the next frames alone show of it: the same view
+    comes again with its whole depth, unless it is refused."""
 
     keyframe: Keyframe
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FirstDepth:
-    """What the next frames show of a view; :class:`KeyframeReady` replaces it, unless the view is
-    refused."""
-
-    keyframe: Keyframe
+    is_first: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,4 +38,4 @@ class PosesChanged:
     poses: Mapping[int, Pose]
 
 
-Event = FramePosed | FirstDepth | KeyframeReady | PosesChanged
+Event = FramePosed | KeyframeReady | PosesChanged

@@ -10,7 +10,6 @@ from dataclasses import replace
 
 from recon.backends import Backend, DenseStages
 from recon.pipeline.config import Timing, untimed
-from recon.pipeline.events import FirstDepth
 from recon.pipeline.keyframe_map import KeyframeMap
 from recon.pipeline.stages import PairStages, Rectify, keyframe_of
 from recon.pipeline.surface_map import SurfaceMap
@@ -18,6 +17,7 @@ from recon.pipeline.views import StereoView
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import plausible
+from recon.types import Keyframe
 
 COARSER = 2
 """The images are smaller by this factor than those of the view's whole depth."""
@@ -49,7 +49,7 @@ class FirstDepths:
         """Follow the width of whole depths."""
         self._rectify.set_effort(width_px // COARSER, upsample=False)
 
-    def __call__(self, view: StereoView) -> FirstDepth | None:
+    def __call__(self, view: StereoView) -> Keyframe | None:
         """The new surface that the view's only partner shows; None where it shows none."""
         ahead = self._keyframes.ahead(view)
         if ahead is None:
@@ -71,4 +71,4 @@ class FirstDepths:
                 return None
             T_odom, pose = ahead
             sigma_m, fresh = self._surface.peek(depth, view.rows_share, T_odom)
-            return FirstDepth(keyframe_of(view, depth, bgr, sigma_m, fresh, pose))
+            return keyframe_of(view, depth, bgr, sigma_m, fresh, pose)

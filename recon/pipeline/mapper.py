@@ -19,7 +19,7 @@ from recon.backends.cpu import CpuBackend
 from recon.mapping.cloud_fusion import cloud_of, fuse
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
 from recon.pipeline.config import Baseline, MapperConfig, Timing, untimed
-from recon.pipeline.events import Event, FirstDepth, FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.first_depth import FirstDepths
 from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
@@ -29,7 +29,6 @@ from recon.pipeline.stages import (
     Plausible,
     Rectify,
     Register,
-    Track,
     Undistort,
     keyframe_of,
 )
@@ -42,16 +41,16 @@ from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
-from recon.tracking.frame import UndistortedFrame
+from recon.tracking.frame import RelativePose, UndistortedFrame
 from recon.tracking.known_track import KnownTrack
-from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.types import Array, Camera, Frame, Keyframe, PointCloud, Pose, PosePrior
 
 __all__ = ["Mapper", "MapperConfig"]
 
-Reconstructed = GraphUpdate | FirstDepth | None
-"""Of a view that is in the graph now, or of one that comes again; None where that shows nothing."""
+Reconstructed = GraphUpdate | Keyframe | None
+"""Of a view that is in the graph now, or the first depth of one that comes again; None where that
+shows nothing."""
 
 Reconstruct = Callable[[StereoView], Reconstructed]
 
@@ -120,12 +119,12 @@ class Mapper:
         self.undistort = Undistort(camera, config.guide_width_px, timing)
         self.odometry = known or Odometry(
             self.undistort.tracking_camera,
-            OdometryConfig(base_to_height=config.base_to_height),
             camera,
-            seeks_readout=config.seeks_readout,
+            config.seeks_readout,
+            config.base_to_height,
         )
         selection = ViewSelection(config.baseline, config.pairs, all_known=known is not None)
-        self.follow = Track(self.odometry, selection, self.refused, timing)
+        self._waiting = Counter[str]()  # frames since a segment's first one, by reason
         self.views = VirtualStereoCamera(
             selection, self.odometry, self.undistort.camera, self.undistort.valid, self.refused
         )
@@ -155,7 +154,7 @@ class Mapper:
             if config.first_depths
             else None
         )
-        self.frames = FramePoses(self.keyframes, self.follow.is_settled)
+        self.frames = FramePoses(self.keyframes, self.is_settled)
         self._lost: UndistortedFrame | None = None  # the last frame, where it has no pose
         self._kept: dict[int, Keyframe] | None = {} if keeps_cloud else None
         self._ready = set[int]()  # numbers of all keyframes that are given out
@@ -173,8 +172,9 @@ class Mapper:
     def skip(self, seq: int, time_ns: int, prior: PosePrior) -> tuple[Event, ...]:
         """A frame that need not be seen: what is done by now, and the frame's event; nothing for
         one that :meth:`track` must take."""
-        if not self.follow.can_skip(time_ns, prior):  # frames are followed as fast as images move
-            return ()
+        frames_per_step = self.views.selection.frames_per_step
+        if not self.odometry.can_skip(time_ns, prior, frames_per_step):
+            return ()  # frames are followed as fast as images move
         skipped = FramePosed(seq, time_ns, Tracked(Tracking.SKIPPED, self.odometry.segment))
         return (*self._finished(), skipped)
 
@@ -201,6 +201,29 @@ class Mapper:
         pose = self.frames.follow(image.prior, reference)
         posed = FramePosed(image.seq, image.time_ns, tracked, pose, reference, is_view)
         return (*late, *done, posed)
+
+    def follow(self, image: UndistortedFrame) -> Tracked:
+        """The frame's pose by the odometry, or why there is none."""
+        with self._timing("track"):
+            tracked = self.odometry.track(image)
+        if tracked.before is not None:
+            self.refused -= Counter([tracked.before.reason])
+        if tracked.state is Tracking.WAITING:
+            self._waiting[tracked.reason] += 1
+        elif tracked.T_odom_camera is None:
+            self.refused[tracked.reason] += 1
+        else:
+            if tracked.state is Tracking.STARTED:  # the segment before never began
+                self.refused.update(self._waiting)
+            self._waiting.clear()
+        return tracked
+
+    def is_settled(self, frame: RelativePose) -> bool:
+        """True when the odometry no longer adjusts the frame's reference keyframe."""
+        key, window = frame.keyframe, self.odometry.keyframes
+        if key is None or key.segment != self.odometry.segment or not window:
+            return True
+        return key.seq < window[0].seq
 
     def _late(self, image: UndistortedFrame, tracked: Tracked) -> tuple[Event, ...]:
         """The frame before, lost until this one came: it begins this one's segment."""
@@ -268,7 +291,7 @@ class Mapper:
         for view, update in self._worker.finished(everything):
             if not isinstance(update, GraphUpdate):
                 if update is not None:
-                    yield update
+                    yield KeyframeReady(update, is_first=True)
                 continue
             self.frames.take(view.reference, update)
             if update.keyframe is not None:
@@ -336,7 +359,7 @@ class Mapper:
 
     def refusals(self) -> Counter[str]:
         """Frames, views and pairs not used, by reason."""
-        return self.refused + self.rejected + self.follow.waiting
+        return self.refused + self.rejected + self._waiting
 
 
 def moved(keyframe: Keyframe, pose: Pose) -> Keyframe:

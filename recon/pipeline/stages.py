@@ -16,17 +16,15 @@ from recon.camera_model import Undistorter, scaled, scaled_K
 from recon.image_quality import BlurWatch, stretch
 from recon.mapping.registration import IcpConfig, agreed_motion
 from recon.pipeline.config import CONTRADICTED, Timing
-from recon.pipeline.views import StereoView, ViewSelection
+from recon.pipeline.views import StereoView
 from recon.posegraph.segments import Segments
 from recon.stereo.depth_edges import drop_edges
 from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import PairDepth, carry, fuse, plausible, reproject
 from recon.stereo.virtual_stereo import at_middle_row, drop_unseen, plane_relief, rectify
-from recon.tracking.frame import Colour, RelativePose, UndistortedFrame
-from recon.tracking.known_track import AnyTrack
+from recon.tracking.frame import Colour, UndistortedFrame
 from recon.tracking.matching import MatchingConfig, build_pyramid
-from recon.tracking.odometry import Tracked, Tracking
 from recon.types import (
     F32,
     F64,
@@ -40,7 +38,6 @@ from recon.types import (
     Keyframe,
     PolarPair,
     Pose,
-    PosePrior,
     RectifiedPair,
     StereoPair,
     Verdict,
@@ -90,49 +87,6 @@ class Undistort:
             return UndistortedFrame(
                 frame.seq, frame.time_ns, frame.prior, colour, gray, pyramid, self._mask, is_blurred
             )
-
-
-class Track:
-    """The odometry: Harris corners, ZSSD (Eq. 4-5) and EPnP (Eq. 6-7)."""
-
-    def __init__(
-        self, odometry: AnyTrack, selection: ViewSelection, refused: Counter[str], timing: Timing
-    ) -> None:
-        self.odometry, self._selection = odometry, selection
-        self._refused, self._timing = refused, timing
-        self.waiting = Counter[str]()
-        """Frames since the segment's first one that wait for its second view, by reason."""
-
-    def can_skip(self, time_ns: int, prior: PosePrior) -> bool:
-        """True for a frame so close to the last one that nothing needs its pose."""
-        return self.odometry.can_skip(time_ns, prior, self._selection.frames_per_step)
-
-    def __call__(self, image: UndistortedFrame) -> Tracked:
-        """The frame's pose, or why there is none."""
-        with self._timing("track"):
-            tracked = self.odometry.track(image)
-        if tracked.before is not None:
-            self._refused -= Counter([tracked.before.reason])
-        if tracked.state is Tracking.WAITING:
-            self.waiting[tracked.reason] += 1
-        elif tracked.T_odom_camera is None:
-            self._refused[tracked.reason] += 1
-        else:
-            if tracked.state is Tracking.STARTED:  # the segment before never began
-                self._refused.update(self.waiting)
-            self.waiting.clear()
-        return tracked
-
-    @property
-    def segment(self) -> int:
-        return self.odometry.segment
-
-    def is_settled(self, frame: RelativePose) -> bool:
-        """True when the odometry no longer adjusts the frame's reference keyframe."""
-        key, window = frame.keyframe, self.odometry.keyframes
-        if key is None or key.segment != self.segment or not window:
-            return True
-        return key.seq < window[0].seq
 
 
 class Rectify:

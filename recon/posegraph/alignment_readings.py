@@ -65,20 +65,9 @@ class Common:
         return replace(prior, R_world_camera=R, position_m=position)
 
 
-@dataclass(frozen=True, slots=True)
-class Heights:
-    """What fixes of one receiver tell about heights against each other."""
-
-    sigma_m: float  # of the mean height
-    time_s: float
-    rate_m_s: float  # of their drift, 0 where they state their accuracy
-    sigma_rate_m_s: float
-
-    def sigma_to(self, main: Heights) -> float:
-        """Sigma in m of the mean height against that of the main segment, which shows the drift."""
-        passed_s = abs(self.time_s - main.time_s)
-        drift_m = passed_s * float(np.hypot(main.rate_m_s, main.sigma_rate_m_s))
-        return float(np.sqrt(self.sigma_m**2 + main.sigma_m**2 + drift_m**2))
+Heights = tuple[float, float, float]
+"""What fixes of one receiver tell about heights against each other: sigma of the mean height in m,
+its time in s, and the drift in m/s that they may have, 0 where they state their accuracy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -264,10 +253,10 @@ class AlignmentReadings:
         of_mean = np.array([north, -east, 0.0, 0.0, 0.0, 1.0, up])
         sigma_m, time_s = float(np.sqrt(of_mean @ covariance @ of_mean)), float(self.fix_s.mean())
         if self.is_height_claimed:
-            return Heights(sigma_m, time_s, 0.0, 0.0)
+            return sigma_m, time_s, 0.0
         sigma_drift_m = float(np.sqrt(np.linalg.inv(H)[10, 10]))
         half_s = self.spanned.half_s
-        return Heights(sigma_m, time_s, at.drift / half_s, sigma_drift_m / half_s)
+        return sigma_m, time_s, float(np.hypot(at.drift / half_s, sigma_drift_m / half_s))
 
     def common(self, at: AlignmentState) -> Common:
         return replace(self.spanned, mount_rad=at.mount, drift_m=at.drift)

@@ -38,6 +38,16 @@ ATTITUDE_S, FIX_S = 40.0, 60.0
 STEPS = 60
 """Maximum number of steps of the solution."""
 
+SIGMA_STEP, SIGMA_STEP_M, SIGMA_TURN_RAD = 0.003, 0.01, 5e-4
+"""Sigmas of one motion: as a share of its length, in metres, and of its turn."""
+
+SIGMA_SCALE, SIGMA_SCALE_WALK, STRETCH = 0.02, 0.003, 20
+"""Sigma of the whole scan's scale, as a share, and between stretches, of so many keyframes that
+share one."""
+
+BREAK_S, SIGMA_BREAK_M, SIGMA_BREAK_RAD = 10.0, 5.0, 0.3
+"""A longer pause between keyframes is a break of vision, with these sigmas of its motion."""
+
 HELD, HELD_PLACE, HELD_SIGMA = "held", "held place", 1e-5
 """Kinds of factors that hold what is not an unknown; rad and m."""
 
@@ -48,21 +58,6 @@ MARK = np.dtype(
     [("key", int), ("point", int), ("scale", int), ("ray", float, (3,)), ("depth", float),
      ("R", float, (3, 3)), ("t", float, (3,)), ("weight", float, (3,))]
 )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class BatchConfig:
-    """How far each kind of knowledge is trusted."""
-
-    sigma_step: float = 0.003  # of one motion, as a share of its length
-    sigma_step_m: float = 0.01
-    sigma_turn_rad: float = 5e-4  # of one motion
-    sigma_scale: float = 0.02  # of the whole scan, as a share
-    sigma_scale_walk: float = 0.003  # between stretches
-    stretch: int = 20  # keyframes that share a scale
-    break_s: float = 10.0  # a longer pause between keyframes is a break of vision
-    sigma_break_m: float = 5.0
-    sigma_break_rad: float = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,21 +125,25 @@ def adjust(
     track: KeyframeTrack,
     points: Sequence[ControlPoint] = (),
     marks: Sequence[Mark] = (),
-    config: BatchConfig | None = None,
+    sigma_scale: float = SIGMA_SCALE,
+    sigma_scale_walk: float = SIGMA_SCALE_WALK,
 ) -> Adjusted:
     """The adjustment of a track with control points; loops that contradict it are left out.
+
+    ``sigma_scale`` is of the whole scan, ``sigma_scale_walk`` between stretches.
 
     Raises ValueError for fewer than two keyframes.
     """
     if len(track.poses) < 2:
         raise ValueError(f"expected two poses (N, 4, 4) or more, got {track.poses.shape}")
+    sigma_scales = sigma_scale, sigma_scale_walk
     loops = list(range(len(track.loops)))
-    problem = _Batch(track, loops, points, marks, config or BatchConfig())
+    problem = _Batch(track, loops, points, marks, sigma_scales)
     chi2 = np.sum(problem.residuals().get("loop", np.zeros((0, 6))) ** 2, axis=1)
     refused = tuple(k for k, value in zip(loops, chi2, strict=True) if value > CHI2_LIMIT)
     if refused:
         loops = [k for k in loops if k not in refused]
-        problem = _Batch(track, loops, points, marks, config or BatchConfig())
+        problem = _Batch(track, loops, points, marks, sigma_scales)
     return Adjusted(*problem.states(), problem.residuals(), refused)
 
 
@@ -276,12 +275,12 @@ class _Batch:
 
     def __init__(
         self, track: KeyframeTrack, loops: Sequence[int], points: Sequence[ControlPoint],
-        marks: Sequence[Mark], config: BatchConfig,
+        marks: Sequence[Mark], sigma_scales: tuple[float, float],
     ) -> None:  # fmt: skip
-        self._track, self._config, self._smoother = track, config, Smoother()
+        self._track, self._smoother = track, Smoother()
         for T, spread in zip(track.poses, track.covariances, strict=True):
             self._smoother.append_pose(T, spread)
-        self._add_scales()
+        self._add_scales(*sigma_scales)
         for key in range(1, len(track.poses)):
             self._add_step(key)
         self._add_telemetry() if track.priors else self._add_placing()
@@ -308,15 +307,14 @@ class _Batch:
     # ---- factors ---------------------------------------------------------------------------
 
     def _scale_key(self, key: int) -> int:
-        return UNIT + key // self._config.stretch
+        return UNIT + key // STRETCH
 
-    def _add_scales(self) -> None:
-        sigma = self._config.sigma_scale
+    def _add_scales(self, sigma: float, sigma_walk: float) -> None:
         for key in range(UNIT, self._scale_key(len(self._track.poses) - 1) + 1):
             self._smoother.append_scale(0.0)
             before = key - 1
             self._smoother.add_scale("scale", (before, key), 0.0, sigma)
-            sigma = self._config.sigma_scale_walk
+            sigma = sigma_walk
 
     def _hold(self, key: int, T: F64, sigma_rad: float, sigma_m: float) -> None:
         self._smoother.add_turn(HELD, key, T[:3, :3], np.full(3, sigma_rad))
@@ -324,13 +322,13 @@ class _Batch:
 
     def _add_step(self, key: int) -> None:
         """The motion from the keyframe before, as vision and ICP measured it."""
-        track, c = self._track, self._config
+        track = self._track
         motion = se3.inverse(track.poses[key - 1]) @ track.poses[key]
         length = float(np.linalg.norm(motion[:3, 3]))
-        turn, shift, kind = c.sigma_turn_rad, c.sigma_step * length + c.sigma_step_m, "vision"
+        turn, shift, kind = SIGMA_TURN_RAD, SIGMA_STEP * length + SIGMA_STEP_M, "vision"
         pause = float(track.times_s[key] - track.times_s[key - 1])
-        if pause > c.break_s:
-            turn, shift, kind = c.sigma_break_rad, c.sigma_break_m * pause / c.break_s, "link"
+        if pause > BREAK_S:
+            turn, shift, kind = SIGMA_BREAK_RAD, SIGMA_BREAK_M * pause / BREAK_S, "link"
         right = np.diag([turn**2] * 3 + [shift**2] * 3)
         spread = left_covariance(motion, right)
         scale = self._scale_key(key - 1)

@@ -9,7 +9,7 @@ agree by ICP. Whether a loop that passes may bend the map is for
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,18 +24,13 @@ MIN_RAD, MIN_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
 points of one depth map have in common does not average out."""
 
-__all__ = ["LoopClosure", "LoopConfig", "LoopView"]
+SEARCH_SHARE = 0.12
+"""Search radius about the places that the graph predicts, as a share of the image's width."""
 
+MIN_MATCHES, MIN_INLIERS = 40, 30
+"""Corners found again, and those of them that the pose explains."""
 
-@dataclass(frozen=True, slots=True)
-class LoopConfig:
-    min_gap: int = 10  # keyframes between the two ends of a loop
-    min_overlap: float = 0.35  # of the later view in the earlier one
-    search_share: float = 0.12  # of the image's width, about the predicted places
-    min_matches: int = 40
-    matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
-    pnp: pnp.PnpConfig = field(default_factory=lambda: pnp.PnpConfig(min_inliers=30))
-    icp: IcpConfig = field(default_factory=IcpConfig)
+MATCHING, ICP = matching.MatchingConfig(), IcpConfig()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,44 +118,39 @@ def candidates(
     )
 
 
-def verify(
-    a: LoopView, b: LoopView, T_a_b_guess: F64, config: LoopConfig | None = None
-) -> LoopClosure | None:
+def verify(a: LoopView, b: LoopView, T_a_b_guess: F64) -> LoopClosure | None:
     """The motion between two keyframes that may see the same place, or None when they do not.
 
     ``T_a_b_guess`` (4, 4) is the pose graph's estimate. Where it is too far off, the features that
     both images share predict instead.
     """
-    config = config or LoopConfig()
-    uv, points = landmarks(a, config.matching)
-    if len(uv) < config.min_matches:
+    uv, points = landmarks(a, MATCHING)
+    if len(uv) < MIN_MATCHES:
         return None
-    pyramids = tuple(matching.build_pyramid(v.gray, config.matching.search_levels) for v in (a, b))
+    pyramids = tuple(matching.build_pyramid(v.gray, MATCHING.search_levels) for v in (a, b))
     T_b_a = se3.inverse(T_a_b_guess)
     predicted = project(b.K, se3.transform(T_b_a, points))
     warp = warps(a.K, b.K, T_b_a, uv, points)
-    solved = _pose(pyramids, uv, points, predicted, warp, b, T_b_a, config)
+    solved = _pose(pyramids, uv, points, predicted, warp, b, T_b_a, SEARCH_SHARE)
     if solved is None:
-        solved = _by_features(pyramids, uv, points, a, b, config)
+        solved = _by_features(pyramids, uv, points, a, b)
     if solved is None:
         return None
     T_a_b = se3.inverse(solved.T_camera_points)
     A = se3.adjoint(T_a_b)
-    return _with_icp(a, b, T_a_b, A @ solved.covariance @ A.T, config)
+    return _with_icp(a, b, T_a_b, A @ solved.covariance @ A.T)
 
 
 def _by_features(
-    pyramids: tuple[matching.Pyramid, ...], uv: F64, points: F64, a: LoopView, b: LoopView,
-    config: LoopConfig,
-) -> pnp.PnpResult | None:  # fmt: skip
+    pyramids: tuple[matching.Pyramid, ...], uv: F64, points: F64, a: LoopView, b: LoopView
+) -> pnp.PnpResult | None:
     """As :func:`_pose`, by the features that both images share."""
     view = common_view(features(a.gray), features(b.gray))
     if view is None:
         return None
     there, warp = view.predict(uv)
     for share in FEATURE_SHARES:
-        near = replace(config, search_share=share)
-        solved = _pose(pyramids, uv, points, there, warp, b, None, near)
+        solved = _pose(pyramids, uv, points, there, warp, b, None, share)
         if solved is not None:
             return solved
     return None
@@ -209,25 +199,21 @@ def warps(K_a: F64, K_b: F64, T_b_a: F64, uv: F64, points: F64) -> F64:
 
 def _pose(
     pyramids: tuple[matching.Pyramid, ...], uv: F64, points: F64, predicted: F64, warp: F64,
-    b: LoopView, prior: F64 | None, config: LoopConfig,
+    b: LoopView, prior: F64 | None, search_share: float,
 ) -> pnp.PnpResult | None:  # fmt: skip
     """EPnP pose of b from a's landmarks found in it."""
-    radius = config.search_share * b.gray.shape[1]
-    found = matching.match(
-        pyramids[0], uv, pyramids[1], predicted, radius, warp, config.matching
-    )  # fmt: skip
-    if np.count_nonzero(found.ok) < config.min_matches:
+    radius = search_share * b.gray.shape[1]
+    found = matching.match(pyramids[0], uv, pyramids[1], predicted, radius, warp, MATCHING)
+    if np.count_nonzero(found.ok) < MIN_MATCHES:
         return None
     seen = found.uv_px[found.ok].astype(np.float64)
-    solved = pnp.solve(points[found.ok], seen, b.K, config.pnp, prior)
+    solved = pnp.solve(points[found.ok], seen, b.K, prior, min_inliers=MIN_INLIERS)
     if solved is None or solved.inlier_share < 0.5:
         return None
     return solved
 
 
-def _with_icp(
-    a: LoopView, b: LoopView, T_a_b: F64, covariance: F64, config: LoopConfig
-) -> LoopClosure | None:
+def _with_icp(a: LoopView, b: LoopView, T_a_b: F64, covariance: F64) -> LoopClosure | None:
     """The loop refined by ICP of the depth maps; None when they contradict it."""
     growth = _growth(a, b, T_a_b)
     if growth is None:
@@ -237,8 +223,8 @@ def _with_icp(
     depth = float(np.nanmedian(a.depth.depth_m))
     sigma = float(np.nanmedian(a.depth.sigma_m))
     covariance = covariance + np.diag([(sigma / depth) ** 2 * 0.01] * 3 + [(0.3 * sigma) ** 2] * 3)
-    aligned = register_projective(b.depth, a.depth, T_a_b, config.icp)
-    agreed = agreed_motion(T_a_b, covariance, aligned, config.icp)
+    aligned = register_projective(b.depth, a.depth, T_a_b, ICP)
+    agreed = agreed_motion(T_a_b, covariance, aligned, ICP)
     if agreed is None:
         return None
     T, covariance = agreed

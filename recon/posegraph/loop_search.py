@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera_model import scaled_K
-from recon.posegraph.loop_closure import LoopConfig, LoopView, candidates, ground_seen, verify
+from recon.posegraph.loop_closure import LoopView, candidates, ground_seen, verify
 from recon.posegraph.trajectory import Trajectory
 from recon.tracking.common_view import alike, signature
 from recon.types import F64, U8, DepthMap
@@ -20,6 +20,10 @@ WIDTH_PX = 640
 
 MIN_DEPTH_PX = 120
 """A depth image at least twice as wide is kept at half its size."""
+
+MIN_GAP, MIN_OVERLAP = 10, 0.35
+"""Keyframes between the two ends of a loop on one chain, and how much of the later view must lie in
+the earlier one."""
 
 TRIES = 2
 """Verifications per keyframe, at most. Each is bounded work: some 30 to 120 ms on one core."""
@@ -94,14 +98,13 @@ class LoopSearch:
     """Keeps keyframes, finds earlier ones that see the same, and adds loops to the trajectory."""
 
     def __init__(
-        self, trajectory: Trajectory, config: LoopConfig | None = None, max_views: int = 400
+        self, trajectory: Trajectory, max_views: int = 400, min_gap: int = MIN_GAP
     ) -> None:
         """Of more than ``max_views`` keyframes, about 0.1 MB each, every second of the older half
         is forgotten.
         """
-        self._max_views = max_views
+        self._max_views, self._min_gap = max_views, min_gap
         self.trajectory = trajectory
-        self._config = config or LoopConfig()
         self._kept: dict[int, _Kept] = {}
         self._tied: _Kept | None = None  # the last end of a loop
         self._turn = 0
@@ -128,7 +131,7 @@ class LoopSearch:
         for seq in self._likely(new, view):
             guess = self.trajectory.step_between(seq, new.seq)
             known = self._kept[seq].unpacked(self.trajectory.scale(seq))
-            found = verify(known, view, guess, self._config)
+            found = verify(known, view, guess)
             if found is not None and self.trajectory.add_loop(seq, new.seq, *found):
                 self._tied = new
                 return
@@ -159,9 +162,7 @@ class LoopSearch:
         apart = np.linalg.norm(ahead - (here[:3, 3] + depth_m * here[:3, 2]), axis=1)
         some = {seqs[i]: there[i] for i in np.argsort(apart)[:8] if apart[i] < reach}
         some[new.seq] = here
-        found = candidates(
-            some, new.K, new.size_px, ground_seen(view.depth), self._config.min_overlap
-        )
+        found = candidates(some, new.K, new.size_px, ground_seen(view.depth), MIN_OVERLAP)
         by_place = [seq for seq, _ in found]
         return list(dict.fromkeys(self._by_look(new, seqs) + by_place))[:TRIES]
 
@@ -185,7 +186,7 @@ class LoopSearch:
     def _is_apart(self, one: _Kept, two: _Kept) -> bool:
         """True when two keyframes are not neighbours on one chain."""
         gap = two.ordinal - one.ordinal
-        return gap >= self._config.min_gap or one.segment != two.segment
+        return gap >= self._min_gap or one.segment != two.segment
 
     def _thin(self) -> None:
         for seq in list(self._kept)[: len(self._kept) // 2 : 2]:

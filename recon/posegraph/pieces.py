@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import Counter
 from collections.abc import Sequence
 
-import numpy as np
+from scipy.cluster.hierarchy import DisjointSet
 
 from recon.posegraph.records import Loop
 from recon.posegraph.segments import HEIGHT_KNOWN_M, Segment, Segments
@@ -25,15 +24,16 @@ def apart(segments: Segments, loops: Sequence[Loop]) -> list[tuple[int, int]]:
     The main piece is the one that fixes place; without fixes, that with most points.
     """
     known = [segment for segment in segments.with_surface() if not segment.is_false]
-    piece = {segment.number: segment.number for segment in known}
+    pieces = DisjointSet([segment.number for segment in known])
     looped: set[int] = set()
     for loop in loops:
         a, b = (_segment_of(known, seq) for seq in loop.ends)
         if a is not None and b is not None:
-            _join(piece, a, b)
+            pieces.merge(a, b)
             looped |= {a, b}
-    heights = {s.number: sigma for s in known if (sigma := _sigma_height_m(s)) is not None}
-    unsure = {number for number, sigma in heights.items() if sigma > HEIGHT_KNOWN_M}
+    # Of those that fixes place, the sigma of the height there.
+    heights = {s.number: s.frame.covariance[5, 5] ** 0.5 for s in known if s.rests_on_fixes}
+    unsure = {number for number, sigma_m in heights.items() if sigma_m > HEIGHT_KNOWN_M}
     main_segment = segments.largest()
     of_any_size = {
         number
@@ -43,21 +43,20 @@ def apart(segments: Segments, loops: Sequence[Loop]) -> list[tuple[int, int]]:
     }
     loose = {number for number in unsure if not _agrees(segments, number)} | of_any_size
     placed = {segment.number for segment in known if segment.is_fixed} - of_any_size
-    fixed = [number for number in piece if number in placed or number in heights.keys() - loose]
+    fixed = [number for number in pieces if number in placed or number in heights.keys() - loose]
     for number in fixed[1:]:
-        _join(piece, fixed[0], number)
+        pieces.merge(fixed[0], number)
     if fixed:
-        main = piece[fixed[0]]
+        main = pieces.subset(fixed[0])
     else:
-        sizes: Counter[int] = Counter()
-        for segment in known:
-            sizes[piece[segment.number]] += segment.points
-        main = sizes.most_common(1)[0][0] if sizes else -1
+        main = max(
+            pieces.subsets(), key=lambda p: sum(segments[n].points for n in p), default=set()
+        )
     return [
         (segment.surface[0], segment.surface[-1])
         for segment in known
         # A long flight forgets loops, and not which segments they tied.
-        if piece[segment.number] != main
+        if segment.number not in main
         and (segment.number in looped or segment.number in loose or not segment.is_tied)
     ]
 
@@ -67,24 +66,8 @@ def _segment_of(known: Sequence[Segment], seq: int) -> int | None:
     return known[at].number if at >= 0 and seq <= known[at].surface[-1] else None
 
 
-def _sigma_height_m(segment: Segment) -> float | None:
-    """Sigma of the height at which fixes place a segment; None where they do not."""
-    found = segment.similarity
-    if found is None or "gnss" not in found.sources:
-        return None
-    return float(np.sqrt(found.covariance[5, 5]))
-
-
 def _agrees(segments: Segments, number: int) -> bool:
     """True when the height is known against the largest segment's: what all fixes of a flight err
     by lays none on another."""
     sigma_m = segments.sigma_height_m(number)
     return sigma_m is not None and sigma_m < HEIGHTS_AGREE_M
-
-
-def _join(piece: dict[int, int], a: int, b: int) -> None:
-    """Make one piece of those that segments ``a`` and ``b`` are in."""
-    old, new = piece[b], piece[a]
-    for number, name in piece.items():
-        if name == old:
-            piece[number] = new

@@ -93,10 +93,8 @@ class Segment:
     @property
     def is_tied(self) -> bool:
         """True when a loop places it, or fixes that measure its scale."""
-        found = self.similarity
-        is_measured = found is not None and "gnss" in found.sources
-        is_scaled = found is not None and found.sigma_scale < GUESSED_SHARE
-        return self.is_tied_by_loop or (is_measured and is_scaled)
+        is_scaled = self.rests_on_fixes and self.frame.sigma_scale < GUESSED_SHARE
+        return self.is_tied_by_loop or is_scaled
 
     def forget(self) -> None:
         self.similarity = self.offsets = None
@@ -199,7 +197,11 @@ class Segments:
         if number not in known:
             return None
         main = max(known, key=lambda one: self._all[one].keyframes)
-        return 0.0 if number == main else known[number].sigma_to(known[main])
+        if number == main:
+            return 0.0
+        (sigma_m, time_s, _), (main_m, main_s, drift_m_s) = known[number], known[main]
+        drift_m = abs(time_s - main_s) * drift_m_s  # that the largest segment shows
+        return float(np.sqrt(sigma_m**2 + main_m**2 + drift_m**2))
 
     def tie(self, number: int, scale: float, R: F64, t: F64) -> None:
         """Place a segment by a loop, for good."""
@@ -226,7 +228,7 @@ class Segments:
         segment.fitted, nodes = segment.keyframes, segment.nodes
         fresh = self._newest_constants()
         readings = self._without_constants(segment, fresh)
-        found = alignment.fit(readings, *self._bias_tau_s, slow_share=fresh.datum.slow_share,
+        found = alignment.fit(readings, *self._bias_tau_s, slow_share=fresh.slow_share,
                               usual=self._usual_noise())  # fmt: skip
         if found is None:
             return False
@@ -234,7 +236,7 @@ class Segments:
         if "gnss" not in found.sources and nodes[0].key > 0:
             found = _kept_in_place(found, nodes[0], pose(nodes[0].key))
         if found.sigma_fixes is not None:
-            most = np.array([np.inf, np.inf, fresh.datum.sigma_m])
+            most = np.array([np.inf, np.inf, fresh.sigma_up_m])
             found = replace(found, sigma_fixes=np.minimum(found.sigma_fixes, most))
         before = segment.similarity
         is_settled = segment.keyframes >= SETTLED and not fresh.differ(segment.constants)

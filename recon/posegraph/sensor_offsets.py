@@ -40,24 +40,43 @@ ROUNDS = 6
 """Gauss-Newton steps, each with new robust weights."""
 
 
+NOTABLE_M, NOTABLE_RAD = 0.1, 0.003
+"""Changes of the constants of a whole flight that the map must follow."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Boresight:
-    """``R_world_camera = R_reported @ exp(turn)``."""
+class Constants:
+    """Constant errors of a whole flight's sensors, whatever becomes of the track.
+
+    The boresight: ``R_world_camera = R_reported @ exp(turn)``. The altitudes' datum: ``up_m`` is to
+    be added to them.
+    """
 
     turn: F64 = field(default_factory=lambda: np.zeros(3))  # rad, in the camera's frame
-    sigma: F64 = field(default_factory=lambda: np.full(3, SIGMA_RAD))
+    sigma_turn: F64 = field(default_factory=lambda: np.full(3, SIGMA_RAD))
+    up_m: float = 0.0
+    sigma_up_m: float = float("inf")  # of what is then left of the constant
+    slow_share: float = 1.0  # of the receiver's variance; the rest is new in each fix
 
     @property
-    def is_sure(self) -> bool:
-        """True when it is significant; otherwise it is not applied."""
-        return float(np.sum(np.square(self.turn / self.sigma))) > SURE
+    def is_turn_sure(self) -> bool:
+        """True when the boresight is significant; otherwise it is not applied."""
+        return float(np.sum(np.square(self.turn / self.sigma_turn))) > SURE
 
     def applied(self, prior: PosePrior) -> PosePrior:
-        """The prior with the camera's own attitude, once that is sure to be another."""
-        R = prior.R_world_camera
-        if R is None or not self.is_sure:
-            return prior
-        return replace(prior, R_world_camera=R @ se3.so3_exp(self.turn))
+        """The prior without them."""
+        R, position = prior.R_world_camera, prior.position_m
+        if self.up_m != 0.0 and position is not None:
+            prior = replace(prior, position_m=position + np.array([0.0, 0.0, self.up_m]))
+        if self.is_turn_sure and R is not None:
+            prior = replace(prior, R_world_camera=R @ se3.so3_exp(self.turn))
+        return prior
+
+    def differ(self, other: Constants) -> bool:
+        """True when the other's would notably move the map."""
+        turn, before = (one.turn * one.is_turn_sure for one in (self, other))
+        is_turned = float(np.abs(turn - before).max()) > NOTABLE_RAD
+        return is_turned or abs(self.up_m - other.up_m) > NOTABLE_M
 
 
 Turns = tuple[F64, F64, F64]
@@ -78,7 +97,7 @@ def turns_of(poses: Sequence[F64], priors: Sequence[PosePrior]) -> Turns | None:
     return odom, reported, sigma
 
 
-def boresight(stretches: Sequence[Turns], span_s: float, bias_tau_s: float = 40.0) -> Boresight:
+def boresight(stretches: Sequence[Turns], span_s: float, bias_tau_s: float = 40.0) -> Constants:
     """The boresight by all stretches of a flight of ``span_s``; small where turns are missing.
 
     Vision turns with the camera, telemetry with the gimbal or the body. Between flights' headings
@@ -92,7 +111,7 @@ def boresight(stretches: Sequence[Turns], span_s: float, bias_tau_s: float = 40.
     """
     count = sum(len(R_odom) for R_odom, *_ in stretches)
     if count == 0:
-        return Boresight()
+        return Constants()
     share = min(1.0, (1.0 + span_s / (2.0 * max(bias_tau_s, 1e-3))) / count)
     turn, H, norms = np.zeros(3), np.eye(3), np.zeros(0)
     frames = [_mean_frame(s) for s in stretches]
@@ -110,8 +129,8 @@ def boresight(stretches: Sequence[Turns], span_s: float, bias_tau_s: float = 40.
         if np.abs(step).max() < 1e-6:
             break
     if float(np.median(norms)) > WILD:
-        return Boresight()
-    return Boresight(turn, np.sqrt(np.diag(np.linalg.inv(H))))
+        return Constants()
+    return Constants(turn, np.sqrt(np.diag(np.linalg.inv(H))))
 
 
 def _mean_frame(stretch: Turns) -> F64:
@@ -156,24 +175,9 @@ WILD_STEPS = 36.0
 """Squared steps from fix to fix beyond so many of their median are jumps, not scatter."""
 
 
-@dataclass(frozen=True, slots=True)
-class AltitudeDatum:
-    """Correction to add to altitudes, and the sigma of what is then left of the constant."""
-
-    shift_m: float = 0.0
-    sigma_m: float = float("inf")
-    slow_share: float = 1.0  # of the receiver's variance; the rest is new in each fix
-
-    def applied(self, prior: PosePrior) -> PosePrior:
-        """The prior with its position raised."""
-        if self.shift_m == 0.0 or prior.position_m is None:
-            return prior
-        return replace(prior, position_m=prior.position_m + np.array([0.0, 0.0, self.shift_m]))
-
-
 def altitude_datum(
     priors: Sequence[PosePrior], span_s: float, bias_tau_s: float = 60.0
-) -> AltitudeDatum:
+) -> Constants:
     """The datum by all fixes of a flight of ``span_s``, in the order of time.
 
     An autopilot's altitude follows its barometer, whose zero is off by decimetres to metres. The
@@ -193,7 +197,7 @@ def altitude_datum(
         and p.sigma_position_m is not None
     ]
     if len(rows) < MIN_INTERVALS:
-        return AltitudeDatum()
+        return Constants()
     above, fixes, claimed = np.array(rows, np.float64).T
     sigma = float(np.median(claimed))
     steps = np.diff(above) ** 2 / (1.0 / fixes[1:] + 1.0 / fixes[:-1])
@@ -210,7 +214,7 @@ def altitude_datum(
     left = slow + white**2 / float(fixes[near].sum())
     share = max(0.0, 1.0 - 2.0 * left / sigma**2)
     left_m = float(np.sqrt(left)) if share > 0 else sigma
-    return AltitudeDatum(float(share * mean), left_m, float(slow_share))
+    return Constants(up_m=float(share * mean), sigma_up_m=left_m, slow_share=float(slow_share))
 
 
 def _wandered(above: F64, fixes: F64, white: float) -> float:
@@ -231,29 +235,6 @@ NEAR_SIGMAS = 5.0
 """Fixes further from the track, or attitudes from their median, are no part of a constant."""
 
 
-NOTABLE_M, NOTABLE_RAD = 0.1, 0.003
-"""Changes of the constants of a whole flight that the map must follow."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Constants:
-    """Constants of a whole flight, whatever becomes of the track."""
-
-    datum: AltitudeDatum = field(default_factory=AltitudeDatum)
-    boresight: Boresight = field(default_factory=Boresight)
-
-    def applied(self, prior: PosePrior) -> PosePrior:
-        """The prior without them."""
-        return self.boresight.applied(self.datum.applied(prior))
-
-    def differ(self, other: Constants) -> bool:
-        """True when the other's would notably move the map."""
-        raised = abs(self.datum.shift_m - other.datum.shift_m) > NOTABLE_M
-        turn, before = (b.turn * b.is_sure for b in (self.boresight, other.boresight))
-        turned = float(np.abs(turn - before).max()) > NOTABLE_RAD
-        return raised or turned
-
-
 def constants(
     stretches: Sequence[tuple[Sequence[F64], Sequence[PosePrior]]],
     span_s: float,
@@ -266,7 +247,9 @@ def constants(
     """
     turns = [t for poses, priors in stretches if (t := turns_of(poses, priors)) is not None]
     every = [prior for _, priors in stretches for prior in priors]
-    return Constants(altitude_datum(every, span_s, fix_s), boresight(turns, span_s, attitude_s))
+    turned = boresight(turns, span_s, attitude_s)
+    datum = altitude_datum(every, span_s, fix_s)
+    return replace(datum, turn=turned.turn, sigma_turn=turned.sigma_turn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

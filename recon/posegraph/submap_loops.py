@@ -11,7 +11,7 @@ Arun et al. 1987, doi:10.1109/TPAMI.1987.4767965, with weights.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -22,69 +22,60 @@ from recon.posegraph.loop_closure import MIN_RAD, MIN_SHARE, LoopClosure, LoopVi
 from recon.tracking import matching
 from recon.types import F32, F64, I64, Bool, DepthMap, Keyframe
 
+SEARCH_SHARES = (0.03, 0.1)
+"""Search radii, as shares of the image's width, tried in turn: the track is near the truth
+already."""
 
-@dataclass(frozen=True, slots=True)
-class SubmapLoopConfig:
-    """Parameters of the search; the track is near the truth already."""
+MIN_MATCHES, MIN_INLIER_SHARE, GATE_SIGMAS = 14, 0.6, 3.0
+"""Places that both surfaces have, and the share of them that one motion must bring together to so
+many sigmas."""
 
-    min_gap: int = 10  # keyframes between the two ends
-    min_overlap: float = 0.2  # of the later view in the earlier one
-    search_shares: tuple[float, ...] = (0.03, 0.1)  # of the image's width, tried in turn
-    min_matches: int = 14
-    min_inlier_share: float = 0.6
-    gate_sigmas: float = 3.0
-    pixel_sigma: float = 0.4  # of a match
-    min_spread: float = 0.02  # of the matches across their narrow side, of their distance
-    matching: matching.MatchingConfig = field(
-        default_factory=lambda: matching.MatchingConfig(
-            grid=50, ambiguity=0.9, max_zssd=0.6, max_return_px=0.7
-        )
-    )
+PIXEL_SIGMA = 0.4
+"""Sigma of a match, px."""
+
+MIN_SPREAD = 0.02
+"""Of the matches across their narrow side, of their distance."""
+
+MATCHING = matching.MatchingConfig(grid=50, ambiguity=0.9, max_zssd=0.6, max_return_px=0.7)
 
 
-def verify_surfaces(
-    a: LoopView, b: LoopView, T_a_b_guess: F64, config: SubmapLoopConfig | None = None
-) -> LoopClosure | None:
+def verify_surfaces(a: LoopView, b: LoopView, T_a_b_guess: F64) -> LoopClosure | None:
     """The motion between two keyframes that may see the same place, or None when they do not.
 
     ``T_a_b_guess`` (4, 4) is the track's estimate. The covariance is of a left perturbation in a's
     camera frame.
     """
-    config = config or SubmapLoopConfig()
-    uv, points = landmarks(a, config.matching)
-    if len(uv) < config.min_matches:
+    uv, points = landmarks(a, MATCHING)
+    if len(uv) < MIN_MATCHES:
         return None
-    pyramids = [matching.build_pyramid(v.gray, config.matching.search_levels) for v in (a, b)]
+    pyramids = [matching.build_pyramid(v.gray, MATCHING.search_levels) for v in (a, b)]
     T_b_a = se3.inverse(T_a_b_guess)
     predicted = project(b.K, se3.transform(T_b_a, points))
     bent = warps(a.K, b.K, T_b_a, uv, points)
-    for share in config.search_shares:
+    for share in SEARCH_SHARES:
         radius = share * b.gray.shape[1]
-        found = matching.match(
-            pyramids[0], uv, pyramids[1], predicted, radius, bent, config.matching
-        )  # fmt: skip
-        closure = _fitted(a, b, points, found, T_a_b_guess, config)
+        found = matching.match(pyramids[0], uv, pyramids[1], predicted, radius, bent, MATCHING)
+        closure = _fitted(a, b, points, found, T_a_b_guess)
         if closure is not None:
             return closure
     return None
 
 
 def _fitted(
-    a: LoopView, b: LoopView, points: F64, found: matching.Matches, guess: F64,
-    config: SubmapLoopConfig,
-) -> LoopClosure | None:  # fmt: skip
+    a: LoopView, b: LoopView, points: F64, found: matching.Matches, guess: F64
+) -> LoopClosure | None:
     there, known = _on_surface(b, found.uv_px.astype(np.float64))
     ok = found.ok & known
-    if np.count_nonzero(ok) < config.min_matches:
+    if np.count_nonzero(ok) < MIN_MATCHES:
         return None
     here, there = points[ok], there[ok]
-    sigma = _sigma(a, here, config) + _sigma(b, there, config)
-    T, inside = _rigid(here, there, sigma, guess, config.gate_sigmas)
+    sigma = _sigma(a, here) + _sigma(b, there)
+    T, inside = _rigid(here, there, sigma, guess)
     count = int(np.count_nonzero(inside))
-    if count < config.min_matches or count < config.min_inlier_share * len(here):
+    if count < MIN_MATCHES or count < MIN_INLIER_SHARE * len(here):
         return None
     spread = np.linalg.svd(here[inside] - here[inside].mean(axis=0), compute_uv=False)
-    if spread[1] < config.min_spread * float(np.median(here[:, 2])) * np.sqrt(count):
+    if spread[1] < MIN_SPREAD * float(np.median(here[:, 2])) * np.sqrt(count):
         return None
     size = [np.linalg.norm(p[inside] - p[inside].mean(axis=0)) for p in (here, there)]
     covariance = _covariance(T, here, there, sigma, inside)
@@ -102,20 +93,20 @@ def _on_surface(view: LoopView, uv: F64) -> tuple[F64, Bool]:
     return rays(view.K, uv) * z[:, None], np.asarray(inside & np.isfinite(z))
 
 
-def _sigma(view: LoopView, points: F64, config: SubmapLoopConfig) -> F64:
+def _sigma(view: LoopView, points: F64) -> F64:
     """(N,) m of a point, by its depth's median sigma and a pixel's width there."""
     own = float(np.nanmedian(view.depth.sigma_m))
-    return np.asarray(np.hypot(own, config.pixel_sigma * points[:, 2] / view.K[0, 0]))
+    return np.asarray(np.hypot(own, PIXEL_SIGMA * points[:, 2] / view.K[0, 0]))
 
 
-def _rigid(here: F64, there: F64, sigma: F64, guess: F64, gate: float) -> tuple[F64, Bool]:
+def _rigid(here: F64, there: F64, sigma: F64, guess: F64) -> tuple[F64, Bool]:
     """(4, 4) motion that takes ``there`` to ``here``, and which pairs (N,) it holds for."""
     T = guess.copy()
     T[:3, 3] += np.median(here - se3.transform(T, there), axis=0)
     inside = np.ones(len(here), bool)
     for _ in range(15):
         off = np.linalg.norm(here - se3.transform(T, there), axis=1) / sigma
-        limit = max(gate, 2.0 * float(np.median(off)))  # opens while the start is still off
+        limit = max(GATE_SIGMAS, 2.0 * float(np.median(off)))  # opens while the start is still off
         weight = np.where(off < limit, (1.0 - (off / limit) ** 2) ** 2, 0.0) / sigma**2
         if np.count_nonzero(weight) < 6:
             return T, np.zeros(len(here), bool)
@@ -123,7 +114,7 @@ def _rigid(here: F64, there: F64, sigma: F64, guess: F64, gate: float) -> tuple[
         centre_a, centre_b = weight @ here, weight @ there
         R = se3.nearest_rotation(((here - centre_a) * weight[:, None]).T @ (there - centre_b))
         T = se3.compose(R, centre_a - R @ centre_b)
-    inside = np.linalg.norm(here - se3.transform(T, there), axis=1) < gate * sigma
+    inside = np.linalg.norm(here - se3.transform(T, there), axis=1) < GATE_SIGMAS * sigma
     return T, np.asarray(inside)
 
 

@@ -10,8 +10,6 @@ doi:10.1093/biomet/73.1.13), as errors of neighbouring landmarks are alike.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from recon.tracking.bundle import BundleResult, linearise_all
@@ -22,15 +20,6 @@ HUBER_PX = 1.0
 
 CELLS = 4
 """Rows and columns of cells of the landmarks."""
-
-
-@dataclass(frozen=True, slots=True)
-class FocalEstimate:
-    """How much the images would change the focal length, in shares of it; from ``windows``."""
-
-    change: float
-    sigma: float
-    windows: int
 
 
 class FocalWatch:
@@ -48,8 +37,9 @@ class FocalWatch:
             self._cells.append(_evidence(window, camera, point, uv_px, self._K))
 
     @property
-    def estimate(self) -> FocalEstimate | None:
-        """By all windows; None where they show nothing."""
+    def estimate(self) -> tuple[float, float, int] | None:
+        """How much the images would change the focal length, and the sigma of that, in shares of
+        it, and from how many windows; None where they show nothing."""
         if not self._cells:
             return None
         cells = np.stack(self._cells)
@@ -65,7 +55,7 @@ class FocalWatch:
         if count > 1:
             of_windows = float(np.square(rest.sum(axis=1)).sum()) * count / (count - 1)
             squares = max(squares, of_windows)
-        return FocalEstimate(float(step[0]), float(np.sqrt(squares)), count)
+        return float(step[0]), float(np.sqrt(squares)), count
 
 
 def _evidence(window: BundleResult, cam: I64, point: I64, uv_px: F64, K: F64) -> F64:

@@ -8,7 +8,7 @@ once, give one, which is the average weighted by each landmark's information.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -22,30 +22,29 @@ from recon.tracking.keyframe_window import OdometryKeyframe, median_depth
 from recon.tracking.prediction import ConstantVelocity
 from recon.types import F64, I64, Bool, Camera, PosePrior
 
+MIN_BASE_TO_HEIGHT = 0.03
+"""Motion over the distance to the ground, under which two frames are not triangulated."""
 
-@dataclass(frozen=True, slots=True)
-class OdometryConfig:
-    """Parameters of the odometry; angles are in rad, shares are of the image width."""
+SEARCH_SHARE, WIDE_SEARCH_SHARE = 0.03, 0.09
+"""ZSSD search radii around a good and a poor prediction, as shares of the image's width."""
 
-    base_to_height: float = 0.1  # motion between keyframes over the distance to the ground
-    min_base_to_height: float = 0.03  # under it two frames are not triangulated
-    window: int = 8  # keyframes adjusted together
-    search_share: float = 0.03  # ZSSD search radius around a good prediction
-    wide_search_share: float = 0.09  # and around a poor one
-    min_tracks: int = 40  # fewer inliers: lost
-    min_track_share: float = 0.25  # of the corners that should be visible
-    tracked_landmarks: int = 450  # of both keyframes; new keyframes match all their corners
-    max_tilt_error_rad: float = 0.35  # vision against attitude: more is a false solution
-    loose_px: float = 6.0  # gate of a second try: a rolling shutter bends images that much
-    lost_after: int = 8  # frames in a row without a pose before a new segment starts
-    low_rate_gap_s: float = 0.7  # frames further apart are stills: no motion model holds
-    matching: matching.MatchingConfig = field(default_factory=matching.MatchingConfig)
-    pnp: pnp.PnpConfig = field(default_factory=pnp.PnpConfig)
+MIN_TRACKS, MIN_TRACK_SHARE = 40, 0.25
+"""Inliers under which a frame is lost, and matches as a share of the corners that should be
+visible."""
 
-    def __post_init__(self) -> None:
-        if not 0.0 < self.min_base_to_height <= self.base_to_height < 1.0:
-            raise ValueError("0 < min_base_to_height <= base_to_height < 1 must hold")
+TRACKED_LANDMARKS = 450
+"""Of both keyframes, for a frame's pose; new keyframes match all their corners."""
 
+MAX_TILT_ERROR_RAD = 0.35
+"""Vision against attitude: more is a false solution."""
+
+LOOSE_PX = 6.0
+"""Gate of a second try: a rolling shutter bends images that much."""
+
+LOW_RATE_GAP_S = 0.7
+"""Frames further apart are stills: no motion model holds."""
+
+MATCHING = matching.MatchingConfig()
 
 RECALLED = 4
 """Newest keyframes that a frame is compared with by features."""
@@ -71,28 +70,6 @@ class Located:
         return int(np.count_nonzero(self.pose.inliers))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Search:
-    """A keyframe's corners looked for in a frame."""
-
-    key: OdometryKeyframe
-    uv: F64  # (N, 2) of its corners
-    ok: Bool  # (N,) found
-    searched: Bool  # (N,)
-    has_landmark: Bool  # (N,) with a landmark
-    in_view: float  # share of its corners that should be visible
-
-    @property
-    def known(self) -> I64:
-        """Rows of the corners that are found and have a landmark."""
-        return np.flatnonzero(self.ok & self.has_landmark)
-
-    @property
-    def points(self) -> F64:
-        """(M, 3) landmarks of the rows :attr:`known`."""
-        return self.key.landmarks[self.key.landmark[self.known]]
-
-
 TwoViewPose = tuple[OdometryKeyframe, F64, F64, Bool]
 """A frame's pose by what it and one keyframe see, whose depths give the scale: that keyframe,
 T_camera_odom (4, 4), where (N, 2) its corners are found, and which (N,) are."""
@@ -107,11 +84,9 @@ heading."""
 class Localiser:
     """Poses of frames of one camera without distortion."""
 
-    def __init__(
-        self, camera: Camera, config: OdometryConfig, features: FeatureCache, row_track: RowTrack
-    ) -> None:
+    def __init__(self, camera: Camera, features: FeatureCache, row_track: RowTrack) -> None:
         """``features`` finds views that no motion predicts."""
-        self.camera, self.config, self._row_track = camera, config, row_track
+        self.camera, self._row_track = camera, row_track
         self._features = features
         self._near_px = [share * camera.size_px[0] for share in FEATURE_SHARES]
         self._drift = np.eye(3)  # from the pixels of a segment's first frame to the last one's
@@ -132,8 +107,8 @@ class Localiser:
             lost: the frame before has no pose.
         """
         reason, best = "no match", None
-        least = self.config.min_tracks
-        most = None if low_frame_rate else self.config.tracked_landmarks
+        least = MIN_TRACKS
+        most = None if low_frame_rate else TRACKED_LANDMARKS
         for key, T_camera_odom, share, by_features in self._starts(new, keyframes, motion, lost):
             left = keyframes[-2] if len(keyframes) > 1 and key is keyframes[-1] else None
             found = self.pose_from(key, new, T_camera_odom, share, least, most, left)
@@ -153,7 +128,7 @@ class Localiser:
         self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe], found: Located
     ) -> list[Located]:
         """The frame against the other recent keyframes that see the same ground."""
-        share, least = 0.5 * self.config.search_share, self.config.min_tracks // 3
+        share, least = 0.5 * SEARCH_SHARE, MIN_TRACKS // 3
         T = found.pose.T_camera_points
         rest = [key for key in keyframes[-RECALLED:] if key is not found.key]
         located = [self.pose_from(key, new, T, share, least) for key in rest]
@@ -207,17 +182,17 @@ class Localiser:
         self, new: UndistortedFrame, key: OdometryKeyframe, uv: F64, ok: Bool
     ) -> TwoViewPose | None:
         """The pose by the keyframe's corners found at ``uv`` (N, 2) where ``ok`` (N,)."""
-        if ok.sum() < 2 * self.config.min_tracks:
+        if ok.sum() < 2 * MIN_TRACKS:
             return None
         turn = prediction.relative_rotation(key.prior, new.prior)
-        largest = np.pi if turn is None else self.config.max_tilt_error_rad
+        largest = np.pi if turn is None else MAX_TILT_ERROR_RAD
         up, K = key.T_camera_odom[:3, 2], self.camera.K
         far = np.full(int(ok.sum()), np.nan_to_num(1.0 / median_depth(key)))
         uv_a, uv_b = key.moving.at_middle(K, key.uv[ok], far), new.motion.at_middle(K, uv[ok], far)
         seen = two_view.solve(uv_a, uv_b, K, turn, largest, up)
         if seen is None and turn is not None:  # tags are often wrong
             seen = two_view.solve(uv_a, uv_b, K, None, np.pi, up)
-        if seen is None or seen.parallax_rad < self.config.min_base_to_height:
+        if seen is None or seen.parallax_rad < MIN_BASE_TO_HEIGHT:
             return None
         rows = np.flatnonzero(ok)[seen.inliers]
         depth = prediction.landmark_depths(key, self.camera.K, rows)
@@ -241,15 +216,15 @@ class Localiser:
         """Where the camera may be, most trusted first."""
         key = keyframes[-1]
         T_odom_camera, turn, gap_s = motion.ahead(new.time_ns, new.prior)
-        low_frame_rate = gap_s > self.config.low_rate_gap_s
+        low_frame_rate = gap_s > LOW_RATE_GAP_S
         by_motion = se3.inverse(T_odom_camera)
         if not low_frame_rate or turn is not None:
-            share = self.config.wide_search_share if low_frame_rate else self.config.search_share
+            share = WIDE_SEARCH_SHARE if low_frame_rate else SEARCH_SHARE
             yield key, by_motion, share, False
         if low_frame_rate or lost:
             yield from self._by_features(new, keyframes, low_frame_rate)
         if not low_frame_rate or turn is None:
-            yield key, by_motion, self.config.wide_search_share, False
+            yield key, by_motion, WIDE_SEARCH_SHARE, False
         if not (low_frame_rate or lost):
             yield from self._by_features(new, keyframes, low_frame_rate)
 
@@ -304,25 +279,29 @@ class Localiser:
         """
         radius_px = share * self.camera.size_px[0]
         amount = most if most is None or left is None else most * 2 // 3
-        right = self._search(key, new, T_camera_odom, radius_px, amount)
-        if np.count_nonzero(right.searched) < least:
+        uv, ok, searched, in_view = self._search(key, new, T_camera_odom, radius_px, amount)
+        if np.count_nonzero(searched) < least:
             return "no known landmark is in view"
-        parts = [right]
+        known = key.landmarks.known(key.landmark)
+        rows = np.flatnonzero(ok & known)
+        points, pixels = key.landmarks[key.landmark[rows]], uv[rows]
+        expected = np.count_nonzero(searched & known)
         if most is not None and left is not None:
-            taken = key.landmark[right.searched]
-            parts.append(self._search(left, new, T_camera_odom, radius_px, most // 3, taken))
-        points = np.vstack([part.points for part in parts])
-        uv = np.vstack([part.uv[part.known] for part in parts])
-        expected = sum(int((part.searched & part.has_landmark).sum()) for part in parts)
-        if len(points) < max(least, self.config.min_track_share * expected):
+            taken = key.landmark[searched]
+            more = self._search(left, new, T_camera_odom, radius_px, most // 3, taken)
+            also = np.flatnonzero(more[1])  # all that are searched have a landmark
+            points = np.vstack([points, left.landmarks[left.landmark[also]]])
+            pixels = np.vstack([pixels, more[0][also]])
+            expected += np.count_nonzero(more[2])
+        if len(points) < max(least, MIN_TRACK_SHARE * expected):
             return "too few matches"
-        solved = self._solve(points, uv, T_camera_odom, max(least, len(points) // 2), new.motion)
+        fewest = max(least, len(points) // 2)
+        solved = self._solve(points, pixels, T_camera_odom, fewest, new.motion)
         if solved is None:
             return "no pose fits the matches"
-        known = right.known
-        right.ok[known[~solved.inliers[: known.size]]] = False
-        found_share = float(right.ok[right.searched].mean())
-        return Located(key, solved, right.uv, right.ok, right.in_view * found_share, found_share)
+        ok[rows[~solved.inliers[: rows.size]]] = False
+        found_share = float(ok[searched].mean())
+        return Located(key, solved, uv, ok, in_view * found_share, found_share)
 
     def _search(
         self,
@@ -332,17 +311,21 @@ class Localiser:
         radius_px: float,
         most: int | None,
         taken: I64 | None = None,
-    ) -> Search:
-        """The keyframe's corners in the frame, without the landmarks ``taken`` (M,) elsewhere."""
+    ) -> tuple[F64, Bool, Bool, float]:
+        """Where (N, 2) the keyframe's corners are in the frame, which (N,) are found, which (N,)
+        were searched, and the share of them that should be visible.
+
+        With ``most`` only about so many are searched, all with a landmark; none of those ``taken``
+        (M,) elsewhere.
+        """
         uv, warp, visible = prediction.on_landmarks(
             key, self.camera.K, self.camera.size_px, T_camera_odom
         )
-        has_landmark = key.landmarks.known(key.landmark)
-        in_view, config = float(visible.mean()), self.config.matching
+        in_view, config = float(visible.mean()), MATCHING
         if taken is not None:
             visible &= ~np.isin(key.landmark, taken)
         if most is not None:
-            rows = np.flatnonzero(visible & has_landmark)
+            rows = np.flatnonzero(visible & key.landmarks.known(key.landmark))
             visible[:] = False
             visible[rows[:: max(1, len(rows) // most)]] = True
             config = replace(config, max_return_px=np.inf)  # the pose refutes what is wrong
@@ -356,7 +339,7 @@ class Localiser:
         )  # fmt: skip
         ok = np.zeros(len(key.uv), np.bool_)
         ok[index], uv[index] = found.ok, found.uv_px
-        return Search(key, uv, ok, visible, has_landmark, in_view)
+        return uv, ok, visible, in_view
 
     def _solve(
         self, points: F64, uv: F64, start: F64, least: int, moving: FrameRows
@@ -365,24 +348,23 @@ class Localiser:
 
         The pose says how the rows moved, so it is solved again with that motion.
         """
-        for gate_px in (self.config.pnp.threshold_px, self.config.loose_px):
-            config = replace(self.config.pnp, threshold_px=gate_px)
-            solved = self._solve_rows(points, uv, start, config, moving)
+        for gate_px in (pnp.THRESHOLD_PX, LOOSE_PX):
+            solved = self._solve_rows(points, uv, start, gate_px, moving)
             if solved is not None and moving.rows is not None:
                 self._row_track.place(moving, solved.T_camera_points)
-                again = self._solve_rows(points, uv, solved.T_camera_points, config, moving)
+                again = self._solve_rows(points, uv, solved.T_camera_points, gate_px, moving)
                 solved = again or solved
             if solved is not None and solved.inliers.sum() >= least:
                 return solved
         return None
 
     def _solve_rows(
-        self, points: F64, uv: F64, start: F64, config: pnp.PnpConfig, moving: FrameRows
+        self, points: F64, uv: F64, start: F64, gate_px: float, moving: FrameRows
     ) -> pnp.PnpResult | None:
         """EPnP on pixels (N, 2) as they would be at the middle row's time."""
         depth = se3.transform(start, points)[:, 2]
         middle = moving.at_middle(self.camera.K, uv, 1.0 / np.maximum(depth, 1e-6))
-        return pnp.solve(points, middle, self.camera.K, config, start)
+        return pnp.solve(points, middle, self.camera.K, start, gate_px)
 
     def _agrees(
         self, T_camera_odom: F64, prior: PosePrior, key: OdometryKeyframe, tilt_only: bool
@@ -401,7 +383,7 @@ class Localiser:
             assert key.prior.R_world_camera is not None and prior.R_world_camera is not None
             cosine = (seen @ key.prior.R_world_camera[2]) @ prior.R_world_camera[2]
             off = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        return off < self.config.max_tilt_error_rad
+        return off < MAX_TILT_ERROR_RAD
 
     # ---- a segment's first frame ---------------------------------------------------------------
 
@@ -432,7 +414,7 @@ class Localiser:
         low_frame_rate: bool,
     ) -> Iterator[tuple[F64, F64, float]]:  # fmt: skip
         """Where the corners went, with warps and radius in px, best first."""
-        wide_px = self.config.wide_search_share * self.camera.size_px[0]
+        wide_px = WIDE_SEARCH_SHARE * self.camera.size_px[0]
         if not low_frame_rate:
             yield *prediction.by_homography(self._drift, first.uv), wide_px
         if R_b_a is not None:
@@ -461,6 +443,6 @@ class Localiser:
         """Where (N, 2) a keyframe's corners are in a frame, about ``uv``, and which are found."""
         found = matching.match(
             key.pyramid, key.uv.astype(np.float32), new.pyramid, uv.astype(np.float32),
-            radius_px, warp.astype(np.float32), self.config.matching,
+            radius_px, warp.astype(np.float32), MATCHING,
         )  # fmt: skip
         return found.uv_px.astype(np.float64), found.ok

@@ -29,7 +29,17 @@ from recon.tracking.keyframe_window import (
     median_depth,
     triangulate,
 )
-from recon.tracking.localisation import Localiser, Located, OdometryConfig, TwoViewPose
+from recon.tracking.localisation import (
+    LOOSE_PX,
+    LOW_RATE_GAP_S,
+    MATCHING,
+    MIN_BASE_TO_HEIGHT,
+    MIN_TRACKS,
+    SEARCH_SHARE,
+    Localiser,
+    Located,
+    TwoViewPose,
+)
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.prediction import ConstantVelocity
 from recon.tracking.readout_search import ReadoutSearch
@@ -37,6 +47,12 @@ from recon.types import F64, I64, Bool, Camera, PosePrior
 
 MAX_TURN_RAD = 0.25
 """A frame that turned this much since the last keyframe becomes one."""
+
+WINDOW = 8
+"""Keyframes adjusted together."""
+
+LOST_AFTER = 8
+"""Frames in a row without a pose before a new segment starts."""
 
 OVERDUE = 1.3
 """A blurred frame becomes a keyframe when the last is this many steps away."""
@@ -76,18 +92,22 @@ class Odometry:
     def __init__(
         self,
         camera: Camera,
-        config: OdometryConfig | None = None,
         lens: Camera | None = None,
         seeks_readout: bool = False,
+        base_to_height: float = 0.1,
     ) -> None:
         """``camera`` has no distortion and the size of the frames to come.
 
         ``lens`` is the camera with its distortion and shutter; None: a global shutter.
         ``seeks_readout``: its readout is a start, to be found by the images.
+        ``base_to_height`` is the motion between keyframes over the distance to the ground; raises
+        ValueError where no two frames so close can be triangulated.
         """
+        if not MIN_BASE_TO_HEIGHT <= base_to_height < 1.0:
+            raise ValueError(f"base_to_height is {base_to_height}, not {MIN_BASE_TO_HEIGHT} to 1")
         self.camera = camera
         self.K = camera.K
-        self.config = config or OdometryConfig()
+        self._base_to_height = base_to_height
         self.keyframes: list[OdometryKeyframe] = []  # of the current segment
         self.segment = -1
         self._lost = 0
@@ -101,7 +121,7 @@ class Odometry:
         self.focal, self._watched_seq = FocalWatch(self.K), -1
         self._unsettled: OdometryKeyframe | None = None  # its rows' motion will be known better
         self._early: list[tuple[FrameRows, F64, Bool]] = []  # frames, the first one's corners there
-        self._localiser = Localiser(camera, self.config, features, self._row_track)
+        self._localiser = Localiser(camera, features, self._row_track)
         self._frame_ns = self._gap_ns = 0  # time of the last frame, and since the one before
         self._depth = float("nan")  # median of the last keyframe's landmarks
 
@@ -117,7 +137,7 @@ class Odometry:
         moved, turned, gap_s = self._moving.shift(time_ns, prior, self._depth)
         max_gap_s = SOUGHT_GAP_S if self._row_track.is_rolling else MAX_GAP_S
         max_gap_s = ROLLING_GAP_S if self._row_track.is_known else max_gap_s
-        step = max(moved / self.config.base_to_height, turned / MAX_TURN_RAD)
+        step = max(moved / self._base_to_height, turned / MAX_TURN_RAD)
         return gap_s < max_gap_s and step * frames_per_step < 1.0
 
     def needs_turn(self, time_ns: int) -> bool:
@@ -158,7 +178,7 @@ class Odometry:
     @property
     def _low_frame_rate(self) -> bool:
         """Too long since the frame before for a motion model to hold."""
-        return self._gap_ns > 1e9 * self.config.low_rate_gap_s
+        return self._gap_ns > 1e9 * LOW_RATE_GAP_S
 
     @property
     def _moving(self) -> ConstantVelocity:
@@ -178,14 +198,14 @@ class Odometry:
                     before = replace(started, state=Tracking.KEYFRAME, reason=why)
                     return replace(second, before=before)
                 return second
-        elif not self._low_frame_rate and self._lost >= self.config.lost_after:
+        elif not self._low_frame_rate and self._lost >= LOST_AFTER:
             self._start(new)
         self._missed_frame = (new, reason) if self._low_frame_rate else None
         return Tracked(Tracking.LOST, self.segment, reason=reason)
 
     def _start(self, new: UndistortedFrame) -> Tracked:
         uv = self._corners(new)
-        if len(uv) < 2 * self.config.min_tracks:
+        if len(uv) < 2 * MIN_TRACKS:
             return Tracked(Tracking.LOST, self.segment, reason="too little texture")
         self.segment += 1
         self._lost = 0
@@ -214,7 +234,7 @@ class Odometry:
 
     def _corners(self, new: UndistortedFrame) -> F64:
         """(N, 2) Harris corners of the frame, Eq. 4-5."""
-        found = matching.harris_grid(new.small, self.config.matching, new.mask)
+        found = matching.harris_grid(new.small, MATCHING, new.mask)
         return found[:, :2].astype(np.float64)
 
     # ---- the second view --------------------------------------------------------------
@@ -224,12 +244,12 @@ class Odometry:
         first = self.keyframes[0]
         R_b_a = prediction.relative_rotation(first.prior, new.prior)
         uv, ok = self._localiser.match_first(new, first, R_b_a, self._low_frame_rate)
-        if self._low_frame_rate and ok.sum() < 2 * self.config.min_tracks:
+        if self._low_frame_rate and ok.sum() < 2 * MIN_TRACKS:
             uv, ok = self._localiser.with_features(new, first, uv, ok) or (uv, ok)
-        if ok.sum() < 2 * self.config.min_tracks:
+        if ok.sum() < 2 * MIN_TRACKS:
             return self._missed(new, "too few matches with the first frame")
         self._lost = 0
-        least = 0.7 * self.config.base_to_height
+        least = 0.7 * self._base_to_height
         moved = prediction.base_to_height(first.uv[ok], uv[ok], self.K, R_b_a)
         view = None
         if moved >= least or (R_b_a is None and self._is_no_turn(first.uv[ok], uv[ok])):
@@ -240,7 +260,7 @@ class Odometry:
             return Tracked(
                 Tracking.WAITING, self.segment, tracks=int(ok.sum()), reason="too little motion"
             )
-        if view is None or view.parallax_rad < self.config.min_base_to_height:
+        if view is None or view.parallax_rad < MIN_BASE_TO_HEIGHT:
             return self._missed(new, "no certain motion between two frames")
         matched = np.flatnonzero(ok)
         ok[matched[~view.inliers]] = False
@@ -288,7 +308,7 @@ class Odometry:
             points = first.landmarks[first.landmark[rows]]
             depth = se3.transform(first.T_camera_odom, points)[:, 2]
             at = moving.at_middle(self.K, uv[rows], 1.0 / depth)
-            found = pnp.solve(points, at, self.K, self.config.pnp, first.T_camera_odom)
+            found = pnp.solve(points, at, self.K, first.T_camera_odom)
             if found is not None:
                 self._row_track.add(moving, found.T_camera_points)
         self._early = []
@@ -308,14 +328,14 @@ class Odometry:
         px_s = self._px_s(T_odom_camera, depth)
         self._moving.update(new.time_ns, T_odom_camera, new.prior)
         self._lost = 0
-        due = self.config.base_to_height * (OVERDUE if new.is_blurred else 1.0)
+        due = self._base_to_height * (OVERDUE if new.is_blurred else 1.0)
         if base < due and found.share > 0.45 and turned < MAX_TURN_RAD:
             self._row_track.add(new.motion, T_camera_odom)
             self._settle()
             return Tracked(Tracking.TRACKED, self.segment, T_odom_camera, tracks, moving=new.moving)
         self.exposure.add(new.small, px_s, 1e-9 * self._gap_ns)
-        share = 0.5 * self.config.search_share
-        whole = self._localiser.pose_from(key, new, T_camera_odom, share, self.config.min_tracks)
+        share = 0.5 * SEARCH_SHARE
+        whole = self._localiser.pose_from(key, new, T_camera_odom, share, MIN_TRACKS)
         found = found if isinstance(whole, str) else whole
         seen = [found]
         if self._low_frame_rate:  # little overlap: every keyframe that sees the same ground counts
@@ -357,26 +377,26 @@ class Odometry:
         ``seen`` are keyframes with where (N, 2) their corners were found and which (N,) were,
         the one that gave the pose first. Of the others only corners with landmarks count.
         """
-        least = 0.5 * self.config.min_base_to_height
+        least = 0.5 * MIN_BASE_TO_HEIGHT
         self._row_track.add(new.motion, T_camera_odom)
         kept, landmark = np.zeros((0, 2)), np.zeros(0, np.int64)
         for key, uv, ok in seen:
-            triangulate(key, T_camera_odom, new.motion, uv, ok, self.K, least, self.config.loose_px)
+            triangulate(key, T_camera_odom, new.motion, uv, ok, self.K, least, LOOSE_PX)
             if key is not seen[0][0]:
                 ok = ok & (key.landmark >= 0) & ~np.isin(key.landmark, landmark)
             kept = np.vstack([kept, uv[ok]])
             landmark = np.concatenate([landmark, key.landmark[ok]])
         fresh = prediction.fresh_corners(
-            self._corners(new), kept, self.camera.size_px, self.config.matching.grid
+            self._corners(new), kept, self.camera.size_px, MATCHING.grid
         )
         uv = np.vstack([kept, fresh])
         landmark = np.concatenate([landmark, np.full(len(fresh), -1, np.int64)])
         key_new = self._keyframe(new, T_camera_odom, uv, landmark, seen[0][0].landmarks)
         self.keyframes.append(key_new)
         self._unsettled = key_new if new.motion.rows is not None else None
-        window = self.keyframes[-self.config.window - 2 :]
+        window = self.keyframes[-WINDOW - 2 :]
         adjusted = adjust_window(window, self.K)
-        if len(window) > self.config.window and window[0].seq > self._watched_seq:
+        if len(window) > WINDOW and window[0].seq > self._watched_seq:
             self._watched_seq = new.seq
             self.focal.add(*adjusted)
         self._depth = median_depth(key_new)
@@ -396,7 +416,7 @@ class Odometry:
 
     def _forget(self) -> None:
         """Drop images and corners that left the window, and landmarks out of sight."""
-        window = self.keyframes[-self.config.window - 2 :]
+        window = self.keyframes[-WINDOW - 2 :]
         for old in self.keyframes[: -len(window)]:
             old.pyramid = ()
             old.uv, old.landmark = np.zeros((0, 2)), np.zeros(0, np.int64)

@@ -20,18 +20,26 @@ from recon.tracking import robust_geometry
 from recon.tracking.bundle import compose, linearise, se3_exp
 from recon.types import F64, Bool
 
+THRESHOLD_PX = 2.0
+"""Largest reprojection error of an inlier."""
 
-@dataclass(frozen=True, slots=True)
-class PnpConfig:
-    threshold_px: float = 2.0  # largest reprojection error of an inlier
-    iterations: int = 200  # RANSAC draws, at most
-    confidence: float = 0.9999  # RANSAC stops early at this chance of a clean draw
-    min_inliers: int = 15
-    min_inlier_share: float = 0.3  # of the points given
-    max_sigma_share: float = 0.03  # sigma of the position over the median depth, at most
-    floor_px: float = 0.1  # least error assumed of a match, 1 sigma
-    prior_share: float = 0.7  # of the points near the prior's pixels: no random draw needed
-    max_prior_rotation_rad: float = 0.35  # a pose this far from the prior needs most points
+MIN_INLIERS, MIN_INLIER_SHARE = 15, 0.3
+"""Inliers of a pose, and their share of the points given, at least."""
+
+DRAWS, CONFIDENCE = 200, 0.9999
+"""RANSAC's draws, at most, and the chance of a clean draw at which it stops early."""
+
+MAX_SIGMA_SHARE = 0.03
+"""Sigma of the position over the median depth, at most."""
+
+FLOOR_PX = 0.1
+"""Least error assumed of a match, 1 sigma."""
+
+PRIOR_SHARE = 0.7
+"""Of the points near the prior's pixels, from which on there is no random draw."""
+
+MAX_PRIOR_TURN_RAD, MOST = 0.35, 0.6
+"""A pose that far from the prior needs that share of the points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,8 +65,9 @@ def solve(
     points_m: F64,
     uv_px: F64,
     K: F64,
-    config: PnpConfig | None = None,
     prior_T_camera_points: F64 | None = None,
+    threshold_px: float = THRESHOLD_PX,
+    min_inliers: int = MIN_INLIERS,
 ) -> PnpResult | None:
     """The pose that projects ``points_m`` (N, 3) to ``uv_px`` (N, 2), or None without trust.
 
@@ -67,10 +76,9 @@ def solve(
     the points. Points or pixels that are not finite are outliers. None: too few inliers, too
     loose a fit, or points so placed that the position stays open.
     """
-    config = config or PnpConfig()
     points, uv = np.asarray(points_m, np.float64), np.asarray(uv_px, np.float64)
     finite = np.isfinite(points).all(axis=1) & np.isfinite(uv).all(axis=1)
-    if np.count_nonzero(finite) < config.min_inliers:
+    if np.count_nonzero(finite) < min_inliers:
         return None
     # The origin moves to the points' middle: far origins cost digits and stall the refinement.
     middle = np.median(points[finite], axis=0)
@@ -78,26 +86,28 @@ def solve(
     shift = se3.compose(np.eye(3), middle)
     prior = None if prior_T_camera_points is None else prior_T_camera_points @ shift
     k = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-    T = _best(_starts(local, pixels, K, k, prior, config), local, pixels, k, config)
+    starts = _starts(local, pixels, K, k, prior, threshold_px)
+    T = _best(starts, local, pixels, k, threshold_px, min_inliers)
     if T is None:
         return None
     error = np.full(len(points), np.inf)
     error[finite] = _errors(T, local, pixels, k)
-    return _judge(T @ se3.inverse(shift), error, points, uv, k, prior_T_camera_points, config)
+    inliers = error <= threshold_px
+    if np.count_nonzero(inliers) < min_inliers:
+        return None
+    return _judge(T @ se3.inverse(shift), error, inliers, points, uv, k, prior_T_camera_points)
 
 
 def _starts(
-    points: F64, uv: F64, K: F64, k: F64, prior: F64 | None, config: PnpConfig
+    points: F64, uv: F64, K: F64, k: F64, prior: F64 | None, threshold_px: float
 ) -> list[F64]:
     """Poses to start from: the prior where it explains most points to a few pixels, else also
     EPnP's on the largest consensus of RANSAC. Eq. (6), (7)."""
     if prior is not None:
-        near = _errors(prior, points, uv, k) <= 3.0 * config.threshold_px
-        if np.mean(near) >= config.prior_share:
+        near = _errors(prior, points, uv, k) <= 3.0 * threshold_px
+        if np.mean(near) >= PRIOR_SHARE:
             return [prior]
-    drawn = robust_geometry.consensus_pose(
-        points, uv, K, config.threshold_px, config.iterations, config.confidence
-    )
+    drawn = robust_geometry.consensus_pose(points, uv, K, threshold_px, DRAWS, CONFIDENCE)
     return [T for T in (prior, drawn) if T is not None]
 
 
@@ -160,19 +170,21 @@ def _descend(
     return here, True
 
 
-def _best(starts: list[F64], points: F64, uv: F64, k: F64, config: PnpConfig) -> F64 | None:
+def _best(
+    starts: list[F64], points: F64, uv: F64, k: F64, threshold_px: float, min_inliers: int
+) -> F64 | None:
     """The start with the lowest truncated error, refined on its inliers."""
     best, lowest = None, np.inf
     for T in starts:
-        cost = float(np.minimum(_errors(T, points, uv, k), 2 * config.threshold_px).sum())
+        cost = float(np.minimum(_errors(T, points, uv, k), 2 * threshold_px).sum())
         if cost < lowest:
             best, lowest = T, cost
     if best is None:
         return None
     # A start is rougher than the answer: its inliers are gathered with wider gates first.
     for gate in (3.0, 1.5, 1.0):
-        used = _errors(best, points, uv, k) <= gate * config.threshold_px
-        if np.count_nonzero(used) < config.min_inliers:
+        used = _errors(best, points, uv, k) <= gate * threshold_px
+        if np.count_nonzero(used) < min_inliers:
             return None
         best, is_closed = _descend(best, points, uv, k, used)
         if not is_closed or not np.isfinite(best).all():
@@ -181,20 +193,19 @@ def _best(starts: list[F64], points: F64, uv: F64, k: F64, config: PnpConfig) ->
 
 
 def _judge(
-    T: F64, error: F64, points: F64, uv: F64, k: F64, prior: F64 | None, config: PnpConfig
+    T: F64, error: F64, inliers: Bool, points: F64, uv: F64, k: F64, prior: F64 | None
 ) -> PnpResult | None:
     """The result with its covariance, or None when it cannot be trusted; ``error`` (N,) px."""
-    inliers = error <= config.threshold_px
     count = int(np.count_nonzero(inliers))
     share = count / len(points)
-    if count < config.min_inliers or share < config.min_inlier_share:
+    if share < MIN_INLIER_SHARE:
         return None
-    if prior is not None and share < 0.6:
+    if prior is not None and share < MOST:
         turn = float(np.linalg.norm(se3.so3_log(T[:3, :3] @ prior[:3, :3].T)))
-        if turn > config.max_prior_rotation_rad:
+        if turn > MAX_PRIOR_TURN_RAD:
             return None
     error = error[inliers]
-    variance = max(float(error @ error) / (2 * count - 6), config.floor_px**2)
+    variance = max(float(error @ error) / (2 * count - 6), FLOOR_PX**2)
     H, _ = _normal_equations(T, points, uv, k, inliers)
     covariance = _inverse(H)
     if covariance is None:
@@ -203,7 +214,7 @@ def _judge(
     # Uncertainty of where the camera is, seen from the points.
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
     depth = points[inliers] @ T[2, :3] + T[2, 3]
-    if not sigma <= config.max_sigma_share * float(np.median(depth)):
+    if not sigma <= MAX_SIGMA_SHARE * float(np.median(depth)):
         return None
     return PnpResult(T, covariance, inliers, float(np.sqrt(np.mean(error**2))))
 

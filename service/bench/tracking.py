@@ -103,7 +103,7 @@ def run_pose(options: BenchOptions) -> list[BenchResult]:
     prior = se3.exp(np.array([0.002, -0.003, 0.004, 0.2, -0.3, 0.1])) @ T
     return [
         compare(
-            "900 points, 15 % wrong", partial(pnp.solve, points, uv, K, None, prior),
+            "900 points, 15 % wrong", partial(pnp.solve, points, uv, K, prior),
             options, "OpenCV RANSAC EPnP + LM", partial(by_opencv, points, uv),
             note="ours with covariance",
         ),
@@ -148,7 +148,7 @@ def frame(options: BenchOptions) -> BenchResult:
         new = build_pyramid(b)
         found = match(key, uv, new, uv, RADIUS_PX, None, config)
         seen = found.uv_px[found.ok].astype(np.float64)
-        if pnp.solve(landmarks[found.ok], seen, K, None, prior) is None:
+        if pnp.solve(landmarks[found.ok], seen, K, prior) is None:
             raise RuntimeError("the benchmark's own frame was not solved")
 
     what = f"matching + pose of a {SIZE[1]}x{SIZE[0]} frame"

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from mavlink.telemetry.samples import VehicleState
     from recon.backends import Backend
     from recon.pipeline.events import FramePosed
-    from recon.types import Camera, Keyframe
+    from recon.types import Camera, Frame, Keyframe
     from service.cameras.source import CameraSource
     from service.daemon.frame_gate import FrameGate
     from service.flight.datalink import DaemonLink
-    from service.flight.scan import Photo, Scan, ScanInputs
+    from service.flight.scan import Scan, ScanInputs
     from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
@@ -291,7 +291,7 @@ class ScanRun:
         if scan is not None and keyframe.time_ns not in self._photos:
             report_keyframe(self._with.vehicle, scan, keyframe)
 
-    def _on_photo(self, photo: Photo) -> None:
+    def _on_photo(self, photo: Frame) -> None:
         scan = self.scan
         if scan is not None:
             self._photos.add(photo.time_ns)
@@ -338,16 +338,16 @@ def report_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> Non
     vehicle.report_keyframe(report)
 
 
-def report_photo(vehicle: VehicleLink, scan: Scan, photo: Photo) -> None:
+def report_photo(vehicle: VehicleLink, scan: Scan, photo: Frame) -> None:
     """Store a photo and report it to ground stations, or why that failed."""
     from service.daemon.stored_image import image_name, store_image
     from service.flight.vehicle_reports import keyframe_report
 
-    inputs = scan.inputs
+    inputs, tag = scan.inputs, photo.prior
     time_ns = photo.time_ns + inputs.unix_offset_ns
     path = inputs.folder / PHOTOS / image_name(time_ns)
     report = keyframe_report(
-        time_ns, photo.R_world_camera, photo.position_m, scan.rig.frame, photo.agl_m,
+        time_ns, tag.R_world_camera, tag.position_m, scan.rig.frame, tag.agl_m,
         f"{inputs.scan_id}/{PHOTOS}/{path.name}",
     )  # fmt: skip
     try:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mavlink.telemetry.samples import VehicleState
 from recon import se3
-from recon.pipeline.events import Event, FirstDepth, FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import pose_at
 from recon.posegraph.ground_heights import GUESSED_SHARE
 from recon.poses import sigma_m
@@ -94,7 +94,7 @@ class Recorder:
             posed.time_ns + self._offset_ns, posed.reference, pose.T_world_camera,
             sigma_m(pose), agl_m, posed.is_view,
         )  # fmt: skip
-        self._frames.add(frame, self.pipeline.follow.is_settled)
+        self._frames.add(frame, self.pipeline.is_settled)
         self.last = self._record(frame, pose)
         self._due.append(self.last)
         if len(self._due) >= self._batch:
@@ -210,11 +210,11 @@ class Recorder:
         self._origin_written = True
 
     def _write_keyframes(self, events: Iterable[Event]) -> None:
-        for event in events:
-            if isinstance(event, FirstDepth):
-                first = encode(event.keyframe, event.keyframe.time_ns + self._offset_ns)[0]
-                self.store.offer_first(event.keyframe.seq, first)
-        keyframes = [event.keyframe for event in events if isinstance(event, KeyframeReady)]
+        ready = [event for event in events if isinstance(event, KeyframeReady)]
+        for first in (event.keyframe for event in ready if event.is_first):
+            coarse, *_ = encode(first, first.time_ns + self._offset_ns)
+            self.store.offer_first(first.seq, coarse)
+        keyframes = [event.keyframe for event in ready if not event.is_first]
         if keyframes:
             self._write_due()
         for keyframe in keyframes:

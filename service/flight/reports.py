@@ -164,16 +164,15 @@ def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
 def _constants(found: Constants) -> dict[str, Any]:
     """Boresight and altitude's zero. ``boresight.deg`` turns the reported camera about its x, y
     and z axes (right, down, ahead); it is used when it is sure."""
-    one, datum = found.boresight, found.datum
     return {
         "boresight": {
-            "deg": [round(float(v), 3) for v in np.degrees(one.turn)],
-            "sigma_deg": [round(float(v), 3) for v in np.degrees(one.sigma)],
-            "sure": one.is_sure,
+            "deg": [round(float(v), 3) for v in np.degrees(found.turn)],
+            "sigma_deg": [round(float(v), 3) for v in np.degrees(found.sigma_turn)],
+            "sure": found.is_turn_sure,
         },
         "altitude_datum": {
-            "shift_m": round(datum.shift_m, 3),
-            "sigma_m": round(datum.sigma_m, 3) if np.isfinite(datum.sigma_m) else None,
+            "shift_m": round(found.up_m, 3),
+            "sigma_m": round(found.sigma_up_m, 3) if np.isfinite(found.sigma_up_m) else None,
         },
     }
 

@@ -23,7 +23,7 @@ from recon.pipeline.events import Event as MapperEvent
 from recon.pipeline.events import FramePosed
 from recon.posegraph.pose_priors import Odometer
 from recon.tracking.known_track import KnownTrack
-from recon.types import F64, U8, Camera, Frame, Keyframe, Pose, PosePrior, Shutter
+from recon.types import Camera, Frame, Keyframe, Pose, PosePrior, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter
 from service.cameras.lens import MAX_FOCAL
 from service.cameras.rig import ASSUMED_AGL_M, Rig, turn_sigma_rad_s
@@ -65,17 +65,6 @@ def short_collections() -> Iterator[None]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Photo:
-    """A frame that was asked for as a photo, with its tag; unknown parts are None."""
-
-    image: U8  # (H, W, 3) BGR
-    time_ns: int  # exposure
-    R_world_camera: F64 | None  # (3, 3)
-    position_m: F64 | None  # (3,) ENU about the scan's origin
-    agl_m: float | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ScanInputs:
     source: CameraSource
     camera: Camera
@@ -95,7 +84,7 @@ class ScanInputs:
     warn: Callable[[str], None] = log.warning  # the operator
     on_frame: Callable[[FramePosed, VehicleState | None], None] | None = None
     on_keyframe: Callable[[Keyframe], None] | None = None
-    on_photo: Callable[[Photo], None] | None = None
+    on_photo: Callable[[Frame], None] | None = None  # its prior is its tag
 
 
 def check_new(folder: Path) -> Path:
@@ -204,22 +193,23 @@ class Scan:
             inputs.warn(doubt)
         self.recorder.write(events, state.alt_agl_m if state is not None else None)
         if is_photo:
-            self._hand_out(Frame(frame.image, exposed_ns, frame.seq, prior), posed.pose, state)
+            photo = Frame(frame.image, exposed_ns, frame.seq, prior)
+            self._hand_out(photo, posed.pose, state.alt_agl_m if state is not None else None)
         if inputs.on_frame is not None:
             inputs.on_frame(posed, state)
         return posed
 
-    def _hand_out(self, frame: Frame, pose: Pose | None, state: VehicleState | None) -> None:
-        """A photo, by telemetry, or by vision where telemetry does not tell."""
+    def _hand_out(self, frame: Frame, pose: Pose | None, agl_m: float | None) -> None:
+        """A photo, tagged by telemetry, or by vision where telemetry does not tell."""
         self._photos.popleft()
         prior = frame.prior
         R = None if prior.is_view_assumed else prior.R_world_camera
         position = prior.position_m
         if pose is not None and (R is None or position is None):
             R, position = pose.T_world_camera[:3, :3], pose.T_world_camera[:3, 3]
-        agl_m = state.alt_agl_m if state is not None else None
         if self.inputs.on_photo is not None:
-            self.inputs.on_photo(Photo(frame.image, frame.time_ns, R, position, agl_m))
+            tag = PosePrior(R_world_camera=R, position_m=position, agl_m=agl_m)
+            self.inputs.on_photo(replace(frame, prior=tag))
 
     def _turning(self, prior: PosePrior, exposed_ns: int) -> PosePrior:
         """The prior with the camera's turn about the moment of exposure, by telemetry."""
@@ -307,20 +297,18 @@ class Scan:
         found = self.pipeline.odometry.focal.estimate
         if found is None:
             return 0.0
-        sigma = math.hypot(found.sigma, self.inputs.sigma_focal)
-        is_off = abs(found.change) > max(MIN_FOCAL_OFF, FOCAL_OFF_SIGMAS * sigma)
-        return found.change if is_off else 0.0
+        change, sigma, _ = found
+        sigma = math.hypot(sigma, self.inputs.sigma_focal)
+        is_off = abs(change) > max(MIN_FOCAL_OFF, FOCAL_OFF_SIGMAS * sigma)
+        return change if is_off else 0.0
 
     def _focal_by_images(self) -> dict[str, Any] | None:
         """The change of the focal length that the images ask for; None where they show none."""
         found = self.pipeline.odometry.focal.estimate
         if found is None:
             return None
-        return {
-            "change": round(found.change, 4),
-            "sigma": round(found.sigma, 4),
-            "windows": found.windows,
-        }
+        change, sigma, windows = found
+        return {"change": round(change, 4), "sigma": round(sigma, 4), "windows": windows}
 
     def _readout(self) -> dict[str, Any] | None:
         """The readout by the images; None where it was not sought or does not show."""

@@ -18,7 +18,6 @@ from recon.rolling_shutter import RowClock, Rows, RowTrack, depth_share, row_tim
 from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.virtual_stereo import at_middle_row, rectify
 from recon.tracking import readout_search
-from recon.tracking.localisation import OdometryConfig
 from recon.tracking.odometry import Odometry
 from recon.tracking.prediction import inverse_depth_plane
 from recon.tracking.readout_search import ReadoutEstimate, ReadoutSearch
@@ -205,7 +204,7 @@ def flown() -> list[U8]:
 
 def height_errors(flown: list[U8], shutter: Shutter) -> F64:
     """(N,) metres that the landmarks of the odometry's keyframes lie off the level ground."""
-    odometry = Odometry(PLAIN, OdometryConfig(), lens=replace(PLAIN, shutter=shutter))
+    odometry = Odometry(PLAIN, lens=replace(PLAIN, shutter=shutter))
     for i, image in enumerate(flown):
         T = se3.inverse(swinging(i / 15))
         turn = -derivative(i / 15)[:3]
@@ -231,7 +230,7 @@ def test_the_odometry_sees_level_ground_through_a_rolling_shutter(flown: list[U8
 def test_frames_after_the_first_tell_how_its_rows_moved(flown: list[U8]) -> None:
     """Telemetry's turn is a tenth of a second late."""
     rolling = replace(PLAIN, shutter=Shutter(0.03))
-    odometry = Odometry(PLAIN, OdometryConfig(), lens=rolling)
+    odometry = Odometry(PLAIN, lens=rolling)
     for i, image in enumerate(flown[:16]):
         T, turn = se3.inverse(swinging(i / 15)), -derivative(i / 15 - 0.1)[:3]
         prior = PosePrior(
@@ -335,7 +334,7 @@ def test_a_sure_readout_names_a_shutter(readout_s: float, way: str, expected: Sh
 def searched(readout_s: float, frames: int) -> tuple[ReadoutEstimate, float | None]:
     """The readout that the odometry finds, from nothing, and the one it uses then; None: global."""
     ground = texture()
-    odometry = Odometry(PLAIN, OdometryConfig(), lens=PLAIN, seeks_readout=True)
+    odometry = Odometry(PLAIN, lens=PLAIN, seeks_readout=True)
     for i in range(frames):
         T = se3.inverse(swinging(i / 15))
         prior = PosePrior(T[:3, :3], 0.01, 0.03, T[:3, 3], np.full(3, 0.5), 60.0, 1.0)

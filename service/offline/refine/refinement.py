@@ -20,8 +20,8 @@ import numpy as np
 from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig
 from recon.parallel import run_parallel
 from recon.posegraph.ground_control import (
+    SIGMA_SCALE,
     Adjusted,
-    BatchConfig,
     ControlPoint,
     KeyframeTrack,
     Mark,
@@ -31,7 +31,6 @@ from recon.posegraph.ground_control import (
 )
 from recon.posegraph.records import Loop
 from recon.posegraph.sensor_offsets import constants
-from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import Camera, Keyframe, PosePrior
 from service.cameras.camera_file import save_camera
 from service.cameras.rig import Rig
@@ -443,7 +442,7 @@ class _Refinement:
                 return None
             return replace(found, depth=replace(found.depth, T_world_camera=track.poses[k]))
 
-        return StoredLoops(track, at, SubmapLoopConfig()).find(self.progress)
+        return StoredLoops(track, at).find(self.progress)
 
     def _ahead_m(self) -> float:
         """Usual distance of the ground; 0 without any surface."""
@@ -453,14 +452,13 @@ class _Refinement:
         known = [float(np.nanmedian(z)) for z in depths if np.isfinite(z).any()]
         return float(np.median(known)) if known else 0.0
 
-    def _config(self) -> BatchConfig:
+    def _sigma_scale(self) -> float:
         """How sure the scan's scale is, as the scan states."""
         scale = (self.store.summary or {}).get("scale")
         sigma = scale.get("sigma") if isinstance(scale, dict) else None
-        usual = BatchConfig()
         if not sigma or self.header.georeference == BY_SURVEY:
-            return usual
-        return replace(usual, sigma_scale=max(float(sigma), MIN_SIGMA_SCALE))
+            return SIGMA_SCALE
+        return max(float(sigma), MIN_SIGMA_SCALE)
 
     # ---- adjustment --------------------------------------------------------------------------
 
@@ -496,7 +494,7 @@ class _Refinement:
         candidates: Sequence[Candidate],
     ) -> Adjusted:  # fmt: skip
         if self.images is None:
-            return adjust(track, points, marks, self._config())
+            return adjust(track, points, marks, self._sigma_scale())
         before = self.images
         found, self.images = adjusted(before, track, points, marks, self.states, self.keyframe)
         for one in candidates:
@@ -519,7 +517,7 @@ class _Refinement:
             marks = [m for c in used if c is not one for m in c.marks]
             mine = one.marks
             if self.images is None:
-                found = adjust(track, points, marks, self._config())
+                found = adjust(track, points, marks, self._sigma_scale())
             else:
                 args = track, points, marks, self.states, self.keyframe
                 found, after = adjusted(self.images, *args)

@@ -19,7 +19,7 @@ from recon import se3
 from recon.posegraph.ground_control import KeyframeTrack
 from recon.posegraph.loop_closure import LoopView, candidates, ground_seen
 from recon.posegraph.records import Loop
-from recon.posegraph.submap_loops import SubmapLoopConfig, filled, verify_surfaces
+from recon.posegraph.submap_loops import filled, verify_surfaces
 from recon.types import F64, Keyframe
 from service.progress import Progress
 
@@ -29,6 +29,10 @@ loop never overlap: one surface at both ends would only confirm the track."""
 
 BREAK_S = 10.0
 """A longer pause between keyframes ends a stretch."""
+
+MIN_GAP, MIN_OVERLAP = 10, 0.2
+"""Keyframes between the two ends of a loop, and how much of the later view must lie in the earlier
+one."""
 
 LOOPS_PER_KEYFRAME, TRIES = 2, 5
 """Loops between one keyframe and another scan, or its own, and verifications for them, at most."""
@@ -71,22 +75,21 @@ class FilledViews:
         return LoopView(gray, whole.depth.K, whole.depth)
 
 
-def likely(view: LoopView, poses: Mapping[int, F64], config: SubmapLoopConfig) -> list[int]:
+def likely(view: LoopView, poses: Mapping[int, F64]) -> list[int]:
     """Numbers of the ``poses`` that see what ``view``, of the last of them, sees, best first; few
     are worth a look."""
     size_px = view.depth.depth_m.shape[::-1]
-    found = candidates(poses, view.K, size_px, ground_seen(view.depth), config.min_overlap)
+    found = candidates(poses, view.K, size_px, ground_seen(view.depth), MIN_OVERLAP)
     return [a for a, _ in found[:TRIES]]
 
 
 def verified(
-    a: int, b: int, views: tuple[LoopView | None, LoopView | None], guess: F64,
-    config: SubmapLoopConfig,
-) -> Loop | None:  # fmt: skip
+    a: int, b: int, views: tuple[LoopView | None, LoopView | None], guess: F64
+) -> Loop | None:
     """The loop between the keyframes ``a`` and ``b``, by what they see."""
     if views[0] is None or views[1] is None:
         return None
-    found = verify_surfaces(views[0], views[1], guess, config)
+    found = verify_surfaces(views[0], views[1], guess)
     if found is None:
         return None
     T_a_b, covariance, growth = found
@@ -100,14 +103,14 @@ class StoredLoops:
         self,
         track: KeyframeTrack,
         keyframe: Callable[[int], Keyframe | None],
-        config: SubmapLoopConfig,
         scans: Sequence[int] | None = None,
+        min_gap: int = MIN_GAP,
     ) -> None:
         """``keyframe`` gives each one with its depth at its pose on the track.
 
         With ``scans``, the number of each keyframe's scan, only loops between scans are sought.
         """
-        self._track, self._config = track, config
+        self._track, self._min_gap = track, min_gap
         self._scans = scans
         pauses = np.diff(track.times_s, prepend=track.times_s[0])
         self._views = FilledViews(keyframe, np.cumsum(pauses > BREAK_S).tolist())
@@ -116,7 +119,7 @@ class StoredLoops:
         """All pairs far apart in time that see the same place, verified."""
         tree = cKDTree(self._track.poses[:, :2, 3])
         out: list[Loop] = []
-        later = range(self._config.min_gap, len(self._track.poses))
+        later = range(self._min_gap, len(self._track.poses))
         for b in (progress or Progress()).over(later, len(later)):
             for earlier in self._near(b, tree):
                 found = (self._verified(a, b) for a in self._likely(b, earlier))
@@ -129,7 +132,7 @@ class StoredLoops:
         if own is None:
             return []
         near = tree.query_ball_point(self._track.poses[b, :2, 3], reach_m(own))
-        earlier = sorted(a for a in near if a <= b - self._config.min_gap)
+        earlier = sorted(a for a in near if a <= b - self._min_gap)
         if self._scans is None:
             return [earlier]
         scans = self._scans
@@ -142,13 +145,13 @@ class StoredLoops:
         if view is None:
             return []
         poses = {a: self._track.poses[a] for a in (*earlier, b)}
-        return likely(view, poses, self._config)
+        return likely(view, poses)
 
     def _verified(self, a: int, b: int) -> Loop | None:
         reach = self._reach(a, b)
         views = self._views.view(a, reach), self._views.view(b, reach)
         guess = se3.inverse(self._track.poses[a]) @ self._track.poses[b]
-        return verified(a, b, views, guess, self._config)
+        return verified(a, b, views, guess)
 
     def _reach(self, a: int, b: int) -> int:
         """Neighbours to fill each of two views with, so that they share none."""

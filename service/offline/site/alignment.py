@@ -18,7 +18,6 @@ import numpy as np
 from recon import se3
 from recon.camera_model import rays
 from recon.posegraph.ground_control import (
-    BatchConfig,
     KeyframeTrack,
     adjust,
     placed_by_points,
@@ -26,7 +25,6 @@ from recon.posegraph.ground_control import (
 )
 from recon.posegraph.records import Loop
 from recon.posegraph.site_alignment import ScanPrior, SiteAlignment, Tie, align, alike
-from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.offline.exports.clouds import VOXELS_MARGIN_M, points_of
@@ -211,7 +209,7 @@ def _aligned(
     ties, kept = [], []
     if len(members) > 1:
         with progress.part("seeking ties", 0.9):
-            stored = StoredLoops(track, keyframe, SubmapLoopConfig(min_gap=1), scans)
+            stored = StoredLoops(track, keyframe, scans, min_gap=1)
             loops = stored.find(progress)
         for loop in supported(loops, track.poses):
             one = keyframe(loop.b)
@@ -254,10 +252,9 @@ def _bent(
             closures.append(replace(loop, T_a_b=T))
     if not closures:
         return moved, track.covariances
-    config = BatchConfig(sigma_scale=SAME_SCALE, sigma_scale_walk=SAME_SCALE)
     whole = KeyframeTrack(moved, track.times_s, track.covariances, loops=closures)
     try:
-        adjusted = adjust(whole, config=config)
+        adjusted = adjust(whole, sigma_scale=SAME_SCALE, sigma_scale_walk=SAME_SCALE)
     except RuntimeError as error:  # so the solver says that the system is ill-posed
         raise InputError("the poses of these scans contradict each other too much") from error
     return adjusted.poses, adjusted.covariances

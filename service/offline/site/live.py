@@ -18,7 +18,6 @@ from recon import se3
 from recon.posegraph.ground_control import supported
 from recon.posegraph.records import Loop
 from recon.posegraph.site_alignment import ScanPrior, ScanSimilarity, align, alike
-from recon.posegraph.submap_loops import SubmapLoopConfig
 from recon.types import F64, Keyframe
 from service.errors import InputError, SkyreliefError
 from service.georeference import LocalFrame
@@ -37,7 +36,6 @@ from service.scans.track import local_frame
 from service.stream import codec
 from service.stream.store import ScanStore
 
-CONFIG = SubmapLoopConfig(min_gap=1)
 UNMOVED = ScanSimilarity(np.eye(3), np.zeros(3), 1.0)
 STRIDE = 20_000
 """Between the first keyframes' numbers of two scans; a scan takes part with so many at most."""
@@ -224,7 +222,7 @@ class LiveSite:
         view, found = one.views.view(k), 0
         if view is None:
             return
-        for a in likely(view, poses, CONFIG):
+        for a in likely(view, poses):
             first, second = sorted(((other, a), (one, k)), key=lambda end: end[0].number)
             ends = first[0].key(first[1]), second[0].key(second[1])
             if ends in self._loops or found == LOOPS_PER_KEYFRAME:
@@ -232,7 +230,7 @@ class LiveSite:
             views = first[0].views.view(first[1]), second[0].views.view(second[1])
             T_a_b = se3.inverse(poses[a]) @ poses[STRIDE]
             guess = T_a_b if second[0] is one else se3.inverse(T_a_b)
-            loop, there = verified(*ends, views, guess, CONFIG), second[0].views.at(second[1])
+            loop, there = verified(*ends, views, guess), second[0].views.at(second[1])
             if loop is not None and there is not None:
                 self._keep(replace(loop, ratio=1.0), corners(there))
                 found += 1

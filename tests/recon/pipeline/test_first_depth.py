@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from painted_ground import CAMERA, HEIGHT_M, pose, still
 
-from recon.pipeline.events import Event, FirstDepth, KeyframeReady, PosesChanged
+from recon.pipeline.events import Event, KeyframeReady, PosesChanged
 from recon.pipeline.mapper import Mapper, MapperConfig
 from recon.types import Frame, PosePrior
 from service.config import load_config
@@ -31,12 +31,16 @@ def fly(first_depths: bool, width_px: int = 320) -> list[Event]:
     return [*events, *mapper.finish()]
 
 
+def is_first(event: Event) -> bool:
+    return isinstance(event, KeyframeReady) and event.is_first
+
+
 @pytest.mark.slow
 def test_a_first_depth_shows_new_ground_early_and_leaves_the_map_as_it_is() -> None:
     plain, events = fly(False), fly(True)
-    firsts = [event for event in events if isinstance(event, FirstDepth)]
-    rest = [event for event in events if not isinstance(event, FirstDepth)]
-    assert len(rest) == len(plain) and not any(isinstance(e, FirstDepth) for e in plain)
+    ready = [event for event in events if isinstance(event, KeyframeReady)]
+    rest = [event for event in events if not is_first(event)]
+    assert len(rest) == len(plain) and not any(map(is_first, plain))
     for one, other in zip(plain, rest, strict=True):
         assert type(one) is type(other)
         if isinstance(one, KeyframeReady) and isinstance(other, KeyframeReady):
@@ -49,10 +53,11 @@ def test_a_first_depth_shows_new_ground_early_and_leaves_the_map_as_it_is() -> N
             assert one.poses.keys() == other.poses.keys()
             for seq, found in one.poses.items():
                 np.testing.assert_array_equal(found.T_world_camera, other.poses[seq].T_world_camera)
-    whole = {e.keyframe.seq: e.keyframe for e in events if isinstance(e, KeyframeReady)}
-    order = [e.keyframe.seq for e in events if isinstance(e, FirstDepth | KeyframeReady)]
+    whole = {e.keyframe.seq: e.keyframe for e in ready if not e.is_first}
+    order = [e.keyframe.seq for e in ready]
+    firsts = [e.keyframe for e in ready if e.is_first]
     assert len(firsts) >= 3
-    for first in (event.keyframe for event in firsts):
+    for first in firsts:
         assert order.index(first.seq) < len(order) - 1 - order[::-1].index(first.seq)
         shown, final = first.fresh & np.isfinite(first.depth.depth_m), whole[first.seq]
         coming = final.fresh & np.isfinite(final.depth.depth_m)
@@ -64,9 +69,9 @@ def test_a_first_depth_shows_new_ground_early_and_leaves_the_map_as_it_is() -> N
 
 @pytest.mark.slow
 def test_first_depths_are_coarser_than_whole_ones_of_another_effort() -> None:
-    events = [e for e in fly(True, 160) if isinstance(e, FirstDepth | KeyframeReady)]
-    widths = {(type(event), event.keyframe.depth.depth_m.shape[1]) for event in events}
-    assert widths == {(KeyframeReady, 160), (FirstDepth, 80)}
+    events = [event for event in fly(True, 160) if isinstance(event, KeyframeReady)]
+    widths = {(event.is_first, event.keyframe.depth.depth_m.shape[1]) for event in events}
+    assert widths == {(False, 160), (True, 80)}
 
 
 @pytest.mark.parametrize(

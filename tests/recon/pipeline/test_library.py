@@ -15,7 +15,7 @@ from some_views import view_at
 
 import recon
 from recon import se3
-from recon.pipeline.events import FirstDepth, FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.keyframe_map import GraphUpdate
 from recon.pipeline.mapper import Mapper, Reconstructed, moved
 from recon.pipeline.views import StereoView
@@ -145,10 +145,11 @@ class FirstOnly(BrokenOff):
     def finished(self, everything: bool = False) -> list[tuple[StereoView, Reconstructed]]:
         self.views += 1
         view = view_at(self.views, np.eye(4))
-        return [(replace(view, is_first=True), FirstDepth(keyframe(self.views)))]
+        return [(replace(view, is_first=True), keyframe(self.views))]
 
 
 def test_a_first_depth_is_said_and_becomes_no_part_of_the_map() -> None:
     mapper = Mapper(CAMERA, worker=FirstOnly)
-    assert [type(event) for event in mapper.drain()] == [FirstDepth]
+    (event,) = mapper.drain()
+    assert isinstance(event, KeyframeReady) and event.is_first
     assert len(mapper.cloud()) == 0 and not mapper.frames._views

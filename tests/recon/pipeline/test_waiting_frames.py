@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import Any, cast
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
-from recon.pipeline.config import untimed
-from recon.pipeline.stages import Track
+from recon.pipeline.mapper import Mapper
 from recon.tracking.frame import UndistortedFrame
 from recon.tracking.odometry import Odometry, Tracked, Tracking
-from recon.types import F64
+from recon.types import F64, Camera
 
 POSE = cast(F64, object())
 STARTED, WAITING = (Tracking.STARTED, POSE, ""), (Tracking.WAITING, None, "too little motion")
@@ -32,8 +31,8 @@ def test_waiting_counts_where_it_is_in_vain(states: list[Any], unused: dict[str,
     results = iter([Tracked(state, 0, T, reason=why) for state, T, why in states])
     odometry, image = Mock(Odometry), Mock(UndistortedFrame)
     odometry.track.side_effect = results
-    refused: Counter[str] = Counter()
-    track = Track(odometry, cast(Any, None), refused, untimed)
+    mapper = Mapper(Camera(np.diag([30.0, 30.0, 1.0]), np.zeros(5), (32, 32)))
+    mapper.odometry = odometry
     for _ in states:
-        track(image)
-    assert refused + track.waiting == unused
+        mapper.follow(image)
+    assert mapper.refusals() == unused

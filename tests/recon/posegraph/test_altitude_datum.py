@@ -30,8 +30,8 @@ def test_white_fixes_tell_the_barometers_zero(offset: float) -> None:
     for _ in range(100):
         above = offset + rng.normal(size=30) * 1.5 / np.sqrt(5)
         found = altitude_datum(intervals(list(above)), 30.0)
-        errors.append(found.shift_m - offset)
-        sigmas.append(found.sigma_m)
+        errors.append(found.up_m - offset)
+        sigmas.append(found.sigma_up_m)
     assert np.sqrt(np.mean(np.square(errors))) < 0.4  # of 1.5 m in one fix
     assert np.median(np.abs(errors)) < np.median(sigmas) < 0.3
 
@@ -39,8 +39,8 @@ def test_white_fixes_tell_the_barometers_zero(offset: float) -> None:
 def test_a_wander_is_not_taken_for_the_zero() -> None:
     """Fixes that all err alike say nothing in half a minute, and something in half an hour."""
     above = [2.0] * 30
-    assert altitude_datum(intervals(above), 30.0).shift_m == 0.0
-    assert 1.5 < altitude_datum(intervals(above), 1800.0).shift_m < 2.0
+    assert altitude_datum(intervals(above), 30.0).up_m == 0.0
+    assert 1.5 < altitude_datum(intervals(above), 1800.0).up_m < 2.0
 
 
 def test_a_wander_under_the_scatter_is_seen_in_five_minutes() -> None:
@@ -53,7 +53,7 @@ def test_a_wander_under_the_scatter_is_seen_in_five_minutes() -> None:
             wander = np.exp(-1 / 60) * wander + 1.5 * np.sqrt(1 - np.exp(-2 / 60)) * rng.normal()
             above.append(wander + 1.5 * rng.normal() / np.sqrt(5))
         found = altitude_datum(intervals(above), 300.0)
-        ratios.append(found.shift_m / found.sigma_m)  # of a zero that is right
+        ratios.append(found.up_m / found.sigma_up_m)  # of a zero that is right
     assert np.sqrt(np.mean(np.square(ratios))) < 2.0
 
 
@@ -61,12 +61,12 @@ def test_a_jump_of_the_receiver_does_not_count() -> None:
     rng = np.random.default_rng(1)
     above = 1.0 + rng.normal(size=40) * 0.67
     above[12:20] += 30.0
-    assert altitude_datum(intervals(list(above)), 40.0).shift_m == pytest.approx(1.0, abs=0.5)
+    assert altitude_datum(intervals(list(above)), 40.0).up_m == pytest.approx(1.0, abs=0.5)
 
 
 def test_without_fixes_nothing_is_shifted() -> None:
-    assert altitude_datum([PosePrior()] * 9, 60.0).shift_m == 0.0
-    assert altitude_datum(intervals([1.0, 1.0]), 60.0).shift_m == 0.0
+    assert altitude_datum([PosePrior()] * 9, 60.0).up_m == 0.0
+    assert altitude_datum(intervals([1.0, 1.0]), 60.0).up_m == 0.0
 
 
 def test_the_mean_of_an_interval_lies_where_its_fixes_were() -> None:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recon import se3
-from recon.posegraph.sensor_offsets import BOUND_RAD, Boresight, Turns, boresight, turns_of
+from recon.posegraph.sensor_offsets import BOUND_RAD, Constants, Turns, boresight, turns_of
 from recon.types import F64, PosePrior
 
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -36,13 +36,13 @@ def test_two_degrees_are_found_on_legs_to_and_fro(seed: int) -> None:
     turn = np.radians([1.6, -1.2, 0.0])
     found = boresight([flown(turn, [0.4, 0.4 + np.pi, 0.4], seed)], 300.0)
     assert np.degrees(np.abs(found.turn[:2] - turn[:2])).max() < 0.3
-    assert found.is_sure and np.degrees(found.sigma[:2]).max() < 0.5
+    assert found.is_turn_sure and np.degrees(found.sigma_turn[:2]).max() < 0.5
 
 
 def test_what_one_leg_cannot_tell_is_left_alone() -> None:
     found = boresight([flown(np.radians([1.6, -1.2, 0.0]), [0.4, 0.4, 0.4], 1)], 300.0)
-    assert not found.is_sure and np.degrees(np.abs(found.turn)).max() < 0.3
-    assert np.degrees(found.sigma).min() > 1.5
+    assert not found.is_turn_sure and np.degrees(np.abs(found.turn)).max() < 0.3
+    assert np.degrees(found.sigma_turn).min() > 1.5
     prior = PosePrior(np.eye(3))
     assert found.applied(prior) is prior
 
@@ -51,13 +51,13 @@ def test_stretches_of_their_own_frames_count_together() -> None:
     """Each leg in a frame of its own tells nothing; with a turn in one of them they agree."""
     turn = np.radians([0.0, 2.0, 0.0])
     alone = [flown(turn, [heading], 7) for heading in (0.0, np.pi)]
-    assert not boresight(alone, 300.0).is_sure
+    assert not boresight(alone, 300.0).is_turn_sure
     both = boresight([*alone, flown(turn, [0.0, np.pi], 8)], 300.0)
     assert np.degrees(np.abs(both.turn - turn)[:2]).max() < 0.3
 
 
 def test_noise_is_no_boresight_and_a_wrong_frame_neither() -> None:
-    sure = [boresight([flown(np.zeros(3), [0.0, np.pi], s)], 60.0).is_sure for s in range(20)]
+    sure = [boresight([flown(np.zeros(3), [0.0, np.pi], s)], 60.0).is_turn_sure for s in range(20)]
     assert not any(sure)
     R_odom, _, sigma = flown(np.zeros(3), [0.0, 1.5, 3.0, 4.5], 1)
     anything = Rotation.random(len(R_odom), random_state=1).as_matrix()
@@ -71,7 +71,7 @@ def test_it_is_bounded() -> None:
 
 def test_a_sure_one_turns_the_attitude() -> None:
     turn = np.array([0.03, -0.02, 0.0])
-    one = Boresight(turn, np.full(3, 0.002))
+    one = Constants(turn, np.full(3, 0.002))
     R = Rotation.random(random_state=2).as_matrix()
     got = one.applied(PosePrior(R)).R_world_camera
     assert got is not None

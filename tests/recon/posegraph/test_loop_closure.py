@@ -14,7 +14,7 @@ import scipy.ndimage as ndi
 from recon import se3
 from recon.camera_model import rays, scaled_K
 from recon.posegraph import loop_search
-from recon.posegraph.loop_closure import LoopConfig, LoopView, candidates, ground_seen, verify
+from recon.posegraph.loop_closure import LoopView, candidates, ground_seen, verify
 from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Trajectory
@@ -305,7 +305,7 @@ def test_a_segment_that_loops_shrink_tells_by_how_much() -> None:
 def search_along(poses: list[F64], chain: list[F64], segment: list[int]) -> LoopSearch:
     """The search fed as the reconstruction feeds it, without telemetry."""
     trajectory = Trajectory()
-    search = LoopSearch(trajectory, LoopConfig(min_gap=5))
+    search = LoopSearch(trajectory, min_gap=5)
     covariance = np.diag([4e-3**2] * 3 + [0.1**2] * 3)
     for i, (T, odom) in enumerate(zip(poses, chain, strict=True)):
         trajectory.add(i, segment[i], odom, PosePrior(), None, i * 10**9, covariance)

@@ -15,7 +15,7 @@ from tracked_frame import undistorted
 from recon import se3
 from recon.tracking import matching
 from recon.tracking.keyframe_window import OdometryKeyframe
-from recon.tracking.localisation import Localiser, OdometryConfig, Search
+from recon.tracking.localisation import TRACKED_LANDMARKS, Localiser
 from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.types import F64, U8, Bool, Camera, PosePrior, Shutter
 
@@ -66,7 +66,7 @@ def fly(
 ) -> tuple[Odometry, list[Tracked]]:
     """Run the odometry at 5 Hz; ``images`` replaces some of the frames."""
     rng = np.random.default_rng(2)
-    odometry, out = Odometry(CAMERA, OdometryConfig()), []
+    odometry, out = Odometry(CAMERA), []
     for i, T in enumerate(track):
         image = photograph(ground, T)
         image = (images or {}).get(i, image)
@@ -149,7 +149,7 @@ def circling(angles_rad: Iterable[float]) -> list[F64]:
 def test_a_camera_that_circles_a_place_moves(ground: U8, step_rad: float) -> None:
     """Its image stays where it is, and no attitude says that it turned."""
     track = circling(np.arange(-0.36, 0.37, step_rad))
-    odometry, found = Odometry(CAMERA, OdometryConfig()), []
+    odometry, found = Odometry(CAMERA), []
     for i, T in enumerate(track):
         prior = PosePrior(DOWN, 0.4, 3.0, agl_m=60.0)
         time_ns = round(i * step_rad * 1e10)
@@ -210,7 +210,7 @@ def skipping(
     attitude: bool = True,
 ) -> list[Tracked]:
     """Run the odometry with telemetry of constant error, without the frames that it can skip."""
-    odometry, out = Odometry(CAMERA, OdometryConfig(), lens, seeks_readout=seeks), []
+    odometry, out = Odometry(CAMERA, lens, seeks_readout=seeks), []
     for i, T in enumerate(track):
         time_ns, prior = round(i * 1e9 / fps), prior_of(T, np.random.default_rng(2))
         prior = prior if attitude else replace(prior, R_world_camera=None)
@@ -270,10 +270,10 @@ def test_each_landmark_is_searched_once(ground: U8, monkeypatch: pytest.MonkeyPa
     searched: list[tuple[int, bool, set[int]]] = []
     search = Localiser._search
 
-    def spy(self: Localiser, key: OdometryKeyframe, *rest: Any) -> Search:
+    def spy(self: Localiser, key: OdometryKeyframe, *rest: Any) -> Any:
         found = search(self, key, *rest)
         is_tracked = rest[3] is not None
-        searched.append((key.seq, is_tracked, set(key.landmark[found.searched].tolist())))
+        searched.append((key.seq, is_tracked, set(key.landmark[found[2]].tolist())))
         return found
 
     monkeypatch.setattr(Localiser, "_search", spy)
@@ -283,7 +283,7 @@ def test_each_landmark_is_searched_once(ground: U8, monkeypatch: pytest.MonkeyPa
         if first and second and left < right:
             pairs += 1
             assert a and not a & b
-            assert len(a | b) <= 1.5 * OdometryConfig().tracked_landmarks
+            assert len(a | b) <= 1.5 * TRACKED_LANDMARKS
     assert pairs > 5
 
 
@@ -297,7 +297,7 @@ def test_a_few_landmarks_show_where_the_others_are(
         return at(self, level, uv_b, active, reach)
 
     monkeypatch.setattr(matching._Search, "at", counted)
-    odometry, rng, out = Odometry(CAMERA, OdometryConfig()), np.random.default_rng(2), []
+    odometry, rng, out = Odometry(CAMERA), np.random.default_rng(2), []
     for i, T in enumerate(poses(20)):
         searched.append(0)
         out.append(

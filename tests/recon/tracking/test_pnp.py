@@ -142,14 +142,15 @@ def test_the_refinement_is_no_worse_than_opencvs_epnp() -> None:
     assert np.mean(ours) <= np.mean(theirs)
 
 
-def test_a_prior_helps_where_outliers_win_the_draw() -> None:
+def test_a_prior_helps_where_outliers_win_the_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     """With seven wrong matches in ten a random draw seldom holds; a good prior still does."""
-    config = pnp.PnpConfig(iterations=2, min_inlier_share=0.2)
+    monkeypatch.setattr(pnp, "DRAWS", 2)
+    monkeypatch.setattr(pnp, "MIN_INLIER_SHARE", 0.2)
     found = 0
     for seed in range(6):
         s = scene(seed, outliers=0.7)
         prior = se3.exp(np.array([0.0005, -0.0004, 0.0006, 0.01, 0.02, -0.02])) @ s.T
-        result = pnp.solve(s.points, s.uv, K, config, prior)
+        result = pnp.solve(s.points, s.uv, K, prior)
         if result is not None:
             found += 1
             assert np.linalg.norm(centre(result.T_camera_points) - centre(s.T)) < 0.06
@@ -161,7 +162,7 @@ def test_a_near_prior_gives_the_same_pose_without_drawing(relief_m: float) -> No
     for seed in range(6):
         s = scene(seed, relief_m=relief_m, outliers=0.2)
         prior = se3.exp(np.array([0.001, -0.001, 0.002, 0.05, 0.04, -0.1])) @ s.T
-        drawn, near = pnp.solve(s.points, s.uv, K), pnp.solve(s.points, s.uv, K, None, prior)
+        drawn, near = pnp.solve(s.points, s.uv, K), pnp.solve(s.points, s.uv, K, prior)
         assert drawn is not None and near is not None
         np.testing.assert_allclose(near.T_camera_points, drawn.T_camera_points, atol=2e-3)
         assert np.mean(near.inliers == drawn.inliers) > 0.99
@@ -170,7 +171,7 @@ def test_a_near_prior_gives_the_same_pose_without_drawing(relief_m: float) -> No
 def test_a_wrong_prior_does_no_harm() -> None:
     s = scene(5)
     prior = se3.exp(np.array([0.3, -0.4, 1.0, 30.0, 2.0, -9.0])) @ s.T
-    result = pnp.solve(s.points, s.uv, K, None, prior)
+    result = pnp.solve(s.points, s.uv, K, prior)
     assert result is not None
     assert np.linalg.norm(centre(result.T_camera_points) - centre(s.T)) < 0.04
 
@@ -180,7 +181,7 @@ def test_a_thin_consensus_against_the_prior_is_rejected() -> None:
     s = scene(7, outliers=0.6)
     prior = se3.exp(np.array([0.0, 0.0, 1.2, 0.0, 0.0, 0.0])) @ s.T
     assert pnp.solve(s.points, s.uv, K) is not None
-    assert pnp.solve(s.points, s.uv, K, None, prior) is None
+    assert pnp.solve(s.points, s.uv, K, prior) is None
 
 
 def test_no_pose_is_invented() -> None:
@@ -253,8 +254,8 @@ def test_one_pose_of_both_keyframes_points_is_as_good_as_the_papers_average() ->
     for seed in range(30):
         s = scene(seed, count=300, outliers=0.1)
         prior = se3.exp(np.array([0.001, -0.001, 0.002, 0.05, 0.04, -0.1])) @ s.T
-        both = pnp.solve(s.points, s.uv, K, None, prior)
-        halves = [pnp.solve(s.points[i::2], s.uv[i::2], K, None, prior) for i in range(2)]
+        both = pnp.solve(s.points, s.uv, K, prior)
+        halves = [pnp.solve(s.points[i::2], s.uv[i::2], K, prior) for i in range(2)]
         assert both is not None and halves[0] is not None and halves[1] is not None
         mean = average_left_right(halves[0], halves[1])
         apart.append(np.linalg.norm(centre(mean.T_camera_points) - centre(s.T)))

@@ -64,7 +64,7 @@ def point_solvers(points: F64, uv: F64) -> list[Callable[[], object]]:
         lambda: robust_geometry.pose_from_points(points, uv, K, cv2.SOLVEPNP_EPNP),
         lambda: robust_geometry.pose_from_points(points, uv, K, cv2.SOLVEPNP_SQPNP),
         lambda: robust_geometry.consensus_pose(points, uv, K, 2.0, 200, 0.9999),
-        lambda: pnp.solve(points, uv, K, None, start),
+        lambda: pnp.solve(points, uv, K, start),
     ]
 
 

@@ -15,12 +15,13 @@ from mavlink.component.camera import KeyframeReport
 from mavlink.component.control import Result
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.samples import VehicleState
+from recon.types import Frame, PosePrior
 from service.cameras.exif import read_tags
 from service.cameras.source import CameraFrame
 from service.daemon.load_shedding import Level
 from service.daemon.scan_run import PHOTOS, report_photo
 from service.daemon.stored_image import image_name, store_image
-from service.flight.scan import Photo, Scan
+from service.flight.scan import Scan
 
 S = 1_000_000_000
 START_NS = 1_790_000_000 * S
@@ -107,7 +108,7 @@ def test_a_photo_without_telemetry_has_the_place_by_vision_or_none(tmp_path: Pat
 def test_a_photo_that_cannot_be_stored_says_why(tmp_path: Path) -> None:
     scan, operator = photos_in(tmp_path)
     (tmp_path / "scan" / PHOTOS).symlink_to(FULL_DISK)
-    scan.inputs.on_photo(Photo(IMAGE, S, None, None, None))  # type: ignore[misc]
+    scan.inputs.on_photo(Frame(IMAGE, S, 0, PosePrior()))  # type: ignore[misc]
     assert operator.texts == ["photo failed: the disk is nearly full"]
     assert operator.reports == [KeyframeReport(ok=False)]
     scan.pipeline.finish()

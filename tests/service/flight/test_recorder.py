@@ -13,7 +13,7 @@ import pytest
 
 from recon import se3
 from recon.camera_model import scaled_K
-from recon.pipeline.events import FirstDepth, FramePosed, KeyframeReady, PosesChanged
+from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
 from recon.posegraph.alignment import Scale, Similarity
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.segments import Segments
@@ -72,7 +72,7 @@ def recorder_of(store: ScanStore, batch: int, of_m: float, graph: object = None)
     pipeline = MagicMock(debug=None)
     pipeline.keyframes.graph = graph
     pipeline.frames.pose = at
-    pipeline.follow.is_settled.return_value = False
+    pipeline.is_settled.return_value = False
     return Recorder(store, pipeline, Mock(Rig, frame=None, georeference="none"), batch=batch)
 
 
@@ -211,7 +211,7 @@ def test_a_first_depth_is_offered_and_neither_stored_nor_counted(
         store.listen(lambda kind, number: news.append((kind, number)))
         recorder = recorder_of(store, 1, 0.1)
         one = house.keyframe(7, 0.0)
-        recorder.write([FirstDepth(one), posed(7)])
+        recorder.write([KeyframeReady(one, is_first=True), posed(7)])
         assert [kind for kind, _ in news] == ["pose", "first"]  # the pose waits for no depth
         assert news[1] == ("first", 7) and store.record("first", 7) is not None
         assert store.seqs() == [] and recorder.keyframes == recorder.points == 0

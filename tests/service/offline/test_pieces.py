@@ -19,7 +19,6 @@ from recon.calibration.global_bundle import Sightings
 from recon.calibration.tracks import MIN_COMMON
 from recon.posegraph import pieces
 from recon.posegraph.alignment import Similarity
-from recon.posegraph.alignment_readings import Heights
 from recon.posegraph.records import Loop, PoseGraphConfig
 from recon.posegraph.segments import Segment, Segments
 from recon.types import F64, PosePrior
@@ -62,7 +61,7 @@ class Ties:
         sources = ("gnss",) if number in self.fixed else ("altitude",)
         out.similarity = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
         if self.against_m is not None:
-            heights = Heights(self.against_m / 2**0.5, 0.0, 0.0, 0.0)
+            heights = self.against_m / 2**0.5, 0.0, 0.0
             out.similarity = replace(out.similarity, heights=heights)
         out.agreement = 0 if number in self.false else 3
         out.is_tied_by_loop, out.keyframes = number in self.tied, 3 + (number == self.main)

@@ -12,7 +12,7 @@ import pytest
 
 from recon import se3
 from recon.posegraph.pose_graph import PoseGraph
-from recon.posegraph.sensor_offsets import AltitudeDatum, Boresight, Constants
+from recon.posegraph.sensor_offsets import Constants
 from recon.types import PosePrior
 from service.flight.reports import graph_figures
 from service.scans.coverage import coverage_of
@@ -193,7 +193,7 @@ def test_accepted_loops_come_back_with_motion_and_covariance() -> None:
 
         def constants(self) -> Constants:
             turn, sigma = np.radians([1.6, -1.2, 0.0]), np.radians([0.2, 0.2, 2.0])
-            return Constants(AltitudeDatum(-0.71234, 0.2), Boresight(turn, sigma))
+            return Constants(turn, sigma, -0.71234, 0.2)
 
         a, b = 3, 40
         T_a_b = se3.exp(np.array([0.1, 0.0, 0.3, 4.0, 5.0, 6.0]))
