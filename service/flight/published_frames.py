@@ -2,90 +2,72 @@
 
 from __future__ import annotations
 
-import struct
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from recon.tracking.frame import RelativePose
-from recon.types import F64
 from service.errors import OutsideError
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PublishedFrame:
-    """A frame's pose as it was written."""
-
-    time_ns: int
-    reference: RelativePose | None  # None: by telemetry alone, never corrected
-    T_world_camera: F64  # (4, 4)
-    sigma_m: float
-    agl_m: float | None
-    is_view: bool
-
-
-_ROW = struct.Struct("<qqi?16d16d2d")
+FRAME = np.dtype(
+    [
+        ("time_ns", np.int64),  # unix
+        ("seq", np.int64),
+        ("segment", np.int32),
+        ("T_odom_camera", np.float64, (4, 4)),
+        ("T_world_camera", np.float64, (4, 4)),  # as written, as all below
+        ("sigma_m", np.float64),
+        ("agl_m", np.float64),  # NaN: unknown
+        ("is_view", np.bool_),
+    ]
+)
+"""A row of the file: one frame."""
 
 
 class PublishedFrames:
-    """Published poses of every frame, in order; on the disk but for the newest.
+    """Published poses of the frames that refer to a keyframe, in order; on the disk but for the
+    newest.
 
     The file has no name and is gone with the process.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._fresh: deque[PublishedFrame] = deque()
+        self._fresh: deque[tuple[RelativePose, Any]] = deque()
         self._file = tempfile.TemporaryFile(dir=folder, buffering=1 << 16)  # noqa: SIM115
 
-    def add(self, frame: PublishedFrame, is_settled: Callable[[RelativePose], bool]) -> None:
-        """Take the next frame; those whose keyframes no longer change go to the disk.
+    def add(
+        self, reference: RelativePose, row: Any, is_settled: Callable[[RelativePose], bool]
+    ) -> None:
+        """Take the next frame's row of :data:`FRAME` but for what its ``reference`` knows; those
+        whose keyframes no longer change go to the disk.
 
         Raises OutsideError when the disk takes no more.
         """
-        self._fresh.append(frame)
-        while self._fresh:
-            reference = self._fresh[0].reference
-            if reference is not None and not is_settled(reference):
-                return
-            first = self._fresh.popleft()
-            if reference is not None:
-                self._write(_packed(first, reference))
+        self._fresh.append((reference, row))
+        while self._fresh and is_settled(self._fresh[0][0]):
+            try:
+                self._file.write(_whole(*self._fresh.popleft()).tobytes())
+            except OSError as error:
+                why = f"poses cannot be stored for the scan: {error.strerror}"
+                raise OutsideError(why) from error
 
-    def _write(self, row: bytes) -> None:
-        try:
-            self._file.write(row)
-        except OSError as error:
-            raise OutsideError(f"poses cannot be stored for the scan: {error.strerror}") from error
-
-    def corrigible(self) -> Iterator[PublishedFrame]:
-        """The frames that refer to a keyframe, in order."""
+    def corrigible(self) -> Iterator[Any]:
+        """The rows of all frames, in order."""
         self._file.seek(0)
-        while row := self._file.read(_ROW.size):
-            yield _unpacked(row)
-        yield from (frame for frame in self._fresh if frame.reference is not None)
+        while row := self._file.read(FRAME.itemsize):
+            yield np.frombuffer(row, FRAME)[0]
+        yield from (_whole(*one) for one in self._fresh)
 
     def close(self) -> None:
         """Release the file."""
         self._file.close()
 
 
-def _packed(frame: PublishedFrame, reference: RelativePose) -> bytes:
-    agl = np.nan if frame.agl_m is None else frame.agl_m
-    return _ROW.pack(
-        frame.time_ns, reference.seq, reference.segment, frame.is_view,
-        *reference.T_odom_camera.ravel(), *frame.T_world_camera.ravel(), frame.sigma_m, agl,
-    )  # fmt: skip
-
-
-def _unpacked(row: bytes) -> PublishedFrame:
-    time_ns, seq, segment, is_view, *rest = _ROW.unpack(row)
-    *rest, sigma_m, agl = rest
-    numbers = np.array(rest)
-    agl_m = None if np.isnan(agl) else agl
-    T_odom_camera, T_world_camera = numbers.reshape(2, 4, 4)
-    reference = RelativePose(seq, segment, T_odom_camera)
-    return PublishedFrame(time_ns, reference, T_world_camera, sigma_m, agl_m, is_view)
+def _whole(reference: RelativePose, row: Any) -> Any:
+    row["seq"], row["segment"] = reference.seq, reference.segment
+    row["T_odom_camera"] = reference.T_odom_camera
+    return row

@@ -18,11 +18,12 @@ from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
 from recon.pipeline.frame_poses import pose_at
 from recon.posegraph.ground_heights import GUESSED_SHARE
 from recon.poses import sigma_m
+from recon.tracking.frame import RelativePose
 from recon.tracking.odometry import Tracking
 from recon.types import F64, Keyframe, Pose
 from service.cameras.rig import Rig, attitude_of
 from service.flight.pipeline import Pipeline
-from service.flight.published_frames import PublishedFrame, PublishedFrames
+from service.flight.published_frames import FRAME, PublishedFrames
 from service.flight.reports import FOUND, gnss_over_heights, graph_figures, sigma_of_scale
 from service.scans.drawing import save_debug
 from service.scans.track import cell, seconds_text
@@ -90,12 +91,15 @@ class Recorder:
         pose = posed.pose
         if pose is None:
             return
-        frame = PublishedFrame(
-            posed.time_ns + self._offset_ns, posed.reference, pose.T_world_camera,
-            sigma_m(pose), agl_m, posed.is_view,
-        )  # fmt: skip
-        self._frames.add(frame, self.pipeline.is_settled)
-        self.last = self._record(frame, pose)
+        time_ns, reference = posed.time_ns + self._offset_ns, posed.reference
+        if reference is not None:
+            row = np.zeros((), FRAME)
+            row["time_ns"], row["is_view"], row["sigma_m"] = time_ns, posed.is_view, sigma_m(pose)
+            row["agl_m"] = np.nan if agl_m is None else agl_m
+            row["T_world_camera"] = pose.T_world_camera
+            self._frames.add(reference, row, self.pipeline.is_settled)
+        view = reference.seq if posed.is_view and reference is not None else None
+        self.last = self._record(time_ns, pose, agl_m, view)
         self._due.append(self.last)
         if len(self._due) >= self._batch:
             self._write_due()
@@ -133,14 +137,18 @@ class Recorder:
 
     def _moved(self) -> Iterator[PoseRecord]:
         """The poses that corrections have moved, or whose sigma they have changed."""
-        for frame in self._frames.corrigible():
-            assert frame.reference is not None
-            T, sigma = frame.T_world_camera, np.full(3, frame.sigma_m / 3**0.5)
-            published = pose_at(T, T[:3, 3], sigma)
-            record = self._record(frame, self.pipeline.frames.pose(frame.reference, published))
+        for row in self._frames.corrigible():
+            T, before_m, agl_m = row["T_world_camera"], float(row["sigma_m"]), float(row["agl_m"])
+            seq = int(row["seq"])
+            reference = RelativePose(seq, int(row["segment"]), row["T_odom_camera"])
+            published = pose_at(T, T[:3, 3], np.full(3, before_m / 3**0.5))
+            record = self._record(
+                int(row["time_ns"]), self.pipeline.frames.pose(reference, published),
+                None if math.isnan(agl_m) else agl_m, seq if row["is_view"] else None,
+            )  # fmt: skip
             moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - T[:3, 3])
             turned_rad = np.linalg.norm(se3.so3_log(T[:3, :3].T @ record.T_world_camera[:3, :3]))
-            resized = abs(record.sigma_m - frame.sigma_m) > REPUBLISH_SHARE * record.sigma_m
+            resized = abs(record.sigma_m - before_m) > REPUBLISH_SHARE * record.sigma_m
             if moved_m > REPUBLISH_M or turned_rad > REPUBLISH_RAD or resized:
                 yield record
 
@@ -251,30 +259,32 @@ class Recorder:
         growth = pose.scale / self._first_scale[seq]
         return Repose(seq, self._revisions[seq], pose.T_world_camera, growth, pose.covariance)
 
-    def _record(self, frame: PublishedFrame, pose: Pose) -> PoseRecord:
+    def _record(
+        self, time_ns: int, pose: Pose, agl_m: float | None, keyframe_seq: int | None
+    ) -> PoseRecord:
         """The pose record of a frame, with speed and turn from the one before it."""
         T = pose.T_world_camera
         roll, pitch, yaw = attitude_of(T)
         speed = turn = 0.0
-        if self._last is not None and frame.time_ns > self._last[0]:
-            dt = (frame.time_ns - self._last[0]) * 1e-9
+        if self._last is not None and time_ns > self._last[0]:
+            dt = (time_ns - self._last[0]) * 1e-9
             step = float(np.linalg.norm(T[:3, 3] - self._last[1][:3, 3]))
             self.distance_m += step
             speed, turn = step / dt, _heading_change(self._last[1], T) / dt
-        self._last = (frame.time_ns, T)
+        self._last = (time_ns, T)
         self.speed_m_s, self.turn_rate_rad_s = speed, turn
         lat = lon = alt = None
         local = self._rig.frame
         if local is not None:
             lat, lon, alt = (float(x) for x in local.to_geodetic(T[None, :3, 3])[0])
         return PoseRecord(
-            time_unix_ns=frame.time_ns,
+            time_unix_ns=time_ns,
             T_world_camera=T,
             covariance=pose.covariance,
             lat_deg=lat,
             lon_deg=lon,
             alt_amsl_m=alt,
-            agl_m=frame.agl_m,
+            agl_m=agl_m,
             roll_rad=roll,
             pitch_rad=pitch,
             yaw_rad=yaw,
@@ -283,7 +293,7 @@ class Recorder:
             turn_rate_rad_s=turn,
             sources=pose.sources,
             sigma_m=sigma_m(pose),
-            keyframe_seq=frame.reference.seq if frame.is_view and frame.reference else None,
+            keyframe_seq=keyframe_seq,
         )
 
 

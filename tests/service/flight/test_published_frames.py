@@ -15,7 +15,7 @@ from recon import se3
 from recon.tracking.frame import RelativePose
 from recon.types import F64
 from service.errors import OutsideError
-from service.flight.published_frames import PublishedFrame, PublishedFrames
+from service.flight.published_frames import FRAME, PublishedFrames
 
 RNG = np.random.default_rng(4)
 
@@ -33,42 +33,39 @@ def before(limit: int) -> Any:
     return is_settled
 
 
-def published(seq: int, key: Any, agl_m: float | None = 41.5) -> PublishedFrame:
-    reference = RelativePose(seq, key.segment, some_pose(), key)
-    return PublishedFrame(10**18 + seq, reference, some_pose(), 0.5 + seq, agl_m, seq % 2 == 0)
+def published(seq: int, key: Any, agl_m: float = 41.5) -> tuple[RelativePose, Any]:
+    row = np.zeros((), FRAME)
+    row["time_ns"], row["T_world_camera"] = 10**18 + seq, some_pose()
+    row["sigma_m"], row["agl_m"], row["is_view"] = 0.5 + seq, agl_m, seq % 2 == 0
+    return RelativePose(seq, key.segment, some_pose(), key), row
 
 
 def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
     keys = [keyframe_at(n, some_pose(), n // 20) for n in range(0, 40, 10)]
-    frames = [published(seq, keys[seq // 10], None if seq == 3 else 41.5) for seq in range(40)]
+    frames = [published(seq, keys[seq // 10], np.nan if seq == 3 else 41.5) for seq in range(40)]
     kept = PublishedFrames(tmp_path)
     for frame in frames:
-        kept.add(frame, before(20))
+        kept.add(*frame, before(20))
     keys[2].T_camera_odom = some_pose()  # still in the window: the newest pose counts
     found = list(kept.corrigible())
     assert not list(tmp_path.iterdir())  # no name: nothing is left behind
-    for one, other in zip(frames, found, strict=True):
-        assert one.reference is not None
-        assert other.reference is not None
-        assert (one.time_ns, one.agl_m, one.is_view) == (other.time_ns, other.agl_m, other.is_view)
-        assert one.sigma_m == other.sigma_m
-        assert np.array_equal(one.T_world_camera, other.T_world_camera)
-        assert np.array_equal(one.reference.T_odom_camera, other.reference.T_odom_camera)
-        assert one.reference.seq == other.reference.seq
-        assert one.reference.segment == other.reference.segment
+    for (reference, one), other in zip(frames, found, strict=True):
+        for name in ("time_ns", "is_view", "sigma_m", "T_world_camera"):
+            assert np.array_equal(one[name], other[name])
+        assert np.array_equal(one["agl_m"], other["agl_m"], equal_nan=True)
+        assert np.array_equal(reference.T_odom_camera, other["T_odom_camera"])
+        assert (reference.seq, reference.segment) == (other["seq"], other["segment"])
     kept.close()
 
 
 def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> None:
     kept, places = PublishedFrames(tmp_path), []
     for seq in range(500):
-        carried = published(seq, keyframe_at(seq, some_pose()))
-        alone = PublishedFrame(10**18 + seq, None, np.eye(4), 0.0, None, False)
-        for frame in (carried, alone):
-            kept.add(frame, before(seq - 9))
-            places.append(weakref.ref(frame.T_world_camera))
-        del carried, alone, frame
-    assert sum(place() is not None for place in places) <= 22
+        reference, row = published(seq, keyframe_at(seq, some_pose()))
+        kept.add(reference, row, before(seq - 9))
+        places.append(weakref.ref(row))
+        del reference, row
+    assert sum(place() is not None for place in places) <= 11
     assert len(list(kept.corrigible())) == 500
     kept.close()
 
@@ -80,7 +77,7 @@ def test_a_full_disk_is_the_outside_worlds_fault(tmp_path: Path) -> None:
     try:
         with pytest.raises(OutsideError):
             for seq in range(1000):
-                kept.add(published(seq, keyframe_at(seq, some_pose())), before(seq))
+                kept.add(*published(seq, keyframe_at(seq, some_pose())), before(seq))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     kept.close()
