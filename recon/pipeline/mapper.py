@@ -24,7 +24,6 @@ from recon.pipeline.first_depth import FirstDepths
 from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.pipeline.stages import (
-    Carry,
     PairStages,
     Plausible,
     Rectify,
@@ -137,7 +136,6 @@ class Mapper:
             UpsamplingConfig(),
             DepthFusionConfig(),
         )
-        self.carry = Carry(backend, timing)
         self.rectify = Rectify(stereo, self.rejected, self.debug, timing)
         self.stereo = PairStages(backend, dense, self.debug, timing)
         self.register = Register(backend, timing)
@@ -242,7 +240,7 @@ class Mapper:
             return self.first_depths(view)
         depth = None
         grid = self.rectify.grid(view)
-        depths = self.carry(view, grid)  # by images that are matched already
+        depths = self.stereo.carried(view, grid)  # by images that are matched already
         pairs = self.rectify(view, depths)  # virtual stereo pairs, section 2.1
         if pairs:
             depth = self.stereo.whole_path(pairs.values(), grid)  # Eq. 1-3 at once, on a device
@@ -251,7 +249,7 @@ class Mapper:
                 disparity = self.stereo.match(pair)  # belief propagation, Eq. 1
                 disparity = self.stereo.upsample(disparity, pair)  # joint bilateral, Eq. 2
                 depths[partner] = self.stereo.reproject(disparity, pair, grid)  # Eq. 3
-            self.carry.keep(view.seq, depths)
+            self.stereo.keep(view.seq, depths)
             depth = self.stereo.fuse([*depths.values()], grid)
         bgr = self.rectify.colours(view, grid)
         depth = self.plausible(view, depth, bgr)  # nothing that cannot be

@@ -148,19 +148,24 @@ class Rectify:
         self._config = replace(self._config, width_px=width_px, guided=upsample)
 
 
-class Carry:
-    """Depth by two images that were matched before, when the other one was the view.
+class PairStages:
+    """Eq. 1 to 3 and the fusion, each by the backend or on the host.
 
-    Matched again they say the same: of a keyframe's pairs that is one in four. A device that keeps
-    the depth of pairs to itself matches them all.
+    Two images that were matched before, when the other one was the view, say the same when matched
+    again: of a keyframe's pairs that is one in four. Their depth is carried over. A device that
+    keeps the depth of pairs to itself matches them all.
     """
 
-    def __init__(self, backend: Backend, timing: Timing) -> None:
-        self._backend, self._timing = backend, timing
+    def __init__(
+        self, backend: Backend, config: DenseStages, debug: dict[str, Array] | None, timing: Timing
+    ) -> None:
+        self._backend, self._config = backend, config
+        self._debug, self._timing = debug, timing
         self._kept: dict[tuple[int, int], PairDepth] = {}  # by view and partner
 
-    def __call__(self, view: StereoView, grid: ViewGrid) -> dict[int, PairDepth]:
-        """Depth on the view's grid by the number of the partner."""
+    def carried(self, view: StereoView, grid: ViewGrid) -> dict[int, PairDepth]:
+        """Depth on the view's grid by images that are matched already, by the number of the
+        partner."""
         found = dict[int, PairDepth]()
         for partner in view.partners:
             pair = self._kept.get((partner.seq, view.seq))
@@ -176,16 +181,6 @@ class Carry:
             return
         later = {(seq, partner): depth for partner, depth in depths.items() if partner > seq}
         self._kept = {key: depth for key, depth in self._kept.items() if key[1] > seq} | later
-
-
-class PairStages:
-    """Eq. 1 to 3 and the fusion, each by the backend or on the host."""
-
-    def __init__(
-        self, backend: Backend, config: DenseStages, debug: dict[str, Array] | None, timing: Timing
-    ) -> None:
-        self._backend, self._config = backend, config
-        self._debug, self._timing = debug, timing
 
     def whole_path(self, pairs: Collection[RectifiedPair], grid: ViewGrid) -> DepthMap | None:
         """Eq. 1 to 3 without leaving the device; None where the stages must do it."""
@@ -204,7 +199,7 @@ class PairStages:
                 pair.left, pair.right, pair.labels, self._config.matching
             )
             coarse = drop_unseen(coarse, pair)
-        self._keep(rect_left=pair.left, rect_right=pair.right, disparity=coarse.px)
+        self._show(rect_left=pair.left, rect_right=pair.right, disparity=coarse.px)
         return coarse
 
     def upsample(self, coarse: DisparityMap, pair: RectifiedPair) -> DisparityMap:
@@ -213,7 +208,7 @@ class PairStages:
         if pair.guide is not None:
             with self._timing("upsample"):
                 fine = self._backend.upsample(coarse, pair.guide, self._config.upsampling)
-        self._keep(upsampled=fine.px)
+        self._show(upsampled=fine.px)
         return fine
 
     def reproject(self, disparity: DisparityMap, pair: RectifiedPair, grid: ViewGrid) -> PairDepth:
@@ -228,7 +223,7 @@ class PairStages:
         with self._timing("fuse"):
             return fuse(depths, grid.K, grid.T_odom_camera, self._config.fusion)
 
-    def _keep(self, **arrays: Array) -> None:
+    def _show(self, **arrays: Array) -> None:
         if self._debug is not None:
             self._debug |= arrays
 
