@@ -131,7 +131,7 @@ class ScanConfig:
 
     def __post_init__(self) -> None:
         """Check ranges and the notation of the baseline."""
-        _within("scan.base_to_height", self.base_to_height, 0.005, 1.0)
+        _within("scan.base_to_height", self.base_to_height, 0.03, 1.0)
         _within("scan.close_after_landing_s", self.close_after_landing_s, 0, 86_400)
         _within("scan.keep_free_mib", self.keep_free_mib, 0, 1e9)
         if self.resolution_m != 0.0:

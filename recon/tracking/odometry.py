@@ -103,7 +103,7 @@ class Odometry:
         ``base_to_height`` is the motion between keyframes over the distance to the ground; raises
         ValueError where no two frames so close can be triangulated.
         """
-        if not MIN_BASE_TO_HEIGHT <= base_to_height < 1.0:
+        if not MIN_BASE_TO_HEIGHT <= base_to_height <= 1.0:
             raise ValueError(f"base_to_height is {base_to_height}, not {MIN_BASE_TO_HEIGHT} to 1")
         self.camera = camera
         self.K = camera.K

@@ -18,6 +18,7 @@ from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.localisation import TRACKED_LANDMARKS, Localiser
 from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.types import F64, U8, Bool, Camera, PosePrior, Shutter
+from service.config import ScanConfig
 
 K = np.array([[400.0, 0, 239.5], [0, 400.0, 179.5], [0, 0, 1]])
 CAMERA = Camera(K, np.zeros(5), (480, 360))
@@ -264,6 +265,18 @@ def test_a_rolling_shutter_skips_less(
     found = skipping(ground, poses(60, step_m=0.2, wobble=0.001), 30.0, lens, seeks)
     followed = [i for i, f in enumerate(found) if f.state in ("tracked", "keyframe")]
     assert max(np.diff(followed)) == apart
+
+
+def test_it_takes_what_the_configuration_may_ask_for() -> None:
+    """A smaller step passed the configuration once, and stopped the scan."""
+    for step in (0.03, 1.0):
+        ScanConfig(base_to_height=step)
+        Odometry(CAMERA, base_to_height=step)
+    for step in (0.02, 1.1):
+        with pytest.raises(ValueError, match="base_to_height"):
+            ScanConfig(base_to_height=step)
+        with pytest.raises(ValueError, match="base_to_height"):
+            Odometry(CAMERA, base_to_height=step)
 
 
 def test_each_landmark_is_searched_once(ground: U8, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -122,6 +122,7 @@ def test_later_override_wins_over_earlier_and_file(tmp_path: Path) -> None:
         ("[scan]\nstart = 'now'\n", "there are on-command, on-boot, on-arm"),
         ("[camera]\nreadout_ms = 'autp'\n", "'autp'; there are model, auto"),
         ("[scan]\nbase_to_height = nan\n", "base_to_height"),
+        ("[scan]\nbase_to_height = 0.02\n", "base_to_height = 0.02 is outside 0.03 to 1"),
         ("[datalink]\nconnect = ['192.168.1.2']\n", "not like tcp/HOST:7447"),
         ("[datalink]\nbudget_kbit_s = 0\n", "budget_kbit_s"),
         ("[health]\nhttp = 'everywhere'\n", "is not HOST:PORT"),
