@@ -22,9 +22,9 @@ from recon.posegraph.alignment_readings import (
     USUAL_RATE_M_S,
     AlignmentReadings,
     AlignmentState,
-    Common,
     Heights,
     ReadingNoise,
+    from_middle,
 )
 from recon.posegraph.ground_heights import GUESSED_SHARE, INDEPENDENT_HEIGHTS
 from recon.posegraph.level_ground import ASSUMED_TILT_RAD
@@ -39,7 +39,7 @@ from recon.posegraph.sensor_noise import (
     drift_noise,
     gauss_markov_noise,
 )
-from recon.types import F64
+from recon.types import F64, PosePrior
 
 
 def umeyama(source: F64, target: F64, weight: F64) -> tuple[float, F64, F64]:
@@ -98,7 +98,9 @@ class Similarity:
     noise: ReadingNoise | None = None  # as measured by the fit; None without one
     sigma_fixes: F64 | None = None  # (3,) m of the mean error of all fixes, where they wander
     sigma_counted: F64 | None = None  # (3,) m that the readings in the graph count for it
-    common: Common = field(default_factory=Common)
+    mount_rad: F64 = field(default_factory=lambda: np.zeros(3))  # turns assumed views
+    drift_m: float = 0.0  # by which altitudes are too high in the end, and too low at first
+    span_s: tuple[float, float] = (0.0, 1.0)  # of the drift: the middle, and half its length
     heights: Heights | None = None  # where the noise of fixes is known
     bend_rad: float = 0.0  # sigma of a part of the track against its mean, as vision's turns add up
     lean: F64 | None = None  # (6, 6) of a left perturbation that tilts all; None: level is known
@@ -114,6 +116,16 @@ class Similarity:
         if self.lean is None:
             return None
         return float(np.sqrt(np.linalg.eigvalsh(self.lean[:2, :2])[-1] + self.bend_rad**2))
+
+    def applied(self, prior: PosePrior, time_s: float) -> PosePrior:
+        """The prior without the turn of an assumed view's mount and the drift of altitudes."""
+        R, position = prior.R_world_camera, prior.position_m
+        if R is not None and prior.is_view_assumed:
+            R = R @ se3.so3_exp(self.mount_rad)
+        if position is not None:
+            drift_m = self.drift_m * float(from_middle(time_s, *self.span_s))
+            position = position - np.array([0.0, 0.0, drift_m])
+        return replace(prior, R_world_camera=R, position_m=position)
 
     def place(self, x_odom: F64) -> F64:
         """(3,) m of a place (3,) in the odometry."""
@@ -181,7 +193,7 @@ def fit(
     at = best.at
     similarity = Similarity(
         float(np.exp(at.log_scale)), at.R, at.t, covariance, _sources(readings), noise, mean,
-        counted, readings.common(at), heights=heights,
+        counted, at.mount, at.drift, readings.span_s, heights,
     )  # fmt: skip
     views = [a.prior for a in usable if a.prior.R_world_camera is not None]
     if any(v.sigma_tilt_rad < ASSUMED_TILT_RAD for v in views) or not len(readings.fix):

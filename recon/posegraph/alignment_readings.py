@@ -42,29 +42,6 @@ TINY = 1e-6
 """Sigma of what no reading has."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Common:
-    """Errors that readings of one kind have in common, where nothing states their accuracy."""
-
-    mount_rad: F64 = field(default_factory=lambda: np.zeros(3))  # turns an assumed view
-    drift_m: float = 0.0  # by which altitudes are too high at the end, and too low at the start
-    middle_s: float = 0.0
-    half_s: float = 1.0
-
-    def along(self, time_s: float | F64) -> F64:
-        """Times as -1 at the start of the readings to 1 at their end, and no further."""
-        return np.asarray(np.clip((time_s - self.middle_s) / self.half_s, -1.0, 1.0))
-
-    def applied(self, prior: PosePrior, time_s: float) -> PosePrior:
-        """The prior without them."""
-        R, position = prior.R_world_camera, prior.position_m
-        if R is not None and prior.is_view_assumed:
-            R = R @ se3.so3_exp(self.mount_rad)
-        if position is not None:
-            position = position - np.array([0.0, 0.0, self.drift_m * float(self.along(time_s))])
-        return replace(prior, R_world_camera=R, position_m=position)
-
-
 Heights = tuple[float, float, float]
 """What fixes of one receiver tell about heights against each other: sigma of the mean height in m,
 its time in s, and the drift in m/s that they may have, 0 where they state their accuracy."""
@@ -236,16 +213,17 @@ class AlignmentReadings:
         return np.array([mount] * 3 + [drift])
 
     @cached_property
-    def spanned(self) -> Common:
+    def span_s(self) -> tuple[float, float]:
+        """The middle of the fixes' time, and half its length."""
         if len(self.fix_s) == 0:
-            return Common()
+            return 0.0, 1.0
         first, last = float(self.fix_s[0]), float(self.fix_s[-1])
-        return Common(middle_s=0.5 * (first + last), half_s=max(0.5 * (last - first), 1e-3))
+        return 0.5 * (first + last), max(0.5 * (last - first), 1e-3)
 
     @property
     def along(self) -> F64:
         """(m,) times of the fixes, -1 to 1."""
-        return self.spanned.along(self.fix_s)
+        return from_middle(self.fix_s, *self.span_s)
 
     def heights(self, at: AlignmentState, H: F64, covariance: F64) -> Heights:
         """What the fixes tell about the mean height; ``covariance`` (7, 7) is that of the fit."""
@@ -255,11 +233,8 @@ class AlignmentReadings:
         if self.is_height_claimed:
             return sigma_m, time_s, 0.0
         sigma_drift_m = float(np.sqrt(np.linalg.inv(H)[10, 10]))
-        half_s = self.spanned.half_s
+        _, half_s = self.span_s
         return sigma_m, time_s, float(np.hypot(at.drift / half_s, sigma_drift_m / half_s))
-
-    def common(self, at: AlignmentState) -> Common:
-        return replace(self.spanned, mount_rad=at.mount, drift_m=at.drift)
 
     def linearised(self, at: AlignmentState) -> tuple[F64, F64]:
         """Whitened residuals (M,) and Jacobian (M, UNKNOWNS)."""
@@ -349,6 +324,11 @@ class AlignmentReadings:
         of_up = (seen @ se3.hat(R_prior[:, 2])) * self.is_assumed[:, None, None]
         of_mount = np.stack([-of_up[:, 1], of_up[:, 0], np.zeros((n, 3))], axis=1)
         return np.where(self.heading_known[:, None], turn, tilt), of_mount
+
+
+def from_middle(time_s: float | F64, middle_s: float, half_s: float) -> F64:
+    """Times as -1 at the start of the readings to 1 at their end, and no further."""
+    return np.asarray(np.clip((time_s - middle_s) / half_s, -1.0, 1.0))
 
 
 def _way(a: PosePrior, b: PosePrior) -> tuple[F64, float] | None:

@@ -104,7 +104,7 @@ class Segment:
         """A node of it without its sensors' constants, its fix brought to the camera."""
         prior = self.constants.applied(node.prior)
         if self.offsets is not None and self.similarity is not None:
-            prior = self.similarity.common.applied(prior, node.time_ns * 1e-9)
+            prior = self.similarity.applied(prior, node.time_s)
             prior = self.offsets.applied(prior, node.lean)
         prior = self.at_camera(replace(node, prior=prior))
         return node if prior is node.prior else replace(node, prior=prior)
@@ -243,7 +243,7 @@ class Segments:
         if before is not None and is_settled and not _differ(before, found, nodes):
             return False  # the graph itself follows such small changes
         segment.similarity, segment.constants = found, fresh
-        readings = [replace(n, prior=found.common.applied(n.prior, n.time_s)) for n in readings]
+        readings = [replace(n, prior=found.applied(n.prior, n.time_s)) for n in readings]
         segment.offsets = offsets(readings, found)
         return True
 

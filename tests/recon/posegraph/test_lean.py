@@ -78,7 +78,7 @@ def test_altitudes_that_agree_with_vision_level_strips(mount_deg: float, turns: 
     assert found is not None and found.sigma_lean_rad is not None
     assert flown.lean_deg(found) < 0.6
     assert np.degrees(found.sigma_lean_rad) < 1.5
-    np.testing.assert_allclose(np.degrees(found.common.mount_rad), [0, mount_deg, 0], atol=1.0)
+    np.testing.assert_allclose(np.degrees(found.mount_rad), [0, mount_deg, 0], atol=1.0)
 
 
 @pytest.mark.parametrize("strips", [2, 3])
@@ -142,7 +142,7 @@ def test_altitudes_that_drift_by_100_m_level_nothing() -> None:
     flown = stills(4, 4.0, turns=True, drift_m=50.0)
     found = fit(flown.nodes)
     assert found is not None and flown.lean_deg(found) < 1.5
-    assert found.common.drift_m == pytest.approx(50.0, abs=5.0)
+    assert found.drift_m == pytest.approx(50.0, abs=5.0)
 
 
 def test_the_drift_of_altitudes_does_not_bend_the_track() -> None:
