@@ -9,7 +9,7 @@ better placed than each. Gauss-Newton with Cauchy weights (Barfoot 2017, ch. 5.3
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -40,28 +40,18 @@ class Tie:
     covariance: F64  # (P, 3, 3) m2, of at_a - at_b; it turns and grows with the scans
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ScanPrior:
-    """How well a scan is placed by its own poses."""
-
-    centre_m: F64  # (3,) about which it turns and grows
-    sigma: F64  # (7,) rad, m, share
-
-
-def alike(priors: Sequence[ScanPrior]) -> list[ScanPrior]:
-    """The priors with sigmas of place that scans of like receivers share.
+def alike(sigma: F64) -> F64:
+    """The sigmas (S, 7) of the scans' own placing, those of place as like receivers share them.
 
     A flight shows its receiver's error by a few independent fixes only, so equal receivers get
     sigmas that differ several times, and a lucky one would place the whole site. None is taken to
     be better than the rms of all, unless it is ALIKE times better.
     """
-    own = np.array([prior.sigma[3:6] for prior in priors])
+    own = sigma[:, 3:6]
+    out: F64 = sigma.copy()
     usual = np.sqrt((own**2).mean(axis=0))
-    shared = np.where(own * ALIKE > usual, np.maximum(own, usual), own)
-    return [
-        replace(prior, sigma=np.concatenate([prior.sigma[:3], place, prior.sigma[6:]]))
-        for prior, place in zip(priors, shared, strict=True)
-    ]
+    out[:, 3:6] = np.where(own * ALIKE > usual, np.maximum(own, usual), own)
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,24 +84,28 @@ class SiteAlignment:
     groups: list[int]  # (S,) scans that ties join have one number
 
 
-def align(ties: Sequence[Tie], priors: Sequence[ScanPrior]) -> SiteAlignment:
-    """The alignment of as many scans as there are ``priors``. A scan without ties stays."""
-    n = len(priors)
-    moves = [ScanSimilarity(np.eye(3), np.zeros(3), 1.0) for _ in priors]
+def align(ties: Sequence[Tie], centres_m: F64, sigma: F64) -> SiteAlignment:
+    """The alignment of S scans. A scan without ties stays.
+
+    Each turns and grows about its centre (S, 3); its own poses place it to a ``sigma`` (S, 7) in
+    rad, m and share.
+    """
+    n = len(centres_m)
+    moves = [ScanSimilarity(np.eye(3), np.zeros(3), 1.0) for _ in centres_m]
     before = _errors(ties, moves)
     state = np.zeros((n, UNKNOWNS))
     for _ in range(STEPS):
-        H, g = _equations(ties, priors, state)
+        H, g = _equations(ties, centres_m, sigma, state)
         step: F64 = np.asarray(-np.linalg.solve(H, g).reshape(n, UNKNOWNS), np.float64)
         state = np.array([_moved(x, d) for x, d in zip(state, step, strict=True)])
         if np.abs(step).max() < 1e-9:
             break
-    moves = [_similarity(x, p) for x, p in zip(state, priors, strict=True)]
+    moves = [_similarity(x, centre) for x, centre in zip(state, centres_m, strict=True)]
     after = _errors(ties, moves)
     size = np.array([_size(e, t) for e, t in zip(after, ties, strict=True)])
     used = size < 5.0
     factor = max(1.0, float(np.sqrt(np.mean(size[used] ** 2)))) if used.any() else 1.0
-    H, _ = _equations(ties, priors, state)
+    H, _ = _equations(ties, centres_m, sigma, state)
     covariance = np.asarray(factor**2 * np.linalg.inv(H), np.float64)
     return SiteAlignment(
         moves, covariance, _lengths(before), _lengths(after), used, factor,
@@ -119,18 +113,18 @@ def align(ties: Sequence[Tie], priors: Sequence[ScanPrior]) -> SiteAlignment:
     )  # fmt: skip
 
 
-def _equations(ties: Sequence[Tie], priors: Sequence[ScanPrior], state: F64) -> tuple[F64, F64]:
+def _equations(ties: Sequence[Tie], centres_m: F64, sigma: F64, state: F64) -> tuple[F64, F64]:
     """Normal equations (7 S, 7 S) and gradient (7 S,) at ``state`` (S, 7)."""
-    information = np.array([1.0 / p.sigma**2 for p in priors]).ravel()
+    information = (1.0 / sigma**2).ravel()
     H, g = np.diag(information), information * state.ravel()
-    moves = [_similarity(x, p) for x, p in zip(state, priors, strict=True)]
+    moves = [_similarity(x, centre) for x, centre in zip(state, centres_m, strict=True)]
     for tie, error in zip(ties, _errors(ties, moves), strict=True):
         weight = 1.0 / (1.0 + (_size(error, tie) / CAUCHY_SIGMAS) ** 2)
         W = weight * np.linalg.inv(tie.covariance)
         sides, R = np.zeros((len(error), 3, 2, UNKNOWNS)), moves[tie.a].R
         ends = ((tie.a, tie.at_a, 1.0), (tie.b, tie.at_b, -1.0))
         for side, (scan, points, sign) in enumerate(ends):
-            centre = priors[scan].centre_m + state[scan, 3:6]
+            centre = centres_m[scan] + state[scan, 3:6]
             lever = _lever(moves[scan].points(points) - centre).reshape(-1, 3, 7)
             sides[:, :, side] = sign * R.T @ lever / _unit(tie, moves)
             sides[:, :, side, 6] -= 0.5 * error
@@ -156,9 +150,9 @@ def _moved(x: F64, step: F64) -> F64:
     return np.concatenate([turn, x[3:] + step[3:]])
 
 
-def _similarity(x: F64, prior: ScanPrior) -> ScanSimilarity:
+def _similarity(x: F64, centre_m: F64) -> ScanSimilarity:
     R, growth = se3.so3_exp(x[:3]), float(np.exp(x[6]))
-    return ScanSimilarity(R, prior.centre_m + x[3:6] - growth * R @ prior.centre_m, growth)
+    return ScanSimilarity(R, centre_m + x[3:6] - growth * R @ centre_m, growth)
 
 
 def _errors(ties: Sequence[Tie], moves: Sequence[ScanSimilarity]) -> list[F64]:

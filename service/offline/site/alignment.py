@@ -24,7 +24,7 @@ from recon.posegraph.ground_control import (
     supported,
 )
 from recon.posegraph.records import Loop
-from recon.posegraph.site_alignment import ScanPrior, SiteAlignment, Tie, align, alike
+from recon.posegraph.site_alignment import SiteAlignment, Tie, align, alike
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.offline.exports.clouds import VOXELS_MARGIN_M, points_of
@@ -162,9 +162,9 @@ def _align(
         members, notes = gather(unique, fresh, out.resolve().name, starts)
         notes += [f"{f} is no longer there: left out" for f in gone]
         with ScanStore.open(fresh) as store:
-            found, priors, ties, adjusted = _aligned(store, members, progress)
+            found, centres_m, ties, adjusted = _aligned(store, members, progress)
             store.add_reposes(_reposes(store, members, found, adjusted))
-            document = _document(store, members, found, priors, ties, notes, known)
+            document = _document(store, members, found, centres_m, ties, notes, known)
             store.update_header(notes=tuple(document["notes"]))
         write_whole(out / SITE, json.dumps(document, indent=1) + "\n")
         _remove(out / "scan.db")
@@ -202,8 +202,9 @@ def _remove(path: Path) -> None:
 
 def _aligned(
     store: ScanStore, members: Sequence[Member], progress: Progress
-) -> tuple[SiteAlignment, list[ScanPrior], list[Tie], dict[int, tuple[F64, F64]]]:
-    """The motions of the scans, their priors, the ties, and each keyframe's pose and covariance."""
+) -> tuple[SiteAlignment, F64, list[Tie], dict[int, tuple[F64, F64]]]:
+    """The motions of the scans, their centres (S, 3), the ties, and each keyframe's pose and
+    covariance."""
     track, seqs, scans = _joined(store, members)
     keyframe = lru_cache(maxsize=KEPT)(lambda k: store.keyframe(seqs[k]))
     ties, kept = [], []
@@ -220,15 +221,14 @@ def _aligned(
             ties.append(tie(loop, ends, track.poses[loop.a], track.poses[loop.b], corners(one)))
             kept.append(loop)
     own = [np.array(scans) == k for k in range(len(members))]
-    priors = [prior(track.poses[mine], track.covariances[mine]) for mine in own]
-    priors = alike([p for p, m in zip(priors, members, strict=True) if m.start is None]) + [
-        replace(p, sigma=np.append(p.sigma[:6], START_SCALE))
-        for p, m in zip(priors, members, strict=True)
-        if m.start is not None
-    ]  # gathered last
-    found = align(ties, priors)
+    centres_m, sigma = placing([(track.poses[k], track.covariances[k]) for k in own])
+    is_started = np.array([member.start is not None for member in members])
+    sigma[is_started, 6] = START_SCALE
+    if not is_started.all():
+        sigma[~is_started] = alike(sigma[~is_started])
+    found = align(ties, centres_m, sigma)
     bent = zip(*_bent(track, scans, found, kept, ties), strict=True)
-    return found, priors, ties, dict(zip(seqs, bent, strict=True))
+    return found, centres_m, ties, dict(zip(seqs, bent, strict=True))
 
 
 def _bent(
@@ -301,12 +301,15 @@ def tie(loop: Loop, scans: tuple[int, int], T_a: F64, T_b: F64, here: F64) -> Ti
     return Tie(*scans, se3.transform(T_a, there), se3.transform(T_b, here), count * spread)
 
 
-def prior(poses: F64, covariances: F64) -> ScanPrior:
-    """The placing of a scan by its own poses (N, 4, 4), with left covariances (N, 6, 6)."""
-    centre = poses[:, :3, 3].mean(axis=0)
-    spread = se3.about(centre, covariances.mean(axis=0))
-    sigma = np.append(np.sqrt(np.maximum(np.diag(spread), 0.0)), SIGMA_SCALE)
-    return ScanPrior(centre, np.clip(sigma, MIN_SIGMA, MAX_SIGMA))
+def placing(scans: Sequence[tuple[F64, F64]]) -> tuple[F64, F64]:
+    """Centres (S, 3) of scans and how sure their own poses (N, 4, 4) place them, with left
+    covariances (N, 6, 6): sigmas (S, 7) in rad, m and share."""
+    centres_m = np.array([poses[:, :3, 3].mean(axis=0) for poses, _ in scans])
+    sigma = np.full((len(scans), 7), SIGMA_SCALE)
+    for k, (_, covariances) in enumerate(scans):
+        spread = se3.about(centres_m[k], covariances.mean(axis=0))
+        sigma[k, :6] = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    return centres_m, np.clip(sigma, MIN_SIGMA, MAX_SIGMA)
 
 
 def _reposes(
@@ -328,7 +331,7 @@ def _reposes(
 
 def _document(
     store: ScanStore, members: Sequence[Member], found: SiteAlignment,
-    priors: Sequence[ScanPrior], ties: Sequence[Tie], notes: Sequence[str], known: dict[str, Any],
+    centres_m: F64, ties: Sequence[Tie], notes: Sequence[str], known: dict[str, Any],
 ) -> dict[str, Any]:  # fmt: skip
     frame = local_frame(store.header)
     assert frame is not None
@@ -348,7 +351,7 @@ def _document(
                 "is not sure (little overlap, another season or light)"
             )
     revision = int(known.get("revision", 0)) + 1
-    scans = [_scan(m, found, priors, k) for k, m in enumerate(members)]
+    scans = [_scan(m, found, centres_m, k) for k, m in enumerate(members)]
     moves = {s["name"]: s["T_site_scan"] for s in scans}
     return {
         "schema": 1,
@@ -363,13 +366,11 @@ def _document(
     }
 
 
-def _scan(
-    member: Member, found: SiteAlignment, priors: Sequence[ScanPrior], k: int
-) -> dict[str, Any]:
+def _scan(member: Member, found: SiteAlignment, centres_m: F64, k: int) -> dict[str, Any]:
     move = found.moves[k]
     sigma = np.sqrt(np.diag(found.covariance)[7 * k : 7 * k + 7])
     tied = sum(g == found.groups[k] for g in found.groups) > 1
-    centre = priors[k].centre_m
+    centre = centres_m[k]
     moved = move.points(centre[None])[0] - centre
     return {
         "name": member.name,

@@ -17,7 +17,7 @@ import numpy as np
 from recon import se3
 from recon.posegraph.ground_control import supported
 from recon.posegraph.records import Loop
-from recon.posegraph.site_alignment import ScanPrior, ScanSimilarity, align, alike
+from recon.posegraph.site_alignment import ScanSimilarity, align, alike
 from recon.types import F64, Keyframe
 from service.errors import InputError, SkyreliefError
 from service.georeference import LocalFrame
@@ -30,7 +30,7 @@ from service.offline.refine.stored_loops import (
     verified,
     weighted,
 )
-from service.offline.site.alignment import MIN_TIES, corners, prior, tie
+from service.offline.site.alignment import MIN_TIES, corners, placing, tie
 from service.offline.site.gather import MAX_DISTANCE_M, between_frames
 from service.scans.track import local_frame
 from service.stream import codec
@@ -148,10 +148,10 @@ class FollowedScan:
         out[:, :3, 3] = self.move.points(out[:, :3, 3])
         return out
 
-    def prior(self) -> ScanPrior:
-        """How well its own poses place it."""
+    def covariances(self) -> F64:
+        """(N, 6, 6) of its poses, left perturbations in the site."""
         A = se3.adjoint(self.T_site_scan)
-        return prior(self.poses, A @ self._covariances @ A.T)
+        return np.asarray(A @ self._covariances @ A.T)
 
     def _at(self, k: int) -> Keyframe | None:
         seq = self._seqs[k]
@@ -268,7 +268,8 @@ class LiveSite:
                 self._loops[one.a, one.b][1])
             for one in weighted(loops)
         ]  # fmt: skip
-        found = align(ties, alike([one.prior() for one in scans]))
+        centres_m, sigma = placing([(one.poses, one.covariances()) for one in scans])
+        found = align(ties, centres_m, alike(sigma))
         sigma = np.sqrt(np.diag(found.covariance)).reshape(-1, 7)[:, 3:6]
         ends = Counter(
             s for t, used in zip(ties, found.used, strict=True) if used for s in (t.a, t.b)
