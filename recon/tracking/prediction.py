@@ -117,7 +117,7 @@ points."""
 
 
 def base_to_height(uv_a: F64, uv_b: F64, K: F64, R_b_a: F64 | None) -> float:
-    """ConstantVelocity of the nearer matches in focal lengths, with the turn taken out when known.
+    """Motion of the nearer matches in focal lengths, with the turn taken out when known.
 
     Without an attitude the turn about the optical axis and the mean shift that a tilt would
     give cannot be distinguished from motion; the shift is then counted as motion.
