@@ -25,11 +25,11 @@ from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.pipeline.stages import (
     PairStages,
-    Plausible,
     Rectify,
     Register,
     Undistort,
     keyframe_of,
+    plausible_depth,
 )
 from recon.pipeline.surface_map import SurfaceMap
 from recon.pipeline.views import StereoView, ViewSelection, VirtualStereoCamera
@@ -139,9 +139,7 @@ class Mapper:
         self.rectify = Rectify(stereo, self.rejected, self.debug, timing)
         self.stereo = PairStages(backend, dense, self.debug, timing)
         self.register = Register(backend, timing)
-        graph = PoseGraph(PoseGraphConfig(max_nodes=config.graph_keyframes))
-        self.plausible = Plausible(graph.segments, self.rejected)
-        trajectory = Trajectory(graph)
+        trajectory = Trajectory(PoseGraph(PoseGraphConfig(max_nodes=config.graph_keyframes)))
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
         self.keyframes = KeyframeMap(trajectory, loops, self.rejected, timing)
         self.surface = SurfaceMap(
@@ -252,7 +250,9 @@ class Mapper:
             self.stereo.keep(view.seq, depths)
             depth = self.stereo.fuse([*depths.values()], grid)
         bgr = self.rectify.colours(view, grid)
-        depth = self.plausible(view, depth, bgr)  # nothing that cannot be
+        if depth is not None:  # nothing that cannot be
+            segments = self.keyframes.graph.segments
+            depth = plausible_depth(view, depth, bgr, segments, self.rejected)
         self.rectify.learn(depth)  # how far the relief of the next pairs may reach
         step, covariance = self.register(view, depth)  # ICP onto the keyframe before
         update = self.keyframes.add(view, step, covariance, depth)  # pose graph

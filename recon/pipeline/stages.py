@@ -228,23 +228,18 @@ class PairStages:
             self._debug |= arrays
 
 
-class Plausible:
-    """Drops the depth that a view cannot have seen, and all of a segment whose motion is false."""
-
-    def __init__(self, segments: Segments, rejected: Counter[str]) -> None:
-        self._segments, self._rejected = segments, rejected
-
-    def __call__(self, view: StereoView, depth: DepthMap | None, bgr: U8) -> DepthMap | None:
-        """The plausible part of ``depth``, which has the colours ``bgr``; None without any."""
-        if depth is None:
-            return None
-        kept = plausible(drop_edges(depth, bgr), view.prior)
-        segment = self._segments.opened(view.segment)
-        segment.agreement += -1 if kept is None else 1
-        if kept is not None and not segment.is_false:
-            return kept
-        self._rejected[CONTRADICTED if kept is None else f"{CONTRADICTED} in earlier views"] += 1
-        return None
+def plausible_depth(
+    view: StereoView, depth: DepthMap, bgr: U8, segments: Segments, rejected: Counter[str]
+) -> DepthMap | None:
+    """The part of a view's ``depth``, which has the colours ``bgr``, that its camera can have seen;
+    None without any, or where the motion of its segment is false."""
+    kept = plausible(drop_edges(depth, bgr), view.prior)
+    segment = segments.opened(view.segment)
+    segment.agreement += -1 if kept is None else 1
+    if kept is not None and not segment.is_false:
+        return kept
+    rejected[CONTRADICTED if kept is None else f"{CONTRADICTED} in earlier views"] += 1
+    return None
 
 
 class Register:

@@ -9,7 +9,8 @@ import numpy as np
 from some_views import view_at
 
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
-from recon.pipeline.stages import Plausible
+from recon.pipeline.stages import plausible_depth
+from recon.pipeline.views import StereoView
 from recon.posegraph.records import PoseGraphConfig
 from recon.posegraph.segments import Segments
 from recon.stereo.reprojection import plausible
@@ -98,15 +99,17 @@ def test_nothing_left_is_no_depth() -> None:
 def test_a_segment_that_was_refuted_needs_more_views_that_agree() -> None:
     """Two views of a false motion contradict themselves; a third that does not stays out."""
     rejected, segments = Counter[str](), Segments(PoseGraphConfig())
-    stage = Plausible(segments, rejected)
+
+    def stage(view: StereoView, depth: DepthMap) -> DepthMap | None:
+        return plausible_depth(view, depth, np.zeros((*SHAPE, 3), np.uint8), segments, rejected)
+
     false, good = surface(np.zeros(SHAPE, np.uint8)), surface(np.full(SHAPE, 2, np.uint8))
-    bgr = np.zeros((*SHAPE, 3), np.uint8)
     first, second = (view_at(n, np.eye(4), segment=n) for n in range(2))
-    assert [stage(first, d, bgr) for d in (false, false, good, good)] == [None] * 4
-    assert stage(first, good, bgr) is good
-    assert stage(second, None, bgr) is None and stage(second, good, bgr) is good
+    assert [stage(first, d) for d in (false, false, good, good)] == [None] * 4
+    assert stage(first, good) is good
+    assert stage(second, good) is good
     assert sum(rejected.values()) == 4
     assert not segments[0].is_false and not segments[1].is_false
     segments[1].add_surface(7, 100, second.prior)
-    assert stage(second, false, bgr) is None and segments[1].is_false
+    assert stage(second, false) is None and segments[1].is_false
     assert segments.false_keyframes() == [7]  # it was kept before its segment was known to be false
