@@ -184,8 +184,7 @@ def air_above(
 
     A camera that looks sideways sees ground below a crown or an eave; where nothing above
     the ground was seen to be empty, the ground need not be the highest surface there. Places
-    are (N, 3) in the world of the depth maps. Where sigma exceeds the heights, most of it is the
-    lens's, which is the same at the place: the air is free if what is seen is nearer the place.
+    are (N, 3) in the world of the depth maps.
     """
     tiles = Tiles(places_m)
     up = np.asarray(heights_m, np.float64)
@@ -249,8 +248,7 @@ def _look_above(
                 u, v = int(np.floor(at + 0.5)), int(np.floor(down + 0.5))
                 if not (0 <= u < w and 0 <= v < h):
                     continue
-                noise = AGREES_SIGMAS * float(depth_sigma[v, u])
-                if depth[v, u] - cz > (min(noise, 0.5 * up_m[j]) if up_m[j] > 0.0 else noise):
+                if depth[v, u] - cz > AGREES_SIGMAS * float(depth_sigma[v, u]):
                     is_open[p, j] = True
                     left -= 1
                 elif depth[v, u] > 0.0 and behind[p, j] < 255:

@@ -49,7 +49,5 @@ class MapperConfig:
     loop_views: int = 400  # keyframes kept for loop detection
     graph_keyframes: int = 400  # nodes of the pose graph; above that, keyframes are interpolated
     resolution_m: float = 0.0  # of the map, at least; 0: as fine as the images
-    sigma_lens: float = 0.0  # sigma of depth over depth by a lens that is not known
-    sigma_k1: float = 0.0  # of the lens's first radial coefficient
     keeps_debug: bool = False  # the images of each view's stages
     first_depths: bool = False  # of views whose partners have not come, while no work waits

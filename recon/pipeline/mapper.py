@@ -142,9 +142,7 @@ class Mapper:
         trajectory = Trajectory(PoseGraph(PoseGraphConfig(max_nodes=config.graph_keyframes)))
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
         self.keyframes = KeyframeMap(trajectory, loops, self.rejected, timing)
-        self.surface = SurfaceMap(
-            float(camera.K[0, 0]), config.resolution_m, config.sigma_lens, config.sigma_k1, new_map
-        )
+        self.surface = SurfaceMap(float(camera.K[0, 0]), config.resolution_m, new_map)
         self.first_depths = (
             FirstDepths(backend, stereo, dense, self.keyframes, self.surface, timing)
             if config.first_depths

@@ -28,25 +28,18 @@ class SurfaceMap:
         self,
         focal_px: float,
         resolution_m: float = 0.0,
-        sigma_lens: float = 0.0,
-        sigma_k1: float = 0.0,
         new_map: Callable[[VoxelMapConfig], VoxelMap] = VoxelMap,
     ) -> None:
-        """``focal_px`` is of the recorded images.
-
-        ``sigma_lens`` of depth over depth and ``sigma_k1`` of the lens's first radial coefficient
-        widen all sigmas; ``new_map`` makes the empty map of a scan.
-        """
-        self._focal_px, self._resolution_m = focal_px, resolution_m
-        self._sigma_lens, self._sigma_k1, self._new_map = sigma_lens, sigma_k1, new_map
+        """``focal_px`` is of the recorded images; ``new_map`` makes the empty map of a scan."""
+        self._focal_px, self._resolution_m, self._new_map = focal_px, resolution_m, new_map
         self.known: VoxelMap | None = None
         self._disagreement, self._segment = Disagreement(), -1
 
     def __call__(
         self, segment: int, depth: DepthMap, rows_share: F32, T_odom_camera: F64
     ) -> tuple[F32, Bool]:
-        """((h, w) sigma, which holds disagreement of views, an unknown readout, an assumed lens;
-        (h, w) surface that is new or better).
+        """((h, w) sigma, which holds disagreement of views and an unknown readout, not what all
+        points share; (h, w) surface that is new or better).
 
         ``rows_share`` (n, m), all over the image, is the sigma of depth over depth by the rows'
         motion.
@@ -62,13 +55,13 @@ class SurfaceMap:
             known = self.known = self._empty(depth)
         fresh = known.fresh(in_odom)
         known.insert(in_odom, fresh)
-        return np.hypot(in_odom.sigma_m, self._bending(depth) * depth.depth_m), fresh
+        return in_odom.sigma_m, fresh
 
     def peek(self, depth: DepthMap, rows_share: F32, T_odom_camera: F64) -> tuple[F32, Bool]:
         """As :meth:`__call__`, of a depth that is not remembered and shows no disagreement."""
         in_odom = self._in_odom(depth, rows_share, T_odom_camera)
         fresh = np.isfinite(depth.depth_m) if self.known is None else self.known.fresh(in_odom)
-        return np.hypot(in_odom.sigma_m, self._bending(depth) * depth.depth_m), fresh
+        return in_odom.sigma_m, fresh
 
     def _in_odom(self, depth: DepthMap, rows_share: F32, T_odom_camera: F64) -> DepthMap:
         """The depth at its place, its sigma widened by what the recording and its rows limit."""
@@ -77,20 +70,6 @@ class SurfaceMap:
         share = cv2.resize(rows_share, depth.depth_m.shape[::-1])
         sigma_m = np.hypot(depth.sigma_m * noise, share * depth.depth_m)
         return replace(depth, sigma_m=sigma_m, T_world_camera=T_odom_camera)
-
-    def _bending(self, depth: DepthMap) -> F32:
-        """Sigma by the lens over depth, (h, w) or a scalar.
-
-        k1 shifts a point at the radius r (of the focal length) by k1 r^3. A pair that sees it with
-        the baseline b shifts its disparity by b k1 (3 r^2 along it, r^2 across): 2 r^2 on average.
-        """
-        if not self._sigma_k1:
-            return np.asarray(self._sigma_lens, np.float32)
-        h, w = depth.depth_m.shape
-        K = depth.K
-        x, y = (np.arange(w) - K[0, 2]) / K[0, 0], (np.arange(h) - K[1, 2]) / K[1, 1]
-        bent = 2.0 * self._sigma_k1 * np.add.outer(y * y, x * x)
-        return np.asarray(np.hypot(bent, self._sigma_lens), np.float32)
 
     def _empty(self, depth: DepthMap) -> VoxelMap:
         """A map as fine as the first view."""

@@ -29,10 +29,6 @@ EDGE_PRECISION = 1.25
 SPARSE_CELLS = 8
 SPARSE_SHARE = 0.5
 
-ALIKE = 3.0
-"""Sigmas within such a factor (5 to 95 % of the points) are mostly a part that neighbours share, as
-that of an uncertain lens: stereo's own differ by more than twice the factor."""
-
 LARGEST_CELLS = 200_000_000
 
 CELLS_PER_POINT, MIN_CELLS = 1000, 10_000_000
@@ -116,7 +112,6 @@ class Raster:
     height_m: F32  # (rows, cols), NaN = unknown
     sigma_m: F32  # (rows, cols), NaN = unknown
     rgb: U8  # (rows, cols, 3), black where unknown
-    own_m: float = math.inf  # limit of sigma's part that neighbours do not share; else unknown
 
     @property
     def known(self) -> Bool:
@@ -173,7 +168,6 @@ def rasterise(cloud: PointCloud, grid: Grid) -> Raster:
 def rasterise_points(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Raster:
     """As :func:`rasterise` for arrays: (N, 3) m in any frame with z up, (N, 3), (N,)."""
     rows, cols = grid.shape
-    own_m = _own_limit(sigma_m, grid.cell_m)
     height, sigma, colour = _top_surface(
         np.ascontiguousarray(xyz_m),
         np.ascontiguousarray(rgb, np.uint8),
@@ -183,24 +177,14 @@ def rasterise_points(xyz_m: F64 | F32, rgb: U8, sigma_m: F32, grid: Grid) -> Ras
         1.0 / grid.cell_m,
         rows,
         cols,
-        own_m,
     )
-    return Raster(grid, height, sigma, colour, own_m)
-
-
-def _own_limit(sigma_m: F32, cell_m: float) -> float:
-    """Limit of the part of sigma (N,) that neighbours do not share: a cell where sigmas are larger
-    and alike, so that they tell no point from another, else none."""
-    if not len(sigma_m):
-        return math.inf
-    low, high = np.quantile(sigma_m[:: max(1, len(sigma_m) // 100_000)], [0.05, 0.95])
-    return cell_m if cell_m < low and high < ALIKE * low else math.inf
+    return Raster(grid, height, sigma, colour)
 
 
 @njit(cache=True, nogil=True)
 def _top_surface(
     xyz: F64 | F32, rgb: U8, sigma: F32, west: float, north: float, inverse: float,
-    rows: int, cols: int, own_m: float,
+    rows: int, cols: int,
 ) -> tuple[F32, F32, U8]:  # fmt: skip
     """Height, sigma and colour per cell in two passes: the highest point, then its layer.
 
@@ -221,7 +205,7 @@ def _top_surface(
             r = int(np.floor((north - float(xyz[p, 1])) * inverse)) - first
             if 0 <= r < count and 0 <= c < cols and xyz[p, 2] > top[r, c]:
                 top[r, c] = xyz[p, 2]
-                floor[r, c] = xyz[p, 2] - TOP_SIGMAS * max(min(float(sigma[p]), own_m), 1e-6)
+                floor[r, c] = xyz[p, 2] - TOP_SIGMAS * max(float(sigma[p]), 1e-6)
         sums = np.zeros((count, cols, 5))
         for p in range(n):
             c = int(np.floor((float(xyz[p, 0]) - west) * inverse))
@@ -250,18 +234,16 @@ def reliable(raster: Raster) -> Raster:
     matching draws across the ground hidden behind a wall. Cells above a step, within the
     width that matching windows make a roof too wide, are kept only where they are known
     clearly better than their neighbourhood: a true roof edge is seen by all views, a spill
-    next to it by few; where sigmas are alike this does not show. And cells high above ground
-    nearby with less than SPARSE_SHARE of the usual number of known neighbours: crumbs of what
-    hides behind a roof or in a crown.
+    next to it by few. And cells high above ground nearby with less than SPARSE_SHARE of the
+    usual number of known neighbours: crumbs of what hides behind a roof or in a crown.
     """
     height = raster.height_m.copy()
-    sigma = np.minimum(np.nan_to_num(raster.sigma_m, nan=1.0), np.float32(raster.own_m))
+    sigma = np.nan_to_num(raster.sigma_m, nan=1.0)
     for reach in SMEAR_CELLS:
         high, low = highest_lowest(height, reach)
         limit = SMEAR_SLOPE * reach * raster.grid.cell_m + sigma
         height[(high - height > limit) & (height - low > limit)] = np.nan
-    if math.isinf(raster.own_m):
-        height[_spills(height, sigma)] = np.nan
+    height[_spills(height, sigma)] = np.nan
     known = np.isfinite(height)
     held = cv2.boxFilter(known.astype(np.float32), -1, (5, 5))
     high = height - highest_lowest(height, SPARSE_CELLS)[1] > STEP_M
@@ -370,7 +352,7 @@ def smoothed(raster: Raster, sigma_cells: float = 1.5) -> Raster:
     if not known.any():
         return raster
     far = np.float32(1e6)
-    tolerance = max(1.5 * min(float(np.median(raster.sigma_m[known])), raster.own_m), 1e-3)
+    tolerance = max(1.5 * float(np.median(raster.sigma_m[known])), 1e-3)
     middle = np.float32(np.median(raster.height_m[known]))
     height = np.where(known, raster.height_m - middle, far).astype(np.float32)
     median = cv2.medianBlur(height, 5)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
-from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from threading import Event
@@ -18,7 +16,6 @@ from recon.tracking.known_track import KnownTrack
 from recon.types import Camera
 from service.background import BackgroundWorker
 from service.cameras.camera_file import seeks_readout, with_shutter
-from service.cameras.lens import SIGMA_K1
 from service.config import ComputeConfig, Config, ScanConfig, parse_baseline
 from service.flight.paged_map import PagedMap
 from service.flight.reports import GraphWatch
@@ -27,14 +24,6 @@ from service.stream.outbox import FIRST_BYTES_S
 
 MAX_WAITING = 3
 """Views that wait for reconstruction."""
-
-ASSUMED_LENS_SHARE = 0.02
-"""Sigma of depth over depth where a lens without distortion is assumed: lenses of action cameras
-bend surfaces by that much."""
-
-COMMON_FOCAL_SHARE, MAX_FOCAL_SHARE = 0.02, 0.05
-"""Sigma of the focal length that all points share, so that it would only hide how they err against
-each other, and up to which sigma of depth holds the rest: above a tenth would drop all points."""
 
 
 class DenseWorker(BackgroundWorker[StereoView, Reconstructed]):
@@ -45,20 +34,7 @@ class DenseWorker(BackgroundWorker[StereoView, Reconstructed]):
             super().drop(item)
 
 
-def sigma_lens(assumed: Collection[str], sigma_focal: float) -> float:
-    """Sigma of depth over depth by what is ``assumed`` of the lens, and by its focal length."""
-    by_lens = ASSUMED_LENS_SHARE if "lens" in assumed else 0.0
-    apart = max(min(sigma_focal, MAX_FOCAL_SHARE) ** 2 - COMMON_FOCAL_SHARE**2, 0.0)
-    return math.hypot(by_lens, math.sqrt(apart))
-
-
-def mapper_config(
-    camera: Camera,
-    config: Config,
-    assumed: Collection[str] = (),
-    sigma_focal: float = 0.0,
-    live: bool = False,
-) -> MapperConfig:
+def mapper_config(camera: Camera, config: Config, live: bool = False) -> MapperConfig:
     """The mapper's parameters by the configuration; ``live`` for a flight that can be followed."""
     compute, scan, link = config.compute, config.scan, config.datalink
     is_sent = live and bool(link.connect or link.listen)
@@ -77,8 +53,6 @@ def mapper_config(
         loop_views=config.fusion.loop_views,
         graph_keyframes=config.fusion.graph_keyframes,
         resolution_m=scan.resolution_m,
-        sigma_lens=sigma_lens(assumed, sigma_focal),
-        sigma_k1=SIGMA_K1 if "distortion" in assumed else 0.0,
         keeps_debug=scan.keep_debug,
         first_depths=is_sent and not scan.keep_debug,
     )
@@ -94,16 +68,14 @@ class Pipeline(Mapper):
         backend: Backend,
         pages: Path,
         live: bool = False,
-        assumed: Collection[str] = (),
-        sigma_focal: float = 0.0,
         known: KnownTrack | None = None,
         in_background: bool = True,
     ) -> None:
         """Raises ValueError for an unusable camera model.
 
         ``pages`` is a folder, made when it is needed, for the oldest parts of the map. ``live``
-        drops old work when reconstruction cannot keep up. An ``assumed`` lens widens sigmas. A
-        ``known`` track takes the odometry's place.
+        drops old work when reconstruction cannot keep up. A ``known`` track takes the odometry's
+        place.
         """
         limit_threads(config.compute.threads)
         self.stopwatch = Stopwatch()
@@ -112,7 +84,7 @@ class Pipeline(Mapper):
         camera = with_shutter(camera, config.camera)
         super().__init__(
             camera,
-            mapper_config(camera, config, assumed, sigma_focal, live),
+            mapper_config(camera, config, live),
             backend,
             known,
             partial(PagedMap, folder=pages, max_voxels=config.compute.map_voxels),

@@ -129,8 +129,7 @@ class Scan:
         self.epoch_ns = inputs.epoch_ns
         config, live, pages = inputs.config, inputs.source.is_live, inputs.folder / PAGES
         self.pipeline = Pipeline(
-            inputs.camera, config, inputs.backend, pages, live=live, assumed=inputs.assumed,
-            sigma_focal=inputs.sigma_focal, known=inputs.known,
+            inputs.camera, config, inputs.backend, pages, live=live, known=inputs.known
         )  # fmt: skip
         self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()
         self.recorder = Recorder(

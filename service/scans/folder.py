@@ -29,6 +29,7 @@ from service.errors import OutsideError, SkyreliefError
 from service.memory import release_memory
 from service.progress import CancelledError, Progress
 from service.redaction import public_configuration, redacted
+from service.scans.absolute import SharedSigma, shared_sigma
 from service.scans.coverage import IMAGE as COVERAGE
 from service.scans.coverage import Coverage, write_coverage_files
 from service.scans.drawing import (
@@ -139,7 +140,7 @@ class _Files:
         self._voxel_m = resolution_m(store.header)
         self.failures = Failures(folder)
         self._frame, self._poses = local_frame(store.header), latest(store.poses())
-        self._left_out = in_words(store)
+        self._left_out, self._shared = in_words(store), shared_sigma(store)
         self._fused = NOTHING
         self._raster: Raster | None = None
         self._cell_m: float | None = None
@@ -174,7 +175,7 @@ class _Files:
         with writing(self._folder / CLOUD) as part:
             datum = flown_datum(self._store.header)
             started = self._store.header.started_unix_ns
-            write_laz(part, parts(), self._frame, started, vertical=datum)
+            write_laz(part, parts(), self._frame, started, vertical=datum, shared=self._shared)
         return FusedCloud(
             joined(kept), tiled.voxel_m, tiled.ground_sample_m, tiled.keyframes, tiled.points_in,
             points_out=count,
@@ -245,6 +246,7 @@ class _Files:
             },
             "quality": _quality(fused, self._raster, self._poses)
             | {
+                "sigma_absolute_median_m": _absolute_m(fused.cloud, self._shared),
                 "scale_sigma": scale_sigma(run, header.georeference),
                 "trust": trust_of(run, header.georeference, slope_deg(fused.cloud.xyz_m)),
             },
@@ -259,9 +261,8 @@ class _Files:
             with self.failures.noted(CLOUD), writing(self._folder / CLOUD) as part:
                 started = self._store.header.started_unix_ns
                 datum = flown_datum(self._store.header)
-                write_laz(
-                    part, [(self._fused.cloud, None, None)], self._frame, started, vertical=datum
-                )
+                parts = [(self._fused.cloud, None, None)]
+                write_laz(part, parts, self._frame, started, vertical=datum, shared=self._shared)
 
     def draw(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Write the preview and the report; returns the content of scan.json."""
@@ -380,6 +381,14 @@ def _quality(
         "area_m2": 0.0 if raster is None else round(raster.area_m2, 1),
         "distance_m": round(float(flown_m(poses)[-1]), 2) if poses else 0.0,
     } | _position_sigmas(poses)
+
+
+def _absolute_m(cloud: PointCloud, shared: SharedSigma | None) -> float | None:
+    """Median sigma of the heights in the world, of up to some hundred thousand points."""
+    if shared is None or not len(cloud):
+        return None
+    some = slice(None, None, 1 + len(cloud) // 200_000)
+    return round(float(np.median(shared.absolute_m(cloud.sigma_m[some], cloud.xyz_m[some]))), 4)
 
 
 def _position_sigmas(poses: Sequence[PoseRecord]) -> dict[str, float | None]:

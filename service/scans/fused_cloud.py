@@ -24,6 +24,7 @@ from recon.types import F64, I64, U8, Keyframe, PointCloud
 from service.georeference import LocalFrame, map_crs
 from service.memory import release_memory
 from service.progress import Progress
+from service.scans.absolute import SharedSigma
 from service.scans.main_piece import Keyframes, main_keyframes
 
 if TYPE_CHECKING:
@@ -205,7 +206,8 @@ def las_header(
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.add_extra_dims(
         [
-            laspy.ExtraBytesParams("sigma_m", np.float32, "1 sigma of the position, m"),
+            laspy.ExtraBytesParams("sigma_m", np.float32, "1 sigma within the map, m"),
+            laspy.ExtraBytesParams("sigma_absolute_m", np.float32, "of the height in the world"),
             laspy.ExtraBytesParams("views", np.uint8, "stereo pairs that agree"),
         ]
     )
@@ -254,10 +256,12 @@ def write_laz(
     started_unix_ns: int,
     laz: bool = True,
     vertical: str | None = None,
+    shared: SharedSigma | None = None,
 ) -> None:
     """Write clouds, at least one, to ``path``, in UTM with AMSL heights when there is a frame.
 
-    They are in ENU metres. RGB are 16 bits as the format requires (8-bit value times 257).
+    They are in ENU metres; ``shared`` is of their points. RGB are 16 bits as the format requires
+    (8-bit value times 257).
     """
     import laspy
 
@@ -273,7 +277,7 @@ def write_laz(
                 cut = slice(at, at + CHUNK_POINTS)
                 part = _cut(cloud, cut)
                 places = placed(part, frame) if xyz_m is None else xyz_m[cut]
-                record = point_record(header, places, part)
+                record = point_record(header, places, part, shared)
                 if classes is not None:
                     record["classification"] = classes[cut]
                 out.write_points(record)
@@ -287,7 +291,7 @@ def _cut(cloud: PointCloud, cut: slice) -> PointCloud:
 
 
 def point_record(
-    header: laspy.LasHeader, xyz_m: F64, cloud: PointCloud
+    header: laspy.LasHeader, xyz_m: F64, cloud: PointCloud, shared: SharedSigma | None
 ) -> laspy.ScaleAwarePointRecord:
     """The cloud's points as LAS records, at the places ``xyz_m`` (N, 3)."""
     import laspy
@@ -299,6 +303,11 @@ def point_record(
     record["return_number"] = np.ones(len(record), np.uint8)
     record["number_of_returns"] = np.ones(len(record), np.uint8)
     record["sigma_m"] = cloud.sigma_m
+    record["sigma_absolute_m"] = (
+        np.full(len(cloud), np.nan)
+        if shared is None
+        else shared.absolute_m(cloud.sigma_m, cloud.xyz_m)
+    )
     record["views"] = cloud.views
     if cloud.time_ns is not None:
         record["gps_time"] = adjusted_gps_s(cloud.time_ns)

@@ -137,7 +137,10 @@ def _cover(
             share = 1.0 - f["gaps_m2"] / f["flown_m2"]
             rows.append(("measured of the area flown", f"{100.0 * share:.1f} %"))
     if quality["sigma_median_m"] is not None:
-        rows.append(("uncertainty of a point, median (1 sigma)", within(quality["sigma_median_m"])))
+        rows.append(("relative uncertainty (1 sigma), median", within(quality["sigma_median_m"])))
+    absolute_m = quality.get("sigma_absolute_median_m")
+    if absolute_m is not None:
+        rows.append(("absolute uncertainty of heights (1 sigma), median", within(absolute_m)))
     rows.append(("trust", "; ".join([quality["trust"]["level"], *quality["trust"]["reasons"]])))
     return rows
 
@@ -161,6 +164,7 @@ def accuracy_words(summary: dict[str, Any]) -> list[str]:
         )
     elif level == "georeferenced":
         h, v = quality["position_sigma_h_median_m"], quality["position_sigma_v_median_m"]
+        v = quality.get("sigma_absolute_median_m") or v
         how = (
             "" if h is None else f": {within(h)} horizontally and {within(v)} vertically (1 sigma)"
         )

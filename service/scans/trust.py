@@ -27,6 +27,9 @@ MIN_LENS_SIGMA, MAX_LENS_SIGMA = 0.01, 0.1
 """Sigma of a focal length above which heights are in doubt, and above which the shape is; so, too,
 where positions and heights give scales that differ by more, as after a zoom."""
 
+BENDS = {"lens": 0.02, "distortion": 0.01}
+"""Sigma of depth over depth by what is assumed of the lens: it bends surfaces by so much."""
+
 MIN_PLACED_SHARE = 0.5
 """Share of the frames; below it vision was lost for most of the flight."""
 
@@ -183,6 +186,17 @@ def scale_sigma(run: Mapping[str, Any], georeference: str) -> float | None:
     heights; None where nothing measured it, or where control points gave a better one."""
     sigma = None if georeference == BY_SURVEY else _number(run.get("scale"), "sigma")
     return None if sigma is None else math.hypot(sigma, _number(run, "sigma_focal") or 0.0)
+
+
+def depth_share(run: Mapping[str, Any], georeference: str) -> float | None:
+    """Sigma of depth over depth that all points share, by scale and lens; None where heights in the
+    world are not measured."""
+    scale = 0.0 if georeference == BY_SURVEY else scale_sigma(run, georeference)
+    if georeference == "none" or scale is None:
+        return None
+    assumed = run.get("assumed")
+    assumed = assumed if isinstance(assumed, list) else []
+    return math.hypot(scale, *(BENDS[what] for what in BENDS if what in assumed))
 
 
 def _said(level: Trust, reasons: list[str]) -> dict[str, Any]:

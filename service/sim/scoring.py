@@ -42,6 +42,7 @@ class ScanResult:
 
     points: F64  # (N, 3)
     sigma_m: F32 | None  # (N,)
+    absolute_m: F32 | None  # (N,) sigma of the height in the world
     times_s: F64  # (P,)
     poses: F64  # (P, 4, 4)
     placed: bool  # False: coordinates are the scan's own
@@ -82,7 +83,8 @@ def score(
         if pairs >= 2
     }
     report["surface"] = {
-        name: _surface_part(scan, truth, fit) for name, fit in fits["surface"].items()
+        name: _surface_part(scan, scan.absolute_m if name == "raw" else scan.sigma_m, truth, fit)
+        for name, fit in fits["surface"].items()
     }
     best = "rigid" if scan.placed else "similarity"
     report["judged_after"] = best
@@ -119,8 +121,8 @@ def alignments(
     return {"trajectory": by_track, "surface": on_surface}
 
 
-def _surface_part(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, Any]:
-    """Errors of the cloud after one fit, and how honest its sigmas are."""
+def _surface_part(scan: ScanResult, sigma_m: F32 | None, truth: Truth, fit: Fit) -> dict[str, Any]:
+    """Errors of the cloud after one fit, and how honest sigmas (N,) of them are."""
     step = max(1, -(-len(scan.points) // MAX_POINTS))
     points = fit.points(scan.points[::step])
     distance, signed = metrics.distances(points, truth.surface, REACH_M)
@@ -129,8 +131,8 @@ def _surface_part(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, Any]:
     out["rms_percent_of_altitude"] = 100.0 * out["rms_m"] / truth.agl_m
     away = _distance_to(truth.poses[:, :3, 3], points)
     out["median_percent_of_distance"] = 100.0 * float(np.nanmedian(distance / away))
-    if scan.sigma_m is not None:
-        claim = metrics.honesty(distance, scan.sigma_m[::step] * np.float32(fit.scale))
+    if sigma_m is not None:
+        claim = metrics.honesty(distance, sigma_m[::step] * np.float32(fit.scale))
         out["honesty"] = None if claim is None else asdict(claim)
     return out
 
@@ -220,19 +222,19 @@ def read_scan(folder: Path, frame: LocalFrame) -> ScanResult:
     if not folder.is_dir():
         raise InputError(f"scan {folder}: no such folder")
     summary = json_object(folder / "scan.json")
-    points, sigma = _read_cloud(folder / "cloud.laz")
+    points, own_m, whole_m = _read_cloud(folder / "cloud.laz")
     if len(points) == 0:
         raise InputError(f"scan {folder}: cloud.laz contains no points; nothing to score")
     times, poses = read_tum(folder / "trajectory.tum")
     origin, epsg = summary.get("origin"), summary.get("epsg")
     if not origin or not epsg:
-        return ScanResult(points, sigma, times, poses, False)
+        return ScanResult(points, own_m, whole_m, times, poses, False)
     with reading(folder / "scan.json"):
         own = LocalFrame(origin["lat_deg"], origin["lon_deg"], origin["alt_amsl_m"])
     if own.epsg != epsg:
         raise InputError(f"scan {folder}: EPSG {epsg} in scan.json is not that of its origin")
     enu = frame.to_enu(own.to_geodetic(own.from_utm(points)))
-    return ScanResult(enu, sigma, times, _moved_poses(poses, own, frame), True)
+    return ScanResult(enu, own_m, whole_m, times, _moved_poses(poses, own, frame), True)
 
 
 def _moved_poses(poses: F64, own: LocalFrame, frame: LocalFrame) -> F64:
@@ -248,13 +250,16 @@ def _moved_poses(poses: F64, own: LocalFrame, frame: LocalFrame) -> F64:
     return out
 
 
-def _read_cloud(path: Path) -> tuple[F64, F32 | None]:
-    """(points (N, 3), sigma_m (N,) or None) of a LAZ file."""
+def _read_cloud(path: Path) -> tuple[F64, F32 | None, F32 | None]:
+    """Points (N, 3), sigma_m and sigma_absolute_m (N,), or None, of a LAZ file."""
     import laspy
 
     with reading(path, laspy.errors.LaspyException):
         las = laspy.read(str(path))
         points = np.asarray(las.xyz, np.float64)
     names = set(las.point_format.extra_dimension_names)
-    sigma = np.asarray(las["sigma_m"], np.float32) if "sigma_m" in names else None
-    return points, sigma
+    own, absolute = (
+        np.asarray(las[name], np.float32) if name in names else None
+        for name in ("sigma_m", "sigma_absolute_m")
+    )
+    return points, own, absolute

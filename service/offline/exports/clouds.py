@@ -85,7 +85,7 @@ def write_laz_file(scan: ScanView, out: Path, options: ExportOptions) -> None:
     started_ns = scan.store.header.started_unix_ns
     with writing(out) as file:
         parts = points_of(scan, options)
-        write_laz(file, parts, scan.frame, started_ns, laz, options.datum)
+        write_laz(file, parts, scan.frame, started_ns, laz, options.datum, scan.shared_sigma)
 
 
 def points_of(
@@ -175,7 +175,7 @@ def _stored(
             if header is None:
                 started_ns = scan.store.header.started_unix_ns
                 header = las_header(xyz_m, scan.frame, started_ns, options.datum)
-            record = point_record(header, xyz_m, cloud)
+            record = point_record(header, xyz_m, cloud, scan.shared_sigma)
             record["classification"] = kinds
             file.write(record.memoryview())
             places.write(np.column_stack([record.x, record.y, record.z]).data)
@@ -329,7 +329,8 @@ def write_tiles(scan: ScanView, out: Path, options: ExportOptions) -> None:
     with writing_folder(out) as part, tempfile.TemporaryDirectory() as work:
         las = Path(work) / "cloud.las"
         parts = points_of(scan, options, is_classified=False)
-        write_laz(las, parts, frame, scan.store.header.started_unix_ns, laz=False)
+        started_ns = scan.store.header.started_unix_ns
+        write_laz(las, parts, frame, started_ns, laz=False, shared=scan.shared_sigma)
         try:
             convert(
                 las,

@@ -64,16 +64,20 @@ class Layers:
 
 
 def dsm(scan: ScanView, options: ExportOptions, box: Box) -> Layers:
-    """Heights in metres (float32, -9999 where unknown), their sigma, and 1 where filled, 2 where
-    measured but uncertain."""
+    """Heights in metres (float32, -9999 where unknown), their sigma within the map, 1 where filled,
+    2 where measured but uncertain, and their sigma in the world."""
     if options.strict:
         raster = surface_model(scan, options.cell_m)
         origin = np.zeros(raster.grid.shape, np.uint8)
     else:
         raster, origin = complete_model(scan, options.cell_m)
-    bands = np.stack([raster.height_m, raster.sigma_m, origin.astype(np.float32)])
+    absolute_m = np.full(raster.grid.shape, NODATA_M, np.float32)
+    if scan.shared_sigma is not None:
+        own_m, places = raster.sigma_m[raster.known], cell_places(scan, raster)[raster.known]
+        absolute_m[raster.known] = scan.shared_sigma.absolute_m(own_m, places)
+    bands = np.stack([raster.height_m, raster.sigma_m, origin.astype(np.float32), absolute_m])
     image = np.where(raster.known, bands, NODATA_M).astype(np.float32)
-    names = (f"height {scan.above(options)}, m", "sigma, m", "filled")
+    names = (f"height {scan.above(options)}, m", "sigma, m", "filled", "sigma in the world, m")
     return Layers(raster.grid, image, names, NODATA_M, options.datum).within(box)
 
 
@@ -223,7 +227,7 @@ def mosaic(scan: ScanView, out: Path, grid: Grid, like: Layers) -> Iterator[Any]
         with rasterio.open(raw, "w+", **profile, **RAW) as image:
             image.descriptions = like.names
             image.update_tags(SCAN=scan.store.header.scan_id, HEIGHTS=heights)
-            if len(like.bands) == 4:
+            if like.bands.dtype == np.uint8:
                 kinds = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
                 image.colorinterp = kinds
             yield image

@@ -23,6 +23,7 @@ from service.offline.exports import EXPORTERS, MAPPED, PACKAGES, kind_of
 from service.offline.tiles import TILE_POINTS, Tile, Tiling, run_tiles, tiling
 from service.packages import needing
 from service.progress import Progress
+from service.scans.absolute import SharedSigma, shared_sigma
 from service.scans.fused_cloud import EVERYWHERE, Box, FusedCloud, fused_cloud, placed
 from service.scans.main_piece import main_keyframes, main_track
 from service.scans.track import flown_datum, local_frame
@@ -196,6 +197,11 @@ class ScanView:
     def poses(self) -> list[PoseRecord]:
         """The main piece's trajectory in order of time."""
         return main_track(self.store)
+
+    @cached_property
+    def shared_sigma(self) -> SharedSigma | None:
+        """What all points share; None where the scan is not placed."""
+        return shared_sigma(self.store)
 
     @cached_property
     def off_nadir_deg(self) -> F64:

@@ -137,17 +137,6 @@ def test_ground_below_an_eave_is_not_open(house: HouseFlight) -> None:
     assert not is_open.any() and not behind.any()
 
 
-def test_air_is_open_however_uncertain_the_lens(house: HouseFlight) -> None:
-    """A lens known to 5 % moves the ground and what stands on it alike."""
-    flat = house.keyframe(0, -100.0).depth
-    depth = flat.depth_m.copy()
-    depth[40:50, 70:90] = 37.0
-    unsure = replace(flat, depth_m=depth, sigma_m=(0.05 * depth).astype(np.float32))
-    below = np.array([[-100.0, 0.0, 0.0], [-90.0, 5.0, 0.0]])
-    is_open, _ = air_above(below, (-1.0, 1.0, 2.0), [unsure])
-    assert is_open.tolist() == [[False, False, False], [False, True, True]]
-
-
 def ground(n: int, seed: int = 0) -> F64:
     """Places in a landscape, one of them far away."""
     rng = np.random.default_rng(seed)

@@ -14,10 +14,9 @@ from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from recon.pipeline.surface_map import SurfaceMap
 from recon.pipeline.views import KNOWN_ROWS
 from recon.types import F64, Camera, DepthMap
-from service.cameras.lens import SIGMA_K1
 from service.config import load_config
 from service.flight.paged_map import MAX_OVER, PagedMap
-from service.flight.pipeline import Pipeline, sigma_lens
+from service.flight.pipeline import Pipeline
 
 K: F64 = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
 NADIR: F64 = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -124,47 +123,6 @@ def test_pages_of_a_map_that_begins_at_the_very_end_are_removed(
 def test_nonsense_limits_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="max_voxels"):
         PagedMap(CONFIG, tmp_path, max_voxels=10)
-
-
-@pytest.mark.parametrize(
-    ("assumed", "sigma_focal", "share"),
-    [
-        ((), 0.0, 0.0),
-        ((), 0.01, 0.0),
-        ((), 0.02001, 0.00063),
-        ((), 0.04, 0.034641),
-        (("lens",), 0.0, 0.02),
-        (("lens",), 0.2, 0.05),
-    ],
-)
-def test_an_uncertain_lens_widens_what_is_stored_and_not_the_choice(
-    assumed: tuple[str, ...], sigma_focal: float, share: float
-) -> None:
-    """By a share of the depth; a better view still counts as better."""
-    surface = SurfaceMap(2.0 * K[0, 0], sigma_lens=sigma_lens(assumed, sigma_focal))
-    first, better = (view(0.0, sigma_m=sigma) for sigma in (0.2, 0.05))
-    sigma, fresh = surface(0, first, KNOWN_ROWS, first.T_world_camera)
-    np.testing.assert_allclose(sigma, np.hypot(0.2, share * first.depth_m), rtol=1e-4)
-    assert fresh.all() and sigma.dtype == np.float32
-    assert surface(0, better, KNOWN_ROWS, better.T_world_camera)[1].all()
-
-
-def test_an_unknown_distortion_widens_the_sigma_towards_the_corners() -> None:
-    """By the change of disparity that k1 of one sigma makes, on average over both axes."""
-    surface = SurfaceMap(2.0 * K[0, 0], sigma_k1=SIGMA_K1)
-    seen = view(0.0, sigma_m=0.2)
-    sigma, _ = surface(0, seen, KNOWN_ROWS, seen.T_world_camera)
-    h = sigma.shape[0]
-    row, column, k1, b = h - 1, 0, SIGMA_K1, 1e-4
-    at = np.array([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]])
-    moved = []
-    for axis in np.eye(2):
-        left, right = at + 0.5 * b * axis, at - 0.5 * b * axis
-        shift = k1 * (left * (left @ left) - right * (right @ right))
-        moved.append(float(shift @ axis) / b)
-    expected = np.hypot(0.2, np.mean(moved) * seen.depth_m[row, column])
-    assert sigma[row, column] == pytest.approx(expected, rel=1e-3)
-    assert sigma.min() < 1.001 * 0.2
 
 
 def test_an_unknown_readout_widens_the_sigma_and_gives_way_to_what_is_seen_later() -> None:

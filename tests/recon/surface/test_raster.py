@@ -14,7 +14,6 @@ from recon.surface.raster import (
     grid_over,
     hillshade,
     rasterise,
-    rasterise_points,
     reliable,
     standing_height,
 )
@@ -206,21 +205,6 @@ def test_of_cells_above_a_step_the_uncertain_are_left_out() -> None:
     assert left.known[:, 23:].all() and left.known[:, :20].all()
     sigma[:, 20:22] = 0.02  # an edge that is well seen
     assert reliable(step_raster(sigma)).known[:, 20:22].all()
-
-
-def test_a_sigma_that_all_points_share_hides_no_roof() -> None:
-    """A focal length known to 4 % moves ground and roof alike."""
-    rng = np.random.default_rng(5)
-    xy = 0.25 * (np.indices((40, 40)).reshape(2, -1).T + 0.5)
-    z = np.where(xy[:, 0] > 5.0, 5.0, 0.0) + rng.normal(0.0, 0.05, len(xy))
-    wall = np.column_stack([np.full(40, 4.9), xy[:40, 1], np.linspace(1.0, 4.0, 40)])
-    sigma = rng.uniform(2.4, 3.6, 1640).astype(np.float32)
-    points = np.concatenate([np.column_stack([xy, z]), wall])
-    grid = Grid(0.0, 10.0, 0.25, (40, 40))
-    found = reliable(rasterise_points(points, np.zeros((1640, 3), np.uint8), sigma, grid))
-    assert found.known[:, 21:].all() and found.known[:, :19].all()
-    assert np.abs(found.height_m[:, 21:] - 5.0).max() < 0.3
-    assert np.median(found.sigma_m[:, 21:]) > 2.0  # though it is stated
 
 
 def test_crumbs_high_above_the_ground_are_left_out_and_a_roof_stays() -> None:

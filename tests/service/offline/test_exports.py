@@ -206,17 +206,22 @@ def test_dsm_by_rasterio(scan_dir: Path, house: HouseFlight) -> None:
 
 def test_dsm_says_what_is_filled(scan_dir: Path, tmp_path: Path) -> None:
     rasterio = pytest.importorskip("rasterio", exc_type=ImportError)
+    with ScanStore.open(scan_dir / "scan.db") as store:
+        store.finish({"scale": {"sigma": 0.05}})
     bands = []
     for strict in (True, False):
         path = written(scan_dir, "dsm", ExportOptions(cell_m=0.2, strict=strict))
         with rasterio.open(path) as image:
             assert image.descriptions[2] == "filled"
+            assert "alpha" not in [kind.name for kind in image.colorinterp]
             bands.append(image.read())
-    strict_m, (height, sigma, origin) = bands[0][0], bands[1]
+    strict_m, (height, sigma, origin, absolute) = bands[0][0], bands[1]
     assert not (bands[0][2] > 0.0).any()
     assert ((strict_m == -9999.0) & (height != -9999.0) == (origin > 0.0)).all()
     assert (origin == 1.0).sum() > 100 and (sigma[origin > 0.0] > 0.0).all()
     known = height != -9999.0
+    assert ((absolute > 0.04 * 40.0) == known).all()  # the scale's 5 %; sigma is within the map
+    assert np.median(sigma[known]) < 0.1
     assert (binary_fill_holes(known) == known).all()
 
 

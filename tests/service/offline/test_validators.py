@@ -74,7 +74,7 @@ def test_clouds_follow_las(scan_dir: Path, kind: str) -> None:
     size, start, records = struct.unpack_from("<HII", head, 94)
     assert size == 375 and start > size + 54 * records and records >= 1
     form, length, *legacy = struct.unpack_from("<BH6I", head, 104)
-    assert form & 0x3F == 7 and length == 36 + 4 + 1 and legacy == [0] * 6
+    assert form & 0x3F == 7 and length == 36 + 4 + 4 + 1 and legacy == [0] * 6
     scales = np.array(struct.unpack_from("<3d", head, 131))
     extents = np.array(struct.unpack_from("<6d", head, 179)).reshape(3, 2)[:, ::-1]
     true = np.stack([las.xyz.min(axis=0), las.xyz.max(axis=0)], axis=1)

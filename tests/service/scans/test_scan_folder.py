@@ -81,12 +81,27 @@ def test_cloud_is_where_the_house_stands(tmp_path: Path, house: HouseFlight) -> 
     assert np.median(red) == pytest.approx(200, abs=12)
     assert np.asarray(cloud["sigma_m"]).dtype == np.float32
     assert 0.02 < np.median(cloud["sigma_m"]) < 0.06
+    assert np.isnan(cloud["sigma_absolute_m"]).all()  # the flight has measured no scale
+    assert summary["quality"]["sigma_absolute_median_m"] is None
     assert np.asarray(cloud["views"]).dtype == np.uint8
     assert np.asarray(cloud["views"]).max() >= 4  # seen from several keyframes
     # Nothing of the ground that the cameras saw is missing.
     assert summary["quality"]["area_m2"] == pytest.approx(
         (160 / 140 * 40 + 20) * (90 / 140 * 40), rel=0.03
     )
+
+
+def test_heights_in_the_world_are_as_sure_as_the_scale(tmp_path: Path, house: HouseFlight) -> None:
+    """5 % of 40 m, and of 34 m to the roof."""
+    with house.flown(tmp_path) as store:
+        store.finish({"scale": {"sigma": 0.05}})
+        summary = write_deliverables(tmp_path, store, {})
+    cloud = laspy.read(tmp_path / CLOUD)
+    enu, whole = enu_of(cloud, house), np.asarray(cloud["sigma_absolute_m"])
+    assert np.median(whole[enu[:, 2] > 5.0]) == pytest.approx(1.7, abs=0.1)
+    assert np.median(whole[enu[:, 2] < 1.0]) == pytest.approx(2.0, abs=0.1)
+    assert np.median(cloud["sigma_m"]) < 0.06  # which neighbours do not notice
+    assert summary["quality"]["sigma_absolute_median_m"] == pytest.approx(2.0, abs=0.1)
 
 
 def test_voxels_are_as_fine_as_the_pixels_on_the_ground(tmp_path: Path, house: HouseFlight) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon.pipeline.config import CONTRADICTED, TWO_ONLY
-from service.scans.trust import BY_SURVEY, slope_deg, trust_of
+from service.scans.trust import BY_SURVEY, depth_share, slope_deg, trust_of
 
 SURE: dict[str, Any] = {
     "assumed": [],
@@ -140,3 +140,22 @@ def test_the_slope_of_a_site_is_found_in_spite_of_towers(angle: float) -> None:
 )
 def test_a_run_that_notes_nothing_limits_nothing(run: dict[str, Any]) -> None:
     assert trust_of(run, "gnss")["level"] == "georeferenced"
+
+
+@pytest.mark.parametrize(
+    ("changes", "georeference", "share"),
+    [
+        ({}, "gnss", 0.03),
+        ({"sigma_focal": 0.04}, "gnss", 0.05),
+        ({"assumed": ["lens"]}, "gnss", np.hypot(0.03, 0.02)),
+        ({"assumed": ["distortion", "altitude"]}, "exif", np.hypot(0.03, 0.01)),
+        ({"sigma_focal": 0.04, "assumed": ["distortion"]}, BY_SURVEY, 0.01),
+        ({"scale": {"from": "first telemetry", "sigma": None}}, "exif", None),
+        ({}, "none", None),
+        ({"assumed": 3}, "gnss", 0.03),
+    ],
+)
+def test_all_depths_share_the_errors_of_scale_and_lens(
+    changes: dict[str, Any], georeference: str, share: float | None
+) -> None:
+    assert depth_share({"scale": {"sigma": 0.03}} | changes, georeference) == pytest.approx(share)
