@@ -108,11 +108,8 @@ class GroundOptions:
         """The receiver's configuration; InputError for impossible options."""
         from service.ground.receiver import ReceiverConfig
 
-        refresh_s = self.refresh_s
-        if refresh_s is None:
-            refresh_s = RADIO_REFRESH_S if self.mavlink else 0.0
         name, session = self._session()
-        return ReceiverConfig(self.store, session, self._limits(), name, refresh_s, self.sites)
+        return ReceiverConfig(self.store, session, self._limits(), name, self.sites)
 
     def _session(self) -> tuple[str, SessionConfig]:
         """The station's name on its certificate, and how it is reached."""
@@ -149,7 +146,10 @@ class GroundOptions:
         if any(size is not None and not size >= 0 for size in sizes_mb):
             raise InputError("--quota-mb and --reserve-mb are 0 or more")
         quota, reserve = (None if size is None else int(size * 1e6) for size in sizes_mb)
-        return DroneLimits(quota, self.drone_share / 100.0, reserve)
+        refresh_s = self.refresh_s
+        if refresh_s is None:
+            refresh_s = RADIO_REFRESH_S if self.mavlink else 0.0
+        return DroneLimits(quota, self.drone_share / 100.0, reserve, refresh_s=refresh_s)
 
 
 @with_options(GroundOptions)

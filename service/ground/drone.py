@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from service.errors import OutsideError, SkyreliefError
-from service.ground.inbox import Answered, Batch, Grown, Inbox, Radio, Written
+from service.ground.inbox import Answered, Batch, Inbox, Radio, Written
 from service.ground.intake import FINE, SILENCE_S, SMALL, Introduction, ScanIntake
 from service.ground.received import ReceivedScan
 from service.ground.storage import DiskShare, scan_folder, total_and_free
@@ -56,6 +56,7 @@ class DroneLimits:
     silent_s: float = 30.0  # without a message for so long, it is silent
     close_whole_s: float = 60.0  # a whole scan without data for so long is written and closed
     full_disk_rest_s: float = 10.0  # until a full disk is tried again
+    refresh_s: float = 0.0  # write deliverables of growing scans so often; 0: when complete
     look_s: float = 1.0  # between two looks at the disk
     usage: Callable[[Path], tuple[int, int]] = total_and_free  # bytes of a folder's disk
 
@@ -116,7 +117,7 @@ class DroneReceiver:
         self._share = DiskShare(
             folder, limits.drone_share, limits.reserve_bytes, limits.usage, limits.look_s
         )
-        self._shown_at = -1e9
+        self._shown_at = self._refresh_at = -1e9
         self._effects: list[Effect] = []
 
     @property
@@ -142,9 +143,10 @@ class DroneReceiver:
                     self._scans[name].intake.answered(slot, serial, now)
                 case Written():
                     self._on_written(event, now)
-                case Grown():
-                    for scan in self.scans:
-                        self._write(scan, now)
+        if self._limits.refresh_s and now >= self._refresh_at:
+            self._refresh_at = now + self._limits.refresh_s
+            for scan in self.scans:
+                self._write(scan, now)
         self._look_after(now)
         if batch or now - self._shown_at >= REPORT_S:
             self.show(now)
@@ -215,7 +217,7 @@ class DroneReceiver:
     def _on_radio(self, event: Radio, now: float) -> None:
         self.heard_at = now
         header, kind, number, part, data = event
-        scan = self._scan(header.name, now) or self._create(header, now)
+        scan = self._scan(header.name, now) or self._open(header.name, now, header)
         if scan is None or now < scan.rest_until:
             return
         store = scan.intake.store
@@ -244,7 +246,7 @@ class DroneReceiver:
         """Take in an item of a scan without a folder; a valid header makes the folder."""
         introduction = self._introductions[name]
         header = introduction.on_items(payload, now)
-        scan = None if header is None else self._create(header, now)
+        scan = None if header is None else self._open(name, now, header)
         if scan is None or introduction.head is None:
             return
         self._introductions.pop(name)
@@ -264,30 +266,25 @@ class DroneReceiver:
             return found
         if now < self._unreadable.get(name, now):
             return None
-        return self._open(name, now, self._reopen)
+        return self._open(name, now)
 
-    def _reopen(self, name: str) -> ScanStore | None:
-        path = self._folder(name) / "scan.db"
-        return ScanStore.open(path, self._limits.scan_bytes) if path.is_file() else None
+    def _store_of(self, name: str, now: float, header: ScanHeader | None) -> ScanStore | None:
+        """Its database, made with the ``header`` if need be; None for neither."""
+        path, max_bytes = self._folder(name) / "scan.db", self._limits.scan_bytes
+        if path.is_file():
+            return ScanStore.open(path, max_bytes)
+        if header is None:
+            return None
+        self._share.check(len(header.to_json()), now)
+        return ScanStore.create(path, header, max_bytes)
 
-    def _create(self, header: ScanHeader, now: float) -> ReceivedScan | None:
-        def create(name: str) -> ScanStore:
-            found = self._reopen(name)
-            if found is not None:
-                return found
-            self._share.check(len(header.to_json()), now)
-            return ScanStore.create(self._folder(name) / "scan.db", header, self._limits.scan_bytes)
-
-        return self._open(header.name, now, create)
-
-    def _open(
-        self, name: str, now: float, opening: Callable[[str], ScanStore | None]
-    ) -> ReceivedScan | None:
+    def _open(self, name: str, now: float, header: ScanHeader | None = None) -> ReceivedScan | None:
+        """The scan, opened; None when it has no folder and no ``header``, or cannot be opened."""
         if not self._has_room(now):
             self.dropped += 1
             return None
         try:
-            store = opening(name)
+            store = self._store_of(name, now, header)
         except SkyreliefError as error:
             log.error("%s", error)
             self._unreadable[name] = now + UNREADABLE_REST_S
@@ -319,11 +316,15 @@ class DroneReceiver:
                 return True
             if now - scan.used_at < BUSY_S and not scan.intake.complete:
                 continue
-            if scan.may_close:
-                self._close(scan)
-            else:
-                self._write(scan, now)
+            self._end(scan, now)
         return len(self._scans) < self.max_open
+
+    def _end(self, scan: ReceivedScan, now: float) -> None:
+        """Close a scan, or have its files written first."""
+        if scan.may_close:
+            self._close(scan)
+        else:
+            self._write(scan, now)
 
     def _close(self, scan: ReceivedScan) -> None:
         self._closed[scan.name] = scan.progress() | {"open": False}
@@ -371,10 +372,7 @@ class DroneReceiver:
             if scan.intake.complete and not scan.changed:  # and the drone knows it
                 limit_s = self._limits.close_whole_s
             if now - scan.used_at > limit_s:
-                if scan.may_close:
-                    self._close(scan)
-                else:
-                    self._write(scan, now)
+                self._end(scan, now)
             elif now - scan.intake.head_at <= self._limits.silent_s:
                 self._tend(scan, now)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -49,11 +48,7 @@ class Written(NamedTuple):
     is_due: bool = False  # the disk refused a file
 
 
-class Grown(NamedTuple):
-    """Deliverables of scans that have grown are due."""
-
-
-Event = Radio | Answered | Written | Grown
+Event = Radio | Answered | Written
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,10 +76,10 @@ class Inbox:
         """A head; it takes the place of one of the same scan that waits."""
         with self._changed:
             heads = self._batch.heads
-            return self._note(
-                scan_id in heads or len(heads) < MAX_HEADS,
-                lambda: heads.__setitem__(scan_id, payload),
-            )
+            has_room = scan_id in heads or len(heads) < MAX_HEADS
+            if has_room:
+                heads[scan_id] = payload
+            return self._noted(has_room)
 
     def put_item(self, scan_id: str, payload: bytes) -> bool:
         with self._changed:
@@ -92,14 +87,18 @@ class Inbox:
             has_room = (
                 self._item_bytes + size <= MAX_ITEM_BYTES and len(self._batch.items) < MAX_ITEMS
             )
-            self._item_bytes += size if has_room else 0
-            return self._note(has_room, lambda: self._batch.items.append((scan_id, payload)))
+            if has_room:
+                self._item_bytes += size
+                self._batch.items.append((scan_id, payload))
+            return self._noted(has_room)
 
     def put_event(self, event: Event) -> bool:
         """Something else to do; only the radio's may be too many, as the others are of our own."""
         with self._changed:
             has_room = len(self._batch.events) < MAX_EVENTS or not isinstance(event, Radio)
-            return self._note(has_room, lambda: self._batch.events.append(event))
+            if has_room:
+                self._batch.events.append(event)
+            return self._noted(has_room)
 
     def take(self, timeout_s: float) -> Batch:
         """All waiting messages; without any, those that arrive within the timeout."""
@@ -109,13 +108,12 @@ class Inbox:
             self._item_bytes = 0
             return batch
 
-    def _note(self, has_room: bool, put: Callable[[], None]) -> bool:
-        if not has_room:
+    def _noted(self, has_room: bool) -> bool:
+        if has_room:
+            self._changed.notify()
+        else:
             self.dropped += 1
-            return False
-        put()
-        self._changed.notify()
-        return True
+        return has_room
 
 
 CHANNEL = 256

@@ -28,7 +28,7 @@ from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.drone import Align, DroneLimits, DroneReceiver, Effect, Get, Opened, Put, Write
 from service.ground.drones import Drones
 from service.ground.front import behind_fronts
-from service.ground.inbox import CHANNEL, Grown, Inbox, Radio, Replies, Written
+from service.ground.inbox import CHANNEL, Inbox, Radio, Replies, Written
 from service.ground.live_site import run as run_live_site
 from service.ground.received import (
     ReceivedScan,
@@ -63,7 +63,6 @@ class ReceiverConfig:
     session: SessionConfig = field(default_factory=lambda: SessionConfig(mode="router"))
     limits: DroneLimits = field(default_factory=DroneLimits)
     name: str = ""  # of this station; empty: made once and kept in the store
-    refresh_s: float = 0.0  # write deliverables of growing scans so often; 0: when complete
     sites: bool = False  # align finished scans that show the same ground
 
 
@@ -101,7 +100,6 @@ class Receiver:
         self._running: list[Worker] = []
         self._fronts: list[Worker] = []
         self._session_config = config.session
-        self._refresh_at = -1e9
         self._dropped = 0
         self._began_at = time.monotonic()
 
@@ -221,7 +219,6 @@ class Receiver:
                     self._look_around(session, now)
                     look_at = now + LOOK_AROUND_S
                 self._drones.retire(now)
-                self._refresh(now)
         finally:
             for subscriber in (heads, items):
                 with contextlib.suppress(zenoh.ZError):
@@ -251,14 +248,6 @@ class Receiver:
             return
         with contextlib.suppress(zenoh.ZError):
             session.get(f"{ROOT}/*/*/head", zenoh.handlers.RingChannel(1), timeout=LOOK_AROUND_S)
-
-    def _refresh(self, now: float) -> None:
-        """Write the deliverables of scans that grow, every ``refresh_s``."""
-        if not self._config.refresh_s or now < self._refresh_at:
-            return
-        self._refresh_at = now + self._config.refresh_s
-        for drone in self._drones.all:
-            drone.inbox.put_event(Grown())
 
     # Effects
 

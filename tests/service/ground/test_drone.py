@@ -30,7 +30,7 @@ from service.ground.drone import (
     Put,
     Write,
 )
-from service.ground.inbox import Answered, Batch, Event, Grown, Written
+from service.ground.inbox import Answered, Batch, Event, Written
 from service.stream import codec
 from service.stream.messages import Head, Held, pack, split, unpack
 from service.stream.naming import place_of
@@ -165,20 +165,20 @@ def test_files_that_a_full_disk_refused_are_written_again(tmp_path: Path) -> Non
 
 
 def test_a_growing_scan_is_written_when_that_is_asked_for(tmp_path: Path) -> None:
-    one = Onboard(tmp_path)
+    one = Onboard(tmp_path, DroneLimits(refresh_s=1.0))
     one.head()
     one.answer()
-    one.hear(Grown())
+    one.pass_time(1.0)
     assert len(one.writes) == 1
-    one.hear(Grown())
+    one.pass_time(1.0)
     assert len(one.writes) == 1  # while it is written, it is not written again
     number = one.store.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
     one.send("pose", number)
     one.written()
-    one.hear(Grown())
+    one.pass_time(1.0)
     assert len(one.writes) == 1
     one.written()
-    one.hear(Grown())
+    one.pass_time(1.0)
     assert one.writes == []  # it did not grow
     one.close()
 
@@ -187,23 +187,23 @@ def test_a_first_depth_is_no_growth_of_the_files(tmp_path: Path) -> None:
     layer = sound_layers()[0]
     head = codec.peek(layer)
     assert head is not None
-    one = Onboard(tmp_path)
+    one = Onboard(tmp_path, DroneLimits(refresh_s=1.0))
     one.head()
     one.answer()
-    one.hear(Grown())
+    one.pass_time(1.0)
     one.written()
     one.store.offer_first(head.seq, layer)
     one.send("first", head.seq)
     (scan,) = one.ground.scans
     assert list(scan.intake.store.states()) == [head.seq]
-    one.hear(Grown())
+    one.pass_time(1.0)
     assert one.writes == []
     one.close()
 
 
 def test_an_answer_to_a_scan_that_was_closed_is_nothing(tmp_path: Path) -> None:
     one = Onboard(tmp_path)
-    one.hear(Answered("never-seen", 0, 1), Grown())
+    one.hear(Answered("never-seen", 0, 1))
     one.head()
     one.answer()
     assert [scan.name for scan in one.ground.scans] == [one.name]

@@ -41,14 +41,13 @@ WHOLE = os.environ.get("SKYRELIEF_TRIALS") == "whole"
 def serving(
     folder: Path,
     limits: DroneLimits | None = None,
-    refresh_s: float = 0.0,
     deliver: Callable[[ReceivedScan], None] = lambda _: None,
     opened: Callable[[ReceivedScan], None] = lambda _: None,
 ) -> Iterator[tuple[Receiver, str]]:
     """A ground station and where it listens."""
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     session = SessionConfig(mode="router", listen=(endpoint,))
-    config = ReceiverConfig(folder, session, limits or DroneLimits(), "base", refresh_s)
+    config = ReceiverConfig(folder, session, limits or DroneLimits(), "base")
     ground = Receiver(config, deliver=deliver, opened=opened)
     ground.start()
     try:
@@ -307,7 +306,8 @@ def test_many_drones_share_the_station_and_one_more_is_refused(tmp_path: Path) -
 
 def test_a_silent_drone_that_brought_min_makes_way_for_another(tmp_path: Path) -> None:
     """Invented drones with a scan each fill the table; who comes later is received all the same."""
-    station = serving(tmp_path / "ground", DroneLimits(drones=3, silent_s=0.5), refresh_s=0.2)
+    limits = DroneLimits(drones=3, silent_s=0.5, refresh_s=0.2)
+    station = serving(tmp_path / "ground", limits)
     with station as (ground, endpoint), hostile(endpoint) as session:
         for name in ("ghost-1", "ghost-2"):
             assert until(partial(_introduced, ground, session, name, "scan-1"))

@@ -110,7 +110,8 @@ def test_what_grows_while_it_is_written_is_written_at_the_end(tmp_path: Path) ->
         release.wait(30.0)
 
     session = SessionConfig(mode="router", listen=(endpoint,))
-    ground = Receiver(ReceiverConfig(tmp_path / "ground", session, refresh_s=0.1), deliver=deliver)
+    limits = DroneLimits(refresh_s=0.1)
+    ground = Receiver(ReceiverConfig(tmp_path / "ground", session, limits), deliver=deliver)
     ground.start()
     store = new_store(tmp_path / "air")
     fly(store, 0, 1)
