@@ -54,6 +54,7 @@ CONTOUR_PX = 4.0
 
 BOUNDS = ("west", "south", "east", "north")
 KML_TILES = 4
+THUMBNAIL_PX = 480  # of its longer side, at most
 REFRESH_S = 2
 FRESH = {"cache-control": "max-age=1"}
 NOW = {"cache-control": "no-cache"}
@@ -66,6 +67,7 @@ def map_routes() -> list[Route]:
         Route(one + ".json", _tile_json),
         Route(one + ".kml", _kml),
         Route("/tiles/{drone}/{scan}/wmts.xml", _wmts),
+        Route("/tiles/{drone}/{scan}/thumbnail.png", _thumbnail),
         Route(one + "/{z:int}/{x:int}/{y:int}.png", _tile),
         Route("/tiles/basemap.json", _basemap_json),
         Route("/tiles/basemap/{z:int}/{x:int}/{y:int}", _basemap),
@@ -78,6 +80,29 @@ def _tile(request: Request) -> Response:
     state, folder, layer = _asked(request)
     z, x, y = _place(request)
     image = tile_image(state, folder, layer, (z, x, y))
+    return Response(_png(image), media_type="image/png", headers=FRESH)
+
+
+def _thumbnail(request: Request) -> Response:
+    """The whole orthophoto of a scan as it is now, also while it grows, as bright as in the portal;
+    transparent where nothing is known."""
+    state, folder = state_of(request), state_of(request).library.folder(*names_of(request))
+    with state.maps.lock:
+        live = state.maps.view(folder)
+        corners, exposure = _corners(live), live.exposure
+    west, north, east, south = corners
+    side = max(east - west, south - north, THUMBNAIL_PX / (SIDE << MAX_ZOOM))
+    zoom = max(0, int(np.floor(np.log2(THUMBNAIL_PX / SIDE / side))))
+    left, top, right, bottom = (int(v * (SIDE << zoom)) for v in corners)
+    columns = range(left // SIDE, right // SIDE + 1)
+    rows = range(top // SIDE, bottom // SIDE + 1)
+    whole = np.vstack([
+        np.hstack([tile_image(state, folder, "ortho", (zoom, x, y)) for x in columns])
+        for y in rows
+    ])  # fmt: skip
+    x, y = SIDE * columns[0], SIDE * rows[0]
+    image = whole[top - y : bottom - y + 1, left - x : right - x + 1]
+    image[..., :3] = cv2.convertScaleAbs(image[..., :3], alpha=exposure)
     return Response(_png(image), media_type="image/png", headers=FRESH)
 
 
@@ -249,12 +274,17 @@ def coverage_image(found: Coverage, tile: Tile) -> U8:
     return np.asarray(out, np.uint8)
 
 
-def _bounds(live: LiveMap) -> tuple[float, float, float, float]:
-    """(west, south, east, north) in degrees; InputError without surface."""
+def _corners(live: LiveMap) -> tuple[float, float, float, float]:
+    """(west, north, east, south) in the square of Web Mercator; InputError without surface."""
     found = live.bounds
     if found is None:
         raise InputError("no surface yet")
-    west, north, east, south = found
+    return found
+
+
+def _bounds(live: LiveMap) -> tuple[float, float, float, float]:
+    """(west, south, east, north) in degrees; InputError without surface."""
+    west, north, east, south = _corners(live)
     (n, w), (s, e) = degrees(west, north), degrees(east, south)
     return w, s, e, n
 
@@ -345,10 +375,7 @@ def _kml(request: Request) -> Response:
     """A layer as overlays for Google Earth and TAK, each fetched again every few seconds."""
     state, folder, layer = _asked(request)
     with state.maps.lock:
-        found = state.maps.view(folder).bounds
-    if found is None:
-        raise InputError("no surface yet")
-    west, north, east, south = found
+        west, north, east, south = _corners(state.maps.view(folder))
     side = max(east - west, south - north, 1e-9)
     zoom = min(MAX_ZOOM, max(0, int(np.floor(np.log2((KML_TILES - 1) / side)))))
     n = 1 << zoom

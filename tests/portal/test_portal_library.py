@@ -62,6 +62,15 @@ def test_a_card_names_place_and_date_and_shows_the_ground_alone(
         assert 0.5 < known / (wide * high) <= 1.0 and red > 0.01 * known  # the roof
 
 
+def test_a_card_shows_the_ground_while_the_scan_grows(
+    browser: Browser, tmp_path: Path, house: HouseFlight
+) -> None:
+    with house.flown(tmp_path / "drone-1/test-1"), listing(browser, tmp_path, 1):
+        wide, high, known, red = browser.wait(THUMBNAIL)
+        assert max(wide, high) > 240 and known / (wide * high) > 0.3 and red > 0.01 * known
+        assert browser.run("document.querySelector('.thumbnail img').alt").endswith("so far")
+
+
 def test_the_map_outlines_scans_and_lists_those_at_a_place(browser: Browser, store: Path) -> None:
     with listing(browser, store, 3):
         browser.wait("document.querySelectorAll('.outlines circle').length === 2")  # far apart

@@ -79,6 +79,22 @@ def test_the_house_lies_where_it_is(client: Client, zoom: int) -> None:
     assert at(client, "ortho", NOWHERE, zoom)[3] == 0
 
 
+def test_the_thumbnail_is_the_whole_map(client: Client) -> None:
+    about = client.ask(f"{TILES}/ortho.json")[1]
+    west, south, east, north = about["bounds"]
+    status, data, _ = client.ask(f"{TILES}/thumbnail.png")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert status == 200 and image is not None
+    high, wide = image.shape[:2]
+    assert 240 <= max(high, wide) <= 481
+    lat, lon, _ = FRAME.to_geodetic(np.array([[*ROOF, 0.0]]))[0]
+    row, col = (north - lat) / (north - south) * high, (lon - west) / (east - west) * wide
+    roof = image[int(row), int(col)]
+    bright = np.minimum(np.multiply(ROOF_BGR, about["exposure"]), 255)
+    assert np.abs(roof[:3] - bright).max() < 20 and roof[3] == 255
+    assert image[..., 3].any(axis=0).mean() > 0.98 and image[..., 3].any(axis=1).mean() > 0.98
+
+
 def test_the_borders_of_the_roof_lie_right(client: Client) -> None:
     """The roof is 12 m wide; its west end is 4 m east of the origin."""
     col, row = pixel(ROOF, ZOOM)
@@ -403,5 +419,6 @@ def adrift(tmp_path: Path, house: HouseFlight) -> Iterator[Client]:
 
 @pytest.mark.parametrize("layer", ["ortho", "coverage"])
 def test_without_a_place_there_is_no_map(adrift: Client, layer: str) -> None:
-    status, answer, _ = adrift.ask(f"{TILES}/{layer}/1/0/0.png")
-    assert status == 404 and "georeference" in answer["error"]
+    for path in (f"{layer}/1/0/0.png", "thumbnail.png"):
+        status, answer, _ = adrift.ask(f"{TILES}/{path}")
+        assert status == 404 and "georeference" in answer["error"]

@@ -281,6 +281,10 @@ export async function upload(files: File[], progress: (share: number) => void): 
 /** The image of a keyframe. */
 export const keyframe = (s: { drone: string; scan: string }, seq: number): string => `${place(s)}/keyframes/${seq}.jpg`;
 
+/** The orthophoto as it is now; an error while there is no surface. */
+export const mapThumbnail = (s: { drone: string; scan: string }): string =>
+  `/tiles/${encodeURIComponent(s.drone)}/${encodeURIComponent(s.scan)}/thumbnail.png`;
+
 export const file = (s: { drone: string; scan: string }, name: string): string =>
   `${place(s)}/files/${encodeURIComponent(name)}`;
 

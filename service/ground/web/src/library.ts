@@ -251,12 +251,18 @@ function card(s: api.Scan, again: () => void): HTMLElement {
   );
 }
 
-/** The scan from above; while it grows its newest image. */
+/** The scan from above, also while it grows; without a georeference its newest image. */
 function thumbnail(s: api.Scan, name: string): HTMLElement {
   const newest = s.newest ?? null;
   const kept = s.thumbnail ? "thumbnail.webp" : s.preview ? "preview.jpg" : null;
   if (kept) return el("img", { src: api.file(s, kept), alt: `${name} from above`, loading: "lazy" });
-  if (newest !== null) return el("img", { src: api.keyframe(s, newest), alt: `newest image of ${name}`, loading: "lazy", className: "whole" });
+  if (newest !== null) {
+    const image = el("img", { src: api.keyframe(s, newest), alt: `newest image of ${name}`, className: "whole" });
+    if (!s.origin) return image;
+    const map = el("img", { src: `${api.mapThumbnail(s)}?v=${s.counts?.keyframes}`, alt: `${name} from above, so far` });
+    map.onerror = () => map.replaceWith(image);
+    return map;
+  }
   return el("div", { className: "blank", textContent: "no image yet" });
 }
 
