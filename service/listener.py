@@ -187,3 +187,10 @@ def raise_descriptor_limit(wanted: int = DESCRIPTORS) -> int:
         log.warning("only %d descriptors may be open (%s)", soft, error)
         return soft
     return target
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    """A TCP or UDP port of this machine that nothing uses."""
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -17,10 +17,11 @@ import numpy as np
 
 from service.bench import BenchOptions, BenchResult
 from service.bench.keyframes import make_keyframe, strip
-from service.bench.link_emulator import LinkEmulator, LinkModel, free_port
+from service.bench.link_emulator import LinkEmulator, LinkModel
 from service.config import DatalinkConfig
 from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
+from service.listener import free_port
 from service.stream import codec
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, ScanHeader, pack_pose

@@ -225,10 +225,3 @@ def _has_closed(writer: asyncio.StreamWriter) -> bool:
     except OSError:
         return True
     return bool(state != ESTABLISHED)
-
-
-def free_port() -> int:
-    """A TCP port of this machine that nothing listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

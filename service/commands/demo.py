@@ -38,7 +38,7 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """Replay a small real flight while a ground station receives it over the datalink."""
-    from service.bench.link_emulator import free_port
+    from service.listener import free_port
 
     source = demo_flight(flight)
     _prepare(out)

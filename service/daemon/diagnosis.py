@@ -32,7 +32,6 @@ from service.scans.retention import existing
 
 if TYPE_CHECKING:
     from mavlink.wire.messages import LinkReport
-    from recon.types import Camera
     from service.compute.backend_choice import Choice
 
 CORE = ("numpy", "scipy", "numba", "opencv-python-headless", "av", "pymavlink", "eclipse-zenoh")
@@ -75,8 +74,6 @@ PLACES = (
     Path(__file__).resolve().parents[2] / "deploy" / "profiles",
     Path(sys.prefix) / "share" / "skyrelief" / "deploy" / "profiles",
 )
-
-WORST = {"ground": NOTE}  # it may be switched off
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,16 +239,22 @@ def examine_compute(config: Config, by: Choice | None = None) -> Iterator[Findin
 
 def _camera(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]:
     from service.cameras import open_camera
+    from service.cameras.camera_file import load_camera
 
     if is_simulated(config):
         yield Finding("camera", GOOD, "sim: a simulated flight; 'skyrelief run' plays it")
         return
-    model = None
-    if config.camera.model:
-        model, finding = _model(config)
-        yield finding
-    else:
+    model, path = None, config.camera.model
+    if not path:
         yield Finding("camera model", NOTE, "none; 'skyrelief calibrate' makes one")
+    else:
+        try:
+            model = load_camera(path)
+        except InputError as error:
+            yield Finding("camera model", BAD, str(error))
+        else:
+            size = f"{model.size_px[0]}x{model.size_px[1]}"
+            yield Finding("camera model", GOOD, f"{path}: {size}, fx {model.K[0, 0]:.0f}")
     if not config.camera.source:
         yield Finding("camera", NOTE, "camera.source is not set")
         return
@@ -273,17 +276,6 @@ def _camera(config: Config, running: dict[str, Any] | None) -> Iterator[Finding]
     if model is not None and model.size_px != source.size_px:
         size = f"{model.size_px[0]}x{model.size_px[1]}"
         yield Finding("camera", BAD, f"the camera model is for {size}; calibrate at {W}x{H}")
-
-
-def _model(config: Config) -> tuple[Camera | None, Finding]:
-    from service.cameras.camera_file import load_camera
-
-    try:
-        model = load_camera(config.camera.model)
-    except InputError as error:
-        return None, Finding("camera model", BAD, str(error))
-    text = f"{config.camera.model}: {model.size_px[0]}x{model.size_px[1]}, fx {model.K[0, 0]:.0f}"
-    return model, Finding("camera model", GOOD, text)
 
 
 def _service(running: dict[str, Any] | None) -> Iterator[Finding]:
@@ -447,4 +439,5 @@ def _why_silent(link: LinkReport) -> str:
 
 
 def _trouble(what: str, text: str, is_grave: bool) -> Finding:
-    return Finding(what, WORST.get(what, BAD) if is_grave else NOTE, text)
+    may_be_off = what == "ground"
+    return Finding(what, BAD if is_grave and not may_be_off else NOTE, text)

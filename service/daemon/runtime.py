@@ -298,12 +298,7 @@ class Daemon:
 
     def _backend_failure(self) -> str:
         """Why the CPU replaced the chosen backend; empty when it did not."""
-        if self.scanning.backend is None:
-            return ""
-        from service.compute.backend_choice import FallbackBackend
-
-        backend = self.scanning.backend
-        return (isinstance(backend, FallbackBackend) and backend.failure) or ""
+        return getattr(self.scanning.backend, "failure", None) or ""
 
     def _report_device(self) -> None:
         """Report once that the device has failed and the CPU has replaced it."""

@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mavlink.component.vehicle import VehicleLink
-    from mavlink.telemetry.samples import VehicleState
     from recon.backends import Backend
-    from recon.pipeline.events import FramePosed
     from recon.types import Camera, Frame, Keyframe
     from service.cameras.source import CameraSource
     from service.daemon.frame_gate import FrameGate
@@ -225,6 +223,7 @@ class ScanRun:
         from service.daemon.camera_memory import measured
         from service.daemon.frame_gate import FrameGate
         from service.flight.scan import ScanInputs
+        from service.flight.vehicle_reports import OdometryReport
 
         vehicle, config, backend = self._with.vehicle, self._config, self._with.backend
         assert self._with.camera is not None and backend is not None
@@ -234,8 +233,11 @@ class ScanRun:
         if earlier.shutter is not None and seeks_readout(camera, config.camera):
             camera = replace(camera, shutter=earlier.shutter)
             config = change(config, "camera.readout_ms", "auto")  # sought on from there
-        zero_ns, offset_ns = _zero_ns(source), vehicle.unix_offset_ns()
-        unix_s = 1e-9 * (time.monotonic_ns() + offset_ns)
+        now_ns, start_ns = time.monotonic_ns(), source.start_monotonic_ns
+        zero_ns = now_ns if start_ns is None else start_ns
+        offset_ns = vehicle.unix_offset_ns()
+        odometry = OdometryReport(config.camera, vehicle.report_odometry).send
+        unix_s = 1e-9 * (now_ns + offset_ns)
         folder = new_folder(scans, unix_s)
         self._with.made.add(folder.name)
         gate = FrameGate(source, folder / LATER, zero_ns + offset_ns, self.alive, self._with.paused)
@@ -254,7 +256,7 @@ class ScanRun:
             extra={"backend": backend.name, "source": source.description},
             latency_ms=earlier.latency_ms,
             warn=lambda text: vehicle.statustext(text, WARNING),
-            on_frame=odometry_reporter(config, vehicle),
+            on_frame=odometry if config.mavlink.odometry else None,
             on_keyframe=self._on_keyframe,
             on_photo=self._on_photo,
         )
@@ -306,23 +308,6 @@ def new_folder(scans: Path, unix_s: float) -> Path:
         if not os.path.exists(folder):
             return folder
         unix_s += 1.0
-
-
-def _zero_ns(source: CameraSource) -> int:
-    """Monotonic clock at the source's time 0: from a live source, otherwise now."""
-    start_ns = source.start_monotonic_ns
-    return time.monotonic_ns() if start_ns is None else start_ns
-
-
-def odometry_reporter(
-    config: Config, vehicle: VehicleLink
-) -> Callable[[FramePosed, VehicleState | None], None] | None:
-    """Reports our motion to the autopilot, if configured."""
-    if not config.mavlink.odometry:
-        return None
-    from service.flight.vehicle_reports import OdometryReport
-
-    return OdometryReport(config.camera, vehicle.report_odometry).send
 
 
 def report_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> None:

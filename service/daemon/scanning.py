@@ -21,7 +21,7 @@ from service.daemon.resumption import Resumption
 from service.daemon.scan_run import Equipment, ScanRun
 from service.daemon.scan_state import Effect, Event, ScanLife, State
 from service.daemon.warm_up import is_warm
-from service.daemon.writing import ClosingWatch, Writings
+from service.daemon.writing import Writings
 from service.errors import InputError, SkyreliefError
 from service.flight.datalink import DaemonLink
 from service.memory import release_memory
@@ -50,7 +50,6 @@ class Scanning:
         attempt: Callable[[Equipment, bool], ScanRun] = ScanRun,
         life: ScanLife | None = None,
         resumption: Resumption | None = None,
-        closing_watch: ClosingWatch | None = None,
         workers: Workers = PROCESS,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -73,7 +72,8 @@ class Scanning:
         self._worker: Worker | None = None  # of the run
         self._closing: Work | None = None  # ends with the run
         self._writings = Writings(lambda text: self.vehicle.statustext(text, WARNING))
-        self._watch = closing_watch or ClosingWatch()
+        self._marks: tuple[Any, ...] | None = None  # of the closing, as seen last
+        self._marked_s = 0.0  # when they changed
 
     def load(self) -> None:
         """Load camera model and backend, which takes long; InputError if they are unusable."""
@@ -199,7 +199,10 @@ class Scanning:
             marks = (*run.closing_marks(), *self._writings.marks())
         elif state is State.ENDED and self._writings:
             marks = self._writings.marks()
-        return self._watch.look(marks)
+        now_s = self._clock_s()
+        if marks is None or marks != self._marks:
+            self._marks, self._marked_s = marks, now_s
+        return now_s - self._marked_s
 
     @property
     def in_the_making(self) -> set[str]:
@@ -262,7 +265,10 @@ class Scanning:
     def _end_run(self, fault: str) -> None:
         with self._lock:
             if fault:
-                self._report(fault)
+                self.fault = fault
+                log.error("%s", fault)
+                is_first = self.life.failures == 0
+                self.vehicle.statustext(f"Scan failed: {fault}", CRITICAL, is_answer=is_first)
             self.handle(Event.FAILED if fault else Event.DONE)
             if fault and self.life.state.is_wanted:
                 log.warning("next attempt in %.1f s", self.life.due_s - self._clock_s())
@@ -270,12 +276,6 @@ class Scanning:
             closing, self._closing = self._closing, None
         if closing is not None:
             closing.finish(Answer(Result.FAILED, fault) if fault else ACCEPTED)
-
-    def _report(self, fault: str) -> None:
-        self.fault = fault
-        log.error("%s", fault)
-        is_first = self.life.failures == 0
-        self.vehicle.statustext(f"Scan failed: {fault}", CRITICAL, is_answer=is_first)
 
     def _write_files(self, folder: Path, store: ScanStore) -> None:
         """Write a scan's files, in the background when another scan is wanted meanwhile."""

@@ -7,18 +7,18 @@ set to it. Options: ``sim:?size=640x360&fps=10&duration_s=30&seed=1``.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import logging
 import os
-import socket
 from collections.abc import Callable
 from pathlib import Path
+from socket import SOCK_DGRAM
 
 from service.cameras import parse_source, reject_options
 from service.config import Config, ScanConfig
 from service.errors import InputError
 from service.init_system import Notifier
+from service.listener import free_port
 from service.scans.writing import writing_folder
 from service.workers import PROCESS, Worker, python_command, run_process
 
@@ -50,7 +50,7 @@ class SimulatedFlight:
         if not (self.folder / "flight.mp4").exists():
             with writing_folder(self.folder) as part:
                 (render or render_flight)(part, given)
-        self._ports = free_ports(2)
+        self._ports = free_port(SOCK_DGRAM), free_port(SOCK_DGRAM)
 
     def configured(self, config: Config) -> Config:
         """``config`` with this flight as its camera and its autopilot.
@@ -99,16 +99,6 @@ def state_folder() -> Path:
         return Path(systemd)
     home = os.environ.get("XDG_STATE_HOME", "")
     return (Path(home) if home else Path.home() / ".local" / "state") / "skyrelief"
-
-
-def free_ports(count: int) -> list[int]:
-    with contextlib.ExitStack() as stack:
-        probes = []
-        for _ in range(count):
-            probe = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            probe.bind(("127.0.0.1", 0))
-            probes.append(probe)
-        return [int(probe.getsockname()[1]) for probe in probes]
 
 
 def render_flight(folder: Path, given: dict[str, str]) -> None:

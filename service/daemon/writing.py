@@ -7,7 +7,6 @@ for them. The stored data is safe by then, and the next start writes files that 
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -113,22 +112,6 @@ class Writings:
             answer = Answer(Result.FAILED, writing.fault)
         if writing.work is not None:
             writing.work.finish(answer)
-
-
-class ClosingWatch:
-    """Measures how long the values of :func:`marks` have not changed; call :meth:`look` often."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._marks: tuple[Any, ...] | None = None
-        self._since_s = 0.0
-
-    def look(self, marks: tuple[Any, ...] | None) -> float:
-        """Seconds without progress; 0 when nothing is being closed (``marks`` is None)."""
-        now_s = self._clock()
-        if marks is None or marks != self._marks:
-            self._marks, self._since_s = marks, now_s
-        return 0.0 if marks is None else now_s - self._since_s
 
 
 def sizes(folder: Path) -> tuple[tuple[str, int], ...]:

@@ -26,9 +26,10 @@ from pathlib import Path
 import numpy as np
 
 from service.bench import BenchOptions, BenchResult
-from service.bench.link_emulator import LinkEmulator, LinkModel, free_port
+from service.bench.link_emulator import LinkEmulator, LinkModel
 from service.daemon.simulated import SimulatedFlight
 from service.errors import OutsideError, SkyreliefError
+from service.listener import free_port
 from service.packages import needing
 from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore

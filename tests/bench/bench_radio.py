@@ -29,9 +29,9 @@ from recon import se3
 from recon.posegraph.submap_loops import points_of
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.bench import BenchOptions, BenchResult
-from service.bench.link_emulator import free_port
 from service.config import DatalinkConfig
 from service.ground.receiver import Receiver, ReceiverConfig
+from service.listener import free_port
 from service.radio import GROUND, TUNNEL, RadioLink, VehicleRadio
 from service.stream import codec
 from service.stream.link import DatalinkSender

@@ -17,23 +17,8 @@ from mavlink.component.control import Phase
 from service.daemon import runtime
 from service.daemon.scan_run import ScanRun
 from service.daemon.scan_state import Event
-from service.daemon.writing import ClosingWatch, sizes
+from service.daemon.writing import sizes
 from service.memory import one_pool, release_memory
-
-
-def test_only_what_changes_is_progress() -> None:
-    now_s = 100.0
-    watch = ClosingWatch(lambda: now_s)
-    assert watch.look(None) == 0.0
-    assert watch.look((1, "a")) == 0.0
-    now_s = 130.0
-    assert watch.look((1, "a")) == 30.0
-    assert watch.look((2, "a")) == 0.0  # it got on
-    now_s = 135.0
-    assert watch.look((2, "a")) == 5.0
-    assert watch.look(None) == 0.0  # closed
-    now_s = 150.0
-    assert watch.look((2, "a")) == 0.0  # another scan is closed
 
 
 def test_files_grow_but_not_by_the_work_of_others(tmp_path: Path) -> None:
@@ -72,7 +57,7 @@ class Hung:
 
 def test_a_closing_that_hangs_is_no_progress(tmp_path: Path) -> None:
     now_s, hung = 0.0, Hung(tmp_path)
-    daemon = Onboard(tmp_path, script=hung, closing_watch=ClosingWatch(lambda: now_s))
+    daemon = Onboard(tmp_path, script=hung, clock_s=lambda: now_s)
     scanning = daemon.scanning
     limit_s = runtime.CLOSING_S + daemon.config.datalink.drain_s
     scanning.start()
@@ -98,7 +83,7 @@ def test_a_closing_that_hangs_is_no_progress(tmp_path: Path) -> None:
 
 def test_systemd_is_asked_to_wait_only_while_closing_gets_on(tmp_path: Path) -> None:
     now_s, asked, hung = 0.0, list[float](), Hung(tmp_path)
-    daemon = Onboard(tmp_path, script=hung, closing_watch=ClosingWatch(lambda: now_s))
+    daemon = Onboard(tmp_path, script=hung, clock_s=lambda: now_s)
     scanning = daemon.scanning
     scanning.start()
     until(lambda: scanning.scan is not None)

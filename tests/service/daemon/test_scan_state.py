@@ -33,7 +33,6 @@ from service.daemon.resumption import MARK, Landing, LandingWatch, Left, Resumpt
 from service.daemon.scan_run import ScanRun
 from service.daemon.scan_state import LAST_RETRY_S, TRANSITIONS, Effect, Event, ScanLife, State
 from service.daemon.scanning import Scanning
-from service.daemon.writing import ClosingWatch
 from service.errors import OutsideError
 from service.init_system import Notifier
 from service.workers import Worker, Workers, row_of
@@ -296,8 +295,7 @@ def test_the_heartbeat_stays_active_while_the_last_scan_is_closed(tmp_path: Path
         run.stop.wait(60.0)
         end.wait(60.0)
 
-    watch = ClosingWatch(lambda: time.monotonic() + ahead_s)
-    daemon = Onboard(tmp_path, script=script, of=Loaded, closing_watch=watch)
+    daemon = Onboard(tmp_path, script=script, of=Loaded, clock_s=lambda: time.monotonic() + ahead_s)
     thread = threading.Thread(target=daemon.run, args=(notifier,))
     thread.start()
     until(lambda: daemon.actions.is_ready)
