@@ -123,7 +123,9 @@ MAX_AT_ONCE = 64
 POLL_S = 0.01
 
 
-class _Pending(NamedTuple):
+class Pending(NamedTuple):
+    """A request under way: its replies go into the inbox as items of a scan, then their end."""
+
     replies: zenoh.handlers.Handler[Any]
     inbox: Inbox
     scan: str
@@ -134,18 +136,11 @@ class Replies:
     """The requests under way. :meth:`add` is safe from any thread."""
 
     def __init__(self) -> None:
-        self._pending: deque[_Pending] = deque()
+        self._pending: deque[Pending] = deque()
         self._news = threading.Event()
 
-    def add(
-        self,
-        replies: zenoh.handlers.Handler[Any],
-        inbox: Inbox,
-        scan: str,
-        answered: Answered | None,
-    ) -> None:
-        """Put the payloads of ``replies`` into the inbox as items of a scan, then their end."""
-        self._pending.append(_Pending(replies, inbox, scan, answered))
+    def add(self, request: Pending) -> None:
+        self._pending.append(request)
         self._news.set()
 
     def run(self, worker: Worker) -> None:
@@ -173,7 +168,7 @@ class Replies:
         return moved
 
 
-def _take(pending: _Pending) -> tuple[int, bool]:
+def _take(pending: Pending) -> tuple[int, bool]:
     """Number of replies, and whether that is all."""
     import zenoh
 

@@ -28,7 +28,7 @@ from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.drone import Align, DroneLimits, DroneReceiver, Effect, Get, Opened, Put, Write
 from service.ground.drones import Drones
 from service.ground.front import behind_fronts
-from service.ground.inbox import CHANNEL, Inbox, Radio, Replies, Written
+from service.ground.inbox import CHANNEL, Inbox, Pending, Radio, Replies, Written
 from service.ground.live_site import run as run_live_site
 from service.ground.received import (
     ReceivedScan,
@@ -303,7 +303,7 @@ class Receiver:
         except zenoh.ZError as error:
             log.debug("request not sent: %s", error)
             return
-        self._replies.add(replies, inbox, effect.scan, effect.answered)
+        self._replies.add(Pending(replies, inbox, effect.scan, effect.answered))
 
     def align(self, folder: Path) -> None:
         """Align a finished scan with those that show the same ground, if configured."""
