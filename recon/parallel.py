@@ -85,7 +85,7 @@ def parallel_for(
     The bands run at the same time, so none may write what another reads. A band that no thread has
     begun when the caller is done with its own is the caller's too: no caller waits for the work of
     others, and a band may share out rows itself. An exception of the kernel is raised after all
-    bands have ended.
+    bands that have begun have ended.
     """
     bands = min(threads() if cells is None else shares(cells), count)
     if bands <= 1:
@@ -101,10 +101,12 @@ def parallel_for(
             faults[first] = fault
 
     others = {pool().submit(run, *band): band for band in pairwise(edges[1:])}
-    run(edges[0], edges[1])
-    for one, band in others.items():
-        if one.cancel():
-            run(*band)
-    wait(one for one in others if not one.cancelled())
+    try:
+        run(edges[0], edges[1])
+        for one, band in others.items():
+            if one.cancel():
+                run(*band)
+    finally:  # also after Ctrl-C, which is no Exception: what they read may be closed next
+        wait(one for one in others if not one.cancel())
     if faults:
         raise faults[min(faults)]

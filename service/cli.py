@@ -22,6 +22,7 @@ import typer.main
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.init_system import log_handler
 from service.packages import needing
+from service.progress import CancelledError
 from service.redaction import without_credentials
 from service.version import software
 
@@ -99,7 +100,7 @@ class LazyCommands(typer.core.TyperGroup):
             cause: BaseException | None = error
             while isinstance(cause, SystemError):  # numba's, of a signal during a kernel
                 cause = cause.__cause__
-            if isinstance(cause, KeyboardInterrupt):
+            if isinstance(cause, KeyboardInterrupt | CancelledError):
                 _end(CancelledByUser("cancelled"))
             if isinstance(cause, SystemExit):
                 raise cause from None

@@ -96,7 +96,8 @@ def showing(name: str) -> Iterator[Progress]:
                 share = f", {5 * step[1]} %" if step[1] else ""
                 print(f"{name}: {now.text}{share}", file=sys.stderr)
 
-        yield Progress(say)
+        with _cancelled_by_ctrl_c(Progress(say)) as progress:
+            yield progress
         return
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -110,4 +111,24 @@ def showing(name: str) -> Iterator[Progress]:
         def show(now: Progress) -> None:
             bars.update(bar, completed=now.share, description=f"{name}: {now.text}")
 
-        yield Progress(show)
+        with _cancelled_by_ctrl_c(Progress(show)) as progress:
+            yield progress
+
+
+@contextmanager
+def _cancelled_by_ctrl_c(progress: Progress) -> Iterator[Progress]:
+    """Ctrl-C also cancels the work of other threads; a shell's background jobs ignore it."""
+
+    def cancel(*_: object) -> None:
+        progress.cancel()
+        raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.default_int_handler:
+        yield progress
+        return
+    signal.signal(signal.SIGINT, cancel)
+    try:
+        yield progress
+    finally:
+        signal.signal(signal.SIGINT, before)

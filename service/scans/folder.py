@@ -308,6 +308,8 @@ class Failures:
         except CancelledError:
             raise
         except Exception as error:  # a corrupt scan must not stop the other files
+            if isinstance(error.__cause__, KeyboardInterrupt):  # during a kernel of numba
+                raise
             if isinstance(error, OutsideError) and self.of_the_disk is None:
                 self.of_the_disk = error
             first, *_ = str(error).strip().splitlines() or [""]

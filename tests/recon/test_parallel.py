@@ -50,6 +50,23 @@ def test_bands_run_at_the_same_time(four: None) -> None:
     parallel.parallel_for(meet, 4)
 
 
+def test_an_interrupted_caller_waits_for_the_bands_that_have_begun(four: None) -> None:
+    begun, ended = threading.Semaphore(0), threading.Semaphore(0)
+    caller = threading.current_thread()
+
+    def work(begin: int, end: int) -> None:
+        if threading.current_thread() is caller:
+            assert all(begun.acquire(timeout=20.0) for _ in range(3))
+            raise KeyboardInterrupt
+        begun.release()
+        threading.Event().wait(0.05)
+        ended.release()
+
+    with pytest.raises(KeyboardInterrupt):
+        parallel.parallel_for(work, 4)
+    assert all(ended.acquire(blocking=False) for _ in range(3))
+
+
 def test_no_call_uses_more_threads_than_the_limit(four: None) -> None:
     calls: list[tuple[int, int]] = []
     parallel.limit_threads(1)

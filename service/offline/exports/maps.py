@@ -27,7 +27,7 @@ from service.offline.exports.rasters import open_map, write_ortho, written_ortho
 from service.offline.exports.view import ExportOptions, ScanView, check, export
 from service.scans.folder import Failures
 from service.scans.track import flown_datum
-from service.scans.writing import write_whole, writing
+from service.scans.writing import filling_folder, write_whole, writing
 from service.version import software
 
 MAX_OVERLAY_PX = 4096
@@ -202,21 +202,21 @@ def write_all(scan: ScanView, out: Path, options: ExportOptions) -> None:
 
     Raises the first error when none is written.
     """
-    out.mkdir(parents=True, exist_ok=True)
     failures = Failures(out, logging.WARNING)
-    done = write_kinds(scan, MAPS, lambda kind: out / EXPORTERS[kind][1], options, failures)
-    if not done and failures.first is not None:
-        raise failures.first
-    frame = scan.frame
-    document = {
-        "scan": scan.store.header.scan_id,
-        "software": software(),
-        "epsg": None if frame is None else frame.epsg,
-        "heights": _heights(scan, options),
-        "files": [_entry(kind, done[kind]) for kind in MAPS if kind in done],
-        "failed": failures.why,
-    }
-    write_whole(out / MANIFEST, json.dumps(document, indent=1) + "\n")
+    with filling_folder(out) as part:
+        done = write_kinds(scan, MAPS, lambda kind: part / EXPORTERS[kind][1], options, failures)
+        if not done and failures.first is not None:
+            raise failures.first
+        frame = scan.frame
+        document = {
+            "scan": scan.store.header.scan_id,
+            "software": software(),
+            "epsg": None if frame is None else frame.epsg,
+            "heights": _heights(scan, options),
+            "files": [_entry(kind, done[kind]) for kind in MAPS if kind in done],
+            "failed": failures.why,
+        }
+        write_whole(part / MANIFEST, json.dumps(document, indent=1) + "\n")
 
 
 def write_kinds(

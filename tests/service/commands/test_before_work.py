@@ -139,6 +139,7 @@ def test_cancelling_is_no_fault_of_a_product(scan: Path, monkeypatch: pytest.Mon
         progress.cancel()
         with pytest.raises(CancelledError):
             export(view, "all", scan / "cancelled", ExportOptions())
+    assert not list(scan.glob("*cancelled*"))
 
 
 def test_replay_ends_with_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,6 +6,7 @@ import io
 import os
 import pty
 import select
+import signal
 import subprocess
 import sys
 from contextlib import redirect_stderr
@@ -158,6 +159,20 @@ def test_without_a_terminal_steps_and_twentieths_are_lines() -> None:
         progress("texture")
     lines = ["fusing", "fusing, 30 %", "fusing, 65 %", "texture, 65 %"]
     assert text.getvalue().splitlines() == [f"mesh: {line}" for line in lines]
+
+
+def test_ctrl_c_cancels_other_threads_too() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), showing("export") as progress:
+            try:
+                signal.raise_signal(signal.SIGINT)
+            finally:
+                with pytest.raises(CancelledError):
+                    progress.branches(2)[1]("the other branch")
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 SCRIPT = """
