@@ -40,13 +40,14 @@ def calibrate(
     check_writable(out)
     with showing("calibrate") as progress:
         boards = find_boards(sources, board, progress)
-    if len(boards.views) < MIN_VIEWS:
-        raise InputError(
-            f"the board was found in {len(boards.views)} of "
-            f"{len(boards.views) + len(boards.missed)} images, {MIN_VIEWS} are needed; "
-            f"is --pattern {pattern} the number of inner corners?"
-        )
-    result = fit(boards.views, board, boards.size_px, CalibrationConfig(tangential))
+        if len(boards.views) < MIN_VIEWS:
+            raise InputError(
+                f"the board was found in {len(boards.views)} of "
+                f"{len(boards.views) + len(boards.missed)} images, {MIN_VIEWS} are needed; "
+                f"is --pattern {pattern} the number of inner corners?"
+            )
+        progress(f"fitting the camera to {len(boards.views)} views")
+        result = fit(boards.views, board, boards.size_px, CalibrationConfig(tangential))
     if result is None:
         raise InputError("no camera fits these views; take the board from different angles")
     try:
