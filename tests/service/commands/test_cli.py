@@ -27,7 +27,7 @@ from service.offline.exports import EXPORTERS
 from service.offline.exports.model import LARGEST_FACES
 from service.offline.exports.view import ExportOptions, ScanView
 from service.packages import installs
-from service.progress import Progress
+from service.progress import CancelledError, Progress
 from service.stream.session import SessionConfig, open_session
 from service.version import software
 
@@ -314,9 +314,12 @@ def test_the_shell_is_offered_values(
     assert offered <= found and (not words.split()[-1].isalpha() or found == offered)
 
 
-def test_ctrl_c_ends_a_command_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [KeyboardInterrupt, CancelledError])
+def test_ctrl_c_ends_a_command_in_one_line(
+    error: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def stopped(as_json: AsJson = False) -> None:
-        raise KeyboardInterrupt
+        raise error
 
     working(stopped, monkeypatch)
     ended = skyrelief("work", "--json")
