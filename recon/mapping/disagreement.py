@@ -14,9 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon import se3
-from recon.camera_model import project
-from recon.mapping.voxel_map import sampled
+from recon.mapping.voxel_map import sampled, shared
 from recon.types import F32, Bool, DepthMap
 
 NORMAL_MEDIAN = 0.6745
@@ -80,20 +78,14 @@ class Disagreement:
 
     def _apart(self, depth: DepthMap, one: _Samples) -> float | None:
         """Robust normalised difference along z; None with too little in common."""
-        h, w = depth.depth_m.shape
-        here = se3.transform(se3.inverse(depth.T_world_camera), one.points.astype(np.float64))
-        ahead = here[:, 2] > 1e-3
-        uv = np.rint(project(depth.K, here[ahead]))
-        inside = (uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] < w) & (uv[:, 1] < h)
-        u, v = uv[inside].astype(np.int64).T
-        z = depth.depth_m[v, u]
-        known = np.isfinite(z)
-        sure = known & (depth.views[v, u] >= 2) & one.is_sure[ahead][inside]
-        known = sure if np.count_nonzero(sure) >= MIN_COMMON else known
-        if np.count_nonzero(known) < MIN_COMMON:
+        which, (v, u), there = shared(depth, one.points)
+        sure = (depth.views[v, u] >= 2) & one.is_sure[which]
+        if np.count_nonzero(sure) >= MIN_COMMON:
+            which, v, u, there = which[sure], v[sure], u[sure], there[sure]
+        if len(which) < MIN_COMMON:
             return None
-        there, sigma = here[ahead][inside][known, 2], one.sigma_m[ahead][inside][known]
-        off = np.abs(there - z[known]) / np.hypot(sigma, depth.sigma_m[v, u][known])
+        off = np.abs(there - depth.depth_m[v, u])
+        off /= np.hypot(one.sigma_m[which], depth.sigma_m[v, u])
         return float(np.median(off)) / NORMAL_MEDIAN
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from recon import se3
-from recon.camera_model import rays
+from recon.camera_model import project, rays
 from recon.parallel import parallel_for
 from recon.types import F32, F64, I32, I64, Bool, DepthMap
 
@@ -108,6 +108,20 @@ def sampled(depth: DepthMap) -> tuple[tuple[I64, I64], F64]:
     z = depth.depth_m[v, u, None].astype(np.float64)
     uv = np.column_stack([u, v]).astype(np.float64)
     return (v, u), se3.transform(depth.T_world_camera, rays(depth.K, uv) * z)
+
+
+def shared(depth: DepthMap, points_m: F32) -> tuple[I64, tuple[I64, I64], F64]:
+    """Which of (N, 3) world points lie in the image of ``depth`` where that is known, the row and
+    column of each, and its own depth there."""
+    h, w = depth.depth_m.shape
+    here = se3.transform(se3.inverse(depth.T_world_camera), points_m.astype(np.float64))
+    which = np.flatnonzero(here[:, 2] > 1e-3)
+    uv = np.rint(project(depth.K, here[which]))
+    inside = (uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] < w) & (uv[:, 1] < h)
+    u, v = uv[inside].astype(np.int64).T
+    which = which[inside]
+    known = np.isfinite(depth.depth_m[v, u])
+    return which[known], (v[known], u[known]), here[which[known], 2]
 
 
 def tiles_under(depth: DepthMap, voxel_m: float, margin_m: float) -> I64:

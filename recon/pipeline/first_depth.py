@@ -9,6 +9,7 @@ from collections import Counter
 from dataclasses import replace
 
 from recon.backends import Backend, DenseStages
+from recon.mapping.exposure import Exposure
 from recon.pipeline.config import Timing, untimed
 from recon.pipeline.keyframe_map import KeyframeMap
 from recon.pipeline.stages import PairStages, Rectify, keyframe_of
@@ -35,6 +36,7 @@ class FirstDepths:
         dense: DenseStages,
         keyframes: KeyframeMap,
         surface: SurfaceMap,
+        exposure: Exposure,
         timing: Timing,
     ) -> None:
         stereo = replace(
@@ -43,7 +45,8 @@ class FirstDepths:
         )  # fmt: skip
         self._rectify = Rectify(stereo, Counter(), None, untimed)
         self._stereo = PairStages(backend, dense, None, untimed)
-        self._keyframes, self._surface, self._timing = keyframes, surface, timing
+        self._keyframes, self._surface = keyframes, surface
+        self._exposure, self._timing = exposure, timing
 
     def set_width(self, width_px: int) -> None:
         """Follow the width of whole depths."""
@@ -71,4 +74,5 @@ class FirstDepths:
                 return None
             T_odom, pose = ahead
             sigma_m, fresh = self._surface.peek(depth, view.rows_share, T_odom)
+            bgr = self._exposure.level(bgr)
             return keyframe_of(view, depth, bgr, sigma_m, fresh, pose)

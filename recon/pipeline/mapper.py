@@ -17,6 +17,7 @@ import numpy as np
 from recon.backends import Backend, DenseStages
 from recon.backends.cpu import CpuBackend
 from recon.mapping.cloud_fusion import cloud_of, fuse
+from recon.mapping.exposure import Exposure
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
 from recon.pipeline.config import Baseline, MapperConfig, Timing, untimed
 from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
@@ -143,8 +144,9 @@ class Mapper:
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
         self.keyframes = KeyframeMap(trajectory, loops, self.rejected, timing)
         self.surface = SurfaceMap(float(camera.K[0, 0]), config.resolution_m, new_map)
+        self.exposure = Exposure()
         self.first_depths = (
-            FirstDepths(backend, stereo, dense, self.keyframes, self.surface, timing)
+            FirstDepths(backend, stereo, dense, self.keyframes, self.surface, self.exposure, timing)
             if config.first_depths
             else None
         )
@@ -259,6 +261,8 @@ class Mapper:
         with self._timing("map"):  # what is new
             T_odom = self.keyframes.trajectory.odom_pose(view.seq)
             sigma_m, fresh = self.surface(view.segment, depth, view.rows_share, T_odom)
+            in_odom = replace(depth, T_world_camera=T_odom)
+            bgr = self.exposure(view.segment, in_odom, bgr)  # as bright as the map
         keyframe = keyframe_of(view, depth, bgr, sigma_m, fresh, update.pose)
         if self.debug is not None:
             metric = keyframe.depth

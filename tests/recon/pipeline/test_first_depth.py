@@ -9,7 +9,7 @@ from painted_ground import CAMERA, HEIGHT_M, pose, still
 
 from recon.pipeline.events import Event, KeyframeReady, PosesChanged
 from recon.pipeline.mapper import Mapper, MapperConfig
-from recon.types import Frame, PosePrior
+from recon.types import F64, Frame, PosePrior
 from service.config import load_config
 from service.flight.pipeline import mapper_config
 
@@ -19,7 +19,8 @@ STRIP_PX = 12
 """Of 160 across: the ground on the right that the keyframe before does not see."""
 
 
-def fly(first_depths: bool, width_px: int = 320) -> list[Event]:
+def fly(first_depths: bool, width_px: int = 320, later_gain: float = 1.0) -> list[Event]:
+    """``later_gain`` is the exposure of the second half."""
     config = MapperConfig(upsample=False, first_depths=first_depths)
     mapper, events = Mapper(CAMERA, config), list[Event]()
     mapper.set_effort(config.pairs, width_px, upsample=False)
@@ -27,6 +28,7 @@ def fly(first_depths: bool, width_px: int = 320) -> list[Event]:
         T = pose(STEP_M * i)
         prior = PosePrior(T[:3, :3], 0.005, 0.01, T[:3, 3], np.full(3, 0.1), HEIGHT_M, 0.1)
         image = cv2.cvtColor(still(T), cv2.COLOR_GRAY2BGR)
+        image = cv2.convertScaleAbs(image, alpha=later_gain if i >= FRAMES // 2 else 1.0)
         events += mapper.track(Frame(np.asarray(image, np.uint8), i * 100_000_000, i, prior))
     return [*events, *mapper.finish()]
 
@@ -65,6 +67,21 @@ def test_a_first_depth_shows_new_ground_early_and_leaves_the_map_as_it_is() -> N
         off = np.abs(first.depth.depth_m[shown] / HEIGHT_M - 1.0)
         assert np.median(off) < 0.03
         assert np.median(first.depth.sigma_m[shown]) > np.median(final.depth.sigma_m[coming])
+
+
+@pytest.mark.slow
+def test_a_step_of_exposure_shows_in_no_keyframe_and_no_first_depth() -> None:
+    def brightness(events: list[Event], kind: type[FirstDepth] | type[KeyframeReady]) -> F64:
+        found = [e.keyframe for e in events if isinstance(e, kind)]
+        return np.array([np.median(keyframe.bgr) for keyframe in found])
+
+    plain, stepped = fly(True), fly(True, later_gain=0.6)
+    for kind, unlevelled in ((KeyframeReady, 0), (FirstDepth, 1)):
+        one, other = brightness(plain, kind), brightness(stepped, kind)
+        off = np.abs(other / one - 1.0)
+        assert len(one) == len(other) > 3 and off[0] == 0.0 and 0.0 < off[-1] < 0.15
+        # A first depth comes before its keyframe, and so with the exposure before.
+        assert np.count_nonzero(off > 0.15) <= unlevelled
 
 
 @pytest.mark.slow

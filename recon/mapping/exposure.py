@@ -1,0 +1,133 @@
+"""One exposure for all images of a flight, whatever automatic exposure and clouds do.
+
+A colour times a gain is the same colour at another exposure. Most of what an image shows earlier
+ones showed, too; a gain for each channel, which changes linearly over the image, makes them agree.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import cv2
+import numpy as np
+
+from recon.mapping.voxel_map import sampled, shared
+from recon.types import F32, F64, I64, U8, DepthMap
+
+IMAGES = 64
+"""Number of images that are kept."""
+
+MIN_COMMON = 60
+"""Minimum number of samples in common with earlier images."""
+
+KEPT = np.array([[0.95], [0.8], [0.8]])
+"""Share of the logarithm of a gain, and of its slopes, that is kept from image to image. What has
+one side of all images brighter, as sunlight does, adds up otherwise."""
+
+LEVEL = 0.1
+"""Weight of a gain without slope, over that of samples all over the image."""
+
+UNSEEN = np.array([[0.03], [0.06], [0.06]])
+"""Smaller changes show in no seam and are left: what looks different from another side, or darker
+towards the edge of an image, is no change of exposure."""
+
+SAME_SHARE = 0.02
+"""Samples are of one surface where their depths differ by less than this share."""
+
+FITTED, STEPS, HUBER = 2000, 6, 1.5
+"""About so many samples are used; steps of the reweighted least squares; residuals of more medians
+count less."""
+
+BLUR_PX = 9
+"""Side of the square that is a sample's colour: places are right to some pixels."""
+
+DARK, BURNT = 5, 245
+"""Beyond these levels a colour says nothing about exposure."""
+
+KNEE = np.float32(224)
+"""Levels that a gain lifts beyond this one approach white: none is burnt."""
+
+MAX_LOG = float(np.log(3.0))
+
+
+class Exposure:
+    """Levels each new image with the last ones."""
+
+    def __init__(self) -> None:
+        self._earlier: deque[tuple[F32, F32]] = deque(maxlen=IMAGES)
+        # Places of some surface of each, m, in the segment's frame, and the logarithms of its
+        # levelled colours, both (N, 3); NaN where a colour says nothing.
+        self._segment = -1
+        self._gain = np.zeros((3, 3))  # of the last image: logarithm in the middle, slopes across
+        # and down, each for blue, green and red
+
+    def __call__(self, segment: int, depth: DepthMap, bgr: U8) -> U8:
+        """``bgr`` (h, w, 3) on the grid of the depth, levelled; it is remembered.
+
+        ``depth`` is in the frame of its segment. Where no earlier image of that shows its ground,
+        the camera's exposure is that of the last image.
+        """
+        if segment != self._segment:
+            self._earlier.clear()
+            self._segment = segment
+        calm = np.asarray(cv2.blur(bgr.astype(np.float32), (BLUR_PX, BLUR_PX)), np.float32)
+        if self._earlier:
+            points, before = (np.concatenate(arrays) for arrays in zip(*self._earlier, strict=True))
+            which, at, there = shared(depth, points)
+            same = np.abs(depth.depth_m[at] / there - 1.0) < SAME_SHARE
+            off = np.where(same[:, None], before[which] - _logs(calm[at]), np.nan)
+            self._fit(off, _places(at, bgr.shape))
+        self._gain *= KEPT
+        at, points = sampled(depth)
+        known = _logs(calm[at]) + _places(at, bgr.shape) @ self._gain
+        self._earlier.append((points.astype(np.float32), known.astype(np.float32)))
+        return self.level(bgr)
+
+    def level(self, bgr: U8) -> U8:
+        """An image (h, w, 3) that has the exposure of the last one, levelled."""
+        if not self._gain.any():
+            return bgr
+        h, w = bgr.shape[:2]
+        u, v = np.arange(w, dtype=np.float32) / w - 0.5, np.arange(h, dtype=np.float32) / h - 0.5
+        gain = cv2.merge(
+            [
+                np.outer(np.exp(b * v), np.exp(middle + a * u))
+                for middle, a, b in self._gain.T.astype(np.float32)
+            ]
+        )
+        lit = cv2.multiply(bgr, gain, dtype=cv2.CV_32F)
+        above = lit > KNEE
+        room = np.maximum(255 * gain[above] - KNEE, 255 - KNEE)
+        lit[above] = KNEE + (lit[above] - KNEE) * ((255 - KNEE) / room)
+        return np.asarray(cv2.convertScaleAbs(lit), np.uint8)
+
+    def _fit(self, off: F64, places: F64) -> None:
+        """The gain by differences of logarithms (N, 3) at ``places`` (N, 3)."""
+        known = np.isfinite(off).all(axis=1)
+        every = max(1, np.count_nonzero(known) // FITTED)
+        off, places = off[known][::every], places[known][::every]
+        if len(off) < MIN_COMMON:
+            return
+        gain = np.zeros((3, 3))
+        gain[0] = np.median(off, axis=0)
+        for _ in range(STEPS):
+            rest = np.linalg.norm(off - places @ gain, axis=1)
+            limit = HUBER * max(float(np.median(rest)), 1e-3)
+            weighted = places * np.minimum(1.0, limit / np.maximum(rest, limit))[:, None]
+            level = LEVEL / 12.0 * weighted[:, 0].sum() * np.diag([0.0, 1.0, 1.0])
+            gain = np.linalg.solve(weighted.T @ places + level, weighted.T @ off)
+        change = gain - self._gain
+        self._gain += np.sign(change) * np.maximum(np.abs(change) - UNSEEN, 0.0)
+        self._gain = np.clip(self._gain, -MAX_LOG, MAX_LOG)
+
+
+def _logs(colours: F32) -> F32:
+    """Logarithms of colours (N, 3); NaN where one says nothing."""
+    fair = ((colours > DARK) & (colours < BURNT)).all(axis=1, keepdims=True)
+    return np.where(fair, np.log(np.maximum(colours, np.float32(1))), np.float32(np.nan))
+
+
+def _places(at: tuple[I64, I64], shape: tuple[int, ...]) -> F64:
+    """(N, 3) terms of the gain at rows and columns: 1, and the place from -0.5 to 0.5."""
+    v, u = at
+    return np.stack([np.ones(v.shape), u / shape[1] - 0.5, v / shape[0] - 0.5], axis=-1)

@@ -1,0 +1,109 @@
+"""Automatic exposure leaves no seam: each image is as bright as those that showed its ground."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from painted_ground import HEIGHT_M, K, on_plane, pose, still
+
+from recon.mapping.exposure import KNEE, Exposure
+from recon.types import F64, U8, Camera, DepthMap
+
+SIZE = (120, 90)
+SMALL = np.diag([0.25, 0.25, 1.0]) @ K
+STEP_M = 8.0
+SPOTS = np.random.default_rng(3).integers(0, 255, (240, 240)).astype(np.uint8)
+GROUND = np.asarray(cv2.resize(SPOTS, (2400, 2400)), np.uint8)
+
+
+def _seen(T: F64) -> tuple[DepthMap, U8]:
+    """Depth and image of the ground from there, at one exposure; no colour is burnt."""
+    image = still(T, Camera(SMALL, np.zeros(5), SIZE), GROUND)
+    z = on_plane(SMALL, SIZE, T)[:, 2].reshape(SIZE[::-1]).astype(np.float32)
+    depth = DepthMap(z, np.full_like(z, 0.1), np.full(z.shape, 2, np.uint8), SMALL, T)
+    return depth, np.repeat((40 + image * 0.3).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def _apart(levelled: U8, right: U8) -> F64:
+    """(3,) median of the colours over those at the first exposure, less one."""
+    ratio = levelled.reshape(-1, 3).astype(float) / right.reshape(-1, 3)
+    return np.asarray(np.abs(np.median(ratio, axis=0) - 1.0))
+
+
+def test_a_step_of_exposure_in_flight_leaves_no_seam() -> None:
+    """Brighter by half, and redder, from the fifth image on."""
+    exposure, gain = Exposure(), np.array([1.4, 1.5, 1.7])
+    for k in range(10):
+        depth, right = _seen(pose(STEP_M * k))
+        raw = np.rint(right * (gain if k >= 4 else np.ones(3))).astype(np.uint8)
+        levelled = exposure(0, depth, raw)
+        assert levelled.shape == raw.shape and levelled.dtype == np.uint8
+        # By as much as it returns from image to image, and by what is left.
+        assert (_apart(levelled, right) < 0.02 + 0.04 * max(k - 3, 0)).all(), k
+    before, after = _apart(raw, right), _apart(levelled, right)
+    assert (after < 0.4 * before).all()
+
+
+def test_a_shadow_on_one_side_of_an_image_leaves_no_seam() -> None:
+    exposure = Exposure()
+    exposure(0, *_seen(pose(0.0)))
+    depth, right = _seen(pose(STEP_M))
+    shadow = np.linspace(1.0, 0.6, SIZE[0])[None, :, None]
+    levelled = exposure(0, depth, np.rint(right * shadow).astype(np.uint8))
+    left, middle = np.s_[:, :20], np.s_[:, 50:70]
+    assert (_apart(levelled[left], right[left]) < 0.1).all()
+    assert (_apart(levelled[middle], right[middle]) < 0.1).all()
+
+
+def test_images_of_one_exposure_stay_as_they_are() -> None:
+    """Nearly so where their edges are somewhat darker, as lenses make them."""
+    exposure, darkened = Exposure(), Exposure()
+    x, y = np.meshgrid(np.linspace(-1, 1, SIZE[0]), np.linspace(-1, 1, SIZE[1]))
+    vignette = (1.0 - 0.05 * (x * x + y * y))[..., None]
+    for k in range(8):
+        depth, image = _seen(pose(STEP_M * k, seed=k))
+        np.testing.assert_array_equal(exposure(0, depth, image), image)
+        dark = np.rint(image * vignette).astype(np.uint8)
+        assert np.abs(darkened(0, depth, dark).astype(int) - dark).max() <= 2
+
+
+def test_without_common_ground_a_gain_lasts_and_returns_to_one() -> None:
+    exposure = Exposure()
+    exposure(0, *_seen(pose(0.0)))
+    depth, right = _seen(pose(1.0))
+    exposure(0, depth, np.rint(right * 2.0).astype(np.uint8))
+    raw = np.full((90, 120, 3), 100, np.uint8)
+    assert 45 < exposure.level(raw)[45, 60, 1] < 58
+    blank = DepthMap(
+        np.full_like(depth.depth_m, np.nan), *(depth.sigma_m, depth.views), SMALL, np.eye(4)
+    )
+    assert 47 < exposure(1, blank, raw)[45, 60, 1] < 60  # of a new segment
+    for _ in range(100):
+        back = exposure(1, blank, raw)
+    assert (np.abs(back.astype(int) - 100) <= 1).all()
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.0, 2.0])
+def test_a_gain_burns_nothing(gain: float) -> None:
+    """Levels stay in order, and white stays apart from what was less bright."""
+    exposure = Exposure()
+    exposure._gain[0] = np.log(gain)
+    ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    levels = exposure.level(ramp)[0, :, 1].astype(int)
+    assert (np.diff(levels) >= 0).all() and levels[-1] == round(255 * min(gain, 1.0))
+    linear = np.arange(256) * gain <= KNEE
+    np.testing.assert_allclose(levels[linear], gain * np.arange(256)[linear], atol=0.5)
+    assert np.unique(levels[128:]).size > 25
+
+
+def test_colours_that_say_nothing_change_nothing() -> None:
+    """Black, burnt, of another surface, or too few."""
+    exposure = Exposure()
+    depth, right = _seen(pose(0.0))
+    exposure(0, depth, right)
+    for raw in (np.zeros_like(right), np.full_like(right, 255)):
+        np.testing.assert_array_equal(exposure(0, depth, raw), raw)
+    higher = DepthMap(0.9 * depth.depth_m, depth.sigma_m, depth.views, SMALL, depth.T_world_camera)
+    np.testing.assert_array_equal(exposure(0, higher, right // 2), right // 2)
+    assert np.median(depth.depth_m) == pytest.approx(HEIGHT_M, rel=0.02)
