@@ -18,6 +18,7 @@ import typer
 
 from service.commands import AsJson
 from service.errors import InputError, OutsideError
+from service.scans.report_parts import within
 from service.workers import python_command
 
 FLIGHT = Path("demo") / "caliterra"
@@ -218,6 +219,7 @@ def _figures(out: Path, received: Path, seconds: float) -> dict[str, Any]:
         "ground_points": ground["counts"]["points"],
         "area_m2": quality["area_m2"],
         "sigma_median_m": quality["sigma_median_m"],
+        "quality": quality,
         "distance_m": quality["distance_m"],
         "epsg": onboard["epsg"],
         "seconds": round(seconds, 1),
@@ -231,14 +233,26 @@ def _in_words(report: dict[str, Any]) -> str:
 Scan onboard:         {onboard}
 Received at ground:   {ground}
   {report["points"]:,} points from {report["keyframes"]} keyframes over {report["area_m2"]:,.0f} m2,
-  {report["distance_m"]:.0f} m flown, median sigma {report["sigma_median_m"]:.2f} m, \
-{report["seconds"]:.0f} s in all
+  {report["distance_m"]:.0f} m flown, {report["seconds"]:.0f} s in all
+  {_verdict(report["quality"])}
 Look at:
   {onboard}/preview.jpg   image: colour and relief from above
   {onboard}/report.html   map, accuracy and faults, in a browser
   {onboard}/cloud.laz     coloured points for CloudCompare or QGIS (EPSG:{report["epsg"]})
   {program} ground --store {report["ground_store"]} --portal 127.0.0.1:8080
                           the map in 3D, in a browser"""
+
+
+def _verdict(quality: dict[str, Any]) -> str:
+    """What may be measured, and one sigma of each: what holds within the map first."""
+    scale, across = quality["scale_sigma"], quality["position_sigma_h_median_m"]
+    parts = [f"detail {within(quality['sigma_median_m'])}"]
+    if scale is not None:
+        parts.append(f"lengths ± {100.0 * scale:.1f} %")
+    if across is not None:
+        up = within(quality["position_sigma_v_median_m"])
+        parts.append(f"place on the earth {within(across)}, height above sea level {up}")
+    return f"{quality['trust']['level']}: {', '.join(parts)}"
 
 
 def _read(path: Path) -> dict[str, Any]:

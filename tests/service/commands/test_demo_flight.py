@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from loopback import until
@@ -34,6 +35,19 @@ def test_an_installed_wheel_brings_the_flight(tmp_path: Path) -> None:
 def test_a_named_flight_alone_counts(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nothing-here contains no frames"):
         demo.demo_flight(tmp_path / "nothing-here")
+
+
+def test_the_verdict_begins_with_what_holds_within_the_map() -> None:
+    quality: dict[str, Any] = {
+        "sigma_median_m": 0.054, "scale_sigma": 0.0464, "position_sigma_h_median_m": 6.57,
+        "position_sigma_v_median_m": 23.4, "trust": {"level": "georeferenced", "reasons": ["no"]},
+    }  # fmt: skip
+    assert demo._verdict(quality) == (
+        "georeferenced: detail ± 5.4 cm, lengths ± 4.6 %, place on the earth ± 6.57 m, "
+        "height above sea level ± 23 m"
+    )
+    quality |= {"scale_sigma": None, "position_sigma_h_median_m": None}
+    assert demo._verdict(quality) == "georeferenced: detail ± 5.4 cm"
 
 
 @pytest.mark.slow
