@@ -71,13 +71,13 @@ def test_a_first_depth_shows_new_ground_early_and_leaves_the_map_as_it_is() -> N
 
 @pytest.mark.slow
 def test_a_step_of_exposure_shows_in_no_keyframe_and_no_first_depth() -> None:
-    def brightness(events: list[Event], kind: type[FirstDepth] | type[KeyframeReady]) -> F64:
-        found = [e.keyframe for e in events if isinstance(e, kind)]
-        return np.array([np.median(keyframe.bgr) for keyframe in found])
+    def brightness(events: list[Event], of_first: bool) -> F64:
+        ready = [e for e in events if isinstance(e, KeyframeReady) and e.is_first == of_first]
+        return np.array([np.median(event.keyframe.bgr) for event in ready])
 
     plain, stepped = fly(True), fly(True, later_gain=0.6)
-    for kind, unlevelled in ((KeyframeReady, 0), (FirstDepth, 1)):
-        one, other = brightness(plain, kind), brightness(stepped, kind)
+    for of_first, unlevelled in ((False, 0), (True, 1)):
+        one, other = brightness(plain, of_first), brightness(stepped, of_first)
         off = np.abs(other / one - 1.0)
         assert len(one) == len(other) > 3 and off[0] == 0.0 and 0.0 < off[-1] < 0.15
         # A first depth comes before its keyframe, and so with the exposure before.
