@@ -122,8 +122,7 @@ class KeyframeMap:
         """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
         return apart(self.graph.segments, self.graph.loops.taken)
 
-    def left_out(self) -> list[tuple[int, int]]:
-        """First and last keyframe of each stretch that is not part of the map: those apart, and
-        those of false depth, each by itself or with the next one, as they are no piece of a map."""
-        false = self.graph.segments.false_keyframes()
-        return [*self.apart(), *self.graph.refuted.items(), *zip(false, false, strict=True)]
+    def false(self) -> list[tuple[int, int]]:
+        """First and last keyframe of each stretch in which vision is wrong, and its depth, too."""
+        segments = [(one.surface[0], one.surface[-1]) for one in self.graph.segments.false()]
+        return [*self.graph.refuted.items(), *segments]

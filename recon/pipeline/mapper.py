@@ -343,7 +343,7 @@ class Mapper:
         """
         if self._kept is None:
             raise ValueError("this mapper was made with keeps_cloud=False")
-        out = self.keyframes.left_out()
+        out = [*self.keyframes.apart(), *self.keyframes.false()]
         kept = [k for seq, k in self._kept.items() if not any(a <= seq <= b for a, b in out)]
         sizes = [size for k in kept if (size := ground_sample_m(k.depth)) is not None]
         fine = voxel_m or min(sizes, default=1.0)

@@ -146,9 +146,9 @@ class Segments:
         """Those that keyframes with depth belong to, in order."""
         return [segment for segment in self._all.values() if segment.surface]
 
-    def false_keyframes(self) -> list[int]:
-        """Those with depth of segments whose motion is false."""
-        return [seq for one in self.with_surface() if one.is_false for seq in one.surface]
+    def false(self) -> list[Segment]:
+        """Those with surface that contradicts itself."""
+        return [segment for segment in self.with_surface() if segment.is_false]
 
     def opened(self, number: int) -> Segment:
         return self._all.setdefault(number, Segment(number))

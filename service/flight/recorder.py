@@ -116,7 +116,8 @@ class Recorder:
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Close the scan, which is flushed; return its summary."""
         summary = self.summary() | {"graph": graph_figures(self._graph)}
-        summary["apart"] = [list(ends) for ends in self.pipeline.keyframes.left_out()]
+        summary["apart"] = [list(ends) for ends in self.pipeline.keyframes.apart()]
+        summary["false"] = [list(ends) for ends in self.pipeline.keyframes.false()]
         summary |= extra
         self.store.finish(summary)
         return summary

@@ -375,7 +375,7 @@ class Scan:
                 "segments of the flight, which neither loops nor fixes of known height and scale "
                 "tie to the rest; fly with more overlap, or with GNSS that states its accuracy"
             )
-        false = len(self.pipeline.keyframes.graph.segments.false_keyframes())
+        false = sum(len(s.surface) for s in self.pipeline.keyframes.graph.segments.false())
         if false:
             out.append(
                 f"left out of the cloud: {false} of {self.recorder.keyframes} keyframes, as the "

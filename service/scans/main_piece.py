@@ -38,8 +38,21 @@ Keyframes = ScanStore | Piece
 
 
 def stretches_apart(store: Keyframes) -> list[Stretch]:
-    """The unconnected stretches by the refinement in force, else by the scan's summary."""
-    rows = (store.refinement or {}).get("apart", (store.summary or {}).get("apart"))
+    """The stretches that are left out: the unconnected ones, and those of false depth."""
+    return _unconnected(store) + _false(store)
+
+
+def _unconnected(store: Keyframes) -> list[Stretch]:
+    """By the refinement in force, else by the scan's summary."""
+    return _stretches((store.refinement or {}).get("apart", (store.summary or {}).get("apart")))
+
+
+def _false(store: Keyframes) -> list[Stretch]:
+    """Those whose depth no better pose makes true."""
+    return _stretches((store.summary or {}).get("false"))
+
+
+def _stretches(rows: object) -> list[Stretch]:
     if not isinstance(rows, list):
         return []
     pairs = [row for row in rows if isinstance(row, list) and len(row) == 2]
@@ -52,11 +65,11 @@ def is_apart(seq: int, apart: Iterable[Stretch]) -> bool:
 
 
 def pieces_apart(store: ScanStore) -> list[Piece]:
-    """The unconnected stretches of at least MIN_PIECE keyframes; none counts twice."""
-    apart, own = stretches_apart(store), dict[int, list[int]]()
+    """The unconnected stretches with MIN_PIECE sound keyframes or more; none counts twice."""
+    apart, false, own = _unconnected(store), _false(store), dict[int, list[int]]()
     for seq in store.seqs():
         k = next((k for k, (first, last) in enumerate(apart) if first <= seq <= last), None)
-        if k is not None:
+        if k is not None and not is_apart(seq, false):
             own.setdefault(k, []).append(seq)
     return [Piece(store, seqs) for seqs in own.values() if len(seqs) >= MIN_PIECE]
 

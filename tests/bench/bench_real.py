@@ -176,7 +176,7 @@ def seams(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
 
 def _maps(flight: ReplayedSet) -> list[DepthMap]:
     """The depth images that the cloud is made of."""
-    left_out = flight.summary["run"]["apart"]
+    left_out = flight.summary["run"]["apart"] + flight.summary["run"]["false"]
     with ScanStore.open(flight.scan / "scan.db") as store:
         return [
             keyframe.depth

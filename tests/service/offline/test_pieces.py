@@ -208,13 +208,17 @@ def test_no_deliverable_shows_what_is_apart(tmp_path: Path, house: HouseFlight) 
 
 
 def test_a_scan_of_false_depth_alone_shows_none(tmp_path: Path, house: HouseFlight) -> None:
-    with finished(house.flown(tmp_path), [[seq, seq] for seq in range(5)]) as store:
+    """Images that tie its keyframes place them, and make their depth no truer."""
+    with house.flown(tmp_path) as store:
+        store.finish({"frames": 5, "frames_tracked": 5, "apart": [[0, 4]], "false": [[0, 4]]})
         summary = write_deliverables(tmp_path, store, {})
+        set_refinement(store, {"apart": []})
+        assert not main_seqs(store)
     assert summary["counts"]["points"] == 0 and not summary["failed"]
     assert any("5 of 5 keyframes" in note for note in summary["notes"])
     assert not list(tmp_path.glob("piece-*")) and len(laspy.read(tmp_path / "cloud.laz")) == 0
     with ScanView(tmp_path) as view:
-        for kind in ("dsm", "mesh", "las"):
+        for kind in ("dsm", "glb", "laz"):
             with pytest.raises(InputError):
                 export(view, kind, None, ExportOptions())
 
