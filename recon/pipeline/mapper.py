@@ -126,7 +126,7 @@ class Mapper:
         selection = ViewSelection(config.baseline, config.pairs, all_known=known is not None)
         self._waiting = Counter[str]()  # frames since a segment's first one, by reason
         self.views = VirtualStereoCamera(
-            selection, self.odometry, self.undistort.camera, self.undistort.valid, self.refused
+            selection, self.odometry, self.undistort.undistorter, self.refused
         )
         stereo = VirtualStereoConfig(
             min_base_to_height=selection.min_base_to_height, width_px=config.stereo_width_px,

@@ -23,7 +23,7 @@ from recon.stereo.polar import reproject_polar
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import PairDepth, carry, fuse, plausible, reproject
 from recon.stereo.virtual_stereo import at_middle_row, drop_unseen, plane_relief, rectify
-from recon.tracking.frame import Colour, UndistortedFrame
+from recon.tracking.frame import UndistortedFrame
 from recon.tracking.matching import MatchingConfig, build_pyramid
 from recon.types import (
     F32,
@@ -60,11 +60,11 @@ class Undistort:
 
     def __init__(self, camera: Camera, guide_width_px: int, timing: Timing) -> None:
         """Raises ValueError for an unusable camera model."""
-        self._undistorter = Undistorter(_within_width(camera, int(1.3 * guide_width_px)))
+        self.undistorter = Undistorter(_within_width(camera, int(1.3 * guide_width_px)))
         self._timing, self._blur = timing, BlurWatch()
-        self.camera, self.valid = self._undistorter.camera, self._undistorter.valid
+        self.camera = self.undistorter.camera
         self.tracking_camera = _within_width(self.camera, MAX_TRACKING_WIDTH_PX)
-        mask = self.valid
+        mask = self.undistorter.valid
         if self.tracking_camera.size_px != self.camera.size_px:
             size = self.tracking_camera.size_px
             mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST), np.uint8)
@@ -76,16 +76,15 @@ class Undistort:
         with self._timing("undistort"):
             image = _resized(frame.image, self.camera.size_px)
             gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-            gray = self._undistorter.image(gray)
+            gray = self.undistorter.image(gray)
             small, size = gray, self.tracking_camera.size_px
             if size != self.camera.size_px:
                 small = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
             small = stretch(small, self._seen)
             is_blurred = self._blur.blurred(small)
-            colour = Colour(image, self._undistorter)
             pyramid = build_pyramid(small, MatchingConfig().search_levels)
             return UndistortedFrame(
-                frame.seq, frame.time_ns, frame.prior, colour, gray, pyramid, self._mask, is_blurred
+                frame.seq, frame.time_ns, frame.prior, image, gray, pyramid, self._mask, is_blurred
             )
 
 

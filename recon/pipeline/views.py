@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from recon import se3
+from recon.camera_model import Undistorter
 from recon.pipeline.config import TWO_ONLY, Baseline
 from recon.posegraph.pose_priors import FixAverage
 from recon.rolling_shutter import NEAR_S, depth_share, on_image
@@ -24,7 +25,7 @@ from recon.tracking.keyframe_window import landmark_points, median_depth, step_c
 from recon.tracking.known_track import AnyTrack
 from recon.tracking.odometry import Tracked, Tracking
 from recon.tracking.prediction import inverse_depth_plane
-from recon.types import F32, F64, U8, Camera, PosePrior
+from recon.types import F32, F64, U8, PosePrior
 
 KEPT = 6
 """Views remembered as partners; those further back see the ground from too far aside."""
@@ -149,9 +150,9 @@ class ViewSelection:
             self._kept.append(frame)
             return True
         if self._between.maxlen:
-            self._between.append(replace(frame, colour=None))
+            self._between.append(frame)
         elif self._moved_on(frame):
-            self._recent.append(replace(frame, colour=None))
+            self._recent.append(frame)
         return False
 
     def end_stretch(self, frame: UndistortedFrame | None) -> bool:
@@ -267,7 +268,7 @@ class ViewSelection:
     ) -> list[UndistortedFrame]:
         """Partners between half and twice the keyframes' spacing, evenly spread."""
         base = [_apart(v, view) for v in others]
-        steps = [b for v, b in zip(others, base, strict=True) if v.colour is not None]
+        steps = [b for v, b in zip(others, base, strict=True) if v in self._kept]
         spacing = steps[0] if steps else 0.0
         near, far = NEAREST_PARTNER * spacing, FARTHEST_PARTNER * spacing
         good = [v for v, b in zip(others, base, strict=True) if near <= b <= far]
@@ -299,19 +300,19 @@ class VirtualStereoCamera:
         self,
         selection: ViewSelection,
         odometry: AnyTrack,
-        camera: Camera,
-        seen: U8,
+        undistorter: Undistorter,
         refused: Counter[str],
     ) -> None:
-        """``seen`` (H, W) is zero where the undistorted ``camera`` sees nothing."""
-        self.selection = selection
-        self._odometry, self._K, self._seen, self._refused = odometry, camera.K, seen, refused
+        """``undistorter`` takes out the distortion of views in colour."""
+        self.selection, self._undistorter = selection, undistorter
+        self._odometry, self._K, self._refused = odometry, undistorter.camera.K, refused
         self._segment = odometry.segment
         self._fixes = FixAverage()
-        self._waiting: deque[tuple[UndistortedFrame, PosePrior]] = deque()
+        self._waiting: deque[tuple[UndistortedFrame, U8 | None, PosePrior]] = deque()
         self._given: deque[RelativePose] = deque(maxlen=8)
         self._first = -1  # number of the newest view that was given with its first partner
-        self._latest: UndistortedFrame | None = None  # the last tracked frame, unless it is a view
+        # The last tracked frame, unless it is a view, and its image.
+        self._latest: tuple[UndistortedFrame, U8 | None] | None = None
         self._tracked: deque[tuple[int, RelativePose]] = deque(maxlen=TRACKED)  # times and places
 
     def take(self, image: UndistortedFrame, tracked: Tracked) -> tuple[RelativePose | None, bool]:
@@ -324,38 +325,39 @@ class VirtualStereoCamera:
         key = next(key for key in reversed(self._odometry.keyframes) if key.seq <= image.seq)
         T_keyframe_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
         reference = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
-        frame = replace(image, pyramid=(), mask=None, reference=reference, moving=tracked.moving)
+        frame = replace(
+            image, image=None, pyramid=(), mask=None, reference=reference, moving=tracked.moving
+        )
         self._tracked.append((image.time_ns, reference))
         is_view = self.selection.offer(frame, tracked)
         self._fixes.take(tracked.T_odom_camera, image.prior)
         if is_view:
-            self._wait(frame)
-        self._latest = None if is_view else frame
+            self._wait(frame, image.image)
+        self._latest = None if is_view else (frame, image.image)
         return reference, is_view
 
     def end_stretch(self) -> None:
         """Make a view of a stretch's last frame: only it shows what the camera saw last."""
-        if self.selection.end_stretch(self._latest) and self._latest is not None:
-            self._wait(self._latest)
+        frame, image = self._latest or (None, None)
+        if self.selection.end_stretch(frame) and frame is not None:
+            self._wait(frame, image)
         self._fixes.forget()
         self._latest = None
 
-    def _wait(self, view: UndistortedFrame) -> None:
+    def _wait(self, view: UndistortedFrame, image: U8 | None) -> None:
         """Keep a view until its partners are there; all fixes since the last one are its own."""
-        self._waiting.append((view, self._fixes.given(view.T_odom_camera, view.prior)))
+        self._waiting.append((view, image, self._fixes.given(view.T_odom_camera, view.prior)))
 
     def ready(self, everything: bool = False) -> Iterator[StereoView]:
         """The views whose partners are there, in order."""
         while self._waiting and (everything or self._is_ready(self._waiting[0][0])):
-            view, prior = self._waiting.popleft()
+            view, image, prior = self._waiting.popleft()
             if not self.selection.confirmed(view):
                 self._refused[TWO_ONLY] += 1
             elif view.is_blurred:
                 self._refused["blurred"] += 1
             else:
-                assert view.colour is not None
-                partners = self.selection.partners(view)
-                found = self._stereo_view(view, prior, partners, view.colour.take())
+                found = self._stereo_view(view, image, prior, self.selection.partners(view))
                 self._given.append(found.reference)
                 yield found
 
@@ -363,13 +365,11 @@ class VirtualStereoCamera:
         """The newest view with the first frame that shows its depth as the only partner; once."""
         if not self._waiting or self._latest is None:
             return None
-        (view, prior), partner = self._waiting[-1], self._latest
+        (view, image, prior), (partner, _) = self._waiting[-1], self._latest
         if view.seq == self._first or not self.selection.shows_first(partner, view):
             return None
         self._first = view.seq
-        assert view.colour is not None
-        found = self._stereo_view(view, prior, [partner], view.colour.look())
-        return replace(found, is_first=True)
+        return replace(self._stereo_view(view, image, prior, [partner]), is_first=True)
 
     def _is_ready(self, view: UndistortedFrame) -> bool:
         """True when its partners are there, and the images could show the readout."""
@@ -378,10 +378,15 @@ class VirtualStereoCamera:
         return self.selection.ready(view) and not (shows and len(self._waiting) < HELD)
 
     def _stereo_view(
-        self, view: UndistortedFrame, prior: PosePrior, partners: list[UndistortedFrame], bgr: U8
+        self,
+        view: UndistortedFrame,
+        image: U8 | None,
+        prior: PosePrior,
+        partners: list[UndistortedFrame],
     ) -> StereoView:
+        """The view with its ``image``, which is without distortion from now on."""
         reference, points = view.reference, landmark_points(view.keyframe)
-        assert reference is not None
+        assert reference is not None and image is not None
         points = se3.transform(se3.inverse(reference.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         return StereoView(
@@ -389,7 +394,7 @@ class VirtualStereoCamera:
             view.time_ns,
             view.segment,
             prior,
-            replace(self._posed(view, in_odom), bgr=bgr),
+            replace(self._posed(view, in_odom), bgr=self._undistorter.image(image)),
             tuple(self._posed(partner, in_odom) for partner in partners),
             reference,
             points,
@@ -432,7 +437,7 @@ class VirtualStereoCamera:
     def _posed(self, view: UndistortedFrame, points: F64) -> PosedImage:
         """The view in gray with its pose; ``points`` (N, 3) of the odometry are the ground."""
         posed = PosedImage(
-            None, view.gray, self._K, view.T_odom_camera, self._seen,
+            None, view.gray, self._K, view.T_odom_camera, self._undistorter.valid,
             blur_px=self._blur_px(view, points), seq=view.seq,
         )  # fmt: skip
         rows = None if view.moving is None else view.moving.rows

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.camera_model import Undistorter
 from recon.rolling_shutter import FrameRows
 from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.matching import Pyramid
@@ -37,29 +36,9 @@ class RelativePose:
         return RelativePose(self.seq, self.segment, self.T_odom_camera)
 
 
-class Colour:
-    """A frame's image in colour, until its view takes it."""
-
-    def __init__(self, image: U8, undistorter: Undistorter) -> None:
-        """``image`` (H, W, 3) is distorted."""
-        self._image: U8 | None = image
-        self._undistorter = undistorter
-
-    def look(self) -> U8:
-        """(H, W, 3) without distortion."""
-        assert self._image is not None, "a view is given once"
-        return self._undistorter.image(self._image)
-
-    def take(self) -> U8:
-        """As :meth:`look`, once, as the image is not kept."""
-        bgr = self.look()
-        self._image = None
-        return bgr
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class UndistortedFrame:
-    """A frame without distortion.
+    """A frame without distortion but for its image in colour, which only views need.
 
     The odometry adds the motion of its rows. Once it has a pose it may take part in stereo, as a
     view or as a view's partner, and its pose follows its odometry keyframe's.
@@ -68,7 +47,7 @@ class UndistortedFrame:
     seq: int
     time_ns: int
     prior: PosePrior
-    colour: Colour | None  # None for one that is only a partner
+    image: U8 | None  # (H, W, 3) with distortion; None for one that is only a partner
     gray: U8  # (H, W)
     pyramid: Pyramid  # of (h, w) gray, as the odometry takes it; empty once it is tracked
     mask: U8 | None  # (h, w) non-zero where the image is valid; None: everywhere

@@ -21,12 +21,12 @@ from recon.pipeline.views import (
     frames_apart,
 )
 from recon.rolling_shutter import FrameRows, RowClock, Rows
-from recon.tracking.frame import Colour, RelativePose, UndistortedFrame
+from recon.tracking.frame import RelativePose, UndistortedFrame
 from recon.tracking.keyframe_window import Landmarks, OdometryKeyframe
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.tracking.readout_search import ReadoutSearch
-from recon.types import U8, Camera, PosePrior
+from recon.types import Camera, PosePrior
 
 
 def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> UndistortedFrame:
@@ -34,9 +34,8 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Undi
     key = keyframe_at(seq, T, segment)
     image = np.zeros((32, 32, 3), np.uint8)
     reference = RelativePose(seq, segment, np.eye(4), key)
-    colour = Colour(image, Undistorter(Camera(np.diag([30.0, 30.0, 1.0]), np.zeros(5), (32, 32))))
     return UndistortedFrame(
-        seq, seq, PosePrior(), colour, image[..., 0], (), None, blurred, reference
+        seq, seq, PosePrior(), image, image[..., 0], (), None, blurred, reference
     )  # fmt: skip
 
 
@@ -51,13 +50,16 @@ class KnownTrack:
 
 
 def stereo_camera(
-    keys: list[OdometryKeyframe], readout: ReadoutSearch | None = None, shown_s: float = 0.0
+    keys: list[OdometryKeyframe],
+    readout: ReadoutSearch | None = None,
+    shown_s: float = 0.0,
+    undistorter: Undistorter | None = None,
 ) -> VirtualStereoCamera:
     K, size = np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), (32, 32)
     track = KnownTrack(keys, Mock(ExposureWatch, shown_s=shown_s), readout)
     return VirtualStereoCamera(
-        ViewSelection(Baseline()), cast(Odometry, track), Camera(K, np.zeros(5), size),
-        np.ones(size, np.uint8), Counter(),
+        ViewSelection(Baseline()), cast(Odometry, track),
+        undistorter or Undistorter(Camera(K, np.zeros(5), size)), Counter(),
     )  # fmt: skip
 
 
@@ -69,24 +71,26 @@ def offer(
     return taken if views.offer(taken, tracked) else None
 
 
-def test_colour_is_undistorted_when_it_is_taken_and_not_kept() -> None:
+def test_colour_is_undistorted_when_its_view_is_given_and_not_kept() -> None:
     lens = Camera(np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]), np.full(5, 0.05), (32, 32))
-    undistorter, calls = Undistorter(lens), []
-    image = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)
-    want = undistorter.image(image)
-
-    class Counted(Undistorter):
-        def image(self, image: U8) -> U8:
-            calls.append(image.shape)
-            return super().image(image)
-
-    colour = Colour(image, Counted(lens))
-    assert not calls
-    held = weakref.ref(image)
-    np.testing.assert_array_equal(colour.take(), want)
-    assert len(calls) == 1
-    del image
-    assert held() is None
+    undistorter, keys = Mock(wraps=Undistorter(lens)), list[OdometryKeyframe]()
+    undistorter.valid, undistorter.camera = np.ones((32, 32), np.uint8), lens
+    views = stereo_camera(keys, undistorter=undistorter)
+    held = []
+    for i in range(3):
+        plain = frame(i, 5.0 * i)
+        keys.append(plain.keyframe)
+        image = np.random.default_rng(i).integers(0, 255, (32, 32, 3), np.uint8)
+        held.append((weakref.ref(image), Undistorter(lens).image(image)))
+        taken = replace(plain, image=image, reference=None)
+        state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
+        views.take(taken, Tracked(state, 0, plain.T_odom_camera))
+        del image, taken
+    assert not undistorter.image.called and all(there() is not None for there, _ in held)
+    for view, (_, want) in zip(views.ready(everything=True), held, strict=True):
+        np.testing.assert_array_equal(view.bgr, want)
+    undistorter.reset_mock()
+    assert all(there() is None for there, _ in held)
 
 
 def test_automatic_takes_the_odometrys_keyframes() -> None:
@@ -225,7 +229,7 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
         turn = np.array([0.0, 2.0 * i, 0.0, 0.0, 0.0, 0.0])
         moving = FrameRows(i, PosePrior(), np.eye(4), Rows(clock, turn, np.zeros(6)))
         image = UndistortedFrame(
-            i, i, PosePrior(), plain.colour, plain.gray, plain.pyramid, None, False
+            i, i, PosePrior(), plain.image, plain.gray, plain.pyramid, None, False
         )
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
         views.take(image, Tracked(state, 0, plain.T_odom_camera, moving=moving))
@@ -253,7 +257,7 @@ def test_views_wait_for_the_first_word_on_their_readout(
         keys.append(plain.keyframe)
         moving = FrameRows(i, PosePrior(), np.eye(4), is_measured=is_measured)
         image = UndistortedFrame(
-            i, i, PosePrior(), plain.colour, plain.gray, plain.pyramid, None, False
+            i, i, PosePrior(), plain.image, plain.gray, plain.pyramid, None, False
         )
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
         views.take(image, Tracked(state, 0, plain.T_odom_camera, moving=moving))
@@ -274,7 +278,7 @@ def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: f
         plain = frame(i, float(i))
         keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))
         image = UndistortedFrame(
-            i, i * 10**8, PosePrior(), plain.colour, plain.gray, plain.pyramid, None,
+            i, i * 10**8, PosePrior(), plain.image, plain.gray, plain.pyramid, None,
             False,
         )  # fmt: skip
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
@@ -300,7 +304,7 @@ def test_a_view_is_given_once_with_the_first_frame_that_shows_its_depth() -> Non
         if is_key:
             keys.append(plain.keyframe)
         image = UndistortedFrame(
-            seq, seq, PosePrior(), plain.colour, plain.gray, plain.pyramid, None, blurred
+            seq, seq, PosePrior(), plain.image, plain.gray, plain.pyramid, None, blurred
         )
         state = Tracking.TRACKED if not is_key else Tracking.KEYFRAME if seq else Tracking.STARTED
         views.take(image, Tracked(state, 0, plain.T_odom_camera))
