@@ -94,13 +94,19 @@ class BackgroundWorker(Generic[In, Out]):
     """Runs ``work`` on offered items, in order, on a thread of the table.
 
     When the queue is full, :meth:`offer` waits; live, the oldest item that has not begun is dropped
-    instead and counted in :attr:`dropped`. Without a row, :meth:`offer` does the work itself.
+    instead and counted in :attr:`dropped`, if it ``counts``. Without a row, :meth:`offer` does the
+    work itself.
     """
 
     def __init__(
-        self, row: str | None, work: Callable[[In], Out], bound: int, live: bool = False
+        self,
+        row: str | None,
+        work: Callable[[In], Out],
+        bound: int,
+        live: bool = False,
+        counts: Callable[[In], bool] = lambda _: True,
     ) -> None:
-        self._work, self._bound, self._live = work, bound, live
+        self._work, self._bound, self._live, self._counts = work, bound, live, counts
         self._offered: dict[Future[Out], In] = {}  # in order; dropped items leave at once
         self.dropped = 0
         self._began_s: list[float] = []  # start of the current work, if any
@@ -131,7 +137,7 @@ class BackgroundWorker(Generic[In, Out]):
 
     def offer(self, item: In) -> None:
         if self._ends.is_set():
-            self.drop(item)
+            self.dropped += self._counts(item)
             return
         future: Future[Out] = Future()
         self._offered[future] = item
@@ -145,11 +151,7 @@ class BackgroundWorker(Generic[In, Out]):
         if not self._live:
             self._wait(waiting[0])
         elif (late := next((one for one in waiting[1:] if one.cancel()), None)) is not None:
-            self.drop(self._offered.pop(late))
-
-    def drop(self, item: In) -> None:
-        """Count an item that no result comes of."""
-        self.dropped += 1
+            self.dropped += self._counts(self._offered.pop(late))
 
     def finished(self, everything: bool = False) -> list[tuple[In, Out]]:
         """Finished work, in order; ``everything`` waits for the rest.
@@ -160,7 +162,7 @@ class BackgroundWorker(Generic[In, Out]):
         while self._offered:
             future = next(iter(self._offered))
             if everything and not self._wait(future):
-                self.drop(self._offered.pop(future))
+                self.dropped += self._counts(self._offered.pop(future))
                 continue
             if not future.done() or (future.exception() is not None and out):
                 break

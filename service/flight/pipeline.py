@@ -26,12 +26,9 @@ MAX_WAITING = 3
 """Views that wait for reconstruction."""
 
 
-class DenseWorker(BackgroundWorker[StereoView, Reconstructed]):
-    """Of views: one that comes again is not lost when its first depth is."""
-
-    def drop(self, item: StereoView) -> None:
-        if not item.is_first:
-            super().drop(item)
+def counts(view: StereoView) -> bool:
+    """False for a view that comes again: it is not lost when its first depth is."""
+    return not view.is_first
 
 
 def mapper_config(camera: Camera, config: Config, live: bool = False) -> MapperConfig:
@@ -94,8 +91,11 @@ class Pipeline(Mapper):
         )
         self.watch = GraphWatch(self.keyframes.graph)
 
-    def _in_background(self, row: str | None, live: bool, work: Reconstruct) -> DenseWorker:
-        self._background = DenseWorker(row, partial(self._watched, work), MAX_WAITING, live)
+    def _in_background(
+        self, row: str | None, live: bool, work: Reconstruct
+    ) -> BackgroundWorker[StereoView, Reconstructed]:
+        watched = partial(self._watched, work)
+        self._background = BackgroundWorker(row, watched, MAX_WAITING, live, counts)
         return self._background
 
     def _watched(self, work: Reconstruct, view: StereoView) -> Reconstructed:

@@ -18,7 +18,7 @@ from recon.pipeline.mapper import Mapper
 from recon.pipeline.views import StereoView, VirtualStereoCamera
 from recon.types import Camera
 from service.background import BackgroundWorker
-from service.flight.pipeline import DenseWorker
+from service.flight.pipeline import counts
 
 
 def test_results_come_in_order_and_nothing_is_dropped() -> None:
@@ -58,7 +58,7 @@ def test_a_first_depth_that_gives_way_is_no_lost_view() -> None:
     def work(view: StereoView) -> None:
         gate.wait(5)
 
-    jobs = DenseWorker("dense", work, 2, live=True)
+    jobs = BackgroundWorker("dense", work, 2, live=True, counts=counts)
     views = [view_at(seq, np.eye(4)) for seq in range(4)]
     first = replace(views[2], is_first=True)
     for view in (views[0], first, *views[1:3]):  # no more than the queue takes but for the first
