@@ -49,22 +49,16 @@ class MachineReadings:
     memory_free_mib: float | None = None  # below the limit of the service or the machine
 
 
-@dataclass(frozen=True, slots=True)
-class LadderConfig:
-    """Thresholds and times of the steps."""
-
-    hottest_c: float = 90.0
-    cooler_c: float = 8.0  # this far below before stepping up
-    min_memory_mib: float = 300.0  # half of it: directly to the last step
-    late_views: float = 0.25  # tolerated share of late views
-    late_frames: float = 0.6  # tolerated share of missed frames
-    oldest_s: float = 1.5  # tolerated age of a frame when its processing begins
-    hopeless: float = 2.5  # at this multiple: only record
-    patience_s: float = 6.0  # of overload before a step down, and between two
-    heat_patience_s: float = 20.0  # the same for heat: cooling is slow
-    calm_s: float = 30.0  # without overload before a step up; doubled when that failed
-    longest_calm_s: float = 240.0
-    relief: bool = True  # False: always FULL
+COOLER_C = 8.0
+"""So far below ``compute.hottest_c`` a step up is tried."""
+LATE_VIEWS, LATE_FRAMES, OLDEST_S = 0.25, 0.6, 1.5
+"""Tolerated shares of late views and missed frames, and age of a frame as its processing begins."""
+HOPELESS = 2.5
+"""At this multiple of them images are only recorded."""
+PATIENCE_S, HEAT_PATIENCE_S = 6.0, 20.0
+"""Of overload before a step down, and between two; of heat, since cooling is slow."""
+CALM_S, LONGEST_CALM_S = 30.0, 240.0
+"""Without overload before a step up; doubled when that failed, up to the longest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +84,14 @@ class Move:
 class Ladder:
     """The current load level and its transitions."""
 
-    def __init__(self, config: LadderConfig | None = None) -> None:
-        self.config = config or LadderConfig()
+    def __init__(self, config: ComputeConfig) -> None:
+        self.config = config
         self.level = Level.FULL
         self.reason = ""  # cause of the last step down; empty at FULL
         self._strained_s = self._calm_since_s = math.nan  # start times; NaN: not now
         self._moved_s = -math.inf
         self._went_up = False
-        self._calm_s = self.config.calm_s
+        self._calm_s = CALM_S
 
     def update(self, readings: MachineReadings, now_s: float) -> Move | None:
         """The step to take at ``now_s`` of a monotonic clock, if any."""
@@ -123,7 +117,7 @@ class Ladder:
         if self.level >= found.lowest or (waited_s < found.patience_s and not found.jump):
             return None
         if self._went_up and now_s - self._moved_s < 2.0 * self._calm_s:
-            self._calm_s = min(2.0 * self._calm_s, self.config.longest_calm_s)
+            self._calm_s = min(2.0 * self._calm_s, LONGEST_CALM_S)
         self.level = found.lowest if found.jump else Level(self.level + 1)
         self.reason = found.reason
         self._moved_s, self._went_up = now_s, False
@@ -132,8 +126,8 @@ class Ladder:
     def _up(self, now_s: float) -> Move | None:
         calm_s = now_s - max(self._calm_since_s, self._moved_s)
         if self.level is Level.FULL:
-            if calm_s > self.config.longest_calm_s:
-                self._calm_s = self.config.calm_s
+            if calm_s > LONGEST_CALM_S:
+                self._calm_s = CALM_S
             return None
         if calm_s < self._calm_s:
             return None
@@ -144,33 +138,33 @@ class Ladder:
         return Move(self.level, "")
 
 
-def strain(readings: MachineReadings, config: LadderConfig) -> Strain | None:
+def strain(readings: MachineReadings, config: ComputeConfig) -> Strain | None:
     """The overload in ``readings``: memory before heat before lag; None without any."""
     memory, heat = readings.memory_free_mib, readings.temperature_c
-    if memory is not None and memory < config.min_memory_mib:
+    if memory is not None and memory < config.least_memory_mib:
         text = f"{memory:.0f} MiB memory free"
-        short = memory < 0.5 * config.min_memory_mib
-        return Strain(text, config.patience_s, Level.RECORD_ONLY, jump=short)
+        short = memory < 0.5 * config.least_memory_mib
+        return Strain(text, PATIENCE_S, Level.RECORD_ONLY, jump=short)
     if heat is not None and heat > config.hottest_c:
-        return Strain(f"{heat:.0f} degrees", config.heat_patience_s, Level.RECORD_ONLY)
+        return Strain(f"{heat:.0f} degrees", HEAT_PATIENCE_S, Level.RECORD_ONLY)
     if readings.throttled:
-        return Strain("throttled", config.heat_patience_s, Level.NO_UPSAMPLING)
+        return Strain("throttled", HEAT_PATIENCE_S, Level.NO_UPSAMPLING)
     return _lag(readings, config)
 
 
-def _lag(readings: MachineReadings, config: LadderConfig) -> Strain | None:
+def _lag(readings: MachineReadings, config: ComputeConfig) -> Strain | None:
     """The worst lag above its threshold, if any."""
     views, frames = late_shares(readings)
     found = (
-        (views / config.late_views, f"{100 * views:.0f} % of the views late"),
-        (readings.age_s / config.oldest_s, f"images {readings.age_s:.1f} s late"),
-        (frames / config.late_frames, f"{100 * frames:.0f} % of the images missed"),
+        (views / LATE_VIEWS, f"{100 * views:.0f} % of the views late"),
+        (readings.age_s / OLDEST_S, f"images {readings.age_s:.1f} s late"),
+        (frames / LATE_FRAMES, f"{100 * frames:.0f} % of the images missed"),
     )
     times, reason = max(found)
     if times <= 1.0:
         return None
-    lowest = Level.RECORD_ONLY if times > config.hopeless else Level.NO_UPSAMPLING
-    return Strain(reason, config.patience_s, lowest)
+    lowest = Level.RECORD_ONLY if times > HOPELESS else Level.NO_UPSAMPLING
+    return Strain(reason, PATIENCE_S, lowest)
 
 
 def late_shares(readings: MachineReadings) -> tuple[float, float]:
@@ -181,17 +175,17 @@ def late_shares(readings: MachineReadings) -> tuple[float, float]:
     )
 
 
-def is_calm(readings: MachineReadings, config: LadderConfig) -> bool:
+def is_calm(readings: MachineReadings, config: ComputeConfig) -> bool:
     """True when everything is well below its threshold: a step up may be tried."""
     views, frames = late_shares(readings)
     heat, memory = readings.temperature_c, readings.memory_free_mib
     return (
         not readings.throttled
-        and (heat is None or heat < config.hottest_c - config.cooler_c)
-        and (memory is None or memory > 1.5 * config.min_memory_mib)
-        and views < 0.5 * config.late_views
-        and frames < 0.75 * config.late_frames
-        and readings.age_s < 0.5 * config.oldest_s
+        and (heat is None or heat < config.hottest_c - COOLER_C)
+        and (memory is None or memory > 1.5 * config.least_memory_mib)
+        and views < 0.5 * LATE_VIEWS
+        and frames < 0.75 * LATE_FRAMES
+        and readings.age_s < 0.5 * OLDEST_S
     )
 
 
@@ -205,9 +199,3 @@ def lowered(compute: ComputeConfig, level: Level) -> ComputeConfig:
     if level >= Level.NO_UPSAMPLING:
         compute = replace(compute, upsample=False)
     return compute
-
-
-def ladder_config(compute: ComputeConfig) -> LadderConfig:
-    return LadderConfig(
-        hottest_c=compute.hottest_c, min_memory_mib=compute.least_memory_mib, relief=compute.relief
-    )

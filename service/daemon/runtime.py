@@ -23,7 +23,7 @@ from mavlink.wire.first_beat import FirstBeats
 from service.config import Config, reload
 from service.daemon.control_actions import ControlActions
 from service.daemon.health import HealthServer
-from service.daemon.load_shedding import Ladder, MachineReadings, ladder_config
+from service.daemon.load_shedding import Ladder, MachineReadings
 from service.daemon.machine import CoreLoad, Machine, computer_load, read_machine
 from service.daemon.resumption import Landing, LandingWatch
 from service.daemon.scan_state import Event, State
@@ -84,7 +84,7 @@ class Daemon:
         self._cores = CoreLoad()
         self._is_silent = False  # no images arrive, and that was reported
         self.scanning = scanning or Scanning(config)
-        self.ladder = Ladder()
+        self.ladder = Ladder(config.compute)
         self._reported_failure = ""  # of the compute device
         self.actions = ControlActions(self.scanning, self.quit)
         self.vehicle = link(vehicle_config(config), self.actions, first)
@@ -288,7 +288,7 @@ class Daemon:
             throttled=machine.throttled,
             memory_free_mib=machine.memory_left_mib,
         )
-        ladder.config = ladder_config(self.config.compute)
+        ladder.config = self.config.compute
         move = ladder.update(readings, time.monotonic() if now_s is None else now_s)
         if scanning.level is not ladder.level:
             scanning.set_level(ladder.level)

@@ -13,8 +13,11 @@ from hypothesis import strategies as st
 
 from service.config import ComputeConfig
 from service.daemon.load_shedding import (
+    CALM_S,
+    HEAT_PATIENCE_S,
+    LONGEST_CALM_S,
+    PATIENCE_S,
     Ladder,
-    LadderConfig,
     Level,
     MachineReadings,
     Move,
@@ -43,39 +46,44 @@ def run(
 
 
 def test_nothing_happens_while_it_keeps_up() -> None:
-    assert run(Ladder(), lambda _: CALM, 0.0, 1000.0) == []
+    assert run(Ladder(ComputeConfig()), lambda _: CALM, 0.0, 1000.0) == []
 
 
 def test_a_hiccup_is_borne() -> None:
-    hiccup = run(Ladder(), lambda s: LATE if 10 <= s <= 13 else CALM, 0.0, 200.0)
+    hiccup = run(Ladder(ComputeConfig()), lambda s: LATE if 10 <= s <= 13 else CALM, 0.0, 200.0)
     assert hiccup == []
 
 
 def test_lag_steps_down_one_by_one_but_not_to_recording_alone() -> None:
-    moves = run(Ladder(), lambda _: LATE, 0.0, 300.0)
+    moves = run(Ladder(ComputeConfig()), lambda _: LATE, 0.0, 300.0)
     assert [m.level for _, m in moves] == [1, 2, 3]
     assert moves[0][1].text == "Load: lower rate (40 % of the views late)"
     gaps = [b - a for (a, _), (b, _) in pairwise(moves)]
-    assert min(gaps) >= LadderConfig().patience_s
-    assert [m.level for _, m in run(Ladder(), lambda _: HOPELESS, 0.0, 300.0)] == [1, 2, 3, 4]
+    assert min(gaps) >= PATIENCE_S
+    assert [m.level for _, m in run(Ladder(ComputeConfig()), lambda _: HOPELESS, 0.0, 300.0)] == [
+        1,
+        2,
+        3,
+        4,
+    ]
 
 
 def test_it_comes_back_when_the_strain_passes() -> None:
-    ladder = Ladder()
+    ladder = Ladder(ComputeConfig())
     down = run(ladder, lambda _: HOT, 0.0, 100.0)
     assert [m.level for _, m in down] == [1, 2, 3, 4]
-    assert down[0][0] >= LadderConfig().heat_patience_s
+    assert down[0][0] >= HEAT_PATIENCE_S
     warm = replace(CALM, temperature_c=86.0)  # neither too hot nor cool enough
     assert run(ladder, lambda _: warm, 100.0, 400.0) == []
     up = run(ladder, lambda _: CALM, 400.0, 700.0)
     assert [m.level for _, m in up] == [3, 2, 1, 0]
-    assert up[0][0] >= 400.0 + LadderConfig().calm_s
+    assert up[0][0] >= 400.0 + CALM_S
     assert up[-1][1].text == "Load: full quality again"
     assert ladder.reason == ""
 
 
 def test_a_step_up_that_does_not_hold_is_tried_less_and_less_often() -> None:
-    ladder = Ladder()
+    ladder = Ladder(ComputeConfig())
 
     def only_without_full_rate(_: float) -> MachineReadings:
         return LATE if ladder.level is Level.FULL else CALM
@@ -85,7 +93,7 @@ def test_a_step_up_that_does_not_hold_is_tried_less_and_less_often() -> None:
     ups = [s for s, m in moves if m.level is Level.FULL]
     gaps = [b - a for a, b in pairwise(ups)]
     assert gaps == sorted(gaps)
-    assert gaps[-1] > LadderConfig().longest_calm_s
+    assert gaps[-1] > LONGEST_CALM_S
     calm = run(ladder, lambda _: CALM, 2000.0, 3000.0)  # long calm: patience is forgotten
     assert ladder.level is Level.FULL and len(calm) <= 1
     again = run(ladder, lambda s: LATE if s < 3020.0 else CALM, 3000.0, 3150.0)
@@ -94,14 +102,14 @@ def test_a_step_up_that_does_not_hold_is_tried_less_and_less_often() -> None:
 
 def test_memory_goes_straight_to_recording_when_it_is_nearly_gone() -> None:
     short, gone = replace(CALM, memory_free_mib=250.0), replace(CALM, memory_free_mib=100.0)
-    assert [m.level for _, m in run(Ladder(), lambda _: short, 0.0, 18.0)] == [1, 2]
-    moves = run(Ladder(), lambda _: gone, 0.0, 20.0)
+    assert [m.level for _, m in run(Ladder(ComputeConfig()), lambda _: short, 0.0, 18.0)] == [1, 2]
+    moves = run(Ladder(ComputeConfig()), lambda _: gone, 0.0, 20.0)
     assert [(s, m.level) for s, m in moves] == [(0.0, Level.RECORD_ONLY)]
     assert "100 MiB" in moves[0][1].text
 
 
 def test_throttling_never_ends_the_reconstruction() -> None:
-    moves = run(Ladder(), lambda _: replace(CALM, throttled=True), 0.0, 500.0)
+    moves = run(Ladder(ComputeConfig()), lambda _: replace(CALM, throttled=True), 0.0, 500.0)
     assert [m.level for _, m in moves] == [1, 2, 3]
 
 
@@ -115,7 +123,7 @@ def test_throttling_never_ends_the_reconstruction() -> None:
     ],
 )
 def test_the_reason_is_reported(readings: MachineReadings, word: str) -> None:
-    found = strain(readings, LadderConfig())
+    found = strain(readings, ComputeConfig())
     assert (found.reason if found else "") == "" if not word else found and word in found.reason
 
 
@@ -138,7 +146,7 @@ def test_the_reason_is_reported(readings: MachineReadings, word: str) -> None:
 def test_any_readings_move_it_by_whole_steps_within_the_ladder(
     series: list[MachineReadings],
 ) -> None:
-    ladder = Ladder()
+    ladder = Ladder(ComputeConfig())
     for i, readings in enumerate(series):
         before = ladder.level
         move = ladder.update(readings, 2.0 * i)
