@@ -9,12 +9,10 @@ import os
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from mavlink.component.status import ComputerLoad
 from service.scans.retention import existing
-
-if TYPE_CHECKING:
-    from mavlink.component.status import ComputerLoad
 
 THROTTLED_NOW = 0b1111  # Raspberry Pi: under-voltage, frequency capped, throttled, soft limit
 
@@ -75,7 +73,6 @@ class CoreLoad:
 
 def computer_load(machine: Machine, cores: tuple[int, ...], keep_free_mib: float) -> ComputerLoad:
     """The readings in the form sent over MAVLink."""
-    from mavlink.component.status import ComputerLoad
 
     def used(free: float | None, total: float | None) -> int | None:
         return None if free is None or total is None else round(total - free)
