@@ -15,6 +15,7 @@ import struct
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F32, F64, U8, Array, Bool, Camera
 from service.errors import InputError
 from service.georeference import LocalFrame
-from service.sim.recording import SimulationOptions, prepare
+from service.sim.recording import Simulation, SimulationOptions, prepare
 from service.sim.render import Look, Renderer
 from service.sim.scoring import alignments, read_scan
 from service.sim.truth import (
@@ -341,6 +342,23 @@ def view_from_above(
     Raises InputError where it does not, or where its ground was made of photographs, which
     the truth does not hold.
     """
+    simulation = _simulated(truth)
+    rows, cols = shape
+    out = np.empty((rows, cols, 3), np.uint8)
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    bands = -(-rows // BAND_ROWS)
+    for k in range(bands):
+        top, end = k * rows // bands, (k + 1) * rows // bands
+        T[:3, 3] = west_m + 0.5 * cols * cell_m, north_m - 0.5 * (top + end) * cell_m, HEIGHT_M
+        camera = _straight_down(HEIGHT_M / cell_m, cols, end - top)
+        band = Renderer(simulation.scene, simulation.renderer.texture, camera)
+        out[top:end] = band.frame(T, 0, Look(0.0, 0.0, 1.0))
+    return out
+
+
+@cache
+def _simulated(truth: Path) -> Simulation:
+    """The simulation of :func:`view_from_above`, laid out once for all its images."""
     with reading(truth / "params.json"):
         options = options_of(json.loads((truth / "params.json").read_text())["options"])
     if options.photos is not None:
@@ -351,17 +369,7 @@ def view_from_above(
     same = vertices.shape == scene.vertices.shape and triangles.shape == scene.triangles.shape
     if not (same and np.abs(vertices - scene.vertices).max() < 0.01):
         raise InputError(f"{truth}: made by another version of simulate; simulate it again")
-    rows, cols = shape
-    out = np.empty((rows, cols, 3), np.uint8)
-    T = np.diag([1.0, -1.0, -1.0, 1.0])
-    bands = -(-rows // BAND_ROWS)
-    for k in range(bands):
-        top, end = k * rows // bands, (k + 1) * rows // bands
-        T[:3, 3] = west_m + 0.5 * cols * cell_m, north_m - 0.5 * (top + end) * cell_m, HEIGHT_M
-        camera = _straight_down(HEIGHT_M / cell_m, cols, end - top)
-        band = Renderer(scene, simulation.renderer.texture, camera)
-        out[top:end] = band.frame(T, 0, Look(0.0, 0.0, 1.0))
-    return out
+    return simulation
 
 
 def _straight_down(focal_px: float, cols: int, rows: int) -> Camera:

@@ -3,7 +3,8 @@
     PYTHONPATH=tests/bench python tests/bench/product_sheets.py OUT SCAN FLIGHT [SCAN FLIGHT ...]
         [--before FOLDER ...]
 
-Writes ``OUT/index.html`` and its images. Products that a scan lacks are made first. ``--before``
+Writes ``OUT/index.html`` and its images, of the roof edges (where there is truth, its own) also
+one image, ``OUT/edges-SCAN.png``. Products that a scan lacks are made first. ``--before``
 is a folder of products of an older version, one per scan. ``FLIGHT`` is a folder of ``simulate``,
 or a video or folder of stills without truth.
 """
@@ -71,12 +72,9 @@ def from_above(folder: Path, grid: Grid, low_high_m: F64) -> Images:
 
 def truth_from_above(truth: Truth, fit: Fit, grid: Grid, low_high_m: F64) -> Images:
     """The same of the place that was flown over; ``fit`` takes the scan's places to it."""
-    cell_m, frame = grid.cell_m, truth.frame
-    utm = np.column_stack([_middles(grid), np.full(grid.shape[0] * grid.shape[1], low_high_m[0])])
-    moved = fit.points(frame.from_utm(utm))
-    places, off_m = moved[:, :2], float(np.median(utm[:, 2] - moved[:, 2]))
-    height = heights_below(truth.surface, places).reshape(grid.shape) + off_m
-    out = {"dsm": relief(height.astype(np.float32), cell_m, low_high_m)}
+    cell_m = grid.cell_m
+    places, height = true_heights(truth, fit, grid, float(low_high_m[0]))
+    out = {"dsm": relief(height, cell_m, low_high_m)}
     (west, south), (east, north) = places.min(axis=0) - cell_m, places.max(axis=0) + cell_m
     shape = round((north - south) / cell_m) + 1, round((east - west) / cell_m) + 1
     try:
@@ -85,6 +83,16 @@ def truth_from_above(truth: Truth, fit: Fit, grid: Grid, low_high_m: F64) -> Ima
         return out
     px = (places - [west, north]) / [cell_m, -cell_m] - 0.5
     return out | {"ortho": _warped(image, px, grid)}
+
+
+def true_heights(truth: Truth, fit: Fit, grid: Grid, level_m: float) -> tuple[F64, F32]:
+    """(rows * cols, 2) true places of a grid of the map, and (rows, cols) the map's heights there;
+    the places are those of about ``level_m``."""
+    utm = np.column_stack([_middles(grid), np.full(grid.shape[0] * grid.shape[1], level_m)])
+    moved = fit.points(truth.frame.from_utm(utm))
+    places, off_m = moved[:, :2], float(np.median(utm[:, 2] - moved[:, 2]))
+    height = heights_below(truth.surface, places).reshape(grid.shape) + off_m
+    return places, height.astype(np.float32)
 
 
 def _warped(image: U8, px: F64, grid: Grid) -> U8:
@@ -138,8 +146,8 @@ def window(middle: F64, cell_m: float, size_px: int) -> Grid:
 
 
 def edges(height_m: F32, grid: Grid) -> list[tuple[F64, float]]:
-    """Middles on the map and heights of straight steps of the surface, the longest first, apart
-    from each other."""
+    """Middles on the map and heights of straight steps of a surface (unknown cells are NaN), the
+    longest first, apart from each other."""
     high, low = highest_lowest(height_m, 1)
     step = (high - low > EDGE_STEP_M) & (height_m > 0.5 * (high + low))
     least = EDGE_M / grid.cell_m
@@ -241,7 +249,11 @@ def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) ->
             for kind in seen["now"]
         }
 
-    roofs = edges(height, own) or [(np.mean(_middles(own), axis=0), float(low_high_m[0]))]
+    steps = height
+    if truth is not None and fit is not None:
+        true = true_heights(truth, fit, own, float(low_high_m[0]))[1]
+        steps = np.where(np.isfinite(height), true, np.float32(np.nan))
+    roofs = edges(steps, own) or [(np.mean(_middles(own), axis=0), float(low_high_m[0]))]
     page.parts.append(f"<h2>{name}: from above, {cell_m:g} m a pixel</h2>")
     chosen: list[F64] = []
     for place, _ in roofs:
@@ -252,10 +264,14 @@ def add_flight(page: Page, scan: ScanView, flight: Path, before: Path | None) ->
             page.row(images)
     page.parts.append(f"<h2>{name}: roof edges, the frame laid on the roof's level first</h2>")
     views = shared_images(scan, options)
+    sheet = []
     for place, height_m in roofs:
         grid = window(place, cell_m, EDGE_PX)
         ours = rows(grid)
-        page.row(frame_on_plane(scan.frame, views, grid, height_m) | ours["ortho"] | ours["dsm"])
+        row = frame_on_plane(scan.frame, views, grid, height_m) | ours["ortho"] | ours["dsm"]
+        sheet.append(np.hstack([np.pad(one, ((2, 2), (2, 2), (0, 0))) for one in row.values()]))
+        page.row(row)
+    cv2.imwrite(str(page.out / f"edges-{folder.name}.png"), np.vstack(sheet))
     page.parts.append(f"<h2>{name}: mesh and splats from five sides</h2>")
     utm = np.array([[*chosen[0], low_high_m[0]]])
     target = (utm if scan.frame is None else scan.frame.from_utm(utm))[0]
