@@ -13,6 +13,8 @@ from house_flight import HouseFlight
 from person import Browser
 from portal_client import NEEDS, browser, flown_store, listing
 
+from service.stream.codec import encode
+
 if TYPE_CHECKING:
     from playwright.sync_api import Route
 
@@ -62,13 +64,27 @@ def test_a_card_names_place_and_date_and_shows_the_ground_alone(
         assert 0.5 < known / (wide * high) <= 1.0 and red > 0.01 * known  # the roof
 
 
+@pytest.mark.slow
 def test_a_card_shows_the_ground_while_the_scan_grows(
     browser: Browser, tmp_path: Path, house: HouseFlight
 ) -> None:
-    with house.flown(tmp_path / "drone-1/test-1"), listing(browser, tmp_path, 1):
+    held: list[Route] = []
+    with house.flown(tmp_path / "drone-1/test-1") as scan, listing(browser, tmp_path, 1):
         wide, high, known, red = browser.wait(THUMBNAIL)
         assert max(wide, high) > 240 and known / (wide * high) > 0.3 and red > 0.01 * known
         assert browser.run("document.querySelector('.thumbnail img').alt").endswith("so far")
+        browser.page.route("**/thumbnail.png*", lambda route: held.append(route))
+        one = house.keyframe(9, 50.0)
+        scan.add_keyframe(9, encode(one, one.time_ns))
+        browser.wait("document.querySelector('.facts').textContent.includes('6 keyframes')")
+        assert browser.run(THUMBNAIL) == [wide, high, known, red]  # until the next one is here
+        for _ in range(1200):
+            if held:
+                break
+            browser.page.wait_for_timeout(50)
+        held[0].continue_()
+        browser.wait(f"{THUMBNAIL}?.join() !== '{wide},{high},{known},{red}'")
+        browser.page.unroute_all(behavior="ignoreErrors")
 
 
 def test_the_map_outlines_scans_and_lists_those_at_a_place(browser: Browser, store: Path) -> None:

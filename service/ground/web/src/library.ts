@@ -112,8 +112,14 @@ function kept(old: Card | undefined, s: api.Scan, again: () => void, overview: O
   return { content, element };
 }
 
-/** Opens and focuses in `now` what is open and focused in `old`, and takes over its jobs. */
+/** Opens and focuses in `now` what is open and focused in `old`, and takes over its jobs; its image until there is another. */
 function leaveAsFound(old: HTMLElement, now: HTMLElement): void {
+  const [was, is] = [old, now].map((one) => one.querySelector<HTMLImageElement>(".thumbnail img"));
+  if (was?.naturalWidth && is && was.src !== is.src) {
+    is.replaceWith(was);
+    is.loading = "eager"; // out of the page
+    void is.decode().then(() => was.replaceWith(is), () => (was.replaceWith(is), is.onerror?.("")));
+  }
   now.querySelector("details")!.open = old.querySelector("details")!.open;
   const focused = old.contains(document.activeElement) ? document.activeElement : null;
   now.querySelector(".made")!.replaceWith(old.querySelector(".made")!);
