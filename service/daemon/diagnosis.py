@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
 from http.client import HTTPException
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -226,7 +227,8 @@ def examine_compute(config: Config, by: Choice | None = None) -> Iterator[Findin
     start = time.monotonic()
     try:
         backend = open_backend(config.compute, by=by or Choice())
-    except SkyreliefError as error:
+        import_module("recon.stereo.belief_propagation")  # a scan's kernels; opening loads none
+    except (SkyreliefError, ImportError) as error:
         yield Finding("compute", BAD, str(error))
         return
     seconds = time.monotonic() - start

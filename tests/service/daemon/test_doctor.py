@@ -16,7 +16,7 @@ from paths import DEMO
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import load_config
-from service.daemon.diagnosis import BAD, GOOD, NOTE, examine, examine_software
+from service.daemon.diagnosis import BAD, GOOD, NOTE, examine, examine_compute, examine_software
 
 
 def findings(*overrides: str, listen_s: float = 0.1) -> dict[str, tuple[str, str]]:
@@ -173,6 +173,12 @@ def test_the_boards_settings_are_compared() -> None:
 def test_kernels_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.daemon.diagnosis.is_warm", lambda: True)
     assert findings()["kernels"][0] == GOOD
+
+
+def test_kernels_that_cannot_be_loaded_are_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "recon.stereo.belief_propagation", None)
+    (found,) = examine_compute(load_config(None, ["compute.backend=cpu"]))
+    assert found.verdict == BAD and "belief_propagation" in found.text
 
 
 def test_what_a_running_service_holds_is_asked_of_it(tmp_path: Path) -> None:
