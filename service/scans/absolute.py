@@ -13,7 +13,7 @@ from service.scans.trust import depth_share
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
-MOST_POSES = 5000
+MAX_POSES = 5000
 """Of the track, that are asked; sigma of the position changes slowly along it."""
 
 
@@ -22,7 +22,7 @@ class SharedSigma:
 
     def __init__(self, poses: Sequence[PoseRecord], share: float) -> None:
         """``share`` of a depth is its sigma by scale and lens."""
-        poses = poses[:: 1 + len(poses) // MOST_POSES]
+        poses = poses[:: 1 + len(poses) // MAX_POSES]
         places = np.array([p.T_world_camera[:3, 3] for p in poses])
         self._near, self._up_m = cKDTree(places[:, :2]), places[:, 2]
         self._sigma_m = np.array([p.sigma_h_v_m[1] for p in poses])
