@@ -202,7 +202,7 @@ class ScanRun:
             vehicle.statustext(text, WARNING)
         self._news_reported = len(gate.warnings)
         vehicle.record(inputs.folder / "link.tlog", inputs.unix_offset_ns)
-        link.take_off(store, self._config, vehicle)
+        link.begin_scan(store, self._config, vehicle)
         self.store, self.gate, self.scan = store, gate, scan
         self.follow(self._config, self._level)
         vehicle.statustext(f"Scan {inputs.scan_id} started")

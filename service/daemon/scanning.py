@@ -160,7 +160,7 @@ class Scanning:
             if worker is not None:
                 worker.join(1.0)
             self._writings.wait(1.0)
-        self.link.rest(self.config.datalink.drain_s, wait)
+        self.link.end_backlog(self.config.datalink.drain_s, wait)
 
     # ---- state ------------------------------------------------------------------------------
 
@@ -280,17 +280,17 @@ class Scanning:
     def _write_files(self, folder: Path, store: ScanStore) -> None:
         """Write a scan's files, in the background when another scan is wanted meanwhile."""
 
-        def land() -> None:
+        def end_sender() -> None:
             is_last = self.life.state in (State.ENDING, State.ENDED)
-            self.link.land(self.config, is_last=is_last)
+            self.link.end_scan(self.config, is_last=is_last)
 
         self._writings.write(
-            folder, store, lambda: self.life.state.is_wanted, land, self._hand_over
+            folder, store, lambda: self.life.state.is_wanted, end_sender, self._hand_over
         )
 
     def _hand_over(self) -> Work | None:
         """Release a scan whose files are being written; returns the work that ends with them."""
-        self.link.land(self.config, in_haste=True)
+        self.link.end_scan(self.config, is_next_wanted=True)
         with self._lock:
             work, self._closing = self._closing, None
         return work

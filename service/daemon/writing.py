@@ -70,12 +70,12 @@ class Writings:
             writing.done.wait(seconds)
 
     def write(
-        self, folder: Path, store: ScanStore, in_haste: Callable[[], bool],
-        land: Callable[[], None], hand_over: Callable[[], Work | None],
+        self, folder: Path, store: ScanStore, is_next_wanted: Callable[[], bool],
+        end_sender: Callable[[], None], hand_over: Callable[[], Work | None],
     ) -> None:  # fmt: skip
-        """Write a scan's files, then ``land`` its sender and close its store.
+        """Write a scan's files, then ``end_sender`` and close its store.
 
-        While ``in_haste`` reports that another scan is wanted, no scan waits for the files:
+        While ``is_next_wanted`` reports that another scan is wanted, no scan waits for the files:
         ``hand_over`` ends the sender, and the work that it returns is finished with the files.
         Raises OutsideError when they cannot be written.
         """
@@ -83,13 +83,13 @@ class Writings:
         self._all.append(writing)
         writing.worker = PROCESS.start("files", lambda _: self._write(writing))
         while not writing.done.wait(0.1):
-            if in_haste():
+            if is_next_wanted():
                 with self._lock:
                     if not writing.done.is_set():
                         writing.work, writing.is_left = hand_over(), True
                         return
         self._all.remove(writing)
-        land()
+        end_sender()
         store.close()
         if writing.fault:
             raise OutsideError(writing.fault)

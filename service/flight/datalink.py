@@ -87,58 +87,60 @@ def deliver(sender: DatalinkSender, max_s: float, wait: Callable[[], None] = lam
 
 
 class DaemonLink:
-    """The datalink over a daemon's life: a scan's sender while one is flown, else the backlog.
+    """The datalink over a daemon's life: a scan's sender while one runs, else the backlog.
 
     Safe between threads; nothing here waits for the link.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self.flying: DatalinkSender | None = None  # the sender of the scan that is flown
+        self.sender: DatalinkSender | None = None  # of the running scan
         self.backlog: DatalinkSender | None = None
-        self._is_wanted = False  # the backlog
+        self._wants_backlog = False
         self._serial = 0  # of the last wish for the backlog
         self._radio: VehicleRadio | None = None
 
-    def take_off(self, store: ScanStore, config: Config, vehicle: VehicleLink) -> None:
+    def begin_scan(self, store: ScanStore, config: Config, vehicle: VehicleLink) -> None:
         """Send a scan, in place of the backlog, to the ground stations that are configured.
 
         Where that cannot be done, the operator is warned, and the scan is only stored.
         """
-        self.rest()
+        self.end_backlog()
         if config.datalink.radio == OWN_LINKS and self._radio is None:
             from service.radio import VehicleRadio
 
             self._radio = VehicleRadio(vehicle)
         try:
-            self.flying = open_datalink(store, config, self._radio)
+            self.sender = open_datalink(store, config, self._radio)
         except SkyreliefError as error:
             log.error("the scan is only stored: %s", error)
             vehicle.statustext(f"Scan is only stored: {error}", WARNING)
 
-    def land(self, config: Config, in_haste: bool = False, is_last: bool = False) -> None:
-        """End the scan's sender. The backlog sends the rest. By radio alone there is no backlog:
-        then wait for the rest, unless the next scan is ``in_haste``. So does the ``is_last`` of
-        the process, as :func:`deliver` says."""
-        sender, self.flying = self.flying, None
+    def end_scan(self, config: Config, is_next_wanted: bool = False, is_last: bool = False) -> None:
+        """End the scan's sender; the backlog sends the rest.
+
+        By radio alone there is no backlog: wait for the rest, unless another scan
+        ``is_next_wanted``. The ``is_last`` scan of the process waits, too (:func:`deliver`).
+        """
+        sender, self.sender = self.sender, None
         if sender is None:
             return
         has_backlog = config.datalink.connect or config.datalink.listen
-        if not (in_haste or has_backlog):
+        if not (is_next_wanted or has_backlog):
             sender.drain(config.datalink.drain_s)
         elif is_last:
             deliver(sender, config.datalink.drain_s)
         sender.close()
 
     def offer_backlog(self, config: Config, is_idle: Callable[[], bool] = lambda: True) -> None:
-        """Send earlier scans that the ground lacks until :meth:`take_off` or :meth:`rest`.
+        """Send earlier scans that the ground lacks, while ``is_idle`` is true.
 
-        Only while ``is_idle`` is true.
+        Ends with :meth:`begin_scan` or :meth:`end_backlog`.
         """
         with self._lock:
-            if self._is_wanted or not is_idle():
+            if self._wants_backlog or not is_idle():
                 return
-            self._is_wanted = True
+            self._wants_backlog = True
             self._serial += 1
             serial = self._serial
         PROCESS.start("backlog", lambda _: self._open_backlog(config, serial))
@@ -151,16 +153,16 @@ class DaemonLink:
             log.error("earlier scans are not offered: %s", error)
             return
         with self._lock:
-            if self._is_wanted and self._serial == serial:
+            if self._wants_backlog and self._serial == serial:
                 self.backlog, sender = sender, None
         if sender is not None:
             sender.close()
 
-    def rest(self, deliver_s: float = 0.0, wait: Callable[[], None] = lambda: None) -> None:
+    def end_backlog(self, deliver_s: float = 0.0, wait: Callable[[], None] = lambda: None) -> None:
         """End the backlog, after :func:`deliver` if it may take a while; a separate thread closes
         the rest."""
         with self._lock:
-            self._is_wanted = False
+            self._wants_backlog = False
             sender, self.backlog = self.backlog, None
         if sender is not None:
             if deliver_s:
@@ -170,6 +172,6 @@ class DaemonLink:
 
     def follow(self, config: Config) -> None:
         """Keep to another budget, also in flight."""
-        for sender in (self.flying, self.backlog):
+        for sender in (self.sender, self.backlog):
             if sender is not None:
                 sender.set_budget(config.datalink.budget_kbit_s, config.datalink.share)

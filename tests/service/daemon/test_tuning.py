@@ -174,7 +174,7 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         run = scanning.run
         assert run is not None
         run.gate = FrameGate(FakeCamera((160, 90)), tmp_path, 0, run.alive, scanning.paused)
-        run.scan, scanning.link.flying = scan, link  # type: ignore[assignment]
+        run.scan, scanning.link.sender = scan, link  # type: ignore[assignment]
         operator.set("SR_LINK_KBIT_S", 64.0)
         assert link.budgets[-1] == (64.0, operator.config.datalink.share)
         operator.set("SR_BASELINE_M", 2.5)
@@ -184,7 +184,7 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         assert scan.check.exposed_ns(3 * 10**9) == 3 * 10**9 - 70_000_000
         operator.set("SR_YAW_FRAME", 2.0)
         assert operator.daemon.vehicle.history.config.yaw_frame == "earth"
-        scanning.link.flying = None
+        scanning.link.sender = None
         scanning.end()
         scan.pipeline.finish()
 

@@ -64,8 +64,8 @@ def test_at_the_end_the_ground_gets_the_rest_or_what_it_lacks_is_said(
 ) -> None:
     datalink = dataclasses.replace(Config().datalink, connect=("tcp/10.0.0.1:1",), drain_s=0.05)
     link = DaemonLink()
-    link.flying = cast(DatalinkSender, sender)
-    link.land(dataclasses.replace(Config(), datalink=datalink), is_last=True)
+    link.sender = cast(DatalinkSender, sender)
+    link.end_scan(dataclasses.replace(Config(), datalink=datalink), is_last=True)
     assert sender.closed and left in (None, sender.lacking)
     said = f"the ground lacks {sender.lacking} items; the next start sends them"
     assert [r.message for r in caplog.records] == ([said] if sender.lacking else [])
@@ -80,8 +80,8 @@ def test_a_datalink_that_cannot_be_used_stops_no_scan(tmp_path: Path, drone: str
     header = ScanHeader("one", drone, 1, run_id="0" * 32)
     with ScanStore.create(tmp_path / "scan.db", header) as store:
         link = DaemonLink()
-        link.take_off(store, dataclasses.replace(Config(), datalink=config), vehicle)
-        assert link.flying is None and vehicle.said[0].startswith("Scan is only stored: ")
+        link.begin_scan(store, dataclasses.replace(Config(), datalink=config), vehicle)
+        assert link.sender is None and vehicle.said[0].startswith("Scan is only stored: ")
         assert not [w for w in running() if w["name"].startswith(("datalink", "radio"))]
 
 
@@ -158,27 +158,27 @@ def test_the_daemon_offers_earlier_scans_between_flights(tmp_path: Path) -> None
         link.offer_backlog(config)
         assert complete("one")
         flown = ScanStore.create(scans / "two" / "scan.db", ScanHeader("two", "red", 1))
-        link.take_off(flown, config, vehicle)
-        assert link.flying is not None and link.backlog is None
+        link.begin_scan(flown, config, vehicle)
+        assert link.sender is not None and link.backlog is None
         changed = dataclasses.replace(config.datalink, budget_kbit_s=123.0, share=0.5)
         link.follow(dataclasses.replace(config, datalink=changed))
-        assert isinstance(link.flying, DatalinkSender)
-        sender = link.flying
+        assert isinstance(link.sender, DatalinkSender)
+        sender = link.sender
         until(lambda: sender.progress.rate_kbit_s == 61.5)
         flown.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
         flown.finish({})
-        link.land(config)  # at once: the ground cannot have everything yet
+        link.end_scan(config)  # at once: the ground cannot have everything yet
         flown.close()
         link.offer_backlog(config)
         assert complete("two")
-        link.rest()
+        link.end_backlog()
         flown = ScanStore.create(scans / "three" / "scan.db", ScanHeader("three", "red", 1))
-        link.take_off(flown, config, vehicle)
+        link.begin_scan(flown, config, vehicle)
         flown.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
         flown.finish({})
-        link.land(config, is_last=True)  # waits: no backlog will follow
+        link.end_scan(config, is_last=True)  # waits: no backlog will follow
         assert delivered(flown)
         flown.close()
     finally:
-        link.rest()
+        link.end_backlog()
         ground.close()

@@ -362,7 +362,7 @@ def test_through_the_vehicles_own_serial_port_heeding_its_radio(tmp_path: Path) 
     config = DatalinkConfig(radio=OWN_LINKS, radio_share=1.0)
     link = DaemonLink()
     try:
-        link.take_off(store, Config(datalink=config), vehicle)
+        link.begin_scan(store, Config(datalink=config), vehicle)
         store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
         full = dialect.MAVLink_radio_status_message(200, 200, 3, 50, 50, 0, 0)
         radio = dialect.MAVLink(None, 51, 68)
@@ -377,11 +377,11 @@ def test_through_the_vehicles_own_serial_port_heeding_its_radio(tmp_path: Path) 
                     message = listener.decode(bytearray(packet.data))
                     payload = bytes(message.payload[: message.payload_length])
                     found += [item for item in intake.receive(payload) if item[1] != "pose"]
-        sender = link.flying
+        sender = link.sender
         assert isinstance(sender, DatalinkSender) and sender._radio is not None
         assert sender._radio._tunnel._factor < 1.0  # the full buffer was heard
     finally:
-        link.land(Config(datalink=dataclasses.replace(config, drain_s=0.0)))
+        link.end_scan(Config(datalink=dataclasses.replace(config, drain_s=0.0)))
         vehicle.stop()
         store.close()
         os.close(ours)

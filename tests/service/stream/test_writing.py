@@ -40,12 +40,16 @@ class Landing:
         self.reported: list[str] = []
         self.asked: list[str] = []
         self.work = Work()
-        self.in_haste = threading.Event()
+        self.is_next_wanted = threading.Event()
         self.writings = Writings(self.reported.append, files)
 
     def write(self) -> None:
         self.writings.write(
-            self.store.path.parent, self.store, self.in_haste.is_set, self._land, self._hand_over
+            self.store.path.parent,
+            self.store,
+            self.is_next_wanted.is_set,
+            self._land,
+            self._hand_over,
         )
 
     def _land(self) -> None:
@@ -103,7 +107,7 @@ def test_what_went_wrong_with_them_is_raised(slow: Slow, landing: Landing) -> No
 
 
 def test_another_scan_does_not_wait_for_them(slow: Slow, landing: Landing) -> None:
-    landing.in_haste.set()
+    landing.is_next_wanted.set()
     landing.write()
     assert landing.asked == ["hand over"]
     assert landing.is_open
@@ -120,7 +124,7 @@ def test_another_scan_does_not_wait_for_them(slow: Slow, landing: Landing) -> No
 
 def test_a_fault_during_another_scan_is_reported(slow: Slow, landing: Landing) -> None:
     slow.error = OutsideError("the disk is full")
-    landing.in_haste.set()
+    landing.is_next_wanted.set()
     landing.write()
     slow.may_end.set()
     until(lambda: landing.work.answer)
