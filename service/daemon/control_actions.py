@@ -165,7 +165,7 @@ class ControlActions:
     def parameter_changed(self, name: str, value: float) -> Answer:
         """Apply a new value of a parameter, or refuse it with the reason."""
         try:
-            self._scanning.follow(lambda config: with_parameter(config, name, value))
+            self._scanning.configure(lambda config: with_parameter(config, name, value))
         except InputError as error:
             return Answer(Result.DENIED, str(error))
         return ACCEPTED

@@ -248,7 +248,7 @@ class Daemon:
             self._wanted = wanted
             return config
 
-        self.scanning.follow(change)
+        self.scanning.configure(change)
         tuned = parameters_of(self.config).items()
         self.vehicle.show_parameters({n: v for n, v in tuned if TUNABLES[n].key in taken})
         log.info("configuration: now in force: %s", ", ".join(taken) or "nothing new")
@@ -320,7 +320,7 @@ class Daemon:
         """Report why the scan does not grow, and when it does again."""
         run = self.scanning.run
         if run is not None and not self.scanning.life.state.is_closing:
-            for text in run.camera_news():
+            for text in run.new_camera_warnings():
                 self.vehicle.statustext(f"Camera: {text}", WARNING)
         was_silent, self._is_silent = self._is_silent, self.scanning.silent_s > STUCK_S
         if self._is_silent and not was_silent:

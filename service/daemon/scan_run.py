@@ -71,12 +71,12 @@ class ScanRun:
         self.store: ScanStore | None = None
         self.thread_id = 0
         self.started_s = self.progress_s = clock_s()
-        self._with, self._is_asked, self._opener = equipment, is_asked, opener
+        self._equipment, self._is_asked, self._opener = equipment, is_asked, opener
         self._config, self._level, self._clock_s = equipment.config, equipment.level, clock_s
         self._is_feeding = False  # frames go into the scan
         self._has_grown = False
         self._counted = MachineReadings()
-        self._news_reported = 0  # camera warnings reported so far
+        self._warnings_reported = 0  # camera warnings reported so far
         self._photos: set[int] = set()  # times of the frames that were reported as photos
 
     @property
@@ -96,11 +96,11 @@ class ScanRun:
     def alive(self) -> None:
         self.progress_s = self._clock_s()
 
-    def camera_news(self) -> list[str]:
+    def new_camera_warnings(self) -> list[str]:
         """Camera warnings since the last call."""
         gate = self.gate
-        fresh = [] if gate is None else gate.warnings[self._news_reported :]
-        self._news_reported += len(fresh)
+        fresh = [] if gate is None else gate.warnings[self._warnings_reported :]
+        self._warnings_reported += len(fresh)
         return fresh
 
     def closing_marks(self) -> tuple[Any, ...]:
@@ -110,7 +110,7 @@ class ScanRun:
             return ()
         return (store.uses(self.thread_id), scan.recorder.keyframes)
 
-    def follow(self, config: Config, level: Level) -> None:
+    def configure(self, config: Config, level: Level) -> None:
         """Use the live keys of ``config``, reduced to a load level."""
         self._config, self._level = config, level
         scan, gate = self.scan, self.gate
@@ -179,7 +179,7 @@ class ScanRun:
             except OutsideError as error:
                 log.warning("%s; trying again", error)
                 text = f"Camera: {error}"
-                self._with.vehicle.statustext(text, WARNING, is_answer=is_answer)
+                self._equipment.vehicle.statustext(text, WARNING, is_answer=is_answer)
                 is_answer = False
                 # A source that listens for a sender is open again at once.
                 self.stop.wait(max(0.0, began_s + wait_s - time.monotonic()))
@@ -189,7 +189,7 @@ class ScanRun:
     def _scan(self, source: CameraSource) -> None:
         from service.flight.scan import Scan, create_store
 
-        vehicle, link = self._with.vehicle, self._with.link
+        vehicle, link = self._equipment.vehicle, self._equipment.link
         inputs, gate = self._inputs(source)
         store = create_store(inputs)
         with ExitStack() as on_fault:  # nothing is sent or recorded of a scan that cannot begin
@@ -200,11 +200,11 @@ class ScanRun:
         gate.warnings += clocks
         for text in (*inputs.notes, *clocks):
             vehicle.statustext(text, WARNING)
-        self._news_reported = len(gate.warnings)
+        self._warnings_reported = len(gate.warnings)
         vehicle.record(inputs.folder / "link.tlog", inputs.unix_offset_ns)
         link.begin_scan(store, self._config, vehicle)
         self.store, self.gate, self.scan = store, gate, scan
-        self.follow(self._config, self._level)
+        self.configure(self._config, self._level)
         vehicle.statustext(f"Scan {inputs.scan_id} started")
         try:
             self._feed(scan)
@@ -215,7 +215,7 @@ class ScanRun:
                 gate.warnings += set_since(inputs.unix_offset_ns, vehicle.unix_offset_ns())
                 self._close_scan(scan, store)
             finally:
-                self._with.write_files(inputs.folder, store)
+                self._equipment.write_files(inputs.folder, store)
 
     def _inputs(self, source: CameraSource) -> tuple[ScanInputs, FrameGate]:
         from service.cameras.camera_file import seeks_readout
@@ -225,9 +225,9 @@ class ScanRun:
         from service.flight.scan import ScanInputs
         from service.flight.vehicle_reports import OdometryReport
 
-        vehicle, config, backend = self._with.vehicle, self._config, self._with.backend
-        assert self._with.camera is not None and backend is not None
-        camera, notes = fitted(self._with.camera, source)
+        vehicle, config, backend = self._equipment.vehicle, self._config, self._equipment.backend
+        assert self._equipment.camera is not None and backend is not None
+        camera, notes = fitted(self._equipment.camera, source)
         scans = Path(config.scan.folder)
         earlier = measured(scans, source.description, source.size_px)
         if earlier.shutter is not None and seeks_readout(camera, config.camera):
@@ -239,8 +239,10 @@ class ScanRun:
         odometry = OdometryReport(config.camera, vehicle.report_odometry).send
         unix_s = 1e-9 * (now_ns + offset_ns)
         folder = new_folder(scans, unix_s)
-        self._with.made.add(folder.name)
-        gate = FrameGate(source, folder / LATER, zero_ns + offset_ns, self.alive, self._with.paused)
+        self._equipment.made.add(folder.name)
+        gate = FrameGate(
+            source, folder / LATER, zero_ns + offset_ns, self.alive, self._equipment.paused
+        )
         inputs = ScanInputs(
             gate,
             camera,
@@ -266,11 +268,11 @@ class ScanRun:
         """Feed frames into the scan until it is stopped or the recording ends."""
         event, self._is_feeding = Event.INTERRUPTED, True
         try:
-            scan.run(self.stop, self._on_frame, self._with.paused)
+            scan.run(self.stop, self._on_frame, self._equipment.paused)
             event = Event.COMPLETED
         finally:
             self._is_feeding = False
-            self._with.report(event)
+            self._equipment.report(event)
 
     def _close_scan(self, scan: Scan, store: ScanStore) -> None:
         """Finish the scan; if the pipeline fails, mark the stored part as interrupted."""
@@ -278,7 +280,7 @@ class ScanRun:
             on_fault.callback(store.finish, {"interrupted": True})
             summary = scan.close()
             on_fault.pop_all()
-        self._with.vehicle.statustext(
+        self._equipment.vehicle.statustext(
             f"Scan {scan.inputs.scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
         )
 
@@ -286,18 +288,18 @@ class ScanRun:
         self.alive()
         if scan.recorder.keyframes > 1 and not self._has_grown:
             self._has_grown = True
-            self._with.report(Event.GROWN)
+            self._equipment.report(Event.GROWN)
 
     def _on_keyframe(self, keyframe: Keyframe) -> None:
         scan = self.scan
         if scan is not None and keyframe.time_ns not in self._photos:
-            report_keyframe(self._with.vehicle, scan, keyframe)
+            report_keyframe(self._equipment.vehicle, scan, keyframe)
 
     def _on_photo(self, photo: Frame) -> None:
         scan = self.scan
         if scan is not None:
             self._photos.add(photo.time_ns)
-            report_photo(self._with.vehicle, scan, photo)
+            report_photo(self._equipment.vehicle, scan, photo)
 
 
 def new_folder(scans: Path, unix_s: float) -> Path:

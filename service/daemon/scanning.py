@@ -212,7 +212,7 @@ class Scanning:
 
     # ---- changes in flight --------------------------------------------------------------------
 
-    def follow(self, change: Callable[[Config], Config]) -> None:
+    def configure(self, change: Callable[[Config], Config]) -> None:
         """Change the configuration in one step; live keys also change in the running scan.
 
         Raises what ``change`` raises; then nothing is changed.
@@ -220,15 +220,15 @@ class Scanning:
         with self._lock:
             self.config = config = change(self.config)
             if self.run is not None:
-                self.run.follow(config, self.level)
-            self.link.follow(config)
+                self.run.configure(config, self.level)
+            self.link.configure(config)
 
     def set_level(self, level: Level) -> None:
         """Change the load level, in this scan and in the next."""
         with self._lock:
             self.level = level
             if self.run is not None:
-                self.run.follow(self.config, level)
+                self.run.configure(self.config, level)
 
     def offer_backlog(self) -> None:
         """Send earlier scans that the ground lacks while no scan runs."""

@@ -170,7 +170,7 @@ class DaemonLink:
             # The process does not end before it has: Zenoh would abort it.
             PROCESS.start("backlog closing", lambda _: sender.close())
 
-    def follow(self, config: Config) -> None:
+    def configure(self, config: Config) -> None:
         """Keep to another budget, also in flight."""
         for sender in (self.sender, self.backlog):
             if sender is not None:

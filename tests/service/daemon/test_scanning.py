@@ -132,7 +132,7 @@ def test_a_camera_that_fails_is_reported(tmp_path: Path) -> None:
     assert run is not None
     run.gate = FrameGate(source, tmp_path, 0, run.alive, threading.Event())
     source.warnings.append("known when it was opened")
-    assert run.camera_news() == ["known when it was opened"]
+    assert run.new_camera_warnings() == ["known when it was opened"]
     source.warnings.append("the image is frozen for 8 s")
     for now_s in (0.0, 9.0, 11.0, 300.0):  # noqa: B007
         daemon.look()

@@ -205,7 +205,7 @@ def test_a_parameter_that_is_set_during_a_reload_stands(tmp_path: Path) -> None:
         between.wait(60.0)
         return change(config, "datalink.budget_kbit_s", 500)
 
-    scanning.follow(slowly)
+    scanning.configure(slowly)
     tuning.join()
     assert scanning.config.datalink.budget_kbit_s == 500
     assert scanning.config.scan.resolution_m == 0.25

@@ -161,7 +161,7 @@ def test_the_daemon_offers_earlier_scans_between_flights(tmp_path: Path) -> None
         link.begin_scan(flown, config, vehicle)
         assert link.sender is not None and link.backlog is None
         changed = dataclasses.replace(config.datalink, budget_kbit_s=123.0, share=0.5)
-        link.follow(dataclasses.replace(config, datalink=changed))
+        link.configure(dataclasses.replace(config, datalink=changed))
         assert isinstance(link.sender, DatalinkSender)
         sender = link.sender
         until(lambda: sender.progress.rate_kbit_s == 61.5)
