@@ -118,7 +118,7 @@ class DatalinkSender:
         self._events: deque[Callable[[float], None]] = deque(maxlen=MAX_WAITING_EVENTS)
         self._asks: deque[tuple[Any, str, str, RangeSet, Ask]] = deque()
         self._reports, self._notes = Reports(self._outbox), HeldNotes(self._outbox)
-        self._is_looked_for = False  # somebody asks for the heads
+        self._heads_are_asked = False  # a ground station asks for the heads
         self._wake = threading.Event()
         self._stop = threading.Event()
         self._workers = Workers()
@@ -136,7 +136,7 @@ class DatalinkSender:
             self._threads.append(self._workers.start("datalink", self._serve))
         for connection in self._connections:
             name = f"datalink {' '.join(connection.config.connect) or 'calls'}"
-            self._threads.append(self._workers.start(name, partial(self._keep, connection)))
+            self._threads.append(self._workers.start(name, partial(self._keep_open, connection)))
         atexit.register(self.close)  # Zenoh aborts a process that ends around an open session
 
     def _listened(self) -> bool:
@@ -154,13 +154,13 @@ class DatalinkSender:
         if owned:
             self._owned.append(store)
 
-        def news(kind: str, number: int) -> None:
-            self._post(lambda now: self._outbox.news(scan_id, kind, number, now))
+        def on_item(kind: str, number: int) -> None:
+            self._post(lambda now: self._outbox.on_item(scan_id, kind, number, now))
 
         with self._lock:
             self._outbox.add(store, time.monotonic())
-        store.listen(news)
-        self._stores.append((store, news))
+        store.listen(on_item)
+        self._stores.append((store, on_item))
         self._wake.set()
 
     def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
@@ -212,8 +212,8 @@ class DatalinkSender:
         if self._radio is not None:
             self._radio.close()
             self._radio = None
-        for store, news in self._stores:
-            store.unlisten(news)
+        for store, listener in self._stores:
+            store.unlisten(listener)
             self._notes.keep(store, time.monotonic(), is_last=True)
         self._stores.clear()
         while self._owned:
@@ -229,7 +229,7 @@ class DatalinkSender:
     def _open_sessions(self) -> list[zenoh.Session]:
         return [c.session for c in self._connections if c.session is not None]
 
-    def _keep(self, connection: _LinkSession, _: Worker) -> None:
+    def _keep_open(self, connection: _LinkSession, _: Worker) -> None:
         """Keep a session open until the stop; a new one follows when its stations fall silent."""
         attempt = 0
         opening_s = FIRST_PATIENCE_S / PATIENCE  # what the last session took to open
@@ -306,12 +306,12 @@ class DatalinkSender:
         base, channel = f"{ROOT}/{self._drone}", zenoh.handlers.FifoChannel(CHANNEL)
         held = session.declare_subscriber(f"{base}/*/held/*", channel)
         asks = session.declare_queryable(f"{base}/*/item/*/*", channel)
-        looks = session.declare_queryable(f"{base}/*/head", channel)
+        head_queries = session.declare_queryable(f"{base}/*/head", channel)
         start = self._workers.start
         return [
             start("datalink reports", lambda _: _pump(held, partial(self._on_held, connection))),
             start("datalink requests", lambda _: _pump(asks, partial(self._on_query, connection))),
-            start("datalink looks", lambda _: _pump(looks, self._on_look)),
+            start("datalink looks", lambda _: _pump(head_queries, self._on_head_query)),
         ]
 
     def _serve(self, _: Worker) -> None:
@@ -335,16 +335,16 @@ class DatalinkSender:
             self._events.popleft()(now)
         while self._asks:
             query, scan_id, kind, numbers, ask = self._asks.popleft()
-            for ended in self._outbox.ask(scan_id, kind, numbers, ask, query, now):
+            for ended in self._outbox.on_ask(scan_id, kind, numbers, ask, query, now):
                 ended.drop()
-        if self._is_looked_for:
-            self._is_looked_for = False
+        if self._heads_are_asked:
+            self._heads_are_asked = False
             self._outbox.publish_heads(now)
         reports = self._reports.take(now)
         for scan_id, peer, payload in reports:
             held = unpack(payload, Held)
             if held is not None:
-                self._outbox.held(scan_id, peer, held, now)
+                self._outbox.on_held(scan_id, peer, held, now)
         for store, _ in list(self._stores) if reports else ():
             self._notes.keep(store, now)
 
@@ -378,9 +378,9 @@ class DatalinkSender:
         if self._reports.put(str(sample.key_expr), sample.payload.to_bytes()):
             self._wake.set()
 
-    def _on_look(self, query: zenoh.Query) -> None:
+    def _on_head_query(self, query: zenoh.Query) -> None:
         query.drop()
-        self._is_looked_for = True
+        self._heads_are_asked = True
         self._wake.set()
 
     def _on_query(self, connection: _LinkSession, query: zenoh.Query) -> None:

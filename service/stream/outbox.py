@@ -267,7 +267,7 @@ class Outbox:
 
     # Events
 
-    def news(self, scan_id: str, kind: str, number: int, now: float) -> None:
+    def on_item(self, scan_id: str, kind: str, number: int, now: float) -> None:
         """The store of ``scan_id`` has a new item."""
         feed = self._feeds.get(scan_id)
         if feed is None:
@@ -286,7 +286,7 @@ class Outbox:
     def serves(self, peer: str) -> bool:
         return peer in self._heard
 
-    def held(self, scan_id: str, peer: str, report: Held, now: float) -> bool:
+    def on_held(self, scan_id: str, peer: str, report: Held, now: float) -> bool:
         """A ground station reports its items; False when it is not served."""
         feed = self._feeds.get(scan_id)
         is_first = not self.listened(now)
@@ -342,7 +342,7 @@ class Outbox:
         ]
         self.bucket.set_rate(max(rates, default=self._configured), now)
 
-    def ask(
+    def on_ask(
         self, scan_id: str, kind: str, numbers: RangeSet, ask: Ask, token: Any, now: float
     ) -> list[Any]:
         """A ground station requests items; returns the tokens of requests that this ends.

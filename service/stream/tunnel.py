@@ -84,7 +84,7 @@ class TunnelSender:
         self._again: deque[_Waiting] = deque(maxlen=MAX_WAITING)
         self.sent_bytes = 0
 
-    def news(self, kind: str, number: int) -> None:
+    def on_item(self, kind: str, number: int) -> None:
         """The store has a new item."""
         if kind == "header":
             self._announcement, self._announce_at = pack_announce(self._store.header), -math.inf
@@ -224,7 +224,7 @@ class RadioSender:
         self._store = store
         self._needed = needed
         self._carrier = carrier
-        store.listen(self._news)
+        store.listen(self._on_item)
         carrier.open(self._status)
         self._worker = (workers or Workers()).start("radio", self._run)
 
@@ -236,11 +236,11 @@ class RadioSender:
     def close(self) -> None:
         """Stop sending."""
         self._worker.join(5.0)
-        self._store.unlisten(self._news)
+        self._store.unlisten(self._on_item)
         self._carrier.close()
 
-    def _news(self, kind: str, number: int) -> None:
-        self._events.append(lambda _: self._tunnel.news(kind, number))
+    def _on_item(self, kind: str, number: int) -> None:
+        self._events.append(lambda _: self._tunnel.on_item(kind, number))
 
     def _status(self, free_percent: int) -> None:
         self._events.append(lambda now: self._tunnel.radio_status(free_percent, now))

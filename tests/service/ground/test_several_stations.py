@@ -140,10 +140,10 @@ def test_the_budget_counts_a_live_message_once_for_each_session(tmp_path: Path) 
         with ScanStore.create(tmp_path / f"{sessions}.db", ScanHeader("scan-1", "red", 1)) as store:
             outbox = Outbox(20_000.0, 0.0)
             outbox.add(store, 0.0)
-            outbox.held("scan-1", "base", Held({}, 0), 0.0)
+            outbox.on_held("scan-1", "base", Held({}, 0), 0.0)
             for k in range(60):
                 store.add_pose(PoseRecord(1000 * k, np.eye(4), np.eye(6), keyframe_seq=k))
-                outbox.news("scan-1", "pose", k, 0.0)
+                outbox.on_item("scan-1", "pose", k, 0.0)
             messages = [m for m in sent(outbox, sessions, 0.0) if m.token is None]
             payloads.append(sum(len(m.payload) for m in messages))
     assert payloads[1] == pytest.approx(payloads[0] / 2, rel=0.15)
@@ -159,10 +159,10 @@ def test_what_another_station_requested_does_not_count_as_lost(tmp_path: Path) -
         for turn in range(6):
             now = 1.0 * turn
             for k, peer in enumerate(received):
-                outbox.held("scan-1", peer, Held({}, received[peer]), now)
+                outbox.on_held("scan-1", peer, Held({}, received[peer]), now)
                 first = 50 * turn + 25 * k
                 numbers = RangeSet([(first, first + 24)])
-                outbox.ask("scan-1", "pose", numbers, Ask(peer), f"request of {peer}", now)
+                outbox.on_ask("scan-1", "pose", numbers, Ask(peer), f"request of {peer}", now)
             for message in sent(outbox, 2, now):
                 if message.token is not None:
                     received[message.token.removeprefix("request of ")] += len(message.payload)

@@ -154,14 +154,14 @@ def test_a_drone_serves_few_stations_and_keeps_those_that_listen(onboard: ScanSt
     outbox = Outbox(1e6, 0.0)
     outbox.add(onboard, 0.0)
     nothing = Held({})
-    assert outbox.held("scan", "base", nothing, 0.0)
-    served = [outbox.held("scan", f"invented-{k}", nothing, 1.0) for k in range(1000)]
+    assert outbox.on_held("scan", "base", nothing, 0.0)
+    served = [outbox.on_held("scan", f"invented-{k}", nothing, 1.0) for k in range(1000)]
     assert sum(served) == MAX_STATIONS - 1
-    assert outbox.ask("scan", "pose", RangeSet([(1, 1)]), Ask("stranger"), 7, 2.0) == [7]
-    assert not outbox.ask("scan", "pose", RangeSet([(1, 1)]), Ask("base"), 8, 2.0)
+    assert outbox.on_ask("scan", "pose", RangeSet([(1, 1)]), Ask("stranger"), 7, 2.0) == [7]
+    assert not outbox.on_ask("scan", "pose", RangeSet([(1, 1)]), Ask("base"), 8, 2.0)
     late = 2.0 + PEER_TIMEOUT_S
-    assert outbox.held("scan", "base", nothing, late)
-    assert outbox.held("scan", "newcomer", nothing, late)
+    assert outbox.on_held("scan", "base", nothing, late)
+    assert outbox.on_held("scan", "newcomer", nothing, late)
     assert outbox.serves("base") and outbox.serves("newcomer")
 
 
@@ -169,7 +169,7 @@ def test_a_request_for_what_is_no_kind_ends_at_once(onboard: ScanStore) -> None:
     outbox = Outbox(1e6, 0.0)
     outbox.add(onboard, 0.0)
     for kind in ("kx", "nothing", "k9", "poses"):
-        assert outbox.ask("scan", kind, RangeSet([(1, 1)]), Ask("base"), 7, 0.0) == [7]
+        assert outbox.on_ask("scan", kind, RangeSet([(1, 1)]), Ask("base"), 7, 0.0) == [7]
     while not isinstance(outbox.next(0.0), float):
         pass
 
@@ -177,7 +177,7 @@ def test_a_request_for_what_is_no_kind_ends_at_once(onboard: ScanStore) -> None:
 def test_of_many_reports_few_wait_and_a_served_station_is_among_them(onboard: ScanStore) -> None:
     outbox = Outbox(1e6, 0.0)
     outbox.add(onboard, 0.0)
-    outbox.held("scan", "base", Held({}), 0.0)
+    outbox.on_held("scan", "base", Held({}), 0.0)
     reports = Reports(outbox)
     for k in range(10_000):
         reports.put(f"skyrelief/drone/scan/held/invented-{k}", b"")

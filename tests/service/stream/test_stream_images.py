@@ -93,8 +93,8 @@ def test_an_image_goes_over_the_link_before_the_detail(tmp_path: Path, house: Ho
     ):
         outbox = Outbox(1e6, 0.0)
         outbox.add(onboard, 0.0)
-        outbox.held(onboard.header.name, "base", Held({}), 0.0)
-        onboard.listen(lambda kind, number: outbox.news("scan", kind, number, 0.0))
+        outbox.on_held(onboard.header.name, "base", Held({}), 0.0)
+        onboard.listen(lambda kind, number: outbox.on_item("scan", kind, number, 0.0))
         one = house.keyframe(0, 0.0)
         onboard.add_keyframe(0, encode(one, one.time_ns), image)
         intake = ScanIntake(station, "base")

@@ -77,7 +77,9 @@ class World:
         self.store = ScanStore.create(self.folder / "g.db", ScanHeader("scan", "drone", 0))
         self.outbox = Outbox(self.rate, 0.0)
         self.outbox.add(self.onboard, 0.0)
-        self.onboard.listen(lambda kind, number: self.outbox.news("scan", kind, number, self.now))
+        self.onboard.listen(
+            lambda kind, number: self.outbox.on_item("scan", kind, number, self.now)
+        )
         self.ground = ScanIntake(self.store, "base")
         self._random = random.Random(1)
         self._air: list[tuple[float, int, Callable[[], object]]] = []
@@ -104,7 +106,7 @@ class World:
             if round(self.now * 100) % 100 == 0:
                 report = unpack(pack(self.ground.held()), Held)
                 assert report is not None
-                self.carry(self._later(self.outbox.held, "scan", "base", report))
+                self.carry(self._later(self.outbox.on_held, "scan", "base", report))
             for slot in (SMALL, FINE):
                 self._ask(slot)
             self.now = round(self.now + 0.01, 2)
@@ -131,7 +133,7 @@ class World:
         assert again is not None
         token = next(self._count)
         self._tokens[token] = slot, self.ground.asked
-        self.carry(self._later(self.outbox.ask, "scan", kind, numbers, again, token))
+        self.carry(self._later(self.outbox.on_ask, "scan", kind, numbers, again, token))
 
     def produce(self, first: int, last: int) -> None:
         for seq in range(first, last):
@@ -253,7 +255,7 @@ def test_a_missing_part_is_asked_for_alone(tmp_path: Path) -> None:
     assert wanted is not None
     assert (wanted[0], list(wanted[1])) == ("k1", [0])
     assert wanted[2].parts is not None and list(wanted[2].parts) == [1]
-    world.outbox.ask("scan", "k1", wanted[1], wanted[2], 7, 5.0)
+    world.outbox.on_ask("scan", "k1", wanted[1], wanted[2], 7, 5.0)
     answers: list[Outgoing] = []
     now = 5.0
     while not answers or not answers[-1].last:

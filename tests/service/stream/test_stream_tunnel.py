@@ -181,8 +181,8 @@ def fly(sender: TunnelSender, store: ScanStore, seconds: float) -> list[tuple[fl
             frame = keyframe(seq, 8.0 * seq, fresh_from_px=0 if seq == 0 else 290)
             store.add_keyframe(seq, codec.encode(frame, round(now * 1e9)))
             store.add_pose(PoseRecord(round(now * 1e9), frame.pose.T_world_camera, np.eye(6)))
-            sender.news("k0", seq)
-            sender.news("pose", seq + 1)
+            sender.on_item("k0", seq)
+            sender.on_item("pose", seq + 1)
             seq, next_frame = seq + 1, next_frame + seconds / 13
         todo = sender.next(now)
         if isinstance(todo, bytes):
@@ -302,7 +302,7 @@ def test_a_full_radio_buffer_slows_it_down_and_an_empty_one_speeds_it_up(tmp_pat
 
         def bytes_in_ten_seconds(start: float, free_percent: int) -> int:
             before, now = sender.sent_bytes, start
-            sender.news("k0", 0)
+            sender.on_item("k0", 0)
             while now < start + 10:
                 todo = sender.next(now)
                 if isinstance(todo, float):
