@@ -79,7 +79,7 @@ class Rig:
 
     def __init__(self, camera: CameraConfig, scan: ScanConfig, fusion: FusionConfig) -> None:
         self._camera, self._scan, self._fusion = camera, scan, fusion
-        self.frame: LocalFrame | None = None
+        self.local_frame: LocalFrame | None = None
         self.georeference = "none"
         self.vertical_datum = ""
         self._is_altitude_stated = False
@@ -217,10 +217,10 @@ class Rig:
         altitude = fix.alt_amsl_m
         if altitude is not None and not abs(altitude) < MAX_ALTITUDE_M:
             altitude = None
-        if self.frame is None:
-            self.frame = LocalFrame(fix.lat_deg, fix.lon_deg, altitude or 0.0)
-        height = self.frame.alt_amsl_m if altitude is None else altitude
-        enu = self.frame.to_enu(np.array([[fix.lat_deg, fix.lon_deg, height]]))[0]
+        if self.local_frame is None:
+            self.local_frame = LocalFrame(fix.lat_deg, fix.lon_deg, altitude or 0.0)
+        height = self.local_frame.alt_amsl_m if altitude is None else altitude
+        enu = self.local_frame.to_enu(np.array([[fix.lat_deg, fix.lon_deg, height]]))[0]
         sigma_v_m = fix.sigma_v_m if altitude is not None else NO_ALTITUDE_M
         sigma = np.array([fix.sigma_h_m, fix.sigma_h_m, sigma_v_m])
         return enu, np.maximum(sigma, MIN_SIGMA_M)

@@ -321,7 +321,7 @@ def report_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> Non
     agl_m = None if state is None else state.alt_agl_m
     time_ns = keyframe.time_ns + inputs.unix_offset_ns
     T = keyframe.pose.T_world_camera
-    report = keyframe_report(time_ns, T[:3, :3], T[:3, 3], scan.rig.frame, agl_m)
+    report = keyframe_report(time_ns, T[:3, :3], T[:3, 3], scan.rig.local_frame, agl_m)
     vehicle.report_keyframe(report)
 
 
@@ -334,7 +334,7 @@ def report_photo(vehicle: VehicleLink, scan: Scan, photo: Frame) -> None:
     time_ns = photo.time_ns + inputs.unix_offset_ns
     path = inputs.folder / PHOTOS / image_name(time_ns)
     report = keyframe_report(
-        time_ns, tag.R_world_camera, tag.position_m, scan.rig.frame, tag.agl_m,
+        time_ns, tag.R_world_camera, tag.position_m, scan.rig.local_frame, tag.agl_m,
         f"{inputs.scan_id}/{PHOTOS}/{path.name}",
     )  # fmt: skip
     try:

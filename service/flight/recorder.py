@@ -205,7 +205,7 @@ class Recorder:
 
     def _write_origin(self) -> None:
         """The origin goes into the header once the first position is known."""
-        frame = self._rig.frame
+        frame = self._rig.local_frame
         if frame is None or self._origin_written:
             return
         self.store.update_header(
@@ -275,7 +275,7 @@ class Recorder:
         self._last = (time_ns, T)
         self.speed_m_s, self.turn_rate_rad_s = speed, turn
         lat = lon = alt = None
-        local = self._rig.frame
+        local = self._rig.local_frame
         if local is not None:
             lat, lon, alt = (float(x) for x in local.to_geodetic(T[None, :3, 3])[0])
         return PoseRecord(

@@ -130,7 +130,7 @@ def camera_view(config: CameraConfig, camera: Camera, state: VehicleState | None
     )
     R = None if prior.is_view_assumed else prior.R_world_camera
     view = CameraView(None, None, None if R is None else _head(R), hfov, vfov)
-    frame, position = rig.frame, prior.position_m
+    frame, position = rig.local_frame, prior.position_m
     if frame is None or position is None or state is None or state.alt_amsl_m is None:
         return view
     view = replace(view, camera=_place(frame, position))

@@ -565,5 +565,5 @@ def _rig(header: ScanHeader, frame: LocalFrame) -> Rig:
         _section(ScanConfig, kept.get("scan")),
         _section(FusionConfig, kept.get("fusion")),
     )
-    rig.frame = frame
+    rig.local_frame = frame
     return rig

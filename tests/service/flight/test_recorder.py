@@ -73,7 +73,7 @@ def recorder_of(store: ScanStore, batch: int, of_m: float, graph: object = None)
     pipeline.keyframes.graph = graph
     pipeline.frames.pose = at
     pipeline.is_settled.return_value = False
-    return Recorder(store, pipeline, Mock(Rig, frame=None, georeference="none"), batch=batch)
+    return Recorder(store, pipeline, Mock(Rig, local_frame=None, georeference="none"), batch=batch)
 
 
 @pytest.mark.parametrize(("batch", "transactions"), [(1, 20), (REPLAYED, 2)])
