@@ -10,7 +10,7 @@ import numpy as np
 
 from recon import se3
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
-from recon.posegraph.pose_priors import carried as carried_by_telemetry
+from recon.posegraph.pose_priors import dead_reckoned
 from recon.poses import carried
 from recon.tracking.frame import RelativePose, UndistortedFrame
 from recon.tracking.odometry import Tracked, Tracking
@@ -135,7 +135,7 @@ class FramePoses:
         if self._seen is not None:
             before, seen, segment = self._seen
             if segment == self._aligned:
-                T = carried_by_telemetry(before, prior, seen.T_world_camera, None, 0.0)
+                T = dead_reckoned(before, prior, seen.T_world_camera, None, 0.0)
         tilt, yaw = prior.sigma_tilt_rad, prior.sigma_yaw_rad
         covariance = se3.about(-T[:3, 3], np.diag(np.square([tilt, tilt, yaw, *sigma])))
         return Pose(T, covariance, ("attitude", "gnss", "dead reckoning"))

@@ -18,7 +18,7 @@ import numpy as np
 from recon import se3
 from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.ground_heights import height_ratio
-from recon.posegraph.pose_priors import MIN_FIX_M, carried, has_fix
+from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_noise import bias_time_constant_s, inflation
@@ -318,7 +318,7 @@ class MotionFactors:
             T = T_last @ node.T_prev_segment
         else:
             priors = self._segments[last.segment].at_camera(last), segment.at_camera(node)
-            T = carried(*priors, T_last, self._velocity(last, T_last), passed_s)
+            T = dead_reckoned(*priors, T_last, self._velocity(last, T_last), passed_s)
         prior = node.prior
         is_turn_known = prior.R_world_camera is not None and prior.sigma_yaw_rad < 1.0
         sigma_r = self._config.sigma_link_rad if is_turn_known else 1.5

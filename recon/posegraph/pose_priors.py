@@ -1,4 +1,4 @@
-"""Priors on a keyframe's pose by telemetry: made sound, averaged between keyframes, carried on.
+"""Priors on a keyframe's pose by telemetry: made sound, averaged between keyframes, dead-reckoned.
 
 A keyframe speaks for what came since the one before it: for frames that are no keyframes
 (:class:`FixAverage`), and for keyframes that are no nodes any more (:func:`averaged`). The mean of
@@ -184,14 +184,14 @@ MAX_GAP_S = 3.0
 """A longer time without a velocity begins a new run."""
 
 
-class Odometer:
-    """Takes the prior of every frame, in the order of time, and adds the travel to it."""
+class VelocityIntegrator:
+    """Takes the prior of every frame, in the order of time, and adds its velocity's integral."""
 
     def __init__(self) -> None:
         self._last: tuple[int, F64] | None = None  # time in ns, (3,) m/s
         self._travel = Travel(np.zeros(3), 0.0, 0)
 
-    def take(self, time_ns: int, prior: PosePrior) -> PosePrior:
+    def add(self, time_ns: int, prior: PosePrior) -> PosePrior:
         """The prior with its travel; as it is when it has no velocity."""
         velocity = prior.velocity_m_s
         if velocity is None or not np.isfinite(velocity).all():
@@ -207,7 +207,7 @@ class Odometer:
         return replace(prior, travel=self._travel)
 
 
-def carried(
+def dead_reckoned(
     before: PosePrior, now: PosePrior, T_before: F64, velocity_m_s: F64 | None, seconds: float
 ) -> F64:
     """(4, 4) pose by telemetry's motion since ``before``, when the camera was at ``T_before``.

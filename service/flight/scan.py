@@ -21,7 +21,7 @@ from mavlink.telemetry.samples import VehicleState
 from recon.backends import Backend
 from recon.pipeline.events import Event as MapperEvent
 from recon.pipeline.events import FramePosed
-from recon.posegraph.pose_priors import Odometer
+from recon.posegraph.pose_priors import VelocityIntegrator
 from recon.tracking.known_track import KnownTrack
 from recon.types import Camera, Frame, Keyframe, Pose, PosePrior, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter
@@ -131,7 +131,8 @@ class Scan:
         self.pipeline = Pipeline(
             inputs.camera, config, inputs.backend, pages, live=live, known=inputs.known
         )  # fmt: skip
-        self.rig, self._odometer = Rig(config.camera, config.scan, config.fusion), Odometer()
+        self.rig = Rig(config.camera, config.scan, config.fusion)
+        self._velocity = VelocityIntegrator()
         self.recorder = Recorder(
             store,
             self.pipeline,
@@ -174,7 +175,7 @@ class Scan:
         prior = self.rig.prior(state, frame.geotag)
         self.heights += not prior.is_agl_assumed
         self.attitudes += not prior.is_view_assumed
-        prior = self._odometer.take(exposed_ns, prior)
+        prior = self._velocity.add(exposed_ns, prior)
         if self.pipeline.odometry.needs_turn(exposed_ns):
             prior = self._turning(prior, exposed_ns)
         is_photo = bool(self._photos)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from recon import se3
-from recon.posegraph.pose_priors import carried
+from recon.posegraph.pose_priors import dead_reckoned
 from recon.types import F64, PosePrior
 
 
@@ -22,17 +22,17 @@ def test_telemetrys_constant_errors_do_not_move_the_camera() -> None:
     place, later = np.array([10.0, 20.0, 60.0]), np.array([13.0, 24.0, 61.0])
     before = PosePrior(compass @ at, 0.01, 0.05, place + shift, np.ones(3))
     now = PosePrior(compass @ then, 0.01, 0.05, later + shift, np.ones(3))
-    T = carried(before, now, se3.compose(at, place), None, 2.0)
+    T = dead_reckoned(before, now, se3.compose(at, place), None, 2.0)
     np.testing.assert_allclose(T[:3, 3], later, atol=1e-12)
     angle = np.linalg.norm(se3.so3_log(T[:3, :3] @ then.T))
     assert angle < 0.06  # what the compass error turns of the tilt's change
-    still = carried(before, before, se3.compose(at, place), None, 2.0)
+    still = dead_reckoned(before, before, se3.compose(at, place), None, 2.0)
     np.testing.assert_allclose(still, se3.compose(at, place), atol=1e-12)
 
 
 def test_without_positions_the_last_velocity_goes_on() -> None:
     prior = PosePrior(np.eye(3), 0.01, 3.0)
-    T = carried(prior, prior, np.eye(4), np.array([1.0, 0.0, -0.5]), 4.0)
+    T = dead_reckoned(prior, prior, np.eye(4), np.array([1.0, 0.0, -0.5]), 4.0)
     np.testing.assert_allclose(T[:3, 3], [4.0, 0.0, -2.0])
     np.testing.assert_allclose(T[:3, :3], np.eye(3))
 
@@ -41,4 +41,4 @@ def test_an_attitude_that_begins_after_the_loss_is_taken_as_it_is() -> None:
     R = turned(0.2, 0.1, -2.0)
     now = PosePrior(R, 0.01, 0.05)
     before = replace(now, R_world_camera=None)
-    np.testing.assert_allclose(carried(before, now, np.eye(4), None, 1.0)[:3, :3], R)
+    np.testing.assert_allclose(dead_reckoned(before, now, np.eye(4), None, 1.0)[:3, :3], R)

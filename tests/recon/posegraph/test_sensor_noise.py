@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from recon import se3
 from recon.posegraph.alignment import fit, scales
-from recon.posegraph.pose_priors import Odometer
+from recon.posegraph.pose_priors import VelocityIntegrator
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import (
     CHI_SQUARED_MEDIANS,
@@ -264,17 +264,17 @@ def test_velocities_that_contradict_the_fixes_are_left_out() -> None:
 
 
 def test_velocity_is_integrated_until_a_gap() -> None:
-    odometer = Odometer()
+    integrator = VelocityIntegrator()
     prior = PosePrior(velocity_m_s=np.array([4.0, 0.0, 0.0]))
     faster = PosePrior(velocity_m_s=np.array([6.0, 0.0, 0.0]))
-    assert odometer.take(0, PosePrior()).travel is None
-    steps = [odometer.take(t, p).travel for t, p in ((10**9, prior), (2 * 10**9, faster))]
+    assert integrator.add(0, PosePrior()).travel is None
+    steps = [integrator.add(t, p).travel for t, p in ((10**9, prior), (2 * 10**9, faster))]
     assert steps[0] is not None and steps[1] is not None
     np.testing.assert_allclose(steps[1].metres - steps[0].metres, [5.0, 0.0, 0.0])
     assert (steps[1].seconds, steps[1].run) == (1.0, steps[0].run)
-    after = odometer.take(20 * 10**9, faster).travel
+    after = integrator.add(20 * 10**9, faster).travel
     assert after is not None and after.run != steps[1].run and after.seconds == 0.0
-    back = odometer.take(19 * 10**9, faster).travel
+    back = integrator.add(19 * 10**9, faster).travel
     assert back is not None and back.run != after.run
 
 
