@@ -54,8 +54,8 @@ class FirstDepths:
 
     def __call__(self, view: StereoView) -> Keyframe | None:
         """The new surface that the view's only partner shows; None where it shows none."""
-        ahead = self._keyframes.ahead(view)
-        if ahead is None:
+        predicted = self._keyframes.predicted(view)
+        if predicted is None:
             return None
         with self._timing("first depth"):
             grid = self._rectify.grid(view)
@@ -72,7 +72,7 @@ class FirstDepths:
             self._rectify.learn(depth)
             if depth is None or self._keyframes.graph.segments[view.segment].agreement < 0:
                 return None
-            T_odom, pose = ahead
+            T_odom, pose = predicted
             sigma_m, fresh = self._surface.peek(depth, view.rows_share, T_odom)
             bgr = self._exposure.level(bgr)
             return keyframe_of(view, depth, bgr, sigma_m, fresh, pose)

@@ -12,7 +12,7 @@ from recon import se3
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.posegraph.pose_priors import dead_reckoned
 from recon.poses import carried
-from recon.tracking.frame import RelativePose, UndistortedFrame
+from recon.tracking.frame import RelativePose
 from recon.tracking.odometry import Tracked, Tracking
 from recon.types import F64, Pose, PosePrior
 
@@ -42,7 +42,7 @@ class FramePoses:
         self._newest: Pose | None = None  # of a view; None again once all is done
         self._aligned = -1  # the newest segment that has a similarity to the world
 
-    def take(self, view: RelativePose, update: GraphUpdate) -> None:
+    def add_view(self, view: RelativePose, update: GraphUpdate) -> None:
         """Let a view that is in the graph carry frames from now on."""
         self._views.append(view)
         self._newest = update.pose
@@ -60,7 +60,7 @@ class FramePoses:
         """Place frames by the whole graph from now on."""
         self._newest = None
 
-    def follow(self, prior: PosePrior, frame: RelativePose) -> Pose:
+    def place(self, prior: PosePrior, frame: RelativePose) -> Pose:
         """A new frame in the world."""
         pose = self.pose(frame, self._fallback(prior, frame))
         self._seen = prior, pose, frame.segment
@@ -119,13 +119,12 @@ class FramePoses:
         about = se3.about(-pose.T_world_camera[:3, 3], spread)
         return replace(pose, covariance=pose.covariance + about)
 
-    def by_telemetry(self, image: UndistortedFrame, tracked: Tracked) -> Pose | None:
+    def by_telemetry(self, prior: PosePrior, tracked: Tracked) -> Pose | None:
         """A lost frame where telemetry alone says the camera is; None without attitude, heading
         or position.
 
         Telemetry's error when vision was lost is subtracted, so that the track continues.
         """
-        prior = image.prior
         R, position, sigma = prior.R_world_camera, prior.position_m, prior.sigma_position_m
         if tracked.state is not Tracking.LOST or R is None or position is None or sigma is None:
             return None

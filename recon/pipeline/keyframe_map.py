@@ -30,7 +30,7 @@ class GraphUpdate:
 
     pose: Pose  # of the view
     is_placed: bool  # its segment has a similarity to the world
-    is_near: bool = True  # at a possible distance
+    is_plausible: bool = True  # its place is not impossibly far away
     changed: Mapping[int, Pose] = field(default_factory=dict)  # of keyframes published before
     keyframe: Keyframe | None = None
 
@@ -46,7 +46,7 @@ class KeyframeMap:
         timing: Timing,
     ) -> None:
         self.trajectory, self._loops = trajectory, loops
-        self.views = self.levelled = 0  # keyframes, and those whose ground is taken as level
+        self._count = self._levelled = 0  # keyframes, and those whose ground is taken as level
         self._rejected, self._timing = rejected, timing
         self._newest, self._T_chain = -1, np.eye(4)  # the last keyframe
 
@@ -57,7 +57,7 @@ class KeyframeMap:
     @property
     def is_levelled(self) -> bool:
         """True when what is level follows from the ground: too many views are off the mount."""
-        return self.levelled > MAX_LEVELLED_SHARE * self.views
+        return self._levelled > MAX_LEVELLED_SHARE * self._count
 
     @property
     def held(self) -> dict[str, int]:
@@ -80,8 +80,8 @@ class KeyframeMap:
         height = (below, 0.0) if below is not None else height_above(view.points, up)
         prior = levelled(view.prior, view.points)
         self._newest = view.seq
-        self.views += 1
-        self.levelled += prior is not view.prior
+        self._count += 1
+        self._levelled += prior is not view.prior
         self.trajectory.add(
             view.seq, view.segment, self._T_chain, prior, height, view.time_ns, covariance
         )
@@ -89,15 +89,17 @@ class KeyframeMap:
             with self._timing("loops"):
                 self._loops.look(view.seq, view.segment, view.image.gray, view.image.K, depth)
         pose = self.trajectory.pose(view.seq)
-        is_near = bool(np.abs(pose.T_world_camera[:3, 3]).max() < FARTHEST_M)
-        if depth is not None and is_near:
+        is_plausible = bool(np.abs(pose.T_world_camera[:3, 3]).max() < FARTHEST_M)
+        if depth is not None and is_plausible:
             self.trajectory.publish(view.seq, pose)
         elif depth is not None:
             self._rejected["placed impossibly far away"] += 1
         is_placed = self.graph.segments[view.segment].similarity is not None
-        return GraphUpdate(pose, is_placed, is_near, self.changed() if depth is not None else {})
+        return GraphUpdate(
+            pose, is_placed, is_plausible, self.changed() if depth is not None else {}
+        )
 
-    def ahead(self, view: StereoView) -> tuple[F64, Pose] | None:
+    def predicted(self, view: StereoView) -> tuple[F64, Pose] | None:
         """A view that is not added yet: T_odom_camera (4, 4) in its segment's chain, and its pose
         in the world. None without a keyframe before it that has a place there."""
         T_before = view.earlier.get(self._newest)
@@ -113,7 +115,7 @@ class KeyframeMap:
             self.trajectory.publish(seq, pose)
         return found
 
-    def measured(self, view: StereoView, keyframe: Keyframe) -> None:
+    def add_surface(self, view: StereoView, keyframe: Keyframe) -> None:
         """Count the surface of a view that became a keyframe."""
         points = int(np.count_nonzero(keyframe.fresh & np.isfinite(keyframe.depth.depth_m)))
         self.graph.segments[view.segment].add_surface(view.seq, points, view.prior)

@@ -179,14 +179,14 @@ class Mapper:
 
         Raises ValueError when the image is not of the camera model's size.
         """
-        image = self.undistort(frame)  # section 2.1
-        tracked = self.follow(image)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
-        late = self._late(image, tracked)
-        reference, is_view = self.views.take(image, tracked)  # virtual stereo camera, section 2.3
+        undistorted = self.undistort(frame)  # section 2.1
+        tracked = self.locate(undistorted)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
+        late = self._late(undistorted, tracked)
+        reference, is_view = self.views.take(undistorted, tracked)  # virtual stereo, 2.3
         if reference is None:
             done = tuple(self._finished())  # while vision is lost, too
-            pose = self.frames.by_telemetry(image, tracked)
-            return (*done, FramePosed(image.seq, image.time_ns, tracked, pose))
+            pose = self.frames.by_telemetry(undistorted.prior, tracked)
+            return (*done, FramePosed(frame.seq, frame.time_ns, tracked, pose))
         for view in self.views.ready():
             self._worker.offer(view)  # to be reconstructed
         if self.first_depths is not None and self._worker.is_free:
@@ -194,14 +194,14 @@ class Mapper:
             if first is not None:
                 self._worker.offer(first)
         done = tuple(self._finished())
-        pose = self.frames.follow(image.prior, reference)
-        posed = FramePosed(image.seq, image.time_ns, tracked, pose, reference, is_view)
+        pose = self.frames.place(frame.prior, reference)
+        posed = FramePosed(frame.seq, frame.time_ns, tracked, pose, reference, is_view)
         return (*late, *done, posed)
 
-    def follow(self, image: UndistortedFrame) -> Tracked:
+    def locate(self, frame: UndistortedFrame) -> Tracked:
         """The frame's pose by the odometry, or why there is none."""
         with self._timing("track"):
-            tracked = self.odometry.track(image)
+            tracked = self.odometry.track(frame)
         if tracked.before is not None:
             self.refused -= Counter([tracked.before.reason])
         if tracked.state is Tracking.WAITING:
@@ -221,14 +221,14 @@ class Mapper:
             return True
         return key.seq < window[0].seq
 
-    def _late(self, image: UndistortedFrame, tracked: Tracked) -> tuple[Event, ...]:
+    def _late(self, frame: UndistortedFrame, tracked: Tracked) -> tuple[Event, ...]:
         """The frame before, lost until this one came: it begins this one's segment."""
-        before, self._lost = self._lost, image if tracked.state is Tracking.LOST else None
+        before, self._lost = self._lost, frame if tracked.state is Tracking.LOST else None
         if before is None or tracked.before is None:
             return ()
         reference, is_view = self.views.take(before, tracked.before)
         assert reference is not None
-        pose = self.frames.follow(before.prior, reference)
+        pose = self.frames.place(before.prior, reference)
         return (FramePosed(before.seq, before.time_ns, tracked.before, pose, reference, is_view),)
 
     def reconstruct(self, view: StereoView) -> Reconstructed:
@@ -256,7 +256,7 @@ class Mapper:
         self.rectify.learn(depth)  # how far the relief of the next pairs may reach
         step, covariance = self.register(view, depth)  # ICP onto the keyframe before
         update = self.keyframes.add(view, step, covariance, depth)  # pose graph
-        if depth is None or not update.is_near:
+        if depth is None or not update.is_plausible:
             return update
         with self._timing("map"):  # what is new
             T_odom = self.keyframes.trajectory.odom_pose(view.seq)
@@ -267,7 +267,7 @@ class Mapper:
         if self.debug is not None:
             metric = keyframe.depth
             self.debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
-        self.keyframes.measured(view, keyframe)
+        self.keyframes.add_surface(view, keyframe)
         return replace(update, keyframe=keyframe)
 
     def drain(self) -> tuple[Event, ...]:
@@ -293,7 +293,7 @@ class Mapper:
                 if update is not None:
                     yield KeyframeReady(update, is_first=True)
                 continue
-            self.frames.take(view.reference, update)
+            self.frames.add_view(view.reference, update)
             if update.keyframe is not None:
                 self._ready.add(view.seq)
                 if self._kept is not None:

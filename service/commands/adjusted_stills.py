@@ -105,8 +105,8 @@ def _tracked(
         time_ns = inputs.epoch_ns + frame.time_ns
         state = history.state_at(check.exposed_ns(time_ns))
         prior = rig.prior(state, frame.geotag)
-        image = pipeline.undistort(Frame(frame.image, time_ns, frame.seq, prior))
-        tracked = pipeline.follow(image)
+        undistorted = pipeline.undistort(Frame(frame.image, time_ns, frame.seq, prior))
+        tracked = pipeline.locate(undistorted)
         check.add(time_ns, tracked)
         is_tracked = tracked.T_odom_camera is not None
         if tracked.before is not None:

@@ -36,7 +36,7 @@ def following() -> Any:
     def follow(seq: int, north_m: float, fix: F64 | None = None) -> Pose:
         sigma = None if fix is None else np.full(3, 5.0)
         prior = PosePrior(position_m=fix, sigma_position_m=sigma)
-        pose = frames.follow(prior, frame_at(seq, north_m))
+        pose = frames.place(prior, frame_at(seq, north_m))
         place_m = pose.T_world_camera[:3, 3]
         frame = frame_at(seq, north_m)
         published = pose_at(frame.T_odom_camera, place_m, np.full(3, sigma_m(pose) / 3**0.5))
@@ -89,7 +89,7 @@ def test_views_keep_their_places_when_they_settle() -> None:
     frames = FramePoses(empty(), lambda view: view.keyframe is None or view.keyframe.seq < 70)
     update = GraphUpdate(Pose(np.eye(4), np.eye(6)), True)
     for key in keys:
-        frames.take(RelativePose(key.seq, key.segment, some_pose(), key), update)
+        frames.add_view(RelativePose(key.seq, key.segment, some_pose(), key), update)
     taken = [RelativePose(n, n // 50, some_pose(), keys[n // 10]) for n in range(100)]
     fallback = pose_at(np.eye(4), np.zeros(3), np.ones(3))
     before = [frames.pose(frame, fallback) for frame in taken]
@@ -112,13 +112,13 @@ def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None
     frames = FramePoses(keyframes, lambda frame: False)
     key = keyframe_at(3, some_pose())
     frame, view = (RelativePose(seq, 0, some_pose(), key) for seq in (7, 5))
-    assert frames.follow(PosePrior(), frame).sources == ("vision",)  # nothing is reconstructed yet
+    assert frames.place(PosePrior(), frame).sources == ("vision",)  # nothing is reconstructed yet
     update = keyframes.add(view_at(5, view.T_odom_camera), None, np.eye(6), None)
     trajectory, known = keyframes.trajectory, keyframes.trajectory.pose(5)
     keyframes.trajectory = None
     fallback = pose_at(np.eye(4), np.full(3, 9.0), np.ones(3))
     np.testing.assert_array_equal(frames.pose(frame, fallback).T_world_camera[:3, 3], np.full(3, 9))
-    frames.take(view, update)  # the view is done
+    frames.add_view(view, update)  # the view is done
     step = se3.inverse(view.T_odom_camera) @ frame.T_odom_camera
     step[:3, 3] *= known.scale
     found = frames.pose(frame, fallback)
@@ -137,10 +137,10 @@ def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> N
     key, fix = keyframe_at(3, np.eye(4)), np.array([20.0, -10.0, 50.0])
     prior = PosePrior(position_m=fix, sigma_position_m=np.full(3, 5.0))
     view, frame = (RelativePose(seq, 0, some_pose(), key) for seq in (5, 7))
-    frames.take(
+    frames.add_view(
         view, keyframes.add(view_at(5, view.T_odom_camera, prior=prior), None, np.eye(6), None)
     )
-    in_flight = frames.follow(prior, frame)
+    in_flight = frames.place(prior, frame)
     keyframes.changed(final=True)
     frames.finish()
     again = frames.pose(frame, pose_at(np.eye(4), fix, np.full(3, 5.0)))

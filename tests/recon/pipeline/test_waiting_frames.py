@@ -34,5 +34,5 @@ def test_waiting_counts_where_it_is_in_vain(states: list[Any], unused: dict[str,
     mapper = Mapper(Camera(np.diag([30.0, 30.0, 1.0]), np.zeros(5), (32, 32)))
     mapper.odometry = odometry
     for _ in states:
-        mapper.follow(image)
+        mapper.locate(image)
     assert mapper.refusals() == unused
