@@ -18,7 +18,7 @@ class FramePosed:
     time_ns: int
     tracked: Tracked
     pose: Pose | None = None  # in the world; by telemetry alone when vision fails
-    reference: RelativePose | None = None  # gives its pose again, as it is known later
+    relative: RelativePose | None = None  # to its keyframe: gives its pose again, as known later
     is_view: bool = False  # the frame takes part in stereo and may become a keyframe
 
 

@@ -182,8 +182,8 @@ class Mapper:
         undistorted = self.undistort(frame)  # section 2.1
         tracked = self.locate(undistorted)  # Harris and ZSSD (Eq. 4-5), EPnP (Eq. 6-7)
         late = self._late(undistorted, tracked)
-        reference, is_view = self.views.take(undistorted, tracked)  # virtual stereo, 2.3
-        if reference is None:
+        relative, is_view = self.views.take(undistorted, tracked)  # virtual stereo, 2.3
+        if relative is None:
             done = tuple(self._finished())  # while vision is lost, too
             pose = self.frames.by_telemetry(undistorted.prior, tracked)
             return (*done, FramePosed(frame.seq, frame.time_ns, tracked, pose))
@@ -194,8 +194,8 @@ class Mapper:
             if first is not None:
                 self._worker.offer(first)
         done = tuple(self._finished())
-        pose = self.frames.place(frame.prior, reference)
-        posed = FramePosed(frame.seq, frame.time_ns, tracked, pose, reference, is_view)
+        pose = self.frames.place(frame.prior, relative)
+        posed = FramePosed(frame.seq, frame.time_ns, tracked, pose, relative, is_view)
         return (*late, *done, posed)
 
     def locate(self, frame: UndistortedFrame) -> Tracked:
@@ -226,10 +226,10 @@ class Mapper:
         before, self._lost = self._lost, frame if tracked.state is Tracking.LOST else None
         if before is None or tracked.before is None:
             return ()
-        reference, is_view = self.views.take(before, tracked.before)
-        assert reference is not None
-        pose = self.frames.place(before.prior, reference)
-        return (FramePosed(before.seq, before.time_ns, tracked.before, pose, reference, is_view),)
+        relative, is_view = self.views.take(before, tracked.before)
+        assert relative is not None
+        pose = self.frames.place(before.prior, relative)
+        return (FramePosed(before.seq, before.time_ns, tracked.before, pose, relative, is_view),)
 
     def reconstruct(self, view: StereoView) -> Reconstructed:
         """One view: its depth from all its partners, its pose, and its new surface."""
@@ -293,7 +293,7 @@ class Mapper:
                 if update is not None:
                     yield KeyframeReady(update, is_first=True)
                 continue
-            self.frames.add_view(view.reference, update)
+            self.frames.add_view(view.relative, update)
             if update.keyframe is not None:
                 self._ready.add(view.seq)
                 if self._kept is not None:

@@ -73,7 +73,7 @@ class StereoView:
     prior: PosePrior
     image: PosedImage  # in colour
     partners: tuple[PosedImage, ...]
-    reference: RelativePose
+    relative: RelativePose
     points: F64  # (N, 3) landmarks in the view's camera
     covariance: F64  # (6, 6) of vision's motion from the view before, left, in the view's camera
     earlier: Mapping[int, F64]  # number to pose (4, 4) of the segment's last few views
@@ -324,17 +324,17 @@ class VirtualStereoCamera:
             return None, False
         key = next(key for key in reversed(self._odometry.keyframes) if key.seq <= image.seq)
         T_keyframe_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
-        reference = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
+        relative = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
         frame = replace(
-            image, image=None, pyramid=(), mask=None, reference=reference, moving=tracked.moving
+            image, image=None, pyramid=(), mask=None, relative=relative, moving=tracked.moving
         )
-        self._tracked.append((image.time_ns, reference))
+        self._tracked.append((image.time_ns, relative))
         is_view = self.selection.offer(frame, tracked)
         self._fixes.take(tracked.T_odom_camera, image.prior)
         if is_view:
             self._wait(frame, image.image)
         self._latest = None if is_view else (frame, image.image)
-        return reference, is_view
+        return relative, is_view
 
     def end_stretch(self) -> None:
         """Make a view of a stretch's last frame: only it shows what the camera saw last."""
@@ -358,7 +358,7 @@ class VirtualStereoCamera:
                 self._refused["blurred"] += 1
             else:
                 found = self._stereo_view(view, image, prior, self.selection.partners(view))
-                self._given.append(found.reference)
+                self._given.append(found.relative)
                 yield found
 
     def first(self) -> StereoView | None:
@@ -385,9 +385,9 @@ class VirtualStereoCamera:
         partners: list[UndistortedFrame],
     ) -> StereoView:
         """The view with its ``image``, which is without distortion from now on."""
-        reference, points = view.reference, landmark_points(view.keyframe)
-        assert reference is not None and image is not None
-        points = se3.transform(se3.inverse(reference.T_keyframe_camera), points)
+        relative, points = view.relative, landmark_points(view.keyframe)
+        assert relative is not None and image is not None
+        points = se3.transform(se3.inverse(relative.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         return StereoView(
             view.seq,
@@ -396,7 +396,7 @@ class VirtualStereoCamera:
             prior,
             replace(self._posed(view, in_odom), bgr=self._undistorter.image(image)),
             tuple(self._posed(partner, in_odom) for partner in partners),
-            reference,
+            relative,
             points,
             self._step_covariance(view),
             {a.seq: a.T_odom_camera for a in self._given if a.segment == view.segment},

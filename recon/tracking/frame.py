@@ -52,7 +52,7 @@ class UndistortedFrame:
     pyramid: Pyramid  # of (h, w) gray, as the odometry takes it; empty once it is tracked
     mask: U8 | None  # (h, w) non-zero where the image is valid; None: everywhere
     is_blurred: bool  # takes no part in stereo, only in the track
-    reference: RelativePose | None = None  # to the last keyframe when it was tracked
+    relative: RelativePose | None = None  # to the last keyframe when it was tracked
     moving: FrameRows | None = None  # its rows' motion, better once its neighbours are known
 
     @property
@@ -67,19 +67,19 @@ class UndistortedFrame:
 
     @property
     def segment(self) -> int:
-        return self._reference.segment
+        return self._relative.segment
 
     @property
     def keyframe(self) -> OdometryKeyframe:
-        assert self._reference.keyframe is not None, "a frame of stereo is not settled"
-        return self._reference.keyframe
+        assert self._relative.keyframe is not None, "a frame of stereo is not settled"
+        return self._relative.keyframe
 
     @property
     def T_odom_camera(self) -> F64:
         """(4, 4) as refined by now."""
-        return self._reference.T_odom_camera
+        return self._relative.T_odom_camera
 
     @property
-    def _reference(self) -> RelativePose:
-        assert self.reference is not None, "the frame is not tracked"
-        return self.reference
+    def _relative(self) -> RelativePose:
+        assert self.relative is not None, "the frame is not tracked"
+        return self.relative

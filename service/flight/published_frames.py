@@ -40,14 +40,14 @@ class PublishedFrames:
         self._file = tempfile.TemporaryFile(dir=folder, buffering=1 << 16)  # noqa: SIM115
 
     def add(
-        self, reference: RelativePose, row: Any, is_settled: Callable[[RelativePose], bool]
+        self, relative: RelativePose, row: Any, is_settled: Callable[[RelativePose], bool]
     ) -> None:
-        """Take the next frame's row of :data:`FRAME` but for what its ``reference`` knows; those
+        """Take the next frame's row of :data:`FRAME` but for what its ``relative`` knows; those
         whose keyframes no longer change go to the disk.
 
         Raises OutsideError when the disk takes no more.
         """
-        self._fresh.append((reference, row))
+        self._fresh.append((relative, row))
         while self._fresh and is_settled(self._fresh[0][0]):
             try:
                 self._file.write(_whole(*self._fresh.popleft()).tobytes())
@@ -67,7 +67,7 @@ class PublishedFrames:
         self._file.close()
 
 
-def _whole(reference: RelativePose, row: Any) -> Any:
-    row["seq"], row["segment"] = reference.seq, reference.segment
-    row["T_odom_camera"] = reference.T_odom_camera
+def _whole(relative: RelativePose, row: Any) -> Any:
+    row["seq"], row["segment"] = relative.seq, relative.segment
+    row["T_odom_camera"] = relative.T_odom_camera
     return row

@@ -91,14 +91,14 @@ class Recorder:
         pose = posed.pose
         if pose is None:
             return
-        time_ns, reference = posed.time_ns + self._offset_ns, posed.reference
-        if reference is not None:
+        time_ns, relative = posed.time_ns + self._offset_ns, posed.relative
+        if relative is not None:
             row = np.zeros((), FRAME)
             row["time_ns"], row["is_view"], row["sigma_m"] = time_ns, posed.is_view, sigma_m(pose)
             row["agl_m"] = np.nan if agl_m is None else agl_m
             row["T_world_camera"] = pose.T_world_camera
-            self._frames.add(reference, row, self.pipeline.is_settled)
-        view = reference.seq if posed.is_view and reference is not None else None
+            self._frames.add(relative, row, self.pipeline.is_settled)
+        view = relative.seq if posed.is_view and relative is not None else None
         self.last = self._record(time_ns, pose, agl_m, view)
         self._due.append(self.last)
         if len(self._due) >= self._batch:
@@ -141,10 +141,10 @@ class Recorder:
         for row in self._frames.corrigible():
             T, before_m, agl_m = row["T_world_camera"], float(row["sigma_m"]), float(row["agl_m"])
             seq = int(row["seq"])
-            reference = RelativePose(seq, int(row["segment"]), row["T_odom_camera"])
+            relative = RelativePose(seq, int(row["segment"]), row["T_odom_camera"])
             published = pose_at(T, T[:3, 3], np.full(3, before_m / 3**0.5))
             record = self._record(
-                int(row["time_ns"]), self.pipeline.frames.pose(reference, published),
+                int(row["time_ns"]), self.pipeline.frames.pose(relative, published),
                 None if math.isnan(agl_m) else agl_m, seq if row["is_view"] else None,
             )  # fmt: skip
             moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - T[:3, 3])

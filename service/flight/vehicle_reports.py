@@ -47,7 +47,7 @@ class OdometryReport:
     def send(self, posed: FramePosed, state: VehicleState | None) -> None:
         """Hand on the pose of one frame; nothing for a frame without one by vision."""
         pose, time_ns = posed.pose, posed.time_ns
-        if pose is None or posed.reference is None:
+        if pose is None or posed.relative is None:
             return
         position: F64 = np.asarray(R_ENU_NED.T @ pose.T_world_camera[:3, 3])
         R_ned_head = R_ENU_NED.T @ pose.T_world_camera[:3, :3] @ R_GIMBAL_CAMERA.T

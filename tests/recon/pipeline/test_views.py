@@ -33,9 +33,9 @@ def frame(seq: int, x_m: float, segment: int = 0, blurred: bool = False) -> Undi
     T = se3.compose(np.eye(3), np.array([x_m, 0.0, 50.0]))
     key = keyframe_at(seq, T, segment)
     image = np.zeros((32, 32, 3), np.uint8)
-    reference = RelativePose(seq, segment, np.eye(4), key)
+    relative = RelativePose(seq, segment, np.eye(4), key)
     return UndistortedFrame(
-        seq, seq, PosePrior(), image, image[..., 0], (), None, blurred, reference
+        seq, seq, PosePrior(), image, image[..., 0], (), None, blurred, relative
     )  # fmt: skip
 
 
@@ -82,7 +82,7 @@ def test_colour_is_undistorted_when_its_view_is_given_and_not_kept() -> None:
         keys.append(plain.keyframe)
         image = np.random.default_rng(i).integers(0, 255, (32, 32, 3), np.uint8)
         held.append((weakref.ref(image), Undistorter(lens).image(image)))
-        taken = replace(plain, image=image, reference=None)
+        taken = replace(plain, image=image, relative=None)
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
         views.take(taken, Tracked(state, 0, plain.T_odom_camera))
         del image, taken

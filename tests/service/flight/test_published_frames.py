@@ -49,22 +49,22 @@ def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
     keys[2].T_camera_odom = some_pose()  # still in the window: the newest pose counts
     found = list(kept.corrigible())
     assert not list(tmp_path.iterdir())  # no name: nothing is left behind
-    for (reference, one), other in zip(frames, found, strict=True):
+    for (relative, one), other in zip(frames, found, strict=True):
         for name in ("time_ns", "is_view", "sigma_m", "T_world_camera"):
             assert np.array_equal(one[name], other[name])
         assert np.array_equal(one["agl_m"], other["agl_m"], equal_nan=True)
-        assert np.array_equal(reference.T_odom_camera, other["T_odom_camera"])
-        assert (reference.seq, reference.segment) == (other["seq"], other["segment"])
+        assert np.array_equal(relative.T_odom_camera, other["T_odom_camera"])
+        assert (relative.seq, relative.segment) == (other["seq"], other["segment"])
     kept.close()
 
 
 def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> None:
     kept, places = PublishedFrames(tmp_path), []
     for seq in range(500):
-        reference, row = published(seq, keyframe_at(seq, some_pose()))
-        kept.add(reference, row, before(seq - 9))
+        relative, row = published(seq, keyframe_at(seq, some_pose()))
+        kept.add(relative, row, before(seq - 9))
         places.append(weakref.ref(row))
-        del reference, row
+        del relative, row
     assert sum(place() is not None for place in places) <= 11
     assert len(list(kept.corrigible())) == 500
     kept.close()
