@@ -1,4 +1,4 @@
-"""What the pipeline has to say: frames and keyframes with their poses, and corrections of both."""
+"""The events of :class:`recon.pipeline.mapper.Mapper`: frames, keyframes, and their new poses."""
 
 from __future__ import annotations
 
@@ -24,16 +24,19 @@ class FramePosed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeReady:
-    """A view has its depth, or ``is_first`` what the next frames alone show of it: the same view
-    comes again with its whole depth, unless it is refused."""
+    """A view has become a keyframe, with the depth of all its partners.
+
+    ``is_first_depth``: only what one partner shows, to look at now. The same view comes again with
+    its whole depth, unless it is refused.
+    """
 
     keyframe: Keyframe
-    is_first: bool = False
+    is_first_depth: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosesChanged:
-    """Keyframes, by number, that came before and whose pose is better now."""
+    """Better poses of keyframes that came before, by number."""
 
     poses: Mapping[int, Pose]
 

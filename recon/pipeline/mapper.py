@@ -233,7 +233,7 @@ class Mapper:
 
     def reconstruct(self, view: StereoView) -> Reconstructed:
         """One view: its depth from all its partners, its pose, and its new surface."""
-        if view.is_first:
+        if view.is_first_depth:
             assert self.first_depths is not None
             return self.first_depths(view)
         depth = None
@@ -291,7 +291,7 @@ class Mapper:
         for view, update in self._worker.finished(everything):
             if not isinstance(update, GraphUpdate):
                 if update is not None:
-                    yield KeyframeReady(update, is_first=True)
+                    yield KeyframeReady(update, is_first_depth=True)
                 continue
             self.frames.add_view(view.relative, update)
             if update.keyframe is not None:

@@ -79,7 +79,7 @@ class StereoView:
     earlier: Mapping[int, F64]  # number to pose (4, 4) of the segment's last few views
     # (n, m), all over the image: sigma of depth over depth by readout and turns that are not sure
     rows_share: F32 = field(default_factory=KNOWN_ROWS.copy)
-    is_first: bool = False  # it comes again, with all its partners
+    is_first_depth: bool = False  # it comes again, with all its partners
 
     @property
     def bgr(self) -> U8:
@@ -369,7 +369,7 @@ class VirtualStereoCamera:
         if view.seq == self._first or not self.selection.shows_first(partner, view):
             return None
         self._first = view.seq
-        return replace(self._stereo_view(view, image, prior, [partner]), is_first=True)
+        return replace(self._stereo_view(view, image, prior, [partner]), is_first_depth=True)
 
     def _is_ready(self, view: UndistortedFrame) -> bool:
         """True when its partners are there, and the images could show the readout."""

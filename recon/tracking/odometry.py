@@ -112,7 +112,7 @@ class Odometry:
         self.segment = -1
         self._lost = 0
         self._missed_frame: tuple[UndistortedFrame, str] | None = None  # the last frame, and why
-        self._motion: ConstantVelocity | None = None
+        self._model: ConstantVelocity | None = None
         features = FeatureCache()
         self.exposure = ExposureWatch()
         self._row_track = RowTrack(lens or camera, seeks_readout)
@@ -134,7 +134,7 @@ class Odometry:
         """
         if not self._is_metric or self._lost:
             return False
-        moved, turned, gap_s = self._moving.shift(time_ns, prior, self._depth)
+        moved, turned, gap_s = self._motion_model.shift(time_ns, prior, self._depth)
         max_gap_s = SOUGHT_GAP_S if self._row_track.is_rolling else MAX_GAP_S
         max_gap_s = ROLLING_GAP_S if self._row_track.is_known else max_gap_s
         step = max(moved / self._base_to_height, turned / MAX_TURN_RAD)
@@ -156,17 +156,17 @@ class Odometry:
         if not self._is_metric:
             return self._second_view(new)
         found = self._localiser.locate(
-            new, self.keyframes, self._moving, self._low_frame_rate, lost=self._lost > 0
+            new, self.keyframes, self._motion_model, self._low_frame_rate, lost=self._lost > 0
         )
         if not isinstance(found, str):
             return self._accept(new, found)
         pair = self._localiser.by_two_views(new, self.keyframes) if self._low_frame_rate else None
-        return self._missed(new, found) if pair is None else self._cross(new, pair)
+        return self._missed(new, found) if pair is None else self._accept_two_views(new, pair)
 
     def _expected(self, time_ns: int, prior: PosePrior) -> F64:
         """(4, 4) T_camera_odom of a new frame, as far as it can be foreseen."""
-        if self._motion is not None:
-            return se3.inverse(self._motion.ahead(time_ns, prior)[0])
+        if self._model is not None:
+            return se3.inverse(self._model.ahead(time_ns, prior)[0])
         R = prior.R_world_camera
         return np.eye(4) if R is None else se3.compose(R.T, np.zeros(3))
 
@@ -181,10 +181,10 @@ class Odometry:
         return self._gap_ns > 1e9 * LOW_RATE_GAP_S
 
     @property
-    def _moving(self) -> ConstantVelocity:
+    def _motion_model(self) -> ConstantVelocity:
         """The motion since the segment's first frame."""
-        assert self._motion is not None
-        return self._motion
+        assert self._model is not None
+        return self._model
 
     def _missed(self, new: UndistortedFrame, reason: str) -> Tracked:
         """Count a frame without a pose; after too many, or two stills, begin a new segment."""
@@ -220,7 +220,7 @@ class Odometry:
         unknown = np.full(len(uv), -1, np.int64)
         self.keyframes = [self._keyframe(new, T_camera_odom, uv, unknown, Landmarks())]
         self._row_track.add(new.motion, T_camera_odom)
-        self._motion = ConstantVelocity(new.time_ns, T_odom_camera, new.prior)
+        self._model = ConstantVelocity(new.time_ns, T_odom_camera, new.prior)
         return Tracked(Tracking.STARTED, self.segment, T_odom_camera, moving=new.moving)
 
     def _keyframe(
@@ -267,7 +267,7 @@ class Odometry:
         scale = self._first_landmarks(view, matched[view.inliers], new.prior)
         self._place_early(first)
         second = se3.compose(view.T_b_a[:3, :3], view.T_b_a[:3, 3] * scale)
-        return self._cross(new, (first, second @ first.T_camera_odom, uv, ok))
+        return self._accept_two_views(new, (first, second @ first.T_camera_odom, uv, ok))
 
     def _is_no_turn(self, uv_a: F64, uv_b: F64) -> bool:
         """True where no turn of the camera explains matched pixels (N, 2).
@@ -326,7 +326,7 @@ class Odometry:
         turned = float(np.linalg.norm(se3.so3_log(moved[:3, :3])))
         T_odom_camera = se3.inverse(T_camera_odom)
         px_s = self._px_s(T_odom_camera, depth)
-        self._moving.update(new.time_ns, T_odom_camera, new.prior)
+        self._motion_model.update(new.time_ns, T_odom_camera, new.prior)
         self._lost = 0
         due = self._base_to_height * (OVERDUE if new.is_blurred else 1.0)
         if base < due and found.share > 0.45 and turned < MAX_TURN_RAD:
@@ -343,7 +343,7 @@ class Odometry:
         self._add_keyframe(
             new, found.pose.T_camera_points, [(other.key, other.uv, other.ok) for other in seen]
         )
-        self._moving.correct(self.keyframes[-1].T_odom_camera)
+        self._motion_model.correct(self.keyframes[-1].T_odom_camera)
         return self._as_keyframe(new, found.ok)
 
     def _px_s(self, T_odom_camera: F64, depth: float) -> F64:
@@ -351,14 +351,14 @@ class Odometry:
         gap_s = 1e-9 * self._gap_ns
         if not (0.0 < gap_s < NEAR_S and np.isfinite(depth)):
             return np.zeros(2)
-        return np.asarray(self.K[0, 0] / gap_s * self._moving.across(T_odom_camera, depth))
+        return np.asarray(self.K[0, 0] / gap_s * self._motion_model.across(T_odom_camera, depth))
 
-    def _cross(self, new: UndistortedFrame, found: TwoViewPose) -> Tracked:
+    def _accept_two_views(self, new: UndistortedFrame, found: TwoViewPose) -> Tracked:
         """Make a keyframe of a frame that two views alone place."""
         self._lost = 0
         key, T_camera_odom, uv, ok = found
         self._add_keyframe(new, T_camera_odom, [(key, uv, ok)])
-        self._moving.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
+        self._motion_model.update(new.time_ns, self.keyframes[-1].T_odom_camera, new.prior)
         return self._as_keyframe(new, ok)
 
     def _as_keyframe(self, new: UndistortedFrame, ok: Bool) -> Tracked:

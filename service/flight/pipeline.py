@@ -28,7 +28,7 @@ MAX_WAITING = 3
 
 def counts(view: StereoView) -> bool:
     """False for a view that comes again: it is not lost when its first depth is."""
-    return not view.is_first
+    return not view.is_first_depth
 
 
 def mapper_config(camera: Camera, config: Config, live: bool = False) -> MapperConfig:

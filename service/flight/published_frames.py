@@ -55,7 +55,7 @@ class PublishedFrames:
                 why = f"poses cannot be stored for the scan: {error.strerror}"
                 raise OutsideError(why) from error
 
-    def corrigible(self) -> Iterator[Any]:
+    def rows(self) -> Iterator[Any]:
         """The rows of all frames, in order."""
         self._file.seek(0)
         while row := self._file.read(FRAME.itemsize):

@@ -138,7 +138,7 @@ class Recorder:
 
     def _moved(self) -> Iterator[PoseRecord]:
         """The poses that corrections have moved, or whose sigma they have changed."""
-        for row in self._frames.corrigible():
+        for row in self._frames.rows():
             T, before_m, agl_m = row["T_world_camera"], float(row["sigma_m"]), float(row["agl_m"])
             seq = int(row["seq"])
             relative = RelativePose(seq, int(row["segment"]), row["T_odom_camera"])
@@ -220,10 +220,10 @@ class Recorder:
 
     def _write_keyframes(self, events: Iterable[Event]) -> None:
         ready = [event for event in events if isinstance(event, KeyframeReady)]
-        for first in (event.keyframe for event in ready if event.is_first):
+        for first in (event.keyframe for event in ready if event.is_first_depth):
             coarse, *_ = encode(first, first.time_ns + self._offset_ns)
             self.store.offer_first(first.seq, coarse)
-        keyframes = [event.keyframe for event in ready if not event.is_first]
+        keyframes = [event.keyframe for event in ready if not event.is_first_depth]
         if keyframes:
             self._write_due()
         for keyframe in keyframes:

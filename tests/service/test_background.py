@@ -60,7 +60,7 @@ def test_a_first_depth_that_gives_way_is_no_lost_view() -> None:
 
     jobs = BackgroundWorker("dense", work, 2, live=True, counts=counts)
     views = [view_at(seq, np.eye(4)) for seq in range(4)]
-    first = replace(views[2], is_first=True)
+    first = replace(views[2], is_first_depth=True)
     for view in (views[0], first, *views[1:3]):  # no more than the queue takes but for the first
         jobs.offer(view)
     assert jobs.dropped == 0

@@ -33,16 +33,16 @@ def fly(first_depths: bool, width_px: int = 320, later_gain: float = 1.0) -> lis
     return [*events, *mapper.finish()]
 
 
-def is_first(event: Event) -> bool:
-    return isinstance(event, KeyframeReady) and event.is_first
+def is_first_depth(event: Event) -> bool:
+    return isinstance(event, KeyframeReady) and event.is_first_depth
 
 
 @pytest.mark.slow
 def test_a_first_depth_shows_new_ground_early_and_leaves_the_map_as_it_is() -> None:
     plain, events = fly(False), fly(True)
     ready = [event for event in events if isinstance(event, KeyframeReady)]
-    rest = [event for event in events if not is_first(event)]
-    assert len(rest) == len(plain) and not any(map(is_first, plain))
+    rest = [event for event in events if not is_first_depth(event)]
+    assert len(rest) == len(plain) and not any(map(is_first_depth, plain))
     for one, other in zip(plain, rest, strict=True):
         assert type(one) is type(other)
         if isinstance(one, KeyframeReady) and isinstance(other, KeyframeReady):
@@ -55,9 +55,9 @@ def test_a_first_depth_shows_new_ground_early_and_leaves_the_map_as_it_is() -> N
             assert one.poses.keys() == other.poses.keys()
             for seq, found in one.poses.items():
                 np.testing.assert_array_equal(found.T_world_camera, other.poses[seq].T_world_camera)
-    whole = {e.keyframe.seq: e.keyframe for e in ready if not e.is_first}
+    whole = {e.keyframe.seq: e.keyframe for e in ready if not e.is_first_depth}
     order = [e.keyframe.seq for e in ready]
-    firsts = [e.keyframe for e in ready if e.is_first]
+    firsts = [e.keyframe for e in ready if e.is_first_depth]
     assert len(firsts) >= 3
     for first in firsts:
         assert order.index(first.seq) < len(order) - 1 - order[::-1].index(first.seq)
@@ -87,7 +87,7 @@ def test_a_step_of_exposure_shows_in_no_keyframe_and_no_first_depth() -> None:
 @pytest.mark.slow
 def test_first_depths_are_coarser_than_whole_ones_of_another_effort() -> None:
     events = [event for event in fly(True, 160) if isinstance(event, KeyframeReady)]
-    widths = {(event.is_first, event.keyframe.depth.depth_m.shape[1]) for event in events}
+    widths = {(event.is_first_depth, event.keyframe.depth.depth_m.shape[1]) for event in events}
     assert widths == {(False, 160), (True, 80)}
 
 

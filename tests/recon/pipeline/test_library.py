@@ -145,11 +145,11 @@ class FirstOnly(BrokenOff):
     def finished(self, everything: bool = False) -> list[tuple[StereoView, Reconstructed]]:
         self.views += 1
         view = view_at(self.views, np.eye(4))
-        return [(replace(view, is_first=True), keyframe(self.views))]
+        return [(replace(view, is_first_depth=True), keyframe(self.views))]
 
 
 def test_a_first_depth_is_said_and_becomes_no_part_of_the_map() -> None:
     mapper = Mapper(CAMERA, worker=FirstOnly)
     (event,) = mapper.drain()
-    assert isinstance(event, KeyframeReady) and event.is_first
+    assert isinstance(event, KeyframeReady) and event.is_first_depth
     assert len(mapper.cloud()) == 0 and not mapper.frames._views

@@ -321,12 +321,12 @@ def test_a_view_is_given_once_with_the_first_frame_that_shows_its_depth() -> Non
     assert views.first() is None
     take(23, 15.0)
     first = views.first()
-    assert first is not None and first.is_first
+    assert first is not None and first.is_first_depth
     assert (first.seq, [partner.seq for partner in first.partners]) == (20, [23])
     take(24, 16.0)
     assert views.first() is None  # once
     take(30, 18.0)
     whole = {view.seq: view for view in views.ready()}
-    assert not any(view.is_first for view in whole.values())
+    assert not any(view.is_first_depth for view in whole.values())
     assert {partner.seq for partner in whole[20].partners} == {0, 10, 30}
     np.testing.assert_array_equal(whole[20].bgr, first.bgr)

@@ -47,7 +47,7 @@ def test_frames_come_back_from_the_disk_as_they_were(tmp_path: Path) -> None:
     for frame in frames:
         kept.add(*frame, before(20))
     keys[2].T_camera_odom = some_pose()  # still in the window: the newest pose counts
-    found = list(kept.corrigible())
+    found = list(kept.rows())
     assert not list(tmp_path.iterdir())  # no name: nothing is left behind
     for (relative, one), other in zip(frames, found, strict=True):
         for name in ("time_ns", "is_view", "sigma_m", "T_world_camera"):
@@ -66,7 +66,7 @@ def test_only_frames_of_keyframes_that_change_stay_in_memory(tmp_path: Path) -> 
         places.append(weakref.ref(row))
         del relative, row
     assert sum(place() is not None for place in places) <= 11
-    assert len(list(kept.corrigible())) == 500
+    assert len(list(kept.rows())) == 500
     kept.close()
 
 

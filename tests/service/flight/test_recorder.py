@@ -211,7 +211,7 @@ def test_a_first_depth_is_offered_and_neither_stored_nor_counted(
         store.listen(lambda kind, number: news.append((kind, number)))
         recorder = recorder_of(store, 1, 0.1)
         one = house.keyframe(7, 0.0)
-        recorder.write([KeyframeReady(one, is_first=True), posed(7)])
+        recorder.write([KeyframeReady(one, is_first_depth=True), posed(7)])
         assert [kind for kind, _ in news] == ["pose", "first"]  # the pose waits for no depth
         assert news[1] == ("first", 7) and store.record("first", 7) is not None
         assert store.seqs() == [] and recorder.keyframes == recorder.points == 0
