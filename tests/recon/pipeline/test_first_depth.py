@@ -72,7 +72,7 @@ def test_a_first_depth_shows_new_ground_early_and_leaves_the_map_as_it_is() -> N
 @pytest.mark.slow
 def test_a_step_of_exposure_shows_in_no_keyframe_and_no_first_depth() -> None:
     def brightness(events: list[Event], of_first: bool) -> F64:
-        ready = [e for e in events if isinstance(e, KeyframeReady) and e.is_first == of_first]
+        ready = [e for e in events if isinstance(e, KeyframeReady) and e.is_first_depth == of_first]
         return np.array([np.median(event.keyframe.bgr) for event in ready])
 
     plain, stepped = fly(True), fly(True, later_gain=0.6)
