@@ -114,7 +114,7 @@ class Recorder:
         self._frames.close()
 
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
-        """Close the scan, which is flushed; return its summary."""
+        """Finish the scan in the store, after :meth:`flush`; return its summary with ``extra``."""
         summary = self.summary() | {"graph": graph_figures(self._graph)}
         summary["apart"] = [list(ends) for ends in self.pipeline.keyframes.apart()]
         summary["false"] = [list(ends) for ends in self.pipeline.keyframes.false()]

@@ -271,10 +271,8 @@ class Scan:
         if shutter is not None:
             camera = self.store.header.camera | shutter_document(shutter)
             self.store.update_header(camera=camera)
-        summary = self.recorder.close(redacted(extra | self.inputs.extra))
-        summary["clouds_per_second"] = round(summary["clouds"] / elapsed, 2)
-        self.store.finish(summary)
-        return summary
+        extra["clouds_per_second"] = round(self.pipeline.pairs / elapsed, 2)
+        return self.recorder.close(redacted(extra | self.inputs.extra))
 
     def discard(self) -> None:
         """End the scan and delete its store; another one may be made in its folder."""

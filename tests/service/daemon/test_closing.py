@@ -164,3 +164,13 @@ def test_memory_settings_are_taken_where_the_library_has_them() -> None:
     assert one_pool()
     assert release_memory() in (True, False)
     assert release_memory(collect=True) in (True, False)
+
+
+def test_a_scan_is_finished_once(tmp_path: Path) -> None:
+    """Whatever is stored is sent: two summaries would pass the radio."""
+    scan, kinds = real_scan(tmp_path / "scan"), list[str]()
+    scan.store.listen(lambda kind, number: kinds.append(kind))
+    summary = scan.close()
+    assert kinds.count("summary") == 1 and scan.store.summary == summary
+    assert summary["clouds_per_second"] == 0.0
+    scan.store.close()
