@@ -240,7 +240,7 @@ def test_a_late_origin_and_corrections_reach_the_ground(tmp_path: Path) -> None:
     bare = ScanHeader(HEADER.scan_id, HEADER.drone, HEADER.started_unix_ns)
     with ScanStore.create(tmp_path / "a.db", bare) as store:
         sender = TunnelSender(store, TunnelConfig(radio_bytes_s=50_000), 0.0)
-        store.listen(sender.news)
+        store.listen(sender.on_item)
         store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
         drain(sender, 0.0, 5.0)
         store.update_header(origin_lat_deg=47.5, origin_lon_deg=8.25)
@@ -266,7 +266,7 @@ def test_a_correction_beyond_the_tiles_resolution_resends_them(
 ) -> None:
     with ScanStore.create(tmp_path / "a.db", HEADER) as store:
         sender = TunnelSender(store, TunnelConfig(radio_bytes_s=50_000), 0.0)
-        store.listen(sender.news)
+        store.listen(sender.on_item)
         frame = keyframe(0, 0.0)
         store.add_keyframe(0, codec.encode(frame, 0))
         drain(sender, 0.0, 5.0)
@@ -279,7 +279,7 @@ def test_a_correction_beyond_the_tiles_resolution_resends_them(
 def test_poses_take_a_message_a_second_and_the_share_counts_what_wraps_it(tmp_path: Path) -> None:
     with ScanStore.create(tmp_path / "a.db", HEADER) as store:
         sender = TunnelSender(store, TunnelConfig(radio_bytes_s=1000, share=0.5), 0.0)
-        store.listen(sender.news)
+        store.listen(sender.on_item)
         T, sent, poses, now = keyframe(0, 0.0).pose.T_world_camera, 0, 0, 0.0
         for seq in range(4):
             store.add_keyframe(seq, codec.encode(keyframe(seq, 8.0 * seq), 0))
