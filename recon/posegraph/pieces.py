@@ -5,8 +5,6 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 
-from scipy.cluster.hierarchy import DisjointSet
-
 from recon.posegraph.records import Loop
 from recon.posegraph.segments import HEIGHT_KNOWN_M, Segment, Segments
 
@@ -23,6 +21,9 @@ def apart(segments: Segments, loops: Sequence[Loop]) -> list[tuple[int, int]]:
 
     The main piece is the one that fixes place; without fixes, that with most points.
     """
+    # Loads scipy.spatial, which a flight does without until its end.
+    from scipy.cluster.hierarchy import DisjointSet
+
     known = [segment for segment in segments.with_surface() if not segment.is_false]
     pieces = DisjointSet([segment.number for segment in known])
     looped: set[int] = set()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from recon.types import F32, F64
 from service.scans.main_piece import main_track
@@ -24,6 +23,8 @@ class SharedSigma:
         """``share`` of a depth is its sigma by scale and lens."""
         poses = poses[:: 1 + len(poses) // MAX_POSES]
         places = np.array([p.T_world_camera[:3, 3] for p in poses])
+        from scipy.spatial import cKDTree  # a flight does without it
+
         self._near, self._up_m = cKDTree(places[:, :2]), places[:, 2]
         self._sigma_m = np.array([p.sigma_h_v_m[1] for p in poses])
         self._share = share
