@@ -77,8 +77,8 @@ def store(tmp_path_factory: pytest.TempPathFactory, house: HouseFlight) -> Path:
     root = tmp_path_factory.mktemp("scans")
     folder = root / "drone-1" / "test-1"
     with house.flown(folder) as scan:
-        scan.finish({})
-        write_deliverables(folder, scan, {"scale": {"from": "gnss", "sigma": 0.0065}})
+        scan.finish({"scale": {"from": "gnss", "sigma": 0.0065}})
+        write_deliverables(folder, scan, {})
     return root
 
 
@@ -417,17 +417,18 @@ def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, s
     browser.wait("document.querySelectorAll('article').length === 1")
     facts = browser.run("document.querySelector('article .facts').innerText")
     assert f"{points} points" in facts
-    assert f"detail ±{quality['sigma_median_m']:.2f} m" in facts
-    across, up = (quality[f"position_sigma_{way}_median_m"] for way in "hv")
+    assert f"relative ±{quality['sigma_median_m']:.2f} m" in facts
+    across, up = quality["position_sigma_h_median_m"], quality["sigma_absolute_median_m"]
+    assert up > quality["position_sigma_v_median_m"]
     absolute = f"±{across:.2f} m across, ±{up:.2f} m up"
-    assert f"position {absolute}" in facts
+    assert f"absolute {absolute}" in facts
     assert f"Trust\n{quality['trust']['level']}" in facts
     open_scan(browser, portal)
     browser.wait(f"document.querySelector('.figures').innerText.includes('{points}')")
     figures = browser.run("document.querySelector('.figures').innerText")
     assert f"Points\n{points}" in figures
-    assert f"Detail\n±{quality['sigma_median_m']:.2f} m" in figures
-    assert f"Position\n{absolute}" in figures
+    assert f"Relative\n±{quality['sigma_median_m']:.2f} m" in figures
+    assert f"Absolute\n{absolute}" in figures
     assert "Scale\n±0.7 %" in figures
     assert "Speed" not in figures  # it has landed
     follow = "[...document.querySelectorAll('button')].find(b => b.textContent === 'Follow')"

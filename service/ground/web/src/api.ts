@@ -44,6 +44,7 @@ export interface Scan {
   quality?: {
     area_m2?: number | null;
     sigma_median_m?: number | null;
+    sigma_absolute_median_m?: number | null;
     position_sigma_h_median_m?: number | null;
     position_sigma_v_median_m?: number | null;
     scale_sigma?: number | null;

@@ -277,15 +277,16 @@ function facts(s: api.Scan): HTMLElement {
   const isNamed = s.title !== s.scan; // else its name is place and date
   if (isNamed) rows.push(["Flown", date(s.started_unix_s)]);
   if (s.origin && isNamed) rows.push(["Place", placeName(s.origin.lat_deg, s.origin.lon_deg)]);
-  const { area_m2, sigma_median_m, position_sigma_h_median_m: across, position_sigma_v_median_m: up, trust } = s.quality ?? {};
+  const { area_m2, sigma_median_m, position_sigma_h_median_m: across, position_sigma_v_median_m, sigma_absolute_median_m, trust } = s.quality ?? {};
+  const up = sigma_absolute_median_m ?? position_sigma_v_median_m;
   const size: string[] = [];
   if (s.counts?.points !== undefined) size.push(`${count(s.counts.points)} points`);
   else if (s.counts?.keyframes !== undefined) size.push(`${s.counts.keyframes} keyframes`);
   if (area_m2) size.push(`${count(area_m2)} m²`);
   if (size.length) rows.push(["Size", size.join(", ")]);
   const sigma: string[] = [];
-  if (sigma_median_m) sigma.push(`detail ${units.accuracy(sigma_median_m)}`);
-  if (s.origin && across && up) sigma.push(`position ${units.sigmas(across, up)}`);
+  if (sigma_median_m) sigma.push(`relative ${units.accuracy(sigma_median_m)}`);
+  if (s.origin && across && up) sigma.push(`absolute ${units.sigmas(across, up)}`);
   if (sigma.length) rows.push(["Accuracy", sigma.join(", ")]);
   if (trust) rows.push(["Trust", [trust.level, ...trust.reasons].join("; ")]);
   return el(
