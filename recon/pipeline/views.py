@@ -111,6 +111,7 @@ class ViewSelection:
             None  # a last view's partner
         )
         self._max_partners = partners
+        self._views_of: Counter[int] = Counter()  # views by segment, kept or not
         self._take_next = False
         self.set_baseline(baseline or Baseline())
 
@@ -147,7 +148,7 @@ class ViewSelection:
         """True when the frame is to be a view."""
         if self._take_next or self._wants(frame.seq, tracked):
             self._take_next = False
-            self._kept.append(frame)
+            self._keep(frame)
             return True
         if self._between.maxlen:
             self._between.append(frame)
@@ -168,7 +169,7 @@ class ViewSelection:
             frame is not None and not frame.is_blurred and _apart(frame, self._kept[-1]) >= least
         )
         if frame is not None and is_view:
-            self._kept.append(frame)
+            self._keep(frame)
         last = self._kept[-1]
         near = [v for v in self._recent if v.segment == last.segment and not v.is_blurred]
         near = [v for v in near if 0.5 * step <= _apart(v, last) < 0.9 * step]
@@ -198,6 +199,10 @@ class ViewSelection:
             return False
         last = max([self._kept[-1], *self._recent], key=lambda v: v.seq)
         return last.segment == frame.segment and _apart(frame, last) > 0.25 * step
+
+    def _keep(self, view: UndistortedFrame) -> None:
+        self._kept.append(view)
+        self._views_of[view.segment] += 1
 
     def _wants(self, seq: int, tracked: Tracked) -> bool:
         if tracked.state is Tracking.STARTED or not self._kept:
@@ -232,7 +237,7 @@ class ViewSelection:
         Clouds in the sky or a false first motion would otherwise become surface. A baseline
         that the operator fixed pairs each view once and is not checked.
         """
-        return self._mode != "auto" or sum(v.segment == view.segment for v in self._kept) >= 3
+        return self._mode != "auto" or self._views_of[view.segment] >= 3
 
     def partners(self, view: UndistortedFrame) -> list[UndistortedFrame]:
         """The views to pair it with, the best first.

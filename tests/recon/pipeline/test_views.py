@@ -267,6 +267,22 @@ def test_views_wait_for_the_first_word_on_their_readout(
     assert counts == expected
 
 
+def test_a_view_that_waited_while_the_next_segment_grew_is_confirmed_by_its_own() -> None:
+    """Only one of those is kept by then."""
+    search, keys = Mock(ReadoutSearch, doubt_s=0.0, is_open=True), list[OdometryKeyframe]()
+    views = stereo_camera(keys, search)
+    given = []
+    for i in range(8):
+        plain = frame(i, 5.0 * i, segment=i // 4)
+        keys.append(plain.keyframe)
+        moving = FrameRows(i, PosePrior(), np.eye(4), is_measured=True)
+        state = Tracking.KEYFRAME if i % 4 else Tracking.STARTED
+        tracked = Tracked(state, i // 4, plain.T_odom_camera, moving=moving)
+        views.take(replace(plain, relative=None), tracked)
+        given += [view.seq for view in views.ready()]
+    assert given == [0, 1, 2, 3]
+
+
 @pytest.mark.parametrize("exposure_s", [0.0, 0.05])
 def test_a_view_knows_how_far_its_image_moved_while_it_was_exposed(exposure_s: float) -> None:
     """1 m in each tenth of a second, 50 m above points 100 m further on, at 30 px."""
