@@ -204,10 +204,13 @@ def start_of(
     """
     is_dated = log is None or log.clock == "unix"
     is_assumed = False
+    stated_ns = None if log is None else log.start_unix_ns
+    if stated_ns is not None and not is_time(stated_ns):
+        stated_ns = None  # a clock that was never set, or a spoilt one
     if video_epoch is not None:
         start_ns = round(video_epoch * 1e9) if math.isfinite(video_epoch) else MAX_TIME_NS
-    elif log is not None and log.start_unix_ns is not None:
-        start_ns = log.start_unix_ns
+    elif stated_ns is not None:
+        start_ns = stated_ns
     elif source.epoch_unix_ns is not None:
         start_ns = source.epoch_unix_ns
         start_ns -= local_zone_ns(start_ns, log, notes) if is_dated else 0
@@ -225,7 +228,7 @@ def start_of(
     is_of_log = video_epoch is not None and log is not None and _covers(log, start_ns)
     if log is not None and not is_dated and not is_of_log:
         zero_ns = 0 if log.clock == "video" else log.first_ns
-        if log.start_unix_ns is None:
+        if stated_ns is None:
             notes.append("the log has no date: it begins with the recording")
         return zero_ns, start_ns - zero_ns, log.clock != "video"
     if log is not None and not _covers(log, start_ns):

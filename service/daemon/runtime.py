@@ -268,14 +268,14 @@ class Daemon:
         """Monitor the machine, shed load, keep free space on the disk, and prepare for a scan."""
         if self._quit.is_set():
             return
-        if self._was_armed and self.scanning.is_warm:
-            load_kernels()
         folder, keep_free_mib = Path(self.config.scan.folder), self.config.scan.keep_free_mib
         machine = read_machine(folder)
         self.vehicle.set_load(computer_load(machine, self._cores.percent(), keep_free_mib))
         self.shed_load(machine)
         make_room(folder, keep_free_mib, self.scanning.in_the_making)
         release_memory()
+        if self._was_armed and self.scanning.is_warm:
+            load_kernels()
 
     def shed_load(self, machine: Machine, now_s: float | None = None) -> None:
         """Take the step of the load ladder that heat, memory and the scan's lag ask for."""

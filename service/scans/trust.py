@@ -27,6 +27,9 @@ MIN_LENS_SIGMA, MAX_LENS_SIGMA = 0.01, 0.1
 """Sigma of a focal length above which heights are in doubt, and above which the shape is; so, too,
 where positions and heights give scales that differ by more, as after a zoom."""
 
+MAX_NUMBER = 1e12
+"""A larger figure in a summary is none: a peer's may be anything that JSON can be."""
+
 BENDS = {"lens": 0.02, "distortion": 0.01}
 """Sigma of depth over depth by what is assumed of the lens: it bends surfaces by so much."""
 
@@ -205,7 +208,9 @@ def _said(level: Trust, reasons: list[str]) -> dict[str, Any]:
 
 def _number(document: Any, key: str) -> float | None:
     value = document.get(key) if isinstance(document, Mapping) else None
-    return float(value) if isinstance(value, int | float) else None
+    if isinstance(value, int | float) and abs(value) < MAX_NUMBER:
+        return float(value)
+    return None
 
 
 def slope_deg(xyz_m: Array) -> float:

@@ -19,6 +19,7 @@ from mavlink.component.vehicle import VehicleLink
 from service.background import BackgroundWorker
 from service.cameras import CameraFrame
 from service.config import load_config
+from service.daemon import runtime
 from service.daemon.frame_gate import FrameGate
 from service.daemon.runtime import COMPILING_S, HUNG_S
 from service.daemon.warm_up import SyntheticGround, is_warm, warm_up, warm_up_command
@@ -89,6 +90,23 @@ def test_an_idle_service_holds_no_compiler_and_an_armed_one_is_prepared(tmp_path
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (0, "\nnumba service.flight.scan\n"), done.stderr
+
+
+def test_kernels_that_cannot_be_loaded_leave_the_rest_of_housekeeping(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails() -> None:
+        raise RuntimeError("no cache")
+
+    daemon, kept = Onboard(tmp_path), list[Path]()
+    monkeypatch.setattr(runtime, "load_kernels", fails)
+    monkeypatch.setattr(runtime, "make_room", lambda folder, *_: kept.append(folder))
+    daemon.vehicle.arm()
+    daemon.look()
+    daemon.scanning.is_warm = True
+    with pytest.raises(RuntimeError, match="no cache"):
+        daemon._housekeeping()
+    assert kept == [Path(daemon.config.scan.folder)]
 
 
 def test_the_command_fits_the_installation() -> None:

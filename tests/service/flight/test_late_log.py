@@ -207,6 +207,13 @@ def test_a_log_without_a_date_takes_that_of_its_video(
     assert found == is_assumed
 
 
+@pytest.mark.parametrize("stated_ns", [1000 * 2**64, -400 * 86_400 * 10**9])
+def test_an_impossible_date_of_the_telemetry_in_a_video_is_none(stated_ns: int) -> None:
+    log = TelemetryLog(VehicleHistory(), "video", 0, 40, (), {}, start_unix_ns=stated_ns)
+    source = cast(CameraSource, SimpleNamespace(epoch_unix_ns=round(EPOCH_S * 1e9)))
+    assert start_of(source, log, None, [])[:2] == (0, round(EPOCH_S * 1e9))
+
+
 @pytest.mark.parametrize("given_s", [None, EPOCH_S + 9.0])
 def test_a_date_of_the_telemetry_in_a_video_is_that_of_the_video(given_s: float | None) -> None:
     """The container's may be local time; one that is given counts before both."""

@@ -153,6 +153,8 @@ def test_a_run_that_notes_nothing_limits_nothing(run: dict[str, Any]) -> None:
         ({"scale": {"from": "first telemetry", "sigma": None}}, "exif", None),
         ({}, "none", None),
         ({"assumed": 3}, "gnss", 0.03),
+        ({"sigma_focal": 10**400}, "gnss", 0.03),  # of a peer
+        ({"scale": {"sigma": 1e300}}, "gnss", None),
     ],
 )
 def test_all_depths_share_the_errors_of_scale_and_lens(
