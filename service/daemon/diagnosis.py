@@ -228,7 +228,7 @@ def examine_compute(config: Config, by: Choice | None = None) -> Iterator[Findin
     try:
         backend = open_backend(config.compute, by=by or Choice())
         import_module("recon.stereo.belief_propagation")  # a scan's kernels; opening loads none
-    except (SkyreliefError, ImportError) as error:
+    except (SkyreliefError, ImportError, RuntimeError) as error:  # numba's, without a cache
         yield Finding("compute", BAD, str(error))
         return
     seconds = time.monotonic() - start

@@ -16,6 +16,7 @@ from paths import DEMO
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
 from service.config import load_config
+from service.daemon import diagnosis
 from service.daemon.diagnosis import BAD, GOOD, NOTE, examine, examine_compute, examine_software
 
 
@@ -179,6 +180,13 @@ def test_kernels_that_cannot_be_loaded_are_a_fault(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "recon.stereo.belief_propagation", None)
     (found,) = examine_compute(load_config(None, ["compute.backend=cpu"]))
     assert found.verdict == BAD and "belief_propagation" in found.text
+
+    def fails(_: str) -> None:
+        raise RuntimeError("cannot cache function 'aggregate': no locator available")
+
+    monkeypatch.setattr(diagnosis, "import_module", fails)
+    (found,) = examine_compute(load_config(None, ["compute.backend=cpu"]))
+    assert found.verdict == BAD and "no locator" in found.text
 
 
 def test_what_a_running_service_holds_is_asked_of_it(tmp_path: Path) -> None:
