@@ -244,15 +244,18 @@ Look at:
 
 
 def _verdict(quality: dict[str, Any]) -> str:
-    """What may be measured, and one sigma of each: what holds within the map first."""
-    scale, across = quality["scale_sigma"], quality["position_sigma_h_median_m"]
-    parts = [f"detail {within(quality['sigma_median_m'])}"]
+    """What may be measured, and one sigma of each, named as in the portal: what holds within the
+    map first."""
+    relative, scale = quality["sigma_median_m"], quality["scale_sigma"]
+    across, up = quality["position_sigma_h_median_m"], quality["position_sigma_v_median_m"]
+    up = quality["sigma_absolute_median_m"] or up
+    parts = [] if relative is None else [f"relative {within(relative)}"]
     if scale is not None:
         parts.append(f"lengths ± {100.0 * scale:.1f} %")
     if across is not None:
-        up = within(quality["position_sigma_v_median_m"])
-        parts.append(f"place on the earth {within(across)}, height above sea level {up}")
-    return f"{quality['trust']['level']}: {', '.join(parts)}"
+        parts.append(f"absolute {within(across)} across, {within(up)} up")
+    level: str = quality["trust"]["level"]
+    return f"{level}: {', '.join(parts)}" if parts else level
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -40,14 +40,15 @@ def test_a_named_flight_alone_counts(tmp_path: Path) -> None:
 def test_the_verdict_begins_with_what_holds_within_the_map() -> None:
     quality: dict[str, Any] = {
         "sigma_median_m": 0.054, "scale_sigma": 0.0464, "position_sigma_h_median_m": 6.57,
-        "position_sigma_v_median_m": 23.4, "trust": {"level": "georeferenced", "reasons": ["no"]},
+        "position_sigma_v_median_m": 23.4, "sigma_absolute_median_m": 23.7,
+        "trust": {"level": "georeferenced", "reasons": ["no"]},
     }  # fmt: skip
     assert demo._verdict(quality) == (
-        "georeferenced: detail ± 5.4 cm, lengths ± 4.6 %, place on the earth ± 6.57 m, "
-        "height above sea level ± 23 m"
+        "georeferenced: relative ± 5.4 cm, lengths ± 4.6 %, absolute ± 6.57 m across, ± 24 m up"
     )
     quality |= {"scale_sigma": None, "position_sigma_h_median_m": None}
-    assert demo._verdict(quality) == "georeferenced: detail ± 5.4 cm"
+    assert demo._verdict(quality) == "georeferenced: relative ± 5.4 cm"
+    assert demo._verdict(quality | {"sigma_median_m": None}) == "georeferenced"
 
 
 @pytest.mark.slow
