@@ -116,9 +116,12 @@ function kept(old: Card | undefined, s: api.Scan, again: () => void, overview: O
 function leaveAsFound(old: HTMLElement, now: HTMLElement): void {
   const [was, is] = [old, now].map((one) => one.querySelector<HTMLImageElement>(".thumbnail img"));
   if (was?.naturalWidth && is && was.src !== is.src) {
+    const place = is.parentElement!;
     is.replaceWith(was);
     is.loading = "eager"; // out of the page
-    void is.decode().then(() => was.replaceWith(is), () => (was.replaceWith(is), is.onerror?.("")));
+    // The image before this one may have come meanwhile, in place of the old one.
+    const show = (): void => (was.parentElement ? was.replaceWith(is) : place.replaceChildren(is));
+    void is.decode().then(show, () => (show(), is.onerror?.("")));
   }
   now.querySelector("details")!.open = old.querySelector("details")!.open;
   const focused = old.contains(document.activeElement) ? document.activeElement : null;
