@@ -22,7 +22,8 @@ MIN_COMMON = 60
 
 KEPT = np.array([[0.95], [0.8], [0.8]])
 """Share of the logarithm of a gain, and of its slopes, that is kept from image to image. What has
-one side of all images brighter, as sunlight does, adds up otherwise."""
+one side of all images brighter, as sunlight does, adds up otherwise, as far as the fit takes it for
+one."""
 
 LEVEL = 0.1
 """Weight of a gain without slope, over that of samples all over the image."""
@@ -54,9 +55,9 @@ class Exposure:
     """Levels each new image with the last ones."""
 
     def __init__(self) -> None:
-        self._earlier: deque[tuple[F32, F32]] = deque(maxlen=IMAGES)
-        # Places of some surface of each, m, in the segment's frame, and the logarithms of its
-        # levelled colours, both (N, 3); NaN where a colour says nothing.
+        self._earlier: deque[tuple[F32, F32, F64]] = deque(maxlen=IMAGES)
+        # Places of some surface of each, m, in the segment's frame, the logarithms of its levelled
+        # colours, NaN where a colour says nothing, and its places in the image, all (N, 3).
         self._segment = -1
         self._gain = np.zeros((3, 3))  # of the last image: logarithm in the middle, slopes across
         # and down, each for blue, green and red
@@ -72,15 +73,17 @@ class Exposure:
             self._segment = segment
         calm = np.asarray(cv2.blur(bgr.astype(np.float32), (BLUR_PX, BLUR_PX)), np.float32)
         if self._earlier:
-            points, before = (np.concatenate(arrays) for arrays in zip(*self._earlier, strict=True))
+            points, before, seen_at = map(np.concatenate, zip(*self._earlier, strict=True))
             which, at, there = shared(depth, points)
             same = np.abs(depth.depth_m[at] / there - 1.0) < SAME_SHARE
             off = np.where(same[:, None], before[which] - _logs(calm[at]), np.nan)
-            self._fit(off, _places(at, bgr.shape))
+            places = _places(at, bgr.shape)
+            self._fit(off, np.hstack([places, places[:, 1:] - seen_at[which, 1:]]))
         self._gain *= KEPT
         at, points = sampled(depth)
-        known = _logs(calm[at]) + _places(at, bgr.shape) @ self._gain
-        self._earlier.append((points.astype(np.float32), known.astype(np.float32)))
+        places = _places(at, bgr.shape)
+        known = _logs(calm[at]) + places @ self._gain
+        self._earlier.append((points.astype(np.float32), known.astype(np.float32), places))
         return self.level(bgr)
 
     def level(self, bgr: U8) -> U8:
@@ -102,21 +105,23 @@ class Exposure:
         return np.asarray(cv2.convertScaleAbs(lit), np.uint8)
 
     def _fit(self, off: F64, places: F64) -> None:
-        """The gain by differences of logarithms (N, 3) at ``places`` (N, 3)."""
+        """The gain by differences of logarithms (N, 3) at ``places`` (N, 5): the terms of the gain,
+        and how far across and down each moved over the image. What makes one side of all images
+        brighter depends on that, and is no gain."""
         known = np.isfinite(off).all(axis=1)
         every = max(1, np.count_nonzero(known) // FITTED)
         off, places = off[known][::every], places[known][::every]
         if len(off) < MIN_COMMON:
             return
-        gain = np.zeros((3, 3))
+        gain = np.zeros((5, 3))
         gain[0] = np.median(off, axis=0)
         for _ in range(STEPS):
             rest = np.linalg.norm(off - places @ gain, axis=1)
             limit = HUBER * max(float(np.median(rest)), 1e-3)
             weighted = places * np.minimum(1.0, limit / np.maximum(rest, limit))[:, None]
-            level = LEVEL / 12.0 * weighted[:, 0].sum() * np.diag([0.0, 1.0, 1.0])
+            level = LEVEL / 12.0 * weighted[:, 0].sum() * np.diag([0.0, 1.0, 1.0, 1.0, 1.0])
             gain = np.linalg.solve(weighted.T @ places + level, weighted.T @ off)
-        change = gain - self._gain
+        change = gain[:3] - self._gain
         self._gain += np.sign(change) * np.maximum(np.abs(change) - UNSEEN, 0.0)
         self._gain = np.clip(self._gain, -MAX_LOG, MAX_LOG)
 

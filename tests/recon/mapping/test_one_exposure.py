@@ -68,6 +68,17 @@ def test_images_of_one_exposure_stay_as_they_are() -> None:
         assert np.abs(darkened(0, depth, dark).astype(int) - dark).max() <= 2
 
 
+def test_a_side_that_is_brighter_in_all_images_adds_up_to_no_gain() -> None:
+    """Ahead, as with the sun behind the drone: ground darkens as it moves through the image."""
+    exposure = Exposure()
+    ramp = np.linspace(1.2, 0.8, SIZE[0])[None, :, None]
+    for k in range(30):
+        depth, right = _seen(pose(STEP_M * k))
+        raw = np.rint(right * ramp).astype(np.uint8)
+        levelled = exposure(0, depth, raw)
+    assert (_apart(levelled, raw) < 0.1).all()
+
+
 def test_without_common_ground_a_gain_lasts_and_returns_to_one() -> None:
     exposure = Exposure()
     exposure(0, *_seen(pose(0.0)))
