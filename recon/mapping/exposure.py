@@ -56,8 +56,8 @@ class Exposure:
 
     def __init__(self) -> None:
         self._earlier: deque[tuple[F32, F32, F64]] = deque(maxlen=IMAGES)
-        # Places of some surface of each, m, in the segment's frame, the logarithms of its levelled
-        # colours, NaN where a colour says nothing, and its places in the image, all (N, 3).
+        # Places (N, 3) of some surface of each, m, in the segment's frame, the logarithms (N, 3) of
+        # its levelled colours, NaN where a colour says nothing, and its places (N, 2) in the image.
         self._segment = -1
         self._gain = np.zeros((3, 3))  # of the last image: logarithm in the middle, slopes across
         # and down, each for blue, green and red
@@ -78,12 +78,13 @@ class Exposure:
             same = np.abs(depth.depth_m[at] / there - 1.0) < SAME_SHARE
             off = np.where(same[:, None], before[which] - _logs(calm[at]), np.nan)
             places = _places(at, bgr.shape)
-            self._fit(off, np.hstack([places, places[:, 1:] - seen_at[which, 1:]]))
+            self._fit(off, np.hstack([places, places[:, 1:] - seen_at[which]]))
         self._gain *= KEPT
         at, points = sampled(depth)
         places = _places(at, bgr.shape)
         known = _logs(calm[at]) + places @ self._gain
-        self._earlier.append((points.astype(np.float32), known.astype(np.float32), places))
+        seen = points.astype(np.float32), known.astype(np.float32), places[:, 1:]
+        self._earlier.append(seen)
         return self.level(bgr)
 
     def level(self, bgr: U8) -> U8:

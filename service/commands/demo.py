@@ -18,7 +18,7 @@ import typer
 
 from service.commands import AsJson
 from service.errors import InputError, OutsideError
-from service.scans.report_parts import within
+from service.scans.report_parts import height_sigma_m, within
 from service.workers import python_command
 
 FLIGHT = Path("demo") / "caliterra"
@@ -247,12 +247,11 @@ def _verdict(quality: dict[str, Any]) -> str:
     """What may be measured, and one sigma of each, named as in the portal: what holds within the
     map first."""
     relative, scale = quality["sigma_median_m"], quality["scale_sigma"]
-    across, up = quality["position_sigma_h_median_m"], quality["position_sigma_v_median_m"]
-    up = quality["sigma_absolute_median_m"] or up
+    across, up = quality["position_sigma_h_median_m"], height_sigma_m(quality)
     parts = [] if relative is None else [f"relative {within(relative)}"]
     if scale is not None:
         parts.append(f"lengths ± {100.0 * scale:.1f} %")
-    if across is not None:
+    if across is not None and up is not None:
         parts.append(f"absolute {within(across)} across, {within(up)} up")
     level: str = quality["trust"]["level"]
     return f"{level}: {', '.join(parts)}" if parts else level

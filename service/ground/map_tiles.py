@@ -90,12 +90,8 @@ def _thumbnail(request: Request) -> Response:
     with state.maps.lock:
         live = state.maps.view(folder)
         corners, exposure = _corners(live), live.exposure
-    west, north, east, south = corners
-    side = max(east - west, south - north, THUMBNAIL_PX / (SIDE << MAX_ZOOM))
-    zoom = max(0, int(np.floor(np.log2(THUMBNAIL_PX / SIDE / side))))
+    zoom, columns, rows = _tiles_under(corners, THUMBNAIL_PX / SIDE)
     left, top, right, bottom = (int(v * (SIDE << zoom)) for v in corners)
-    columns = range(left // SIDE, right // SIDE + 1)
-    rows = range(top // SIDE, bottom // SIDE + 1)
     whole = np.vstack([
         np.hstack([tile_image(state, folder, "ortho", (zoom, x, y)) for x in columns])
         for y in rows
@@ -282,6 +278,18 @@ def _corners(live: LiveMap) -> tuple[float, float, float, float]:
     return found
 
 
+def _tiles_under(
+    corners: tuple[float, float, float, float], wide: float
+) -> tuple[int, range, range]:
+    """The finest zoom at which what lies within ``corners`` is no wider than ``wide`` tiles, and
+    the columns and rows of the tiles that show it."""
+    west, north, east, south = corners
+    side = max(east - west, south - north, 1e-9)
+    zoom = min(MAX_ZOOM, max(0, int(np.floor(np.log2(wide / side)))))
+    n = 1 << zoom
+    return zoom, range(int(west * n), int(east * n) + 1), range(int(north * n), int(south * n) + 1)
+
+
 def _bounds(live: LiveMap) -> tuple[float, float, float, float]:
     """(west, south, east, north) in degrees; InputError without surface."""
     west, north, east, south = _corners(live)
@@ -375,14 +383,12 @@ def _kml(request: Request) -> Response:
     """A layer as overlays for Google Earth and TAK, each fetched again every few seconds."""
     state, folder, layer = _asked(request)
     with state.maps.lock:
-        west, north, east, south = _corners(state.maps.view(folder))
-    side = max(east - west, south - north, 1e-9)
-    zoom = min(MAX_ZOOM, max(0, int(np.floor(np.log2((KML_TILES - 1) / side)))))
-    n = 1 << zoom
+        corners = _corners(state.maps.view(folder))
+    zoom, columns, rows = _tiles_under(corners, KML_TILES - 1)
     overlays = "".join(
         _overlay(f"{request.base_url}{_path(folder, layer)}/{zoom}/{x}/{y}.png", (zoom, x, y))
-        for x in range(int(west * n), int(east * n) + 1)
-        for y in range(int(north * n), int(south * n) + 1)
+        for x in columns
+        for y in rows
     )
     text = (
         '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">'

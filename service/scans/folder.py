@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -172,14 +172,19 @@ class _Files:
                 count += len(part[0])
                 yield part
 
-        with writing(self._folder / CLOUD) as part:
-            datum = flown_datum(self._store.header)
-            started = self._store.header.started_unix_ns
-            write_laz(part, parts(), self._frame, started, vertical=datum, shared=self._shared)
+        self._write_laz(parts())
         return FusedCloud(
             joined(kept), tiled.voxel_m, tiled.ground_sample_m, tiled.keyframes, tiled.points_in,
             points_out=count,
         )  # fmt: skip
+
+    def _write_laz(self, parts: Iterable[LazPart]) -> None:
+        header = self._store.header
+        with writing(self._folder / CLOUD) as part:
+            write_laz(
+                part, parts, self._frame, header.started_unix_ns, vertical=flown_datum(header),
+                shared=self._shared,
+            )  # fmt: skip
 
     def write_pieces(self) -> None:
         """Write each unconnected stretch as a cloud about its first camera."""
@@ -258,11 +263,8 @@ class _Files:
 
     def write_cloud(self) -> None:
         if self._fused is not NOTHING and self._tiled is None:
-            with self.failures.noted(CLOUD), writing(self._folder / CLOUD) as part:
-                started = self._store.header.started_unix_ns
-                datum = flown_datum(self._store.header)
-                parts = [(self._fused.cloud, None, None)]
-                write_laz(part, parts, self._frame, started, vertical=datum, shared=self._shared)
+            with self.failures.noted(CLOUD):
+                self._write_laz([(self._fused.cloud, None, None)])
 
     def draw(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Write the preview and the report; returns the content of scan.json."""

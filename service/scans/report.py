@@ -23,7 +23,7 @@ from service.scans.coverage import Coverage
 from service.scans.drawing import draw_maps
 from service.scans.report_appendix import appendix
 from service.scans.report_map import map_figure
-from service.scans.report_parts import area, figure, length, table, within
+from service.scans.report_parts import area, figure, height_sigma_m, length, table, within
 from service.stream.records import PoseRecord
 
 STYLE = (
@@ -163,10 +163,11 @@ def accuracy_words(summary: dict[str, Any]) -> list[str]:
             f"{_apart(control)} (RMS). Without check points there is no independent measure."
         )
     elif level == "georeferenced":
-        h, v = quality["position_sigma_h_median_m"], quality["position_sigma_v_median_m"]
-        v = quality.get("sigma_absolute_median_m") or v
+        h, v = quality["position_sigma_h_median_m"], height_sigma_m(quality)
         how = (
-            "" if h is None else f": {within(h)} horizontally and {within(v)} vertically (1 sigma)"
+            ""
+            if h is None or v is None
+            else f": {within(h)} horizontally and {within(v)} vertically (1 sigma)"
         )
         out.append(
             f"No surveyed point was used. The aircraft's own positions place the map{how}. As a "

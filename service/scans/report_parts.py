@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
+from typing import Any
 
 
 def area(value_m2: float) -> str:
@@ -22,6 +23,12 @@ def length(value_m: float) -> str:
 def within(sigma_m: float) -> str:
     """Such as ``± 3.2 cm``."""
     return f"± {length(sigma_m)}"
+
+
+def height_sigma_m(quality: Mapping[str, Any]) -> float | None:
+    """Sigma of heights in the world; where the points' is not known, the track's."""
+    found: float | None = quality.get("sigma_absolute_median_m")
+    return found or quality["position_sigma_v_median_m"]
 
 
 def table(rows: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:

@@ -279,6 +279,10 @@ export async function upload(files: File[], progress: (share: number) => void): 
     request.send(new Blob(files));
   });
 }
+/** Sigma of heights in the world; where the points' is not known, the track's. */
+export const heightSigma = (quality: Scan["quality"]): number | null | undefined =>
+  quality?.sigma_absolute_median_m ?? quality?.position_sigma_v_median_m;
+
 /** The image of a keyframe. */
 export const keyframe = (s: { drone: string; scan: string }, seq: number): string => `${place(s)}/keyframes/${seq}.jpg`;
 

@@ -280,8 +280,8 @@ function facts(s: api.Scan): HTMLElement {
   const isNamed = s.title !== s.scan; // else its name is place and date
   if (isNamed) rows.push(["Flown", date(s.started_unix_s)]);
   if (s.origin && isNamed) rows.push(["Place", placeName(s.origin.lat_deg, s.origin.lon_deg)]);
-  const { area_m2, sigma_median_m, position_sigma_h_median_m: across, position_sigma_v_median_m, sigma_absolute_median_m, trust } = s.quality ?? {};
-  const up = sigma_absolute_median_m ?? position_sigma_v_median_m;
+  const { area_m2, sigma_median_m, position_sigma_h_median_m: across, trust } = s.quality ?? {};
+  const up = api.heightSigma(s.quality);
   const size: string[] = [];
   if (s.counts?.points !== undefined) size.push(`${count(s.counts.points)} points`);
   else if (s.counts?.keyframes !== undefined) size.push(`${s.counts.keyframes} keyframes`);

@@ -211,8 +211,7 @@ function rows(cloud: Cloud, { counts, quality }: api.Scan, finished: boolean, la
     ["Images", String(cloud.own.keyframes)],
   ];
   if (finished && quality?.sigma_median_m) facts.push(["Relative", units.accuracy(quality.sigma_median_m)]);
-  const up_m = quality?.sigma_absolute_median_m ?? quality?.position_sigma_v_median_m;
-  const [across, up] = finished ? [quality?.position_sigma_h_median_m, up_m] : (last?.sigma_h_v_m ?? []);
+  const [across, up] = finished ? [quality?.position_sigma_h_median_m, api.heightSigma(quality)] : (last?.sigma_h_v_m ?? []);
   if (across && up) facts.push(["Absolute", units.sigmas(across, up)]);
   if (finished && quality?.scale_sigma) facts.push(["Scale", `±${units.share(quality.scale_sigma)}`]);
   if (last) facts.push(["Flown", units.length(last.distance_m, 0)]);
