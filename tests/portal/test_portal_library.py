@@ -26,7 +26,7 @@ NAMES = "[...document.querySelectorAll('article h2')].map(h => h.textContent)"
 OUTLINES = """[...document.querySelectorAll('.outlines polygon')].map(p => {
   const box = p.getBoundingClientRect(); return [box.x, box.y, box.width, box.height]; })"""
 THUMBNAIL = """(() => { const i = document.querySelector('.thumbnail img');
-  if (!i.naturalWidth) return null;
+  if (!i.complete || !i.naturalWidth) return null;
   const c = document.createElement('canvas');
   [c.width, c.height] = [i.naturalWidth, i.naturalHeight];
   const g = c.getContext('2d'); g.drawImage(i, 0, 0);
