@@ -22,6 +22,7 @@ from service.cameras import open_camera
 from service.cameras.exif import name_unix_ns, read_tags
 from service.cameras.images import natural_key, open_images
 from service.cameras.rig import Rig
+from service.cameras.source import GeoTag
 from service.config import CameraConfig, FusionConfig, ScanConfig
 from service.errors import InputError
 
@@ -201,6 +202,13 @@ def test_times_in_names(name: str, unix_ns: int | None) -> None:
     assert name_unix_ns(name) == unix_ns
 
 
+def geotag_of(folder: Path, xmp: str) -> GeoTag | None:
+    """That of a still with a position in EXIF and this XMP."""
+    path = folder / "DJI_0001.jpg"
+    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
+    return read_tags(path).geotag
+
+
 def test_dji_xmp_gives_attitude_height_and_accuracy(tmp_path: Path) -> None:
     xmp = (
         '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description '
@@ -210,9 +218,7 @@ def test_dji_xmp_gives_attitude_height_and_accuracy(tmp_path: Path) -> None:
         "<drone-dji:GimbalPitchDegree>-89.90</drone-dji:GimbalPitchDegree>"
         "</rdf:Description></x:xmpmeta>"
     )
-    path = tmp_path / "DJI_0001.jpg"
-    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
-    tag = read_tags(path).geotag
+    tag = geotag_of(tmp_path, xmp)
     assert tag is not None
     assert tag.ypr_deg == (-91.3, -89.9, 0.0)
     assert tag.relative_alt_m == 60.02
@@ -245,10 +251,7 @@ def test_dji_xmp_gives_attitude_height_and_accuracy(tmp_path: Path) -> None:
     ],
 )
 def test_other_makers_state_the_attitude_too(tmp_path: Path, block: str) -> None:
-    path = tmp_path / "0001.jpg"
-    xmp = f'<x:xmpmeta xmlns:x="adobe:ns:meta/">{block}</x:xmpmeta>'
-    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
-    tag = read_tags(path).geotag
+    tag = geotag_of(tmp_path, f'<x:xmpmeta xmlns:x="adobe:ns:meta/">{block}</x:xmpmeta>')
     assert tag is not None and tag.ypr_deg == (146.5, -78.4, -0.3)
 
 
@@ -264,9 +267,7 @@ def test_angles_of_the_prefix_camera_are_read_where_it_is_pix4ds(
         f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description xmlns:Camera="{namespace}" '
         'Camera:Yaw="18.678" Camera:Pitch="2.054" Camera:Roll="-2.392"/></x:xmpmeta>'
     )
-    path = tmp_path / "0001.jpg"
-    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
-    tag = read_tags(path).geotag
+    tag = geotag_of(tmp_path, xmp)
     assert tag is not None and tag.lat_deg is not None
     assert (tag.ypr_deg is not None) == is_read
 
@@ -278,9 +279,7 @@ def test_gimbal_angles_that_are_all_zero_are_unknown(tmp_path: Path) -> None:
         'drone-dji:GimbalRollDegree="+0.00" drone-dji:GimbalYawDegree="+0.00" '
         'drone-dji:GimbalPitchDegree="+0.00" drone-dji:FlightYawDegree="+176.50"/></x:xmpmeta>'
     )
-    path = tmp_path / "DJI_0001.jpg"
-    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
-    tag = read_tags(path).geotag
+    tag = geotag_of(tmp_path, xmp)
     assert tag is not None and tag.relative_alt_m == 110.8
     assert tag.ypr_deg is None
 
@@ -328,9 +327,7 @@ def test_pix4d_xmp_counts_angles_from_straight_down(
         f'Camera:Yaw="90" Camera:Pitch="{pitch}" Camera:Roll="{roll}" '
         'Camera:GPSXYAccuracy="2.138" Camera:GPSZAccuracy="3.362"/></x:xmpmeta>'
     )
-    path = tmp_path / "IMG_0001.jpg"
-    write_still(path, "2024:06:01 14:00:00", gps=gps_tags(47, 8, 129.5, (12, 0, 0)), xmp=xmp)
-    tag = read_tags(path).geotag
+    tag = geotag_of(tmp_path, xmp)
     assert tag is not None and tag.ypr_deg is not None
     assert (tag.sigma_h_m, tag.sigma_v_m) == (2.138, 3.362)
     yaw, pitch, roll = np.radians(tag.ypr_deg)
