@@ -68,13 +68,15 @@ def solve(
     prior_T_camera_points: F64 | None = None,
     threshold_px: float = THRESHOLD_PX,
     min_inliers: int = MIN_INLIERS,
+    draws: int = DRAWS,
 ) -> PnpResult | None:
     """The pose that projects ``points_m`` (N, 3) to ``uv_px`` (N, 2), or None without trust.
 
     ``K`` (3, 3) is of the undistorted image. ``prior_T_camera_points`` (4, 4) competes with
     EPnP's answer as a start, and a result that turns far away from it must explain most of
-    the points. Points or pixels that are not finite are outliers. None: too few inliers, too
-    loose a fit, or points so placed that the position stays open.
+    the points. RANSAC draws up to ``draws`` times. Points or pixels that are not finite are
+    outliers. None: too few inliers, too loose a fit, or points so placed that the position
+    stays open.
     """
     points, uv = np.asarray(points_m, np.float64), np.asarray(uv_px, np.float64)
     finite = np.isfinite(points).all(axis=1) & np.isfinite(uv).all(axis=1)
@@ -86,7 +88,7 @@ def solve(
     shift = se3.compose(np.eye(3), middle)
     prior = None if prior_T_camera_points is None else prior_T_camera_points @ shift
     k = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-    starts = _starts(local, pixels, K, k, prior, threshold_px)
+    starts = _starts(local, pixels, K, k, prior, threshold_px, draws)
     T = _best(starts, local, pixels, k, threshold_px, min_inliers)
     if T is None:
         return None
@@ -99,7 +101,7 @@ def solve(
 
 
 def _starts(
-    points: F64, uv: F64, K: F64, k: F64, prior: F64 | None, threshold_px: float
+    points: F64, uv: F64, K: F64, k: F64, prior: F64 | None, threshold_px: float, draws: int
 ) -> list[F64]:
     """Poses to start from: the prior where it explains most points to a few pixels, else also
     EPnP's on the largest consensus of RANSAC. Eq. (6), (7)."""
@@ -107,7 +109,7 @@ def _starts(
         near = _errors(prior, points, uv, k) <= 3.0 * threshold_px
         if np.mean(near) >= PRIOR_SHARE:
             return [prior]
-    drawn = robust_geometry.consensus_pose(points, uv, K, threshold_px, DRAWS, CONFIDENCE)
+    drawn = robust_geometry.consensus_pose(points, uv, K, threshold_px, draws, CONFIDENCE)
     return [T for T in (prior, drawn) if T is not None]
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from spied import spied
 
 from recon import parallel, se3
 from recon.calibration import flight
@@ -182,16 +183,10 @@ def test_poses_that_agree_with_the_images_are_adjusted_once(
     seen, known = replace(seen, uv_px=uv), known_by_survey(T, points)
     held = camera_information(TRUE, FREE)
     first = network(TRUE, off(T), seen, known, held)
-    solved: list[Problem] = []
-
-    def counted(problem: Problem, **options: bool) -> Solution:
-        solved.append(problem)
-        return solve(problem, **options)
-
-    monkeypatch.setattr(flight, "solve", counted)
+    solved = spied(monkeypatch, flight, "solve")
     s = first.solution
     again = network(TRUE, s.poses, seen, known, held, near=s.camera)
-    assert len(solved) == 1 and solved[0].given is TRUE
+    assert solved.call_count == 1 and solved.call_args.args[0].given is TRUE
     assert again.sigma_px == pytest.approx(first.sigma_px, rel=0.1)
     assert np.abs(again.solution.poses - s.poses).max() < 0.1  # a fifth of its sigma
     assert again.solution.camera.K[0, 0] == pytest.approx(s.camera.K[0, 0], abs=1.0)

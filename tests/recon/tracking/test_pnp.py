@@ -142,15 +142,13 @@ def test_the_refinement_is_no_worse_than_opencvs_epnp() -> None:
     assert np.mean(ours) <= np.mean(theirs)
 
 
-def test_a_prior_helps_where_outliers_win_the_draw(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With seven wrong matches in ten a random draw seldom holds; a good prior still does."""
-    monkeypatch.setattr(pnp, "DRAWS", 2)
-    monkeypatch.setattr(pnp, "MIN_INLIER_SHARE", 0.2)
+def test_a_prior_helps_where_outliers_win_the_draw() -> None:
+    """With two wrong matches in three a random draw seldom holds; a good prior still does."""
     found = 0
     for seed in range(6):
-        s = scene(seed, outliers=0.7)
+        s = scene(seed, outliers=0.65)
         prior = se3.exp(np.array([0.0005, -0.0004, 0.0006, 0.01, 0.02, -0.02])) @ s.T
-        result = pnp.solve(s.points, s.uv, K, prior)
+        result = pnp.solve(s.points, s.uv, K, prior, draws=2)
         if result is not None:
             found += 1
             assert np.linalg.norm(centre(result.T_camera_points) - centre(s.T)) < 0.06

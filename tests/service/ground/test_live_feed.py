@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import time
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from spied import spied
 
 from service.ground.live import LiveFeed
 from service.scans.track import latest
@@ -49,20 +49,14 @@ def test_a_pose_and_a_repose_are_read_once(
 ) -> None:
     scan.add_reposes([Repose(seq, 1, house.pose(9.0), 1.0, np.eye(6)) for seq in range(5)])
     texts(feed)
-    read: Counter[str] = Counter()
-    for name in ("unpack_pose", "unpack_repose"):
-        real = getattr(store, name)
-
-        def counted(data: bytes, name: str = name, real: Any = real) -> Any:
-            read[name] += 1
-            return real(data)
-
-        monkeypatch.setattr(store, name, counted)
+    poses = spied(monkeypatch, store, "unpack_pose")
+    reposes = spied(monkeypatch, store, "unpack_repose")
     scan.add_poses([house.record(5, 25.0), house.record(6, 30.0)])
     scan.add_reposes([Repose(3, 2, house.pose(8.0), 1.0, np.eye(6))])
-    read.clear()
+    poses.reset_mock()
+    reposes.reset_mock()
     assert [m["type"] for m in texts(feed)] == ["repose", "track"]
-    assert read == {"unpack_pose": 2, "unpack_repose": 1}
+    assert (poses.call_count, reposes.call_count) == (2, 1)
 
 
 def test_a_scan_is_heard_when_it_grows_not_when_its_file_is_written(

@@ -18,6 +18,7 @@ import laspy
 import numpy as np
 import pytest
 from house_flight import HillsideFlight
+from spied import spied
 
 from recon.types import F64, Keyframe
 from service.errors import InputError
@@ -70,25 +71,16 @@ def test_the_maps_share_what_they_are_made_from(
     """Cloud, surface, bare ground and contours are computed once for all of them."""
     from service.offline.exports import contours, surface, view
 
-    made: list[str] = []
-
-    def counted(module: Any, name: str) -> None:
-        real = getattr(module, name)
-
-        def call(*args: Any) -> Any:
-            made.append(name)
-            return real(*args)
-
-        monkeypatch.setattr(module, name, call)
-
-    counted(view, "fused_cloud")
-    counted(surface, "_open_to_the_sky")
-    counted(surface, "terrain")
-    counted(contours, "contour_lines")
+    spies = [
+        spied(monkeypatch, view, "fused_cloud"),
+        spied(monkeypatch, surface, "_open_to_the_sky"),
+        spied(monkeypatch, surface, "terrain"),
+        spied(monkeypatch, contours, "contour_lines"),
+    ]
     house.flown(tmp_path / "scan").close()
     with ScanView(tmp_path / "scan") as scan:
         export(scan, "all", None, ExportOptions())
-    assert sorted(made) == ["_open_to_the_sky", "contour_lines", "fused_cloud", "terrain"]
+    assert [spy.call_count for spy in spies] == [1, 1, 1, 1]
 
 
 def test_each_keyframe_is_decoded_once_and_stays_as_it_is(
