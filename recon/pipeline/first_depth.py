@@ -12,12 +12,10 @@ from recon.backends import Backend, DenseStages
 from recon.mapping.exposure import Exposure
 from recon.pipeline.config import Timing, untimed
 from recon.pipeline.keyframe_map import KeyframeMap
-from recon.pipeline.stages import PairStages, Rectify, keyframe_of
+from recon.pipeline.stages import PairStages, Rectify, keyframe_of, without_false_surface
 from recon.pipeline.surface_map import SurfaceMap
 from recon.pipeline.views import StereoView
-from recon.stereo.depth_edges import drop_edges
 from recon.stereo.posed_image import VirtualStereoConfig
-from recon.stereo.reprojection import plausible
 from recon.types import Keyframe
 
 COARSER = 2
@@ -68,7 +66,7 @@ class FirstDepths:
                 depth = self._stereo.fuse(depths, grid)
             bgr = self._rectify.colours(view, grid)
             if depth is not None:
-                depth = plausible(drop_edges(depth, bgr), view.prior)
+                depth = without_false_surface(view, depth, bgr)
             self._rectify.learn(depth)
             if depth is None or self._keyframes.graph.segments[view.segment].agreement < 0:
                 return None

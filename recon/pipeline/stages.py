@@ -227,12 +227,18 @@ class PairStages:
             self._debug |= arrays
 
 
+def without_false_surface(view: StereoView, depth: DepthMap, bgr: U8) -> DepthMap | None:
+    """A view's ``depth``, which has the colours ``bgr``, where its camera can have seen that; None
+    with nothing left."""
+    return plausible(drop_edges(depth, bgr), view.prior)
+
+
 def plausible_depth(
     view: StereoView, depth: DepthMap, bgr: U8, segments: Segments, rejected: Counter[str]
 ) -> DepthMap | None:
-    """The part of a view's ``depth``, which has the colours ``bgr``, that its camera can have seen;
-    None without any, or where the motion of its segment is false."""
-    kept = plausible(drop_edges(depth, bgr), view.prior)
+    """``depth`` :func:`without_false_surface`; None with nothing left, or where the motion of the
+    view's segment is false."""
+    kept = without_false_surface(view, depth, bgr)
     segment = segments.opened(view.segment)
     segment.agreement += -1 if kept is None else 1
     if kept is not None and not segment.is_false:
