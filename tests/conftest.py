@@ -5,17 +5,16 @@ from __future__ import annotations
 import os
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 # Threads of OpenBLAS and torch spin: up to fifty times the processor time. Read at their import.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
-from house_flight import HouseFlight
-from hypothesis import settings
-from trial_rig import Row, Table
 
-settings.register_profile("loaded machines", deadline=None)
-settings.load_profile("loaded machines")
+if TYPE_CHECKING:
+    from house_flight import HouseFlight
+    from trial_rig import Row, Table
 
 
 pytest_plugins = ["tiers"]
@@ -24,6 +23,8 @@ pytest_plugins = ["tiers"]
 @pytest.fixture(scope="session")
 def house() -> HouseFlight:
     """The flight over the house."""
+    from house_flight import HouseFlight
+
     return HouseFlight()
 
 
@@ -38,6 +39,15 @@ def pytest_configure(config: pytest.Config) -> None:
     """Without a GPU Triton interprets its kernels; it decides so when it is imported."""
     if config.getoption("--device") == "cpu":
         os.environ.setdefault("TRITON_INTERPRET", "1")
+
+
+def pytest_collection() -> None:
+    """Hypothesis sets no deadline, as machines are loaded. Here, before the tests are imported, and
+    not in the process that only hands them to workers: half a second."""
+    from hypothesis import settings
+
+    settings.register_profile("loaded machines", deadline=None)
+    settings.load_profile("loaded machines")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -67,6 +77,8 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 @pytest.fixture(scope="session")
 def table() -> Table:
     """Collects the rows of trials; written where SKYRELIEF_TRIALS_TABLE says, older ones kept."""
+    from trial_rig import Table
+
     target = os.environ.get("SKYRELIEF_TRIALS_TABLE", "")
     return Table(Path(target) if target else None)
 
