@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from web_module import NEEDS_NODE, web_module
 
 from recon.types import F64
-from service.ground.http import PAGE
 
-WEB = PAGE.parent
-ROLLDOWN = WEB / "node_modules/.bin/rolldown"
-SCRIPT = """import { readFileSync } from "fs";
-import { Vector3, volume } from "./figures.mjs";
-const scenes = JSON.parse(readFileSync(0));
-console.log(JSON.stringify(scenes.map(({ corners, points }) =>
-  volume(corners.map((c) => new Vector3(...c)), (use) => points.forEach((p) => use(...p))))));"""
+RESULT = """given.map(({ corners, points }) => page.volume(
+  corners.map((c) => new three.Vector3(...c)), (use) => points.forEach((p) => use(...p))))"""
 
-pytestmark = [
-    pytest.mark.skipif(not ROLLDOWN.is_file(), reason="needs npm ci in service/ground/web"),
-    pytest.mark.skipif(shutil.which("node") is None, reason="needs node"),
-]
+pytestmark = NEEDS_NODE
 
 Volumes = Callable[[list[dict[str, Any]]], list[dict[str, float]]]
 LENGTH_M, WIDTH_M, HEIGHT_M, APART_M, NOISE_M = 10.0, 8.0, 5.0, 0.125, 0.05
@@ -34,23 +23,7 @@ LENGTH_M, WIDTH_M, HEIGHT_M, APART_M, NOISE_M = 10.0, 8.0, 5.0, 0.125, 0.05
 @pytest.fixture(scope="module")
 def volumes(tmp_path_factory: pytest.TempPathFactory) -> Volumes:
     """``volume`` of figures.ts for scenes of corners and points, as node computes it."""
-    folder = tmp_path_factory.mktemp("figures")
-    entry = WEB / "src/figures.ts"
-    (folder / "entry.ts").write_text(
-        f'export * from "{entry}"; export {{ Vector3 }} from "{WEB}/node_modules/three";'
-    )
-    bundle = [str(ROLLDOWN), str(folder / "entry.ts"), "-o", str(folder / "figures.mjs")]
-    subprocess.run(bundle, cwd=WEB, check=True, capture_output=True)
-    (folder / "run.mjs").write_text(SCRIPT)
-
-    def run(scenes: list[dict[str, Any]]) -> list[dict[str, float]]:
-        done = subprocess.run(
-            ["node", str(folder / "run.mjs")],
-            input=json.dumps(scenes), text=True, check=True, capture_output=True,
-        )  # fmt: skip
-        return list(json.loads(done.stdout))
-
-    return run
+    return web_module(tmp_path_factory.mktemp("figures"), "figures", RESULT)
 
 
 def house(seed: int) -> dict[str, Any]:

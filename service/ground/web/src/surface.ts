@@ -214,7 +214,8 @@ function reach({ codes, w, h, K, low, step, box }: Chunk): THREE.Sphere {
  * The triangles of a level.
  *
  * A vertex is the known pixel nearest to the middle of its block. The mask grows by a skirt: vertices on the plane of
- * those next to them (planes are linear in inverse depth) and a little lower. A triangle is drawn where its corners are one surface.
+ * those next to them (planes are linear in inverse depth) and a little lower. A triangle is drawn where no step lies between its
+ * corners, also of pixels that the level leaves out: a coarse one does not stretch from a roof to the ground.
  */
 export function triangulate(chunk: Chunk, level: number): Grid {
   const { codes, w, h, low, step, K } = chunk;
@@ -248,19 +249,38 @@ export function triangulate(chunk: Chunk, level: number): Grid {
       from[k] = best;
     }
   for (let pass = 0; pass < ring; pass++) grow();
-  const depth = code.map((c) => (c < 0 ? 0 : 1 / (low + step * c)));
+  const inverse = code.map((c) => (c < 0 ? 0 : low + step * c)); // of the depth
+
+  /** True if no step lies between two vertices: each pixel on the way there is one surface with the one before. */
+  const isOne = (a: number, b: number): boolean => {
+    let [last, at] = [inverse[a]!, 0];
+    const end = inverse[b]!;
+    if (!last || !end) return false;
+    const slack = SIGMAS * sigmaAt(chunk, from[a]! % w, (from[a]! / w) | 0);
+    const [dx, dy] = [x[b]! - x[a]!, y[b]! - y[a]!];
+    const pixels = Math.max(Math.abs(dx), Math.abs(dy), 1);
+    for (let k = 1; k <= pixels; k++) {
+      let next = end;
+      if (k < pixels) {
+        const [u, v] = [Math.round(x[a]! + (k * dx) / pixels), Math.round(y[a]! + (k * dy) / pixels)];
+        const known = u < 0 || v < 0 || u >= w || v >= h ? 0 : codes[v * w + u]!;
+        if (!known) continue;
+        next = low + step * (known - 1);
+      }
+      if (Math.abs(next - last) > (STEEPEST * (k - at) * Math.max(next, last)) / K[0] + slack * next * last) return false;
+      [last, at] = [next, k];
+    }
+    return true;
+  };
+  const [right, below] = [new Uint8Array(n), new Uint8Array(n)];
+  for (let k = 0; k < n; k++) {
+    right[k] = (k + 1) % cols && isOne(k, k + 1) ? 1 : 0;
+    below[k] = k + cols < n && isOne(k, k + cols) ? 1 : 0;
+  }
 
   const index = new Uint32Array(6 * (cols - 1) * (rows - 1));
   let count = 0;
-  const isOne = (a: number, b: number, c: number): boolean => {
-    const [p, q, r] = [depth[a]!, depth[b]!, depth[c]!];
-    if (!p || !q || !r) return false;
-    const far = Math.max(p, q, r);
-    const sigma = sigmaAt(chunk, from[a]! % w, (from[a]! / w) | 0);
-    return far - Math.min(p, q, r) <= (STEEPEST * side * far) / K[0] + SIGMAS * sigma;
-  };
   const add = (a: number, b: number, c: number): void => {
-    if (!isOne(a, b, c)) return;
     index[count++] = a;
     index[count++] = b;
     index[count++] = c;
@@ -269,14 +289,16 @@ export function triangulate(chunk: Chunk, level: number): Grid {
     for (let i = 0; i + 1 < cols; i++) {
       const a = j * cols + i;
       const [b, c, d] = [a + 1, a + cols, a + cols + 1];
-      const falling = depth[a] && depth[d] ? Math.abs(depth[a]! - depth[d]!) : Infinity;
-      const rising = depth[b] && depth[c] ? Math.abs(depth[b]! - depth[c]!) : Infinity;
+      const falling = inverse[a] && inverse[d] ? Math.abs(inverse[a]! - inverse[d]!) : Infinity;
+      const rising = inverse[b] && inverse[c] ? Math.abs(inverse[b]! - inverse[c]!) : Infinity;
       if (falling < rising) {
-        add(a, c, d);
-        add(a, d, b);
+        if (!isOne(a, d)) continue;
+        if (below[a] && right[c]) add(a, c, d);
+        if (right[a] && below[b]) add(a, d, b);
       } else if (rising < Infinity) {
-        add(a, c, b);
-        add(b, c, d);
+        if (!isOne(b, c)) continue;
+        if (below[a] && right[a]) add(a, c, b);
+        if (below[b] && right[c]) add(b, c, d);
       }
     }
   return compact(index.subarray(0, withoutSmall(index.subarray(0, count), n, side)));
