@@ -35,6 +35,7 @@ import numpy as np
 
 from recon.types import U8
 from service.cameras import open_container, reject_options
+from service.cameras.access_units import access_units
 from service.cameras.decoded import frame_bgr
 from service.cameras.lens import same_shape
 from service.cameras.source import CameraFrame, CameraSource, Paced
@@ -55,6 +56,11 @@ OPEN_S = 10.0
 
 LIVE_OPTIONS = {"fflags": "nobuffer", "flags": "low_delay", "fpsprobesize": "0"}
 """The last one: open the stream at once, without waiting some twenty images for its rate."""
+
+TS_OPTIONS = LIVE_OPTIONS | {"fflags": "nobuffer+noparse"}
+"""Images are not held back until the next one begins: :mod:`service.cameras.access_units`."""
+
+NO_PARSE = 32  # of a container's flags
 
 LISTEN_OPTIONS = {
     "listen": "1",
@@ -215,7 +221,10 @@ class LiveSource:
             rate = stream.average_rate  # nominal, not measured
             self.fps = float(rate) if rate else None
             log.info("%s: connected", self.description)
-            yield from self.stamped(decoded_frames(container, stream, self._warn, self._damage))
+            packets = container.demux(stream)
+            if container.flags & NO_PARSE:
+                packets = access_units(packets, stream)
+            yield from self.stamped(decoded_frames(packets, stream, self._warn, self._damage))
         finally:
             container.close()
 
@@ -285,7 +294,7 @@ def open_stream(rest: str, options: Mapping[str, str]) -> CameraSource:
     reject_options("stream", options)
     if "://" not in rest:
         raise InputError(f"stream:{rest} is not like stream:udp://0.0.0.0:5600")
-    return _live(rest, LIVE_OPTIONS)
+    return _live(rest, TS_OPTIONS if rest.startswith("udp:") else LIVE_OPTIONS)
 
 
 def open_rtmp_listen(rest: str, options: Mapping[str, str]) -> CameraSource:
@@ -311,7 +320,8 @@ def open_srt(rest: str, options: Mapping[str, str]) -> CameraSource:
     source = ["srtsrc", f"uri=srt:{rest}", *([] if place[1] else ["mode=listener"])]
     description = without_credentials(f"srt:{rest}")
     pipeline = [*source, "!", "fdsink", "fd=1"]
-    return _launched(pipeline, description, LISTEN_OPTIONS, listens=not place[1])
+    options = LISTEN_OPTIONS | {"fflags": "noparse"}
+    return _launched(pipeline, description, options, listens=not place[1])
 
 
 def open_v4l2(rest: str, options: Mapping[str, str]) -> CameraSource:
@@ -450,7 +460,7 @@ class _CommandContainer:
     def __init__(self, container: Any, process: subprocess.Popen[bytes]) -> None:
         self._container = container
         self._process = process
-        self.streams = container.streams
+        self.streams, self.flags = container.streams, container.flags
 
     def demux(self, stream: Any) -> Any:
         return self._container.demux(stream)

@@ -79,7 +79,7 @@ class VideoSource:
         self._stream = stream
         self.images = self._stream.frames  # by the index; 0 without one
         self._decoded = decoded_frames(
-            container, self._stream, self._warn, self._damage, self._is_needed
+            container.demux(stream), self._stream, self._warn, self._damage, self._is_needed
         )
         self._first = next(self._decoded, None)
         if self._first is None:
@@ -235,21 +235,20 @@ def video_stream(
 
 
 def decoded_frames(
-    container: av.container.InputContainer,
+    packets: Iterator[av.Packet[Any]],
     stream: av.VideoStream,
     broke_off: Callable[[str], None],
     damaged: Callable[[Exception], None],
     is_needed: Callable[[av.Packet[Any]], bool] = lambda packet: True,
 ) -> Iterator[av.VideoFrame]:
-    """Every complete image of ``stream``, packet by packet: a damaged one affects no other.
+    """Every complete image of ``packets`` of ``stream``: a damaged one affects no other.
 
-    ``broke_off`` is called when the container ends with an error, ``damaged`` for each image
+    ``broke_off`` is called when they end with an error, ``damaged`` for each image
     that does not decode or that the decoder concealed. Packets that are not ``is_needed`` are
     passed over.
     """
     import av.error
 
-    packets = container.demux(stream)
     while True:
         try:
             packet = next(packets, None)

@@ -1,0 +1,59 @@
+"""Coded images of a live stream, each as soon as it is whole.
+
+FFmpeg's demuxer of MPEG-TS passes an image on when it finds the start of the next one, an interval
+later. Most senders give each image a packet (PES) of its own: such a packet need not wait.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import av
+
+SURE = 5
+"""Packets in a row that begin with an image, before one counts as whole when it comes."""
+
+
+def access_units(
+    packets: Iterator[av.Packet[Any]], stream: av.VideoStream
+) -> Iterator[av.Packet[Any]]:
+    """The images of ``packets``, which were demuxed with FFmpeg's flag ``noparse``.
+
+    Where packets do not hold an image each, FFmpeg's parser cuts them, as it does without the flag.
+    An image has the times of the packet in which it begins.
+    """
+    import av
+
+    parser = av.CodecContext.create(stream.codec_context.name, "r")
+    try:
+        parser.parse(None)
+    except ValueError:  # no parser: the packets of this codec are images
+        yield from packets
+        return
+    begun: deque[tuple[int, av.Packet[Any]]] = deque()  # the packets that may begin an image
+    fed = cut = given = 0  # bytes from the stream's start: parsed, in whole images, passed on
+    in_a_row = 0
+    for packet in packets:  # the last one is empty, and empties the parser
+        start, fed = fed, fed + packet.size
+        begun.append((start, packet))
+        is_start = False
+        for image in parser.parse(bytes(packet)):
+            while len(begun) > 1 and begun[1][0] <= cut:
+                begun.popleft()
+            began, cut = cut, cut + image.size
+            is_start = is_start or cut == start
+            if began >= given:
+                yield _timed(image, begun[0][1])
+        in_a_row = in_a_row + 1 if is_start else 0
+        if in_a_row >= SURE and packet.size:
+            given = fed
+            yield packet
+
+
+def _timed(image: av.Packet[Any], packet: av.Packet[Any]) -> av.Packet[Any]:
+    image.pts, image.dts, image.time_base = packet.pts, packet.dts, packet.time_base
+    image.stream = packet.stream
+    return image
