@@ -105,16 +105,19 @@ def test_the_mesh_is_made_and_shown(browser: Browser, portal: Portal) -> None:
     browser.wait("document.querySelectorAll('article').length === 1")
     browser.open(f"{base(portal)}/#/view/drone-1/test-1")
     browser.wait("Number(document.body.dataset.points) || 0")
+    browser.page.select_option('[aria-label="colour by"]', "height")
     browser.click("Make mesh")
     browser.wait("document.body.dataset.mesh === 'shown'", 60)
     names = "[...document.querySelectorAll('.tools button')].map(b => b.textContent)"
     assert "Mesh" in browser.run(names) and "Make tiles" in browser.run(names)
-    colour = "document.querySelector('[aria-label=\"colour by\"]').disabled"
+    colour = (
+        "(s => `${s.disabled} ${s.value}`)(document.querySelector('[aria-label=\"colour by\"]'))"
+    )
     time_shown = "document.querySelector('.time').checkVisibility()"
-    assert browser.run(f"[{colour}, {time_shown}]") == [True, False]  # both are of the points
+    assert browser.run(f"[{colour}, {time_shown}]") == ["true colour", False]  # of the points
     browser.click("Points")
     browser.wait("!document.body.dataset.mesh")
-    assert browser.run(f"[{colour}, {time_shown}]") == [False, True]
+    assert browser.run(f"[{colour}, {time_shown}]") == ["false height", True]
 
 
 def roof_red(browser: Browser) -> float:

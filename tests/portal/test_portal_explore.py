@@ -279,6 +279,17 @@ def test_a_link_opens_the_same_view(page: Browser) -> None:
     assert np.abs(view(page) - here).max() < 0.02
 
 
+def test_the_ground_is_not_looked_at_from_below(page: Browser) -> None:
+    before = view(page)
+    page.page.mouse.move(640, 700)
+    page.page.mouse.down()
+    page.page.mouse.move(640, 120, steps=6)
+    page.page.mouse.up()
+    settle(page)
+    _, _, eye_m, _, _, target_m = view(page)
+    assert before[2] - before[5] > 10.0 and target_m - 0.01 <= eye_m < target_m + 1.0
+
+
 @pytest.mark.parametrize("broken", ["1,2,3", "1,2,3,4,5,x", "", "NaN,0,0,0,0,0"])
 def test_a_link_with_a_broken_view_shows_the_whole_site(
     browser: Browser, base: str, broken: str

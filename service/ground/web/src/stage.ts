@@ -13,6 +13,7 @@ const INPUTS = ["click", "input", "change"];
 // Until then a part of many points is drawn: after a movement, after other news.
 const MOVED_MS = 250;
 const NEWS_MS = 500;
+const LOWEST = Math.PI / 2; // the eye is not turned below what it looks at: the ground has no other side
 const MARGIN = 0.92; // of the scene that is filled
 const OUTLINE_POINTS = 1000;
 
@@ -58,6 +59,7 @@ export class Stage {
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(0, -120, 90);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
+    this.controls.maxPolarAngle = LOWEST;
     this.controls.addEventListener("start", () => {
       if (this.follow) this.touch();
       this.follow = this.framed = false;

@@ -211,13 +211,16 @@ function showGroup(parts: Parts, colour: HTMLSelectElement): HTMLElement[] {
   const points = el("button", { textContent: "Points" });
   const own = [surface, points];
   const buttons = [...own];
+  let by = colour.value; // of the keyframes; a product has its own colours
   const show = async (chosen: HTMLButtonElement, layer: Layer, open: () => Promise<() => void>): Promise<void> => {
     buttons.forEach((b) => (b.disabled = true));
     try {
       stage.shows(await open());
       const isOwn = own.includes(chosen);
       cloud.layer = layer;
+      if (!colour.disabled) by = colour.value;
       colour.disabled = !isOwn;
+      colour.value = isOwn ? by : "colour";
       measured.disabled = layer === "points" || layer === "none";
       for (const part of [parts.legend, parts.time]) part.classList.toggle("off", !isOwn);
       stage.touch();
