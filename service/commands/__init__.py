@@ -1,5 +1,6 @@
 """The subcommands, and the options that several of them take."""
 
+import _thread
 import re
 import signal
 import sys
@@ -74,11 +75,20 @@ def parse_size(text: str, option: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
+def on_signals(act: Callable[[], object], *numbers: int) -> None:
+    """Call ``act`` on a thread of its own when one of the signals comes.
+
+    A handler interrupts the main thread: a lock that this holds, such as that of an event for which
+    it waits, would never be free. ``Thread.start`` takes such a lock, too.
+    """
+    for number in numbers:
+        signal.signal(number, lambda *_: _thread.start_new_thread(act, ()))
+
+
 def stop_by_signals() -> Event:
     """An event that Ctrl-C or a TERM signal sets, instead of ending the process."""
     stop = Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    on_signals(stop.set, signal.SIGINT, signal.SIGTERM)
     return stop
 
 

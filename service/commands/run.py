@@ -7,7 +7,7 @@ import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.commands import ConfigFile, Overrides
+from service.commands import ConfigFile, Overrides, on_signals
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,9 +36,8 @@ def run(config: ConfigFile = None, set_: Overrides = None) -> None:
     from service.daemon.runtime import Daemon
 
     daemon = Daemon(chosen, first, fault)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: daemon.quit())
-    signal.signal(signal.SIGHUP, lambda *_: _reload(daemon, flight, config, set_ or []))
+    on_signals(daemon.quit, signal.SIGINT, signal.SIGTERM)
+    on_signals(lambda: _reload(daemon, flight, config, set_ or []), signal.SIGHUP)
     daemon.run()
 
 

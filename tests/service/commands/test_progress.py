@@ -12,7 +12,7 @@ import sys
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Thread
+from threading import Event, Lock, Thread
 from typing import TYPE_CHECKING, cast
 from unittest.mock import Mock
 
@@ -20,7 +20,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.commands import replay, showing
+from service.commands import on_signals, replay, showing
 from service.offline.exports.view import ExportOptions, ScanView, export
 from service.progress import CancelledError, Progress
 
@@ -173,6 +173,24 @@ def test_ctrl_c_cancels_other_threads_too() -> None:
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_what_a_signal_does_may_wait_for_a_lock_that_the_main_thread_holds() -> None:
+    """Such as that of the event for which it waits: set in the handler, both waited for ever."""
+    lock, is_done = Lock(), Event()
+
+    def act() -> None:
+        with lock:
+            is_done.set()
+
+    before = signal.getsignal(signal.SIGUSR1)
+    on_signals(act, signal.SIGUSR1)
+    try:
+        with lock:
+            signal.raise_signal(signal.SIGUSR1)
+        assert is_done.wait(60.0)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
 
 
 SCRIPT = """
