@@ -23,18 +23,25 @@ from numba import njit
 from recon.image_quality import local_variance
 from recon.parallel import parallel_for
 from recon.stereo.exposure import equalised
+from recon.stereo.lanes import LANES
 from recon.stereo.matching_cost import (
     COST_UNIT,
     MatchingCostConfig,
-    Workspace,
     check_pair,
     matching_cost,
     plain,
 )
-from recon.stereo.message_passing import Smoothness, propagate
+from recon.stereo.message_passing import (
+    Smoothness,
+    advance,
+    coarser_messages,
+    edges_of,
+    masks_of,
+    pyramid_of,
+    reach_of,
+    ring_of,
+)
 from recon.types import F32, I16, U8, DisparityMap
-
-_space = Workspace()
 
 SPECKLE_STEP = 16
 """Sixteenths of a label: neighbours further apart than one label belong to two surfaces."""
@@ -87,15 +94,10 @@ def belief_propagation(
     """
     check_pair(left, right, labels)
     right = equalised(left, right, labels, config.min_disparity)
-    height, width = left.shape
-    volume = _space.take("cost", (height, labels, width))
-    cost = matching_cost(left, right, labels, config.cost, config.min_disparity, volume)
-    data, messages = propagate(
-        cost, plain(left), config.iterations, config.levels, config.smoothness
-    )
-    px, confidence = select(
-        data, messages, cost, config.min_disparity, config.truncation, config.min_evidence
-    )
+    most = min(4 * config.truncation, 255)
+    above, least = matching_cost(left, right, labels, config.cost, config.min_disparity, most)
+    weights = pyramid_of(config.smoothness.weights(plain(left)), config.levels)
+    px, confidence = _labels(above, least, weights, config)
     return drop_unreliable(left, px, confidence, config)
 
 
@@ -143,6 +145,9 @@ def _forget(coarse: Any, px: Any, confidence: Any) -> None:  # pragma: no cover 
 RADIUS = 3
 """Radius of the window whose summed cost places the minimum between labels."""
 
+PAD = 2
+"""Cells beyond a row of cells that the window reaches."""
+
 SURE_EVIDENCE = 0.6
 """Evidence of a well textured match; confidence grows up to it."""
 
@@ -156,117 +161,153 @@ NOISE = 0.2 * COST_UNIT
 """Mean cost below which a window is taken for plain."""
 
 
-def select(
-    data: I16, messages: U8, cost: I16, min_disparity: int, truncation: int, min_evidence: float
+def _labels(
+    above: U8, least: U8, weights: list[I16], config: BeliefPropagationConfig
 ) -> tuple[F32, F32]:
     """Real-valued labels (h, w) and their confidence, 0 to 1; 0 where rejected.
 
-    ``data`` and ``messages`` come from :func:`recon.stereo.message_passing.propagate` for ``cost``
-    (h, L, w). Evidence is how far the winner's cost lies below the mean over the labels that
+    ``above`` and ``least`` come from :func:`recon.stereo.matching_cost.matching_cost`. Evidence is
+    how far the winner's cost lies below the mean over the labels that
     are seen, relative to that mean: about 0.1 for unrelated images, 0.6 for texture. Not
     accepted are winners with less than ``min_evidence`` and those that tie with another
     label. NaN are those whose partner lies outside the right image.
     """
-    height, _, width = cost.shape
+    _, height, width = weights[0].shape
+    smoothness, iterations = config.smoothness, config.iterations
+    coarser = coarser_messages(above, weights, iterations, smoothness)
+    edges = edges_of(weights[0], smoothness)
     px = np.empty((height, width), np.float32)
     confidence = np.empty((height, width), np.float32)
-    parallel_for(
-        _select, height, data, messages, cost, min_disparity, 2 * truncation, float(min_evidence),
-        px, confidence, cells=cost.size,
-    )  # fmt: skip
+
+    def select(begin: int, end: int) -> None:
+        _select(
+            begin, end, above, least, coarser, edges, iterations, ring_of(above, iterations),
+            config.min_disparity, 2 * config.truncation, float(config.min_evidence), px, confidence,
+        )  # fmt: skip
+
+    parallel_for(select, height, cells=above.size)
     return px, confidence
 
 
 @njit(cache=True, nogil=True)
-def _add_row(cost: Any, v: int, sign: Any, sums: Any) -> None:  # pragma: no cover - compiled
-    """Add or take away a row of costs; rows beyond the image count as nothing."""
-    height, labels, width = cost.shape
-    if 0 <= v < height:
-        for label in range(labels):
-            row = cost[v, label]
-            out = sums[label, RADIUS : RADIUS + width]
-            for u in range(width):
-                out[u] += np.int16(sign * row[u])
+def _move_window(
+    above: Any, least: Any, v: int, begin: int, sums: Any, low: Any
+) -> None:  # pragma: no cover - compiled
+    """Sums (L, 2, cells) over the rows around ``v``, from those around ``v - 1``; rows before
+    ``begin`` are not in them, rows beyond the image count as nothing."""
+    height, _, labels, cells = above.shape
+    enters, leaves = v + RADIUS, v - RADIUS - 1
+    for parity in range(2):
+        if 0 <= enters < height:
+            for label in range(labels):
+                row, out = above[enters, parity, label], sums[label, parity, PAD : PAD + cells]
+                for i in range(cells):
+                    out[i] += np.int16(row[i])
+            low[parity, PAD : PAD + cells] += least[enters, parity]
+        if begin <= leaves:
+            for label in range(labels):
+                row, out = above[leaves, parity, label], sums[label, parity, PAD : PAD + cells]
+                for i in range(cells):
+                    out[i] -= np.int16(row[i])
+            low[parity, PAD : PAD + cells] -= least[leaves, parity]
+
+
+@njit(cache=True, nogil=True)
+def _window(sums: Any, out: Any) -> None:  # pragma: no cover - compiled
+    """Sums over columns, of both parities (2, cells), from those over rows (2, PAD + cells + PAD).
+
+    Of seven columns three are of the one parity and four of the other.
+    """
+    cells = out.shape[1]
+    even, odd = sums[0], sums[1]
+    a, b, c, d = even[1:][:cells], even[2:][:cells], even[3:][:cells], even[4:][:cells]
+    e, f, g, h = odd[:cells], odd[1:][:cells], odd[2:][:cells], odd[3:][:cells]
+    first, second = out[0], out[1]
+    for i in range(cells):
+        one = np.int16(np.int16(a[i] + b[i]) + c[i])
+        both = np.int16(one + np.int16(np.int16(f[i] + g[i]) + h[i]))
+        first[i] = np.int16(both + e[i])
+        second[i] = np.int16(both + d[i])
 
 
 @njit(cache=True, nogil=True)
 def _window_costs(
-    sums: Any, min_disparity: int, box: Any, total: Any, mean: Any
+    sums: Any, width: int, min_disparity: int, box: Any, total: Any
 ) -> None:  # pragma: no cover - compiled
-    """Summed cost (L, w) of a row, and its mean over the labels that each pixel sees."""
-    labels, width = box.shape
+    """Summed cost (L, 2, cells) of a row, and its sum over the labels that each pixel sees."""
+    labels = box.shape[0]
     total[:] = 0
     for label in range(labels):
-        row, out = sums[label], box[label]
-        a, b, c, d = row[:width], row[1:][:width], row[2:][:width], row[3:][:width]
-        e, f, g = row[4:][:width], row[5:][:width], row[6:][:width]
-        for u in range(width):
-            left = np.int16(np.int16(a[u] + b[u]) + c[u])
-            right = np.int16(np.int16(e[u] + f[u]) + g[u])
-            out[u] = np.int16(np.int16(left + d[u]) + right)
+        _window(sums[label], box[label])
         shift = label + min_disparity
         first, last = max(0, min(shift, width)), max(0, min(width, width + shift))
-        seen, part = total[first:last], out[first:last]
-        for u in range(seen.shape[0]):
-            seen[u] += np.int32(part[u])
-    for u in range(width):
-        seen_labels = min(labels - 1, u - min_disparity) - max(0, u - min_disparity - width + 1) + 1
-        mean[u] = np.float32(total[u]) / np.float32(max(seen_labels, 1))
+        for parity in range(2):
+            begin, end = (first + 1 - parity) // 2, (last + 1 - parity) // 2
+            seen, part = total[parity, begin:end], box[label, parity, begin:end]
+            for i in range(seen.shape[0]):
+                seen[i] += np.int32(part[i])
 
 
 @njit(cache=True, nogil=True)
 def _best_labels(
-    data: Any, messages: Any, v: int, parity: int, belief: Any, best: Any, label_of: Any,
+    above: Any, ring: Any, v: int, width: int, parity: int, belief: Any, best: Any, label_of: Any,
     second: Any,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
     """Of one parity of a row: the least belief, its label, and the least belief of the labels not
     adjacent to it. Only without a branch do vector registers take the cells."""
-    _, _, labels, cells = data.shape
+    _, rows, _, labels, cells = ring.shape
     count = cells - 1
+    before, here, after = v % rows, (v + 1) % rows, (v + 2) % rows
     best[:] = 32767
     label_of[:] = 0
     for label in range(labels):
         b = belief[label, :count]
-        d = data[v, parity, label, :count]
-        m0 = messages[0, v + 2, parity, label, :count]
-        m1 = messages[1, v, parity, label, :count]
-        m2 = messages[2, v + 1, 1 - parity, label, parity : parity + count]
+        d = above[v, parity, label, :count]
+        m0 = ring[0, after, parity, label, :count]
+        m1 = ring[1, before, parity, label, :count]
+        m2 = ring[2, here, 1 - parity, label, parity : parity + count]
         for i in range(count):
-            b[i] = np.int16(d[i] + np.int16(m0[i] + m1[i]) + np.int16(m2[i]))
-        after = b[1 - parity :]  # nothing arrives from the left of a row's first cell
-        m3 = messages[3, v + 1, 1 - parity, label, : after.shape[0]]
-        for i in range(after.shape[0]):
-            after[i] += np.int16(m3[i])
-        here = np.int16(label)
+            b[i] = np.int16(np.int16(d[i]) + np.int16(m0[i])) + np.int16(
+                np.int16(m1[i]) + np.int16(m2[i])
+            )
+        right = b[1 - parity :]  # nothing arrives from the left of a row's first cell
+        m3 = ring[3, here, 1 - parity, label, : right.shape[0]]
+        for i in range(right.shape[0]):
+            right[i] += np.int16(m3[i])
+        this = np.int16(label)
         for i in range(count):
             belief_here, least, label_before = b[i], best[i], label_of[i]
-            label_of[i] = here if belief_here < least else label_before
+            label_of[i] = this if belief_here < least else label_before
             best[i] = min(belief_here, least)
     second[:] = 32767
     for label in range(labels):
-        b, here = belief[label, :count], np.int16(label)
+        b, this = belief[label, :count], np.int16(label)
         for i in range(count):
-            apart = np.int16(abs(np.int16(label_of[i] - here)))
+            apart = np.int16(abs(np.int16(label_of[i] - this)))
             adjacent = FAR if apart <= np.int16(1) else np.int16(0)
             second[i] = min(second[i], np.int16(b[i] + adjacent))
 
 
 @njit(cache=True, nogil=True)
 def _note_winners(
-    best: Any, label_of: Any, second: Any, box: Any, parity: int, winner: Any, around: Any,
-    lead: Any,
+    best: Any, label_of: Any, second: Any, box: Any, low: Any, total: Any, width: int, parity: int,
+    min_disparity: int, winner: Any, around: Any, lead: Any, mean: Any,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
     """Of each pixel of one parity of a row: the winner, its cost and that of the labels below and
-    above it, and by how much it leads. An outermost label has no such neighbours."""
-    labels, width = box.shape
+    above it, by how much it leads, and the mean cost of the labels that the pixel sees. An
+    outermost label has no such neighbours."""
+    labels = box.shape[0]
     for i in range((width + 1 - parity) // 2):
         u, label = 2 * i + parity, np.int64(label_of[i])
         inner = 0 < label < labels - 1
         winner[u] = label
         lead[u] = np.int32(second[i]) - np.int32(best[i])
-        around[0, u] = box[label - 1, u] if inner else box[label, u]
-        around[1, u] = box[label, u]
-        around[2, u] = box[label + 1, u] if inner else box[label, u]
+        around[0, u] = box[label - 1, parity, i] if inner else box[label, parity, i]
+        around[1, u] = box[label, parity, i]
+        around[2, u] = box[label + 1, parity, i] if inner else box[label, parity, i]
+        seen_labels = min(labels - 1, u - min_disparity) - max(0, u - min_disparity - width + 1) + 1
+        mean[0, u], mean[1, u] = total[parity, i], max(seen_labels, 1)
+        mean[2, u] = low[parity, i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -290,8 +331,9 @@ def _place_winners(
         partner = np.int32(u) - winner[u] - np.int32(min_disparity)
         visible = (partner >= 0) & (partner < np.int32(width))
         px[u] = np.float32(winner[u]) + offset if visible else np.float32(np.nan)
-        evidence = (mean[u] - np.float32(here)) / (mean[u] + noise)
-        enough = (lead[u] > 0) & ((evidence >= min_evidence) | (min_evidence <= 0))
+        typical = np.float32(mean[0, u] + mean[1, u] * mean[2, u]) / np.float32(mean[1, u])
+        evidence = (typical - np.float32(here + mean[2, u])) / (typical + noise)
+        enough = (lead[u] > 0) & ((evidence >= np.float32(min_evidence)) | (min_evidence <= 0))
         margin = min(np.float32(1), np.float32(lead[u]) / np.float32(sure_lead))
         sure = max(evidence, np.float32(0.01)) / np.float32(SURE_EVIDENCE)
         sure = margin * min(np.float32(1), sure)
@@ -300,37 +342,45 @@ def _place_winners(
 
 @njit(cache=True, nogil=True)
 def _select(
-    begin: int,
-    end: int,
-    data: Any,
-    messages: Any,
-    cost: Any,
-    min_disparity: int,
-    sure_lead: int,
-    min_evidence: float,
-    px: Any,
-    confidence: Any,
-) -> None:  # pragma: no cover - compiled
-    _, labels, width = cost.shape
-    cells = data.shape[3]
-    sums = np.zeros((labels, width + 2 * RADIUS), np.int16)
-    box = np.empty((labels, width), np.int16)
-    total, mean = np.empty(width, np.int32), np.empty(width, np.float32)
+    begin: int, end: int, above: Any, least: Any, coarser: Any, edges: Any, iterations: int,
+    ring: Any, min_disparity: int, sure_lead: int, min_evidence: float, px: Any, confidence: Any,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Labels of the rows, each as soon as its messages are done."""
+    height, _, labels, cells = above.shape
+    width = px.shape[1]
+    sums, low = (
+        np.zeros((labels, 2, cells + 2 * PAD), np.int16),
+        np.zeros((2, cells + 2 * PAD), np.int16),
+    )
+    box, low_box = np.empty((labels, 2, cells), np.int16), np.empty((2, cells), np.int16)
+    total, mean = np.empty((2, cells), np.int32), np.empty((3, width), np.int32)
     belief = np.empty((labels, cells), np.int16)
     best = np.empty(cells, np.int16)  # each on its own: rows of one array lose their layout
     label_of, second = np.empty(cells, np.int16), np.empty(cells, np.int16)
     winner = np.empty(width, np.int32)
     lead = np.empty(width, np.int32)
     around = np.empty((3, width), np.int32)
-    for v in range(begin - RADIUS, begin + RADIUS):
-        _add_row(cost, v, 1, sums)
-    for v in range(begin, end):
-        _add_row(cost, v + RADIUS, 1, sums)
-        _window_costs(sums, min_disparity, box, total, mean)
-        _add_row(cost, v - RADIUS, -1, sums)
+    masks, scratch = masks_of(width, cells), np.empty((labels + 1) * 4 * LANES, np.int16)
+    top = max(begin - RADIUS, 0)
+    for v in range(begin - 2 * RADIUS, begin):
+        if v + RADIUS >= top:
+            _move_window(above, least, v, top, sums, low)
+    first, last, start, stop = reach_of(begin, end, height, iterations)
+    for front in range(start, stop):
+        v = advance(
+            front, first, last, above, coarser, edges, width, iterations, masks, scratch, ring
+        )
+        if not begin <= v < end:
+            continue
+        _move_window(above, least, v, top, sums, low)
+        _window_costs(sums, width, min_disparity, box, total)
+        _window(low, low_box)
         for parity in range(2):
-            _best_labels(data, messages, v, parity, belief, best, label_of, second)
-            _note_winners(best, label_of, second, box, parity, winner, around, lead)
+            _best_labels(above, ring, v, width, parity, belief, best, label_of, second)
+            _note_winners(
+                best, label_of, second, box, low_box, total, width, parity, min_disparity,
+                winner, around, lead, mean,
+            )  # fmt: skip
         _place_winners(
             winner, around, lead, mean, min_disparity, sure_lead, min_evidence, px[v], confidence[v]
         )

@@ -16,7 +16,7 @@ from numba import njit
 
 from recon.parallel import parallel_for
 from recon.small_matrices import solve_symmetric
-from recon.stereo.matching_cost import CENSUS_REACH, bordered, census_row, plain, popcount
+from recon.stereo.matching_cost import BORDER, census_row, columns_apart, plain, popcount
 from recon.types import U8
 
 SAMPLES = 2400
@@ -50,8 +50,8 @@ def equalised(left: U8, right: U8, labels: int, min_disparity: int = 0) -> U8:
     left, right = plain(left), plain(right)
     partners = np.empty((rows, columns), np.int32)
     parallel_for(
-        _match, rows, bordered(left), bordered(right), step, labels, min_disparity, partners,
-        cells=rows * columns * labels,
+        _match, rows, columns_apart(left), columns_apart(right), width, step, labels,
+        min_disparity, partners, cells=rows * columns * labels,
     )  # fmt: skip
     clear = np.count_nonzero(partners >= 0)
     if clear < MIN_SAMPLES:
@@ -117,28 +117,27 @@ def _fit(
 
 @njit(cache=True, nogil=True)
 def _join(parts: Any, words: Any) -> None:  # pragma: no cover - compiled
-    """Four bytes (4, w) as a word each (w,)."""
+    """Four bytes of each column as a word: (2, 5, cells) by parity to (w,)."""
     for u in range(words.shape[0]):
         word = np.uint32(0)
         for k in range(4):
-            word = np.uint32(word << np.uint32(8)) | np.uint32(parts[k, u])
+            word = np.uint32(word << np.uint32(8)) | np.uint32(parts[u & 1, k, u >> 1])
         words[u] = word
 
 
 @njit(cache=True, nogil=True)
 def _match(
-    begin: int, end: int, left: Any, right: Any, step: int, labels: int, min_disparity: int,
-    partners: Any,
+    begin: int, end: int, left: Any, right: Any, width: int, step: int, labels: int,
+    min_disparity: int, partners: Any,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
     """Column in the right image of each sample's clear match; -1 without one."""
-    width = left.shape[1] - 2 * CENSUS_REACH
     here, there = np.empty(width, np.uint32), np.empty(width, np.uint32)
-    parts = np.empty((4, width), np.uint8)
+    parts = np.empty((2, 5, left.shape[2] - BORDER), np.uint8)
     differ = np.empty(labels, np.int32)
     for n in range(begin, end):
         v = n * step + step // 2
         for image, words in ((left, here), (right, there)):
-            census_row(image, v, parts)
+            census_row(image, v, parts, 0)
             _join(parts, words)
         for k in range(partners.shape[1]):
             u = k * step + step // 2

@@ -15,10 +15,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from recon.parallel import parallel_for
+from recon.stereo.lanes import LANES, Lanes, cells_of
 from recon.types import I16, U8
 
 COST_UNIT = 100
@@ -30,11 +33,14 @@ CENSUS_OFFSETS = tuple(_NEAR + _FAR)
 """Row and column of the neighbours that a pixel is compared with: 5x5, and eight on a ring around
 them, which tell weak texture from noise. They fill one 32-bit word."""
 
-MAX_COST = 668
-"""The sum over a window of 7x7 fits 16 bits."""
+MAX_COST = 254
+"""One byte holds it; 255 is that of a label that is not seen."""
 
 CENSUS_REACH = 3
 """The farthest row or column of a neighbour."""
+
+BORDER = 4
+"""Columns before the first one, an even number not below the reach."""
 
 MAX_SPARE = 8
 """Memory this many times larger than requested is released."""
@@ -55,13 +61,23 @@ class MatchingCostConfig:
     unseen: float = 1.0  # of a label whose partner is outside the image, above the best one
 
     def __post_init__(self) -> None:
-        most = (
-            round(self.census_weight * COST_UNIT) * self.census_truncation
-            + round(self.difference_weight * COST_UNIT) * self.difference_truncation
-            + round(self.unseen * COST_UNIT)
-        )
+        per_bit, max_bits, per_level, max_levels, unseen = self._rounded
+        most = max(per_bit * max_bits + per_level * max_levels, unseen)
         if most > MAX_COST:
             raise ValueError(f"costs of up to {most} are too large, at most {MAX_COST}")
+
+    @property
+    def integers(self) -> tuple[np.uint8, ...]:
+        """The fields in their order, in integer units; a byte holds what there is to truncate."""
+        return tuple(np.uint8(min(value, 255)) for value in self._rounded)
+
+    @property
+    def _rounded(self) -> tuple[int, ...]:
+        return (
+            round(self.census_weight * COST_UNIT), self.census_truncation,
+            round(self.difference_weight * COST_UNIT), self.difference_truncation,
+            round(self.unseen * COST_UNIT),
+        )  # fmt: skip
 
 
 def matching_cost(
@@ -70,25 +86,26 @@ def matching_cost(
     labels: int,
     config: MatchingCostConfig,
     min_disparity: int = 0,
-    out: I16 | None = None,
-) -> I16:
-    """Cost of every label of every left pixel, (h, labels, w) int16 in ``1 / COST_UNIT``.
+    most: int = 255,
+) -> tuple[U8, U8]:
+    """Cost of every label above the pixel's best one, (h, 2, labels, cells), and the best (h, 2,
+    cells), in ``1 / COST_UNIT``; cells as in :mod:`recon.stereo.lanes`.
 
     Label ``l`` of left pixel (u, v) is compared with ``right[v, u - l - min_disparity]``. A
     partner outside the right image is unseen: it costs ``config.unseen`` more than the
-    pixel's best seen label, so that neighbours decide. ``out`` is filled and returned when it
-    is given. Raises ValueError for bad shapes.
+    pixel's best seen label, so that neighbours decide. Seen ones cost ``most`` more at most. The
+    arrays are used again by the next call of the same thread. Raises ValueError for bad shapes.
     """
     check_pair(left, right, labels)
     height, width = left.shape
-    cost = np.empty((height, labels, width), np.int16) if out is None else out
+    cells = cells_of(width)
+    above = _space.take_bytes("above", (height, 2, labels, cells))
+    least = _space.take_bytes("least", (height, 2, cells))
     parallel_for(
-        _cost_volume, height, bordered(left), bordered(right), min_disparity,
-        round(config.census_weight * COST_UNIT), config.census_truncation,
-        round(config.difference_weight * COST_UNIT), config.difference_truncation,
-        round(config.unseen * COST_UNIT), cost, cells=cost.size,
+        _cost_volume, height, columns_apart(left), columns_apart(right), width,
+        min_disparity, (*config.integers, np.uint8(most)), above, least, cells=above.size,
     )  # fmt: skip
-    return cost
+    return above, least
 
 
 def plain(array: Any) -> Any:
@@ -110,27 +127,63 @@ def check_pair(left: U8, right: U8, labels: int) -> None:
         raise ValueError(f"labels must be 2 to 1024, not {labels}")
 
 
-def bordered(image: U8) -> Any:
-    """The image and, as far as census reaches beyond it, its last row and column again."""
+def columns_apart(image: U8) -> U8:
+    """The even and the odd columns (2, h + 2 * CENSUS_REACH, cells + BORDER) of an image (h, w).
+
+    Beyond the image its last rows and columns go on; cell 0 of a row of cells is cell BORDER / 2
+    here.
+    """
     reach = CENSUS_REACH
-    return cv2.copyMakeBorder(image, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
+    border = (reach, reach, BORDER, BORDER)
+    padded = cv2.copyMakeBorder(image, *border, cv2.BORDER_REPLICATE)
+    apart = np.zeros((2, len(padded), cells_of(image.shape[1]) + BORDER), np.uint8)
+    for parity in range(2):
+        columns = padded[:, parity::2]
+        apart[parity, :, : columns.shape[1]] = columns
+    return apart
+
+
+@intrinsic
+def _census_block(typingctx: Any, own: Any, other: Any, step: Any, out: Any, stride: Any) -> Any:
+    """Write the census of LANES cells, a bit where a neighbour is darker, and their gray levels.
+
+    Addresses of: the cells, those of the other parity to their right, ``step`` bytes from row to
+    row, and five rows of cells, ``stride`` bytes apart: four of eight neighbours each, the first
+    of :data:`CENSUS_OFFSETS` in the highest bit, and the gray levels.
+    """
+    one = types.intp
+    return types.void(one, one, one, one, one), _census_code
+
+
+def _census_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    own, other, step, out, stride = args
+    word, lanes = own.type, Lanes(builder, 8, LANES)
+    centre = lanes.load(own)
+    for k in range(4):
+        part = lanes.constant(0)
+        for dv, du in CENSUS_OFFSETS[8 * k : 8 * k + 8]:
+            start, cell = (other, (du - 1) // 2) if du % 2 else (own, du // 2)
+            row = builder.add(start, builder.mul(step, ir.Constant(word, dv)))
+            neighbour = lanes.load(builder.add(row, ir.Constant(word, cell)))
+            darker = builder.icmp_unsigned("<", neighbour, centre)
+            part = builder.sub(builder.add(part, part), builder.sext(darker, lanes.type))
+        lanes.save(part, builder.add(out, builder.mul(stride, ir.Constant(word, k))))
+    lanes.save(centre, builder.add(out, builder.mul(stride, ir.Constant(word, 4))))
+    return context.get_dummy_value()
 
 
 @njit(cache=True, nogil=True)
-def census_row(padded: Any, v: int, parts: Any) -> None:  # pragma: no cover - compiled
-    """Census of a row's pixels: a bit is set where a neighbour is darker.
-
-    ``padded`` is a :func:`bordered` image. ``parts`` (4, w) uint8 holds eight neighbours each, the
-    first of :data:`CENSUS_OFFSETS` in the highest bit: of bytes a vector register holds the most.
-    """
-    width = parts.shape[1]
-    centre = padded[v + CENSUS_REACH, CENSUS_REACH : CENSUS_REACH + width]
-    for bit, (dv, du) in enumerate(CENSUS_OFFSETS):
-        start = CENSUS_REACH + du
-        shifted = padded[v + CENSUS_REACH + dv, start : start + width]
-        row = parts[bit // 8]
-        for u in range(width):
-            row[u] = np.uint8(row[u] << 1) | np.uint8(shifted[u] < centre[u])
+def census_row(apart: Any, v: int, row: Any, first: int) -> None:  # pragma: no cover - compiled
+    """Census and gray levels of a row of :func:`columns_apart` (2, at least 5, any) uint8, from
+    ``first`` on."""
+    _, rows, step = apart.shape
+    cells = step - BORDER
+    for parity in range(2):
+        own = apart.ctypes.data + (parity * rows + v + CENSUS_REACH) * step + BORDER // 2
+        other = apart.ctypes.data + ((1 - parity) * rows + v + CENSUS_REACH) * step + BORDER // 2
+        out = row.ctypes.data + parity * row.shape[1] * row.shape[2] + first
+        for block in range(0, cells, LANES):
+            _census_block(own + block, other + parity + block, step, out + block, row.shape[2])
 
 
 @intrinsic
@@ -143,83 +196,97 @@ def popcount(typingctx: Any, word: Any) -> Any:
     return word(word), codegen
 
 
-@njit(cache=True, nogil=True)
-def _count_bits(
-    a: Any, b: Any, first: int, shift: int, bits: Any
-) -> None:  # pragma: no cover - compiled
-    """Bits of census (4, w) of the left row ``a`` from column ``first`` on that differ from the
-    right row's, ``shift`` columns further left."""
-    count = bits.shape[0]
-    for k in (0, 2):
-        a0, b0 = a[k, first : first + count], b[k, first - shift : first - shift + count]
-        a1, b1 = a[k + 1, first : first + count], b[k + 1, first - shift : first - shift + count]
-        for i in range(count):
-            differ = popcount(np.uint8(a0[i] ^ b0[i])) + popcount(np.uint8(a1[i] ^ b1[i]))
-            bits[i] = np.uint8(differ + (bits[i] if k else np.uint8(0)))
+@intrinsic
+def _cost_block(
+    typingctx: Any, left: Any, right: Any, stride: Any, partners: Any, labels: Any, step: Any,
+    weights: Any, above: Any, least: Any,
+) -> Any:  # fmt: skip
+    """Write LANES cells of all labels, less their least, and that.
+
+    Addresses of: the cells in the left row (four parts of census, gray levels, what lies beyond),
+    ``stride`` bytes apart, the same cells of the right row, the byte of each label's partner
+    relative to those, int64, the costs of label 0, ``step`` bytes from label to label, and the
+    least costs. ``weights`` are the integers of the configuration and the most above the least.
+    """
+    one = types.intp
+    parameters = types.UniTuple(types.uint8, 6)
+    return types.void(one, one, one, one, one, one, parameters, one, one), _cost_code
 
 
-@njit(cache=True, nogil=True)
-def _add_up(
-    bits: Any, a: Any, b: Any, weights: Any, cost: Any, low: Any
-) -> None:  # pragma: no cover - compiled
-    """Cost of pixels by the bits that differ and the gray levels; and the least so far."""
-    per_bit, max_bits, per_level, max_levels = weights
-    for i in range(cost.shape[0]):
-        apart = np.int16(abs(np.int16(a[i]) - np.int16(b[i])))
-        value = np.int16(min(np.int16(bits[i]), max_bits) * per_bit)
-        value = np.int16(value + np.int16(min(apart, max_levels) * per_level))
-        cost[i] = value
-        low[i] = min(low[i], value)
+def _cost_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    left, right, stride, partners, labels, step, weights, above, least = args
+    word, lanes = left.type, Lanes(builder, 8, LANES)
+    settings = [lanes.splat(w) for w in cgutils.unpack_tuple(builder, weights, 6)]
+    per_bit, max_bits, per_level, max_levels, unseen, most = settings
+    none, all_bits = lanes.constant(0), lanes.constant(255)
+
+    def row(start: Any) -> list[Any]:
+        at = (builder.mul(stride, ir.Constant(word, k)) for k in range(6))
+        return [lanes.load(builder.add(start, offset)) for offset in at]
+
+    *here, gray, beyond = row(left)
+    low = lanes.variable(255)
+    with cgutils.for_range(builder, labels) as loop:
+        place = builder.add(partners, builder.mul(loop.index, ir.Constant(word, 8)))
+        offset = builder.load(builder.inttoptr(place, word.as_pointer()))
+        *there, partner_gray, outside = row(builder.add(right, offset))
+        differ = [lanes.bits(builder.xor(a, b)) for a, b in zip(here, there, strict=True)]
+        bits = builder.add(builder.add(*differ[:2]), builder.add(*differ[2:]))
+        apart = builder.sub(lanes.most(gray, partner_gray), lanes.least(gray, partner_gray))
+        value = builder.add(
+            builder.mul(lanes.least(bits, max_bits), per_bit),
+            builder.mul(lanes.least(apart, max_levels), per_level),
+        )
+        value = builder.or_(value, outside)
+        builder.store(lanes.least(builder.load(low), value), low)
+        lanes.save(value, builder.add(above, builder.mul(loop.index, step)))
+    best = builder.load(low)
+    blind = builder.icmp_unsigned("==", best, all_bits)
+    rise = builder.select(blind, none, unseen)
+    exists = builder.not_(beyond)
+    with cgutils.for_range(builder, labels) as loop:
+        at = builder.add(above, builder.mul(loop.index, step))
+        value = lanes.load(at)
+        over = lanes.least(builder.sub(value, best), most)
+        over = builder.select(builder.icmp_unsigned("==", value, all_bits), rise, over)
+        lanes.save(builder.and_(over, exists), at)
+    lanes.save(builder.and_(builder.select(blind, none, best), exists), least)
+    return context.get_dummy_value()
 
 
 @njit(cache=True, nogil=True)
 def _cost_volume(
-    begin: int,
-    end: int,
-    left: Any,
-    right: Any,
-    min_disparity: int,
-    census_weight: int,
-    census_truncation: int,
-    difference_weight: int,
-    difference_truncation: int,
-    unseen: int,
-    cost: Any,
-) -> None:  # pragma: no cover - compiled
-    _, labels, width = cost.shape
-    parts_left, parts_right = np.empty((4, width), np.uint8), np.empty((4, width), np.uint8)
-    bits = np.empty(width, np.uint8)
-    best = np.empty(width, np.int16)
-    weights = (
-        np.int16(census_weight),
-        np.int16(census_truncation),
-        np.int16(difference_weight),
-        np.int16(difference_truncation),
-    )
+    begin: int, end: int, left: Any, right: Any, width: int, min_disparity: int, weights: Any,
+    above: Any, least: Any,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    _, _, labels, cells = above.shape
+    here, there = np.zeros((2, 6, 3 * cells), np.uint8), np.zeros((2, 6, 3 * cells), np.uint8)
+    plane = 6 * 3 * cells
+    partners = np.empty((2, labels), np.int64)
+    for parity in range(2):
+        for row in (here, there):
+            row[parity, 5] = 255
+            row[parity, 5, cells : cells + (width + 1 - parity) // 2] = 0
+        for label in range(labels):
+            column = parity - label - min_disparity
+            cell = min(max(column // 2, -cells), cells)
+            partners[parity, label] = (column % 2) * plane + cell
     for v in range(begin, end):
-        census_row(left, v, parts_left)
-        census_row(right, v, parts_right)
-        gray_left = left[v + CENSUS_REACH, CENSUS_REACH : CENSUS_REACH + width]
-        gray_right = right[v + CENSUS_REACH, CENSUS_REACH : CENSUS_REACH + width]
-        best[:] = 32767
-        for label in range(labels):
-            shift = label + min_disparity
-            first = min(max(0, shift), width)
-            count = max(min(width, width + shift) - first, 0)
-            differ = bits[:count]
-            _count_bits(parts_left, parts_right, first, shift, differ)
-            row, low = cost[v, label, first : first + count], best[first : first + count]
-            a = gray_left[first : first + count]
-            b = gray_right[first - shift : first - shift + count]
-            _add_up(differ, a, b, weights, row, low)
-        for u in range(width):
-            best[u] = np.int16(best[u] + unseen) if best[u] < 32767 else np.int16(0)
-        for label in range(labels):
-            shift = label + min_disparity
-            for u in range(min(max(0, shift), width)):
-                cost[v, label, u] = best[u]
-            for u in range(max(min(width, width + shift), 0), width):
-                cost[v, label, u] = best[u]
+        census_row(left, v, here, cells)
+        census_row(right, v, there, cells)
+        for parity in range(2):
+            for first in range(0, cells, LANES):
+                _cost_block(
+                    here.ctypes.data + parity * plane + cells + first,
+                    there.ctypes.data + cells + first,
+                    3 * cells,
+                    partners.ctypes.data + parity * labels * 8,
+                    labels,
+                    cells,
+                    weights,
+                    above.ctypes.data + (2 * v + parity) * labels * cells + first,
+                    least.ctypes.data + (2 * v + parity) * cells + first,
+                )
 
 
 class Workspace(threading.local):
@@ -241,3 +308,6 @@ class Workspace(threading.local):
         """The same of uint8."""
         size = math.prod(shape)
         return self.take(name, ((size + 1) // 2,)).view(np.uint8)[:size].reshape(shape)
+
+
+_space = Workspace()

@@ -1,21 +1,16 @@
-"""Messages of belief propagation on a checkerboard, 32 pixels of one label at a time.
+"""Messages of belief propagation on a checkerboard, in the layout of :mod:`recon.stereo.lanes`.
 
-Layout: the cells of one column parity of a row lie side by side, (row, parity, label, cell),
-so that a SIMD register holds one label of neighbouring pixels of one colour and any number of
-labels costs the same per label. A row of cells ends with at least one empty cell, and the
-messages have an empty row above and below: what lies beyond the border says nothing.
+What lies beyond the border says nothing. Messages are 8-bit integers, data 8-bit ones at the finest
+level and 16-bit ones at the coarser levels, the sums of finer ones. A cost further than four
+truncations above its pixel's best cannot win its pixel (a message is at most one truncation), so
+it is cut there at every level and no sum overflows.
 
-Data are 16-bit integers, messages 8-bit ones: the caches hold twice as many. A cost further than
-four truncations above its pixel's best cannot win its pixel (a message is at most one truncation),
-so it is cut there, at every level before the next coarser one sums it, and no sum overflows.
-
-The innermost step is written for vector registers: left to find them in loops over arrays, LLVM
-checks the arrays for overlap at every label, which took ten times as long.
+All iterations go down the rows at once, each a row behind the one before: the messages of a few
+rows are all that the finest level keeps.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,12 +20,10 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from recon.parallel import parallel_for, shares
+from recon.parallel import parallel_for
+from recon.stereo.lanes import LANES, Lanes, cells_of
 from recon.stereo.matching_cost import Workspace
 from recon.types import I16, U8
-
-LANES = 32
-"""Cells that are updated together; LLVM spreads them over the registers that there are."""
 
 PARTS = 2
 """Parts of them whose 16-bit envelopes the registers of AVX2 hold at once."""
@@ -42,6 +35,7 @@ _FAR = 16383
 def update_block(
     typingctx: Any,
     data: Any,
+    sample: Any,
     arriving: Any,
     leaving: Any,
     mask: Any,
@@ -53,16 +47,18 @@ def update_block(
 ) -> Any:
     """Write the four messages that leave LANES pixels of one colour of one row.
 
-    Addresses of: the data of label 0, the four messages that arrive (from below, above,
-    right, left), the four that leave (up, down, left, right), the lanes that exist (-1 or 0)
-    and ``(labels + 1) * 4 * LANES`` int16 of scratch. ``strides`` are bytes from label to label
-    of the data and of the messages; ``slopes`` and ``cuts`` are the addresses of the smoothness
-    of the four edges.
+    Addresses of: the data of label 0, of the type of ``sample``, the four messages that arrive
+    (from below, above, right, left), the four that leave (up, down, left, right), the lanes that
+    exist (-1 or 0) and ``(labels + 1) * 4 * LANES`` int16 of scratch. ``strides`` are bytes from
+    label to label of the data and of the messages; ``slopes`` and ``cuts`` are the addresses of
+    the smoothness of the four edges.
     """
     addresses = types.UniTuple(types.intp, 4)
     one = types.intp
     two = types.UniTuple(types.intp, 2)
-    signature = types.void(one, addresses, addresses, one, one, two, one, addresses, addresses)
+    signature = types.void(
+        one, sample, addresses, addresses, one, one, two, one, addresses, addresses
+    )
     return signature, _code
 
 
@@ -72,15 +68,16 @@ def _code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     Upwards in 16 bits, half the lanes at a time, whose envelopes stay in registers; downwards
     nothing is above a truncation, so that 8 bits hold it.
     """
-    data, arriving, leaving, mask, scratch, strides, labels, slopes, cuts = args
+    data, sample, arriving, leaving, mask, scratch, strides, labels, slopes, cuts = args
+    data_bits = sample.type.width
     word = data.type
     data_stride, stride = cgutils.unpack_tuple(builder, strides, 2)
     m_from = cgutils.unpack_tuple(builder, arriving, 4)
     m_to = cgutils.unpack_tuple(builder, leaving, 4)
     slopes, cuts = (cgutils.unpack_tuple(builder, one, 4) for one in (slopes, cuts))
     sources = (m_from[1], m_from[0], m_from[3], m_from[2])  # what each message must leave out
-    wide, narrow = _Lanes(builder, 16, LANES // PARTS), _Lanes(builder, 8, LANES)
-    whole = _Lanes(builder, 16, LANES)
+    wide, narrow = Lanes(builder, 16, LANES // PARTS), Lanes(builder, 8, LANES)
+    whole = Lanes(builder, 16, LANES)
 
     def moved(address: Any, bytes_on: int) -> Any:
         return builder.add(address, ir.Constant(word, bytes_on))
@@ -96,8 +93,8 @@ def _code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         envelope, low = ([wide.variable(_FAR) for _ in range(4)] for _ in range(2))
         with cgutils.for_range(builder, labels) as loop:
             offset = moved(builder.mul(loop.index, stride), first)
-            at = moved(builder.mul(loop.index, data_stride), 2 * first)
-            total = wide.load(builder.add(data, at))
+            at = moved(builder.mul(loop.index, data_stride), data_bits // 8 * first)
+            total = wide.load(builder.add(data, at), data_bits)
             arrived = {a: wide.load(builder.add(a, offset), 8) for a in m_from}
             for message in arrived.values():
                 total = builder.add(total, message)
@@ -124,51 +121,6 @@ def _code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             builder.store(best, after[k])
             narrow.save(builder.and_(best, exists), builder.add(m_to[k], offset))
     return context.get_dummy_value()
-
-
-class _Lanes:
-    """Builds the instructions on some integers at once: signed ones of 16 bits, unsigned of 8."""
-
-    def __init__(self, builder: Any, bits: int, count: int) -> None:
-        self.builder, self.bits, self.count = builder, bits, count
-        self.type = ir.VectorType(ir.IntType(bits), count)
-
-    def load(self, address: Any, bits: int = 0) -> Any:
-        """The lanes at an address, aligned or not; stored as so many ``bits``, if not as here."""
-        stored = ir.VectorType(ir.IntType(bits or self.bits), self.count)
-        lanes = self.builder.load(self.builder.inttoptr(address, stored.as_pointer()), align=1)
-        return lanes if stored == self.type else self.builder.zext(lanes, self.type)
-
-    def save(self, value: Any, address: Any) -> None:
-        """Put the lanes at an address."""
-        pointer = self.builder.inttoptr(address, self.type.as_pointer())
-        self.builder.store(value, pointer, align=1)
-
-    def cut(self, wide: Any) -> Any:
-        """The lanes of 16 bits in 8, those above 255 as 255 and those below 0 as 0."""
-        none, most = (ir.Constant(wide.type, [n] * self.count) for n in (0, 255))
-        wide = self.builder.select(self.builder.icmp_signed(">", wide, none), wide, none)
-        wide = self.builder.select(self.builder.icmp_signed("<", wide, most), wide, most)
-        return self.builder.trunc(wide, self.type)
-
-    def variable(self, value: int) -> Any:
-        """A local variable with this value in all lanes."""
-        variable = cgutils.alloca_once(self.builder, self.type)
-        self.builder.store(ir.Constant(self.type, [value] * self.count), variable)
-        return variable
-
-    def sum(self, a: Any, b: Any) -> Any:
-        """The sum of 8-bit lanes, 255 where it is more."""
-        kind = ir.FunctionType(self.type, (self.type, self.type))
-        name = f"llvm.uadd.sat.v{self.count}i{self.bits}"
-        return self.builder.call(
-            cgutils.get_or_insert_function(self.builder.module, kind, name), (a, b)
-        )
-
-    def least(self, a: Any, b: Any) -> Any:
-        """The lesser of each lane."""
-        compare = self.builder.icmp_unsigned if self.bits == 8 else self.builder.icmp_signed
-        return self.builder.select(compare("<", a, b), a, b)
 
 
 WEIGHT_BITS = np.int32(8)
@@ -227,14 +179,19 @@ def _coarser_weights(fine: Any) -> Any:  # pragma: no cover - compiled
     return coarse
 
 
-@njit(cache=True, nogil=True)
-def _edges(
-    weights: Any, cells: int, slope: int, truncation: int
-) -> Any:  # pragma: no cover - compiled
+def edges_of(weights: I16, smoothness: Smoothness) -> I16:
     """Slope and truncation of each edge: (slope or cut, vertical or horizontal, row, parity, cell).
 
     A row and a cell beyond the border are never read for a pixel that exists.
     """
+    cells = cells_of(weights.shape[2])
+    return np.asarray(_edges(weights, cells, smoothness.slope, smoothness.truncation))
+
+
+@njit(cache=True, nogil=True)
+def _edges(
+    weights: Any, cells: int, slope: int, truncation: int
+) -> Any:  # pragma: no cover - compiled
     _, height, width = weights.shape
     edges = np.zeros((2, 2, height + 2, 2, cells), np.int16)
     per_label, most = np.int32(slope), np.int32(truncation)
@@ -250,96 +207,57 @@ def _edges(
     return edges
 
 
-def propagate(
-    cost: I16, image: U8, iterations: int, levels: int, smoothness: Smoothness
-) -> tuple[I16, U8]:
-    """Data (h, 2, L, cells) and messages (4, h + 2, 2, L, cells) of the finest level.
+def propagate(data: U8 | I16, weights: list[I16], iterations: int, smoothness: Smoothness) -> U8:
+    """Messages (4, h + 2, 2, L, cells) of the level with this ``data`` (h, 2, L, cells).
 
-    ``cost`` is (h, L, w) int16, at least 0; ``image`` (h, w) uint8 says where surfaces may end.
-    Coarse to fine, each level runs ``iterations``, each of which updates one colour of the
-    checkerboard. The arrays are used again by the next call of the same thread.
+    ``weights`` are the edges of this level and of the coarser ones, whose messages it starts from.
+    An iteration updates one colour of the checkerboard.
     """
-    truncation = smoothness.truncation
-    height, labels, width = cost.shape
-    cells = cells_of(width)
-    pyramid = [_space.take("data", (height, 2, labels, cells))]
-    shape = (4, height + 2, 2, labels, cells)
-    coarse = _Coarse(_space.take_bytes("messages", shape).reshape(-1))
-    parallel_for(_split, height, cost, truncation, pyramid[0], cells=cost.size)
-    weights = [smoothness.weights(image)]
-    while len(pyramid) < levels and min(weights[-1].shape[1:]) >= 8:
-        weights.append(_coarser_weights(weights[-1]))
-        _, h, w = weights[-1].shape
-        pyramid.append(coarse.take((h, 2, labels, cells_of(w)), np.int16))
-        parallel_for(_coarser, h, pyramid[-2], w, truncation, pyramid[-1], cells=pyramid[-2].size)
-    messages = np.zeros((4, 1, 2, labels, 1), np.uint8)
-    for level in range(len(pyramid) - 1, -1, -1):
-        data, weight = pyramid[level], weights[level]
-        h, _, _, cells = data.shape
-        w = weight.shape[2]
-        shape = (4, h + 2, 2, labels, cells)
-        if level > 1:
-            finer = coarse.take(shape, np.uint8)
-        else:
-            finer = _space.take_bytes("messages 1" if level else "messages", shape)
-        parallel_for(_start, h + 2, messages, w, finer, cells=data.size)
-        messages = finer
-        edges = _edges(weight, cells, smoothness.slope, truncation)
-        _sweeps(data, messages, edges, w, iterations)
-    return pyramid[0], messages
+    _, height, width = weights[0].shape
+    coarser = coarser_messages(data, weights, iterations, smoothness)
+    edges = edges_of(weights[0], smoothness)
+    out = _space.take_bytes(f"messages {len(weights)}", (4, height + 2, *data.shape[1:]))
+
+    def sweep(begin: int, end: int) -> None:
+        ring = out if end - begin == height else ring_of(data, iterations)
+        _propagate(begin, end, data, coarser, edges, width, iterations, ring, out)
+
+    parallel_for(sweep, height, cells=data.size)
+    return out
 
 
-class _Coarse:
-    """The memory of the finest messages, as long as coarser levels are worked on.
-
-    The messages of the second finest level, from which the finest ones start, are not in it.
-    """
-
-    def __init__(self, memory: U8) -> None:
-        self._memory = memory
-
-    def take(self, shape: tuple[int, ...], dtype: type[np.generic]) -> Any:
-        """An array whose values are undefined, in memory of its own where there is no more."""
-        size = math.prod(shape) * np.dtype(dtype).itemsize
-        if size > self._memory.size:
-            return np.empty(shape, dtype)
-        taken, self._memory = self._memory[:size], self._memory[size:]
-        return taken.view(dtype).reshape(shape)
+def coarser_messages(
+    data: U8 | I16, weights: list[I16], iterations: int, smoothness: Smoothness
+) -> U8:
+    """The messages that a level starts from; empty ones where there is no coarser level."""
+    if len(weights) == 1:
+        return np.zeros((4, 1, 2, data.shape[2], 1), np.uint8)
+    _, height, width = weights[1].shape
+    shape = (height, 2, data.shape[2], cells_of(width))
+    coarse = _space.take(f"data {len(weights)}", shape)
+    parallel_for(_coarser, height, data, width, smoothness.truncation, coarse, cells=data.size)
+    return propagate(coarse, weights[1:], iterations, smoothness)
 
 
-def cells_of(width: int) -> int:
-    """Length of a row of cells of one parity: whole blocks, and at least one empty cell."""
-    return ((width + 1) // 2 // LANES + 1) * LANES
+def pyramid_of(weights: I16, levels: int) -> list[I16]:
+    """Weights of the edges of all levels, the finest first."""
+    pyramid = [weights]
+    while len(pyramid) < levels and min(pyramid[-1].shape[1:]) >= 8:
+        pyramid.append(_coarser_weights(pyramid[-1]))
+    return pyramid
+
+
+def ring_of(data: U8 | I16, iterations: int) -> U8:
+    """Memory for the messages of as many rows as are in work at a time, or all of the image; a
+    thread uses it again."""
+    height, _, labels, cells = data.shape
+    return _space.take_bytes("ring", (4, min(iterations + 3, height + 2), 2, labels, cells))
 
 
 @njit(cache=True, nogil=True)
 def _blocks(width: int) -> int:  # pragma: no cover - compiled
     """Blocks of a row of cells that have pixels: all, or all but the last one."""
     return ((width + 1) // 2 + LANES - 1) // LANES
-
-
-@njit(cache=True, nogil=True)
-def _split(
-    begin: int, end: int, cost: Any, truncation: int, data: Any
-) -> None:  # pragma: no cover - compiled
-    """(h, L, w) to (h, 2, L, cells), each pixel less its least cost and cut."""
-    _, labels, width = cost.shape
-    for v in range(begin, end):
-        low = cost[v, 0].copy()
-        for label in range(1, labels):
-            row = cost[v, label]
-            for u in range(width):
-                low[u] = min(low[u], row[u])
-        top = np.int16(4 * truncation)
-        for label in range(labels):
-            row = cost[v, label]
-            for parity in range(2):
-                out = data[v, parity, label]
-                count = (width + 1 - parity) // 2
-                for i in range(count):
-                    u = 2 * i + parity
-                    out[i] = min(np.int16(row[u] - low[u]), top)
-                out[count:] = 0
 
 
 @njit(cache=True, nogil=True)
@@ -356,11 +274,11 @@ def _coarser(
             row = sums[label]
             a, b = fine[2 * v, 0, label, :width], fine[2 * v, 1, label, :width]
             for u in range(width):
-                row[u] = np.int16(a[u] + b[u])
+                row[u] = np.int16(a[u]) + np.int16(b[u])
             if 2 * v + 1 < fine_height:
                 a, b = fine[2 * v + 1, 0, label, :width], fine[2 * v + 1, 1, label, :width]
                 for u in range(width):
-                    row[u] += np.int16(a[u] + b[u])
+                    row[u] += np.int16(a[u]) + np.int16(b[u])
             for u in range(width):
                 low[u] = min(low[u], row[u])
         for label in range(labels):
@@ -373,65 +291,92 @@ def _coarser(
                 out[count:] = 0
 
 
+@intrinsic
+def _interleave(
+    typingctx: Any, even: Any, odd: Any, coarse_cells: Any, out: Any, rest: Any, cells: Any,
+    labels: Any, pixels: Any,
+) -> Any:  # fmt: skip
+    """Copy rows of cells ``even`` and ``odd`` of all labels to every other cell of ``out``; zero
+    LANES cells of ``rest``, and cell ``pixels``.
+
+    Addresses of label 0; ``coarse_cells`` and ``cells`` are bytes from label to label.
+    """
+    return types.void(*(types.intp,) * 8), _interleave_code
+
+
+def _interleave_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    even, odd, coarse_cells, out, rest, cells, labels, pixels = args
+    word, half, lanes = even.type, Lanes(builder, 8, LANES // 2), Lanes(builder, 8, LANES)
+    order = [n // 2 + (n % 2) * (LANES // 2) for n in range(LANES)]
+    mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), order)
+    blocks = builder.udiv(cells, ir.Constant(word, LANES))
+    with cgutils.for_range(builder, labels) as label:
+        coarse, fine = (builder.mul(label.index, stride) for stride in (coarse_cells, cells))
+        to = builder.add(out, fine)
+        with cgutils.for_range(builder, blocks) as block:
+            at = builder.add(coarse, builder.mul(block.index, ir.Constant(word, LANES // 2)))
+            both = (half.load(builder.add(row, at)) for row in (even, odd))
+            pair = builder.shuffle_vector(*both, mask)
+            lanes.save(pair, builder.add(to, builder.mul(block.index, ir.Constant(word, LANES))))
+        lanes.save(lanes.constant(0), builder.add(rest, fine))
+        byte = builder.inttoptr(builder.add(to, pixels), ir.IntType(8).as_pointer())
+        builder.store(ir.Constant(ir.IntType(8), 0), byte)
+    return context.get_dummy_value()
+
+
 @njit(cache=True, nogil=True)
-def _start(
-    begin: int, end: int, coarse: Any, width: int, messages: Any
+def _start_row(
+    coarse: Any, v: int, height: int, width: int, ring: Any
 ) -> None:  # pragma: no cover - compiled
-    """The messages that a level starts from: those of the coarser cells that it divides.
+    """The messages that row ``v`` starts from: those of the coarser cells that it divides.
 
     Only the colour that the first sweep reads is filled; the sweep writes the other.
     """
-    height, labels, cells = messages.shape[1] - 2, messages.shape[3], messages.shape[4]
-    known, written = coarse.shape[4], _blocks(width) * LANES
-    for r in range(begin, end):
-        for direction in range(4):
-            if r in (0, height + 1):
-                messages[direction, r] = 0
-                continue
-            parity = r & 1  # row r - 1 + colour 1
-            # The cell before the first one of the row's other parity is read as a neighbour.
-            messages[direction, r, 1 - parity, labels - 1, cells - 1] = 0
-            for label in range(labels):
-                messages[direction, r, 1 - parity, label, written:] = 0
-                out = messages[direction, r, parity, label]
-                if known == 1:
-                    out[:] = 0
-                    continue
-                even = coarse[direction, (r + 1) // 2, 0, label]
-                odd = coarse[direction, (r + 1) // 2, 1, label]
-                for i in range(cells // 2):
-                    out[2 * i] = even[i]
-                    out[2 * i + 1] = odd[i]
-                out[(width + 1 - parity) // 2 :] = 0
+    _, rows, _, labels, cells = ring.shape
+    row = ring[:, (v + 1) % rows]
+    if v > height:
+        return
+    if not 0 <= v < height or coarse.shape[4] == 1:
+        row[:] = 0
+        return
+    parity = (v + 1) & 1  # of colour 1
+    cc, plane = coarse.shape[4], labels * cells
+    for direction in range(4):
+        start = ring.ctypes.data + ((direction * rows + (v + 1) % rows) * 2) * plane
+        even = coarse.ctypes.data + (direction * coarse.shape[1] + v // 2 + 1) * 2 * labels * cc
+        # The last cell of the row's other parity is read as the neighbour before a first one.
+        rest = start + (1 - parity) * plane + cells - LANES
+        _interleave(
+            even, even + labels * cc, cc, start + parity * plane, rest, cells, labels,
+            (width + 1 - parity) // 2,
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
 def _update_row(
-    data: Any, messages: Any, v: int, colour: int, edges: Any, blocks: int, masks: Any, scratch: Any
+    data: Any, ring: Any, v: int, colour: int, edges: Any, blocks: int, masks: Any, scratch: Any
 ) -> None:  # pragma: no cover - compiled
     """Messages that leave the pixels of one colour of row ``v``."""
-    _, _, labels, cells = data.shape
+    height, _, labels, cells = data.shape
     parity = (v + colour) & 1
     row = labels * cells  # bytes of the messages of one parity
-    base = messages.ctypes.data
-    step = (data.shape[0] + 2) * 2 * row  # from direction to direction
-    here = base + (2 * (v + 1) + parity) * row
-    adjacent = base + (2 * (v + 1) + 1 - parity) * row
-    d = data.ctypes.data + (2 * v + parity) * 2 * row
+    rows = ring.shape[1]
+    step = rows * 2 * row  # from direction to direction
     line = 2 * cells  # bytes of the edges of one parity of a row
-    side = (data.shape[0] + 2) * 2 * line  # from vertical to horizontal edges
+    side = (height + 2) * 2 * line  # from vertical to horizontal edges
     for block in range(blocks):
-        at = 2 * LANES * block
-        start = here + LANES * block
-        beside = adjacent + LANES * block + parity
+        at = LANES * block
+        base = ring.ctypes.data + at
+        start = base + (2 * ((v + 1) % rows) + parity) * row
+        beside = base + (2 * ((v + 1) % rows) + 1 - parity) * row + parity
         arriving = (
-            start + 2 * row + UP * step,
-            start - 2 * row + DOWN * step,
+            base + (2 * ((v + 2) % rows) + parity) * row + UP * step,
+            base + (2 * (v % rows) + parity) * row + DOWN * step,
             beside + LEFT * step,
             beside + RIGHT * step - 1,
         )
         leaving = (start, start + step, start + 2 * step, start + 3 * step)
-        e = edges.ctypes.data + at
+        e = edges.ctypes.data + 2 * at
         # smoothness towards above, below, left and right
         places = (
             e + (2 * (v + 1) + parity) * line,
@@ -441,12 +386,13 @@ def _update_row(
         )
         cut = 2 * side
         update_block(
-            d + at,
+            data.ctypes.data + ((2 * v + parity) * row + at) * data.itemsize,
+            data[0, 0, 0, 0],
             arriving,
             leaving,
-            masks.ctypes.data + parity * 2 * cells + at,
+            masks.ctypes.data + parity * 2 * cells + 2 * at,
             scratch.ctypes.data,
-            (2 * cells, cells),
+            (cells * data.itemsize, cells),
             labels,
             places,
             (places[0] + cut, places[1] + cut, places[2] + cut, places[3] + cut),
@@ -454,7 +400,7 @@ def _update_row(
 
 
 @njit(cache=True, nogil=True)
-def _masks(width: int, cells: int) -> Any:  # pragma: no cover - compiled
+def masks_of(width: int, cells: int) -> Any:  # pragma: no cover - compiled
     """(2, cells) -1 where a cell of that parity is a pixel, else 0."""
     masks = np.zeros((2, cells), np.int16)
     masks[0, : (width + 1) // 2] = -1
@@ -463,53 +409,46 @@ def _masks(width: int, cells: int) -> Any:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _sweep_band(
-    data: Any, messages: Any, edges: Any, width: int, iterations: int, band: int, bands: int
-) -> None:  # pragma: no cover - compiled
-    """All iterations of a band of rows, as far as it can go alone, in one pass of the memory.
+def advance(
+    front: int, first: int, last: int, data: Any, coarse: Any, edges: Any, width: int,
+    iterations: int, masks: Any, scratch: Any, ring: Any,
+) -> int:  # fmt: skip  # pragma: no cover - compiled
+    """Start row ``front`` and give each row behind it its next iteration, so that the messages stay
+    in the caches; the row that is done, with both its neighbours.
 
-    Iteration t of a row needs iteration t - 1 of the neighbouring rows, so a band does one row
-    less at each inner edge per iteration.
+    Iteration t of a row needs iteration t - 1 of its neighbours: of rows ``first`` to ``last`` one
+    less at each end is right after each iteration.
     """
-    height, _, labels, cells = data.shape
-    masks, blocks = _masks(width, cells), _blocks(width)
-    scratch = np.empty((labels + 1) * 4 * LANES, np.int16)
-    first, last = height * band // bands, height * (band + 1) // bands
-    for front in range(first, last + iterations):
-        for t in range(iterations):
-            v = front - t
-            begin = first + t if band > 0 else 0
-            end = last - t if band < bands - 1 else height
-            if begin <= v < end:
-                _update_row(data, messages, v, t & 1, edges, blocks, masks, scratch)
+    height = data.shape[0]
+    _start_row(coarse, front, height, width, ring)
+    for t in range(iterations):
+        v = front - 1 - t
+        if first <= v < last:
+            _update_row(data, ring, v, t & 1, edges, _blocks(width), masks, scratch)
+    return front - iterations - 1
 
 
 @njit(cache=True, nogil=True)
-def _sweep_gap(
-    data: Any, messages: Any, edges: Any, width: int, iterations: int, edge: int
-) -> None:  # pragma: no cover - compiled
-    """The messages that the bands on both sides of row ``edge`` left out."""
-    labels, cells = data.shape[2], data.shape[3]
-    masks, blocks = _masks(width, cells), _blocks(width)
-    scratch = np.empty((labels + 1) * 4 * LANES, np.int16)
-    for t in range(1, iterations):
-        for v in range(edge - t, edge + t):
-            _update_row(data, messages, v, t & 1, edges, blocks, masks, scratch)
+def reach_of(
+    begin: int, end: int, height: int, iterations: int
+) -> Any:  # pragma: no cover - compiled
+    """The rows that must be worked on for ``begin`` to ``end``, and the fronts."""
+    first, last = max(begin - iterations, 0), min(end + iterations, height)
+    return first, last, first - 1, end + iterations + 1
 
 
-def _sweeps(data: I16, messages: U8, edges: Any, width: int, iterations: int) -> None:
-    """All iterations of a level, in bands of rows; then what the bands left out between them."""
-    height = data.shape[0]
-    bands = max(1, min(shares(data.size), height // (2 * iterations)))
-
-    def sweep(begin: int, end: int) -> None:
-        for band in range(begin, end):
-            _sweep_band(data, messages, edges, width, iterations, band, bands)
-
-    def close(begin: int, end: int) -> None:
-        for band in range(begin, end):
-            edge = height * (band + 1) // bands
-            _sweep_gap(data, messages, edges, width, iterations, edge)
-
-    parallel_for(sweep, bands)
-    parallel_for(close, bands - 1)
+@njit(cache=True, nogil=True)
+def _propagate(
+    begin: int, end: int, data: Any, coarse: Any, edges: Any, width: int, iterations: int,
+    ring: Any, out: Any,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Copy the rows that are done to ``out`` (4, h + 2, 2, L, cells), unless it is the ring."""
+    height, _, labels, cells = data.shape
+    masks, scratch = masks_of(width, cells), np.empty((labels + 1) * 4 * LANES, np.int16)
+    first, last, front, stop = reach_of(begin, end, height, iterations)
+    for row in range(front, stop):
+        v = advance(row, first, last, data, coarse, edges, width, iterations, masks, scratch, ring)
+        if begin <= v < end and ring.ctypes.data != out.ctypes.data:
+            for direction in range(4):
+                done = ring[direction, (v + 1) % ring.shape[1]]
+                out[direction, v + 1].reshape(-1)[:] = done.reshape(-1)

@@ -75,7 +75,10 @@ def test_labels_minimise_the_reference_beliefs(
         }
     )  # fmt: skip
     left, right = pair(height, width, labels, config.min_disparity)
-    cost = matching_cost(left, right, labels, MatchingCostConfig(), config.min_disparity)
+    above, _ = matching_cost(left, right, labels, MatchingCostConfig(), config.min_disparity)
+    cost = np.empty((height, labels, width), np.int16)
+    for parity in range(2):
+        cost[:, :, parity::2] = above[:, parity, :, : (width + 1 - parity) // 2]
     belief = reference.beliefs(cost, left, config.iterations, config.levels, config.smoothness)
     winner = belief.argmin(axis=2)
     low = belief.min(axis=2)

@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 
 from recon import parallel
+from recon.stereo import matching_cost as costs
 from recon.stereo import message_passing
 from recon.stereo.belief_propagation import BeliefPropagationConfig, belief_propagation
+from recon.stereo.lanes import cells_of
 from recon.stereo.matching_cost import (
     CENSUS_OFFSETS,
     COST_UNIT,
     MatchingCostConfig,
     Workspace,
-    bordered,
     census_row,
+    columns_apart,
     matching_cost,
 )
-from recon.stereo.message_passing import propagate
+from recon.stereo.message_passing import Smoothness, propagate, pyramid_of
 from recon.types import F64, I16, U8, Array
 
 ACCEPT_ALL = BeliefPropagationConfig(
@@ -53,9 +55,17 @@ def shifted_pair(disparity: F64, seed: int = 0, blur: float = 1.2) -> tuple[U8, 
     return gray(left), gray(canvas[:, margin : margin + width])
 
 
-def beliefs_of(data: Array, messages: Array, width: int) -> Array:
-    """(h, w, L) beliefs from the compiled layout, assembled cell by cell."""
-    height, _, labels, _ = data.shape
+def beliefs(cost: I16, image: U8, iterations: int, levels: int, smoothness: Smoothness) -> Array:
+    """(h, w, L) beliefs by the compiled kernels, assembled cell by cell; bytes if they fit."""
+    height, labels, width = cost.shape
+    above = np.minimum(cost - cost.min(axis=1, keepdims=True), 4 * smoothness.truncation)
+    kind = np.uint8 if cost.max() < 256 else np.int16
+    data = np.zeros((height, 2, labels, cells_of(width)), kind)
+    for parity in range(2):
+        columns = above[:, :, parity::2]
+        data[:, parity, :, : columns.shape[2]] = columns
+    weights = pyramid_of(smoothness.weights(image), levels)
+    messages = propagate(data, weights, iterations, smoothness)
     out = np.zeros((height, width, labels), np.int64)
     for v in range(height):
         for u in range(width):
@@ -69,6 +79,7 @@ def beliefs_of(data: Array, messages: Array, width: int) -> Array:
     return out
 
 
+@pytest.mark.parametrize("most", [255, 1200])
 @pytest.mark.parametrize(
     ("height", "width", "labels", "iterations", "levels"),
     [
@@ -77,13 +88,13 @@ def beliefs_of(data: Array, messages: Array, width: int) -> Array:
     ],
 )  # fmt: skip
 def test_beliefs_equal_the_reference(
-    height: int, width: int, labels: int, iterations: int, levels: int
+    height: int, width: int, labels: int, iterations: int, levels: int, most: int
 ) -> None:
     rng = np.random.default_rng(height * width)
-    cost = rng.integers(0, 1200, (height, labels, width)).astype(np.int16)
+    cost = rng.integers(0, most, (height, labels, width)).astype(np.int16)
     image = rng.integers(0, 256, (height, width), np.uint8)
     smoothness = BeliefPropagationConfig(edge_floor=0.3).smoothness
-    got = beliefs_of(*propagate(cost, image, iterations, levels, smoothness), width)
+    got = beliefs(cost, image, iterations, levels, smoothness)
     want = reference.beliefs(cost, image, iterations, levels, smoothness)
     np.testing.assert_array_equal(got, want)
 
@@ -96,7 +107,7 @@ def test_one_row_finds_the_exact_minimum_of_the_energy() -> None:
     image = np.full((1, width), 90, np.uint8)
     config = BeliefPropagationConfig()
     belief = reference.beliefs(cost, image, 60, 1, config.smoothness)
-    data, messages = propagate(cost, image, 60, 1, config.smoothness)
+    found = beliefs(cost, image, 60, 1, config.smoothness)
     step = abs(np.arange(labels)[:, None] - np.arange(labels)[None, :])
     price = np.minimum(step * COST_UNIT, config.truncation)
     best = cost[0, :, 0].astype(np.int64)
@@ -109,16 +120,22 @@ def test_one_row_finds_the_exact_minimum_of_the_energy() -> None:
     for back in reversed(trace):
         path.append(int(back[path[-1]]))
     np.testing.assert_array_equal(belief[0].argmin(axis=1), path[::-1])
-    np.testing.assert_array_equal(beliefs_of(data, messages, width)[0].argmin(axis=1), path[::-1])
+    np.testing.assert_array_equal(found[0].argmin(axis=1), path[::-1])
 
 
 def census(image: U8) -> Array:
     """(h, w) words of 32 bits from the compiled rows, the first neighbour in the highest bit."""
-    parts = np.empty((len(image), 4, image.shape[1]), np.uint8)
-    for v, row in enumerate(parts):
-        census_row(bordered(image), v, row)
-    first, second, third, fourth = np.moveaxis(parts.astype(np.int64), 1, 0)
-    return np.asarray(first << 24 | second << 16 | third << 8 | fourth)
+    height, width = image.shape
+    words = np.zeros((height, width), np.int64)
+    row = np.empty((2, 5, cells_of(width)), np.uint8)
+    for v in range(height):
+        census_row(columns_apart(image), v, row, 0)
+        for parity in range(2):
+            here = words[v, parity::2]
+            for part in row[parity, :4].astype(np.int64):
+                here[:] = here << 8 | part[: len(here)]
+            np.testing.assert_array_equal(row[parity, 4, : len(here)], image[v, parity::2])
+    return words
 
 
 def test_census_against_its_definition() -> None:
@@ -131,10 +148,13 @@ def test_census_against_its_definition() -> None:
         assert int(words[v, u]) == int("".join("1" if b else "0" for b in bits), 2)
 
 
-def test_costs_whose_sums_do_not_fit_are_refused() -> None:
-    assert MatchingCostConfig(difference_truncation=110).difference_truncation == 110
-    with pytest.raises(ValueError, match="costs of up to 672 are too large, at most 668"):
-        MatchingCostConfig(difference_truncation=111)
+def test_costs_that_do_not_fit_a_byte_are_refused() -> None:
+    assert MatchingCostConfig(difference_truncation=31).difference_truncation == 31
+    with pytest.raises(ValueError, match="costs of up to 256 are too large, at most 254"):
+        MatchingCostConfig(difference_truncation=32)
+    with pytest.raises(ValueError, match="costs of up to 260 are too large"):
+        MatchingCostConfig(unseen=2.6)
+    assert MatchingCostConfig(difference_weight=0, difference_truncation=999).integers[3] == 255
 
 
 @pytest.mark.parametrize("min_disparity", [0, 3, -4, 40, -40])
@@ -142,7 +162,7 @@ def test_matching_cost_against_its_definition(min_disparity: int) -> None:
     rng = np.random.default_rng(2)
     left, right = rng.integers(0, 256, (2, 9, 22), np.uint8)
     config = MatchingCostConfig()
-    cost = matching_cost(left, right, 6, config, min_disparity)
+    above, least = matching_cost(left, right, 6, config, min_disparity)
     words_left, words_right = census(left), census(right)
     weights = [round(w * COST_UNIT) for w in (config.census_weight, config.difference_weight)]
     for v in range(9):
@@ -159,7 +179,9 @@ def test_matching_cost_against_its_definition(min_disparity: int) -> None:
                     )
             unseen = min(seen.values()) + round(config.unseen * COST_UNIT) if seen else 0
             want = [seen.get(label, unseen) for label in range(6)]
-            assert cost[v, :, u].tolist() == want
+            cell = (u & 1, slice(None), u // 2)
+            assert least[v, u & 1, u // 2] == min(want)
+            assert (above[v][cell].astype(int) + min(want)).tolist() == want
 
 
 @pytest.mark.parametrize(("labels", "top"), [(16, 12.0), (32, 27.0), (64, 57.0), (5, 3.4)])
@@ -294,13 +316,15 @@ def test_exposure_change_is_survived() -> None:
     assert np.nanmean(np.abs(px - truth[:, 20:]) < 0.5) > 0.97
 
 
-def test_result_does_not_depend_on_the_number_of_threads() -> None:
+@pytest.mark.parametrize(("tiles", "labels"), [(8, 20), (3, 160)])
+def test_result_does_not_depend_on_the_number_of_threads(tiles: int, labels: int) -> None:
+    """Of the finest level, and of the next one too, where there are labels enough."""
     _, *views = box_scene()
-    left, right = (np.tile(view, (4, 1)) for view in views)  # tall enough for several bands
-    many = belief_propagation(left, right, 20, BeliefPropagationConfig())
+    left, right = (np.tile(view, (tiles, 1)) for view in views)  # tall enough for several bands
+    many = belief_propagation(left, right, labels, BeliefPropagationConfig())
     parallel.limit_threads(1)
     try:
-        one = belief_propagation(left, right, 20, BeliefPropagationConfig())
+        one = belief_propagation(left, right, labels, BeliefPropagationConfig())
     finally:
         parallel.limit_threads(0)
     np.testing.assert_array_equal(many.px, one.px)
@@ -316,7 +340,7 @@ def test_read_only_and_strided_images_compile_nothing_new() -> None:
 
     image = np.random.default_rng(0).integers(0, 256, (40, 60), np.uint8)
     guide = np.random.default_rng(1).integers(0, 256, (80, 120, 3), np.uint8)
-    modules = (message_passing, labels, upsampling)
+    modules = (costs, message_passing, labels, upsampling)
     kernels = [k for m in modules for k in vars(m).values() if isinstance(k, Dispatcher)]
     assert len(kernels) > 5
 
@@ -376,19 +400,21 @@ def test_memory_need_not_be_cleared_and_grows_no_further_than_needed(
         np.testing.assert_array_equal(got.confidence, want.confidence)
 
 
-def test_coarse_levels_work_in_the_memory_of_the_finest_messages() -> None:
+def test_the_finest_messages_are_never_kept() -> None:
+    """All that is held: costs, a byte each, and the coarser levels' data and messages."""
     from concurrent.futures import ThreadPoolExecutor
 
-    _, left, right = box_scene()
+    _, *views = box_scene()
+    left, right = (np.tile(view, (3, 3)) for view in views)
 
-    def held() -> tuple[int, int]:
+    def held() -> int:
         belief_propagation(left, right, 20, BeliefPropagationConfig())
-        kept = message_passing._space._kept
-        return sum(a.nbytes for a in kept.values()), kept["messages"].nbytes
+        spaces = (message_passing._space, costs._space)
+        return sum(a.nbytes for space in spaces for a in space._kept.values())
 
     with ThreadPoolExecutor(1) as pool:
-        total, finest = pool.submit(held).result()
-    assert total < 1.9 * finest  # half for the data, a good quarter for the next level's messages
+        total = pool.submit(held).result()
+    assert total < 4.5 * left.size * 20, "with those messages 9"
 
 
 def test_one_piece_of_memory_serves_sizes_that_are_alike() -> None:
