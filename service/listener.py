@@ -189,8 +189,10 @@ def raise_descriptor_limit(wanted: int = DESCRIPTORS) -> int:
     return target
 
 
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    """A TCP or UDP port of this machine that nothing uses."""
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_STREAM) -> list[int]:
+    """So many TCP or UDP ports of this machine that nothing uses, all of them different."""
+    with contextlib.ExitStack() as open_now:
+        probes = [open_now.enter_context(socket.socket(socket.AF_INET, kind)) for _ in range(count)]
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return [int(probe.getsockname()[1]) for probe in probes]

@@ -14,6 +14,8 @@ import numpy.typing as npt
 
 from mavlink.telemetry.quaternion import Quaternion, Vector
 
+DATED_UNIX_S = 946_684_800  # 2000-01-01: a recorder without a clock counts from 1904 or 1970
+
 RECEIVER_SIGMA_H_M, RECEIVER_SIGMA_V_M = 2.1, 3.5
 """1 sigma per axis of a receiver that reports no accuracy: a circular error of 2.5 m, from the data
 sheets of u-blox M8 receivers, is 2.1 m per axis; heights are about 1.7 times worse."""

@@ -21,7 +21,7 @@ from service.bench.link_emulator import LinkEmulator, LinkModel
 from service.config import DatalinkConfig
 from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
-from service.listener import free_port
+from service.listener import free_ports
 from service.stream import codec
 from service.stream.link import DatalinkSender
 from service.stream.records import PoseRecord, ScanHeader, pack_pose
@@ -154,7 +154,7 @@ def fly(trial: Trial) -> Outcome:
 
 
 def _fly(trial: Trial, folder: Path) -> Outcome:
-    ground_port = free_port()
+    (ground_port,) = free_ports(1)
     session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{ground_port}",))
     ground = _WatchedReceiver(ReceiverConfig(folder / "ground", session))
     ground.start()
@@ -186,7 +186,7 @@ def fly_plain(trial: Trial) -> Outcome:
     """The same data put on Zenoh at once: no store, no budget, default settings."""
     import zenoh
 
-    ground_port, port = free_port(), free_port()
+    ground_port, port = free_ports(2)
     came: dict[tuple[str, int], float] = {}
 
     def on_sample(sample: zenoh.Sample) -> None:
@@ -248,7 +248,7 @@ def _find(drone: _Drone) -> None:
 
 
 def _switch_on(trial: Trial, folder: Path, number: int, ground_port: int) -> _Drone:
-    port = free_port()
+    (port,) = free_ports(1)
     emulator = LinkEmulator(replace(trial.link, seed=number), port, ground_port)
     emulator.start()
     name = f"drone-{number}"

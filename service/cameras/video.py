@@ -17,6 +17,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
+from mavlink.telemetry.samples import DATED_UNIX_S
 from service.cameras import open_container, reject_options
 from service.cameras.decoded import Decoded
 from service.cameras.source import CameraFrame
@@ -30,8 +31,6 @@ log = logging.getLogger(__name__)
 
 MAX_PIXELS = 1 << 27
 """Maximum pixels of an image; the decoder refuses larger ones before allocating memory."""
-
-EARLIEST_UNIX_S = 946_684_800  # 2000-01-01: cameras without a clock write 1904 or 1970
 
 OPTIONS = ("format", "video_size", "pixel_format", "framerate")
 
@@ -357,7 +356,7 @@ def parse_time_unix_ns(text: str) -> int | None:
         moment = moment.replace(tzinfo=timezone.utc)
     since = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
     unix_us = (since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds
-    return unix_us * 1000 if unix_us >= EARLIEST_UNIX_S * 1_000_000 else None
+    return unix_us * 1000 if unix_us >= DATED_UNIX_S * 1_000_000 else None
 
 
 def _start_s(stream: av.VideoStream, first: av.VideoFrame) -> Fraction:

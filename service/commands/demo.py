@@ -39,14 +39,15 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """Replay a small real flight while a ground station receives it over the datalink."""
-    from service.listener import free_port
+    from service.listener import free_ports
 
     source = demo_flight(flight)
     _prepare(out)
     began = time.monotonic()
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    at_ground, at_portal = free_ports(2)
+    endpoint = f"tcp/127.0.0.1:{at_ground}"
     has_portal = all(find_spec(package) for package in ("starlette", "uvicorn", "websockets"))
-    portal = f"127.0.0.1:{free_port()}" if has_portal else ""
+    portal = f"127.0.0.1:{at_portal}" if has_portal else ""
     compilers = compile_meanwhile()
     if compilers:
         _say(1, "compiling kernels in the background: once, a minute or two")

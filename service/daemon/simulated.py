@@ -18,7 +18,7 @@ from service.cameras import parse_source, reject_options
 from service.config import Config, ScanConfig
 from service.errors import InputError
 from service.init_system import Notifier
-from service.listener import free_port
+from service.listener import free_ports
 from service.scans.writing import writing_folder
 from service.workers import PROCESS, Worker, python_command, run_process
 
@@ -50,7 +50,7 @@ class SimulatedFlight:
         if not (self.folder / "flight.mp4").exists():
             with writing_folder(self.folder) as part:
                 (render or render_flight)(part, given)
-        self._ports = free_port(SOCK_DGRAM), free_port(SOCK_DGRAM)
+        self._ports = free_ports(2, SOCK_DGRAM)
 
     def configured(self, config: Config) -> Config:
         """``config`` with this flight as its camera and its autopilot.

@@ -29,7 +29,7 @@ from service.bench import BenchOptions, BenchResult
 from service.bench.link_emulator import LinkEmulator, LinkModel
 from service.daemon.simulated import SimulatedFlight
 from service.errors import OutsideError, SkyreliefError
-from service.listener import free_port
+from service.listener import free_ports
 from service.packages import needing
 from service.stream.ranges import RangeSet
 from service.stream.store import ScanStore
@@ -97,7 +97,7 @@ def fly(trial: Trial) -> Outcome:
 
 
 def _fly(trial: Trial, folder: Path, open_now: ExitStack) -> Outcome:
-    at_ground, at_link, at_portal, at_status = (free_port() for _ in range(4))
+    at_ground, at_link, at_portal, at_status = free_ports(4)
     onboard, received = folder / "scans", folder / "ground"
     emulator = LinkEmulator(trial.link, at_link, at_ground)
     emulator.start()

@@ -31,7 +31,7 @@ from recon.types import F64, DepthMap, Keyframe, Pose
 from service.bench import BenchOptions, BenchResult
 from service.config import DatalinkConfig
 from service.ground.receiver import Receiver, ReceiverConfig
-from service.listener import free_port
+from service.listener import free_ports
 from service.radio import GROUND, TUNNEL, RadioLink, VehicleRadio
 from service.stream import codec
 from service.stream.link import DatalinkSender
@@ -130,7 +130,7 @@ def _fly(folder: Path) -> list[BenchResult]:
     radio, flight = _Radio(), _TileTimes()
     vehicle = VehicleLink(VehicleConfig(links=(radio.names[0],)), NoScans())
     vehicle.start()
-    session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{free_port()}",))
+    session = SessionConfig(mode="router", listen=(f"tcp/127.0.0.1:{free_ports(1)[0]}",))
     receiver = Receiver(ReceiverConfig(folder / "ground", session), deliver=lambda _: None)
     receiver.start()
 

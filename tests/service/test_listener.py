@@ -13,6 +13,7 @@ from clock import Clock
 from service.listener import (
     BoundedListener,
     ListenerLimits,
+    free_ports,
     host_name,
     is_loopback,
     network_of,
@@ -147,3 +148,7 @@ def test_the_name_in_a_host_header(header: str, name: str) -> None:
 def test_nonsense_limits_are_refused(wrong: tuple[int, int, float]) -> None:
     with pytest.raises(ValueError, match="listener"):
         ListenerLimits(*wrong)
+
+
+def test_free_ports_are_different_ones() -> None:
+    assert len(set(free_ports(200, socket.SOCK_DGRAM))) == 200

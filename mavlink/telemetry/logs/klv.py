@@ -23,6 +23,7 @@ from mavlink.telemetry.logs import TelemetryLog, by_own_clock, finish
 from mavlink.telemetry.logs.gpmf import Packet
 from mavlink.telemetry.quaternion import from_rpy, multiply
 from mavlink.telemetry.samples import (
+    DATED_UNIX_S,
     AttitudeSample,
     GimbalFrame,
     GimbalSample,
@@ -35,7 +36,6 @@ MARK = bytes.fromhex("060e2b34")
 LOCAL_SET = bytes.fromhex("060e2b34020b01010e01030101000000")
 UNIVERSAL_SET = bytes.fromhex("060e2b34020101010e01010201010000")
 MAX_ITEMS, CHECKSUM, STAMP = 256, 1, 2
-DATED_NS = 946_684_800 * 10**9  # 2000: a clock that was never set counts from 1970
 
 CAMERA = 100  # component id for the head's attitude
 SAME_VIEW = 0.02
@@ -105,7 +105,7 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
         )
     log = replace(finish(path, history, counts, warnings), clock="video")
     view = median(views) if views else None
-    dated_ns = start_ns if start_ns > DATED_NS else None
+    dated_ns = start_ns if start_ns >= DATED_UNIX_S * 10**9 else None
     return replace(log, hfov_deg=view, start_unix_ns=dated_ns, may_lag=True)
 
 
