@@ -43,8 +43,23 @@ OPEN_LENGTH, OPEN_SHARE = 0.005, 3.0
 vision's scale may have changed there, as where stills turn and have little in common. Where all
 images are noisy, lengths scatter and the scale stays."""
 
-UNKNOWN_SCALE = 1.0
-"""Sigma of the logarithm of a scale that no reading measures."""
+KNOWN_SCALE, UNKNOWN_SCALE = 0.1, 1.0
+"""Sigma of the logarithm of a segment's first scale: at least, as its alignment fits one scale to
+a track whose scale drifts; and where no reading measures it."""
+
+BLOCKS_PER_HEIGHT = 2.0
+"""Heights above ground of so many blocks count as one: relief is the same under neighbours."""
+
+GATE_SIGMAS, HUBER_SIGMAS = 5.0, 1.5
+"""Beyond so many sigmas from the prediction a reading is left out, as noise alone reaches that once
+in a million; and from so many of its residual on it loses weight."""
+
+ALTITUDE_SLACK_M = 3.0
+"""An altitude further beyond its gate has stepped: pressure by a climb or a gust is less."""
+
+LINK_RAD, LINK_WITHOUT_HEADING_RAD, LINK_M, LINK_M_S = 0.3, 1.5, 5.0, 3.0
+"""Sigmas of dead reckoning: of its turn, with a heading and without, and of its way at the start
+and for each second: about what a drone's speed changes by."""
 
 
 class ReadingFactors:
@@ -62,7 +77,6 @@ class ReadingFactors:
         """``keyframes`` are known so far over ``span_s``; ``altitude_offset_m`` is altitude less
         world z; None: that of the first reading."""
         self._config, self._smoother, self._counts = config, smoother, counts
-        self._huber = config.huber_sigmas
         self._keyframes, self._span_s = max(keyframes, 1), max(span_s, 1.0)
         self._inflation = partial(inflation, self._keyframes, self._span_s)
         self._offset_m = altitude_offset_m
@@ -96,9 +110,9 @@ class ReadingFactors:
         if node.lean == 0.0 and abs(ratio[0] - np.log(scale)) > HEIGHT_GATE:
             self._counts["height off"] += 1  # a tree or a roof under the one sensor alone
             return False
-        sigma = ratio[1] * float(np.sqrt(BLOCK * self._config.blocks_per_height))
+        sigma = ratio[1] * float(np.sqrt(BLOCK * BLOCKS_PER_HEIGHT))
         measured = ratio[0] - float(np.log(scale))
-        self._smoother.add_scale("height", (NO_SCALE, scale_key), measured, sigma, self._huber)
+        self._smoother.add_scale("height", (NO_SCALE, scale_key), measured, sigma, HUBER_SIGMAS)
         return True
 
     def _attitude(self, node: Node, T: F64, spread: F64, is_placed: bool) -> bool:
@@ -110,7 +124,7 @@ class ReadingFactors:
         sure = np.diag(spread)[:3]
         if is_placed:  # the frame rests on all attitudes: it is no worse than this
             sure = np.minimum(sure, np.square(FRAME_SIGMA_RAD))
-        allowed = self._config.gate_sigmas * np.sqrt(sure + sigma**2)
+        allowed = GATE_SIGMAS * np.sqrt(sure + sigma**2)
         if abs(turn[2]) > allowed[2]:
             self._counts["heading off"] += 1
             turn, sigma[2] = _turn(T[:3, :3], prior.R_world_camera, False), np.pi
@@ -119,7 +133,7 @@ class ReadingFactors:
             return False
         R = se3.so3_exp(turn) @ T[:3, :3]
         sigma = sigma * self._inflation(self._config.attitude_s)
-        self._smoother.add_turn("attitude", node.key, R, sigma, self._huber)
+        self._smoother.add_turn("attitude", node.key, R, sigma, HUBER_SIGMAS)
         return True
 
     def _position(
@@ -132,7 +146,7 @@ class ReadingFactors:
         # The frame rests on all fixes: it is no worse than one of them.
         sure = np.minimum(place, sigma**2 + drift_m**2)
         apart = np.abs(prior.position_m - T[:3, 3])
-        if np.any(apart > self._config.gate_sigmas * np.sqrt(sure + sigma**2)):
+        if np.any(apart > GATE_SIGMAS * np.sqrt(sure + sigma**2)):
             self._counts["position off"] += 1
             return False
         if measured is not None and (known := measured.by_axis):
@@ -141,7 +155,7 @@ class ReadingFactors:
         else:
             tau_s = bias_time_constant_s(float(sigma[0]), self._config.fix_s)
             sigma = sigma * self._inflation(tau_s)
-        self._smoother.add_place("position", node.key, prior.position_m, sigma, self._huber)
+        self._smoother.add_place("position", node.key, prior.position_m, sigma, HUBER_SIGMAS)
         return True
 
     def _altitude(self, node: Node, T: F64) -> bool:
@@ -152,13 +166,13 @@ class ReadingFactors:
         if self._offset_m is None:
             self._offset_m = prior.altitude_m - T[2, 3]
         z, one = prior.altitude_m - self._offset_m, prior.sigma_altitude_m
-        if abs(z - T[2, 3]) > self._config.gate_sigmas * one + self._config.altitude_slack_m:
+        if abs(z - T[2, 3]) > GATE_SIGMAS * one + ALTITUDE_SLACK_M:
             self._counts["altitude off"] += 1
             self._offset_m = prior.altitude_m - T[2, 3]
             return False
         sigma = np.array([np.inf, np.inf, one * self._inflation(self._config.altitude_s)])
         place = np.array([0.0, 0.0, z])
-        self._smoother.add_place("altitude", node.key, place, sigma, self._huber)
+        self._smoother.add_place("altitude", node.key, place, sigma, HUBER_SIGMAS)
         return True
 
 
@@ -245,7 +259,7 @@ class MotionFactors:
             before = scales.newest
             log = float(self._smoother.logs()[before])
             known = segment.frame.sigma_scale
-            sigma = float(np.clip(known, self._config.sigma_scale, UNKNOWN_SCALE))
+            sigma = float(np.clip(known, KNOWN_SCALE, UNKNOWN_SCALE))
             if before != NO_SCALE:
                 walk = self._config.sigma_scale_walk * np.sqrt(max(1.0, scales.held / BLOCK))
                 sigma = float(np.hypot(walk, jump))
@@ -286,8 +300,8 @@ class MotionFactors:
         changed = np.square([one.change(passed_s) for one in known])
         sigma_m = np.sqrt(changed + np.trace(covariance[3:, 3:]) / 3.0)
         sigma_rad = float(np.sqrt(np.trace(covariance[:3, :3]) / 3.0 + b.sigma_tilt_rad**2))
-        gate = self._config.gate_sigmas
-        return tilt_rad > gate * sigma_rad and bool(np.any(off_m > gate * sigma_m))
+        is_moved = bool(np.any(off_m > GATE_SIGMAS * sigma_m))
+        return tilt_rad > GATE_SIGMAS * sigma_rad and is_moved
 
     def _connect(self, node: Node, last: Node, motion: F64, covariance: F64, is_seen: bool) -> None:
         """The motion between two keyframes; of an aligned segment, with its scale left open."""
@@ -321,8 +335,8 @@ class MotionFactors:
             T = dead_reckoned(*priors, T_last, self._velocity(last, T_last), passed_s)
         prior = node.prior
         is_turn_known = prior.R_world_camera is not None and prior.sigma_yaw_rad < 1.0
-        sigma_r = self._config.sigma_link_rad if is_turn_known else 1.5
-        sigma_m = self._config.sigma_link_m * max(passed_s, 1.0) + 5.0
+        sigma_r = LINK_RAD if is_turn_known else LINK_WITHOUT_HEADING_RAD
+        sigma_m = LINK_M_S * max(passed_s, 1.0) + LINK_M
         motion = se3.inverse(T_last) @ T
         # Translation and rotation are separate: an error of one does not rotate the other.
         apart = np.diag(np.square([sigma_r] * 3 + [sigma_m] * 3))

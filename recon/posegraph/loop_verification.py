@@ -9,12 +9,19 @@ from typing import Protocol
 import numpy as np
 
 from recon import se3
-from recon.posegraph.records import Loop, Node, PoseGraphConfig, loops_agree
+from recon.posegraph.records import Loop, Node, loops_agree
 from recon.posegraph.thinning import moved_loops
 from recon.types import F64
 
 CHI2_LIMIT = 22.5
 """99.9 % of chi-square with six degrees of freedom."""
+
+DRIFT, SLACK_M, MAX_TURN_RAD = 0.05, 2.0, 0.5
+"""A loop off by more than this share of the path between its ends and so many metres, or by such a
+turn, is impossible: vision drifts by less."""
+
+WINDOW = 15
+"""Keyframes within which two loops support each other: between those, vision is trusted."""
 
 MAX_PENDING = 50
 """Loops that wait for one that agrees; older ones are forgotten."""
@@ -35,11 +42,11 @@ class Track(Protocol):
 class LoopVerification:
     """Loops that were offered, and which of them the map rests on."""
 
-    def __init__(self, config: PoseGraphConfig, track: Track) -> None:
+    def __init__(self, track: Track) -> None:
         self.taken: list[Loop] = []
         self.pending: list[Loop] = []  # none that agrees was found yet
         self.counts: Counter[str] = Counter()
-        self._config, self._track = config, track
+        self._track = track
 
     def offer(self, loop: Loop) -> list[Loop]:
         """Return the loops accepted from now on; empty while this one waits or is refused."""
@@ -72,19 +79,19 @@ class LoopVerification:
 
     def _is_possible(self, loop: Loop) -> bool:
         """False when a loop within a segment is off by more than vision can drift."""
-        track, config = self._track, self._config
+        track = self._track
         if track.node(loop.a).segment != track.node(loop.b).segment:
             return True
         T = se3.inverse(track.place(loop.a)) @ track.place(loop.b)
         apart = se3.log(se3.inverse(loop.scaled(track.scale(loop.a)).T_a_b) @ T)
-        allowed_m = config.loop_slack_m + config.loop_drift * track.path_m(loop.a, loop.b)
+        allowed_m = SLACK_M + DRIFT * track.path_m(loop.a, loop.b)
         turned, moved = float(np.linalg.norm(apart[:3])), float(np.linalg.norm(apart[3:]))
-        return moved < allowed_m and turned < config.loop_turn_rad
+        return moved < allowed_m and turned < MAX_TURN_RAD
 
     def _agree(self, one: Loop, other: Loop) -> bool:
         """True when two loops, joined by the track between their ends, close on themselves."""
-        window, track = self._config.loop_window, self._track
-        near = all(self._apart(*pair) <= window for pair in zip(one.ends, other.ends, strict=True))
+        track = self._track
+        near = all(self._apart(*pair) <= WINDOW for pair in zip(one.ends, other.ends, strict=True))
         if not near or one.ends == other.ends:
             return False
         ends = (one.a, other.a, other.b, one.b)

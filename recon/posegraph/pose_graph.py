@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from recon import parallel, se3
-from recon.posegraph.factors import MotionFactors, ReadingFactors
+from recon.posegraph.factors import HUBER_SIGMAS, MotionFactors, ReadingFactors
 from recon.posegraph.loop_verification import LoopVerification
 from recon.posegraph.pose_priors import is_frozen, sound
 from recon.posegraph.records import Loop, Node, PoseGraphConfig
@@ -39,6 +39,12 @@ log = logging.getLogger(__name__)
 
 SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
 
+FRAME_DRIFT = 0.003
+"""Share of the path flown by which a track may leave the frame of its segment."""
+
+SIGMA_LOOP_SCALE = 0.002
+"""Of the ratio of the depths at a loop's ends."""
+
 RELEASE_EVERY = 4
 """Keyframes of a rebuild, in which other threads wait."""
 
@@ -58,7 +64,7 @@ class PoseGraph:
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
         self.segments = Segments(self.config)
-        self.loops = LoopVerification(self.config, self)
+        self.loops = LoopVerification(self)
         self._built = 0
         self._start()
 
@@ -310,7 +316,7 @@ class PoseGraph:
         self._smoother.append_pose(T, spread)
         segment = self.segments[node.segment]
         frame = segment.similarity
-        drift_m = None if frame is None else self.config.frame_drift * self._path[node.key]
+        drift_m = None if frame is None else FRAME_DRIFT * self._path[node.key]
         node = segment.without_biases(node)
         used = self._readings.add(node, T, spread, drift_m, segment.noise)
         if frame is not None and self._readings.height(
@@ -354,9 +360,7 @@ class PoseGraph:
             return
         frames = [self.segments[self._nodes[seq].segment].frame.scale for seq in loop.ends]
         log = float(np.log(loop.ratio * frames[0] / frames[1]))
-        self._smoother.add_scale(
-            "loop scale", keys, log, self.config.sigma_loop_scale, self.config.huber_sigmas
-        )
+        self._smoother.add_scale("loop scale", keys, log, SIGMA_LOOP_SCALE, HUBER_SIGMAS)
 
     def _newest(self) -> Node:
         return next(reversed(self._nodes.values()))

@@ -12,28 +12,14 @@ from recon.types import F64, PosePrior
 
 @dataclass(frozen=True, slots=True)
 class PoseGraphConfig:
-    """Noise and limits of the graph; docs/pose-graph.md says where each enters, and why."""
+    """Size of the graph, and how its sensors err; docs/pose-graph.md says where each enters."""
 
-    sigma_scale: float = 0.1  # of a segment's scale after its alignment, before the readings
-    sigma_scale_walk: float = 0.003  # change of the scale per twenty keyframes
-    sigma_step: float = 0.002  # of one vision motion, as a share of its length
-    min_keyframes: int = 3  # keyframes of a segment before telemetry places it
+    max_nodes: int = 100_000  # keyframes in the graph; of more, some are interpolated
     fix_s: float = 60.0  # a receiver's error wanders with this time constant
     attitude_s: float = 40.0  # an attitude's
     altitude_s: float = 120.0  # a barometer's
-    altitude_slack_m: float = 3.0  # beyond its gate, until the barometer counts as stepped
-    blocks_per_height: float = 2.0  # heights over ground of so many blocks count as one
-    gate_sigmas: float = 5.0  # readings further from the prediction are left out
-    huber_sigmas: float = 1.5
-    sigma_link_m: float = 3.0  # per second without vision
-    sigma_link_rad: float = 0.3
-    frame_drift: float = 0.003  # share of the path flown by which a track may leave its frame
-    sigma_loop_scale: float = 0.002  # of the ratio of the depths at a loop's ends
-    loop_drift: float = 0.05  # of the path between its ends; a loop off by more is impossible
-    loop_slack_m: float = 2.0  # and this
-    loop_turn_rad: float = 0.5
-    loop_window: int = 15  # keyframes within which two loops support each other
-    max_nodes: int = 100_000  # keyframes in the graph; of more, some are interpolated
+    sigma_step: float = 0.002  # of one vision motion, as a share of its length
+    sigma_scale_walk: float = 0.003  # change of the scale per twenty keyframes
 
 
 @dataclass(frozen=True, slots=True, eq=False)

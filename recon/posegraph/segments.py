@@ -22,6 +22,9 @@ REFIT_GROWTH, SETTLED_GROWTH = 1.3, 1.6
 """A segment's similarity is fitted again when its keyframes have grown by so much: at first,
 and once it has settled."""
 
+MIN_KEYFRAMES = 3
+"""Keyframes of a segment before telemetry places it: two leave the turn about their line open."""
+
 SETTLED = 100
 """Keyframes after which a segment's similarity is taken over only when it has changed notably."""
 
@@ -128,7 +131,7 @@ class Segments:
 
     def __init__(self, config: PoseGraphConfig) -> None:
         self._all: dict[int, Segment] = {}
-        self._least, self._bias_tau_s = config.min_keyframes, (config.fix_s, config.attitude_s)
+        self._bias_tau_s = config.fix_s, config.attitude_s
 
     def __getitem__(self, number: int) -> Segment:
         return self._all[number]
@@ -222,7 +225,7 @@ class Segments:
         ``pose`` gives the present pose of a key in the graph.
         """
         growth = REFIT_GROWTH if segment.fitted < SETTLED else SETTLED_GROWTH
-        due = max(self._least, int(growth * segment.fitted))
+        due = max(MIN_KEYFRAMES, int(growth * segment.fitted))
         if segment.keyframes < due or segment.is_tied_by_loop:
             return False
         segment.fitted, nodes = segment.keyframes, segment.nodes

@@ -14,11 +14,10 @@ from doc_pages import FENCE, PAGES, text_of
 from paths import ROOT
 from trial_rig import Table
 
+from recon.posegraph import factors, loop_verification
 from recon.posegraph.alignment import HUBER as MIN_FIT_SIGMAS
 from recon.posegraph.alignment import WILD
-from recon.posegraph.factors import BLOCK
-from recon.posegraph.loop_verification import CHI2_LIMIT
-from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
+from recon.posegraph.pose_graph import SIGMA_LOOP_SCALE, PoseGraph, PoseGraphConfig
 from recon.posegraph.segments import REFIT_GROWTH, SETTLED_GROWTH
 from recon.posegraph.sensor_noise import PRECISE_TAU_S, TAUS_S
 from service.config import keys
@@ -93,23 +92,25 @@ def test_the_page_on_the_pose_graph_has_the_factors_and_numbers_of_the_code() ->
     config = PoseGraphConfig()
     for words in (
         f"grown by {(REFIT_GROWTH - 1) * 100:.0f} % ({(SETTLED_GROWTH - 1) * 100:.0f} % from",
-        f"block of {BLOCK} keyframes",
+        f"block of {factors.BLOCK} keyframes",
         f"({config.sigma_step} of its length)",
         f"{MIN_FIT_SIGMAS} sigmas. Fixes and attitudes beyond {WILD} sigmas",
         f"claimed, inflated over {config.attitude_s:.0f} s",
         f"claimed and inflated over {config.fix_s:.0f} s",
         f"claimed, inflated over {config.altitude_s:.0f} s",
-        f"\\sqrt{{{BLOCK} \\cdot {config.blocks_per_height:.0f}}}",
-        f"{config.sigma_scale_walk} for {BLOCK} keyframes; the first {config.sigma_scale} to 1",
-        f"depths at a loop's ends | {config.sigma_loop_scale} |",
-        f"{config.sigma_link_rad} rad (1.5 without a heading); 5 m and {config.sigma_link_m:.0f} m",
-        f"Huber's loss begins at {config.huber_sigmas} sigmas",
-        f"more than {config.gate_sigmas:.0f} sigmas from the prediction",
-        f"{config.altitude_slack_m:.0f} m further off",
-        f"{config.loop_slack_m:.0f} m and {config.loop_drift * 100:.0f} % of the path",
-        f"{config.loop_turn_rad} rad; and",
-        f"within {config.loop_window} keyframes",
-        f"below {CHI2_LIMIT}",
+        f"\\sqrt{{{factors.BLOCK} \\cdot {factors.BLOCKS_PER_HEIGHT:.0f}}}",
+        f"{config.sigma_scale_walk} for {factors.BLOCK} keyframes; the first "
+        f"{factors.KNOWN_SCALE} to {factors.UNKNOWN_SCALE:.0f}",
+        f"depths at a loop's ends | {SIGMA_LOOP_SCALE} |",
+        f"{factors.LINK_RAD} rad ({factors.LINK_WITHOUT_HEADING_RAD} without a heading); "
+        f"{factors.LINK_M:.0f} m and {factors.LINK_M_S:.0f} m",
+        f"Huber's loss begins at {factors.HUBER_SIGMAS} sigmas",
+        f"more than {factors.GATE_SIGMAS:.0f} sigmas from the prediction",
+        f"{factors.ALTITUDE_SLACK_M:.0f} m further off",
+        f"{loop_verification.SLACK_M:.0f} m and {loop_verification.DRIFT * 100:.0f} % of the path",
+        f"{loop_verification.MAX_TURN_RAD} rad; and",
+        f"within {loop_verification.WINDOW} keyframes",
+        f"below {loop_verification.CHI2_LIMIT}",
         f"from {TAUS_S[0]:.0f} to {TAUS_S[-1]:.0f} s",
         f"{PRECISE_TAU_S:.0f} s for RTK",
     ):
