@@ -191,16 +191,26 @@ def _length_sigma(node: Node, last: Node) -> float:
     return float(np.sqrt(step @ node.covariance[3:, 3:] @ step)) / square if square > 0.0 else 0.0
 
 
-def _contradiction(a: PosePrior, b: PosePrior, motion: F64) -> tuple[float, F64]:
-    """rad by which vision's ``motion`` (4, 4) from a to b tilts against known attitudes, and (3,) m
-    by which it leaves the positions; none where one of both is not known."""
+def _is_refuted(
+    a: PosePrior, b: PosePrior, passed_s: float, motion: F64, covariance: F64, noise: ReadingNoise
+) -> bool:
+    """True where both known attitudes and positions contradict vision's ``motion`` (4, 4) from a to
+    b: two sensors do not fail at once by chance, and images that smear do."""
     R_a, R_b, from_m, to_m = a.R_world_camera, b.R_world_camera, a.position_m, b.position_m
     are_assumed = a.is_view_assumed or b.is_view_assumed
     if R_a is None or R_b is None or are_assumed or not (has_fix(a) and has_fix(b)):
-        return 0.0, np.zeros(3)
+        return False
     assert from_m is not None and to_m is not None
+    if (known := noise.by_axis) is None:
+        return False
     up = R_a @ motion[:3, :3] @ R_b[2]  # where that of b points
-    return float(np.hypot(up[0], up[1])), np.abs(R_a @ motion[:3, 3] - (to_m - from_m))
+    sigma_rad = float(np.sqrt(np.trace(covariance[:3, :3]) / 3.0 + b.sigma_tilt_rad**2))
+    if not np.hypot(up[0], up[1]) > GATE_SIGMAS * sigma_rad:
+        return False
+    changed = np.square([one.change(passed_s) for one in known])
+    sigma_m = np.sqrt(changed + np.trace(covariance[3:, 3:]) / 3.0)
+    off_m = np.abs(R_a @ motion[:3, 3] - (to_m - from_m))
+    return bool(np.any(off_m > GATE_SIGMAS * sigma_m))
 
 
 class MotionFactors:
@@ -231,13 +241,17 @@ class MotionFactors:
         self._smoother.add_place("prior place", node.key, T[:3, 3], sigma[3:])
         return T, left_covariance(T, np.diag(sigma**2))
 
-    def add(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64, bool]:
+    def add(
+        self, node: Node, last: Node, T_last: F64, priors: tuple[PosePrior, PosePrior]
+    ) -> tuple[F64, F64, bool]:
         """T_last_node in metres, its (6, 6) covariance, left, in last's frame, and whether vision
-        gives it; now a factor."""
+        gives it; now a factor. The ``priors`` of last and node have no biases."""
         is_seen = node.segment == last.segment
         if is_seen:
             motion, covariance = self._seen(node, last)
-            if self._is_refuted(node, last, motion, covariance):
+            noise = self._segments[node.segment].noise
+            passed_s = (node.time_ns - last.time_ns) * 1e-9
+            if noise is not None and _is_refuted(*priors, passed_s, motion, covariance, noise):
                 self.refuted[last.seq] = node.seq
                 self._counts["vision off"] += 1
                 is_seen = False
@@ -286,22 +300,6 @@ class MotionFactors:
         scale, unit = self.scale_of[a.key], self._segments[a.segment].scales.unit
         # Not robust: two loops agreed, and a late one with a large misclosure would lose weight.
         self._smoother.add_motion("loop", (a.key, b.key), T_a_b, covariance, scale, unit)
-
-    def _is_refuted(self, node: Node, last: Node, motion: F64, covariance: F64) -> bool:
-        """True where both attitude and positions contradict vision's motion: two sensors do not
-        fail at once by chance, and images that smear do."""
-        segment = self._segments[node.segment]
-        known = None if segment.noise is None else segment.noise.by_axis
-        if known is None:
-            return False
-        a, b = segment.without_biases(last).prior, segment.without_biases(node).prior
-        tilt_rad, off_m = _contradiction(a, b, motion)
-        passed_s = (node.time_ns - last.time_ns) * 1e-9
-        changed = np.square([one.change(passed_s) for one in known])
-        sigma_m = np.sqrt(changed + np.trace(covariance[3:, 3:]) / 3.0)
-        sigma_rad = float(np.sqrt(np.trace(covariance[:3, :3]) / 3.0 + b.sigma_tilt_rad**2))
-        is_moved = bool(np.any(off_m > GATE_SIGMAS * sigma_m))
-        return tilt_rad > GATE_SIGMAS * sigma_rad and is_moved
 
     def _connect(self, node: Node, last: Node, motion: F64, covariance: F64, is_seen: bool) -> None:
         """The motion between two keyframes; of an aligned segment, with its scale left open."""

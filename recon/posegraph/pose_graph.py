@@ -45,9 +45,6 @@ FRAME_DRIFT = 0.003
 SIGMA_LOOP_SCALE = 0.002
 """Of the ratio of the depths at a loop's ends."""
 
-RELEASE_EVERY = 4
-"""Keyframes of a rebuild, in which other threads wait."""
-
 
 class PoseGraph:
     """Keyframe poses in the world, corrected as evidence comes in.
@@ -254,15 +251,15 @@ class PoseGraph:
         )  # fmt: skip
         self._motions = MotionFactors(self.config, self._smoother, self.segments, self._left_out)
         self._sources: list[set[str]] = []
+        self._prior = PosePrior()  # of the newest node, without biases
         self._path: list[float] = []  # m flown up to each keyframe
 
     def rebuild(self) -> None:
         """Rebuild the graph from all readings and the segments' present frames."""
         self._start()
         last: Node | None = None
-        for count, node in enumerate(self._nodes.values()):
-            if count % RELEASE_EVERY == 0:
-                parallel.release_gil()
+        for node in self._nodes.values():
+            parallel.release_gil()  # each takes about a millisecond
             self._insert(node, last)
             last = node
         for loop in self.loops.taken:
@@ -301,6 +298,9 @@ class PoseGraph:
         }
 
     def _insert(self, node: Node, last: Node | None) -> None:
+        segment = self.segments[node.segment]
+        frame = segment.similarity
+        before, self._prior = self._prior, segment.without_biases(node)
         self._sources.append({"vision"})
         self._motions.scale_of.append(0)
         self._path.append(self._path[-1] if self._path else 0.0)
@@ -308,16 +308,15 @@ class PoseGraph:
             T, spread = self._motions.first(node)
         else:
             T_last, spread_last = self._smoother.state(last.key)
-            motion, covariance, is_seen = self._motions.add(node, last, T_last)
+            priors = before, self._prior
+            motion, covariance, is_seen = self._motions.add(node, last, T_last, priors)
             self._sources[-1] = {"vision" if is_seen else "dead reckoning"}
             T = se3.project_to_so3(T_last @ motion)
             self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
             spread = spread_last + left_covariance(T_last, covariance)
         self._smoother.append_pose(T, spread)
-        segment = self.segments[node.segment]
-        frame = segment.similarity
         drift_m = None if frame is None else FRAME_DRIFT * self._path[node.key]
-        node = segment.without_biases(node)
+        node = replace(node, prior=self._prior)
         used = self._readings.add(node, T, spread, drift_m, segment.noise)
         if frame is not None and self._readings.height(
             node, self._motions.scale_key(node), frame.scale

@@ -103,14 +103,13 @@ class Segment:
         self.similarity = self.offsets = None
         self.constants, self.fitted, self.is_tied_by_loop = Constants(), 0, False
 
-    def without_biases(self, node: Node) -> Node:
-        """A node of it without its sensors' constants, its fix brought to the camera."""
+    def without_biases(self, node: Node) -> PosePrior:
+        """A node's prior without its sensors' constants, its fix brought to the camera."""
         prior = self.constants.applied(node.prior)
         if self.offsets is not None and self.similarity is not None:
             prior = self.similarity.applied(prior, node.time_s)
             prior = self.offsets.applied(prior, node.lean)
-        prior = self.at_camera(replace(node, prior=prior))
-        return node if prior is node.prior else replace(node, prior=prior)
+        return self.at_camera(replace(node, prior=prior))
 
     def at_camera(self, node: Node) -> PosePrior:
         """The prior of a node of it, with its fix brought to where the camera is."""
