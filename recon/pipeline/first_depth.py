@@ -9,7 +9,7 @@ from collections import Counter
 from dataclasses import replace
 
 from recon.backends import Backend, DenseStages
-from recon.mapping.exposure import Exposure
+from recon.mapping.exposure_compensation import ExposureCompensation
 from recon.pipeline.config import Timing, untimed
 from recon.pipeline.keyframe_map import KeyframeMap
 from recon.pipeline.stages import PairStages, Rectify, keyframe_of, without_false_surface
@@ -34,7 +34,7 @@ class FirstDepths:
         dense: DenseStages,
         keyframes: KeyframeMap,
         surface: SurfaceMap,
-        exposure: Exposure,
+        exposure: ExposureCompensation,
         timing: Timing,
     ) -> None:
         stereo = replace(

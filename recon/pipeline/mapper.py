@@ -17,7 +17,7 @@ import numpy as np
 from recon.backends import Backend, DenseStages
 from recon.backends.cpu import CpuBackend
 from recon.mapping.cloud_fusion import cloud_of, fuse
-from recon.mapping.exposure import Exposure
+from recon.mapping.exposure_compensation import ExposureCompensation
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
 from recon.pipeline.config import Baseline, MapperConfig, Timing, untimed
 from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
@@ -144,7 +144,7 @@ class Mapper:
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
         self.keyframes = KeyframeMap(trajectory, loops, self.rejected, timing)
         self.surface = SurfaceMap(float(camera.K[0, 0]), config.resolution_m, new_map)
-        self.exposure = Exposure()
+        self.exposure = ExposureCompensation()
         self.first_depths = (
             FirstDepths(backend, stereo, dense, self.keyframes, self.surface, self.exposure, timing)
             if config.first_depths

@@ -51,7 +51,7 @@ KNEE = np.float32(224)
 MAX_LOG = float(np.log(3.0))
 
 
-class Exposure:
+class ExposureCompensation:
     """Levels each new image with the last ones."""
 
     def __init__(self) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from painted_ground import HEIGHT_M, K, on_plane, pose, still
 
-from recon.mapping.exposure import KNEE, Exposure
+from recon.mapping.exposure_compensation import KNEE, ExposureCompensation
 from recon.types import F64, U8, Camera, DepthMap
 
 SIZE = (120, 90)
@@ -33,7 +33,7 @@ def _apart(levelled: U8, right: U8) -> F64:
 
 def test_a_step_of_exposure_in_flight_leaves_no_seam() -> None:
     """Brighter by half, and redder, from the fifth image on."""
-    exposure, gain = Exposure(), np.array([1.4, 1.5, 1.7])
+    exposure, gain = ExposureCompensation(), np.array([1.4, 1.5, 1.7])
     for k in range(10):
         depth, right = _seen(pose(STEP_M * k))
         raw = np.rint(right * (gain if k >= 4 else np.ones(3))).astype(np.uint8)
@@ -46,7 +46,7 @@ def test_a_step_of_exposure_in_flight_leaves_no_seam() -> None:
 
 
 def test_a_shadow_on_one_side_of_an_image_leaves_no_seam() -> None:
-    exposure = Exposure()
+    exposure = ExposureCompensation()
     exposure(0, *_seen(pose(0.0)))
     depth, right = _seen(pose(STEP_M))
     shadow = np.linspace(1.0, 0.6, SIZE[0])[None, :, None]
@@ -58,7 +58,7 @@ def test_a_shadow_on_one_side_of_an_image_leaves_no_seam() -> None:
 
 def test_images_of_one_exposure_stay_as_they_are() -> None:
     """Nearly so where their edges are somewhat darker, as lenses make them."""
-    exposure, darkened = Exposure(), Exposure()
+    exposure, darkened = ExposureCompensation(), ExposureCompensation()
     x, y = np.meshgrid(np.linspace(-1, 1, SIZE[0]), np.linspace(-1, 1, SIZE[1]))
     vignette = (1.0 - 0.05 * (x * x + y * y))[..., None]
     for k in range(8):
@@ -70,7 +70,7 @@ def test_images_of_one_exposure_stay_as_they_are() -> None:
 
 def test_a_side_that_is_brighter_in_all_images_adds_up_to_no_gain() -> None:
     """Ahead, as with the sun behind the drone: ground darkens as it moves through the image."""
-    exposure = Exposure()
+    exposure = ExposureCompensation()
     ramp = np.linspace(1.2, 0.8, SIZE[0])[None, :, None]
     for k in range(30):
         depth, right = _seen(pose(STEP_M * k))
@@ -80,7 +80,7 @@ def test_a_side_that_is_brighter_in_all_images_adds_up_to_no_gain() -> None:
 
 
 def test_without_common_ground_a_gain_lasts_and_returns_to_one() -> None:
-    exposure = Exposure()
+    exposure = ExposureCompensation()
     exposure(0, *_seen(pose(0.0)))
     depth, right = _seen(pose(1.0))
     exposure(0, depth, np.rint(right * 2.0).astype(np.uint8))
@@ -98,7 +98,7 @@ def test_without_common_ground_a_gain_lasts_and_returns_to_one() -> None:
 @pytest.mark.parametrize("gain", [0.5, 1.0, 2.0])
 def test_a_gain_burns_nothing(gain: float) -> None:
     """Levels stay in order, and white stays apart from what was less bright."""
-    exposure = Exposure()
+    exposure = ExposureCompensation()
     exposure._gain[0] = np.log(gain)
     ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
     levels = exposure.level(ramp)[0, :, 1].astype(int)
@@ -110,7 +110,7 @@ def test_a_gain_burns_nothing(gain: float) -> None:
 
 def test_colours_that_say_nothing_change_nothing() -> None:
     """Black, burnt, of another surface, or too few."""
-    exposure = Exposure()
+    exposure = ExposureCompensation()
     depth, right = _seen(pose(0.0))
     exposure(0, depth, right)
     for raw in (np.zeros_like(right), np.full_like(right, 255)):
