@@ -1,15 +1,19 @@
 """Readings of the machine: heat, throttling, power, memory, disk, as far as available.
 
-All come from the kernel's files, so no package is needed; tests replace ``/`` by ``root``.
+psutil reads what every machine has; heat, power and limits differ from board to board and come from
+the kernel's files, which tests have below another ``root`` than ``/``.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import psutil  # type: ignore[import-untyped]
 
 from mavlink.component.status import ComputerLoad
 from service.scans.retention import existing
@@ -43,36 +47,8 @@ class Machine:
         return {key: value for key, value in asdict(self).items() if value is not None}
 
 
-class CoreLoad:
-    """Load of each core since the last call, from the kernel's tick counters."""
-
-    def __init__(self, root: Path = Path("/")) -> None:
-        self._file = root / "proc/stat"
-        self._last = self._read()
-
-    def percent(self) -> tuple[int, ...]:
-        """Percent per core since the last call; empty where not available."""
-        now = self._read()
-        pairs = zip(now, self._last, strict=False)
-        self._last = now
-        return tuple(
-            round(100.0 * (1.0 - (idle - idle0) / (total - total0))) if total > total0 else 0
-            for (idle, total), (idle0, total0) in pairs
-        )
-
-    def _read(self) -> list[tuple[int, int]]:
-        """(idle ticks, all ticks) of each core."""
-        cores = []
-        for line in _text(self._file).splitlines():
-            name, *ticks = line.split()
-            if name.startswith("cpu") and name != "cpu" and len(ticks) >= 5:
-                counts = [int(t) for t in ticks[:8]]
-                cores.append((counts[3] + counts[4], sum(counts)))
-        return cores
-
-
-def computer_load(machine: Machine, cores: tuple[int, ...], keep_free_mib: float) -> ComputerLoad:
-    """The readings in the form sent over MAVLink."""
+def computer_load(machine: Machine, cores: Sequence[float], keep_free_mib: float) -> ComputerLoad:
+    """The readings, and the load of each ``cores`` in per cent, in the form sent over MAVLink."""
 
     def used(free: float | None, total: float | None) -> int | None:
         return None if free is None or total is None else round(total - free)
@@ -82,7 +58,7 @@ def computer_load(machine: Machine, cores: tuple[int, ...], keep_free_mib: float
 
     free = machine.disk_free_mib
     return ComputerLoad(
-        cpu_percent=cores,
+        cpu_percent=tuple(map(round, cores)),
         temperature_c=whole(machine.temperature_c),
         ram_used_mib=used(machine.memory_free_mib, machine.memory_total_mib),
         ram_total_mib=whole(machine.memory_total_mib),
@@ -96,16 +72,17 @@ def computer_load(machine: Machine, cores: tuple[int, ...], keep_free_mib: float
 def read_machine(disk: Path, root: Path = Path("/")) -> Machine:
     """The readings now; ``disk`` is any path on the disk of the scans."""
     disk_free_mib, disk_total_mib = _disk_mib(disk)
+    memory = psutil.virtual_memory()
     return Machine(
         model=_text(root / "proc/device-tree/model") or os.uname().machine,
         temperature_c=_hottest(root),
         throttled=_throttled(root),
         power_w=_power_w(root),
-        memory_free_mib=_field_mib(root / "proc/meminfo", "MemAvailable:"),
-        memory_total_mib=_field_mib(root / "proc/meminfo", "MemTotal:"),
+        memory_free_mib=memory.available / 2**20,
+        memory_total_mib=memory.total / 2**20,
         memory_limit_free_mib=_limit_free_mib(root),
-        resident_mib=_field_mib(root / "proc/self/status", "VmRSS:"),
-        load=_load(root),
+        resident_mib=psutil.Process().memory_info().rss / 2**20,
+        load=os.getloadavg()[0] / (os.cpu_count() or 1),
         disk_free_mib=disk_free_mib,
         disk_total_mib=disk_total_mib,
     )
@@ -165,11 +142,6 @@ def _power_w(root: Path) -> float | None:
     return None
 
 
-def _load(root: Path) -> float | None:
-    text = _text(root / "proc/loadavg")
-    return float(text.split()[0]) / (os.cpu_count() or 1) if text else None
-
-
 def _disk_mib(disk: Path) -> tuple[float | None, float | None]:
     """(free, total) of the disk that holds ``disk`` or the nearest folder above it."""
     try:
@@ -177,13 +149,6 @@ def _disk_mib(disk: Path) -> tuple[float | None, float | None]:
     except OSError:
         return None, None
     return usage.free / 2**20, usage.total / 2**20
-
-
-def _field_mib(path: Path, name: str) -> float | None:
-    for line in _text(path).splitlines():
-        if line.startswith(name):
-            return float(line.split()[1]) / 1024.0
-    return None
 
 
 def _number(path: Path) -> float | None:

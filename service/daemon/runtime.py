@@ -15,6 +15,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import psutil  # type: ignore[import-untyped]
+
 from mavlink.component.control import Phase
 from mavlink.component.presence import RECENT_NS, Health
 from mavlink.component.status import CRITICAL, INFO, NOTICE, WARNING
@@ -24,7 +26,7 @@ from service.config import Config, reload
 from service.daemon.control_actions import ControlActions
 from service.daemon.health import HealthServer
 from service.daemon.load_shedding import Ladder, MachineReadings
-from service.daemon.machine import CoreLoad, Machine, computer_load, read_machine
+from service.daemon.machine import Machine, computer_load, read_machine
 from service.daemon.resumption import Landing, LandingWatch
 from service.daemon.scan_state import Event, State
 from service.daemon.scanning import Scanning
@@ -81,7 +83,6 @@ class Daemon:
         self._clock_ns = clock_ns
         self._landing = LandingWatch()
         self._was_armed = False
-        self._cores = CoreLoad()
         self._is_silent = False  # no images arrive, and that was reported
         self.scanning = scanning or Scanning(config)
         self.ladder = Ladder(config.compute)
@@ -270,7 +271,8 @@ class Daemon:
             return
         folder, keep_free_mib = Path(self.config.scan.folder), self.config.scan.keep_free_mib
         machine = read_machine(folder)
-        self.vehicle.set_load(computer_load(machine, self._cores.percent(), keep_free_mib))
+        cores = psutil.cpu_percent(percpu=True)  # since the last call
+        self.vehicle.set_load(computer_load(machine, cores, keep_free_mib))
         self.shed_load(machine)
         make_room(folder, keep_free_mib, self.scanning.in_the_making)
         release_memory()
