@@ -18,12 +18,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from recon.image_quality import local_variance
 from recon.parallel import parallel_for
 from recon.stereo.exposure import equalised
-from recon.stereo.lanes import LANES
+from recon.stereo.lanes import LANES, PARTS, Lanes
 from recon.stereo.matching_cost import (
     COST_UNIT,
     MatchingCostConfig,
@@ -34,6 +37,7 @@ from recon.stereo.matching_cost import (
 from recon.stereo.message_passing import (
     Smoothness,
     advance,
+    arriving_at,
     coarser_messages,
     edges_of,
     masks_of,
@@ -154,7 +158,7 @@ SURE_EVIDENCE = 0.6
 FILLED_CONFIDENCE = 0.05
 """Confidence of a pixel that only its neighbours speak for."""
 
-FAR = np.int16(16384)
+FAR = 16384
 """Above any belief."""
 
 NOISE = 0.2 * COST_UNIT
@@ -197,19 +201,22 @@ def _move_window(
     ``begin`` are not in them, rows beyond the image count as nothing."""
     height, _, labels, cells = above.shape
     enters, leaves = v + RADIUS, v - RADIUS - 1
+    none = np.zeros(cells, np.uint8)
     for parity in range(2):
-        if 0 <= enters < height:
-            for label in range(labels):
-                row, out = above[enters, parity, label], sums[label, parity, PAD : PAD + cells]
-                for i in range(cells):
-                    out[i] += np.int16(row[i])
-            low[parity, PAD : PAD + cells] += least[enters, parity]
-        if begin <= leaves:
-            for label in range(labels):
-                row, out = above[leaves, parity, label], sums[label, parity, PAD : PAD + cells]
-                for i in range(cells):
-                    out[i] -= np.int16(row[i])
-            low[parity, PAD : PAD + cells] -= least[leaves, parity]
+        for label in range(labels):
+            new = above[enters, parity, label] if enters < height else none
+            old = above[leaves, parity, label] if begin <= leaves else none
+            _slide(new, old, sums[label, parity])
+        new = least[enters, parity] if enters < height else none
+        _slide(new, least[leaves, parity] if begin <= leaves else none, low[parity])
+
+
+@njit(cache=True, nogil=True)
+def _slide(new: Any, old: Any, sums: Any) -> None:  # pragma: no cover - compiled
+    """Add a row of cells to sums (PAD + cells + PAD), and take one away."""
+    out = sums[PAD : PAD + new.shape[0]]
+    for i in range(new.shape[0]):
+        out[i] += np.int16(np.int16(new[i]) - np.int16(old[i]))
 
 
 @njit(cache=True, nogil=True)
@@ -248,96 +255,132 @@ def _window_costs(
                 seen[i] += np.int32(part[i])
 
 
+@intrinsic
+def _best_block(
+    typingctx: Any, above: Any, arriving: Any, cells: Any, labels: Any, belief: Any, best: Any,
+    label_of: Any, second: Any,
+) -> Any:  # fmt: skip
+    """Write, int16, of LANES cells the least belief, its label, and the least belief of the labels
+    not adjacent to it.
+
+    Addresses of: the data of label 0, ``cells`` bytes from label to label, the messages that
+    arrive, likewise, ``labels * LANES`` int16 of scratch, and what is written.
+    """
+    one = types.intp
+    return types.void(one, types.UniTuple(one, 4), *(one,) * 6), _best_code
+
+
+def _best_code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    above, arriving, cells, labels, belief, best, label_of, second = args
+    word, lanes = above.type, Lanes(builder, 16, LANES // PARTS)
+    sources = [above, *cgutils.unpack_tuple(builder, arriving, 4)]
+    adjacent, far = lanes.constant(3), lanes.constant(FAR)
+
+    def number(label: Any) -> Any:
+        return lanes.splat(builder.trunc(label, ir.IntType(16)))
+
+    def place(label: Any, start: int) -> Any:
+        offset = builder.add(builder.mul(label, ir.Constant(word, LANES)), ir.Constant(word, start))
+        return builder.add(belief, builder.mul(offset, ir.Constant(word, 2)))
+
+    for start in range(0, LANES, lanes.count):
+        least, winner, rest = lanes.variable(32767), lanes.variable(0), lanes.variable(32767)
+        with cgutils.for_range(builder, labels) as loop:
+            row = builder.add(builder.mul(loop.index, cells), ir.Constant(word, start))
+            total = lanes.constant(0)
+            for source in sources:
+                total = builder.add(total, lanes.load(builder.add(source, row), 8))
+            lanes.save(total, place(loop.index, start))
+            before = builder.load(least)
+            is_less = builder.icmp_signed("<", total, before)
+            label = builder.select(is_less, number(loop.index), builder.load(winner))
+            builder.store(label, winner)
+            builder.store(lanes.least(total, before), least)
+        with cgutils.for_range(builder, labels) as loop:
+            apart = builder.sub(builder.load(winner), number(loop.index))
+            near = builder.icmp_unsigned("<", builder.add(apart, lanes.constant(1)), adjacent)
+            total = lanes.load(place(loop.index, start))
+            total = builder.select(near, far, total)
+            builder.store(lanes.least(total, builder.load(rest)), rest)
+        for value, out in ((least, best), (winner, label_of), (rest, second)):
+            lanes.save(builder.load(value), builder.add(out, ir.Constant(word, 2 * start)))
+    return context.get_dummy_value()
+
+
 @njit(cache=True, nogil=True)
 def _best_labels(
-    above: Any, ring: Any, v: int, width: int, parity: int, belief: Any, best: Any, label_of: Any,
-    second: Any,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
-    """Of one parity of a row: the least belief, its label, and the least belief of the labels not
-    adjacent to it. Only without a branch do vector registers take the cells."""
-    _, rows, _, labels, cells = ring.shape
-    count = cells - 1
-    before, here, after = v % rows, (v + 1) % rows, (v + 2) % rows
-    best[:] = 32767
-    label_of[:] = 0
-    for label in range(labels):
-        b = belief[label, :count]
-        d = above[v, parity, label, :count]
-        m0 = ring[0, after, parity, label, :count]
-        m1 = ring[1, before, parity, label, :count]
-        m2 = ring[2, here, 1 - parity, label, parity : parity + count]
-        for i in range(count):
-            b[i] = np.int16(np.int16(d[i]) + np.int16(m0[i])) + np.int16(
-                np.int16(m1[i]) + np.int16(m2[i])
-            )
-        right = b[1 - parity :]  # nothing arrives from the left of a row's first cell
-        m3 = ring[3, here, 1 - parity, label, : right.shape[0]]
-        for i in range(right.shape[0]):
-            right[i] += np.int16(m3[i])
-        this = np.int16(label)
-        for i in range(count):
-            belief_here, least, label_before = b[i], best[i], label_of[i]
-            label_of[i] = this if belief_here < least else label_before
-            best[i] = min(belief_here, least)
-    second[:] = 32767
-    for label in range(labels):
-        b, this = belief[label, :count], np.int16(label)
-        for i in range(count):
-            apart = np.int16(abs(np.int16(label_of[i] - this)))
-            adjacent = FAR if apart <= np.int16(1) else np.int16(0)
-            second[i] = min(second[i], np.int16(b[i] + adjacent))
+    above: Any, ring: Any, v: int, parity: int, belief: Any, best: Any, label_of: Any, second: Any
+) -> None:  # pragma: no cover - compiled
+    """:func:`_best_block` of one parity of a row."""
+    _, _, labels, cells = above.shape
+    data = above.ctypes.data + (2 * v + parity) * labels * cells
+    first = arriving_at(ring, v, parity)
+    for at in range(0, cells, LANES):
+        _best_block(
+            data + at,
+            (first[0] + at, first[1] + at, first[2] + at, first[3] + at),
+            cells,
+            labels,
+            belief.ctypes.data,
+            best.ctypes.data + 2 * at,
+            label_of.ctypes.data + 2 * at,
+            second.ctypes.data + 2 * at,
+        )
 
 
 @njit(cache=True, nogil=True)
-def _note_winners(
-    best: Any, label_of: Any, second: Any, box: Any, low: Any, total: Any, width: int, parity: int,
-    min_disparity: int, winner: Any, around: Any, lead: Any, mean: Any,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
-    """Of each pixel of one parity of a row: the winner, its cost and that of the labels below and
-    above it, by how much it leads, and the mean cost of the labels that the pixel sees. An
-    outermost label has no such neighbours."""
-    labels = box.shape[0]
-    for i in range((width + 1 - parity) // 2):
-        u, label = 2 * i + parity, np.int64(label_of[i])
-        inner = 0 < label < labels - 1
-        winner[u] = label
-        lead[u] = np.int32(second[i]) - np.int32(best[i])
-        around[0, u] = box[label - 1, parity, i] if inner else box[label, parity, i]
-        around[1, u] = box[label, parity, i]
-        around[2, u] = box[label + 1, parity, i] if inner else box[label, parity, i]
-        seen_labels = min(labels - 1, u - min_disparity) - max(0, u - min_disparity - width + 1) + 1
-        mean[0, u], mean[1, u] = total[parity, i], max(seen_labels, 1)
-        mean[2, u] = low[parity, i]
+def _costs_around(
+    label_of: Any, box: Any, parity: int, count: int, below: Any, here: Any, over: Any
+) -> None:  # pragma: no cover - compiled
+    """Of each winner the cost, and that of the labels below and above it, which an outermost label
+    has not."""
+    last = box.shape[0] - 1
+    for i in range(count):
+        label = np.int64(label_of[i])
+        side = np.int64(0 < label < last)
+        below[i], here[i] = box[label - side, parity, i], box[label, parity, i]
+        over[i] = box[label + side, parity, i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _place_winners(
-    winner: Any, around: Any, lead: Any, mean: Any, min_disparity: int, sure_lead: int,
-    min_evidence: float, px: Any, confidence: Any,
+    label_of: Any, best: Any, second: Any, below: Any, here: Any, over: Any, low: Any, total: Any,
+    seen: Any, first: int, width: int, sure_lead: int, min_evidence: float, px: Any,
+    confidence: Any,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
     """Where between the labels the summed cost is least, an equiangular V, and how sure that is.
 
-    Without a branch, so that a vector register takes several pixels.
+    The partner of label 0 of cell 0 is at column ``first``, of the next cell two further. Without a
+    branch, so that a vector register takes several pixels.
     """
-    width = px.shape[0]
     noise = np.float32((2 * RADIUS + 1) ** 2) * np.float32(NOISE)
-    for u in range(width):
-        here = around[1, u]
-        a, b = np.float32(around[0, u] - here), np.float32(around[2, u] - here)
+    for i in range(px.shape[0]):
+        cost = np.int32(here[i])
+        a, b = np.float32(np.int32(below[i]) - cost), np.float32(np.int32(over[i]) - cost)
         steep = max(a, b)
         offset = (a - b) / (np.float32(2) * max(steep, np.float32(1)))
         offset = min(max(offset, np.float32(-0.5)), np.float32(0.5))
         offset = offset if steep > 0 else np.float32(0)
-        partner = np.int32(u) - winner[u] - np.int32(min_disparity)
+        partner = np.int32(np.int32(2 * i + first) - np.int32(label_of[i]))
         visible = (partner >= 0) & (partner < np.int32(width))
-        px[u] = np.float32(winner[u]) + offset if visible else np.float32(np.nan)
-        typical = np.float32(mean[0, u] + mean[1, u] * mean[2, u]) / np.float32(mean[1, u])
-        evidence = (typical - np.float32(here + mean[2, u])) / (typical + noise)
-        enough = (lead[u] > 0) & ((evidence >= np.float32(min_evidence)) | (min_evidence <= 0))
-        margin = min(np.float32(1), np.float32(lead[u]) / np.float32(sure_lead))
+        px[i] = np.float32(label_of[i]) + offset if visible else np.float32(np.nan)
+    for i in range(px.shape[0]):
+        mean = np.float32(total[i] + seen[i] * np.int32(low[i])) / np.float32(seen[i])
+        evidence = (mean - np.float32(np.int32(here[i]) + np.int32(low[i]))) / (mean + noise)
+        lead = np.int32(second[i]) - np.int32(best[i])
+        enough = (lead > 0) & ((evidence >= np.float32(min_evidence)) | (min_evidence <= 0))
+        margin = min(np.float32(1), np.float32(lead) / np.float32(sure_lead))
         sure = max(evidence, np.float32(0.01)) / np.float32(SURE_EVIDENCE)
         sure = margin * min(np.float32(1), sure)
-        confidence[u] = sure if visible & enough else np.float32(0)
+        confidence[i] = sure if enough & (px[i] == px[i]) else np.float32(0)
+
+
+@njit(cache=True, nogil=True)
+def _seen_labels(labels: int, width: int, first: int, seen: Any) -> None:  # pragma: no cover
+    """How many labels each cell sees, at least 1."""
+    for i in range(seen.shape[0]):
+        u = 2 * i + first
+        seen[i] = max(min(labels - 1, u) - max(0, u - width + 1) + 1, 1)
 
 
 @njit(cache=True, nogil=True)
@@ -353,13 +396,15 @@ def _select(
         np.zeros((2, cells + 2 * PAD), np.int16),
     )
     box, low_box = np.empty((labels, 2, cells), np.int16), np.empty((2, cells), np.int16)
-    total, mean = np.empty((2, cells), np.int32), np.empty((3, width), np.int32)
-    belief = np.empty((labels, cells), np.int16)
+    total, seen = np.empty((2, cells), np.int32), np.empty((2, cells), np.int32)
+    belief = np.empty((labels, LANES), np.int16)
     best = np.empty(cells, np.int16)  # each on its own: rows of one array lose their layout
     label_of, second = np.empty(cells, np.int16), np.empty(cells, np.int16)
-    winner = np.empty(width, np.int32)
-    lead = np.empty(width, np.int32)
-    around = np.empty((3, width), np.int32)
+    below, over = np.empty(cells, np.int16), np.empty(cells, np.int16)
+    here = np.empty(cells, np.int16)
+    labels_px, sure = np.empty((2, cells), np.float32), np.empty((2, cells), np.float32)
+    for parity in range(2):
+        _seen_labels(labels, width, parity - min_disparity, seen[parity])
     masks, scratch = masks_of(width, cells), np.empty((labels + 1) * 4 * LANES, np.int16)
     top = max(begin - RADIUS, 0)
     for v in range(begin - 2 * RADIUS, begin):
@@ -376,14 +421,17 @@ def _select(
         _window_costs(sums, width, min_disparity, box, total)
         _window(low, low_box)
         for parity in range(2):
-            _best_labels(above, ring, v, width, parity, belief, best, label_of, second)
-            _note_winners(
-                best, label_of, second, box, low_box, total, width, parity, min_disparity,
-                winner, around, lead, mean,
+            count = (width + 1 - parity) // 2
+            _best_labels(above, ring, v, parity, belief, best, label_of, second)
+            _costs_around(label_of, box, parity, count, below, here, over)
+            _place_winners(
+                label_of, best, second, below, here, over, low_box[parity], total[parity],
+                seen[parity], parity - min_disparity, width, sure_lead, min_evidence,
+                labels_px[parity, :count], sure[parity, :count],
             )  # fmt: skip
-        _place_winners(
-            winner, around, lead, mean, min_disparity, sure_lead, min_evidence, px[v], confidence[v]
-        )
+            for i in range(count):
+                px[v, 2 * i + parity] = labels_px[parity, i]
+                confidence[v, 2 * i + parity] = sure[parity, i]
 
 
 @njit(cache=True, nogil=True)
@@ -399,26 +447,27 @@ def _check_visibility(
     becomes NaN.
     """
     height, width = px.shape
+    nearest, hidden = np.empty(width, np.float32), np.empty(width, np.bool_)
+    partner = np.empty(width, np.int32)
     for v in range(height):
-        row = px[v]
-        nearest = np.full(width, np.float32(-np.inf), np.float32)
-        hidden = np.zeros(width, np.bool_)
+        row, sure = px[v], confidence[v]
+        nearest[:] = -np.inf
         for u in range(width):
-            if confidence[v, u] > 0:
-                partner = u - int(row[u] + np.float32(0.5)) - min_disparity
-                if 0 <= partner < width:
-                    nearest[partner] = max(nearest[partner], row[u])
+            partner[u] = np.int32(u - min_disparity) - np.int32(row[u] + np.float32(0.5))
         for u in range(width):
-            if not np.isnan(row[u]):
-                partner = u - int(row[u] + np.float32(0.5)) - min_disparity
-                hidden[u] = 0 <= partner < width and nearest[partner] > row[u] + tolerance
+            there = partner[u]
+            if sure[u] > 0 and 0 <= there < width:
+                nearest[there] = max(nearest[there], row[u])
         for u in range(width):
-            if hidden[u] or confidence[v, u] <= 0:
-                row[u] = np.nan
-                confidence[v, u] = 0
+            there = partner[u]
+            hidden[u] = 0 <= there < width and nearest[there] > row[u] + tolerance
+        for u in range(width):
+            known = (sure[u] > 0) & (not hidden[u])
+            row[u] = row[u] if known else np.float32(np.nan)
+            sure[u] = sure[u] if known else np.float32(0)
         if fill:
             _mark_strips(row, hidden, tolerance)
-            _fill_row(row, confidence[v], hidden, min_disparity)
+            _fill_row(row, sure, hidden, min_disparity)
 
 
 @njit(cache=True, nogil=True)

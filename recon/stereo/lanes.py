@@ -19,6 +19,10 @@ LANES = 32
 """Cells that are updated together; LLVM spreads them over the registers that there are."""
 
 
+PARTS = 2
+"""Parts of them whose 16-bit envelopes the registers of AVX2 hold at once."""
+
+
 def cells_of(width: int) -> int:
     """Length of a row of cells of one parity: whole blocks, and at least one empty cell."""
     return ((width + 1) // 2 // LANES + 1) * LANES

@@ -21,12 +21,9 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from recon.parallel import parallel_for
-from recon.stereo.lanes import LANES, Lanes, cells_of
+from recon.stereo.lanes import LANES, PARTS, Lanes, cells_of
 from recon.stereo.matching_cost import Workspace
 from recon.types import I16, U8
-
-PARTS = 2
-"""Parts of them whose 16-bit envelopes the registers of AVX2 hold at once."""
 
 _FAR = 16383
 
@@ -353,29 +350,36 @@ def _start_row(
 
 
 @njit(cache=True, nogil=True)
+def arriving_at(ring: Any, v: int, parity: int) -> Any:  # pragma: no cover - compiled
+    """Addresses of the messages from below, above, right and left to the first cell of a row."""
+    _, rows, _, labels, cells = ring.shape
+    row = labels * cells
+    base, step = ring.ctypes.data, rows * 2 * row
+    beside = base + (2 * ((v + 1) % rows) + 1 - parity) * row + parity
+    return (
+        base + (2 * ((v + 2) % rows) + parity) * row + UP * step,
+        base + (2 * (v % rows) + parity) * row + DOWN * step,
+        beside + LEFT * step,
+        beside + RIGHT * step - 1,
+    )
+
+
+@njit(cache=True, nogil=True)
 def _update_row(
     data: Any, ring: Any, v: int, colour: int, edges: Any, blocks: int, masks: Any, scratch: Any
 ) -> None:  # pragma: no cover - compiled
     """Messages that leave the pixels of one colour of row ``v``."""
     height, _, labels, cells = data.shape
     parity = (v + colour) & 1
-    row = labels * cells  # bytes of the messages of one parity
-    rows = ring.shape[1]
+    rows, row = ring.shape[1], labels * cells  # bytes of the messages of one parity
     step = rows * 2 * row  # from direction to direction
     line = 2 * cells  # bytes of the edges of one parity of a row
     side = (height + 2) * 2 * line  # from vertical to horizontal edges
+    arriving = arriving_at(ring, v, parity)
+    here = ring.ctypes.data + (2 * ((v + 1) % rows) + parity) * row
     for block in range(blocks):
         at = LANES * block
-        base = ring.ctypes.data + at
-        start = base + (2 * ((v + 1) % rows) + parity) * row
-        beside = base + (2 * ((v + 1) % rows) + 1 - parity) * row + parity
-        arriving = (
-            base + (2 * ((v + 2) % rows) + parity) * row + UP * step,
-            base + (2 * (v % rows) + parity) * row + DOWN * step,
-            beside + LEFT * step,
-            beside + RIGHT * step - 1,
-        )
-        leaving = (start, start + step, start + 2 * step, start + 3 * step)
+        start = here + at
         e = edges.ctypes.data + 2 * at
         # smoothness towards above, below, left and right
         places = (
@@ -388,8 +392,8 @@ def _update_row(
         update_block(
             data.ctypes.data + ((2 * v + parity) * row + at) * data.itemsize,
             data[0, 0, 0, 0],
-            arriving,
-            leaving,
+            (arriving[0] + at, arriving[1] + at, arriving[2] + at, arriving[3] + at),
+            (start, start + step, start + 2 * step, start + 3 * step),
             masks.ctypes.data + parity * 2 * cells + 2 * at,
             scratch.ctypes.data,
             (cells * data.itemsize, cells),
