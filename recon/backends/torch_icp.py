@@ -76,10 +76,9 @@ def _descent(config: IcpConfig) -> Callable[..., tuple[Tensor, ...]]:
         z_a: Tensor, sigma_a: Tensor, K_a: Tensor, z_b: Tensor, sigma_b: Tensor, K_b: Tensor,
         T: Tensor,
     ) -> tuple[Tensor, ...]:  # fmt: skip
-        a = build(z_a, sigma_a, K_a, config.edge_share)
-        b = build(z_b, sigma_b, K_b, config.edge_share)
+        a, b = build(z_a, sigma_a, K_a), build(z_b, sigma_b, K_b)
         T, state, seen = descend(a, b, T, config)
-        last = weigh(seen, a, b, T, True, config)
+        last = weigh(seen, a, b, T, True)
         size = last.residual.view(seen.shape)
         near = (last.found.view(seen.shape) > 0) & (size.abs() < AREA_SIGMAS * last.scale)
         numbers = [
@@ -103,8 +102,8 @@ def descend(
         seen = points(a, stride)
         state = torch.stack([state[0], state[0], state[2]])
         for _ in range(limit):
-            found = weigh(seen, a, b, T, level == last, config)
-            T, state = advance(found, a, T, state, 0.3 if level == last else 1.0, config)
+            found = weigh(seen, a, b, T, level == last)
+            T, state = advance(found, a, T, state, 0.3 if level == last else 1.0)
     return T, state, seen
 
 
@@ -136,9 +135,9 @@ def area_of(lags: F64) -> float:
     return area
 
 
-def build(depth: Tensor, sigma: Tensor, intrinsics: Tensor, edge_share: float) -> DeviceSurface:
+def build(depth: Tensor, sigma: Tensor, intrinsics: Tensor) -> DeviceSurface:
     """The surface of ``depth`` and ``sigma`` (h, w) float32; NaN is unknown."""
-    elements = surface_elements(depth, sigma, intrinsics, edge_share)
+    elements = surface_elements(depth, sigma, intrinsics)
     h, w = depth.shape
     some = elements[::4, ::4, 4] > 0
     z = torch.where(some, depth[::4, ::4], 0.0).to(DOUBLE)

@@ -20,7 +20,14 @@ from torch import Tensor
 
 from recon.backends.triton_dense import blocks
 from recon.mapping.icp_kernels import MIN_PIXELS, REACH
-from recon.mapping.registration import MIN_PARTNERS, IcpConfig
+from recon.mapping.registration import (
+    EDGE_SHARE,
+    GATE_SHARE,
+    HUBER_SIGMAS,
+    MIN_PARTNERS,
+    TUKEY_SIGMAS,
+    WEAK_SLOPE,
+)
 
 POINTS = 128
 """Points of one program."""
@@ -75,9 +82,8 @@ class Weighed:
 
 
 def weigh(
-    seen: SourcePoints, a: DeviceSurface, b: DeviceSurface, T: Tensor, tukey: bool,
-    config: IcpConfig,
-) -> Weighed:  # fmt: skip
+    seen: SourcePoints, a: DeviceSurface, b: DeviceSurface, T: Tensor, tukey: bool
+) -> Weighed:
     """The problem of the points ``seen`` of ``a`` against ``b`` at the motion ``T`` (4, 4)."""
     count = len(seen.sigma)
     residual, found = torch.empty((2, count), dtype=torch.float64, device=T.device)
@@ -86,13 +92,13 @@ def weigh(
     h, w = b.elements.shape[:2]
     given = (seen.point, seen.normal, seen.sigma, b.elements, b.intrinsics, T)
     residuals_kernel[(programs,)](
-        *given, residual, found, count, h, w, config.gate_share, POINTS, num_warps=1
+        *given, residual, found, count, h, w, GATE_SHARE, POINTS, num_warps=1
     )
     every = max(count // MEDIAN_OF, 1)
     scale = scale_of(residual[::every], found[::every])
-    sigmas = config.tukey_sigmas if tukey else config.huber_sigmas
+    sigmas = TUKEY_SIGMAS if tukey else HUBER_SIGMAS
     normal_equations_kernel[(programs,)](
-        *given, a.centre, scale, partial, count, h, w, config.gate_share, sigmas, int(tukey),
+        *given, a.centre, scale, partial, count, h, w, GATE_SHARE, sigmas, int(tukey),
         POINTS, ROW, num_warps=1,
     )  # fmt: skip
     sums = partial.sum(0)
@@ -105,7 +111,7 @@ def weigh(
 
 
 def advance(
-    weighed: Weighed, a: DeviceSurface, T: Tensor, state: Tensor, share: float, config: IcpConfig
+    weighed: Weighed, a: DeviceSurface, T: Tensor, state: Tensor, share: float
 ) -> tuple[Tensor, Tensor]:
     """The motion after a step, unless it stands still, and the new state; both are new tensors.
 
@@ -114,24 +120,24 @@ def advance(
 
     The host splits the directions by the eigenvectors of H. Here the split is the spectral
     projector of ``C - SHARED H``, C the part of H that both surfaces share: positive where more
-    than that share is common and the slope is above ``weak_slope``. Its sign is found by Newton
+    than that share is common and the slope is above ``WEAK_SLOPE``. Its sign is found by Newton
     and Schulz (Higham, Functions of Matrices, 2008, chapter 5), with matrix products alone.
     """
     T, state = T.clone(), state.clone()
     advance_kernel[(1,)](
         weighed.H, weighed.common, weighed.g, weighed.partners, weighed.centre, a.lever_m, T,
-        state, share, config.weak_slope, SHARED, MIN_PARTNERS, SIGN_ROUNDS,
+        state, share, WEAK_SLOPE, SHARED, MIN_PARTNERS, SIGN_ROUNDS,
         num_warps=1,
     )  # fmt: skip
     return T, state
 
 
-def surface_elements(depth: Tensor, sigma: Tensor, intrinsics: Tensor, edge_share: float) -> Tensor:
+def surface_elements(depth: Tensor, sigma: Tensor, intrinsics: Tensor) -> Tensor:
     """(h, w, 6) float32, a plane fitted to the inverse depth of each window."""
     h, w = depth.shape
     out = torch.empty((h, w, 6), device=depth.device)
     surface_kernel[(blocks(h * w, POINTS),)](
-        depth, sigma, intrinsics, out, h, w, edge_share, MIN_PIXELS, REACH, POINTS
+        depth, sigma, intrinsics, out, h, w, EDGE_SHARE, MIN_PIXELS, REACH, POINTS
     )
     return out
 

@@ -29,6 +29,28 @@ lag."""
 MIN_PARTNERS = 50
 """Minimum number of partners; fewer do not count as an overlap."""
 
+GATE_SHARE = 0.05
+"""Residuals above this share of the depth are no partners."""
+
+EDGE_SHARE = 0.004
+"""A 5x5 window that bends by more than this share of its depth holds a depth edge."""
+
+HUBER_SIGMAS, TUKEY_SIGMAS = 1.345, 4.685
+"""Of the coarse levels and of the last one: 95 % efficient on Gaussian noise, both."""
+
+MIN_INLIER_SHARE, MAX_RMS_SHARE, MAX_TURN_RAD = 0.3, 0.01, 0.1
+"""Of the source's surface; point to plane over the median depth; of the correction. A registration
+beyond one of them is rejected: the start is off by less."""
+
+WEAK_SLOPE = 0.02
+"""Rms slope of the ground that a direction needs to be observed: noise tilts normals by less."""
+
+UNKNOWN_SIGMA_M = 10.0
+"""Of directions that are not observed."""
+
+MAX_DISAGREEMENT = 4.0
+"""Chi-square per degree of freedom against the images' motion."""
+
 
 @dataclass(frozen=True, slots=True)
 class IcpConfig:
@@ -36,17 +58,7 @@ class IcpConfig:
 
     strides: tuple[int, ...] = (6, 3)  # pixels between the source points, level by level
     iterations: tuple[int, ...] = (8, 6)  # of each level, at most
-    gate_share: float = 0.05  # residuals above this share of the depth are no partners
-    edge_share: float = 0.004  # a 5x5 window that bends more than this holds a depth edge
-    huber_sigmas: float = 1.345
-    tukey_sigmas: float = 4.685
-    min_inlier_share: float = 0.3  # of the source's surface, else rejected
-    max_rms_share: float = 0.01  # point to plane over the median depth, else rejected
     max_step_share: float = 0.05  # correction over the median depth, else rejected
-    max_turn_rad: float = 0.1
-    weak_slope: float = 0.02  # rms slope of the ground that a direction needs to be observed
-    unknown_sigma_m: float = 10.0  # given to directions that are not observed
-    max_disagreement: float = 4.0  # chi-square per degree of freedom against the images' motion
 
 
 def arrays_of(depth: DepthMap) -> tuple[F32, F32, F64]:
@@ -68,7 +80,7 @@ class DepthSurface:
     lever_m: float  # rms distance of the surface from its centre
 
     @staticmethod
-    def build(depth: DepthMap, config: IcpConfig) -> DepthSurface:
+    def build(depth: DepthMap) -> DepthSurface:
         """The surface of ``depth``; raises ValueError when its shapes disagree."""
         z, sigma, intrinsics = arrays_of(depth)
         h, w = z.shape
@@ -77,7 +89,7 @@ class DepthSurface:
         chunks = -(-h // icp_kernels.CHUNK)
         parallel_for(
             icp_kernels.surface_elements, chunks, z, inverse, sigma, *intrinsics,
-            config.edge_share, elements,
+            EDGE_SHARE, elements,
         )  # fmt: skip
         v, u = np.nonzero(elements[::4, ::4, 4])
         some = z[4 * v, 4 * u].astype(np.float64)
@@ -134,7 +146,7 @@ class _Problem:
 
 
 def _problem(
-    source: DepthSurface, target: DepthSurface, T: F64, stride: int, tukey: bool, config: IcpConfig
+    source: DepthSurface, target: DepthSurface, T: F64, stride: int, tukey: bool
 ) -> _Problem | None:
     """The problem at ``T``, or None when fewer than :data:`MIN_PARTNERS` points find a partner."""
     h, w = source.elements.shape[:2]
@@ -142,7 +154,7 @@ def _problem(
     size, rows = np.empty(shape, np.float32), np.empty((*shape, 10), np.float32)
     icp_kernels.residuals(
         source.elements, source.intrinsics, target.elements, target.intrinsics,
-        T, stride, config.gate_share, size, rows,
+        T, stride, GATE_SHARE, size, rows,
     )  # fmt: skip
     matched = size[size < icp_kernels.UNMATCHED]
     if len(matched) < MIN_PARTNERS:
@@ -151,17 +163,17 @@ def _problem(
     scale = max(float(np.median(np.abs(matched[::every]))) / 0.6745, 1e-3)
     H, common, g, sums = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(4)
     centre = T[:3, :3] @ source.centre + T[:3, 3]
-    limit = scale * (config.tukey_sigmas if tukey else config.huber_sigmas)
+    limit = scale * (TUKEY_SIGMAS if tukey else HUBER_SIGMAS)
     icp_kernels.normal_equations(size, rows, centre, limit, tukey, H, common, g, sums)
 
     def area() -> float:
         return float(icp_kernels.correlated_area(size, AREA_SIGMAS * scale, AREA_LAGS))
 
     equations = Equations(H, common, g, sums, centre, source.lever_m, area)
-    return _along_directions(equations, config)
+    return _along_directions(equations)
 
 
-def _along_directions(equations: Equations, config: IcpConfig) -> _Problem:
+def _along_directions(equations: Equations) -> _Problem:
     """The problem in its principal directions."""
     H, common, g, lever_m = equations.H, equations.common, equations.g, equations.lever_m
     unit = np.array([1 / lever_m] * 3 + [1.0] * 3)
@@ -169,7 +181,7 @@ def _along_directions(equations: Equations, config: IcpConfig) -> _Problem:
     shared = np.einsum("ik,ij,jk->k", vectors, common * np.outer(unit, unit), vectors)
     # The eigenvalues are mean squares of the slope against each motion, 1 for a motion along
     # all normals. Noise tilts the normals too, but not those of both surfaces alike.
-    enough = config.weak_slope**2 * max(float(values[-1]), 1e-30)
+    enough = WEAK_SLOPE**2 * max(float(values[-1]), 1e-30)
     strong = (shared > enough) & (shared > 0.35 * values)
     return _Problem(equations, unit, values, vectors, shared, vectors.T @ (unit * g), strong)
 
@@ -181,7 +193,7 @@ def conclude(
 
     ``available`` counts the source's surface elements.
     """
-    problem = _along_directions(equations, config)
+    problem = _along_directions(equations)
     return _judged(problem, problem.step() @ T, T_start, available, iterations + 1, config)
 
 
@@ -192,11 +204,11 @@ def register_projective(
 
     The maps' own poses are not used. Directions that the surface does not determine (on flat
     ground: both horizontal shifts and the turn about the vertical) keep the start, get
-    ``unknown_sigma_m`` in the covariance and make the verdict DEGENERATE. REJECTED: too
+    ``UNKNOWN_SIGMA_M`` in the covariance and make the verdict DEGENERATE. REJECTED: too
     little overlap, residuals too large, or a correction too large to be plausible.
     """
     config = config or IcpConfig()
-    a, b = DepthSurface.build(source, config), DepthSurface.build(target, config)
+    a, b = DepthSurface.build(source), DepthSurface.build(target)
     T = np.array(T_target_source, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise ValueError("T_target_source must be (4, 4) finite numbers")
@@ -205,7 +217,7 @@ def register_projective(
     last = len(config.strides) - 1
     for level, (stride, limit) in enumerate(zip(config.strides, config.iterations, strict=True)):
         for _ in range(limit):
-            problem = _problem(a, b, T, stride, level == last, config)
+            problem = _problem(a, b, T, stride, level == last)
             if problem is None:
                 return no_overlap(T_target_source, done)
             step = problem.step()
@@ -218,13 +230,11 @@ def register_projective(
     return _judged(problem, T, T_target_source, int(np.count_nonzero(grid)), done, config)
 
 
-def agreed_motion(
-    T: F64, covariance: F64, found: Registration, config: IcpConfig
-) -> tuple[F64, F64] | None:
+def agreed_motion(T: F64, covariance: F64, found: Registration) -> tuple[F64, F64] | None:
     """The images' motion (4, 4) with its covariance, averaged with a registration's; None where
     that is rejected or contradicts the images."""
     both = T, covariance, found.T_target_source, found.covariance
-    if not found.converged or se3.disagreement(*both) > config.max_disagreement:
+    if not found.converged or se3.disagreement(*both) > MAX_DISAGREEMENT:
         return None
     return se3.average(*both)
 
@@ -239,17 +249,17 @@ def no_overlap(T: F64, iterations: int) -> Registration:
 def _judged(
     problem: _Problem, T: F64, T_start: F64, available: int, iterations: int, config: IcpConfig
 ) -> Registration:
-    covariance = _covariance(problem, config)
+    covariance = _covariance(problem)
     sums, depth = problem.equations.sums, float(problem.equations.centre[2])
     rms = float(np.sqrt(sums[3] / max(sums[0], 1e-9)))
     share = float(sums[2]) / max(available, 1)
     change = T @ se3.inverse(T_start)
     turn = float(np.linalg.norm(se3.so3_log(change[:3, :3])))
     implausible = (
-        share < config.min_inlier_share
-        or rms > config.max_rms_share * depth
+        share < MIN_INLIER_SHARE
+        or rms > MAX_RMS_SHARE * depth
         or problem.moved_m(change) > config.max_step_share * depth
-        or turn > config.max_turn_rad
+        or turn > MAX_TURN_RAD
         or not problem.strong.any()
     )
     good = Verdict.CONVERGED if problem.strong.all() else Verdict.DEGENERATE
@@ -257,7 +267,7 @@ def _judged(
     return Registration(T, covariance, verdict, rms, share, iterations)
 
 
-def _covariance(problem: _Problem, config: IcpConfig) -> F64:
+def _covariance(problem: _Problem) -> F64:
     """(6, 6) covariance of a left perturbation."""
     weights, squares = (float(s) for s in problem.equations.sums[:2])
     # Residuals of neighbours err together, so they count as fewer than they are.
@@ -265,7 +275,7 @@ def _covariance(problem: _Problem, config: IcpConfig) -> F64:
     variance = max(squares / max(weights - 6.0, 1.0), 1e-6) * area * _UNSEEN_VARIANCE
     # Information from noise in the normals is none: only the shared part moves the estimate.
     information = np.maximum(problem.shared, 1e-30) ** 2 / np.maximum(problem.values, 1e-30)
-    spread = np.where(problem.strong, variance / information, config.unknown_sigma_m**2)
+    spread = np.where(problem.strong, variance / information, UNKNOWN_SIGMA_M**2)
     # The rotation was about the centre; a left perturbation turns about the origin.
     move = se3.adjoint(se3.compose(np.eye(3), problem.equations.centre))
     directions = move @ (problem.unit[:, None] * problem.vectors)

@@ -24,7 +24,7 @@ from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import PairDepth, carry, fuse, plausible, reproject
 from recon.stereo.virtual_stereo import at_middle_row, drop_unseen, plane_relief, rectify
 from recon.tracking.frame import UndistortedFrame
-from recon.tracking.matching import MatchingConfig, build_pyramid
+from recon.tracking.matching import build_pyramid
 from recon.types import (
     F32,
     F64,
@@ -82,7 +82,7 @@ class Undistort:
                 small = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
             small = stretch(small, self._seen)
             is_blurred = self._blur.blurred(small)
-            pyramid = build_pyramid(small, MatchingConfig().search_levels)
+            pyramid = build_pyramid(small)
             return UndistortedFrame(
                 frame.seq, frame.time_ns, frame.prior, image, gray, pyramid, self._mask, is_blurred
             )
@@ -275,7 +275,7 @@ class Register:
         with self._timing("icp"):
             found = self._backend.register(depth, before[1], step, self._config)
         self.verdicts[found.verdict] += 1
-        agreed = agreed_motion(step, covariance, found, self._config)
+        agreed = agreed_motion(step, covariance, found)
         return agreed or (step, covariance)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import project, rays
-from recon.mapping.registration import IcpConfig, agreed_motion, register_projective
+from recon.mapping.registration import agreed_motion, register_projective
 from recon.tracking import matching, pnp
 from recon.tracking.common_view import FEATURE_SHARES, common_view, features
 from recon.types import F32, F64, U8, Bool, DepthMap
@@ -30,7 +30,7 @@ SEARCH_SHARE = 0.12
 MIN_MATCHES, MIN_INLIERS = 40, 30
 """Corners found again, and those of them that the pose explains."""
 
-MATCHING, ICP = matching.MatchingConfig(), IcpConfig()
+MATCHING = matching.MatchingConfig()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +127,7 @@ def verify(a: LoopView, b: LoopView, T_a_b_guess: F64) -> LoopClosure | None:
     uv, points = landmarks(a, MATCHING)
     if len(uv) < MIN_MATCHES:
         return None
-    pyramids = tuple(matching.build_pyramid(v.gray, MATCHING.search_levels) for v in (a, b))
+    pyramids = tuple(matching.build_pyramid(v.gray) for v in (a, b))
     T_b_a = se3.inverse(T_a_b_guess)
     predicted = project(b.K, se3.transform(T_b_a, points))
     warp = warps(a.K, b.K, T_b_a, uv, points)
@@ -223,8 +223,8 @@ def _with_icp(a: LoopView, b: LoopView, T_a_b: F64, covariance: F64) -> LoopClos
     depth = float(np.nanmedian(a.depth.depth_m))
     sigma = float(np.nanmedian(a.depth.sigma_m))
     covariance = covariance + np.diag([(sigma / depth) ** 2 * 0.01] * 3 + [(0.3 * sigma) ** 2] * 3)
-    aligned = register_projective(b.depth, a.depth, T_a_b, ICP)
-    agreed = agreed_motion(T_a_b, covariance, aligned, ICP)
+    aligned = register_projective(b.depth, a.depth, T_a_b)
+    agreed = agreed_motion(T_a_b, covariance, aligned)
     if agreed is None:
         return None
     T, covariance = agreed

@@ -48,7 +48,7 @@ def verify_surfaces(a: LoopView, b: LoopView, T_a_b_guess: F64) -> LoopClosure |
     uv, points = landmarks(a, MATCHING)
     if len(uv) < MIN_MATCHES:
         return None
-    pyramids = [matching.build_pyramid(v.gray, MATCHING.search_levels) for v in (a, b)]
+    pyramids = [matching.build_pyramid(v.gray) for v in (a, b)]
     T_b_a = se3.inverse(T_a_b_guess)
     predicted = project(b.K, se3.transform(T_b_a, points))
     bent = warps(a.K, b.K, T_b_a, uv, points)

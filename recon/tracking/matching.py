@@ -135,6 +135,22 @@ def harris_cells(
                 found[j, i, 0], found[j, i, 1], found[j, i, 2] = bx, y0 + by - 1, best
 
 
+HARRIS_K = 0.04
+"""k of Eq. 5."""
+
+MIN_RESPONSE, MIN_CONTRAST = 4.0, 2.0
+"""R of Eq. 5, gray levels to the fourth, and standard deviation of a patch, gray levels, at least:
+noise alone reaches no more."""
+
+PATCH_RADIUS_PX = 5
+"""A patch is 11 x 11 px."""
+
+LEVELS, COARSE_REACH_PX = 5, 8
+"""Levels of a pyramid, and the search radius in pixels of the level that a search begins at, both
+at most."""
+
+REFINE_ITERATIONS = 6
+
 FAR = 1e6
 """px; stands for a prediction that is not a number."""
 
@@ -142,16 +158,9 @@ FAR = 1e6
 @dataclass(frozen=True, slots=True)
 class MatchingConfig:
     grid: int = 30  # cells along each side; one corner per cell (paper: 30 x 30)
-    harris_k: float = 0.04  # k of Eq. 5
-    min_response: float = 4.0  # threshold of R, gray levels to the fourth
-    patch_radius_px: int = 5  # the patch is (2 r + 1) squared
-    search_levels: int = 5  # pyramid levels that a search may use, at most
-    coarse_reach_px: int = 8  # search radius that decides on the level to start at
-    min_contrast: float = 2.0  # standard deviation of a patch, gray levels
     max_zssd: float = 0.4  # of patches made unit: 2 (1 - correlation)
     ambiguity: float = 0.8  # best zssd over that of the next separate peak, at most
     max_return_px: float = 0.5  # forward and backward match may differ by this; inf: not matched
-    refine_iterations: int = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,7 +176,7 @@ Pyramid = tuple[U8, ...]
 """A gray image and its halvings, each (ceil(H / 2^l), ceil(W / 2^l)) uint8."""
 
 
-def build_pyramid(gray: U8, levels: int = 5) -> Pyramid:
+def build_pyramid(gray: U8, levels: int = LEVELS) -> Pyramid:
     """The pyramid of ``gray`` (H, W) uint8; levels under 40 px are left out."""
     _check_gray(gray)
     stack = [np.ascontiguousarray(gray)]
@@ -187,7 +196,7 @@ def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> F32
     ``mask`` (H, W) is zero where the image holds nothing; patches stay clear of it.
     """
     _check_gray(gray)
-    margin = config.patch_radius_px + 3
+    margin = PATCH_RADIUS_PX + 3
     allowed = np.zeros((0, 0), np.uint8)
     if mask is not None:
         if mask.shape != gray.shape:
@@ -198,10 +207,10 @@ def harris_grid(gray: U8, config: MatchingConfig, mask: U8 | None = None) -> F32
     cells = np.zeros((config.grid, config.grid, 3), np.float32)
     parallel_for(
         harris_cells, config.grid, np.ascontiguousarray(gray), allowed, config.grid, config.grid,
-        margin, config.harris_k, cells,
+        margin, HARRIS_K, cells,
     )  # fmt: skip
     best = cells.reshape(-1, 3)
-    return np.asarray(best[best[:, 2] > config.min_response])
+    return np.asarray(best[best[:, 2] > MIN_RESPONSE])
 
 
 def checked_points(uv_px: npt.ArrayLike) -> F64:
@@ -244,8 +253,8 @@ class _Search:
         parallel_for(
             patch_search.search, -(-N // patch_search.CHUNK), self.a[level], self.b[level],
             self.uv_a / 2.0**level, uv.copy(),
-            self.inverse_warp, active, reach, self.config.patch_radius_px,
-            self.config.min_contrast, uv, score, second, contrast,
+            self.inverse_warp, active, reach, PATCH_RADIUS_PX,
+            MIN_CONTRAST, uv, score, second, contrast,
         )  # fmt: skip
         return uv * 2.0**level, score, second, contrast
 
@@ -257,7 +266,7 @@ class _Search:
         parallel_for(
             patch_search.refine, -(-N // patch_search.CHUNK), self.a[0], self.b[0], self.uv_a,
             self.inverse_warp, active,
-            self.config.patch_radius_px, self.config.refine_iterations, uv, score, contrast_a,
+            PATCH_RADIUS_PX, REFINE_ITERATIONS, uv, score, contrast_a,
             contrast_b,
         )  # fmt: skip
         return uv, score, contrast_a, contrast_b
@@ -277,11 +286,10 @@ def _consensus(uv: F64, residual: F64, good: Bool, tolerance_px: float) -> F64 |
     return np.asarray(everywhere)
 
 
-def start_level(radius_px: float, levels: int, config: MatchingConfig) -> tuple[int, int]:
+def start_level(radius_px: float, levels: int) -> tuple[int, int]:
     """Level to start at and the search radius in its pixels."""
     level = 0
-    usable = min(levels, config.search_levels)
-    while level + 1 < usable and radius_px / 2.0**level > config.coarse_reach_px:
+    while level + 1 < min(levels, LEVELS) and radius_px / 2.0**level > COARSE_REACH_PX:
         level += 1
     return level, min(max(2, int(np.ceil(radius_px / 2.0**level))), 64)
 
@@ -316,7 +324,7 @@ def match(
         uv, active, contrast = _coarse_to_fine(forward, back, predicted, everyone, radius_px)
     uv, score, contrast_a, contrast_b = forward.refined(uv, active)
     ok = active & (2.0 * (1.0 - score) <= config.max_zssd)
-    ok &= contrast_b >= config.min_contrast
+    ok &= contrast_b >= MIN_CONTRAST
     if contrast is not None:
         ok &= ~_repeats(forward, uv, ok, contrast, contrast_a)
     if np.isfinite(config.max_return_px):
@@ -363,7 +371,7 @@ def _coarse_to_fine(
     """(N, 2) places in b to about a pixel, which (N,) take part, and the contrast (N,) on the level
     where the search began; None where that is the finest."""
     a, config = forward.uv_a, forward.config
-    level, reach = start_level(radius_px, min(len(forward.a), len(forward.b)), config)
+    level, reach = start_level(radius_px, min(len(forward.a), len(forward.b)))
     uv, score, second, contrast = forward.at(level, predicted, everyone, reach)
     # A coarse pixel blurs; the fine patches have the last word on likeness.
     active = _distinct(score, second, config.ambiguity) & (1.0 - score <= config.max_zssd)

@@ -79,12 +79,12 @@ def test_surface_elements_are_the_compiled_ones(device: str, gaps: float) -> Non
 
     depth = seen(se3.compose(DOWN, np.array([0.0, 0.0, 40.0])), "hills", 3, gaps)
     depth.depth_m[40:60, 70:100] -= 6
-    want = DepthSurface.build(depth, IcpConfig())
+    want = DepthSurface.build(depth)
     z, sigma, intrinsics = (
         torch.from_numpy(np.ascontiguousarray(x)).to(device)
         for x in (depth.depth_m, depth.sigma_m, want.intrinsics)
     )
-    got = build(z, sigma, intrinsics, IcpConfig().edge_share)
+    got = build(z, sigma, intrinsics)
     elements = got.elements.cpu().numpy()
     there = want.elements[..., 4] > 0
     assert 0.3 < there.mean() < 0.99

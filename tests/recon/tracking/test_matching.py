@@ -15,7 +15,15 @@ from hypothesis import strategies as st
 from paths import SHARED
 
 from recon.tracking.common_view import common_view, features
-from recon.tracking.matching import MatchingConfig, build_pyramid, checked_warps, harris_grid, match
+from recon.tracking.matching import (
+    HARRIS_K,
+    PATCH_RADIUS_PX,
+    MatchingConfig,
+    build_pyramid,
+    checked_warps,
+    harris_grid,
+    match,
+)
 from recon.types import F64, U8, Bool
 
 CALITERRA = SHARED / "caliterra_nadir" / "frames"
@@ -73,11 +81,11 @@ def naive_response(image: U8, k: float) -> F64:
 def test_corners_are_the_best_of_their_cells() -> None:
     image = gray(view(0, 0))
     corners = harris_grid(image, CONFIG)
-    R = naive_response(image, CONFIG.harris_k)
+    R = naive_response(image, HARRIS_K)
     u, v = corners[:, :2].astype(int).T
     np.testing.assert_allclose(corners[:, 2], R[v, u], rtol=1e-3)
     H, W = image.shape
-    margin = CONFIG.patch_radius_px + 3
+    margin = PATCH_RADIUS_PX + 3
     for x, y in zip(u, v, strict=True):
         i, j = (x * 30 + 29) // W, (y * 30 + 29) // H
         i = next(c for c in (i - 1, i, i + 1) if W * c // 30 <= x < W * (c + 1) // 30)
@@ -97,9 +105,9 @@ def test_corners_stay_clear_of_the_mask_and_the_border() -> None:
     mask[:, :200] = 0
     corners = harris_grid(image, CONFIG, mask)
     assert len(corners) > 200
-    assert corners[:, :2][:, 0].min() >= 200 + CONFIG.patch_radius_px
+    assert corners[:, :2][:, 0].min() >= 200 + PATCH_RADIUS_PX
     everywhere = harris_grid(image, CONFIG)
-    assert inside(everywhere[:, :2], image.shape, margin=CONFIG.patch_radius_px).all()
+    assert inside(everywhere[:, :2], image.shape, margin=PATCH_RADIUS_PX).all()
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
