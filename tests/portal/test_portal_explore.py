@@ -383,7 +383,7 @@ def test_the_list_follows_a_dark_desktop(browser: Browser, base: str) -> None:
 def test_a_keyframe_whose_first_depth_is_void_is_gone(
     browser: Browser, tmp_path: Path, house: HouseFlight
 ) -> None:
-    """Its points, its step of the time slider, and its camera."""
+    """Its points, its step of the time slider, and its camera; its image was never asked for."""
     folder = tmp_path / "drone-1/test-1"
     portal = Portal(PortalConfig(tmp_path, port=0, token=TOKEN))
     with ScanStore.create(folder / "scan.db", ScanHeader("test-1", "drone-1", 1)) as store:
@@ -392,6 +392,7 @@ def test_a_keyframe_whose_first_depth_is_void_is_gone(
             store.add_keyframe(seq, layers[seq])
         portal.start()
         browser.open("about:blank")
+        browser.requests.clear()
         browser.open(f"{portal.url.split('/?')[0]}/#/view/drone-1/test-1")
         browser.wait("document.body.dataset.points === '28800'")
         for seq in (2, 3):
@@ -404,5 +405,7 @@ def test_a_keyframe_whose_first_depth_is_void_is_gone(
         browser.wait("document.body.dataset.points === '28800'")
         assert browser.run("document.querySelector('.time input').max") == "2"
         browser.wait("document.body.dataset.image === '1'")
+        asked = {url.split("?")[0].rsplit("/", 1)[1] for url in browser.requests}
+        assert "1.jpg" in asked and not {"2.jpg", "3.jpg"} & asked  # no whole image is there yet
         browser.open("about:blank")
         portal.close()

@@ -13,6 +13,12 @@ export function el<K extends keyof HTMLElementTagNameMap>(
   return node;
 }
 
+const SHORT = 28; // letters
+
+/** A text of which no line break parts what is between two commas, if it is short: a number stays with its unit. */
+export const unbroken = (text: string): (HTMLElement | string)[] =>
+  text.split(/(?<=,) /).flatMap((part, i) => [i ? " " : "", el("span", { textContent: part, className: part.length < SHORT ? "figure" : "" })]);
+
 /** The way back to the list; a phone shows its arrow only. */
 export const toScans = (): HTMLElement => el("a", { href: "#/", className: "back" }, "‹ ", el("span", { textContent: "Scans" }));
 

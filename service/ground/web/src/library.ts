@@ -1,7 +1,7 @@
 // All scans on a map and as cards: look, open, export, rename, tag, delete, bring back.
 
 import * as api from "./api";
-import { count, date, el, notify } from "./dom";
+import { count, date, el, notify, unbroken } from "./dom";
 import { askText } from "./dialog";
 import { homeInDialog, showExports } from "./exports";
 import { jobList } from "./jobs";
@@ -11,7 +11,6 @@ import * as units from "./units";
 import { vehicleStrip } from "./vehicle";
 
 const REFRESH_MS = 3000;
-const SHORT = 28; // letters
 
 /** Shows the list and keeps it as the server has it; gives what ends that. */
 export async function showLibrary(root: HTMLElement): Promise<() => void> {
@@ -296,13 +295,9 @@ function facts(s: api.Scan): HTMLElement {
   return el(
     "dl",
     { className: "facts" },
-    ...rows.flatMap(([k, v]) => [el("dt", { textContent: k }), el("dd", {}, ...figures(v))]),
+    ...rows.flatMap(([k, v]) => [el("dt", { textContent: k }), el("dd", {}, ...unbroken(v))]),
   );
 }
-
-/** A text of which no line break parts what is between two commas, if it is short: a number stays with its unit. */
-const figures = (text: string): (HTMLElement | string)[] =>
-  text.split(/(?<=,) /).flatMap((part, i) => [i ? " " : "", el("span", { textContent: part, className: part.length < SHORT ? "figure" : "" })]);
 
 async function rename(s: api.Scan, again: () => void): Promise<void> {
   const title = await askText("Name of this scan", s.title === s.scan ? "" : s.title, `none: ${s.scan}`, { maxLength: 200 });

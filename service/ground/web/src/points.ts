@@ -173,8 +173,9 @@ export class Cloud implements Gradual {
     let time = -Infinity;
     for (const [seq, held] of this.chunks) {
       if (seq >= STRIDE || !held.shown) continue;
-      out.keyframes += held.layer > FIRST ? 1 : 0;
       out.points += held.points;
+      if (held.layer <= FIRST) continue; // its image is still to come
+      out.keyframes += 1;
       if (held.time >= time) [time, out.newest] = [held.time, seq];
     }
     return out;

@@ -228,6 +228,7 @@ export function triangulate(chunk: Chunk, level: number): Grid {
   const [x, y] = [new Int16Array(n), new Int16Array(n)]; // of the vertex
   const from = new Int32Array(n); // the pixel whose colour and sigma it has
   const half = side >> 1;
+  const reach = Math.max(half, 1); // of a skirt, from the last known pixel of a block
   for (let j = ring; j < rows - ring; j++)
     for (let i = ring; i < cols - ring; i++) {
       const [left, top] = [(i - ring) * side, (j - ring) * side];
@@ -320,7 +321,7 @@ export function triangulate(chunk: Chunk, level: number): Grid {
             const [bi, bj] = [ai + di, aj + dj];
             const b = bi < 0 || bj < 0 || bi >= cols || bj >= rows ? -1 : code[bj * cols + bi]!;
             const inverse = low + step * a;
-            const guess = b >= 0 && step * Math.abs(a - b) < SAME * inverse ? 2 * a - b : a;
+            const guess = b >= 0 && step * Math.abs(a - b) < SAME * inverse ? a + (reach / side) * (a - b) : a;
             if (!twice) {
               if (near < 0) near = aj * cols + ai;
               least = Math.min(least, guess);
@@ -335,8 +336,8 @@ export function triangulate(chunk: Chunk, level: number): Grid {
     for (const [k, c, near] of grown) {
       code[k] = c;
       isGrown[k] = 1;
-      x[k] = ((k % cols) - ring) * side + half;
-      y[k] = (Math.floor(k / cols) - ring) * side + half;
+      x[k] = x[near]! + reach * ((k % cols) - (near % cols));
+      y[k] = y[near]! + reach * (Math.floor(k / cols) - Math.floor(near / cols));
       from[k] = from[near]!;
     }
   }

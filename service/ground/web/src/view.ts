@@ -5,7 +5,7 @@ import * as api from "./api";
 import { Cameras } from "./cameras";
 import { compass } from "./compass";
 import { isVoid } from "./depth";
-import { count, el, notify, toScans } from "./dom";
+import { count, el, notify, toScans, unbroken } from "./dom";
 import { Images, takeView, timeSlider } from "./explore";
 import { jobsOf } from "./jobs";
 import { LinkState } from "./link";
@@ -225,5 +225,5 @@ function rows(cloud: Cloud, { counts, quality }: api.Scan, finished: boolean, la
       facts.push(["At", `${last.lat_deg.toFixed(6)}, ${last.lon_deg.toFixed(6)}`]);
   }
   if (site) facts.push(["Site", site]);
-  return facts.map(([k, v]) => el("div", {}, el("dt", { textContent: k }), el("dd", { textContent: v })));
+  return facts.map(([k, v]) => el("div", {}, el("dt", { textContent: k }), el("dd", {}, ...unbroken(v))));
 }
