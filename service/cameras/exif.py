@@ -358,13 +358,22 @@ def _xmp_number(xmp: dict[str, str], *names: str) -> float | None:
 
 
 def _degrees(value: Any) -> tuple[float, float] | None:
-    """Degrees of EXIF's degrees, minutes and seconds, and the finest step that they can state."""
-    parts = finite_numbers(value, 3)
+    """Degrees of EXIF's degrees, minutes and seconds, and the finest step that they can state.
+
+    Seconds of 0/0 are none: the minutes have decimals, as a Nikon writes them.
+    """
+    if not isinstance(value, tuple) or len(value) != 3:
+        return None
+    is_short = getattr(value[2], "numerator", 1) == getattr(value[2], "denominator", 1) == 0
+    given = value[:2] if is_short else value
+    parts = finite_numbers(given, len(given))
     if parts is None:
         return None
-    step = min(_step(part) / sixties for part, sixties in zip(value, (1, 60, 3600), strict=True))
+    sixties = (1, 60, 3600)[: len(given)]
+    step = min(_step(part) / sixty for part, sixty in zip(given, sixties, strict=True))
     sign = math.copysign(1.0, parts[0]) if any(parts) else 1.0
-    return sign * (abs(parts[0]) + parts[1] / 60 + parts[2] / 3600), step
+    rest = sum(part / sixty for part, sixty in zip(parts[1:], sixties[1:], strict=True))
+    return sign * (abs(parts[0]) + rest), step
 
 
 def _step(value: Any) -> float:

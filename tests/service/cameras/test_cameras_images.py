@@ -498,6 +498,22 @@ def test_a_position_cut_to_seconds_is_as_uncertain(tmp_path: Path) -> None:
     assert tag is not None and 20.0 < tag.sigma_h_m < 30.0
 
 
+def test_minutes_with_decimals_have_no_seconds(tmp_path: Path) -> None:
+    """As a Nikon D5000 writes them (drewnoakes/metadata-extractor-images): seconds of 0/0."""
+    none = IFDRational(0, 0)
+    minutes = {
+        2: (IFDRational(48), IFDRational(5_332_358, 100_000), none),
+        4: (IFDRational(21), IFDRational(3, 1), none),
+    }
+    gps = gps_tags(1, 1, 1, (1, 1, 1)) | minutes
+    write_still(tmp_path / "a.jpg", gps=gps)
+    write_still(tmp_path / "b.jpg", gps=gps | {4: (none, IFDRational(3), IFDRational(1))})
+    tag = read_tags(tmp_path / "a.jpg").geotag
+    assert tag is not None and tag.sigma_h_m > 500.0  # whole minutes of longitude
+    assert (tag.lat_deg, tag.lon_deg) == pytest.approx((48.888726, 21.05), abs=1e-6)
+    assert read_tags(tmp_path / "b.jpg").geotag is None
+
+
 def test_a_position_without_its_hemisphere_waits_for_it(tmp_path: Path) -> None:
     """Texas lay in Myanmar."""
     gps = gps_tags(TRUE_LAT, TRUE_LON, 350.0, (12, 0, 0))
