@@ -6,7 +6,7 @@ import math
 import re
 import struct
 from collections.abc import Iterator, Sequence
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from fractions import Fraction
 from pathlib import Path
 
@@ -99,6 +99,15 @@ def test_newer_gopros_state_fix_and_accuracy_with_each_position() -> None:
         gpmf.of_packets(
             HERE, [(k * SECOND_NS, SECOND_NS, p) for k, p in enumerate(with_none)], HistoryConfig()
         )
+
+
+def test_a_gopro_without_gpsu_is_dated_by_its_positions() -> None:
+    """As a HERO13 writes them (juanmcasillas/gopro2gpx): days from 2000 and seconds in GPS9."""
+    packets = [(SECOND_NS, SECOND_NS, gps9(47.0, 3, 1.0)), (0, SECOND_NS, gps9(0.0, 0, 99.99))]
+    began = gpmf.of_packets(HERE, packets, HistoryConfig()).start_unix_ns
+    assert began is not None
+    stated = datetime(2000, 1, 1, tzinfo=timezone.utc) + timedelta(days=9000, seconds=0.001 - 1.0)
+    assert began / 1e9 == pytest.approx(stated.timestamp(), abs=1e-6)
 
 
 def test_a_real_karma_gives_its_autopilots_position() -> None:

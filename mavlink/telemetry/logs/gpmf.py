@@ -8,7 +8,8 @@ CORI (from the start of the recording to the camera), IORI (from the camera to t
 camera's stabilisation turns) and GRAV (gravity in the camera), of HERO8 and later; its heading
 counts from an unknown direction. Their axes are x right, y down, z ahead. Times are the video's
 own; samples spread over the time of their packet, those of GPS9 and a drone by their own clock.
-GPSU dates the recording, whose container has local time.
+GPSU dates the recording, whose container has local time; a HERO13 writes no GPSU, but GPS9 has a
+date of its own.
 """
 
 from __future__ import annotations
@@ -61,6 +62,9 @@ PLACES = (b"GLPI", b"GPS9", b"GPS5")
 """Best first; the first that has one gives them all."""
 
 UNKNOWN_DOP, MAX_OWN_S = 99.0, 1e10
+GPS9_FROM_NS = 946_684_800 * 10**9
+"""Unix time of 2000-01-01, from which GPS9 counts days."""
+
 DRIFT_NS = 2_000_000_000
 """Gravity is averaged so long before and after: what else accelerates the camera averages out."""
 
@@ -108,6 +112,8 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
                 own_s, samples = READERS[key](row, stream)
                 track.times_ns.append(time_ns + i * duration_ns // len(rows))
                 known_s = math.inf if own_s is None else own_s
+                if key == b"GPS9" and _is_placed(samples) and 0.0 < known_s < MAX_OWN_S:
+                    dates_ns.append(GPS9_FROM_NS + round(1e9 * known_s) - track.times_ns[-1])
                 track.own_ns.append(round(1e9 * known_s) if abs(known_s) < MAX_OWN_S else None)
                 track.samples.append(samples)
                 counts[key.decode("ascii")] += 1
