@@ -42,7 +42,6 @@ from recon.stereo.message_passing import (
     edges_of,
     masks_of,
     pyramid_of,
-    reach_of,
     ring_of,
 )
 from recon.types import F32, I16, U8, DisparityMap
@@ -180,12 +179,16 @@ def _labels(
     smoothness, iterations = config.smoothness, config.iterations
     coarser = coarser_messages(above, weights, iterations, smoothness)
     edges = edges_of(weights[0], smoothness)
+    _, _, labels, cells = above.shape
+    first = 2 * np.arange(cells) + [[0], [1]] - config.min_disparity  # partner of label 0
+    seen = np.minimum(labels - 1, first) - np.maximum(0, first - width + 1) + 1
+    seen = np.maximum(seen, 1).astype(np.int32)
     px = np.empty((height, width), np.float32)
     confidence = np.empty((height, width), np.float32)
 
     def select(begin: int, end: int) -> None:
         _select(
-            begin, end, above, least, coarser, edges, iterations, ring_of(above, iterations),
+            begin, end, above, least, seen, coarser, edges, iterations, ring_of(above, iterations),
             config.min_disparity, 2 * config.truncation, float(config.min_evidence), px, confidence,
         )  # fmt: skip
 
@@ -376,44 +379,32 @@ def _place_winners(
 
 
 @njit(cache=True, nogil=True)
-def _seen_labels(labels: int, width: int, first: int, seen: Any) -> None:  # pragma: no cover
-    """How many labels each cell sees, at least 1."""
-    for i in range(seen.shape[0]):
-        u = 2 * i + first
-        seen[i] = max(min(labels - 1, u) - max(0, u - width + 1) + 1, 1)
-
-
-@njit(cache=True, nogil=True)
 def _select(
-    begin: int, end: int, above: Any, least: Any, coarser: Any, edges: Any, iterations: int,
-    ring: Any, min_disparity: int, sure_lead: int, min_evidence: float, px: Any, confidence: Any,
+    begin: int, end: int, above: Any, least: Any, seen: Any, coarser: Any, edges: Any,
+    iterations: int, ring: Any, min_disparity: int, sure_lead: int, min_evidence: float, px: Any,
+    confidence: Any,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
     """Labels of the rows, each as soon as its messages are done."""
-    height, _, labels, cells = above.shape
+    _, _, labels, cells = above.shape
     width = px.shape[1]
-    sums, low = (
-        np.zeros((labels, 2, cells + 2 * PAD), np.int16),
-        np.zeros((2, cells + 2 * PAD), np.int16),
-    )
+    sums = np.zeros((labels, 2, cells + 2 * PAD), np.int16)
+    low = np.zeros((2, cells + 2 * PAD), np.int16)
     box, low_box = np.empty((labels, 2, cells), np.int16), np.empty((2, cells), np.int16)
-    total, seen = np.empty((2, cells), np.int32), np.empty((2, cells), np.int32)
+    total = np.empty((2, cells), np.int32)
     belief = np.empty((labels, LANES), np.int16)
     best = np.empty(cells, np.int16)  # each on its own: rows of one array lose their layout
     label_of, second = np.empty(cells, np.int16), np.empty(cells, np.int16)
     below, over = np.empty(cells, np.int16), np.empty(cells, np.int16)
     here = np.empty(cells, np.int16)
     labels_px, sure = np.empty((2, cells), np.float32), np.empty((2, cells), np.float32)
-    for parity in range(2):
-        _seen_labels(labels, width, parity - min_disparity, seen[parity])
     masks, scratch = masks_of(width, cells), np.empty((labels + 1) * 4 * LANES, np.int16)
     top = max(begin - RADIUS, 0)
     for v in range(begin - 2 * RADIUS, begin):
         if v + RADIUS >= top:
             _move_window(above, least, v, top, sums, low)
-    first, last, start, stop = reach_of(begin, end, height, iterations)
-    for front in range(start, stop):
+    for front in range(begin - iterations - 1, end + iterations + 1):
         v = advance(
-            front, first, last, above, coarser, edges, width, iterations, masks, scratch, ring
+            front, begin, end, above, coarser, edges, width, iterations, masks, scratch, ring
         )
         if not begin <= v < end:
             continue

@@ -414,31 +414,22 @@ def masks_of(width: int, cells: int) -> Any:  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def advance(
-    front: int, first: int, last: int, data: Any, coarse: Any, edges: Any, width: int,
+    front: int, begin: int, end: int, data: Any, coarse: Any, edges: Any, width: int,
     iterations: int, masks: Any, scratch: Any, ring: Any,
 ) -> int:  # fmt: skip  # pragma: no cover - compiled
     """Start row ``front`` and give each row behind it its next iteration, so that the messages stay
     in the caches; the row that is done, with both its neighbours.
 
-    Iteration t of a row needs iteration t - 1 of its neighbours: of rows ``first`` to ``last`` one
-    less at each end is right after each iteration.
+    For rows ``begin`` to ``end`` the front goes ``iterations + 1`` rows further at both ends:
+    iteration t of a row needs iteration t - 1 of its neighbours.
     """
     height = data.shape[0]
     _start_row(coarse, front, height, width, ring)
     for t in range(iterations):
         v = front - 1 - t
-        if first <= v < last:
+        if max(begin - iterations, 0) <= v < min(end + iterations, height):
             _update_row(data, ring, v, t & 1, edges, _blocks(width), masks, scratch)
     return front - iterations - 1
-
-
-@njit(cache=True, nogil=True)
-def reach_of(
-    begin: int, end: int, height: int, iterations: int
-) -> Any:  # pragma: no cover - compiled
-    """The rows that must be worked on for ``begin`` to ``end``, and the fronts."""
-    first, last = max(begin - iterations, 0), min(end + iterations, height)
-    return first, last, first - 1, end + iterations + 1
 
 
 @njit(cache=True, nogil=True)
@@ -447,11 +438,10 @@ def _propagate(
     ring: Any, out: Any,
 ) -> None:  # fmt: skip  # pragma: no cover - compiled
     """Copy the rows that are done to ``out`` (4, h + 2, 2, L, cells), unless it is the ring."""
-    height, _, labels, cells = data.shape
+    _, _, labels, cells = data.shape
     masks, scratch = masks_of(width, cells), np.empty((labels + 1) * 4 * LANES, np.int16)
-    first, last, front, stop = reach_of(begin, end, height, iterations)
-    for row in range(front, stop):
-        v = advance(row, first, last, data, coarse, edges, width, iterations, masks, scratch, ring)
+    for front in range(begin - iterations - 1, end + iterations + 1):
+        v = advance(front, begin, end, data, coarse, edges, width, iterations, masks, scratch, ring)
         if begin <= v < end and ring.ctypes.data != out.ctypes.data:
             for direction in range(4):
                 done = ring[direction, (v + 1) % ring.shape[1]]
