@@ -178,35 +178,48 @@ SAME_PLACE = 1e-6
 """Share of a coordinate, some metres, by which a place may miss itself there and back."""
 
 
-def system_of(text: str) -> tuple[Transformer, str]:
-    """The horizontal coordinate system in a surveyor's file, and the datum of its heights.
+IN_FEET = {6360: 5703, 8228: 5703}
+"""EPSG codes of heights in feet, and of those in metres above the same datum: NAVD 88."""
+
+
+def system_of(text: str) -> tuple[Transformer, str, float]:
+    """The coordinate system in a surveyor's file: of places, the datum of heights, their unit.
 
     ``text`` is what PROJ knows (``EPSG:25832``, ``EPSG:25832+7837``, a PROJ string) or ``WGS84 UTM
     32N``. The transformer gives longitude and latitude of x and y (of latitude and longitude in
     degrees as well, x is the longitude). The datum is one of :func:`vertical_code`, empty where the
-    system has no heights. Raises ValueError.
+    system has no heights; the unit is in metres. Raises ValueError.
     """
     from pyproj import CRS, Transformer
     from pyproj.exceptions import CRSError
 
     if zone := UTM_NAME.fullmatch(text.strip()):
         text = f"EPSG:{(32600 if zone[2] in 'Nn' else 32700) + int(zone[1])}"
+    text = text.strip()
     try:
-        crs = CRS.from_user_input(text.strip())
+        crs = CRS.from_user_input(text)
         flat, *more = crs.sub_crs_list or [crs]
         if not (flat.is_geographic or flat.is_projected):
             raise CRSError("neither degrees nor a map")
-        vertical = [one.to_epsg() for one in more if one.is_vertical]
-        names = {code: name for name, code in DATUMS.items() if code is not None}
-        datum = "ellipsoid" if not more and len(flat.axis_info) == 3 else ""
-        if vertical and vertical[0] is not None:
-            datum = names.get(vertical[0], f"EPSG:{vertical[0]}")
-        return Transformer.from_crs(flat.to_2d(), "EPSG:4326", always_xy=True), datum
+        vertical = next((one for one in more if one.is_vertical), None)
+        code = None if vertical is None else vertical.to_epsg()
+        axis = (vertical or flat).axis_info[0]
+        to_degrees = Transformer.from_crs(flat.to_2d(), "EPSG:4326", always_xy=True)
     except CRSError as error:
         raise ValueError(
-            f"{text.strip()[:80]!r} is not a coordinate system; give EPSG:n, a PROJ string or "
-            "WGS84 UTM 32N"
+            f"{text[:80]!r} is not a coordinate system; give EPSG:n, a PROJ string or WGS84 UTM 32N"
         ) from error
+    unit_m = 1.0 if vertical is None and flat.is_geographic else axis.unit_conversion_factor
+    if unit_m != 1.0:
+        if code not in IN_FEET:
+            raise ValueError(
+                f"{text[:80]!r} is in {axis.unit_name}; say what its heights are, after a +: "
+                "EPSG:n+5703 (NAVD 88, metres), EPSG:n+6360 (US survey feet) or EPSG:n+8228 (feet)"
+            )
+        code = IN_FEET[code]
+    names = {known: name for name, known in DATUMS.items() if known is not None}
+    datum = "ellipsoid" if not more and len(flat.axis_info) == 3 else ""
+    return to_degrees, datum if code is None else names.get(code, f"EPSG:{code}"), unit_m
 
 
 def degrees_of(system: Transformer, x: float, y: float) -> tuple[float, float]:

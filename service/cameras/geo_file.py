@@ -39,7 +39,7 @@ def read_geo(path: Path) -> dict[str, GeoTag]:
     lines = read_small(path, LARGEST_BYTES, "file of positions").decode("utf-8-sig", "replace")
     head, *rows = lines.splitlines() or [""]
     try:
-        system, datum = system_of(head)
+        system, datum, unit_m = system_of(head)
     except ValueError as error:
         raise InputError(f"{path} line 1: {error}") from error
     found = {}
@@ -54,7 +54,7 @@ def read_geo(path: Path) -> dict[str, GeoTag]:
             lon, lat = degrees_of(system, numbers[0], numbers[1])
         except ValueError as error:
             raise InputError(f"{path} line {number}: {error}") from error
-        height = numbers[2] if len(numbers) > 2 else None
+        height = unit_m * numbers[2] if len(numbers) > 2 else None
         if not plausible_place(lat, lon) or abs(height or 0.0) > MAX_HEIGHT_M:
             raise InputError(f"{path} line {number}: {row[:80]!r} is not on the globe")
         tag = GeoTag(lat, lon, height, datum="" if height is None else datum)

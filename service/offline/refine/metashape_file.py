@@ -79,7 +79,7 @@ class _Reader:
         """The marks of markers that have a place."""
         if not self._system:
             raise ValueError("it names no coordinate system; export the markers with one")
-        system, datum = system_of(self._system)
+        system, datum, unit_m = system_of(self._system)
         if datum == "ellipsoid":
             raise ValueError("heights above mean sea level are needed, not ellipsoidal")
         for line, marker, mark in self._marks:
@@ -90,7 +90,7 @@ class _Reader:
                 lon, lat = degrees_of(system, float(place["x"]), float(place["y"]))
                 row = {
                     "name": self._labels.get(marker, f"point {marker}"), "lat": lat, "lon": lon,
-                    "alt_amsl_m": float(place["z"]) if "z" in place else None,
+                    "alt_amsl_m": unit_m * float(place["z"]) if "z" in place else None,
                     "image": self._cameras[mark["camera_id"]],
                     "u_px": float(mark["x"]) - 0.5, "v_px": float(mark["y"]) - 0.5,
                     "role": "control" if _is_enabled(place) else "check",

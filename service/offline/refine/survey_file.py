@@ -198,14 +198,14 @@ def _marked(
     path: Path, lines: Sequence[str], seen: dict[str, list[Sighting]], marks: Path
 ) -> list[SurveyPoint]:
     """The points below the coordinate system in ``lines``, with their sightings in ``marks``."""
-    system, points = _system(path, lines), dict[str, SurveyPoint]()
+    (system, unit_m), points = _system(path, lines), dict[str, SurveyPoint]()
     for number, cells in _cells(lines[1:], 2):
         where = f"{path} line {number}"
         try:
             name, x, y, z, *sigmas = cells
             lon, lat = degrees_of(system, float(x), float(y))
             named = dict(zip(("sigma_h_m", "sigma_v_m"), map(float, sigmas[:2]), strict=False))
-            row = {"name": name, "lat": lat, "lon": lon, "alt_amsl_m": float(z), **named}
+            row = {"name": name, "lat": lat, "lon": lon, "alt_amsl_m": unit_m * float(z), **named}
             point = _point(number, msgspec.convert(row, SurveyRow))
         except (ValueError, msgspec.ValidationError) as error:
             said = f"name, x, y, z and accuracies: {_why(error)}"
@@ -235,8 +235,8 @@ def _is_places(lines: Sequence[str]) -> bool:
         return False
     try:
         system_of(lines[0])
-    except ValueError:
-        return False
+    except ValueError as error:
+        return "not a coordinate system" not in str(error)
     return True
 
 
@@ -249,20 +249,20 @@ def is_list(lines: Sequence[str]) -> bool:
     return len(next(rows, ())) >= LIST_COLUMNS and "lat" not in lines[0].split(",")
 
 
-def _system(path: Path, lines: Sequence[str]) -> Transformer:
-    """x and y of the coordinate system in the first line to longitude and latitude."""
+def _system(path: Path, lines: Sequence[str]) -> tuple[Transformer, float]:
+    """The coordinate system in the first line, and the unit of its heights in metres."""
     try:
-        system, datum = system_of(lines[0] if lines else "")
+        system, datum, unit_m = system_of(lines[0] if lines else "")
     except ValueError as error:
         raise InputError(f"{path} line 1: {error}") from error
     if datum == "ellipsoid":
         raise InputError(f"{path} line 1: heights above mean sea level are needed, not ellipsoidal")
-    return system
+    return system, unit_m
 
 
 def _marks(path: Path, lines: Sequence[str]) -> Iterator[Row]:
     """Line number and content of each row of a ``gcp_list.txt``."""
-    system = _system(path, lines)
+    system, unit_m = _system(path, lines)
     table = [(n, s.split()) for n, s in enumerate(lines[1:], 2) if s.strip() and s[0] != "#"]
     is_flat = all(
         cells[2:3] in (["0"], ["0.0"], ["0.00"], ["0.000"], ["NaN"]) for _, cells in table
@@ -279,7 +279,7 @@ def _marks(path: Path, lines: Sequence[str]) -> Iterator[Row]:
             lon, lat = degrees_of(system, float(cells[0]), float(cells[1]))
             row = {
                 "name": cells[6] if len(cells) > LIST_COLUMNS else name, "lat": lat, "lon": lon,
-                "alt_amsl_m": None if is_flat else float(cells[2]),
+                "alt_amsl_m": None if is_flat else unit_m * float(cells[2]),
                 "u_px": float(cells[3]), "v_px": float(cells[4]), "image": cells[5],
             }  # fmt: skip
             yield number, msgspec.convert(row, SurveyRow)

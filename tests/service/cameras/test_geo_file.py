@@ -54,9 +54,22 @@ def test_positions_in_any_coordinate_system(
     assert third.alt_amsl_m == 198.609 and not third.is_sigma_h_stated
 
 
+@pytest.mark.parametrize(("code", "foot_m"), [(6360, 1200 / 3937), (8228, 0.3048)])
+def test_heights_in_feet_are_converted(tmp_path: Path, code: int, foot_m: float) -> None:
+    """State plane coordinates, which ODM's own tests have (EPSG:2251): feet up as well."""
+    x, y = Transformer.from_crs(4326, 2251, always_xy=True).transform(LON, LAT)
+    row = f"a.jpg {x:.5f} {y:.5f} {198.609 / foot_m:.5f}"
+    (tag,) = read_geo(write(tmp_path / "geo.txt", f"EPSG:2251+{code}", row)).values()
+    assert (tag.lat_deg, tag.lon_deg) == pytest.approx((LAT, LON), abs=2e-8)
+    assert tag.alt_amsl_m == pytest.approx(198.609, abs=1e-4)
+    assert tag.datum == "EPSG:5703"
+
+
 @pytest.mark.parametrize(
     ("lines", "what"),
     [
+        (["EPSG:2251", "a.jpg 1 2 3"], "line 1: 'EPSG:2251' is in foot; say what its heights are"),
+        (["EPSG:4326+5702", "a.jpg 8 47 3"], "line 1: 'EPSG:4326+5702' is in US survey foot"),
         (["nothing"], "line 1: 'nothing' is not a coordinate system"),
         (["EPSG:4326"], "no positions below"),
         (["EPSG:4326", "a.jpg 8"], "line 2: 'a.jpg 8'; give name, x, y and z"),

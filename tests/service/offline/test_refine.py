@@ -636,6 +636,26 @@ def test_a_list_of_odm_is_read_as_a_table_is(tmp_path: Path) -> None:
     assert read_survey(path)[0].alt_amsl_m is None
 
 
+def test_survey_files_in_feet_give_metres(tmp_path: Path) -> None:
+    """A map in feet, as ODM's own tests have it (EPSG:2251), with heights in feet."""
+    path, head, feet = tmp_path / "points.txt", "EPSG:2251+8228\n", "26607594.75 -26813.88 563.2"
+    read = []
+    for row in (f"{feet} 1 2 a.jpg", f"GCP1 {feet}"):
+        path.write_text(head + row)
+        read += read_survey(path)
+    frame = "<a><camera id='0' label='a.jpg'/><marker id='0'><reference x='26607594.75'"
+    path.write_text(
+        f"{frame} y='-26813.88' z='563.2'/><location camera_id='0' x='1' y='2'/></marker>"
+        f"<wkt>{head}</wkt></a>"
+    )
+    for point in (*read, *read_survey(path)):
+        assert (point.lat_deg, point.lon_deg) == pytest.approx((44.7011463, -85.6124687), abs=1e-7)
+        assert point.alt_amsl_m == pytest.approx(563.2 * 0.3048)
+    path.write_text(f"EPSG:2251\nGCP1 {feet}")
+    with pytest.raises(InputError, match=r"line 1: 'EPSG:2251' is in foot; say what its heights"):
+        read_survey(path)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
