@@ -3,7 +3,8 @@
 Keys: ``image_width``, ``image_height``, ``camera_matrix.data`` (9, row by row),
 ``distortion_model: plumb_bob``, ``distortion_coefficients.data`` (k1 k2 p1 p2 k3), of a
 rolling shutter ``readout_ms`` and ``readout_direction``, and ``sigma_focal`` of the focal length,
-as a share. Other keys of the format are allowed and not read.
+as a share. Other keys of the format are allowed and not read. OpenCV's own calibration writes the
+same keys but the model, of five coefficients in its order; a fisheye has four.
 """
 
 from __future__ import annotations
@@ -29,6 +30,17 @@ LARGEST_FILE_BYTES = 1 << 20
 LONGEST_READOUT_MS = 200.0
 
 Pixels = Annotated[int, Meta(gt=0, le=100_000)]
+
+
+OPENCV_HEAD = "%YAML:1.0"
+"""Which is no YAML."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads OpenCV's matrices as what they are: mappings."""
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)
 
 
 class _Matrix(msgspec.Struct):
@@ -146,14 +158,14 @@ def save_camera(
 def _read(path: Path) -> dict[str, Any]:
     try:
         text = read_small(path, LARGEST_FILE_BYTES, "camera_info YAML file").decode("utf-8")
-        document = yaml.safe_load(text)
+        document = yaml.load(text.removeprefix(OPENCV_HEAD), _Loader)
     except InputError as error:
         raise InputError(f"camera model {error}") from error
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
         raise InputError(f"camera model {path}: not a YAML file ({_one_line(error)})") from error
     if not isinstance(document, dict):
         raise InputError(f"camera model {path}: not a camera_info YAML file (no keys at its top)")
-    return document
+    return {"distortion_model": MODEL, **document} if text.startswith(OPENCV_HEAD) else document
 
 
 def _one_line(error: Exception) -> str:

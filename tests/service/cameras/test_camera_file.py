@@ -64,6 +64,37 @@ def test_yaml_written_by_ros_is_read(tmp_path: Path) -> None:
     assert camera.distortion.tolist() == [-0.361976, 0.110510, 0.001014, 0.000505, 0]
 
 
+OPENCV = """%YAML:1.0
+---
+image_width: 640
+image_height: 480
+flags: 2
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 5.36e+02, 0., 3.42e+02, 0., 5.36e+02, 2.36e+02, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ -2.66e-01, -3.9e-02, 1.8e-03, -2.8e-04, 2.4e-01 ]
+avg_reprojection_error: 3.9e-01
+"""
+
+
+def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
+    """As its calibration example does; the four coefficients of a fisheye are another model."""
+    path = tmp_path / "camera.yml"
+    path.write_text(OPENCV)
+    camera = load_camera(path)
+    assert camera.size_px == (640, 480) and camera.K[1].tolist() == [0.0, 536.0, 236.0]
+    assert camera.distortion.tolist() == [-0.266, -0.039, 0.0018, -0.00028, 0.24]
+    path.write_text(OPENCV.replace(", 2.4e-01", ""))
+    with pytest.raises(InputError, match="length >= 5"):
+        load_camera(path)
+
+
 def test_written_file_has_the_ros_form(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     save_camera(path, CAMERA)
