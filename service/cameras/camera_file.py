@@ -39,8 +39,11 @@ OPENCV_HEAD = "%YAML:1.0"
 class _Loader(yaml.SafeLoader):
     """Reads OpenCV's matrices as what they are: mappings."""
 
+    def matrix(self, node: Any) -> dict[Any, Any]:
+        return self.construct_mapping(node, deep=True)
 
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _Loader.matrix)
 
 
 class _Matrix(msgspec.Struct):

@@ -157,8 +157,17 @@ def test_missing_key_is_named(key: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"\x00\x01\xff\xfe", b"{a: [1, 2", b"- 1\n- 2\n", b"just words", b"[" * 1100],
-    ids=["empty", "bytes", "broken", "list", "words", "deep"],
+    [
+        b"",
+        b"\x00\x01\xff\xfe",
+        b"{a: [1, 2",
+        b"- 1\n- 2\n",
+        b"just words",
+        b"[" * 1100,
+        b"%YAML:1.0\na: !!opencv-matrix 1\n",
+        b"%YAML:1.0\nM1: !!opencv-matrix\n   rows: 3\n",
+    ],
+    ids=["empty", "bytes", "broken", "list", "words", "deep", "no matrix", "stereo"],
 )
 def test_not_a_camera_file(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
