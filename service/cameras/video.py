@@ -40,6 +40,9 @@ RESTART_NS = 1_000_000_000
 LONGEST_NS = 366 * 86_400 * 1_000_000_000
 """No recording is longer: a time beyond is damage."""
 
+UNEQUAL = 0.01
+"""Share by which width and height of a pixel may differ."""
+
 HEAD_BYTES = 4096
 NS_PER_S = 1_000_000_000
 
@@ -67,7 +70,7 @@ class VideoSource:
         self._wanted_ns: list[int] | None = None  # all
         self._within_ns = self._late_ns = 0
         self._end_ns = LONGEST_NS
-        self.passed = 0  # coded images that were not decoded
+        self.passed = 0  # coded images that are not shown
         if not container.streams.video:
             self.close()
             raise InputError(f"{description}: contains no video stream; give a video of the flight")
@@ -93,6 +96,14 @@ class VideoSource:
         self.epoch_unix_ns = creation_unix_ns(container, self._stream)
         rate = self._stream.average_rate or self._stream.guessed_rate
         self.fps = float(rate) if rate else None
+        wide = self._stream.sample_aspect_ratio
+        if wide and abs(wide - 1) > UNEQUAL:
+            self._warn(
+                f"a pixel is {float(wide):.2f} times as wide as high, a lens that is not calibrated"
+                " counts as if they were square; ffmpeg -vf scale=iw*sar:ih,setsar=1 makes them so"
+            )
+        if self._first.interlaced_frame:
+            self._warn("its images are interlaced, their edges are torn; ffmpeg -vf bwdif mends it")
 
     def __iter__(self) -> Iterator[CameraFrame]:
         """Yield the images whose time increases; warns at the end about skipped ones."""
@@ -144,6 +155,9 @@ class VideoSource:
 
     def _is_needed(self, packet: av.Packet[Any]) -> bool:
         """Whether an image that is wanted may depend on ``packet``."""
+        if packet.is_discard:  # before the start that an edit list sets
+            self.passed += 1
+            return True
         entries = getattr(self._stream, "index_entries", None)
         if self._wanted_ns is None or packet.dts is None or packet.time_base is None:
             return True

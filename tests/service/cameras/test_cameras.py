@@ -63,6 +63,8 @@ def write_video(
     options: dict[str, str] | None = None,
     creation_time: str | None = None,
     codec: str = "libx264",
+    coder: str = "",
+    earlier_ms: int = 0,
 ) -> None:
     """Code the images at ``TIMES_MS`` into ``target`` (path or stream)."""
     with av.open(target, "w", format=container_format, options=options or {}) as out:
@@ -73,10 +75,10 @@ def write_video(
         stream.pix_fmt = "yuv420p" if codec == "libx264" else "yuvj420p"
         stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
         if codec == "libx264":
-            stream.options = {"bf": "0", "crf": "12"}
+            stream.options = {"bf": "0", "crf": "12", "x264-params": coder}
         for i, ms in enumerate(TIMES_MS):
             frame = av.VideoFrame.from_ndarray(image(i), format="bgr24")
-            frame.pts, frame.time_base = ms, Fraction(1, 1000)
+            frame.pts, frame.time_base = ms - earlier_ms, Fraction(1, 1000)
             out.mux(stream.encode(frame))
         out.mux(stream.encode(None))
 
@@ -210,6 +212,31 @@ def test_truncated_video_gives_what_decodes_and_says_so(tmp_path: Path) -> None:
     frames = list(source)
     assert 0 < len(frames) < len(TIMES_MS)
     assert any("cut off" in w for w in source.warnings)
+
+
+def test_images_before_the_start_of_an_edit_list_are_not_missed(tmp_path: Path) -> None:
+    """A phone trims like this: the coded images stay, the start moves."""
+    path = str(tmp_path / "trimmed.mp4")
+    write_video(path, "mp4", {"avoid_negative_ts": "disabled"}, earlier_ms=TIMES_MS[2])
+    source = open_camera(path)
+    assert isinstance(source, VideoSource)
+    times_ns = [frame.time_ns for frame in source]
+    assert times_ns == [(ms - TIMES_MS[2]) * 1_000_000 for ms in TIMES_MS[2:]]
+    assert source.passed == 2 and source.warnings == []
+
+
+@pytest.mark.parametrize(
+    ("coder", "said"), [("sar=4/3", "1.33 times as wide as high"), ("interlaced=1", "interlaced")]
+)
+def test_images_that_no_camera_model_explains_are_reported(
+    tmp_path: Path, coder: str, said: str
+) -> None:
+    path = str(tmp_path / "v.mp4")
+    write_video(path, "mp4", coder=coder)
+    source = open_camera(path)
+    assert isinstance(source, VideoSource)
+    (warning,) = source.warnings
+    assert said in warning and "ffmpeg -vf" in warning
 
 
 def test_joined_recordings_follow_each_other(tmp_path: Path) -> None:
