@@ -600,6 +600,21 @@ def dataflash_flight(dated: bool) -> DataflashWriter:
     return writer
 
 
+def test_damage_of_an_onboard_log_is_counted_in_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "log.BIN"
+    data = dataflash_flight(True).data
+    path.write_bytes(data)
+    sound = load_telemetry(path)
+    assert sound.counts["skipped_bytes"] == 0 and sound.warnings == ()
+    path.write_bytes(data + bytes(5000) + data[-3000:])
+    damaged = load_telemetry(path)
+    assert 5000 <= damaged.counts["skipped_bytes"] <= 5100  # and what was torn
+    assert damaged.warnings == (f"{damaged.counts['skipped_bytes']} damaged bytes were skipped",)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_damaged_time_of_an_onboard_log_costs_its_message_only(tmp_path: Path) -> None:
     path = tmp_path / "log.BIN"
     path.write_bytes(dataflash_flight(True).data)

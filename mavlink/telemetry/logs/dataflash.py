@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,7 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     reader = _Reader()
     is_placed = False
     attitudes: list[tuple[AttitudeSample, float]] = []
-    for message in _messages(path):
+    for message in _messages(path, counts):
         if not 0.0 <= message._timestamp < 1e-6 * LATEST_USEC:
             continue  # damaged
         name = message.get_type()
@@ -74,14 +75,38 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
         history.add(attitude, round(time_s * 1e9))
     dated = (history.first_ns or 0) > UNIX_FROM_S * 1e9
     warnings = [] if dated else ["no GPS time in this log: its clock starts at boot"]
+    if counts["skipped_bytes"]:
+        warnings.append(f"{counts['skipped_bytes']} damaged bytes were skipped")
     return finish(path, history, counts, warnings, "unix" if dated else "boot")
 
 
-def _messages(path: Path) -> Iterator[Any]:
+TAIL_BYTES = 528
+"""What an autopilot may leave unwritten at the end of a log, by pymavlink."""
+
+
+@contextmanager
+def _unheard() -> Iterator[None]:
+    """Drop what pymavlink's compiled indexer writes to stderr: a line for each damaged byte."""
+    stderr = os.dup(2)
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+
+
+def _messages(path: Path, counts: Counter[str]) -> Iterator[Any]:
+    """The messages that are read; ``counts`` gets the bytes that belong to none."""
     from pymavlink.DFReader import DFReader_binary  # type: ignore[import-untyped]
 
     try:
-        log = DFReader_binary(str(path))
+        with _unheard():
+            log = DFReader_binary(str(path))
+        whole = sum(log.counts[kind] * form.len for kind, form in log.formats.items())
+        skipped = log.data_len - whole
+        counts["skipped_bytes"] = skipped if skipped >= TAIL_BYTES else 0
     except Exception as error:  # DFReader raises this class itself
         raise ValueError(f"{path}: the .BIN log cannot be read ({error})") from error
     # Where the log is cut off, what was read before counts.
