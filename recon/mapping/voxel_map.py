@@ -153,6 +153,9 @@ class VoxelMap:
     def __len__(self) -> int:
         return self._count
 
+    def close(self) -> None:
+        """Release what is held outside of memory; here nothing is."""
+
     @property
     def nbytes(self) -> int:
         return sum(a.nbytes for a in (self._keys, self._ids, self._sigma, self._seen))

@@ -78,4 +78,6 @@ class SurfaceMap:
         return self._new_map(VoxelMapConfig(voxel_m=voxel_m))
 
     def clear(self) -> None:
-        self.known = None
+        known, self.known = self.known, None
+        if known is not None:
+            known.close()

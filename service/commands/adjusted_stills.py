@@ -21,6 +21,8 @@ from recon.calibration.global_bundle import Knowledge
 from recon.calibration.joint_adjustment import JointAdjustment, Turning, adjust_jointly
 from recon.calibration.tracks import pieces
 from recon.camera_model import scaled
+from recon.parallel import limit_threads
+from recon.pipeline.mapper import Mapper
 from recon.tracking.known_track import KnownTrack, KnownView
 from recon.types import F64, U8, Camera, Frame, PosePrior
 from service.cameras.camera_file import seeks_readout, with_shutter
@@ -29,11 +31,10 @@ from service.cameras.rig import Rig, turn_sigma_rad_s
 from service.cameras.source import CameraFrame
 from service.config import change
 from service.errors import InputError
-from service.flight.pipeline import Pipeline
+from service.flight.pipeline import mapper_config
 from service.flight.scan import ScanInputs, check_new
 from service.flight.telemetry_check import TelemetryCheck, differs
 from service.offline.refine.own_camera import sightings
-from service.scans.retention import PAGES
 
 log = logging.getLogger(__name__)
 
@@ -95,9 +96,9 @@ def _tracked(
     inputs: ScanInputs, source: ImagesSource, history: VehicleHistory
 ) -> tuple[list[Still], LatencyEstimate | None]:
     """The stills by the odometry, and how long before its stamp each was exposed."""
-    pipeline = Pipeline(
-        inputs.camera, inputs.config, inputs.backend, inputs.folder / PAGES, in_background=False
-    )
+    limit_threads(inputs.config.compute.threads)
+    camera = with_shutter(inputs.camera, inputs.config.camera)
+    mapper = Mapper(camera, mapper_config(camera, inputs.config), inputs.backend)
     rig = Rig(inputs.config.camera, inputs.config.scan, inputs.config.fusion)
     check = TelemetryCheck(inputs.config.camera, history, log.info)
     out = list[Still]()
@@ -105,8 +106,8 @@ def _tracked(
         time_ns = inputs.epoch_ns + frame.time_ns
         state = history.state_at(check.exposed_ns(time_ns))
         prior = rig.prior(state, frame.geotag)
-        undistorted = pipeline.undistort(Frame(frame.image, time_ns, frame.seq, prior))
-        tracked = pipeline.locate(undistorted)
+        undistorted = mapper.undistort(Frame(frame.image, time_ns, frame.seq, prior))
+        tracked = mapper.locate(undistorted)
         check.add(time_ns, tracked)
         is_tracked = tracked.T_odom_camera is not None
         if tracked.before is not None:

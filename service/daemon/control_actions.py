@@ -141,7 +141,7 @@ class ControlActions:
         scan = self._scanning.scan
         if scan is None:
             return Answer(Result.DENIED, "no scan is running")
-        scan.pipeline.reset_map()
+        scan.mapper.reset_map()
         return ACCEPTED
 
     def self_test(self) -> Handled:

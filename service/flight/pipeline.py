@@ -55,8 +55,8 @@ def mapper_config(camera: Camera, config: Config, live: bool = False) -> MapperC
     )
 
 
-class Pipeline(Mapper):
-    """The mapper of a scan: reconstructs on the worker ``dense``, keeps old surface on disk."""
+class Pipeline:
+    """A scan's mapper, which reconstructs on the worker ``dense`` and keeps old surface on disk."""
 
     def __init__(
         self,
@@ -66,7 +66,6 @@ class Pipeline(Mapper):
         pages: Path,
         live: bool = False,
         known: KnownTrack | None = None,
-        in_background: bool = True,
     ) -> None:
         """Raises ValueError for an unusable camera model.
 
@@ -77,9 +76,9 @@ class Pipeline(Mapper):
         limit_threads(config.compute.threads)
         self.stopwatch = Stopwatch()
         self._doubts: deque[str] = deque()  # found on the worker, taken by the operator's thread
-        row = "dense" if in_background and not config.scan.keep_debug else None
+        row = None if config.scan.keep_debug else "dense"
         camera = with_shutter(camera, config.camera)
-        super().__init__(
+        self.mapper = Mapper(
             camera,
             mapper_config(camera, config, live),
             backend,
@@ -89,7 +88,7 @@ class Pipeline(Mapper):
             self.stopwatch,
             keeps_cloud=False,
         )
-        self.watch = GraphWatch(self.keyframes.graph)
+        self.watch = GraphWatch(self.mapper.keyframes.graph)
 
     def _in_background(
         self, row: str | None, live: bool, work: Reconstruct
@@ -116,18 +115,11 @@ class Pipeline(Mapper):
 
     def configure_baseline(self, scan: ScanConfig) -> None:
         """Apply a new ``scan.baseline`` from the next frame on."""
-        self.set_baseline(Baseline(*parse_baseline(scan.baseline)))
+        self.mapper.set_baseline(Baseline(*parse_baseline(scan.baseline)))
 
     def configure_effort(self, compute: ComputeConfig) -> None:
         """Apply new ``pairs``, ``stereo_width`` and ``upsample`` from the next view on."""
-        self.set_effort(compute.pairs, compute.stereo_width, compute.upsample)
-
-    def reset_map(self) -> None:
-        """As :meth:`Mapper.reset_map`, and remove the map's pages."""
-        known = self.surface.known
-        super().reset_map()
-        if isinstance(known, PagedMap):
-            known.close()
+        self.mapper.set_effort(compute.pairs, compute.stereo_width, compute.upsample)
 
     # ---- figures -----------------------------------------------------------------------
 
@@ -145,8 +137,8 @@ class Pipeline(Mapper):
     def held(self) -> dict[str, int]:
         """Memory that this scan takes: the map's voxels, its tiles on disk, views for loops,
         and keyframes in the pose graph."""
-        known = self.surface.known
+        known = self.mapper.surface.known
         return {
             "map_voxels": 0 if known is None else len(known),
             "map_tiles_on_disk": known.tiles_on_disk if isinstance(known, PagedMap) else 0,
-        } | self.keyframes.held
+        } | self.mapper.keyframes.held

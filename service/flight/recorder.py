@@ -59,7 +59,8 @@ class Recorder:
         self._on_keyframe = on_keyframe
         self._batch, self._due = batch, list[PoseRecord]()
         self.store, self.pipeline, self._rig = store, pipeline, rig
-        self._graph = pipeline.keyframes.graph
+        self.mapper = pipeline.mapper
+        self._graph = self.mapper.keyframes.graph
         self._first_scale: dict[int, float] = {}  # of keyframes, by number
         self._revisions: Counter[int] = Counter()  # poses of each, after the first
         self.points = self.keyframes = self.frames = self.chunk_bytes = self.image_bytes = 0
@@ -97,7 +98,7 @@ class Recorder:
             row["time_ns"], row["is_view"], row["sigma_m"] = time_ns, posed.is_view, sigma_m(pose)
             row["agl_m"] = np.nan if agl_m is None else agl_m
             row["T_world_camera"] = pose.T_world_camera
-            self._frames.add(relative, row, self.pipeline.is_settled)
+            self._frames.add(relative, row, self.mapper.is_settled)
         view = relative.seq if posed.is_view and relative is not None else None
         self.last = self._record(time_ns, pose, agl_m, view)
         self._due.append(self.last)
@@ -107,17 +108,17 @@ class Recorder:
     def flush(self) -> None:
         """Write the pipeline's remaining results and correct the trajectory; call it once."""
         try:
-            self._write_keyframes(self.pipeline.drain())
+            self._write_keyframes(self.mapper.drain())
         finally:
-            self._write_keyframes(self.pipeline.finish())
+            self._write_keyframes(self.mapper.finish())
         self._correct_trajectory()
         self._frames.close()
 
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Finish the scan in the store, after :meth:`flush`; return its summary with ``extra``."""
         summary = self.summary() | {"graph": graph_figures(self._graph)}
-        summary["apart"] = [list(ends) for ends in self.pipeline.keyframes.apart()]
-        summary["false"] = [list(ends) for ends in self.pipeline.keyframes.false()]
+        summary["apart"] = [list(ends) for ends in self.mapper.keyframes.apart()]
+        summary["false"] = [list(ends) for ends in self.mapper.keyframes.false()]
         summary |= extra
         self.store.finish(summary)
         return summary
@@ -144,7 +145,7 @@ class Recorder:
             relative = RelativePose(seq, int(row["segment"]), row["T_odom_camera"])
             published = pose_at(T, T[:3, 3], np.full(3, before_m / 3**0.5))
             record = self._record(
-                int(row["time_ns"]), self.pipeline.frames.pose(relative, published),
+                int(row["time_ns"]), self.mapper.frames.pose(relative, published),
                 None if math.isnan(agl_m) else agl_m, seq if row["is_view"] else None,
             )  # fmt: skip
             moved_m = np.linalg.norm(record.T_world_camera[:3, 3] - T[:3, 3])
@@ -155,14 +156,13 @@ class Recorder:
 
     def summary(self) -> dict[str, Any]:
         """Figures of the scan so far, fit for JSON."""
-        pipeline = self.pipeline
         return {
             "frames": self.frames,
             "frames_tracked": sum(self.states[state] for state in FOUND),
             "frames_lost": self.states[Tracking.LOST],
-            "segments": pipeline.segments,
-            "pairs": pipeline.pairs,
-            "clouds": pipeline.pairs,  # one per stereo pair, Eq. 3
+            "segments": self.mapper.segments,
+            "pairs": self.mapper.pairs,
+            "clouds": self.mapper.pairs,  # one per stereo pair, Eq. 3
             "keyframes": self.keyframes,
             "points": self.points,
             "chunk_bytes": self.chunk_bytes,
@@ -171,16 +171,16 @@ class Recorder:
             "georeference": self._rig.georeference,
             "scale": self._scale(),
             "lean_sigma_deg": self._lean_sigma_deg(),
-            "stage_ms": {k: round(v, 2) for k, v in pipeline.stopwatch.mean_ms().items()},
-            "refusals": dict(pipeline.refusals()),
+            "stage_ms": {k: round(v, 2) for k, v in self.pipeline.stopwatch.mean_ms().items()},
+            "refusals": dict(self.mapper.refusals()),
             "drops": self._drops(),
-            "registrations": {v.value: n for v, n in pipeline.register.verdicts.items()},
+            "registrations": {v.value: n for v, n in self.mapper.register.verdicts.items()},
         }
 
     def _drops(self) -> dict[str, int]:
         """Unused frames and views, by reason."""
         late = {"newer views came faster": self.pipeline.dropped} if self.pipeline.dropped else {}
-        return dict(self.pipeline.refusals()) | late
+        return dict(self.mapper.refusals()) | late
 
     def _scale(self) -> dict[str, Any]:
         """Source of the metric scale, its relative sigma, and what contradicts it: of the largest
@@ -228,8 +228,8 @@ class Recorder:
             self._write_due()
         for keyframe in keyframes:
             self._write_keyframe(keyframe)
-        if self.pipeline.debug and keyframes:
-            save_debug(self.store.path.parent, keyframes[-1].seq, self.pipeline.debug)
+        if self.mapper.debug and keyframes:
+            save_debug(self.store.path.parent, keyframes[-1].seq, self.mapper.debug)
         reposes = [
             self._repose(seq, pose)
             for event in events

@@ -131,6 +131,7 @@ class Scan:
         self.pipeline = Pipeline(
             inputs.camera, config, inputs.backend, pages, live=live, known=inputs.known
         )  # fmt: skip
+        self.mapper = self.pipeline.mapper
         self.rig = Rig(config.camera, config.scan, config.fusion)
         self._velocity = VelocityIntegrator()
         self.recorder = Recorder(
@@ -145,7 +146,7 @@ class Scan:
             inputs.config.camera, inputs.history, inputs.warn, inputs.latency_ms
         )
         self.tracking = TrackingWatch(inputs.warn)
-        odometry = self.pipeline.odometry
+        odometry = self.mapper.odometry
         coarser = float(inputs.camera.K[0, 0] / odometry.K[0, 0])
         self.shutter = ShutterWatch(odometry.exposure, coarser, inputs.warn)
         self.tags = FrameTags(inputs.folder / TAGS_FILE) if inputs.history is not None else None
@@ -156,7 +157,7 @@ class Scan:
     def take_photo(self) -> None:
         """Hand out the next frame as a photo; it becomes a keyframe where it has partners."""
         self._photos.append(None)
-        self.pipeline.take_next()
+        self.mapper.take_next()
 
     def feed(self, frame: CameraFrame) -> FramePosed | None:
         """One frame through the pipeline; None when its size is not the camera's."""
@@ -176,14 +177,14 @@ class Scan:
         self.heights += not prior.is_agl_assumed
         self.attitudes += not prior.is_view_assumed
         prior = self._velocity.add(exposed_ns, prior)
-        if self.pipeline.odometry.needs_turn(exposed_ns):
+        if self.mapper.odometry.needs_turn(exposed_ns):
             prior = self._turning(prior, exposed_ns)
         is_photo = bool(self._photos)
         events: tuple[MapperEvent, ...] = ()
         if not is_photo:
-            events = self.pipeline.skip(frame.seq, exposed_ns, prior)
+            events = self.mapper.skip(frame.seq, exposed_ns, prior)
         if not events:
-            events = self.pipeline.track(Frame(frame.image, exposed_ns, frame.seq, prior))
+            events = self.mapper.track(Frame(frame.image, exposed_ns, frame.seq, prior))
         posed = events[-1]
         assert isinstance(posed, FramePosed)
         self.check.add(time_ns, posed.tracked)
@@ -271,7 +272,7 @@ class Scan:
         if shutter is not None:
             camera = self.store.header.camera | shutter_document(shutter)
             self.store.update_header(camera=camera)
-        extra["clouds_per_second"] = round(self.pipeline.pairs / elapsed, 2)
+        extra["clouds_per_second"] = round(self.mapper.pairs / elapsed, 2)
         return self.recorder.close(redacted(extra | self.inputs.extra))
 
     def discard(self) -> None:
@@ -283,7 +284,7 @@ class Scan:
 
     def found_shutter(self) -> Shutter | None:
         """The shutter by the images; None where it was not sought or is not sure."""
-        search = self.pipeline.odometry.readout
+        search = self.mapper.odometry.readout
         found = None if search is None else search.estimate
         if found is None or not found.is_sure:
             return None
@@ -292,7 +293,7 @@ class Scan:
 
     def _focal_off(self) -> float:
         """Share by which the images contradict the focal length; 0 where they do not."""
-        found = self.pipeline.odometry.focal.estimate
+        found = self.mapper.odometry.focal.estimate
         if found is None:
             return 0.0
         change, sigma, _ = found
@@ -302,7 +303,7 @@ class Scan:
 
     def _focal_by_images(self) -> dict[str, Any] | None:
         """The change of the focal length that the images ask for; None where they show none."""
-        found = self.pipeline.odometry.focal.estimate
+        found = self.mapper.odometry.focal.estimate
         if found is None:
             return None
         change, sigma, windows = found
@@ -310,7 +311,7 @@ class Scan:
 
     def _readout(self) -> dict[str, Any] | None:
         """The readout by the images; None where it was not sought or does not show."""
-        search = self.pipeline.odometry.readout
+        search = self.mapper.odometry.readout
         found = None if search is None else search.estimate
         if found is None:
             return None
@@ -328,7 +329,7 @@ class Scan:
         out = [w for w in self.inputs.assumed if w != "start" or not self.check.is_clock_sure]
         if self.attitudes == 0:
             out.append("view")
-        if self.pipeline.keyframes.is_levelled:
+        if self.mapper.keyframes.is_levelled:
             out.append("level")
         if self.heights == 0 and self.rig.georeference == "none":
             out.append("height")
@@ -367,21 +368,21 @@ class Scan:
                 f"no telemetry: the scale assumes {ASSUMED_AGL_M:g} m above ground; "
                 "set scan.assumed_agl_m to the true height"
             )
-        apart = self.pipeline.keyframes.apart()
+        apart = self.mapper.keyframes.apart()
         if apart:
             out.append(
-                f"left out of the cloud: {len(apart)} of {self.pipeline.segments} "
+                f"left out of the cloud: {len(apart)} of {self.mapper.segments} "
                 "segments of the flight, which neither loops nor fixes of known height and scale "
                 "tie to the rest; fly with more overlap, or with GNSS that states its accuracy"
             )
-        false = sum(len(s.surface) for s in self.pipeline.keyframes.graph.segments.false())
+        false = sum(len(s.surface) for s in self.mapper.keyframes.graph.segments.false())
         if false:
             out.append(
                 f"left out of the cloud: {false} of {self.recorder.keyframes} keyframes, as the "
                 "depths of most views of the same segment contradict each other"
             )
         if frames and self.recorder.keyframes == false:
-            top = self.pipeline.refusals().most_common(2)
+            top = self.mapper.refusals().most_common(2)
             why = "; ".join(f"{reason} ({n})" for reason, n in top) or "too few frames"
             out.append(f"nothing was reconstructed: {why}")
         return out

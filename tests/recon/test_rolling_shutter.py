@@ -320,8 +320,8 @@ def test_the_image_becomes_that_of_the_middle_row() -> None:
 ])  # fmt: skip
 def test_a_sure_readout_names_a_shutter(readout_s: float, way: str, expected: Shutter) -> None:
     def found(sigma_s: float) -> Shutter | None:
-        scan = Mock(Scan, pipeline=Mock(), inputs=Mock(ScanInputs))
-        scan.pipeline.odometry.readout.estimate = ReadoutEstimate(readout_s, sigma_s, 3)
+        scan = Mock(Scan, mapper=Mock(), inputs=Mock(ScanInputs))
+        scan.mapper.odometry.readout.estimate = ReadoutEstimate(readout_s, sigma_s, 3)
         config = Config()
         scan.inputs.config = replace(config, camera=replace(config.camera, readout_ms="auto"))
         scan.inputs.camera = replace(PLAIN, shutter=Shutter(0.0, way))

@@ -130,7 +130,7 @@ def real_scan(
     folder: Path, *, config: Config | None = None, history: VehicleHistory | None = None,
     **inputs: Any,
 ) -> Scan:  # fmt: skip
-    """A scan into ``folder`` over a camera without images; end it by ``pipeline.finish()``."""
+    """A scan into ``folder`` over a camera without images; end it by ``mapper.finish()``."""
     K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 44.5], [0.0, 0.0, 1.0]])
     camera = Camera(K, np.zeros(5), (160, 90))
     source: Any = FakeCamera(camera.size_px)

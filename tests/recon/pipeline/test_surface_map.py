@@ -111,12 +111,12 @@ def test_pages_of_a_map_that_begins_at_the_very_end_are_removed(
 
     def drain() -> tuple[()]:
         for depth in survey()[:40]:
-            pipeline.surface(0, depth, KNOWN_ROWS, depth.T_world_camera)
+            pipeline.mapper.surface(0, depth, KNOWN_ROWS, depth.T_world_camera)
         assert pages.exists() and pipeline.held["map_tiles_on_disk"] > 0
         return ()
 
-    monkeypatch.setattr(pipeline, "drain", drain)
-    pipeline.finish()
+    monkeypatch.setattr(pipeline.mapper, "drain", drain)
+    pipeline.mapper.finish()
     assert not pages.exists() and pipeline.held["map_voxels"] == 0
 
 

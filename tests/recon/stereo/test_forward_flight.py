@@ -110,8 +110,8 @@ def fly() -> list[Keyframe]:
         T = pose(i)
         prior = PosePrior(T[:3, :3], 0.005, 0.01, T[:3, 3], np.full(3, 0.1), HEIGHT_M, 0.1)
         frame = Frame(photograph(levels, T), i * 100_000_000, i, prior)
-        out += keyframes_of(pipeline.track(frame))
-    return out + keyframes_of(pipeline.finish())
+        out += keyframes_of(pipeline.mapper.track(frame))
+    return out + keyframes_of(pipeline.mapper.finish())
 
 
 @pytest.mark.slow

@@ -208,8 +208,8 @@ def test_the_first_still_of_a_segment_is_placed_and_reconstructed() -> None:
             DOWN, 0.1, 0.1, T[:3, 3], np.full(3, 0.5), agl_m=HEIGHT_M, sigma_agl_m=2.0
         )
         image = np.repeat(still(T)[..., None], 3, axis=2)
-        events += pipeline.track(Frame(image, i * 2_000_000_000, i, prior))
-    events += pipeline.finish()
+        events += pipeline.mapper.track(Frame(image, i * 2_000_000_000, i, prior))
+    events += pipeline.mapper.finish()
     posed = [event for event in events if isinstance(event, FramePosed)]
     assert [event.seq for event in posed] == [0, 1, 2, 3, 3, 4, 5]
     lost, late = posed[3:5]
@@ -218,7 +218,7 @@ def test_the_first_still_of_a_segment_is_placed_and_reconstructed() -> None:
     np.testing.assert_allclose(late.pose.T_world_camera[:3, 3], track[3][:3, 3], atol=2.0)
     keyframes = [keyframe.seq for keyframe in keyframes_of(events)]
     assert keyframes == list(range(6))
-    assert pipeline.refusals().total() == 0
+    assert pipeline.mapper.refusals().total() == 0
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ class Hung:
 
     def close(self) -> None:
         """End the scan's threads."""
-        self.scan.pipeline.finish()
+        self.scan.mapper.finish()
         self.store.close()
 
 

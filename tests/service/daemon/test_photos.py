@@ -79,7 +79,7 @@ def test_a_photo_in_a_steady_hover_is_an_image_with_its_tag(tmp_path: Path) -> N
             scan.take_photo()  # by another ground station: a photo each
         scan.feed(CameraFrame(IMAGE, k * S, k, None, f"frame {k}"))
     assert len(operator.reports) == 2 and operator.texts == []
-    scan.pipeline.finish()
+    scan.mapper.finish()
     scan.store.close()
     for k, report in zip((3, 4), operator.reports, strict=True):
         assert report.ok and report.unix_us == (START_NS + k * S) // 1000
@@ -111,7 +111,7 @@ def test_a_photo_that_cannot_be_stored_says_why(tmp_path: Path) -> None:
     scan.inputs.on_photo(Frame(IMAGE, S, 0, PosePrior()))  # type: ignore[misc]
     assert operator.texts == ["photo failed: the disk is nearly full"]
     assert operator.reports == [KeyframeReport(ok=False)]
-    scan.pipeline.finish()
+    scan.mapper.finish()
     scan.store.close()
 
 
@@ -126,5 +126,5 @@ def test_a_photo_while_images_are_only_stored_is_refused_with_the_reason(tmp_pat
     assert answer.result is Result.TEMPORARILY_REJECTED and "only stored" in answer.text
     end.set()
     daemon.scanning.end()
-    scan.pipeline.finish()
+    scan.mapper.finish()
     scan.store.close()

@@ -178,7 +178,7 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         operator.set("SR_LINK_KBIT_S", 64.0)
         assert link.budgets[-1] == (64.0, operator.config.datalink.share)
         operator.set("SR_BASELINE_M", 2.5)
-        assert scan.pipeline.views.selection.min_base_to_height == pytest.approx(0.002)
+        assert scan.pipeline.mapper.views.selection.min_base_to_height == pytest.approx(0.002)
         scan.check.exposed_ns(10**9)
         operator.set("SR_CAM_LATENCY", 70.0)
         assert scan.check.exposed_ns(3 * 10**9) == 3 * 10**9 - 70_000_000
@@ -186,7 +186,7 @@ def test_a_running_scan_follows_at_once(operator: Operator, tmp_path: Path) -> N
         assert operator.daemon.vehicle.history.config.yaw_frame == "earth"
         scanning.link.sender = None
         scanning.end()
-        scan.pipeline.finish()
+        scan.mapper.finish()
 
 
 def test_a_parameter_that_is_set_during_a_reload_stands(tmp_path: Path) -> None:

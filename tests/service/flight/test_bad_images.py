@@ -70,9 +70,9 @@ def fly(images: list[U8]) -> tuple[list[Keyframe], Counter[str], Pipeline]:
     keyframes: list[Keyframe] = []
     for i, image in enumerate(images):
         time_ns, prior = i * 40_000_000, rig.prior(state(i), None)
-        keyframes += keyframes_of(pipeline.add(Frame(image, time_ns, i, prior)))
-    keyframes += keyframes_of(pipeline.finish())
-    return keyframes, pipeline.refusals(), pipeline
+        keyframes += keyframes_of(pipeline.mapper.add(Frame(image, time_ns, i, prior)))
+    keyframes += keyframes_of(pipeline.mapper.finish())
+    return keyframes, pipeline.mapper.refusals(), pipeline
 
 
 def off_the_plane(keyframe: Keyframe) -> float:
@@ -124,7 +124,7 @@ def test_the_clean_flight_gives_the_plane(clean: list[U8]) -> None:
 def test_spoiled_frames_make_no_false_surface(clean: list[U8], spoil: Callable[[U8], U8]) -> None:
     images = [spoil(p) if 25 <= i < 29 else p for i, p in enumerate(clean)]
     keyframes, reasons, pipeline = fly(images)
-    assert len(keyframes) >= 4 and pipeline.segments == 1
+    assert len(keyframes) >= 4 and pipeline.mapper.segments == 1
     assert all(off_the_plane(k) < 0.01 for k in keyframes)
     if spoil is over_exposed:
         assert sum(reasons.values()) >= 4, reasons
@@ -175,11 +175,11 @@ def test_telemetry_goes_on_where_vision_was_lost() -> None:
             state(i), lat_deg=47.0, lon_deg=8.0 + (STEP_M * i + off_m) * metre_east,
             alt_amsl_m=500.0 + HEIGHT_M, sigma_h_m=1.0, sigma_v_m=1.5, sigma_yaw_rad=0.03,
         )  # fmt: skip
-        *_, posed = pipeline.track(Frame(image, i * 40_000_000, i, rig.prior(sensed, None)))
+        *_, posed = pipeline.mapper.track(Frame(image, i * 40_000_000, i, rig.prior(sensed, None)))
         if isinstance(posed, FramePosed) and posed.pose is not None:
             kept = seen if posed.relative is not None else lost
             kept.append((i, posed.pose.T_world_camera[:3, 3]))
-    pipeline.finish()
+    pipeline.mapper.finish()
     assert len(seen) > 30 and len(lost) > 8
     (a, before), (b, after) = seen[-1], lost[0]
     np.testing.assert_allclose(after - before, [STEP_M * (b - a), 0.0, 0.0], atol=0.6)

@@ -88,7 +88,7 @@ def test_a_frame_that_tracking_skips_is_not_looked_at(
         with pytest.raises(AssertionError, match="looked at"):
             scan.feed(frame)
         skipped = FramePosed(0, 0, Tracked(Tracking.SKIPPED, 0))
-        monkeypatch.setattr(scan.pipeline, "skip", lambda seq, time_ns, prior: (skipped,))
+        monkeypatch.setattr(scan.mapper, "skip", lambda seq, time_ns, prior: (skipped,))
         assert scan.feed(frame) is skipped
         assert scan.recorder.states[Tracking.SKIPPED] == 1
-        scan.pipeline.finish()
+        scan.mapper.finish()

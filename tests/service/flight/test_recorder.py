@@ -70,9 +70,9 @@ def recorder_of(store: ScanStore, batch: int, of_m: float, graph: object = None)
         return pose(frame.seq, of_m or sigma_m(published))
 
     pipeline = MagicMock(debug=None)
-    pipeline.keyframes.graph = graph
-    pipeline.frames.pose = at
-    pipeline.is_settled.return_value = False
+    pipeline.mapper.keyframes.graph = graph
+    pipeline.mapper.frames.pose = at
+    pipeline.mapper.is_settled.return_value = False
     return Recorder(store, pipeline, Mock(Rig, local_frame=None, georeference="none"), batch=batch)
 
 

@@ -66,8 +66,8 @@ def flown(site: Simulation, down_deg: float) -> F64:
         image = site.renderer.frame(T, i, site.options.look)
         height = float(T[2, 3] - house_of(site)[shapes.BASE])
         prior = PosePrior(T[:3, :3], 0.01, 0.02, T[:3, 3], np.full(3, 0.05), height, 1.0)
-        keyframes += keyframes_of(pipeline.track(Frame(image, 400_000_000 * i, i, prior)))
-    keyframes += keyframes_of(pipeline.finish())
+        keyframes += keyframes_of(pipeline.mapper.track(Frame(image, 400_000_000 * i, i, prior)))
+    keyframes += keyframes_of(pipeline.mapper.finish())
     return np.vstack([points(keyframe) for keyframe in keyframes])
 
 
