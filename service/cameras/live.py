@@ -36,9 +36,8 @@ import numpy as np
 from recon.types import U8
 from service.cameras import open_container, reject_options
 from service.cameras.access_units import access_units
-from service.cameras.decoded import frame_bgr
 from service.cameras.lens import same_shape
-from service.cameras.source import CameraFrame, CameraSource, Paced
+from service.cameras.source import CameraFrame, CameraSource, Paced, frame_bgr
 from service.cameras.video import decoded_frames, video_stream
 from service.errors import InputError, NoSenderError, OutsideError
 from service.redaction import without_credentials

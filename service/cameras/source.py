@@ -7,14 +7,16 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from threading import Event, Lock
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
 from recon.types import U8
 from service.background import Channel
-from service.cameras.decoded import Decoded
 from service.workers import PROCESS, Worker
+
+if TYPE_CHECKING:
+    import av
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +34,30 @@ class GeoTag:
     """Yaw from true north, pitch, roll of the gimbal head (FRD in NED); pitch -90 looks down."""
     is_yaw_known: bool = True  # False: the aircraft's own headings contradict it
     relative_alt_m: float | None = None  # above the take-off point
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """An image as the decoder gave it, in BGR once that is asked for."""
+
+    frame: av.VideoFrame
+    turned_deg: int  # clockwise
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(H, W, 3) as turned."""
+        stored = int(self.frame.width), int(self.frame.height)
+        W, H = stored[::-1] if self.turned_deg % 180 else stored
+        return H, W, 3
+
+    def __call__(self) -> U8:
+        """(H, W, 3) BGR."""
+        return np.ascontiguousarray(np.rot90(frame_bgr(self.frame), -(self.turned_deg // 90)))
+
+
+def frame_bgr(frame: av.VideoFrame) -> U8:
+    """(H, W, 3) BGR of a decoded image."""
+    return np.ascontiguousarray(frame.to_ndarray(format="bgr24"), dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

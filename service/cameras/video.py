@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from mavlink.telemetry.samples import DATED_UNIX_S
 from service.cameras import open_container, reject_options
-from service.cameras.decoded import Decoded
-from service.cameras.source import CameraFrame
+from service.cameras.source import CameraFrame, Decoded
 from service.errors import InputError
 
 if TYPE_CHECKING:
