@@ -59,3 +59,6 @@ def test_the_first_change_fails_and_then_passes(copy: Path) -> None:
     before(copy / "docs" / "operators.md", "| `PREFLIGHT_REBOOT_SHUTDOWN` 246", row)
     passed = ran(copy, COMMANDS, RESULTS)
     assert passed.returncode == 0, passed.stdout
+    hints = "import typing, mavlink.component.commands as c; typing.get_type_hints(c.report_space)"
+    typed = subprocess.run([sys.executable, "-c", hints], cwd=copy, capture_output=True, text=True)
+    assert typed.returncode == 0, typed.stderr
