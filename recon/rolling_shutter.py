@@ -193,6 +193,10 @@ class FrameRows:
         return rows.at_middle(K, uv, inverse_depth)
 
 
+GLOBAL_SHUTTER = FrameRows(0, PosePrior(), np.eye(4))
+"""The motion of rows that are all exposed at once: none."""
+
+
 class RowTrack:
     """The motion of each frame's rows, from its neighbours' poses in the odometry."""
 

@@ -222,8 +222,7 @@ class ViewSelection:
             return False
         if self._kept[-1].segment != view.segment:
             return True
-        newest = self._kept[-1].moving
-        if newest is not None and newest.is_awaited:
+        if self._kept[-1].row_motion.is_awaited:
             return False
         if self._mode != "auto":
             return True
@@ -331,7 +330,12 @@ class VirtualStereoCamera:
         T_keyframe_camera = se3.inverse(key.T_odom_camera) @ tracked.T_odom_camera
         relative = RelativePose(image.seq, key.segment, T_keyframe_camera, key)
         frame = replace(
-            image, image=None, pyramid=(), mask=None, relative=relative, moving=tracked.moving
+            image,
+            image=None,
+            pyramid=(),
+            mask=None,
+            relative=relative,
+            row_motion=tracked.row_motion,
         )
         self._tracked.append((image.time_ns, relative))
         is_view = self.selection.offer(frame, tracked)
@@ -378,8 +382,8 @@ class VirtualStereoCamera:
 
     def _is_ready(self, view: UndistortedFrame) -> bool:
         """True when its partners are there, and the images could show the readout."""
-        search, newest = self._odometry.readout, self._waiting[-1][0].moving
-        shows = search is not None and search.is_open and newest is not None and newest.is_measured
+        search, newest = self._odometry.readout, self._waiting[-1][0].row_motion
+        shows = search is not None and search.is_open and newest.is_measured
         return self.selection.ready(view) and not (shows and len(self._waiting) < HELD)
 
     def _stereo_view(
@@ -415,11 +419,11 @@ class VirtualStereoCamera:
 
         ``points`` (N, 3) of the view's camera are the ground.
         """
-        rows = None if view.moving is None else view.moving.rows
+        rows = view.row_motion.rows
         pairs = [
-            (partner.moving.rows, se3.inverse(partner.T_odom_camera) @ view.T_odom_camera)
+            (partner.row_motion.rows, se3.inverse(partner.T_odom_camera) @ view.T_odom_camera)
             for partner in partners
-            if partner.moving is not None and partner.moving.rows is not None
+            if partner.row_motion.rows is not None
         ]
         seen = points[points[:, 2] > 0]
         if rows is None or not pairs or not len(seen):
@@ -445,7 +449,7 @@ class VirtualStereoCamera:
             None, view.gray, self._K, view.T_odom_camera, self._undistorter.valid,
             blur_px=self._blur_px(view, points), seq=view.seq,
         )  # fmt: skip
-        rows = None if view.moving is None else view.moving.rows
+        rows = view.row_motion.rows
         if rows is None or not rows.clock.readout_s:
             return posed
         ground = se3.transform(se3.inverse(view.T_odom_camera), points)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.rolling_shutter import FrameRows
+from recon.rolling_shutter import GLOBAL_SHUTTER, FrameRows
 from recon.tracking.keyframe_window import OdometryKeyframe
 from recon.tracking.matching import Pyramid
 from recon.types import F64, U8, PosePrior
@@ -53,17 +53,12 @@ class UndistortedFrame:
     mask: U8 | None  # (h, w) non-zero where the image is valid; None: everywhere
     is_blurred: bool  # takes no part in stereo, only in the track
     relative: RelativePose | None = None  # to the last keyframe when it was tracked
-    moving: FrameRows | None = None  # its rows' motion, better once its neighbours are known
+    row_motion: FrameRows = GLOBAL_SHUTTER  # better once its neighbours are known
 
     @property
     def small(self) -> U8:
         """(h, w) gray, as the odometry takes it."""
         return self.pyramid[0]
-
-    @property
-    def motion(self) -> FrameRows:
-        assert self.moving is not None, "the odometry has not seen the frame"
-        return self.moving
 
     @property
     def segment(self) -> int:

@@ -80,7 +80,7 @@ class OdometryKeyframe:
     uv: F64  # (N, 2) corners
     landmark: I64  # (N,) number in ``landmarks``, -1 none yet
     landmarks: Landmarks  # of its segment, in the odometry's frame
-    moving: FrameRows  # its corners lie where their own rows saw them
+    row_motion: FrameRows  # its corners lie where their own rows saw them
 
     @property
     def T_odom_camera(self) -> F64:
@@ -107,7 +107,7 @@ def median_depth(key: OdometryKeyframe) -> float:
 def triangulate(
     key: OdometryKeyframe,
     T_camera_odom: F64,
-    moving: FrameRows,
+    row_motion: FrameRows,
     uv: F64,
     ok: Bool,
     K: F64,
@@ -124,7 +124,8 @@ def triangulate(
     if rows.size == 0:
         return
     far = np.full(rows.size, np.nan_to_num(1.0 / median_depth(key)))
-    uv_a, uv_b = key.moving.at_middle(K, key.uv[rows], far), moving.at_middle(K, uv[rows], far)
+    uv_a = key.row_motion.at_middle(K, key.uv[rows], far)
+    uv_b = row_motion.at_middle(K, uv[rows], far)
     points, angle = bundle.triangulate(key.T_camera_odom, T_camera_odom, K, uv_a, uv_b)
     error = np.maximum(
         two_view.reprojection_error(key.T_camera_odom, points, K, uv_a),
@@ -149,7 +150,7 @@ def observations(
         known, P = key.known_points()
         cam.append(np.full(len(P), c, np.int64))
         pt.append(key.landmark[known])
-        uv.append(key.moving.at_middle(K, key.uv[known], 1.0 / P[:, 2], readout_s))
+        uv.append(key.row_motion.at_middle(K, key.uv[known], 1.0 / P[:, 2], readout_s))
     point = np.concatenate(pt)
     _, index, counts = np.unique(point, return_inverse=True, return_counts=True)
     use = counts[index] >= views

@@ -74,13 +74,13 @@ class KnownTrack:
             spread = np.zeros((6, 6))
             spread[:3, :3] = view.turn_covariance
             rows = Rows(self._clock, view.rate, np.zeros(6), spread)
-        moving = FrameRows(time_ns, prior, T_camera_odom, rows, is_measured=True)
+        row_motion = FrameRows(time_ns, prior, T_camera_odom, rows, is_measured=True)
         key = OdometryKeyframe(
             seq, 0, T_camera_odom, view.covariance, prior, frame.pyramid,
-            np.zeros((len(view.landmark), 2)), view.landmark, self._landmarks, moving,
+            np.zeros((len(view.landmark), 2)), view.landmark, self._landmarks, row_motion,
         )  # fmt: skip
         self.keyframes = [*self.keyframes[1 - KEPT :], key]
-        return Tracked(state, 0, view.T_odom_camera, len(view.landmark), moving=moving)
+        return Tracked(state, 0, view.T_odom_camera, len(view.landmark), row_motion=row_motion)
 
 
 AnyTrack = Odometry | KnownTrack

@@ -188,7 +188,8 @@ class Localiser:
         largest = np.pi if turn is None else MAX_TILT_ERROR_RAD
         up, K = key.T_camera_odom[:3, 2], self.camera.K
         far = np.full(int(ok.sum()), np.nan_to_num(1.0 / median_depth(key)))
-        uv_a, uv_b = key.moving.at_middle(K, key.uv[ok], far), new.motion.at_middle(K, uv[ok], far)
+        uv_a = key.row_motion.at_middle(K, key.uv[ok], far)
+        uv_b = new.row_motion.at_middle(K, uv[ok], far)
         seen = two_view.solve(uv_a, uv_b, K, turn, largest, up)
         if seen is None and turn is not None:  # tags are often wrong
             seen = two_view.solve(uv_a, uv_b, K, None, np.pi, up)
@@ -296,7 +297,7 @@ class Localiser:
         if len(points) < max(least, MIN_TRACK_SHARE * expected):
             return "too few matches"
         fewest = max(least, len(points) // 2)
-        solved = self._solve(points, pixels, T_camera_odom, fewest, new.motion)
+        solved = self._solve(points, pixels, T_camera_odom, fewest, new.row_motion)
         if solved is None:
             return "no pose fits the matches"
         ok[rows[~solved.inliers[: rows.size]]] = False
@@ -342,28 +343,28 @@ class Localiser:
         return uv, ok, visible, in_view
 
     def _solve(
-        self, points: F64, uv: F64, start: F64, least: int, moving: FrameRows
+        self, points: F64, uv: F64, start: F64, least: int, row_motion: FrameRows
     ) -> pnp.PnpResult | None:
         """EPnP with a tight gate, else with a loose one; None with fewer than ``least``.
 
         The pose says how the rows moved, so it is solved again with that motion.
         """
         for gate_px in (pnp.THRESHOLD_PX, LOOSE_PX):
-            solved = self._solve_rows(points, uv, start, gate_px, moving)
-            if solved is not None and moving.rows is not None:
-                self._row_track.place(moving, solved.T_camera_points)
-                again = self._solve_rows(points, uv, solved.T_camera_points, gate_px, moving)
+            solved = self._solve_rows(points, uv, start, gate_px, row_motion)
+            if solved is not None and row_motion.rows is not None:
+                self._row_track.place(row_motion, solved.T_camera_points)
+                again = self._solve_rows(points, uv, solved.T_camera_points, gate_px, row_motion)
                 solved = again or solved
             if solved is not None and solved.inliers.sum() >= least:
                 return solved
         return None
 
     def _solve_rows(
-        self, points: F64, uv: F64, start: F64, gate_px: float, moving: FrameRows
+        self, points: F64, uv: F64, start: F64, gate_px: float, row_motion: FrameRows
     ) -> pnp.PnpResult | None:
         """EPnP on pixels (N, 2) as they would be at the middle row's time."""
         depth = se3.transform(start, points)[:, 2]
-        middle = moving.at_middle(self.camera.K, uv, 1.0 / np.maximum(depth, 1e-6))
+        middle = row_motion.at_middle(self.camera.K, uv, 1.0 / np.maximum(depth, 1e-6))
         return pnp.solve(points, middle, self.camera.K, start, gate_px)
 
     def _agrees(

@@ -17,7 +17,7 @@ from enum import Enum
 import numpy as np
 
 from recon import se3
-from recon.rolling_shutter import NEAR_S, FrameRows, RowTrack
+from recon.rolling_shutter import GLOBAL_SHUTTER, NEAR_S, FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, two_view
 from recon.tracking.common_view import FeatureCache
 from recon.tracking.focal_watch import FocalWatch
@@ -82,7 +82,7 @@ class Tracked:
     T_odom_camera: F64 | None = None  # (4, 4)
     tracks: int = 0
     reason: str = ""
-    moving: FrameRows | None = None  # its rows' motion, better once its neighbours are known
+    row_motion: FrameRows = GLOBAL_SHUTTER  # better once its neighbours are known
     before: Tracked | None = None  # the still before, now a segment's first, and why it was lost
 
 
@@ -148,8 +148,8 @@ class Odometry:
         """Pose of a new frame, or why there is none. Of a blurred one a later frame makes a better
         keyframe, if it comes soon."""
         time_ns, prior = frame.time_ns, frame.prior
-        moving = self._row_track.expect(time_ns, prior, self._expected(time_ns, prior))
-        new = replace(frame, moving=moving)
+        expected = self._expected(time_ns, prior)
+        new = replace(frame, row_motion=self._row_track.expect(time_ns, prior, expected))
         self._gap_ns, self._frame_ns = time_ns - self._frame_ns, time_ns
         if not self.keyframes:
             return self._start(new)
@@ -219,9 +219,9 @@ class Odometry:
         T_camera_odom = se3.inverse(T_odom_camera)
         unknown = np.full(len(uv), -1, np.int64)
         self.keyframes = [self._keyframe(new, T_camera_odom, uv, unknown, Landmarks())]
-        self._row_track.add(new.motion, T_camera_odom)
+        self._row_track.add(new.row_motion, T_camera_odom)
         self._model = ConstantVelocity(new.time_ns, T_odom_camera, new.prior)
-        return Tracked(Tracking.STARTED, self.segment, T_odom_camera, moving=new.moving)
+        return Tracked(Tracking.STARTED, self.segment, T_odom_camera, row_motion=new.row_motion)
 
     def _keyframe(
         self, new: UndistortedFrame, T_camera_odom: F64, uv: F64, landmark: I64, table: Landmarks
@@ -229,7 +229,7 @@ class Odometry:
         """The frame as a keyframe with corners ``uv`` (N, 2)."""
         return OdometryKeyframe(
             new.seq, self.segment, T_camera_odom, np.zeros((6, 6)), new.prior, new.pyramid, uv,
-            landmark, table, new.motion,
+            landmark, table, new.row_motion,
         )  # fmt: skip
 
     def _corners(self, new: UndistortedFrame) -> F64:
@@ -256,7 +256,7 @@ class Odometry:
             view = self._motion_of_two(new, uv, ok, R_b_a)
         if moved < least and (view is None or view.parallax_rad < least):
             if self._row_track.is_known and len(self._early) < EARLY:
-                self._early.append((new.motion, uv, ok))
+                self._early.append((new.row_motion, uv, ok))
             return Tracked(
                 Tracking.WAITING, self.segment, tracks=int(ok.sum()), reason="too little motion"
             )
@@ -285,8 +285,8 @@ class Odometry:
         up_a = first.T_camera_odom[:3, 2]
         turn = 0.12 if R_b_a is not None else np.pi
         far = np.full(int(ok.sum()), 1.0 / new.prior.agl_m if new.prior.agl_m else 0.0)
-        uv_a = first.moving.at_middle(self.K, first.uv[ok], far)
-        uv_b = new.motion.at_middle(self.K, uv[ok], far)
+        uv_a = first.row_motion.at_middle(self.K, first.uv[ok], far)
+        uv_b = new.row_motion.at_middle(self.K, uv[ok], far)
         view = two_view.solve(uv_a, uv_b, self.K, R_b_a, turn, up_a)
         if view is None and R_b_a is not None and self._low_frame_rate:  # tags are often wrong
             view = two_view.solve(uv_a, uv_b, self.K, None, np.pi, up_a)
@@ -303,14 +303,14 @@ class Odometry:
 
     def _place_early(self, first: OdometryKeyframe) -> None:
         """Poses of the frames after the first; they say how its rows moved."""
-        for moving, uv, ok in self._early:
+        for row_motion, uv, ok in self._early:
             rows = np.flatnonzero(ok & first.landmarks.known(first.landmark[: len(ok)]))
             points = first.landmarks[first.landmark[rows]]
             depth = se3.transform(first.T_camera_odom, points)[:, 2]
-            at = moving.at_middle(self.K, uv[rows], 1.0 / depth)
+            at = row_motion.at_middle(self.K, uv[rows], 1.0 / depth)
             found = pnp.solve(points, at, self.K, first.T_camera_odom)
             if found is not None:
-                self._row_track.add(moving, found.T_camera_points)
+                self._row_track.add(row_motion, found.T_camera_points)
         self._early = []
 
     # ---- keyframes ---------------------------------------------------------------------
@@ -330,9 +330,11 @@ class Odometry:
         self._lost = 0
         due = self._base_to_height * (OVERDUE if new.is_blurred else 1.0)
         if base < due and found.share > 0.45 and turned < MAX_TURN_RAD:
-            self._row_track.add(new.motion, T_camera_odom)
+            self._row_track.add(new.row_motion, T_camera_odom)
             self._settle()
-            return Tracked(Tracking.TRACKED, self.segment, T_odom_camera, tracks, moving=new.moving)
+            return Tracked(
+                Tracking.TRACKED, self.segment, T_odom_camera, tracks, row_motion=new.row_motion
+            )
         self.exposure.add(new.small, px_s, 1e-9 * self._gap_ns)
         share = 0.5 * SEARCH_SHARE
         whole = self._localiser.pose_from(key, new, T_camera_odom, share, MIN_TRACKS)
@@ -364,7 +366,7 @@ class Odometry:
     def _as_keyframe(self, new: UndistortedFrame, ok: Bool) -> Tracked:
         """The newest keyframe's outcome, by the corners that are ``ok``."""
         T, tracks = self.keyframes[-1].T_odom_camera, int(ok.sum())
-        return Tracked(Tracking.KEYFRAME, self.segment, T, tracks, moving=new.moving)
+        return Tracked(Tracking.KEYFRAME, self.segment, T, tracks, row_motion=new.row_motion)
 
     def _add_keyframe(
         self,
@@ -378,10 +380,10 @@ class Odometry:
         the one that gave the pose first. Of the others only corners with landmarks count.
         """
         least = 0.5 * MIN_BASE_TO_HEIGHT
-        self._row_track.add(new.motion, T_camera_odom)
+        self._row_track.add(new.row_motion, T_camera_odom)
         kept, landmark = np.zeros((0, 2)), np.zeros(0, np.int64)
         for key, uv, ok in seen:
-            triangulate(key, T_camera_odom, new.motion, uv, ok, self.K, least, LOOSE_PX)
+            triangulate(key, T_camera_odom, new.row_motion, uv, ok, self.K, least, LOOSE_PX)
             if key is not seen[0][0]:
                 ok = ok & (key.landmark >= 0) & ~np.isin(key.landmark, landmark)
             kept = np.vstack([kept, uv[ok]])
@@ -393,7 +395,7 @@ class Odometry:
         landmark = np.concatenate([landmark, np.full(len(fresh), -1, np.int64)])
         key_new = self._keyframe(new, T_camera_odom, uv, landmark, seen[0][0].landmarks)
         self.keyframes.append(key_new)
-        self._unsettled = key_new if new.motion.rows is not None else None
+        self._unsettled = key_new if new.row_motion.rows is not None else None
         window = self.keyframes[-WINDOW - 2 :]
         adjusted = adjust_window(window, self.K)
         if len(window) > WINDOW and window[0].seq > self._watched_seq:
@@ -405,7 +407,7 @@ class Odometry:
     def _settle(self) -> None:
         """Adjust the window again once frames after its last keyframe say how its rows moved, and
         look for the readout, until it is known that there is none."""
-        if self._unsettled is not None and self._unsettled.moving.is_settled:
+        if self._unsettled is not None and self._unsettled.row_motion.is_settled:
             adjust_window(self.keyframes, self.K)
             self._unsettled = None
             search = self.readout if self._row_track.is_rolling else None

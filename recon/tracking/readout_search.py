@@ -119,7 +119,7 @@ class ReadoutSearch:
         window = keyframes[-size:]
         if len(window) < size or window[0].seq < self._last_seq:
             return False
-        if all(key.moving.is_measured for key in window):
+        if all(key.row_motion.is_measured for key in window):
             self._last_seq = window[-1].seq
             self._take(window)
         return self._clock.readout_s != before_s

@@ -238,7 +238,7 @@ def test_frames_after_the_first_tell_how_its_rows_moved(flown: list[U8]) -> None
             velocity_m_s=np.array([8.0, 1.0, 0.0]), turn_rad_s=turn, sigma_turn_rad_s=0.2,
         )  # fmt: skip
         odometry.track(undistorted(image, i, int(i * 1e9 / 15), prior))
-    first = odometry.keyframes[0].moving
+    first = odometry.keyframes[0].row_motion
     assert first.time_ns == 0 and first.is_measured and first.rows is not None
     off = first.rows.rate[:3] - derivative(0.0)[:3]
     late = derivative(-0.1)[:3] - derivative(0.0)[:3]
@@ -342,7 +342,7 @@ def searched(readout_s: float, frames: int) -> tuple[ReadoutEstimate, float | No
             undistorted(photograph(ground, i / 15, readout_s), i, int(i * 1e9 / 15), prior)
         )
     assert odometry.readout is not None and odometry.readout.estimate is not None
-    rows = odometry.keyframes[-1].moving.rows
+    rows = odometry.keyframes[-1].row_motion.rows
     return odometry.readout.estimate, None if rows is None else rows.clock.readout_s
 
 

@@ -21,10 +21,10 @@ def keyframe_at(
     seq: int, T_odom_camera: F64, segment: int = 0, is_measured: bool = False
 ) -> OdometryKeyframe:
     """A keyframe of the odometry without corners."""
-    moving = FrameRows(seq, UNKNOWN, T_odom_camera, is_measured=is_measured)
+    row_motion = FrameRows(seq, UNKNOWN, T_odom_camera, is_measured=is_measured)
     return OdometryKeyframe(
         seq, segment, se3.inverse(T_odom_camera), np.eye(6), UNKNOWN, (),
-        np.zeros((0, 2)), np.zeros(0, np.int64), Landmarks(), moving,
+        np.zeros((0, 2)), np.zeros(0, np.int64), Landmarks(), row_motion,
     )  # fmt: skip
 
 

@@ -227,12 +227,12 @@ def test_a_view_knows_what_an_unknown_readout_does_to_its_depth(
         plain = frame(i, 5.0 * i)
         keys.append(replace(plain.keyframe, uv=corners, landmark=ids, landmarks=ground))
         turn = np.array([0.0, 2.0 * i, 0.0, 0.0, 0.0, 0.0])
-        moving = FrameRows(i, PosePrior(), np.eye(4), Rows(clock, turn, np.zeros(6)))
+        row_motion = FrameRows(i, PosePrior(), np.eye(4), Rows(clock, turn, np.zeros(6)))
         image = UndistortedFrame(
             i, i, PosePrior(), plain.image, plain.gray, plain.pyramid, None, False
         )
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
-        views.take(image, Tracked(state, 0, plain.T_odom_camera, moving=moving))
+        views.take(image, Tracked(state, 0, plain.T_odom_camera, row_motion=row_motion))
     shares = [view.rows_share for view in views.ready(everything=True)]
     assert len(shares) == 3 and all((share.min() > 0.005) == expected for share in shares)
 
@@ -255,12 +255,12 @@ def test_views_wait_for_the_first_word_on_their_readout(
     for i in range(6):
         plain = frame(i, 5.0 * i)
         keys.append(plain.keyframe)
-        moving = FrameRows(i, PosePrior(), np.eye(4), is_measured=is_measured)
+        row_motion = FrameRows(i, PosePrior(), np.eye(4), is_measured=is_measured)
         image = UndistortedFrame(
             i, i, PosePrior(), plain.image, plain.gray, plain.pyramid, None, False
         )
         state = Tracking.STARTED if i == 0 else Tracking.KEYFRAME
-        views.take(image, Tracked(state, 0, plain.T_odom_camera, moving=moving))
+        views.take(image, Tracked(state, 0, plain.T_odom_camera, row_motion=row_motion))
         search.is_open = is_open and i < 5
         given += list(views.ready())
         counts.append(len(given))
@@ -275,9 +275,9 @@ def test_a_view_that_waited_while_the_next_segment_grew_is_confirmed_by_its_own(
     for i in range(8):
         plain = frame(i, 5.0 * i, segment=i // 4)
         keys.append(plain.keyframe)
-        moving = FrameRows(i, PosePrior(), np.eye(4), is_measured=True)
+        row_motion = FrameRows(i, PosePrior(), np.eye(4), is_measured=True)
         state = Tracking.KEYFRAME if i % 4 else Tracking.STARTED
-        tracked = Tracked(state, i // 4, plain.T_odom_camera, moving=moving)
+        tracked = Tracked(state, i // 4, plain.T_odom_camera, row_motion=row_motion)
         views.take(replace(plain, relative=None), tracked)
         given += [view.seq for view in views.ready()]
     assert given == [0, 1, 2, 3]

@@ -151,7 +151,7 @@ def test_frames_that_wait_are_placed_though_features_follow_the_corners_since() 
     odometry.track(undistorted(still(pose(0.0)), 0, 0, prior))
     first = odometry.keyframes[0]
     seen = np.zeros(len(first.uv), np.bool_)
-    odometry._early = [(first.moving, first.uv, seen)]
+    odometry._early = [(first.row_motion, first.uv, seen)]
     first.uv = np.vstack([first.uv, first.uv[:5] + 0.5])
     first.landmark = np.concatenate([first.landmark, np.full(5, -1, np.int64)])
     odometry._place_early(first)
