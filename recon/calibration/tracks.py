@@ -18,9 +18,9 @@ from recon.calibration.global_bundle import RowMotion, Sightings, joint
 from recon.camera_model import project, rays
 from recon.parallel import run_parallel
 from recon.tracking import robust_geometry
-from recon.tracking.common_view import Features, features, mutual
 from recon.tracking.matching import Pyramid, match
 from recon.tracking.prediction import by_homography
+from recon.tracking.sift_features import Features, features, mutual
 from recon.types import F64, I64, U8, Camera
 
 WIDTH_PX, FEATURES = 1920, 2500

@@ -41,8 +41,8 @@ from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.posed_image import VirtualStereoConfig
 from recon.stereo.reprojection import DepthFusionConfig
 from recon.stereo.upsampling import UpsamplingConfig
+from recon.tracking.adjusted_track import AdjustedTrack
 from recon.tracking.frame import RelativePose, UndistortedFrame
-from recon.tracking.known_track import KnownTrack
 from recon.tracking.odometry import Odometry, Tracked, Tracking
 from recon.types import Array, Camera, Frame, Keyframe, PointCloud, Pose, PosePrior
 
@@ -99,7 +99,7 @@ class Mapper:
         camera: Camera,
         config: MapperConfig | None = None,
         backend: Backend | None = None,
-        known: KnownTrack | None = None,
+        known: AdjustedTrack | None = None,
         new_map: Callable[[VoxelMapConfig], VoxelMap] = VoxelMap,
         worker: Callable[[Reconstruct], Worker] = InTurn,
         timing: Timing = untimed,

@@ -17,7 +17,7 @@ from recon import se3
 from recon.camera_model import project, rays
 from recon.mapping.registration import agreed_motion, register_projective
 from recon.tracking import matching, pnp
-from recon.tracking.common_view import FEATURE_SHARES, common_view, features
+from recon.tracking.sift_features import FEATURE_SHARES, features, match_features
 from recon.types import F32, F64, U8, Bool, DepthMap
 
 MIN_RAD, MIN_SHARE = 2e-4, 0.1
@@ -34,7 +34,7 @@ MATCHING = matching.MatchingConfig()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LoopView:
+class LoopEnd:
     """A keyframe as the search for loops needs it."""
 
     gray: U8  # (H, W) without distortion
@@ -118,7 +118,7 @@ def candidates(
     )
 
 
-def verify(a: LoopView, b: LoopView, T_a_b_guess: F64) -> LoopClosure | None:
+def verify(a: LoopEnd, b: LoopEnd, T_a_b_guess: F64) -> LoopClosure | None:
     """The motion between two keyframes that may see the same place, or None when they do not.
 
     ``T_a_b_guess`` (4, 4) is the pose graph's estimate. Where it is too far off, the features that
@@ -142,13 +142,13 @@ def verify(a: LoopView, b: LoopView, T_a_b_guess: F64) -> LoopClosure | None:
 
 
 def _by_features(
-    pyramids: tuple[matching.Pyramid, ...], uv: F64, points: F64, a: LoopView, b: LoopView
+    pyramids: tuple[matching.Pyramid, ...], uv: F64, points: F64, a: LoopEnd, b: LoopEnd
 ) -> pnp.PnpResult | None:
     """As :func:`_pose`, by the features that both images share."""
-    view = common_view(features(a.gray), features(b.gray))
-    if view is None:
+    shared = match_features(features(a.gray), features(b.gray))
+    if shared is None:
         return None
-    there, warp = view.predict(uv)
+    there, warp = shared.predict(uv)
     for share in FEATURE_SHARES:
         solved = _pose(pyramids, uv, points, there, warp, b, None, share)
         if solved is not None:
@@ -156,16 +156,16 @@ def _by_features(
     return None
 
 
-def landmarks(view: LoopView, config: matching.MatchingConfig) -> tuple[F64, F64]:
+def landmarks(end: LoopEnd, config: matching.MatchingConfig) -> tuple[F64, F64]:
     """(N, 2) corners with a known depth and their (N, 3) points in the camera frame."""
-    corners = matching.harris_grid(view.gray, config)[:, :2].astype(np.float64)
-    h, w = view.depth.depth_m.shape
-    H, W = view.gray.shape
+    corners = matching.harris_grid(end.gray, config)[:, :2].astype(np.float64)
+    h, w = end.depth.depth_m.shape
+    H, W = end.gray.shape
     place = np.rint((corners + 0.5) * [w / W, h / H] - 0.5).astype(np.int64)
     place = np.clip(place, 0, [w - 1, h - 1])
-    depth = view.depth.depth_m[place[:, 1], place[:, 0]].astype(np.float64)
-    known = np.isfinite(depth) & ~_at_edge(view.depth.depth_m, place)
-    return corners[known], rays(view.K, corners[known]) * depth[known, None]
+    depth = end.depth.depth_m[place[:, 1], place[:, 0]].astype(np.float64)
+    known = np.isfinite(depth) & ~_at_edge(end.depth.depth_m, place)
+    return corners[known], rays(end.K, corners[known]) * depth[known, None]
 
 
 def _at_edge(depth: F32, place: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Bool:
@@ -199,7 +199,7 @@ def warps(K_a: F64, K_b: F64, T_b_a: F64, uv: F64, points: F64) -> F64:
 
 def _pose(
     pyramids: tuple[matching.Pyramid, ...], uv: F64, points: F64, predicted: F64, warp: F64,
-    b: LoopView, prior: F64 | None, search_share: float,
+    b: LoopEnd, prior: F64 | None, search_share: float,
 ) -> pnp.PnpResult | None:  # fmt: skip
     """EPnP pose of b from a's landmarks found in it."""
     radius = search_share * b.gray.shape[1]
@@ -213,7 +213,7 @@ def _pose(
     return solved
 
 
-def _with_icp(a: LoopView, b: LoopView, T_a_b: F64, covariance: F64) -> LoopClosure | None:
+def _with_icp(a: LoopEnd, b: LoopEnd, T_a_b: F64, covariance: F64) -> LoopClosure | None:
     """The loop refined by ICP of the depth maps; None when they contradict it."""
     growth = _growth(a, b, T_a_b)
     if growth is None:
@@ -232,7 +232,7 @@ def _with_icp(a: LoopView, b: LoopView, T_a_b: F64, covariance: F64) -> LoopClos
     return T, covariance, growth
 
 
-def _growth(a: LoopView, b: LoopView, T_a_b: F64) -> float | None:
+def _growth(a: LoopEnd, b: LoopEnd, T_a_b: F64) -> float | None:
     """Median ratio of a's depths to b's where both see the same; None with too few."""
     h, w = a.depth.depth_m.shape
     v, u = np.mgrid[0:h:4, 0:w:4].reshape(2, -1)

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera_model import scaled_K
-from recon.posegraph.loop_closure import LoopView, candidates, ground_seen, verify
+from recon.posegraph.loop_closure import LoopEnd, candidates, ground_seen, verify
 from recon.posegraph.trajectory import Trajectory
-from recon.tracking.common_view import alike, signature
+from recon.tracking.sift_features import alike, signature
 from recon.types import F64, U8, DepthMap
 
 WIDTH_PX = 640
@@ -65,13 +65,13 @@ class _Kept:
     def signature(self) -> U8:
         return signature(self.gray())
 
-    def unpacked(self, scale: float) -> LoopView:
-        """The view with its depth in metres."""
+    def unpacked(self, scale: float) -> LoopEnd:
+        """The end with its depth in metres."""
         depth = self.depth.astype(np.float32) * np.float32(scale * self.far / 65535.0)
         depth[self.depth == 0] = np.nan
         sigma = self.sigma.astype(np.float32) * np.float32(scale)
         views = np.where(self.depth > 0, 2, 0).astype(np.uint8)
-        return LoopView(
+        return LoopEnd(
             self.gray(), self.K,
             DepthMap(depth, sigma, views, self.depth_K, np.eye(4)),
         )  # fmt: skip
@@ -127,11 +127,11 @@ class LoopSearch:
             self._thin()
 
     def _search(self, new: _Kept) -> None:
-        view = new.unpacked(self.trajectory.scale(new.seq))
-        for seq in self._likely(new, view):
+        end = new.unpacked(self.trajectory.scale(new.seq))
+        for seq in self._likely(new, end):
             guess = self.trajectory.step_between(seq, new.seq)
             known = self._kept[seq].unpacked(self.trajectory.scale(seq))
-            found = verify(known, view, guess)
+            found = verify(known, end, guess)
             if found is not None and self.trajectory.add_loop(seq, new.seq, *found):
                 self._tied = new
                 return
@@ -146,9 +146,9 @@ class LoopSearch:
         moved = float(np.linalg.norm(step[:3, 3] + distance * step[:3, 2]))
         return moved < MOVED * distance * float(np.hypot(*new.size_px)) / float(new.K[0, 0])
 
-    def _likely(self, new: _Kept, view: LoopView) -> list[int]:
+    def _likely(self, new: _Kept, end: LoopEnd) -> list[int]:
         """Earlier keyframes worth a verification, the best first."""
-        depth_m = float(np.nanmedian(view.depth.depth_m))
+        depth_m = float(np.nanmedian(end.depth.depth_m))
         if not depth_m > 0:
             return []
         seqs = [seq for seq, kept in self._kept.items() if self._is_apart(kept, new)]
@@ -162,7 +162,7 @@ class LoopSearch:
         apart = np.linalg.norm(ahead - (here[:3, 3] + depth_m * here[:3, 2]), axis=1)
         some = {seqs[i]: there[i] for i in np.argsort(apart)[:8] if apart[i] < reach}
         some[new.seq] = here
-        found = candidates(some, new.K, new.size_px, ground_seen(view.depth), MIN_OVERLAP)
+        found = candidates(some, new.K, new.size_px, ground_seen(end.depth), MIN_OVERLAP)
         by_place = [seq for seq, _ in found]
         return list(dict.fromkeys(self._by_look(new, seqs) + by_place))[:TRIES]
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import project, rays
-from recon.posegraph.loop_closure import MIN_RAD, MIN_SHARE, LoopClosure, LoopView, landmarks, warps
+from recon.posegraph.loop_closure import MIN_RAD, MIN_SHARE, LoopClosure, LoopEnd, landmarks, warps
 from recon.tracking import matching
 from recon.types import F32, F64, I64, Bool, DepthMap, Keyframe
 
@@ -39,7 +39,7 @@ MIN_SPREAD = 0.02
 MATCHING = matching.MatchingConfig(grid=50, ambiguity=0.9, max_zssd=0.6, max_return_px=0.7)
 
 
-def verify_surfaces(a: LoopView, b: LoopView, T_a_b_guess: F64) -> LoopClosure | None:
+def verify_surfaces(a: LoopEnd, b: LoopEnd, T_a_b_guess: F64) -> LoopClosure | None:
     """The motion between two keyframes that may see the same place, or None when they do not.
 
     ``T_a_b_guess`` (4, 4) is the track's estimate. The covariance is of a left perturbation in a's
@@ -62,7 +62,7 @@ def verify_surfaces(a: LoopView, b: LoopView, T_a_b_guess: F64) -> LoopClosure |
 
 
 def _fitted(
-    a: LoopView, b: LoopView, points: F64, found: matching.Matches, guess: F64
+    a: LoopEnd, b: LoopEnd, points: F64, found: matching.Matches, guess: F64
 ) -> LoopClosure | None:
     there, known = _on_surface(b, found.uv_px.astype(np.float64))
     ok = found.ok & known
@@ -82,21 +82,21 @@ def _fitted(
     return T, covariance, float(size[0] / size[1])
 
 
-def _on_surface(view: LoopView, uv: F64) -> tuple[F64, Bool]:
+def _on_surface(one: LoopEnd, uv: F64) -> tuple[F64, Bool]:
     """(N, 3) surface points at pixels (N, 2) of the image, and where there is one."""
-    h, w = view.depth.depth_m.shape
-    H, W = view.gray.shape
+    h, w = one.depth.depth_m.shape
+    H, W = one.gray.shape
     at = np.rint((uv + 0.5) * [w / W, h / H] - 0.5)
     inside = ((at >= 0) & (at <= [w - 1, h - 1])).all(axis=1)
     at = np.clip(np.nan_to_num(at), 0, [w - 1, h - 1]).astype(np.int64)
-    z = view.depth.depth_m[at[:, 1], at[:, 0]].astype(np.float64)
-    return rays(view.K, uv) * z[:, None], np.asarray(inside & np.isfinite(z))
+    z = one.depth.depth_m[at[:, 1], at[:, 0]].astype(np.float64)
+    return rays(one.K, uv) * z[:, None], np.asarray(inside & np.isfinite(z))
 
 
-def _sigma(view: LoopView, points: F64) -> F64:
+def _sigma(one: LoopEnd, points: F64) -> F64:
     """(N,) m of a point, by its depth's median sigma and a pixel's width there."""
-    own = float(np.nanmedian(view.depth.sigma_m))
-    return np.asarray(np.hypot(own, PIXEL_SIGMA * points[:, 2] / view.K[0, 0]))
+    own = float(np.nanmedian(one.depth.sigma_m))
+    return np.asarray(np.hypot(own, PIXEL_SIGMA * points[:, 2] / one.K[0, 0]))
 
 
 def _rigid(here: F64, there: F64, sigma: F64, guess: F64) -> tuple[F64, Bool]:

@@ -16,10 +16,10 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, robust_geometry, two_view
-from recon.tracking.common_view import FEATURE_SHARES, CommonView, FeatureCache
 from recon.tracking.frame import UndistortedFrame
 from recon.tracking.keyframe_window import OdometryKeyframe, median_depth
 from recon.tracking.prediction import ConstantVelocity
+from recon.tracking.sift_features import FEATURE_SHARES, FeatureCache, FeatureMatches
 from recon.types import F64, I64, Bool, Camera, PosePrior
 
 MIN_BASE_TO_HEIGHT = 0.03
@@ -142,8 +142,8 @@ class Localiser:
         The scale is that of the keyframe's landmarks, or where none is shared of the ground
         that they lie on.
         """
-        for key, view in self._views(new, keyframes, low_frame_rate=True):
-            guess = view.predict(key.uv)
+        for key, shared in self._shared(new, keyframes, low_frame_rate=True):
+            guess = shared.predict(key.uv)
             for radius_px in self._near_px:
                 uv, ok = self._find(key, new, *guess, radius_px)
                 found = self._two_views(new, key, uv, ok)
@@ -166,17 +166,17 @@ class Localiser:
         Treetops have few corners that look alike from two places. Features follow the corners that
         are there, each place once however often it is found.
         """
-        view = self._features.fine_view((key.seq, key.pyramid[0]), (new.seq, new.small))
-        if view is None:
+        shared = self._features.match_finely((key.seq, key.pyramid[0]), (new.seq, new.small))
+        if shared is None:
             return None
         row_of = {tuple(place): row for row, place in enumerate(key.uv.tolist())}
-        rows = np.array([row_of.get(tuple(place), -1) for place in view.uv_a.tolist()])
+        rows = np.array([row_of.get(tuple(place), -1) for place in shared.uv_a.tolist()])
         fresh, uv, ok = rows < 0, uv.copy(), ok.copy()
-        uv[rows[~fresh]], ok[rows[~fresh]] = view.uv_b[~fresh], True
+        uv[rows[~fresh]], ok[rows[~fresh]] = shared.uv_b[~fresh], True
         count = int(np.count_nonzero(fresh))
-        key.uv = np.vstack([key.uv, view.uv_a[fresh]])
+        key.uv = np.vstack([key.uv, shared.uv_a[fresh]])
         key.landmark = np.concatenate([key.landmark, np.full(count, -1, np.int64)])
-        return np.vstack([uv, view.uv_b[fresh]]), np.concatenate([ok, np.ones(count, np.bool_)])
+        return np.vstack([uv, shared.uv_b[fresh]]), np.concatenate([ok, np.ones(count, np.bool_)])
 
     def _two_views(
         self, new: UndistortedFrame, key: OdometryKeyframe, uv: F64, ok: Bool
@@ -233,28 +233,28 @@ class Localiser:
         self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
     ) -> Iterator[Start]:
         """Poses by features that the frame shares with recent keyframes, the most first."""
-        for key, view in self._views(new, keyframes, low_frame_rate):
-            T_camera_odom = self._pose_by(key, view)
+        for key, shared in self._shared(new, keyframes, low_frame_rate):
+            T_camera_odom = self._pose_by(key, shared)
             if T_camera_odom is not None:
                 for share in FEATURE_SHARES:
                     yield key, T_camera_odom, share, True
 
-    def _views(
+    def _shared(
         self, new: UndistortedFrame, keyframes: Sequence[OdometryKeyframe], low_frame_rate: bool
-    ) -> list[tuple[OdometryKeyframe, CommonView]]:
+    ) -> list[tuple[OdometryKeyframe, FeatureMatches]]:
         """Recent keyframes that share features with the frame, the most first."""
-        here, views = (new.seq, new.small), []
+        here, found = (new.seq, new.small), []
         for key in keyframes[-RECALLED:]:
             there = key.seq, key.pyramid[0]
-            view = self._features.common_view(there, here, low_frame_rate)
-            if view is not None:
-                views.append((key, view))
-        return sorted(views, key=lambda item: -len(item[1]))
+            shared = self._features.match_features(there, here, low_frame_rate)
+            if shared is not None:
+                found.append((key, shared))
+        return sorted(found, key=lambda item: -len(item[1]))
 
-    def _pose_by(self, key: OdometryKeyframe, view: CommonView) -> F64 | None:
-        """T_camera_odom by the keyframe's landmarks, carried to where ``view`` says."""
+    def _pose_by(self, key: OdometryKeyframe, shared: FeatureMatches) -> F64 | None:
+        """T_camera_odom by the keyframe's landmarks, carried to where ``shared`` says."""
         known = np.flatnonzero(key.landmarks.known(key.landmark))
-        there = view.carry(key.uv[known])
+        there = shared.carry(key.uv[known])
         inside = np.all((there > 0) & (there < self.camera.size_px), axis=1)
         if inside.sum() < 12:
             return None
@@ -422,9 +422,9 @@ class Localiser:
             H = self._by_telemetry(new, first, R_b_a)
             yield *prediction.by_homography(H, first.uv), wide_px
         images = (first.seq, first.pyramid[0]), (new.seq, new.small)
-        view = self._features.common_view(*images, low_frame_rate)
-        if view is not None:
-            guess = view.predict(first.uv)
+        shared = self._features.match_features(*images, low_frame_rate)
+        if shared is not None:
+            guess = shared.predict(first.uv)
             for radius_px in self._near_px:
                 yield *guess, radius_px
 

@@ -19,7 +19,6 @@ import numpy as np
 from recon import se3
 from recon.rolling_shutter import GLOBAL_SHUTTER, NEAR_S, FrameRows, RowTrack
 from recon.tracking import matching, pnp, prediction, two_view
-from recon.tracking.common_view import FeatureCache
 from recon.tracking.focal_watch import FocalWatch
 from recon.tracking.frame import UndistortedFrame
 from recon.tracking.keyframe_window import (
@@ -43,6 +42,7 @@ from recon.tracking.localisation import (
 from recon.tracking.motion_blur import ExposureWatch
 from recon.tracking.prediction import ConstantVelocity
 from recon.tracking.readout_search import ReadoutSearch
+from recon.tracking.sift_features import FeatureCache
 from recon.types import F64, I64, Bool, Camera, PosePrior
 
 MAX_TURN_RAD = 0.25

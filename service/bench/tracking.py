@@ -10,8 +10,8 @@ import numpy as np
 from recon import se3
 from recon.camera_model import rays
 from recon.tracking import pnp
-from recon.tracking.common_view import CommonView, common_view, features
 from recon.tracking.matching import MatchingConfig, build_pyramid, harris_grid, match
+from recon.tracking.sift_features import FeatureMatches, features, match_features
 from recon.types import F32, F64, U8
 from service.bench import BenchOptions, BenchResult, compare
 
@@ -49,9 +49,9 @@ def run(options: BenchOptions) -> list[BenchResult]:
     ]  # fmt: skip
 
 
-def shared(a: U8, b: U8) -> CommonView | None:
+def shared(a: U8, b: U8) -> FeatureMatches | None:
     """Correspondences of two images, their features included."""
-    return common_view(features(a), features(b))
+    return match_features(features(a), features(b))
 
 
 def images() -> tuple[U8, U8]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from recon.parallel import run_parallel
-from recon.tracking.common_view import SIGNATURE_WIDTH_PX, alike, signature
+from recon.tracking.sift_features import SIGNATURE_WIDTH_PX, alike, signature
 from recon.types import F64, U8
 
 MOST = 200

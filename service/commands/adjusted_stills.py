@@ -23,7 +23,7 @@ from recon.calibration.tracks import pieces
 from recon.camera_model import scaled
 from recon.parallel import limit_threads
 from recon.pipeline.mapper import Mapper
-from recon.tracking.known_track import KnownTrack, KnownView
+from recon.tracking.adjusted_track import AdjustedStill, AdjustedTrack
 from recon.types import F64, U8, Camera, Frame, PosePrior
 from service.cameras.camera_file import seeks_readout, with_shutter
 from service.cameras.images import ImagesSource
@@ -218,14 +218,14 @@ def _turning(priors: Sequence[PosePrior], history: VehicleHistory) -> Turning:
     return Turning(rates, turn_sigma_rad_s(gap_s))
 
 
-def _track(found: JointAdjustment, views: dict[int, int], lens: Camera) -> KnownTrack:
+def _track(found: JointAdjustment, views: dict[int, int], lens: Camera) -> AdjustedTrack:
     """The track of ``views``: rows of ``found`` by the number of the frame."""
     rows, known = found.seen.view, np.asarray(np.isfinite(found.points).all(axis=1))
     number = np.cumsum(known) - 1
     shown = known[found.seen.landmark]
-    return KnownTrack(
+    return AdjustedTrack(
         {
-            seq: KnownView(
+            seq: AdjustedStill(
                 found.poses[k], found.steps[k], found.rates[k], found.turn_covariances[k],
                 number[found.seen.landmark[shown & (rows == k)]],
             )

@@ -12,7 +12,7 @@ from recon.parallel import limit_threads
 from recon.pipeline.config import Baseline, MapperConfig
 from recon.pipeline.mapper import Mapper, Reconstruct, Reconstructed
 from recon.pipeline.views import StereoView
-from recon.tracking.known_track import KnownTrack
+from recon.tracking.adjusted_track import AdjustedTrack
 from recon.types import Camera
 from service.background import BackgroundWorker
 from service.cameras.camera_file import seeks_readout, with_shutter
@@ -65,7 +65,7 @@ class Pipeline:
         backend: Backend,
         pages: Path,
         live: bool = False,
-        known: KnownTrack | None = None,
+        known: AdjustedTrack | None = None,
     ) -> None:
         """Raises ValueError for an unusable camera model.
 

@@ -22,7 +22,7 @@ from recon.backends import Backend
 from recon.pipeline.events import Event as MapperEvent
 from recon.pipeline.events import FramePosed
 from recon.posegraph.pose_priors import VelocityIntegrator
-from recon.tracking.known_track import KnownTrack
+from recon.tracking.adjusted_track import AdjustedTrack
 from recon.types import Camera, Frame, Keyframe, Pose, PosePrior, Shutter
 from service.cameras.camera_file import shutter_document, with_shutter
 from service.cameras.lens import MAX_FOCAL
@@ -80,7 +80,7 @@ class ScanInputs:
     sigma_focal: float = 0.0  # of the focal length, as a share; 0: a calibrated camera
     extra: dict[str, Any] = field(default_factory=dict)  # goes into scan.json
     latency_ms: float | None = None  # the camera's as an earlier scan found it
-    known: KnownTrack | None = None  # takes the odometry's place
+    known: AdjustedTrack | None = None  # takes the odometry's place
     warn: Callable[[str], None] = log.warning  # the operator
     on_frame: Callable[[FramePosed, VehicleState | None], None] | None = None
     on_keyframe: Callable[[Keyframe], None] | None = None

@@ -21,7 +21,13 @@ from recon.camera_model import Undistorter, rays, scaled
 from recon.surface.hole_filling import outlined
 from recon.surface.splats import COVERED, Splats, rendered
 from recon.tracking import pnp
-from recon.tracking.common_view import FINE_MOST, FINE_WIDTH_PX, Features, common_view, features
+from recon.tracking.sift_features import (
+    FINE_MOST,
+    FINE_WIDTH_PX,
+    Features,
+    features,
+    match_features,
+)
 from recon.types import F32, F64, I64, U8, Bool, Camera, Keyframe
 from service.cameras.images import ImagesSource
 from service.errors import InputError
@@ -176,7 +182,7 @@ def placed(
     )
     points, pixels = [np.zeros((0, 3))], [np.zeros((0, 2))]
     for k in sorted(keyframes, key=lambda k: abs(k.time_ns - time_ns))[:NEIGHBOURS]:
-        shared = common_view(features_of(k), there)
+        shared = match_features(features_of(k), there)
         if shared is None:
             continue
         u, v = np.rint(shared.uv_a).astype(int).T

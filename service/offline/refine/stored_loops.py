@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from recon import se3
 from recon.posegraph.ground_control import KeyframeTrack
-from recon.posegraph.loop_closure import LoopView, candidates, ground_seen
+from recon.posegraph.loop_closure import LoopEnd, candidates, ground_seen
 from recon.posegraph.records import Loop
 from recon.posegraph.submap_loops import filled, verify_surfaces
 from recon.types import F64, Keyframe
@@ -44,7 +44,7 @@ LOOP_SCALE = 0.005
 """Sigma of a loop's length, as a share of it, from the scale of the depths that gave it."""
 
 
-class FilledViews:
+class LoopEnds:
     """Keyframes of one track, each filled with what its neighbours on the same stretch add."""
 
     def __init__(
@@ -55,7 +55,7 @@ class FilledViews:
         self._keyframe = keyframe
         self._view = lru_cache(maxsize=held)(self._filled)
 
-    def view(self, k: int, reach: int = NEIGHBOURS) -> LoopView | None:
+    def end(self, k: int, reach: int = NEIGHBOURS) -> LoopEnd | None:
         """A keyframe with what ``reach`` neighbours on each side add; None without any surface."""
         return self._view(k, max(k - reach, 0), min(k + reach + 1, len(self.stretches)))
 
@@ -64,7 +64,7 @@ class FilledViews:
         found = self._keyframe(k)
         return found if found is not None and np.isfinite(found.depth.depth_m).any() else None
 
-    def _filled(self, k: int, first: int, end: int) -> LoopView | None:
+    def _filled(self, k: int, first: int, end: int) -> LoopEnd | None:
         own = self.at(k)
         if own is None:
             return None
@@ -72,24 +72,24 @@ class FilledViews:
         others = [self.at(j) for j in nearby]
         whole = filled(own, [one for one in others if one is not None])
         gray = np.asarray(cv2.cvtColor(whole.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-        return LoopView(gray, whole.depth.K, whole.depth)
+        return LoopEnd(gray, whole.depth.K, whole.depth)
 
 
-def likely(view: LoopView, poses: Mapping[int, F64]) -> list[int]:
-    """Numbers of the ``poses`` that see what ``view``, of the last of them, sees, best first; few
+def likely(end: LoopEnd, poses: Mapping[int, F64]) -> list[int]:
+    """Numbers of the ``poses`` that see what ``end``, of the last of them, sees, best first; few
     are worth a look."""
-    size_px = view.depth.depth_m.shape[::-1]
-    found = candidates(poses, view.K, size_px, ground_seen(view.depth), MIN_OVERLAP)
+    size_px = end.depth.depth_m.shape[::-1]
+    found = candidates(poses, end.K, size_px, ground_seen(end.depth), MIN_OVERLAP)
     return [a for a, _ in found[:TRIES]]
 
 
 def verified(
-    a: int, b: int, views: tuple[LoopView | None, LoopView | None], guess: F64
+    a: int, b: int, ends: tuple[LoopEnd | None, LoopEnd | None], guess: F64
 ) -> Loop | None:
     """The loop between the keyframes ``a`` and ``b``, by what they see."""
-    if views[0] is None or views[1] is None:
+    if ends[0] is None or ends[1] is None:
         return None
-    found = verify_surfaces(views[0], views[1], guess)
+    found = verify_surfaces(ends[0], ends[1], guess)
     if found is None:
         return None
     T_a_b, covariance, growth = found
@@ -113,7 +113,7 @@ class StoredLoops:
         self._track, self._min_gap = track, min_gap
         self._scans = scans
         pauses = np.diff(track.times_s, prepend=track.times_s[0])
-        self._views = FilledViews(keyframe, np.cumsum(pauses > BREAK_S).tolist())
+        self._ends = LoopEnds(keyframe, np.cumsum(pauses > BREAK_S).tolist())
 
     def find(self, progress: Progress | None = None) -> list[Loop]:
         """All pairs far apart in time that see the same place, verified."""
@@ -128,7 +128,7 @@ class StoredLoops:
 
     def _near(self, b: int, tree: cKDTree) -> list[list[int]]:
         """Earlier keyframes near ``b``, those of each other scan by themselves."""
-        own = self._views.at(b)
+        own = self._ends.at(b)
         if own is None:
             return []
         near = tree.query_ball_point(self._track.poses[b, :2, 3], reach_m(own))
@@ -141,21 +141,21 @@ class StoredLoops:
 
     def _likely(self, b: int, earlier: Sequence[int]) -> list[int]:
         """Those of the ``earlier`` keyframes that see what ``b`` sees, best first."""
-        view = self._views.view(b) if earlier else None
-        if view is None:
+        end = self._ends.end(b) if earlier else None
+        if end is None:
             return []
         poses = {a: self._track.poses[a] for a in (*earlier, b)}
-        return likely(view, poses)
+        return likely(end, poses)
 
     def _verified(self, a: int, b: int) -> Loop | None:
         reach = self._reach(a, b)
-        views = self._views.view(a, reach), self._views.view(b, reach)
+        ends = self._ends.end(a, reach), self._ends.end(b, reach)
         guess = se3.inverse(self._track.poses[a]) @ self._track.poses[b]
-        return verified(a, b, views, guess)
+        return verified(a, b, ends, guess)
 
     def _reach(self, a: int, b: int) -> int:
         """Neighbours to fill each of two views with, so that they share none."""
-        if self._views.stretches[a] != self._views.stretches[b]:
+        if self._ends.stretches[a] != self._ends.stretches[b]:
             return NEIGHBOURS
         return next((n for n in (NEIGHBOURS, NEIGHBOURS // 2, 2, 1) if 2 * n < b - a), 0)
 

@@ -24,7 +24,7 @@ from service.georeference import LocalFrame
 from service.offline.refine.stored_loops import (
     BREAK_S,
     LOOPS_PER_KEYFRAME,
-    FilledViews,
+    LoopEnds,
     likely,
     reach_m,
     verified,
@@ -90,7 +90,7 @@ class FollowedScan:
         self._last_ns = 0
         self._corrections: tuple[int | None, ...] = ()
         self._keyframe = lru_cache(maxsize=HELD)(lambda seq, _: self.store.keyframe(seq))
-        self.views = FilledViews(self._at, self._stretches, HELD)
+        self.ends = LoopEnds(self._at, self._stretches, HELD)
 
     def key(self, k: int) -> int:
         """The number, among all scans, of its keyframe at place ``k``."""
@@ -204,7 +204,7 @@ class LiveSite:
         if not one.due:
             return
         k = one.due.pop()
-        own = one.views.at(k)
+        own = one.ends.at(k)
         if own is None:
             return
         here, near_m = one.moved()[k], reach_m(own)
@@ -219,18 +219,18 @@ class LiveSite:
         self, one: FollowedScan, k: int, other: FollowedScan, poses: dict[int, F64]
     ) -> None:
         """Keep the loops of a keyframe, at ``poses[STRIDE]``, with another scan's."""
-        view, found = one.views.view(k), 0
-        if view is None:
+        end, found = one.ends.end(k), 0
+        if end is None:
             return
-        for a in likely(view, poses):
+        for a in likely(end, poses):
             first, second = sorted(((other, a), (one, k)), key=lambda end: end[0].number)
             ends = first[0].key(first[1]), second[0].key(second[1])
             if ends in self._loops or found == LOOPS_PER_KEYFRAME:
                 continue
-            views = first[0].views.view(first[1]), second[0].views.view(second[1])
+            pair = first[0].ends.end(first[1]), second[0].ends.end(second[1])
             T_a_b = se3.inverse(poses[a]) @ poses[STRIDE]
             guess = T_a_b if second[0] is one else se3.inverse(T_a_b)
-            loop, there = verified(*ends, views, guess), second[0].views.at(second[1])
+            loop, there = verified(*ends, pair, guess), second[0].ends.at(second[1])
             if loop is not None and there is not None:
                 self._keep(replace(loop, ratio=1.0), corners(there))
                 found += 1

@@ -14,7 +14,7 @@ import scipy.ndimage as ndi
 from recon import se3
 from recon.camera_model import rays, scaled_K
 from recon.posegraph import loop_search
-from recon.posegraph.loop_closure import LoopView, candidates, ground_seen, verify
+from recon.posegraph.loop_closure import LoopEnd, candidates, ground_seen, verify
 from recon.posegraph.loop_search import LoopSearch
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Trajectory
@@ -47,7 +47,7 @@ def camera(x: float, y: float, z: float, yaw: float) -> F64:
     return se3.compose(NADIR @ turn, np.array([x, y, z]))
 
 
-def view(T: F64, seed: int = 0, ground: int = 1, sigma_m: float = 0.08) -> LoopView:
+def view(T: F64, seed: int = 0, ground: int = 1, sigma_m: float = 0.08) -> LoopEnd:
     """An image with noise and a depth map at half its size with noise."""
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(np.float64)
@@ -68,7 +68,7 @@ def view(T: F64, seed: int = 0, ground: int = 1, sigma_m: float = 0.08) -> LoopV
     depth = t.reshape(SIZE[1], SIZE[0])
     small = cv2.resize(depth, (320, 180), interpolation=cv2.INTER_AREA)
     small = small + rng.normal(size=small.shape) * sigma_m
-    return LoopView(
+    return LoopEnd(
         gray, K,
         DepthMap(
             small.astype(np.float32), np.full(small.shape, sigma_m, np.float32),
@@ -176,19 +176,19 @@ def test_the_same_image_over_another_relief_is_no_loop() -> None:
     other = DepthMap(
         bent.astype(np.float32), b.depth.sigma_m, b.depth.views, b.depth.K, b.depth.T_world_camera
     )
-    assert verify(a, LoopView(b.gray, K, other), se3.inverse(A) @ B) is None
+    assert verify(a, LoopEnd(b.gray, K, other), se3.inverse(A) @ B) is None
 
 
 def test_without_texture_or_depth_there_is_no_loop() -> None:
     B = camera(3.0, 2.0, 40.0, 0.2)
     a, b, guess = view(A, 1), view(B, 2), se3.inverse(A) @ B
-    blank = LoopView(np.full_like(a.gray, 120), K, a.depth)
+    blank = LoopEnd(np.full_like(a.gray, 120), K, a.depth)
     hollow = DepthMap(
         np.full_like(a.depth.depth_m, np.nan), a.depth.sigma_m, a.depth.views, a.depth.K, np.eye(4)
     )
     assert verify(blank, b, guess) is None
     assert verify(a, blank, guess) is None
-    assert verify(LoopView(a.gray, K, hollow), b, guess) is None
+    assert verify(LoopEnd(a.gray, K, hollow), b, guess) is None
 
 
 def lawnmower() -> dict[int, F64]:

@@ -11,7 +11,7 @@ import scipy.ndimage as ndi
 from recon import se3
 from recon.camera_model import rays
 from recon.posegraph.ground_control import KeyframeTrack, adjust, supported
-from recon.posegraph.loop_closure import LoopView
+from recon.posegraph.loop_closure import LoopEnd
 from recon.posegraph.records import Loop
 from recon.posegraph.submap_loops import filled, verify_surfaces
 from recon.types import F64, DepthMap, Keyframe, Pose
@@ -81,8 +81,8 @@ def _legs() -> list[F64]:
     return there + [_oblique(40.0 - 7.0 * k, 12.0, True) for k in range(5)]
 
 
-def _view(one: Keyframe) -> LoopView:
-    return LoopView(one.bgr[..., 0], one.depth.K, one.depth)
+def _view(one: Keyframe) -> LoopEnd:
+    return LoopEnd(one.bgr[..., 0], one.depth.K, one.depth)
 
 
 def test_a_view_is_filled_with_what_its_neighbours_measured() -> None:

@@ -14,7 +14,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from paths import SHARED
 
-from recon.tracking.common_view import common_view, features
 from recon.tracking.matching import (
     HARRIS_K,
     PATCH_RADIUS_PX,
@@ -24,6 +23,7 @@ from recon.tracking.matching import (
     harris_grid,
     match,
 )
+from recon.tracking.sift_features import features, match_features
 from recon.types import F64, U8, Bool
 
 CALITERRA = SHARED / "caliterra_nadir" / "frames"
@@ -297,7 +297,7 @@ def test_wrong_shapes_are_named() -> None:
 @pytest.mark.slow
 def test_any_turn_and_zoom_is_found(angle: float, scale: float, du: float, dv: float) -> None:
     a, b, A, t = turned(angle, scale, (du, dv))
-    view = common_view(features(a), features(b))
+    view = match_features(features(a), features(b))
     assert view is not None
     grid = np.array([[250.0, 180.0], [350.0, 180.0], [300.0, 225.0], [300.0, 270.0]])
     assert np.linalg.norm(view.carry(grid) - (grid @ A.T + t), axis=1).max() < 4.0
@@ -305,7 +305,7 @@ def test_any_turn_and_zoom_is_found(angle: float, scale: float, du: float, dv: f
 
 def test_a_common_view_is_a_start_for_matching() -> None:
     a, b, A, t = turned(100.0, 1.0, (60.0, -40.0))
-    view = common_view(features(a), features(b))
+    view = match_features(features(a), features(b))
     assert view is not None
     corners = harris_grid(a, CONFIG)[:, :2].astype(np.float64)
     there, warp = view.predict(corners)
@@ -317,9 +317,9 @@ def test_a_common_view_is_a_start_for_matching() -> None:
 
 def test_strangers_share_nothing() -> None:
     images = [features(gray(ground(300, 400, seed=i))) for i in range(8)]
-    assert all(common_view(a, b) is None for a, b in itertools.combinations(images, 2))
+    assert all(match_features(a, b) is None for a, b in itertools.combinations(images, 2))
     blank = features(np.full((300, 400), 90, np.uint8))
-    assert len(blank.uv_px) == 0 and common_view(blank, images[0]) is None
+    assert len(blank.uv_px) == 0 and match_features(blank, images[0]) is None
 
 
 @pytest.mark.skipif(not CALITERRA.is_dir(), reason="caliterra_nadir is not here")
@@ -331,7 +331,7 @@ def test_real_stills_obey_one_epipolar_geometry(first: str, second: str) -> None
         np.asarray(cv2.imread(str(next(CALITERRA.glob(f"*{n}*"))), cv2.IMREAD_GRAYSCALE), np.uint8)
         for n in (first, second)
     )
-    view = common_view(features(a), features(b))
+    view = match_features(features(a), features(b))
     assert view is not None
     corners = harris_grid(a, CONFIG)[:, :2].astype(np.float64)
     there, warp = view.predict(corners)

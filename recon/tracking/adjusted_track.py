@@ -22,23 +22,23 @@ KEPT = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class KnownView:
+class AdjustedStill:
     """Where a still was taken, and what it shows."""
 
     T_odom_camera: F64  # (4, 4) of its middle row, m
-    covariance: F64  # (6, 6) of the motion from the view before, left of T_here_before
+    covariance: F64  # (6, 6) of the motion from the still before, left of T_here_before
     rate: F64  # (6,) of T_camera_odom per s; unused under a global shutter
     turn_covariance: F64  # (3, 3) of its rotation
     landmark: I64  # (n,) which of the points it shows
 
 
-class KnownTrack:
+class AdjustedTrack:
     """Takes frames as :class:`recon.tracking.odometry.Odometry` does, and says what is known."""
 
     def __init__(
-        self, views: Mapping[int, KnownView], points: F64, lens: Camera, sigma_readout_s: float
+        self, stills: Mapping[int, AdjustedStill], points: F64, lens: Camera, sigma_readout_s: float
     ) -> None:
-        """``views`` by the number of the frame; ``points`` (P, 3) m are finite.
+        """``stills`` by the number of the frame; ``points`` (P, 3) m are finite.
 
         ``lens`` is the camera with its distortion and shutter; ``sigma_readout_s`` is 0 for one
         that was given.
@@ -48,10 +48,10 @@ class KnownTrack:
         clock = RowClock(lens)
         self.readout = ReadoutSearch(clock, lens.K) if sigma_readout_s else None
         if self.readout is not None:  # and its search is over
-            known = lens.shutter.readout_s, sigma_readout_s, len(views)
+            known = lens.shutter.readout_s, sigma_readout_s, len(stills)
             self.readout.estimate = ReadoutEstimate(*known)
         self.K = lens.K
-        self._views, self._landmarks = views, Landmarks()
+        self._stills, self._landmarks = stills, Landmarks()
         self._landmarks.add(points)
         self._clock = clock if lens.shutter.readout_s else None
 
@@ -63,24 +63,24 @@ class KnownTrack:
 
     def track(self, frame: UndistortedFrame) -> Tracked:
         seq, time_ns, prior = frame.seq, frame.time_ns, frame.prior
-        view = self._views.get(seq)
-        if view is None:
+        still = self._stills.get(seq)
+        if still is None:
             return Tracked(Tracking.LOST, self.segment, reason="not tied to other stills")
         state = Tracking.KEYFRAME if self.keyframes else Tracking.STARTED
         self.segment = 0
-        T_camera_odom = se3.inverse(view.T_odom_camera)
+        T_camera_odom = se3.inverse(still.T_odom_camera)
         rows = None
         if self._clock is not None:
             spread = np.zeros((6, 6))
-            spread[:3, :3] = view.turn_covariance
-            rows = Rows(self._clock, view.rate, np.zeros(6), spread)
+            spread[:3, :3] = still.turn_covariance
+            rows = Rows(self._clock, still.rate, np.zeros(6), spread)
         row_motion = FrameRows(time_ns, prior, T_camera_odom, rows, is_measured=True)
         key = OdometryKeyframe(
-            seq, 0, T_camera_odom, view.covariance, prior, frame.pyramid,
-            np.zeros((len(view.landmark), 2)), view.landmark, self._landmarks, row_motion,
+            seq, 0, T_camera_odom, still.covariance, prior, frame.pyramid,
+            np.zeros((len(still.landmark), 2)), still.landmark, self._landmarks, row_motion,
         )  # fmt: skip
         self.keyframes = [*self.keyframes[1 - KEPT :], key]
-        return Tracked(state, 0, view.T_odom_camera, len(view.landmark), row_motion=row_motion)
+        return Tracked(state, 0, still.T_odom_camera, len(still.landmark), row_motion=row_motion)
 
 
-AnyTrack = Odometry | KnownTrack
+AnyTrack = Odometry | AdjustedTrack

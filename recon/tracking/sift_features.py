@@ -44,7 +44,7 @@ they are tried: where texture repeats, as the rows of a field do, a wide search 
 as good."""
 
 SIGNATURE_WIDTH_PX, SIGNATURE, SIGNATURE_STEPS = 320, 200, 400.0
-"""Image width and number of features that describe a view's appearance, and levels of a
+"""Image width and number of features that describe the look of an image, and levels of a
 descriptor's byte."""
 
 KEPT = 16
@@ -61,7 +61,7 @@ class Features:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CommonView:
+class FeatureMatches:
     """The ground that two images share, as a homography and the matches that follow it."""
 
     H: F64  # (3, 3) pixels of image a to pixels of image b
@@ -126,7 +126,7 @@ def features(
     return Features((uv + 0.5) * scale - 0.5, np.asarray(root, np.float32), W)
 
 
-def common_view(a: Features, b: Features) -> CommonView | None:
+def match_features(a: Features, b: Features) -> FeatureMatches | None:
     """The features that images ``a`` and ``b`` share, or None when none are certain."""
     rows_a, rows_b = mutual(a.descriptors, b.descriptors)
     if len(rows_a) < MIN_MATCHES:
@@ -140,7 +140,7 @@ def common_view(a: Features, b: Features) -> CommonView | None:
         return None
     if not _is_sound(H, uv_a[good]):
         return None
-    return CommonView(H, uv_a[good], uv_b[good], a.width_px)
+    return FeatureMatches(H, uv_a[good], uv_b[good], a.width_px)
 
 
 def mutual(a: F32, b: F32) -> tuple[np.ndarray, np.ndarray]:
@@ -190,19 +190,19 @@ class FeatureCache:
         self._kept = kept
         self._of: dict[tuple[int, int], Features] = {}
 
-    def common_view(
+    def match_features(
         self, a: tuple[int, U8], b: tuple[int, U8], low_frame_rate: bool
-    ) -> CommonView | None:
+    ) -> FeatureMatches | None:
         """What two images, each by number and pixels (H, W), share, or None.
 
         Stills are compared in finer detail where they need it: they are few and far apart.
         """
-        view = common_view(self.of(*a), self.of(*b))
-        return self.fine_view(a, b) if view is None and low_frame_rate else view
+        shared = match_features(self.of(*a), self.of(*b))
+        return self.match_finely(a, b) if shared is None and low_frame_rate else shared
 
-    def fine_view(self, a: tuple[int, U8], b: tuple[int, U8]) -> CommonView | None:
+    def match_finely(self, a: tuple[int, U8], b: tuple[int, U8]) -> FeatureMatches | None:
         """The same in fine detail."""
-        return common_view(*(self.of(*image, FINE_WIDTH_PX, FINE_MOST) for image in (a, b)))
+        return match_features(*(self.of(*image, FINE_WIDTH_PX, FINE_MOST) for image in (a, b)))
 
     def of(self, seq: int, gray: U8, width_px: int = WIDTH_PX, most: int = MOST) -> Features:
         """Features of image ``seq``, which is ``gray`` (H, W)."""

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from painted_ground import pose, still
 
-from recon.tracking import common_view
-from recon.tracking.common_view import (
+from recon.tracking import sift_features
+from recon.tracking.sift_features import (
     FeatureCache,
     Features,
     alike,
@@ -53,7 +53,7 @@ def test_a_cache_forgets_what_was_not_asked_for_longest(monkeypatch: pytest.Monk
         made.append(int(gray[0, 0]))
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), 16)
 
-    monkeypatch.setattr(common_view, "features", counted)
+    monkeypatch.setattr(sift_features, "features", counted)
     cache = FeatureCache(kept=2)
     for number in (0, 1, 0, 2, 0, 1):
         cache.of(number, np.full((16, 16), number, np.uint8))
@@ -87,8 +87,8 @@ def textured(shared_px: float, own_px: float, own: float) -> list[U8]:
 def test_stills_that_share_fine_detail_alone_are_compared_in_fine_detail() -> None:
     a, b = enumerate(textured(shared_px=1.8, own_px=8.0, own=20.0))
     cache = FeatureCache()
-    assert cache.common_view(a, b, low_frame_rate=False) is None
-    view = cache.common_view(a, b, low_frame_rate=True)
+    assert cache.match_features(a, b, low_frame_rate=False) is None
+    view = cache.match_features(a, b, low_frame_rate=True)
     assert view is not None
     np.testing.assert_allclose(view.carry(np.array([[640.0, 360.0]])), [[540.0, 360.0]], atol=2.0)
 
@@ -96,7 +96,7 @@ def test_stills_that_share_fine_detail_alone_are_compared_in_fine_detail() -> No
 def test_masses_tie_images_whose_leaves_differ() -> None:
     a, b = textured(shared_px=16.0, own_px=2.0, own=30.0)
     largest, strongest = (
-        common_view.common_view(*(features(image, are_strongest=one) for image in (a, b)))
+        sift_features.match_features(*(features(image, are_strongest=one) for image in (a, b)))
         for one in (False, True)
     )
     assert largest is not None
@@ -110,7 +110,7 @@ def test_a_place_is_carried_as_far_off_the_plane_as_the_matches_next_to_it() -> 
     """A roof 5 px off the ground's homography, seen by three of six matches."""
     uv_a = np.array([[100.0, 100], [104, 100], [100, 104], [600, 400], [604, 400], [600, 404]])
     off = np.array([[5.0, 0.0]] * 3 + [[0.0, 0.0]] * 3)
-    view = common_view.CommonView(np.eye(3), uv_a, uv_a + off, 640)
+    view = sift_features.FeatureMatches(np.eye(3), uv_a, uv_a + off, 640)
     carried = view.carry(np.array([[101.0, 101.0], [601.0, 401.0], [350.0, 250.0]]))
     np.testing.assert_allclose(carried, [[106.0, 101.0], [601.0, 401.0], [350.0, 250.0]])
 
@@ -125,7 +125,7 @@ def test_mutual_matches_are_those_of_a_search_both_ways() -> None:
     expected = []
     for i, row in enumerate(apart):
         j = int(row.argmin())
-        if row[j] < common_view.RATIO * np.delete(row, j).min() and apart[:, j].argmin() == i:
+        if row[j] < sift_features.RATIO * np.delete(row, j).min() and apart[:, j].argmin() == i:
             expected.append((i, j))
     rows_a, rows_b = mutual(a.astype(np.float32), b.astype(np.float32))
     assert 20 < len(expected) < 30
