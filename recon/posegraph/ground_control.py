@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from recon import se3
-from recon.posegraph.records import Loop, loops_agree
+from recon.posegraph.records import CHI2_LIMIT, LOOP_WINDOW, Loop, loops_agree
 from recon.posegraph.site_alignment import ScanSimilarity
 from recon.posegraph.smoother import (
     NO_SCALE,
@@ -28,9 +28,6 @@ from recon.posegraph.smoother import (
 )
 from recon.table import Rows
 from recon.types import F64, Bool, PosePrior
-
-CHI2_LIMIT = 22.5
-"""99.9 % of chi-square with six degrees of freedom: loops beyond it are left out."""
 
 ATTITUDE_S, FIX_S = 40.0, 60.0
 """Errors of attitude and fixes wander with these time constants."""
@@ -147,10 +144,8 @@ def adjust(
     return Adjusted(*problem.states(), problem.residuals(), refused)
 
 
-def supported(
-    loops: Sequence[Loop], poses: F64 | Mapping[int, F64], window: int = 15
-) -> list[Loop]:
-    """Those loops that another one confirms, whose ends lie within ``window`` keyframes.
+def supported(loops: Sequence[Loop], poses: F64 | Mapping[int, F64]) -> list[Loop]:
+    """Those loops that another one confirms, whose ends lie within LOOP_WINDOW keyframes.
 
     Both, joined by the track between their ends (trusted to 3 % of its length), must close on
     themselves. Repeated texture gives perfect matches at the wrong place, but not twice alike.
@@ -158,8 +153,8 @@ def supported(
     out = []
     for one in loops:
         for other in loops:
-            near = abs(one.a - other.a) <= window and abs(one.b - other.b) <= window
-            if near and (one.a, one.b) != (other.a, other.b) and _agree(one, other, poses):
+            apart = max(abs(one.a - other.a), abs(one.b - other.b))
+            if 0 < apart <= LOOP_WINDOW and _agree(one, other, poses):
                 out.append(one)
                 break
     return out
@@ -168,7 +163,7 @@ def supported(
 def _agree(one: Loop, other: Loop, poses: F64 | Mapping[int, F64]) -> bool:
     T_a_a = se3.inverse(poses[one.a]) @ poses[other.a]
     T_b_b = se3.inverse(poses[other.b]) @ poses[one.b]
-    return loops_agree(one, other, T_a_a, T_b_b, CHI2_LIMIT)
+    return loops_agree(one, other, T_a_a, T_b_b)
 
 
 def map_position(poses: F64, scales: F64, marks: Sequence[Mark]) -> tuple[F64, float] | None:

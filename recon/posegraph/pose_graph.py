@@ -17,9 +17,9 @@ import numpy as np
 
 from recon import parallel, se3
 from recon.posegraph.factors import HUBER_SIGMAS, MotionFactors, ReadingFactors
-from recon.posegraph.loop_verification import LoopVerification
+from recon.posegraph.loop_verification import LoopVerification, is_explained
 from recon.posegraph.pose_priors import is_frozen, sound
-from recon.posegraph.records import Loop, Node, PoseGraphConfig
+from recon.posegraph.records import LOOP_WINDOW, Loop, Node, PoseGraphConfig, loops_agree
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_offsets import Constants
 from recon.posegraph.smoother import (
@@ -61,7 +61,7 @@ class PoseGraph:
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
         self.segments = Segments(self.config)
-        self.loops = LoopVerification(self)
+        self.loops = LoopVerification()
         self._built = 0
         self._start()
 
@@ -123,7 +123,10 @@ class PoseGraph:
         scale = self.scale(a)
         ratio = growth * self.scale(b) / scale
         loop = Loop(a, b, T_a_b, covariance, ratio).scaled(1.0 / scale)
-        fresh = self.loops.offer(loop)
+        if not self._is_possible(loop):
+            self.loops.counts["loop impossible"] += 1
+            return False
+        fresh = self.loops.offer(loop, self._agree)
         if not fresh:
             return False
         if self._tie(loop):
@@ -139,7 +142,7 @@ class PoseGraph:
         for segment in self.segments:
             segment.forget()
             self.segments.refit(segment, self._smoother.pose)
-            loops = self.loops.into(segment.number)
+            loops = [one for one in self.loops.taken if self._enters(one, segment.number)]
             if loops and not segment.is_tied:
                 self.rebuild()  # so that the segments before are where they belong
                 for loop in loops:
@@ -188,14 +191,6 @@ class PoseGraph:
 
     def __len__(self) -> int:
         return len(self._nodes)
-
-    def place(self, seq: int) -> F64:
-        """(4, 4) T_world_camera of keyframe ``seq``."""
-        return self._smoother.pose(self._nodes[seq].key)
-
-    def path_m(self, a: int, b: int) -> float:
-        """Metres flown from keyframe ``a`` to the later ``b``."""
-        return self._path[self._nodes[b].key] - self._path[self._nodes[a].key]
 
     def pose(self, seq: int) -> Pose:
         """The pose of keyframe ``seq`` with its covariance and sources."""
@@ -333,10 +328,40 @@ class PoseGraph:
 
     # ---- loops ---------------------------------------------------------------------------------
 
+    def _enters(self, loop: Loop, segment: int) -> bool:
+        """True when the loop leads from an earlier segment into this one."""
+        return self._nodes[loop.b].segment == segment != self._nodes[loop.a].segment
+
+    def _is_possible(self, loop: Loop) -> bool:
+        """False when a loop within a segment is off by more than vision can drift."""
+        a, b = self._nodes[loop.a], self._nodes[loop.b]
+        if a.segment != b.segment:
+            return True
+        T = se3.inverse(self._smoother.pose(a.key)) @ self._smoother.pose(b.key)
+        path_m = self._path[b.key] - self._path[a.key]
+        return is_explained(loop.scaled(self.scale(loop.a)), T, path_m)
+
+    def _agree(self, one: Loop, other: Loop) -> bool:
+        """True when two loops, joined by the track between their ends, close on themselves."""
+        pairs = list(zip(one.ends, other.ends, strict=True))
+        if one.ends == other.ends or not all(self._are_near(*pair) for pair in pairs):
+            return False
+        (a, a_other), (b, b_other) = (
+            [self._smoother.pose(self._nodes[seq].key) for seq in pair] for pair in pairs
+        )
+        T_a_a, T_b_b = se3.inverse(a) @ a_other, se3.inverse(b_other) @ b
+        T_b_b[:3, 3] *= one.ratio * self.scale(one.a) / self.scale(one.b)
+        one, other = one.scaled(self.scale(one.a)), other.scaled(self.scale(other.a))
+        return loops_agree(one, other, T_a_a, T_b_b)
+
+    def _are_near(self, seq: int, other: int) -> bool:
+        one, two = self._nodes[seq], self._nodes[other]
+        return one.segment == two.segment and abs(one.key - two.key) <= LOOP_WINDOW
+
     def _tie(self, loop: Loop) -> bool:
         """True when a loop between segments now places the later one, which no fix does."""
         a, b = self._nodes[loop.a], self._nodes[loop.b]
-        if not self.loops.enters(loop, b.segment) or self.segments[b.segment].is_tied:
+        if not self._enters(loop, b.segment) or self.segments[b.segment].is_tied:
             return False
         scale = self.scale(loop.a)
         T = self._smoother.pose(a.key) @ loop.scaled(scale).T_a_b

@@ -81,11 +81,18 @@ class Loop:
         return replace(self, T_a_b=T, covariance=self.covariance * np.outer(units, units))
 
 
-def loops_agree(one: Loop, other: Loop, T_a_a: F64, T_b_b: F64, limit: float) -> bool:
+LOOP_WINDOW = 15
+"""Keyframes within which two loops support each other: between those, vision is trusted."""
+
+CHI2_LIMIT = 22.5
+"""99.9 % of chi-square with six degrees of freedom."""
+
+
+def loops_agree(one: Loop, other: Loop, T_a_a: F64, T_b_b: F64) -> bool:
     """True when two loops, joined by the track between their ends, close on themselves.
 
     ``T_a_a`` takes the other's first camera to the one's, ``T_b_b`` the one's second to the
-    other's. The track is trusted to 3 % of its length; ``limit`` is of chi-square.
+    other's. The track is trusted to 3 % of its length.
     """
     circle = T_a_a @ other.T_a_b @ T_b_b @ se3.inverse(one.T_a_b)
     length = float(np.linalg.norm(T_a_a[:3, 3]) + np.linalg.norm(T_b_b[:3, 3]))
@@ -93,4 +100,4 @@ def loops_agree(one: Loop, other: Loop, T_a_a: F64, T_b_b: F64, limit: float) ->
     slack = np.diag([0.01**2] * 3 + [(0.03 * length + 0.02) ** 2] * 3)
     covariance = one.covariance + A @ other.covariance @ A.T + slack
     error = se3.log(circle)
-    return bool(error @ np.linalg.solve(covariance, error) < limit)
+    return bool(error @ np.linalg.solve(covariance, error) < CHI2_LIMIT)

@@ -14,7 +14,7 @@ from doc_pages import FENCE, PAGES, text_of
 from paths import ROOT
 from trial_rig import Table
 
-from recon.posegraph import factors, loop_verification
+from recon.posegraph import factors, loop_verification, records
 from recon.posegraph.alignment import HUBER as MIN_FIT_SIGMAS
 from recon.posegraph.alignment import WILD
 from recon.posegraph.pose_graph import SIGMA_LOOP_SCALE, PoseGraph, PoseGraphConfig
@@ -109,8 +109,8 @@ def test_the_page_on_the_pose_graph_has_the_factors_and_numbers_of_the_code() ->
         f"{factors.ALTITUDE_SLACK_M:.0f} m further off",
         f"{loop_verification.SLACK_M:.0f} m and {loop_verification.DRIFT * 100:.0f} % of the path",
         f"{loop_verification.MAX_TURN_RAD} rad; and",
-        f"within {loop_verification.WINDOW} keyframes",
-        f"below {loop_verification.CHI2_LIMIT}",
+        f"within {records.LOOP_WINDOW} keyframes",
+        f"below {records.CHI2_LIMIT}",
         f"from {TAUS_S[0]:.0f} to {TAUS_S[-1]:.0f} s",
         f"{PRECISE_TAU_S:.0f} s for RTK",
     ):

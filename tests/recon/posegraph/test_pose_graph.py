@@ -318,7 +318,7 @@ def test_a_stretch_without_vision_is_bridged_and_said() -> None:
     assert graph.segments.largest() is graph.segments[1]
     assert graph.scale(119) == pytest.approx(0.6, rel=0.02)
     for i in (20, 49, 60, 80, 119):
-        assert np.linalg.norm(graph.place(i)[:3, 3] - f.truth[i][:3, 3]) < 1.2
+        assert np.linalg.norm(graph.pose(i).T_world_camera[:3, 3] - f.truth[i][:3, 3]) < 1.2
 
 
 @pytest.mark.parametrize("burst_ns", [0, 996_000_000])
@@ -637,7 +637,7 @@ def test_readings_that_cannot_be_are_left_out(fault: dict[str, Any]) -> None:
     for i, (T, prior) in enumerate(zip(f.odom, f.priors, strict=True)):
         prior = replace(prior, **fault) if i % 5 == 0 else prior
         graph.add_keyframe(i, i * 10**9, 0, T, f.covariance, prior, (60.0 / 1.3, 0.0))
-        assert i < 3 or np.linalg.norm((graph.place(i) - f.truth[i])[:3, 3]) < 5.0
+        assert i < 3 or np.linalg.norm((graph.pose(i).T_world_camera - f.truth[i])[:3, 3]) < 5.0
     assert not graph.counts["solved badly"]
     graph.solve()
     assert rms_m(graph, f) < 1.5

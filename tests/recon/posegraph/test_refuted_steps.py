@@ -50,7 +50,7 @@ def test_a_smeared_stretch_is_placed_by_telemetry_and_reported() -> None:
     truth, graph = flown(smears=True)
     assert graph.refuted == dict(pairwise(range(29, 34)))
     assert all(graph.sources(i) == ("attitude", "gnss", "dead reckoning") for i in SMEARED)
-    poses = np.array([graph.place(i) for i in range(COUNT)])
+    poses = np.array([graph.pose(i).T_world_camera for i in range(COUNT)])
     off_m = np.linalg.norm((poses - np.array(truth))[:, :3, 3], axis=1)
     assert off_m.max() < 4.0
     assert GraphWatch(graph).sentences() == [
