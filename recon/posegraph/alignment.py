@@ -31,6 +31,8 @@ from recon.posegraph.level_ground import ASSUMED_TILT_RAD
 from recon.posegraph.pose_priors import has_fix
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import (
+    ATTITUDE_S,
+    FIX_S,
     MIN_BIAS,
     MIN_READINGS,
     SURE_OF_BIAS,
@@ -140,8 +142,8 @@ class Similarity:
 
 def fit(
     nodes: Sequence[Node],
-    fix_s: float = 60.0,
-    attitude_s: float = 40.0,
+    fix_s: float = FIX_S,
+    attitude_s: float = ATTITUDE_S,
     slow_share: float = 1.0,
     usual: ReadingNoise | None = None,
 ) -> Similarity | None:

@@ -17,7 +17,7 @@ from recon import se3
 from recon.posegraph.ground_heights import GUESSED_SHARE, UNMEASURED_HEIGHTS, height_ratios
 from recon.posegraph.pose_priors import MIN_FIX_M, has_fix
 from recon.posegraph.records import Node
-from recon.posegraph.sensor_noise import Noise, bias_time_constant_s, inflation
+from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S, Noise, bias_time_constant_s, inflation
 from recon.types import F64, PosePrior
 
 BIAS_SHARE = 0.6
@@ -139,7 +139,7 @@ class AlignmentReadings:
         self,
         nodes: Sequence[Node],
         noise: ReadingNoise | None = None,
-        bias_tau_s: tuple[float, float] = (60.0, 40.0),
+        bias_tau_s: tuple[float, float] = (FIX_S, ATTITUDE_S),
     ) -> None:
         turned = [a for a in nodes if a.prior.R_world_camera is not None]
         fixed = [a for a in nodes if has_fix(a.prior)]

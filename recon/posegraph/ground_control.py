@@ -16,6 +16,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph.records import CHI2_LIMIT, LOOP_WINDOW, Loop, loops_agree
+from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S
 from recon.posegraph.site_alignment import ScanSimilarity
 from recon.posegraph.smoother import (
     NO_SCALE,
@@ -28,9 +29,6 @@ from recon.posegraph.smoother import (
 )
 from recon.table import Rows
 from recon.types import F64, Bool, PosePrior
-
-ATTITUDE_S, FIX_S = 40.0, 60.0
-"""Errors of attitude and fixes wander with these time constants."""
 
 STEPS = 60
 """Maximum number of steps of the solution."""

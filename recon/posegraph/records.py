@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon import se3
+from recon.posegraph.sensor_noise import ALTITUDE_S, ATTITUDE_S, FIX_S
 from recon.types import F64, PosePrior
 
 
@@ -15,9 +16,9 @@ class PoseGraphConfig:
     """Size of the graph, and how its sensors err; docs/pose-graph.md says where each enters."""
 
     max_nodes: int = 100_000  # keyframes in the graph; of more, some are interpolated
-    fix_s: float = 60.0  # a receiver's error wanders with this time constant
-    attitude_s: float = 40.0  # an attitude's
-    altitude_s: float = 120.0  # a barometer's
+    fix_s: float = FIX_S
+    attitude_s: float = ATTITUDE_S
+    altitude_s: float = ALTITUDE_S
     sigma_step: float = 0.002  # of one vision motion, as a share of its length
     sigma_scale_walk: float = 0.003  # change of the scale per twenty keyframes
 

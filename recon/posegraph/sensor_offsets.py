@@ -16,6 +16,7 @@ from recon import se3
 from recon.posegraph.alignment import Similarity
 from recon.posegraph.ground_heights import EXACT_HEIGHTS, height_ratios
 from recon.posegraph.records import Node
+from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S
 from recon.types import F64, PosePrior
 
 SIGMA_RAD = np.radians(2.0)
@@ -97,7 +98,9 @@ def turns_of(poses: Sequence[F64], priors: Sequence[PosePrior]) -> Turns | None:
     return odom, reported, sigma
 
 
-def boresight(stretches: Sequence[Turns], span_s: float, bias_tau_s: float = 40.0) -> Constants:
+def boresight(
+    stretches: Sequence[Turns], span_s: float, bias_tau_s: float = ATTITUDE_S
+) -> Constants:
     """The boresight by all stretches of a flight of ``span_s``; small where turns are missing.
 
     Vision turns with the camera, telemetry with the gimbal or the body. Between flights' headings
@@ -176,7 +179,7 @@ WILD_STEPS = 36.0
 
 
 def altitude_datum(
-    priors: Sequence[PosePrior], span_s: float, bias_tau_s: float = 60.0
+    priors: Sequence[PosePrior], span_s: float, bias_tau_s: float = FIX_S
 ) -> Constants:
     """The datum by all fixes of a flight of ``span_s``, in the order of time.
 
@@ -238,8 +241,8 @@ NEAR_SIGMAS = 5.0
 def constants(
     stretches: Sequence[tuple[Sequence[F64], Sequence[PosePrior]]],
     span_s: float,
-    fix_s: float = 60.0,
-    attitude_s: float = 40.0,
+    fix_s: float = FIX_S,
+    attitude_s: float = ATTITUDE_S,
 ) -> Constants:
     """Those of a flight of ``span_s`` from poses (4, 4) and priors, segment by segment.
 
