@@ -67,9 +67,7 @@ LAST_VIEW_SHARE = 0.1
 class StereoView:
     """A view with everything that its reconstruction needs, poses as they are known now."""
 
-    seq: int
     time_ns: int
-    segment: int
     prior: PosePrior
     image: PosedImage  # in colour
     partners: tuple[PosedImage, ...]
@@ -80,6 +78,14 @@ class StereoView:
     # (n, m), all over the image: sigma of depth over depth by readout and turns that are not sure
     rows_share: F32 = field(default_factory=KNOWN_ROWS.copy)
     is_first_depth: bool = False  # it comes again, with all its partners
+
+    @property
+    def seq(self) -> int:
+        return self.relative.seq
+
+    @property
+    def segment(self) -> int:
+        return self.relative.segment
 
     @property
     def bgr(self) -> U8:
@@ -399,9 +405,7 @@ class VirtualStereoCamera:
         points = se3.transform(se3.inverse(relative.T_keyframe_camera), points)
         in_odom = se3.transform(view.T_odom_camera, points)
         return StereoView(
-            view.seq,
             view.time_ns,
-            view.segment,
             prior,
             replace(self._posed(view, in_odom), bgr=self._undistorter.image(image)),
             tuple(self._posed(partner, in_odom) for partner in partners),

@@ -37,7 +37,7 @@ def view_at(
     """A view at a place of the odometry, of no image unless one is given."""
     blank = PosedImage(None, np.zeros((1, 1), np.uint8), np.eye(3), T_odom_camera, seq=seq)
     return StereoView(
-        seq, seq, segment, prior, image or blank, tuple(partners),
+        seq, prior, image or blank, tuple(partners),
         RelativePose(seq, segment, T_odom_camera),
         np.zeros((0, 3)) if points is None else points,
         np.eye(6) if covariance is None else covariance, earlier,
