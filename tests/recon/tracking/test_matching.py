@@ -303,7 +303,7 @@ def test_any_turn_and_zoom_is_found(angle: float, scale: float, du: float, dv: f
     assert np.linalg.norm(view.carry(grid) - (grid @ A.T + t), axis=1).max() < 4.0
 
 
-def test_a_common_view_is_a_start_for_matching() -> None:
+def test_matched_features_are_a_start_for_matching() -> None:
     a, b, A, t = turned(100.0, 1.0, (60.0, -40.0))
     view = match_features(features(a), features(b))
     assert view is not None
