@@ -143,7 +143,9 @@ class Mapper:
         trajectory = Trajectory(PoseGraph(PoseGraphConfig(max_nodes=config.graph_keyframes)))
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
         self.keyframes = KeyframeMap(trajectory, loops, self.rejected, timing)
-        self.surface = SurfaceMap(float(camera.K[0, 0]), config.resolution_m, new_map)
+        self.surface = SurfaceMap(
+            float(camera.K[0, 0]), trajectory.similarities, config.resolution_m, new_map
+        )
         self.exposure = ExposureCompensation()
         self.first_depths = (
             FirstDepths(backend, stereo, dense, self.keyframes, self.surface, self.exposure, timing)
@@ -260,7 +262,7 @@ class Mapper:
             return update
         with self._timing("map"):  # what is new
             T_odom = self.keyframes.trajectory.odom_pose(view.seq)
-            sigma_m, fresh = self.surface(view.segment, depth, view.rows_share, T_odom)
+            sigma_m, fresh = self.surface(view.seq, view.segment, depth, view.rows_share, T_odom)
             in_odom = replace(depth, T_world_camera=T_odom)
             bgr = self.exposure(view.segment, in_odom, bgr)  # as bright as the map
         keyframe = keyframe_of(view, depth, bgr, sigma_m, fresh, update.pose)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -27,16 +27,19 @@ class SurfaceMap:
     def __init__(
         self,
         focal_px: float,
+        placed: Callable[[Sequence[int]], F64],
         resolution_m: float = 0.0,
         new_map: Callable[[VoxelMapConfig], VoxelMap] = VoxelMap,
     ) -> None:
-        """``focal_px`` is of the recorded images; ``new_map`` makes the empty map of a scan."""
+        """``focal_px`` is of the recorded images, ``placed`` as
+        :meth:`recon.posegraph.trajectory.Trajectory.similarities`; ``new_map`` makes the empty
+        map of a scan."""
         self._focal_px, self._resolution_m, self._new_map = focal_px, resolution_m, new_map
         self.known: VoxelMap | None = None
-        self._disagreement, self._segment = Disagreement(), -1
+        self._disagreement, self._segment = Disagreement(placed), -1
 
     def __call__(
-        self, segment: int, depth: DepthMap, rows_share: F32, T_odom_camera: F64
+        self, seq: int, segment: int, depth: DepthMap, rows_share: F32, T_odom_camera: F64
     ) -> tuple[F32, Bool]:
         """((h, w) sigma, which holds disagreement of views and an unknown readout, not what all
         points share; (h, w) surface that is new or better).
@@ -48,7 +51,7 @@ class SurfaceMap:
             self._disagreement.forget()
             self._segment = segment
         in_odom = self._in_odom(depth, rows_share, T_odom_camera)
-        factor = np.float32(self._disagreement.take(in_odom))
+        factor = np.float32(self._disagreement.take(seq, in_odom))
         in_odom = replace(in_odom, sigma_m=in_odom.sigma_m * factor)
         known = self.known
         if known is None:

@@ -132,6 +132,12 @@ class Trajectory:
         """(N, 4, 4) T_world_camera of keyframes."""
         return self._placed(np.searchsorted(self._table.rows["seq"], seqs))[0]
 
+    def similarities(self, seqs: Sequence[int]) -> F64:
+        """(N, 4, 4) from the cameras of keyframes, in units of the odometry, to the world in m."""
+        T, scales = self._placed(np.searchsorted(self._table.rows["seq"], seqs))
+        T[:, :3, :3] *= scales[:, None, None]
+        return T
+
     def scale(self, seq: int) -> float:
         """Metres per unit of the odometry at a keyframe."""
         return self.graph.scale(seq) if seq in self.graph else self.pose(seq).scale

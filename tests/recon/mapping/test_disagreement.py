@@ -32,7 +32,20 @@ def _seen(T: F64, sigma_m: float, seed: int, tilt: float = 0.0, noise: float = 1
 PLACES = [_pose(0.0, 0.0), _pose(8.0, 2.0), _pose(12.0, 8.0, 1.7), _pose(6.0, 10.0, 3.1)]
 
 
-def _independent(found: Disagreement, depth: DepthMap) -> float:
+class _Images:
+    """Images in a map that has each where it is."""
+
+    def __init__(self) -> None:
+        self.placed = dict[int, F64]()
+        self.found = Disagreement(lambda seqs: np.array([self.placed[seq] for seq in seqs]))
+
+    def take(self, depth: DepthMap) -> float:
+        seq = len(self.placed)
+        self.placed[seq] = depth.T_world_camera
+        return self.found.take(seq, depth)
+
+
+def _independent(found: _Images, depth: DepthMap) -> float:
     """The factor of an image that shares no frame with those before it: two lie in between."""
     blank = _seen(depth.T_world_camera, 0.1, 0)
     blank.depth_m[:] = np.nan
@@ -42,22 +55,22 @@ def _independent(found: Disagreement, depth: DepthMap) -> float:
 
 
 def test_noise_as_the_sigmas_say_leaves_them() -> None:
-    found = Disagreement()
+    found = _Images()
     factors = [_independent(found, _seen(T, 0.1, k)) for k, T in enumerate(PLACES)]
     assert factors[0] == 1.0 and factors == pytest.approx([1.0] * 4, abs=0.05)
 
 
 def test_images_clearer_than_stereo_states_have_smaller_sigmas_down_to_a_limit() -> None:
-    found = Disagreement()
+    found = _Images()
     factors = [_independent(found, _seen(T, 0.1, k, noise=0.85)) for k, T in enumerate(PLACES)]
     assert factors[1:] == pytest.approx([0.85] * 3, rel=0.06)
-    same = Disagreement()
+    same = _Images()
     same.take(_seen(PLACES[0], 0.1, 0, noise=0.0))
     assert _independent(same, _seen(PLACES[0], 0.1, 1, noise=0.0)) == MIN_FACTOR
 
 
 def test_noise_of_twice_the_sigma_is_reported() -> None:
-    found = Disagreement()
+    found = _Images()
     factors = [_independent(found, _seen(T, 0.1, k, noise=2.0)) for k, T in enumerate(PLACES)]
     assert factors[0] == 1.0 and factors[1:] == pytest.approx([2.0] * 3, rel=0.05)
 
@@ -69,7 +82,7 @@ def test_neighbours_disagree_by_less_than_they_err(noise: float) -> None:
     w, h = SIZE
     white = np.random.default_rng(1).normal(size=(6, h * w))
     errors = noise * 0.1 * (np.linalg.cholesky(correlation) @ white).reshape(6, h, w)
-    found = Disagreement()
+    found = _Images()
     for k, error in enumerate(errors):
         image = _seen(PLACES[0], 0.1, 0, noise=0.0)
         image.depth_m[:] += error.astype(np.float32)
@@ -80,7 +93,7 @@ def test_neighbours_disagree_by_less_than_they_err(noise: float) -> None:
 def test_images_tilted_their_own_way_disagree_once_the_camera_has_turned() -> None:
     """A lens off its axis: along a leg the tilts look alike, and meet at the turn."""
     leg = [_pose(0.0, 4.0 * k) for k in range(3)]
-    found = Disagreement()
+    found = _Images()
     assert max(_independent(found, _seen(T, 0.05, k, tilt=1.0)) for k, T in enumerate(leg)) < 1.1
     turned = _independent(found, _seen(_pose(0.0, 4.0, np.pi), 0.05, 9, tilt=1.0))
     # They differ by 2 m over the width: the median of |x| over an even spread of +-1 m is 0.5 m.
@@ -88,8 +101,20 @@ def test_images_tilted_their_own_way_disagree_once_the_camera_has_turned() -> No
     assert turned == pytest.approx(expected, rel=0.1)
 
 
+def test_what_a_loop_has_corrected_is_no_error_of_the_map() -> None:
+    """Back over the start the odometry is off by 2 % in scale, and by as much in height."""
+    images = _Images()
+    for k in range(3):
+        _independent(images, _seen(_pose(0.0, 4.0 * k), 0.05, k))
+    back, again = (_seen(_pose(4.0, 0.0), 0.05, k) for k in (8, 9))
+    back.depth_m[:] *= np.float32(1.02)
+    assert _independent(images, back) > 10.0
+    images.placed[len(images.placed) - 1][:3, :3] /= 1.02
+    assert _independent(images, again) == pytest.approx(1.0, abs=0.1)
+
+
 def test_points_of_single_pairs_count_where_there_are_too_few_others() -> None:
-    found = Disagreement()
+    found = _Images()
     found.take(_seen(PLACES[0], 0.1, 0))
     mixed = _seen(PLACES[0], 0.1, 1)
     noisy = _seen(PLACES[0], 0.1, 2, noise=9.0)
@@ -101,11 +126,11 @@ def test_points_of_single_pairs_count_where_there_are_too_few_others() -> None:
 
 
 def test_other_ground_and_what_was_forgotten_say_nothing() -> None:
-    found = Disagreement()
+    found = _Images()
     found.take(_seen(PLACES[0], 0.1, 0))
     assert found.take(_seen(_pose(500.0, 0.0), 0.1, 1, noise=9.0)) == 1.0
     upward = se3.compose(np.eye(3), np.array([0.0, 0.0, 50.0]))
     assert found.take(_seen(upward, 0.1, 3, noise=9.0)) == 1.0
-    found.forget()
+    found.found.forget()
     assert found.take(_seen(PLACES[0], 0.1, 4, noise=9.0)) == 1.0
     assert found.take(_seen(PLACES[0], 0.1, 5, noise=3.0)) > 3.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from recon.mapping.disagreement import MIN_FACTOR
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, tiles_under
 from recon.pipeline.surface_map import SurfaceMap
 from recon.pipeline.views import KNOWN_ROWS
-from recon.types import F64, Camera, DepthMap
+from recon.types import F64, Camera, DepthMap, PosePrior
 from service.config import load_config
 from service.flight.paged_map import MAX_OVER, PagedMap
 from service.flight.pipeline import Pipeline
@@ -32,6 +33,10 @@ def view(east_m: float, north_m: float = 0.0, sigma_m: float = 0.2) -> DepthMap:
     T = se3.compose(NADIR, np.array([east_m, north_m, 30.0]))
     sigma = np.full((h, w), sigma_m, np.float32)
     return DepthMap(depth, sigma, np.ones((h, w), np.uint8), K, T)
+
+
+def at_origin(seqs: Sequence[int]) -> F64:
+    return np.tile(np.eye(4), (len(seqs), 1, 1))
 
 
 def survey() -> list[DepthMap]:
@@ -110,8 +115,10 @@ def test_pages_of_a_map_that_begins_at_the_very_end_are_removed(
     pipeline = Pipeline(Camera(K, np.zeros(5), (80, 60)), config, CpuBackend(), pages)
 
     def drain() -> tuple[()]:
-        for depth in survey()[:40]:
-            pipeline.mapper.surface(0, depth, KNOWN_ROWS, depth.T_world_camera)
+        for seq, depth in enumerate(survey()[:40]):
+            T, track = depth.T_world_camera, pipeline.mapper.keyframes.trajectory
+            track.add(seq, 0, T, PosePrior(), None, seq, 1e-6 * np.eye(6))
+            pipeline.mapper.surface(seq, 0, depth, KNOWN_ROWS, T)
         assert pages.exists() and pipeline.held["map_tiles_on_disk"] > 0
         return ()
 
@@ -126,19 +133,19 @@ def test_nonsense_limits_are_refused(tmp_path: Path) -> None:
 
 
 def test_an_unknown_readout_widens_the_sigma_and_gives_way_to_what_is_seen_later() -> None:
-    surface = SurfaceMap(2.0 * K[0, 0])
+    surface = SurfaceMap(2.0 * K[0, 0], at_origin)
     seen = view(0.0, sigma_m=0.05)
     unsure, sure = (np.full((1, 1), share, np.float32) for share in (0.03, 0.0))
-    sigma, _ = surface(0, seen, unsure, seen.T_world_camera)
+    sigma, _ = surface(0, 0, seen, unsure, seen.T_world_camera)
     np.testing.assert_allclose(sigma, np.hypot(0.05, 0.03 * seen.depth_m), rtol=1e-5)
-    sigma, better = surface(0, seen, sure, seen.T_world_camera)
+    sigma, better = surface(1, 0, seen, sure, seen.T_world_camera)
     np.testing.assert_allclose(sigma, MIN_FACTOR * 0.05, rtol=1e-5)  # the same image agrees wholly
     assert better.all()
 
 
 @pytest.mark.parametrize(("reduced", "expected"), [(1.0, 0.11 / 0.075), (1.2, 0.11 / 0.09), (2, 1)])
 def test_images_that_are_not_reduced_are_noisier(reduced: float, expected: float) -> None:
-    surface = SurfaceMap(reduced * K[0, 0])
+    surface = SurfaceMap(reduced * K[0, 0], at_origin)
     seen = view(0.0)
-    sigma, _ = surface(0, seen, KNOWN_ROWS, seen.T_world_camera)
+    sigma, _ = surface(0, 0, seen, KNOWN_ROWS, seen.T_world_camera)
     np.testing.assert_allclose(sigma, expected * 0.2, rtol=1e-5)
