@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bench_options import DataOptions
-from bench_real import flatness, run, shared_ground
+from bench_real import flatness, run, shared_ground, whole_depth
 from paths import DEMO
 
 from recon.types import DepthMap
 from service.bench.keyframes import make_keyframe
 from service.errors import InputError
+from service.scans.drawing import save_debug
 
 STILLS = sorted((DEMO / "frames").glob("*.jpg"))
 
@@ -62,6 +64,21 @@ def test_a_shifted_surface_shows_as_a_seam() -> None:
     off, sigma = found
     assert np.median(off) == pytest.approx(0.5, abs=0.05)
     assert np.median(sigma) == pytest.approx(np.sqrt(2) * np.nanmedian(depth.sigma_m), rel=0.1)
+
+
+def test_whole_depth_images_have_the_scale_that_their_keyframe_has_in_the_end(
+    tmp_path: Path,
+) -> None:
+    keyframe = make_keyframe(0)
+    depth = keyframe.depth
+    save_debug(tmp_path, 0, {"depth_m": 0.5 * depth.depth_m, "sigma_m": 0.5 * depth.sigma_m})
+    stored = depth.depth_m.copy()
+    stored[: len(stored) // 2] = np.nan
+    fresh = replace(keyframe, depth=replace(depth, depth_m=stored))
+    whole = whole_depth(tmp_path, fresh)
+    np.testing.assert_allclose(whole.depth_m, depth.depth_m, rtol=1e-5)
+    np.testing.assert_allclose(whole.sigma_m, depth.sigma_m, rtol=1e-5)
+    assert whole_depth(tmp_path, replace(fresh, seq=1)) is fresh.depth
 
 
 def test_tilts_between_keyframes_are_told_from_the_bend_of_each() -> None:
