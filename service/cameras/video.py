@@ -265,7 +265,7 @@ def decoded_frames(
         try:
             packet = next(packets, None)
         except (av.error.FFmpegError, OSError) as error:
-            broke_off(f"the recording is cut off: {error}")
+            broke_off(f"it is cut off: {error}")
             packet = None
         if packet is not None and not is_needed(packet):
             continue
