@@ -23,7 +23,8 @@ def access_units(
     """The images of ``packets``, which were demuxed with FFmpeg's flag ``noparse``.
 
     Where packets do not hold an image each, FFmpeg's parser cuts them, as it does without the flag.
-    An image has the times of the packet in which it begins.
+    An image has the times of the packet in which it begins. The first ones come together: the time
+    of a live image follows from its arrival, which must not become earlier in a stream.
     """
     import av
 
@@ -34,9 +35,10 @@ def access_units(
         yield from packets
         return
     begun: deque[tuple[int, av.Packet[Any]]] = deque()  # the packets that may begin an image
+    held: list[av.Packet[Any]] = []  # until the first packets show what they hold
     fed = cut = given = 0  # bytes from the stream's start: parsed, in whole images, passed on
     in_a_row = 0
-    for packet in packets:  # the last one is empty, and empties the parser
+    for number, packet in enumerate(packets):  # the last one is empty, and empties the parser
         start, fed = fed, fed + packet.size
         begun.append((start, packet))
         is_start = False
@@ -46,11 +48,14 @@ def access_units(
             began, cut = cut, cut + image.size
             is_start = is_start or cut == start
             if began >= given:
-                yield _timed(image, begun[0][1])
+                held.append(_timed(image, begun[0][1]))
         in_a_row = in_a_row + 1 if is_start else 0
         if in_a_row >= SURE and packet.size:
             given = fed
-            yield packet
+            held.append(packet)
+        if number >= SURE or not packet.size:
+            yield from held
+            held.clear()
 
 
 def _timed(image: av.Packet[Any], packet: av.Packet[Any]) -> av.Packet[Any]:

@@ -25,7 +25,7 @@ import pytest
 from loopback import free_port, until
 
 from service.cameras import CameraFrame, CameraSource, live, open_camera
-from service.cameras.access_units import access_units
+from service.cameras.access_units import SURE, access_units
 from service.cameras.live import LiveConfig, LiveSource, StampFilter
 from service.cameras.source import Paced
 from service.cameras.video import decoded_frames, video_stream
@@ -137,6 +137,20 @@ def test_an_image_is_not_held_back_until_later_ones_come() -> None:
     finally:
         sender.end.set()
         receiver.join(60.0)
+
+
+def test_no_image_comes_earlier_after_its_exposure_than_those_before_it() -> None:
+    """Else the images of a stream's start would be dated later than the others."""
+    with av.open(io.BytesIO(h264(12, "mpegts")), options={"fflags": "noparse"}) as container:
+        stream, came = container.streams.video[0], list[int]()
+
+        def counted() -> Iterator[av.Packet[Any]]:
+            for packet in container.demux(stream):
+                came.append(packet.size)
+                yield packet
+
+        seen = [len(came) for _ in access_units(counted(), stream)]
+    assert seen == [SURE + 1] * SURE + [*range(SURE + 1, 13)]
 
 
 @pytest.mark.parametrize("whole", [0, 9])
