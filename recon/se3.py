@@ -215,6 +215,22 @@ def _quaternion(R: F64) -> tuple[float, ...]:
     return tuple(part / length for part in q)
 
 
+def each_quaternion(R: F64) -> F64:
+    """(N, 4) unit quaternions w, x, y, z of the (N, 3, 3) rotations ``R``, of either sign."""
+    (a, b, c), (d, e, f), (g, h, i) = R.transpose(1, 2, 0)
+    # Each row is the quaternion by one of its own parts (Shepperd); the largest part is sure.
+    rows = np.array(
+        [
+            [1.0 + a + e + i, h - f, c - g, d - b],
+            [h - f, 1.0 + a - e - i, b + d, c + g],
+            [c - g, b + d, 1.0 - a + e - i, f + h],
+            [d - b, c + g, f + h, 1.0 - a - e + i],
+        ]
+    )
+    q = rows[rows[range(4), range(4)].argmax(axis=0), :, np.arange(len(R))]
+    return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
+
+
 def disagreement(T_a: F64, covariance_a: F64, T_b: F64, covariance_b: F64) -> float:
     """Chi-square per degree of freedom of the difference of two estimates of one motion.
 

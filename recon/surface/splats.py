@@ -11,9 +11,10 @@ doi:10.1016/0022-5193(72)90180-4); nothing else is trained.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
+import cv2
 import numpy as np
 from numba import njit
 
@@ -24,7 +25,7 @@ from recon.mapping.free_space import seen_through, spread
 from recon.parallel import run_parallel, threads
 from recon.surface.meshing import Mesh
 from recon.surface.texture_views import TextureView, rays_onto
-from recon.types import F32, F64, I64, U8, Bool, DepthMap, Keyframe, PointCloud
+from recon.types import F32, F64, I32, I64, U8, Bool, DepthMap, Keyframe, PointCloud
 
 WIDTH = 0.5
 """Sigma along the surface, in footprints of a pixel: neighbours meet at 0.37 of their height."""
@@ -60,6 +61,9 @@ REACH = 3.33
 
 FITS = 2
 """Rounds of fitting the colours."""
+
+AROUND = np.ones((2 * NORMAL_PX + 1,) * 2, np.uint8)
+"""Of a pixel: what its normal is taken from."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,9 +107,7 @@ def splats_of(
     splats, sigma = joined([one for one, _ in found]), np.concatenate([s for _, s in found])
     splats = _merged(splats, sigma, [k.depth for k in keyframes])
     splats = joined([splats, *_fillings(splats, views, surface, progress)])
-    for _ in range(FITS):
-        splats = _fitted(splats, views, progress)
-    return splats
+    return _fitted(splats, views, progress)
 
 
 def steps(keyframes: int) -> int:
@@ -130,11 +132,9 @@ def of_depth(depth: DepthMap, mask: Bool, view: TextureView) -> tuple[Splats, F3
     sizes = np.column_stack(
         [WIDTH * footprint / cosine, WIDTH * footprint, np.minimum(sigma, WIDTH * footprint)]
     )
-    splats = Splats(
-        se3.transform(T, xyz.astype(np.float64)).astype(np.float32),
-        _quaternions(T[:3, :3] @ axes), sizes.astype(np.float32), opacity, rgb,
-    )  # fmt: skip
-    return splats, sigma
+    places = se3.transform(T, xyz.astype(np.float64)).astype(np.float32)
+    turned = se3.each_quaternion(T[:3, :3] @ axes).astype(np.float32)
+    return Splats(places, turned, sizes.astype(np.float32), opacity, rgb), sigma
 
 
 def _normals(depth: DepthMap) -> F32:
@@ -222,15 +222,6 @@ def _axes(xyz: F32, normal: F32) -> tuple[F64, F64]:
     return axes, np.maximum(np.abs(along), MIN_COSINE)
 
 
-def _quaternions(R: F64) -> F32:
-    """(N, 4) wxyz of (N, 3, 3) rotations."""
-    from scipy.spatial.transform import Rotation
-
-    if not len(R):
-        return np.zeros((0, 4), np.float32)
-    return np.asarray(Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]], np.float32)
-
-
 def _merged(splats: Splats, sigma_m: F32, depths: Sequence[DepthMap]) -> Splats:
     """Without what other views see through, and one Gaussian where several images show a place."""
     count = len(splats)
@@ -240,18 +231,23 @@ def _merged(splats: Splats, sigma_m: F32, depths: Sequence[DepthMap]) -> Splats:
     if not len(kept):
         return splats.at(kept)
     cell_m = MERGED / WIDTH * float(np.median(splats.sigma_m[kept, 1]))
-    cell = np.floor(splats.xyz_m[kept] / cell_m).astype(np.int64)
-    order = np.lexsort((sigma_m[kept], *cell.T))
-    is_first = np.ones(len(order), np.bool_)
-    is_first[1:] = (np.diff(cell[order], axis=0) != 0).any(axis=1)
+    cell = _cells(splats.xyz_m[kept], cell_m)
+    order = np.lexsort((sigma_m[kept], cell))
+    is_first = np.diff(cell[order], prepend=-1) != 0
     kept = np.sort(kept[order[is_first]])
     return splats.at(kept[~_is_lone(splats.xyz_m[kept], cell_m * (1 << ISLAND_SHIFT))])
 
 
+def _cells(xyz_m: F32, cell_m: float) -> I64:
+    """(N,) keys of the cells that places lie in."""
+    cell = np.floor(xyz_m / cell_m).astype(np.int64)
+    i, j, k = (cell - cell.min(axis=0) + 1).T
+    return np.asarray((i << 2 * BITS) | (j << BITS) | k, np.int64)
+
+
 def _is_lone(xyz_m: F32, cell_m: float) -> Bool:
     """(N,) those in pieces of surface of fewer than ISLAND_POINTS, by cells that touch."""
-    i, j, k = np.floor((xyz_m - xyz_m.min(axis=0)) / cell_m).astype(np.int64).T + 1
-    cells, cell = np.unique((i << 2 * BITS) | (j << BITS) | k, return_inverse=True)
+    cells, cell = np.unique(_cells(xyz_m - xyz_m.min(axis=0), cell_m), return_inverse=True)
     part = pieces(cells)[cell]
     count = np.bincount(part)
     return np.asarray((count < min(ISLAND_POINTS, count.max()))[part])
@@ -262,27 +258,40 @@ def _fillings(
 ) -> list[Splats]:
     """Gaussians on ``surface`` where views show a hole, which no earlier view has filled."""
     reach = rays_onto(surface)
-    out: list[Splats] = []
-    for view in views:
+
+    def behind(view: TextureView) -> F32:
         progress("filling holes from the closed surface")
-        h, w = view.bgra.shape[:2]
-        near = joined([splats, *out])
-        hole = (rendered(near, view.K, (w, h), view.T_world_camera)[1] < COVERED) & (
-            view.bgra[..., 3] > 0
-        )
+        left = np.ones(view.bgra.shape[:2], np.float32)
+        _hide(splats, view, left)
+        return left
+
+    out: list[Splats] = []
+    for view, left in zip(views, run_parallel(*(partial(behind, v) for v in views)), strict=True):
+        for one in out:
+            _hide(one, view, left)
+        hole = (left > 1.0 - COVERED) & (view.bgra[..., 3] > 0)
         if not hole.any():
             continue
-        # Normals need the surface around a hole, so rays go everywhere.
-        u, v = np.meshgrid(np.arange(w, dtype=np.float64), np.arange(h, dtype=np.float64))
-        ways = rays(view.K, np.column_stack([u.ravel(), v.ravel()]))
+        v, u = np.nonzero(cv2.dilate(hole.astype(np.uint8), AROUND) > 0)
+        ways = rays(view.K, np.column_stack([u, v]).astype(np.float64))
         length = np.linalg.norm(ways, axis=1)
         T = view.T_world_camera
-        depth_m = reach(T[:3, 3], (ways / length[:, None]) @ T[:3, :3].T) / length
-        depth_m = np.where(np.isfinite(depth_m), depth_m, np.nan).reshape(h, w).astype(np.float32)
+        found_m = reach(T[:3, 3], (ways / length[:, None]) @ T[:3, :3].T) / length
+        depth_m = np.full(hole.shape, np.nan, np.float32)
+        depth_m[v, u] = np.where(np.isfinite(found_m), found_m, np.nan)
         sigma_m = (depth_m / np.float32(view.K[0, 0])).astype(np.float32)
-        depth = DepthMap(depth_m, sigma_m, np.zeros((h, w), np.uint8), view.K, T)
+        depth = DepthMap(depth_m, sigma_m, np.zeros(hole.shape, np.uint8), view.K, T)
         out.append(of_depth(depth, hole, view)[0])
     return out
+
+
+def _hide(splats: Splats, view: TextureView, left: F32) -> None:
+    """Take from ``left`` (h, w), the share of light from behind, what the Gaussians hide; at least
+    until they cover a pixel."""
+    h, w = left.shape
+    rows, _ = _in_view(splats, view.K, (w, h), view.T_world_camera)
+    flat = _projected(splats, rows, view.K, (w, h), view.T_world_camera)
+    _blend(flat, splats.opacity[rows], NO_COLOURS, NO_COLOURS[None], left, NO_SHARES, 1.0 - COVERED)
 
 
 def _fitted(
@@ -290,23 +299,33 @@ def _fitted(
 ) -> Splats:
     """The Gaussians with colours that reproduce the images better: each takes the mean error of the
     pixels that it colours."""
-    sums = np.zeros((len(splats), 4), np.float32)
+    order: dict[int, I32] = {}
 
-    def errors(view: TextureView) -> tuple[I64, F32]:
+    def errors(number: int) -> tuple[I32, F32]:
         progress("fitting colours")
+        view = views[number]
         h, w = view.bgra.shape[:2]
-        flat, rows = _in_view(splats, view.K, (w, h), view.T_world_camera)
-        opacity, rgb = splats.opacity[rows], splats.rgb[rows]
-        image, left, _ = _blend(flat, opacity, rgb, w, h, NO_ERROR)
+        K, T = view.K, view.T_world_camera
+        rows = order.get(number)
+        if rows is None:
+            rows = order[number] = _nearest_first(splats, K, (w, h), T)
+        flat, opacity = _projected(splats, rows, K, (w, h), T), splats.opacity[rows]
+        shares = np.empty(_pixels_reached(flat, w, h), np.float32)
+        image, left = np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32)
+        _blend(flat, opacity, rgb[rows], image, left, shares, DONE)
         error = view.bgra[..., 2::-1].astype(np.float32) - image
         error[(view.bgra[..., 3] == 0) | (left > 1.0 - COVERED)] = np.nan
-        return rows, _blend(flat, opacity, rgb, w, h, error)[2]
+        return rows, _back(flat, error, shares)
 
-    for at in range(0, len(views), threads()):
-        for rows, found in run_parallel(*(partial(errors, v) for v in views[at : at + threads()])):
-            sums[rows] += found
-    rgb = splats.rgb + sums[:, :3] / np.maximum(sums[:, 3:], 0.05)
-    return Splats(splats.xyz_m, splats.q_wxyz, splats.sigma_m, splats.opacity, np.clip(rgb, 0, 255))
+    rgb = splats.rgb
+    for _ in range(FITS):
+        sums = np.zeros((len(splats), 4), np.float32)
+        for at in range(0, len(views), threads()):
+            some = range(len(views))[at : at + threads()]
+            for rows, found in run_parallel(*(partial(errors, n) for n in some)):
+                sums[rows] += found
+        rgb = np.clip(rgb + sums[:, :3] / np.maximum(sums[:, 3:], 0.05), 0, 255)
+    return replace(splats, rgb=rgb)
 
 
 def rendered(
@@ -317,43 +336,80 @@ def rendered(
     As the reference draws them: projected to first order, sorted by depth, front to back.
     """
     w, h = size_px
-    flat, rows = _in_view(splats, K, size_px, T_world_camera)
-    image, left, _ = _blend(flat, splats.opacity[rows], splats.rgb[rows], w, h, NO_ERROR)
+    rows = _nearest_first(splats, K, size_px, T_world_camera)
+    flat = _projected(splats, rows, K, size_px, T_world_camera)
+    image, left = np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32)
+    _blend(flat, splats.opacity[rows], splats.rgb[rows], image, left, NO_SHARES, DONE)
     return image, 1.0 - left
 
 
-def _in_view(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> tuple[F32, I64]:
-    """(M, 7) the Gaussians in the image, nearest first, and their rows: u, v, depth, the inverse
-    covariance uu, uv, vv in the image, and how many pixels they reach."""
-    flat = np.empty((len(splats), 7), np.float32)
-    T_camera_world = np.ascontiguousarray(se3.inverse(T))
+def _nearest_first(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> I32:
+    """(M,) the Gaussians that may show in an image."""
+    rows, depth = _in_view(splats, K, size_px, T)
+    return np.asarray(rows[np.argsort(depth)])
+
+
+def _widest(K: F64, size_px: tuple[int, int]) -> tuple[float, float]:
     w, h = size_px
-    widest = (
-        WIDEST * max(K[0, 2], w - K[0, 2]) / K[0, 0],
-        WIDEST * max(K[1, 2], h - K[1, 2]) / K[1, 1],
-    )
-    _project(splats.xyz_m, splats.q_wxyz, splats.sigma_m, K, T_camera_world, widest, flat)
-    u, v, z, reach = flat[:, 0], flat[:, 1], flat[:, 2], flat[:, 6]
-    on = (z > 0.1) & (u > -reach) & (u < w + reach) & (v > -reach) & (v < h + reach)
-    rows = np.flatnonzero(on)
-    rows = rows[np.argsort(z[rows], kind="stable")]
-    return flat[rows], rows
+    x, y = max(K[0, 2], w - K[0, 2]) / K[0, 0], max(K[1, 2], h - K[1, 2]) / K[1, 1]
+    return WIDEST * x, WIDEST * y
+
+
+def _in_view(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> tuple[I32, F32]:
+    """(M,) the Gaussians that may show in an image, in their own order, and (M,) their depth."""
+    T_camera_world = np.ascontiguousarray(se3.inverse(T))
+    widest = _widest(K, size_px)
+    found = _reached(splats.xyz_m, splats.sigma_m, K, T_camera_world, size_px, widest)
+    return found[0], found[1]
 
 
 @njit(cache=True, nogil=True)
-def _project(
-    xyz: F32, q: F32, sigma: F32, K: F64, T: F64, widest: tuple[float, float], out: F32
-) -> None:
-    R = np.empty((3, 3))
-    for n in range(xyz.shape[0]):
+def _reached(
+    xyz: F32, sigma: F32, K: F64, T: F64, size_px: tuple[int, int], widest: tuple[float, float]
+) -> tuple[I32, F32]:
+    """Rows and depths, m, by a bound of how far each reaches in the image."""
+    rows, depth = np.empty(len(xyz), np.int32), np.empty(len(xyz), np.float32)
+    length = K[0, 0] * np.sqrt(1.0 + widest[0] ** 2), K[1, 1] * np.sqrt(1.0 + widest[1] ** 2)
+    count = 0
+    for n in range(len(xyz)):
         z = T[2, 0] * xyz[n, 0] + T[2, 1] * xyz[n, 1] + T[2, 2] * xyz[n, 2] + T[2, 3]
-        out[n, 2] = z
         if z <= 0.1:
             continue
         x = T[0, 0] * xyz[n, 0] + T[0, 1] * xyz[n, 1] + T[0, 2] * xyz[n, 2] + T[0, 3]
         y = T[1, 0] * xyz[n, 0] + T[1, 1] * xyz[n, 1] + T[1, 2] * xyz[n, 2] + T[1, 3]
-        slope_x = min(max(x / z, -widest[0]), widest[0])
-        slope_y = min(max(y / z, -widest[1]), widest[1])
+        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        longest = max(sigma[n, 0], sigma[n, 1], sigma[n, 2]) / z
+        reach_u = REACH * np.sqrt(LOW_PASS_PX2 + (length[0] * longest) ** 2)
+        reach_v = REACH * np.sqrt(LOW_PASS_PX2 + (length[1] * longest) ** 2)
+        if -reach_u < u < size_px[0] + reach_u and -reach_v < v < size_px[1] + reach_v:
+            rows[count], depth[count] = n, z
+            count += 1
+    return rows[:count].copy(), depth[:count].copy()
+
+
+def _projected(splats: Splats, rows: I32, K: F64, size_px: tuple[int, int], T: F64) -> F32:
+    """(M, 7) of some Gaussians before the camera: u, v, the inverse covariance uu, uv, vv in the
+    image, and how many pixels they reach along u and v."""
+    flat = np.empty((len(rows), 7), np.float32)
+    T_camera_world = np.ascontiguousarray(se3.inverse(T))
+    arrays = rows, splats.xyz_m, splats.q_wxyz, splats.sigma_m
+    _project(*arrays, K, T_camera_world, _widest(K, size_px), flat)
+    return flat
+
+
+@njit(cache=True, nogil=True)
+def _project(
+    rows: I32, xyz: F32, q: F32, sigma: F32, K: F64, T: F64, widest: tuple[float, float], out: F32
+) -> None:
+    R = np.empty((3, 3))
+    for m in range(len(rows)):
+        n = rows[m]
+        x = T[0, 0] * xyz[n, 0] + T[0, 1] * xyz[n, 1] + T[0, 2] * xyz[n, 2] + T[0, 3]
+        y = T[1, 0] * xyz[n, 0] + T[1, 1] * xyz[n, 1] + T[1, 2] * xyz[n, 2] + T[1, 3]
+        z = T[2, 0] * xyz[n, 0] + T[2, 1] * xyz[n, 1] + T[2, 2] * xyz[n, 2] + T[2, 3]
+        x, y, fx, fy = x / z, y / z, K[0, 0] / z, K[1, 1] / z
+        slope_x = min(max(x, -widest[0]), widest[0])
+        slope_y = min(max(y, -widest[1]), widest[1])
         w, a, b, c = q[n, 0], q[n, 1], q[n, 2], q[n, 3]
         R[0, 0], R[1, 1], R[2, 2] = b * b + c * c, a * a + c * c, a * a + b * b
         R[0, 1], R[0, 2], R[1, 2] = a * b - w * c, a * c + w * b, b * c - w * a
@@ -367,25 +423,14 @@ def _project(
             dx = s * (T[0, 0] * R[0, k] + T[0, 1] * R[1, k] + T[0, 2] * R[2, k])
             dy = s * (T[1, 0] * R[0, k] + T[1, 1] * R[1, k] + T[1, 2] * R[2, k])
             dz = s * (T[2, 0] * R[0, k] + T[2, 1] * R[1, k] + T[2, 2] * R[2, k])
-            du, dv = K[0, 0] * (dx - slope_x * dz) / z, K[1, 1] * (dy - slope_y * dz) / z
+            du, dv = fx * (dx - slope_x * dz), fy * (dy - slope_y * dz)
             uu += du * du
             uv += du * dv
             vv += dv * dv
         det = uu * vv - uv * uv
-        out[n, 0], out[n, 1] = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-        out[n, 3], out[n, 4], out[n, 5] = vv / det, -uv / det, uu / det
-        out[n, 6] = REACH * np.sqrt(max(uu, vv))
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _alpha(flat: F32, n: int, opacity: float, col: int, row: int) -> float:
-    """How much of pixel (col, row) one Gaussian hides; 0 where that is too little to draw."""
-    du, dv = col - flat[n, 0], row - flat[n, 1]
-    e = -0.5 * (flat[n, 3] * du * du + 2.0 * flat[n, 4] * du * dv + flat[n, 5] * dv * dv)
-    if e < -5.6:
-        return 0.0
-    alpha = min(opacity * np.exp(e), LARGEST_ALPHA)
-    return alpha if alpha >= SMALLEST_ALPHA else 0.0
+        out[m, 0], out[m, 1] = K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]
+        out[m, 2], out[m, 3], out[m, 4] = vv / det, -uv / det, uu / det
+        out[m, 5], out[m, 6] = REACH * np.sqrt(uu), REACH * np.sqrt(vv)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -393,33 +438,87 @@ def _span(middle: float, reach: float, size: int) -> tuple[int, int]:
     return max(int(np.ceil(middle - reach)), 0), min(int(np.floor(middle + reach)) + 1, size)
 
 
-NO_ERROR = np.zeros((0, 0, 3), np.float32)
+@njit(cache=True, nogil=True)
+def _pixels_reached(flat: F32, w: int, h: int) -> int:
+    count = 0
+    for n in range(flat.shape[0]):
+        first_row, last_row = _span(flat[n, 1], flat[n, 6], h)
+        first, last = _span(flat[n, 0], flat[n, 5], w)
+        count += max(last_row - first_row, 0) * max(last - first, 0)
+    return count
+
+
+FAINTEST = 5.6
+"""Half the square of the sigmas from a Gaussian's middle to where it hides nothing."""
+
+FADING = np.exp(-FAINTEST * np.arange(1026) / 1024).astype(np.float32)
+"""How much a Gaussian hides that many 1024ths of FAINTEST from its middle."""
+
+NO_COLOURS, NO_SHARES = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
 
 
 @njit(cache=True, nogil=True)
-def _blend(flat: F32, opacity: F32, rgb: F32, w: int, h: int, error: F32) -> tuple[F32, F32, F32]:
-    """(h, w, 3) the image over black, (h, w) the share of light that comes from behind, and (N, 4)
-    sums of ``error`` (h, w, 3) over the pixels of each Gaussian by its share of them, and of these
-    shares.
+def _blend(
+    flat: F32, opacity: F32, rgb: F32, image: F32, left: F32, shares: F32, done: float
+) -> None:
+    """Draw Gaussians one behind the other.
 
-    Errors that are NaN, or NO_ERROR, do not count.
+    ``image`` (h, w, 3) is over black, ``left`` (h, w) the share of light that comes from behind; a
+    pixel with less than ``done`` of it takes no more. ``shares`` takes the share of each Gaussian
+    of the light of each pixel that it reaches. NO_COLOURS are not drawn, NO_SHARES not kept.
     """
-    image, left = np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32)
-    sums, has_error = np.zeros((flat.shape[0], 4), np.float32), error.size > 0
+    h, w = left.shape
+    has_colours, keeps, at = rgb.size > 0, shares.size > 0, 0
+    scale = np.float32(1024.0 / FAINTEST)
+    half = scale * np.float32(0.5)
+    most, least = np.float32(LARGEST_ALPHA), np.float32(SMALLEST_ALPHA)
+    for n in range(flat.shape[0]):
+        u, v, reach_u, reach_v = flat[n, 0], flat[n, 1], flat[n, 5], flat[n, 6]
+        uu, uv, vv = half * flat[n, 2], scale * flat[n, 3], half * flat[n, 4]
+        first_row, last_row = _span(v, reach_v, h)
+        first, last = _span(u, reach_u, w)
+        for row in range(first_row, last_row):
+            dv = np.float32(row) - v
+            for col in range(first, last):
+                share = np.float32(0.0)
+                before = left[row, col]
+                if before >= done:
+                    du = np.float32(col) - u
+                    far = (uu * du + uv * dv) * du + vv * dv * dv
+                    step = np.int32(far)
+                    if step < 1024:
+                        between = far - np.float32(step)
+                        near = FADING[step] + between * (FADING[step + 1] - FADING[step])
+                        alpha = min(opacity[n] * near, most)
+                        if alpha >= least:
+                            share = alpha * before
+                            left[row, col] = before - share
+                            if has_colours:
+                                for k in range(3):
+                                    image[row, col, k] += share * rgb[n, k]
+                if keeps:
+                    shares[at] = share
+                    at += 1
+
+
+@njit(cache=True, nogil=True)
+def _back(flat: F32, error: F32, shares: F32) -> F32:
+    """(N, 4) sums of ``error`` (h, w, 3) over the pixels of each Gaussian by its share of them, and
+    of these shares; errors that are NaN do not count."""
+    h, w = error.shape[:2]
+    sums, at = np.zeros((flat.shape[0], 4), np.float32), 0
     for n in range(flat.shape[0]):
         first_row, last_row = _span(flat[n, 1], flat[n, 6], h)
-        first, last = _span(flat[n, 0], flat[n, 6], w)
+        first, last = _span(flat[n, 0], flat[n, 5], w)
+        red = green = blue = total = np.float32(0.0)
         for row in range(first_row, last_row):
             for col in range(first, last):
-                if left[row, col] < DONE:
-                    continue
-                alpha = _alpha(flat, n, opacity[n], col, row)
-                share = alpha * left[row, col]
-                for k in range(3):
-                    image[row, col, k] += share * rgb[n, k]
-                left[row, col] -= share
-                if has_error and share > 0.0 and not np.isnan(error[row, col, 0]):
-                    for k in range(3):
-                        sums[n, k] += share * error[row, col, k]
-                    sums[n, 3] += share
-    return image, left, sums
+                share = shares[at]
+                at += 1
+                if share > 0.0 and not np.isnan(error[row, col, 0]):
+                    red += share * error[row, col, 0]
+                    green += share * error[row, col, 1]
+                    blue += share * error[row, col, 2]
+                    total += share
+        sums[n, 0], sums[n, 1], sums[n, 2], sums[n, 3] = red, green, blue, total
+    return sums

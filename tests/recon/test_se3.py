@@ -110,6 +110,8 @@ def test_quaternions_agree_with_scipy(q: F64) -> None:
     back = se3.quaternion_from_rotation(R)
     assert back[0] >= 0
     assert abs(back @ q) / np.linalg.norm(q) == pytest.approx(1.0, abs=1e-9)
+    each = se3.each_quaternion(np.stack([np.eye(3), R]))
+    assert np.abs(each @ np.stack([[1, 0, 0, 0], back]).T).diagonal() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("q", [np.zeros(4), np.full(4, np.nan), np.array([np.inf, 0, 0, 0])])

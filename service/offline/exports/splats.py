@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from recon import se3
 from recon.surface.splats import Splats, joined, splats_of, steps
 from recon.types import F32, F64, Bool
 from service.errors import InputError
@@ -103,11 +104,9 @@ def _inside(scan: ScanView, splats: Splats, box: Box) -> Bool:
 
 def turned(splats: Splats, R: F64) -> Splats:
     """The Gaussians in other axes: R (3, 3) takes the old to the new."""
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_matrix(R)
-    old = Rotation.from_quat(splats.q_wxyz[:, [1, 2, 3, 0]])
-    q = (turn * old).as_quat()[:, [3, 0, 1, 2]].astype(np.float32)
+    w, x, y, z = se3.quaternion_from_rotation(R)
+    turn = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    q = (splats.q_wxyz @ turn.T).astype(np.float32)
     return replace(splats, xyz_m=(splats.xyz_m @ R.T).astype(np.float32), q_wxyz=q)
 
 
