@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Mapping
 from importlib import import_module
 from types import MappingProxyType, TracebackType
@@ -137,6 +138,10 @@ def _root(
     """Terrain and buildings in 3D, in real time, from the camera of a drone."""
     quiet = logging.INFO if context.invoked_subcommand in SERVICES else logging.WARNING
     logging.basicConfig(level=logging.DEBUG if verbose else quiet, handlers=[log_handler()])
+    if not (verbose or sys.warnoptions):
+        # What Pillow and OpenCV say of each odd tag of each image; we report what is not read.
+        warnings.simplefilter("ignore")
+        os.environ.setdefault("OPENCV_LOG_LEVEL", "FATAL")
 
 
 def _end_by_signals() -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from command_line import skyrelief
+from PIL import Image, TiffImagePlugin
 from typer.testing import CliRunner
 
 import service.cli
@@ -238,6 +239,19 @@ def test_a_port_that_is_taken_is_said_in_plain_words() -> None:
         config = SessionConfig("router", listen=(f"tcp/127.0.0.1:{port}",))
         with pytest.raises(OutsideError, match="another program has this port"):
             open_session(config)
+
+
+@pytest.mark.slow
+def test_what_libraries_say_of_odd_tags_is_not_printed(tmp_path: Path) -> None:
+    """OpenCV wrote a line for each unknown tag of each image, as a MicaSense has many."""
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[48020] = "a maker's own"
+    for name in ("a.tif", "b.tif", "c.tif"):
+        Image.new("L", (64, 48)).save(tmp_path / name, tiffinfo=tags)
+    options = ["--pattern", "9x6", "--square-m", "0.03", "--out", str(tmp_path / "camera.yaml")]
+    quiet = run_cli("calibrate", str(tmp_path), *options)
+    assert quiet.returncode == 2 and "48020" not in quiet.stderr
+    assert "48020" in run_cli("--verbose", "calibrate", str(tmp_path), *options).stderr
 
 
 def test_input_errors_are_one_line_and_exit_2(tmp_path: Path) -> None:
