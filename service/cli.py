@@ -139,7 +139,7 @@ def _root(
     quiet = logging.INFO if context.invoked_subcommand in SERVICES else logging.WARNING
     logging.basicConfig(level=logging.DEBUG if verbose else quiet, handlers=[log_handler()])
     if not (verbose or sys.warnoptions):
-        # What Pillow and OpenCV say of each odd tag of each image; we report what is not read.
+        # Pillow and OpenCV print a line for each odd tag of each image; we report what is not read.
         warnings.simplefilter("ignore")
         os.environ.setdefault("OPENCV_LOG_LEVEL", "FATAL")
 

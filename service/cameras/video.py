@@ -102,7 +102,7 @@ class VideoSource:
                 " counts as if they were square; ffmpeg -vf scale=iw*sar:ih,setsar=1 makes them so"
             )
         if self._first.interlaced_frame:
-            self._warn("its images are interlaced, their edges are torn; ffmpeg -vf bwdif mends it")
+            self._warn("its images are interlaced, their edges are torn; ffmpeg -vf bwdif fixes it")
 
     def __iter__(self) -> Iterator[CameraFrame]:
         """Yield the images whose time increases; warns at the end about skipped ones."""
