@@ -442,7 +442,8 @@ def coloured(title: str, values: Array, unit: str, colours: int = cv2.COLORMAP_T
     image = cv2.applyColorMap(tone, colours)
     image[~known] = BACKGROUND
     share = 100.0 * float(known.mean())
-    text = f"{title} {low:.2f} to {high:.2f} {unit}".rstrip()
+    digits = 2 if unit else 0  # counts are whole
+    text = f"{title} {low:.{digits}f} to {high:.{digits}f} {unit}".rstrip()
     return Panel(f"{text}, {share:.0f} % known", np.asarray(image, np.uint8))
 
 

@@ -41,7 +41,7 @@ STYLE = (
     "print-color-adjust:exact}figure,table,tr,h2,h3,h4{break-inside:avoid}"
     "h2,h3,h4{break-after:avoid}section{break-before:page}section.first{break-before:auto}"
     "h2{margin-top:0}img,svg{max-height:110mm;width:auto}.map img{max-height:225mm}"
-    ".first img{max-height:130mm}}"
+    ".first img{max-height:130mm}.first td:first-child{min-width:17em}}"
 )
 
 

@@ -85,6 +85,7 @@ def test_colours_follow_values_and_titles_say_the_range() -> None:
     first, last = panel.image[0, 1].astype(int), panel.image[-1, -1].astype(int)
     assert first[0] > first[2] and last[2] > last[0]  # blue is near, red is far
     assert "no data" in coloured("depth", values * np.nan, "m").title
+    assert coloured("pairs", values, "").title.startswith("pairs 10 to 20,")
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04broken"])
