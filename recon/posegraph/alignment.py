@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from recon import se3
+from recon import parallel, se3
 from recon.posegraph.alignment_readings import (
     AXES,
     NO_YAW_RAD,
@@ -347,6 +347,7 @@ def _solve(readings: AlignmentReadings, at: AlignmentState, settled: float) -> _
     weight = kept
     ridge = np.diag([1e-6] * 6 + [1e-4] + [0.0] * 4)
     for i in range(ITERATIONS + 10):
+        parallel.release_gil()
         r, J = readings.linearised(at)
         norms = np.sqrt(np.bincount(group, weights=r**2, minlength=len(kept)))
         cost = float(np.sum(np.where(norms < HUBER, 0.5 * norms**2, HUBER * (norms - HUBER / 2))))

@@ -59,6 +59,7 @@ class Trajectory:
         """``graph`` places the keyframes; a :class:`PoseGraph` when left out."""
         self.graph = PoseGraph() if graph is None else graph
         self._table = Table(KEYFRAME)  # of all keyframes, in order
+        self._row = dict[int, int]()  # place of each in the table, by number
         self._nodes = np.zeros(0, np.int64)  # rows of those that are nodes, in order
         self._generation = 0  # of the graph
         self._checked = -1  # version of the graph that all published poses follow
@@ -81,6 +82,7 @@ class Trajectory:
         row = np.zeros(1, KEYFRAME)
         row["seq"], row["segment"], row["T_odom_camera"] = seq, segment, T_odom_camera
         row["height"] = height[0] if height is not None and height[0] else 1.0
+        self._row[seq] = len(self._table)
         self._table.append(row)
         if self.graph.generation == self._generation:
             self._nodes = np.append(self._nodes, len(self._table) - 1)
@@ -89,26 +91,18 @@ class Trajectory:
             self._nodes = np.searchsorted(self._table.rows["seq"], self.graph.seqs)
 
     def __contains__(self, seq: int) -> bool:
-        rows = self._table.rows
-        row = np.searchsorted(rows["seq"], seq)
-        return bool(row < len(rows) and rows["seq"][row] == seq)
-
-    def _row(self, seq: int) -> int:
-        """Place of a keyframe in the table. Raises KeyError for an unknown one."""
-        if seq not in self:
-            raise KeyError(seq)
-        return int(np.searchsorted(self._table.rows["seq"], seq))
+        return seq in self._row
 
     def odom_pose(self, seq: int) -> F64:
         """(4, 4) T_odom_camera of a keyframe in its segment's chain."""
-        return np.array(self._table.rows["T_odom_camera"][self._row(seq)])
+        return np.array(self._table.rows["T_odom_camera"][self._row[seq]])
 
     # ---- poses ---------------------------------------------------------------------------------
 
     def pose(self, seq: int) -> Pose:
         """The keyframe in the world, as known now. Raises KeyError for an unknown keyframe."""
         if seq not in self.graph:
-            row = np.array([self._row(seq)])
+            row = np.array([self._row[seq]])
             T, scales = self._placed(row)
             node = self.pose(int(self._table.rows["seq"][self._node_before(row)[0]]))
             return replace(node, T_world_camera=T[0], scale=float(scales[0]))
@@ -198,7 +192,7 @@ class Trajectory:
         then the loop is moved to the node before it, with vision's covariance on the way there;
         False where that node is of another segment."""
         if a not in self.graph:
-            row = self._row(a)
+            row = self._row[a]
             if self._is_dropped(np.array([row]))[0]:
                 return False  # no node carries it
             i = int(np.searchsorted(self._nodes, row))
@@ -215,7 +209,7 @@ class Trajectory:
 
     def publish(self, seq: int, pose: Pose) -> None:
         """Remember that this pose of the keyframe was published."""
-        row = self._table.rows[self._row(seq)]
+        row = self._table.rows[self._row[seq]]
         row["is_published"], row["sigma_m"], row["scale"] = True, sigma_m(pose), pose.scale
         row["T_world_camera"], row["covariance"] = pose.T_world_camera, pose.covariance
 
