@@ -171,6 +171,12 @@ def test_clicks_measure_the_house(ruler: Ruler, house: HouseFlight) -> None:
     assert ruler.page.run("document.querySelector('.measure').hidden")
 
 
+IN_FRONT = """(b => {{ b.scrollIntoView(); const r = b.getBoundingClientRect();
+  return document.elementFromPoint(r.x + r.width / 2, r.y + r.height / 2) === b; }})(
+  [...document.querySelectorAll('button')].find(b => b.textContent === '{}'))"""
+"""Whether a click on a button reaches it."""
+
+
 def test_measurements_are_named_kept_and_leave_as_csv_geojson_and_print(
     ruler: Ruler, house: HouseFlight, tmp_path: Path
 ) -> None:
@@ -192,6 +198,8 @@ def test_measurements_are_named_kept_and_leave_as_csv_geojson_and_print(
     page.run("document.querySelector('.measure .note-text').click()")
     length = float(np.linalg.norm(last - first))
     assert abs(ruler.number("Distance") - length) < 0.02
+    page.wait("!!document.body.dataset.image")  # which lies below the panel
+    assert page.run(IN_FRONT.format("All as CSV"))
     with page.page.expect_download() as download:
         page.click("All as CSV")
     rows = list(csv.DictReader(io.StringIO(download.value.path().read_text())))

@@ -2,7 +2,7 @@
 
 import { Vector3 } from "three";
 import * as api from "./api";
-import { copy, el, notify, save, short, svg } from "./dom";
+import { copy, el, notify, save, short, svg, unbroken } from "./dom";
 import { along, area, type Points } from "./figures";
 import { coordinates, pointOf } from "./globe";
 import { chart, csvOf, geojsonOf, type Measured, measured, type Named, print, spotsOf, wordsOf } from "./measured";
@@ -196,7 +196,7 @@ export class Ruler {
     const { heights } = this.now;
     const facts = Object.entries(wordsOf(this.now, this.scene.scaleSigma())).flatMap(([k, v]) => [
       el("dt", { textContent: k }),
-      el("dd", { textContent: v }),
+      el("dd", {}, ...unbroken(v)),
     ]);
     const keep = button("Save", "keep this measurement with the scan", homeless, () => this.save());
     return [

@@ -2,7 +2,7 @@
 
 import type { Vector3 } from "three";
 import type { Origin, Triple } from "./api";
-import { el, svg } from "./dom";
+import { date, el, svg } from "./dom";
 import { along, area, lastStep, type Points, profile, type Volume, volume } from "./figures";
 import { placeOf } from "./globe";
 import * as units from "./units";
@@ -25,7 +25,7 @@ export function wordsOf({ places, volume }: Measured, scaleSigma: number | null 
   const step = lastStep(places);
   const words: Record<string, string> = {
     Distance: units.length(step.distance_m),
-    Level: units.length(step.level_m),
+    Horizontal: units.length(step.level_m),
     Height: `${step.height_m >= 0 ? "+" : ""}${units.length(step.height_m)}`,
     Slope: `${step.slope_deg.toFixed(1)}° (${((100 * step.height_m) / step.level_m).toFixed(0)} %)`,
   };
@@ -113,7 +113,7 @@ export function print(title: string, origin: Origin | null, scaleSigma: number |
       one.heights ? chart(one.heights, origin, along(one.places)) : null,
     ),
   );
-  const sheet = el("div", { className: "sheet" }, el("h1", { textContent: title }), el("p", { textContent: new Date().toLocaleString() }), ...image, ...sections);
+  const sheet = el("div", { className: "sheet" }, el("h1", { textContent: title }), el("p", { textContent: date(Date.now() / 1000) }), ...image, ...sections);
   document.body.append(sheet);
   addEventListener("afterprint", () => sheet.remove(), { once: true });
   // An image that is not decoded yet would be printed blank.

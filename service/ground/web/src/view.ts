@@ -206,10 +206,9 @@ function linkTo(link: HTMLAnchorElement, scan: api.Scan): void {
 
 /** The figures; of a finished scan none of the moment. */
 function rows(cloud: Cloud, { counts, quality }: api.Scan, finished: boolean, last: LastPose | undefined, site: string): HTMLElement[] {
-  const facts: [string, string][] = [
-    ["Points", count(cloud.isWhole && counts?.points !== undefined ? counts.points : cloud.own.points)],
-    ["Images", String(cloud.own.keyframes)],
-  ];
+  const kept = counts?.points; // of those drawn, after what other images see through is removed: known for all together
+  const facts: [string, string][] = [["Images", String(cloud.own.keyframes)]];
+  if (kept === undefined || cloud.isWhole) facts.unshift(["Points", count(kept ?? cloud.own.points)]);
   if (finished && quality?.sigma_median_m) facts.push(["Relative", units.accuracy(quality.sigma_median_m)]);
   const [across, up] = finished ? [quality?.position_sigma_h_median_m, api.heightSigma(quality)] : (last?.sigma_h_v_m ?? []);
   if (across && up) facts.push(["Absolute", units.sigmas(across, up)]);
