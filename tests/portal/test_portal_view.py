@@ -433,6 +433,11 @@ def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, s
     assert "Speed" not in figures  # it has landed
     follow = "[...document.querySelectorAll('button')].find(b => b.textContent === 'Follow')"
     assert browser.run(f"{follow}.hidden")
+    at = "const field = document.querySelector('.time input'); field.value = '{}';"
+    figure = "document.querySelector('.figures').innerText.includes('Points')"
+    for step, shown in (("2", "!"), ("5", "!!")):  # of a part nobody has counted what is kept
+        browser.run(f"(() => {{ {at.format(step)}{CHANGED} }})()")
+        browser.wait(f"{shown}{figure}")
 
 
 def test_the_colours_of_sigma_span_what_is_there(browser: Browser, portal: Portal) -> None:
