@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     import av
 
 SURE = 5
-"""Packets in a row that begin with an image, before one counts as whole when it comes."""
+"""Packets in a row that hold an image each, before one counts as whole when it comes."""
+
+LARGEST_BYTES = 1 << 23
+"""Of a packet, and so of a coded image; without a limit given, FFmpeg's demuxer cuts at 200 KiB."""
 
 
 def access_units(
@@ -24,7 +27,8 @@ def access_units(
 
     Where packets do not hold an image each, FFmpeg's parser cuts them, as it does without the flag.
     An image has the times of the packet in which it begins. The first ones come together: the time
-    of a live image follows from its arrival, which must not become earlier in a stream.
+    of a live image follows from its arrival, which must not become earlier in a stream. Once a
+    packet that counted as whole was not, none does any more. Raises OSError when no image ends.
     """
     import av
 
@@ -38,19 +42,23 @@ def access_units(
     held: list[av.Packet[Any]] = []  # until the first packets show what they hold
     fed = cut = given = 0  # bytes from the stream's start: parsed, in whole images, passed on
     in_a_row = 0
+    may_be_sure = True
     for number, packet in enumerate(packets):  # the last one is empty, and empties the parser
         start, fed = fed, fed + packet.size
         begun.append((start, packet))
-        is_start = False
-        for image in parser.parse(bytes(packet)):
+        images = parser.parse(bytes(packet))
+        for image in images:
             while len(begun) > 1 and begun[1][0] <= cut:
                 begun.popleft()
             began, cut = cut, cut + image.size
-            is_start = is_start or cut == start
             if began >= given:
                 held.append(_timed(image, begun[0][1]))
-        in_a_row = in_a_row + 1 if is_start else 0
-        if in_a_row >= SURE and packet.size:
+        if fed - cut > 2 * LARGEST_BYTES:
+            raise OSError(f"no image in {(fed - cut) >> 20} MiB")
+        holds_one = len(images) == 1 and cut == start  # as far as the packet before shows
+        may_be_sure = may_be_sure and (holds_one or in_a_row < SURE)
+        in_a_row = in_a_row + 1 if holds_one else 0
+        if may_be_sure and in_a_row >= SURE and packet.size:
             given = fed
             held.append(packet)
         if number >= SURE or not packet.size:

@@ -35,7 +35,7 @@ import numpy as np
 
 from recon.types import U8
 from service.cameras import open_container, reject_options
-from service.cameras.access_units import access_units
+from service.cameras.access_units import LARGEST_BYTES, access_units
 from service.cameras.lens import same_shape
 from service.cameras.source import CameraFrame, CameraSource, Paced, frame_bgr
 from service.cameras.video import decoded_frames, video_stream
@@ -56,8 +56,10 @@ OPEN_S = 10.0
 LIVE_OPTIONS = {"fflags": "nobuffer", "flags": "low_delay", "fpsprobesize": "0"}
 """The last one: open the stream at once, without waiting some twenty images for its rate."""
 
-TS_OPTIONS = LIVE_OPTIONS | {"fflags": "nobuffer+noparse"}
+UNPARSED = {"fflags": "noparse", "max_packet_size": str(LARGEST_BYTES)}
 """Images are not held back until the next one begins: :mod:`service.cameras.access_units`."""
+
+TS_OPTIONS = LIVE_OPTIONS | UNPARSED | {"fflags": "nobuffer+noparse"}
 
 NO_PARSE = 32  # of a container's flags
 
@@ -319,8 +321,7 @@ def open_srt(rest: str, options: Mapping[str, str]) -> CameraSource:
     source = ["srtsrc", f"uri=srt:{rest}", *([] if place[1] else ["mode=listener"])]
     description = without_credentials(f"srt:{rest}")
     pipeline = [*source, "!", "fdsink", "fd=1"]
-    options = LISTEN_OPTIONS | {"fflags": "noparse"}
-    return _launched(pipeline, description, options, listens=not place[1])
+    return _launched(pipeline, description, LISTEN_OPTIONS | UNPARSED, listens=not place[1])
 
 
 def open_v4l2(rest: str, options: Mapping[str, str]) -> CameraSource:

@@ -14,7 +14,7 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -153,30 +153,92 @@ def test_no_image_comes_earlier_after_its_exposure_than_those_before_it() -> Non
     assert seen == [SURE + 1] * SURE + [*range(SURE + 1, 13)]
 
 
+def cut_out(
+    container: av.container.InputContainer, chunks: Iterable[bytes]
+) -> list[av.Packet[Any]]:
+    """The images of a stream whose packets are ``chunks``, a second's tenth apart."""
+    stream = container.streams.video[0]
+
+    def packets() -> Iterator[av.Packet[Any]]:
+        for number, chunk in enumerate((*chunks, b"")):
+            packet = av.Packet(chunk)
+            packet.stream, packet.pts, packet.time_base = stream, number, Fraction(1, 10)
+            yield packet
+
+    return list(access_units(packets(), stream))
+
+
+@contextlib.contextmanager
+def twenty_images() -> Iterator[tuple[av.container.InputContainer, list[bytes]]]:
+    """A stream, and each of its images."""
+    with av.open(io.BytesIO(h264(20, "h264")), options={"fflags": "noparse"}) as container:
+        data = b"".join(bytes(packet) for packet in container.demux(video=0))
+        parser = av.CodecContext.create("h264", "r")
+        yield container, [bytes(unit) for unit in (*parser.parse(data), *parser.parse(None))]
+
+
 @pytest.mark.parametrize("whole", [0, 9])
 def test_images_that_lie_anywhere_in_their_packets_are_cut_out(whole: int) -> None:
     """Also after a stream whose first packets were images."""
-    with av.open(io.BytesIO(h264(20, "h264")), options={"fflags": "noparse"}) as container:
-        stream = container.streams.video[0]
-        data = b"".join(bytes(packet) for packet in container.demux(stream))
-        parser = av.CodecContext.create("h264", "r")
-        images = [bytes(unit) for unit in (*parser.parse(data), *parser.parse(None))]
+    with twenty_images() as (container, images):
         rest = b"".join(images[whole:])
         chunks = [rest[at : at + 700] for at in range(0, len(rest), 700)]
-
-        def packets() -> Iterator[av.Packet[Any]]:
-            for number, chunk in enumerate((*images[:whole], *chunks, b"")):
-                packet = av.Packet(chunk)
-                packet.stream, packet.pts, packet.time_base = stream, number, Fraction(1, 10)
-                yield packet
-
-        units = list(access_units(packets(), stream))
+        units = cut_out(container, (*images[:whole], *chunks))
     found = [bytes(unit) for unit in units if bytes(unit) in images]
     # Only the chunk after it shows that the first one was no image.
     assert found == images[:whole] + images[whole + bool(whole) :]
     assert len(units) - len(found) == bool(whole)
     starts = np.cumsum([0, *(len(image) for image in images[whole:])])
     assert [unit.pts for unit in units[-5:]] == [whole + start // 700 for start in starts[-6:-1]]
+
+
+@pytest.mark.parametrize("whole", [0, 8])
+def test_images_that_share_a_packet_are_parted(whole: int) -> None:
+    """The first one of each packet came twice, the second only with it."""
+    with twenty_images() as (container, images):
+        pairs = [a + b for a, b in zip(images[whole::2], images[whole + 1 :: 2], strict=True)]
+        units = cut_out(container, (*images[:whole], *pairs))
+    assert [bytes(unit) for unit in units] == images
+
+
+def test_a_sender_that_parts_its_large_images_spoils_no_more_than_the_first() -> None:
+    """Each of them was taken for whole again, and its second part dropped."""
+    with twenty_images() as (container, images):
+        parted = [
+            part
+            for k, image in enumerate(images)
+            for part in ((image[:600], image[600:]) if k in (7, 14) else (image,))
+        ]
+        units = cut_out(container, parted)
+    assert [k for k, image in enumerate(images) if image not in map(bytes, units)] == [7]
+
+
+def test_a_stream_without_an_image_ends() -> None:
+    """The parser kept its bytes for ever."""
+    chunks = itertools.repeat(b"\x55" * (1 << 20), 100)
+    with twenty_images() as (container, _), pytest.raises(OSError, match="no image in 17 MiB"):
+        cut_out(container, chunks)
+
+
+def test_an_image_larger_than_the_demuxers_packets_is_whole() -> None:
+    """FFmpeg's demuxer of MPEG-TS cuts at 200 KiB: each large key frame was lost."""
+    data = io.BytesIO()
+    with av.open(data, "w", format="mpegts") as out:
+        options = {"tune": "zerolatency", "qp": "0", "g": "7", "preset": "ultrafast"}
+        stream: Any = out.add_stream("libx264", rate=10, options=options)
+        stream.width, stream.height, stream.pix_fmt = 480, 360, "yuv420p"
+        noise = np.random.default_rng(0).integers(0, 256, (360, 480, 3), np.uint8)
+        for i in range(10):
+            shown = noise if i % 7 == 0 else np.full_like(noise, i)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(shown, format="bgr24")))
+        out.mux(stream.encode(None))
+    with av.open(io.BytesIO(data.getvalue())) as recording:
+        images = [bytes(packet) for packet in recording.demux(video=0) if packet.size]
+    with av.open(io.BytesIO(data.getvalue()), options=dict(live.TS_OPTIONS)) as container:
+        stream = container.streams.video[0]
+        units = [bytes(unit) for unit in access_units(container.demux(stream), stream)]
+    assert len(images[7]) > 210_000
+    assert units == images
 
 
 def take(source: LiveSource, n: int) -> list[CameraFrame]:
