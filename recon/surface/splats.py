@@ -485,8 +485,9 @@ def _blend(
                 if before >= done:
                     du = np.float32(col) - u
                     far = (uu * du + uv * dv) * du + vv * dv * dv
-                    step = np.int32(far)
-                    if step < 1024:
+                    if far < 1024.0:  # also no NaN, nor what no integer holds
+                        far = max(far, np.float32(0.0))
+                        step = np.int32(far)
                         between = far - np.float32(step)
                         near = FADING[step] + between * (FADING[step + 1] - FADING[step])
                         alpha = min(opacity[n] * near, most)

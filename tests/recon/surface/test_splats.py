@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recon import se3
+from recon.camera_model import rays
 from recon.surface.meshing import Mesh
 from recon.surface.splats import (
     COVERED,
@@ -83,6 +84,28 @@ def test_a_gaussian_beside_the_camera_is_not_drawn_all_over_the_image() -> None:
         np.full((1, 3), 200.0, np.float32),
     )
     assert rendered(splats, K, SIZE, np.eye(4))[1].max() == 0.0
+
+
+@pytest.mark.parametrize(("middle_px", "hidden"), [((-9968.0, 10024.0), 0.0), ((32.0, 24.0), 0.9)])
+def test_a_needle_next_to_the_camera_hides_what_lies_behind_it_only(
+    middle_px: tuple[float, float], hidden: float
+) -> None:
+    # Half the square of the sigmas to a pixel may be more than an integer of 32 bits holds.
+    tele = np.array([[1000.0, 0.0, 32.0], [0.0, 1000.0, 24.0], [0.0, 0.0, 1.0]])
+    along = Rotation.from_euler("z", 45, degrees=True).as_quat()[[3, 0, 1, 2]]
+    places = rays(tele, np.array([middle_px])) * 0.2
+    needle = Splats(
+        places.astype(np.float32),
+        along[None].astype(np.float32),
+        np.array([[2.0, 1e-4, 1e-4]], np.float32),
+        np.full(1, 0.9, np.float32),
+        np.full((1, 3), 200.0, np.float32),
+    )
+    opacity = rendered(needle, tele, (64, 48), np.eye(4))[1]
+    v, u = np.mgrid[:48, :64]
+    off_px = abs((u - middle_px[0]) - (v - middle_px[1])) / np.sqrt(2)
+    assert opacity[off_px > 4].max() == 0.0
+    assert opacity[24, 32] == pytest.approx(hidden, abs=0.01)
 
 
 def slope(T: F64, up: F64, sigma_m: float = 0.05) -> DepthMap:
