@@ -33,9 +33,13 @@ def access_units(
     import av
 
     parser = av.CodecContext.create(stream.codec_context.name, "r")
+    # H.264 with lengths in place of start codes, as Matroska has it
+    are_images = (stream.codec_context.extradata or b"").startswith(b"\x01")
     try:
         parser.parse(None)
     except ValueError:  # no parser: the packets of this codec are images
+        are_images = True
+    if are_images:
         yield from packets
         return
     begun: deque[tuple[int, av.Packet[Any]]] = deque()  # the packets that may begin an image

@@ -264,7 +264,11 @@ def decoded_frames(
     while True:
         try:
             packet = next(packets, None)
-        except (av.error.FFmpegError, OSError) as error:
+        except (
+            av.error.FFmpegError,
+            OSError,
+            IndexError,
+        ) as error:  # PyAV's, of a new stream's end
             broke_off(f"it is cut off: {error}")
             packet = None
         if packet is not None and not is_needed(packet):

@@ -213,6 +213,32 @@ def test_a_sender_that_parts_its_large_images_spoils_no_more_than_the_first() ->
     assert [k for k, image in enumerate(images) if image not in map(bytes, units)] == [7]
 
 
+@pytest.mark.parametrize("container", ["mpegts", "h264", "matroska"])
+def test_all_images_of_any_format_are_passed_on(container: str) -> None:
+    """Of Matroska, whose H.264 has no start codes, all came as one image at the end."""
+    data = io.BytesIO(h264(20, container))
+    with av.open(data, options={"fflags": "noparse"}) as stream:
+        video = stream.streams.video[0]
+        units = access_units(stream.demux(video), video)
+        assert len(list(decoded_frames(units, video, print, print))) == 20
+
+
+def test_a_stream_that_appears_late_only_ends_the_connection() -> None:
+    """PyAV raises IndexError when what it demuxes ends."""
+    said = list[str]()
+    with twenty_images() as (container, images):
+        stream = container.streams.video[0]
+
+        def packets() -> Iterator[av.Packet[Any]]:
+            packet = av.Packet(images[0])
+            packet.stream = stream
+            yield packet
+            raise IndexError("list index out of range")
+
+        frames = list(decoded_frames(packets(), stream, said.append, print))
+    assert len(frames) == 1 and said == ["it is cut off: list index out of range"]
+
+
 def test_a_stream_without_an_image_ends() -> None:
     """The parser kept its bytes for ever."""
     chunks = itertools.repeat(b"\x55" * (1 << 20), 100)
