@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from recon.tracking.frame import RelativePose
 from recon.tracking.odometry import Tracked
-from recon.types import Keyframe, Pose
+from recon.types import Array, Keyframe, Pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,11 +27,13 @@ class KeyframeReady:
     """A view has become a keyframe, with the depth of all its partners.
 
     ``is_first_depth``: only what one partner shows, to look at now. The same view comes again with
-    its whole depth, unless it is refused.
+    its whole depth, unless it is refused. ``stages``: the images of its stages, by name, where they
+    are kept.
     """
 
     keyframe: Keyframe
     is_first_depth: bool = False
+    stages: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

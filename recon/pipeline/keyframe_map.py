@@ -18,7 +18,7 @@ from recon.posegraph.pieces import apart
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import carried
-from recon.types import F64, DepthMap, Keyframe, Pose
+from recon.types import F64, Array, DepthMap, Keyframe, Pose
 
 FARTHEST_M = 1e6
 """Maximum distance from the scan's origin."""
@@ -33,6 +33,7 @@ class GraphUpdate:
     is_plausible: bool = True  # its place is not impossibly far away
     changed: Mapping[int, Pose] = field(default_factory=dict)  # of keyframes published before
     keyframe: Keyframe | None = None
+    stages: Mapping[str, Array] = field(default_factory=dict)  # of the keyframe; only for debugging
 
 
 class KeyframeMap:

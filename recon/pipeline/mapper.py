@@ -238,6 +238,8 @@ class Mapper:
         if view.is_first_depth:
             assert self.first_depths is not None
             return self.first_depths(view)
+        if self.debug is not None:
+            self.debug.clear()
         depth = None
         grid = self.rectify.grid(view)
         depths = self.stereo.carried(view, grid)  # by images that are matched already
@@ -270,7 +272,7 @@ class Mapper:
             metric = keyframe.depth
             self.debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
         self.keyframes.add_surface(view, keyframe)
-        return replace(update, keyframe=keyframe)
+        return replace(update, keyframe=keyframe, stages=dict(self.debug or {}))
 
     def drain(self) -> tuple[Event, ...]:
         """The views still waiting for partners, up to one whose work failed."""
@@ -300,7 +302,7 @@ class Mapper:
                 self._ready.add(view.seq)
                 if self._kept is not None:
                     self._kept[view.seq] = update.keyframe
-                yield KeyframeReady(update.keyframe)
+                yield KeyframeReady(update.keyframe, stages=update.stages)
             yield from self._changed(update.changed)
         self.frames.settle()
 

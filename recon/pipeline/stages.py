@@ -128,7 +128,6 @@ class Rectify:
                 continue
             pairs[partner.seq] = pair
             if self._debug is not None:
-                self._debug.clear()
                 self._debug |= {"raw_left": view.bgr, "raw_right": partner.gray}
         self.pairs += len(pairs) + len(known)
         return pairs

@@ -63,7 +63,8 @@ class SurfaceMap:
     def peek(self, depth: DepthMap, rows_share: F32, T_odom_camera: F64) -> tuple[F32, Bool]:
         """As :meth:`__call__`, of a depth that is not remembered and shows no disagreement."""
         in_odom = self._in_odom(depth, rows_share, T_odom_camera)
-        fresh = np.isfinite(depth.depth_m) if self.known is None else self.known.fresh(in_odom)
+        known = self.known  # another thread may clear it meanwhile
+        fresh = np.isfinite(depth.depth_m) if known is None else known.fresh(in_odom)
         return in_odom.sigma_m, fresh
 
     def _in_odom(self, depth: DepthMap, rows_share: F32, T_odom_camera: F64) -> DepthMap:

@@ -223,13 +223,13 @@ class Recorder:
         for first in (event.keyframe for event in ready if event.is_first_depth):
             coarse, *_ = encode(first, first.time_ns + self._offset_ns)
             self.store.offer_first(first.seq, coarse)
-        keyframes = [event.keyframe for event in ready if not event.is_first_depth]
-        if keyframes:
+        whole = [event for event in ready if not event.is_first_depth]
+        if whole:
             self._write_due()
-        for keyframe in keyframes:
-            self._write_keyframe(keyframe)
-        if self.mapper.debug and keyframes:
-            save_debug(self.store.path.parent, keyframes[-1].seq, self.mapper.debug)
+        for event in whole:
+            self._write_keyframe(event.keyframe)
+            if event.stages:
+                save_debug(self.store.path.parent, event.keyframe.seq, event.stages)
         reposes = [
             self._repose(seq, pose)
             for event in events

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -331,7 +331,7 @@ def debug_path(folder: Path, seq: int) -> Path:
     return folder / "debug" / f"keyframe_{seq:06d}.npz"
 
 
-def save_debug(folder: Path, seq: int, arrays: dict[str, Array]) -> Path:
+def save_debug(folder: Path, seq: int, arrays: Mapping[str, Array]) -> Path:
     """Save the stages of a keyframe for ``skyrelief inspect``, which reads those of DEBUG_KEYS."""
     path = debug_path(folder, seq)
     path.parent.mkdir(parents=True, exist_ok=True)

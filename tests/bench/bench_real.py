@@ -187,8 +187,7 @@ def _keyframes(flight: ReplayedSet) -> list[Keyframe]:
 
 
 def whole_depth(scan: Path, keyframe: Keyframe) -> DepthMap:
-    """Its depth with the surface that was known before, at the scale that it has in the end; of
-    several that came at once, only the last one's is kept."""
+    """Its depth with the surface that was known before, at the scale that it has in the end."""
     stages = load_debug(debug_path(scan, keyframe.seq))
     if stages is None:
         return keyframe.depth

@@ -19,9 +19,11 @@ STRIP_PX = 12
 """Of 160 across: the ground on the right that the keyframe before does not see."""
 
 
-def fly(first_depths: bool, width_px: int = 320, later_gain: float = 1.0) -> list[Event]:
+def fly(
+    first_depths: bool, width_px: int = 320, later_gain: float = 1.0, keeps_debug: bool = False
+) -> list[Event]:
     """``later_gain`` is the exposure of the second half."""
-    config = MapperConfig(upsample=False, first_depths=first_depths)
+    config = MapperConfig(upsample=False, first_depths=first_depths, keeps_debug=keeps_debug)
     mapper, events = Mapper(CAMERA, config), list[Event]()
     mapper.set_effort(config.pairs, width_px, upsample=False)
     for i in range(FRAMES):
@@ -67,6 +69,15 @@ def test_a_first_depth_shows_new_ground_early_and_leaves_the_map_as_it_is() -> N
         off = np.abs(first.depth.depth_m[shown] / HEIGHT_M - 1.0)
         assert np.median(off) < 0.03
         assert np.median(first.depth.sigma_m[shown]) > np.median(final.depth.sigma_m[coming])
+
+
+@pytest.mark.slow
+def test_each_keyframe_says_the_stages_of_its_own_where_they_are_kept() -> None:
+    ready = [e for e in fly(False, keeps_debug=True) if isinstance(e, KeyframeReady)]
+    assert len(ready) > 5
+    for event in ready:
+        np.testing.assert_array_equal(event.stages["depth_m"], event.keyframe.depth.depth_m)
+        np.testing.assert_array_equal(event.stages["bgr"], event.keyframe.bgr)
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from recon.tracking.odometry import Tracked, Tracking
 from recon.types import DepthMap, Keyframe, Pose
 from service.cameras.rig import Rig
 from service.flight.recorder import REPLAYED, Recorder
+from service.scans.drawing import debug_path, load_debug
 from service.stream.images import IMAGE_SHARE
 from service.stream.records import PoseRecord, ScanHeader
 from service.stream.store import ScanStore
@@ -69,7 +70,7 @@ def recorder_of(store: ScanStore, batch: int, of_m: float, graph: object = None)
         assert np.linalg.norm(published.T_world_camera[:3, 3] - there) == 0
         return pose(frame.seq, of_m or sigma_m(published))
 
-    pipeline = MagicMock(debug=None)
+    pipeline = MagicMock()
     pipeline.mapper.keyframes.graph = graph
     pipeline.mapper.frames.pose = at
     pipeline.mapper.is_settled.return_value = False
@@ -217,6 +218,20 @@ def test_a_first_depth_is_offered_and_neither_stored_nor_counted(
         assert store.seqs() == [] and recorder.keyframes == recorder.points == 0
         recorder.write([KeyframeReady(one), posed(8)])
         assert store.record("first", 7) is None and store.seqs() == [7]
+
+
+def test_keyframes_that_come_at_once_keep_their_own_stages(
+    tmp_path: Path, house: HouseFlight
+) -> None:
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("scan", "drone", 0)) as store:
+        recorder = recorder_of(store, 1, 0.1)
+        ready = [
+            KeyframeReady(house.keyframe(seq, 0.0), stages={"depth_m": np.full((2, 2), float(seq))})
+            for seq in (1, 2)
+        ]
+        recorder.write([*ready, KeyframeReady(house.keyframe(3, 0.0)), posed(3)])
+    found = [load_debug(debug_path(tmp_path, seq)) for seq in (1, 2, 3)]
+    assert [None if one is None else one["depth_m"][0, 0] for one in found] == [1.0, 2.0, None]
 
 
 def larger(one: Keyframe, factor: int, rng: np.random.Generator) -> Keyframe:
