@@ -203,13 +203,14 @@ def system_of(text: str) -> tuple[Transformer, str, float]:
             raise CRSError("neither degrees nor a map")
         vertical = next((one for one in more if one.is_vertical), None)
         code = None if vertical is None else vertical.to_epsg()
-        axis = (vertical or flat).axis_info[0]
+        axis = (vertical or flat).axis_info[-1]  # the heights', or else what stands for it
         to_degrees = Transformer.from_crs(flat.to_2d(), "EPSG:4326", always_xy=True)
     except CRSError as error:
         raise ValueError(
             f"{text[:80]!r} is not a coordinate system; give EPSG:n, a PROJ string or WGS84 UTM 32N"
         ) from error
-    unit_m = 1.0 if vertical is None and flat.is_geographic else axis.unit_conversion_factor
+    is_flat_in_degrees = vertical is None and flat.is_geographic and len(flat.axis_info) == 2
+    unit_m = 1.0 if is_flat_in_degrees else axis.unit_conversion_factor
     if unit_m != 1.0:
         if code not in IN_FEET:
             raise ValueError(

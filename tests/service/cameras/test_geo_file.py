@@ -69,6 +69,8 @@ def test_heights_in_feet_are_converted(tmp_path: Path, code: int, foot_m: float)
     ("lines", "what"),
     [
         (["EPSG:2251", "a.jpg 1 2 3"], "line 1: 'EPSG:2251' is in foot; say what its heights are"),
+        (["+proj=longlat +datum=WGS84 +vunits=us-ft", "a.jpg 8 47 3"], "is in US survey foot"),
+        (["+proj=utm +zone=32 +datum=WGS84 +vunits=ft", "a.jpg 1 2 3"], "is in foot"),
         (["EPSG:4326+5702", "a.jpg 8 47 3"], "line 1: 'EPSG:4326+5702' is in US survey foot"),
         (["nothing"], "line 1: 'nothing' is not a coordinate system"),
         (["EPSG:4326"], "no positions below"),
