@@ -33,11 +33,16 @@ Pixels = Annotated[int, Meta(gt=0, le=100_000)]
 
 
 OPENCV_HEAD = "%YAML:1.0"
-"""Which is no YAML."""
+"""Which is no YAML; OpenCV 5 writes another one."""
+
+OPENCV_MATRIX = "!!opencv-matrix"
 
 
 class _Loader(yaml.SafeLoader):
     """Reads OpenCV's matrices as what they are: mappings."""
+
+    def flatten_mapping(self, node: Any) -> None:
+        """Merge nothing: a few lines of merges would take all memory."""
 
     def matrix(self, node: Any) -> dict[Any, Any]:
         return self.construct_mapping(node, deep=True)
@@ -168,7 +173,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(f"camera model {path}: not a YAML file ({_one_line(error)})") from error
     if not isinstance(document, dict):
         raise InputError(f"camera model {path}: not a camera_info YAML file (no keys at its top)")
-    return {"distortion_model": MODEL, **document} if text.startswith(OPENCV_HEAD) else document
+    return {"distortion_model": MODEL, **document} if OPENCV_MATRIX in text else document
 
 
 def _one_line(error: Exception) -> str:

@@ -83,10 +83,11 @@ avg_reprojection_error: 3.9e-01
 """
 
 
-def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("head", ["%YAML:1.0", "%YAML 1.2"])
+def test_what_opencv_writes_is_read(tmp_path: Path, head: str) -> None:
     """As its calibration example does; the four coefficients of a fisheye are another model."""
     path = tmp_path / "camera.yml"
-    path.write_text(OPENCV)
+    path.write_text(OPENCV.replace("%YAML:1.0", head))
     camera = load_camera(path)
     assert camera.size_px == (640, 480) and camera.K[1].tolist() == [0.0, 536.0, 236.0]
     assert camera.distortion.tolist() == [-0.266, -0.039, 0.0018, -0.00028, 0.24]
@@ -166,8 +167,9 @@ def test_missing_key_is_named(key: str, tmp_path: Path) -> None:
         b"[" * 1100,
         b"%YAML:1.0\na: !!opencv-matrix 1\n",
         b"%YAML:1.0\nM1: !!opencv-matrix\n   rows: 3\n",
+        OPENCV.encode() + b"a: &a {x: 1}\nb: {<<: [*a, *a]}\n",
     ],
-    ids=["empty", "bytes", "broken", "list", "words", "deep", "no matrix", "stereo"],
+    ids=["empty", "bytes", "broken", "list", "words", "deep", "no matrix", "stereo", "merge"],
 )
 def test_not_a_camera_file(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
