@@ -444,5 +444,9 @@ def _propagate(
         v = advance(front, begin, end, data, coarse, edges, width, iterations, masks, scratch, ring)
         if begin <= v < end and ring.ctypes.data != out.ctypes.data:
             for direction in range(4):
-                done = ring[direction, (v + 1) % ring.shape[1]]
-                out[direction, v + 1].reshape(-1)[:] = done.reshape(-1)
+                for parity in range(2):
+                    for label in range(labels):
+                        done = ring[direction, (v + 1) % ring.shape[1], parity, label]
+                        kept = out[direction, v + 1, parity, label]
+                        for i in range(kept.shape[0]):
+                            kept[i] = done[i]
