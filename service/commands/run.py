@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING
 
 from service.commands import ConfigFile, Overrides, on_signals
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from service.daemon.simulated import SimulatedFlight
 
 log = logging.getLogger(__name__)
+
+_reloads = Lock()
 
 
 def run(config: ConfigFile = None, set_: Overrides = None) -> None:
@@ -94,10 +97,12 @@ def _simulated(config: Config) -> SimulatedFlight | None:
 def _reload(
     daemon: Daemon, flight: SimulatedFlight | None, path: Path | None, overrides: list[str]
 ) -> None:
+    """Read the configuration again, each signal after the one before: the newest file counts."""
     from service.config import load_config
 
-    try:
-        wanted = load_config(path, overrides)
-        daemon.reload(wanted if flight is None else flight.configured(wanted))
-    except InputError as error:
-        log.error("the configuration is unchanged: %s", error)
+    with _reloads:
+        try:
+            wanted = load_config(path, overrides)
+            daemon.reload(wanted if flight is None else flight.configured(wanted))
+        except InputError as error:
+            log.error("the configuration is unchanged: %s", error)

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from loopback import until
@@ -17,6 +18,7 @@ from mavlink.component.parameters import PARAMETERS
 from mavlink.component.vehicle import VehicleLink
 from mavlink.wire.dialect import dialect
 from mavlink.wire.framing import Framer
+from service.commands.run import _reload
 from service.config import Config, change, load_config
 from service.daemon.frame_gate import FrameGate
 from service.daemon.vehicle_config import TUNABLES, parameters_of, with_parameter
@@ -209,3 +211,22 @@ def test_a_parameter_that_is_set_during_a_reload_stands(tmp_path: Path) -> None:
     tuning.join()
     assert scanning.config.datalink.budget_kbit_s == 500
     assert scanning.config.scan.resolution_m == 0.25
+
+
+def test_of_two_reloads_the_newest_file_counts(tmp_path: Path) -> None:
+    """Each runs on a thread of its own: the earlier one put its older file in force last."""
+    path, in_force = tmp_path / "sr.toml", list[float]()
+    path.write_text("[datalink]\nbudget_kbit_s = 300\n")
+
+    def take(wanted: Config) -> None:
+        if second.ident is None:
+            path.write_text("[datalink]\nbudget_kbit_s = 500\n")
+            second.start()
+            second.join(0.2)  # it waits for this one
+        in_force.append(wanted.datalink.budget_kbit_s)
+
+    daemon = Mock(reload=take)
+    second = threading.Thread(target=_reload, args=(daemon, None, path, []))
+    _reload(daemon, None, path, [])
+    second.join()
+    assert in_force == [300.0, 500.0]
