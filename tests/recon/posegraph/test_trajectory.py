@@ -164,6 +164,10 @@ def test_a_frame_rides_on_its_keyframe() -> None:
     assert key.scale == pytest.approx(2.0, rel=0.03)
     here = se3.inverse(key.T_world_camera) @ frame.T_world_camera
     assert here[0, 3] == pytest.approx(0.5 * key.scale)
+    ahead = np.array([[1.0, 2.0, 0.5 * HEIGHT_M]])  # in units of the odometry
+    (T,) = trajectory.similarities([50])
+    there = se3.transform(key.T_world_camera, key.scale * ahead)
+    np.testing.assert_allclose(se3.transform(T, ahead), there, atol=1e-9)
 
 
 def test_the_end_publishes_each_sigma_as_it_is() -> None:
