@@ -1,7 +1,8 @@
 """One exposure for all images of a flight, whatever automatic exposure and clouds do.
 
 A colour times a gain is the same colour at another exposure. Most of what an image shows earlier
-ones showed, too; a gain for each channel, which changes linearly over the image, makes them agree.
+ones showed, too; a gain for each channel makes them agree. It is the same all over the image: one
+that changes across it takes the lens's shading for an exposure, and adds it up along a line.
 """
 
 from __future__ import annotations
@@ -20,17 +21,16 @@ IMAGES = 64
 MIN_COMMON = 60
 """Minimum number of samples in common with earlier images."""
 
-KEPT = np.array([[0.95], [0.8], [0.8]])
-"""Share of the logarithm of a gain, and of its slopes, that is kept from image to image. What has
-one side of all images brighter, as sunlight does, adds up otherwise, as far as the fit takes it for
-one."""
+KEPT = 0.95
+"""Share of the logarithm of a gain that is kept from image to image. What has one side of all
+images brighter, as sunlight does, adds up otherwise, as far as the fit takes it for one."""
 
 LEVEL = 0.1
-"""Weight of a gain without slope, over that of samples all over the image."""
+"""Weight of the same brightness on all sides of an image, over that of samples all over it."""
 
-UNSEEN = np.array([[0.03], [0.06], [0.06]])
-"""Smaller changes show in no seam and are left: what looks different from another side, or darker
-towards the edge of an image, is no change of exposure."""
+UNSEEN = 0.03
+"""Smaller changes show in no seam and are left: what looks different from another side is no change
+of exposure."""
 
 SAME_SHARE = 0.02
 """Samples are of one surface where their depths differ by less than this share."""
@@ -59,8 +59,7 @@ class ExposureCompensation:
         # Places (N, 3) of some surface of each, m, in the segment's frame, the logarithms (N, 3) of
         # its levelled colours, NaN where a colour says nothing, and its places (N, 2) in the image.
         self._segment = -1
-        self._gain = np.zeros((3, 3))  # of the last image: logarithm in the middle, slopes across
-        # and down, each for blue, green and red
+        self._gain = np.zeros(3)  # of the last image: logarithms for blue, green and red
 
     def __call__(self, segment: int, depth: DepthMap, bgr: U8) -> U8:
         """``bgr`` (h, w, 3) on the grid of the depth, levelled; it is remembered.
@@ -77,13 +76,11 @@ class ExposureCompensation:
             which, at, there = shared(depth, points)
             same = np.abs(depth.depth_m[at] / there - 1.0) < SAME_SHARE
             off = np.where(same[:, None], before[which] - _logs(calm[at]), np.nan)
-            places = _places(at, bgr.shape)
-            self._fit(off, np.hstack([places, places[:, 1:] - seen_at[which]]))
+            self._fit(off, _places(at, bgr.shape) - seen_at[which])
         self._gain *= KEPT
         at, points = sampled(depth)
-        places = _places(at, bgr.shape)
-        known = _logs(calm[at]) + places @ self._gain
-        seen = points.astype(np.float32), known.astype(np.float32), places[:, 1:]
+        known = _logs(calm[at]) + self._gain
+        seen = points.astype(np.float32), known.astype(np.float32), _places(at, bgr.shape)
         self._earlier.append(seen)
         return self.level(bgr)
 
@@ -91,38 +88,31 @@ class ExposureCompensation:
         """An image (h, w, 3) that has the exposure of the last one, levelled."""
         if not self._gain.any():
             return bgr
-        h, w = bgr.shape[:2]
-        u, v = np.arange(w, dtype=np.float32) / w - 0.5, np.arange(h, dtype=np.float32) / h - 0.5
-        gain = cv2.merge(
-            [
-                np.outer(np.exp(b * v), np.exp(middle + a * u))
-                for middle, a, b in self._gain.T.astype(np.float32)
-            ]
-        )
-        lit = cv2.multiply(bgr, gain, dtype=cv2.CV_32F)
+        gain = np.broadcast_to(np.exp(self._gain).astype(np.float32), bgr.shape)
+        lit = bgr * gain
         above = lit > KNEE
         room = np.maximum(255 * gain[above] - KNEE, 255 - KNEE)
         lit[above] = KNEE + (lit[above] - KNEE) * ((255 - KNEE) / room)
         return np.asarray(cv2.convertScaleAbs(lit), np.uint8)
 
-    def _fit(self, off: F64, places: F64) -> None:
-        """The gain by differences of logarithms (N, 3) at ``places`` (N, 5): the terms of the gain,
-        and how far across and down each moved over the image. What makes one side of all images
-        brighter depends on that, and is no gain."""
+    def _fit(self, off: F64, moved: F64) -> None:
+        """The gain by differences of logarithms (N, 3) of ground that ``moved`` (N, 2) over the
+        image. What makes one side of all images brighter depends on that, and is no gain."""
         known = np.isfinite(off).all(axis=1)
         every = max(1, np.count_nonzero(known) // FITTED)
-        off, places = off[known][::every], places[known][::every]
+        off, moved = off[known][::every], moved[known][::every]
         if len(off) < MIN_COMMON:
             return
-        gain = np.zeros((5, 3))
+        terms = np.hstack([np.ones((len(off), 1)), moved])
+        gain = np.zeros((3, 3))
         gain[0] = np.median(off, axis=0)
         for _ in range(STEPS):
-            rest = np.linalg.norm(off - places @ gain, axis=1)
+            rest = np.linalg.norm(off - terms @ gain, axis=1)
             limit = HUBER * max(float(np.median(rest)), 1e-3)
-            weighted = places * np.minimum(1.0, limit / np.maximum(rest, limit))[:, None]
-            level = LEVEL / 12.0 * weighted[:, 0].sum() * np.diag([0.0, 1.0, 1.0, 1.0, 1.0])
-            gain = np.linalg.solve(weighted.T @ places + level, weighted.T @ off)
-        change = gain[:3] - self._gain
+            weighted = terms * np.minimum(1.0, limit / np.maximum(rest, limit))[:, None]
+            level = LEVEL / 12.0 * weighted[:, 0].sum() * np.diag([0.0, 1.0, 1.0])
+            gain = np.linalg.solve(weighted.T @ terms + level, weighted.T @ off)
+        change = gain[0] - self._gain
         self._gain += np.sign(change) * np.maximum(np.abs(change) - UNSEEN, 0.0)
         self._gain = np.clip(self._gain, -MAX_LOG, MAX_LOG)
 
@@ -134,6 +124,6 @@ def _logs(colours: F32) -> F32:
 
 
 def _places(at: tuple[I64, I64], shape: tuple[int, ...]) -> F64:
-    """(N, 3) terms of the gain at rows and columns: 1, and the place from -0.5 to 0.5."""
+    """(N, 2) places across and down, from -0.5 to 0.5, of rows and columns."""
     v, u = at
-    return np.stack([np.ones(v.shape), u / shape[1] - 0.5, v / shape[0] - 0.5], axis=-1)
+    return np.stack([u / shape[1] - 0.5, v / shape[0] - 0.5], axis=-1)
