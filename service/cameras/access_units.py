@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import av
 
 SURE = 5
-"""Packets in a row that hold an image each, before one counts as whole when it comes."""
+"""Packets at the start of a stream that end with an image, before one counts as whole."""
 
 LARGEST_BYTES = 1 << 23
 """Of a packet, and so of a coded image; without a limit given, FFmpeg's demuxer cuts at 200 KiB."""
@@ -27,8 +27,8 @@ def access_units(
 
     Where packets do not hold an image each, FFmpeg's parser cuts them, as it does without the flag.
     An image has the times of the packet in which it begins. The first ones come together: the time
-    of a live image follows from its arrival, which must not become earlier in a stream. Once a
-    packet that counted as whole was not, none does any more. Raises OSError when no image ends.
+    of a live image follows from its arrival, which must not become earlier in a stream. After a
+    packet that did not end with an image, none counts as whole. Raises OSError when no image ends.
     """
     import av
 
@@ -45,12 +45,13 @@ def access_units(
     begun: deque[tuple[int, av.Packet[Any]]] = deque()  # the packets that may begin an image
     held: list[av.Packet[Any]] = []  # until the first packets show what they hold
     fed = cut = given = 0  # bytes from the stream's start: parsed, in whole images, passed on
-    in_a_row = 0
-    may_be_sure = True
+    are_whole = True
     for number, packet in enumerate(packets):  # the last one is empty, and empties the parser
         start, fed = fed, fed + packet.size
         begun.append((start, packet))
         images = parser.parse(bytes(packet))
+        if number:
+            are_whole = are_whole and bool(images) and cut + images[0].size == start
         for image in images:
             while len(begun) > 1 and begun[1][0] <= cut:
                 begun.popleft()
@@ -59,10 +60,7 @@ def access_units(
                 held.append(_timed(image, begun[0][1]))
         if fed - cut > 2 * LARGEST_BYTES:
             raise OSError(f"no image in {(fed - cut) >> 20} MiB")
-        holds_one = len(images) == 1 and cut == start  # as far as the packet before shows
-        may_be_sure = may_be_sure and (holds_one or in_a_row < SURE)
-        in_a_row = in_a_row + 1 if holds_one else 0
-        if may_be_sure and in_a_row >= SURE and packet.size:
+        if are_whole and number >= SURE and len(images) == 1 and packet.size:
             given = fed
             held.append(packet)
         if number >= SURE or not packet.size:

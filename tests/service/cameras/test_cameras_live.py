@@ -155,17 +155,17 @@ def test_no_image_comes_earlier_after_its_exposure_than_those_before_it() -> Non
 
 def cut_out(
     container: av.container.InputContainer, chunks: Iterable[bytes]
-) -> list[av.Packet[Any]]:
+) -> Iterator[av.Packet[Any]]:
     """The images of a stream whose packets are ``chunks``, a second's tenth apart."""
     stream = container.streams.video[0]
 
     def packets() -> Iterator[av.Packet[Any]]:
-        for number, chunk in enumerate((*chunks, b"")):
+        for number, chunk in enumerate(itertools.chain(chunks, (b"",))):
             packet = av.Packet(chunk)
             packet.stream, packet.pts, packet.time_base = stream, number, Fraction(1, 10)
             yield packet
 
-    return list(access_units(packets(), stream))
+    return access_units(packets(), stream)
 
 
 @contextlib.contextmanager
@@ -183,7 +183,7 @@ def test_images_that_lie_anywhere_in_their_packets_are_cut_out(whole: int) -> No
     with twenty_images() as (container, images):
         rest = b"".join(images[whole:])
         chunks = [rest[at : at + 700] for at in range(0, len(rest), 700)]
-        units = cut_out(container, (*images[:whole], *chunks))
+        units = list(cut_out(container, (*images[:whole], *chunks)))
     found = [bytes(unit) for unit in units if bytes(unit) in images]
     # Only the chunk after it shows that the first one was no image.
     assert found == images[:whole] + images[whole + bool(whole) :]
@@ -197,7 +197,7 @@ def test_images_that_share_a_packet_are_parted(whole: int) -> None:
     """The first one of each packet came twice, the second only with it."""
     with twenty_images() as (container, images):
         pairs = [a + b for a, b in zip(images[whole::2], images[whole + 1 :: 2], strict=True)]
-        units = cut_out(container, (*images[:whole], *pairs))
+        units = list(cut_out(container, (*images[:whole], *pairs)))
     assert [bytes(unit) for unit in units] == images
 
 
@@ -209,7 +209,7 @@ def test_a_sender_that_parts_its_large_images_spoils_no_more_than_the_first() ->
             for k, image in enumerate(images)
             for part in ((image[:600], image[600:]) if k in (7, 14) else (image,))
         ]
-        units = cut_out(container, parted)
+        units = list(cut_out(container, parted))
     assert [k for k, image in enumerate(images) if image not in map(bytes, units)] == [7]
 
 
@@ -239,11 +239,26 @@ def test_a_stream_that_appears_late_only_ends_the_connection() -> None:
     assert len(frames) == 1 and said == ["it is cut off: list index out of range"]
 
 
+def test_no_image_comes_earlier_where_the_first_packets_were_parts() -> None:
+    """Each comes with the packet after it, as at first."""
+    came = list[bytes]()
+
+    def counted(chunks: Iterable[bytes]) -> Iterator[bytes]:
+        for chunk in chunks:
+            came.append(chunk)
+            yield chunk
+
+    with twenty_images() as (container, images):
+        chunks = (images[0][:600], images[0][600:], *images[1:])
+        seen = [len(came) for _ in cut_out(container, counted(chunks))]
+    assert seen[5:-1] == [*range(8, 22)]
+
+
 def test_a_stream_without_an_image_ends() -> None:
     """The parser kept its bytes for ever."""
     chunks = itertools.repeat(b"\x55" * (1 << 20), 100)
     with twenty_images() as (container, _), pytest.raises(OSError, match="no image in 17 MiB"):
-        cut_out(container, chunks)
+        list(cut_out(container, chunks))
 
 
 def test_an_image_larger_than_the_demuxers_packets_is_whole() -> None:
