@@ -344,9 +344,10 @@ def rendered(
 
 
 def _nearest_first(splats: Splats, K: F64, size_px: tuple[int, int], T: F64) -> I32:
-    """(M,) the Gaussians that may show in an image."""
+    """(M,) the Gaussians that may show in an image; of those equally near, of which flat ground has
+    many, the first one first on every machine."""
     rows, depth = _in_view(splats, K, size_px, T)
-    return np.asarray(rows[np.argsort(depth)])
+    return np.asarray(rows[np.argsort(depth, kind="stable")])
 
 
 def _widest(K: F64, size_px: tuple[int, int]) -> tuple[float, float]:

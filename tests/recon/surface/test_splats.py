@@ -108,6 +108,21 @@ def test_a_needle_next_to_the_camera_hides_what_lies_behind_it_only(
     assert opacity[24, 32] == pytest.approx(hidden, abs=0.01)
 
 
+def test_of_gaussians_that_are_equally_near_the_first_hides_the_others() -> None:
+    count = 400
+    splats = Splats(
+        np.column_stack([np.zeros((count, 2)), 22 - np.arange(count) % 3]).astype(np.float32),
+        np.tile(np.array([[1.0, 0.0, 0.0, 0.0]], np.float32), (count, 1)),
+        np.full((count, 3), 2.0, np.float32),
+        np.full(count, 0.95, np.float32),
+        np.linspace(250.0, 0.0, 3 * count, dtype=np.float32).reshape(count, 3),
+    )
+    middle = np.array([[30.0, 0.0, 8.0], [0.0, 30.0, 8.0], [0.0, 0.0, 1.0]])
+    image, _ = rendered(splats, middle, (17, 17), np.eye(4))
+    first, second, third = splats.rgb[2:9:3].astype(np.float64)  # 0.95 of what comes through each
+    assert np.abs(image[8, 8] - (0.95 * first + 0.0475 * second + 0.002375 * third)).max() < 0.2
+
+
 def slope(T: F64, up: F64, sigma_m: float = 0.05) -> DepthMap:
     """The exact view of the plane through the origin with normal ``up``."""
     u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
