@@ -159,7 +159,8 @@ def seams(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
     Whole depth images are compared: a map keeps surface a second time only where the first visit
     was unsure of it.
     """
-    maps = [whole_depth(flight.scan, keyframe) for keyframe in _keyframes(flight)]
+    with ScanStore.open(flight.scan / "scan.db") as store:
+        maps = [whole_depth(store, keyframe) for keyframe in _keyframes(flight)]
     rng = np.random.default_rng(1)
     pairs = [(a, b) for a in range(len(maps)) for b in range(a + REVISIT, len(maps))]
     rng.shuffle(pairs)
@@ -186,12 +187,13 @@ def _keyframes(flight: ReplayedSet) -> list[Keyframe]:
         ]
 
 
-def whole_depth(scan: Path, keyframe: Keyframe) -> DepthMap:
+def whole_depth(store: ScanStore, keyframe: Keyframe) -> DepthMap:
     """Its depth with the surface that was known before, at the scale that it has in the end."""
-    stages = load_debug(debug_path(scan, keyframe.seq))
+    stages = load_debug(debug_path(store.path.parent, keyframe.seq))
     if stages is None:
         return keyframe.depth
-    grown = np.float32(np.nanmedian(keyframe.depth.depth_m / stages["depth_m"]))
+    repose = store.repose(keyframe.seq)
+    grown = np.float32(1.0 if repose is None else repose.scale)
     return replace(
         keyframe.depth, depth_m=stages["depth_m"] * grown, sigma_m=stages["sigma_m"] * grown
     )

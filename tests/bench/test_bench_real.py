@@ -16,6 +16,8 @@ from recon.types import DepthMap
 from service.bench.keyframes import make_keyframe
 from service.errors import InputError
 from service.scans.drawing import save_debug
+from service.stream.records import Repose, ScanHeader
+from service.stream.store import ScanStore
 
 STILLS = sorted((DEMO / "frames").glob("*.jpg"))
 
@@ -72,13 +74,16 @@ def test_whole_depth_images_have_the_scale_that_their_keyframe_has_in_the_end(
     keyframe = make_keyframe(0)
     depth = keyframe.depth
     save_debug(tmp_path, 0, {"depth_m": 0.5 * depth.depth_m, "sigma_m": 0.5 * depth.sigma_m})
-    stored = depth.depth_m.copy()
-    stored[: len(stored) // 2] = np.nan
-    fresh = replace(keyframe, depth=replace(depth, depth_m=stored))
-    whole = whole_depth(tmp_path, fresh)
+    known = replace(depth, depth_m=np.full_like(depth.depth_m, np.nan))  # nothing in it is new
+    again = replace(keyframe, depth=known)
+    with ScanStore.create(tmp_path / "scan.db", ScanHeader("scan", "drone", 0)) as store:
+        first = whole_depth(store, again)
+        store.add_reposes([Repose(0, 1, depth.T_world_camera, 2.0, np.eye(6))])
+        whole = whole_depth(store, again)
+        assert whole_depth(store, replace(again, seq=1)) is known
+    np.testing.assert_allclose(first.depth_m, 0.5 * depth.depth_m, rtol=1e-5)
     np.testing.assert_allclose(whole.depth_m, depth.depth_m, rtol=1e-5)
     np.testing.assert_allclose(whole.sigma_m, depth.sigma_m, rtol=1e-5)
-    assert whole_depth(tmp_path, replace(fresh, seq=1)) is fresh.depth
 
 
 def test_tilts_between_keyframes_are_told_from_the_bend_of_each() -> None:
