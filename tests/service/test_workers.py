@@ -160,11 +160,14 @@ def test_a_worker_outside_the_table_is_refused() -> None:
         Workers().start("made up", lambda _: None)
 
 
-STARTERS = re.compile(r"\b(?:Thread|Process|Popen|ThreadPoolExecutor|ProcessPoolExecutor|Timer)\(")
+STARTERS = re.compile(
+    r"\b(?:Thread|(?<!psutil\.)Process|Popen|\w+PoolExecutor|Timer|start_new_thread)\("
+)
 OUTSIDE = {
     "recon/parallel.py": "the rows of one compiled call; recon knows nothing of service",
     "service/workers.py": "it is the executor",
     "service/bench/": "benchmarks make their own load, peers and links",
+    "service/commands/__init__.py": "a signal's handler must not wait for the table's lock",
     "service/commands/demo.py": "it starts the other commands, as a person would",
     "mavlink/component/vehicle.py": "mavlink knows nothing of service; rows by name",
     "mavlink/wire/link.py": "the same",
