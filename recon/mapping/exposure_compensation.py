@@ -70,7 +70,7 @@ class ExposureCompensation:
         if segment != self._segment:
             self._earlier.clear()
             self._segment = segment
-        calm = np.asarray(cv2.blur(bgr.astype(np.float32), (BLUR_PX, BLUR_PX)), np.float32)
+        calm = np.asarray(cv2.boxFilter(bgr, cv2.CV_32F, (BLUR_PX, BLUR_PX)), np.float32)
         if self._earlier:
             points, before, seen_at = map(np.concatenate, zip(*self._earlier, strict=True))
             which, at, there = shared(depth, points)
@@ -88,12 +88,11 @@ class ExposureCompensation:
         """An image (h, w, 3) that has the exposure of the last one, levelled."""
         if not self._gain.any():
             return bgr
-        gain = np.broadcast_to(np.exp(self._gain).astype(np.float32), bgr.shape)
-        lit = bgr * gain
-        above = lit > KNEE
-        room = np.maximum(255 * gain[above] - KNEE, 255 - KNEE)
-        lit[above] = KNEE + (lit[above] - KNEE) * ((255 - KNEE) / room)
-        return np.asarray(cv2.convertScaleAbs(lit), np.uint8)
+        gain = np.exp(self._gain).astype(np.float32)
+        lit = np.arange(256, dtype=np.float32)[:, None] * gain
+        above = KNEE + (lit - KNEE) * ((255 - KNEE) / np.maximum(255 * gain - KNEE, 255 - KNEE))
+        table = cv2.convertScaleAbs(np.where(lit > KNEE, above, lit))
+        return np.asarray(cv2.LUT(bgr, table[:, None]), np.uint8)
 
     def _fit(self, off: F64, moved: F64) -> None:
         """The gain by differences of logarithms (N, 3) of ground that ``moved`` (N, 2) over the
