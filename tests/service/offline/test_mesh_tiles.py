@@ -326,7 +326,7 @@ def test_models_share_surface_images_and_texture(
     pytest.importorskip("trimesh")
     house.flown(tmp_path).close()
     volume = spied(monkeypatch, model, "volume_mesh")
-    pictures = spied(monkeypatch, images, "scan_images")
+    read = spied(monkeypatch, images, "scan_images")
     texture = spied(monkeypatch, model, "texture")
     options = ExportOptions(voxel_m=1.0, stored=True)
     with ScanView(tmp_path, 1.0) as scan:
@@ -336,7 +336,7 @@ def test_models_share_surface_images_and_texture(
         assert texture.call_count == 1
         export(scan, "3dtiles-mesh", None, options)
     assert texture.call_count == model.LEVELS
-    assert volume.call_count == pictures.call_count == 1
+    assert volume.call_count == read.call_count == 1
 
 
 def test_the_mesh_lies_on_the_globe_as_3d_tiles(tmp_path: Path, house: HouseFlight) -> None:
