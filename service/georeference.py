@@ -190,25 +190,11 @@ def system_of(text: str) -> tuple[Transformer, str, float]:
     degrees as well, x is the longitude). The datum is one of :func:`vertical_code`, empty where the
     system has no heights; the unit is in metres. Raises ValueError.
     """
-    from pyproj import CRS, Transformer
-    from pyproj.exceptions import CRSError
-
-    if zone := UTM_NAME.fullmatch(text.strip()):
-        text = f"EPSG:{(32600 if zone[2] in 'Nn' else 32700) + int(zone[1])}"
     text = text.strip()
-    try:
-        crs = CRS.from_user_input(text)
-        flat, *more = crs.sub_crs_list or [crs]
-        if not (flat.is_geographic or flat.is_projected):
-            raise CRSError("neither degrees nor a map")
-        vertical = next((one for one in more if one.is_vertical), None)
-        code = None if vertical is None else vertical.to_epsg()
-        axis = (vertical or flat).axis_info[-1]  # the heights', or else what stands for it
-        to_degrees = Transformer.from_crs(flat.to_2d(), "EPSG:4326", always_xy=True)
-    except CRSError as error:
-        raise ValueError(
-            f"{text[:80]!r} is not a coordinate system; give EPSG:n, a PROJ string or WGS84 UTM 32N"
-        ) from error
+    to_degrees, flat, more = _parts_of(text)
+    vertical = next((one for one in more if one.is_vertical), None)
+    code = None if vertical is None else vertical.to_epsg()
+    axis = (vertical or flat).axis_info[-1]  # the heights', or else what stands for it
     is_flat_in_degrees = vertical is None and flat.is_geographic and len(flat.axis_info) == 2
     unit_m = 1.0 if is_flat_in_degrees else axis.unit_conversion_factor
     if unit_m != 1.0:
@@ -221,6 +207,36 @@ def system_of(text: str) -> tuple[Transformer, str, float]:
     names = {known: name for name, known in DATUMS.items() if known is not None}
     datum = "ellipsoid" if not more and len(flat.axis_info) == 3 else ""
     return to_degrees, datum if code is None else names.get(code, f"EPSG:{code}"), unit_m
+
+
+def is_system(text: str) -> bool:
+    """Whether ``text`` is a coordinate system, also one that :func:`system_of` refuses because it
+    does not say what its heights are."""
+    try:
+        _parts_of(text.strip())
+    except ValueError:
+        return False
+    return True
+
+
+def _parts_of(text: str) -> tuple[Transformer, CRS, list[CRS]]:
+    """What :func:`system_of` reads: to longitude and latitude, the system of places, the others."""
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import CRSError
+
+    name = text
+    if zone := UTM_NAME.fullmatch(text):
+        name = f"EPSG:{(32600 if zone[2] in 'Nn' else 32700) + int(zone[1])}"
+    try:
+        crs = CRS.from_user_input(name)
+        flat, *more = crs.sub_crs_list or [crs]
+        if not (flat.is_geographic or flat.is_projected):
+            raise CRSError("neither degrees nor a map")
+        return Transformer.from_crs(flat.to_2d(), "EPSG:4326", always_xy=True), flat, more
+    except CRSError as error:
+        raise ValueError(
+            f"{name[:80]!r} is not a coordinate system; give EPSG:n, a PROJ string or WGS84 UTM 32N"
+        ) from error
 
 
 def degrees_of(system: Transformer, x: float, y: float) -> tuple[float, float]:

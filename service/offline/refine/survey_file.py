@@ -24,7 +24,7 @@ import msgspec
 from msgspec import Meta
 
 from service.errors import InputError
-from service.georeference import degrees_of, system_of
+from service.georeference import degrees_of, is_system, system_of
 from service.offline.refine.metashape_file import read_metashape
 from service.small_file import read_small
 
@@ -233,11 +233,7 @@ def _is_places(lines: Sequence[str]) -> bool:
     row = next((cells for _, cells in _cells(lines[1:])), [])
     if not 4 <= len(row) < LIST_COLUMNS + 1 or is_list(lines):
         return False
-    try:
-        system_of(lines[0])
-    except ValueError as error:
-        return "not a coordinate system" not in str(error)
-    return True
+    return is_system(lines[0])
 
 
 LIST_COLUMNS = 6
