@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from mavlink.telemetry.quaternion import Quaternion, Vector
 
-DATED_UNIX_S = 946_684_800  # 2000-01-01: a recorder without a clock counts from 1904 or 1970
+YEAR_2000_UNIX_S = 946_684_800
+"""Start of 2000: a recorder without a clock counts from 1904 or 1970, and GPS9 its days from it."""
 
 RECEIVER_SIGMA_H_M, RECEIVER_SIGMA_V_M = 2.1, 3.5
 """1 sigma per axis of a receiver that reports no accuracy: a circular error of 2.5 m, from the data

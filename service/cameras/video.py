@@ -17,7 +17,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from mavlink.telemetry.samples import DATED_UNIX_S
+from mavlink.telemetry.samples import YEAR_2000_UNIX_S
 from service.cameras import open_container, reject_options
 from service.cameras.source import CameraFrame, Decoded
 from service.errors import InputError
@@ -264,11 +264,8 @@ def decoded_frames(
     while True:
         try:
             packet = next(packets, None)
-        except (
-            av.error.FFmpegError,
-            OSError,
-            IndexError,
-        ) as error:  # PyAV's, of a new stream's end
+        # IndexError: PyAV's, at the end of a stream that began late
+        except (av.error.FFmpegError, OSError, IndexError) as error:
             broke_off(f"it is cut off: {error}")
             packet = None
         if packet is not None and not is_needed(packet):
@@ -373,7 +370,7 @@ def parse_time_unix_ns(text: str) -> int | None:
         moment = moment.replace(tzinfo=timezone.utc)
     since = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
     unix_us = (since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds
-    return unix_us * 1000 if unix_us >= DATED_UNIX_S * 1_000_000 else None
+    return unix_us * 1000 if unix_us >= YEAR_2000_UNIX_S * 1_000_000 else None
 
 
 def _start_s(stream: av.VideoStream, first: av.VideoFrame) -> Fraction:

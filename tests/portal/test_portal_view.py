@@ -435,7 +435,7 @@ def test_card_and_view_give_the_same_figures(browser: Browser, portal: Portal, s
     assert browser.run(f"{follow}.hidden")
     at = "const field = document.querySelector('.time input'); field.value = '{}';"
     figure = "document.querySelector('.figures').innerText.includes('Points')"
-    for step, shown in (("2", "!"), ("5", "!!")):  # of a part nobody has counted what is kept
+    for step, shown in (("2", "!"), ("5", "!!")):  # of a part, what is kept is not counted
         browser.run(f"(() => {{ {at.format(step)}{CHANGED} }})()")
         browser.wait(f"{shown}{figure}")
 

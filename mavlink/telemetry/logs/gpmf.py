@@ -36,7 +36,13 @@ from mavlink.telemetry.quaternion import (
     multiply,
     normalised,
 )
-from mavlink.telemetry.samples import GimbalFrame, GimbalSample, PositionSample, Sample
+from mavlink.telemetry.samples import (
+    YEAR_2000_UNIX_S,
+    GimbalFrame,
+    GimbalSample,
+    PositionSample,
+    Sample,
+)
 
 Packet = tuple[int, int, bytes]
 """Time and duration in ns, and the bytes."""
@@ -62,9 +68,6 @@ PLACES = (b"GLPI", b"GPS9", b"GPS5")
 """Best first; the first that has one gives them all."""
 
 UNKNOWN_DOP, MAX_OWN_S = 99.0, 1e10
-GPS9_FROM_NS = 946_684_800 * 10**9
-"""Unix time of 2000-01-01, from which GPS9 counts days."""
-
 DRIFT_NS = 2_000_000_000
 """Gravity is averaged so long before and after: what else accelerates the camera averages out."""
 
@@ -113,7 +116,8 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
                 track.times_ns.append(time_ns + i * duration_ns // len(rows))
                 known_s = math.inf if own_s is None else own_s
                 if key == b"GPS9" and _is_placed(samples) and 0.0 < known_s < MAX_OWN_S:
-                    dates_ns.append(GPS9_FROM_NS + round(1e9 * known_s) - track.times_ns[-1])
+                    zero_ns = YEAR_2000_UNIX_S * 10**9 - track.times_ns[-1]
+                    dates_ns.append(zero_ns + round(1e9 * known_s))
                 track.own_ns.append(round(1e9 * known_s) if abs(known_s) < MAX_OWN_S else None)
                 track.samples.append(samples)
                 counts[key.decode("ascii")] += 1

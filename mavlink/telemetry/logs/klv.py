@@ -23,7 +23,7 @@ from mavlink.telemetry.logs import TelemetryLog, by_own_clock, finish
 from mavlink.telemetry.logs.gpmf import Packet
 from mavlink.telemetry.quaternion import from_rpy, multiply
 from mavlink.telemetry.samples import (
-    DATED_UNIX_S,
+    YEAR_2000_UNIX_S,
     AttitudeSample,
     GimbalFrame,
     GimbalSample,
@@ -105,7 +105,7 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
         )
     log = replace(finish(path, history, counts, warnings), clock="video")
     view = median(views) if views else None
-    dated_ns = start_ns if start_ns >= DATED_UNIX_S * 10**9 else None
+    dated_ns = start_ns if start_ns >= YEAR_2000_UNIX_S * 10**9 else None
     return replace(log, hfov_deg=view, start_unix_ns=dated_ns, may_lag=True)
 
 
