@@ -8,6 +8,7 @@ is not mixed with it.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -29,6 +30,7 @@ EDGE_PRECISION = 1.25
 SPARSE_CELLS = 8
 SPARSE_SHARE = 0.5
 
+BAND_ROWS = 128
 LARGEST_CELLS = 200_000_000
 
 CELLS_PER_POINT, MIN_CELLS = 1000, 10_000_000
@@ -351,15 +353,33 @@ def smoothed(raster: Raster, sigma_cells: float = 1.5) -> Raster:
     known = raster.known
     if not known.any():
         return raster
-    far = np.float32(1e6)
     tolerance = max(1.5 * float(np.median(raster.sigma_m[known])), 1e-3)
     middle = np.float32(np.median(raster.height_m[known]))
-    height = np.where(known, raster.height_m - middle, far).astype(np.float32)
+    out = np.empty_like(raster.height_m)
+    for band, own in _bands(len(out), margin=8):
+        out[band][own] = _smoothed(raster.height_m[band] - middle, tolerance, sigma_cells)[own]
+    return replace(raster, height_m=out + middle)
+
+
+def _smoothed(height_m: F32, tolerance_m: float, sigma_cells: float) -> F32:
+    known = np.isfinite(height_m)
+    far = np.float32(1e6)
+    height = np.where(known, height_m, far)
     median = cv2.medianBlur(height, 5)
-    height = np.where(known & (median < 0.5 * far), median, height).astype(np.float32)
-    smooth = cv2.bilateralFilter(height, -1, tolerance, sigma_cells)
-    out = np.where(known, smooth + middle, np.float32(np.nan)).astype(np.float32)
-    return replace(raster, height_m=out)
+    np.copyto(height, median, where=known & (median < 0.5 * far))
+    smooth = cv2.bilateralFilter(height, -1, tolerance_m, sigma_cells)
+    smooth[~known] = np.nan
+    return np.asarray(smooth)
+
+
+def _bands(rows: int, margin: int) -> Iterator[tuple[slice, slice]]:
+    """Rows of a map with ``margin`` neighbours, and which of these are the band's own.
+
+    What a filter needs beside the map is several times as large as the map.
+    """
+    for top in range(0, rows, BAND_ROWS):
+        first = max(top - margin, 0)
+        yield slice(first, top + BAND_ROWS + margin), slice(top - first, top - first + BAND_ROWS)
 
 
 def hillshade(
@@ -370,18 +390,21 @@ def hillshade(
     Lambertian shading of the surface normal (Horn 1981, doi:10.1109/PROC.1981.11918), with
     slopes from differences to the known neighbours.
     """
-    dz_east = _slope(height_m, axis=1) / cell_m
-    dz_north = -_slope(height_m, axis=0) / cell_m
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
     sun = (
         math.sin(azimuth) * math.cos(elevation),
         math.cos(azimuth) * math.cos(elevation),
         math.sin(elevation),
     )
-    dot = -dz_east * sun[0] - dz_north * sun[1] + sun[2]
-    shade = np.clip(dot / np.sqrt(1.0 + dz_east**2 + dz_north**2), 0.0, 1.0)
-    shade[~np.isfinite(height_m)] = np.nan
-    return np.asarray(shade, np.float32)
+    out = np.empty(height_m.shape, np.float32)
+    for band, own in _bands(len(out), margin=1):
+        dz_east = _slope(height_m[band], axis=1) / cell_m
+        dz_north = -_slope(height_m[band], axis=0) / cell_m
+        dot = -dz_east * sun[0] - dz_north * sun[1] + sun[2]
+        shade = np.clip(dot / np.sqrt(1.0 + dz_east**2 + dz_north**2), 0.0, 1.0)
+        out[band][own] = shade[own]
+    out[~np.isfinite(height_m)] = np.nan
+    return out
 
 
 def _slope(height_m: F32, axis: int) -> F32:

@@ -15,6 +15,7 @@ from recon.surface.raster import (
     hillshade,
     rasterise,
     reliable,
+    smoothed,
     standing_height,
 )
 from recon.types import F32, F64, PointCloud
@@ -166,6 +167,18 @@ def test_unknown_cells_have_no_shade_and_do_not_spoil_their_neighbours() -> None
     shade = hillshade(height, 1.0)
     assert np.isnan(shade[4, 4])
     np.testing.assert_allclose(shade[np.isfinite(height)], math.sqrt(0.5), atol=1e-6)
+
+
+def test_a_large_map_is_smoothed_and_shaded_without_seams() -> None:
+    """Of a plane with waves across the slope, each row is as the one a wavelength further."""
+    rows, columns = np.mgrid[:600, :40]
+    height = (0.5 * columns + np.sin(2.0 * np.pi * rows / 50.0)).astype(np.float32)
+    smooth = smoothed(raster_of(height)).height_m
+    shade = hillshade(height, 1.0)
+    for values in (smooth, shade):
+        inner = values[10:-10]
+        assert inner[:-50] == pytest.approx(inner[50:], abs=1e-3)
+    assert float(np.ptp(shade)) > 0.05
 
 
 def test_grids_are_checked() -> None:
