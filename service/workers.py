@@ -85,10 +85,8 @@ ROWS: tuple[Row, ...] = (
     # The ground.
     Row("front", "passes on connections of drones, within limits", 2, restarts=True,
         is_essential=True),
-    Row("receiver", "the session with the drones", 1, None, "", _STALL_S, True, True),
-    Row("heads", "receives what drones announce", 1, restarts=True, is_essential=True),
-    Row("items", "receives what drones send", 1, restarts=True, is_essential=True),
-    Row("replies", "answers that drones wait for", 2, None, "", _STALL_S, True, True),
+    Row("receiver", "the session with the drones, and what they send", 1, None, "", _STALL_S,
+        True, True),
     Row("drone", "the scans of one drone", 3, None, "", _STALL_S, True),
     Row("deliverables", "files of received scans", 4, restarts=True, is_essential=True),
     Row("sites", "aligns finished scans of the same ground", 4, restarts=True),

@@ -7,18 +7,16 @@ in use, and has a folder only once its valid header has arrived.
 from __future__ import annotations
 
 import logging
-import os
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from service.errors import OutsideError, SkyreliefError
-from service.ground.inbox import Answered, Batch, Inbox, Radio, Written
 from service.ground.intake import FINE, SILENCE_S, SMALL, Introduction, ScanIntake
 from service.ground.received import ReceivedScan
-from service.ground.storage import DiskShare, scan_folder, total_and_free
+from service.ground.storage import DiskShare, drone_folder, scan_folder, total_and_free
 from service.stream.messages import Ask, Head, count, pack, unpack
 from service.stream.naming import ROOT
 from service.stream.radio_messages import RADIO_NOTE
@@ -27,6 +25,7 @@ from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 REPORT_S = 1.0
 REPORT_IDLE_S = 3.0
@@ -61,37 +60,68 @@ class DroneLimits:
     usage: Callable[[Path], tuple[int, int]] = total_and_free  # bytes of a folder's disk
 
 
+class Item(NamedTuple):
+    """A message of parts of a scan's records."""
+
+    scan: str
+    data: bytes
+
+
+class Radio(NamedTuple):
+    """A message of the narrow radio."""
+
+    header: ScanHeader
+    kind: str
+    number: int
+    part: int
+    data: bytes
+
+
+class Answered(NamedTuple):
+    """The ``serial``-th request of a scan, made in ``slot``, is over."""
+
+    scan: str
+    slot: int
+    serial: int
+
+
+class Written(NamedTuple):
+    """The deliverables of a scan are written, or why they are not."""
+
+    scan: str
+    trouble: str
+    is_due: bool = False  # the disk refused a file
+
+
+Event = Item | Radio | Answered | Written
+
+
 class Put(NamedTuple):
     key: str
     payload: bytes
 
 
 class Get(NamedTuple):
-    """Ask the drone; the replies are items of the scan, and their end an event."""
+    """Ask the drone; the replies are items of a scan, and their end is ``answered``."""
 
-    scan: str
     key: str
     payload: bytes
-    answered: Answered | None
+    answered: Answered
 
 
 class Write(NamedTuple):
     """Have the scan's deliverables written; :class:`Written` follows."""
 
-    scan: ReceivedScan
+    scan: str
+    folder: Path
+    is_whole: bool = False  # then the scan is aligned with those that show the same ground
 
 
 class Opened(NamedTuple):
     scan: ReceivedScan
 
 
-class Align(NamedTuple):
-    """Align a finished scan with those that show the same ground."""
-
-    folder: Path
-
-
-Effect = Put | Get | Write | Opened | Align
+Effect = Put | Get | Write | Opened
 
 
 class DroneReceiver:
@@ -102,21 +132,19 @@ class DroneReceiver:
     ) -> None:
         """Scans go below ``store``; ``station`` is the name that reports give."""
         self.drone = drone
-        self.inbox = Inbox()
         self.max_open = limits.open_scans  # scans that may be open now
         self.heard_at = self.news_at = now  # a message, and something new that was stored
         self.dropped = 0  # messages that were malformed, or of a scan without a header
-        self.entries: list[dict[str, Any]] = []
-        self.is_known = False  # has, or had, a scan here
+        self.entries: list[dict[str, Any]] = []  # of all scans, for any thread
         self._store, self._station, self._limits = store, station, limits
         self._scans: OrderedDict[str, ReceivedScan] = OrderedDict()  # open, the last used last
         self._closed: OrderedDict[str, dict[str, Any]] = OrderedDict()
         self._introductions: OrderedDict[str, Introduction] = OrderedDict()
-        self._unreadable: OrderedDict[str, float] = OrderedDict()
-        folder = self._folder("scan").parent
+        self._unreadable: OrderedDict[str, float] = OrderedDict()  # until when
         self._share = DiskShare(
-            folder, limits.drone_share, limits.reserve_bytes, limits.usage, limits.look_s
-        )
+            drone_folder(store, drone), limits.drone_share, limits.reserve_bytes, limits.usage,
+            limits.look_s,
+        )  # fmt: skip
         self._shown_at = self._refresh_at = -1e9
         self._effects: list[Effect] = []
 
@@ -124,19 +152,21 @@ class DroneReceiver:
     def scans(self) -> list[ReceivedScan]:
         return list(self._scans.values())
 
-    def _folder(self, name: str) -> Path:
-        return scan_folder(self._store, self.drone, name)
+    def is_idle(self, now: float) -> bool:
+        """Whether it is silent and has nothing open."""
+        return not self._scans and now - self.heard_at > self._limits.silent_s
 
-    def handle(self, batch: Batch, now: float) -> list[Effect]:
-        """Take in what has come, and look after the scans; what is to be done about it."""
-        if batch.heads or batch.items:  # events may be of our own
+    def handle(self, heads: dict[str, bytes], events: list[Event], now: float) -> list[Effect]:
+        """Take in the newest head of each scan and what else has come, and look after the scans;
+        what is to be done about it."""
+        if heads:
             self.heard_at = now
-        for name, payload in batch.heads.items():
+        for name, payload in heads.items():
             self._on_head(name, payload, now)
-        for name, payload in batch.items:
-            self._on_items(name, payload, now)
-        for event in batch.events:
+        for event in events:
             match event:
+                case Item():
+                    self._on_item(*event, now)
                 case Radio():
                     self._on_radio(event, now)
                 case Answered(name, slot, serial) if name in self._scans:
@@ -148,10 +178,21 @@ class DroneReceiver:
             for scan in self.scans:
                 self._write(scan, now)
         self._look_after(now)
-        if batch or now - self._shown_at >= REPORT_S:
-            self.show(now)
+        if heads or events or now - self._shown_at >= REPORT_S:
+            self._show(now)
         effects, self._effects = self._effects, []
         return effects
+
+    def close(self, now: float) -> list[Effect]:
+        """Close every scan; the files of those that grew are to be written."""
+        scans = self.scans
+        for scan in scans:
+            self._close(scan)
+        self._show(now)
+        for scan in scans:
+            if scan.unwritten or scan.is_writing:
+                self._closed.pop(scan.name, None)  # its files are due when it is opened again
+        return [Write(scan.name, scan.folder) for scan in scans if scan.unwritten]
 
     # What comes
 
@@ -163,7 +204,9 @@ class DroneReceiver:
         scan = self._scan(name, now)
         if scan is None:
             if name not in self._closed and now >= self._unreadable.get(name, now):
-                self._introduction(name).on_head(head, now)
+                found = self._introductions.get(name) or Introduction(self.drone, name)
+                _keep(self._introductions, name, found, MAX_INTRODUCTIONS)
+                found.on_head(head, now)
             return
         if now - scan.intake.head_at > SILENCE_S:
             scan.reported_at = -1e9  # the drone is back: say at once that we listen
@@ -171,14 +214,13 @@ class DroneReceiver:
         scan.intake.on_head(head, now)
         scan.changed = scan.changed or count(scan.intake.missing()) != count(before)
 
-    def _on_items(self, name: str, payload: bytes, now: float) -> None:
+    def _on_item(self, name: str, payload: bytes, now: float) -> None:
+        self.heard_at = now
         if name in self._introductions:
             self._introduce(name, payload, now)
             return
-        if name not in self._scans and name not in self._closed:
-            self.dropped += 1  # a head or an announcement comes first
-            return
-        scan = self._scan(name, now)
+        is_known = name in self._scans or name in self._closed  # a head or an announcement is first
+        scan = self._scan(name, now) if is_known else None
         if scan is None:
             self.dropped += 1
         elif now >= scan.rest_until:
@@ -192,27 +234,6 @@ class DroneReceiver:
                 scan.trouble = ""
         except OutsideError as error:
             self._rest(scan, str(error), now)
-
-    def _rest(self, scan: ReceivedScan, trouble: str, now: float) -> None:
-        """Pause a scan that cannot be written; missing items are requested later.
-
-        One whose database was deleted is forgotten: the drone's next head begins it again.
-        """
-        if trouble != scan.trouble:
-            log.error("%s; trying again every %.0f s", trouble, self._limits.full_disk_rest_s)
-        scan.trouble, scan.rest_until = trouble, now + self._limits.full_disk_rest_s
-        if self._scans.get(scan.name) is scan and not scan.is_writing:
-            try:
-                os.stat(scan.intake.store.path)
-            except FileNotFoundError:
-                del self._scans[scan.name]
-                scan.intake.store.close()
-            except OSError as error:
-                log.debug("%s", error)
-
-    def _grew(self, scan: ReceivedScan, now: float) -> None:
-        scan.grew()
-        self.news_at = now
 
     def _on_radio(self, event: Radio, now: float) -> None:
         self.heard_at = now
@@ -232,15 +253,25 @@ class DroneReceiver:
         except OutsideError as error:
             self._rest(scan, str(error), now)
 
-    # Scans that have no folder yet
+    def _grew(self, scan: ReceivedScan, now: float) -> None:
+        scan.grew()
+        self.news_at = now
 
-    def _introduction(self, name: str) -> Introduction:
-        """That of a scan, a new one if need be; the one heard longest ago makes way."""
-        found = self._introductions.pop(name, None) or Introduction(self.drone, name)
-        self._introductions[name] = found
-        while len(self._introductions) > MAX_INTRODUCTIONS:
-            self._introductions.popitem(last=False)
-        return found
+    def _rest(self, scan: ReceivedScan, trouble: str, now: float) -> None:
+        """Pause a scan that cannot be written; missing items are requested later.
+
+        One whose database was deleted is forgotten: the drone's next head begins it again.
+        """
+        if trouble != scan.trouble:
+            log.error("%s; trying again every %.0f s", trouble, self._limits.full_disk_rest_s)
+        scan.trouble, scan.rest_until = trouble, now + self._limits.full_disk_rest_s
+        try:
+            scan.intake.store.path.stat()
+        except FileNotFoundError:
+            self._scans.pop(scan.name, None)
+            scan.intake.store.close()
+        except OSError as error:
+            log.debug("%s", error)
 
     def _introduce(self, name: str, payload: bytes, now: float) -> None:
         """Take in an item of a scan without a folder; a valid header makes the folder."""
@@ -249,13 +280,13 @@ class DroneReceiver:
         scan = None if header is None else self._open(name, now, header)
         if scan is None or introduction.head is None:
             return
-        self._introductions.pop(name)
+        del self._introductions[name]
         scan.intake.store.put_record("header", introduction.number, introduction.record)
         scan.intake.on_head(introduction.head, now)
         for message in introduction.kept:
             self._take_in(scan, message, now)
 
-    # Scans that have one
+    # Open scans
 
     def _scan(self, name: str, now: float) -> ReceivedScan | None:
         """The scan, opened if need be; None when it has no folder or cannot be opened."""
@@ -263,45 +294,34 @@ class DroneReceiver:
         if found is not None:
             self._scans.move_to_end(name)
             found.used_at = now
-            return found
-        if now < self._unreadable.get(name, now):
-            return None
-        return self._open(name, now)
-
-    def _store_of(self, name: str, now: float, header: ScanHeader | None) -> ScanStore | None:
-        """Its database, made with the ``header`` if need be; None for neither."""
-        path, max_bytes = self._folder(name) / "scan.db", self._limits.scan_bytes
-        if path.is_file():
-            return ScanStore.open(path, max_bytes)
-        if header is None:
-            return None
-        self._share.check(len(header.to_json()), now)
-        return ScanStore.create(path, header, max_bytes)
+        elif now >= self._unreadable.get(name, now):
+            found = self._open(name, now)
+        return found
 
     def _open(self, name: str, now: float, header: ScanHeader | None = None) -> ReceivedScan | None:
-        """The scan, opened; None when it has no folder and no ``header``, or cannot be opened."""
+        """The scan, opened, or made with the ``header``; None where that cannot be."""
         if not self._has_room(now):
             self.dropped += 1
             return None
         try:
-            store = self._store_of(name, now, header)
+            path = scan_folder(self._store, self.drone, name) / "scan.db"
+            if path.is_file():
+                store = ScanStore.open(path, self._limits.scan_bytes)
+            elif header is None:
+                return None
+            else:
+                self._share.check(len(header.to_json()), now)
+                store = ScanStore.create(path, header, self._limits.scan_bytes)
         except SkyreliefError as error:
             log.error("%s", error)
-            self._unreadable[name] = now + UNREADABLE_REST_S
-            while len(self._unreadable) > MAX_UNREADABLE:
-                self._unreadable.popitem(last=False)
+            _keep(self._unreadable, name, now + UNREADABLE_REST_S, MAX_UNREADABLE)
             return None
         self._unreadable.pop(name, None)
-        if store is None:
-            return None
-        intake = ScanIntake(store, self._station)
-        scan = ReceivedScan(self.drone, name, store.path.parent, intake, used_at=now)
-        before = self._closed.pop(name, None)
-        scan.is_written = before is not None
-        if before is None:
+        scan = ReceivedScan(self.drone, name, path.parent, ScanIntake(store, self._station), now)
+        scan.is_written = self._closed.pop(name, None) is not None
+        if not scan.is_written:
             scan.grew()
         self._scans[name] = scan
-        self.is_known = True
         self._effects.append(Opened(scan))
         log.info("receiving %s/%s into %s", self.drone, name, scan.folder)
         return scan
@@ -311,63 +331,51 @@ class DroneReceiver:
 
         Those that are coming in just now stay: another scan of this drone waits for its turn.
         """
-        for scan in list(self._scans.values()):
+        for scan in self.scans:
             if len(self._scans) < self.max_open:
                 return True
-            if now - scan.used_at < BUSY_S and not scan.intake.complete:
-                continue
-            self._end(scan, now)
+            if now - scan.used_at >= BUSY_S or scan.intake.complete:
+                self._end(scan, now)
         return len(self._scans) < self.max_open
 
     def _end(self, scan: ReceivedScan, now: float) -> None:
         """Close a scan, or have its files written first."""
-        if scan.may_close:
-            self._close(scan)
-        else:
+        if scan.unwritten or scan.is_writing:
             self._write(scan, now)
+        else:
+            self._close(scan)
 
     def _close(self, scan: ReceivedScan) -> None:
-        self._closed[scan.name] = scan.progress() | {"open": False}
-        while len(self._closed) > MAX_CLOSED:
-            self._closed.popitem(last=False)
+        _keep(self._closed, scan.name, scan.progress() | {"open": False}, MAX_CLOSED)
         del self._scans[scan.name]
         scan.intake.store.close()
-
-    def close_all(self) -> None:
-        """Close every scan; for use when the worker has ended."""
-        for scan in self.scans:
-            self._close(scan)
-            if not scan.may_close:
-                del self._closed[scan.name]  # its files are due when it is opened again
 
     def _write(self, scan: ReceivedScan, now: float) -> None:
         """Have a scan's deliverables written where it grew, one scan of a drone at a time."""
         is_due = scan.unwritten and now >= scan.write_at
-        if is_due and not any(other.is_writing for other in self._scans.values()):
+        if is_due and not any(other.is_writing for other in self.scans):
             scan.changed, scan.unwritten, scan.is_writing = True, False, True
-            self._effects.append(Write(scan))
+            self._effects.append(Write(scan.name, scan.folder, scan.intake.complete))
 
     def _on_written(self, event: Written, now: float) -> None:
-        scan = event.scan
+        scan = self._scans.get(event.scan)
+        if scan is None or not scan.is_writing:
+            return  # it was closed, or deleted and begun again
         scan.is_written, scan.is_writing, scan.trouble = True, False, event.trouble
         if event.is_due:
             scan.unwritten, scan.write_at = True, now + REWRITE_S
-        if scan.intake.complete and not scan.trouble:
-            self._effects.append(Align(scan.folder))
 
     # What to say
 
     def _look_after(self, now: float) -> None:
-        for introduction in list(self._introductions.values()):
+        for name, introduction in list(self._introductions.items()):
             if now - introduction.seen_at > self._limits.silent_s:
-                del self._introductions[introduction.name]
-                continue
-            wanted = introduction.next_ask(now)
-            if wanted is not None:
-                self._get(introduction.name, "header", wanted, Ask(self._station), None)
+                del self._introductions[name]
+            elif (wanted := introduction.next_ask(now)) is not None:
+                self._get("header", wanted, Ask(self._station), Answered(name, SMALL, 0))
         while sum(scan.intake.held_bytes for scan in self.scans) > self._limits.unfinished_bytes:
             max(self.scans, key=lambda scan: scan.intake.held_bytes).intake.forget_unfinished()
-        for scan in list(self._scans.values()):
+        for scan in self.scans:
             limit_s = CLOSE_AFTER_S
             if scan.intake.complete and not scan.changed:  # and the drone knows it
                 limit_s = self._limits.close_whole_s
@@ -390,16 +398,20 @@ class DroneReceiver:
         for slot in (SMALL, FINE):
             asked = scan.intake.next_ask(slot, now)
             if asked is not None:
-                answered = Answered(scan.name, slot, scan.intake.asked)
-                self._get(scan.name, *asked, answered)
+                self._get(*asked, Answered(scan.name, slot, scan.intake.asked))
 
-    def _get(
-        self, name: str, kind: str, numbers: RangeSet, ask: Ask, answered: Answered | None
-    ) -> None:
-        key = f"{ROOT}/{self.drone}/{name}/item/{kind}/{numbers.text()}"
-        self._effects.append(Get(name, key, pack(ask), answered))
+    def _get(self, kind: str, numbers: RangeSet, ask: Ask, answered: Answered) -> None:
+        key = f"{ROOT}/{self.drone}/{answered.scan}/item/{kind}/{numbers.text()}"
+        self._effects.append(Get(key, pack(ask), answered))
 
-    def show(self, now: float) -> None:
+    def _show(self, now: float) -> None:
         self._shown_at = now
-        entries = [scan.progress() for scan in self.scans]
-        self.entries = entries + list(self._closed.values())
+        self.entries = [*(scan.progress() for scan in self.scans), *self._closed.values()]
+
+
+def _keep(kept: OrderedDict[str, T], name: str, value: T, most: int) -> None:
+    """Put a value last; beyond ``most`` the first make way."""
+    kept[name] = value
+    kept.move_to_end(name)
+    while len(kept) > most:
+        kept.popitem(last=False)

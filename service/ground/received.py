@@ -1,4 +1,4 @@
-"""A scan that is being received: its state, its deliverables, and which are yet to be written.
+"""A scan that is being received, and the files of scans that are yet to be written.
 
 A marker file in the scan's folder shows that it grew since its files were written. It is renamed
 while they are written and deleted afterwards, so a kill at any time leaves one of the two names.
@@ -6,44 +6,28 @@ while they are written and deleted afterwards, so a kill at any time leaves one 
 
 from __future__ import annotations
 
-import logging
+import contextlib
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from service.errors import InputError
+from service.errors import InputError, OutsideError
 from service.ground.intake import ScanIntake
 from service.ground.storage import is_regular, scan_files
 from service.scans.folder import write_deliverables
 from service.scans.writing import files_due
 from service.stream.store import ScanStore
-
-log = logging.getLogger(__name__)
+from service.workers import guarded
 
 MARK, BEGUN = ".files-due", ".files-begun"
 
 
 def mark_due(folder: Path) -> None:
-    try:
+    with contextlib.suppress(OSError):  # a full disk is reported where the scan itself is written
         (folder / MARK).touch()
-    except OSError as error:  # a full disk is reported where the scan itself is written
-        log.debug("%s: %s", folder, error)
-
-
-def begin_files(folder: Path) -> None:
-    """Note that its files are being written; later arrivals mark it again."""
-    try:
-        (folder / MARK).replace(folder / BEGUN)
-    except OSError as error:
-        log.debug("%s: %s", folder, error)
-
-
-def end_files(folder: Path) -> None:
-    """Writing has ended; the mark stays where the disk refused a file."""
-    if not files_due(folder):
-        (folder / BEGUN).unlink(missing_ok=True)
 
 
 def folders_due(store: Path) -> list[Path]:
@@ -53,13 +37,40 @@ def folders_due(store: Path) -> list[Path]:
     return sorted(sound, key=lambda folder: folder.name, reverse=True)
 
 
-def write_left(folder: Path) -> None:
-    """Write the files that a former process could not; its errors are passed on."""
-    begin_files(folder)
+def deliver(folder: Path) -> None:
+    """Write the scan's deliverables next to its database.
+
+    Raises InputError that names those which could not be made, OutsideError for the disk.
+    """
     with ScanStore.open(folder / "scan.db") as store:
-        write_deliverables(folder, store, {})
-    end_files(folder)
-    log.info("%s: files written that a former process had left", folder)
+        failed = write_deliverables(folder, store, {})["failed"]
+    if failed:
+        why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())
+        raise InputError(f"some could not be made: {why}")
+
+
+def write_files(folder: Path, deliver: Callable[[Path], None] = deliver) -> tuple[str, bool]:
+    """Have ``deliver`` write a scan's files; what went wrong, and whether they stay due.
+
+    What the disk refuses stays due, whatever an earlier ``scan.json`` says; a fault in the scan
+    itself would only come again. What arrives meanwhile marks the folder again.
+    """
+    is_refused = False
+
+    def work() -> None:
+        nonlocal is_refused
+        try:
+            deliver(folder)
+        except (OutsideError, OSError):
+            is_refused = True
+            raise
+
+    with contextlib.suppress(OSError):
+        (folder / MARK).replace(folder / BEGUN)
+    trouble = guarded(f"deliverables of {folder}", work)
+    if not is_refused and not files_due(folder):
+        (folder / BEGUN).unlink(missing_ok=True)
+    return trouble, is_refused
 
 
 @dataclass(slots=True, eq=False)
@@ -70,14 +81,14 @@ class ReceivedScan:
     name: str  # on the datalink
     folder: Path
     intake: ScanIntake
-    reported_at: float = -1e9
-    used_at: float = 0.0
-    changed: bool = True  # since the last report
-    unwritten: bool = False  # since the last deliverables
-    rest_until: float = 0.0
-    write_at: float = 0.0  # deliverables, not before
-    is_writing: bool = False
+    used_at: float
     is_written: bool = False
+    is_writing: bool = False
+    unwritten: bool = False  # it grew since its files were written, or since that began
+    write_at: float = 0.0  # its files, not before
+    changed: bool = True  # since the last report
+    reported_at: float = -1e9
+    rest_until: float = 0.0
     radio_messages: int = 0
     trouble: str = ""  # why it does not grow, or has no deliverables
 
@@ -87,20 +98,10 @@ class ReceivedScan:
             mark_due(self.folder)
         self.changed = self.unwritten = True
 
-    @property
-    def may_close(self) -> bool:
-        """Whether nothing would be lost by closing it."""
-        return not self.unwritten and not self.is_writing
-
     def progress(self) -> dict[str, Any]:
         """Items held and missing, bytes, lags and folder, for people and for JSON."""
         intake = self.intake
         held = intake.store.numbers()
-        lags = {
-            kind: round(median(lags), 3)
-            for kind, lags in intake.lag_s.items()
-            if lags and kind.startswith("k")
-        }
         return {
             "drone": self.drone,
             "scan": self.folder.name,
@@ -115,18 +116,11 @@ class ReceivedScan:
             "unsound": intake.unsound,
             "refused": intake.store.refused,
             "radio_messages": self.radio_messages,
-            "lag_s": lags,
+            "lag_s": {
+                kind: round(median(lags), 3)
+                for kind, lags in intake.lag_s.items()
+                if lags and kind.startswith("k")
+            },
             "heard_unix_s": round(time.time() - (time.monotonic() - self.used_at), 1),
             "trouble": self.trouble or None,
         }
-
-
-def deliver(scan: ReceivedScan) -> None:
-    """Write the scan's deliverables next to its database.
-
-    Raises InputError that names those which could not be made, OutsideError for the disk.
-    """
-    failed = write_deliverables(scan.folder, scan.intake.store, {})["failed"]
-    if failed:
-        why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())
-        raise InputError(f"some could not be made: {why}")

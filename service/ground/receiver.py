@@ -4,17 +4,19 @@ Each scan lives in ``<store>/drones/<drone>/<scan>/scan.db``, the same database 
 finished scan is complete, and when the receiver closes, the deliverables are written next to
 it. Everything may be killed at any time and started again.
 
-Threads, all of the table of workers: one that keeps the session, three that take messages
-from it, one per drone (:mod:`service.ground.drones`), one that writes deliverables, and one that
-aligns finished scans (:mod:`service.ground.sites`). A process aligns those in flight
-(:mod:`service.ground.live_site`).
+What a drone's messages ask for is decided in :mod:`service.ground.drone` and carried out here.
+Threads, all of the table of workers: one keeps the session and takes messages from it; each drone
+has one, so that none waits for another, until it is silent and has nothing open; one writes
+deliverables, and one aligns finished scans (:mod:`service.ground.sites`).
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import queue
+import resource
 import threading
 import time
 from collections import deque
@@ -22,37 +24,44 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
-from service.errors import InputError, OutsideError, SkyreliefError
-from service.ground.drone import Align, DroneLimits, DroneReceiver, Effect, Get, Opened, Put, Write
-from service.ground.drones import Drones
+import zenoh
+
+from service.errors import InputError, SkyreliefError
+from service.ground import drone
+from service.ground.drone import DroneLimits, DroneReceiver, Get, Put, Write
 from service.ground.front import behind_fronts
-from service.ground.inbox import CHANNEL, Inbox, Pending, Radio, Replies, Written
+from service.ground.inbox import Inbox
 from service.ground.live_site import run as run_live_site
-from service.ground.received import (
-    ReceivedScan,
-    begin_files,
-    deliver,
-    end_files,
-    folders_due,
-    write_left,
-)
+from service.ground.received import ReceivedScan, deliver, folders_due, write_files
 from service.ground.sites import Sites
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.tunnel import TunnelIntake
-from service.workers import Worker, Workers, guarded
-
-if TYPE_CHECKING:
-    import zenoh
+from service.workers import Worker, Workers
 
 log = logging.getLogger(__name__)
 
 ASK_TIMEOUT_S = 120.0
-RETRY_S = 1.0
-LOOK_AROUND_S = 3.0
-TURN_S = 0.1
+RETRY_S, LOOK_AROUND_S, POLL_S = 1.0, 3.0, 0.01
+CHANNEL = 256
+"""Messages that may wait in the session, of one kind or to one request."""
+MAX_AT_ONCE = 64
+"""Messages of one kind or request that are taken before the next one's turn."""
+TICK_S, MAX_REST_S = 0.1, 0.5
+"""After each turn a drone's worker rests as long as it computed, at most so long: one drone never
+takes more than half of a core."""
+DESCRIPTORS_PER_SCAN, DESCRIPTOR_SHARE = 3, 4
+"""An open scan holds so many; all of them together get this fraction (1/n) of the limit."""
+MAX_RESTING = 256
+"""Drones without a worker whose figures are kept."""
+STRANGER_S = 1.0
+"""A drone without any scan is replaced by another after so long without a message."""
+REFUSAL_S = 60.0
+"""Interval between two warnings about a drone that is not received."""
+ASKED, END, LEFT = range(3)
+"""The order of writing: what is asked for, then what a former process left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +75,18 @@ class ReceiverConfig:
     sites: bool = False  # align finished scans that show the same ground
 
 
+class _Drone(NamedTuple):
+    """A drone; while its worker runs, that alone changes the scans."""
+
+    scans: DroneReceiver
+    inbox: Inbox
+    worker: Worker
+
+    @property
+    def brought(self) -> int:
+        return sum(e["received_bytes"] + e["radio_messages"] for e in self.scans.entries)
+
+
 class Receiver:
     """Receives on threads of its own between :meth:`start` and :meth:`close`.
 
@@ -76,99 +97,88 @@ class Receiver:
         self,
         config: ReceiverConfig,
         workers: Workers | None = None,
-        deliver: Callable[[ReceivedScan], None] = deliver,
+        deliver: Callable[[Path], None] = deliver,
         opened: Callable[[ReceivedScan], None] = lambda _: None,
     ) -> None:
         """``deliver`` writes the deliverables of a scan; ``opened`` gets each that is opened."""
         check_endpoints(config.session)
-        self._config, self._deliver, self._opened_scan = config, deliver, opened
+        self._config, self._deliver, self._opened = config, deliver, opened
         try:
             config.store.mkdir(parents=True, exist_ok=True)
             self.name = config.name or station_name(config.store)
         except OSError as error:
             raise InputError(f"cannot write the store {config.store}: {error.strerror}") from error
-        self.limits = config.limits
-        self.workers = workers or Workers()
-        self._drones = Drones(config.store, self.name, config.limits, self.workers, self._perform)
+        self.limits, self.workers = config.limits, workers or Workers()
         self._session: zenoh.Session | None = None
-        self._replies = Replies()
-        self._opened = threading.Event()
-        self._failure: SkyreliefError | None = None
-        self._tunnel, self._tunnelled = TunnelIntake(), threading.Lock()
-        self._writes: queue.Queue[tuple[ReceivedScan, Inbox | None] | None] = queue.Queue()
+        self._session_config = config.session
+        self._sources: deque[tuple[Any, Callable[[], object]]] = deque()  # and what follows its end
+        self._lock = threading.RLock()  # of the table of drones, and of the radio
+        self._drones: dict[str, _Drone] = {}  # the last begun last
+        self._tunnel = TunnelIntake()
+        self._writes: queue.PriorityQueue[tuple[int, int, Write, Inbox | None]]
+        self._writes, self._serial = queue.PriorityQueue(), itertools.count()
         self._sites = Sites(config.store, config.limits)
         self._running: list[Worker] = []
-        self._fronts: list[Worker] = []
-        self._session_config = config.session
         self._dropped = 0
+        self._refused_at = -1e9
         self._began_at = time.monotonic()
 
     def start(self) -> None:
         """Begin; returns when the endpoints are open. Raises OutsideError when they cannot."""
-        start = self.workers.start
+        store, start = self._config.store, self.workers.start
         self._session_config, fronts = behind_fronts(self._config.session)
-        self._fronts = [start(f"front {front.endpoint}", front.run) for front in fronts]
+        try:
+            self._session = open_session(self._session_config)
+        except SkyreliefError as error:
+            if self._config.session.listen or isinstance(error, InputError):
+                for front in fronts:
+                    front.close()
+                raise
+            log.debug("%s", error)  # a station that only connects waits for its router
+        for folder in folders_due(store):
+            self._write(LEFT, Write("", folder))
         self._running = [
-            start("deliverables", self._write_all),
-            start("replies", self._replies.run),
             start("receiver", self._run),
-            *(self._start_sites() if self._config.sites else ()),
+            *(start(f"front {front.endpoint}", front.run) for front in fronts),
+            start("deliverables", self._write_all),
         ]
-        while not self._opened.wait(0.1):
-            if self._failure is not None:
-                self.close()
-                raise self._failure
-
-    def _start_sites(self) -> list[Worker]:
-        in_flight = partial(run_live_site, self._config.store)
-        start = self.workers.start
-        return [start("sites", self._sites.run), start("live site", in_flight)]
+        if self._config.sites:
+            self._running.append(start("sites", self._sites.run))
+            self._running.append(start("live site", partial(run_live_site, store)))
 
     def close(self) -> None:
         """End, and write the deliverables of what has changed."""
-        if not self._running:
-            return
-        writer, replies, main, *sites = self._running
-        self._running = []
-        main.join()
-        replies.join()
-        for front in self._fronts:
-            front.join()
-        scans = self._drones.close()
-        for scan in scans:
-            if scan.unwritten:  # also one that grew while it was being written
-                self._writes.put((scan, None))
-        self._writes.put(None)
-        writer.join()
-        for worker in sites:
+        for worker in self._running:
+            if worker.row.name == "deliverables":  # when nothing more comes
+                for one in self._all:
+                    one.worker.stop.set()
+                for one in self._all:
+                    one.worker.join()
+                self._write(END, Write("", Path()))
             worker.join()
-        for scan in scans:
-            scan.intake.store.close()
+        self._running = []
 
     def add_radio(self, payload: bytes) -> None:
         """Take in a message of the narrow radio; from any thread."""
-        with self._tunnelled:
-            items = self._tunnel.receive(payload)
-        for item in items:
-            drone = self._drones.get(item[0].drone)
-            if drone is None:
-                self._dropped += 1
-            else:
-                drone.inbox.put_event(Radio(*item))
+        with self._lock:
+            for item in self._tunnel.receive(payload):
+                inbox = self._inbox(item[0].drone)
+                if inbox is not None:
+                    inbox.put(drone.Radio(*item))
 
     def progress(self) -> list[dict[str, Any]]:
         """One entry per scan: drone, scan, items held and missing, bytes, lags, folder."""
-        return self._drones.entries
+        return [entry for one in self._all for entry in one.scans.entries]
 
     @property
     def dropped(self) -> int:
         """Messages that were malformed, foreign or too many."""
-        return self._dropped + self._drones.dropped
+        return self._dropped + sum(one.scans.dropped + one.inbox.dropped for one in self._all)
 
     @property
     def last_news_at(self) -> float:
         """When something new was stored last, or this began; monotonic seconds."""
-        return max(self._began_at, self._drones.news_at)
+        return max((one.scans.news_at for one in self._all), default=self._began_at)
 
     # The session
 
@@ -176,15 +186,9 @@ class Receiver:
         while not worker.stop.is_set():
             worker.beat()
             try:
-                session = open_session(self._session_config)
+                session = self._session = self._session or open_session(self._session_config)
             except SkyreliefError as error:
-                if not self._opened.is_set() and (
-                    self._config.session.listen or isinstance(error, InputError)
-                ):
-                    self._failure = error
-                    return
                 log.debug("%s", error)
-                self._opened.set()  # a station that only connects waits for its router
                 worker.stop.wait(RETRY_S)
                 continue
             try:
@@ -196,156 +200,182 @@ class Receiver:
     def _serve(self, session: zenoh.Session, worker: Worker) -> None:
         """Take messages until the stop, or until the session ends.
 
-        Channels and threads of our own: a callback's thread would belong to the library, and
+        Channels and a thread of our own: a callback's thread would belong to the library, and
         end the process with an abort when it outlives the interpreter.
         """
-        import zenoh
-
-        channel = zenoh.handlers.FifoChannel(CHANNEL)
-        heads = session.declare_subscriber(f"{ROOT}/*/*/head", channel)
-        items = session.declare_subscriber(f"{ROOT}/*/*/item/*/*", channel)
-        pumps = [
-            self.workers.start("heads", lambda _: self._pump(heads, Inbox.put_head)),
-            self.workers.start("items", lambda _: self._pump(items, Inbox.put_item)),
-        ]
-        self._session = session
-        self._opened.set()
+        channel, ring = zenoh.handlers.FifoChannel(CHANNEL), zenoh.handlers.RingChannel(1)
+        for key in ("head", "item/*/*"):
+            subscriber = session.declare_subscriber(f"{ROOT}/*/*/{key}", channel)
+            self._sources.append((subscriber, lambda: None))
         look_at = 0.0
-        try:
-            while not worker.stop.wait(TURN_S) and not session.is_closed():
-                worker.beat()
-                now = time.monotonic()
-                if now >= look_at:
-                    self._look_around(session, now)
-                    look_at = now + LOOK_AROUND_S
-                self._drones.retire(now)
-        finally:
-            for subscriber in (heads, items):
-                with contextlib.suppress(zenoh.ZError):
-                    subscriber.undeclare()
-            for pump in pumps:
-                pump.join()
+        while not worker.stop.is_set() and not session.is_closed():
+            worker.beat()
+            now = time.monotonic()
+            if now >= look_at:
+                look_at = now + LOOK_AROUND_S
+                if all(now - one.scans.heard_at > LOOK_AROUND_S for one in self._all):
+                    with contextlib.suppress(zenoh.ZError):  # all present drones send their heads
+                        session.get(f"{ROOT}/*/*/head", ring, timeout=LOOK_AROUND_S)
+            if not self._poll():
+                worker.stop.wait(POLL_S)
 
-    def _pump(
-        self,
-        subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]],
-        put: Callable[[Inbox, str, bytes], bool],
-    ) -> None:
-        """Hand on each message until the subscriber ends."""
-        for sample in subscriber:
-            place = place_of(str(sample.key_expr))
-            drone = None if place is None else self._drones.get(place[0])
-            if place is None or drone is None:
+    def _poll(self) -> bool:
+        """Take some messages of each source; whether there were any."""
+        has_news = False
+        for _ in range(len(self._sources)):
+            source, ended = self._sources.popleft()
+            try:
+                for _ in range(MAX_AT_ONCE):
+                    message = source.try_recv()
+                    if message is None:
+                        break
+                    has_news = True
+                    sample = message.ok if isinstance(message, zenoh.Reply) else message
+                    if sample is not None:
+                        self._take(str(sample.key_expr), sample.payload.to_bytes())
+            except zenoh.ZError:
+                ended()
+            else:
+                self._sources.append((source, ended))
+        return has_news
+
+    def _take(self, key: str, payload: bytes) -> None:
+        """Hand on what a drone has sent."""
+        place = place_of(key)
+        inbox = None if place is None else self._inbox(place[0])
+        if place is None:
+            self._dropped += 1
+        elif inbox is not None and key.endswith("/head"):
+            inbox.put_head(place[1], payload)
+        elif inbox is not None:
+            inbox.put(drone.Item(place[1], payload))
+
+    # The drones
+
+    @property
+    def _all(self) -> list[_Drone]:
+        with self._lock:
+            return list(self._drones.values())
+
+    @property
+    def _busy(self) -> list[_Drone]:
+        return [one for one in self._all if not one.worker.is_done]
+
+    def _inbox(self, name: str) -> Inbox | None:
+        """That of a drone, its worker started if need be; None, and a message is dropped, when
+        there are too many."""
+        with self._lock:
+            found = self._drones.get(name)
+            if found is not None and not found.worker.is_done:
+                return found.inbox
+            now = time.monotonic()
+            if not self._has_room(now):
                 self._dropped += 1
-                continue
-            put(drone.inbox, place[1], sample.payload.to_bytes())
+                if now - self._refused_at > REFUSAL_S:
+                    self._refused_at = now
+                    log.warning("%s is not received: %d drones are", name, self.limits.drones)
+                return None
+            if name in self._drones:
+                scans, inbox, _ = self._drones.pop(name)
+            else:
+                scans = DroneReceiver(name, self._config.store, self.name, self.limits, now)
+                inbox = Inbox()
+            scans.heard_at = now
+            worker = self.workers.start(f"drone {name}", partial(self._receive, scans, inbox))
+            self._drones[name] = _Drone(scans, inbox, worker)
+            return inbox
 
-    def _look_around(self, session: zenoh.Session, now: float) -> None:
-        """Ask all present drones for their heads at once."""
-        import zenoh
+    def _has_room(self, now: float) -> bool:
+        """Whether one more drone may come. If need be one that never had a scan and is silent makes
+        way, else the silent one that brought least is told to end, with its scans."""
+        ended = [one for one in self._all if one.worker.is_done]
+        faulty = [one for one in ended if one.worker.has_failed or not one.scans.entries]
+        for one in (*faulty, *[one for one in ended if one not in faulty][:-MAX_RESTING]):
+            one.scans.close(now)  # what a fault left open
+            self._forget(one)
+        busy = self._busy
+        if len(busy) < self.limits.drones:
+            return True
+        for one in busy:
+            if not one.scans.entries and now - one.scans.heard_at > STRANGER_S:
+                self._forget(one)
+                return True
+        silent = [one for one in busy if now - one.scans.heard_at > self.limits.silent_s]
+        if silent:
+            min(silent, key=lambda one: (one.brought, one.scans.heard_at)).worker.stop.set()
+        return False
 
-        if any(now - drone.heard_at < LOOK_AROUND_S for drone in self._drones.all):
-            return
-        with contextlib.suppress(zenoh.ZError):
-            session.get(f"{ROOT}/*/*/head", zenoh.handlers.RingChannel(1), timeout=LOOK_AROUND_S)
+    def _forget(self, one: _Drone) -> None:
+        one.worker.stop.set()
+        self._dropped += one.scans.dropped + one.inbox.dropped
+        del self._drones[one.scans.drone]
+
+    def _receive(self, scans: DroneReceiver, inbox: Inbox, worker: Worker) -> None:
+        """Take in what arrives from one drone, until the stop or until nothing more comes."""
+        now = time.monotonic()
+        while not (worker.stop.is_set() or scans.is_idle(now)):
+            worker.beat()
+            came = inbox.take(TICK_S)
+            began_s, now = time.thread_time(), time.monotonic()
+            soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+            room = soft // DESCRIPTOR_SHARE // DESCRIPTORS_PER_SCAN // max(1, len(self._busy))
+            scans.max_open = max(2, min(self.limits.open_scans, room))
+            for effect in scans.handle(*came, now):
+                self._perform(inbox, effect)
+            worker.stop.wait(min(time.thread_time() - began_s, MAX_REST_S))
+        for effect in scans.close(now):
+            self._perform(inbox, effect)
 
     # Effects
 
-    def _perform(self, drone: DroneReceiver, effect: Effect) -> None:
-        """Carry out what a drone's worker has decided."""
+    def _perform(self, inbox: Inbox, effect: drone.Effect) -> None:
+        """Carry out what a drone's worker has decided; what follows goes to its inbox."""
         match effect:
-            case Put(key, payload):
-                self._put(key, payload)
-            case Get():
-                self._get(drone.inbox, effect)
-            case Write(scan):
-                self._writes.put((scan, drone.inbox))
-            case Opened(scan):
-                self._opened_scan(scan)
-            case Align(folder):
-                self.align(folder)
+            case Put() | Get():
+                self._send(inbox, effect)
+            case Write():
+                self._write(ASKED, effect, inbox)
+            case drone.Opened(scan):
+                self._opened(scan)
 
-    def _put(self, key: str, payload: bytes) -> None:
-        """Publish; nothing happens while there is no session."""
-        import zenoh
-
-        session = self._session
+    def _send(self, inbox: Inbox, effect: Put | Get) -> None:
+        """Put or get; nothing happens while there is no session."""
+        session, drop = self._session, zenoh.CongestionControl.DROP
         if session is None:
             return
         try:
-            session.put(
-                key,
-                payload,
-                priority=zenoh.Priority.INTERACTIVE_HIGH,
-                congestion_control=zenoh.CongestionControl.DROP,
-                express=True,
-            )
-        except zenoh.ZError as error:
-            log.debug("report not sent: %s", error)
-
-    def _get(self, inbox: Inbox, effect: Get) -> None:
-        """Ask a drone; what comes, from another thread, goes to its inbox."""
-        import zenoh
-
-        session = self._session
-        if session is None:
-            return
-        try:
+            if isinstance(effect, Put):
+                high = zenoh.Priority.INTERACTIVE_HIGH
+                session.put(*effect, priority=high, congestion_control=drop, express=True)
+                return
             replies = session.get(
                 effect.key,
                 zenoh.handlers.FifoChannel(CHANNEL),
                 payload=effect.payload,
                 priority=zenoh.Priority.BACKGROUND,
-                congestion_control=zenoh.CongestionControl.DROP,
+                congestion_control=drop,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=ASK_TIMEOUT_S,
             )
         except zenoh.ZError as error:
-            log.debug("request not sent: %s", error)
+            log.debug("%s is not sent: %s", effect.key, error)
             return
-        self._replies.add(Pending(replies, inbox, effect.scan, effect.answered))
+        self._sources.append((replies, partial(inbox.put, effect.answered)))
 
     def align(self, folder: Path) -> None:
         """Align a finished scan with those that show the same ground, if configured."""
         if self._config.sites:
             self._sites.put(folder)
 
+    def _write(self, turn: int, effect: Write, inbox: Inbox | None = None) -> None:
+        self._writes.put((turn, next(self._serial), effect, inbox))
+
     def _write_all(self, worker: Worker) -> None:
-        """Write requested deliverables, and in between those that a former process left."""
-        left = deque(folders_due(self._config.store))
-        while True:
-            try:
-                asked = self._writes.get(block=not left)
-            except queue.Empty:
-                folder = left.popleft()
-                if worker.stop.is_set():
-                    left.clear()  # for the next process
-                else:
-                    guarded(f"files of {folder}", partial(write_left, folder))
-                continue
-            if asked is None:
-                return
-            scan, inbox = asked
-            written = written_files(scan, self._deliver)
+        """Write deliverables until the end; what a former process left is then for the next."""
+        while (asked := self._writes.get())[0] != END:
+            _, _, effect, inbox = asked
+            trouble, is_due = write_files(effect.folder, self._deliver)
             if inbox is not None:
-                inbox.put_event(written)
-
-
-def written_files(scan: ReceivedScan, deliver: Callable[[ReceivedScan], None]) -> Written:
-    """Have ``deliver`` write a scan's files. What the disk refuses stays due, whatever an earlier
-    ``scan.json`` says; a fault in the scan itself would only come again."""
-    is_refused = False
-
-    def work() -> None:
-        nonlocal is_refused
-        try:
-            deliver(scan)
-        except (OutsideError, OSError):
-            is_refused = True
-            raise
-
-    begin_files(scan.folder)
-    trouble = guarded(f"deliverables of {scan.folder}", work)
-    if not is_refused:
-        end_files(scan.folder)
-    return Written(scan, trouble, is_refused)
+                inbox.put(drone.Written(effect.scan, trouble, is_due))
+            if effect.is_whole and not trouble:
+                self.align(effect.folder)

@@ -21,16 +21,18 @@ from hypothesis.stateful import (
 
 from service.ground.drone import (
     REWRITE_S,
-    Align,
+    Answered,
     DroneLimits,
     DroneReceiver,
     Effect,
+    Event,
     Get,
+    Item,
     Opened,
     Put,
     Write,
+    Written,
 )
-from service.ground.inbox import Answered, Batch, Event, Written
 from service.stream import codec
 from service.stream.messages import Head, Held, pack, split, unpack
 from service.stream.naming import place_of
@@ -56,19 +58,19 @@ class Onboard:
 
     def pass_time(self, seconds: float) -> None:
         self.now += seconds
-        self._hand_on(Batch())
+        self._hand_on({}, [])
 
     def head(self) -> None:
         """The drone says what it has."""
         payload = pack(Head(self.store.numbers(), {}, self.store.finished))
-        self._hand_on(Batch(heads={self.name: payload}))
+        self._hand_on({self.name: payload}, [])
 
     def send(self, kind: str, number: int) -> None:
         """A record, in one part."""
         record = self.store.record(kind, number)
         assert record is not None
         (part,) = split(kind, number, record, 1 << 16)
-        self._hand_on(Batch(items=[(self.name, part.pack())]))
+        self._hand_on({}, [Item(self.name, part.pack())])
 
     def answer(self) -> None:
         """Send what the oldest request asked for, and say that this was all."""
@@ -78,18 +80,19 @@ class Onboard:
         assert ranges
         for number in ranges:
             self.send(kind, number)
-        if asked.answered is not None:
-            self.hear(asked.answered)
+        self.hear(asked.answered)
 
     def hear(self, *events: Event) -> None:
-        self._hand_on(Batch(events=list(events)))
+        self._hand_on({}, list(events))
 
     def written(self, trouble: str = "", is_due: bool = False) -> None:
         """The oldest writing of files has ended."""
-        self.hear(Written(self.writes.pop(0).scan, trouble, is_due))
+        scan, folder, is_whole = self.writes.pop(0)
+        self.aligned += [folder] if is_whole and not trouble else []
+        self.hear(Written(scan, trouble, is_due))
 
-    def _hand_on(self, batch: Batch) -> None:
-        for effect in self.ground.handle(batch, self.now):
+    def _hand_on(self, heads: dict[str, bytes], events: list[Event]) -> None:
+        for effect in self.ground.handle(heads, events, self.now):
             self._perform(effect)
 
     def _perform(self, effect: Effect) -> None:
@@ -104,8 +107,6 @@ class Onboard:
                 self.writes.append(effect)
             case Opened():
                 self.opened += 1
-            case Align(folder):
-                self.aligned.append(folder)
 
     def finish(self) -> None:
         """The scan ends, and all of it arrives."""
@@ -117,7 +118,7 @@ class Onboard:
                 self.answer()
 
     def close(self) -> None:
-        self.ground.close_all()
+        self.ground.close(self.now)
         self.store.close()
 
 
@@ -169,7 +170,7 @@ def test_a_growing_scan_is_written_when_that_is_asked_for(tmp_path: Path) -> Non
     one.head()
     one.answer()
     one.pass_time(1.0)
-    assert len(one.writes) == 1
+    assert len(one.writes) == 1 and not one.writes[0].is_whole
     one.pass_time(1.0)
     assert len(one.writes) == 1  # while it is written, it is not written again
     number = one.store.add_pose(PoseRecord(1, np.eye(4), np.eye(6)))
@@ -217,14 +218,14 @@ def test_unfinished_records_of_all_scans_of_a_drone_share_one_bound(tmp_path: Pa
         record = ScanHeader(f"scan-{k}", "evil", 1).to_json()
         number = zlib.crc32(record)
         head = pack(Head({"header": RangeSet.of([number])}))
-        ground.handle(Batch(heads={f"scan-{k}": head}), 0.0)
+        ground.handle({f"scan-{k}": head}, [], 0.0)
         (header,) = split("header", number, record, 1 << 16)
-        ground.handle(Batch(items=[(f"scan-{k}", header.pack())]), 0.0)
-        ground.handle(Batch(items=[(f"scan-{k}", part)]), 0.0)
-    ground.show(0.0)
+        ground.handle({}, [Item(f"scan-{k}", header.pack())], 0.0)
+        ground.handle({}, [Item(f"scan-{k}", part)], 0.0)
+    ground.handle({}, [], 1.0)
     assert sum(entry["received_bytes"] > 45_000 for entry in ground.entries) == 4
     assert sum(scan.intake.held_bytes for scan in ground.scans) <= 100_000
-    ground.close_all()
+    ground.close(0.0)
 
 
 class AnyOrder(RuleBasedStateMachine):
@@ -258,8 +259,8 @@ class AnyOrder(RuleBasedStateMachine):
 
     @rule(junk=st.binary(max_size=40))
     def disturb(self, junk: bytes) -> None:
-        self.one.ground.handle(Batch(heads={self.one.name: junk}), self.one.now)
-        self.one.ground.handle(Batch(items=[(self.one.name, junk)]), self.one.now)
+        self.one.ground.handle({self.one.name: junk}, [], self.one.now)
+        self.one.ground.handle({}, [Item(self.one.name, junk)], self.one.now)
 
     @precondition(lambda self: self.one.asked)
     @rule(lost=st.booleans())

@@ -22,7 +22,7 @@ from loopback import free_port, until
 from paths import ROOT
 
 from service.config import DatalinkConfig
-from service.ground.drone import DroneLimits
+from service.ground.drone import Answered, DroneLimits, Item
 from service.ground.inbox import MAX_HEADS, MAX_ITEM_BYTES, MAX_ITEMS, Inbox
 from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
@@ -41,7 +41,7 @@ WHOLE = os.environ.get("SKYRELIEF_TRIALS") == "whole"
 def serving(
     folder: Path,
     limits: DroneLimits | None = None,
-    deliver: Callable[[ReceivedScan], None] = lambda _: None,
+    deliver: Callable[[Path], None] = lambda _: None,
     opened: Callable[[ReceivedScan], None] = lambda _: None,
 ) -> Iterator[tuple[Receiver, str]]:
     """A ground station and where it listens."""
@@ -138,10 +138,10 @@ def test_a_fault_of_ours_in_one_drones_work_is_reported_and_stops_no_other(tmp_p
 def test_deliverables_that_fail_are_said_and_stop_no_others(tmp_path: Path) -> None:
     written = []
 
-    def deliver(scan: ReceivedScan) -> None:
-        if scan.drone == "evil":
+    def deliver(folder: Path) -> None:
+        if folder.parent.name == "evil":
             raise KeyError("made up")
-        written.append(scan.drone)
+        written.append(folder.parent.name)
 
     with serving(tmp_path / "ground", deliver=deliver) as (ground, endpoint):
         assert arrives(tmp_path, endpoint, "evil")
@@ -279,15 +279,22 @@ def test_a_scan_that_is_deleted_while_it_comes_in_is_received_anew(tmp_path: Pat
 
 def test_an_inbox_holds_no_more_than_its_bounds() -> None:
     inbox = Inbox()
-    assert all(inbox.put_head(f"scan-{k}", b"first") for k in range(MAX_HEADS))
-    assert not inbox.put_head("one-more", b"")
-    assert inbox.put_head("scan-0", b"second")
-    assert inbox.put_item("scan-0", bytes(MAX_ITEM_BYTES - 1000))
-    assert not inbox.put_item("scan-0", bytes(1000))
-    batch = inbox.take(0.0)
-    assert batch.heads["scan-0"] == b"second" and len(batch.items) == 1
-    assert sum(inbox.put_item("scan-0", b"") for _ in range(2 * MAX_ITEMS)) == MAX_ITEMS
-    assert inbox.dropped == 2 + MAX_ITEMS
+    for k in range(MAX_HEADS):
+        inbox.put_head(f"scan-{k}", b"first")
+    assert inbox.dropped == 0
+    inbox.put_head("one-more", b"")
+    inbox.put_head("scan-0", b"second")
+    inbox.put(Item("scan-0", bytes(MAX_ITEM_BYTES - 1000)))
+    assert inbox.dropped == 1
+    inbox.put(Item("scan-0", bytes(1000)))
+    inbox.put(Answered("scan-0", 0, 1))  # of our own: always
+    assert inbox.dropped == 2
+    heads, events = inbox.take(0.0)
+    assert heads["scan-0"] == b"second" and len(heads) == MAX_HEADS
+    assert [type(event) for event in events] == [Item, Answered]
+    for _ in range(2 * MAX_ITEMS):
+        inbox.put(Item("scan-0", b""))
+    assert len(inbox.take(0.0)[1]) == MAX_ITEMS and inbox.dropped == 2 + MAX_ITEMS
 
 
 def test_many_drones_share_the_station_and_one_more_is_refused(tmp_path: Path) -> None:
@@ -322,8 +329,8 @@ def test_a_silent_drone_has_no_worker_and_its_scans_stay_listed(tmp_path: Path) 
     written: list[str] = []
     limits = DroneLimits(silent_s=0.5, close_whole_s=0.0)
 
-    def deliver(scan: ReceivedScan) -> None:
-        written.append(scan.name)
+    def deliver(folder: Path) -> None:
+        written.append(folder.name)
 
     with serving(tmp_path / "ground", limits, deliver=deliver) as (ground, endpoint):
         for scan_id in ("first", "second"):

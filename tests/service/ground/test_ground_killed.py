@@ -16,16 +16,8 @@ from house_flight import HouseFlight
 from paths import ROOT
 
 from service.errors import OutsideError
-from service.ground.intake import ScanIntake
-from service.ground.received import (
-    ReceivedScan,
-    begin_files,
-    end_files,
-    folders_due,
-    mark_due,
-    write_left,
-)
-from service.ground.receiver import Receiver, ReceiverConfig, written_files
+from service.ground.received import BEGUN, MARK, deliver, folders_due, mark_due, write_files
+from service.ground.receiver import Receiver, ReceiverConfig
 from service.scans.folder import CLOUD, CSV, PREVIEW, TUM, write_deliverables
 from service.stream.session import SessionConfig
 from service.stream.store import ScanStore
@@ -142,7 +134,7 @@ def test_files_that_a_killed_station_left_are_written_at_the_next_start(
     house.flown(folder).close()
     mark_due(folder)
     if killed == "while writing":
-        begin_files(folder)
+        (folder / MARK).rename(folder / BEGUN)
     assert folders_due(tmp_path) == [folder]
     station = Receiver(ReceiverConfig(tmp_path, SessionConfig(mode="peer")))
     station.start()
@@ -164,14 +156,17 @@ def test_what_comes_while_files_are_written_is_due_again(
 ) -> None:
     folder = tmp_path / "drone-1" / "test-1"
     mark_due(folder)  # of a folder that is gone: nothing happens
-    with house.flown(folder) as store:
+    house.flown(folder).close()
+
+    def grows_meanwhile(folder: Path) -> None:
+        assert folders_due(tmp_path) == [folder]
         mark_due(folder)
-        begin_files(folder)
-        mark_due(folder)
-        write_deliverables(folder, store, {})
-        end_files(folder)
+        deliver(folder)
+
+    mark_due(folder)
+    assert write_files(folder, grows_meanwhile) == ("", False)
     assert folders_due(tmp_path) == [folder]
-    write_left(folder)
+    assert write_files(folder) == ("", False)
     assert folders_due(tmp_path) == []
 
 
@@ -181,16 +176,15 @@ def test_only_files_that_the_disk_refused_are_written_again(
 ) -> None:
     """Also where scan.json is of an earlier state; a fault of the scan would come at each time."""
 
-    def fail(_: ReceivedScan) -> None:
+    def fail(_: Path) -> None:
         raise error
 
     folder = tmp_path / "drone-1" / "test-1"
-    with house.flown(folder) as store:
-        scan = ReceivedScan("drone-1", "test-1", folder, ScanIntake(store, "here"))
-        for is_written in (False, True):
-            if is_written:
-                write_deliverables(folder, store, {})
-            mark_due(folder)
-            written = written_files(scan, fail)
-            assert written.trouble and written.is_due == (not isinstance(error, ValueError))
-            assert (folders_due(tmp_path) == [folder]) == (written.is_due or not is_written)
+    house.flown(folder).close()
+    for is_written in (False, True):
+        if is_written:
+            deliver(folder)
+        mark_due(folder)
+        trouble, is_due = write_files(folder, fail)
+        assert trouble and is_due == (not isinstance(error, ValueError))
+        assert (folders_due(tmp_path) == [folder]) == (is_due or not is_written)

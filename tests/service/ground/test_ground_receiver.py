@@ -20,7 +20,6 @@ from recon.types import DepthMap, Keyframe, Pose
 from service.config import DatalinkConfig
 from service.errors import InputError, OutsideError
 from service.ground.drone import DroneLimits
-from service.ground.received import ReceivedScan
 from service.ground.receiver import Receiver, ReceiverConfig
 from service.ground.storage import scan_folder
 from service.stream import codec
@@ -68,9 +67,9 @@ def fly(store: ScanStore, first: int, last: int) -> None:
 WRITTEN: list[Path] = []
 
 
-def note(scan: ReceivedScan) -> None:
+def note(folder: Path) -> None:
     """Instead of writing the deliverables, which are another module's matter."""
-    WRITTEN.append(scan.folder)
+    WRITTEN.append(folder)
 
 
 def start_ground(folder: Path, endpoint: str, name: str = "") -> Receiver:
@@ -105,8 +104,9 @@ def test_what_grows_while_it_is_written_is_written_at_the_end(tmp_path: Path) ->
     endpoint, release = free_endpoint(), threading.Event()
     seen: list[int] = []
 
-    def deliver(scan: ReceivedScan) -> None:
-        seen.append(len(scan.intake.store.seqs()))
+    def deliver(folder: Path) -> None:
+        with ScanStore.peek(folder / "scan.db") as received:
+            seen.append(len(received.seqs()))
         release.wait(30.0)
 
     session = SessionConfig(mode="router", listen=(endpoint,))
