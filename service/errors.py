@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from types import MappingProxyType
 from typing import Any
 
 from service.redaction import without_credentials
@@ -16,15 +18,25 @@ class SkyreliefError(Exception):
 
     exit_code = 1
 
-    def __init__(self, text: str = "") -> None:
+    def __init__(self, text: str = "", report: Mapping[str, Any] = MappingProxyType({})) -> None:
+        """``report`` is what was done all the same, for --json."""
         super().__init__(without_credentials(text))
-        self.report: Mapping[str, Any] = {}  # what was done all the same, for --json
+        self.report = report
 
 
 class InputError(SkyreliefError):
     """Wrong usage, configuration or input: the caller can fix it."""
 
     exit_code = 2
+
+
+@contextmanager
+def refusing(what: str) -> Iterator[None]:
+    """Make a ValueError of the block, which refuses what was given, an InputError of ``what``."""
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(f"{what}: {error}") from error
 
 
 class OutsideError(SkyreliefError):

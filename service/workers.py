@@ -171,17 +171,12 @@ class Worker:
             "fault": self.fault,
             "waiting": self.depth(),
             "lag_s": round(self.lag_s(), 3),
-        } | _bounds(self.row)
-
-
-def _bounds(row: Row) -> dict[str, Any]:
-    return {
-        "bound": row.bound,
-        "when_full": row.full,
-        "deadline_s": row.deadline_s,
-        "stop": row.stop,
-        "does": row.does,
-    }
+            "bound": self.row.bound,
+            "when_full": self.row.full,
+            "deadline_s": self.row.deadline_s,
+            "stop": self.row.stop,
+            "does": self.row.does,
+        }
 
 
 class Workers:

@@ -10,7 +10,6 @@ import json
 import multiprocessing
 import os
 import platform
-import statistics
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +20,9 @@ from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
+
+import numpy as np
+import psutil  # type: ignore[import-untyped]
 
 from service.errors import InputError, OutsideError
 
@@ -80,22 +82,22 @@ def compare(
     peer: str = "",
     theirs: Callable[[], object] | None = None,
     note: str = "",
+    clock: Callable[[], float] = time.perf_counter,
 ) -> BenchResult:
-    """Median milliseconds of ``ours`` and ``theirs``, rounds alternating."""
-    runs: list[Callable[[], object]] = [ours] if theirs is None else [ours, theirs]
-    taken: list[list[float]] = [[] for _ in runs]
-    for number in range(options.warm_up + options.rounds):
-        for run, times in zip(runs, taken, strict=True):
-            start = time.perf_counter()
+    """Median milliseconds of ``ours`` and ``theirs`` by a clock in seconds, rounds alternating."""
+    runs = [ours] if theirs is None else [ours, theirs]
+    taken_ms = np.empty((options.warm_up + options.rounds, len(runs)))
+    for row in taken_ms:
+        for k, run in enumerate(runs):
+            start = clock()
             run()
-            seconds = time.perf_counter() - start
-            if number >= options.warm_up:
-                times.append(1e3 * seconds)
-    value, spread = statistics.median(taken[0]), _spread(taken[0])
+            row[k] = 1e3 * (clock() - start)
+    low, median, high = np.percentile(taken_ms[options.warm_up :], (10, 50, 90), axis=0).tolist()
+    spread = [b - a for a, b in zip(low, high, strict=True)]
+    result = BenchResult(what, median[0], "ms", spread[0], note=note)
     if theirs is None:
-        return BenchResult(what, value, "ms", spread, note=note)
-    theirs_ms = statistics.median(taken[1])
-    return BenchResult(what, value, "ms", spread, peer, theirs_ms, _spread(taken[1]), note)
+        return result
+    return replace(result, peer=peer, peer_value=median[1], peer_spread=spread[1])
 
 
 def run_benchmarks(
@@ -203,15 +205,6 @@ def commit() -> str:
 def machine() -> str:
     """Architecture, cores and memory; nothing that names the machine."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    words = [platform.machine() or "unknown processor", f"{cores} cores"]
-    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-        words.append(f"{memory:.0f} GiB")
-    return ", ".join([*words, f"Python {platform.python_version()}"])
-
-
-def _spread(values: list[float]) -> float:
-    """10th to 90th percentile."""
-    ordered = sorted(values)
-    last = len(ordered) - 1
-    return ordered[round(0.9 * last)] - ordered[round(0.1 * last)]
+    processor = platform.machine() or "unknown processor"
+    memory = f"{psutil.virtual_memory().total / 2**30:.0f} GiB"
+    return f"{processor}, {cores} cores, {memory}, Python {platform.python_version()}"

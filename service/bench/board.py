@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 
@@ -58,29 +57,26 @@ def _rate_hz(images: Iterable[object]) -> float:
     return sum(1 for _ in images) / (time.perf_counter() - start)
 
 
-class _Flight(NamedTuple):
-    elapsed_s: float
-    keyframes: int
-    peak_mib: float  # of its process
-
-
 def _whole_path(video: Path, width: int, backend: str, flight_s: int) -> list[BenchResult]:
     """Times real time and peak memory, with this backend and with SGBM."""
-    ours, theirs = (in_process(_flown, video, width, name) for name in (backend, SgbmBackend.name))
+    (ours_s, keyframes, ours_mib), (theirs_s, _, theirs_mib) = (
+        in_process(_flown, video, width, name) for name in (backend, SgbmBackend.name)
+    )
     peer = "with OpenCV SGBM"
-    note = f"{ours.keyframes} keyframes of {SIZE[0]}x{SIZE[1]} at {FPS} images/s"
+    note = f"{keyframes} keyframes of {SIZE[0]}x{SIZE[1]} at {FPS} images/s"
     words, memory = f"whole path, stereo {width} wide", f"its memory, {width} wide"
     return [
         BenchResult(
-            words, flight_s / ours.elapsed_s, "times real time",
-            peer=peer, peer_value=flight_s / theirs.elapsed_s, note=note,
+            words, flight_s / ours_s, "times real time",
+            peer=peer, peer_value=flight_s / theirs_s, note=note,
         ),
-        BenchResult(memory, ours.peak_mib, "MiB", peer=peer, peer_value=theirs.peak_mib),
+        BenchResult(memory, ours_mib, "MiB", peer=peer, peer_value=theirs_mib),
     ]  # fmt: skip
 
 
-def _flown(video: Path, width: int, backend: str) -> _Flight:
-    """The second flight of this process: the first loads or compiles kernels."""
+def _flown(video: Path, width: int, backend: str) -> tuple[float, int, float]:
+    """Seconds, keyframes and the process's peak MiB of its second flight: the first loads or
+    compiles kernels."""
     chosen = SgbmBackend() if backend == SgbmBackend.name else choose_backend(backend)
     flags = [f"compute.stereo_width={width}", f"compute.guide_width={max(width, 640)}"]
     with tempfile.TemporaryDirectory() as folder:
@@ -88,7 +84,7 @@ def _flown(video: Path, width: int, backend: str) -> _Flight:
             summary, elapsed_s = fly(video, Path(folder) / name, flags, chosen)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     in_kib = sys.platform != "darwin"
-    return _Flight(elapsed_s, summary["keyframes"], peak / (2**10 if in_kib else 2**20))
+    return elapsed_s, summary["keyframes"], peak / (2**10 if in_kib else 2**20)
 
 
 @contextmanager

@@ -6,11 +6,11 @@ correlated). Ours carries mask, sigma, views and a coarse layer too.
 
 from __future__ import annotations
 
-import contextlib
 import io
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import laspy
@@ -18,12 +18,11 @@ import numpy as np
 
 from recon.mapping.cloud_fusion import cloud_of
 from recon.types import F32, U8, Keyframe
-from service.bench import BenchOptions, BenchResult
+from service.bench import BenchOptions, BenchResult, compare
 from service.bench.keyframes import make_keyframe, strip
 from service.stream import codec
 
 SIZE_PX = (320, 180)
-REPEATS = 30
 LAZ = "LAZ 1 cm"
 
 
@@ -31,41 +30,31 @@ def run(options: BenchOptions) -> list[BenchResult]:
     """Milliseconds to encode a keyframe and its fresh part, and to decode it."""
     whole = make_keyframe(0, SIZE_PX, seed=1)
     part = replace(whole, fresh=strip(SIZE_PX, 20))
-    coded, xyz, rgb = codec.encode(whole, 0), *points(whole)
-    with one_core():
-        ours, theirs, new, decoded = map(
-            median_ms,
-            (
-                lambda: codec.encode(whole, 0), lambda: encode_laz(xyz, rgb),
-                lambda: codec.encode(part, 0), lambda: codec.decode(coded[-1:]),
-            ),
-        )  # fmt: skip
-    what = "encode 320x180, both layers, one core"
+    last_layer = codec.encode(whole, 0)[-1:]
+    encode = "encode 320x180, both layers, one core"
+    laz = partial(encode_laz, *points(whole))
     return [
-        BenchResult(what, ours, "ms", peer=LAZ, peer_value=theirs),
-        BenchResult("encode its fresh part at 80 % overlap", new, "ms"),
-        BenchResult("decode a whole keyframe", decoded, "ms"),
+        on_one_core(encode, partial(codec.encode, whole, 0), options, LAZ, laz),
+        on_one_core(
+            "encode its fresh part at 80 % overlap", partial(codec.encode, part, 0), options
+        ),
+        on_one_core("decode a whole keyframe", partial(codec.decode, last_layer), options),
     ]
 
 
-def median_ms(work: Callable[[], object]) -> float:
-    """Milliseconds of one core: processor time of this thread, so a busy machine counts less."""
-    work()
-    times = []
-    for _ in range(REPEATS):
-        began = time.thread_time()
-        work()
-        times.append(time.thread_time() - began)
-    return float(np.median(times)) * 1e3
-
-
-@contextlib.contextmanager
-def one_core() -> Iterator[None]:
-    """OpenCV without threads of its own."""
+def on_one_core(
+    what: str,
+    ours: Callable[[], object],
+    options: BenchOptions,
+    peer: str = "",
+    theirs: Callable[[], object] | None = None,
+) -> BenchResult:
+    """As :func:`compare`, by the processor time of this thread, so a busy machine counts less;
+    OpenCV has no threads of its own."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        yield
+        return compare(what, ours, options, peer, theirs, clock=time.thread_time)
     finally:
         cv2.setNumThreads(threads)
 

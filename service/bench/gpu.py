@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -46,22 +46,20 @@ def calls(backend: Backend, compiled: Backend, options: BenchOptions) -> list[Be
     icp = IcpConfig(strides=(1,), iterations=(6,))
     size = f"{SIZE[0]}x{SIZE[1]}"
     note = f"{backend.name} on {backend.device}"
-    own: Iterator[tuple[str, Callable[[Backend], object]]] = iter(
-        (
-            (f"stereo {size}, {LABELS} labels",
-             lambda b: b.belief_propagation(left, right, LABELS, matching)),
-            (f"upsampling {size} to {GUIDE[0]}x{GUIDE[1]}, exact",
-             lambda b: b.upsample(coarse, guide, upsampling)),
-            (f"ICP of {SIZE[0] * SIZE[1]} points, 6 iterations",
-             lambda b: b.register(source, target, np.eye(4), icp)),
-        )
-    )  # fmt: skip
+    work: dict[str, Callable[[Backend], object]] = {
+        f"stereo {size}, {LABELS} labels":
+            lambda b: b.belief_propagation(left, right, LABELS, matching),
+        f"upsampling {size} to {GUIDE[0]}x{GUIDE[1]}, exact":
+            lambda b: b.upsample(coarse, guide, upsampling),
+        f"ICP of {SIZE[0] * SIZE[1]} points, 6 iterations":
+            lambda b: b.register(source, target, np.eye(4), icp),
+    }  # fmt: skip
     return [
         compare(
             f"{what}, with uploads", partial(call, backend), options, "cpu backend",
             partial(call, compiled), note,
         )
-        for what, call in own
+        for what, call in work.items()
     ]  # fmt: skip
 
 

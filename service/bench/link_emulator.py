@@ -76,20 +76,15 @@ class _Direction:
         """Bytes that wait for the radio."""
         return max(0.0, self._free_at - now) * self._model.rate_kbit_s * 125
 
-    def cut_end(self, at: float) -> float | None:
-        """When the cut ends that the link is in at a time; None while it is up."""
-        for first, last in self._model.cuts:
-            if self.started + first <= at < self.started + last:
-                return self.started + last
-        return None
-
     def resumes(self, at: float, wait_s: float) -> float:
         """The time at which TCP succeeds, sending first at a given time and again after doubling
         waits."""
-        up = self.cut_end(at)
-        while up is not None and at < up:
-            at += wait_s
-            wait_s *= 2
+        first_at = at
+        for first, last in self._model.cuts:
+            if self.started + first <= first_at < self.started + last:
+                while at < self.started + last:
+                    at += wait_s
+                    wait_s *= 2
         return at
 
     @property
@@ -112,7 +107,7 @@ class _Direction:
 class LinkEmulator:
     """Relays ``listen_port`` to ``target_port`` of this machine through a :class:`LinkModel`.
 
-    :attr:`up` is what the calling side (the drone) sent, :attr:`down` what came back.
+    :attr:`up` is the traffic from the side that calls, the drone.
     """
 
     def __init__(self, model: LinkModel, listen_port: int, target_port: int) -> None:
@@ -121,15 +116,11 @@ class LinkEmulator:
         self.started = time.monotonic()
         self._up = _Direction(model, self.started, model.seed)
         self._down = _Direction(model, self.started, model.seed + 1)
+        self.up = self._up.traffic
         self._loop = asyncio.new_event_loop()
         self._ready = threading.Event()
         self._tasks: set[asyncio.Task[None]] = set()
         self._thread = threading.Thread(target=self._run, name="link-emulator", daemon=True)
-
-    @property
-    def up(self) -> Traffic:
-        """From the side that calls."""
-        return self._up.traffic
 
     def take_off(self, now: float) -> None:
         """Count the times of the cuts from now on, and forget the traffic so far."""
@@ -138,12 +129,10 @@ class LinkEmulator:
         self._down.traffic.log.clear()
 
     def start(self) -> None:
-        """Begin to relay."""
         self._thread.start()
         self._ready.wait(5.0)
 
     def close(self) -> None:
-        """End all connections."""
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(5.0)
 

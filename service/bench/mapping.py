@@ -14,10 +14,14 @@ import numpy as np
 from recon import se3
 from recon.camera_model import rays
 from recon.mapping.registration import IcpConfig, register_projective
+from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F64, DepthMap
 from service.bench import BenchOptions, BenchResult, compare
+from service.sim.scene import Area, make
 
 K: F64 = np.array([[190.7, 0, 159.5], [0, 190.7, 89.5], [0, 0, 1.0]])
+PIXELS: F64 = np.indices((180, 320), np.float64)[::-1].reshape(2, -1).T
+"""(57,600, 2) u and v, row by row."""
 SCENES = 8
 NOISE_M = 0.05
 
@@ -46,37 +50,16 @@ def peers() -> dict[str, Callable[[DepthMap, DepthMap, F64], F64]]:
     return found
 
 
-def height(x: F64, y: F64) -> F64:
-    """Hills with houses, in m."""
-    z = 0.6 * np.sin(x / 7 + 1) * np.cos(y / 9) + 0.3 * np.sin(x / 3.1 + y / 4.3)
-    fx, fy = np.mod(x, 18) - 9, np.mod(y, 22) - 11
-    roof = (np.abs(fx) < 4) & (np.abs(fy) < 5)
-    return np.asarray(z + np.where(roof, 5 - 0.8 * np.abs(fx), 0.0))
+@lru_cache(maxsize=1)
+def village() -> TriangleGrid:
+    """Hills with houses and trees, under all the scenes."""
+    return make(Area(-80.0, -70.0, 110.0, 80.0), relief_m=8.0, density=1.0, seed=1).grid
 
 
 def rendered(T_world_camera: F64) -> F64:
-    """(180, 320) depth along z of the terrain, by marching every ray and halving."""
-    v, u = np.mgrid[0:180, 0:320].astype(np.float64)
-    directions = rays(K, np.column_stack([u.ravel(), v.ravel()])) @ T_world_camera[:3, :3].T
-    origin = T_world_camera[:3, 3]
-
-    def below(t: F64) -> Any:
-        p = origin + directions * t[:, None]
-        return p[:, 2] <= height(p[:, 0], p[:, 1])
-
-    near = np.full(len(directions), 0.8 * origin[2])
-    far = near.copy()
-    still = np.ones(len(near), bool)
-    for t in np.linspace(0.8, 1.15, 90) * origin[2]:
-        far[still] = t
-        hit = below(far)
-        near[still & ~hit] = t
-        still &= ~hit
-    for _ in range(20):
-        middle = 0.5 * (near + far)
-        hit = below(middle)
-        far, near = np.where(hit, middle, far), np.where(hit, near, middle)
-    return np.asarray(far.reshape(180, 320))
+    """(180, 320) depth along z of the village."""
+    directions = rays(K, PIXELS) @ T_world_camera[:3, :3].T
+    return village().cast(T_world_camera[:3, 3], directions)[0].reshape(180, 320)
 
 
 @lru_cache(maxsize=2 * SCENES)
@@ -136,8 +119,7 @@ def by_small_gicp(source: DepthMap, target: DepthMap, guess: F64) -> F64:
     """(4, 4) by voxelised generalised ICP of small_gicp on two threads."""
     import small_gicp
 
-    v, u = np.mgrid[0:180, 0:320].astype(np.float64)
-    directions = rays(K, np.column_stack([u.ravel(), v.ravel()]))
+    directions = rays(K, PIXELS)
     clouds = [directions * d.depth_m.reshape(-1, 1) for d in (target, source)]
     found = small_gicp.align(
         *clouds, guess, registration_type="VGICP", voxel_resolution=1.0,

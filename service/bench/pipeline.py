@@ -12,10 +12,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
+import psutil  # type: ignore[import-untyped]
 
 from recon import se3
 from recon.backends import Backend
@@ -38,23 +39,25 @@ def run(options: BenchOptions) -> list[BenchResult]:
     with tempfile.TemporaryDirectory() as folder:
         video = Path(folder) / "flight.mp4"
         make_video(video, int(seconds * FPS))
-        _path(video, Path(folder) / "warm", upsample=True, sgbm=False)
-        for upsample, words in ((False, "320x180"), (True, "320x180, with JBU")):
-            ours = _path(video, Path(folder) / f"ours{upsample}", upsample, sgbm=False)
-            theirs = _path(video, Path(folder) / f"theirs{upsample}", upsample, sgbm=True)
-            note = f"{ours.fps:.1f} frames/s, {ours.rss_mib:.0f} MiB"
+        fly(video, Path(folder) / "warm", [], CpuBackend())
+        for upsample, words in (("false", "320x180"), ("true", "320x180, with JBU")):
+            flags = [f"compute.upsample={upsample}", "compute.pairs=30"]
+            ours, ours_s = fly(video, Path(folder) / f"ours-{upsample}", flags, CpuBackend())
+            note = f"{ours['frames'] / ours_s:.1f} frames/s, {resident_mib():.0f} MiB"
+            theirs, theirs_s = fly(video, Path(folder) / f"sgbm-{upsample}", flags, SgbmBackend())
+            peer = "with OpenCV SGBM"
             results.append(
                 BenchResult(
-                    f"whole path, {words}", ours.clouds, "clouds/s",
-                    peer="with OpenCV SGBM", peer_value=theirs.clouds, note=note,
+                    f"whole path, {words}", ours["clouds"] / ours_s, "clouds/s",
+                    peer=peer, peer_value=theirs["clouds"] / theirs_s, note=note,
                 )
             )  # fmt: skip
             results += [
                 BenchResult(
                     f"a call of {stage} in it", ms, "ms",
-                    peer="with OpenCV SGBM", peer_value=theirs.stage_ms.get(stage),
+                    peer=peer, peer_value=theirs["stage_ms"].get(stage),
                 )
-                for stage, ms in ours.stage_ms.items()
+                for stage, ms in ours["stage_ms"].items()  # wall time, among all the threads
             ]  # fmt: skip
     return results
 
@@ -101,22 +104,6 @@ def _photograph(ground: U8, T_world_camera: F64) -> U8:
     return np.asarray(cv2.warpPerspective(ground, H, SIZE, flags=cv2.INTER_AREA), np.uint8)
 
 
-class _Flown(NamedTuple):
-    clouds: float  # a second
-    fps: float
-    rss_mib: float  # of the process at its end
-    stage_ms: dict[str, float]  # wall time of a call, among all the threads
-
-
-def _path(video: Path, folder: Path, upsample: bool, sgbm: bool) -> _Flown:
-    flags = [f"compute.upsample={str(upsample).lower()}", "compute.pairs=30"]
-    summary, elapsed = fly(video, folder, flags, SgbmBackend() if sgbm else CpuBackend())
-    return _Flown(
-        summary["clouds"] / elapsed, summary["frames"] / elapsed, resident_mib(),
-        summary["stage_ms"],
-    )  # fmt: skip
-
-
 def fly(
     video: Path,
     folder: Path,
@@ -143,12 +130,8 @@ def fly(
 
 
 def resident_mib() -> float:
-    """Resident memory of this process now; NaN where the system does not report it."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except (OSError, ValueError, IndexError):
-        return float("nan")
-    return pages * 4096 / 2**20
+    """Resident memory of this process now."""
+    return float(psutil.Process().memory_info().rss) / 2**20
 
 
 class SgbmBackend(CpuBackend):

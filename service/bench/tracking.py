@@ -14,6 +14,7 @@ from recon.tracking.matching import MatchingConfig, build_pyramid, harris_grid, 
 from recon.tracking.sift_features import FeatureMatches, features, match_features
 from recon.types import F32, F64, U8
 from service.bench import BenchOptions, BenchResult, compare
+from service.bench.keyframes import natural
 
 SIZE = (720, 1280)
 SHIFT_PX = np.array([23.4, -17.7])
@@ -58,13 +59,7 @@ def images() -> tuple[U8, U8]:
     """Two noisy views of one texture with detail at every scale, shifted by SHIFT_PX."""
     rng = np.random.default_rng(0)
     h, w = SIZE[0] + 128, SIZE[1] + 128
-    total = np.zeros((h, w), np.float64)
-    for k in range(7):
-        small = rng.normal(size=((h >> k) + 4, (w >> k) + 4))
-        blurred = cv2.GaussianBlur(small, (0, 0), 1.2)
-        layer = cv2.resize(blurred, None, fx=2.0**k, fy=2.0**k, interpolation=cv2.INTER_CUBIC)
-        total += 2 ** (0.3 * k) * layer[:h, :w]
-    total = 128 + 55 * (total - total.mean()) / total.std()
+    total = 128 + 55 * natural(h, w, 1.3, 0)
     fy, fx = np.fft.fftfreq(h)[:, None], np.fft.fftfreq(w)[None]
     phase = np.exp(2j * np.pi * (fx * SHIFT_PX[0] + fy * SHIFT_PX[1]))
     moved = np.fft.ifft2(np.fft.fft2(total) * phase).real

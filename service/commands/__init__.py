@@ -4,7 +4,7 @@ import _thread
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from inspect import Parameter, Signature
@@ -27,6 +27,8 @@ Overrides = Annotated[
     list[str] | None, typer.Option("--set", help="section.key=value, may be repeated")
 ]
 ConfigFile = Annotated[Path | None, typer.Option(help="configuration file (TOML)")]
+BACKENDS = ("auto", "cpu", "torch", "onnx")
+BackendName = typer.Option(help="auto, cpu, torch or onnx", autocompletion=choices(BACKENDS))
 ScanDir = Annotated[Path, typer.Argument(help="scan folder (holds scan.db)")]
 Voxel = Annotated[
     float | None, typer.Option("--voxel-m", help="fused voxel size; default: pixel on ground")
@@ -37,7 +39,6 @@ TilePoints = Annotated[
 Scheduler = Annotated[
     str | None, typer.Option(help="Dask scheduler that makes the tiles: tcp://HOST:8786")
 ]
-BACKENDS = ("auto", "cpu", "torch", "onnx")
 AsJson = Annotated[bool, typer.Option("--json", help="one JSON object at the end")]
 
 Options = TypeVar("Options")
@@ -65,6 +66,19 @@ def with_options(of: type[Options]) -> Callable[[Callable[[Options], None]], Cal
         return run
 
     return wrap
+
+
+def record_of(kind: type[Options], given: object, **others: Any) -> Options:
+    """A record of ``kind``: ``others``, and what is ``given`` under the names of its fields."""
+    names = {field.name for field in fields(kind)} - others.keys()  # type: ignore[arg-type]
+    same = {name: getattr(given, name) for name in names if hasattr(given, name)}
+    return kind(**same, **others)
+
+
+def one_of(action: str, actions: Sequence[str], command: str) -> None:
+    """InputError for an action that the command does not have."""
+    if action not in actions:
+        raise InputError(f"{command} {action}: there are {', '.join(actions)}")
 
 
 def parse_size(text: str, option: str) -> tuple[int, int]:

@@ -8,13 +8,13 @@ from typing import Annotated
 
 import typer
 
-from service.commands import AsJson
+from service.commands import AsJson, BackendName
 
 
 def bench(
     names: Annotated[list[str] | None, typer.Argument(help="benchmarks; default: all")] = None,
     rounds: Annotated[int, typer.Option(help="timed rounds of each figure", min=1)] = 30,
-    backend: Annotated[str, typer.Option(help="auto, cpu, torch or onnx")] = "cpu",
+    backend: Annotated[str, BackendName] = "cpu",
     keep: Annotated[
         Path | None, typer.Option(help="folder for JSON; compares with the last")
     ] = None,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.commands import AsJson, showing
-from service.errors import InputError
+from service.errors import InputError, refusing
 
 if TYPE_CHECKING:
     from recon.calibration.board import Board, Calibration
@@ -50,13 +50,14 @@ def calibrate(
         result = fit(boards.views, board, boards.size_px, CalibrationConfig(tangential))
     if result is None:
         raise InputError("no camera fits these views; take the board from different angles")
+    record = _record(result, boards, board)
     try:
-        save_camera(out, result.camera, name, {"calibration": _record(result, boards, board)})
+        save_camera(out, result.camera, name, {"calibration": record})
     except ValueError as error:
         raise InputError(f"the views give no usable camera ({error}); take more views") from error
     image = out.with_name(f"{out.stem}_coverage.png")
     write_image(image, draw_coverage(result, boards.views))
-    report = _record(result, boards, board) | {
+    report = record | {
         "out": str(out),
         "coverage_picture": str(image),
         "K": result.camera.K.tolist(),
@@ -71,10 +72,8 @@ def _board(pattern: str, square_m: float) -> Board:
     found = re.match(r"^(\d{1,3})x(\d{1,3})$", pattern.strip())
     if found is None:
         raise InputError(f"--pattern {pattern!r}: expected inner corners such as 9x6")
-    try:
+    with refusing(f"--pattern {pattern} --square-m {square_m:g}"):
         return Board(int(found[1]), int(found[2]), square_m)
-    except ValueError as error:
-        raise InputError(f"--pattern {pattern} --square-m {square_m:g}: {error}") from error
 
 
 def _record(result: Calibration, boards: BoardSet, board: Board) -> dict[str, Any]:

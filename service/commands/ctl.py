@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import AsJson, choices
+from service.commands import AsJson, choices, one_of
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,8 +49,7 @@ def ctl(
 
 
 def _check(action: str, metres: float | None, timeout: float) -> None:
-    if action not in ACTIONS:
-        raise InputError(f"ctl {action}: there are {', '.join(ACTIONS)}")
+    one_of(action, ACTIONS, "ctl")
     if (action == "baseline") != (metres is not None):
         raise InputError(
             "ctl baseline METRES takes metres (0 follows the altitude); no other action does"

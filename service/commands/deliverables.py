@@ -11,10 +11,30 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands import AsJson, ScanDir, Scheduler, TilePoints, Voxel, choices, showing
-from service.errors import InputError
+from service.commands import (
+    AsJson,
+    ScanDir,
+    Scheduler,
+    TilePoints,
+    Voxel,
+    choices,
+    one_of,
+    showing,
+)
+from service.errors import InputError, refusing
 from service.offline.exports import EXPORTERS, kind_of
 from service.packages import needing
+
+Recording = Annotated[
+    Path | None,
+    typer.Option(help="the flight's video or folder of images; default: as named in scan.json"),
+]
+StoredImages = Annotated[
+    bool, typer.Option("--stored", help="use the scan's own small images, not the recording")
+]
+RecordingStart = Annotated[
+    float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
+]
 
 
 def export(
@@ -38,16 +58,9 @@ def export(
     strict: Annotated[
         bool, typer.Option("--strict", help="leave the holes of the surface model unknown")
     ] = False,
-    video: Annotated[
-        Path | None,
-        typer.Option(help="the flight's, for ortho and glb; default: as named in scan.json"),
-    ] = None,
-    stored: Annotated[
-        bool, typer.Option("--stored", help="make ortho and glb from the scan's own small images")
-    ] = False,
-    video_epoch: Annotated[
-        float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
-    ] = None,
+    video: Recording = None,
+    stored: StoredImages = False,
+    video_epoch: RecordingStart = None,
     vertical_datum: Annotated[
         str | None,
         typer.Option(help="of the heights as flown, if known: ellipsoid, EGM96, EGM2008, EPSG:n"),
@@ -71,22 +84,11 @@ def export(
         raise InputError("--out names one file; give one --to with it")
     for kind in to:
         kind_of(kind, out)
-    try:
+    with refusing("export"):
         options = ExportOptions(
-            voxel_m,
-            cell_m,
-            contour_m,
-            strict,
-            video,
-            stored,
-            _epoch_ns(video_epoch),
-            vertical_datum,
-            to_datum,
-            tile_points,
-            scheduler,
-        )
-    except ValueError as error:
-        raise InputError(f"export: {error}") from error
+            voxel_m, cell_m, contour_m, strict, video, stored, _epoch_ns(video_epoch),
+            vertical_datum, to_datum, tile_points, scheduler,
+        )  # fmt: skip
     kinds = list(dict.fromkeys(to))
     with showing("export") as progress, ScanView(scan_dir, voxel_m, progress) as scan:
         failures = Failures(scan_dir, logging.DEBUG)
@@ -126,16 +128,9 @@ def mesh(
     scan_dir: ScanDir,
     faces: Annotated[int, typer.Option("--faces", min=100, help="triangles at most")] = 400_000,
     voxel_m: Voxel = None,
-    video: Annotated[
-        Path | None,
-        typer.Option(help="the flight's video or folder of images; default: as named in scan.json"),
-    ] = None,
-    stored: Annotated[
-        bool, typer.Option("--stored", help="texture from the scan's own small images")
-    ] = False,
-    video_epoch: Annotated[
-        float | None, typer.Option(help="unix seconds of its start; default: the scan's start")
-    ] = None,
+    video: Recording = None,
+    stored: StoredImages = False,
+    video_epoch: RecordingStart = None,
     tile_points: TilePoints = 20_000_000,
     scheduler: Scheduler = None,
     out: Annotated[
@@ -148,13 +143,11 @@ def mesh(
     from service.offline.exports.view import ExportOptions, ScanView
     from service.scans.writing import check_writable
 
-    try:
+    with refusing("mesh"):
         options = ExportOptions(
             voxel_m=voxel_m, video=video, stored=stored, video_epoch_ns=_epoch_ns(video_epoch),
             tile_points=tile_points, scheduler=scheduler,
         )  # fmt: skip
-    except ValueError as error:
-        raise InputError(f"mesh: {error}") from error
     if stored and video is not None:
         raise InputError("mesh: give either --video or --stored")
     kind_of("glb", out)
@@ -213,18 +206,14 @@ def inspect(
     path = out or scan_dir / f"keyframe_{seq:06d}.png"
     write_whole(path, cv2.imencode(".png", image)[1].tobytes())
     known = np.isfinite(found.depth.depth_m)
+    depth_m, sigma_m = (
+        round(float(np.median(values[known])), digits) if known.any() else None
+        for values, digits in ((found.depth.depth_m, 3), (found.depth.sigma_m, 4))
+    )
     figures = {
-        "keyframe": seq,
-        "picture": str(path),
-        "stages": complete,
-        "points": int(known.sum()),
-        "depth_median_m": round(float(np.median(found.depth.depth_m[known])), 3)
-        if known.any()
-        else None,
-        "sigma_median_m": round(float(np.median(found.depth.sigma_m[known])), 4)
-        if known.any()
-        else None,
-    }
+        "keyframe": seq, "picture": str(path), "stages": complete, "points": int(known.sum()),
+        "depth_median_m": depth_m, "sigma_median_m": sigma_m,
+    }  # fmt: skip
     if as_json:
         print(json.dumps(figures))
         return
@@ -238,7 +227,7 @@ ACTIONS = ("align", "compare")
 
 def site(
     action: Annotated[
-        str, typer.Argument(help="align or compare", autocompletion=choices(("align", "compare")))
+        str, typer.Argument(help="align or compare", autocompletion=choices(ACTIONS))
     ],
     scans: Annotated[list[Path], typer.Argument(help="scan folders; compare: before and after")],
     out: Annotated[Path, typer.Option("--out", help="folder of the site")],
@@ -261,8 +250,7 @@ def site(
     The scans are not changed. A site's folder is a scan folder: export, mesh and refine --gcp
     work on it.
     """
-    if action not in ACTIONS:
-        raise InputError(f"site {action}: there are {', '.join(ACTIONS)}")
+    one_of(action, ACTIONS, "site")
     if action == "align":
         from service.offline.site.alignment import align_site
         from service.offline.site.start import read_start

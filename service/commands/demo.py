@@ -19,7 +19,8 @@ import typer
 from service.commands import AsJson
 from service.errors import InputError, OutsideError
 from service.scans.report_parts import height_sigma_m, within
-from service.workers import python_command
+from service.scans.writing import check_writable
+from service.workers import end_process, python_command
 
 FLIGHT = Path("demo") / "caliterra"
 MARKER = ".skyrelief-demo"
@@ -64,15 +65,14 @@ def demo(
         received = _wait_for_ground(ground, out)
     finally:
         for process in (ground, *compilers):
-            _stop(process)
+            end_process(process, 20.0)
     report = _figures(out, received, time.monotonic() - began)
     if report["ground_points"] != report["points"]:
-        error = OutsideError(
+        raise OutsideError(
             f"the ground holds {report['ground_points']} of {report['points']} points; "
-            f"see {out / 'ground.log'}"
+            f"see {out / 'ground.log'}",
+            report,
         )
-        error.report = report
-        raise error
     print(json.dumps(report) if as_json else _in_words(report))
 
 
@@ -83,29 +83,21 @@ def _say(step: int, what: str) -> None:
 
 def compile_kernels() -> None:
     """Compile the kernels of stereo, ICP and the codec, or load them from numba's cache."""
-    import numpy as np
-
     from recon.backends.cpu import warm_up
-    from recon.types import DepthMap, Keyframe, Pose
+    from service.bench.keyframes import make_keyframe
     from service.stream.codec import decode, encode
 
     warm_up()
-    size = (90, 160)
-    depth = np.tile(np.linspace(50, 60, 160, dtype=np.float32), (90, 1))
-    K = np.array([[140.0, 0, 80], [0, 140, 45], [0, 0, 1]])
-    one = np.full(size, 0.1, np.float32), np.full(size, 2, np.uint8)
-    bgr, known = np.full((*size, 3), 120, np.uint8), np.indices(size).sum(axis=0) % 7 > 0
-    pose = Pose(np.eye(4), np.eye(6), ("vision",))
-    decode(encode(Keyframe(0, 0, DepthMap(depth, *one, K, np.eye(4)), bgr, pose, known), 0))
+    decode(encode(make_keyframe(size_px=(160, 90)), 0))
 
 
-def compile_meanwhile() -> list[subprocess.Popen[str]]:
+def compile_meanwhile() -> list[subprocess.Popen[bytes]]:
     """A process that compiles what the replay needs later; none when numba has its kernels."""
     from service.daemon.warm_up import has_kernels
 
     if has_kernels():
         return []
-    return [subprocess.Popen(python_command(__name__), stdin=subprocess.DEVNULL, text=True)]
+    return [subprocess.Popen(python_command(__name__), stdin=subprocess.DEVNULL)]
 
 
 HOMES = (Path(__file__).resolve().parents[2], Path(sys.prefix) / "share" / "skyrelief")
@@ -125,35 +117,28 @@ def demo_flight(flight: Path | None, homes: Sequence[Path] = HOMES) -> Path:
 
 def _prepare(out: Path) -> None:
     """Make ``out`` empty but for the marker; only what an earlier demo made is removed."""
+    check_writable(out, is_folder=True)
     if out.exists() and any(out.iterdir()) and not (out / MARKER).exists():
         raise InputError(f"{out} is not empty and not of an earlier demo; give another --out")
-    try:
-        if out.exists():
-            shutil.rmtree(out)
-        out.mkdir(parents=True)
-        (out / MARKER).touch()
-    except OSError as error:
-        raise InputError(
-            f"{out} cannot be written: {error.strerror}; give another --out"
-        ) from error
+    if out.exists():
+        shutil.rmtree(out)
+    out.mkdir(parents=True)
+    (out / MARKER).touch()
 
 
-def _skyrelief(*arguments: str) -> list[str]:
-    return python_command("service.cli", *arguments)
-
-
-def _start_ground(out: Path, endpoint: str, portal: str) -> subprocess.Popen[str]:
+def _start_ground(out: Path, endpoint: str, portal: str) -> subprocess.Popen[bytes]:
     """A receiver that ends on SIGINT, with its report as JSON."""
-    command = _skyrelief("ground", "--store", str(out / "ground"), "--listen", endpoint, "--json")
-    if portal:
-        command += ["--portal", portal]
+    command = python_command(
+        "service.cli", "ground", "--store", str(out / "ground"), "--listen", endpoint, "--json",
+        *(("--portal", portal) if portal else ()),
+    )  # fmt: skip
     with (out / "ground.log").open("wb") as log:
         return subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log
         )
 
 
-def _said(ground: subprocess.Popen[str], out: Path, start: str) -> str:
+def _said(ground: subprocess.Popen[bytes], out: Path, start: str) -> str:
     """The rest of the line of the receiver's log that begins with ``start``, once it is there."""
     deadline = time.monotonic() + READY_S
     while time.monotonic() < deadline and ground.poll() is None:
@@ -166,23 +151,17 @@ def _said(ground: subprocess.Popen[str], out: Path, start: str) -> str:
 
 def _replay(flight: Path, out: Path, endpoint: str, overrides: list[str]) -> None:
     settings = [f'datalink.connect=["{endpoint}"]', "datalink.budget_kbit_s=20000", *overrides]
-    command = _skyrelief(
-        "replay",
-        str(flight / "frames"),
-        "--camera-model",
-        str(flight / "camera.yaml"),
-        "--out",
-        str(out / "onboard"),
+    command = python_command(
+        "service.cli", "replay", str(flight / "frames"), "--out", str(out / "onboard"),
+        "--camera-model", str(flight / "camera.yaml"),
         *(part for setting in settings for part in ("--set", setting)),
-    )
-    code = subprocess.run(
-        command, stdin=subprocess.DEVNULL, stdout=sys.stderr, check=False
-    ).returncode
+    )  # fmt: skip
+    code = subprocess.run(command, stdin=subprocess.DEVNULL, stdout=sys.stderr).returncode
     if code != 0:
         raise OutsideError(f"the replay ended with exit code {code}; see its message above")
 
 
-def _wait_for_ground(ground: subprocess.Popen[str], out: Path) -> Path:
+def _wait_for_ground(ground: subprocess.Popen[bytes], out: Path) -> Path:
     """The scan folder at the ground. The replay has ended, and so delivered what it could."""
     ground.send_signal(signal.SIGINT)
     try:
@@ -197,19 +176,10 @@ def _wait_for_ground(ground: subprocess.Popen[str], out: Path) -> Path:
     return Path(scan["folder"])
 
 
-def _stop(process: subprocess.Popen[str]) -> None:
-    if process.poll() is not None:
-        return
-    process.send_signal(signal.SIGINT)
-    try:
-        process.wait(timeout=20.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-
-
 def _figures(out: Path, received: Path, seconds: float) -> dict[str, Any]:
-    onboard, ground = _read(out / "onboard" / "scan.json"), _read(received / "scan.json")
+    onboard, ground = (
+        json.loads((folder / "scan.json").read_bytes()) for folder in (out / "onboard", received)
+    )
     quality = onboard["quality"]
     return {
         "scan_folder": str(out / "onboard"),
@@ -256,14 +226,6 @@ def _verdict(quality: dict[str, Any]) -> str:
         parts.append(f"absolute {within(across)} across, {within(up)} up")
     level: str = quality["trust"]["level"]
     return f"{level}: {', '.join(parts)}" if parts else level
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return document
 
 
 if __name__ == "__main__":

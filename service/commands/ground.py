@@ -278,7 +278,7 @@ def _watch(
 
 
 def show_news(entries: list[dict[str, Any]], shown: dict[str, str]) -> None:
-    """Print the scans whose line is not the one in ``shown``, by folder, and keep it there."""
+    """Print the scans whose line is not the one ``shown``, by folder."""
     for entry in entries:
         line = _line(entry)
         if shown.get(entry["folder"]) != line:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from service.commands import AsJson, ScanDir, showing
 from service.errors import InputError
-
-if TYPE_CHECKING:
-    from service.offline.refine.refly import Refly
 
 
 def refine(
@@ -54,25 +51,25 @@ def refine(
 
     if marks and not gcp:
         raise InputError("--marks needs --gcp with the points")
-    if intrinsics and video is None:
-        raise InputError("--intrinsics needs --video FILE")
-    if intrinsics and video is not None:
-        if gcp or undo:
-            raise InputError("--intrinsics takes --video, --telemetry and --out only")
-        with showing("refine") as progress:
-            figures = run_intrinsics(scan_dir, video, telemetry, out, progress)
-        print(json.dumps(figures) if as_json else "\n".join(_camera_lines(figures)))
-        return
-    if undo:
-        if gcp or marks or telemetry or out or video:
-            raise InputError("--undo takes nothing else")
-        figures = run_undo(scan_dir)
-    else:
-        with showing("refine") as progress:
-            figures = run(
-                scan_dir, RefineOptions(gcp, telemetry, out, loops, video, marks), progress
+    lines = _lines
+    with showing("refine") as progress:
+        if intrinsics:
+            if video is None:
+                raise InputError("--intrinsics needs --video FILE")
+            if gcp or undo:
+                raise InputError("--intrinsics takes --video, --telemetry and --out only")
+            figures, lines = (
+                run_intrinsics(scan_dir, video, telemetry, out, progress),
+                _camera_lines,
             )
-    print(json.dumps(figures) if as_json else "\n".join(_lines(figures)))
+        elif undo:
+            if gcp or marks or telemetry or out or video:
+                raise InputError("--undo takes nothing else")
+            figures = run_undo(scan_dir)
+        else:
+            options = RefineOptions(gcp, telemetry, out, loops, video, marks)
+            figures = run(scan_dir, options, progress)
+    print(json.dumps(figures) if as_json else "\n".join(lines(figures)))
 
 
 def _camera_lines(figures: dict[str, Any]) -> list[str]:
@@ -157,7 +154,15 @@ def refly(
     as_json: AsJson = False,
 ) -> None:
     """Plan a mission over gaps, places in too few images and places of large sigma."""
-    from service.scans.writing import check_writable
+    from service.offline.exports.view import ScanView
+    from service.offline.refine.refly import (
+        NO_FLIGHT,
+        plan_json,
+        suggest_as_flown,
+        waypoints_text,
+    )
+    from service.scans.coverage import coverage_of
+    from service.scans.writing import check_writable, write_whole
 
     path = out or scan_dir / "refly.plan"
     if path.suffix not in (".plan", ".waypoints"):
@@ -168,63 +173,39 @@ def refly(
         raise InputError(f"--overlap {overlap:g}: give 0 to 0.9")
     if scan_dir.is_dir():
         check_writable(path)
-    given: dict[str, Any] = {"min_views": views, "max_sigma_m": sigma_m}
-    limits = {name: value for name, value in given.items() if value is not None}
-    flight = _flight(scan_dir, limits, overlap, relative, photos)
-    if flight is None:
-        from service.offline.refine.refly import NO_FLIGHT
-
-        nothing = {"lines": 0, "weak_m2": 0.0, "plan": None}
-        print(json.dumps(nothing) if as_json else NO_FLIGHT)
-        return
-    _write_plan(path, flight)
-    figures = _plan_figures(path, flight)
-    print(json.dumps(figures) if as_json else _plan_line(figures, flight.swath.speed_m_s))
-
-
-def _flight(
-    scan_dir: Path, limits: dict[str, Any], overlap: float, relative: bool, photos: bool
-) -> Refly | None:
-    """Lines over the cells that are weak by ``limits``, at the scan's height and speed; None
-    without any."""
-    from service.offline.exports.view import ScanView
-    from service.offline.refine.refly import suggest_as_flown
-    from service.scans.coverage import coverage_of
-
     with ScanView(scan_dir) as scan:
         found = coverage_of(scan.store)
         if found is None:
             raise InputError(f"{scan_dir} contains no surface; there is nothing to compare with")
-        found = replace(found, limits=replace(found.limits, **limits))
-        return suggest_as_flown(found, scan.poses, overlap, relative, photos)
-
-
-def _write_plan(path: Path, flight: Refly) -> None:
-    from service.offline.refine.refly import plan_json, waypoints_text
-    from service.scans.writing import write_whole
-
-    text = waypoints_text(flight) if path.suffix == ".waypoints" else plan_json(flight)
-    write_whole(path, text)
-
-
-def _plan_figures(path: Path, flight: Refly) -> dict[str, Any]:
-    swath = flight.swath
-    return {
-        "plan": str(path),
-        "lines": len(flight.lines),
-        "patches": flight.patches,
-        "weak_m2": round(flight.weak_m2, 1),
-        "length_m": round(flight.length_m, 1),
-        "seconds": round(flight.length_m / max(swath.speed_m_s, 1.0)),
-        "spacing_m": round(flight.spacing_m, 1),
-        "altitude_amsl_m": round(swath.altitude_amsl_m, 1),
-        "picture_m": [round(swath.across_m, 1), round(swath.along_m, 1)],
-    }
-
-
-def _plan_line(figures: dict[str, Any], speed_m_s: float) -> str:
-    return (
-        f"{figures['plan']}: {figures['lines']} line(s) over {figures['weak_m2']:.0f} m2 in "
-        f"{figures['patches']} place(s), {figures['length_m']:.0f} m, {figures['seconds']} s at "
-        f"{speed_m_s:.1f} m/s, {figures['altitude_amsl_m']:.0f} m above sea level"
+        limits = replace(
+            found.limits,
+            min_views=found.limits.min_views if views is None else views,
+            max_sigma_m=found.limits.max_sigma_m if sigma_m is None else sigma_m,
+        )
+        found = replace(found, limits=limits)
+        flight = suggest_as_flown(found, scan.poses, overlap, relative, photos)
+    if flight is None:
+        print(json.dumps({"lines": 0, "weak_m2": 0.0, "plan": None}) if as_json else NO_FLIGHT)
+        return
+    write_whole(path, waypoints_text(flight) if path.suffix == ".waypoints" else plan_json(flight))
+    swath, lines = flight.swath, len(flight.lines)
+    seconds = round(flight.length_m / max(swath.speed_m_s, 1.0))
+    if as_json:
+        figures = {
+            "plan": str(path),
+            "lines": lines,
+            "patches": flight.patches,
+            "weak_m2": round(flight.weak_m2, 1),
+            "length_m": round(flight.length_m, 1),
+            "seconds": seconds,
+            "spacing_m": round(flight.spacing_m, 1),
+            "altitude_amsl_m": round(swath.altitude_amsl_m, 1),
+            "picture_m": [round(swath.across_m, 1), round(swath.along_m, 1)],
+        }
+        print(json.dumps(figures))
+        return
+    print(
+        f"{path}: {lines} line(s) over {flight.weak_m2:.0f} m2 in {flight.patches} place(s), "
+        f"{flight.length_m:.0f} m, {seconds} s at {swath.speed_m_s:.1f} m/s, "
+        f"{swath.altitude_amsl_m:.0f} m above sea level"
     )

@@ -18,11 +18,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.commands import (
-    BACKENDS,
     AsJson,
+    BackendName,
     ConfigFile,
     Overrides,
-    choices,
     showing,
     stop_by_signals,
 )
@@ -33,7 +32,6 @@ from service.workers import PROCESS, Worker, end_processes
 if TYPE_CHECKING:
     from mavlink.telemetry.history import HistoryConfig
     from mavlink.telemetry.logs import TelemetryLog
-    from recon.types import Camera
     from service.cameras.source import CameraSource
     from service.config import Config
     from service.flight.scan import Scan, ScanInputs
@@ -61,9 +59,7 @@ def replay(
         float | None, typer.Option(help="unix seconds of the video's first instant")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="scan folder to make")] = None,
-    backend: Annotated[
-        str | None, typer.Option(help="auto, cpu, torch or onnx", autocompletion=choices(BACKENDS))
-    ] = None,
+    backend: Annotated[str | None, BackendName] = None,
     realtime: Annotated[
         bool, typer.Option("--realtime", help="at the video's pace; late frames are dropped")
     ] = False,
@@ -78,10 +74,20 @@ def replay(
     from service.memory import one_pool
 
     one_pool()
-    from service.cameras import open_camera
+    from service.cameras import open_camera, parse_source
+    from service.cameras.camera_file import load_camera
+    from service.cameras.lens import check_width, fitted
     from service.cameras.source import Paced
+    from service.commands.adjusted_stills import adjusted_stills
+    from service.commands.missing_metadata import (
+        start_lens,
+        start_of,
+        with_own_lens,
+        with_stated_readout,
+    )
+    from service.compute.backend_choice import open_backend
     from service.config import is_given, load_config
-    from service.flight.scan import check_new
+    from service.flight.scan import ScanInputs, check_new
     from service.scans.writing import check_writable
 
     overrides = list(set_ or [])
@@ -91,18 +97,49 @@ def replay(
     if out is not None:
         check_new(out)
         check_writable(out, is_folder=True)
-    camera = _load_model(camera_model, chosen)
+    model = camera_model or chosen.camera.model
+    camera = load_camera(model) if model else None
     log = _load_telemetry(telemetry, chosen) if telemetry else own_telemetry(video, chosen)
     source = open_camera(video)
-    played = Paced(source) if realtime else source
-    with closing(played):
+    with closing(Paced(source) if realtime else source) as played:
         if not (realtime or chosen.compute.model or is_given(WIDTH, config, overrides)):
             chosen = denser(chosen, source)
-        summary = _replay(
-            video, source, played, camera, find_lens and not realtime, log, video_epoch, out,
-            chosen, as_json, is_given(LATENCY, config, overrides),
+        notes: list[str] = []
+        if camera is not None:
+            start, (lens, notes) = None, fitted(camera, source)
+        else:
+            start = start_lens(source, log)
+            lens = start.camera
+        check_width(lens, source.description)
+        lens, chosen = with_stated_readout(lens, chosen, video, source, notes)
+        epoch_ns, unix_offset_ns, is_assumed = start_of(source, log, video_epoch, notes)
+        start_s = (epoch_ns + unix_offset_ns) / 1e9
+        scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(start_s))
+        folder = out or Path(f"scan-{scan_id}")
+        opened = open_backend(chosen.compute, source.size_px)
+        notes += log.warnings if log is not None else ()
+        inputs = ScanInputs(
+            played, lens, chosen, opened, folder, scan_id, epoch_ns, unix_offset_ns,
+            history=log.history if log is not None else None, notes=tuple(notes),
+            sigma_focal=lens.sigma_focal,
+            extra={"backend": opened.name, "source": source.description},
         )  # fmt: skip
-    report(summary, as_json)
+        is_latency_given = is_given(LATENCY, config, overrides)
+        unsure: set[str] = set()  # what the images may correct: then the scan begins again
+        if not realtime and parse_source(video)[0] == "file":
+            is_clock_given = is_latency_given or (video_epoch is not None and not is_assumed)
+            is_of_camera = log is None or (log.clock == "video" and not log.may_lag)
+            unsure = {"readout"} if is_of_camera or is_clock_given else {"readout", "clock"}
+        with nullcontext(Progress()) if as_json else showing("replay") as progress:
+            if start is not None:
+                find = find_lens and not realtime
+                inputs = with_own_lens(inputs, video, start, find, progress)
+            if is_assumed:
+                inputs = replace(inputs, assumed=(*inputs.assumed, "start"))
+            if not realtime:
+                inputs = adjusted_stills(inputs, is_latency_given, progress)
+            summary = _corrected(inputs, video, unsure, progress)
+    report(summary | {"scan_folder": str(folder)}, as_json)
     if summary.get("backend") == "torch":
         await_dense(PROCESS.table())
 
@@ -132,13 +169,6 @@ def denser(config: Config, source: CameraSource) -> Config:
     compute = config.compute
     width = min(STEREO_WIDTH_PX, source.size_px[0] // 2, compute.guide_width)
     return change(config, WIDTH, max(width, compute.stereo_width))
-
-
-def _load_model(path: Path | None, config: Config) -> Camera | None:
-    from service.cameras.camera_file import load_camera
-
-    chosen = path or (Path(config.camera.model) if config.camera.model else None)
-    return None if chosen is None else load_camera(chosen)
 
 
 def _history_config(config: Config) -> HistoryConfig:
@@ -198,84 +228,24 @@ def telemetry_inside(path: Path, config: HistoryConfig) -> tuple[TelemetryLog, s
     return klv.of_packets(path, every, config), "the video's own metadata (MISB KLV)"
 
 
-def _replay(
-    video: str,
-    source: CameraSource,
-    played: CameraSource,
-    camera: Camera | None,
-    find_lens: bool,
-    log: TelemetryLog | None,
-    video_epoch: float | None,
-    out: Path | None,
-    config: Config,
-    as_json: bool,
-    is_latency_given: bool,
+def _corrected(
+    inputs: ScanInputs, video: str, unsure: set[str], progress: Progress
 ) -> dict[str, Any]:
-    from service.cameras import open_camera, parse_source
-    from service.cameras.lens import check_width, fitted
-    from service.commands.adjusted_stills import adjusted_stills
-    from service.commands.missing_metadata import (
-        start_lens,
-        start_of,
-        with_own_lens,
-        with_stated_readout,
-    )
-    from service.compute.backend_choice import open_backend
-    from service.flight.scan import ScanInputs
+    """The figures of the scan, begun again for each thing ``unsure`` that its images correct."""
+    from service.cameras import open_camera
 
-    notes: list[str] = []
-    if camera is not None:
-        start, (lens, notes) = None, fitted(camera, source)
-    else:
-        start = start_lens(source, log)
-        lens = start.camera
-    check_width(lens, source.description)
-    lens, config = with_stated_readout(lens, config, video, source, notes)
-    epoch_ns, unix_offset_ns, is_assumed = start_of(source, log, video_epoch, notes)
-    start_s = (epoch_ns + unix_offset_ns) / 1e9
-    scan_id = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(start_s))
-    folder = out or Path(f"scan-{scan_id}")
-    chosen = open_backend(config.compute, source.size_px)
-    notes += log.warnings if log is not None else ()
-    inputs = ScanInputs(
-        played,
-        lens,
-        config,
-        chosen,
-        folder,
-        scan_id,
-        epoch_ns,
-        unix_offset_ns,
-        history=log.history if log is not None else None,
-        notes=tuple(notes),
-        sigma_focal=lens.sigma_focal,
-        extra={"backend": chosen.name, "source": source.description},
-    )
-    unsure: set[str] = set()  # what the images may correct: then the scan begins again
-    if played is source and parse_source(video)[0] == "file":
-        is_clock_given = is_latency_given or (video_epoch is not None and not is_assumed)
-        is_of_camera = log is None or (log.clock == "video" and not log.may_lag)
-        is_clock_sure = is_of_camera or is_clock_given
-        unsure = {"readout"} if is_clock_sure else {"readout", "clock"}
-    with nullcontext(Progress()) if as_json else showing("replay") as progress:
-        if start is not None:
-            inputs = with_own_lens(inputs, video, start, find_lens, progress)
-        if is_assumed:
-            inputs = replace(inputs, assumed=(*inputs.assumed, "start"))
-        if played is source:
-            inputs = adjusted_stills(inputs, is_latency_given, progress)
-        stop = stop_by_signals()
-        found = _fly(inputs, stop, progress, unsure)
-        corrected = inputs
-        while isinstance(found, _Correction):
-            progress(f"beginning again with the {found.of} that was found")
-            # A readout that was sought with another clock is sought once more.
-            unsure = {"readout"} if found.of == "clock" else unsure - {"readout"}
-            base = inputs if found.of == "clock" else corrected
-            with closing(open_camera(video)) as again:
-                corrected = replace(base, source=again, **found.changed)
-                found = _fly(corrected, stop, progress, unsure)
-    return found | {"scan_folder": str(folder)}
+    stop = stop_by_signals()
+    found = _fly(inputs, stop, progress, unsure)
+    corrected = inputs
+    while isinstance(found, _Correction):
+        progress(f"beginning again with the {found.of} that was found")
+        # A readout that was sought with another clock is sought once more.
+        unsure = {"readout"} if found.of == "clock" else unsure - {"readout"}
+        base = inputs if found.of == "clock" else corrected
+        with closing(open_camera(video)) as again:
+            corrected = replace(base, source=again, **found.changed)
+            found = _fly(corrected, stop, progress, unsure)
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands import AsJson, ConfigFile, Overrides, choices, showing
+from service.commands import AsJson, ConfigFile, Overrides, choices, one_of, showing
 from service.config import keys as configuration_keys
 from service.config import load_config
 from service.errors import InputError, OutsideError
@@ -31,8 +31,7 @@ def config(
 
     'default FILE' prints it with the settings of FILE, such as a board's profile.
     """
-    if action not in ACTIONS:
-        raise InputError(f"config {action}: there are {', '.join(ACTIONS)}")
+    one_of(action, ACTIONS, "config")
     if action == "check" and file is None:
         raise InputError("config check: name the file to check")
     chosen = load_config(file, set_ or [])
@@ -95,9 +94,7 @@ def doctor(
     report = {"ok": not bad, "findings": [asdict(f) for f in findings]}
     if bad:
         ready = "for the desk" if desk else "to fly"
-        error = OutsideError(f"not ready {ready}: {', '.join(dict.fromkeys(bad))}")
-        error.report = report
-        raise error
+        raise OutsideError(f"not ready {ready}: {', '.join(dict.fromkeys(bad))}", report)
     if as_json:
         print(json.dumps(report))
 
@@ -127,28 +124,20 @@ def keys(
     if revoke is not None:
         if any(members.values()):
             raise InputError("give either --revoke or members to make keys for")
-        _say_revoked(revoke, fleet_keys.revoke(folder, revoke, days), as_json)
+        paths = [str(path) for path in fleet_keys.revoke(folder, revoke, days)]
+        if as_json:
+            print(json.dumps({"revoked": revoke, "copy": paths}))
+            return
+        print(f"revoked {revoke}; copy these files and restart every ground station:")
+        print(*(f"  {path}" for path in paths), sep="\n")
         return
     if not any(members.values()):
         raise InputError("name at least one --drone, --ground or --viewer")
-    made = fleet_keys.make_keys(folder, members, days)
+    made = [str(path) for path in fleet_keys.make_keys(folder, members, days)]
     if as_json:
-        print(json.dumps({"made": [str(path) for path in made]}))
-        return
-    for path in made:
-        print(f"made {path}")
-    if not made:
-        print("all of them already have keys")
-
-
-def _say_revoked(member: str, paths: list[Path], as_json: bool) -> None:
-    """List the files to copy again before the revocation takes effect."""
-    if as_json:
-        print(json.dumps({"revoked": member, "copy": [str(path) for path in paths]}))
-        return
-    print(f"revoked {member}; copy these files and restart every ground station:")
-    for path in paths:
-        print(f"  {path}")
+        print(json.dumps({"made": made}))
+    else:
+        print("\n".join(f"made {path}" for path in made) or "all of them already have keys")
 
 
 def warm_up(config: ConfigFile = None, set_: Overrides = None, as_json: AsJson = False) -> None:

@@ -6,25 +6,23 @@ import json
 import re
 import sys
 import time
-from dataclasses import dataclass, fields
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import AsJson, parse_size, showing, with_options
-from service.errors import InputError
+from service.commands import AsJson, parse_size, record_of, showing, with_options
+from service.errors import InputError, refusing
 
 if TYPE_CHECKING:
     from service.progress import Progress
-    from service.sim import recording
-    from service.sim.flight import SensorNoise
-    from service.sim.telemetry import TelemetryOptions
+    from service.sim.recording import SimulationOptions
 
 VIDEO_TO = "udp://127.0.0.1:5600?pkt_size=1316"
-Made = TypeVar("Made")
-PAIR = re.compile(r"^(-?[0-9.]+):(-?[0-9.]+)$")
+PAIR = re.compile(r"(-?(?:\d+\.?\d*|\.\d+)):(-?(?:\d+\.?\d*|\.\d+))", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -103,63 +101,41 @@ class SimulateOptions:
     until_stdin_ends: Annotated[bool, typer.Option("--until-stdin-ends", hidden=True)] = False
     as_json: AsJson = False
 
-    def simulation(self) -> recording.SimulationOptions:
+    def simulation(self) -> SimulationOptions:
         """Raises ValueError for an impossible flight, InputError for unreadable text."""
         from service.cameras.camera_file import shutter_of
-        from service.sim import recording
-        from service.sim.flight import FlightPlan
+        from service.sim.flight import FlightPlan, SensorNoise
+        from service.sim.recording import DISTORTION, Faults, SimulationOptions
         from service.sim.render import Look
+        from service.sim.telemetry import TelemetryOptions
 
-        return self._as(
-            recording.SimulationOptions,
-            plan=self._as(FlightPlan, centred=self.site_m is not None),
-            noise=self._noise(),
-            telemetry=self._telemetry(),
+        noise = SensorNoise(
+            gps_m=self.gps_noise_m, baro_m=self.baro_noise_m,
+            attitude_deg=self.attitude_noise_deg, yaw_deg=self.yaw_noise_deg,
+        )  # fmt: skip
+        gap_s = _pair(self.telemetry_gap, "--telemetry-gap") if self.telemetry_gap else None
+        blank = [_pair(value, "--blank") for value in self.blank or []]
+        exposure = [_pair(value, "--exposure") for value in self.exposure or []]
+        return record_of(
+            SimulationOptions,
+            self,
+            plan=record_of(FlightPlan, self, centred=self.site_m is not None),
+            noise=SensorNoise.of(self.gnss_noise, noise),
+            telemetry=record_of(
+                TelemetryOptions, self, gap_s=gap_s, lead_s=self.log_lead_s,
+                boresight_deg=_pair(self.boresight_deg, "--boresight-deg"),
+                accuracy=self.gnss_accuracy,
+            ),
             look=Look(noise=self.image_noise, water_m=self.water_m),
-            faults=self._faults(),
+            faults=Faults(tuple((int(a), int(b)) for a, b in blank), tuple(sorted(exposure))),
             size_px=parse_size(self.size, "--size"),
             focal_share=self.focal,
-            distortion=recording.DISTORTION if self.distortion else (0.0,) * 5,
+            distortion=DISTORTION if self.distortion else (0.0,) * 5,
             with_telemetry=self.telemetry,
             with_video=self.video,
             shutter=shutter_of(self.readout_ms, self.readout_direction),
             exposure_s=1e-3 * self.shutter_ms,
-        )
-
-    def _as(self, kind: type[Made], **others: Any) -> Made:
-        """A record of ``kind``: ``others``, and the options that have the names of its fields."""
-        names = {field.name for field in fields(kind)} - others.keys()  # type: ignore[arg-type]
-        same = {name: getattr(self, name) for name in names if hasattr(self, name)}
-        return kind(**same, **others)
-
-    def _noise(self) -> SensorNoise:
-        from service.sim.flight import SensorNoise
-
-        noise = SensorNoise(
-            gps_m=self.gps_noise_m,
-            baro_m=self.baro_noise_m,
-            attitude_deg=self.attitude_noise_deg,
-            yaw_deg=self.yaw_noise_deg,
-        )
-        return SensorNoise.of(self.gnss_noise, noise)
-
-    def _telemetry(self) -> TelemetryOptions:
-        from service.sim.telemetry import TelemetryOptions
-
-        return self._as(
-            TelemetryOptions,
-            gap_s=_pair(self.telemetry_gap, "--telemetry-gap") if self.telemetry_gap else None,
-            lead_s=self.log_lead_s,
-            boresight_deg=_pair(self.boresight_deg, "--boresight-deg"),
-            accuracy=self.gnss_accuracy,
-        )
-
-    def _faults(self) -> recording.Faults:
-        from service.sim.recording import Faults
-
-        blank = [_pair(value, "--blank") for value in self.blank or []]
-        exposure = [_pair(value, "--exposure") for value in self.exposure or []]
-        return Faults(tuple((int(a), int(b)) for a, b in blank), tuple(sorted(exposure)))
+        )  # fmt: skip
 
 
 @with_options(SimulateOptions)
@@ -176,14 +152,11 @@ def simulate(given: SimulateOptions) -> None:
         _play(given)
         return
     started = time.monotonic()
-    try:
+    with refusing("simulate"), showing("simulate") as progress:
         options = given.simulation()
         _check_new(given.out)
-        with showing("simulate") as progress:
-            progress("laying out the site")
-            simulation = recording.prepare(options)
-    except ValueError as error:
-        raise InputError(f"simulate: {error}") from error
+        progress("laying out the site")
+        simulation = recording.prepare(options)
     with showing("simulate") as progress, filling_folder(given.out) as part:
         result = recording.write(simulation, part, partial(_frames, progress))
     if not given.live:
@@ -209,26 +182,20 @@ def _play(given: SimulateOptions) -> None:
     where = f"video to {given.video_to}, MAVLink to {given.mavlink_to}"
     print(f"playing {given.out}: {where}", file=sys.stderr)
     options = LiveOptions(given.video_to, given.mavlink_to, given.loop, given.until_stdin_ends)
-    try:
+    counts = None
+    with refusing("simulate --live"), suppress(KeyboardInterrupt):
         counts = play(given.out, options)
-    except ValueError as error:
-        raise InputError(f"simulate --live: {error}") from error
-    except KeyboardInterrupt:
-        return
-    if given.as_json:
+    if given.as_json and counts is not None:
         is_piped = given.video_to.startswith("pipe:")
         print(json.dumps(counts), file=sys.stderr if is_piped else sys.stdout)
 
 
 def _pair(text: str, option: str) -> tuple[float, float]:
     """Two numbers of ``A:B``."""
-    found = PAIR.match(text.strip())
-    try:
-        if found is not None:
-            return float(found[1]), float(found[2])
-    except ValueError:
-        pass
-    raise InputError(f"{option} {text!r}: expected two numbers with a colon, such as 10:2.5")
+    found = PAIR.fullmatch(text.strip())
+    if found is None:
+        raise InputError(f"{option} {text!r}: expected two numbers with a colon, such as 10:2.5")
+    return float(found[1]), float(found[2])
 
 
 def _frames(progress: Progress, done: int, total: int) -> None:

@@ -2,34 +2,37 @@
 
 from __future__ import annotations
 
+import io
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.commands import BACKENDS, AsJson, choices, parse_size
-from service.compute.rectified_pair import matching_config, read_gray
-from service.errors import InputError, OutsideError
+from service.commands import AsJson, BackendName, parse_size
+from service.errors import InputError, refusing
 from service.packages import needing
-from service.scans.writing import check_writable
+from service.scans.writing import check_writable, write_whole, writing
 
 if TYPE_CHECKING:
-    from recon.backends import Backend
+    from recon.stereo.belief_propagation import BeliefPropagationConfig
     from recon.types import F32, U8
+
+Labels = Annotated[int, typer.Option(help="number of disparities")]
+MinDisparity = Annotated[int, typer.Option(help="the smallest disparity, px")]
+Iterations = Annotated[int, typer.Option(help="of belief propagation, per level")]
 
 
 def stereo(
     left: Annotated[Path, typer.Argument(help="left image, rectified")],
     right: Annotated[Path, typer.Argument(help="right image, of the same size")],
-    labels: Annotated[int, typer.Option(help="number of disparities")],
+    labels: Labels,
     out: Annotated[Path, typer.Option(help="float32 (h, w) pixels, NaN = unknown (.npy)")],
-    min_disparity: Annotated[int, typer.Option(help="the smallest disparity, px")] = 0,
-    iterations: Annotated[int, typer.Option(help="of belief propagation, per level")] = 5,
-    backend: Annotated[
-        str, typer.Option(help="auto, cpu, torch or onnx", autocompletion=choices(BACKENDS))
-    ] = "auto",
+    min_disparity: MinDisparity = 0,
+    iterations: Iterations = 5,
+    backend: Annotated[str, BackendName] = "auto",
     model: Annotated[
         Path | None, typer.Option(help="TOML file of a learned model to use instead")
     ] = None,
@@ -47,23 +50,22 @@ def stereo(
     and surface outside the right image are unknown. --checked keeps only verified disparities,
     as in flight.
     """
+    from service.compute.backend_choice import choose_backend, load_learned_model
+
     gray_left, gray_right = read_gray(left), read_gray(right)
     if gray_left.shape != gray_right.shape:
         raise InputError(
             f"{left} is {_size(gray_left)} but {right} is {_size(gray_right)}: "
             "a rectified pair has one size"
         )
-    _check_labels(labels)
-    config = matching_config(iterations, min_disparity, checked)
+    config = matching_config(labels, iterations, min_disparity, checked)
     check_output(out, ".npy")
     if image is not None:
         check_output(image, ".png")
-    chosen = open_matcher(backend, model)
+    chosen = choose_backend(backend) if model is None else load_learned_model(model)
     start = time.perf_counter()
-    try:
+    with refusing("stereo"):
         found = chosen.belief_propagation(gray_left, gray_right, labels, config)
-    except ValueError as error:
-        raise InputError(f"stereo: {error}") from error
     seconds = time.perf_counter() - start
     write(out, image, found.px + config.min_disparity, labels, min_disparity)
     known = float((found.px == found.px).mean())
@@ -74,11 +76,33 @@ def stereo(
         print(f"{out}: {_size(gray_left)}, {100 * known:.1f} % known, {chosen.name}")
 
 
-def open_matcher(backend: str, model: Path | None) -> Backend:
-    """The backend of that name, or the operator's learned model."""
-    from service.compute.backend_choice import choose_backend, load_learned_model
+def matching_config(
+    labels: int, iterations: int, min_disparity: int, checked: bool
+) -> BeliefPropagationConfig:
+    """How one pair is matched, densely unless ``checked``; InputError for numbers out of range."""
+    from recon.stereo.belief_propagation import BeliefPropagationConfig
 
-    return choose_backend(backend) if model is None else load_learned_model(model)
+    if not 2 <= labels <= 1024:
+        raise InputError(f"--labels {labels}: give 2 to 1024")
+    with refusing("stereo"):
+        config = BeliefPropagationConfig(iterations=iterations, min_disparity=min_disparity)
+    if checked:
+        return config
+    return replace(config, min_evidence=0.05, min_contrast=0.3, fill_occluded=True)
+
+
+def read_gray(path: Path) -> U8:
+    """A gray 8-bit image (h, w); InputError when there is none."""
+    import cv2
+    import numpy as np
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    data = np.fromfile(path, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+    if image is None:
+        raise InputError(f"{path}: not an image that can be read; give PNG, JPEG or TIFF")
+    return np.asarray(image, np.uint8)
 
 
 def check_output(path: Path, suffix: str) -> None:
@@ -95,21 +119,15 @@ def write(out: Path, image: Path | None, px: F32, labels: int, min_disparity: in
     import cv2
     import numpy as np
 
-    try:
-        np.save(out, px.astype(np.float32))
-        if image is not None:
-            known = np.isfinite(px)
-            level = np.where(known, (px - min_disparity) * (255 / (labels - 1)), 0)
-            colour = cv2.applyColorMap(level.astype(np.uint8), cv2.COLORMAP_TURBO)
-            colour[~known] = 0
-            image.write_bytes(cv2.imencode(".png", colour)[1].tobytes())
-    except OSError as error:
-        raise OutsideError(f"{out}: cannot be written: {error.strerror}") from error
-
-
-def _check_labels(labels: int) -> None:
-    if not 2 <= labels <= 1024:
-        raise InputError(f"--labels {labels}: give 2 to 1024")
+    array = io.BytesIO()
+    np.save(array, px.astype(np.float32))
+    write_whole(out, array.getvalue())
+    if image is not None:
+        known = np.isfinite(px)
+        level = np.where(known, (px - min_disparity) * (255 / (labels - 1)), 0)
+        colour = cv2.applyColorMap(level.astype(np.uint8), cv2.COLORMAP_TURBO)
+        colour[~known] = 0
+        write_whole(image, cv2.imencode(".png", colour)[1].tobytes())
 
 
 def _size(image: U8) -> str:
@@ -119,38 +137,25 @@ def _size(image: U8) -> str:
 def export_model(
     out: Annotated[Path, typer.Option(help="model file to write (.onnx)")],
     size: Annotated[str, typer.Option(help="size of the rectified pair, WIDTHxHEIGHT")] = "320x180",
-    labels: Annotated[int, typer.Option(help="number of disparities")] = 16,
-    min_disparity: Annotated[int, typer.Option(help="the smallest disparity, px")] = 0,
-    iterations: Annotated[int, typer.Option(help="of belief propagation, per level")] = 5,
+    labels: Labels = 16,
+    min_disparity: MinDisparity = 0,
+    iterations: Iterations = 5,
 ) -> None:
     """Write belief propagation as an ONNX model, and its declaration (.toml) for compute.model.
 
     The model takes left, right (1, 1, h, w) float32 gray levels and gives disparity (1, 1, h, w),
     px.
     """
-    height, width = _shape(size, "--size")
-    _check_labels(labels)
+    width, height = parse_size(size, "--size")
+    if not (8 <= width <= 8192 and 8 <= height <= 8192):
+        raise InputError(f"--size {size!r}: sides are 8 to 8192")
     check_output(out, ".onnx")
-    config = matching_config(iterations, min_disparity, checked=False)
+    config = matching_config(labels, iterations, min_disparity, checked=False)
     with needing("export-model"):
         from recon.backends.exported_stereo import export_stereo
     declaration = out.with_suffix(".toml")
-    try:
-        with out.open("wb") as file:
-            export_stereo(file, (height, width), labels, config)
-        declaration.write_text(
-            f'model = "{out.name}"\nheight = {height}\nwidth = {width}\n'
-            "channels = 1\nscale = 1.0\n",
-            encoding="utf-8",
-        )
-    except OSError as error:
-        raise OutsideError(f"{out}: cannot be written: {error.strerror}") from error
+    with writing(out) as part, part.open("wb") as file:
+        export_stereo(file, (height, width), labels, config)
+    shape = f"height = {height}\nwidth = {width}\nchannels = 1\nscale = 1.0\n"
+    write_whole(declaration, f'model = "{out.name}"\n{shape}')
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; use it with compute.model = {declaration}")
-
-
-def _shape(text: str, option: str) -> tuple[int, int]:
-    """(height, width) of ``WIDTHxHEIGHT``."""
-    width, height = parse_size(text, option)
-    if not (8 <= width <= 8192 and 8 <= height <= 8192):
-        raise InputError(f"{option} {text!r}: sides are 8 to 8192")
-    return height, width

@@ -1,1 +1,1 @@
-"""Choice of the backend, and sharing of cores between threads."""
+"""Choice of the backend."""

@@ -52,20 +52,13 @@ class FallbackBackend:
     """
 
     def __init__(self, backend: Backend) -> None:
-        self._backend = backend
         self.failure: str | None = None
+        self._use(backend)
 
-    @property
-    def name(self) -> str:
-        return self._backend.name
-
-    @property
-    def device(self) -> str:
-        return self._backend.device
-
-    @property
-    def keeps_pairs(self) -> bool:
-        return self._backend.keeps_pairs
+    def _use(self, backend: Backend) -> None:
+        self._backend = backend
+        self.name, self.device = backend.name, backend.device
+        self.keeps_pairs = backend.keeps_pairs
 
     def belief_propagation(
         self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
@@ -96,7 +89,7 @@ class FallbackBackend:
         log.error(
             "backend %s on %s failed (%s): the CPU takes over", self.name, self.device, self.failure
         )
-        self._backend = load_backend("cpu")
+        self._use(load_backend("cpu"))
 
     def _run(self, operation: Callable[[Backend], Result]) -> Result:
         backend = self._backend

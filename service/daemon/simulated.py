@@ -16,7 +16,7 @@ from socket import SOCK_DGRAM
 
 from service.cameras import parse_source, reject_options
 from service.config import Config, ScanConfig
-from service.errors import InputError
+from service.errors import InputError, refusing
 from service.init_system import Notifier
 from service.listener import free_ports
 from service.scans.writing import writing_folder
@@ -105,7 +105,7 @@ def render_flight(folder: Path, given: dict[str, str]) -> None:
     from service.sim import recording
     from service.sim.flight import FlightPlan
 
-    try:
+    with refusing("camera.source sim"):
         W, _, H = given["size"].partition("x")
         options = recording.SimulationOptions(
             FlightPlan("legs", float(given["duration_s"]), legs=2),
@@ -116,8 +116,6 @@ def render_flight(folder: Path, given: dict[str, str]) -> None:
         )
         log.info("laying out the site of the simulated flight; rendering takes some minutes, once")
         simulation = recording.prepare(options)
-    except ValueError as error:
-        raise InputError(f"camera.source sim: {error}") from error
     notifier = Notifier()
 
     def report(done: int, total: int) -> None:

@@ -21,6 +21,13 @@ SWING_HZ = np.array([1.0, 0.9, 0.0])
 """Frequencies of a swinging head about its roll and pitch axes."""
 
 
+def check_ranges(*rows: tuple[str, float, str, float, float]) -> None:
+    """ValueError for the first value out of its range: what it is, value, unit, least and most."""
+    for what, value, unit, low, high in rows:
+        if not low <= value <= high:
+            raise ValueError(f"{what} of {value:g}{unit} is not within {low:g} to {high:g}{unit}")
+
+
 @dataclass(frozen=True, slots=True)
 class FlightPlan:
     """Plan of a flight. ``height_m`` counts above the ground at the world's origin."""
@@ -42,24 +49,19 @@ class FlightPlan:
     def __post_init__(self) -> None:
         if self.pattern not in PATTERNS:
             raise ValueError(f"pattern {self.pattern!r} is not one of {', '.join(PATTERNS)}")
-        if not (0.1 <= self.duration_s <= 7200):
-            raise ValueError(f"duration of {self.duration_s:g} s is not within 0.1 to 7200 s")
-        if not (2.0 <= self.height_m <= 1000):
-            raise ValueError(f"height of {self.height_m:g} m is not within 2 to 1000 m")
-        if not (0.0 <= self.speed_m_s <= 50):
-            raise ValueError(f"speed of {self.speed_m_s:g} m/s is not within 0 to 50 m/s")
-        if not 1 <= self.legs <= 100:
-            raise ValueError(f"{self.legs} legs are not within 1 to 100")
+        check_ranges(
+            ("duration", self.duration_s, " s", 0.1, 7200),
+            ("height", self.height_m, " m", 2, 1000),
+            ("speed", self.speed_m_s, " m/s", 0, 50),
+            ("number of legs", self.legs, "", 1, 100),
+            ("camera pitch", self.pitch_deg, " deg", -90, 0),
+            ("wobble", self.wobble_deg, " deg", 0, 20),
+            ("sway", self.sway_m, " m", 0, 5),
+            ("height after the climb", self.height_m + self.climb_m, " m", 2, 1000),
+            ("swing", self.swing_deg, " deg", 0, 20),
+        )
         if self.spacing_m is not None and not 0 < self.spacing_m < 1e4:
             raise ValueError(f"leg spacing of {self.spacing_m:g} m is not positive")
-        if not -90 <= self.pitch_deg <= 0:
-            raise ValueError(f"camera pitch of {self.pitch_deg:g} deg is not within -90 to 0")
-        if not (0 <= self.wobble_deg <= 20 and 0 <= self.sway_m <= 5):
-            raise ValueError("wobble must be 0 to 20 deg and sway 0 to 5 m")
-        if not 2.0 <= self.lowest_m <= self.highest_m <= 1000:
-            raise ValueError(f"climb of {self.climb_m:g} m does not end within 2 to 1000 m")
-        if not 0 <= self.swing_deg <= 20:
-            raise ValueError(f"swing of {self.swing_deg:g} deg is not within 0 to 20 deg")
 
     @property
     def lowest_m(self) -> float:
@@ -233,10 +235,7 @@ class SensorNoise:
         raise ValueError(f"GNSS noise {gnss!r} is not 'wander', 'white' or 'exact'")
 
     def __post_init__(self) -> None:
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if not 0.0 <= value < 1000.0:
-                raise ValueError(f"{name} of {value:g} is not within 0 to 1000")
+        check_ranges(*((name, getattr(self, name), "", 0, 1000) for name in self.__slots__))
 
 
 @dataclass(slots=True, eq=False)

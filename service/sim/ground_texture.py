@@ -73,9 +73,8 @@ def make(scene: Scene, texel_m: float, mosaic: U8 | None = None) -> GroundTextur
     light = _light(scene, sun)
     out = np.empty((size[1], size[0], 3), np.uint8)
     base = np.zeros((1, 1, 3), np.uint8) if mosaic is None else _fit(mosaic, size)
-    blocks = scene.blocks if len(scene.blocks) else np.zeros((1, shapes.COLUMNS))
     parallel_for(
-        _colour, len(out), out, base, cover, which, blocks, light, scene.terrain.z_m,
+        _colour, len(out), out, base, cover, which, scene.blocks, light, scene.terrain.z_m,
         scene.area.x0, scene.area.y0, texel_m, scene.terrain.step_m, sun, scene.seed,
     )  # fmt: skip
     flat, levels = _pyramid(out)
@@ -129,8 +128,7 @@ def _light(scene: Scene, sun: F64) -> F32:
     gx, gy = np.meshgrid(x, y)
     z = scene.terrain.height(gx.ravel(), gy.ravel()).reshape(gx.shape)
     out = np.empty(gx.shape, np.float32)
-    blocks = scene.blocks if len(scene.blocks) else np.zeros((1, shapes.COLUMNS))
-    parallel_for(_shadow, len(gx), scene.grid.arrays(), gx, gy, z, which, blocks, sun, out)
+    parallel_for(_shadow, len(gx), scene.grid.arrays(), gx, gy, z, which, scene.blocks, sun, out)
     return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.7), np.float32)
 
 

@@ -23,12 +23,14 @@ import av
 from mavlink.wire.tlog import packets
 from service.cameras.video import creation_unix_ns
 from service.errors import InputError, OutsideError
-from service.sim.telemetry import BOOT_BEFORE_VIDEO_S
+from service.sim.telemetry import BOOT_BEFORE_VIDEO_S, Senders
 
 log = logging.getLogger(__name__)
 
 CAMERA, TELEMETRY = 0, 1
 START_DELAY_S = 0.5
+EACH_LENGTH = {"omit_video_pes_length": "0"}
+"""MPEG-TS that states the length of each image: a receiver need not wait for the next one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,36 +42,32 @@ class LiveOptions:
     loop: bool = False
     until_stdin_ends: bool = False  # also end when standard input does: with who started us
 
-    @property
-    def mavlink_address(self) -> tuple[str, int]:
-        """(host, port); raises ValueError when it is not that."""
-        host, _, port = self.mavlink.rpartition(":")
-        if not host or not port.isdigit() or not 0 < int(port) < 65536:
-            raise ValueError(f"MAVLink address {self.mavlink!r} is not host:port")
-        return host, int(port)
-
 
 class MavlinkPlayer:
     """Sends the flight's messages from their components, and answers TIMESYNC."""
 
-    def __init__(self, address: tuple[str, int], until_stdin_ends: bool = False) -> None:
-        """Open the socket; OutsideError when the address cannot be used."""
+    def __init__(self, options: LiveOptions) -> None:
+        """Open the socket; ValueError for what is no address, OutsideError for one that cannot be
+        used."""
         from pymavlink.dialects.v20 import common  # type: ignore[import-untyped]
 
+        host, _, port = options.mavlink.rpartition(":")
+        if not host or not port.isdigit() or not 0 < int(port) < 65536:
+            raise ValueError(f"MAVLink address {options.mavlink!r} is not host:port")
         self.dialect: Any = common
         self.sent = self.answered = 0
-        self._senders: dict[int, Any] = {}
+        self._senders = Senders(common)
         self._reader = common.MAVLink(None)
         self._requests = common.MAVLink(None)
         self._requests.robust_parsing = True
         self.has_ended = False
         try:
-            self._to = socket.getaddrinfo(*address, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
+            self._to = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
             self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self.socket.setblocking(False)
-            self._stdin = [sys.stdin] if until_stdin_ends else []
+            self._stdin = [sys.stdin] if options.until_stdin_ends else []
         except OSError as error:
-            raise OutsideError(f"MAVLink to {address[0]}:{address[1]}: {error}") from error
+            raise OutsideError(f"MAVLink to {options.mavlink}: {error}") from error
 
     def listen(self, seconds: float) -> None:
         """Wait for a request for so long; note when standard input has ended."""
@@ -79,13 +77,11 @@ class MavlinkPlayer:
     def play(self, packet: bytes, boot_s: float) -> None:
         """Send one packet of the log as if it happened ``boot_s`` after the boot."""
         for message in self._reader.parse_buffer(packet) or []:
+            component = message.get_srcComponent()
             if message.get_type() == "SYSTEM_TIME":
-                message = self.dialect.MAVLink_system_time_message(
-                    time.time_ns() // 1000, round(boot_s * 1e3)
-                )
-                self._send(message, 1)
-            else:
-                self._send(message, message.get_srcComponent())
+                now_us = time.time_ns() // 1000
+                message = self.dialect.MAVLink_system_time_message(now_us, round(boot_s * 1e3))
+            self._send(message, component)
             self.sent += 1
 
     def answer(self, boot_s: float) -> None:
@@ -102,20 +98,10 @@ class MavlinkPlayer:
                     self.answered += 1
 
     def _send(self, message: Any, component: int) -> None:
-        if component not in self._senders:
-            self._senders[component] = self.dialect.MAVLink(
-                None, srcSystem=1, srcComponent=component
-            )
-        sender = self._senders[component]
-        data = bytes(message.pack(sender))
-        sender.seq = (sender.seq + 1) % 256
         try:
-            self.socket.sendto(data, self._to)
+            self.socket.sendto(self._senders.packed(message, component), self._to)
         except OSError as error:  # a full buffer or a refused datagram loses one packet
             log.debug("MAVLink packet not sent: %s", error)
-
-    def close(self) -> None:
-        self.socket.close()
 
 
 def play(folder: Path, options: LiveOptions) -> dict[str, int]:
@@ -126,7 +112,7 @@ def play(folder: Path, options: LiveOptions) -> dict[str, int]:
     video, tlog = folder / "flight.mp4", folder / "flight.tlog"
     if not video.exists():
         raise InputError(f"{folder} contains no flight.mp4 to play")
-    player = MavlinkPlayer(options.mavlink_address, options.until_stdin_ends)
+    player = MavlinkPlayer(options)
     frames = 0
     try:
         while True:
@@ -134,7 +120,7 @@ def play(folder: Path, options: LiveOptions) -> dict[str, int]:
             if not options.loop or player.has_ended:
                 break
     finally:
-        player.close()
+        player.socket.close()
     return {"frames": frames, "packets": player.sent, "timesync_answers": player.answered}
 
 
@@ -146,7 +132,10 @@ def _play_once(video: Path, tlog: Path, options: LiveOptions, player: MavlinkPla
     """
     frames, url = 0, options.video
     try:
-        with av.open(str(video)) as source, _sink(url) as sink:
+        with (
+            av.open(str(video)) as source,
+            av.open(url, "w", format="mpegts", options=EACH_LENGTH) as sink,
+        ):
             stream = sink.add_stream_from_template(source.streams.video[0])
             end_s = (source.duration or 0) / av.time_base
             start_ns = creation_unix_ns(source, source.streams.video[0])
@@ -171,11 +160,6 @@ def _play_once(video: Path, tlog: Path, options: LiveOptions, player: MavlinkPla
     except (av.error.FFmpegError, OSError) as error:
         raise OutsideError(f"video to {url}: {error}") from error
     return frames
-
-
-def _sink(url: str) -> av.container.OutputContainer:
-    """MPEG-TS that states the length of each image: a receiver need not wait for the next one."""
-    return av.open(url, "w", format="mpegts", options={"omit_video_pes_length": "0"})
 
 
 def _wait(start: float, due_s: float, player: MavlinkPlayer) -> None:

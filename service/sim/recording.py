@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
@@ -13,24 +12,20 @@ from typing import Any
 
 import av
 import numpy as np
-import numpy.typing as npt
 
 from recon.rolling_shutter import row_times_s
 from recon.se3 import inverse, quaternion_from_rotation, so3_log
 from recon.types import F64, GLOBAL_SHUTTER, U8, Camera, Shutter
 from service.cameras.camera_file import save_camera
-from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
 from service.sim import flight as flights
 from service.sim import ground_texture, scene
-from service.sim.flight import Flight, FlightPlan, SensorNoise, Sensors
+from service.sim.flight import Flight, FlightPlan, SensorNoise, Sensors, check_ranges
 from service.sim.ground_texture import patchwork
 from service.sim.render import Look, Renderer
 from service.sim.scene import Area
 from service.sim.telemetry import TelemetryOptions, packets, write_tlog
 from service.sim.truth import write_surface
-
-log = logging.getLogger(__name__)
 
 EPOCH_UNIX_S = 1_777_629_600  # 2026-05-01 10:00:00 UTC: containers keep whole seconds
 FLIGHT_S, FLIGHTS = 600, 10_000
@@ -84,28 +79,24 @@ class SimulationOptions:
         W, H = self.size_px
         if not (64 <= W <= 7680 and 64 <= H <= 4320) or W % 2 or H % 2:
             raise ValueError(f"size {W}x{H} must be even and within 64x64 to 7680x4320")
-        if not 0.1 <= self.fps <= 240:
-            raise ValueError(f"{self.fps:g} frames per second are not within 0.1 to 240")
-        if not 0.2 <= self.focal_share <= 10:
-            raise ValueError(f"focal length of {self.focal_share:g} widths is not within 0.2 to 10")
-        if not (0 <= self.relief_m <= 200 and 0 <= self.density <= 3):
-            raise ValueError("relief must be 0 to 200 m and density 0 to 3")
-        if not (0 <= self.depth_frames <= 10000 and 0 <= self.crf <= 51):
-            raise ValueError("depth frames must be 0 to 10000 and crf 0 to 51")
-        if not 0 <= self.changes <= 1000 or self.date not in (1, 2):
-            raise ValueError("changes must be 0 to 1000, the date 1 or 2")
-        if self.site_m is not None and not 20.0 <= self.site_m <= 5000.0:
-            raise ValueError(f"a site of {self.site_m:g} m is not within 20 to 5000 m")
-        if not 0 <= self.shutter.readout_s <= 1 / self.fps:
-            raise ValueError(
-                f"readout of {1e3 * self.shutter.readout_s:g} ms is not within 0 and the "
-                f"{1e3 / self.fps:g} ms between frames"
-            )
-        if not 0 <= self.exposure_s <= 1 / self.fps:
-            raise ValueError(
-                f"exposure of {1e3 * self.exposure_s:g} ms is not within 0 and the "
-                f"{1e3 / self.fps:g} ms between frames"
-            )
+        if self.date not in (1, 2):
+            raise ValueError("the date must be 1 or 2")
+        check_ranges(
+            ("rate", self.fps, " frames per second", 0.1, 240),
+            ("focal length", self.focal_share, " widths", 0.2, 10),
+            ("relief", self.relief_m, " m", 0, 200),
+            ("density", self.density, "", 0, 3),
+            ("number of depth frames", self.depth_frames, "", 0, 10_000),
+            ("crf", self.crf, "", 0, 51),
+            ("number of changes", self.changes, "", 0, 1000),
+            ("site", 20.0 if self.site_m is None else self.site_m, " m", 20, 5000),
+        )
+        for what, seconds in (("readout", self.shutter.readout_s), ("exposure", self.exposure_s)):
+            if not 0 <= seconds <= 1 / self.fps:
+                raise ValueError(
+                    f"{what} of {1e3 * seconds:g} ms is not within 0 and the "
+                    f"{1e3 / self.fps:g} ms between frames"
+                )
 
     @property
     def camera(self) -> Camera:
@@ -252,31 +243,22 @@ def _area(flight: Flight, options: SimulationOptions) -> Area:
 def write(
     simulation: Simulation, folder: Path, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, Any]:
-    """Write the flight and its truth into ``folder`` and return the parameters written there.
-
-    InputError when the folder already holds a flight; OutsideError when it cannot be written.
-    """
-    truth = folder / "truth"
-    if (folder / "flight.mp4").exists():
-        raise InputError(f"{folder} already holds a flight; give another folder with --out")
-    try:
-        truth.mkdir(parents=True, exist_ok=True)
-        options = simulation.options
-        save_camera(folder / "camera.yaml", options.camera, "simulated")
-        packet_count = 0
-        if options.with_telemetry:
-            stream = packets(
-                simulation.sensors(), ORIGIN, options.started_unix_s,
-                simulation.surface_range, options.telemetry,
-            )  # fmt: skip
-            packet_count = write_tlog(folder / "flight.tlog", options.started_unix_s, stream)
-        _write_truth(simulation, truth)
-        parameters = _parameters(simulation, packet_count)
-        (truth / "params.json").write_text(json.dumps(parameters, indent=2) + "\n")
-        if options.with_video:
-            _write_video(simulation, folder / "flight.mp4", progress)
-    except OSError as error:
-        raise OutsideError(f"{folder} cannot be written: {error.strerror or error}") from error
+    """Write the flight and its truth into ``folder`` and return the parameters written there."""
+    truth, options = folder / "truth", simulation.options
+    truth.mkdir(parents=True, exist_ok=True)
+    save_camera(folder / "camera.yaml", options.camera, "simulated")
+    packet_count = 0
+    if options.with_telemetry:
+        stream = packets(
+            simulation.sensors(), ORIGIN, options.started_unix_s, simulation.surface_range,
+            options.telemetry,
+        )  # fmt: skip
+        packet_count = write_tlog(folder / "flight.tlog", options.started_unix_s, stream)
+    _write_truth(simulation, truth)
+    parameters = _parameters(simulation, packet_count)
+    (truth / "params.json").write_text(json.dumps(parameters, indent=2) + "\n")
+    if options.with_video:
+        _write_video(simulation, folder / "flight.mp4", progress)
     return parameters
 
 
@@ -284,7 +266,11 @@ def _write_truth(simulation: Simulation, truth: Path) -> None:
     """Origin, surface, trajectory and some depth maps."""
     origin = {"lat_deg": ORIGIN.lat_deg, "lon_deg": ORIGIN.lon_deg, "alt_amsl_m": ORIGIN.alt_amsl_m}
     (truth / "origin.json").write_text(json.dumps(origin) + "\n")
-    write_surface(truth / "surface.ply", simulation.scene.vertices, _dry(simulation))
+    vertices, triangles = simulation.scene.vertices, simulation.scene.triangles
+    level = simulation.options.look.water_m
+    if level is not None:
+        triangles = triangles[vertices[triangles, 2].max(axis=1) > level]
+    write_surface(truth / "surface.ply", vertices, triangles)
     if simulation.scene.changes:
         boxes = [asdict(change) for change in simulation.scene.changes]
         (truth / "changes.json").write_text(json.dumps(boxes, indent=1) + "\n")
@@ -298,20 +284,11 @@ def _write_truth(simulation: Simulation, truth: Path) -> None:
     for k in np.unique(np.linspace(0, len(simulation.times_s) - 1, count).astype(int)):
         np.savez_compressed(
             truth / f"depth_{k:06d}.npz",
-            depth_m=simulation.renderer.depth(simulation.poses[k], simulation.options.look.water_m),
+            depth_m=simulation.renderer.depth(simulation.poses[k], level),
             K=simulation.options.camera.K,
             T_world_camera=simulation.poses[k],
             time_unix_ns=np.int64(round((start_s + simulation.times_s[k]) * 1e9)),
         )
-
-
-def _dry(simulation: Simulation) -> npt.NDArray[np.int32]:
-    """(M, 3) triangles of the place that reach out of the water."""
-    vertices, triangles = simulation.scene.vertices, simulation.scene.triangles
-    level = simulation.options.look.water_m
-    if level is None:
-        return triangles
-    return np.asarray(triangles[vertices[triangles, 2].max(axis=1) > level])
 
 
 def _parameters(simulation: Simulation, packet_count: int) -> dict[str, Any]:

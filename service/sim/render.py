@@ -12,7 +12,6 @@ from recon.camera_model import check_camera
 from recon.parallel import parallel_for
 from recon.surface.triangle_grid import first_hit
 from recon.types import F32, F64, U8, Camera
-from service.sim import shapes
 from service.sim.ground_texture import (
     AMBIENT,
     SUN_STRENGTH,
@@ -72,11 +71,8 @@ class Renderer:
         """Prepare the rays and tables; raises ValueError for an unusable camera."""
         self.scene, self.texture, self.camera = scene, texture, camera
         self.rays = camera_rays(camera)
-        plain = Camera(camera.K, np.zeros(5), camera.size_px)
-        self._straight = camera_rays(plain)
+        self._straight = camera_rays(Camera(camera.K, np.zeros(5), camera.size_px))
         self._normals = scene.grid.normals()
-        self._blocks = scene.blocks if len(scene.blocks) else np.zeros((1, shapes.COLUMNS))
-        self._trees = scene.trees if len(scene.trees) else np.zeros((1, 8))
 
     def frame(self, T_world_camera: F64, index: int, look: Look, time_s: float = 0.0) -> U8:
         """(H, W, 3) BGR image as the distorted camera takes it at one moment."""
@@ -124,7 +120,7 @@ class Renderer:
         p = self.texture
         return (
             self.scene.grid.arrays(), self._normals, self.scene.material, self.scene.owner,
-            self._blocks, self._trees, p.bgr, p.levels, p.x0, p.y0, p.texel_m, p.sun,
+            self.scene.blocks, self.scene.trees, p.bgr, p.levels, p.x0, p.y0, p.texel_m, p.sun,
         )  # fmt: skip
 
 

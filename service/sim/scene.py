@@ -15,7 +15,7 @@ from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F64, U8
 from service.sim import shapes
 from service.sim.noise import fractal2
-from service.sim.shapes import FLAT, GABLED, PLAIN, VEHICLE, MeshParts
+from service.sim.shapes import FLAT, GABLED, PLAIN, VEHICLE, Body
 
 ASPHALT, DIRT = 1, 2
 ROOFS = ((50, 62, 128), (58, 80, 140), (72, 72, 78), (62, 68, 96), (96, 92, 90))
@@ -79,13 +79,11 @@ def make(
     boxes, changed = _changes(area, ground, free, changes, seed)
     blocks += [box for box, change in zip(boxes, changed, strict=True) if change.date == date]
     table = np.array(blocks + trunks) if blocks or trunks else np.zeros((0, shapes.COLUMNS))
-    parts = MeshParts()
-    _add_ground(parts, ground, table)
-    for k, block in enumerate(table):
-        shapes.add_block(parts, block, k)
-    for k, tree in enumerate(trees):
-        shapes.add_crown(parts, tree, float(heights[k]), k)
-    vertices, triangles, material, owner = parts.joined()
+    vertices, triangles, material, owner = shapes.joined([
+        _ground_body(ground, table),
+        *(body for k, block in enumerate(table) for body in shapes.block_bodies(block, k)),
+        *(shapes.crown(tree, float(heights[k]), k) for k, tree in enumerate(trees)),
+    ])  # fmt: skip
     grid = triangle_grid.build(vertices, triangles, 1.0)
     return Scene(
         area, ground, roads, table, trees, vertices, triangles, material, owner, grid, seed,
@@ -332,7 +330,7 @@ def _trees(
     return table, np.array(heights), trunks
 
 
-def _add_ground(parts: MeshParts, ground: HeightField, blocks: F64) -> None:
+def _ground_body(ground: HeightField, blocks: F64) -> Body:
     """The terrain's triangles, left out where a block's floor covers them whole."""
     ny, nx = ground.z_m.shape
     x = ground.area.x0 + ground.step_m * np.arange(nx)
@@ -348,7 +346,7 @@ def _add_ground(parts: MeshParts, ground: HeightField, blocks: F64) -> None:
     c, d = corner[1:, :-1][keep], corner[1:, 1:][keep]
     triangles = np.concatenate([np.stack([a, b, d], axis=1), np.stack([a, d, c], axis=1)])
     vertices = np.stack([gx.ravel(), gy.ravel(), ground.z_m.ravel()], axis=1)
-    parts.add(vertices, triangles, shapes.GROUND, -1)
+    return vertices, triangles, shapes.GROUND, -1
 
 
 @dataclass(frozen=True, slots=True)

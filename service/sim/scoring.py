@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.spatial import cKDTree
 
 from recon import se3
 from recon.surface import metrics
 from recon.surface.metrics import Fit
-from recon.surface.raster import Grid, grid_over, rasterise_points, reliable
+from recon.surface.raster import grid_over, rasterise_points, reliable
 from recon.types import F32, F64
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -27,8 +28,6 @@ from service.sim.truth import (
     reading,
     seen_surface,
 )
-
-log = logging.getLogger(__name__)
 
 REACH_M = 5.0
 COMPLETE_WITHIN_M = 0.5
@@ -103,21 +102,14 @@ def alignments(
     scan: ScanResult, truth: Truth, at_truth: F64, known: Any
 ) -> dict[str, dict[str, Fit]]:
     """Alignments by name: from the trajectory, and refined on the surface."""
-    by_track: dict[str, Fit] = {}
-    if scan.placed:
-        by_track["raw"] = Fit.identity()
+    by_track = {"raw": Fit.identity()} if scan.placed else {}
+    on_surface = dict(by_track)
     for name, with_scale in (("rigid", False), ("similarity", True)):
+        fit = Fit.identity()
         if known.sum() >= 2:
             fit = metrics.fit_trajectory(scan.poses[known], at_truth[known], with_scale)
-        else:
-            fit = Fit.identity()
         by_track[name] = fit
-    on_surface = dict(by_track)
-    for name in ("rigid", "similarity"):
-        refined = metrics.fit_surface(
-            scan.points, truth.surface, by_track[name], name == "similarity", REACH_M
-        )
-        on_surface[name] = refined
+        on_surface[name] = metrics.fit_surface(scan.points, truth.surface, fit, with_scale, REACH_M)
     return {"trajectory": by_track, "surface": on_surface}
 
 
@@ -147,11 +139,12 @@ def _dsm(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, float]:
     grid = grid_over(points[:, :2], DSM_CELL_M, margin_cells=1)
     measured = rasterise_points(points, np.zeros((len(points), 3), np.uint8), sigma, grid)
     model = reliable(measured)
-    height = _truth_heights(truth, grid)
+    places = grid.centres(*np.indices(grid.shape).reshape(2, -1))
+    height = heights_below(truth.surface, places).reshape(grid.shape)  # NaN outside
     error = (model.height_m - height)[model.known & np.isfinite(height)]
     if not len(error):
         return {"cell_m": DSM_CELL_M, "cells": 0}
-    level = _range_of_three(height) < 1.0
+    level = maximum_filter(height, 3) - minimum_filter(height, 3) < 1.0  # no NaN next to it
     away = (model.height_m - height)[model.known & level]
     return {
         "cell_m": DSM_CELL_M,
@@ -163,19 +156,6 @@ def _dsm(scan: ScanResult, truth: Truth, fit: Fit) -> dict[str, float]:
         "within_30cm": float(np.mean(np.abs(error) < 0.3)),
         "rms_away_from_steps_m": float(np.sqrt(np.mean(away**2))) if len(away) else float("nan"),
     }
-
-
-def _truth_heights(truth: Truth, grid: Grid) -> F64:
-    """(rows, cols) height of the truth straight below the middle of each cell; NaN outside."""
-    places = grid.centres(*np.indices(grid.shape).reshape(2, -1))
-    return heights_below(truth.surface, places).reshape(grid.shape)
-
-
-def _range_of_three(height: F64) -> F64:
-    """(rows, cols) highest less lowest of the 3x3 cells about each; NaN next to unknown ones."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    return np.asarray(maximum_filter(height, 3) - minimum_filter(height, 3))
 
 
 def _fit_size(fit: Fit, points: F64) -> dict[str, float]:
@@ -192,8 +172,6 @@ def _fit_size(fit: Fit, points: F64) -> dict[str, float]:
 
 def _distance_to(track: F64, points: F64) -> F64:
     """(N,) distance of each of ``points`` to the nearest place of ``track``."""
-    from scipy.spatial import cKDTree
-
     return np.asarray(cKDTree(track).query(points)[0])
 
 

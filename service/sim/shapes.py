@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 import numpy.typing as npt
 
-from recon.types import F64, I32
+from recon.types import F64, I32, U8
 from service.sim.noise import value3
 
 GROUND, TOP, WALL, CROWN = 0, 1, 2, 3
@@ -24,32 +22,20 @@ FLAT, GABLED, VEHICLE, PLAIN = 0.0, 1.0, 2.0, 3.0
 TREE_X, TREE_Y, TREE_Z, TREE_R, TREE_B, TREE_G, TREE_RED, TREE_SEED = range(8)
 
 
-@dataclass(slots=True)
-class MeshParts:
-    """Triangles as they are collected; :meth:`joined` makes the arrays."""
+Body = tuple[F64, I32, int, int]
+"""Vertices (N, 3), triangles (M, 3) of them, their material and row in the block or tree table."""
 
-    vertices: list[F64] = field(default_factory=list)
-    triangles: list[I32] = field(default_factory=list)
-    material: list[npt.NDArray[np.uint8]] = field(default_factory=list)
-    owner: list[I32] = field(default_factory=list)
-    count: int = 0
 
-    def add(self, vertices: F64, triangles: I32, material: int, owner: int) -> None:
-        """Append one body; ``owner`` is its row in the block or tree table."""
-        self.vertices.append(vertices)
-        self.triangles.append(triangles.astype(np.int32) + np.int32(self.count))
-        self.material.append(np.full(len(triangles), material, np.uint8))
-        self.owner.append(np.full(len(triangles), owner, np.int32))
-        self.count += len(vertices)
-
-    def joined(self) -> tuple[F64, I32, npt.NDArray[np.uint8], I32]:
-        """(vertices (N, 3), triangles (M, 3), material (M,), owner (M,))."""
-        return (
-            np.concatenate(self.vertices),
-            np.concatenate(self.triangles),
-            np.concatenate(self.material),
-            np.concatenate(self.owner),
-        )
+def joined(bodies: list[Body]) -> tuple[F64, I32, U8, I32]:
+    """(vertices (N, 3), triangles (M, 3), material (M,), owner (M,)) of all bodies."""
+    vertices, triangles, material, owner = zip(*bodies, strict=True)
+    first = np.cumsum([0, *map(len, vertices[:-1])])
+    each = [len(some) for some in triangles]
+    moved = [some + start for some, start in zip(triangles, first, strict=True)]
+    return (
+        np.concatenate(vertices), np.concatenate(moved).astype(np.int32),
+        np.repeat(np.array(material, np.uint8), each), np.repeat(np.array(owner, np.int32), each),
+    )  # fmt: skip
 
 
 def footprint(block: F64, grow_m: float = 0.0) -> F64:
@@ -70,22 +56,22 @@ def inside(block: F64, x_m: F64, y_m: F64, shrink_m: float = 0.0) -> npt.NDArray
     )
 
 
-def add_block(parts: MeshParts, block: F64, owner: int) -> None:
+def block_bodies(block: F64, owner: int) -> list[Body]:
     """Walls and roof of one block; outward normals, no floor."""
     corners = footprint(block)
     bottom = np.column_stack([corners, np.full(4, block[BASE])])
     eave = np.column_stack([corners, np.full(4, block[EAVE])])
     walls = np.vstack([bottom, eave])
     quads = [[i, (i + 1) % 4, 4 + (i + 1) % 4, 4 + i] for i in range(4)]
-    parts.add(walls, _split(quads), WALL, owner)
+    body = walls, _split(quads), WALL, owner
     if block[KIND] != GABLED:
-        parts.add(eave, _split([[0, 1, 2, 3]]), TOP, owner)
-        return
+        return [body, (eave, _split([[0, 1, 2, 3]]), TOP, owner)]
     west = np.append(0.5 * (corners[0] + corners[3]), block[RIDGE])
     east = np.append(0.5 * (corners[1] + corners[2]), block[RIDGE])
     roof = np.vstack([eave, east, west])  # 4 = east end of the ridge, 5 = west end
-    parts.add(roof, _split([[0, 1, 4, 5], [2, 3, 5, 4]]), TOP, owner)
-    parts.add(roof, np.array([[1, 2, 4], [3, 0, 5]], np.int32), WALL, owner)
+    gables = np.array([[1, 2, 4], [3, 0, 5]], np.int32)
+    slopes = _split([[0, 1, 4, 5], [2, 3, 5, 4]])
+    return [body, (roof, slopes, TOP, owner), (roof, gables, WALL, owner)]
 
 
 def _split(quads: list[list[int]]) -> I32:
@@ -127,16 +113,14 @@ def icosphere(subdivisions: int) -> tuple[F64, I32]:
 SPHERE = icosphere(2)
 
 
-def add_crown(parts: MeshParts, tree: F64, height_m: float, owner: int) -> None:
+def crown(tree: F64, height_m: float, owner: int) -> Body:
     """A lumpy crown: an ellipsoid, flatter below, pushed in and out by noise."""
     unit, triangles = SPHERE
     seed = int(tree[TREE_SEED])
     lumps = np.array([value3(3 * x + 9, 3 * y + 9, 3 * z + 9, seed) for x, y, z in unit])
     radius = tree[TREE_R] * (0.72 + 0.5 * lumps)[:, None]
     half = 0.4 * height_m
-    flat = np.where(unit[:, 2:] < 0, 0.7, 1.0)
+    flat = np.where(unit < 0, [1.0, 1.0, 0.7], 1.0)
     centre = tree[[TREE_X, TREE_Y, TREE_Z]] + [0.0, 0.0, 0.6 * height_m]
-    vertices = centre + unit * radius * np.array([1.0, 1.0, half / tree[TREE_R]]) * np.hstack(
-        [np.ones((len(unit), 2)), flat]
-    )
-    parts.add(vertices, triangles, CROWN, owner)
+    vertices = centre + unit * radius * np.array([1.0, 1.0, half / tree[TREE_R]]) * flat
+    return vertices, triangles, CROWN, owner

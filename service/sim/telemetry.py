@@ -16,7 +16,7 @@ from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
 from recon.se3 import quaternion_from_rotation, so3_exp
 from recon.types import F64
 from service.georeference import LocalFrame
-from service.sim.flight import LEAD_S, Sensors
+from service.sim.flight import LEAD_S, Sensors, check_ranges
 
 BOOT_BEFORE_VIDEO_S = 100.0
 GIMBAL_COMPONENT = 154
@@ -39,12 +39,11 @@ class TelemetryOptions:
     home_above_m: float = 0.0  # the take-off point above the ground at the world's origin
 
     def __post_init__(self) -> None:
-        if not all(abs(angle) <= 45.0 for angle in self.boresight_deg):
-            raise ValueError(f"boresight of {self.boresight_deg} deg is not within 45 deg")
-        if not 0.0 <= self.lead_s <= LEAD_S:
-            raise ValueError(f"log lead of {self.lead_s:g} s is not within 0 to {LEAD_S:g} s")
-        if not abs(self.home_above_m) <= 1000.0:
-            raise ValueError(f"home of {self.home_above_m:g} m above the site is not within 1000 m")
+        check_ranges(
+            *(("boresight", angle, " deg", -45, 45) for angle in self.boresight_deg),
+            ("log lead", self.lead_s, " s", 0, LEAD_S),
+            ("home above the site", self.home_above_m, " m", -1000, 1000),
+        )
         if self.gimbal_frame not in ("earth", "vehicle"):
             raise ValueError(f"gimbal frame {self.gimbal_frame!r} is not 'earth' or 'vehicle'")
 
@@ -64,19 +63,29 @@ def packets(
         messages.housekeeping(), messages.attitude(), messages.gimbal(), messages.position(),
         messages.satellites(), *([messages.range()] if options.rangefinder else []),
     ]  # fmt: skip
-    senders = {
-        1: dialect.MAVLink(None, srcSystem=1, srcComponent=1),
-        GIMBAL_COMPONENT: dialect.MAVLink(None, srcSystem=1, srcComponent=GIMBAL_COMPONENT),
-    }
+    senders = Senders(dialect)
     for message, component, t in heapq.merge(*kinds, key=lambda item: item[2]):
         if t < -options.lead_s:  # a video piped without its time is taken to begin with the log
             continue
         if options.gap_s and options.gap_s[0] <= t < options.gap_s[1]:
             continue
-        sender = senders[component]
+        yield t, senders.packed(message, component)
+
+
+class Senders:
+    """The components of the vehicle, each with its own sequence number."""
+
+    def __init__(self, dialect: Any) -> None:
+        self._dialect, self._of = dialect, dict[int, Any]()
+
+    def packed(self, message: Any, component: int) -> bytes:
+        """The next packet of a component."""
+        if component not in self._of:
+            self._of[component] = self._dialect.MAVLink(None, srcSystem=1, srcComponent=component)
+        sender = self._of[component]
         data = bytes(message.pack(sender))
         sender.seq = (sender.seq + 1) % 256
-        yield t, data
+        return data
 
 
 def write_tlog(path: Path, epoch_unix_s: float, stream: Iterator[tuple[float, bytes]]) -> int:

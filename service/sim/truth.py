@@ -124,13 +124,11 @@ def reading(path: Path, *faults: type[Exception]) -> Iterator[None]:
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file") from error
     except unfit as error:
-        raise InputError(
-            f"{path}: cannot be read ({' '.join(str(error).split())[:120]})"
-        ) from error
+        why = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: cannot be read ({why})") from error
 
 
 FACE = np.dtype([("n", "u1"), ("v", "<i4", 3)])
-FORMAT = "binary_little_endian 1.0"
 HEADER = re.compile(
     rb"ply\nformat binary_little_endian 1\.0\n(?:comment [^\n]*\n)*element vertex (\d{1,9})\n"
     rb"property (float|double) x\nproperty \2 y\nproperty \2 z\nelement face (\d{1,9})\n"
@@ -140,22 +138,16 @@ HEADER = re.compile(
 
 def write_surface(path: Path, vertices: F64, triangles: I32) -> None:
     """Write (N, 3) vertices and (M, 3) triangles as binary PLY with float coordinates."""
-    header = [
-        "ply",
-        f"format {FORMAT}",
-        "comment ENU metres about the origin in origin.json",
-        f"element vertex {len(vertices)}",
-        "property float x",
-        "property float y",
-        "property float z",
-        f"element face {len(triangles)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    ]
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        "comment ENU metres about the origin in origin.json\n"
+        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
     faces = np.empty(len(triangles), FACE)
     faces["n"], faces["v"] = 3, triangles
     with path.open("wb") as out:
-        out.write(("\n".join(header) + "\n").encode("ascii"))
+        out.write(header.encode("ascii"))
         out.write(np.ascontiguousarray(vertices, "<f4").tobytes())
         out.write(faces.tobytes())
 

@@ -12,8 +12,8 @@ from stereo_scenes import TruePair
 
 from recon.types import F32, Bool
 from service.bench import BenchResult
+from service.commands.stereo import read_gray
 from service.compute.backend_choice import choose_backend
-from service.compute.rectified_pair import read_gray
 from service.errors import InputError
 
 OPENCV_SAMPLES = Path("/usr/share/doc/opencv-doc/examples/data")

@@ -16,8 +16,8 @@ from recon.backends import Backend
 from recon.types import F32, F64
 from service.bench import BenchOptions, BenchResult
 from service.bench.stereo import ITERATIONS, semi_global
+from service.commands.stereo import matching_config
 from service.compute.backend_choice import choose_backend
-from service.compute.rectified_pair import matching_config
 
 
 def run(options: BenchOptions) -> list[BenchResult]:
@@ -45,9 +45,9 @@ def accuracy(pairs: Sequence[TruePair], backend: Backend) -> list[BenchResult]:
 
 def _wrong(pairs: Sequence[TruePair], backend: Backend) -> F64:
     """Per cent of wrong pixels, ours and the matcher's: the mean of some pairs."""
-    config = matching_config(ITERATIONS, 0, checked=False)
     shares = []
     for pair in pairs:
+        config = matching_config(pair.labels, ITERATIONS, 0, checked=False)
         ours = backend.belief_propagation(pair.left, pair.right, pair.labels, config).px
         theirs = min(bad_share(semi_global_disparity(pair, m), pair, 1.0) for m in (0, 2))
         shares.append((bad_share(ours, pair, 1.0), theirs))

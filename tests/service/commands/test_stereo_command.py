@@ -18,8 +18,8 @@ from paths import SHARED
 from recon.backends.cpu import CpuBackend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.types import U8, DisparityMap
+from service.commands.stereo import matching_config
 from service.compute.backend_choice import Choice, FallbackBackend, choose_backend
-from service.compute.rectified_pair import matching_config
 from service.errors import InputError, OutsideError
 
 DATA = SHARED / "stereo_gt_middlebury"
@@ -225,7 +225,7 @@ def test_better_than_semi_global_matching_on_truth() -> None:
     from recon.stereo.belief_propagation import belief_propagation
 
     for pair in true_pairs(DATA):
-        config = matching_config(5, 0, checked=False)
+        config = matching_config(pair.labels, 5, 0, checked=False)
         px = belief_propagation(pair.left, pair.right, pair.labels, config).px
         theirs = min(bad_share(semi_global_disparity(pair, mode), pair, 1.0) for mode in (0, 2))
         ours = bad_share(px, pair, 1.0)
