@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from recon import se3
 from recon.types import F64, Array
 from service.errors import InputError
 
@@ -94,6 +95,13 @@ class LocalFrame:
 
     def _geodetic_enu(self) -> Transformer:
         return _topocentric(float(self.lat_deg), float(self.lon_deg), float(self.alt_amsl_m))
+
+
+def between_frames(site: LocalFrame, scan: LocalFrame) -> F64:
+    """(4, 4) motion from the ENU metres of ``scan`` to those of ``site``; both are rigid."""
+    axes = np.vstack([np.zeros(3), 100.0 * np.eye(3)])
+    there = site.to_enu(scan.to_geodetic(axes))
+    return se3.project_to_so3(se3.compose((there[1:] - there[0]).T / 100.0, there[0]))
 
 
 NODES = 33

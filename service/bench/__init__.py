@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from importlib import import_module
 from pathlib import Path
@@ -25,6 +25,7 @@ import numpy as np
 import psutil  # type: ignore[import-untyped]
 
 from service.errors import InputError, OutsideError
+from service.scans.writing import write_whole
 
 T = TypeVar("T")
 
@@ -71,8 +72,7 @@ class BenchResult:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON, with the ratio."""
-        fields = {name: getattr(self, name) for name in self.__slots__}
-        return fields | {"ratio": self.ratio}
+        return asdict(self) | {"ratio": self.ratio}
 
 
 def compare(
@@ -146,17 +146,10 @@ def record(results: list[BenchResult], options: BenchOptions) -> dict[str, Any]:
 
 
 def keep(folder: Path, names: Sequence[str], report: dict[str, Any]) -> Path:
-    """Write the result file; its name has the benchmarks, the date and the commit.
-
-    Raises OutsideError when it cannot be written.
-    """
+    """Write the result file; its name has the benchmarks, the date and the commit."""
     day = str(report["date"])[:10]
     path = folder / f"{day}-{str(report['commit']).rstrip('+')}-{'-'.join(names)}.json"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutsideError(f"{path}: cannot be written: {error.strerror}") from error
+    write_whole(path, json.dumps(report, indent=2) + "\n")
     return path
 
 

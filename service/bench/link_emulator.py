@@ -119,7 +119,6 @@ class LinkEmulator:
         self.up = self._up.traffic
         self._loop = asyncio.new_event_loop()
         self._ready = threading.Event()
-        self._tasks: set[asyncio.Task[None]] = set()
         self._thread = threading.Thread(target=self._run, name="link-emulator", daemon=True)
 
     def take_off(self, now: float) -> None:
@@ -172,9 +171,6 @@ class LinkEmulator:
         After a cut, data for an end that has closed meanwhile is sent as one segment, because a
         reset answers it.
         """
-        waiting: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
-        task = self._loop.create_task(self._deliver(waiting, writer))
-        self._tasks.add(task)
         latest = 0.0
         with contextlib.suppress(OSError):
             while data := await reader.read(CHUNK_BYTES):
@@ -185,25 +181,12 @@ class LinkEmulator:
                 out = pipe.send(len(data), now)
                 if late > 0 and _has_closed(writer):
                     break
-                latest = max(latest, out)  # a stream keeps its order
-                waiting.put_nowait((latest, data))
+                latest = max(latest + 1e-9, out)  # a stream keeps its order
+                self._loop.call_at(latest, writer.write, data)
                 excess = pipe.backlog_bytes(now) - QUEUE_BYTES
                 if excess > 0:
                     await asyncio.sleep(excess / (self._model.rate_kbit_s * 125))
-        waiting.put_nowait((latest, b""))
-
-    async def _deliver(
-        self, waiting: asyncio.Queue[tuple[float, bytes]], writer: asyncio.StreamWriter
-    ) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                at, data = await waiting.get()
-                await asyncio.sleep(max(0.0, at - time.monotonic()))
-                if not data:
-                    break
-                writer.write(data)
-                await writer.drain()
-        writer.close()
+        self._loop.call_at(latest, writer.close)
 
 
 def _has_closed(writer: asyncio.StreamWriter) -> bool:

@@ -7,7 +7,6 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from service.ground.portal import Portal
     from service.ground.receiver import Receiver, ReceiverConfig
     from service.init_system import Notifier
-    from service.radio import RadioLink
     from service.stream.session import SessionConfig
     from service.workers import Worker, Workers
 
@@ -177,7 +175,23 @@ def ground(given: GroundOptions) -> None:
         if given.portal is not None:
             page = _open_portal(given.portal, given, receiver, workers)
         notifier.ready()
-        _watch(stop, receiver, workers, notifier, radios, given)
+        shown: dict[str, str] = {}
+        shown_at = beat_at = 0.0
+        while not stop.wait(0.2):
+            now, entries = time.monotonic(), receiver.progress()
+            if now >= beat_at:
+                beat_at = now + NOTIFY_S
+                feed_watchdog(workers, notifier)
+                for radio in radios:
+                    radio.beat()
+            if given.once and any(entry["complete"] for entry in entries):
+                stop.wait(1.5)  # let the report reach the drone
+                break
+            if given.idle_exit_s is not None and now - receiver.last_news_at > given.idle_exit_s:
+                break
+            if sys.stderr.isatty() and now - shown_at > SHOW_S:
+                shown_at = now
+                show_news(entries, shown)
         entries = receiver.progress()
     finally:
         notifier.stopping()
@@ -188,7 +202,12 @@ def ground(given: GroundOptions) -> None:
             radio.close()
         receiver.close()
         closing.join()
-    _report(entries, receiver.dropped, workers.report(), given.as_json)
+    if given.as_json:
+        report = {"scans": entries, "dropped": receiver.dropped, "workers": workers.report()}
+        print(json.dumps(report))
+        return
+    lines = [f"{_line(entry)}; {entry['folder']}" for entry in entries]
+    print("\n".join(lines) or "no scan was received")
 
 
 def _take_in(store: Path, folders: list[Path]) -> list[Path]:
@@ -246,37 +265,6 @@ def feed_watchdog(workers: Workers, notifier: Notifier) -> None:
         notifier.alive()
 
 
-def _watch(
-    stop: Event,
-    receiver: Receiver,
-    workers: Workers,
-    notifier: Notifier,
-    radios: list[RadioLink],
-    given: GroundOptions,
-) -> None:
-    """Return on a signal, or when ``--once`` or ``--idle-exit-s`` is met."""
-    shown: dict[str, str] = {}
-    shown_at = beat_at = 0.0
-    while not stop.wait(0.2):
-        entries = receiver.progress()
-        if time.monotonic() >= beat_at:
-            beat_at = time.monotonic() + NOTIFY_S
-            feed_watchdog(workers, notifier)
-            for radio in radios:
-                radio.beat()
-        if given.once and any(entry["complete"] for entry in entries):
-            stop.wait(1.5)  # let the report reach the drone
-            return
-        if (
-            given.idle_exit_s is not None
-            and time.monotonic() - receiver.last_news_at > given.idle_exit_s
-        ):
-            return
-        if sys.stderr.isatty() and time.monotonic() - shown_at > SHOW_S:
-            shown_at = time.monotonic()
-            show_news(entries, shown)
-
-
 def show_news(entries: list[dict[str, Any]], shown: dict[str, str]) -> None:
     """Print the scans whose line is not the one ``shown``, by folder."""
     for entry in entries:
@@ -284,18 +272,6 @@ def show_news(entries: list[dict[str, Any]], shown: dict[str, str]) -> None:
         if shown.get(entry["folder"]) != line:
             shown[entry["folder"]] = line
             print(line, file=sys.stderr, flush=True)
-
-
-def _report(
-    entries: list[dict[str, Any]], dropped: int, workers: list[dict[str, Any]], as_json: bool
-) -> None:
-    if as_json:
-        print(json.dumps({"scans": entries, "dropped": dropped, "workers": workers}))
-        return
-    for entry in entries:
-        print(f"{_line(entry)}; {entry['folder']}")
-    if not entries:
-        print("no scan was received")
 
 
 def _line(entry: dict[str, Any]) -> str:

@@ -17,17 +17,18 @@ from recon.surface.metrics import Fit
 from recon.surface.raster import grid_over, rasterise_points, reliable
 from recon.types import F32, F64
 from service.errors import InputError
-from service.georeference import LocalFrame
+from service.georeference import LocalFrame, between_frames
 from service.sim.truth import (
+    MAX_JSON_BYTES,
     SeenSurface,
     Truth,
     heights_below,
-    json_object,
     read_truth,
     read_tum,
     reading,
     seen_surface,
 )
+from service.small_file import read_json
 
 REACH_M = 5.0
 COMPLETE_WITHIN_M = 0.5
@@ -199,7 +200,7 @@ def read_scan(folder: Path, frame: LocalFrame) -> ScanResult:
     """The scan in ``folder``, brought into ``frame`` when it is georeferenced."""
     if not folder.is_dir():
         raise InputError(f"scan {folder}: no such folder")
-    summary = json_object(folder / "scan.json")
+    summary = read_json(folder / "scan.json", dict[str, Any], MAX_JSON_BYTES, "scan.json")
     points, own_m, whole_m = _read_cloud(folder / "cloud.laz")
     if len(points) == 0:
         raise InputError(f"scan {folder}: cloud.laz contains no points; nothing to score")
@@ -212,20 +213,7 @@ def read_scan(folder: Path, frame: LocalFrame) -> ScanResult:
     if own.epsg != epsg:
         raise InputError(f"scan {folder}: EPSG {epsg} in scan.json is not that of its origin")
     enu = frame.to_enu(own.to_geodetic(own.from_utm(points)))
-    return ScanResult(enu, own_m, whole_m, times, _moved_poses(poses, own, frame), True)
-
-
-def _moved_poses(poses: F64, own: LocalFrame, frame: LocalFrame) -> F64:
-    """Poses about one origin as poses about another; exact, the axes turn with the globe."""
-    out = np.array(poses, dtype=np.float64)
-    if len(poses) == 0:
-        return out
-    axes = np.vstack([np.zeros(3), np.eye(3)])
-    tips = frame.to_enu(own.to_geodetic(axes))
-    U, _, Vt = np.linalg.svd((tips[1:] - tips[0]).T)
-    out[:, :3, :3] = (U @ Vt) @ poses[:, :3, :3]
-    out[:, :3, 3] = frame.to_enu(own.to_geodetic(poses[:, :3, 3]))
-    return out
+    return ScanResult(enu, own_m, whole_m, times, between_frames(frame, own) @ poses, True)
 
 
 def _read_cloud(path: Path) -> tuple[F64, F32 | None, F32 | None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import struct
 from collections.abc import Iterator
@@ -19,10 +18,12 @@ from recon.surface.triangle_grid import TriangleGrid
 from recon.types import F64, I32
 from service.errors import InputError
 from service.georeference import LocalFrame
+from service.small_file import read_json
 
 SAMPLE_SPACING_M = 0.4
 FRAMES_FOR_VISIBILITY = 60
 VIEWS_TO_COUNT = 3
+MAX_JSON_BYTES = 1 << 26
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,8 +55,10 @@ def read_truth(folder: Path) -> Truth:
         folder = folder / "truth"
     if not folder.is_dir():
         raise InputError(f"truth {folder}: no such folder; `skyrelief simulate` makes one")
-    origin = json_object(folder / "origin.json")
-    params = json_object(folder / "params.json")
+    origin, params = (
+        read_json(folder / f"{name}.json", dict[str, Any], MAX_JSON_BYTES, "truth of simulate")
+        for name in ("origin", "params")
+    )
     vertices, triangles = read_surface(folder / "surface.ply")
     times, poses = read_tum(folder / "trajectory.tum")
     with reading(folder):
@@ -105,11 +108,6 @@ def read_tum(path: Path) -> tuple[F64, F64]:
             poses[k, :3, :3] = se3.rotation_from_quaternion(row[[7, 4, 5, 6]])
         poses[:, :3, 3] = table[:, 1:4]
     return table[:, 0], poses
-
-
-def json_object(path: Path) -> dict[str, Any]:
-    with reading(path):
-        return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 UNFIT = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError, struct.error)

@@ -14,7 +14,7 @@ from recon import se3
 from recon.camera_model import rays
 from recon.posegraph.site_alignment import ScanSimilarity
 from recon.types import F64, Bool, DepthMap, Keyframe, Pose
-from service.georeference import LocalFrame
+from service.georeference import LocalFrame, between_frames
 from service.stream.codec import encode
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -139,7 +139,6 @@ def layers(
     frame: LocalFrame = FRAME, day: int = 0, lift_m: float = 0.0, truth: LocalFrame = FRAME,
 ) -> list[bytes]:  # fmt: skip
     """The coded keyframe at a true pose, wrongly placed by ``errors`` and ``lift_m`` up."""
-    from service.offline.site.gather import between_frames
 
     one = view(seq, T, boxes, ground)
     d, wrong = one.depth, (errors or Errors()).as_similarity()

@@ -20,7 +20,7 @@ from recon import se3
 from recon.posegraph.site_alignment import ScanSimilarity
 from recon.types import F64
 from service.errors import InputError
-from service.georeference import LocalFrame
+from service.georeference import LocalFrame, between_frames
 from service.offline.site import DRONE
 from service.offline.site.start import StartPoints
 from service.scans.main_piece import main_seqs
@@ -151,13 +151,6 @@ def _frame(header: ScanHeader) -> LocalFrame:
     if frame is None:
         raise ValueError(f"{header.scan_id} has no georeference")
     return frame
-
-
-def between_frames(site: LocalFrame, scan: LocalFrame) -> F64:
-    """(4, 4) motion from the ENU metres of ``scan`` to those of ``site``; both are rigid."""
-    axes = np.vstack([np.zeros(3), 100.0 * np.eye(3)])
-    there = site.to_enu(scan.to_geodetic(axes))
-    return se3.project_to_so3(se3.compose((there[1:] - there[0]).T / 100.0, there[0]))
 
 
 def _site_header(name: str, headers: Sequence[ScanHeader], origin: LocalFrame) -> ScanHeader:

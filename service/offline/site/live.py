@@ -20,7 +20,7 @@ from recon.posegraph.records import Loop
 from recon.posegraph.site_alignment import ScanSimilarity, align, alike
 from recon.types import F64, Keyframe
 from service.errors import InputError, SkyreliefError
-from service.georeference import LocalFrame
+from service.georeference import LocalFrame, between_frames
 from service.offline.refine.stored_loops import (
     BREAK_S,
     LOOPS_PER_KEYFRAME,
@@ -31,7 +31,7 @@ from service.offline.refine.stored_loops import (
     weighted,
 )
 from service.offline.site.alignment import MIN_TIES, corners, placing, tie
-from service.offline.site.gather import MAX_DISTANCE_M, between_frames
+from service.offline.site.gather import MAX_DISTANCE_M
 from service.scans.track import local_frame
 from service.stream import codec
 from service.stream.store import ScanStore

@@ -156,7 +156,7 @@ def test_replay_ends_with_the_verdict(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_a_backend_without_a_device_warns(caplog: pytest.LogCaptureFixture) -> None:
     class Slow:
-        name, device = "torch", "cpu"
+        name, device, keeps_pairs = "torch", "cpu", False
 
     slow: Any = Slow()
     with caplog.at_level(logging.WARNING):

@@ -16,10 +16,10 @@ import pytest
 from site_scans import ELSEWHERE, FRAME, START_NS, Errors, header_of, layers, leg, write_scan
 
 from recon.types import F64
+from service.georeference import between_frames
 from service.ground.live_site import FILE, MAX_SCANS, Follower, SiteNews, run
 from service.ground.sites import references
 from service.offline.site.alignment import align_site
-from service.offline.site.gather import between_frames
 from service.scans.folder import write_deliverables
 from service.stream.store import ScanStore
 from service.workers import Workers, running

@@ -23,12 +23,11 @@ from recon import se3
 from recon.types import F64
 from service.cli import app
 from service.errors import InputError
-from service.georeference import LocalFrame
+from service.georeference import LocalFrame, between_frames
 from service.offline.refine.refinement import RefineOptions, refine
 from service.offline.site import alignment
 from service.offline.site.alignment import AlignedSite, align_site
 from service.offline.site.compare import compare
-from service.offline.site.gather import between_frames
 from service.stream.store import ScanStore
 
 pytestmark = pytest.mark.slow
