@@ -1,17 +1,29 @@
-"""JSON of the portal's requests and answers."""
+"""JSON of the portal's requests and answers, and the endpoints that change something."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from functools import wraps
 from typing import Any, TypeVar
 
 import msgspec
+from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse as StarletteJSONResponse
+from starlette.responses import Response
 
 from service.errors import InputError
+from service.ground.guard import note
 
 T = TypeVar("T")
+
+BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {}
+"""Bodies of the endpoints that take one."""
+
+
+class Body(msgspec.Struct, forbid_unknown_fields=True):
+    """The JSON object of a request."""
 
 
 class JSONResponse(StarletteJSONResponse):
@@ -21,7 +33,29 @@ class JSONResponse(StarletteJSONResponse):
         return json.dumps(content, allow_nan=False, separators=(",", ":")).encode("ascii")
 
 
-async def body_of(request: Request, kind: type[T]) -> T:
+def changing(action: str, body: type[Body] | None = None) -> Callable[..., Callable[..., Any]]:
+    """Makes an endpoint of ``work(request)`` or ``work(request, body)``, which runs on a thread.
+
+    The audit log gets the ``action`` and the scan, also where the body is refused.
+    """
+
+    def decorate(work: Callable[..., Response]) -> Callable[..., Any]:
+        @wraps(work)
+        async def endpoint(request: Request) -> Response:
+            note(request, action)
+            if "scan" in request.path_params:
+                note(request, action, scan="{drone}/{scan}".format(**request.path_params))
+            given = () if body is None else (await _body_of(request, body),)
+            return await run_in_threadpool(work, request, *given)
+
+        if body is not None:
+            BODIES[endpoint] = body
+        return endpoint
+
+    return decorate
+
+
+async def _body_of(request: Request, kind: type[T]) -> T:
     """The JSON object sent; InputError for anything else. Starlette's own checks no types."""
     try:
         return msgspec.json.decode(await request.body(), type=kind)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,10 +16,10 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from service.errors import InputError
-from service.ground.bodies import JSONResponse, body_of
+from service.ground.bodies import Body, JSONResponse, changing
 from service.ground.guard import note
-from service.ground.scan_files import SEQ
-from service.ground.state import names_of, state_of
+from service.ground.scan_files import seq_of
+from service.ground.state import folder_of, state_of
 from service.offline.refine.marking import (
     GCP,
     Marked,
@@ -40,14 +40,14 @@ MAX_POINTS, MAX_MARKS = 1000, 20_000
 Px = Annotated[float, msgspec.Meta(ge=-1.0, le=100_000.0)]
 
 
-class ControlFile(msgspec.Struct, forbid_unknown_fields=True):
+class ControlFile(Body):
     """The text of a file of control points, and of Pix4D's file of marks."""
 
     text: str
     marks: str | None = None
 
 
-class NewMark(msgspec.Struct, forbid_unknown_fields=True):
+class NewMark(Body):
     """Where a keyframe's image shows a point, in the camera's pixels; null: nowhere."""
 
     name: str
@@ -68,43 +68,46 @@ def control_routes(one: str) -> list[Route]:
 def _points(request: Request) -> Response:
     """The control points of a scan: the images that show each, where it is expected and marked
     there, and how far the map is off (map less survey: east, north, up)."""
-    folder = state_of(request).library.folder(*names_of(request))
+    folder = folder_of(request)
     return JSONResponse(_listed(folder, _known(folder)))
 
 
-async def _replace(request: Request) -> Response:
+@changing("control points", ControlFile)
+def _replace(request: Request, given: ControlFile) -> Response:
     """Give a scan its control points, in any form that `refine --gcp` reads; the points. Marks in
     stills, by file name, are left out."""
-    folder = state_of(request).library.folder(*names_of(request))
-    note(request, "control points", scan="/".join(names_of(request)))
-    given = await body_of(request, ControlFile)
-    return JSONResponse(await run_in_threadpool(_replaced, folder, given))
+    folder = folder_of(request)
+    with tempfile.TemporaryDirectory() as place:
+        path, marks = Path(place) / "points", None
+        path.write_text(given.text, encoding="utf-8")
+        if given.marks is not None:
+            marks = Path(place) / "marks"
+            marks.write_text(given.marks, encoding="utf-8")
+        survey = _read(path, marks)
+    with _WRITING:
+        return _kept(folder, survey)
 
 
-async def _mark(request: Request) -> Response:
+@changing("mark", NewMark)
+def _mark(request: Request, new: NewMark) -> Response:
     """Mark a point in a keyframe's image, or take the mark away; the points."""
-    folder = state_of(request).library.folder(*names_of(request))
-    note(request, "mark", scan="/".join(names_of(request)))
-    new = await body_of(request, NewMark)
     note(request, "mark", point=new.name, keyframe=new.keyframe_seq)
-    return JSONResponse(await run_in_threadpool(_with_mark, folder, new))
+    folder = folder_of(request)
+    with _WRITING:
+        return _kept(folder, marked(_known(folder), new.name, new.keyframe_seq, new.uv_px))
 
 
 async def _image(request: Request) -> Response:
     """The image of a keyframe with the lens's distortion: the frame of a recording in the scan's
     folder, else as the scan stores it."""
-    state = state_of(request)
-    folder = state.library.folder(*names_of(request))
-    if not SEQ.fullmatch(request.path_params["seq"]):
-        raise InputError("no such keyframe")
-    async with state.decoding:
-        data = await run_in_threadpool(_decoded, folder, int(request.path_params["seq"]))
-    return Response(data, media_type="image/jpeg")
+    folder, seq = folder_of(request), seq_of(request)
 
+    def decoded() -> bytes:
+        with ScanStore.peek(folder / "scan.db") as store:
+            return image_of(folder, store, seq)
 
-def _decoded(folder: Path, seq: int) -> bytes:
-    with ScanStore.peek(folder / "scan.db") as store:
-        return image_of(folder, store, seq)
+    async with state_of(request).decoding:
+        return Response(await run_in_threadpool(decoded), media_type="image/jpeg")
 
 
 def _known(folder: Path) -> list[SurveyPoint]:
@@ -119,28 +122,11 @@ def _read(path: Path, marks: Path | None = None) -> list[SurveyPoint]:
         raise InputError(str(error).replace(f"{path.parent}/", "")) from error
 
 
-def _replaced(folder: Path, given: ControlFile) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory() as place:
-        path, marks = Path(place) / "points", None
-        path.write_text(given.text, encoding="utf-8")
-        if given.marks is not None:
-            marks = Path(place) / "marks"
-            marks.write_text(given.marks, encoding="utf-8")
-        survey = _read(path, marks)
-    with _WRITING:
-        return _kept(folder, survey)
-
-
-def _with_mark(folder: Path, new: NewMark) -> dict[str, Any]:
-    with _WRITING:
-        return _kept(folder, marked(_known(folder), new.name, new.keyframe_seq, new.uv_px))
-
-
-def _kept(folder: Path, survey: Sequence[SurveyPoint]) -> dict[str, Any]:
+def _kept(folder: Path, survey: Sequence[SurveyPoint]) -> Response:
     """The points as they are listed, written once all marks fit the scan."""
     listed = _listed(folder, survey)
     write_whole(folder / GCP, survey_text(survey))
-    return listed
+    return JSONResponse(listed)
 
 
 def _listed(folder: Path, survey: Sequence[SurveyPoint]) -> dict[str, Any]:
@@ -166,10 +152,3 @@ def _shown(one: Marked) -> dict[str, Any]:
         "why_not": one.why_not,
         "images": [asdict(image) for image in one.images],
     }
-
-
-CONTROL_BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {
-    _replace: ControlFile,
-    _mark: NewMark,
-}
-"""Bodies of the requests that take one."""

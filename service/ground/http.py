@@ -26,8 +26,8 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
 from service.errors import InputError, OutsideError
-from service.ground.bodies import JSONResponse, body_of
-from service.ground.control import CONTROL_BODIES, control_routes
+from service.ground.bodies import BODIES, Body, JSONResponse, changing
+from service.ground.control import control_routes
 from service.ground.guard import (
     CHANGING,
     UPLOAD,
@@ -46,7 +46,7 @@ from service.ground.map_tiles import map_routes
 from service.ground.products import job_title, products_of
 from service.ground.scan_files import file_routes
 from service.ground.sites import align_by_points
-from service.ground.state import KINDS, PortalState, names_of, state_of
+from service.ground.state import KINDS, PortalState, folder_of, names_of, state_of
 from service.ground.upload import Upload, check_parts
 from service.ground.vehicle import BUTTONS
 from service.offline.exports.view import ExportOptions
@@ -75,7 +75,7 @@ NO_PAGE = (
 )
 
 
-class LabelChange(msgspec.Struct, forbid_unknown_fields=True):
+class LabelChange(Body):
     """A new title or tags, and the edition of the labels that they were made on."""
 
     title: str | None = None
@@ -83,7 +83,7 @@ class LabelChange(msgspec.Struct, forbid_unknown_fields=True):
     edition: int | None = None
 
 
-class NewAnnotation(msgspec.Struct, forbid_unknown_fields=True):
+class NewAnnotation(Body):
     """A place (longitude, latitude, AMSL metres) or the places of a measurement, and the text."""
 
     text: str
@@ -91,7 +91,7 @@ class NewAnnotation(msgspec.Struct, forbid_unknown_fields=True):
     line: Line | None = None
 
 
-class ExportOrder(msgspec.Struct, forbid_unknown_fields=True):
+class ExportOrder(Body):
     """A deliverable to make; ``vertical_datum`` is that of the heights as flown."""
 
     kind: Annotated[str, msgspec.Meta(extra_json_schema={"enum": list(KINDS)})]
@@ -99,7 +99,7 @@ class ExportOrder(msgspec.Struct, forbid_unknown_fields=True):
     to_datum: str | None = None
 
 
-class AlignOrder(msgspec.Struct, forbid_unknown_fields=True):
+class AlignOrder(Body):
     """A scan or a site with georeference, and three or more points of the scan on its ground."""
 
     drone: str
@@ -107,13 +107,13 @@ class AlignOrder(msgspec.Struct, forbid_unknown_fields=True):
     points: list[Pair]
 
 
-class ImportOrder(msgspec.Struct, forbid_unknown_fields=True):
+class ImportOrder(Body):
     """A scan folder or a recording of this machine."""
 
     folder: str
 
 
-class VehicleOrder(msgspec.Struct, forbid_unknown_fields=True):
+class VehicleOrder(Body):
     """An order to the companion."""
 
     action: Annotated[str, msgspec.Meta(extra_json_schema={"enum": list(BUTTONS)})]
@@ -161,7 +161,7 @@ def portal_app(state: PortalState, tokens: Tokens, local: bool) -> ASGIApp:
         routes.append(Mount("/assets", files, middleware=COMPRESSED))
     app = Starlette(
         routes=routes,
-        exception_handlers={InputError: _said, OutsideError: _said, HTTPException: _refused},
+        exception_handlers=dict.fromkeys((InputError, OutsideError, HTTPException), _said),
     )
     app.state.portal = state
     app.state.tokens = tokens
@@ -212,19 +212,15 @@ def _operation(endpoint: Callable[..., Any], method: str) -> dict[str, Any]:
 
 
 def _said(request: HTTPConnection, error: Exception) -> Response:
-    """One of our errors as JSON: 404 for a missing resource, 409 for a conflict with a newer
-    change, 503 for an outside failure, else 400.
+    """An error as JSON: 404 for a missing resource, 409 for a conflict with a newer change, 503 for
+    an outside failure, else 400.
     """
-    if isinstance(error, OutsideError):
-        return JSONResponse({"error": str(error)}, 503)
-    if isinstance(error, ConflictError):
-        return JSONResponse({"error": str(error)}, 409)
-    return JSONResponse({"error": str(error)}, 404 if str(error).startswith("no ") else 400)
-
-
-def _refused(request: HTTPConnection, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+    if isinstance(error, HTTPException):
+        return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+    status = 404 if str(error).startswith("no ") else 400
+    for kind, code in ((OutsideError, 503), (ConflictError, 409)):
+        status = code if isinstance(error, kind) else status
+    return JSONResponse({"error": str(error)}, status)
 
 
 def _page(request: Request) -> Response:
@@ -257,61 +253,52 @@ def _scan(request: Request) -> Response:
     return JSONResponse(entry)
 
 
-async def _label(request: Request) -> Response:
+@changing("rename", LabelChange)
+def _label(request: Request, change: LabelChange) -> Response:
     """Rename or tag. With the edition that was seen: 409 when it is no longer the last."""
-    drone, scan = names_of(request)
-    note(request, "rename", scan=f"{drone}/{scan}")
-    change = await body_of(request, LabelChange)
     note(request, "rename", title=change.title, tags=change.tags)
     library = state_of(request).library
-    labels = await run_in_threadpool(
-        library.label, drone, scan, change.title, change.tags, change.edition
-    )
-    return JSONResponse(
-        {"title": labels.title, "tags": list(labels.tags), "edition": labels.edition}
-    )
+    labels = library.label(*names_of(request), change.title, change.tags, change.edition)
+    return JSONResponse(msgspec.to_builtins(labels))
 
 
+@changing("delete")
 def _delete(request: Request) -> Response:
     """Move a scan to the bin; its name there."""
-    state, (drone, scan) = state_of(request), names_of(request)
-    note(request, "delete", scan=f"{drone}/{scan}")
+    state, folder = state_of(request), folder_of(request)
     for entry in state.progress():
-        if entry.get("open", True) and (entry["drone"], entry["scan"]) == (drone, scan):
+        if entry.get("open", True) and (entry["drone"], entry["scan"]) == names_of(request):
             raise HTTPException(409, "this scan is being received; delete it some minutes later")
-    if state.jobs.busy(state.library.folder(drone, scan)):
+    if state.jobs.busy(folder):
         raise HTTPException(409, "a deliverable of this scan is being made; wait for it")
     for kept in (state.coverages, state.maps):
-        kept.forget(state.library.folder(drone, scan))
-    return JSONResponse({"bin": state.library.delete(drone, scan)})
+        kept.forget(folder)
+    return JSONResponse({"bin": state.library.delete(*names_of(request))})
 
 
 def _annotations(request: Request) -> Response:
     """The annotations of a scan as GeoJSON."""
-    folder = state_of(request).library.folder(*names_of(request))
-    return JSONResponse(as_json(read_annotations(folder)))
+    return JSONResponse(as_json(read_annotations(folder_of(request))))
 
 
-async def _annotate(request: Request) -> Response:
+@changing("annotate", NewAnnotation)
+def _annotate(request: Request, new: NewAnnotation) -> Response:
     """Add a place with a text, or a named measurement; the feature."""
-    drone, scan = names_of(request)
-    note(request, "annotate", scan=f"{drone}/{scan}")
-    new = await body_of(request, NewAnnotation)
     note(request, "annotate", text=new.text)
     if (new.coordinates is None) == (new.line is None):
         raise InputError("the request is not valid: it gives coordinates or a line")
     geometry = LineString(new.line) if new.line else Point(new.coordinates or (0.0, 0.0, 0.0))
     by = str(request.scope[WHO]).partition(".")[0]
-    library = state_of(request).library
-    made = await run_in_threadpool(library.annotate, drone, scan, geometry, new.text, by)
+    made = state_of(request).library.annotate(*names_of(request), geometry, new.text, by)
     return JSONResponse(as_json(made), 201)
 
 
+@changing("erase annotation")
 def _erase_annotation(request: Request) -> Response:
     """Delete an annotation."""
-    (drone, scan), number = names_of(request), request.path_params["number"]
-    note(request, "erase annotation", scan=f"{drone}/{scan}", number=number)
-    state_of(request).library.erase_annotation(drone, scan, number)
+    number = request.path_params["number"]
+    note(request, "erase annotation", number=number)
+    state_of(request).library.erase_annotation(*names_of(request), number)
     return JSONResponse({})
 
 
@@ -323,30 +310,26 @@ def _products(request: Request) -> Response:
     return JSONResponse(products_of(library.folder(*names), points, entry["origin"] is not None))
 
 
-async def _export(request: Request) -> Response:
+@changing("export", ExportOrder)
+def _export(request: Request, order: ExportOrder) -> Response:
     """Make a deliverable in the background, or refine the scan; the job."""
-    state, (drone, scan) = state_of(request), names_of(request)
-    note(request, "export", scan=f"{drone}/{scan}")
-    order = await body_of(request, ExportOrder)
     note(request, "export", **msgspec.structs.asdict(order))
-    folder = state.library.folder(drone, scan)
     try:
         options = ExportOptions(vertical_datum=order.vertical_datum, to_datum=order.to_datum)
     except ValueError as error:
         raise InputError(f"the request is not valid: {error}"[:300]) from error
-    return JSONResponse(state.jobs.start(folder, order.kind, options=options), 202)
+    job = state_of(request).jobs.start(folder_of(request), order.kind, options=options)
+    return JSONResponse(job, 202)
 
 
-async def _align(request: Request) -> Response:
+@changing("align", AlignOrder)
+def _align(request: Request, order: AlignOrder) -> Response:
     """Place a scan without georeference by points, and align it with another or a site; the job."""
-    state, (drone, scan) = state_of(request), names_of(request)
-    note(request, "align", scan=f"{drone}/{scan}")
-    order = await body_of(request, AlignOrder)
     note(request, "align", to=f"{order.drone}/{order.scan}", points=len(order.points))
-    folder = state.library.folder(drone, scan)
+    state, folder = state_of(request), folder_of(request)
     other = state.library.folder(order.drone, order.scan)
-    store, start = state.library.store, StartPoints(order.points)
-    work = partial(align_by_points, store, state.limits, other, folder, start)
+    start = StartPoints(order.points)
+    work = partial(align_by_points, state.library.store, state.limits, other, folder, start)
     return JSONResponse(state.jobs.start(folder, "align", work), 202)
 
 
@@ -356,6 +339,7 @@ def _jobs(request: Request) -> Response:
     return JSONResponse([job | {"title": job_title(job["kind"])} for job in jobs])
 
 
+@changing("cancel")
 def _cancel(request: Request) -> Response:
     """Cancel a job that waits or runs; the job."""
     number = request.path_params["number"]
@@ -368,6 +352,7 @@ def _bin(request: Request) -> Response:
     return JSONResponse(state_of(request).library.bin())
 
 
+@changing("restore")
 def _restore(request: Request) -> Response:
     """Bring a scan back; its drone and scan."""
     name = request.path_params["name"]
@@ -376,15 +361,14 @@ def _restore(request: Request) -> Response:
     return JSONResponse({"drone": drone, "scan": scan})
 
 
-async def _import(request: Request) -> Response:
+@changing("import", ImportOrder)
+def _import(request: Request, order: ImportOrder) -> Response:
     """Copy the known files of a scan folder, or an MCAP, of this machine in; 409 while another
     import runs."""
-    note(request, "import")
-    folder = (await body_of(request, ImportOrder)).folder
-    note(request, "import", folder=folder)
-    if not folder or "\0" in folder:
+    note(request, "import", folder=order.folder)
+    if not order.folder or "\0" in order.folder:
         raise InputError("give the folder or the .mcap to import")
-    drone, scan = await run_in_threadpool(state_of(request).library.bring_in, Path(folder))
+    drone, scan = state_of(request).library.bring_in(Path(order.folder))
     note(request, "import", scan=f"{drone}/{scan}")
     return JSONResponse({"drone": drone, "scan": scan}, 201)
 
@@ -429,9 +413,9 @@ async def _upload(request: Request) -> Response:
     return JSONResponse({"drone": drone, "scan": scan}, 201)
 
 
+@changing("logout")
 def _logout(request: Request) -> Response:
     """End this browser's session."""
-    note(request, "logout")
     return logged_out(request, request.app.state.tokens)
 
 
@@ -453,17 +437,16 @@ def _figures(request: Request) -> Response:
     return JSONResponse({"connected": None} if vehicle is None else vehicle.figures())
 
 
-async def _order(request: Request) -> Response:
+@changing("order", VehicleOrder)
+def _order(request: Request, order: VehicleOrder) -> Response:
     """Give an order to the companion; 429 when they come too fast, but for stop."""
-    note(request, "order")
-    wanted = await body_of(request, VehicleOrder)
-    note(request, wanted.action, metres=wanted.metres)
+    note(request, order.action, metres=order.metres)
     vehicle = state_of(request).vehicle
     if vehicle is None:
         raise InputError("no vehicle: start with 'skyrelief ground --vehicle ENDPOINT'")
-    if wanted.action != "stop" and not request.app.state.order_pace.take():
+    if order.action != "stop" and not request.app.state.order_pace.take():
         raise HTTPException(429, "too many commands; wait a second", {"retry-after": "1"})
-    return JSONResponse(await run_in_threadpool(vehicle.order, wanted.action, wanted.metres))
+    return JSONResponse(vehicle.order(order.action, order.metres))
 
 
 def _metrics(request: Request) -> Response:
@@ -487,7 +470,7 @@ async def _live(socket: WebSocket) -> None:
     """WebSocket: chunks, corrections and track as they come."""
     state = state_of(socket)
     try:
-        folder = state.library.folder(*names_of(socket))
+        folder = folder_of(socket)
     except InputError as error:
         await socket.close(1008, str(error)[:100])
         return
@@ -509,15 +492,3 @@ async def _live(socket: WebSocket) -> None:
     finally:
         state.live_views -= 1
         state.views_without_token -= without_token
-
-
-BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {
-    _label: LabelChange,
-    _annotate: NewAnnotation,
-    _export: ExportOrder,
-    _align: AlignOrder,
-    _import: ImportOrder,
-    _order: VehicleOrder,
-    **CONTROL_BODIES,
-}
-"""Bodies of the requests that take one."""

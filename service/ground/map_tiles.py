@@ -34,7 +34,7 @@ from service.ground.live_map import (
     on_map,
     pixel_m,
 )
-from service.ground.state import PortalState, names_of, state_of
+from service.ground.state import PortalState, folder_of, state_of
 from service.offline.exports.rasters import open_map
 from service.scans.coverage import Coverage
 from service.scans.writing import SUMMARY
@@ -86,7 +86,7 @@ def _tile(request: Request) -> Response:
 def _thumbnail(request: Request) -> Response:
     """The whole orthophoto of a scan as it is now, also while it grows, as bright as in the portal;
     transparent where nothing is known."""
-    state, folder = state_of(request), state_of(request).library.folder(*names_of(request))
+    state, folder = state_of(request), folder_of(request)
     with state.maps.lock:
         live = state.maps.view(folder)
         corners, exposure = _corners(live), live.exposure
@@ -115,7 +115,7 @@ def _asked(request: Request) -> tuple[PortalState, Path, str]:
     state, layer = state_of(request), request.path_params["layer"]
     if layer not in (*LAYERS, TERRAIN):
         raise InputError(f"no layer {layer[:40]}; there are {', '.join((*LAYERS, TERRAIN))}")
-    return state, state.library.folder(*names_of(request)), layer
+    return state, folder_of(request), layer
 
 
 def _png(image: U8) -> bytes:
@@ -363,7 +363,7 @@ WMTS_ZOOM = (
 
 def _wmts(request: Request) -> Response:
     """All layers of a scan as WMTS 1.0.0 capabilities, whose tiles are the XYZ ones."""
-    state, folder = state_of(request), state_of(request).library.folder(*names_of(request))
+    state, folder = state_of(request), folder_of(request)
     with state.maps.lock:
         bounds = dict(zip(BOUNDS, _bounds(state.maps.view(folder)), strict=True))
     tiles = escape(f"{request.base_url}tiles/{folder.parent.name}/{folder.name}")

@@ -19,7 +19,7 @@ from starlette.routing import Route
 from recon.types import Keyframe
 from service.errors import InputError
 from service.ground.live import FlightPath
-from service.ground.state import names_of, state_of
+from service.ground.state import folder_of, names_of, state_of
 from service.ground.storage import is_regular
 from service.offline.exports import EXPORTERS
 from service.offline.exports.maps import MANIFEST
@@ -80,7 +80,7 @@ def _file(request: Request) -> Response:
 
 def _maps(request: Request) -> Response:
     """All maps in one zip, as the deliverable ``all`` has left them."""
-    folder = state_of(request).library.folder(*names_of(request)) / MAPS
+    folder = folder_of(request) / MAPS
     if not is_regular(folder / MANIFEST):
         raise InputError(f"no maps yet; make {MAPS_KIND!r} first")
     name = f"{request.path_params['scan']}-maps.zip"
@@ -124,7 +124,7 @@ def zip_parts(folder: Path) -> Iterator[bytes]:
 
 def _tile(request: Request) -> Response:
     """A file of the scan's 3D Tiles, from ``3dtiles/`` or a folder in it."""
-    folder = state_of(request).library.folder(*names_of(request)) / "3dtiles"
+    folder = folder_of(request) / "3dtiles"
     *inner, name = request.path_params["name"].split("/")
     fit = TILE.fullmatch(name) and all(re.fullmatch(r"[A-Za-z0-9_]{1,80}", part) for part in inner)
     path = folder.joinpath(*inner, name) if fit and len(inner) < DEEPEST_TILE else folder
@@ -135,17 +135,21 @@ def _tile(request: Request) -> Response:
 
 def _image(request: Request) -> Response:
     """The JPEG of a whole keyframe, finest where it is new; of an older scan only what was new."""
-    folder = state_of(request).library.folder(*names_of(request))
-    if not SEQ.fullmatch(request.path_params["seq"]):
-        raise InputError("no such keyframe")
-    seq = int(request.path_params["seq"])
-    with ScanStore.peek(folder / "scan.db") as store:
+    seq = seq_of(request)
+    with ScanStore.peek(folder_of(request) / "scan.db") as store:
         data, keyframe = store.image(seq), store.keyframe(seq)
     if keyframe is not None:
         data = _jpeg(keyframe, data)
     if data is None:
         raise InputError("no such keyframe")
     return Response(data, media_type="image/jpeg")
+
+
+def seq_of(request: Request) -> int:
+    """The keyframe in the path. Raises InputError for what is no number of one."""
+    if not SEQ.fullmatch(request.path_params["seq"]):
+        raise InputError("no such keyframe")
+    return int(request.path_params["seq"])
 
 
 def _jpeg(keyframe: Keyframe, image: bytes | None) -> bytes:
@@ -161,8 +165,7 @@ def _jpeg(keyframe: Keyframe, image: bytes | None) -> bytes:
 
 def _coverage(request: Request) -> Response:
     """The coverage layer as it is now, also of a scan that still grows."""
-    state = state_of(request)
-    found = state.coverages.view(state.library.folder(*names_of(request))).found
+    found = state_of(request).coverages.view(folder_of(request)).found
     if found is None:
         raise InputError("no surface yet")
     if request.scope["path"].endswith(".png"):
@@ -172,8 +175,7 @@ def _coverage(request: Request) -> Response:
 
 def _track(request: Request) -> Response:
     """The flight path so far as GeoJSON: longitude, latitude and metres above mean sea level."""
-    folder = state_of(request).library.folder(*names_of(request))
-    with ScanStore.peek(folder / "scan.db") as store:
+    with ScanStore.peek(folder_of(request) / "scan.db") as store:
         frame, path = local_frame(store.header), FlightPath(store)
         path.grown()
     if frame is None:
@@ -188,11 +190,11 @@ def _track(request: Request) -> Response:
 def _refly(request: Request) -> Response:
     """A flight over the gaps and weak places as they are now: geojson (lines and the ground that
     their images cover), plan (QGroundControl) or waypoints (Mission Planner)."""
-    state, kind = state_of(request), request.path_params["kind"]
+    kind = request.path_params["kind"]
     if kind not in ("geojson", "plan", "waypoints"):
         raise InputError("there is refly.geojson, refly.plan and refly.waypoints")
-    folder = state.library.folder(*names_of(request))
-    found = state.coverages.view(folder).found
+    folder = folder_of(request)
+    found = state_of(request).coverages.view(folder).found
     if found is None or found.frame is None:
         raise InputError("no surface yet" if found is None else "the scan has no georeference")
     with ScanStore.peek(folder / "scan.db") as store:

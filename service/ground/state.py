@@ -289,3 +289,8 @@ def state_of(connection: HTTPConnection) -> PortalState:
 def names_of(connection: HTTPConnection) -> tuple[str, str]:
     """Drone and scan in the path, unchecked."""
     return connection.path_params["drone"], connection.path_params["scan"]
+
+
+def folder_of(connection: HTTPConnection) -> Path:
+    """The folder of the scan in the path. Raises InputError when there is none."""
+    return state_of(connection).library.folder(*names_of(connection))
