@@ -14,7 +14,6 @@ import logging
 import os
 import re
 import secrets
-import stat
 import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -22,14 +21,17 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
-from starlette.websockets import WebSocket
+from starlette.websockets import WebSocketClose
 
-from service.errors import InputError, OutsideError
+from service.errors import InputError
 from service.listener import BoundedListener, Peer, host_name, is_loopback
+from service.scans.writing import writing
+from service.small_file import read_small
 
 log = logging.getLogger(__name__)
 
@@ -123,20 +125,12 @@ def parse_tokens(text: str) -> dict[str, str]:
 def read_tokens(path: Path) -> str:
     """The text of a token file. Raises InputError, in one line, when it cannot be used."""
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        with open(handle, encoding="utf-8") as file:
-            mode = os.fstat(handle).st_mode
-            if not stat.S_ISREG(mode):
-                raise InputError(f"portal token {path} is not a regular file")
-            text = file.read(MAX_TOKEN_FILE_BYTES)
-    except (OSError, ValueError) as error:
-        raise InputError(f"portal token {path} cannot be read ({error})") from error
-    try:
+        text = read_small(path, MAX_TOKEN_FILE_BYTES, "file of tokens").decode()
         parse_tokens(text)
-    except InputError as error:
+        if path.stat().st_mode & 0o077:
+            log.warning("portal token %s can be read by others; chmod 600 %s", path, path)
+    except (InputError, OSError, UnicodeDecodeError) as error:
         raise InputError(f"portal token {path}: {error}") from error
-    if mode & 0o077:
-        log.warning("portal token %s can be read by others; chmod 600 %s", path, path)
     return text
 
 
@@ -147,17 +141,9 @@ def kept_token(store: Path) -> str:
     """
     path = store / TOKEN_FILE
     if not path.exists():
-        part = store / f".{TOKEN_FILE}-{secrets.token_hex(4)}"
-        try:
-            store.mkdir(parents=True, exist_ok=True)
-            handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-            with open(handle, "w", encoding="ascii") as file:
-                file.write(secrets.token_urlsafe(24) + "\n")
-                file.flush()
-                os.fsync(handle)
-            os.replace(part, path)
-        except OSError as error:
-            raise OutsideError(f"portal token {path} cannot be written ({error})") from error
+        with writing(path) as part:
+            part.touch(0o600)
+            part.write_text(f"{secrets.token_urlsafe(24)}\n", encoding="ascii")
     return read_tokens(path)
 
 
@@ -363,17 +349,14 @@ WHO = "skyrelief.who"
 """Key of a request's scope for its sender; None without a token."""
 
 CHANGING = {"POST", "PATCH", "DELETE", "PUT"}
-HEADERS = (
-    (b"x-content-type-options", b"nosniff"),
-    (b"referrer-policy", b"no-referrer"),
-    (b"cross-origin-resource-policy", b"same-origin"),
-    (
-        b"content-security-policy",
-        b"default-src 'self'; script-src 'self' 'wasm-unsafe-eval';"
-        b" img-src 'self' blob: data:; style-src 'self' 'unsafe-inline';"
-        b" connect-src 'self' blob:; worker-src 'self' blob:; frame-ancestors 'none'",
-    ),
-)
+HEADERS = {
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-resource-policy": "same-origin",
+    "content-security-policy": "default-src 'self'; script-src 'self' 'wasm-unsafe-eval';"
+    " img-src 'self' blob: data:; style-src 'self' 'unsafe-inline';"
+    " connect-src 'self' blob:; worker-src 'self' blob:; frame-ancestors 'none'",
+}
 """On every answer, refusals too. Starlette has no layer for them, and a package only the values."""
 
 
@@ -399,8 +382,12 @@ class Guard:
         opening = scope["path"] == "/" and "token" in connection.query_params
         refusal = self._refusal(connection, who, opening)
         if refusal is not None:
-            self._note_refusal(connection, who, refusal[0])
-            await _refuse(scope, receive, send, refusal)
+            status, reason = refusal
+            self._note_refusal(connection, who, status)
+            answer: ASGIApp = JSONResponse({"error": reason}, status, CLOSE)
+            if scope["type"] == "websocket":
+                answer = WebSocketClose(1008, reason[:100])
+            await answer(scope, receive, send)
         elif opening and scope["type"] == "http":
             await self._open(connection)(scope, receive, send)
         elif scope.get("method") in CHANGING:
@@ -415,14 +402,12 @@ class Guard:
             return self._tokens.name_of(bearer)
         return self._tokens.holder_of(session)
 
-    def _renewal(self, connection: HTTPConnection, session: str) -> list[tuple[bytes, bytes]]:
+    def _renewal(self, connection: HTTPConnection, session: str) -> list[tuple[str, str]]:
         """The header with the session's next cookie when it is due."""
-        following = self._tokens.renewed(session)
-        if following is None:
-            return []
-        answer = Response()
-        _set_cookie(answer, connection, following)
-        return [(b"set-cookie", answer.headers["set-cookie"].encode())]
+        answer, following = Response(), self._tokens.renewed(session)
+        if following is not None:
+            _set_cookie(answer, connection, following)
+        return [(name, value) for name, value in answer.headers.items() if name == "set-cookie"]
 
     def _refusal(
         self, connection: HTTPConnection, who: str | None, opening: bool
@@ -500,23 +485,16 @@ def where(connection: HTTPConnection) -> str:
     return connection.client.host if connection.client is not None else ""
 
 
-async def _refuse(scope: Scope, receive: Receive, send: Send, refusal: tuple[int, str]) -> None:
-    status, reason = refusal
-    if scope["type"] == "websocket":
-        await WebSocket(scope, receive, send).close(1008, reason[:100])
-        return
-    await JSONResponse({"error": reason}, status, CLOSE)(scope, receive, send)
+def _with_headers(send: Send, *more: tuple[str, str]) -> Send:
+    """``send`` that puts the safety headers, and more, on every answer."""
 
-
-def _with_headers(send: Send, *more: tuple[bytes, bytes]) -> Send:
     async def wrapped(message: Message) -> None:
         if message["type"] == "http.response.start":
-            present = {name.lower() for name, _ in message["headers"]}
-            message["headers"] = [
-                *message["headers"],
-                *more,
-                *(pair for pair in HEADERS if pair[0] not in present),
-            ]
+            headers = MutableHeaders(scope=message)
+            for name, value in HEADERS.items():
+                headers.setdefault(name, value)
+            for name, value in more:
+                headers.append(name, value)
         await send(message)
 
     return wrapped
