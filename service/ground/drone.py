@@ -7,6 +7,7 @@ in use, and has a folder only once its valid header has arrived.
 from __future__ import annotations
 
 import logging
+import os
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -157,8 +158,7 @@ class DroneReceiver:
         return not self._scans and now - self.heard_at > self._limits.silent_s
 
     def handle(self, heads: dict[str, bytes], events: list[Event], now: float) -> list[Effect]:
-        """Take in the newest head of each scan and what else has come, and look after the scans;
-        what is to be done about it."""
+        """Take in the newest head of each scan and what else came; what is to be done about it."""
         if heads:
             self.heard_at = now
         for name, payload in heads.items():
@@ -238,7 +238,7 @@ class DroneReceiver:
     def _on_radio(self, event: Radio, now: float) -> None:
         self.heard_at = now
         header, kind, number, part, data = event
-        scan = self._scan(header.name, now) or self._open(header.name, now, header)
+        scan = self._scan(header.name, now, header)
         if scan is None or now < scan.rest_until:
             return
         store = scan.intake.store
@@ -258,26 +258,19 @@ class DroneReceiver:
         self.news_at = now
 
     def _rest(self, scan: ReceivedScan, trouble: str, now: float) -> None:
-        """Pause a scan that cannot be written; missing items are requested later.
-
-        One whose database was deleted is forgotten: the drone's next head begins it again.
-        """
+        """Pause a scan that cannot be written; one whose folder was deleted begins again."""
         if trouble != scan.trouble:
             log.error("%s; trying again every %.0f s", trouble, self._limits.full_disk_rest_s)
         scan.trouble, scan.rest_until = trouble, now + self._limits.full_disk_rest_s
-        try:
-            scan.intake.store.path.stat()
-        except FileNotFoundError:
+        if not os.path.isdir(scan.folder):
             self._scans.pop(scan.name, None)
             scan.intake.store.close()
-        except OSError as error:
-            log.debug("%s", error)
 
     def _introduce(self, name: str, payload: bytes, now: float) -> None:
         """Take in an item of a scan without a folder; a valid header makes the folder."""
         introduction = self._introductions[name]
         header = introduction.on_items(payload, now)
-        scan = None if header is None else self._open(name, now, header)
+        scan = None if header is None else self._scan(name, now, header)
         if scan is None or introduction.head is None:
             return
         del self._introductions[name]
@@ -288,18 +281,15 @@ class DroneReceiver:
 
     # Open scans
 
-    def _scan(self, name: str, now: float) -> ReceivedScan | None:
-        """The scan, opened if need be; None when it has no folder or cannot be opened."""
+    def _scan(self, name: str, now: float, header: ScanHeader | None = None) -> ReceivedScan | None:
+        """The scan, opened if need be, or made with the ``header``; None where that cannot be."""
         found = self._scans.get(name)
         if found is not None:
             self._scans.move_to_end(name)
             found.used_at = now
-        elif now >= self._unreadable.get(name, now):
-            found = self._open(name, now)
-        return found
-
-    def _open(self, name: str, now: float, header: ScanHeader | None = None) -> ReceivedScan | None:
-        """The scan, opened, or made with the ``header``; None where that cannot be."""
+            return found
+        if now < self._unreadable.get(name, now):
+            return None
         if not self._has_room(now):
             self.dropped += 1
             return None
@@ -327,10 +317,7 @@ class DroneReceiver:
         return scan
 
     def _has_room(self, now: float) -> bool:
-        """Close the scans used longest ago until one more may be open.
-
-        Those that are coming in just now stay: another scan of this drone waits for its turn.
-        """
+        """Close scans used longest ago until one more may be open; none that is coming in."""
         for scan in self.scans:
             if len(self._scans) < self.max_open:
                 return True

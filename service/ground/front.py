@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import socket
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from typing import Any
 
 from service.errors import OutsideError
 from service.listener import (
@@ -28,8 +27,6 @@ from service.listener import (
 from service.stream.session import ENDPOINT, SessionConfig
 from service.workers import Worker
 
-log = logging.getLogger(__name__)
-
 LIMITS = ListenerLimits(total=512, per_address=128, wait_s=10.0)
 """64 drones may share an address, that of a router."""
 MAX_HANDSHAKES, MAX_OF_ADDRESS, KEPT = 48, 16, 12
@@ -40,9 +37,11 @@ HANDSHAKE_S = 12.0
 ADMITTED = 2
 """Replies of Zenoh after which it has checked the other end: the second of TLS needs its
 certificate."""
-BLOCK_BYTES = 65_536
-LOOK_S, SWEEP_S = 0.1, 1.0
+BLOCK_BYTES = 16_384
+LOOK_S = 0.1
 BACKLOG = 512
+
+Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 class Front:
@@ -72,8 +71,6 @@ class Front:
                 f"datalink does not open at {self.endpoint}: {error.strerror}; another program may "
                 "have this port, such as a second ground station"
             ) from error
-        listener.listen(BACKLOG)
-        listener.setblocking(False)
         return listener
 
     def close(self) -> None:
@@ -89,60 +86,47 @@ class Front:
             listener.close()
 
     async def _serve(self, worker: Worker, listener: BoundedListener) -> None:
-        accepting = asyncio.create_task(self._accept(listener))
-        loop, sweep_at = asyncio.get_running_loop(), 0.0
-        while not worker.stop.is_set() and not accepting.done():
-            if loop.time() >= sweep_at:
-                sweep_at = loop.time() + SWEEP_S
-                listener.sweep()
+        async def accept(*outer: Any) -> None:
+            with contextlib.closing(outer[1]), contextlib.suppress(OSError):
+                await self._pass(listener, outer)
+
+        server = await asyncio.start_server(
+            accept, sock=listener, backlog=BACKLOG, limit=BLOCK_BYTES
+        )
+        while not worker.stop.is_set():
+            listener.sweep()
             await asyncio.sleep(LOOK_S)
-        accepting.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await accepting  # its fault, if it has one
+        server.close()
 
-    async def _accept(self, listener: BoundedListener) -> None:
-        loop, passing = asyncio.get_running_loop(), set[asyncio.Task[None]]()
-        while True:
-            await asyncio.sleep(0)  # a connection that waits already would not let others run
-            try:
-                outer, address = await loop.sock_accept(listener)
-            except ConnectionError:  # over the limits, or gone already
-                continue
-            except OSError as error:
-                log.warning("datalink at %s: %s", self.endpoint, error)
-                await asyncio.sleep(SWEEP_S)
-                continue
-            task = asyncio.create_task(self._pass(listener, outer, address[:2]))
-            passing.add(task)
-            task.add_done_callback(passing.discard)
-
-    async def _pass(self, listener: BoundedListener, outer: socket.socket, peer: Peer) -> None:
+    async def _pass(self, listener: BoundedListener, outer: Stream) -> None:
         """Pass the bytes of one connection until an end closes it."""
+        peer: Peer = (outer[1].get_extra_info("peername") or ("", 0))[:2]
         loop, network = asyncio.get_running_loop(), network_of(peer[0])
-        with outer, contextlib.suppress(OSError):
-            first = await loop.sock_recv(outer, BLOCK_BYTES)
-            if not first:
+        first = await outer[0].read(BLOCK_BYTES)
+        if not first:
+            return
+        deadline = loop.time() + LIMITS.wait_s
+        while not self._has_place(network):
+            await asyncio.sleep(LOOK_S)
+            if loop.time() > deadline or outer[0].at_eof():
                 return
-            deadline = loop.time() + LIMITS.wait_s
-            while not self._has_place(network):
-                await asyncio.sleep(LOOK_S)
-                if loop.time() > deadline or _is_closed(outer):
-                    return
-            self._handshakes[network] += 1
-            handshake = _Handshake(partial(self._end_handshake, network))
-            with socket.socket() as inner, contextlib.closing(handshake):
-                inner.setblocking(False)
-                for end in (outer, inner):
-                    end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                await loop.sock_connect(inner, self._inner)
-                await loop.sock_sendall(inner, first)
-                await _exchange(outer, inner, handshake, partial(listener.begin, peer))
-                outer.close()
-                inner.shutdown(socket.SHUT_WR)
+        self._handshakes[network] += 1
+        with contextlib.ExitStack() as handshake:
+            handshake.callback(self._end_handshake, network)
+            inner = await asyncio.open_connection(*self._inner, limit=BLOCK_BYTES)
+
+            def admit() -> None:
+                handshake.close()
+                listener.begin(peer)
+
+            with contextlib.closing(inner[1]):
+                inner[1].write(first)
+                is_over = await _exchange(outer, inner, admit)
+                outer[1].close()
+                inner[1].write_eof()
                 with contextlib.suppress(asyncio.TimeoutError):
-                    while not handshake.is_over:  # Zenoh still works on it
-                        data = await asyncio.wait_for(loop.sock_recv(inner, 4096), HANDSHAKE_S)
-                        handshake.is_over = not data
+                    while not is_over:  # Zenoh still works on it
+                        is_over = not await asyncio.wait_for(inner[0].read(4096), HANDSHAKE_S)
 
     def _has_place(self, network: str) -> bool:
         own, total = self._handshakes[network], sum(self._handshakes.values())
@@ -154,60 +138,38 @@ class Front:
             del self._handshakes[network]
 
 
-class _Handshake:
-    """A connection's handshake with Zenoh; ``ended`` is called once."""
+async def _exchange(outer: Stream, inner: Stream, admit: Callable[[], None]) -> bool:
+    """Pass bytes both ways until an end closes; ``admit`` is called once Zenoh has admitted it.
 
-    def __init__(self, ended: Callable[[], None]) -> None:
-        self._ended, self.is_over = ended, False
-        self._is_counted = True
-
-    def close(self) -> None:
-        """Zenoh has admitted or refused it."""
-        self.is_over = True
-        if self._is_counted:
-            self._is_counted = False
-            self._ended()
-
-
-async def _exchange(
-    outer: socket.socket, inner: socket.socket, handshake: _Handshake, admit: Callable[[], None]
-) -> None:
-    """Pass bytes both ways until an end closes; ``admit`` is called once Zenoh has admitted it."""
-    loop = asyncio.get_running_loop()
+    Returns whether it has, or has refused it.
+    """
     replies, is_answered = 0, False
 
     async def inwards() -> None:
         nonlocal is_answered
-        while data := await loop.sock_recv(outer, BLOCK_BYTES):
+        while data := await outer[0].read(BLOCK_BYTES):
             is_answered = False
-            await loop.sock_sendall(inner, data)
+            inner[1].write(data)
+            await inner[1].drain()
 
     async def outwards() -> None:
         nonlocal replies, is_answered
-        while data := await loop.sock_recv(inner, BLOCK_BYTES):
+        while data := await inner[0].read(BLOCK_BYTES):
             if not is_answered:
                 is_answered, replies = True, replies + 1
                 if replies == ADMITTED:
-                    handshake.close()
                     admit()
-            await loop.sock_sendall(outer, data)
-        handshake.close()
+            outer[1].write(data)
+            await outer[1].drain()
 
     tasks = [asyncio.create_task(inwards()), asyncio.create_task(outwards())]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        return replies >= ADMITTED or tasks[1].done()
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-
-
-def _is_closed(connection: socket.socket) -> bool:
-    """Whether the other end, or the listener, has closed it."""
-    try:
-        return not connection.recv(1, socket.MSG_PEEK)
-    except BlockingIOError:
-        return False
 
 
 def behind_fronts(session: SessionConfig) -> tuple[SessionConfig, list[Front]]:

@@ -103,11 +103,11 @@ class LiveMap:
         self._points = lru_cache(maxsize=64)(self._points_of)
 
     @property
-    def bounds(self) -> tuple[float, float, float, float] | None:
-        """(west, north, east, south) in the square of Web Mercator; None without surface."""
+    def bounds(self) -> tuple[float, float, float, float]:
+        """(west, north, east, south) in the square of Web Mercator; InputError without surface."""
         boxes = np.array(list(self._boxes.values())).reshape(-1, 4)
         if not np.isfinite(boxes).any():
-            return None
+            raise InputError("no surface yet")
         west, north = np.nanmin(boxes[:, :2], axis=0).tolist()
         east, south = np.nanmax(boxes[:, 2:], axis=0).tolist()
         return west, north, east, south

@@ -89,7 +89,7 @@ def _thumbnail(request: Request) -> Response:
     state, folder = state_of(request), folder_of(request)
     with state.maps.lock:
         live = state.maps.view(folder)
-        corners, exposure = _corners(live), live.exposure
+        corners, exposure = live.bounds, live.exposure
     zoom, columns, rows = _tiles_under(corners, THUMBNAIL_PX / SIDE)
     left, top, right, bottom = (int(v * (SIDE << zoom)) for v in corners)
     whole = np.vstack([
@@ -270,14 +270,6 @@ def coverage_image(found: Coverage, tile: Tile) -> U8:
     return np.asarray(out, np.uint8)
 
 
-def _corners(live: LiveMap) -> tuple[float, float, float, float]:
-    """(west, north, east, south) in the square of Web Mercator; InputError without surface."""
-    found = live.bounds
-    if found is None:
-        raise InputError("no surface yet")
-    return found
-
-
 def _tiles_under(
     corners: tuple[float, float, float, float], wide: float
 ) -> tuple[int, range, range]:
@@ -292,7 +284,7 @@ def _tiles_under(
 
 def _bounds(live: LiveMap) -> tuple[float, float, float, float]:
     """(west, south, east, north) in degrees; InputError without surface."""
-    west, north, east, south = _corners(live)
+    west, north, east, south = live.bounds
     (n, w), (s, e) = degrees(west, north), degrees(east, south)
     return w, s, e, n
 
@@ -383,7 +375,7 @@ def _kml(request: Request) -> Response:
     """A layer as overlays for Google Earth and TAK, each fetched again every few seconds."""
     state, folder, layer = _asked(request)
     with state.maps.lock:
-        corners = _corners(state.maps.view(folder))
+        corners = state.maps.view(folder).bounds
     zoom, columns, rows = _tiles_under(corners, KML_TILES - 1)
     overlays = "".join(
         _overlay(f"{request.base_url}{_path(folder, layer)}/{zoom}/{x}/{y}.png", (zoom, x, y))

@@ -121,32 +121,31 @@ class Portal:
     def start(self) -> None:
         """Begin to serve; raises OutsideError when the address cannot be used."""
         config = self.config
-        self._listener = self._listen(config.port)
-        self._port = int(self._listener.getsockname()[1])
+        self._open(config.port)
         if not is_loopback(config.host) and not config.tls:
             log.warning("portal on %s without TLS: the token can be read in transit", config.host)
-        self._server = self._new_server(self._listener)
         self._worker = self._workers.start("portal", self._run)
 
-    def _listen(self, port: int) -> BoundedListener:
-        host = self.config.host
-        try:
-            # A quarter of the descriptors, so that the datalink has some.
-            return BoundedListener(host, port, fitting(ListenerLimits(), 4))
-        except OSError as error:
-            raise OutsideError(
-                f"portal: cannot listen on {host}:{port} ({error.strerror}); choose another address"
-            ) from error
-
-    def _new_server(self, listener: BoundedListener) -> Any:
+    def _open(self, port: int) -> None:
+        """Listen, with a new server. Raises OutsideError when the address cannot be used."""
         import uvicorn
 
+        config = self.config
+        try:
+            # A quarter of the descriptors, so that the datalink has some.
+            listener = BoundedListener(config.host, port, fitting(ListenerLimits(), 4))
+        except OSError as error:
+            raise OutsideError(
+                f"portal: cannot listen on {config.host}:{port} ({error.strerror}); "
+                "choose another address"
+            ) from error
+        self._listener, self._port = listener, int(listener.getsockname()[1])
         server_log = logging.getLogger("uvicorn.error")
         if not any(isinstance(found, _PacedWarnings) for found in server_log.filters):
             server_log.addFilter(_PacedWarnings())
-        return uvicorn.Server(
+        self._server = uvicorn.Server(
             uvicorn.Config(
-                RequestLimits(self.app, listener, self.config.body_s, self.config.stall_s),
+                RequestLimits(self.app, listener, config.body_s, config.stall_s),
                 http="h11",
                 loop="asyncio",
                 backlog=BACKLOG,
@@ -155,8 +154,8 @@ class Portal:
                 access_log=False,
                 lifespan="off",
                 ws_max_size=MAX_BODY_BYTES,
-                ssl_certfile=self.config.tls_certificate or None,
-                ssl_keyfile=self.config.tls_key or None,
+                ssl_certfile=config.tls_certificate or None,
+                ssl_keyfile=config.tls_key or None,
             )
         )
 
@@ -165,25 +164,18 @@ class Portal:
         assert self._listener is not None
         if worker.restarts:
             self._listener.close()
-            self._listener = self._listen(self._port)
-            self._server = self._new_server(self._listener)
+            self._open(self._port)
+        asyncio.run(self._serve(worker, self._listener))
+
+    async def _serve(self, worker: Worker, listener: BoundedListener) -> None:
+        """Serve; close the connections whose request does not come, once a second."""
         self.state.decoding = asyncio.Semaphore(2)  # each loop has its own
-        asyncio.run(self._serve(worker))
-
-    async def _serve(self, worker: Worker) -> None:
-        sweeper = asyncio.create_task(self._sweep(worker))
-        try:
-            await self._server.serve(sockets=[self._listener])
-        finally:
-            sweeper.cancel()
-
-    async def _sweep(self, worker: Worker) -> None:
-        """Close the connections whose request does not come, once a second."""
-        assert self._listener is not None
-        while True:
-            await asyncio.sleep(1.0)
+        serving = asyncio.create_task(self._server.serve(sockets=[listener]))
+        while not serving.done():
+            await asyncio.wait({serving}, timeout=1.0)
             worker.beat()
-            self._listener.sweep()
+            listener.sweep()
+        await serving  # its fault, if it has one
 
     def close(self) -> None:
         """End; open connections and the vehicle's link are closed, jobs cancelled."""

@@ -38,10 +38,7 @@ def folders_due(store: Path) -> list[Path]:
 
 
 def deliver(folder: Path) -> None:
-    """Write the scan's deliverables next to its database.
-
-    Raises InputError that names those which could not be made, OutsideError for the disk.
-    """
+    """Write the scan's deliverables; InputError names those which could not be made."""
     with ScanStore.open(folder / "scan.db") as store:
         failed = write_deliverables(folder, store, {})["failed"]
     if failed:
@@ -50,10 +47,9 @@ def deliver(folder: Path) -> None:
 
 
 def write_files(folder: Path, deliver: Callable[[Path], None] = deliver) -> tuple[str, bool]:
-    """Have ``deliver`` write a scan's files; what went wrong, and whether they stay due.
+    """Have ``deliver`` write a scan's files; what went wrong, and whether the disk refused one.
 
-    What the disk refuses stays due, whatever an earlier ``scan.json`` says; a fault in the scan
-    itself would only come again. What arrives meanwhile marks the folder again.
+    That stays due, whatever an earlier ``scan.json`` says; a fault in the scan would come again.
     """
     is_refused = False
 

@@ -16,7 +16,6 @@ import contextlib
 import itertools
 import logging
 import queue
-import resource
 import threading
 import time
 from collections import deque
@@ -24,18 +23,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import zenoh
 
 from service.errors import InputError, SkyreliefError
 from service.ground import drone
-from service.ground.drone import DroneLimits, DroneReceiver, Get, Put, Write
 from service.ground.front import behind_fronts
-from service.ground.inbox import Inbox
 from service.ground.live_site import run as run_live_site
 from service.ground.received import ReceivedScan, deliver, folders_due, write_files
 from service.ground.sites import Sites
+from service.listener import raise_descriptor_limit
 from service.stream.naming import ROOT, place_of, station_name
 from service.stream.session import SessionConfig, check_endpoints, open_session
 from service.stream.tunnel import TunnelIntake
@@ -54,6 +52,11 @@ TICK_S, MAX_REST_S = 0.1, 0.5
 takes more than half of a core."""
 DESCRIPTORS_PER_SCAN, DESCRIPTOR_SHARE = 3, 4
 """An open scan holds so many; all of them together get this fraction (1/n) of the limit."""
+MAX_ITEM_BYTES, MAX_ITEMS = 8 << 20, 4096
+MAX_HEADS = 256
+"""Scans of one drone whose newest head may wait."""
+ITEM_BYTES = 200
+"""Bytes that a kept message takes beyond its payload."""
 MAX_RESTING = 256
 """Drones without a worker whose figures are kept."""
 STRANGER_S = 1.0
@@ -70,17 +73,57 @@ class ReceiverConfig:
 
     store: Path
     session: SessionConfig = field(default_factory=lambda: SessionConfig(mode="router"))
-    limits: DroneLimits = field(default_factory=DroneLimits)
+    limits: drone.DroneLimits = field(default_factory=drone.DroneLimits)
     name: str = ""  # of this station; empty: made once and kept in the store
     sites: bool = False  # align finished scans that show the same ground
 
 
-class _Drone(NamedTuple):
-    """A drone; while its worker runs, that alone changes the scans."""
+class Drone:
+    """A drone's scans, which its worker alone changes, and what waits for them: put in from any
+    thread, and bounded so that no drone takes another's memory."""
 
-    scans: DroneReceiver
-    inbox: Inbox
     worker: Worker
+
+    def __init__(self, scans: drone.DroneReceiver) -> None:
+        self.scans = scans
+        self._changed = threading.Condition()
+        self._heads: dict[str, bytes] = {}  # scan to its newest
+        self._events: list[drone.Event] = []
+        self._bytes = 0
+        self.dropped = 0
+
+    def put_head(self, scan: str, payload: bytes) -> None:
+        """A head; it takes the place of one of the same scan that waits."""
+        with self._changed:
+            has_room = scan in self._heads or len(self._heads) < MAX_HEADS
+            if has_room:
+                self._heads[scan] = payload
+            self._note(has_room)
+
+    def put(self, event: drone.Event) -> None:
+        """Anything else; only what a drone sends may be too much, as the rest is of our own."""
+        with self._changed:
+            size = 0
+            if isinstance(event, drone.Item | drone.Radio):
+                size = len(event.data) + ITEM_BYTES
+            is_full = self._bytes + size > MAX_ITEM_BYTES or len(self._events) >= MAX_ITEMS
+            has_room = not size or not is_full
+            if has_room:
+                self._bytes += size
+                self._events.append(event)
+            self._note(has_room)
+
+    def _note(self, has_room: bool) -> None:
+        self.dropped += not has_room
+        self._changed.notify()
+
+    def take(self, timeout_s: float) -> tuple[dict[str, bytes], list[drone.Event]]:
+        """Heads and events that wait; without any, those that arrive within the timeout."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._heads or self._events, timeout_s)
+            taken = self._heads, self._events
+            self._heads, self._events, self._bytes = {}, [], 0
+            return taken
 
     @property
     def brought(self) -> int:
@@ -113,9 +156,9 @@ class Receiver:
         self._session_config = config.session
         self._sources: deque[tuple[Any, Callable[[], object]]] = deque()  # and what follows its end
         self._lock = threading.RLock()  # of the table of drones, and of the radio
-        self._drones: dict[str, _Drone] = {}  # the last begun last
+        self._drones: dict[str, Drone] = {}  # the last begun last
         self._tunnel = TunnelIntake()
-        self._writes: queue.PriorityQueue[tuple[int, int, Write, Inbox | None]]
+        self._writes: queue.PriorityQueue[tuple[int, int, drone.Write, Drone | None]]
         self._writes, self._serial = queue.PriorityQueue(), itertools.count()
         self._sites = Sites(config.store, config.limits)
         self._running: list[Worker] = []
@@ -136,7 +179,7 @@ class Receiver:
                 raise
             log.debug("%s", error)  # a station that only connects waits for its router
         for folder in folders_due(store):
-            self._write(LEFT, Write("", folder))
+            self._write(LEFT, drone.Write("", folder))
         self._running = [
             start("receiver", self._run),
             *(start(f"front {front.endpoint}", front.run) for front in fronts),
@@ -154,7 +197,7 @@ class Receiver:
                     one.worker.stop.set()
                 for one in self._all:
                     one.worker.join()
-                self._write(END, Write("", Path()))
+                self._write(END, drone.Write("", Path()))
             worker.join()
         self._running = []
 
@@ -162,9 +205,9 @@ class Receiver:
         """Take in a message of the narrow radio; from any thread."""
         with self._lock:
             for item in self._tunnel.receive(payload):
-                inbox = self._inbox(item[0].drone)
-                if inbox is not None:
-                    inbox.put(drone.Radio(*item))
+                one = self._drone(item[0].drone)
+                if one is not None:
+                    one.put(drone.Radio(*item))
 
     def progress(self) -> list[dict[str, Any]]:
         """One entry per scan: drone, scan, items held and missing, bytes, lags, folder."""
@@ -173,7 +216,7 @@ class Receiver:
     @property
     def dropped(self) -> int:
         """Messages that were malformed, foreign or too many."""
-        return self._dropped + sum(one.scans.dropped + one.inbox.dropped for one in self._all)
+        return self._dropped + sum(one.dropped + one.scans.dropped for one in self._all)
 
     @property
     def last_news_at(self) -> float:
@@ -242,48 +285,46 @@ class Receiver:
     def _take(self, key: str, payload: bytes) -> None:
         """Hand on what a drone has sent."""
         place = place_of(key)
-        inbox = None if place is None else self._inbox(place[0])
-        if place is None:
-            self._dropped += 1
-        elif inbox is not None and key.endswith("/head"):
-            inbox.put_head(place[1], payload)
-        elif inbox is not None:
-            inbox.put(drone.Item(place[1], payload))
+        one = self._drone(None if place is None else place[0])
+        if place is None or one is None:
+            return
+        if key.endswith("/head"):
+            one.put_head(place[1], payload)
+        else:
+            one.put(drone.Item(place[1], payload))
 
     # The drones
 
     @property
-    def _all(self) -> list[_Drone]:
+    def _all(self) -> list[Drone]:
         with self._lock:
             return list(self._drones.values())
 
     @property
-    def _busy(self) -> list[_Drone]:
+    def _busy(self) -> list[Drone]:
         return [one for one in self._all if not one.worker.is_done]
 
-    def _inbox(self, name: str) -> Inbox | None:
-        """That of a drone, its worker started if need be; None, and a message is dropped, when
-        there are too many."""
+    def _drone(self, name: str | None) -> Drone | None:
+        """A drone, its worker started if need be; None, and a message is dropped, without a name
+        and when there are too many."""
         with self._lock:
-            found = self._drones.get(name)
+            found, now = self._drones.get(name or ""), time.monotonic()
             if found is not None and not found.worker.is_done:
-                return found.inbox
-            now = time.monotonic()
-            if not self._has_room(now):
+                return found
+            if name is None or not self._has_room(now):
                 self._dropped += 1
-                if now - self._refused_at > REFUSAL_S:
+                if name is not None and now - self._refused_at > REFUSAL_S:
                     self._refused_at = now
                     log.warning("%s is not received: %d drones are", name, self.limits.drones)
                 return None
-            if name in self._drones:
-                scans, inbox, _ = self._drones.pop(name)
-            else:
-                scans = DroneReceiver(name, self._config.store, self.name, self.limits, now)
-                inbox = Inbox()
-            scans.heard_at = now
-            worker = self.workers.start(f"drone {name}", partial(self._receive, scans, inbox))
-            self._drones[name] = _Drone(scans, inbox, worker)
-            return inbox
+            one = self._drones.pop(name, None)
+            if one is None:
+                store, station = self._config.store, self.name
+                one = Drone(drone.DroneReceiver(name, store, station, self.limits, now))
+            one.scans.heard_at = now
+            one.worker = self.workers.start(f"drone {name}", partial(self._receive, one))
+            self._drones[name] = one
+            return one
 
     def _has_room(self, now: float) -> bool:
         """Whether one more drone may come. If need be one that never had a scan and is silent makes
@@ -305,46 +346,46 @@ class Receiver:
             min(silent, key=lambda one: (one.brought, one.scans.heard_at)).worker.stop.set()
         return False
 
-    def _forget(self, one: _Drone) -> None:
+    def _forget(self, one: Drone) -> None:
         one.worker.stop.set()
-        self._dropped += one.scans.dropped + one.inbox.dropped
+        self._dropped += one.dropped + one.scans.dropped
         del self._drones[one.scans.drone]
 
-    def _receive(self, scans: DroneReceiver, inbox: Inbox, worker: Worker) -> None:
+    def _receive(self, one: Drone, worker: Worker) -> None:
         """Take in what arrives from one drone, until the stop or until nothing more comes."""
-        now = time.monotonic()
+        scans, now = one.scans, time.monotonic()
         while not (worker.stop.is_set() or scans.is_idle(now)):
             worker.beat()
-            came = inbox.take(TICK_S)
+            came = one.take(TICK_S)
             began_s, now = time.thread_time(), time.monotonic()
-            soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-            room = soft // DESCRIPTOR_SHARE // DESCRIPTORS_PER_SCAN // max(1, len(self._busy))
+            descriptors = raise_descriptor_limit() // DESCRIPTOR_SHARE
+            room = descriptors // DESCRIPTORS_PER_SCAN // max(1, len(self._busy))
             scans.max_open = max(2, min(self.limits.open_scans, room))
             for effect in scans.handle(*came, now):
-                self._perform(inbox, effect)
+                self._perform(one, effect)
             worker.stop.wait(min(time.thread_time() - began_s, MAX_REST_S))
         for effect in scans.close(now):
-            self._perform(inbox, effect)
+            self._perform(one, effect)
 
     # Effects
 
-    def _perform(self, inbox: Inbox, effect: drone.Effect) -> None:
-        """Carry out what a drone's worker has decided; what follows goes to its inbox."""
+    def _perform(self, one: Drone, effect: drone.Effect) -> None:
+        """Carry out what a drone's worker has decided; what follows is put into it."""
         match effect:
-            case Put() | Get():
-                self._send(inbox, effect)
-            case Write():
-                self._write(ASKED, effect, inbox)
+            case drone.Put() | drone.Get():
+                self._send(one, effect)
+            case drone.Write():
+                self._write(ASKED, effect, one)
             case drone.Opened(scan):
                 self._opened(scan)
 
-    def _send(self, inbox: Inbox, effect: Put | Get) -> None:
+    def _send(self, one: Drone, effect: drone.Put | drone.Get) -> None:
         """Put or get; nothing happens while there is no session."""
         session, drop = self._session, zenoh.CongestionControl.DROP
         if session is None:
             return
         try:
-            if isinstance(effect, Put):
+            if isinstance(effect, drone.Put):
                 high = zenoh.Priority.INTERACTIVE_HIGH
                 session.put(*effect, priority=high, congestion_control=drop, express=True)
                 return
@@ -360,22 +401,22 @@ class Receiver:
         except zenoh.ZError as error:
             log.debug("%s is not sent: %s", effect.key, error)
             return
-        self._sources.append((replies, partial(inbox.put, effect.answered)))
+        self._sources.append((replies, partial(one.put, effect.answered)))
 
     def align(self, folder: Path) -> None:
         """Align a finished scan with those that show the same ground, if configured."""
         if self._config.sites:
             self._sites.put(folder)
 
-    def _write(self, turn: int, effect: Write, inbox: Inbox | None = None) -> None:
-        self._writes.put((turn, next(self._serial), effect, inbox))
+    def _write(self, turn: int, effect: drone.Write, one: Drone | None = None) -> None:
+        self._writes.put((turn, next(self._serial), effect, one))
 
     def _write_all(self, worker: Worker) -> None:
         """Write deliverables until the end; what a former process left is then for the next."""
         while (asked := self._writes.get())[0] != END:
-            _, _, effect, inbox = asked
+            _, _, effect, one = asked
             trouble, is_due = write_files(effect.folder, self._deliver)
-            if inbox is not None:
-                inbox.put(drone.Written(effect.scan, trouble, is_due))
+            if one is not None:
+                one.put(drone.Written(effect.scan, trouble, is_due))
             if effect.is_whole and not trouble:
                 self.align(effect.folder)

@@ -22,10 +22,16 @@ from loopback import free_port, until
 from paths import ROOT
 
 from service.config import DatalinkConfig
-from service.ground.drone import Answered, DroneLimits, Item
-from service.ground.inbox import MAX_HEADS, MAX_ITEM_BYTES, MAX_ITEMS, Inbox
+from service.ground.drone import Answered, DroneLimits, DroneReceiver, Item
 from service.ground.received import ReceivedScan
-from service.ground.receiver import Receiver, ReceiverConfig
+from service.ground.receiver import (
+    MAX_HEADS,
+    MAX_ITEM_BYTES,
+    MAX_ITEMS,
+    Drone,
+    Receiver,
+    ReceiverConfig,
+)
 from service.stream.link import DatalinkSender
 from service.stream.messages import split
 from service.stream.records import PoseRecord, ScanHeader
@@ -277,8 +283,8 @@ def test_a_scan_that_is_deleted_while_it_comes_in_is_received_anew(tmp_path: Pat
             onboard.close()
 
 
-def test_an_inbox_holds_no_more_than_its_bounds() -> None:
-    inbox = Inbox()
+def test_an_inbox_holds_no_more_than_its_bounds(tmp_path: Path) -> None:
+    inbox = Drone(DroneReceiver("red", tmp_path, "base", DroneLimits(), 0.0))
     for k in range(MAX_HEADS):
         inbox.put_head(f"scan-{k}", b"first")
     assert inbox.dropped == 0
