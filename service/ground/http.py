@@ -51,15 +51,24 @@ from service.ground.upload import Upload, check_parts
 from service.ground.vehicle import BUTTONS
 from service.offline.exports.view import ExportOptions
 from service.offline.site.start import Pair, StartPoints
-from service.scans.annotations import Line, LineString, Point, Spot, as_json, read_annotations
+from service.scans.annotations import (
+    Line,
+    LineString,
+    Point,
+    Spot,
+    add_annotation,
+    as_json,
+    delete_annotation,
+    read_annotations,
+)
 
 PAGE = Path(__file__).parent / "web" / "dist"
 COMPRESSED = [Middleware(GZipMiddleware, compresslevel=5)]
 """For what a slow network is to carry and is no image: the page, and the list, asked for again and
 again."""
 
-MAX_LIVE_VIEWS = 16
-MAX_VIEWS_WITHOUT_TOKEN = 8
+MAX_LIVE_VIEWS = {False: 8, True: 16}
+"""Without a token, and with one."""
 ORDERS_HZ, ORDERS_AT_ONCE = 1.0, 10
 """Rate limit of orders to the vehicle; a stop always passes."""
 
@@ -289,7 +298,8 @@ def _annotate(request: Request, new: NewAnnotation) -> Response:
         raise InputError("the request is not valid: it gives coordinates or a line")
     geometry = LineString(new.line) if new.line else Point(new.coordinates or (0.0, 0.0, 0.0))
     by = str(request.scope[WHO]).partition(".")[0]
-    made = state_of(request).library.annotate(*names_of(request), geometry, new.text, by)
+    with state_of(request).library.changing(*names_of(request)) as folder:
+        made = add_annotation(folder, geometry, new.text, by, time.time())
     return JSONResponse(as_json(made), 201)
 
 
@@ -298,7 +308,8 @@ def _erase_annotation(request: Request) -> Response:
     """Delete an annotation."""
     number = request.path_params["number"]
     note(request, "erase annotation", number=number)
-    state_of(request).library.erase_annotation(*names_of(request), number)
+    with state_of(request).library.changing(*names_of(request)) as folder:
+        delete_annotation(folder, number)
     return JSONResponse({})
 
 
@@ -425,7 +436,7 @@ def _status(request: Request) -> Response:
     return JSONResponse(
         {
             "up_s": round(time.monotonic() - state.started, 1),
-            "live_views": state.live_views,
+            "live_views": sum(state.live_views.values()),
             "receiving": state.progress(),
         }
     )
@@ -474,21 +485,13 @@ async def _live(socket: WebSocket) -> None:
     except InputError as error:
         await socket.close(1008, str(error)[:100])
         return
-    without_token = socket.scope[WHO] is None
-    anonymous = state.views_without_token
-    views, most = (
-        (anonymous, MAX_VIEWS_WITHOUT_TOKEN)
-        if without_token
-        else (state.live_views - anonymous, MAX_LIVE_VIEWS)
-    )
-    if views >= most:
+    has_token = socket.scope[WHO] is not None
+    if state.live_views[has_token] >= MAX_LIVE_VIEWS[has_token]:
         await socket.close(1013, "too many live views")
         return
-    state.live_views += 1
-    state.views_without_token += without_token
+    state.live_views[has_token] += 1
     try:
         await socket.accept()
         await serve_live(socket, state.library.store, folder, state.progress)
     finally:
-        state.live_views -= 1
-        state.views_without_token -= without_token
+        state.live_views[has_token] -= 1

@@ -21,7 +21,7 @@ import msgspec
 
 from service.errors import InputError, OutsideError, SkyreliefError
 from service.ground.mcap_import import header_in, store_from_mcap
-from service.ground.scan_facts import Labels, facts_of, labels_in
+from service.ground.scan_facts import Labels, facts_of, read_strictly
 from service.ground.storage import (
     OTHER_FILES,
     SITES,
@@ -36,13 +36,6 @@ from service.ground.storage import (
     workplace,
 )
 from service.offline.site import SITE
-from service.scans.annotations import (
-    Annotation,
-    LineString,
-    Point,
-    add_annotation,
-    delete_annotation,
-)
 from service.scans.folder import PIECE, write_deliverables
 from service.scans.writing import write_whole
 from service.stream.records import ScanHeader
@@ -173,8 +166,7 @@ class Library:
         ``edition`` is that of the labels the change was made on: ConflictError when they have
         changed since, and nothing is written. Without it the last of two changes holds.
         """
-        folder = self.folder(drone, scan)
-        with self._lock:
+        with self.changing(drone, scan) as folder:
             old = read_labels(folder)
             if edition is not None and edition != old.edition:
                 name = old.title or scan
@@ -189,27 +181,16 @@ class Library:
             write_whole(folder / LABELS, msgspec.json.encode(new))
         return new
 
-    def annotate(
-        self, drone: str, scan: str, geometry: Point | LineString, text: str, by: str
-    ) -> Annotation:
-        """Add a place with a text, or a named measurement, to a scan.
-
-        Raises InputError for an unfit text, or too many.
-        """
+    @contextlib.contextmanager
+    def changing(self, drone: str, scan: str) -> Iterator[Path]:
+        """The folder of a scan, which nobody else changes meanwhile."""
         folder = self.folder(drone, scan)
         with self._lock:
-            return add_annotation(folder, geometry, text, by, time.time())
-
-    def erase_annotation(self, drone: str, scan: str, number: int) -> None:
-        """Delete one annotation. Raises InputError when there is none of this number."""
-        folder = self.folder(drone, scan)
-        with self._lock:
-            delete_annotation(folder, number)
+            yield folder
 
     def delete(self, drone: str, scan: str) -> str:
         """Move a scan to the bin; the name it has there."""
-        folder = self.folder(drone, scan)
-        with self._lock:
+        with self.changing(drone, scan) as folder:
             name = f"{drone}~{scan}~{time.time_ns()}"
             _move(folder, self.store / BIN / name)
         with contextlib.suppress(OSError):
@@ -323,7 +304,7 @@ class Library:
 def read_labels(folder: Path) -> Labels:
     """The labels of a scan folder; none when the file is missing or unfit."""
     try:
-        found = labels_in(folder / LABELS)
+        found = read_strictly(folder / LABELS, Labels)
         return Labels(_title(found.title), _tags(found.tags), found.edition)
     except InputError:
         return Labels()

@@ -23,13 +23,12 @@ import numpy as np
 from recon import se3
 from recon.types import F64
 from service.errors import InputError, SkyreliefError
-from service.ground.scan_facts import UnixTime
+from service.ground.scan_facts import UnixTime, read_strictly
 from service.ground.sites import references
-from service.ground.storage import STORE_FILES, is_regular, scan_files
+from service.ground.storage import STORE_FILES, scan_files
 from service.offline.site import SAME_VISIT_S
 from service.offline.site.live import LiveSite, PlacedScan
 from service.scans.writing import write_whole
-from service.small_file import read_json
 from service.workers import Worker, guarded, python_command, run_process
 
 log = logging.getLogger(__name__)
@@ -37,7 +36,6 @@ log = logging.getLogger(__name__)
 FILE = ".live-site.json"
 """Where the scans in flight are shown; below the receiver's folder."""
 
-MAX_BYTES = 200_000
 POLL_S = 0.25
 GROWING_S = 60.0
 """A scan that did not change for so long is no longer in flight."""
@@ -189,18 +187,12 @@ class SiteNews:
         if written == self._seen:
             return None
         self._seen = written
-        scans = self._read()
+        scans: list[Shown] = []
+        with contextlib.suppress(InputError):
+            scans = read_strictly(self._path, list[Shown])
         own = next((one for one in scans if (one.drone, one.scan) == self._names), None)
         near = [one for one in scans if own and _is_for(own, one)]
         return json.dumps({"type": "site", "scans": [_entry(own, one) for one in near if own]})
-
-    def _read(self) -> list[Shown]:
-        if not is_regular(self._path):
-            return []
-        try:
-            return read_json(self._path, list[Shown], MAX_BYTES, "scans in flight")
-        except InputError:
-            return []
 
 
 def _is_for(own: Shown, one: Shown) -> bool:

@@ -109,11 +109,6 @@ class Labels(msgspec.Struct, frozen=True):
     edition: Count = 0  # counts the changes
 
 
-def labels_in(path: Path) -> Labels:
-    """The labels in ``path``; InputError for unfit ones."""
-    return _decoded(path, Labels)
-
-
 def facts_of(folder: Path) -> dict[str, Any]:
     """A scan's entry in the list, from its ``scan.json`` or else its store.
 
@@ -131,9 +126,9 @@ def ground_in(path: Path) -> Ground:
 
 
 def _of_summary(path: Path, kind: type[T]) -> T:
-    if _decoded(path, _Schema).schema != SCHEMA:
+    if read_strictly(path, _Schema).schema != SCHEMA:
         raise InputError(f"{path.name} was written by another version; update skyrelief")
-    return _decoded(path, kind)
+    return read_strictly(path, kind)
 
 
 def _from_store(store: ScanStore) -> Facts:
@@ -157,8 +152,8 @@ def _from_store(store: ScanStore) -> Facts:
     )
 
 
-def _decoded(path: Path, kind: type[T]) -> T:
-    """The content of a small file. Raises InputError when it is another, or a link."""
+def read_strictly(path: Path, kind: type[T]) -> T:
+    """The content of a small JSON file. Raises InputError when it is another, or a link."""
     if not is_regular(path):
         raise InputError(f"{path.name} is not a regular file")
     return read_json(path, kind, MAX_JSON_BYTES, "file of a scan")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import cv2
 import numpy as np
@@ -88,31 +87,28 @@ def _maps(request: Request) -> Response:
     return StreamingResponse(zip_parts(folder), media_type="application/zip", headers=headers)
 
 
-class _Pipe(io.RawIOBase):
+class _Pipe(list[bytes]):
     """Keeps what is written until it is taken: zipfile needs a file, and a package for streaming
     (zipstream-ng) would replace these lines only."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._kept: list[bytes] = []
-
-    def writable(self) -> bool:
-        return True
-
     def write(self, data: Any) -> int:
-        self._kept.append(bytes(data))
-        return len(self._kept[-1])
+        self.append(bytes(data))
+        return len(self[-1])
+
+    def flush(self) -> None:
+        pass
 
     def take(self) -> bytes:
         """The bytes written since the last call."""
-        out, self._kept = b"".join(self._kept), []
+        out = b"".join(self)
+        self.clear()
         return out
 
 
 def zip_parts(folder: Path) -> Iterator[bytes]:
     """The regular files of a folder as a zip, made while it is read."""
     pipe = _Pipe()
-    with zipfile.ZipFile(pipe, "w") as whole:
+    with zipfile.ZipFile(cast(IO[bytes], pipe), "w") as whole:
         for path in sorted(p for p in folder.iterdir() if is_regular(p)):
             about = zipfile.ZipInfo.from_file(path, path.name)
             with whole.open(about, "w", force_zip64=True) as out, open(path, "rb") as file:

@@ -7,7 +7,7 @@ import logging
 import math
 import threading
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -274,8 +274,7 @@ class PortalState:
     limits: DroneLimits  # of the disk
     coverages: OpenScans[LiveCoverage]
     maps: OpenScans[LiveMap]
-    live_views: int = 0
-    views_without_token: int = 0  # of these
+    live_views: Counter[bool] = field(default_factory=Counter)  # without a token, and with one
     decoding: asyncio.Semaphore = field(init=False)
     """Recordings opened at a time; who waits holds no thread."""
     started: float = field(default_factory=time.monotonic)

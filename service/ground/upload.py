@@ -249,9 +249,8 @@ class _Bounded:
 
     def read(self, size: int = -1) -> bytes:
         """As of a file; ValueError for more than MAX_LISTING_BYTES."""
-        if size > MAX_LISTING_BYTES:
-            raise ValueError("its table of contents is too large")
-        data = self._file.read(size if size >= 0 else MAX_LISTING_BYTES + 1)
+        most = MAX_LISTING_BYTES + 1
+        data = self._file.read(min(size, most) if size >= 0 else most)
         if len(data) > MAX_LISTING_BYTES:
             raise ValueError("its table of contents is too large")
         return data

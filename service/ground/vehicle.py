@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from service.errors import InputError, OutsideError
@@ -109,17 +110,14 @@ class Vehicle:
                 worker.stop.wait(1.0)
                 continue
             for name in HEARD:
-                operator.subscribe(name, self._keeper(name))
+                operator.subscribe(name, partial(self._keep, name))
             with self._lock:
                 self._operator = operator
             log.info("companion of system %d found at %s", operator.system, self.endpoint)
             return
 
-    def _keeper(self, name: str) -> Callable[[int, dict[str, Any]], None]:
-        def keep(_: int, fields: dict[str, Any]) -> None:
-            self._heard[name] = (time.monotonic(), fields)
-
-        return keep
+    def _keep(self, name: str, _: int, fields: dict[str, Any]) -> None:
+        self._heard[name] = (time.monotonic(), fields)
 
     def _last(self, name: str) -> dict[str, Any]:
         """The last message of a kind; empty when it is old. Home does not grow old."""
