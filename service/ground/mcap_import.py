@@ -44,8 +44,8 @@ log = logging.getLogger(__name__)
 
 HEADER = re.compile(r"scan (\S+) of (\S+), (.*), origin (\S+), (\S+), (\S+) m")
 MAX_WAITING = 4
-"""Keyframes of which something is missing: the recording has their parts one after the other."""
-USED = ("/points", "/image", "/camera", "/pose", "/fix", "/log")
+"""Times whose messages are gathered: the recording has those of a keyframe one after the other."""
+USED = ("/points", "/image", "/camera", "/pose", "/fix")
 UNKNOWN = np.diag([0.1**2] * 3 + [1.0] * 3)
 """Covariance of turn (rad) and place (m), which the file lacks; a larger turn would hide the
 position's in float32."""
@@ -88,20 +88,12 @@ def store_from_mcap(path: Path, out: Path) -> ScanStore:
     """
     store = ScanStore.create(out, header_in(path))
     try:
-        waiting: dict[int, dict[str, Any]] = {}
-        track = _Track(store)
-        count = 0
-        for topic, time_ns, message in messages(path, USED):
-            if topic in ("/points", "/image", "/camera"):
-                parts = waiting.setdefault(time_ns, {})
-                parts[topic] = message
-                if len(parts) == 3:
-                    count += _add_keyframe(store, waiting.pop(time_ns), time_ns)
-                elif len(waiting) > MAX_WAITING:
-                    del waiting[next(iter(waiting))]
-            elif topic in ("/pose", "/fix"):
-                track.add(topic, time_ns, message)
-        track.close()
+        track, count = _Track(store), 0
+        for time_ns, parts in _by_time(messages(path, USED)):
+            if "/pose" in parts:
+                track.add(time_ns, parts["/pose"], parts.get("/fix"))
+            if parts.keys() >= {"/points", "/image", "/camera"}:
+                count += _add_keyframe(store, parts, time_ns)
         if not count:
             raise InputError(f"{path} contains no keyframe; nothing to import")
         store.finish({"keyframes": count, "source": "mcap"})
@@ -109,6 +101,19 @@ def store_from_mcap(path: Path, out: Path) -> ScanStore:
         store.close()
         raise
     return store
+
+
+def _by_time(
+    found: Iterator[tuple[str, int, Any]],
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """The messages of each time, by topic, in the order of their first."""
+    waiting: dict[int, dict[str, Any]] = {}
+    for topic, time_ns, message in found:
+        waiting.setdefault(time_ns, {})[topic] = message
+        if len(waiting) > MAX_WAITING:
+            first = next(iter(waiting))
+            yield first, waiting.pop(first)
+    yield from waiting.items()
 
 
 def _add_keyframe(store: ScanStore, parts: dict[str, Any], time_ns: int) -> bool:
@@ -169,37 +174,26 @@ class _Track:
 
     def __init__(self, store: ScanStore) -> None:
         self._store = store
-        self._now: dict[str, Any] = {}  # the messages of one time
-        self._time_ns = 0
         self._before: tuple[int, F64] | None = None
         self._flown_m = 0.0
 
-    def add(self, topic: str, time_ns: int, message: Any) -> None:
-        """A pose or a fix; both of one time follow each other."""
-        if time_ns != self._time_ns:
-            self.close()
-            self._time_ns = time_ns
-        self._now[topic] = message
-
-    def close(self) -> None:
-        """Store what is complete."""
-        message, fix = self._now.get("/pose"), self._now.get("/fix")
-        self._now = {}
-        T = None if message is None else _transform(message.pose)
+    def add(self, time_ns: int, pose: Any, fix: Any) -> None:
+        """A pose with its fix, if there is one."""
+        T = _transform(pose.pose)
         if T is None:
             return
         speed = 0.0
         if self._before is not None:
             step = float(np.linalg.norm(T[:3, 3] - self._before[1][:3, 3]))
             self._flown_m += step
-            speed = step / max((self._time_ns - self._before[0]) / 1e9, 1e-3)
-        self._before = (self._time_ns, T)
+            speed = step / max((time_ns - self._before[0]) / 1e9, 1e-3)
+        self._before = (time_ns, T)
         own = UNKNOWN.copy()
         if fix is not None and len(fix.position_covariance) == 9:
             own[3:, 3:] = np.array(fix.position_covariance).reshape(3, 3)
         spread = float(np.sqrt(max(np.trace(own[3:, 3:]), 0.0)))
         record = PoseRecord(
-            self._time_ns,
+            time_ns,
             T,
             se3.about(-T[:3, 3], own),
             speed_m_s=min(speed, 1e4),
