@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 from service.errors import OutsideError, SkyreliefError
 from service.ground.intake import FINE, SILENCE_S, SMALL, Introduction, ScanIntake
 from service.ground.received import ReceivedScan
-from service.ground.storage import DiskShare, drone_folder, scan_folder, total_and_free
+from service.ground.storage import DiskShare, drone_folder, scan_folder
 from service.stream.messages import Ask, Head, count, pack, unpack
 from service.stream.naming import ROOT
 from service.stream.radio_messages import RADIO_NOTE
@@ -58,7 +59,7 @@ class DroneLimits:
     full_disk_rest_s: float = 10.0  # until a full disk is tried again
     refresh_s: float = 0.0  # write deliverables of growing scans so often; 0: when complete
     look_s: float = 1.0  # between two looks at the disk
-    usage: Callable[[Path], tuple[int, int]] = total_and_free  # bytes of a folder's disk
+    usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage  # of a folder's disk
 
 
 class Item(NamedTuple):

@@ -56,8 +56,7 @@ class PortalConfig:
     host: str = "127.0.0.1"
     port: int = 8080
     token: str = ""  # one, or lines of NAME TOKEN; empty: made at the start, only on this machine
-    tls_certificate: str = ""
-    tls_key: str = ""
+    tls: tuple[Path, Path] | None = None  # certificate and key
     basemap: Path | None = None  # an MBTiles or PMTiles file
     limits: drone.DroneLimits = field(default_factory=drone.DroneLimits)  # of the disk
     map_age_s: float = 1.0  # at which the live map of a scan is made again
@@ -75,10 +74,6 @@ class PortalConfig:
                 f"portal on {self.host}: others can reach it; "
                 f"give a token of {MIN_TOKEN_LETTERS} letters or more"
             )
-
-    @property
-    def tls(self) -> bool:
-        return bool(self.tls_certificate)
 
 
 class Portal:
@@ -105,7 +100,6 @@ class Portal:
         tokens = parse_tokens(config.token or secrets.token_urlsafe(24))
         self.token = next(iter(tokens.values()))
         self.app = portal_app(self.state, Tokens(tokens), is_loopback(config.host))
-        self._vehicle = vehicle
         self._listener: BoundedListener | None = None
         self._port = config.port
         self._server: Any = None
@@ -154,8 +148,8 @@ class Portal:
                 access_log=False,
                 lifespan="off",
                 ws_max_size=MAX_BODY_BYTES,
-                ssl_certfile=config.tls_certificate or None,
-                ssl_keyfile=config.tls_key or None,
+                ssl_certfile=config.tls and config.tls[0],
+                ssl_keyfile=config.tls and config.tls[1],
             )
         )
 
@@ -187,8 +181,8 @@ class Portal:
             self._worker.join(5.0)
         if self._listener is not None:
             self._listener.close()
-        if self._vehicle is not None:
-            self._vehicle.close()
+        if self.state.vehicle is not None:
+            self.state.vehicle.close()
 
 
 class _PacedWarnings(logging.Filter):
@@ -215,5 +209,4 @@ def config_of(
     for path in tls or ():
         if not path.is_file():
             raise InputError(f"portal certificate {path}: no such file")
-    certificate, key = (str(path) for path in tls) if tls else ("", "")
-    return PortalConfig(store, host, port, token, certificate, key, **rest)
+    return PortalConfig(store, host, port, token, tls, **rest)

@@ -39,12 +39,6 @@ class QuotaError(OutsideError):
     """A drone's share, or the disk without its reserve, is full; nothing was written."""
 
 
-def total_and_free(folder: Path) -> tuple[int, int]:
-    """Bytes of the disk of a folder."""
-    usage = shutil.disk_usage(folder)
-    return usage.total, usage.free
-
-
 class DiskShare:
     """Space that one drone may still use; use from one thread.
 
@@ -56,10 +50,10 @@ class DiskShare:
         folder: Path,
         share: float,
         reserve_bytes: int | None,
-        usage: Callable[[Path], tuple[int, int]] = total_and_free,
+        usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage,
         look_s: float = 1.0,
     ) -> None:
-        """``usage`` looks at the disk of a folder, every ``look_s``."""
+        """``usage`` gives total, used and free bytes of a folder's disk, asked every ``look_s``."""
         self._folder, self._usage, self._look_s = folder, usage, look_s
         self._share, self._reserve_bytes = share, reserve_bytes
         self._used_bytes, self._measured_at = 0, -1e9
@@ -95,10 +89,9 @@ class DiskShare:
         if now - self._looked_at >= self._look_s:
             self._looked_at = now
             try:
-                total_bytes, free_bytes = self._usage(existing(self._folder))
+                self._total_bytes, _, self._free_bytes = self._usage(existing(self._folder))
             except OSError as error:
                 raise OutsideError(f"cannot read the disk of {self._folder} ({error})") from error
-            self._total_bytes, self._free_bytes = total_bytes, free_bytes
         if now - self._measured_at >= MEASURE_S:
             self._measured_at = now
             self._used_bytes = folder_bytes(self._folder)

@@ -12,7 +12,7 @@ from service.ground.storage import DiskShare, QuotaError, folder_bytes
 
 def test_share_and_reserve_hold_to_the_byte(tmp_path: Path) -> None:
     def share_of(name: str, share: float, reserve_bytes: int | None) -> DiskShare:
-        return DiskShare(tmp_path / name, share, reserve_bytes, lambda _: (10_000, 3_000))
+        return DiskShare(tmp_path / name, share, reserve_bytes, lambda _: (10_000, 7_000, 3_000))
 
     (tmp_path / "red" / "scan").mkdir(parents=True)
     (tmp_path / "red" / "scan" / "scan.db").write_bytes(bytes(4_000))

@@ -245,7 +245,7 @@ def test_a_drone_over_its_share_of_the_disk_is_refused_and_another_is_not(tmp_pa
 def test_poses_stop_at_the_reserve_and_go_on_when_there_is_room(tmp_path: Path) -> None:
     """Poses and coarse layers count too, and a scan in the making says why it does not grow."""
     free = [1_000_000]
-    limits = DroneLimits(full_disk_rest_s=0.3, look_s=0.0, usage=lambda _: (10_000_000, free[0]))
+    limits = DroneLimits(full_disk_rest_s=0.3, look_s=0.0, usage=lambda _: (10_000_000, 0, free[0]))
     onboard = ScanStore.create(tmp_path / "a.db", ScanHeader("scan-1", "red", 1))
     with serving(tmp_path / "ground", limits) as (ground, endpoint):
         config = DatalinkConfig(connect=(endpoint,), budget_kbit_s=50_000.0)

@@ -185,9 +185,7 @@ def test_half_open_tls_handshakes_leave_the_portal_answering(store: Path, tmp_pa
     import ssl
 
     certificate, key = certificate_for(tmp_path)
-    config = PortalConfig(
-        store, port=0, token=TOKEN, tls_certificate=str(certificate), tls_key=str(key)
-    )
+    config = PortalConfig(store, port=0, token=TOKEN, tls=(certificate, key))
     portal = Portal(config)
     portal.start()
     held = []
