@@ -180,12 +180,9 @@ class AuditLog:
 
     def _append(self, line: bytes) -> None:
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
-        handle = os.open(self.path, flags, 0o600)
-        try:
-            os.write(handle, line)
-            size = os.fstat(handle).st_size
-        finally:
-            os.close(handle)
+        with open(os.open(self.path, flags, 0o600), "ab") as file:
+            file.write(line)
+            size = file.tell()
         if size > self._max_bytes:
             os.replace(self.path, self.path.with_name(f"{AUDIT_FILE}.1"))
 
@@ -258,9 +255,6 @@ class RequestLimits:
         self._body_s, self._stall_s = body_s, stall_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] not in ("http", "websocket"):
-            await self._app(scope, receive, send)
-            return
         peer: Peer | None = scope.get("client") and tuple(scope["client"])
         self._listener.begin(peer)
         try:

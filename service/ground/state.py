@@ -112,7 +112,7 @@ class Jobs:
         self.carry_out = carry_out
         self._worker: Worker | None = None  # while jobs wait
         self._lock = threading.Lock()
-        self._jobs: list[Job] = []
+        self._jobs: list[Job] = []  # replaced, not changed, so that anybody may iterate over it
         self._number = 0
 
     def start(
@@ -145,18 +145,15 @@ class Jobs:
 
     def of(self, folder: Path) -> list[dict[str, Any]]:
         """The jobs of a scan, the oldest first."""
-        with self._lock:
-            return [job.shown() for job in self._jobs if job.folder == folder]
+        return [job.shown() for job in self._jobs if job.folder == folder]
 
     def listed(self) -> list[dict[str, Any]]:
         """The jobs that wait, run or have ended lately, the oldest first."""
         since = time.time() - self._shown_s
-        with self._lock:
-            return [j.shown() for j in self._jobs if (j.ended_unix_s or since) >= since]
+        return [j.shown() for j in self._jobs if (j.ended_unix_s or since) >= since]
 
     def busy(self, folder: Path) -> bool:
-        with self._lock:
-            return any(job.folder == folder and not job.has_ended for job in self._jobs)
+        return any(job.folder == folder and not job.has_ended for job in self._jobs)
 
     def cancel(self, number: int) -> dict[str, Any]:
         """Take a waiting job off the queue, or stop a running one at its next step.
