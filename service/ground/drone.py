@@ -13,7 +13,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from service.errors import OutsideError, SkyreliefError
 from service.ground.intake import FINE, SILENCE_S, SMALL, Introduction, ScanIntake
@@ -27,7 +27,6 @@ from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
-T = TypeVar("T")
 
 REPORT_S = 1.0
 REPORT_IDLE_S = 3.0
@@ -231,8 +230,8 @@ class DroneReceiver:
         try:
             self._share.check(len(payload), now)
             if scan.intake.on_items(payload, now):
-                self._grew(scan, now)
-                scan.trouble = ""
+                scan.grew()
+                self.news_at, scan.trouble = now, ""
         except OutsideError as error:
             self._rest(scan, str(error), now)
 
@@ -249,14 +248,10 @@ class DroneReceiver:
             if provisional and header != store.header:
                 store.put_header(header)
             if kind != "header" and store.add_radio(kind, number, part, data):
-                scan.radio_messages += 1
-                self._grew(scan, now)
+                scan.grew()
+                self.news_at, scan.radio_messages = now, scan.radio_messages + 1
         except OutsideError as error:
             self._rest(scan, str(error), now)
-
-    def _grew(self, scan: ReceivedScan, now: float) -> None:
-        scan.grew()
-        self.news_at = now
 
     def _rest(self, scan: ReceivedScan, trouble: str, now: float) -> None:
         """Pause a scan that cannot be written; one whose folder was deleted begins again."""
@@ -397,7 +392,7 @@ class DroneReceiver:
         self.entries = [*(scan.progress() for scan in self.scans), *self._closed.values()]
 
 
-def _keep(kept: OrderedDict[str, T], name: str, value: T, most: int) -> None:
+def _keep(kept: OrderedDict[str, Any], name: str, value: Any, most: int) -> None:
     """Put a value last; beyond ``most`` the first make way."""
     kept[name] = value
     kept.move_to_end(name)

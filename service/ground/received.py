@@ -39,14 +39,16 @@ def folders_due(store: Path) -> list[Path]:
 
 def deliver(folder: Path) -> None:
     """Write the scan's deliverables; InputError names those which could not be made."""
-    with ScanStore.open(folder / "scan.db") as store:
+    with ScanStore.peek(folder / "scan.db") as store:  # others may write
         failed = write_deliverables(folder, store, {})["failed"]
     if failed:
         why = "; ".join(f"{name} ({reason})" for name, reason in failed.items())
         raise InputError(f"some could not be made: {why}")
 
 
-def write_files(folder: Path, deliver: Callable[[Path], None] = deliver) -> tuple[str, bool]:
+def write_files(
+    folder: Path, deliver: Callable[[Path], None] = deliver, is_left: bool = False
+) -> tuple[str, bool]:
     """Have ``deliver`` write a scan's files; what went wrong, and whether the disk refused one.
 
     That stays due, whatever an earlier ``scan.json`` says; a fault in the scan would come again.
@@ -56,6 +58,8 @@ def write_files(folder: Path, deliver: Callable[[Path], None] = deliver) -> tupl
     def work() -> None:
         nonlocal is_refused
         try:
+            if is_left:  # by a former process: what a crash damaged is repaired
+                ScanStore.open(folder / "scan.db").close()
             deliver(folder)
         except (OutsideError, OSError):
             is_refused = True

@@ -414,8 +414,8 @@ class Receiver:
     def _write_all(self, worker: Worker) -> None:
         """Write deliverables until the end; what a former process left is then for the next."""
         while (asked := self._writes.get())[0] != END:
-            _, _, effect, one = asked
-            trouble, is_due = write_files(effect.folder, self._deliver)
+            turn, _, effect, one = asked
+            trouble, is_due = write_files(effect.folder, self._deliver, turn == LEFT)
             if one is not None:
                 one.put(drone.Written(effect.scan, trouble, is_due))
             if effect.is_whole and not trouble:
