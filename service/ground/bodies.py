@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 from starlette.concurrency import run_in_threadpool
@@ -15,8 +15,6 @@ from starlette.responses import Response
 
 from service.errors import InputError
 from service.ground.guard import note
-
-T = TypeVar("T")
 
 BODIES: dict[Callable[..., Any], type[msgspec.Struct]] = {}
 """Bodies of the endpoints that take one."""
@@ -45,21 +43,18 @@ def changing(action: str, body: type[Body] | None = None) -> Callable[..., Calla
             note(request, action)
             if "scan" in request.path_params:
                 note(request, action, scan="{drone}/{scan}".format(**request.path_params))
-            given = () if body is None else (await _body_of(request, body),)
-            return await run_in_threadpool(work, request, *given)
+            if body is None:
+                return await run_in_threadpool(work, request)
+            try:  # Starlette's own checks no types
+                given = msgspec.json.decode(await request.body(), type=body)
+            except ClientDisconnect:
+                raise InputError("the request was cancelled") from None
+            except (ValueError, RecursionError) as error:
+                raise InputError(f"the request is not valid: {error}"[:300]) from error
+            return await run_in_threadpool(work, request, given)
 
         if body is not None:
             BODIES[endpoint] = body
         return endpoint
 
     return decorate
-
-
-async def _body_of(request: Request, kind: type[T]) -> T:
-    """The JSON object sent; InputError for anything else. Starlette's own checks no types."""
-    try:
-        return msgspec.json.decode(await request.body(), type=kind)
-    except ClientDisconnect:
-        raise InputError("the request was cancelled") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"the request is not valid: {error}"[:300]) from error

@@ -13,7 +13,7 @@ import re
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -215,11 +215,9 @@ class Library:
         return parts[0], parts[1]
 
     def bring_in(self, source: Path) -> tuple[str, str]:
-        """Import a scan folder or an MCAP; its drone and scan."""
+        """As :meth:`take`. Raises ConflictError while another import runs."""
         with self.importing():
-            if source.suffix.lower() == ".mcap":
-                return self.import_mcap(source)
-            return self.import_folder(source)
+            return self.take(source)
 
     @contextlib.contextmanager
     def importing(self) -> Iterator[None]:
@@ -231,53 +229,43 @@ class Library:
         finally:
             self._import_lock.release()
 
-    def import_mcap(self, source: Path) -> tuple[str, str]:
-        """Make a scan folder of an aircraft's MCAP, with its usual files.
-
-        Raises InputError when it is not a scan's recording or the library has that scan already.
-        """
-        if not is_regular(source):
-            raise InputError(f"{str(source)[:200]} is not a file; give the recording itself")
-        header = header_in(source)
-
-        def fill(part: Path) -> ScanHeader:
-            with store_from_mcap(source, part / "scan.db") as store:
-                write_deliverables(part, store, {})
-            return header
-
-        self._check_new(header, source)
-        return self._take(fill)
-
-    def import_folder(self, source: Path) -> tuple[str, str]:
-        """Copy a scan folder, as it lay on the aircraft's disk, into the library.
+    def take(self, source: Path) -> tuple[str, str]:
+        """Import a scan folder, as it lay on the aircraft's disk, or an MCAP; its drone and scan.
 
         Raises InputError when it is none or the library has that scan already.
         """
-
-        def fill(part: Path) -> ScanHeader:
-            if STORE_FILES[0] not in copy_files(source, part, STORE_FILES):
-                raise InputError(f"{str(source)[:200]} contains no scan.db; give a scan folder")
-            try:
-                with ScanStore.open(part / STORE_FILES[0]) as store:
-                    header = store.header
-            except (sqlite3.Error, ValueError) as error:
-                raise InputError(f"{str(source)[:200]} contains no valid scan ({error})") from error
-            self._check_new(header, source)
-            copy_files(source, part, ({*FILES, *OTHER_FILES} - {*STORE_FILES}))
-            return header
-
-        return self._take(fill)
-
-    def _take(self, fill: Callable[[Path], ScanHeader]) -> tuple[str, str]:
-        """Have ``fill`` make a scan folder, then give it its place, under the lock."""
         with workplace(self.store) as place:
             part = place / "scan"
             part.mkdir(0o750)
-            header = fill(part)
+            is_recording = source.suffix.lower() == ".mcap"
+            header = (self._recorded if is_recording else self._copied)(source, part)
             with self._lock:
                 target = self._check_new(header, part)
                 _move(part, target)
         return target.parent.name, target.name
+
+    def _recorded(self, source: Path, part: Path) -> ScanHeader:
+        """Make a scan folder of an aircraft's MCAP, with its usual files."""
+        if not is_regular(source):
+            raise InputError(f"{str(source)[:200]} is not a file; give the recording itself")
+        header = header_in(source)
+        self._check_new(header, source)
+        with store_from_mcap(source, part / "scan.db") as store:
+            write_deliverables(part, store, {})
+        return header
+
+    def _copied(self, source: Path, part: Path) -> ScanHeader:
+        """Copy a scan folder."""
+        if STORE_FILES[0] not in copy_files(source, part, STORE_FILES):
+            raise InputError(f"{str(source)[:200]} contains no scan.db; give a scan folder")
+        try:
+            with ScanStore.open(part / STORE_FILES[0]) as store:
+                header = store.header
+        except (sqlite3.Error, ValueError) as error:
+            raise InputError(f"{str(source)[:200]} contains no valid scan ({error})") from error
+        self._check_new(header, source)
+        copy_files(source, part, ({*FILES, *OTHER_FILES} - {*STORE_FILES}))
+        return header
 
     def _home(self, drone: str, source: Path) -> Path:
         """Where the scan in ``source`` belongs: the drone's folder, or that of the sites."""

@@ -268,12 +268,6 @@ def link_message(entry: dict[str, Any], heard_unix_s: float) -> str:
     )
 
 
-def _entry(folder: Path, entries: list[dict[str, Any]]) -> dict[str, Any]:
-    """The receiver's report about the scan in ``folder``; empty when it does not receive it."""
-    names = (folder.parent.name, folder.name)
-    return next((e for e in entries if (e["drone"], e["scan"]) == names), {})
-
-
 POLL_S = 0.25
 LINK_S = 1.0
 
@@ -303,7 +297,9 @@ async def serve_live(
                 await asyncio.wait({gone}, timeout=POLL_S)
             if time.monotonic() >= link_at and not gone.done():
                 link_at = time.monotonic() + LINK_S
-                await _send(socket, link_message(_entry(folder, progress()), feed.heard_unix_s))
+                entries = {(e["drone"], e["scan"]): e for e in progress()}
+                entry = entries.get((folder.parent.name, folder.name), {})
+                await _send(socket, link_message(entry, feed.heard_unix_s))
             if gone.done():
                 break
     except (SkyreliefError, WebSocketDisconnect, RuntimeError) as error:

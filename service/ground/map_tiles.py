@@ -20,7 +20,7 @@ from starlette.routing import Route
 from recon.surface.raster import hillshade
 from recon.types import F32, U8
 from service.errors import InputError
-from service.ground.basemap import tile_of, tile_px
+from service.ground.basemap import Basemap, tile_of, tile_px
 from service.ground.live_map import (
     EQUATOR_M,
     MARGIN,
@@ -403,18 +403,21 @@ def _overlay(address: str, tile: Tile) -> str:
 
 def _basemap_json(request: Request) -> Response:
     """The operator's own basemap as TileJSON; 404 where none was given."""
-    found = state_of(request).basemap
-    if found is None:
-        raise InputError("no basemap: start with 'skyrelief ground --basemap FILE'")
+    found = _given(request)
     tiles = str(request.base_url) + "tiles/basemap/{z}/{x}/{y}"
     return JSONResponse({"tilejson": "3.0.0", "tiles": [tiles], **found.about})
 
 
-def _basemap(request: Request) -> Response:
-    """A tile of the basemap; below its finest zoom enlarged, clear where it has none."""
+def _given(request: Request) -> Basemap:
     found = state_of(request).basemap
     if found is None:
-        raise InputError("no basemap")
+        raise InputError("no basemap: start with 'skyrelief ground --basemap FILE'")
+    return found
+
+
+def _basemap(request: Request) -> Response:
+    """A tile of the basemap; below its finest zoom enlarged, clear where it has none."""
+    found = _given(request)
     z, x, y = _place(request)
     up = max(0, z - found.max_zoom)
     data = tile_of(found, z - up, x >> up, y >> up)

@@ -41,8 +41,8 @@ log = logging.getLogger(__name__)
 
 MIN_TOKEN_LETTERS = 16
 
-WARNINGS_HZ, WARNINGS_AT_ONCE = 1.0, 10
-"""Rate limit of the web server's warnings: each malformed request makes one."""
+_warnings_pace = Pace(rate_hz=1.0, burst=10)
+"""Of the web server's warnings: each malformed request makes one."""
 
 BACKLOG = 64
 """Connections that may wait to be accepted, and that are accepted at once."""
@@ -134,9 +134,7 @@ class Portal:
                 "choose another address"
             ) from error
         self._listener, self._port = listener, int(listener.getsockname()[1])
-        server_log = logging.getLogger("uvicorn.error")
-        if not any(isinstance(found, _PacedWarnings) for found in server_log.filters):
-            server_log.addFilter(_PacedWarnings())
+        logging.getLogger("uvicorn.error").addFilter(_few_warnings)
         self._server = uvicorn.Server(
             uvicorn.Config(
                 RequestLimits(self.app, listener, config.body_s, config.stall_s),
@@ -185,15 +183,9 @@ class Portal:
             self.state.vehicle.close()
 
 
-class _PacedWarnings(logging.Filter):
+def _few_warnings(record: logging.LogRecord) -> bool:
     """Lets through few warnings; errors all."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._pace = Pace(WARNINGS_HZ, WARNINGS_AT_ONCE)
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        return record.levelno > logging.WARNING or self._pace.take()
+    return record.levelno > logging.WARNING or _warnings_pace.take()
 
 
 def config_of(

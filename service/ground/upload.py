@@ -33,8 +33,11 @@ from service.workers import python_command, run_to_end
 
 KINDS = (".zip", ".db", ".mcap")
 """Of an upload that is a scan already."""
-VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".ts", ".m4v")
-LOGS, CAMERAS = (".tlog", ".bin", ".ulg", ".srt"), (".yaml", ".yml")
+RECORDING = ["--camera-model", "--telemetry", "video"]
+PARTS = dict.fromkeys((".mp4", ".mov", ".mkv", ".avi", ".ts", ".m4v"), RECORDING[2])
+PARTS |= dict.fromkeys((".tlog", ".bin", ".ulg", ".srt"), RECORDING[1])
+PARTS |= dict.fromkeys((".yaml", ".yml"), RECORDING[0])
+"""What a file of a recording is, by its suffix: an option of ``replay``, or the video."""
 Part = tuple[str, int]
 """Name and size in bytes of one uploaded file."""
 MAX_LISTING_BYTES = 4 << 20
@@ -69,8 +72,7 @@ def check_parts(library: Library, parts: Sequence[Part], room_bytes: int | None 
 
 def _is_recording(suffixes: Sequence[str]) -> bool:
     """Whether there is one video, one log, and at most one camera model."""
-    counts = [sum(s in kind for s in suffixes) for kind in (VIDEOS, LOGS, CAMERAS)]
-    return sum(counts) == len(suffixes) and counts in ([1, 1, 0], [1, 1, 1])
+    return sorted(PARTS.get(suffix, "") for suffix in suffixes) in (RECORDING, RECORDING[1:])
 
 
 class Upload:
@@ -134,7 +136,7 @@ class Upload:
         (path,) = self._paths
         try:
             if path.suffix == ".mcap":
-                return self._library.import_mcap(path)
+                return self._library.take(path)
             folder = self._place / "uploaded"
             folder.mkdir(0o750)
             if path.suffix == ".zip":
@@ -142,7 +144,7 @@ class Upload:
                 path.unlink()
             else:
                 path.rename(folder / STORE_FILES[0])
-            return self._library.import_folder(folder)
+            return self._library.take(folder)
         except OSError as error:
             raise OutsideError(f"the upload cannot be stored ({error.strerror})") from error
         except InputError as error:
@@ -158,7 +160,7 @@ class Upload:
                 folder = place / "replayed"
                 _replay(paths, folder, progress)
                 progress.commit("importing")
-                return "/".join(library.import_folder(folder))
+                return "/".join(library.take(folder))
 
         return work
 
@@ -173,16 +175,7 @@ def _replay(paths: Sequence[Path], out: Path, progress: Progress) -> None:
 
     Raises InputError with the process's last line when it fails.
     """
-    of = {
-        kind: path
-        for path in paths
-        for kind, suffixes in (
-            ("video", VIDEOS),
-            ("--telemetry", LOGS),
-            ("--camera-model", CAMERAS),
-        )
-        if path.suffix in suffixes
-    }
+    of = {PARTS[path.suffix]: path for path in paths}
     command = python_command("service.cli", "replay", str(of.pop("video")))
     command += [word for option, path in of.items() for word in (option, str(path))]
 

@@ -165,12 +165,12 @@ def test_the_library_imports_two_runs_of_one_time_and_no_run_twice(tmp_path: Pat
         cards.append(tmp_path / run_id)
         ScanStore.create(cards[-1] / "scan.db", replace(HEADER, run_id=run_id)).close()
     (tmp_path / "ground").mkdir()
-    assert [library.import_folder(card) for card in cards] == [
+    assert [library.take(card) for card in cards] == [
         ("red", "scan-1"),
         ("red", "scan-1-2"),
     ]
     with pytest.raises(InputError, match="holds red/scan-1-2 already"):
-        library.import_folder(cards[1])
+        library.take(cards[1])
 
 
 def test_a_drone_of_any_name_keeps_to_its_own_folder(tmp_path: Path) -> None:
