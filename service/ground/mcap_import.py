@@ -15,14 +15,13 @@ from __future__ import annotations
 import io
 import logging
 import math
-import os
 import re
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,6 +29,7 @@ import numpy as np
 from recon import se3
 from recon.types import F64, U8, DepthMap, Keyframe, Pose
 from service.errors import InputError
+from service.ground.storage import bounded
 from service.offline.exports.recording import POINT
 from service.packages import needing
 from service.stream import codec
@@ -310,9 +310,8 @@ def _records(path: Path) -> Iterator[Any]:
     from mcap.stream_reader import StreamReader
 
     with open(path, "rb") as file:
-        size = os.fstat(file.fileno()).st_size
         reader = StreamReader(
-            cast(IO[bytes], _AtMost(file, size)),
+            bounded(file, MAX_RECORD_BYTES, "a record"),
             emit_chunks=True,
             record_size_limit=MAX_RECORD_BYTES,
         )
@@ -321,18 +320,6 @@ def _records(path: Path) -> Iterator[Any]:
                 yield from _in_chunk(record)
             else:
                 yield record
-
-
-class _AtMost:
-    """A file that never makes room for more than is left of it."""
-
-    def __init__(self, file: IO[bytes], size: int) -> None:
-        self._file, self._left = file, size
-
-    def read(self, size: int = -1) -> bytes:
-        data = self._file.read(self._left if size < 0 else min(size, self._left))
-        self._left -= len(data)
-        return data
 
 
 def _in_chunk(chunk: Any) -> Iterator[Any]:

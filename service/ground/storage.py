@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 from service.errors import InputError, OutsideError
 from service.offline.site import DRONE
@@ -257,6 +257,28 @@ def _copy(handle: int, target: Path, size: int) -> None:
         while size > 0 and (block := os.read(handle, min(BLOCK_BYTES, size))):
             out.write(block)
             size -= len(block)
+
+
+class _Bounded:
+    """A file of a stranger, see :func:`bounded`."""
+
+    def __init__(self, file: IO[bytes], max_bytes: int, what: str) -> None:
+        self._file, self._max_bytes, self._what = file, max_bytes, what
+        self._size = os.fstat(file.fileno()).st_size
+        self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
+
+    def read(self, size: int = -1) -> bytes:
+        left = max(self._size - self.tell(), 0)
+        size = left if size < 0 else min(size, left)
+        if size > self._max_bytes:
+            raise ValueError(f"{self._what} is too large")
+        return self._file.read(size)
+
+
+def bounded(file: IO[bytes], max_bytes: int, what: str) -> IO[bytes]:
+    """``file``, of which no read makes room for more than is left; ValueError, which names
+    ``what``, for more than ``max_bytes``."""
+    return cast(IO[bytes], _Bounded(file, max_bytes, what))
 
 
 def _short(path: Path) -> str:

@@ -15,7 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import IO, cast
+from typing import IO
 
 from service.errors import InputError, OutsideError
 from service.ground.guard import MAX_UPLOAD_BYTES
@@ -25,6 +25,7 @@ from service.ground.storage import (
     OTHER_FILES,
     STORE_FILES,
     TAKING,
+    bounded,
     check_room,
     workplace,
 )
@@ -198,7 +199,8 @@ def unpack(archive: Path, folder: Path, room_bytes: int | None = None) -> None:
     where what it claims to hold does not fit the disk, or ``room_bytes`` of it.
     """
     try:
-        with open(archive, "rb") as file, zipfile.ZipFile(cast(IO[bytes], _Bounded(file))) as found:
+        with open(archive, "rb") as file:
+            found = zipfile.ZipFile(bounded(file, MAX_LISTING_BYTES, "its table of contents"))
             members = _members(found.infolist())
             check_room(sum(member.file_size for member in members.values()), folder, room_bytes)
             for name, member in members.items():
@@ -231,19 +233,3 @@ def _copy(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path) -> No
             if left < 0:
                 raise InputError("the ZIP holds more than it says")
             out.write(block)
-
-
-class _Bounded:
-    """A file of which no read makes room for more than a table of contents."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
-        self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
-
-    def read(self, size: int = -1) -> bytes:
-        """As of a file; ValueError for more than MAX_LISTING_BYTES."""
-        most = MAX_LISTING_BYTES + 1
-        data = self._file.read(min(size, most) if size >= 0 else most)
-        if len(data) > MAX_LISTING_BYTES:
-            raise ValueError("its table of contents is too large")
-        return data
