@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
-from recon.types import F32, F64, I32, U8, Bool
+from recon.types import F32, F64, I32, I64, U8, Bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +23,7 @@ class Mesh:
 
 def reduced(vertices: F64, faces: I32, largest_faces: int) -> tuple[F64, I32]:
     """About ``largest_faces`` triangles of the same surface, or all of one with fewer: flat parts
-    are merged.
+    are merged. No edge has more than two triangles.
 
     Quadric error (Garland and Heckbert 1997, doi:10.1145/258734.258849).
     """
@@ -34,7 +35,60 @@ def reduced(vertices: F64, faces: I32, largest_faces: int) -> tuple[F64, I32]:
     small, triangles = simplify(
         (vertices - middle).astype(np.float32), faces, target_count=largest_faces
     )
-    return small.astype(np.float64) + middle, triangles.astype(np.int32)
+    return mended(small.astype(np.float64) + middle, triangles.astype(np.int32))
+
+
+def mended(vertices: F64, faces: I32) -> tuple[F64, I32]:
+    """The surface without edges of more than two triangles, where sheets touch each other.
+
+    A cone over each loop around such triangles takes their place.
+    """
+    _, number, count = edges(faces)
+    is_bad = (count > 2)[number].any(axis=1)
+    if not is_bad.any():
+        return vertices, faces
+    bad = faces[is_bad]
+    ways = np.stack([bad, np.roll(bad, -1, axis=1)], axis=2).reshape(-1, 2).tolist()
+    times = Counter((a, b) for a, b in ways)
+    after: dict[int, list[int]] = {a: [] for a, _ in times}
+    for (a, b), n in times.items():
+        after[a] += [b] * (n - times[b, a])
+    places, cones = [vertices], [faces[~is_bad]]
+    for first in after:
+        path = [first]
+        while after[path[-1]]:
+            path.append(after[path[-1]].pop())
+            at = path.index(path[-1])
+            loop, path = path[at:-1], path[: at + 1]
+            if loop:
+                top = np.full(len(loop), len(vertices) + len(places) - 1)
+                places.append(vertices[loop].mean(axis=0)[None])
+                cones.append(np.column_stack([loop, np.roll(loop, -1), top]))
+    return np.concatenate(places), np.concatenate(cones).astype(np.int32)
+
+
+def edges(faces: I32) -> tuple[I64, I64, I64]:
+    """(E, 2) vertices of each edge, the lower one first; (F, 3) the edge from corner k to k + 1;
+    (E,) how many triangles have it."""
+    ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2).astype(np.int64)
+    total = int(faces.max(initial=0)) + 1
+    key, number, count = np.unique(
+        ends[..., 0] * total + ends[..., 1], return_inverse=True, return_counts=True
+    )
+    return np.column_stack([key // total, key % total]), number.reshape(faces.shape), count
+
+
+def largest_parts(vertices: F64, faces: I32, share: float) -> tuple[F64, I32]:
+    """The parts with at least this ``share`` of the triangles of the largest one."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    size, ends = (len(vertices),) * 2, np.concatenate([faces[:, :2], faces[:, 1:]])
+    ones = np.ones(len(ends), np.int8)
+    part = connected_components(coo_matrix((ones, ends.T), size), directed=False)[1][faces[:, 0]]
+    count = np.bincount(part)
+    used, faces = used_vertices(len(vertices), faces[(count >= share * count.max())[part]])
+    return vertices[used], faces
 
 
 def coarser(mesh: Mesh, largest_faces: int) -> Mesh:

@@ -9,7 +9,7 @@ image sees stand below the edge of the roof.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -21,7 +21,7 @@ from recon import se3
 from recon.parallel import parallel_for
 from recon.surface.ground import terrain
 from recon.surface.hole_filling import completed, outline
-from recon.surface.meshing import Mesh, reduced, used_vertices
+from recon.surface.meshing import Mesh, largest_parts, reduced
 from recon.surface.raster import Raster, reliable, without_cells
 from recon.types import F32, F64, I32, I64, Bool, DepthMap
 
@@ -44,6 +44,12 @@ MIN_PART = 0.01
 KEPT_FACES, MIN_FACES = 1 / 6, 5000
 """Of the zero crossing: voxels are finer than what they hold, and most ground is flat."""
 
+GROWN_BLOCKS = 16
+"""Images move the surface up or down by so many blocks at most."""
+
+LEAST = np.float32(1e-3)
+"""The least distance of a voxel, in truncations."""
+
 LARGEST_BLOCKS = 120_000
 """Some 6 GB; a tile has about a thousandth of it to a tenth."""
 
@@ -57,7 +63,7 @@ class Volume:
     block: I32  # (B, 3) place of each block, in blocks
     distance: F32  # (B, SIDE, SIDE, SIDE) by z, y, x, in truncations
     weight: F32  # the same: of the images; 0 where only the upper surface counts
-    is_inside: Bool  # (B, SIDE, SIDE) by y, x: columns inside the outline
+    is_inside: Bool | None = None  # (B, SIDE, SIDE) by y, x: columns inside the outline
 
 
 def volume_mesh(depths: Iterable[DepthMap], upper: Raster, largest_faces: int = 400_000) -> Mesh:
@@ -74,55 +80,100 @@ def volume_mesh(depths: Iterable[DepthMap], upper: Raster, largest_faces: int = 
     inside = outline(upper.known, sure.known, upper.grid.cell_m)
     low_m = terrain(sure, inside).everywhere_m
     upper = without_cells(completed(upper, low_m, inside, upper.known & ~sure.known), ~inside)
-    volume = _prior(upper)
-    images = list(depths)
-    truncation_m = _truncation(images, volume.voxel_m)
-    _vote(volume, upper, images, truncation_m)
+    volume = _voted(upper, list(depths))
     vertices, faces = _extracted(volume)
     vertices, faces = reduced(
         vertices, faces, min(largest_faces, max(MIN_FACES, round(KEPT_FACES * len(faces))))
     )
+    vertices, faces = largest_parts(vertices, faces, MIN_PART)
     rgb = upper.rgb[upper.grid.cells(vertices[:, :2])]
     return Mesh(vertices, faces, None, rgb, _measured(volume, vertices))
 
 
-def _prior(upper: Raster) -> Volume:
-    """The blocks that the surface can be in, without any image's vote."""
+def _voted(upper: Raster, depths: Sequence[DepthMap]) -> Volume:
+    """The blocks that the surface passes through, with all votes.
+
+    They are those around ``upper``, and others as far as images have moved the surface out of
+    these.
+    """
     grid = upper.grid
     rows, cols = grid.shape
     height = np.full(-(-np.array([rows, cols]) // SIDE) * SIDE, np.nan, np.float32)
     height[:rows, :cols] = upper.height_m[::-1]
-    inside = np.isfinite(height)
-    if not inside.any():
+    if not np.isfinite(height).any():
         raise ValueError("the surface has no cell inside its outline")
     base_m = float(np.nanmin(height))
     origin = np.array(
         [grid.west_m + 0.5 * grid.cell_m, grid.north_m - (rows - 0.5) * grid.cell_m, base_m]
     )
-    tiles = height.reshape(height.shape[0] // SIDE, SIDE, -1, SIDE)
-    low = np.where(np.isfinite(tiles), tiles, np.inf).min(axis=(1, 3))
-    high = np.where(np.isfinite(tiles), tiles, -np.inf).max(axis=(1, 3))
-    near = np.ones((3, 3), np.uint8)
-    low, high = (
-        cv2.erode(low, near, borderValue=np.inf),
-        cv2.dilate(high, near, borderValue=-np.inf),
-    )
-    span_m = SIDE * grid.cell_m
-    has = inside.reshape(tiles.shape).any(axis=(1, 3))
-    blocks = []
-    for y, x in zip(*np.nonzero(has), strict=True):
-        first = int(np.floor((low[y, x] - base_m) / span_m - 0.5))
-        last = int(np.floor((high[y, x] - base_m) / span_m + 0.5))
-        blocks += [(x, y, z) for z in range(first, last + 1)]
-    if len(blocks) > LARGEST_BLOCKS:
-        raise ValueError(f"{len(blocks)} blocks are too many; mesh it in smaller tiles")
-    block = np.array(blocks, np.int32)
-    shape = (len(block), SIDE, SIDE, SIDE)
-    columns = inside.reshape(tiles.shape).transpose(0, 2, 1, 3)[block[:, 1], block[:, 0]]
-    return Volume(
-        origin, grid.cell_m, block, np.zeros(shape, np.float32), np.zeros(shape, np.float32),
-        columns,
-    )  # fmt: skip
+    tiles = height.reshape(height.shape[0] // SIDE, SIDE, -1, SIDE).transpose(0, 2, 1, 3)
+    inside = np.isfinite(tiles)
+    low_m = np.where(inside, tiles, np.inf).min(axis=(2, 3))
+    high_m = np.where(inside, tiles, -np.inf).max(axis=(2, 3))
+    near, span_m = np.ones((3, 3), np.uint8), SIDE * grid.cell_m
+    has = inside.any(axis=(2, 3))
+    low_m = np.where(has, cv2.erode(low_m, near, borderValue=np.inf), 0.0)
+    high_m = np.where(has, cv2.dilate(high_m, near, borderValue=-np.inf), -np.inf)
+    lowest = np.floor((low_m - base_m) / span_m - 0.5)
+    highest = np.where(has, np.floor((high_m - base_m) / span_m + 0.5), lowest - 1)
+    lowest, highest = lowest.astype(np.int32), highest.astype(np.int32)
+    block, truncation_m = np.zeros((0, 3), np.int32), _truncation(depths, grid.cell_m)
+    distance = weight = np.zeros((0, SIDE, SIDE, SIDE), np.float32)
+    added = _blocks(lowest, highest)
+    if len(added) > LARGEST_BLOCKS:
+        raise ValueError(f"{len(added)} blocks are too many; mesh it in smaller tiles")
+    for grown in range(GROWN_BLOCKS + 1):
+        shape = (len(added), SIDE, SIDE, SIDE)
+        new = Volume(origin, grid.cell_m, added, *np.zeros((2, *shape), np.float32))
+        _vote(new, height, depths, truncation_m)
+        block = np.concatenate([block, added])
+        distance, weight = (
+            np.concatenate(two) for two in ((distance, new.distance), (weight, new.weight))
+        )
+        down, up = lowest.copy(), highest.copy()
+        _leave(block, distance, inside, lowest, highest, down, up, grown == GROWN_BLOCKS)
+        added = np.concatenate([_blocks(down, lowest - 1), _blocks(highest + 1, up)])
+        lowest, highest = down, up
+        if not len(added):
+            break
+    return Volume(origin, grid.cell_m, block, distance, weight, inside[block[:, 1], block[:, 0]])
+
+
+def _blocks(lowest: I32, highest: I32) -> I32:
+    """(B, 3) of the columns (Y, X) from the lowest block to the highest."""
+    count = np.maximum(highest - lowest + 1, 0)
+    y, x = (np.repeat(at.ravel(), count.ravel()) for at in np.indices(count.shape))
+    rank = np.arange(len(x)) - np.repeat(np.cumsum(count) - count.ravel(), count.ravel())
+    return np.column_stack([x, y, lowest[y, x] + rank]).astype(np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _leave(
+    block: I32, distance: F32, inside: Bool, lowest: I32, highest: I32, down: I32, up: I32,
+    ends: bool,
+) -> None:  # fmt: skip
+    """Let columns of blocks reach ``down`` and ``up`` to where the surface leaves the blocks:
+    above a column is air, below it building. With ``ends`` the surface ends there instead."""
+    span = np.array([[0, 1], [0, SIDE], [SIDE - 1, SIDE]])
+    for b in range(len(block)):
+        x, y, z = block[b]
+        for turn in range(27):
+            dx, dy, dz = turn % 3 - 1, turn // 3 % 3 - 1, turn // 9 - 1
+            u, v, w = x + dx, y + dy, z + dz
+            if not (0 <= v < lowest.shape[0] and 0 <= u < lowest.shape[1]):
+                continue
+            if lowest[v, u] > highest[v, u] or lowest[v, u] <= w <= highest[v, u]:
+                continue
+            air = w > highest[v, u]
+            for k in range(span[dz + 1, 0], span[dz + 1, 1]):
+                for j in range(span[dy + 1, 0], span[dy + 1, 1]):
+                    for i in range(span[dx + 1, 0], span[dx + 1, 1]):
+                        if not inside[y, x, j, i] or (distance[b, k, j, i] > 0.0) == air:
+                            continue
+                        if ends:
+                            distance[b, k, j, i] = 1.0 if air else -1.0
+                        else:
+                            down[v, u], up[v, u] = min(down[v, u], w), max(up[v, u], w)
 
 
 def _truncation(depths: Iterable[DepthMap], voxel_m: float) -> float:
@@ -131,8 +182,9 @@ def _truncation(depths: Iterable[DepthMap], voxel_m: float) -> float:
     return max(TRUNCATION_VOXELS * voxel_m, TRUNCATION_SIGMAS * typical)
 
 
-def _vote(volume: Volume, upper: Raster, depths: Iterable[DepthMap], truncation_m: float) -> None:
-    """Add each image's distances, then the upper surface's own, and divide by the weights."""
+def _vote(volume: Volume, height: F32, depths: Iterable[DepthMap], truncation_m: float) -> None:
+    """Add each image's distances, then those of the upper surface's ``height`` (rows, cols) from
+    the south, and divide by the weights."""
     middle = volume.origin_m + (volume.block * SIDE + 0.5 * (SIDE - 1)) * volume.voxel_m
     radius = 0.5 * np.sqrt(3.0) * SIDE * volume.voxel_m
     for one in depths:
@@ -144,7 +196,6 @@ def _vote(volume: Volume, upper: Raster, depths: Iterable[DepthMap], truncation_
                 volume.weight, volume.origin_m, volume.voxel_m, truncation_m, one.depth_m,
                 one.sigma_m, one.K, T, cells=SIDE**3 * len(seen),
             )  # fmt: skip
-    height = np.ascontiguousarray(upper.height_m[::-1])
     every = np.arange(len(volume.block))
     parallel_for(
         _add_upper, len(every), every, volume.block, volume.distance,
@@ -211,14 +262,13 @@ def _add_upper(
     begin: int, end: int, every: I64, block: I32, distance: F32, weight: F32, origin: F64,
     voxel: float, truncation: float, height: F32,
 ) -> None:  # fmt: skip
-    rows, cols = height.shape
     for n in range(begin, end):
         b = every[n]
         for j in range(SIDE):
             row = block[b, 1] * SIDE + j
             for i in range(SIDE):
                 col = block[b, 0] * SIDE + i
-                if row >= rows or col >= cols or not np.isfinite(height[row, col]):
+                if not np.isfinite(height[row, col]):
                     continue
                 for k in range(SIDE):
                     z = origin[2] + (block[b, 2] * SIDE + k) * voxel
@@ -239,14 +289,15 @@ def _extracted(volume: Volume) -> tuple[F64, I32]:
     )  # fmt: skip
     places, _ = grid.hashmap().activate(core.Tensor(volume.block))
     at = places.numpy().astype(np.int64)
-    grid.attribute("tsdf").numpy()[at, ..., 0] = volume.distance
+    distance = volume.distance  # one of zero would put vertices of several edges into one place
+    sure = np.where(distance < 0.0, np.minimum(distance, -LEAST), np.maximum(distance, LEAST))
+    grid.attribute("tsdf").numpy()[at, ..., 0] = sure
     grid.attribute("weight").numpy()[at, ..., 0] = volume.is_inside[:, None]
     made = grid.extract_triangle_mesh(weight_threshold=0.5).to_legacy()
     if not len(made.triangles):
         raise ValueError("no surface crosses the volume")
     vertices, faces = _in_order(np.asarray(made.vertices, np.float64), np.asarray(made.triangles))
-    vertices, faces = _cleaned(vertices, faces)
-    return vertices + volume.origin_m, faces
+    return _smoothed(vertices, faces) + volume.origin_m, faces
 
 
 def _in_order(vertices: F64, faces: I32) -> tuple[F64, I32]:
@@ -264,22 +315,14 @@ def _in_order(vertices: F64, faces: I32) -> tuple[F64, I32]:
     return ordered[is_new], faces[np.lexsort(faces.T[::-1])]
 
 
-def _cleaned(vertices: F64, faces: I32) -> tuple[F64, I32]:
-    """Parts at least MIN_PART as large as the largest one, after SMOOTHINGS steps forth and back;
-    the outline stays."""
+def _smoothed(vertices: F64, faces: I32) -> F64:
+    """The vertices after SMOOTHINGS steps forth and back; the outline stays."""
     from scipy.sparse import coo_matrix, diags
-    from scipy.sparse.csgraph import connected_components
 
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     size = (len(vertices), len(vertices))
     edges = coo_matrix((np.ones(len(ends), np.float32), ends.T), size).tocsr()
     edges = edges + edges.T  # faces at each edge: one at the outline
-    _, part = connected_components(edges, directed=False)
-    count = np.bincount(part[faces[:, 0]], minlength=part.max() + 1)
-    used, faces = used_vertices(
-        len(vertices), faces[(count >= MIN_PART * count.max())[part[faces[:, 0]]]]
-    )
-    edges, vertices = edges[used][:, used], vertices[used]
     border = np.repeat(np.arange(len(vertices)), np.diff(edges.indptr))[edges.data == 1.0]
     edges.data[:] = 1.0
     mean = diags(1.0 / np.maximum(np.diff(edges.indptr), 1)) @ edges
@@ -287,7 +330,7 @@ def _cleaned(vertices: F64, faces: I32) -> tuple[F64, I32]:
     for step in (0.5, -0.53) * SMOOTHINGS:
         vertices = vertices + step * (mean @ vertices - vertices)
         vertices[border] = held
-    return np.asarray(vertices, np.float64), faces
+    return np.asarray(vertices, np.float64)
 
 
 def _measured(volume: Volume, vertices: F64) -> Bool:

@@ -12,7 +12,7 @@ import pytest
 from sheets import height_mesh
 from typer.testing import CliRunner
 
-from recon.surface.meshing import Mesh, coarser, reduced
+from recon.surface.meshing import Mesh, coarser, edges, largest_parts, mended, reduced
 from recon.surface.raster import Grid, Raster, smoothed
 from recon.types import F32
 from service.cli import app
@@ -49,6 +49,34 @@ def test_a_mesh_of_few_faces_keeps_them(largest: int) -> None:
     mesh = Mesh(corners, np.array([[0, 1, 2], [1, 3, 2]], np.int32), None, None)
     few = coarser(mesh, largest)
     assert np.array_equal(few.vertices_m, corners) and np.array_equal(few.faces, mesh.faces)
+
+
+def test_sheets_that_touch_at_an_edge_are_taken_apart() -> None:
+    """Two boxes share an edge of four triangles."""
+    box = np.array(list(np.ndindex(2, 2, 2)), np.float64)
+    sides = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    one = np.array([t for a, b, c, d in sides for t in ((a, b, c), (a, c, d))], np.int32)
+    both = np.vstack([box, box + [1.0, 1.0, 0.0]])
+    both, place = np.unique(both, axis=0, return_inverse=True)
+    faces = place[np.vstack([one, one + 8])].astype(np.int32)
+    assert edges(faces)[2].max() == 4
+    vertices, faces = mended(both, faces)
+    assert set(edges(faces)[2]) == {2}
+    corners = vertices[faces]
+    volume = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert abs(volume) == pytest.approx(2.0, abs=0.7)
+    same = mended(box, one)
+    assert same[0] is box and same[1] is one
+
+
+def test_parts_that_float_go() -> None:
+    whole = height_mesh(raster(np.zeros((40, 40), np.float32)))
+    speck = Mesh(whole.vertices_m[:3] + [0.0, 0.0, 5.0], np.array([[0, 1, 2]], np.int32))
+    vertices = np.vstack([speck.vertices_m, whole.vertices_m])
+    faces = np.vstack([speck.faces, whole.faces + 3]).astype(np.int32)
+    kept = largest_parts(vertices, faces, 0.01)
+    np.testing.assert_array_equal(kept[0], whole.vertices_m)
+    np.testing.assert_array_equal(kept[1], whole.faces)
 
 
 def test_smoothing_takes_noise_and_keeps_steps() -> None:

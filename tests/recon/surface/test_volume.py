@@ -100,3 +100,20 @@ def test_no_surface_is_an_error() -> None:
     nowhere = without_cells(upper, upper.known)
     with pytest.raises(ValueError, match="no cell inside"):
         volume_mesh(depths, nowhere)
+
+
+def test_it_is_closed_where_images_see_far_through_the_upper_surface() -> None:
+    """As where stray points make a platform in the air."""
+    depths, upper = seen(HouseFlight())
+    height = upper.height_m.copy()
+    x, y = upper.grid.centres(*np.indices(upper.grid.shape).reshape(2, -1)).T
+    raised = (np.abs(x - 24.0) < 7.0) & (np.abs(y) < 9.0)
+    height.ravel()[raised] = 9.0
+    mesh = volume_mesh(depths, replace(upper, height_m=height))
+    places, low, high = (
+        one[:, :2] for one in (mesh.vertices_m[border(mesh)], mesh.vertices_m, mesh.vertices_m)
+    )
+    inward = np.minimum(places - low.min(axis=0), high.max(axis=0) - places).min(axis=1)
+    assert inward.max() < 2.0 * VOXEL_M
+    middle = np.hypot(*(mesh.vertices_m[:, :2] - [24.0, 0.0]).T) < 4.0
+    assert middle.any() and np.abs(mesh.vertices_m[middle, 2]).max() < 0.5
