@@ -60,10 +60,10 @@ class Volume:
 
     origin_m: F64  # (3,) of voxel (0, 0, 0)
     voxel_m: float
-    block: I32  # (B, 3) place of each block, in blocks
+    inside: Bool  # (Y, X, SIDE, SIDE) columns inside the outline, by blocks and in them
+    block: I32  # (B, 3) place of each block, in blocks: x, y, z
     distance: F32  # (B, SIDE, SIDE, SIDE) by z, y, x, in truncations
     weight: F32  # the same: of the images; 0 where only the upper surface counts
-    is_inside: Bool | None = None  # (B, SIDE, SIDE) by y, x: columns inside the outline
 
 
 def volume_mesh(depths: Iterable[DepthMap], upper: Raster, largest_faces: int = 400_000) -> Mesh:
@@ -117,26 +117,28 @@ def _voted(upper: Raster, depths: Sequence[DepthMap]) -> Volume:
     lowest = np.floor((low_m - base_m) / span_m - 0.5)
     highest = np.where(has, np.floor((high_m - base_m) / span_m + 0.5), lowest - 1)
     lowest, highest = lowest.astype(np.int32), highest.astype(np.int32)
-    block, truncation_m = np.zeros((0, 3), np.int32), _truncation(depths, grid.cell_m)
-    distance = weight = np.zeros((0, SIDE, SIDE, SIDE), np.float32)
-    added = _blocks(lowest, highest)
+    truncation_m = _truncation(depths, grid.cell_m)
+    added, parts = _blocks(lowest, highest), []
     if len(added) > LARGEST_BLOCKS:
         raise ValueError(f"{len(added)} blocks are too many; mesh it in smaller tiles")
     for grown in range(GROWN_BLOCKS + 1):
-        shape = (len(added), SIDE, SIDE, SIDE)
-        new = Volume(origin, grid.cell_m, added, *np.zeros((2, *shape), np.float32))
-        _vote(new, height, depths, truncation_m)
-        block = np.concatenate([block, added])
-        distance, weight = (
-            np.concatenate(two) for two in ((distance, new.distance), (weight, new.weight))
-        )
+        zero = np.zeros((2, len(added), SIDE, SIDE, SIDE), np.float32)
+        parts.append(Volume(origin, grid.cell_m, inside, added, *zero))
+        _vote(parts[-1], height, depths, truncation_m)
         down, up = lowest.copy(), highest.copy()
-        _leave(block, distance, inside, lowest, highest, down, up, grown == GROWN_BLOCKS)
+        for one in parts:
+            _leave(
+                one.block, one.distance, inside, lowest, highest, down, up, grown == GROWN_BLOCKS
+            )
         added = np.concatenate([_blocks(down, lowest - 1), _blocks(highest + 1, up)])
         lowest, highest = down, up
         if not len(added):
             break
-    return Volume(origin, grid.cell_m, block, distance, weight, inside[block[:, 1], block[:, 0]])
+    block, distance, weight = (
+        np.concatenate([getattr(one, name) for one in parts])
+        for name in ("block", "distance", "weight")
+    )
+    return Volume(origin, grid.cell_m, inside, block, distance, weight)
 
 
 def _blocks(lowest: I32, highest: I32) -> I32:
@@ -292,7 +294,9 @@ def _extracted(volume: Volume) -> tuple[F64, I32]:
     distance = volume.distance  # one of zero would put vertices of several edges into one place
     sure = np.where(distance < 0.0, np.minimum(distance, -LEAST), np.maximum(distance, LEAST))
     grid.attribute("tsdf").numpy()[at, ..., 0] = sure
-    grid.attribute("weight").numpy()[at, ..., 0] = volume.is_inside[:, None]
+    grid.attribute("weight").numpy()[at, ..., 0] = volume.inside[
+        volume.block[:, 1], volume.block[:, 0], None
+    ]
     made = grid.extract_triangle_mesh(weight_threshold=0.5).to_legacy()
     if not len(made.triangles):
         raise ValueError("no surface crosses the volume")

@@ -56,7 +56,7 @@ def test_sheets_that_touch_at_an_edge_are_taken_apart() -> None:
     box = np.array(list(np.ndindex(2, 2, 2)), np.float64)
     sides = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     one = np.array([t for a, b, c, d in sides for t in ((a, b, c), (a, c, d))], np.int32)
-    both = np.vstack([box, box + [1.0, 1.0, 0.0]])
+    both = np.vstack([box, box + np.array([1.0, 1.0, 0.0])])
     both, place = np.unique(both, axis=0, return_inverse=True)
     faces = place[np.vstack([one, one + 8])].astype(np.int32)
     assert edges(faces)[2].max() == 4
@@ -71,9 +71,8 @@ def test_sheets_that_touch_at_an_edge_are_taken_apart() -> None:
 
 def test_parts_that_float_go() -> None:
     whole = height_mesh(raster(np.zeros((40, 40), np.float32)))
-    speck = Mesh(whole.vertices_m[:3] + [0.0, 0.0, 5.0], np.array([[0, 1, 2]], np.int32))
-    vertices = np.vstack([speck.vertices_m, whole.vertices_m])
-    faces = np.vstack([speck.faces, whole.faces + 3]).astype(np.int32)
+    vertices = np.vstack([whole.vertices_m[:3] + 5.0, whole.vertices_m])
+    faces = np.vstack([[[0, 1, 2]], whole.faces + 3]).astype(np.int32)
     kept = largest_parts(vertices, faces, 0.01)
     np.testing.assert_array_equal(kept[0], whole.vertices_m)
     np.testing.assert_array_equal(kept[1], whole.faces)
