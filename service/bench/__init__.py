@@ -181,18 +181,13 @@ def last_kept(folder: Path, names: Sequence[str]) -> dict[tuple[str, str], float
 
 def commit() -> str:
     """The commit of the source that runs, with ``+`` when it was changed since; or ``unknown``."""
+    command = ("git", "describe", "--always", "--abbrev=10", "--exclude=*", "--dirty=+")
     folder = Path(__file__).parent
-
-    def git(*words: str) -> str:
-        done = subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True)
-        return done.stdout.strip() if done.returncode == 0 else ""
-
     try:
-        head = git("rev-parse", "--short=10", "HEAD")
-        changed = "+" if head and git("status", "--porcelain", "--untracked-files=no") else ""
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     except OSError:
         return "unknown"
-    return head + changed or "unknown"
+    return done.stdout.strip() or "unknown"
 
 
 def machine() -> str:

@@ -17,9 +17,8 @@ from pathlib import Path
 
 import cv2
 
-from service.bench import BenchOptions, BenchResult, in_process
+from service.bench import BenchOptions, BenchResult, in_process, stereo
 from service.bench.pipeline import FPS, SIZE, SgbmBackend, fly, make_video
-from service.bench.stereo import speed
 from service.cameras import open_camera
 from service.compute.backend_choice import choose_backend
 from service.daemon.machine import Machine, read_machine
@@ -31,7 +30,7 @@ EVERY_S = 1.0
 def run(options: BenchOptions, widths: Sequence[int] = WIDTHS) -> list[BenchResult]:
     """Stereo, decoding, the whole path at three widths, and the sensors that the board has."""
     flight_s = max(2, round(options.rounds / 3.0))
-    results = speed(options, choose_backend(options.backend))
+    results = stereo.run(options)
     with tempfile.TemporaryDirectory() as folder, watched(Path(folder)) as readings:
         video = Path(folder) / "flight.mp4"
         make_video(video, flight_s * FPS)

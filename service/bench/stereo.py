@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.backends import Backend
 from recon.stereo.belief_propagation import BeliefPropagationConfig
 from recon.stereo.upsampling import UpsamplingConfig
 from recon.types import U8, DisparityMap
@@ -21,11 +20,7 @@ ITERATIONS = 5
 
 def run(options: BenchOptions) -> list[BenchResult]:
     """Milliseconds for the sizes of flight."""
-    return speed(options, choose_backend(options.backend))
-
-
-def speed(options: BenchOptions, backend: Backend) -> list[BenchResult]:
-    """Milliseconds for the sizes of flight."""
+    backend = choose_backend(options.backend)
     results = []
     for width, height, labels in SIZES:
         left, right = scene(width, height, labels)
@@ -60,16 +55,9 @@ def scene(width: int, height: int, labels: int) -> tuple[U8, U8]:
 def semi_global(labels: int, mode: int = 0) -> Any:
     """OpenCV's matcher, dense, for gray images; its number of disparities is a multiple of 16."""
     return cv2.StereoSGBM.create(
-        minDisparity=0,
-        numDisparities=-(-labels // 16) * 16,
-        blockSize=3,
-        P1=8 * 9,
-        P2=32 * 9,
-        disp12MaxDiff=-1,
-        preFilterCap=63,
-        uniquenessRatio=0,
-        mode=mode,
-    )
+        minDisparity=0, numDisparities=-(-labels // 16) * 16, blockSize=3, P1=8 * 9, P2=32 * 9,
+        disp12MaxDiff=-1, preFilterCap=63, uniquenessRatio=0, mode=mode,
+    )  # fmt: skip
 
 
 COARSE = (180, 320)

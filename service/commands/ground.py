@@ -16,11 +16,9 @@ from service.errors import InputError, SkyreliefError
 from service.packages import needing
 
 if TYPE_CHECKING:
-    from service.ground.drone import DroneLimits
     from service.ground.portal import Portal
     from service.ground.receiver import Receiver, ReceiverConfig
     from service.init_system import Notifier
-    from service.stream.session import SessionConfig
     from service.workers import Worker, Workers
 
 DEFAULT_PORT = 7447
@@ -104,39 +102,10 @@ class GroundOptions:
 
     def receiver(self) -> ReceiverConfig:
         """The receiver's configuration; InputError for impossible options."""
+        from service.ground.drone import DroneLimits
         from service.ground.receiver import ReceiverConfig
-
-        name, session = self._session()
-        return ReceiverConfig(self.store, session, self._limits(), name, self.sites)
-
-    def _session(self) -> tuple[str, SessionConfig]:
-        """The station's name on its certificate, and how it is reached."""
         from service.stream.keys import member_name, tls_files
         from service.stream.session import SessionConfig
-
-        connect, listen, has_keys = self.connect or [], self.listen or [], self.keys is not None
-        ca, certificate, key = tls_files(self.keys) if self.keys is not None else ("", "", "")
-        if has_keys and connect and listen:
-            raise InputError(
-                "with --keys a station listens or joins another: its key does not let it pass on "
-                "what drones send; a drone can name several stations in datalink.connect"
-            )
-        if not connect and not listen:
-            host = "tls/0.0.0.0" if has_keys else "tcp/127.0.0.1"
-            listen = [f"{host}:{DEFAULT_PORT}"]
-        return member_name(Path(certificate)) if certificate else "", SessionConfig(
-            mode="router" if listen or len(connect) > 1 else "client",
-            connect=tuple(connect),
-            listen=tuple(listen),
-            plain=self.plain,
-            tls_ca=ca,
-            tls_certificate=certificate,
-            tls_key=key,
-            fleet_rights=has_keys and bool(listen),
-        )
-
-    def _limits(self) -> DroneLimits:
-        from service.ground.drone import DroneLimits
 
         if not 0.0 < self.drone_share <= 100.0:
             raise InputError("--drone-share is a percentage: more than 0, at most 100")
@@ -147,7 +116,25 @@ class GroundOptions:
         refresh_s = self.refresh_s
         if refresh_s is None:
             refresh_s = RADIO_REFRESH_S if self.mavlink else 0.0
-        return DroneLimits(quota, self.drone_share / 100.0, reserve, refresh_s=refresh_s)
+        limits = DroneLimits(quota, self.drone_share / 100.0, reserve, refresh_s=refresh_s)
+        connect, listen, has_keys = self.connect or [], self.listen or [], self.keys is not None
+        ca, certificate, key = tls_files(self.keys) if self.keys is not None else ("", "", "")
+        if has_keys and connect and listen:
+            raise InputError(
+                "with --keys a station listens or joins another: its key does not let it pass on "
+                "what drones send; a drone can name several stations in datalink.connect"
+            )
+        if not connect and not listen:
+            host = "tls/0.0.0.0" if has_keys else "tcp/127.0.0.1"
+            listen = [f"{host}:{DEFAULT_PORT}"]
+        session = SessionConfig(
+            mode="router" if listen or len(connect) > 1 else "client",
+            connect=tuple(connect), listen=tuple(listen), plain=self.plain,
+            tls_ca=ca, tls_certificate=certificate, tls_key=key,
+            fleet_rights=has_keys and bool(listen),
+        )  # fmt: skip
+        name = member_name(Path(certificate)) if certificate else ""  # on its certificate
+        return ReceiverConfig(self.store, session, limits, name, self.sites)
 
 
 @with_options(GroundOptions)

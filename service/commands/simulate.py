@@ -145,7 +145,7 @@ def simulate(given: SimulateOptions) -> None:
     --live plays it in real time, as a camera's stream and an autopilot's MAVLink. A flight that
     exists is not rendered again.
     """
-    from service.scans.writing import filling_folder
+    from service.scans.writing import check_writable, filling_folder
     from service.sim import recording
 
     if given.live and (given.out / "flight.mp4").exists():
@@ -154,7 +154,9 @@ def simulate(given: SimulateOptions) -> None:
     started = time.monotonic()
     with refusing("simulate"), showing("simulate") as progress:
         options = given.simulation()
-        _check_new(given.out)
+        if any((given.out / name).exists() for name in ("flight.mp4", "truth")):
+            raise InputError(f"{given.out} already holds a flight; give another folder with --out")
+        check_writable(given.out, is_folder=True)
         progress("laying out the site")
         simulation = recording.prepare(options)
     with showing("simulate") as progress, filling_folder(given.out) as part:
@@ -164,15 +166,6 @@ def simulate(given: SimulateOptions) -> None:
         return
     print(f"{given.out}: {result['frames']} frames rendered", file=sys.stderr)
     _play(given)
-
-
-def _check_new(folder: Path) -> None:
-    """Raise InputError when ``folder`` holds a flight; OutsideError when it cannot be written."""
-    from service.scans.writing import check_writable
-
-    if any((folder / name).exists() for name in ("flight.mp4", "truth")):
-        raise InputError(f"{folder} already holds a flight; give another folder with --out")
-    check_writable(folder, is_folder=True)
 
 
 def _play(given: SimulateOptions) -> None:

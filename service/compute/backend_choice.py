@@ -10,28 +10,23 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 import numpy as np
 
-from recon.backends import BACKENDS, Backend, DenseStages, load_backend
-from recon.types import F64, U8, DepthMap, DisparityMap, Registration, StereoPair
+from recon.backends import BACKENDS, Backend, load_backend
 from service.config import ComputeConfig
 from service.errors import InputError, OutsideError
 from service.packages import loads, needing
 
 if TYPE_CHECKING:
     from recon.backends.onnx_backend import LearnedStereoBackend
-    from recon.mapping.registration import IcpConfig
-    from recon.stereo.belief_propagation import BeliefPropagationConfig
-    from recon.stereo.upsampling import UpsamplingConfig
-
-Result = TypeVar("Result")
 
 log = logging.getLogger(__name__)
 
@@ -52,36 +47,13 @@ class FallbackBackend:
     """
 
     def __init__(self, backend: Backend) -> None:
-        self.failure: str | None = None
-        self._use(backend)
-
-    def _use(self, backend: Backend) -> None:
         self._backend = backend
-        self.name, self.device = backend.name, backend.device
-        self.keeps_pairs = backend.keeps_pairs
+        self.failure: str | None = None
 
-    def belief_propagation(
-        self, left: U8, right: U8, labels: int, config: BeliefPropagationConfig
-    ) -> DisparityMap:
-        return self._run(lambda b: b.belief_propagation(left, right, labels, config))
-
-    def upsample(self, coarse: DisparityMap, guide: U8, config: UpsamplingConfig) -> DisparityMap:
-        return self._run(lambda b: b.upsample(coarse, guide, config))
-
-    def register(
-        self, source: DepthMap, target: DepthMap, T_target_source: F64, config: IcpConfig
-    ) -> Registration:
-        return self._run(lambda b: b.register(source, target, T_target_source, config))
-
-    def fused_depth(
-        self,
-        pairs: Sequence[StereoPair],
-        K: F64,
-        size_px: tuple[int, int],
-        T_world_camera: F64,
-        stages: DenseStages,
-    ) -> DepthMap | None:
-        return self._run(lambda b: b.fused_depth(pairs, K, size_px, T_world_camera, stages))
+    def __getattr__(self, name: str) -> Any:
+        """What the backend has under this name; an operation falls back."""
+        found = getattr(self.__dict__["_backend"], name)
+        return partial(self._run, name) if callable(found) else found
 
     def fail(self, error: Exception) -> None:
         """Use the CPU from now on, because of this error."""
@@ -89,18 +61,23 @@ class FallbackBackend:
         log.error(
             "backend %s on %s failed (%s): the CPU takes over", self.name, self.device, self.failure
         )
-        self._use(load_backend("cpu"))
+        self._backend = load_backend("cpu")
 
-    def _run(self, operation: Callable[[Backend], Result]) -> Result:
+    def _run(self, operation: str, *given: object, **named: object) -> Any:
         backend = self._backend
         try:
-            return operation(backend)
+            return getattr(backend, operation)(*given, **named)
         except (RuntimeError, MemoryError) as error:
             if backend.name == "cpu":
                 raise
             if self._backend is backend:
                 self.fail(error)
-            return operation(self._backend)
+            return getattr(self._backend, operation)(*given, **named)
+
+
+def with_fallback(backend: Backend) -> Backend:
+    """The backend itself where it is the CPU's, else a :class:`FallbackBackend`."""
+    return backend if backend.name == "cpu" else cast(Backend, FallbackBackend(backend))
 
 
 def pointless(name: str, is_there: Callable[[str], object] = find_spec) -> str | None:
@@ -153,7 +130,7 @@ def choose_backend(name: str = "auto", by: Choice = Choice()) -> Backend:
             "backend %s found no device but the processor: expect about %d times the duration of "
             "'--backend cpu'", chosen.name, WITHOUT_DEVICE,
         )  # fmt: skip
-    return chosen if chosen.name == "cpu" else FallbackBackend(chosen)
+    return with_fallback(chosen)
 
 
 def engine_folder() -> str | None:
@@ -250,7 +227,7 @@ def open_backend(
             f"{config.model}: takes pairs up to {learned.config.width}x{learned.config.height}, "
             f"but they would be {found}; set compute.stereo_width"
         )
-    return FallbackBackend(learned)
+    return with_fallback(learned)
 
 
 def load_learned_model(declaration: Path) -> LearnedStereoBackend:

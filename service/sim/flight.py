@@ -284,13 +284,9 @@ class Sensors:
 
     def R_ned_gimbal(self, t_s: F64) -> F64:
         """(T, 3, 3) attitude of the head as the gimbal gives it; it shares the wander."""
-        tilt = self._wander(t_s, 4, 7)
+        roll, pitch, turn = self._wander(t_s, 4, 7).T
         yaw = self.flight.course(t_s)
-        white = np.radians(self.noise.attitude_white_deg) * self.rng.normal(size=(len(t_s), 3))
-        out = self.flight.R_ned_gimbal(t_s)
-        for k in range(len(t_s)):
-            s, c = np.sin(yaw[k]), np.cos(yaw[k])
-            roll, pitch = tilt[k, 0], tilt[k, 1]
-            error = np.array([c * roll - s * pitch, s * roll + c * pitch, tilt[k, 2]])
-            out[k] = se3.so3_exp(error + white[k]) @ out[k]
-        return out
+        s, c = np.sin(yaw), np.cos(yaw)
+        error = np.column_stack([c * roll - s * pitch, s * roll + c * pitch, turn])
+        white = np.radians(self.noise.attitude_white_deg) * self.rng.normal(size=error.shape)
+        return np.asarray(se3.each_so3_exp(error + white) @ self.flight.R_ned_gimbal(t_s))

@@ -72,17 +72,15 @@ def make(scene: Scene, texel_m: float, mosaic: U8 | None = None) -> GroundTextur
     which = _which_block(scene, size, texel_m)
     light = _light(scene, sun)
     out = np.empty((size[1], size[0], 3), np.uint8)
-    base = np.zeros((1, 1, 3), np.uint8) if mosaic is None else _fit(mosaic, size)
+    base: U8 = np.zeros((1, 1, 3), np.uint8)
+    if mosaic is not None:
+        base = np.asarray(cv2.resize(mosaic, size, interpolation=cv2.INTER_CUBIC), np.uint8)
     parallel_for(
         _colour, len(out), out, base, cover, which, scene.blocks, light, scene.terrain.z_m,
         scene.area.x0, scene.area.y0, texel_m, scene.terrain.step_m, sun, scene.seed,
     )  # fmt: skip
     flat, levels = _pyramid(out)
     return GroundTexture(flat, levels, scene.area.x0, scene.area.y0, texel_m, sun)
-
-
-def _fit(mosaic: U8, size: tuple[int, ...]) -> U8:
-    return np.asarray(cv2.resize(mosaic, size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
 def _texels(scene: Scene, points: F64, texel_m: float) -> npt.NDArray[np.int32]:

@@ -20,10 +20,12 @@ from typing import Any
 
 import av
 
+from mavlink.wire.dialect import dialect
+from mavlink.wire.messages import OutgoingMessage, Packer
 from mavlink.wire.tlog import packets
 from service.cameras.video import creation_unix_ns
 from service.errors import InputError, OutsideError
-from service.sim.telemetry import BOOT_BEFORE_VIDEO_S, Senders
+from service.sim.telemetry import BOOT_BEFORE_VIDEO_S
 
 log = logging.getLogger(__name__)
 
@@ -49,16 +51,13 @@ class MavlinkPlayer:
     def __init__(self, options: LiveOptions) -> None:
         """Open the socket; ValueError for what is no address, OutsideError for one that cannot be
         used."""
-        from pymavlink.dialects.v20 import common  # type: ignore[import-untyped]
-
         host, _, port = options.mavlink.rpartition(":")
         if not host or not port.isdigit() or not 0 < int(port) < 65536:
             raise ValueError(f"MAVLink address {options.mavlink!r} is not host:port")
-        self.dialect: Any = common
         self.sent = self.answered = 0
-        self._senders = Senders(common)
-        self._reader = common.MAVLink(None)
-        self._requests = common.MAVLink(None)
+        self._packer = Packer(0)
+        self._reader = dialect.MAVLink(None)
+        self._requests = dialect.MAVLink(None)
         self._requests.robust_parsing = True
         self.has_ended = False
         try:
@@ -76,13 +75,13 @@ class MavlinkPlayer:
 
     def play(self, packet: bytes, boot_s: float) -> None:
         """Send one packet of the log as if it happened ``boot_s`` after the boot."""
-        for message in self._reader.parse_buffer(packet) or []:
-            component = message.get_srcComponent()
-            if message.get_type() == "SYSTEM_TIME":
-                now_us = time.time_ns() // 1000
-                message = self.dialect.MAVLink_system_time_message(now_us, round(boot_s * 1e3))
-            self._send(message, component)
-            self.sent += 1
+        message = self._reader.decode(bytearray(packet))
+        component = message.get_srcComponent()
+        if message.get_type() == "SYSTEM_TIME":
+            now_us = time.time_ns() // 1000
+            message = dialect.MAVLink_system_time_message(now_us, round(boot_s * 1e3))
+        self._send(message, component)
+        self.sent += 1
 
     def answer(self, boot_s: float) -> None:
         """Answer what has come in: TIMESYNC requests get the time since the boot."""
@@ -93,13 +92,14 @@ class MavlinkPlayer:
                 return
             for message in self._requests.parse_buffer(data) or []:
                 if message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                    reply = self.dialect.MAVLink_timesync_message(round(boot_s * 1e9), message.ts1)
+                    reply = dialect.MAVLink_timesync_message(round(boot_s * 1e9), message.ts1)
                     self._send(reply, 1)
                     self.answered += 1
 
     def _send(self, message: Any, component: int) -> None:
+        data = self._packer.pack(1, OutgoingMessage(component, message), 0)
         try:
-            self.socket.sendto(self._senders.packed(message, component), self._to)
+            self.socket.sendto(data or b"", self._to)
         except OSError as error:  # a full buffer or a refused datagram loses one packet
             log.debug("MAVLink packet not sent: %s", error)
 

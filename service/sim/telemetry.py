@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from mavlink.wire.dialect import dialect
+from mavlink.wire.messages import OutgoingMessage, Packer
 from recon.frames import R_ENU_NED, R_GIMBAL_CAMERA, rotation_from_rpy
 from recon.se3 import quaternion_from_rotation, so3_exp
 from recon.types import F64
@@ -56,36 +58,20 @@ def packets(
     options: TelemetryOptions,
 ) -> Iterator[tuple[float, bytes]]:
     """(seconds since the first frame, MAVLink 2 packet) in the order of time."""
-    from pymavlink.dialects.v20 import common as dialect  # type: ignore[import-untyped]
-
-    messages = _SimulatedMessages(sensors, origin, epoch_unix_s, ground_range, options, dialect)
+    messages = _SimulatedMessages(sensors, origin, epoch_unix_s, ground_range, options)
     kinds = [
         messages.housekeeping(), messages.attitude(), messages.gimbal(), messages.position(),
         messages.satellites(), *([messages.range()] if options.rangefinder else []),
     ]  # fmt: skip
-    senders = Senders(dialect)
+    packer = Packer(0)
     for message, component, t in heapq.merge(*kinds, key=lambda item: item[2]):
         if t < -options.lead_s:  # a video piped without its time is taken to begin with the log
             continue
         if options.gap_s and options.gap_s[0] <= t < options.gap_s[1]:
             continue
-        yield t, senders.packed(message, component)
-
-
-class Senders:
-    """The components of the vehicle, each with its own sequence number."""
-
-    def __init__(self, dialect: Any) -> None:
-        self._dialect, self._of = dialect, dict[int, Any]()
-
-    def packed(self, message: Any, component: int) -> bytes:
-        """The next packet of a component."""
-        if component not in self._of:
-            self._of[component] = self._dialect.MAVLink(None, srcSystem=1, srcComponent=component)
-        sender = self._of[component]
-        data = bytes(message.pack(sender))
-        sender.seq = (sender.seq + 1) % 256
-        return data
+        data = packer.pack(1, OutgoingMessage(component, message), 0)
+        if data is not None:
+            yield t, data
 
 
 def write_tlog(path: Path, epoch_unix_s: float, stream: Iterator[tuple[float, bytes]]) -> int:
@@ -112,7 +98,6 @@ class _SimulatedMessages:
     epoch_unix_s: float
     ground_range: RANGE_TO_GROUND
     options: TelemetryOptions
-    dialect: Any
 
     def _times(self, hz: float) -> F64:
         """From before the first frame until after the last."""
@@ -124,13 +109,13 @@ class _SimulatedMessages:
         lat, lon = round(self.origin.lat_deg * 1e7), round(self.origin.lon_deg * 1e7)
         level = [1.0, 0.0, 0.0, 0.0]
         for t in self._times(1.0):
-            heartbeat = self.dialect.MAVLink_heartbeat_message
+            heartbeat = dialect.MAVLink_heartbeat_message
             yield heartbeat(2, 3, 128 | 16 | 8 | 1, 3, 4, 3), 1, float(t)
             yield heartbeat(26, 8, 0, 0, 4, 3), GIMBAL_COMPONENT, float(t)
             unix_us, boot_ms = round((self.epoch_unix_s + t) * 1e6), int(_boot_ms(np.array([t]))[0])
-            yield self.dialect.MAVLink_system_time_message(unix_us, boot_ms), 1, float(t) + 0.001
+            yield dialect.MAVLink_system_time_message(unix_us, boot_ms), 1, float(t) + 0.001
             alt = round((self.origin.alt_amsl_m + self.options.home_above_m) * 1e3)
-            home = self.dialect.MAVLink_home_position_message
+            home = dialect.MAVLink_home_position_message
             yield home(lat, lon, alt, 0, 0, 0, level, 0, 0, 0), 1, float(t) + 0.002
 
     def attitude(self) -> Iterator[Timed]:
@@ -140,7 +125,7 @@ class _SimulatedMessages:
         rates = _body_rates(self.sensors.flight.vehicle_rpy(t), t)
         for k, boot in enumerate(_boot_ms(t)):
             yaw = float((rpy[k, 2] + np.pi) % (2 * np.pi) - np.pi)
-            attitude = self.dialect.MAVLink_attitude_message
+            attitude = dialect.MAVLink_attitude_message
             yield attitude(int(boot), rpy[k, 0], rpy[k, 1], yaw, *rates[k]), 1, float(t[k])
 
     def gimbal(self) -> Iterator[Timed]:
@@ -157,7 +142,7 @@ class _SimulatedMessages:
         for k, boot in enumerate(_boot_ms(t)):
             q = [float(v) for v in quaternion_from_rotation(R[k])]
             nan = float("nan")
-            message = self.dialect.MAVLink_gimbal_device_attitude_status_message(
+            message = dialect.MAVLink_gimbal_device_attitude_status_message(
                 0, 0, int(boot), flags, q, nan, nan, nan, 0, nan, nan, 0
             )
             yield message, GIMBAL_COMPONENT, float(t[k])
@@ -172,7 +157,7 @@ class _SimulatedMessages:
         for k, boot in enumerate(_boot_ms(t)):
             lat, lon = round(geodetic[k, 0] * 1e7), round(geodetic[k, 1] * 1e7)
             ned = round(v[k, 1] * 100), round(v[k, 0] * 100), round(-v[k, 2] * 100)
-            yield self.dialect.MAVLink_global_position_int_message(
+            yield dialect.MAVLink_global_position_int_message(
                 int(boot), lat, lon, round(geodetic[k, 2] * 1e3),
                 round((at[k, 2] - self.options.home_above_m) * 1e3), *ned,
                 round(float(yaw[k]) * 100) % 36000,
@@ -188,7 +173,7 @@ class _SimulatedMessages:
         for k, boot in enumerate(_boot_ms(t)):
             course = round(float(np.degrees(np.arctan2(v[k, 0], v[k, 1]))) * 100) % 36000
             speed = round(float(np.hypot(v[k, 0], v[k, 1])) * 100)
-            yield self.dialect.MAVLink_gps_raw_int_message(
+            yield dialect.MAVLink_gps_raw_int_message(
                 int(boot) * 1000, 3, round(geodetic[k, 0] * 1e7), round(geodetic[k, 1] * 1e7),
                 round(geodetic[k, 2] * 1e3), 80, 120, speed, course, 14, 0, h_acc,
                 round(1.5 * h_acc), 300, 0,
@@ -204,7 +189,7 @@ class _SimulatedMessages:
         for k, boot in enumerate(_boot_ms(t)):
             if 0.1 < ways[k] < 120.0:
                 cm = round(float(ways[k]) * 100)
-                distance = self.dialect.MAVLink_distance_sensor_message
+                distance = dialect.MAVLink_distance_sensor_message
                 yield distance(int(boot), 10, 12000, cm, 0, 1, 25, 0), 1, float(t[k])
 
 
