@@ -11,16 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands import (
-    AsJson,
-    ScanDir,
-    Scheduler,
-    TilePoints,
-    Voxel,
-    choices,
-    one_of,
-    showing,
-)
+from service.commands import AsJson, ScanDir, Scheduler, TilePoints, Voxel, choices, one_of, showing
 from service.errors import InputError, refusing
 from service.offline.exports import EXPORTERS, kind_of
 from service.packages import needing

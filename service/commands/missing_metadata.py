@@ -10,20 +10,25 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Collection
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event
 from typing import TYPE_CHECKING, Any
 
+from mavlink.telemetry.history import HistoryConfig
+from mavlink.telemetry.logs import TelemetryLog, gpmf, klv, load_telemetry, srt
 from recon.calibration.flight import SelfCalibrated, SelfCalibrationConfig, corner_bend
-from recon.types import Camera, Shutter
+from recon.types import Camera
 from service.cameras import open_camera, parse_source
 from service.cameras.camera_file import seeks_readout
 from service.cameras.dji_metadata import stated_shutter
 from service.cameras.images import ImagesSource
 from service.cameras.lens import Lens, by_full_frame, by_view
+from service.cameras.video import metadata, subtitles
 from service.config import change
 from service.errors import InputError
 from service.flight.scan import Scan, ScanInputs, check_new, create_store
@@ -31,7 +36,6 @@ from service.offline.refine.own_camera import MAX_SIGMA_BEND, MIN_IMAGES, bent, 
 from service.stream.validity import MAX_TIME_NS, is_time
 
 if TYPE_CHECKING:
-    from mavlink.telemetry.logs import TelemetryLog
     from service.cameras.source import CameraSource
     from service.config import Config
     from service.progress import Progress
@@ -186,10 +190,27 @@ def with_stated_readout(
     return replace(camera, shutter=shutter), change(config, "camera.readout_ms", "auto")
 
 
-def with_readout(inputs: ScanInputs, shutter: Shutter) -> dict[str, Any]:
-    """Inputs of the scan with the readout that its images show; the search goes on."""
-    camera = replace(inputs.camera, shutter=shutter)
-    return {"camera": camera, "config": change(inputs.config, "camera.readout_ms", "auto")}
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """What the images of a scan correct, for a scan that is right from its start."""
+
+    of: str  # "readout", "clock"
+    changed: dict[str, Any]  # of its inputs
+
+
+def correction_of(
+    scan: Scan, unsure: Collection[str], has_ended: bool = False
+) -> Correction | None:
+    """What the images of the scan show by now, of what is ``unsure``; None before they do."""
+    off_ms = scan.check.clock_off_ms(has_ended) if "clock" in unsure else None
+    if off_ms is not None:
+        return Correction("clock", at_another_time(scan.inputs, off_ms))
+    shutter = scan.found_shutter() if "readout" in unsure else None
+    if shutter is None:
+        return None
+    camera = replace(scan.inputs.camera, shutter=shutter)
+    config = change(scan.inputs.config, "camera.readout_ms", "auto")  # the search goes on
+    return Correction("readout", {"camera": camera, "config": config})
 
 
 def start_of(
@@ -281,3 +302,49 @@ def at_another_time(inputs: ScanInputs, off_ms: float) -> dict[str, Any]:
         "unix_offset_ns": offset_ns and offset_ns + off_ns,
         "notes": (*inputs.notes, note),
     }
+
+
+def load_log(path: Path, config: Config) -> TelemetryLog:
+    """The flight log of a file; InputError for one that cannot be used."""
+    try:
+        return load_telemetry(path, HistoryConfig(yaw_frame=config.mavlink.gimbal_yaw_frame))
+    except ValueError as error:
+        raise InputError(str(error)) from error
+
+
+def own_telemetry(video: str, config: Config) -> TelemetryLog | None:
+    """The telemetry of a video: in subtitles next to it, under its name, or in the video."""
+    kind, name = parse_source(video)[:2]
+    if kind != "file":
+        return None
+    places = [Path(name).with_suffix(end) for end in (".SRT", ".srt")]
+    path = next((place for place in places if place.is_file()), None)
+    history = HistoryConfig(yaw_frame=config.mavlink.gimbal_yaw_frame)
+    try:
+        if path is not None:
+            found, where = load_telemetry(path, history), f"{path.name}, next to the video"
+        elif (inside := telemetry_inside(Path(name), history)) is not None:
+            found, where = inside
+        else:
+            return None
+    except (InputError, ValueError) as error:
+        log.warning("no telemetry: %s", error)
+        return None
+    return replace(found, warnings=(f"telemetry from {where}", *found.warnings))
+
+
+def telemetry_inside(path: Path, config: HistoryConfig) -> tuple[TelemetryLog, str] | None:
+    """The telemetry in a video's own streams, and their kind in words; None without any.
+
+    Raises ValueError where they hold none that can be used.
+    """
+    cues = subtitles(path)
+    if (cue := next(cues, None)) is not None:
+        return srt.of_cues(path, chain((cue,), cues), config), "the video's own subtitles"
+    packets = metadata(path, (gpmf.MARK, klv.MARK))
+    if (packet := next(packets, None)) is None:
+        return None
+    every = chain((packet,), packets)
+    if packet[2].startswith(gpmf.MARK):
+        return gpmf.of_packets(path, every, config), "the camera's own track (GPMF)"
+    return klv.of_packets(path, every, config), "the video's own metadata (MISB KLV)"

@@ -155,12 +155,7 @@ def refly(
 ) -> None:
     """Plan a mission over gaps, places in too few images and places of large sigma."""
     from service.offline.exports.view import ScanView
-    from service.offline.refine.refly import (
-        NO_FLIGHT,
-        plan_json,
-        suggest_as_flown,
-        waypoints_text,
-    )
+    from service.offline.refine.refly import NO_FLIGHT, plan_json, suggest_as_flown, waypoints_text
     from service.scans.coverage import coverage_of
     from service.scans.writing import check_writable, write_whole
 

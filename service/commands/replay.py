@@ -3,36 +3,25 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands import (
-    AsJson,
-    BackendName,
-    ConfigFile,
-    Overrides,
-    showing,
-    stop_by_signals,
-)
-from service.errors import InputError
+from service.commands import AsJson, BackendName, ConfigFile, Overrides, showing, stop_by_signals
 from service.progress import CancelledError, Progress
 from service.workers import PROCESS, Worker, end_processes
 
 if TYPE_CHECKING:
-    from mavlink.telemetry.history import HistoryConfig
-    from mavlink.telemetry.logs import TelemetryLog
     from service.cameras.source import CameraSource
+    from service.commands.missing_metadata import Correction
     from service.config import Config
     from service.flight.scan import Scan, ScanInputs
 
@@ -80,6 +69,8 @@ def replay(
     from service.cameras.source import Paced
     from service.commands.adjusted_stills import adjusted_stills
     from service.commands.missing_metadata import (
+        load_log,
+        own_telemetry,
         start_lens,
         start_of,
         with_own_lens,
@@ -99,7 +90,7 @@ def replay(
         check_writable(out, is_folder=True)
     model = camera_model or chosen.camera.model
     camera = load_camera(model) if model else None
-    log = _load_telemetry(telemetry, chosen) if telemetry else own_telemetry(video, chosen)
+    log = load_log(telemetry, chosen) if telemetry else own_telemetry(video, chosen)
     source = open_camera(video)
     with closing(Paced(source) if realtime else source) as played:
         if not (realtime or chosen.compute.model or is_given(WIDTH, config, overrides)):
@@ -171,73 +162,17 @@ def denser(config: Config, source: CameraSource) -> Config:
     return change(config, WIDTH, max(width, compute.stereo_width))
 
 
-def _history_config(config: Config) -> HistoryConfig:
-    from mavlink.telemetry.history import HistoryConfig
-
-    return HistoryConfig(yaw_frame=config.mavlink.gimbal_yaw_frame)
-
-
-def _load_telemetry(path: Path, config: Config) -> TelemetryLog:
-    from mavlink.telemetry.logs import load_telemetry
-
-    try:
-        return load_telemetry(path, _history_config(config))
-    except ValueError as error:
-        raise InputError(str(error)) from error
-
-
-def own_telemetry(video: str, config: Config) -> TelemetryLog | None:
-    """The telemetry of a video: in subtitles next to it, under its name, or in the video."""
-    from service.cameras import parse_source
-
-    kind, name = parse_source(video)[:2]
-    if kind != "file":
-        return None
-    places = [Path(name).with_suffix(end) for end in (".SRT", ".srt")]
-    path = next((place for place in places if place.is_file()), None)
-    try:
-        if path is not None:
-            found, where = _load_telemetry(path, config), f"{path.name}, next to the video"
-        elif (inside := telemetry_inside(Path(name), _history_config(config))) is not None:
-            found, where = inside
-        else:
-            return None
-    except (InputError, ValueError) as error:
-        logging.getLogger(__name__).warning("no telemetry: %s", error)
-        return None
-    return replace(found, warnings=(f"telemetry from {where}", *found.warnings))
-
-
-def telemetry_inside(path: Path, config: HistoryConfig) -> tuple[TelemetryLog, str] | None:
-    """The telemetry in a video's own streams, and their kind in words; None without any.
-
-    Raises ValueError where they hold none that can be used.
-    """
-    from mavlink.telemetry.logs import gpmf, klv, srt
-    from service.cameras.video import metadata, subtitles
-
-    cues = subtitles(path)
-    if (cue := next(cues, None)) is not None:
-        return srt.of_cues(path, chain((cue,), cues), config), "the video's own subtitles"
-    packets = metadata(path, (gpmf.MARK, klv.MARK))
-    if (packet := next(packets, None)) is None:
-        return None
-    every = chain((packet,), packets)
-    if packet[2].startswith(gpmf.MARK):
-        return gpmf.of_packets(path, every, config), "the camera's own track (GPMF)"
-    return klv.of_packets(path, every, config), "the video's own metadata (MISB KLV)"
-
-
 def _corrected(
     inputs: ScanInputs, video: str, unsure: set[str], progress: Progress
 ) -> dict[str, Any]:
     """The figures of the scan, begun again for each thing ``unsure`` that its images correct."""
     from service.cameras import open_camera
+    from service.commands.missing_metadata import Correction
 
     stop = stop_by_signals()
     found = _fly(inputs, stop, progress, unsure)
     corrected = inputs
-    while isinstance(found, _Correction):
+    while isinstance(found, Correction):
         progress(f"beginning again with the {found.of} that was found")
         # A readout that was sought with another clock is sought once more.
         unsure = {"readout"} if found.of == "clock" else unsure - {"readout"}
@@ -248,21 +183,14 @@ def _corrected(
     return found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Correction:
-    """What the images of a scan correct, for a scan that is right from its start."""
-
-    of: str  # "readout", "clock"
-    changed: dict[str, Any]  # of its inputs
-
-
 def _fly(
     inputs: ScanInputs, stop: Event, progress: Progress, unsure: Collection[str]
-) -> dict[str, Any] | _Correction:
+) -> dict[str, Any] | Correction:
     """The scan's figures; or once the images correct something ``unsure``, the correction.
 
     What came before that is wrong, so such a scan is discarded, unless it goes to the ground.
     """
+    from service.commands.missing_metadata import correction_of
     from service.daemon.warm_up import has_kernels
     from service.flight.datalink import open_datalink
     from service.flight.scan import Scan, create_store
@@ -281,9 +209,9 @@ def _fly(
             work = f"compiling kernels, once, a minute or two; {work}"
         with progress.part(work, of_rest=0.9):
             show = show_flown(inputs.source, progress)
-            scan.run(stop, show, is_enough=lambda scan: _correction(scan, unsure))
+            scan.run(stop, show, is_enough=lambda scan: correction_of(scan, unsure))
             if not stop.is_set():
-                correction = _correction(scan, unsure, has_ended=True)
+                correction = correction_of(scan, unsure, has_ended=True)
     finally:
         if correction is not None:
             scan.discard()
@@ -320,17 +248,6 @@ def _until_stopped(stop: Event, progress: Progress) -> Progress:
                 now.cancel()
 
     return Progress(show)
-
-
-def _correction(scan: Scan, unsure: Collection[str], has_ended: bool = False) -> _Correction | None:
-    """What the images of the scan show by now, of what is ``unsure``; None before they do."""
-    from service.commands.missing_metadata import at_another_time, with_readout
-
-    off_ms = scan.check.clock_off_ms(has_ended) if "clock" in unsure else None
-    if off_ms is not None:
-        return _Correction("clock", at_another_time(scan.inputs, off_ms))
-    shutter = scan.found_shutter() if "readout" in unsure else None
-    return None if shutter is None else _Correction("readout", with_readout(scan.inputs, shutter))
 
 
 def show_flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:

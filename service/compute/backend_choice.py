@@ -15,7 +15,7 @@ from dataclasses import MISSING, dataclass, fields
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -75,11 +75,6 @@ class FallbackBackend:
             return getattr(self._backend, operation)(*given, **named)
 
 
-def with_fallback(backend: Backend) -> Backend:
-    """The backend itself where it is the CPU's, else a :class:`FallbackBackend`."""
-    return backend if backend.name == "cpu" else cast(Backend, FallbackBackend(backend))
-
-
 def pointless(name: str, is_there: Callable[[str], object] = find_spec) -> str | None:
     """Why ``auto`` skips this backend, or None; imports nothing heavy."""
     if name == "torch" and is_there("torch") is None:
@@ -130,7 +125,7 @@ def choose_backend(name: str = "auto", by: Choice = Choice()) -> Backend:
             "backend %s found no device but the processor: expect about %d times the duration of "
             "'--backend cpu'", chosen.name, WITHOUT_DEVICE,
         )  # fmt: skip
-    return with_fallback(chosen)
+    return chosen if chosen.name == "cpu" else FallbackBackend(chosen)
 
 
 def engine_folder() -> str | None:
@@ -227,7 +222,7 @@ def open_backend(
             f"{config.model}: takes pairs up to {learned.config.width}x{learned.config.height}, "
             f"but they would be {found}; set compute.stereo_width"
         )
-    return with_fallback(learned)
+    return FallbackBackend(learned)
 
 
 def load_learned_model(declaration: Path) -> LearnedStereoBackend:

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from mavlink.telemetry.history import HistoryConfig
 from mavlink.telemetry.logs import TelemetryLog, gpmf, klv
 from mavlink.telemetry.samples import VehicleState
-from service.commands.replay import telemetry_inside
+from service.commands.missing_metadata import telemetry_inside
 
 SECOND_NS = 1_000_000_000
 REAL = DATA / "video_metadata"

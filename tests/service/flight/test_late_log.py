@@ -15,7 +15,7 @@ from command_line import skyrelief
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog
 from service.cameras.source import CameraSource
-from service.commands import replay
+from service.commands import missing_metadata, replay
 from service.commands.missing_metadata import (
     HOUR_NS,
     at_another_time,
@@ -124,7 +124,7 @@ def test_a_date_for_a_log_without_one_leaves_its_clock_open(
         asked.append((inputs.epoch_ns, set(unsure)))
         return {}
 
-    monkeypatch.setattr(replay, "_load_telemetry", lambda path, config: log)
+    monkeypatch.setattr(missing_metadata, "load_log", lambda path, config: log)
     monkeypatch.setattr(replay, "_fly", fly)
     replayed(brief, tmp_path / "scan", "--video-epoch", str(EPOCH_S))
     assert asked == [(round(80e9), {"readout", "clock"})]

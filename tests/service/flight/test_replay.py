@@ -21,7 +21,8 @@ from loopback import until
 from paths import ROOT
 
 from recon.types import Shutter
-from service.commands.replay import await_dense, own_telemetry
+from service.commands.missing_metadata import own_telemetry
+from service.commands.replay import await_dense
 from service.config import load_config
 from service.flight.scan import Scan
 from service.stream.store import ScanStore
