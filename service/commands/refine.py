@@ -172,12 +172,11 @@ def refly(
         found = coverage_of(scan.store)
         if found is None:
             raise InputError(f"{scan_dir} contains no surface; there is nothing to compare with")
-        limits = replace(
-            found.limits,
-            min_views=found.limits.min_views if views is None else views,
-            max_sigma_m=found.limits.max_sigma_m if sigma_m is None else sigma_m,
+        found = replace(
+            found,
+            min_views=found.min_views if views is None else views,
+            max_sigma_m=found.max_sigma_m if sigma_m is None else sigma_m,
         )
-        found = replace(found, limits=limits)
         flight = suggest_as_flown(found, scan.poses, overlap, relative, photos)
     if flight is None:
         print(json.dumps({"lines": 0, "weak_m2": 0.0, "plan": None}) if as_json else NO_FLIGHT)

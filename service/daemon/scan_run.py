@@ -108,7 +108,7 @@ class ScanRun:
         scan, store = self.scan, self.store
         if scan is None or store is None:
             return ()
-        return (store.uses(self.thread_id), scan.recorder.keyframes)
+        return (store.database.uses[self.thread_id], scan.recorder.keyframes)
 
     def configure(self, config: Config, level: Level) -> None:
         """Use the live keys of ``config``, reduced to a load level."""

@@ -60,7 +60,7 @@ class Writings:
     def marks(self) -> tuple[Any, ...]:
         """Values that change when one of them makes progress: uses of the store, bytes of files."""
         return tuple(
-            (one.worker and one.store.uses(one.worker.thread_id), sizes(one.folder))
+            (one.worker and one.store.database.uses[one.worker.thread_id], sizes(one.folder))
             for one in tuple(self._all)
         )
 

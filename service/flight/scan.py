@@ -35,7 +35,7 @@ from service.flight.recorder import REPLAYED, TAGS_FILE, FrameTags, Recorder
 from service.flight.reports import ShutterWatch, TrackingWatch
 from service.flight.telemetry_check import TelemetryCheck
 from service.redaction import public_configuration, redacted
-from service.scans.coverage import CoverageWriter
+from service.scans.coverage import covering
 from service.scans.retention import PAGES
 from service.stream.records import ScanHeader
 from service.stream.store import ScanStore
@@ -235,7 +235,7 @@ class Scan:
         Frames that come while ``paused`` is set are passed over. A recording is decoded ahead.
         """
         live = self.source.is_live
-        coverage = CoverageWriter(self.store) if live else nullcontext()
+        coverage = covering(self.store) if live else nullcontext()
         source = nullcontext(self.source) if live else closing(ahead(self.source))
         with short_collections(), coverage, source as frames:
             for frame in frames:

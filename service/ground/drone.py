@@ -247,7 +247,7 @@ class DroneReceiver:
             provisional = not store.header.started_unix_ns or RADIO_NOTE in store.header.notes
             if provisional and header != store.header:
                 store.put_header(header)
-            if kind != "header" and store.add_radio(kind, number, part, data):
+            if kind != "header" and store.radio.add(kind, number, part, data):
                 scan.grew()
                 self.news_at, scan.radio_messages = now, scan.radio_messages + 1
         except OutsideError as error:

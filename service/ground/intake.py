@@ -12,7 +12,6 @@ from collections import deque
 from dataclasses import dataclass
 from itertools import islice
 
-from service.stream import codec
 from service.stream.messages import Ask, Assembler, Head, Held, Numbers, missing, parse
 from service.stream.ranges import MAX_RANGES, RangeSet
 from service.stream.records import ScanHeader, header_from_json
@@ -165,9 +164,7 @@ class ScanIntake:
 
     def _store(self, kind: str, number: int, record: bytes, now: float) -> bool:
         refused = self.store.refused
-        if not self._is_sound(kind, number, record) or not self.store.put_record(
-            kind, number, record
-        ):
+        if not self.store.put_record(kind, number, record):
             if self.store.refused > refused:
                 log.warning("quota reached: %s %d of %s is not kept", kind, number, self.store.path)
             else:
@@ -178,15 +175,6 @@ class ScanIntake:
             request.brought += request.kind == kind
         self._note_lag(kind, number, now)
         return True
-
-    def _is_sound(self, kind: str, number: int, record: bytes) -> bool:
-        """Whether a layer is the item that its parts named."""
-        if kind == "first":
-            kind = "k0"
-        if not kind.startswith("k"):
-            return True
-        head = codec.peek(record)
-        return head is not None and (f"k{head.layer}", head.seq) == (kind, number)
 
     def _give_up(self, kind: str, number: int) -> None:
         """Stop requesting an item. Beyond a maximum they are forgotten, and requested again."""

@@ -169,7 +169,7 @@ class LiveFeed:
 
     def news(self, max_chunks: int = 20) -> Iterator[str | bytes]:
         """Messages for what has changed; at most ``max_chunks`` keyframes at a time."""
-        before, self._version = self._version, self.store.version()
+        before, self._version = self._version, self.store.database.version()
         if before == self._version and not self._more:
             return
         had_all = self._finished is not None  # of what was there when the feed began

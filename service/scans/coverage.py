@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +26,7 @@ from service.scans.main_piece import Stretch, main_seqs, stretches_apart
 from service.scans.track import local_frame
 from service.scans.writing import write_whole
 from service.stream.store import ScanStore
-from service.workers import PROCESS, Worker
+from service.workers import PROCESS
 
 log = logging.getLogger(__name__)
 
@@ -49,14 +50,6 @@ WRITE_EVERY_S = 15.0
 """Interval at which the layer is written in flight."""
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Thresholds of a weak surface."""
-
-    min_views: int
-    max_sigma_m: float
-
-
 @dataclass(frozen=True, eq=False)
 class Coverage:
     """The layer of a scan at one time, in the scan's ENU metres."""
@@ -64,12 +57,13 @@ class Coverage:
     layer: CoverageGrid
     frame: LocalFrame | None
     places: Rows  # rows of PLACE per keyframe, in order of their number
-    limits: Limits
+    min_views: int  # of a surface that is not weak
+    max_sigma_m: float
 
     @cached_property
     def weak(self) -> Array:
         """(rows, cols) bool: cells worth another flight."""
-        return self.layer.weak(self.limits.min_views, self.limits.max_sigma_m)
+        return self.layer.weak(self.min_views, self.max_sigma_m)
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
@@ -102,24 +96,24 @@ class Coverage:
             "views_median": float(np.median(views)) if len(views) else 0.0,
             "sigma_median_m": round(float(np.median(sigma)), 4) if some else None,
             "sigma_90_percent_m": round(float(np.percentile(sigma, 90)), 4) if some else None,
-            "least_views": self.limits.min_views,
-            "most_sigma_m": round(self.limits.max_sigma_m, 4),
+            "least_views": self.min_views,
+            "most_sigma_m": round(self.max_sigma_m, 4),
             "legend": LEGEND,
         }
 
     def image(self) -> U8:
         """(rows, cols, 4) BGRA, north up: weak cells by cause; clear outside the flown area."""
-        layer, limits = self.layer, self.limits
+        layer = self.layer
         out = np.zeros((*layer.grid.shape, 4), np.uint8)
         known, inside = layer.known, layer.inside
         with np.errstate(invalid="ignore"):
-            share = np.clip(layer.sigma_m / max(limits.max_sigma_m, 1e-6), 0.0, 1.0)
+            share = np.clip(layer.sigma_m / max(self.max_sigma_m, 1e-6), 0.0, 1.0)
         share = np.nan_to_num(share, nan=1.0)[..., None]
         shade = np.array(BEST) * (1 - share) + np.array(USUAL) * share
         out[..., :3] = np.where(known[..., None], shade, 0).astype(np.uint8)
         for cells, colour in (
-            (layer.unsure(limits.max_sigma_m), UNSURE),
-            (layer.seldom(limits.min_views), SELDOM),
+            (layer.unsure(self.max_sigma_m), UNSURE),
+            (layer.seldom(self.min_views), SELDOM),
             (layer.gaps, GAP),
         ):
             out[cells, :3] = colour
@@ -172,8 +166,8 @@ class LiveCoverage:
         if layer is None or not layer.known.any():
             return None
         places = self._map.places()
-        limits = Limits(MIN_VIEWS, MAX_SIGMAS * float(np.median(layer.sigma_m[layer.known])))
-        return Coverage(layer, local_frame(self._store.header), places, limits)
+        max_sigma_m = MAX_SIGMAS * float(np.median(layer.sigma_m[layer.known]))
+        return Coverage(layer, local_frame(self._store.header), places, MIN_VIEWS, max_sigma_m)
 
     def _put(self, seq: int, finer: bool) -> None:
         keyframe = self._store.keyframe(seq)
@@ -201,40 +195,26 @@ def coverage_of(store: ScanStore, cell_m: float | None = None) -> Coverage | Non
     return LiveCoverage(store, cell_m).refresh()
 
 
-def write_coverage_files(folder: Path, store: ScanStore) -> Coverage | None:
+def write_coverage_files(folder: Path, live: LiveCoverage) -> Coverage | None:
     """Write coverage.png and coverage.json into the scan's folder; None without surface."""
-    found = coverage_of(store)
+    found = live.refresh()
     if found is not None:
-        _write(folder, found)
+        write_whole(folder / IMAGE, found.png_bytes())
+        write_whole(folder / FIGURES, found.json_bytes())
     return found
 
 
-def _write(folder: Path, found: Coverage) -> None:
-    write_whole(folder / IMAGE, found.png_bytes())
-    write_whole(folder / FIGURES, found.json_bytes())
+@contextmanager
+def covering(store: ScanStore, every_s: float = WRITE_EVERY_S) -> Iterator[None]:
+    """Write coverage.png and coverage.json of the growing scan, on a separate thread.
 
-
-class CoverageWriter:
-    """Writes coverage.png and coverage.json of a growing scan, on a separate thread.
-
-    Use it in a ``with`` around the flight; disk failures are logged and retried.
+    Disk failures are logged and retried.
     """
-
-    def __init__(self, store: ScanStore, every_s: float = WRITE_EVERY_S) -> None:
-        self._folder = store.path.parent
-        self._live = LiveCoverage(store)
-        self._every_s = every_s
-        self._worker: Worker | None = None
-
-    def __enter__(self) -> CoverageWriter:
-        self._worker = PROCESS.every("coverage", self._every_s, self._write)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._worker is not None:
-            self._worker.join()
-
-    def _write(self) -> None:
-        found = self._live.refresh()
-        if found is not None:
-            _write(self._folder, found)
+    live = LiveCoverage(store)
+    worker = PROCESS.every(
+        "coverage", every_s, lambda: write_coverage_files(store.path.parent, live)
+    )
+    try:
+        yield
+    finally:
+        worker.join()

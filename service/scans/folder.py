@@ -31,7 +31,7 @@ from service.progress import CancelledError, Progress
 from service.redaction import public_configuration, redacted
 from service.scans.absolute import SharedSigma, shared_sigma
 from service.scans.coverage import IMAGE as COVERAGE
-from service.scans.coverage import Coverage, write_coverage_files
+from service.scans.coverage import Coverage, LiveCoverage, write_coverage_files
 from service.scans.drawing import (
     blank_preview,
     draw_preview,
@@ -206,7 +206,7 @@ class _Files:
 
     def cover(self) -> None:
         with self.failures.noted(COVERAGE):
-            self._coverage = write_coverage_files(self._folder, self._store)
+            self._coverage = write_coverage_files(self._folder, LiveCoverage(self._store))
 
     def summary(self, extra: dict[str, Any]) -> dict[str, Any]:
         store, frame, fused = self._store, self._frame, self._fused

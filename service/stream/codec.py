@@ -9,10 +9,10 @@ every bound on a decoder's memory before a section is opened. ``docs/wire.md`` s
 from __future__ import annotations
 
 import math
-import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ import numpy as np
 from recon.camera_model import scaled_K
 from recon.types import F64, DepthMap, Keyframe, Pose
 from service.stream import planes
-from service.stream.records import PLACE_BYTES, pack_place, source_bits, sources_of, unpack_place
+from service.stream.records import Placed, source_bits, sources_of
 from service.stream.validity import MAX_DEPTH_M, MIN_DEPTH_M, is_inverse_depth, is_pinhole, is_time
 
 MAX_SIDE_PX = 4096
@@ -31,18 +31,15 @@ MAX_LAYERS = 8
 IMAGE_LAYER = MAX_LAYERS
 """Place of a keyframe's image among its layers in the store."""
 
-_ID = struct.Struct("<4sBBBBIq")  # magic, version, layer, layers, sources, seq, time
-_GRID = struct.Struct("<HHBB4H")  # full w, full h, factor, depth method, box x y w h
-_OPTICS = struct.Struct("<6f")  # inverse min, inverse step, fx, fy, cx, cy
-_PLACE = struct.Struct(f"<{PLACE_BYTES}s")  # pose and covariance, as in records
-_SIZES = struct.Struct("<5I")
-_CRC = struct.Struct("<I")
-_PARTS = (_ID, _GRID, _OPTICS, _PLACE, _SIZES)
-_SEALED_BYTES = sum(part.size for part in _PARTS)
-
-MAGIC = b"SRKF"
-VERSION = 1
-HEADER_BYTES = _SEALED_BYTES + _CRC.size
+_LAYER = Placed(
+    b"SRKF\x01",
+    # layer, layers, sources, seq, time; full w h, factor, depth method, box x y w h;
+    # inverse min, inverse step, fx, fy, cx, cy
+    first="BBBIqHHBB4H6f",
+    last="5I",  # sizes of the sections
+    max_bytes=MAX_LAYER_BYTES,
+)
+HEADER_BYTES = _LAYER.size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,31 +72,16 @@ class LayerHead:
         return scaled_K(self.K, 1.0 / self.factor, 1.0 / self.factor)
 
 
-def pack(head: LayerHead, sections: Sequence[bytes], place: bytes = b"") -> bytes:
-    """The layer: ``head``, checksum, then mask, depth, sigma, views and colour sections.
-
-    ``place`` is the head's pose and covariance packed by pack_place, if available.
-    """
+def pack(head: LayerHead, sections: Sequence[bytes]) -> bytes:
+    """The layer of ``head`` and its mask, depth, sigma, views and colour sections."""
     K = head.K
-    sealed = b"".join(
-        (
-            _ID.pack(
-                MAGIC,
-                VERSION,
-                head.layer,
-                head.layers,
-                source_bits(head.sources),
-                head.seq,
-                head.time_unix_ns,
-            ),
-            _GRID.pack(*head.full_px, head.factor, head.method, *head.box),
-            _OPTICS.pack(head.inverse_min, head.inverse_step, K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
-            place or pack_place(head.T_world_camera, head.covariance),
-            _SIZES.pack(*(len(s) for s in sections)),
-        )
-    )
-    body = b"".join(sections)
-    return sealed + _CRC.pack(zlib.crc32(body, zlib.crc32(sealed))) + body
+    first = (
+        head.layer, head.layers, source_bits(head.sources), head.seq, head.time_unix_ns,
+        *head.full_px, head.factor, head.method, *head.box,
+        head.inverse_min, head.inverse_step, K[0, 0], K[1, 1], K[0, 2], K[1, 2],
+    )  # fmt: skip
+    sizes = [len(section) for section in sections]
+    return _LAYER.pack(first, head.T_world_camera, head.covariance, sizes, b"".join(sections))
 
 
 def peek(data: bytes) -> LayerHead | None:
@@ -110,36 +92,27 @@ def peek(data: bytes) -> LayerHead | None:
 
 def unpack(data: bytes) -> tuple[LayerHead, tuple[bytes, ...]] | None:
     """Header and the five sections of a layer; None for an invalid layer."""
-    if not HEADER_BYTES <= len(data) <= MAX_LAYER_BYTES or data[:5] != MAGIC + bytes([VERSION]):
+    found = _LAYER.unpack(data)
+    if found is None:
         return None
-    crc = zlib.crc32(memoryview(data)[HEADER_BYTES:], zlib.crc32(data[:_SEALED_BYTES]))
-    if crc != _CRC.unpack_from(data, _SEALED_BYTES)[0]:
+    head = _head(*found[:3])
+    ends = list(accumulate(found[3], initial=HEADER_BYTES))
+    if head is None or ends[-1] != len(data):
         return None
-    fields = []
-    offset = 0
-    for part in _PARTS:
-        fields.append(part.unpack_from(data, offset))
-        offset += part.size
-    head = _head(fields)
-    if head is None or not _plausible(head):
-        return None
-    sections = []
-    offset = HEADER_BYTES
-    for size in fields[4]:
-        sections.append(data[offset : offset + size])
-        offset += size
-    return (head, tuple(sections)) if offset == len(data) else None
+    return head, tuple(data[start:end] for start, end in pairwise(ends))
 
 
-def _head(fields: list[tuple[Any, ...]]) -> LayerHead | None:
-    _, _, layer, layers, bits, seq, time_unix_ns = fields[0]
-    w, h, factor, method, x, y, box_w, box_h = fields[1]
-    optics = np.array(fields[2], np.float64)
-    place = unpack_place(fields[3][0])
-    if place is None or not np.isfinite(optics).all():
+def _head(fields: tuple[Any, ...], T: F64, covariance: F64) -> LayerHead | None:
+    """The header of the leading ``fields``; None for implausible values."""
+    layer, layers, bits, seq, time_unix_ns, w, h, factor, method, x, y, box_w, box_h = fields[:13]
+    low, step, fx, fy, cx, cy = fields[13:]
+    if not (_is_grid(w, h) and is_time(time_unix_ns) and all(map(math.isfinite, fields[13:]))):
         return None
-    fx, fy, cx, cy = optics[2:]
-    return LayerHead(
+    if not (factor >= 1 and layer < layers <= MAX_LAYERS and is_pinhole((fx, fy, cx, cy), (w, h))):
+        return None
+    if box_w and not is_inverse_depth(low, step):
+        return None
+    head = LayerHead(
         layer=layer,
         layers=layers,
         seq=seq,
@@ -148,30 +121,20 @@ def _head(fields: list[tuple[Any, ...]]) -> LayerHead | None:
         factor=factor,
         method=method,
         box=(x, y, box_w, box_h),
-        inverse_min=float(optics[0]),
-        inverse_step=float(optics[1]),
+        inverse_min=low,
+        inverse_step=step,
         K=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-        T_world_camera=place[0],
-        covariance=place[1],
+        T_world_camera=T,
+        covariance=covariance,
         sources=sources_of(bits),
     )
+    W, H = head.grid_px
+    is_inside = x + box_w <= W and y + box_h <= H and (box_w == 0) == (box_h == 0)
+    return head if is_inside else None
 
 
-def _plausible(head: LayerHead) -> bool:
-    w, h = head.full_px
-    if not (0 < w <= MAX_SIDE_PX and 0 < h <= MAX_SIDE_PX and w * h <= MAX_PIXELS):
-        return False
-    if not is_time(head.time_unix_ns):
-        return False
-    if not (head.factor >= 1 and head.layer < head.layers <= MAX_LAYERS):
-        return False
-    K = head.K
-    if not is_pinhole((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), (w, h)):
-        return False
-    x, y, box_w, box_h = head.box
-    if x + box_w > head.grid_px[0] or y + box_h > head.grid_px[1] or (box_w == 0) != (box_h == 0):
-        return False
-    return box_w == 0 or is_inverse_depth(head.inverse_min, head.inverse_step)
+def _is_grid(w: int, h: int) -> bool:
+    return 0 < w <= MAX_SIDE_PX and 0 < h <= MAX_SIDE_PX and w * h <= MAX_PIXELS
 
 
 REFERENCE_DEPTH_M = 60.0
@@ -195,61 +158,47 @@ def encode(keyframe: Keyframe, time_unix_ns: int) -> tuple[bytes, ...]:
     """
     depth = keyframe.depth
     h, w = depth.depth_m.shape
-    _check(keyframe, w, h)
+    if not _is_grid(w, h):
+        raise ValueError(f"keyframe of {w}x{h} px; at most 4096 a side and {MAX_PIXELS} in all")
+    arrays = {"sigma_m": depth.sigma_m, "views": depth.views, "fresh": keyframe.fresh}
+    for name, array in (*arrays.items(), ("bgr", keyframe.bgr)):
+        if array.shape[:2] != (h, w):
+            raise ValueError(f"{name} is {array.shape[:2]}, the depth is {(h, w)}")
     with np.errstate(invalid="ignore"):
         known = keyframe.fresh & (depth.depth_m > MIN_DEPTH_M) & (depth.depth_m < MAX_DEPTH_M)
     fine = planes.planes_of(depth, keyframe.bgr, known)
     factor = -(-w // COARSE_WIDTH_PX)
-    pose = pack_place(depth.T_world_camera, keyframe.pose.covariance)
-
-    def layer(number: int, factor: int, full: planes.Planes, rms_m: float, quality: int) -> bytes:
-        place = (number, layers, factor)
-        return _layer(keyframe, time_unix_ns, place, pose, full, _step(rms_m), quality)
-
-    layers = 1 if factor == 1 else 2
-    finest = layer(layers - 1, 1, fine, FINE_RMS_M, FINE_QUALITY)
-    if layers == 1:
-        return (finest,)
+    layer = partial(_layer, keyframe, time_unix_ns)
+    if factor == 1:
+        return (layer(0, 1, 1, fine, FINE_RMS_M, FINE_QUALITY),)
     coarse = planes.reduce(fine, factor)
-    return layer(0, factor, coarse, COARSE_RMS_M, COARSE_QUALITY), finest
-
-
-def _check(keyframe: Keyframe, w: int, h: int) -> None:
-    if not (0 < w <= MAX_SIDE_PX and 0 < h <= MAX_SIDE_PX and w * h <= MAX_PIXELS):
-        raise ValueError(f"keyframe of {w}x{h} px; at most 4096 a side and {MAX_PIXELS} in all")
-    depth = keyframe.depth
-    for name, shape in (
-        ("sigma_m", depth.sigma_m.shape),
-        ("views", depth.views.shape),
-        ("fresh", keyframe.fresh.shape),
-        ("bgr", keyframe.bgr.shape[:2]),
-    ):
-        if shape != (h, w):
-            raise ValueError(f"{name} is {shape}, the depth is {(h, w)}")
+    return (
+        layer(0, 2, factor, coarse, COARSE_RMS_M, COARSE_QUALITY),
+        layer(1, 2, 1, fine, FINE_RMS_M, FINE_QUALITY),
+    )
 
 
 def _layer(
     keyframe: Keyframe,
     time_unix_ns: int,
-    place: tuple[int, int, int],
-    pose: bytes,
+    layer: int,
+    layers: int,
+    factor: int,
     full: planes.Planes,
-    step: float,
+    rms_m: float,
     quality: int,
 ) -> bytes:
-    """One coded layer; ``place`` is its number, how many there are, and its factor; ``pose``
-    is that of the keyframe, packed."""
+    """One coded layer, of depths whose rounding error at the reference is ``rms_m``."""
     from service.stream import plane_coders
 
-    layer, layers, factor = place
     box = planes.bounding_box(full.known)
-    low = 0.0
+    low, step = 0.0, rms_m * math.sqrt(12.0) / REFERENCE_DEPTH_M**2  # 1/m
     sections: tuple[bytes, ...] = (b"",) * 5
     if box[2] > 0:
         cut = full.crop(box)
         codes, low, step = planes.quantise(cut, step)
         sections = (
-            planes.encode_mask(cut.known),
+            plane_coders.encode_mask(cut.known),
             plane_coders.encode_codes(codes, cut.known),
             planes.encode_sigma(cut),
             planes.encode_views(cut) if layer == layers - 1 else b"",
@@ -272,7 +221,7 @@ def _layer(
         covariance=keyframe.pose.covariance,
         sources=keyframe.pose.sources,
     )
-    return pack(head, sections, pose)
+    return pack(head, sections)
 
 
 def decode(layers: Sequence[bytes]) -> Keyframe | None:
@@ -290,13 +239,15 @@ def decode(layers: Sequence[bytes]) -> Keyframe | None:
 
 
 def _open_planes(head: LayerHead, sections: Sequence[bytes]) -> planes.Planes | None:
+    from service.stream import plane_coders
+
     w, h = head.box[2:]
     if w == 0:
         blank = np.zeros((0, 0), np.float32)
         none = np.zeros((0, 0), np.uint8)
         return planes.Planes(blank, blank, none, np.zeros((0, 0, 3), np.uint8), none > 0)
     mask, depth, sigma, views, colour = sections
-    known = planes.decode_mask(mask, w, h)
+    known = plane_coders.decode_mask(mask, w, h)
     depth_m = planes.decode_depth(depth, known, head.method, head.inverse_min, head.inverse_step)
     sigma_m = planes.decode_sigma(sigma, w, h)
     count = planes.decode_views(views, w, h)

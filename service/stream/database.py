@@ -16,12 +16,12 @@ import sys
 import threading
 import time
 from collections import Counter
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from service.errors import InputError, OutsideError
+from service.errors import InputError, OutsideError, SkyreliefError
 
 log = logging.getLogger(__name__)
 
@@ -104,11 +104,10 @@ def _opened(path: Path, how: str) -> sqlite3.Connection:
             connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
             connection.setlimit(sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH, 1)
         connection.execute("SELECT COUNT(*) FROM sqlite_master")  # opens the file
-    except UnicodeDecodeError as error:  # from SQLite's own message, which quotes the file
+    except BaseException as error:
         connection.close()
-        raise sqlite3.DatabaseError("its schema is damaged") from error
-    except BaseException:
-        connection.close()
+        if isinstance(error, UnicodeDecodeError):  # SQLite's own message quotes the file
+            raise sqlite3.DatabaseError("its schema is damaged") from error
         raise
     return connection
 
@@ -175,19 +174,6 @@ def as_error(path: Path, error: sqlite3.Error) -> InputError | OutsideError:
     return InputError(f"{path} is not a scan database ({text})")
 
 
-def peek_meta(path: Path, key: str) -> str | None:
-    """A text of the meta table, also while the file is open elsewhere; None without one."""
-    try:
-        with closing(connect(path, read_only=True)[0]) as connection:
-            check_schema(connection, path)
-            sql = "SELECT value FROM meta WHERE key = ?"
-            row = connection.execute(sql, (key,)).fetchone()
-    except (sqlite3.Error, OSError, InputError) as error:
-        log.debug("%s: %s", path, error)
-        return None
-    return row[0] if row is not None and isinstance(row[0], str) else None
-
-
 Statement = tuple[str, tuple[Any, ...]]
 
 
@@ -225,25 +211,19 @@ class Database:
         self.lock = threading.RLock()
         self.read_only = read_only or not can_write(path)
         try:
-            self._connection, self._deadline = connect(path, self.read_only, statement_s)
-        except (sqlite3.Error, OSError) as error:
-            raise self._cannot_open(error) from error
-        try:
-            check_schema(self._connection, path)
-            if not self.read_only:
-                self._connection.execute("PRAGMA journal_mode=WAL")
-                self._connection.execute("PRAGMA synchronous=FULL")
-                self._connection.executescript(SCHEMA)
-        except BaseException as error:
-            self._connection.close()
-            if isinstance(error, sqlite3.Error):
-                raise self._cannot_open(error) from error
-            raise
-
-    def _cannot_open(self, error: sqlite3.Error | OSError) -> InputError | OutsideError:
-        if isinstance(error, OSError):
-            return OutsideError(f"{self.path} cannot be opened ({error.strerror or error})")
-        return as_error(self.path, error)
+            with ExitStack() as on_fault:
+                self._connection, self._deadline = connect(path, self.read_only, statement_s)
+                on_fault.callback(self._connection.close)
+                check_schema(self._connection, path)
+                if not self.read_only:
+                    self._connection.execute("PRAGMA journal_mode=WAL")
+                    self._connection.execute("PRAGMA synchronous=FULL")
+                    self._connection.executescript(SCHEMA)
+                on_fault.pop_all()
+        except OSError as error:
+            raise OutsideError(f"{path} cannot be opened ({error.strerror or error})") from error
+        except sqlite3.Error as error:
+            raise as_error(path, error) from error
 
     def one(self, sql: str, values: tuple[Any, ...] = ()) -> tuple[Any, ...] | None:
         """The first row of a query."""
@@ -305,6 +285,16 @@ class Database:
             except sqlite3.Error as error:
                 log.debug("no checkpoint of %s: %s", self.path, error)
             self._connection.close()
+
+
+def peek_meta(path: Path, key: str) -> str | None:
+    """A text of the meta table, also while the file is open elsewhere; None without one."""
+    try:
+        with closing(Database(path, read_only=True)) as database:
+            return database.get(key)
+    except SkyreliefError as error:
+        log.debug("%s", error)
+        return None
 
 
 TABLES = ("meta", "chunks", "poses", "reposes", "radio", "held")

@@ -18,7 +18,7 @@ from service.errors import InputError, OutsideError, SkyreliefError
 from service.stream.messages import Ask, Held, unpack
 from service.stream.naming import ROOT, check_name
 from service.stream.outbox import Outbox, Outgoing
-from service.stream.ranges import RangeSet, ranges_from_text
+from service.stream.ranges import Listener, RangeSet, ranges_from_text
 from service.stream.reports import TAKE_S, HeldNotes, Reports
 from service.stream.session import (
     SessionConfig,
@@ -114,7 +114,7 @@ class DatalinkSender:
             check_endpoints(connection.config)
         self._lock = threading.Lock()  # of the outbox
         self._outbox = Outbox(_rate(config.budget_kbit_s, config.share), time.monotonic())
-        self._stores: list[tuple[ScanStore, Callable[[str, int], None]]] = []
+        self._stores: list[tuple[ScanStore, Listener, bool]] = []  # True: closed with the sender
         self._events: deque[Callable[[float], None]] = deque(maxlen=MAX_WAITING_EVENTS)
         self._asks: deque[tuple[Any, str, str, RangeSet, Ask]] = deque()
         self._reports, self._notes = Reports(self._outbox), HeldNotes(self._outbox)
@@ -123,7 +123,6 @@ class DatalinkSender:
         self._stop = threading.Event()
         self._workers = Workers()
         self._threads: list[Worker] = []
-        self._owned: list[ScanStore] = []
         self._radio = None
         if store is not None and radio is not None:
             tunnel = TunnelConfig(config.radio_baud / 10, config.radio_share)
@@ -151,8 +150,6 @@ class DatalinkSender:
         An ``owned`` store is closed with the sender.
         """
         scan_id = check_name(store.header.name, "scan")
-        if owned:
-            self._owned.append(store)
 
         def on_item(kind: str, number: int) -> None:
             self._post(lambda now: self._outbox.on_item(scan_id, kind, number, now))
@@ -160,7 +157,7 @@ class DatalinkSender:
         with self._lock:
             self._outbox.add(store, time.monotonic())
         store.listen(on_item)
-        self._stores.append((store, on_item))
+        self._stores.append((store, on_item, owned))
         self._wake.set()
 
     def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
@@ -174,7 +171,7 @@ class DatalinkSender:
         with self._lock:
             items = 0
             lacking: dict[str, int] = {}
-            for store, _ in self._stores:
+            for store, *_ in self._stores:
                 items += sum(map(len, store.numbers().values()))
                 for kind, numbers in self._outbox.lacking(store.header.name).items():
                     lacking[kind] = lacking.get(kind, 0) + len(numbers)
@@ -190,16 +187,11 @@ class DatalinkSender:
         """
         deadline = time.monotonic() + timeout_s
         while not self.progress.complete:
-            if time.monotonic() >= deadline or not self._may_send():
+            is_on_its_way = self._threads or (self._radio and not self._radio.all_sent)
+            if time.monotonic() >= deadline or not is_on_its_way:
                 return False
             time.sleep(0.05)
         return True
-
-    def _may_send(self) -> bool:
-        """Whether anything is still on its way, by IP or by radio."""
-        if self._threads:
-            return True
-        return self._radio is not None and not self._radio.all_sent
 
     def close(self) -> None:
         """Stop sending; stores that are not owned stay open."""
@@ -212,12 +204,12 @@ class DatalinkSender:
         if self._radio is not None:
             self._radio.close()
             self._radio = None
-        for store, listener in self._stores:
+        while self._stores:
+            store, listener, owned = self._stores.pop()
             store.unlisten(listener)
             self._notes.keep(store, time.monotonic(), is_last=True)
-        self._stores.clear()
-        while self._owned:
-            self._owned.pop().close()
+            if owned:
+                store.close()
 
     def _post(self, event: Callable[[float], None]) -> None:
         self._events.append(event)
@@ -286,7 +278,12 @@ class DatalinkSender:
             closed.wait(CLOSING_S)
 
         def close(_: Worker) -> None:
-            _close(session, pumps)
+            import zenoh
+
+            with contextlib.suppress(zenoh.ZError):
+                session.close()
+            for pump in pumps:
+                pump.join()
             atexit.unregister(wait)
             closed.set()
 
@@ -345,7 +342,7 @@ class DatalinkSender:
             held = unpack(payload, Held)
             if held is not None:
                 self._outbox.on_held(scan_id, peer, held, now)
-        for store, _ in list(self._stores) if reports else ():
+        for store, *_ in list(self._stores) if reports else ():
             self._notes.keep(store, now)
 
     def _send(self, sessions: list[zenoh.Session], message: Outgoing) -> None:
@@ -399,15 +396,6 @@ def _pump(declared: Any, take: Callable[[Any], None]) -> None:
     """Hand on each message until the subscriber or queryable ends."""
     for message in declared:
         take(message)
-
-
-def _close(session: zenoh.Session, pumps: list[Worker]) -> None:
-    import zenoh
-
-    with contextlib.suppress(zenoh.ZError):
-        session.close()
-    for pump in pumps:
-        pump.join()
 
 
 def _rate(budget_kbit_s: float, share: float) -> float:

@@ -11,7 +11,7 @@ import math
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, TypeVar
 
 import msgspec
@@ -138,15 +138,12 @@ def _size_of(index: int, count: int, total: int) -> int:
 
 @dataclass(slots=True)
 class _Open:
-    count: int
-    total_bytes: int
-    crc: int
-    pieces: dict[int, bytes]
+    """A record in progress."""
+
+    cut: tuple[int, int, int]  # count of parts, bytes and CRC of the record
+    pieces: dict[int, bytes] = field(default_factory=dict)
     held_bytes: int = 0
     touched: float = 0.0
-
-    def same(self, part: Part) -> bool:
-        return (part.count, part.total_bytes, part.crc) == (self.count, self.total_bytes, self.crc)
 
 
 class Assembler:
@@ -161,22 +158,23 @@ class Assembler:
     def add(self, part: Part, now: float) -> bytes | None:
         """The record that ``part`` completes, or None."""
         key = (part.kind, part.number)
+        cut = part.count, part.total_bytes, part.crc
         entry = self._open.get(key)
-        if entry is None or not entry.same(part):
+        if entry is None or entry.cut != cut:
             self.forget(*key)
-            entry = self._open[key] = _Open(part.count, part.total_bytes, part.crc, {})
+            entry = self._open[key] = _Open(cut)
         entry.touched = now
         if part.index in entry.pieces:
             return None
         entry.pieces[part.index] = part.payload
         entry.held_bytes += len(part.payload) + PIECE_BYTES
         self.held_bytes += len(part.payload) + PIECE_BYTES
-        if len(entry.pieces) < entry.count:
+        if len(entry.pieces) < part.count:
             self._make_room(key)
             return None
-        record = b"".join(entry.pieces[k] for k in range(entry.count))
+        record = b"".join(entry.pieces[k] for k in range(part.count))
         self.forget(*key)
-        whole = len(record) == entry.total_bytes and zlib.crc32(record) == entry.crc
+        whole = len(record) == part.total_bytes and zlib.crc32(record) == part.crc
         return record if whole else None
 
     def missing_parts(self, kind: str, number: int) -> tuple[list[int], int]:
@@ -184,7 +182,8 @@ class Assembler:
         entry = self._open.get((kind, number))
         if entry is None:
             return [], 0
-        return [k for k in range(entry.count) if k not in entry.pieces], entry.count
+        count, *_ = entry.cut
+        return [k for k in range(count) if k not in entry.pieces], count
 
     def touched(self, kind: str, number: int) -> float:
         """Time of the last part of a record in progress; -inf for any other."""

@@ -108,7 +108,9 @@ def _decode_bits(data: U8, padded: U8, h: int, w: int) -> None:
 
 
 def encode_mask(known: Bool) -> bytes:
-    """The section for a mask (h, w), without trailing zeros."""
+    """The section for a mask (h, w), without trailing zeros; empty when all pixels are known."""
+    if known.all():
+        return b""
     h, w = known.shape
     out, size = _encode_bits(np.pad(known.astype(np.uint8), _MARGIN), h, w)
     return bytes(out[:size].tobytes().rstrip(b"\0"))
@@ -116,6 +118,8 @@ def encode_mask(known: Bool) -> bytes:
 
 def decode_mask(data: bytes, w: int, h: int) -> Bool:
     """(h, w) mask; accepts any bytes."""
+    if not data:
+        return np.ones((h, w), np.bool_)
     padded = np.zeros((h + 2 * _MARGIN, w + 2 * _MARGIN), np.uint8)
     _decode_bits(np.frombuffer(data, np.uint8), padded, h, w)
     return padded[_MARGIN : _MARGIN + h, _MARGIN : _MARGIN + w] > 0

@@ -20,6 +20,9 @@ METHOD_PREDICTION = 2
 SIGMA_BLOCK_PX = 4
 SIGMA_UNIT_M = 0.001
 SIGMA_STEPS_PER_OCTAVE = 4
+SIGMA_M = SIGMA_UNIT_M * 2.0 ** ((np.arange(256) - 1) / SIGMA_STEPS_PER_OCTAVE)
+"""Sigma by its code; 0 is unknown."""
+SIGMA_M[0] = np.nan
 VIEWS_BLOCK_PX = 2
 MAX_VIEWS = 15
 MCU_PX = 16
@@ -87,23 +90,6 @@ def _fill_back(values: Array, known: Bool) -> Array:
     return np.asarray(values.reshape(known.size)[index].reshape(known.shape))
 
 
-# Mask: which pixels of the box are known.
-
-
-def encode_mask(known: Bool) -> bytes:
-    """The section that says which pixels of the box are known; empty when all are."""
-    from service.stream import plane_coders
-
-    return b"" if known.all() else plane_coders.encode_mask(known)
-
-
-def decode_mask(data: bytes, w: int, h: int) -> Bool:
-    """(h, w) known pixels; accepts any bytes."""
-    from service.stream import plane_coders
-
-    return plane_coders.decode_mask(data, w, h) if data else np.ones((h, w), np.bool_)
-
-
 # Depth: codes of inverse depth.
 
 
@@ -146,13 +132,16 @@ def decode_depth(data: bytes, known: Bool, method: int, low: float, step: float)
 def encode_sigma(planes: Planes) -> bytes:
     """The section of sigma: one code per block of SIGMA_BLOCK_PX."""
     blocks = _blocks(planes.sigma_m, SIGMA_BLOCK_PX, 0)
-    mean = blocks.sum(axis=0) / np.maximum(np.count_nonzero(blocks, axis=0), 1)
-    has = mean > 0
-    if not has.any():
-        return b""
-    octaves = np.log2(np.maximum(mean, SIGMA_UNIT_M) / SIGMA_UNIT_M)
-    codes = np.clip(np.rint(octaves * SIGMA_STEPS_PER_OCTAVE) + 1, 1, 255).astype(np.uint8)
-    return _jpeg_ls(_fill_back(codes, has))
+    codes = sigma_codes(blocks.sum(axis=0) / np.maximum(np.count_nonzero(blocks, axis=0), 1))
+    return _jpeg_ls(_fill_back(codes, codes > 0)) if codes.any() else b""
+
+
+def sigma_codes(sigma_m: Array) -> U8:
+    """The code of each sigma in metres; 0 unless it is positive and finite."""
+    known_m = np.nan_to_num(sigma_m, posinf=0.0)
+    octaves = np.log2(np.maximum(known_m, SIGMA_UNIT_M) / SIGMA_UNIT_M)
+    codes = np.clip(np.rint(octaves * SIGMA_STEPS_PER_OCTAVE) + 1, 1, 255)
+    return np.where(known_m > 0, codes, 0).astype(np.uint8)
 
 
 def decode_sigma(data: bytes, w: int, h: int) -> F32 | None:
@@ -162,9 +151,7 @@ def decode_sigma(data: bytes, w: int, h: int) -> F32 | None:
     codes = open_jpeg_ls(data, -(-w // SIGMA_BLOCK_PX), -(-h // SIGMA_BLOCK_PX))
     if codes is None:
         return None
-    table = SIGMA_UNIT_M * 2.0 ** ((np.arange(256) - 1) / SIGMA_STEPS_PER_OCTAVE)
-    table[0] = np.nan
-    return _enlarge(table.astype(np.float32)[np.minimum(codes, 255)], SIGMA_BLOCK_PX, w, h)
+    return _enlarge(SIGMA_M.astype(np.float32)[np.minimum(codes, 255)], SIGMA_BLOCK_PX, w, h)
 
 
 # Views: minimum count of 2x2 blocks; coarse layers have none.

@@ -9,20 +9,23 @@ from __future__ import annotations
 import math
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from recon import se3
 from recon.types import F32, F64, U8, U16, Bool
 from service.stream.naming import NAME, split_scan_name
+from service.stream.planes import SIGMA_M, sigma_codes
 from service.stream.records import (
     PoseRecord,
     ScanHeader,
     or_nan,
     or_none,
+    pack_motion,
     source_bits,
     sources_of,
+    unpack_motion,
 )
 from service.stream.validity import is_on_globe, is_pinhole, is_time
 
@@ -36,7 +39,7 @@ CELLS = 8
 """A tile is CELLS x CELLS."""
 _DEPTH_UNIT_M = 0.02
 _LEVELS = 62  # depth codes 1 to 63; 0 is unknown
-_METRE_CM = 100.0
+_METRE_CM, _UNIT = 100.0, 32767  # of a quaternion
 
 _ANNOUNCE = struct.Struct("<BIq2dfHB")  # type, tag, started, lat, lon, alt, epsg, drone length
 _POSE = struct.Struct("<BIIq3i4h2ifHBH")
@@ -121,8 +124,7 @@ def pack_pose(tag: int, number: int, pose: PoseRecord) -> bytes:
         tag,
         number,
         pose.time_unix_ns,
-        *_position(pose.T_world_camera),
-        *_rotation(pose.T_world_camera),
+        *_place(pose.T_world_camera),
         -(1 << 31) if no_fix else round(lat * 1e7),
         -(1 << 31) if no_fix else round(lon * 1e7),
         or_nan(pose.alt_amsl_m),
@@ -138,7 +140,7 @@ def unpack_pose(data: bytes) -> tuple[int, int, PoseRecord] | None:
     if len(data) != _POSE.size or data[0] != POSE:
         return None
     f = _POSE.unpack(data)
-    T = _motion(f[4:7], f[7:11])
+    T = _motion(f[4:11])
     if T is None:
         return None
     no_fix = f[11] == -(1 << 31)
@@ -183,14 +185,13 @@ def pack_tile(tag: int, tile: RadioTile) -> bytes:
         w,
         h,
         tile.index,
-        *_position(tile.T_world_camera),
-        *_rotation(tile.T_world_camera),
+        *_place(tile.T_world_camera),
         min(65535, round((K[0, 0] + K[1, 1]) / 2 / w * 8192)),
         round(min(max((K[0, 2] + 0.5) / w, 0.0), 1.0) * 65535),
         round(min(max((K[1, 2] + 0.5) / h, 0.0), 1.0) * 65535),
         near,
         far,
-        _sigma_code(tile.sigma_m),
+        int(sigma_codes(np.array(tile.sigma_m))),
         cb,
         cr,
     )
@@ -205,7 +206,7 @@ def unpack_tile(data: bytes) -> tuple[int, RadioTile] | None:
         return None
     f = _TILE.unpack_from(data)
     w, h, index, near, far = f[4], f[5], f[6], f[17], f[18]
-    T = _motion(f[7:10], f[10:14])
+    T = _motion(f[7:14])
     if T is None or min(w, h, near, f[14]) == 0 or far <= near:
         return None
     if index >= -(-w // CELLS) * -(-h // CELLS):
@@ -226,7 +227,7 @@ def unpack_tile(data: bytes) -> tuple[int, RadioTile] | None:
         index=index,
         K=K,
         T_world_camera=T,
-        sigma_m=0.001 * 2.0 ** ((f[19] - 1) / 4) if f[19] else math.nan,
+        sigma_m=float(SIGMA_M[f[19]]),
         depth_m=np.where(codes > 0, depth, np.nan).astype(np.float32),
         bgr=_from_luma((packed >> np.uint16(6)).reshape(CELLS, CELLS), f[20], f[21]),
     )
@@ -238,25 +239,16 @@ def _extended(data: bytes, size: int) -> bytes:
     return data + bytes(size - len(data)) if 0 < len(data) < size else data
 
 
-def _position(T: F64) -> list[int]:
-    return [round(float(np.clip(v * _METRE_CM, -2e9, 2e9))) for v in T[:3, 3]]
+def _place(T: F64) -> list[int]:
+    """Position in cm and quaternion in 1/32767 of a (4, 4) motion."""
+    motion = pack_motion(T)
+    position_cm = [round(float(np.clip(v * _METRE_CM, -2e9, 2e9))) for v in motion[:3]]
+    return position_cm + [round(v * _UNIT) for v in motion[3:]]
 
 
-def _rotation(T: F64) -> list[int]:
-    return [round(float(v) * 32767) for v in se3.quaternion_from_rotation(T[:3, :3])]
-
-
-def _motion(position_cm: tuple[int, ...], quaternion: tuple[int, ...]) -> F64 | None:
-    q = np.array(quaternion, np.float64) / 32767
-    if not 0.5 < float(np.linalg.norm(q)) < 1.5:
-        return None
-    return se3.compose(se3.rotation_from_quaternion(q), np.array(position_cm) / _METRE_CM)
-
-
-def _sigma_code(sigma_m: float) -> int:
-    if not math.isfinite(sigma_m) or sigma_m <= 0:
-        return 0
-    return min(255, max(1, round(4 * math.log2(sigma_m / 0.001)) + 1))
+def _motion(place: Sequence[int]) -> F64 | None:
+    """(4, 4) motion of what :func:`_place` gives; None for implausible values."""
+    return unpack_motion([*(v / _METRE_CM for v in place[:3]), *(v / _UNIT for v in place[3:])])
 
 
 def _to_luma(bgr: U8, known: Bool) -> tuple[U16, int, int]:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from recon.camera_model import scaled_K
 from recon.types import DepthMap, Keyframe, Pose
 from service.stream import codec, planes
 from service.stream.database import Database, blob
@@ -24,9 +25,7 @@ def tiles_of(coarse: Keyframe) -> list[RadioTile]:
     full = planes.planes_of(depth, coarse.bgr, coarse.fresh)
     factor = -(-full.known.shape[1] // GRID_WIDTH_PX)
     small = planes.reduce(full, factor)
-    K = np.array(depth.K)
-    K[:2] /= factor
-    K[:2, 2] += 0.5 / factor - 0.5
+    K = scaled_K(depth.K, 1.0 / factor, 1.0 / factor)
     h, w = small.known.shape
     out = []
     for index in range(-(-h // CELLS) * -(-w // CELLS)):

@@ -204,7 +204,7 @@ class Inventory:
         self._lock = database.lock
         self.listeners: list[Listener] = []
         self._numbers: dict[str, RangeSet] = {}
-        self.reposes = RangeSet()  # stored, in force or not
+        self._reposes = RangeSet()  # stored, in force or not
         self._database = database
         self._version = database.version()[0]
         self._load(database)
@@ -222,7 +222,7 @@ class Inventory:
     def _load(self, database: Database) -> None:
         self._numbers["pose"] = _ids(database, "poses")
         self._numbers["repose"] = RangeSet.of(row[0] for row in database.all(_IN_FORCE))
-        self.reposes = _ids(database, "reposes")
+        self._reposes = _ids(database, "reposes")
         for kind in ("header", "summary"):
             text = database.get(kind)
             if text is not None:
@@ -241,6 +241,10 @@ class Inventory:
         """The numbers of one kind; do not modify."""
         return self._numbers.setdefault(kind, RangeSet())
 
+    def stored(self, kind: str) -> RangeSet:
+        """As :meth:`of`; with the re-poses that are no longer in force."""
+        return self._reposes if kind == "repose" else self.of(kind)
+
     def note(self, kind: str, number: int) -> None:
         """Add an item and notify the listeners."""
         self.of(kind).add(number)
@@ -257,7 +261,7 @@ class Inventory:
 
     def note_repose(self, number: int, seq: int, revision: int) -> None:
         """Add a stored re-pose; the highest revision, then the highest number, is in force."""
-        self.reposes.add(number)
+        self._reposes.add(number)
         sql = "SELECT revision, id FROM reposes WHERE seq = ? AND id != ? ORDER BY 1 DESC, 2 DESC"
         before = self._database.one(f"{sql} LIMIT 1", (seq, number))
         if before is not None:

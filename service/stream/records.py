@@ -174,64 +174,49 @@ def unpack_motion(seven: Sequence[float] | F64) -> F64 | None:
 
 
 _PLACE = struct.Struct("<7d21f")
+_CRC = struct.Struct("<I")
 
 
-def pack_place(T: F64, covariance: F64) -> bytes:
-    """Position, quaternion and covariance in wire format: 7 f64, 21 f32."""
-    return _PLACE.pack(*pack_motion(T), *pack_covariance(covariance))
+class Placed:
+    """A record with a camera pose.
 
-
-def unpack_place(data: bytes) -> tuple[F64, F64] | None:
-    """Motion and covariance from :func:`pack_place`; None for implausible values."""
-    fields = _PLACE.unpack(data)
-    motion = unpack_motion(fields[:7])
-    if motion is None or not all(map(math.isfinite, fields[7:])):
-        return None
-    return motion, unpack_covariance(fields[7:])
-
-
-PLACE_BYTES = _PLACE.size
-
-
-class _Placed:
-    """A record with leading fields, a camera pose, and trailing fields.
-
-    Magic, version 1, the leading fields, position and quaternion (7 f64), covariance (21 f32),
-    the trailing fields, CRC-32.
+    Magic and version, leading fields, position and quaternion (7 f64), covariance (21 f32),
+    trailing fields, CRC-32 of all the rest, and a body where ``max_bytes`` has room for one.
     """
 
-    def __init__(self, magic: bytes, first: str, last: str) -> None:
-        self._start = magic + b"\x01"
-        self._first, self._last = struct.Struct(f"<3s{first}"), struct.Struct(f"<{last}")
-        self._size = self._first.size + PLACE_BYTES + self._last.size
+    def __init__(self, start: bytes, first: str, last: str, max_bytes: int = 0) -> None:
+        self._start = start
+        self._first, self._last = struct.Struct(f"<{len(start)}s{first}"), struct.Struct(f"<{last}")
+        self._sealed = self._first.size + _PLACE.size + self._last.size
+        self.size = self._sealed + _CRC.size  # without a body
+        self._max_bytes = max_bytes or self.size
 
-    def pack(self, first: Sequence[Any], T: F64, covariance: F64, last: Sequence[Any]) -> bytes:
+    def pack(
+        self, first: Sequence[Any], T: F64, covariance: F64, last: Sequence[Any], body: bytes = b""
+    ) -> bytes:
         """The record."""
-        body = self._first.pack(self._start, *first)
-        body += pack_place(T, covariance) + self._last.pack(*last)
-        return body + _CRC.pack(zlib.crc32(body))
+        sealed = self._first.pack(self._start, *first)
+        sealed += _PLACE.pack(*pack_motion(T), *pack_covariance(covariance))
+        sealed += self._last.pack(*last)
+        return sealed + _CRC.pack(zlib.crc32(body, zlib.crc32(sealed))) + body
 
     def unpack(self, data: bytes) -> tuple[tuple[Any, ...], F64, F64, tuple[Any, ...]] | None:
         """First fields, motion, covariance, last fields; None for anything else."""
-        size = self._size
-        if len(data) != size + _CRC.size or data[:3] != self._start:
+        if not self.size <= len(data) <= self._max_bytes or not data.startswith(self._start):
             return None
-        if zlib.crc32(data[:size]) != _CRC.unpack_from(data, size)[0]:
+        crc = zlib.crc32(memoryview(data)[self.size :], zlib.crc32(data[: self._sealed]))
+        if crc != _CRC.unpack_from(data, self._sealed)[0]:
             return None
-        at = self._first.size
-        place = unpack_place(data[at : at + PLACE_BYTES])
-        if place is None:
+        place = _PLACE.unpack_from(data, self._first.size)
+        motion = unpack_motion(place[:7])
+        if motion is None or not all(map(math.isfinite, place[7:])):
             return None
-        return (
-            self._first.unpack_from(data)[1:],
-            *place,
-            self._last.unpack(data[at + PLACE_BYTES : size]),
-        )
+        last = self._last.unpack_from(data, self._first.size + _PLACE.size)
+        return self._first.unpack_from(data)[1:], motion, unpack_covariance(place[7:]), last
 
 
-_CRC = struct.Struct("<I")
-_POSE = _Placed(b"SP", first="Bqi", last="3d8f")
-_REPOSE = _Placed(b"SR", first="BII", last="f")
+_POSE = Placed(b"SP\x01", first="Bqi", last="3d8f")
+_REPOSE = Placed(b"SR\x01", first="BII", last="f")
 
 
 def or_nan(value: float | None) -> float:

@@ -24,6 +24,7 @@ from service.stream import codec
 from service.stream.database import (
     SCHEMA_VERSION,
     Database,
+    Statement,
     blob,
     can_write,
     is_sound,
@@ -93,7 +94,7 @@ class ScanStore:
         total = self.database.one("SELECT TOTAL(LENGTH(data)) FROM chunks")
         self.chunk_bytes = int(total[0]) if total else 0
         self._inventory = Inventory(self.database)
-        self._radio = RadioStore(self.database)
+        self.radio = RadioStore(self.database)
         self._first = -1, b""  # number and coarse layer of the newest first depth
         self._held: dict[tuple[int, int], Keyframe] = {}  # by number and layer
         self._held_room: int | None = None  # bytes; None: nothing is held
@@ -151,10 +152,6 @@ class ScanStore:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def uses(self, thread: int) -> int:
-        """Number of reads and writes by a thread (``Thread.ident``) so far."""
-        return self.database.uses[thread]
-
     # Header and summary
 
     @property
@@ -207,30 +204,16 @@ class ScanStore:
         Over the quota only the coarse layer is kept. Raises ValueError for bytes that are no
         layer or image of this keyframe, OutsideError when the disk is full.
         """
-        found = [(head, data) for data in layers if (head := codec.peek(data)) is not None]
-        if len(found) < len(layers) or any(head.seq != seq for head, _ in found):
-            raise ValueError(f"not the layers of keyframe {seq}")
-        rows = [_chunk_row(head, data) for head, data in found]
+        rows = [_chunk_row(data) for data in layers]
         if image is not None:
-            if not is_image(image):
-                raise ValueError(f"not the image of keyframe {seq}")
             rows.append(_image_row(seq, image))
+        sound = [row for row in rows if row is not None and row[0] == seq]
+        if len(sound) < len(rows):
+            raise ValueError(f"not the layers or image of keyframe {seq}")
         with self._lock:
-            kept = rows if self._room(sum(map(len, layers))) else rows[:1]
-            self.refused += len(rows) - len(kept)
+            kept = sound if self._room(sum(map(len, layers))) else sound[:1]
+            self.refused += len(sound) - len(kept)
             return self._put_chunks(kept)
-
-    def add_chunk(self, data: bytes) -> bool:
-        """Store one coded layer; False when it is known, invalid or above the quota."""
-        head = codec.peek(data)
-        if head is None:
-            return False
-        return self._add_row(_chunk_row(head, data))
-
-    def add_image(self, seq: int, data: bytes) -> bool:
-        """Store the JPEG of keyframe ``seq``; False when it is known, invalid or above the
-        quota."""
-        return is_image(data) and self._add_row(_image_row(seq, data))
 
     def _add_row(self, row: tuple[Any, ...]) -> bool:
         with self._lock:
@@ -257,13 +240,13 @@ class ScanStore:
 
     def _put_first(self, seq: int, data: bytes) -> bool:
         """Show a first depth from the other end until its keyframe comes, another first depth, or
-        the end of the scan; False when it is no layer of this keyframe."""
+        the end of the scan; False when it is no coarse layer of this keyframe."""
         head = codec.peek(data)
-        if head is None or head.seq != seq:
+        if head is None or (head.layer, head.seq) != (0, seq):
             return False
         with self._lock:
             if not self.finished and seq not in self._inventory.of("k0"):
-                self._radio.put_first(seq, data)
+                self.radio.put_first(seq, data)
         return True
 
     def chunk(self, seq: int, number: int) -> bytes | None:
@@ -293,7 +276,7 @@ class ScanStore:
             decoded = self._decoded(seq, number)
             if decoded is not None and decoded.seq == seq:
                 return decoded
-        return self._radio.keyframe(seq)
+        return self.radio.keyframe(seq)
 
     def hold_decoded(self, max_bytes: int = HELD_BYTES) -> None:
         """Hold decoded layers in memory, for who reads all keyframes several times; they must not
@@ -335,7 +318,7 @@ class ScanStore:
             return sorted(self._only)
         sql = f"SELECT DISTINCT seq FROM chunks WHERE {is_number('seq')} AND {_IS_LAYER}"
         stored = {row[0] for row in self.database.all(sql)}
-        return sorted(stored | self._radio.seqs())
+        return sorted(stored | self.radio.seqs())
 
     def states(self) -> dict[int, tuple[int, int]]:
         """Each keyframe's finest stored layer, -1 for tiles of the narrow radio alone, -2 for a
@@ -349,10 +332,6 @@ class ScanStore:
         revisions = dict(self.database.all(f"{newest} GROUP BY seq"))
         return {seq: (layer, revisions.get(seq, -1)) for seq, layer in layers}
 
-    def version(self) -> tuple[int, int]:
-        """Differs from an earlier one when the file was written since, also by others."""
-        return self.database.version()
-
     # Poses and re-poses
 
     def add_pose(self, pose: PoseRecord) -> int:
@@ -364,28 +343,28 @@ class ScanStore:
 
         Those that receivers would reject are left out.
         """
-        sql = "INSERT INTO poses VALUES (?, ?, ?)"
-        packed = [(p.time_unix_ns, pack_pose(p)) for p in poses]
+        packed = [(pose, pack_pose(pose)) for pose in poses]
         packed = [row for row in packed if unpack_pose(row[1]) is not None]
         with self._lock:
             first = self.next_id("poses")
-            self.database.write([(sql, (first + i, *row)) for i, row in enumerate(packed)])
-            for i in range(len(packed)):
-                self._inventory.note("pose", first + i)
+            self._insert([(first + i, *row) for i, row in enumerate(packed)])
             return first
 
-    def put_pose(self, number: int, data: bytes) -> bool:
-        """Store a packed pose under the drone's number; False if already known."""
-        pose = unpack_pose(data)
-        if pose is None:
-            return False
-        with self._lock:
-            if number in self._inventory.of("pose"):
-                return False
-            row = (number, pose.time_unix_ns, data)
-            self.database.write([("INSERT INTO poses VALUES (?, ?, ?)", row)])
-            self._inventory.note("pose", number)
-            return True
+    def _insert(self, rows: Sequence[tuple[int, PoseRecord | Repose, bytes]]) -> None:
+        """Store poses or re-poses in one transaction: number, record, and its bytes."""
+        statements: list[Statement] = [
+            ("INSERT INTO poses VALUES (?, ?, ?)", (number, record.time_unix_ns, data))
+            if isinstance(record, PoseRecord)
+            else ("INSERT INTO reposes VALUES (?, ?, ?, ?)",
+                  (number, record.seq, record.revision, data))
+            for number, record, data in rows
+        ]  # fmt: skip
+        self.database.write(statements)
+        for number, record, _ in rows:
+            if isinstance(record, PoseRecord):
+                self._inventory.note("pose", number)
+            else:
+                self._inventory.note_repose(number, record.seq, record.revision)
 
     def poses(self, since_unix_ns: int = -(1 << 63)) -> Iterator[PoseRecord]:
         """All poses since then in order of time; of several at one time only the newest."""
@@ -397,7 +376,7 @@ class ScanStore:
             if pose is not None:
                 yield pose
         if not self._inventory.of("pose"):
-            yield from (p for p in self._radio.poses() if p.time_unix_ns >= since_unix_ns)
+            yield from (p for p in self.radio.poses() if p.time_unix_ns >= since_unix_ns)
 
     def poses_beside(self, known: RangeSet) -> Iterator[tuple[int, PoseRecord]]:
         """Number and pose of those whose numbers are not ``known``; adds them to it.
@@ -414,37 +393,15 @@ class ScanStore:
 
     def add_reposes(self, reposes: Sequence[Repose]) -> None:
         """Store several re-poses in one transaction, under the next numbers."""
-        sql = "INSERT INTO reposes VALUES (?, ?, ?, ?)"
         with self._lock:
             first = self.next_id("reposes")
-            rows = [(first + i, r.seq, r.revision, pack_repose(r)) for i, r in enumerate(reposes)]
-            self.database.write([(sql, row) for row in rows])
-            for number, seq, revision, _ in rows:
-                self._inventory.note_repose(number, seq, revision)
-
-    def put_repose(self, number: int, data: bytes) -> bool:
-        """Store a packed re-pose under the drone's number; False if already known."""
-        repose = unpack_repose(data)
-        if repose is None:
-            return False
-        with self._lock:
-            if number in self._inventory.reposes:
-                return False
-            row = (number, repose.seq, repose.revision, data)
-            self.database.write([("INSERT INTO reposes VALUES (?, ?, ?, ?)", row)])
-            self._inventory.note_repose(number, repose.seq, repose.revision)
-            return True
+            self._insert([(first + i, r, pack_repose(r)) for i, r in enumerate(reposes)])
 
     def repose(self, seq: int, below: int = 1 << 32) -> Repose | None:
         """The newest re-pose of keyframe ``seq``, of the revisions ``below`` a number."""
         of = "SELECT data FROM reposes WHERE seq = ? AND revision < ?"
         row = self.database.one(f"{of} ORDER BY revision DESC, id DESC LIMIT 1", (seq, below))
         return None if row is None else unpack_repose(blob(row[0]))
-
-    def add_radio(self, kind: str, number: int, part: int, data: bytes) -> bool:
-        """Store a message of the narrow radio ("tile" or "pose"), the newest of its number;
-        False if already known."""
-        return self._radio.add(kind, number, part, data)
 
     # For the link
 
@@ -469,16 +426,22 @@ class ScanStore:
         return None if row is None else blob(row[0])
 
     def put_record(self, kind: str, number: int, data: bytes) -> bool:
-        """Store a record from the other end; False if invalid or already known."""
-        if kind == "pose":
-            return self.put_pose(number, data)
-        if kind == "repose":
-            return self.put_repose(number, data)
+        """Store a record from the other end; False if it is not this item, invalid, already known,
+        or above the quota."""
         if kind in ("header", "summary"):
             return self._put_whole(kind, number, data)
         if kind == "first":
             return self._put_first(number, data)
-        return self.add_image(number, data) if kind == "image" else self.add_chunk(data)
+        if kind in ("pose", "repose"):
+            record = unpack_pose(data) if kind == "pose" else unpack_repose(data)
+            with self._lock:
+                if record is None or number in self._inventory.stored(kind):
+                    return False
+                self._insert([(number, record, data)])
+                return True
+        row = _image_row(number, data) if kind == "image" else _chunk_row(data)
+        is_named = row is not None and (row[0], chunk_kind(row[1])) == (number, kind)
+        return row is not None and is_named and self._add_row(row)
 
     def _put_whole(self, kind: str, number: int, data: bytes) -> bool:
         with self._lock:
@@ -518,7 +481,7 @@ class ScanStore:
     def _set_whole(self, kind: str, data: bytes, header: ScanHeader) -> None:
         with self._lock:
             if kind == "summary":
-                self._radio.drop_first()
+                self.radio.drop_first()
             self.database.set(kind, data.decode())
             self._header = header
             self._inventory.note_whole(kind, data)
@@ -569,18 +532,17 @@ def header_of(path: Path) -> ScanHeader | None:
     return None if text is None else header_from_json(text.encode())
 
 
-def _chunk_row(head: codec.LayerHead, data: bytes) -> tuple[Any, ...]:
-    return (
-        head.seq,
-        head.layer,
-        head.layers,
-        head.time_unix_ns,
-        zlib.crc32(data),
-        time.time_ns(),
-        data,
-    )
+def _chunk_row(data: bytes) -> tuple[Any, ...] | None:
+    """The row of a coded layer; None for invalid bytes."""
+    head = codec.peek(data)
+    if head is None:
+        return None
+    place = (head.seq, head.layer, head.layers, head.time_unix_ns)
+    return *place, zlib.crc32(data), time.time_ns(), data
 
 
-def _image_row(seq: int, data: bytes) -> tuple[Any, ...]:
-    """A keyframe's image in the table of layers; the keyframe states its time."""
+def _image_row(seq: int, data: bytes) -> tuple[Any, ...] | None:
+    """A keyframe's image in the table of layers, which states its time; None for invalid bytes."""
+    if not is_image(data):
+        return None
     return seq, codec.IMAGE_LAYER, 0, 0, zlib.crc32(data), time.time_ns(), data

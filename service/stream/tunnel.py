@@ -284,10 +284,10 @@ class TunnelIntake:
             self.headers[tag] = header
             while len(self.headers) > MAX_ANNOUNCED:
                 del self.headers[next(iter(self.headers))]
-            ready = [item[1:] for item in self.waiting if item[0] == tag]
-            for item in [item for item in self.waiting if item[0] == tag]:
+            ready = [item for item in self.waiting if item[0] == tag]
+            for item in ready:
                 self.waiting.remove(item)
-            return [(header, "header", 0, 0, payload), *((header, *item) for item in ready)]
+            return [(header, "header", 0, 0, payload), *((header, *item[1:]) for item in ready)]
         found = _item(payload)
         if found is None:
             self.dropped += 1

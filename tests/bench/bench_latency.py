@@ -201,7 +201,7 @@ class _Watch:
 
     def _look(self, place: str) -> None:
         store = self._stores[place]
-        version = store.version()
+        version = store.database.version()
         if version == self._versions[place]:
             return
         self._versions[place] = version

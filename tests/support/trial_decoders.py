@@ -80,7 +80,7 @@ def _planes(_: Path) -> Decoder:
     known = np.ones((9, 13), np.bool_)
 
     def decode(data: bytes) -> None:
-        planes.decode_mask(data, 13, 9)
+        plane_coders.decode_mask(data, 13, 9)
         planes.decode_sigma(data, 13, 9)
         planes.decode_views(data, 13, 9)
         planes.decode_colour(data, 13, 9)

@@ -70,7 +70,7 @@ def test_the_card_completes_what_the_radio_brought(tmp_path: Path, card: Path) -
         coarse = codec.decode(codec.encode(keyframe(0), 0)[:1])
         assert coarse is not None
         for tile in tiles_of(coarse):
-            ground.add_radio("tile", 0, tile.index, pack_tile(tag_of("red", "scan-1"), tile))
+            ground.radio.add("tile", 0, tile.index, pack_tile(tag_of("red", "scan-1"), tile))
     before = {p.name: p.read_bytes() for p in (card / "scan-1").iterdir()}
     assert received(tmp_path / "ground", card) == [path.parent]
     assert received(tmp_path / "ground", card / "scan-1") == [path.parent]  # once more: no harm

@@ -83,7 +83,7 @@ def test_poses_that_arrive_out_of_order_make_the_same_track(
         (31, 3, 3.5),
         (6, 1, 1.5),
     ):
-        scan.put_pose(number, pack_pose(house.record(seq, east_m)))
+        scan.put_record("pose", number, pack_pose(house.record(seq, east_m)))
         east, last = track(feed)
         poses = latest(scan.poses())
         assert east == [p.T_world_camera[0, 3] for p in poses]
@@ -132,7 +132,7 @@ def test_text_in_place_of_numbers_is_left_out(scan: ScanStore, feed: LiveFeed) -
 
 def heard(scan: ScanStore, number: int, pose: PoseRecord) -> None:
     """Store a pose of the narrow radio."""
-    scan.add_radio("pose", number, 0, radio_messages.pack_pose(7, number, pose))
+    scan.radio.add("pose", number, 0, radio_messages.pack_pose(7, number, pose))
 
 
 def test_poses_of_the_datalink_replace_those_of_the_radio(
@@ -147,6 +147,6 @@ def test_poses_of_the_datalink_replace_those_of_the_radio(
             assert track(feed) == ([5.0 * k for k in range(seq + 1)], 5.0 * seq)
         later = scan.poses(house.record(1, 0.0).time_unix_ns)
         assert [p.T_world_camera[0, 3] for p in later] == [5.0, 10.0]
-        scan.put_pose(4, pack_pose(house.record(1, 5.25)))
+        scan.put_record("pose", 4, pack_pose(house.record(1, 5.25)))
         assert track(feed) == ([5.25], 5.25)
         reader.close()

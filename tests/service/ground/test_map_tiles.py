@@ -350,9 +350,9 @@ def test_a_map_gets_the_fine_layer_that_the_receiver_stores_later(
     with house.flown(folder) as receiver:
         one = house.keyframe(9, 30.0)
         coarse, fine = encode(one, one.time_ns)
-        receiver.add_chunk(coarse)
+        receiver.add_keyframe(9, [coarse])
         assert maps.view(folder).version == 6
-        receiver.add_chunk(fine)
+        receiver.add_keyframe(9, [fine])
         assert maps.view(folder).version == 7
     maps.close()
 
@@ -368,10 +368,10 @@ def test_what_has_no_surface_any_more_has_no_part_in_the_exposure(
         found = LiveMap(scan)
         found.refresh(read_s=math.inf)
         before = found.exposure
-        scan.add_chunk(encode(white, white.time_ns)[0])
+        scan.add_keyframe(9, encode(white, white.time_ns)[:1])
         found.refresh(read_s=math.inf)
         assert found.exposure == 1.0 < before
-        scan.add_chunk(encode(bare, bare.time_ns)[1])
+        scan.add_keyframe(9, encode(bare, bare.time_ns)[1:])
         found.refresh(read_s=math.inf)
         assert found.version == 7 and found.exposure == before
 

@@ -369,7 +369,7 @@ def unpack(message: bytes) -> tuple[dict[str, Any], np.ndarray[Any, Any], np.nda
     mask, depth, sigma, views, colour = np.split(np.frombuffer(message, np.uint8), ends)[:5]
     mask = mask[4 + size :]
     x, y, w, h = head["box"]
-    known = planes.decode_mask(mask.tobytes(), w, h)
+    known = plane_coders.decode_mask(mask.tobytes(), w, h)
     codes = plane_coders.decode_codes(depth.tobytes(), known)
     bgr = planes.decode_colour(colour.tobytes(), w, h)
     assert codes is not None and bgr is not None
@@ -482,12 +482,12 @@ def test_depth_in_another_coding_is_coded_anew(tmp_path: Path, house: HouseFligh
             opened = codec.unpack(layer)
             assert opened is not None
             head, sections = opened
-            known = planes.decode_mask(sections[0], *head.box[2:])
+            known = plane_coders.decode_mask(sections[0], *head.box[2:])
             codes = plane_coders.decode_codes(sections[1], known)
             assert codes is not None
             old = sections[0], bytes(imagecodecs.jpegls_encode(codes)), *sections[2:]
             method = planes.METHOD_JPEG_LS
-            scan.add_chunk(codec.pack(replace(head, seq=seq, method=method), old))
+            scan.add_keyframe(seq, [codec.pack(replace(head, seq=seq, method=method), old)])
         heads = [unpack(m) for m in LiveFeed(scan).news() if isinstance(m, bytes)]
     assert [head["seq"] for head, _, _ in heads] == [0, 1]
     np.testing.assert_allclose(heads[1][1][:, 2].min(), 0.0, atol=0.05)
@@ -508,9 +508,9 @@ def test_a_finer_layer_replaces_the_coarse_one(tmp_path: Path, house: HouseFligh
     coarse, fine = encode(one, one.time_ns)
     with ScanStore.create(tmp_path / "scan.db", ScanHeader("x", "d", 0)) as scan:
         feed = LiveFeed(scan)
-        scan.add_chunk(coarse)
+        scan.add_keyframe(0, [coarse])
         heads = [unpack(m)[0] for m in feed.news() if isinstance(m, bytes)]
-        scan.add_chunk(fine)
+        scan.add_keyframe(0, [fine])
         heads += [unpack(m)[0] for m in feed.news() if isinstance(m, bytes)]
     assert [(h["seq"], h["layer"]) for h in heads] == [(0, 0), (0, 1)]
     assert heads[1]["size"] > heads[0]["size"]

@@ -96,8 +96,8 @@ def strewn(store: ScanStore, house: HouseFlight) -> None:
 
 def wide(store: ScanStore, house: HouseFlight) -> None:
     """The widest lens that is let through."""
-    for data in encode(house.keyframe(9, 3.0), 1):
-        assert store.add_chunk(layer_with(data, 42, "2f", 1.5, 1.5))
+    layers = encode(house.keyframe(9, 3.0), 1)
+    assert store.add_keyframe(9, [layer_with(data, 42, "2f", 1.5, 1.5) for data in layers]) == 2
 
 
 def far(store: ScanStore, house: HouseFlight) -> None:

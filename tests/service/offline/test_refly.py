@@ -22,7 +22,7 @@ from service.errors import InputError
 from service.georeference import LocalFrame
 from service.offline.refine import refly
 from service.offline.refine.refly import Refly, plan_json, suggest, waypoints_text
-from service.scans.coverage import Coverage, Limits
+from service.scans.coverage import Coverage
 
 if TYPE_CHECKING:
     from house_flight import HouseFlight
@@ -57,7 +57,7 @@ def covered(depths: list[DepthMap], frame: LocalFrame | None = FRAME) -> Coverag
         layer.put(seq, seq * 10**9, depth)
     grid = layer.grid()
     assert grid is not None
-    return Coverage(grid, frame, layer.places(), Limits(3, 0.3))
+    return Coverage(grid, frame, layer.places(), 3, 0.3)
 
 
 def two_lines(apart_m: float = 130.0, forward: float = 0.0) -> list[DepthMap]:

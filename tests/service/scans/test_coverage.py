@@ -25,9 +25,9 @@ from service.offline.exports.view import ExportOptions, ScanView, export
 from service.scans.coverage import (
     FIGURES,
     IMAGE,
-    CoverageWriter,
     LiveCoverage,
     coverage_of,
+    covering,
 )
 from service.scans.folder import write_deliverables
 from service.stream.codec import encode
@@ -246,10 +246,10 @@ def test_a_fine_layer_that_comes_later_is_taken_in(tmp_path: Path, house: HouseF
     layers = encode(one, one.time_ns)
     assert len(layers) == 2
     with house.flown(tmp_path) as store:
-        store.add_chunk(layers[0])
+        store.add_keyframe(5, layers[:1])
         live = LiveCoverage(store)
         live.refresh()
-        store.add_chunk(layers[1])
+        store.add_keyframe(5, layers[1:])
         late, fresh = live.refresh(), coverage_of(store)
     assert late is not None and fresh is not None
     assert late.figures() == fresh.figures()
@@ -322,7 +322,7 @@ def test_a_growing_scan_has_its_layer_written_next_to_it(
             time.sleep(0.05)
         raise AssertionError(f"never {keyframes} keyframes: {figures()}")
 
-    with house.flown(tmp_path) as store, CoverageWriter(store, every_s=0.05):
+    with house.flown(tmp_path) as store, covering(store, every_s=0.05):
         wait(5)
         one = house.keyframe(5, 30.0)
         store.add_keyframe(5, encode(one, one.time_ns))

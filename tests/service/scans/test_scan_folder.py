@@ -124,12 +124,7 @@ def test_both_ends_write_the_same_bytes(tmp_path: Path, house: HouseFlight) -> N
             for number in sorted(numbers, reverse=True):
                 data = air.record(kind, number)
                 assert data is not None
-                if kind == "pose":
-                    ground.put_pose(number, data)
-                elif kind == "repose":
-                    ground.put_repose(number, data)
-                else:
-                    ground.add_chunk(data)
+                ground.put_record(kind, number, data)
         write_deliverables(tmp_path / "air", air, {})
         write_deliverables(tmp_path / "ground", ground, {})
         ground.close()

@@ -66,7 +66,7 @@ def test_both_depth_methods_carry_the_same() -> None:
     opened = unpack(layer)
     assert opened is not None
     head, (mask, depth, *rest) = opened
-    known = planes.decode_mask(mask, *head.box[2:])
+    known = plane_coders.decode_mask(mask, *head.box[2:])
     codes = plane_coders.decode_codes(depth, known)
     assert codes is not None and codes.max() > 255
     image = bytes(imagecodecs.jpegls_encode(codes))
@@ -226,19 +226,21 @@ def test_an_embedded_image_that_lies_about_its_size_is_not_opened() -> None:
 def test_any_mask_comes_back(h: int, w: int, seed: int, share: float) -> None:
     known = np.random.default_rng(seed).random((h, w)) < share
     known[0, 0] = True
-    np.testing.assert_array_equal(planes.decode_mask(planes.encode_mask(known), w, h), known)
+    np.testing.assert_array_equal(
+        plane_coders.decode_mask(plane_coders.encode_mask(known), w, h), known
+    )
 
 
 @given(st.binary(max_size=100))
 def test_any_bytes_are_some_mask(data: bytes) -> None:
-    assert planes.decode_mask(data, 13, 9).shape == (9, 13)
+    assert plane_coders.decode_mask(data, 13, 9).shape == (9, 13)
 
 
 def test_a_ragged_mask_costs_less_than_zlib() -> None:
     noise = cv2.GaussianBlur(np.random.default_rng(1).normal(size=(180, 320)), (0, 0), 4)
     known = noise > 0
     packed = zlib.compress(np.packbits(known, axis=1).tobytes(), 9)
-    assert len(planes.encode_mask(known)) < 0.7 * len(packed)
+    assert len(plane_coders.encode_mask(known)) < 0.7 * len(packed)
 
 
 def test_records_round_trip() -> None:

@@ -72,8 +72,8 @@ def test_a_reader_follows_what_another_connection_writes(tmp_path: Path) -> None
         reported: list[str] = []
         reader.listen(lambda kind, number: reported.append(kind))
         for change in (
-            lambda: writer.add_chunk(coarse),
-            lambda: writer.add_chunk(fine),
+            lambda: writer.add_keyframe(7, [coarse]),
+            lambda: writer.add_keyframe(7, [fine]),
             lambda: writer.add_reposes([Repose(7, 1, np.eye(4), 1.0, np.eye(6))]),
             lambda: writer.update_header(epsg=32632),
             lambda: writer.finish({}),
@@ -96,9 +96,11 @@ def test_poses_at_once_are_those_one_by_one(tmp_path: Path) -> None:
         b.listen(lambda kind, number: reported.append((kind, number)))
         for one in poses:
             a.add_pose(one)
-        uses = b.uses(threading.get_ident())
+        uses = b.database.uses[threading.get_ident()]
         assert b.add_poses([*poses[:2], broken, poses[2]]) == 1
-        assert b.uses(threading.get_ident()) == uses + 2  # the next number, one transaction
+        assert (
+            b.database.uses[threading.get_ident()] == uses + 2
+        )  # the next number, one transaction
         assert reported == [("pose", 1), ("pose", 2), ("pose", 3)]
         assert b.add_poses([]) == 4 == b.add_pose(broken)
         assert a.numbers() == b.numbers()
@@ -129,15 +131,15 @@ def test_held_keyframes_are_decoded_once_and_several_at_a_time(
 
 
 def test_duplicates_and_order_do_not_matter(tmp_path: Path) -> None:
-    chunks = [data for seq in range(4) for data in codec.encode(keyframe(seq), seq)]
+    chunks = [(seq, [data]) for seq in range(4) for data in codec.encode(keyframe(seq), seq)]
     with (
         ScanStore.create(tmp_path / "a.db", HEADER) as a,
         ScanStore.create(tmp_path / "b.db", HEADER) as b,
     ):
-        assert all(a.add_chunk(data) for data in chunks)
-        for data in reversed(chunks):
-            assert b.add_chunk(data)
-            assert not b.add_chunk(data)
+        assert all(a.add_keyframe(*chunk) for chunk in chunks)
+        for chunk in reversed(chunks):
+            assert b.add_keyframe(*chunk)
+            assert not b.add_keyframe(*chunk)
         assert a.numbers() == b.numbers()
         assert [a.numbers()[kind] for kind in ("k0", "k1")] == [RangeSet([(0, 3)])] * 2
         for left, right in zip(a.keyframes(), b.keyframes(), strict=True):
@@ -179,9 +181,11 @@ def test_damaged_chunks_are_refused(tmp_path: Path) -> None:
     data = bytearray(codec.encode(keyframe(0), 0)[0])
     data[-1] ^= 1
     with ScanStore.create(tmp_path / "a.db", HEADER) as store:
-        assert not store.add_chunk(bytes(data))
-        assert not store.add_chunk(b"")
-        assert not store.put_pose(1, b"nothing")
+        assert not store.put_record("k0", 0, bytes(data))
+        assert not store.put_record("k0", 0, b"")
+        for kind, number in (("k1", 2), ("k0", 3), ("first", 3), ("image", 2)):
+            assert not store.put_record(kind, number, codec.encode(keyframe(2), 0)[0])
+        assert not store.put_record("pose", 1, b"nothing")
         with pytest.raises(ValueError, match="keyframe 3"):
             store.add_keyframe(3, codec.encode(keyframe(2), 0))
         assert store.seqs() == []

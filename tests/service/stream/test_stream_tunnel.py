@@ -147,7 +147,7 @@ def test_tiles_replace_the_first_depth_of_their_keyframe_and_end_earlier_ones(
 
     def tiles(seq: int) -> None:
         for tile in tiles_of(coarse(keyframe(seq, 0.0))):
-            store.add_radio("tile", seq, tile.index, pack_tile(77, tile))
+            store.radio.add("tile", seq, tile.index, pack_tile(77, tile))
 
     with ScanStore.create(tmp_path / "a.db", HEADER) as store:
         for order in ((first, tiles), (tiles, first)):
@@ -208,7 +208,7 @@ def test_a_map_of_100_m_arrives_in_flight_within_the_share(tmp_path: Path) -> No
                 continue
             for _, kind, number, part, data in intake.receive(payload):
                 if kind != "header":
-                    ground.add_radio(kind, number, part, data)
+                    ground.radio.add(kind, number, part, data)
         points = np.concatenate([world_points(frame) for frame in ground.keyframes()])
         error = points[:, 2] - ground_m(points[:, 0], points[:, 1])
         assert float(np.sqrt(np.mean(error**2))) < 0.5
