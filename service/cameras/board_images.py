@@ -13,7 +13,7 @@ import numpy as np
 
 from recon.calibration.board import Board, BoardView, Calibration, find_board
 from recon.types import F32, F64, U8
-from service.errors import InputError, OutsideError
+from service.errors import InputError
 
 log = logging.getLogger(__name__)
 
@@ -154,14 +154,3 @@ def _fold(distortion: F64) -> float:
     bent = r * (1 + distortion[0] * r**2 + distortion[1] * r**4 + distortion[4] * r**6)
     turn = np.flatnonzero(np.diff(bent) <= 0)
     return float(r[turn[0]] ** 2) if len(turn) else 16.0
-
-
-def write_image(path: Path, image: U8) -> None:
-    """Write a PNG; OutsideError when it cannot be written."""
-    ok, data = cv2.imencode(".png", image)
-    try:
-        if not ok:
-            raise OSError("OpenCV cannot write PNG")
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise OutsideError(f"{path} cannot be written: {error.strerror or error}") from error

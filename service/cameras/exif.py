@@ -36,7 +36,7 @@ FINE_M, DIFFER_M = 0.1, 1.0
 TURNED_DEG = {3: 180, 6: 90, 8: 270}
 """EXIF orientation to degrees clockwise; no camera writes the mirrored ones."""
 
-EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,20 +154,27 @@ def name_unix_ns(name: str) -> int | None:
     if found is None:
         return None
     day, time, fraction = found.groups()
-    try:
-        moment = datetime.strptime(day + time, "%Y%m%d%H%M%S").replace(tzinfo=timezone.utc)
-    except ValueError:
-        return None
-    return _unix_ns(moment) + round(float(f"0.{fraction or 0}") * 1_000_000_000)
+    start_ns = _as_utc_ns(day + time, "%Y%m%d%H%M%S")
+    return None if start_ns is None else start_ns + _fraction_ns(fraction or "0")
 
 
 def _local_ns(text: str, sub: str) -> int | None:
+    start_ns = _as_utc_ns(text.strip("\0 ")[:19], "%Y:%m:%d %H:%M:%S")
+    return None if start_ns is None else start_ns + _fraction_ns(sub if sub.isdecimal() else "0")
+
+
+def _as_utc_ns(text: str, form: str) -> int | None:
+    """Unix ns of a time as if it were UTC; None unless a clock that was set can show it, and time
+    in ns as we store it."""
     try:
-        moment = datetime.strptime(text.strip("\0 ")[:19], "%Y:%m:%d %H:%M:%S")
+        moment = datetime.strptime(text, form).replace(tzinfo=timezone.utc)
     except ValueError:
         return None
-    fraction = round(float(f"0.{sub}") * 1_000_000_000) if sub.isdecimal() else 0
-    return _unix_ns(moment.replace(tzinfo=timezone.utc)) + fraction if _is_known(moment) else None
+    return round(moment.timestamp()) * SECOND_NS if 1970 <= moment.year < 2106 else None
+
+
+def _fraction_ns(digits: str) -> int:
+    return round(float(f"0.{digits}") * SECOND_NS)
 
 
 def _offset_ns(text: str) -> int | None:
@@ -175,24 +182,16 @@ def _offset_ns(text: str) -> int | None:
     if found is None:
         return None
     sign = -1 if found[1] == "-" else 1
-    return sign * (int(found[2]) * 3600 + int(found[3]) * 60) * 1_000_000_000
+    return sign * (int(found[2]) * 3600 + int(found[3]) * 60) * SECOND_NS
 
 
 def _gps_unix_ns(gps: dict[int, Any]) -> int | None:
     clock = finite_numbers(gps.get(7), 3)
-    try:
-        day = datetime.strptime(str(gps.get(29, "")).strip("\0 "), "%Y:%m:%d")
-    except ValueError:
-        return None
+    day_ns = _as_utc_ns(str(gps.get(29, "")).strip("\0 "), "%Y:%m:%d")
     seconds = math.inf if clock is None else clock[0] * 3600 + clock[1] * 60 + clock[2]
-    if not (_is_known(day) and 0 <= seconds <= 86_401):
+    if day_ns is None or not 0 <= seconds <= 86_401:
         return None
-    return _unix_ns(day.replace(tzinfo=timezone.utc)) + round(seconds * 1_000_000_000)
-
-
-def _is_known(moment: datetime) -> bool:
-    """Whether a clock that was set, and time in ns as we store it, can show it."""
-    return 1970 <= moment.year < 2106
+    return day_ns + round(seconds * SECOND_NS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,8 +383,3 @@ def _step(value: Any) -> float:
 def _last_digit(text: str) -> float:
     """The unit of a decimal number's last digit."""
     return float(10.0 ** -len(text.strip().partition(".")[2]))
-
-
-def _unix_ns(moment: datetime) -> int:
-    since = moment - EPOCH
-    return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000

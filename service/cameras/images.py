@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 from collections import Counter
@@ -20,10 +19,8 @@ from service.cameras import reject_options
 from service.cameras.exif import Tags, read_tags
 from service.cameras.geo_file import geo_file_of, read_geo
 from service.cameras.lens import turned
-from service.cameras.source import CameraFrame, GeoTag
+from service.cameras.source import CameraFrame, CameraSource, GeoTag
 from service.errors import InputError
-
-log = logging.getLogger(__name__)
 
 SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"))
 
@@ -59,7 +56,7 @@ Still = tuple[Path, Tags]
 """A file and its tags."""
 
 
-class ImagesSource:
+class ImagesSource(CameraSource):
     """The stills of one folder in order of time; unreadable ones are skipped with a warning."""
 
     def __init__(
@@ -76,10 +73,7 @@ class ImagesSource:
         ``hemisphere`` ("NW") is that of positions that state none. Positions in ``geo``, or in
         the ``geo.txt`` of the folder, replace those of the tags.
         """
-        self.description = str(folder)
-        self.is_live = False
-        self.start_monotonic_ns: int | None = None
-        self.warnings: list[str] = []
+        super().__init__(str(folder))
         self._hemisphere = hemisphere
         geo = geo_file_of(folder) if geo is None else geo
         tagged = self._one_camera(self._read(folder), camera)
@@ -131,9 +125,6 @@ class ImagesSource:
     def times(self) -> dict[str, int]:
         """ns since the first still, by file name."""
         return {path.name: time_ns for path, _, time_ns in self._stills}
-
-    def close(self) -> None:
-        """Nothing is open."""
 
     def _read(self, folder: Path) -> list[Still]:
         paths = sorted(
@@ -361,13 +352,6 @@ class ImagesSource:
         else:
             order, by = still_order.by_likeness([path for path, _ in tagged]), "likeness"
         return (named, "name") if order == named else (order, by)
-
-    def _warn(self, text: str) -> None:
-        """Warn once, however often the stills are read."""
-        if text in self.warnings:
-            return
-        self.warnings.append(text)
-        log.warning("%s: %s", self.description, text)
 
 
 def open_images(rest: str, options: Mapping[str, str]) -> ImagesSource:

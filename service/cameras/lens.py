@@ -99,7 +99,7 @@ def fitted(camera: Camera, source: CameraSource) -> tuple[Camera, list[str]]:
     """
     size_px = source.size_px
     (w, h), (W, H) = camera.size_px, size_px
-    for clockwise_deg in dict.fromkeys((getattr(source, "turned_deg", 0), 0)):
+    for clockwise_deg in dict.fromkeys((source.turned_deg, 0)):
         model = turned(camera, clockwise_deg) if clockwise_deg else camera
         if model.size_px == size_px:
             return model, []

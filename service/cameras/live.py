@@ -25,11 +25,10 @@ import subprocess
 import time
 import zlib
 from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -117,8 +116,10 @@ class StampFilter:
         return None if fall_ns > self.BACKLOG * step_ns else pts_ns + round(self._offset_ns)
 
 
-class LiveSource:
+class LiveSource(CameraSource):
     """Images of a stream that is reopened whenever it is lost."""
+
+    is_live = True
 
     def __init__(
         self,
@@ -132,16 +133,12 @@ class LiveSource:
         Raises OutsideError when the camera gives none now, NoSenderError when nothing has come
         where it ``listens``; the constructor does not retry.
         """
-        self.description = description
+        super().__init__(description)
         self.config = config or LiveConfig()
-        self.is_live = True
-        self.fps: float | None = None
-        self.warnings: list[str] = []
         self.losses = 0
         self.misfits = 0  # images of another aspect ratio, dropped
-        self.epoch_unix_ns: int | None = time.time_ns()
-        self._start_ns = time.monotonic_ns()
-        self.start_monotonic_ns: int | None = self._start_ns
+        self.epoch_unix_ns = time.time_ns()
+        self.start_monotonic_ns = self._start_ns = time.monotonic_ns()
         self._open_container = open_container
         self._closed = Event()
         self._iterated = False
@@ -385,46 +382,47 @@ def _launched(
     return Paced(LiveSource(opened, description, listens=listens))
 
 
-class _Complaints:
-    """Standard error of a command: logged, the first complaint kept."""
-
-    def __init__(self, pipe: IO[bytes]) -> None:
-        self.first = ""
-        self._pipe = pipe
-        self._worker = PROCESS.start("gst complaints", self._read)
-
-    def _read(self, _: Worker) -> None:
-        with self._pipe:
-            while line := self._pipe.readline(1000):
-                text = line.decode(errors="replace").strip()
-                is_complaint = text.startswith(("ERROR", "WARNING"))
-                self.first = self.first or (text if is_complaint else "")
-                log.log(logging.WARNING if is_complaint else logging.DEBUG, "gst: %s", text)
-
-    def wait(self) -> str:
-        """The first complaint of a command that has ended; empty when it had none."""
-        self._worker.join(1.0)
-        return self.first
-
-
 OUTPUT_BYTES = 1 << 18
 """Read at once from a command: raw video is 40 MB/s."""
 
 
-class _Output:
-    """Output of a command as a file; FFmpeg's own pipe waits for a silent command for ever."""
+class _Command:
+    """A command: its output as a file, its standard error in the log.
 
-    def __init__(self, pipe: IO[bytes]) -> None:
-        self._number = pipe.fileno()
-        self._poll = select.poll()
-        self._poll.register(self._number, select.POLLIN)
+    FFmpeg's own pipe waits for a silent command for ever.
+    """
+
+    def __init__(self, command: list[str]) -> None:
+        pipe = subprocess.PIPE
+        process = open_process("gst", command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe)
+        assert process.stdout is not None
+        assert process.stderr is not None
         self.wait_s = OPEN_S
+        self.complaint = ""  # the first one
+        self._process, self._output, self._errors = process, process.stdout, process.stderr
+        self._poll = select.poll()
+        self._poll.register(self._output, select.POLLIN)
+        self._reader = PROCESS.start("gst complaints", self._read_errors)
 
     def read(self, size: int) -> bytes:
         """The next bytes, empty at the end; TimeoutError after ``wait_s`` without any."""
         if not self._poll.poll(1e3 * self.wait_s):
             raise TimeoutError(f"no data for {self.wait_s:g} s")
-        return os.read(self._number, size)
+        return os.read(self._output.fileno(), size)
+
+    def _read_errors(self, _: Worker) -> None:
+        with self._errors:
+            while line := self._errors.readline(1000):
+                text = line.decode(errors="replace").strip()
+                is_complaint = text.startswith(("ERROR", "WARNING"))
+                self.complaint = self.complaint or (text if is_complaint else "")
+                log.log(logging.WARNING if is_complaint else logging.DEBUG, "gst: %s", text)
+
+    def end(self) -> None:
+        """End the command, and read what it still says."""
+        end_process(self._process)
+        self._output.close()
+        self._reader.join(1.0)
 
 
 def open_command(command: list[str], stall_s: float, demuxer: dict[str, str]) -> Any:
@@ -434,44 +432,25 @@ def open_command(command: list[str], stall_s: float, demuxer: dict[str, str]) ->
     """
     import av
 
-    pipe = subprocess.PIPE
-    process = open_process("gst", command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe)
-    assert process.stdout is not None
-    assert process.stderr is not None
-    complaints = _Complaints(process.stderr)
-    with ExitStack() as on_fault:
-        on_fault.callback(_end, process)
-        output = _Output(process.stdout)
-        try:
-            container = av.open(output, options=demuxer, buffer_size=OUTPUT_BYTES)
-        except (av.error.FFmpegError, OSError) as error:
-            on_fault.close()
-            if complaint := complaints.wait():
-                raise OSError(complaint) from error
-            raise
-        output.wait_s = stall_s
-        on_fault.pop_all()
-    return _CommandContainer(container, process)
+    running = _Command(command)
+    try:
+        container = av.open(running, options=demuxer, buffer_size=OUTPUT_BYTES)
+    except BaseException as error:
+        running.end()
+        if isinstance(error, (av.error.FFmpegError, OSError)) and running.complaint:
+            raise OSError(running.complaint) from error
+        raise
+    running.wait_s = stall_s
+    return _CommandContainer(container, running)
 
 
 class _CommandContainer:
-    """An open container together with the process that feeds it."""
+    """An open container together with the command that feeds it."""
 
-    def __init__(self, container: Any, process: subprocess.Popen[bytes]) -> None:
-        self._container = container
-        self._process = process
-        self.streams, self.flags = container.streams, container.flags
-
-    def demux(self, stream: Any) -> Any:
-        return self._container.demux(stream)
+    def __init__(self, container: Any, command: _Command) -> None:
+        self._container, self._command = container, command
+        self.streams, self.flags, self.demux = container.streams, container.flags, container.demux
 
     def close(self) -> None:
-        """End the process, then the container."""
-        _end(self._process)
+        self._command.end()
         self._container.close()
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    end_process(process)
-    if process.stdout is not None:
-        process.stdout.close()

@@ -3,11 +3,13 @@ a separate thread."""
 
 from __future__ import annotations
 
+import logging
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from threading import Event, Lock
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +19,8 @@ from service.workers import PROCESS, Worker
 
 if TYPE_CHECKING:
     import av
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,42 +83,56 @@ class CameraFrame:
         return self.pixels.shape[1], self.pixels.shape[0]
 
 
-@runtime_checkable
-class CameraSource(Protocol):
+class CameraSource(ABC):
     """An open camera: iterate once for its images, in order of time, then close it."""
 
-    description: str  # for a log line and scan.json
     size_px: tuple[int, int]  # (W, H)
-    epoch_unix_ns: int | None  # UTC of time_ns = 0, if known
-    start_monotonic_ns: int | None  # this machine's monotonic clock at time_ns = 0, if live
-    fps: float | None  # mean images per second, if known
-    is_live: bool  # images that are not fetched in time are lost
-    warnings: list[str]  # one line each; grows while images are fetched
+    epoch_unix_ns: int | None = None  # UTC of time_ns = 0, if known
+    start_monotonic_ns: int | None = None  # this machine's monotonic clock at time_ns = 0, if live
+    fps: float | None = None  # mean images per second, if known
+    is_live = False  # images that are not fetched in time are lost
+    turned_deg = 0  # clockwise, from the images as they are stored
 
+    def __init__(self, description: str) -> None:
+        self.description = description  # for a log line and scan.json
+        self.warnings: list[str] = []  # one line each; grows while images are fetched
+
+    @abstractmethod
     def __iter__(self) -> Iterator[CameraFrame]:
         """Yield the images, oldest first; ends with the recording."""
-        ...
-
-    def close(self) -> None:
-        """Release the file or device; safe to call twice."""
-        ...
-
-
-@runtime_checkable
-class Counted(Protocol):
-    """A recording that says how long it is."""
 
     @property
     def images(self) -> int:
-        """Their number by its index; 0 where it has none."""
-        ...
+        """Their number by a recording's index; 0 where it has none."""
+        return 0
+
+    @property
+    def dropped(self) -> int:
+        """Images that were not fetched in time."""
+        return 0
+
+    def close(self) -> None:  # noqa: B027, most recordings hold nothing open
+        """Release the file or device; safe to call twice."""
+
+    def _warn(self, text: str) -> None:
+        """Warn once, however often the images are read."""
+        if text not in self.warnings:
+            self.warnings.append(text)
+            log.warning("%s: %s", self.description, text)
 
 
-@runtime_checkable
-class Dropping(Protocol):
-    """A source that drops images that are not fetched in time."""
+class Relayed(CameraSource):
+    """A source whose images are passed on as those of a live camera."""
 
-    dropped: int
+    is_live = True
+
+    def __init__(self, source: CameraSource) -> None:
+        super().__init__(source.description)
+        self._source = source
+        self.size_px, self.fps, self.turned_deg = source.size_px, source.fps, source.turned_deg
+        self.epoch_unix_ns = source.epoch_unix_ns
+        self.start_monotonic_ns = source.start_monotonic_ns
+        self.warnings = source.warnings
 
 
 def ahead(source: CameraSource, kept: int = 4) -> Generator[CameraFrame, None, None]:
@@ -153,7 +171,7 @@ CLOSE_S = 5.0
 """For a recording's reader to end."""
 
 
-class Paced:
+class Paced(Relayed):
     """A source that delivers each image at its presentation time, as a camera does.
 
     A live source is not delayed: it is drained, so that its newest images are used.
@@ -161,17 +179,11 @@ class Paced:
     """
 
     def __init__(self, source: CameraSource, kept: int = 2) -> None:
-        self._source = source
+        super().__init__(source)
         self._queue: Channel[CameraFrame] = Channel(kept, drops=True)
         self._closed = Event()
         self._starting = Lock()
         self._reader: Worker | None = None
-        self.description, self.size_px = source.description, source.size_px
-        self.epoch_unix_ns, self.fps = source.epoch_unix_ns, source.fps
-        self.start_monotonic_ns = source.start_monotonic_ns
-        self.turned_deg = getattr(source, "turned_deg", 0)
-        self.is_live = True
-        self.warnings = source.warnings
 
     @property
     def dropped(self) -> int:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from mavlink.telemetry.samples import YEAR_2000_UNIX_S
 from service.cameras import open_container, reject_options
-from service.cameras.source import CameraFrame, Decoded
+from service.cameras.source import CameraFrame, CameraSource, Decoded
 from service.errors import InputError
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ HEAD_BYTES = 4096
 NS_PER_S = 1_000_000_000
 
 
-class VideoSource:
+class VideoSource(CameraSource):
     """The images of one open PyAV container; its first image is decoded on construction."""
 
     def __init__(
@@ -56,11 +56,7 @@ class VideoSource:
 
         ``follows_turn`` rotates the images as the container requests.
         """
-        self.description = description
-        self.turned_deg = 0
-        self.is_live = False
-        self.start_monotonic_ns: int | None = None
-        self.warnings: list[str] = []
+        super().__init__(description)
         self._container = container
         self._damaged = 0
         self._unordered = 0
@@ -78,7 +74,6 @@ class VideoSource:
             self.close()
             raise InputError(f"{description}: its video has a format that cannot be decoded")
         self._stream = stream
-        self.images = self._stream.frames  # by the index; 0 without one
         self._decoded = decoded_frames(
             container.demux(stream), self._stream, self._warn, self._damage, self._is_needed
         )
@@ -135,6 +130,10 @@ class VideoSource:
         else:
             self._warn_losses(decoded + self.passed)
         self.close()
+
+    @property
+    def images(self) -> int:
+        return self._stream.frames
 
     def only_near(self, times_ns: Iterable[int], within_ns: int) -> None:
         """Yield no other images than those near ``times_ns``, at least one, and end with the last.
@@ -219,10 +218,6 @@ class VideoSource:
                 f"{decoded} of the {self.images} images in the index could be "
                 "decoded; the recording is cut off or damaged"
             )
-
-    def _warn(self, text: str) -> None:
-        self.warnings.append(text)
-        log.warning("%s: %s", self.description, text)
 
 
 MAX_ONE_CORE_PX = 1920 * 1088
@@ -368,8 +363,7 @@ def parse_time_unix_ns(text: str) -> int | None:
         return None
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=timezone.utc)
-    since = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
-    unix_us = (since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds
+    unix_us = round(moment.timestamp() * 1e6)
     return unix_us * 1000 if unix_us >= YEAR_2000_UNIX_S * 1_000_000 else None
 
 

@@ -30,11 +30,13 @@ def calibrate(
 
     Also writes an image of the corners found, next to the camera model.
     """
+    import cv2
+
     from recon.calibration.board import MIN_VIEWS, CalibrationConfig
     from recon.calibration.board import calibrate as fit
-    from service.cameras.board_images import draw_coverage, find_boards, write_image
+    from service.cameras.board_images import draw_coverage, find_boards
     from service.cameras.camera_file import save_camera
-    from service.scans.writing import check_writable
+    from service.scans.writing import check_writable, write_whole
 
     board = _board(pattern, square_m)
     check_writable(out)
@@ -56,7 +58,7 @@ def calibrate(
     except ValueError as error:
         raise InputError(f"the views give no usable camera ({error}); take more views") from error
     image = out.with_name(f"{out.stem}_coverage.png")
-    write_image(image, draw_coverage(result, boards.views))
+    write_whole(image, cv2.imencode(".png", draw_coverage(result, boards.views))[1].tobytes())
     report = record | {
         "out": str(out),
         "coverage_picture": str(image),

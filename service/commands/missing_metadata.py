@@ -180,7 +180,7 @@ def with_stated_readout(
     """
     kind, path = parse_source(video)[:2]
     is_open = seeks_readout(camera, config.camera) and config.camera.readout_ms != "auto"
-    if kind != "file" or not is_open or getattr(source, "turned_deg", 0) != 0:
+    if kind != "file" or not is_open or source.turned_deg != 0:
         return camera, config
     shutter = stated_shutter(path)
     if shutter is None:

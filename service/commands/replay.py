@@ -252,10 +252,7 @@ def _until_stopped(stop: Event, progress: Progress) -> Progress:
 
 def show_flown(source: CameraSource, progress: Progress) -> Callable[[Scan], None]:
     """The bar of a scan, whose figures only a terminal shows."""
-    from service.cameras.source import Counted
-
-    images = source.images if isinstance(source, Counted) else 0
-    say = progress.counting(images) if images else progress
+    say = progress.counting(source.images) if source.images else progress
 
     def show(scan: Scan) -> None:
         r = scan.recorder

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Event
 
-from service.cameras.source import CameraFrame, CameraSource, Dropping
+from service.cameras.source import CameraFrame, CameraSource, Relayed
 from service.daemon.load_shedding import STRIDE, Level
 from service.daemon.stored_image import image_name, store_image
 
@@ -22,7 +22,7 @@ KEEP_EVERY_NS = 200_000_000
 """Interval between stored images; 2 m of flight at 10 m/s."""
 
 
-class FrameGate:
+class FrameGate(Relayed):
     """Passes the camera's frames as the current load level permits."""
 
     def __init__(
@@ -38,7 +38,8 @@ class FrameGate:
         ``alive`` is called for every frame that ends here, so that the scan does not count as hung.
         Nothing is stored while ``paused`` is set.
         """
-        self._source, self._folder = source, folder
+        super().__init__(source)
+        self._folder = folder
         self._zero_unix_ns, self._alive, self._paused = zero_unix_ns, alive, paused
         self.level = Level.FULL
         self.frames = self.kept = self.lost = 0
@@ -46,11 +47,6 @@ class FrameGate:
         self._taken_s: float | None = None  # when the current frame was passed on
         self._kept_ns = -KEEP_EVERY_NS
         self._faulty = False
-        self.description, self.size_px = source.description, source.size_px
-        self.epoch_unix_ns, self.fps = source.epoch_unix_ns, source.fps
-        self.start_monotonic_ns = source.start_monotonic_ns
-        self.is_live = True
-        self.warnings = source.warnings
 
     def __iter__(self) -> Iterator[CameraFrame]:
         try:
@@ -85,7 +81,7 @@ class FrameGate:
     @property
     def late(self) -> int:
         """Camera frames that were dropped because nothing took them in time."""
-        return self._source.dropped if isinstance(self._source, Dropping) else 0
+        return self._source.dropped
 
     def close(self) -> None:
         self._source.close()

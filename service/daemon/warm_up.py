@@ -18,7 +18,7 @@ from threading import Event
 
 import numpy as np
 
-from service.cameras.source import CameraFrame
+from service.cameras.source import CameraFrame, CameraSource
 from service.config import Config, change
 from service.errors import OutsideError
 from service.progress import Progress
@@ -36,16 +36,12 @@ INSTALLED, SERVICE_CACHE = "/opt/skyrelief", "/var/cache/skyrelief"
 AS_SERVICE = f"sudo -u skyrelief env NUMBA_CACHE_DIR={SERVICE_CACHE}"
 
 
-class SyntheticGround:
+class SyntheticGround(CameraSource):
     """A camera on a straight flight over flat ground with a slab; deterministic."""
 
     def __init__(self, frames: int = FRAMES) -> None:
-        self.description, self.size_px = "synthetic ground", SIZE_PX
-        self.epoch_unix_ns: int | None = None
-        self.start_monotonic_ns: int | None = None
-        self.fps: float | None = 10.0
-        self.is_live = False
-        self.warnings: list[str] = []
+        super().__init__("synthetic ground")
+        self.size_px, self.fps = SIZE_PX, 10.0
         self._frames = frames
 
     def __iter__(self) -> Iterator[CameraFrame]:
@@ -64,9 +60,6 @@ class SyntheticGround:
             if a < b:
                 image[60:140, a:b] = ground[150:230, a - left : b - left]
             yield CameraFrame(image, 100_000_000 * i, i, None, f"frame {i}")
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 def warm_up(config: Config, progress: Progress) -> tuple[float, int]:

@@ -199,12 +199,9 @@ def _scale(shape: tuple[int, int], largest_px: int) -> float:
 
 def _padded_to(panel: U8, smallest_px: int = 160) -> U8:
     """The panel with background added to its right and bottom, to make room for labels."""
-    h, w = panel.shape[:2]
-    if min(h, w) >= smallest_px:
-        return panel
-    out = np.full((max(h, smallest_px), max(w, smallest_px), 3), BACKGROUND, np.uint8)
-    out[:h, :w] = panel
-    return out
+    below, right = (max(smallest_px - n, 0) for n in panel.shape[:2])
+    edges = 0, below, 0, right
+    return np.asarray(cv2.copyMakeBorder(panel, *edges, cv2.BORDER_CONSTANT, value=BACKGROUND))
 
 
 def _growth(panel: U8) -> float:

@@ -56,7 +56,6 @@ from service.scans.track import (
     flown_datum,
     flown_m,
     heights_above,
-    latest,
     local_frame,
     tum_lines,
 )
@@ -139,7 +138,7 @@ class _Files:
         self._folder, self._store, self._tiled = folder, store, tiled
         self._voxel_m = resolution_m(store.header)
         self.failures = Failures(folder)
-        self._frame, self._poses = local_frame(store.header), latest(store.poses())
+        self._frame, self._poses = local_frame(store.header), store.poses()
         self._left_out, self._shared = in_words(store), shared_sigma(store)
         self._fused = NOTHING
         self._raster: Raster | None = None

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from recon.types import Keyframe
-from service.scans.track import latest
 from service.stream.records import PoseRecord
 from service.stream.store import ScanStore
 
@@ -100,7 +99,7 @@ def main_poses(poses: Iterable[PoseRecord], apart: Iterable[Stretch]) -> list[Po
 
 def main_track(store: ScanStore) -> list[PoseRecord]:
     """The main piece's trajectory in order of time, each pose as last corrected."""
-    return main_poses(latest(store.poses()), stretches_apart(store))
+    return main_poses(store.poses(), stretches_apart(store))
 
 
 def in_words(store: Keyframes) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -67,11 +67,6 @@ def camera_of(header: ScanHeader) -> Camera:
         return Camera(K, distortion, (int(c["width"]), int(c["height"])), shutter)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"scan {header.scan_id} contains no camera model") from error
-
-
-def latest(poses: Iterator[PoseRecord]) -> list[PoseRecord]:
-    """The poses in order of time; of several at one time only the last record."""
-    return sorted({p.time_unix_ns: p for p in poses}.values(), key=lambda p: p.time_unix_ns)
 
 
 def flown_m(poses: Sequence[PoseRecord]) -> F64:

@@ -24,22 +24,18 @@ class TokenBucket:
     """A token bucket; the caller supplies the time in seconds."""
 
     def __init__(self, rate_bytes_s: float, now: float) -> None:
-        self._rate = rate_bytes_s
+        self.rate_bytes_s = rate_bytes_s
         self._tokens = 0.0
         self._at = now
 
-    @property
-    def rate_bytes_s(self) -> float:
-        return self._rate
-
     def set_rate(self, rate_bytes_s: float, now: float) -> None:
         self._refill(now)
-        self._rate = rate_bytes_s
+        self.rate_bytes_s = rate_bytes_s
 
     @property
     def depth_bytes(self) -> float:
         """Capacity: 3 % of a second, but at least one small part."""
-        return max(self._rate * WINDOW_SHARE, float(wire_bytes(MIN_PART_BYTES)))
+        return max(self.rate_bytes_s * WINDOW_SHARE, float(wire_bytes(MIN_PART_BYTES)))
 
     @property
     def part_bytes(self) -> int:
@@ -54,7 +50,7 @@ class TokenBucket:
         lacking = min(float(size), self.depth_bytes) - self._tokens
         if lacking <= 1e-6:
             return 0.0
-        return lacking / self._rate if self._rate > 0 else math.inf
+        return lacking / self.rate_bytes_s if self.rate_bytes_s > 0 else math.inf
 
     def take(self, size: int, now: float) -> None:
         """Spend ``size`` bytes; the bucket may go negative."""
@@ -63,7 +59,7 @@ class TokenBucket:
 
     def _refill(self, now: float) -> None:
         passed = max(0.0, now - self._at)
-        self._tokens = min(self.depth_bytes, self._tokens + passed * self._rate)
+        self._tokens = min(self.depth_bytes, self._tokens + passed * self.rate_bytes_s)
         self._at = max(self._at, now)
 
 

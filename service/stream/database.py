@@ -85,7 +85,8 @@ def connect(
     try:
         connection = _opened(path, f"mode={mode}")
     except sqlite3.OperationalError:
-        if not read_only or _has_log(path):
+        wal = path.with_name(path.name + "-wal")
+        if not read_only or (wal.exists() and wal.stat().st_size > 0):  # it holds data
             raise
         connection = _opened(path, "immutable=1")  # a disk that cannot even hold locks
     size_bytes = path.stat().st_size if path.exists() else 0
@@ -110,12 +111,6 @@ def _opened(path: Path, how: str) -> sqlite3.Connection:
             raise sqlite3.DatabaseError("its schema is damaged") from error
         raise
     return connection
-
-
-def _has_log(path: Path) -> bool:
-    """Whether part of the data is still in the write-ahead log."""
-    wal = path.with_name(path.name + "-wal")
-    return wal.exists() and wal.stat().st_size > 0
 
 
 def can_write(path: Path) -> bool:

@@ -338,18 +338,8 @@ def _signed(
         builder = builder.add_extension(extension, critical=extension is extensions[0])
     certificate = builder.sign(authority[1] if authority else key, hashes.SHA256())
     home.mkdir(parents=True, exist_ok=True)
-    _write_key(home / KEY, key)
+    how = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    with open(os.open(home / KEY, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as secret:
+        secret.write(key.private_bytes(serialization.Encoding.PEM, *how))
     (home / file).write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
     return certificate, key
-
-
-def _write_key(path: Path, key: EllipticCurvePrivateKey) -> None:
-    from cryptography.hazmat.primitives import serialization
-
-    data = key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
-    )
-    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-        file.write(data)

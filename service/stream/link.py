@@ -27,7 +27,7 @@ from service.stream.session import (
     open_session,
 )
 from service.stream.store import ScanStore
-from service.stream.tunnel import Carrier, RadioSender, TunnelConfig
+from service.stream.tunnel import Carrier, RadioSender
 from service.workers import Worker, Workers
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class DatalinkSender:
         radio: Carrier | None = None,
         opener: Callable[[SessionConfig], zenoh.Session] = open_session,
     ) -> None:
-        self._config, self._open_session = config, opener
+        self._open_session = opener
         self.silence_s = SILENCE_S
         self._drone = check_name(drone if store is None else store.header.drone, "drone")
         self._connections = [_LinkSession(config) for config in _sessions(config)]
@@ -125,9 +125,9 @@ class DatalinkSender:
         self._threads: list[Worker] = []
         self._radio = None
         if store is not None and radio is not None:
-            tunnel = TunnelConfig(config.radio_baud / 10, config.radio_share)
+            rate_bytes_s = config.radio_baud / 10 * config.radio_share
             self._radio = RadioSender(
-                store, tunnel, radio, lambda: not self._listened(), self._workers
+                store, rate_bytes_s, radio, lambda: not self._listened(), self._workers
             )
         if store is not None:
             self.add(store)
@@ -160,9 +160,9 @@ class DatalinkSender:
         self._stores.append((store, on_item, owned))
         self._wake.set()
 
-    def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
+    def set_budget(self, budget_kbit_s: float, share: float) -> None:
         """Change the link's rate, in flight."""
-        rate = _rate(budget_kbit_s, self._config.share if share is None else share)
+        rate = _rate(budget_kbit_s, share)
         self._post(lambda now: self._outbox.set_rate(rate, now))
 
     @property

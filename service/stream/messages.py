@@ -67,20 +67,8 @@ class Part:
     payload: bytes
 
     def pack(self) -> bytes:
-        return (
-            _HEAD.pack(
-                MAGIC,
-                PART_VERSION,
-                CODES[self.kind],
-                self.number,
-                self.index,
-                self.count,
-                self.total_bytes,
-                self.crc,
-                len(self.payload),
-            )
-            + self.payload
-        )
+        place = CODES[self.kind], self.number, self.index, self.count, self.total_bytes, self.crc
+        return _HEAD.pack(MAGIC, PART_VERSION, *place, len(self.payload)) + self.payload
 
 
 def split(kind: str, number: int, record: bytes, part_bytes: int) -> list[Part]:

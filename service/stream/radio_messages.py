@@ -40,6 +40,7 @@ CELLS = 8
 _DEPTH_UNIT_M = 0.02
 _LEVELS = 62  # depth codes 1 to 63; 0 is unknown
 _METRE_CM, _UNIT = 100.0, 32767  # of a quaternion
+_NO_FIX = -(1 << 31)
 
 _ANNOUNCE = struct.Struct("<BIq2dfHB")  # type, tag, started, lat, lon, alt, epsg, drone length
 _POSE = struct.Struct("<BIIq3i4h2ifHBH")
@@ -71,20 +72,10 @@ def pack_announce(header: ScanHeader) -> bytes:
     drone, scan = header.drone.encode(), header.name.encode()
     if _ANNOUNCE.size + len(drone) + len(scan) > MAX_BYTES:
         raise ValueError(f"{header.drone}/{header.name} is too long for the radio")
-    return (
-        _ANNOUNCE.pack(
-            ANNOUNCE,
-            tag_of(header.drone, header.name),
-            header.started_unix_ns,
-            or_nan(header.origin_lat_deg),
-            or_nan(header.origin_lon_deg),
-            or_nan(header.origin_alt_amsl_m),
-            header.epsg or 0,
-            len(drone),
-        )
-        + drone
-        + scan
-    )
+    place = map(or_nan, (header.origin_lat_deg, header.origin_lon_deg, header.origin_alt_amsl_m))
+    tag, started = tag_of(header.drone, header.name), header.started_unix_ns
+    head = _ANNOUNCE.pack(ANNOUNCE, tag, started, *place, header.epsg or 0, len(drone))
+    return head + drone + scan
 
 
 def unpack_announce(data: bytes) -> ScanHeader | None:
@@ -119,18 +110,21 @@ def pack_pose(tag: int, number: int, pose: PoseRecord) -> bytes:
     """A pose, rounded to a centimetre and 3e-5."""
     lat, lon = or_nan(pose.lat_deg), or_nan(pose.lon_deg)
     no_fix = math.isnan(lat) or math.isnan(lon)
+    place = [_NO_FIX if no_fix else round(angle * 1e7) for angle in (lat, lon)]
+    sigma_cm, speed_cm_s = (
+        min(65535, round(v * _METRE_CM)) for v in (pose.sigma_m, pose.speed_m_s)
+    )
     return _POSE.pack(
         POSE,
         tag,
         number,
         pose.time_unix_ns,
         *_place(pose.T_world_camera),
-        -(1 << 31) if no_fix else round(lat * 1e7),
-        -(1 << 31) if no_fix else round(lon * 1e7),
+        *place,
         or_nan(pose.alt_amsl_m),
-        min(65535, round(pose.sigma_m * _METRE_CM)),
+        sigma_cm,
         source_bits(pose.sources),
-        min(65535, round(pose.speed_m_s * _METRE_CM)),
+        speed_cm_s,
     )
 
 
@@ -139,28 +133,29 @@ def unpack_pose(data: bytes) -> tuple[int, int, PoseRecord] | None:
     data = _extended(data, _POSE.size)
     if len(data) != _POSE.size or data[0] != POSE:
         return None
-    f = _POSE.unpack(data)
-    T = _motion(f[4:11])
-    if T is None:
+    _, tag, number, time_unix_ns, *place, lat, lon, alt, sigma_cm, bits, speed_cm_s = _POSE.unpack(
+        data
+    )
+    T = _motion(place)
+    no_fix = lat == _NO_FIX
+    lat_deg, lon_deg = (None, None) if no_fix else (lat * 1e-7, lon * 1e-7)
+    alt_m, sigma_m = or_none(alt), sigma_cm / _METRE_CM
+    if T is None or not is_time(time_unix_ns):
         return None
-    no_fix = f[11] == -(1 << 31)
-    sigma = f[14] / _METRE_CM
-    if not is_time(f[3]):
-        return None
-    if not no_fix and not is_on_globe(f[11] * 1e-7, f[12] * 1e-7, or_none(f[13])):
+    if not no_fix and not is_on_globe(lat_deg, lon_deg, alt_m):
         return None
     pose = PoseRecord(
-        f[3],
+        time_unix_ns,
         T,
-        np.diag([1e-4] * 3 + [sigma**2] * 3),
-        lat_deg=None if no_fix else f[11] * 1e-7,
-        lon_deg=None if no_fix else f[12] * 1e-7,
-        alt_amsl_m=or_none(f[13]),
-        sources=sources_of(f[15]),
-        sigma_m=sigma,
-        speed_m_s=f[16] / _METRE_CM,
+        np.diag([1e-4] * 3 + [sigma_m**2] * 3),
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_amsl_m=alt_m,
+        sources=sources_of(bits),
+        sigma_m=sigma_m,
+        speed_m_s=speed_cm_s / _METRE_CM,
     )
-    return f[1], f[2], pose
+    return tag, number, pose
 
 
 def pack_tile(tag: int, tile: RadioTile) -> bytes:
@@ -204,34 +199,32 @@ def unpack_tile(data: bytes) -> tuple[int, RadioTile] | None:
     data = _extended(data, size)
     if len(data) != size or data[0] != TILE:
         return None
-    f = _TILE.unpack_from(data)
-    w, h, index, near, far = f[4], f[5], f[6], f[17], f[18]
-    T = _motion(f[7:14])
-    if T is None or min(w, h, near, f[14]) == 0 or far <= near:
+    _, tag, seq, unix_s, w, h, index, *rest = _TILE.unpack_from(data)
+    T, (focal, x, y, near, far, sigma, cb, cr) = _motion(rest[:7]), rest[7:]
+    if T is None or min(w, h, near, focal) == 0 or far <= near:
         return None
     if index >= -(-w // CELLS) * -(-h // CELLS):
         return None
-    focal_px = f[14] / 8192 * w
-    cx, cy = f[15] / 65535 * w - 0.5, f[16] / 65535 * h - 0.5
+    focal_px = focal / 8192 * w
+    cx, cy = x / 65535 * w - 0.5, y / 65535 * h - 0.5
     if not is_pinhole((focal_px, focal_px, cx, cy), (w, h)):
         return None
     packed = _from_ten_bits(data[_TILE.size :])
     codes = (packed & np.uint16(63)).reshape(CELLS, CELLS)
     low, high = 1.0 / (far * _DEPTH_UNIT_M), 1.0 / (near * _DEPTH_UNIT_M)
     depth = 1.0 / (low + (codes - 1.0) * (high - low) / _LEVELS)
-    K = np.array([[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]])
     tile = RadioTile(
-        seq=f[2],
-        time_unix_ns=f[3] * 1_000_000_000,
+        seq=seq,
+        time_unix_ns=unix_s * 1_000_000_000,
         grid_px=(w, h),
         index=index,
-        K=K,
+        K=np.array([[focal_px, 0.0, cx], [0.0, focal_px, cy], [0.0, 0.0, 1.0]]),
         T_world_camera=T,
-        sigma_m=float(SIGMA_M[f[19]]),
+        sigma_m=float(SIGMA_M[sigma]),
         depth_m=np.where(codes > 0, depth, np.nan).astype(np.float32),
-        bgr=_from_luma((packed >> np.uint16(6)).reshape(CELLS, CELLS), f[20], f[21]),
+        bgr=_from_luma((packed >> np.uint16(6)).reshape(CELLS, CELLS), cb, cr),
     )
-    return f[1], tile
+    return tag, tile
 
 
 def _extended(data: bytes, size: int) -> bytes:

@@ -4,7 +4,7 @@ also holds the newest first depth."""
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -139,9 +139,8 @@ class RadioStore:
         sql = f"SELECT DISTINCT number FROM radio WHERE kind = 'tile' AND {is_number('number')}"
         return {row[0] for row in self._db.all(sql)}
 
-    def poses(self) -> Iterator[PoseRecord]:
+    def poses(self) -> list[PoseRecord]:
         """The poses in the order of their numbers."""
-        for (data,) in self._db.all("SELECT data FROM radio WHERE kind = 'pose' ORDER BY number"):
-            found = unpack_pose(blob(data))
-            if found is not None:
-                yield found[2]
+        rows = self._db.all("SELECT data FROM radio WHERE kind = 'pose' ORDER BY number")
+        found = [unpack_pose(blob(row[0])) for row in rows]
+        return [message[2] for message in found if message is not None]

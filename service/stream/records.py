@@ -232,21 +232,14 @@ def or_none(value: float) -> float | None:
 def pack_pose(pose: PoseRecord) -> bytes:
     """``pose`` in the format of wire and store."""
     seq = -1 if pose.keyframe_seq is None else pose.keyframe_seq
-    place = (pose.lat_deg, pose.lon_deg, pose.alt_amsl_m, pose.agl_m)
+    place = map(or_nan, (pose.lat_deg, pose.lon_deg, pose.alt_amsl_m, pose.agl_m))
+    angles = pose.roll_rad, pose.pitch_rad, pose.yaw_rad
+    way = pose.speed_m_s, pose.distance_m, pose.turn_rate_rad_s
     return _POSE.pack(
         (source_bits(pose.sources), pose.time_unix_ns, seq),
         pose.T_world_camera,
         pose.covariance,
-        (
-            *map(or_nan, place),
-            pose.roll_rad,
-            pose.pitch_rad,
-            pose.yaw_rad,
-            pose.speed_m_s,
-            pose.distance_m,
-            pose.turn_rate_rad_s,
-            pose.sigma_m,
-        ),
+        (*place, *angles, *way, pose.sigma_m),
     )
 
 
@@ -256,29 +249,15 @@ def unpack_pose(data: bytes) -> PoseRecord | None:
     if found is None:
         return None
     (bits, time_unix_ns, seq), motion, covariance, last = found
-    lat, lon, alt, agl = map(or_none, last[:4])
-    roll, pitch, yaw, speed, distance, turn, sigma = last[4:]
-    if not (validity.is_time(time_unix_ns) and validity.is_on_globe(lat, lon, alt, agl)):
+    place, flown, sigma_m = [or_none(value) for value in last[:4]], last[4:10], last[10]
+    if not (validity.is_time(time_unix_ns) and validity.is_on_globe(*place)):
         return None
     if not all(map(math.isfinite, last[4:])):
         return None
+    keyframe_seq = None if seq < 0 else seq
+    # Place, angles and way are in the order of the record's fields.
     return PoseRecord(
-        time_unix_ns=time_unix_ns,
-        T_world_camera=motion,
-        covariance=covariance,
-        lat_deg=lat,
-        lon_deg=lon,
-        alt_amsl_m=alt,
-        agl_m=agl,
-        roll_rad=roll,
-        pitch_rad=pitch,
-        yaw_rad=yaw,
-        speed_m_s=speed,
-        distance_m=distance,
-        turn_rate_rad_s=turn,
-        sources=sources_of(bits),
-        sigma_m=sigma,
-        keyframe_seq=None if seq < 0 else seq,
+        time_unix_ns, motion, covariance, *place, *flown, sources_of(bits), sigma_m, keyframe_seq
     )
 
 

@@ -366,17 +366,15 @@ class ScanStore:
             else:
                 self._inventory.note_repose(number, record.seq, record.revision)
 
-    def poses(self, since_unix_ns: int = -(1 << 63)) -> Iterator[PoseRecord]:
-        """All poses since then in order of time; of several at one time only the newest."""
-        newest = "SELECT MAX(id) FROM poses WHERE time_unix_ns >= ? GROUP BY time_unix_ns"
-        for (data,) in self.database.all(
-            f"SELECT data FROM poses WHERE id IN ({newest}) ORDER BY time_unix_ns", (since_unix_ns,)
-        ):
-            pose = unpack_pose(blob(data))
-            if pose is not None:
-                yield pose
+    def poses(self) -> list[PoseRecord]:
+        """All poses in order of time; of several at one time only the newest."""
+        newest = "SELECT MAX(id) FROM poses GROUP BY time_unix_ns"
+        rows = self.database.all(f"SELECT data FROM poses WHERE id IN ({newest}) ORDER BY id")
+        poses = [pose for row in rows if (pose := unpack_pose(blob(row[0]))) is not None]
         if not self._inventory.of("pose"):
-            yield from (p for p in self.radio.poses() if p.time_unix_ns >= since_unix_ns)
+            poses = self.radio.poses()
+        newest_at = {pose.time_unix_ns: pose for pose in poses}
+        return sorted(newest_at.values(), key=lambda pose: pose.time_unix_ns)
 
     def poses_beside(self, known: RangeSet) -> Iterator[tuple[int, PoseRecord]]:
         """Number and pose of those whose numbers are not ``known``; adds them to it.

@@ -44,17 +44,10 @@ MAX_ANNOUNCED = 64
 """Scans that the ground knows by announcement; beyond it the oldest is dropped."""
 MOVED_M, TURNED, RESCALED = 0.5, 0.01, 0.01
 """A correction beyond any of these is worth resending a keyframe's tiles."""
+LOW_BUFFER_PERCENT = 50
+"""RADIO_STATUS.txbuf below which sending slows down."""
 MAVLINK_OVERHEAD_BYTES = 17
 """Header, checksum and TUNNEL's own fields around each payload."""
-
-
-@dataclass(frozen=True, slots=True)
-class TunnelConfig:
-    """Permitted use of the telemetry radio."""
-
-    radio_bytes_s: float = 5760.0  # 57,600 baud
-    share: float = 0.3
-    low_buffer_percent: int = 50  # RADIO_STATUS.txbuf below this: slow down
 
 
 @dataclass(slots=True, eq=False)
@@ -67,16 +60,16 @@ class _Waiting:
 class TunnelSender:
     """The drone's sender over the radio. The caller supplies times: seconds, monotonic."""
 
-    def __init__(self, store: ScanStore, config: TunnelConfig, now: float) -> None:
+    def __init__(self, store: ScanStore, rate_bytes_s: float, now: float) -> None:
         """Raises ValueError when the names of drone and scan are too long for the radio."""
         self._store = store
-        self._config = config
+        self._rate_bytes_s = rate_bytes_s  # that may be used
         self._announcement = pack_announce(store.header)
         self._tiles: deque[RadioTile] = deque(maxlen=MAX_WAITING)  # all tiles of the scan
         self._moved: dict[int, Repose] = {}  # keyframe to the correction last sent
         self._tag = tag_of(store.header.drone, store.header.name)
         self._factor = 1.0
-        self._bucket = TokenBucket(config.radio_bytes_s * config.share, now)
+        self._bucket = TokenBucket(rate_bytes_s, now)
         self._announce_at = now
         self._pose_at = now
         self._pose: tuple[int, PoseRecord] | None = None
@@ -135,14 +128,13 @@ class TunnelSender:
 
     def radio_status(self, free_percent: int, now: float) -> None:
         """The radio reports the free share of its buffer (RADIO_STATUS.txbuf)."""
-        if free_percent < self._config.low_buffer_percent // 2:
+        if free_percent < LOW_BUFFER_PERCENT // 2:
             self._factor = max(0.05, self._factor * 0.5)
-        elif free_percent < self._config.low_buffer_percent:
+        elif free_percent < LOW_BUFFER_PERCENT:
             self._factor = max(0.05, self._factor * 0.85)
         elif free_percent > 90:
             self._factor = min(1.0, self._factor * 1.1)
-        rate = self._config.radio_bytes_s * self._config.share * self._factor
-        self._bucket.set_rate(rate, now)
+        self._bucket.set_rate(self._rate_bytes_s * self._factor, now)
 
     def next(self, now: float) -> bytes | float:
         """The TUNNEL payload to send now, or the seconds to wait."""
@@ -211,13 +203,13 @@ class RadioSender:
     def __init__(
         self,
         store: ScanStore,
-        config: TunnelConfig,
+        rate_bytes_s: float,
         carrier: Carrier,
         needed: Callable[[], bool] = lambda: True,
         workers: Workers | None = None,
     ) -> None:
         try:
-            self._tunnel = TunnelSender(store, config, time.monotonic())
+            self._tunnel = TunnelSender(store, rate_bytes_s, time.monotonic())
         except ValueError as error:
             raise InputError(str(error)) from error
         self._events: deque[Callable[[float], None]] = deque(maxlen=10_000)

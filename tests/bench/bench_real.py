@@ -38,7 +38,7 @@ from service.offline.refine.control_points import ScanImages, candidates_of
 from service.offline.refine.revisions import Revisions
 from service.offline.refine.survey_file import Sighting, SurveyPoint
 from service.scans.drawing import debug_path, load_debug
-from service.scans.track import latest, local_frame
+from service.scans.track import local_frame
 from service.scans.trust import Trust
 from service.stream.store import ScanStore
 
@@ -145,7 +145,7 @@ def skyrelief(*words: str) -> None:
 def _placed(flight: ReplayedSet) -> Iterator[tuple[str, float, str]]:
     run = flight.summary["run"]
     with ScanStore.open(flight.scan / "scan.db") as store:
-        placed = sum("vision" in pose.sources for pose in latest(store.poses()))
+        placed = sum("vision" in pose.sources for pose in store.poses())
     yield "frames placed by vision", 100.0 * placed / max(run["frames"], 1), "%"
     yield "unbroken stretches", float(run["segments"]), ""
     level = Trust(flight.summary["quality"]["trust"]["level"])
@@ -256,7 +256,7 @@ def _off_fixes(
 ) -> Iterator[tuple[str, float, str]]:
     """The track against latitudes and longitudes by unix time in ns; None: no fix then."""
     with ScanStore.open(flight.scan / "scan.db") as store:
-        frame, poses = local_frame(store.header), latest(store.poses())
+        frame, poses = local_frame(store.header), store.poses()
     placed = {_tick(pose.time_unix_ns): pose.T_world_camera[:2, 3] for pose in poses}
     off = [
         frame.to_enu(np.array([[lat, lon, 0.0]]))[0, :2] - placed[_tick(time_ns)]

@@ -7,6 +7,7 @@ import logging
 import subprocess
 import sys
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,7 +17,7 @@ import pytest
 from recon.backends import Backend
 from recon.types import Camera
 from service.cameras import open_camera
-from service.cameras.source import CameraSource
+from service.cameras.source import CameraFrame, CameraSource
 from service.config import Config, keys, load_config
 from service.daemon.health import HealthServer
 from service.errors import InputError, OutsideError
@@ -82,17 +83,20 @@ def test_every_secret_key_is_a_key() -> None:
     assert {f"{section}.{field.name}" for section, field in keys()} >= SECRET_KEYS
 
 
-class Source:
+class Source(CameraSource):
     """A camera that has complained, with its address in the text."""
 
     def __init__(self) -> None:
+        super().__init__("camera")
         self.warnings = [f"cannot be opened: {SOURCE}"]
-        self.is_live = False
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        return iter(())
 
 
 def test_a_scan_and_its_files_hold_no_secret(tmp_path: Path, config: Config) -> None:
     camera = Camera(np.eye(3), np.zeros(5), (4, 3))
-    source = cast(CameraSource, Source())
+    source = Source()
     notes = (f"camera {SOURCE}",)
     inputs = ScanInputs(
         source, camera, config, cast(Backend, None), tmp_path, "scan-1", 0, notes=notes

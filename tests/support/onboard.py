@@ -55,15 +55,13 @@ class HeardVehicle(VehicleLink):
         self.presence.hear(message, time.monotonic_ns() if now_ns is None else now_ns)
 
 
-class FakeCamera:
+class FakeCamera(CameraSource):
     """A live camera without images."""
 
     def __init__(self, size_px: tuple[int, int]) -> None:
-        self.description, self.size_px, self.is_live = "gimbal", size_px, True
-        self.start_monotonic_ns: int | None = 0
-        self.epoch_unix_ns: int | None = None
-        self.fps: float | None = None
-        self.warnings, self.closed = list[str](), threading.Event()
+        super().__init__("gimbal")
+        self.size_px, self.is_live, self.start_monotonic_ns = size_px, True, 0
+        self.closed = threading.Event()
 
     def __iter__(self) -> Iterator[CameraFrame]:
         return iter(())

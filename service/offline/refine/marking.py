@@ -31,7 +31,7 @@ from service.offline.refine.control_points import (
 )
 from service.offline.refine.revisions import NEWEST, Revisions
 from service.offline.refine.survey_file import Sighting, SurveyPoint, SurveyRow, read_survey
-from service.scans.track import camera_of, latest, local_frame
+from service.scans.track import camera_of, local_frame
 from service.stream.images import whole_bgr
 from service.stream.store import ScanStore
 
@@ -80,7 +80,7 @@ class Marking:
             raise InputError("no keyframes yet")
         self.camera = camera_of(store.header)
         self._scan = ScanImages(
-            states, latest(store.poses()), store.header, lambda s: store.keyframe(s.seq),
+            states, store.poses(), store.header, lambda s: store.keyframe(s.seq),
             local_frame(store.header),
         )  # fmt: skip
         self._poses = self._scan.poses

@@ -24,7 +24,7 @@ from service.georeference import LocalFrame, between_frames
 from service.offline.site import DRONE
 from service.offline.site.start import StartPoints
 from service.scans.main_piece import main_seqs
-from service.scans.track import latest, local_frame
+from service.scans.track import local_frame
 from service.stream import codec
 from service.stream.records import PoseRecord, Repose, ScanHeader
 from service.stream.store import ScanStore
@@ -138,7 +138,7 @@ def _is_same_flight(a: ScanStore, b: ScanStore) -> bool:
     located = local_frame(a.header) is not None and local_frame(b.header) is not None
     if a.header.started_unix_ns != b.header.started_unix_ns or not located:
         return False
-    one, two = (latest(s.poses())[:1] for s in (a, b))
+    one, two = (s.poses()[:1] for s in (a, b))
     if not one or not two or one[0].time_unix_ns != two[0].time_unix_ns:
         return False
     T = between_frames(_frame(a.header), _frame(b.header))
@@ -217,7 +217,7 @@ def _copy_poses(
     stores: Sequence[ScanStore], site: ScanStore, members: Sequence[Member], origin: LocalFrame
 ) -> None:
     """The trajectories one after the other; none where drones flew at the same time."""
-    tracks = [(latest(s.poses()), k) for k, s in enumerate(stores)]
+    tracks = [(s.poses(), k) for k, s in enumerate(stores)]
     tracks = sorted((t for t in tracks if t[0]), key=lambda t: t[0][0].time_unix_ns)
     ends = [(t[0][0].time_unix_ns, t[0][-1].time_unix_ns) for t in tracks]
     if any(after[0] <= before[1] for before, after in pairwise(ends)):

@@ -28,26 +28,22 @@ from service.daemon.stored_image import image_name
 START_NS = 1_790_000_000_123_456_000
 
 
-class Film:
+class Film(CameraSource):
     """A camera of a hundred numbered images, ten a second."""
 
     def __init__(self, count: int = 100) -> None:
-        self.description, self.size_px = "film", (64, 48)
-        self.epoch_unix_ns: int | None = None
-        self.start_monotonic_ns: int | None = None
-        self.fps: float | None = 10.0
-        self.is_live = True
-        self.warnings: list[str] = []
-        self.dropped = 7
+        super().__init__("film")
+        self.size_px, self.fps, self.is_live = (64, 48), 10.0, True
         self._count = count
+
+    @property
+    def dropped(self) -> int:
+        return 7
 
     def __iter__(self) -> Iterator[CameraFrame]:
         for i in range(self._count):
             image = np.full((48, 64, 3), 2 * i, np.uint8)
             yield CameraFrame(image, 100_000_000 * i, i, None, f"frame {i}")
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 class Kept(NamedTuple):

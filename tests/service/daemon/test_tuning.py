@@ -154,7 +154,7 @@ class Budget:
     def __init__(self) -> None:
         self.budgets: list[tuple[float, float | None]] = []
 
-    def set_budget(self, budget_kbit_s: float, share: float | None = None) -> None:
+    def set_budget(self, budget_kbit_s: float, share: float) -> None:
         self.budgets.append((budget_kbit_s, share))
 
     def drain(self, timeout_s: float) -> bool:

@@ -15,22 +15,19 @@ from recon.backends.cpu import CpuBackend
 from recon.pipeline.events import FramePosed
 from recon.tracking.odometry import Tracked, Tracking
 from recon.types import U8, Camera
-from service.cameras.source import CameraFrame, ahead
+from service.cameras.source import CameraFrame, CameraSource, ahead
 from service.config import load_config
 from service.flight.scan import Scan, ScanInputs, create_store
 
 
-class Recording:
+class Recording(CameraSource):
     """Counts what was taken from it; breaks at ``fault_at``."""
 
-    description, size_px, is_live = "test", (4, 4), False
-    epoch_unix_ns: int | None = None
-    start_monotonic_ns: int | None = None
-    fps: float | None = 30.0
+    size_px, fps = (4, 4), 30.0
 
     def __init__(self, count: int, fault_at: int | None = None) -> None:
+        super().__init__("test")
         self.count, self.fault_at, self.taken = count, fault_at, 0
-        self.warnings: list[str] = []
 
     def __iter__(self) -> Iterator[CameraFrame]:
         for i in range(self.count):
@@ -38,8 +35,6 @@ class Recording:
                 raise OSError("the disk is gone")
             self.taken += 1
             yield CameraFrame(np.full((4, 4, 3), i, np.uint8), i, i, None, f"frame {i}")
-
-    def close(self) -> None: ...
 
 
 def test_every_image_comes_in_order() -> None:

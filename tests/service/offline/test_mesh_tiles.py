@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from recon.surface import triangle_grid
 from recon.surface.meshing import Mesh
 from recon.surface.texture_views import TextureView
-from service.cameras import CameraFrame
+from service.cameras import CameraFrame, CameraSource
 from service.cli import app
 from service.errors import InputError, OutsideError
 from service.georeference import LocalFrame
@@ -175,15 +175,12 @@ def test_the_command_cuts_a_large_site(tmp_path: Path, house: HouseFlight) -> No
     assert uses.count(34963) == figures["tiles"] and uses.count(None) == len(tree["images"])
 
 
-class FakeVideo:
+class FakeVideo(CameraSource):
     """Images twice as fine as the keyframes', one of them at each keyframe's second."""
 
     def __init__(self, house: HouseFlight, size_px: tuple[int, int] = (320, 180)) -> None:
-        self.description, self.is_live, self.warnings = "video", False, list[str]()
-        self.start_monotonic_ns: int | None = None
-        self.epoch_unix_ns: int | None = None
-        self.fps: float | None = 2.0
-        self.size_px, self.closed = size_px, False
+        super().__init__("video")
+        self.size_px, self.fps, self.closed = size_px, 2.0, False
         self._house = house
 
     def __iter__(self) -> Iterator[CameraFrame]:

@@ -21,7 +21,6 @@ from service.scans.report import accuracy_words, overlaps, surveyed
 from service.scans.report_appendix import consistency, sensor_constants
 from service.scans.report_map import map_figure
 from service.scans.report_parts import area, length
-from service.scans.track import latest
 from service.stream.records import PoseRecord, unpack_covariance, unpack_motion
 
 if TYPE_CHECKING:
@@ -55,7 +54,7 @@ SUMMARY: dict[str, Any] = {
 
 def test_the_map_has_ellipses_loops_and_points(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as store:
-        poses, coverage = latest(store.poses()), coverage_of(store)
+        poses, coverage = store.poses(), coverage_of(store)
     figure = map_figure(SUMMARY, poses, coverage)
     assert figure.count("<ellipse") == 5
     assert figure.count("<line ") == 2 and figure.count("stroke-dasharray") == 1

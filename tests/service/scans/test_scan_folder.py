@@ -32,7 +32,6 @@ from service.scans.folder import (
 )
 from service.scans.fused_cloud import Extent, fused_cloud, strip_edges
 from service.scans.retention import close_open_scans
-from service.scans.track import latest
 from service.scans.writing import SUMMARY
 from service.stream.records import Repose, ScanHeader
 from service.stream.store import ScanStore
@@ -154,7 +153,7 @@ def test_trajectory_files(tmp_path: Path, house: HouseFlight) -> None:
 def test_a_pose_written_again_replaces_the_first(tmp_path: Path, house: HouseFlight) -> None:
     with house.flown(tmp_path) as store:
         store.add_pose(house.record(2, 11.5))
-        poses = latest(store.poses())
+        poses = store.poses()
         summary = write_deliverables(tmp_path, store, {})
     assert len(poses) == 5
     numbers = np.loadtxt(tmp_path / TUM)

@@ -45,9 +45,10 @@ from service.stream.records import PoseRecord, Repose, ScanHeader
 from service.stream.records import unpack_pose as unpack_record
 from service.stream.session import SessionConfig
 from service.stream.store import ScanStore
-from service.stream.tunnel import RadioSender, TunnelConfig, TunnelIntake, TunnelSender
+from service.stream.tunnel import RadioSender, TunnelIntake, TunnelSender
 
 HEADER = ScanHeader("20260101T120000Z", "drone-a", 1_767_268_800_000_000_000, 47.5, 8.25, 431.5)
+RATE_BYTES_S = 0.3 * 5760  # 57,600 baud
 F = 260.0
 R_DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 
@@ -198,10 +199,10 @@ def test_a_map_of_100_m_arrives_in_flight_within_the_share(tmp_path: Path) -> No
         ScanStore.create(tmp_path / "a.db", HEADER) as onboard,
         ScanStore.create(tmp_path / "g.db", HEADER) as ground,
     ):
-        sender = TunnelSender(onboard, TunnelConfig(), 0.0)
+        sender = TunnelSender(onboard, RATE_BYTES_S, 0.0)
         sent = fly(sender, onboard, 20.0)
         size = sum(len(payload) + 17 for _, payload in sent)
-        assert size <= 0.3 * 5760 * 20 * 1.05
+        assert size <= RATE_BYTES_S * 20 * 1.05
         intake = TunnelIntake()
         for _, payload in sent:
             if rng.random() < 0.1:
@@ -239,7 +240,7 @@ def drain(sender: TunnelSender, start: float, seconds: float) -> list[bytes]:
 def test_a_late_origin_and_corrections_reach_the_ground(tmp_path: Path) -> None:
     bare = ScanHeader(HEADER.scan_id, HEADER.drone, HEADER.started_unix_ns)
     with ScanStore.create(tmp_path / "a.db", bare) as store:
-        sender = TunnelSender(store, TunnelConfig(radio_bytes_s=50_000), 0.0)
+        sender = TunnelSender(store, 15_000.0, 0.0)
         store.listen(sender.on_item)
         store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
         drain(sender, 0.0, 5.0)
@@ -265,7 +266,7 @@ def test_a_correction_beyond_the_tiles_resolution_resends_them(
     tmp_path: Path, moved_m: float, scale: float, resent: bool
 ) -> None:
     with ScanStore.create(tmp_path / "a.db", HEADER) as store:
-        sender = TunnelSender(store, TunnelConfig(radio_bytes_s=50_000), 0.0)
+        sender = TunnelSender(store, 15_000.0, 0.0)
         store.listen(sender.on_item)
         frame = keyframe(0, 0.0)
         store.add_keyframe(0, codec.encode(frame, 0))
@@ -278,7 +279,7 @@ def test_a_correction_beyond_the_tiles_resolution_resends_them(
 
 def test_poses_take_a_message_a_second_and_the_share_counts_what_wraps_it(tmp_path: Path) -> None:
     with ScanStore.create(tmp_path / "a.db", HEADER) as store:
-        sender = TunnelSender(store, TunnelConfig(radio_bytes_s=1000, share=0.5), 0.0)
+        sender = TunnelSender(store, 500.0, 0.0)
         store.listen(sender.on_item)
         T, sent, poses, now = keyframe(0, 0.0).pose.T_world_camera, 0, 0, 0.0
         for seq in range(4):
@@ -297,7 +298,7 @@ def test_poses_take_a_message_a_second_and_the_share_counts_what_wraps_it(tmp_pa
 
 def test_a_full_radio_buffer_slows_it_down_and_an_empty_one_speeds_it_up(tmp_path: Path) -> None:
     with ScanStore.create(tmp_path / "a.db", HEADER) as store:
-        sender = TunnelSender(store, TunnelConfig(), 0.0)
+        sender = TunnelSender(store, RATE_BYTES_S, 0.0)
         store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
 
         def bytes_in_ten_seconds(start: float, free_percent: int) -> int:
@@ -331,7 +332,7 @@ def test_over_a_real_link_into_the_ground_station(tmp_path: Path) -> None:
     radio.open()
     store = ScanStore.create(tmp_path / "a.db", HEADER)
     carrier = RadioLink(f"udpout:127.0.0.1:{udp}", DRONE)
-    sender = RadioSender(store, TunnelConfig(radio_bytes_s=50_000), carrier)
+    sender = RadioSender(store, 15_000.0, carrier)
     try:
         store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
         until(lambda: any(e["radio_messages"] >= 15 for e in ground.progress()))
