@@ -91,7 +91,8 @@ def load_camera(path: str | Path) -> Camera:
     try:
         shutter = shutter_of(info.readout_ms, info.readout_direction or "down")
         camera = Camera(K, distortion, size, shutter, info.sigma_focal)
-        _check_matrix(K)
+        if not np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1], 0.0, 1e-9):
+            raise ValueError("camera_matrix is not of the form [fx 0 cx; 0 fy cy; 0 0 1]")
         check_camera(camera)
     except ValueError as error:
         raise InputError(f"camera model {path}: {error}; calibrate again") from error
@@ -182,13 +183,6 @@ def _one_line(error: Exception) -> str:
     if mark is not None:
         return f"line {mark.line + 1}: {getattr(error, 'problem', None) or 'syntax error'}"
     return " ".join(str(error).split())[:120]
-
-
-def _check_matrix(K: F64) -> None:
-    """Raise ValueError unless ``K`` has the form of a pinhole matrix without skew."""
-    fixed = [K[0, 1], K[1, 0], K[2, 0], K[2, 1]]
-    if any(abs(value) > 1e-9 for value in fixed) or abs(K[2, 2] - 1.0) > 1e-9:
-        raise ValueError("camera_matrix is not of the form [fx 0 cx; 0 fy cy; 0 0 1]")
 
 
 def _matrix(M: F64) -> dict[str, Any]:

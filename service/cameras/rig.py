@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -114,29 +114,26 @@ class Rig:
         height = self._agl(state, tag, float(lever[2]))
         agl, sigma_agl, is_measured = height or (ASSUMED_AGL_M, 0.5 * ASSUMED_AGL_M, False)
         position = None if position is None else position + lever
-        prior = PosePrior(
-            R, tilt, yaw, position, sigma, agl, sigma_agl,
+        velocity = altitude = receiver = None
+        if state is not None and state.v_ned_m_s is not None and self._fusion.gnss:
+            velocity = R_ENU_NED @ state.v_ned_m_s
+        # A position includes the altitude.
+        if state is not None and position is None and self._fusion.altitude:
+            altitude = None if state.alt_amsl_m is None else state.alt_amsl_m + lever[2]
+        if state is not None and position is not None:
+            receiver = state.receiver
+        return PosePrior(
+            R, tilt, yaw, position, sigma, agl, sigma_agl, altitude,
+            gnss_minus_baro_m=None if receiver is None else receiver.gnss_minus_baro_m,
+            gnss_minus_baro_fixes=0 if receiver is None else 1,
+            gnss_minus_baro_ns=0 if receiver is None else receiver.time_ns,
             is_at_rest=state is not None and _is_at_rest(state),
             is_agl_measured=is_measured,
             is_agl_assumed=height is None,
+            velocity_m_s=velocity,
             is_sigma_claimed=fix is None or fix.is_claimed,
             is_view_assumed=tilt >= ASSUMED_TILT_RAD,
         )  # fmt: skip
-        if state is not None and state.v_ned_m_s is not None and self._fusion.gnss:
-            prior = replace(prior, velocity_m_s=R_ENU_NED @ state.v_ned_m_s)
-        if position is not None and state is not None and state.receiver is not None:
-            above = state.receiver
-            prior = replace(
-                prior,
-                gnss_minus_baro_m=above.gnss_minus_baro_m,
-                gnss_minus_baro_fixes=1,
-                gnss_minus_baro_ns=above.time_ns,
-            )
-        # A position includes the altitude.
-        if position is None and state is not None and self._fusion.altitude:
-            altitude = state.alt_amsl_m
-            prior = replace(prior, altitude_m=None if altitude is None else altitude + lever[2])
-        return prior
 
     def turn_at(self, state_at: Callable[[int], VehicleState | None], time_ns: int) -> F64 | None:
         """(3,) rad/s of the camera in its own frame; by one side where telemetry begins or ends."""

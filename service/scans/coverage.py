@@ -20,7 +20,7 @@ import numpy as np
 
 from recon.surface.coverage import CoverageGrid, CoverageMap, usual_cell_m
 from recon.table import Rows
-from recon.types import U8, Array, DepthMap
+from recon.types import U8, Array
 from service.georeference import LocalFrame
 from service.scans.main_piece import Stretch, main_seqs, stretches_apart
 from service.scans.track import local_frame
@@ -161,7 +161,8 @@ class LiveCoverage:
                 self._put(seq, finer=before is not None and before[0] != now[0])
         if self._map is None:
             return None
-        self._map.refill(self._depths(self._map.stale()))
+        stale = ((seq, self._store.keyframe(seq)) for seq in self._map.stale())
+        self._map.refill((seq, keyframe.depth) for seq, keyframe in stale if keyframe is not None)
         layer = self._map.grid()
         if layer is None or not layer.known.any():
             return None
@@ -179,12 +180,6 @@ class LiveCoverage:
                 return
             self._map = CoverageMap(cell)
         self._map.put(seq, keyframe.time_ns, keyframe.depth, finer)
-
-    def _depths(self, seqs: list[int]) -> Iterator[tuple[int, DepthMap]]:
-        for seq in seqs:
-            keyframe = self._store.keyframe(seq)
-            if keyframe is not None:
-                yield seq, keyframe.depth
 
 
 def coverage_of(store: ScanStore, cell_m: float | None = None) -> Coverage | None:

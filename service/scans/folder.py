@@ -29,16 +29,10 @@ from service.errors import OutsideError, SkyreliefError
 from service.memory import release_memory
 from service.progress import CancelledError, Progress
 from service.redaction import public_configuration, redacted
+from service.scans import drawing, track
 from service.scans.absolute import SharedSigma, shared_sigma
 from service.scans.coverage import IMAGE as COVERAGE
 from service.scans.coverage import Coverage, LiveCoverage, write_coverage_files
-from service.scans.drawing import (
-    blank_preview,
-    draw_preview,
-    draw_thumbnail,
-    middle_keyframe,
-    stages,
-)
 from service.scans.fused_cloud import (
     DEFAULT_VOXEL_M,
     Box,
@@ -51,14 +45,6 @@ from service.scans.fused_cloud import (
 )
 from service.scans.main_piece import in_words, main_poses, main_seqs, pieces_apart, stretches_apart
 from service.scans.report import report_html
-from service.scans.track import (
-    csv_table,
-    flown_datum,
-    flown_m,
-    heights_above,
-    local_frame,
-    tum_lines,
-)
 from service.scans.trust import scale_sigma, slope_deg, trust_of
 from service.scans.writing import SUMMARY, write_whole, writing
 from service.stream.records import PoseRecord, ScanHeader
@@ -138,7 +124,7 @@ class _Files:
         self._folder, self._store, self._tiled = folder, store, tiled
         self._voxel_m = resolution_m(store.header)
         self.failures = Failures(folder)
-        self._frame, self._poses = local_frame(store.header), store.poses()
+        self._frame, self._poses = track.local_frame(store.header), store.poses()
         self._left_out, self._shared = in_words(store), shared_sigma(store)
         self._fused = NOTHING
         self._raster: Raster | None = None
@@ -148,9 +134,9 @@ class _Files:
 
     def write_trajectory(self) -> None:
         with self.failures.noted(TUM):
-            write_whole(self._folder / TUM, tum_lines(self._poses))
+            write_whole(self._folder / TUM, track.tum_lines(self._poses))
         with self.failures.noted(CSV):
-            write_whole(self._folder / CSV, csv_table(self._poses))
+            write_whole(self._folder / CSV, track.csv_table(self._poses))
 
     def fuse(self, progress: Progress) -> None:
         with self.failures.noted(CLOUD):
@@ -181,8 +167,8 @@ class _Files:
         header = self._store.header
         with writing(self._folder / CLOUD) as part:
             write_laz(
-                part, parts, self._frame, header.started_unix_ns, vertical=flown_datum(header),
-                shared=self._shared,
+                part, parts, self._frame, header.started_unix_ns,
+                vertical=track.flown_datum(header), shared=self._shared,
             )  # fmt: skip
 
     def write_pieces(self) -> None:
@@ -237,7 +223,7 @@ class _Files:
             "finished": store.finished,
             "origin": origin,
             "epsg": None if frame is None else frame.epsg,
-            "heights": heights_above(frame, flown_datum(header)),
+            "heights": track.heights_above(frame, track.flown_datum(header)),
             "georeference": header.georeference,
             "camera": header.camera,
             "configuration": public_configuration(header.configuration),
@@ -279,7 +265,7 @@ class _Files:
                 bounds = (
                     self._raster.grid.bounds if self._coverage is None else self._coverage.bounds_m
                 )
-                image = draw_thumbnail(self._raster, bounds)
+                image = drawing.draw_thumbnail(self._raster, bounds)
                 write_whole(
                     self._folder / THUMBNAIL, cv2.imencode(".webp", image, WEBP)[1].tobytes()
                 )
@@ -327,11 +313,11 @@ class Failures:
 
 def stages_jpg(folder: Path, store: ScanStore) -> bytes | None:
     """JPEG of a keyframe's stages for the report; None for a scan without keyframes."""
-    seq = middle_keyframe(folder, store, main_seqs(store))
+    seq = drawing.middle_keyframe(folder, store, main_seqs(store))
     keyframe = None if seq is None else store.keyframe(seq)
     if keyframe is None:
         return None
-    image, _ = stages(folder, store.header.scan_id, keyframe)
+    image, _ = drawing.stages(folder, store.header.scan_id, keyframe)
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
 
 
@@ -382,7 +368,7 @@ def _quality(
         "views_median": None if none else float(np.median(cloud.views)),
         "seen_once_share": None if none else round(float((cloud.views <= 1).mean()), 4),
         "area_m2": 0.0 if raster is None else round(raster.area_m2, 1),
-        "distance_m": round(float(flown_m(poses)[-1]), 2) if poses else 0.0,
+        "distance_m": round(float(track.flown_m(poses)[-1]), 2) if poses else 0.0,
     } | _position_sigmas(poses)
 
 
@@ -410,11 +396,11 @@ def _preview(
     """preview.jpg; ``left_out`` says what is not in it."""
     lines = key_figures(summary) + ([left_out] if left_out else [])
     if raster is None:
-        image = blank_preview(lines)
+        image = drawing.blank_preview(lines)
     else:
-        track = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
+        places_m = np.array([p.T_world_camera[:3, 3] for p in poses]).reshape(-1, 3)
         zero = summary["origin"]["alt_amsl_m"] if summary["origin"] else 0.0
-        image = draw_preview(raster, track, lines, height_of_zero_m=zero)
+        image = drawing.draw_preview(raster, places_m, lines, height_of_zero_m=zero)
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 

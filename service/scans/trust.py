@@ -71,8 +71,7 @@ def trust_of(run: Mapping[str, Any], georeference: str, slope_deg: float = 0.0) 
         georeference: of the scan's header; "none" without.
         slope_deg: of the plane through the cloud.
     """
-    assumed = run.get("assumed")
-    assumed = assumed if isinstance(assumed, list) else []
+    assumed = _assumed(run)
     scale = run.get("scale")
     sigma = _number(scale, "sigma")
     doubts = []
@@ -197,9 +196,12 @@ def depth_share(run: Mapping[str, Any], georeference: str) -> float | None:
     scale = 0.0 if georeference == BY_SURVEY else scale_sigma(run, georeference)
     if georeference == "none" or scale is None:
         return None
+    return math.hypot(scale, *(BENDS[what] for what in BENDS if what in _assumed(run)))
+
+
+def _assumed(run: Mapping[str, Any]) -> list[Any]:
     assumed = run.get("assumed")
-    assumed = assumed if isinstance(assumed, list) else []
-    return math.hypot(scale, *(BENDS[what] for what in BENDS if what in assumed))
+    return assumed if isinstance(assumed, list) else []
 
 
 def _said(level: Trust, reasons: list[str]) -> dict[str, Any]:

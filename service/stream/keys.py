@@ -38,6 +38,11 @@ class Fleet:
     members: dict[str, tuple[str, ...]] = field(default_factory=dict)
     revoked: dict[str, int] = field(default_factory=dict)  # by "<role>.<name>"
 
+    @property
+    def everybody(self) -> list[tuple[str, str]]:
+        """Role and name of each member."""
+        return [(role, name) for role, names in self.members.items() for name in names]
+
     def with_members(self, role: str, names: Sequence[str]) -> Fleet:
         """The fleet with more members of a role."""
         merged = tuple(sorted({*self.members.get(role, ()), *names}))
@@ -69,10 +74,25 @@ def load_fleet(path: Path) -> Fleet:
         revoked = {str(key): int(count) for key, count in raw.get("revoked", {}).items()}
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"{path} is not a fleet.json; make it with 'skyrelief keys'") from error
-    for names in members.values():
-        for name in names:
-            check_name(name, "fleet member")
-    return Fleet(members, revoked)
+    fleet = Fleet(members, revoked)
+    for _, name in fleet.everybody:
+        check_name(name, "fleet member")
+    return fleet
+
+
+def _rights(role: str, name: str) -> list[tuple[str, Sequence[str], str]]:
+    """Flow, messages and keys of each right of a member."""
+    everything = ("put", "query", "reply", "declare_subscriber", "declare_queryable")
+    own, everywhere = f"{ROOT}/{name}/**", f"{ROOT}/**"
+    if role == "drone":
+        return [("ingress", everything, own), ("egress", everything, own)]
+    if role == "viewer":
+        return [("ingress", ("declare_subscriber",), everywhere), ("egress", ("put",), everywhere)]
+    return [
+        ("ingress", ("put",), f"{ROOT}/*/*/held/{name}"),
+        ("ingress", ("declare_subscriber", "query"), everywhere),
+        ("egress", everything, everywhere),
+    ]
 
 
 def access_control(fleet: Fleet) -> dict[str, Any]:
@@ -85,13 +105,11 @@ def access_control(fleet: Fleet) -> dict[str, Any]:
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
-
-    def grant(role: str, name: str, *rights: tuple[str, Sequence[str], str]) -> None:
+    for role, name in fleet.everybody:
         subject = f"{role}.{name}"
-        names = [fleet.common_name(role, name)]
-        subjects.append({"id": subject, "cert_common_names": names})
+        subjects.append({"id": subject, "cert_common_names": [fleet.common_name(role, name)]})
         ids = []
-        for k, (flow, messages, key) in enumerate(rights):
+        for k, (flow, messages, key) in enumerate(_rights(role, name)):
             ids.append(f"{subject}.{k}")
             rules.append(
                 {
@@ -103,26 +121,6 @@ def access_control(fleet: Fleet) -> dict[str, Any]:
                 }
             )
         policies.append({"rules": ids, "subjects": [subject]})
-
-    everything = ("put", "query", "reply", "declare_subscriber", "declare_queryable")
-    for name in fleet.members.get("drone", ()):
-        own = f"{ROOT}/{name}/**"
-        grant("drone", name, ("ingress", everything, own), ("egress", everything, own))
-    for name in fleet.members.get("viewer", ()):
-        grant(
-            "viewer",
-            name,
-            ("ingress", ("declare_subscriber",), f"{ROOT}/**"),
-            ("egress", ("put",), f"{ROOT}/**"),
-        )
-    for name in fleet.members.get("ground", ()):
-        grant(
-            "ground",
-            name,
-            ("ingress", ("put",), f"{ROOT}/*/*/held/{name}"),
-            ("ingress", ("declare_subscriber", "query"), f"{ROOT}/**"),
-            ("egress", everything, f"{ROOT}/**"),
-        )
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -223,8 +221,8 @@ def revoke(folder: Path, member: str, days: int = 365) -> list[Path]:
             stations = _write_fleet(folder, rest)
             _put_away(folder, folder / role / name)
             return stations
-        for other in (folder / r / n for r, names in fleet.members.items() for n in names):
-            _put_away(folder, other)
+        for other in fleet.everybody:
+            _put_away(folder, folder.joinpath(*other))
         _put_away(folder, folder / "authority")
         _write_fleet(folder, rest)
     except OSError as error:
@@ -234,8 +232,7 @@ def revoke(folder: Path, member: str, days: int = 365) -> list[Path]:
 
 def _named(fleet: Fleet, member: str) -> tuple[str, str]:
     """Role and name of the one member called ``member``."""
-    everybody = [(role, name) for role, names in fleet.members.items() for name in names]
-    found = [both for both in everybody if member in (both[1], ".".join(both))]
+    found = [both for both in fleet.everybody if member in (both[1], ".".join(both))]
     if not found:
         raise InputError(f"this fleet has no member {member!r}")
     if len(found) > 1:

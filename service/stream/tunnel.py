@@ -17,21 +17,11 @@ from typing import Protocol
 import numpy as np
 
 from service.errors import InputError
-from service.stream import codec
+from service.stream import codec, radio_messages, records
 from service.stream.budget import TokenBucket
-from service.stream.radio_messages import (
-    RadioTile,
-    pack_announce,
-    pack_pose,
-    pack_tile,
-    tag_of,
-    unpack_announce,
-    unpack_pose,
-    unpack_tile,
-)
+from service.stream.radio_messages import RadioTile, tag_of
 from service.stream.radio_tiles import tiles_of
-from service.stream.records import PoseRecord, Repose, ScanHeader, unpack_repose
-from service.stream.records import unpack_pose as unpack_record
+from service.stream.records import PoseRecord, Repose, ScanHeader
 from service.stream.store import ScanStore
 from service.workers import Worker, Workers
 
@@ -64,7 +54,7 @@ class TunnelSender:
         """Raises ValueError when the names of drone and scan are too long for the radio."""
         self._store = store
         self._rate_bytes_s = rate_bytes_s  # that may be used
-        self._announcement = pack_announce(store.header)
+        self._announcement = radio_messages.pack_announce(store.header)
         self._tiles: deque[RadioTile] = deque(maxlen=MAX_WAITING)  # all tiles of the scan
         self._moved: dict[int, Repose] = {}  # keyframe to the correction last sent
         self._tag = tag_of(store.header.drone, store.header.name)
@@ -80,16 +70,17 @@ class TunnelSender:
     def on_item(self, kind: str, number: int) -> None:
         """The store has a new item."""
         if kind == "header":
-            self._announcement, self._announce_at = pack_announce(self._store.header), -math.inf
+            self._announcement = radio_messages.pack_announce(self._store.header)
+            self._announce_at = -math.inf
             return
         data = self._store.record(kind, number) if kind in ("k0", "pose", "repose") else None
         if data is None:
             return
         if kind == "pose":
-            pose = unpack_record(data)
+            pose = records.unpack_pose(data)
             self._pose = None if pose is None else (number, pose)
         elif kind == "repose":
-            repose = unpack_repose(data)
+            repose = records.unpack_repose(data)
             if repose is not None:
                 self._correct(repose)
         else:
@@ -124,7 +115,7 @@ class TunnelSender:
                 depth_m=tile.depth_m * np.float32(repose.scale),
                 sigma_m=tile.sigma_m * repose.scale,
             )
-        return pack_tile(self._tag, tile)
+        return radio_messages.pack_tile(self._tag, tile)
 
     def radio_status(self, free_percent: int, now: float) -> None:
         """The radio reports the free share of its buffer (RADIO_STATUS.txbuf)."""
@@ -159,7 +150,7 @@ class TunnelSender:
         if now >= self._announce_at:
             return self._announcement
         if self._pose is not None and now >= self._pose_at:
-            return pack_pose(self._tag, *self._pose)
+            return radio_messages.pack_pose(self._tag, *self._pose)
         queue = self._fresh or self._again
         if not queue:
             return None
@@ -269,7 +260,7 @@ class TunnelIntake:
 
     def receive(self, payload: bytes) -> list[tuple[ScanHeader, str, int, int, bytes]]:
         """Records to store from ``payload``; empty for invalid bytes."""
-        header = unpack_announce(payload)
+        header = radio_messages.unpack_announce(payload)
         if header is not None:
             tag = tag_of(header.drone, header.name)
             self.headers.pop(tag, None)
@@ -292,10 +283,10 @@ class TunnelIntake:
 
 
 def _item(payload: bytes) -> tuple[int, str, int, int, bytes] | None:
-    tile = unpack_tile(payload)
+    tile = radio_messages.unpack_tile(payload)
     if tile is not None:
         return tile[0], "tile", tile[1].seq, tile[1].index, payload
-    pose = unpack_pose(payload)
+    pose = radio_messages.unpack_pose(payload)
     if pose is not None:
         return pose[0], "pose", pose[1], 0, payload
     return None
