@@ -65,7 +65,6 @@ class TunnelSender:
         self._pose: tuple[int, PoseRecord] | None = None
         self._fresh: deque[_Waiting] = deque(maxlen=MAX_WAITING)
         self._again: deque[_Waiting] = deque(maxlen=MAX_WAITING)
-        self.sent_bytes = 0
 
     def on_item(self, kind: str, number: int) -> None:
         """The store has a new item."""
@@ -137,7 +136,6 @@ class TunnelSender:
         if wait > 0:
             return wait
         self._bucket.take(size, now)
-        self.sent_bytes += size
         self._sent(chosen, now)
         return chosen
 
