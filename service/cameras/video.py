@@ -61,7 +61,6 @@ class VideoSource(CameraSource):
         self._damaged = 0
         self._unordered = 0
         self._earlier_ns = 0  # time before the clock last began again
-        self._open = True
         self._wanted_ns: list[int] | None = None  # all
         self._within_ns = self._late_ns = 0
         self._end_ns = LONGEST_NS
@@ -179,9 +178,7 @@ class VideoSource(CameraSource):
         return round(ticks * time_base * NS_PER_S)
 
     def close(self) -> None:
-        if self._open:
-            self._open = False
-            self._container.close()
+        self._container.close()
 
     def _damage(self, error: Exception) -> None:
         self._damaged += 1

@@ -206,9 +206,11 @@ def covering(store: ScanStore, every_s: float = WRITE_EVERY_S) -> Iterator[None]
     Disk failures are logged and retried.
     """
     live = LiveCoverage(store)
-    worker = PROCESS.every(
-        "coverage", every_s, lambda: write_coverage_files(store.path.parent, live)
-    )
+
+    def write() -> None:
+        write_coverage_files(store.path.parent, live)
+
+    worker = PROCESS.every("coverage", every_s, write)
     try:
         yield
     finally:

@@ -201,7 +201,8 @@ def _padded_to(panel: U8, smallest_px: int = 160) -> U8:
     """The panel with background added to its right and bottom, to make room for labels."""
     below, right = (max(smallest_px - n, 0) for n in panel.shape[:2])
     edges = 0, below, 0, right
-    return np.asarray(cv2.copyMakeBorder(panel, *edges, cv2.BORDER_CONSTANT, value=BACKGROUND))
+    padded = cv2.copyMakeBorder(panel, *edges, cv2.BORDER_CONSTANT, value=BACKGROUND)
+    return np.asarray(padded, np.uint8)
 
 
 def _growth(panel: U8) -> float:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from recon.camera_model import scaled_K
-from recon.types import F64, DepthMap, Keyframe, Pose
+from recon.types import F64, Array, DepthMap, Keyframe, Pose
 from service.stream import planes
 from service.stream.records import Placed, source_bits, sources_of
 from service.stream.validity import MAX_DEPTH_M, MIN_DEPTH_M, is_inverse_depth, is_pinhole, is_time
@@ -160,8 +160,10 @@ def encode(keyframe: Keyframe, time_unix_ns: int) -> tuple[bytes, ...]:
     h, w = depth.depth_m.shape
     if not _is_grid(w, h):
         raise ValueError(f"keyframe of {w}x{h} px; at most 4096 a side and {MAX_PIXELS} in all")
-    arrays = {"sigma_m": depth.sigma_m, "views": depth.views, "fresh": keyframe.fresh}
-    for name, array in (*arrays.items(), ("bgr", keyframe.bgr)):
+    arrays: dict[str, Array] = {
+        "sigma_m": depth.sigma_m, "views": depth.views, "fresh": keyframe.fresh, "bgr": keyframe.bgr
+    }  # fmt: skip
+    for name, array in arrays.items():
         if array.shape[:2] != (h, w):
             raise ValueError(f"{name} is {array.shape[:2]}, the depth is {(h, w)}")
     with np.errstate(invalid="ignore"):

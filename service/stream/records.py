@@ -249,16 +249,16 @@ def unpack_pose(data: bytes) -> PoseRecord | None:
     if found is None:
         return None
     (bits, time_unix_ns, seq), motion, covariance, last = found
-    place, flown, sigma_m = [or_none(value) for value in last[:4]], last[4:10], last[10]
-    if not (validity.is_time(time_unix_ns) and validity.is_on_globe(*place)):
+    lat, lon, alt, agl = map(or_none, last[:4])
+    roll, pitch, yaw, speed, distance, turn, sigma = last[4:]
+    if not (validity.is_time(time_unix_ns) and validity.is_on_globe(lat, lon, alt, agl)):
         return None
     if not all(map(math.isfinite, last[4:])):
         return None
-    keyframe_seq = None if seq < 0 else seq
-    # Place, angles and way are in the order of the record's fields.
     return PoseRecord(
-        time_unix_ns, motion, covariance, *place, *flown, sources_of(bits), sigma_m, keyframe_seq
-    )
+        time_unix_ns, motion, covariance, lat, lon, alt, agl, roll, pitch, yaw, speed, distance,
+        turn, sources_of(bits), sigma, None if seq < 0 else seq,
+    )  # fmt: skip
 
 
 def pack_repose(repose: Repose) -> bytes:
