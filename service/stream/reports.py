@@ -52,7 +52,7 @@ def open_undelivered(scans: Path) -> list[ScanStore]:
 def _was_delivered(path: Path) -> bool:
     """Whether the scan is finished and delivered, without reading the whole file for damage."""
     try:
-        with ScanStore(path, None, None) as store:
+        with ScanStore.peek(path) as store:
             return store.finished and delivered(store)
     except SkyreliefError:
         return False  # it is then opened and checked

@@ -157,7 +157,8 @@ def hostile_layers() -> Iterator[tuple[str, bytes]]:
         T = head.T_world_camera.copy()
         T[:3, 3] = far
         yield f"camera at {far}", codec.pack(replace(head, T_world_camera=T), sections)
-    place = bytearray(codec.pack(head, sections)[58:198])
+    layer = codec.pack(head, sections)
+    body = layer[codec.HEADER_BYTES :]
     for what, at, put in (
         ("no rotation", 24, bytes(32)),
         ("rotation of NaN", 24, np.full(4, np.nan).tobytes()),
@@ -165,8 +166,9 @@ def hostile_layers() -> Iterator[tuple[str, bytes]]:
         ("negative covariance", 56, np.full(21, -1, np.float32).tobytes()),
         ("huge covariance", 56, np.full(21, 3e38, np.float32).tobytes()),
     ):
-        changed = bytes(place[:at]) + put + bytes(place[at + len(put) :])
-        yield what, codec.pack(head, sections, changed)
+        begin = 58 + at  # of position, quaternion and covariance
+        sealed = layer[:begin] + put + layer[begin + len(put) : codec.HEADER_BYTES - 4]
+        yield what, sealed + struct.pack("<I", zlib.crc32(sealed + body)) + body
     for what, change in (
         ("empty box", {"box": (0, 0, 0, 0)}),
         ("box outside", {"box": (150, 80, 160, 90)}),

@@ -302,15 +302,17 @@ def test_a_full_radio_buffer_slows_it_down_and_an_empty_one_speeds_it_up(tmp_pat
         store.add_keyframe(0, codec.encode(keyframe(0, 0.0), 0))
 
         def bytes_in_ten_seconds(start: float, free_percent: int) -> int:
-            before, now = sender.sent_bytes, start
+            sent, now = 0, start
             sender.on_item("k0", 0)
             while now < start + 10:
                 todo = sender.next(now)
                 if isinstance(todo, float):
                     now += min(todo, 0.05)
+                else:
+                    sent += len(todo) + 17
                 if int(now * 20) % 20 == 0:
                     sender.radio_status(free_percent, now)
-            return sender.sent_bytes - before
+            return sent
 
         full_speed = bytes_in_ten_seconds(0.0, 95)
         slowed = bytes_in_ten_seconds(10.0, 10)
