@@ -8,6 +8,7 @@ import select
 import socket
 import time
 import tty
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -136,6 +137,15 @@ def test_announcement_and_pose_round_trip() -> None:
     assert found[2].alt_amsl_m is None
     with pytest.raises(ValueError, match="too long"):
         pack_announce(ScanHeader("s" * 60, "d" * 60, 0))
+
+
+@pytest.mark.parametrize(("x_m", "is_taken"), [(9.9e5, True), (1.1e6, False), (-2e7, False)])
+def test_a_camera_out_of_reach_is_no_message(x_m: float, is_taken: bool) -> None:
+    T = se3.compose(R_DOWN, np.array([x_m, 20.0, 60.0]))
+    tile = replace(tiles_of(coarse(keyframe(9, 3.0)))[0], T_world_camera=T)
+    assert (unpack_tile(pack_tile(77, tile)) is not None) == is_taken
+    pose = PoseRecord(17, T, np.eye(6))
+    assert (unpack_pose(pack_pose(5, 3, pose)) is not None) == is_taken
 
 
 def test_tiles_replace_the_first_depth_of_their_keyframe_and_end_earlier_ones(
