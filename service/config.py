@@ -67,15 +67,12 @@ class CameraConfig:
     )
 
     def __post_init__(self) -> None:
-        """Check ranges."""
-        _within("camera.mount_roll_deg", self.mount_roll_deg, -180, 180)
-        _within("camera.mount_pitch_deg", self.mount_pitch_deg, -180, 180)
-        _within("camera.mount_yaw_deg", self.mount_yaw_deg, -360, 360)
-        for axis in ("forward", "right", "down"):
-            _within(f"camera.lever_{axis}_m", getattr(self, f"lever_{axis}_m"), -100, 100)
-        _within("camera.latency_ms", self.latency_ms, -10_000, 10_000)
-        if not isinstance(self.readout_ms, str):
-            _within("camera.readout_ms", self.readout_ms, 0, 200)
+        lever_m = (-100, 100)
+        _check_ranges(
+            self, mount_roll_deg=(-180, 180), mount_pitch_deg=(-180, 180),
+            mount_yaw_deg=(-360, 360), lever_forward_m=lever_m, lever_right_m=lever_m,
+            lever_down_m=lever_m, latency_ms=(-10_000, 10_000), readout_ms=(0, 200),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +95,7 @@ class MavlinkConfig:
     )
 
     def __post_init__(self) -> None:
-        """Check ranges."""
-        _within("mavlink.system_id", self.system_id, 0, 255)
+        _check_ranges(self, system_id=(0, 255))
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,14 +126,12 @@ class ScanConfig:
     keep_debug: bool = key(False, "keep every stage for 'skyrelief inspect'")
 
     def __post_init__(self) -> None:
-        """Check ranges and the notation of the baseline."""
-        _within("scan.base_to_height", self.base_to_height, 0.03, 1.0)
-        _within("scan.close_after_landing_s", self.close_after_landing_s, 0, 86_400)
-        _within("scan.keep_free_mib", self.keep_free_mib, 0, 1e9)
+        _check_ranges(
+            self, base_to_height=(0.03, 1.0), close_after_landing_s=(0, 86_400),
+            keep_free_mib=(0, 1e9), assumed_agl_m=(0.5, 10_000),
+        )  # fmt: skip
         if self.resolution_m != 0.0:
-            _within("scan.resolution_m", self.resolution_m, 0.01, 100)
-        if self.assumed_agl_m is not None:
-            _within("scan.assumed_agl_m", self.assumed_agl_m, 0.5, 10_000)
+            _check_ranges(self, resolution_m=(0.01, 100))
         parse_baseline(self.baseline)
 
     @property
@@ -183,16 +177,11 @@ class ComputeConfig:
     least_memory_mib: float = key(300.0, "free memory below which the load is shed", live=True)
 
     def __post_init__(self) -> None:
-        """Check ranges."""
-        _within("compute.threads", self.threads, 0, 1024)
-        _within("compute.stereo_width", self.stereo_width, 64, 4096)
-        _within("compute.labels", self.labels, 4, 96)
-        _within("compute.iterations", self.iterations, 1, 100)
-        _within("compute.pairs", self.pairs, 1, 64)
-        _within("compute.guide_width", self.guide_width, 64, 8192)
-        _within("compute.map_voxels", self.map_voxels, 1000, 8_000_000)
-        _within("compute.hottest_c", self.hottest_c, 30, 150)
-        _within("compute.least_memory_mib", self.least_memory_mib, 0, 1e6)
+        _check_ranges(
+            self, threads=(0, 1024), stereo_width=(64, 4096), labels=(4, 96),
+            iterations=(1, 100), pairs=(1, 64), guide_width=(64, 8192),
+            map_voxels=(1000, 8_000_000), hottest_c=(30, 150), least_memory_mib=(0, 1e6),
+        )  # fmt: skip
         if self.guide_width < self.stereo_width:
             raise ValueError(
                 f"compute.guide_width {self.guide_width} is less than compute.stereo_width "
@@ -220,12 +209,10 @@ class DatalinkConfig:
     drain_s: float = key(20.0, "at the end, maximum wait for the ground to fetch the rest")
 
     def __post_init__(self) -> None:
-        """Check ranges and the form of the endpoints."""
-        _within("datalink.budget_kbit_s", self.budget_kbit_s, 1, 10_000_000)
-        _within("datalink.drain_s", self.drain_s, 0, 86_400)
-        _within("datalink.share", self.share, 0.01, 1.0)
-        _within("datalink.radio_baud", self.radio_baud, 1200, 10_000_000)
-        _within("datalink.radio_share", self.radio_share, 0.01, 1.0)
+        _check_ranges(
+            self, budget_kbit_s=(1, 10_000_000), drain_s=(0, 86_400), share=(0.01, 1.0),
+            radio_baud=(1200, 10_000_000), radio_share=(0.01, 1.0),
+        )  # fmt: skip
         for endpoint in (*self.connect, *self.listen):
             if not re.fullmatch(r"[a-z]+/.+", endpoint):
                 raise ValueError(f"datalink endpoint {endpoint!r} is not like tcp/HOST:7447")
@@ -247,9 +234,7 @@ class FusionConfig:
     )
 
     def __post_init__(self) -> None:
-        """Check ranges."""
-        _within("fusion.loop_views", self.loop_views, 2, 100_000)
-        _within("fusion.graph_keyframes", self.graph_keyframes, 50, 100_000)
+        _check_ranges(self, loop_views=(2, 100_000), graph_keyframes=(50, 100_000))
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +244,6 @@ class HealthConfig:
     http: str = key("127.0.0.1:9560", "address of /healthz, /status and /metrics; empty: off")
 
     def __post_init__(self) -> None:
-        """Check the form of the address."""
         if self.http and not re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[^:\s]+):\d{1,5}", self.http):
             raise ValueError(f"health.http {self.http!r} is not HOST:PORT")
 
@@ -455,6 +439,10 @@ def _override(config: Config, override: str) -> Config:
     raise faults[0]
 
 
-def _within(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise ValueError(f"{name} = {value:g} is outside {low:g} to {high:g}")
+def _check_ranges(section: object, **ranges: tuple[float, float]) -> None:
+    """ValueError for the first number of a section that is out of its range; words are not."""
+    name = type(section).__name__.removesuffix("Config").lower()
+    for key_name, (low, high) in ranges.items():
+        value = getattr(section, key_name)
+        if isinstance(value, int | float) and not low <= value <= high:
+            raise ValueError(f"{name}.{key_name} = {value:g} is outside {low:g} to {high:g}")

@@ -12,28 +12,17 @@ from pathlib import Path
 from service.errors import OutsideError
 
 EXTRAS = {
-    "copclib": "ground",
-    "cryptography": "ground",
     "distributed": "cluster",
-    "foxglove": "ground",
-    "gaussforge": "ground",
-    "google": "ground",
-    "mavsdk": "ground",
-    "mcap": "ground",
     "onnx": "onnx",
     "onnxruntime": "onnx",
-    "open3d": "ground",
-    "py3dtiles": "ground",
     "pyulog": "logs",
-    "rasterio": "ground",
     "rosbags": "ros2",
     "starlette": "portal",
     "torch": "gpu",
-    "trimesh": "ground",
     "uvicorn": "portal",
     "websockets": "portal",
 }
-"""Import name to the smallest extra of skyrelief that installs it."""
+"""Import name to the smallest extra of skyrelief that installs it, but for those of ``ground``."""
 
 NAMES = {"foxglove": "foxglove-sdk", "google": "protobuf", "skimage": "scikit-image"}
 """Import name to the package's name, where they differ."""

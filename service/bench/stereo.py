@@ -24,18 +24,12 @@ def run(options: BenchOptions) -> list[BenchResult]:
     results = []
     for width, height, labels in SIZES:
         left, right = scene(width, height, labels)
-        matcher = semi_global(labels)
         config = BeliefPropagationConfig(iterations=ITERATIONS)
-        results.append(
-            compare(
-                f"{width}x{height}, {labels} labels, {ITERATIONS} iterations",
-                partial(backend.belief_propagation, left, right, labels, config),
-                options,
-                "OpenCV SGBM",
-                partial(matcher.compute, left, right),
-                note=f"{backend.name}, images to checked sub-pixel disparity",
-            )
-        )
+        what = f"{width}x{height}, {labels} labels, {ITERATIONS} iterations"
+        ours = partial(backend.belief_propagation, left, right, labels, config)
+        theirs = partial(semi_global(labels).compute, left, right)
+        note = f"{backend.name}, images to checked sub-pixel disparity"
+        results.append(compare(what, ours, options, "OpenCV SGBM", theirs, note))
     return results
 
 
@@ -77,15 +71,9 @@ def run_upsampling(options: BenchOptions) -> list[BenchResult]:
     results = []
     for height, width in GUIDES:
         guide = rng.integers(0, 256, (height, width, 3), np.uint8)
-        what = f"{COARSE[1]}x{COARSE[0]} to {width}x{height}"
-        results.append(
-            compare(
-                f"{what}, exact",
-                partial(backend.upsample, coarse, guide, UpsamplingConfig()),
-                options,
-                "OpenCV bilateralFilter d 10",
-                partial(cv2.bilateralFilter, guide, 10, 15, 15),
-                note=backend.name,
-            )
-        )
+        what = f"{COARSE[1]}x{COARSE[0]} to {width}x{height}, exact"
+        ours = partial(backend.upsample, coarse, guide, UpsamplingConfig())
+        theirs = partial(cv2.bilateralFilter, guide, 10, 15, 15)
+        peer = "OpenCV bilateralFilter d 10"
+        results.append(compare(what, ours, options, peer, theirs, backend.name))
     return results

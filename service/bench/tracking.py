@@ -6,6 +6,7 @@ from functools import partial
 
 import cv2
 import numpy as np
+from scipy.ndimage import fourier_shift
 
 from recon import se3
 from recon.camera_model import rays
@@ -60,9 +61,7 @@ def images() -> tuple[U8, U8]:
     rng = np.random.default_rng(0)
     h, w = SIZE[0] + 128, SIZE[1] + 128
     total = 128 + 55 * natural(h, w, 1.3, 0)
-    fy, fx = np.fft.fftfreq(h)[:, None], np.fft.fftfreq(w)[None]
-    phase = np.exp(2j * np.pi * (fx * SHIFT_PX[0] + fy * SHIFT_PX[1]))
-    moved = np.fft.ifft2(np.fft.fft2(total) * phase).real
+    moved = np.fft.ifft2(fourier_shift(np.fft.fft2(total), -SHIFT_PX[::-1])).real
     return noisy(total, rng), noisy(moved, rng)
 
 

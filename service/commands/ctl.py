@@ -6,6 +6,8 @@ import json
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -62,30 +64,22 @@ def _check(action: str, metres: float | None, timeout: float) -> None:
 
 def _watch(operator: Operator, seconds: float, as_json: bool) -> None:
     """Print the companion's messages until the time is over or Ctrl-C."""
-    for name, line in LINES.items():
-        operator.subscribe(name, _printer(name, line, as_json))
-    end = time.monotonic() + seconds if seconds > 0.0 else math.inf
-    try:
-        while time.monotonic() < end:
-            time.sleep(0.1)
-    except KeyboardInterrupt:
-        return
+    from service.ground.operator import CAMERA, ONBOARD
 
-
-def _printer(
-    name: str, line: Callable[[dict[str, Any]], str], as_json: bool
-) -> Callable[[int, dict[str, Any]], None]:
-    def show(sender: int, fields: dict[str, Any]) -> None:
-        from service.ground.operator import CAMERA, ONBOARD
-
+    def show(name: str, sender: int, fields: dict[str, Any]) -> None:
         if sender not in (ONBOARD, CAMERA):
             return
         if as_json:
             print(json.dumps({"message": name, "component": sender, **_plain(fields)}), flush=True)
         else:
-            print(line(fields), flush=True)
+            print(LINES[name](fields), flush=True)
 
-    return show
+    for name in LINES:
+        operator.subscribe(name, partial(show, name))
+    end = time.monotonic() + seconds if seconds > 0.0 else math.inf
+    with suppress(KeyboardInterrupt):
+        while time.monotonic() < end:
+            time.sleep(0.1)
 
 
 LINES: dict[str, Callable[[dict[str, Any]], str]] = {

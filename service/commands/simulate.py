@@ -170,14 +170,15 @@ def simulate(given: SimulateOptions) -> None:
 
 def _play(given: SimulateOptions) -> None:
     """Play a flight until its end or Ctrl-C."""
-    from service.sim.live import LiveOptions, play
+    from service.sim.live import play
 
     where = f"video to {given.video_to}, MAVLink to {given.mavlink_to}"
     print(f"playing {given.out}: {where}", file=sys.stderr)
-    options = LiveOptions(given.video_to, given.mavlink_to, given.loop, given.until_stdin_ends)
     counts = None
     with refusing("simulate --live"), suppress(KeyboardInterrupt):
-        counts = play(given.out, options)
+        counts = play(
+            given.out, given.video_to, given.mavlink_to, given.loop, given.until_stdin_ends
+        )
     if given.as_json and counts is not None:
         is_piped = given.video_to.startswith("pipe:")
         print(json.dumps(counts), file=sys.stderr if is_piped else sys.stdout)
@@ -229,33 +230,29 @@ def score(
     as_json: AsJson = False,
 ) -> None:
     """Measure accuracy, completeness and trajectory error of a scan of a simulated flight."""
-    from service.sim import scoring
-
-    if views:
-        _score_views(scan_dir, truth_dir, images, as_json)
-        return
-    with showing("score") as progress:
-        report = scoring.score(scan_dir, truth_dir, progress)
-    print(json.dumps(report) if as_json else _text(report))
-
-
-def _score_views(scan_dir: Path, video: Path, images: Path | None, as_json: bool) -> None:
     from service.offline.exports.view import ScanView
     from service.offline.view_scoring import score_views
+    from service.sim import scoring
 
-    if (video / "flight.mp4").is_file():
-        video = video / "flight.mp4"  # a flight of simulate
-    with showing("score") as progress, ScanView(scan_dir, progress=progress) as scan:
-        report = score_views(scan, video, images)
-    if as_json:
-        print(json.dumps(report))
-        return
-    print(f"{'drawn from':<12} {'frames':>6} {'covered':>9} {'PSNR':>9} {'SSIM':>7}")
+    with showing("score") as progress:
+        if views:
+            flight = truth_dir / "flight.mp4"  # of simulate
+            with ScanView(scan_dir, progress=progress) as scan:
+                report = score_views(scan, flight if flight.is_file() else truth_dir, images)
+        else:
+            report = scoring.score(scan_dir, truth_dir, progress)
+    text = _text_of_views if views else _text
+    print(json.dumps(report) if as_json else text(report))
+
+
+def _text_of_views(report: dict[str, Any]) -> str:
+    lines = [f"{'drawn from':<12} {'frames':>6} {'covered':>9} {'PSNR':>9} {'SSIM':>7}"]
     for name, r in report.items():
-        print(
+        lines.append(
             f"{name:<12} {r['frames']:>6} {r['covered']:>8.2%} {r['psnr_db']:>6.2f} dB "
             f"{r['ssim']:>7.4f}"
         )
+    return "\n".join(lines)
 
 
 def _text(report: dict[str, Any]) -> str:

@@ -14,7 +14,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,25 +34,15 @@ EACH_LENGTH = {"omit_video_pes_length": "0"}
 """MPEG-TS that states the length of each image: a receiver need not wait for the next one."""
 
 
-@dataclass(frozen=True, slots=True)
-class LiveOptions:
-    """Where the flight is played to."""
-
-    video: str = "udp://127.0.0.1:5600?pkt_size=1316"  # any URL of FFmpeg; pipe:1 is stdout
-    mavlink: str = "127.0.0.1:14550"  # host:port of UDP
-    loop: bool = False
-    until_stdin_ends: bool = False  # also end when standard input does: with who started us
-
-
 class MavlinkPlayer:
     """Sends the flight's messages from their components, and answers TIMESYNC."""
 
-    def __init__(self, options: LiveOptions) -> None:
+    def __init__(self, address: str, until_stdin_ends: bool) -> None:
         """Open the socket; ValueError for what is no address, OutsideError for one that cannot be
         used."""
-        host, _, port = options.mavlink.rpartition(":")
+        host, _, port = address.rpartition(":")
         if not host or not port.isdigit() or not 0 < int(port) < 65536:
-            raise ValueError(f"MAVLink address {options.mavlink!r} is not host:port")
+            raise ValueError(f"MAVLink address {address!r} is not host:port")
         self.sent = self.answered = 0
         self._packer = Packer(0)
         self._reader = dialect.MAVLink(None)
@@ -64,9 +53,9 @@ class MavlinkPlayer:
             self._to = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
             self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self.socket.setblocking(False)
-            self._stdin = [sys.stdin] if options.until_stdin_ends else []
+            self._stdin = [sys.stdin] if until_stdin_ends else []
         except OSError as error:
-            raise OutsideError(f"MAVLink to {options.mavlink}: {error}") from error
+            raise OutsideError(f"MAVLink to {address}: {error}") from error
 
     def listen(self, seconds: float) -> None:
         """Wait for a request for so long; note when standard input has ended."""
@@ -104,33 +93,37 @@ class MavlinkPlayer:
             log.debug("MAVLink packet not sent: %s", error)
 
 
-def play(folder: Path, options: LiveOptions) -> dict[str, int]:
-    """Play the flight in ``folder`` to its end, or for ever; counts of what was sent.
+def play(
+    folder: Path, video_to: str, mavlink_to: str, loop: bool = False, until_stdin_ends: bool = False
+) -> dict[str, int]:
+    """Play the flight in ``folder`` to its end, or in a loop for ever; counts of what was sent.
 
-    InputError when the folder contains no flight; OutsideError when the outputs cannot be opened.
+    ``video_to`` is any URL of FFmpeg (pipe:1 is stdout), ``mavlink_to`` host:port of UDP. With
+    ``until_stdin_ends`` it also ends when standard input does: with who started it. InputError
+    when the folder contains no flight; OutsideError when the outputs cannot be opened.
     """
     video, tlog = folder / "flight.mp4", folder / "flight.tlog"
     if not video.exists():
         raise InputError(f"{folder} contains no flight.mp4 to play")
-    player = MavlinkPlayer(options)
+    player = MavlinkPlayer(mavlink_to, until_stdin_ends)
     frames = 0
     try:
         while True:
-            frames += _play_once(video, tlog, options, player)
-            if not options.loop or player.has_ended:
+            frames += _play_once(video, tlog, video_to, loop, player)
+            if not loop or player.has_ended:
                 break
     finally:
         player.socket.close()
     return {"frames": frames, "packets": player.sent, "timesync_answers": player.answered}
 
 
-def _play_once(video: Path, tlog: Path, options: LiveOptions, player: MavlinkPlayer) -> int:
+def _play_once(video: Path, tlog: Path, url: str, loop: bool, player: MavlinkPlayer) -> int:
     """Play once from the start; returns the number of frames.
 
     In a loop without the telemetry before and after the video: a camera that is silent for
     seconds counts as lost.
     """
-    frames, url = 0, options.video
+    frames = 0
     try:
         with (
             av.open(str(video)) as source,
@@ -142,7 +135,7 @@ def _play_once(video: Path, tlog: Path, options: LiveOptions, player: MavlinkPla
             if start_ns is None:
                 raise InputError(f"{video} has no creation time; simulate the flight again")
             said = _telemetry(tlog, start_ns)
-            telemetry = (e for e in said if not options.loop or 0 <= e[0] <= end_s)
+            telemetry = (e for e in said if not loop or 0 <= e[0] <= end_s)
             events = heapq.merge(_packets(source), telemetry, key=lambda e: e[:2])
             start = None
             for due_s, kind, payload in events:

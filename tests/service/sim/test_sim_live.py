@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from service.cli import app
 from service.errors import InputError
-from service.sim.live import LiveOptions, play
+from service.sim.live import play
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_flight_is_played_with_its_telemetry(flight: Path, tmp_path: Path) -> No
     ground = GroundEnd()
     ground.start()
     out = tmp_path / "received.ts"
-    counts = play(flight, LiveOptions(str(out), f"127.0.0.1:{ground.port}"))
+    counts = play(flight, str(out), f"127.0.0.1:{ground.port}")
     time.sleep(0.3)
     ground.stop.set()
     ground.join()
@@ -115,7 +115,7 @@ def test_wrong_addresses_are_refused(address: str, flight: Path) -> None:
 
 def test_empty_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no flight"):
-        play(tmp_path, LiveOptions())
+        play(tmp_path, "pipe:1", "127.0.0.1:14550")
 
 
 def test_a_video_without_a_time_is_refused(flight: Path, tmp_path: Path) -> None:
@@ -128,4 +128,4 @@ def test_a_video_without_a_time_is_refused(flight: Path, tmp_path: Path) -> None
                 packet.stream = stream
                 sink.mux(packet)
     with pytest.raises(InputError, match="creation time"):
-        play(tmp_path, LiveOptions(video=str(tmp_path / "out.ts")))
+        play(tmp_path, str(tmp_path / "out.ts"), "127.0.0.1:14550")
