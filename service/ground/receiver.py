@@ -226,7 +226,7 @@ class Receiver:
     # The session
 
     def _run(self, worker: Worker) -> None:
-        while not worker.stop.is_set():
+        while self._session is not None or not worker.stop.is_set():
             worker.beat()
             try:
                 session = self._session = self._session or open_session(self._session_config)
