@@ -42,7 +42,7 @@ from service.workers import Worker, Workers
 log = logging.getLogger(__name__)
 
 ASK_TIMEOUT_S = 120.0
-RETRY_S, LOOK_AROUND_S, POLL_S = 1.0, 3.0, 0.01
+RETRY_S, LOOK_AROUND_S, POLL_S = 1.0, 3.0, 0.004
 CHANNEL = 256
 """Messages that may wait in the session, of one kind or to one request."""
 MAX_AT_ONCE = 64
