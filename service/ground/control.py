@@ -56,7 +56,6 @@ class NewMark(Body):
 
 
 def control_routes(one: str) -> list[Route]:
-    """The routes below ``one``, the address of a scan."""
     return [
         Route(one + "/control-points", _points, methods=["GET"]),
         Route(one + "/control-points", _replace, methods=["PUT"]),

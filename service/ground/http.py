@@ -237,19 +237,19 @@ def _page(request: Request) -> Response:
     return FileResponse(index) if index.is_file() else HTMLResponse(NO_PAGE)
 
 
-def _growing(state: PortalState) -> set[tuple[str, str]]:
-    """Drone and scan of those that are received now."""
-    since = time.time() - SILENT_S
-    heard = [e for e in state.progress() if e.get("heard_unix_s", 0.0) > since]
-    return {(entry["drone"], entry["scan"]) for entry in heard}
+def _is_growing(state: PortalState, entry: dict[str, Any]) -> bool:
+    if entry["finished"]:
+        return False
+    heard_unix_s = state.receiving(entry["drone"], entry["scan"]).get("heard_unix_s", 0.0)
+    return bool(heard_unix_s > time.time() - SILENT_S)
 
 
 def _scans(request: Request) -> Response:
     """All scans, the newest first."""
     state = state_of(request)
-    entries, growing = state.library.scans(), _growing(state)
+    entries = state.library.scans()
     for entry in entries:
-        entry["growing"] = not entry["finished"] and (entry["drone"], entry["scan"]) in growing
+        entry["growing"] = _is_growing(state, entry)
     return JSONResponse(entries)
 
 
@@ -257,7 +257,7 @@ def _scan(request: Request) -> Response:
     """One scan with its files and jobs."""
     state, names = state_of(request), names_of(request)
     entry = state.library.entry(*names)
-    entry["growing"] = not entry["finished"] and names in _growing(state)
+    entry["growing"] = _is_growing(state, entry)
     entry["jobs"] = state.jobs.of(state.library.folder(*names))
     return JSONResponse(entry)
 
@@ -275,9 +275,8 @@ def _label(request: Request, change: LabelChange) -> Response:
 def _delete(request: Request) -> Response:
     """Move a scan to the bin; its name there."""
     state, folder = state_of(request), folder_of(request)
-    for entry in state.progress():
-        if entry.get("open", True) and (entry["drone"], entry["scan"]) == names_of(request):
-            raise HTTPException(409, "this scan is being received; delete it some minutes later")
+    if (entry := state.receiving(*names_of(request))) and entry.get("open", True):
+        raise HTTPException(409, "this scan is being received; delete it some minutes later")
     if state.jobs.busy(folder):
         raise HTTPException(409, "a deliverable of this scan is being made; wait for it")
     for kept in (state.coverages, state.maps):
@@ -492,6 +491,6 @@ async def _live(socket: WebSocket) -> None:
     state.live_views[has_token] += 1
     try:
         await socket.accept()
-        await serve_live(socket, state.library.store, folder, state.progress)
+        await serve_live(socket, state.library.store, folder, state.receiving)
     finally:
         state.live_views[has_token] -= 1

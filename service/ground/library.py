@@ -255,7 +255,6 @@ class Library:
         return header
 
     def _copied(self, source: Path, part: Path) -> ScanHeader:
-        """Copy a scan folder."""
         if STORE_FILES[0] not in copy_files(source, part, STORE_FILES):
             raise InputError(f"{str(source)[:200]} contains no scan.db; give a scan folder")
         try:

@@ -280,7 +280,7 @@ def _news(feed: LiveFeed, site: SiteNews) -> Iterator[str | bytes | None]:
 
 
 async def serve_live(
-    socket: WebSocket, library: Path, folder: Path, progress: Callable[[], list[dict[str, Any]]]
+    socket: WebSocket, library: Path, folder: Path, receiving: Callable[[str, str], dict[str, Any]]
 ) -> None:
     """Send what is new in the scan of ``folder`` over an accepted socket; close it at the end."""
     store = None
@@ -297,8 +297,7 @@ async def serve_live(
                 await asyncio.wait({gone}, timeout=POLL_S)
             if time.monotonic() >= link_at and not gone.done():
                 link_at = time.monotonic() + LINK_S
-                entries = {(e["drone"], e["scan"]): e for e in progress()}
-                entry = entries.get((folder.parent.name, folder.name), {})
+                entry = receiving(folder.parent.name, folder.name)
                 await _send(socket, link_message(entry, feed.heard_unix_s))
             if gone.done():
                 break

@@ -54,7 +54,6 @@ SANDBOX = {
 
 
 def file_routes(one: str) -> list[Route]:
-    """The routes below ``one``, the address of a scan."""
     return [
         Route(one + "/files/{name}", _file),
         Route(one + "/maps.zip", _maps),

@@ -276,6 +276,11 @@ class PortalState:
     """Recordings opened at a time; who waits holds no thread."""
     started: float = field(default_factory=time.monotonic)
 
+    def receiving(self, drone: str, scan: str) -> dict[str, Any]:
+        """The receiver's report about a scan; empty when it does not receive it."""
+        names = (drone, scan)
+        return next((e for e in self.progress() if (e["drone"], e["scan"]) == names), {})
+
 
 def state_of(connection: HTTPConnection) -> PortalState:
     state: PortalState = connection.app.state.portal

@@ -32,13 +32,15 @@ from service.ground.storage import (
 from service.progress import Progress
 from service.workers import python_command, run_to_end
 
-KINDS = (".zip", ".db", ".mcap")
-"""Of an upload that is a scan already."""
-RECORDING = ["--camera-model", "--telemetry", "video"]
-PARTS = dict.fromkeys((".mp4", ".mov", ".mkv", ".avi", ".ts", ".m4v"), RECORDING[2])
-PARTS |= dict.fromkeys((".tlog", ".bin", ".ulg", ".srt"), RECORDING[1])
-PARTS |= dict.fromkeys((".yaml", ".yml"), RECORDING[0])
-"""What a file of a recording is, by its suffix: an option of ``replay``, or the video."""
+PARTS = {
+    **dict.fromkeys((".zip", ".db", ".mcap"), "scan"),
+    **dict.fromkeys((".mp4", ".mov", ".mkv", ".avi", ".ts", ".m4v"), "video"),
+    **dict.fromkeys((".tlog", ".bin", ".ulg", ".srt"), "--telemetry"),
+    **dict.fromkeys((".yaml", ".yml"), "--camera-model"),
+}
+"""What a file is, by its suffix: a scan already, or of a recording the video or an option of
+``replay``."""
+UPLOADS = (["scan"], ["--telemetry", "video"], ["--camera-model", "--telemetry", "video"])
 Part = tuple[str, int]
 """Name and size in bytes of one uploaded file."""
 MAX_LISTING_BYTES = 4 << 20
@@ -57,8 +59,8 @@ BROKEN = (
 def check_parts(library: Library, parts: Sequence[Part], room_bytes: int | None = None) -> None:
     """Raise InputError for files that make no scan, OutsideError where they do not fit the disk,
     or ``room_bytes`` of it."""
-    suffixes = sorted(PurePosixPath(name).suffix.lower() for name, _ in parts)
-    if not (len(suffixes) == 1 and suffixes[0] in KINDS) and not _is_recording(suffixes):
+    suffixes = (PurePosixPath(name).suffix.lower() for name, _ in parts)
+    if sorted(PARTS.get(suffix, "") for suffix in suffixes) not in UPLOADS:
         names = ", ".join(name[:100] for name, _ in parts[:5])
         raise InputError(
             f"{names or 'nothing'} cannot be uploaded: give a ZIP of a scan folder, its scan.db, "
@@ -69,11 +71,6 @@ def check_parts(library: Library, parts: Sequence[Part], room_bytes: int | None 
             most = f"{MAX_UPLOAD_BYTES >> 30} GiB"
             raise InputError(f"{name[:100]}: 1 byte to {most} can be uploaded, not {size} bytes")
     check_room(sum(size for _, size in parts), library.store, room_bytes)
-
-
-def _is_recording(suffixes: Sequence[str]) -> bool:
-    """Whether there is one video, one log, and at most one camera model."""
-    return sorted(PARTS.get(suffix, "") for suffix in suffixes) in (RECORDING, RECORDING[1:])
 
 
 class Upload:
