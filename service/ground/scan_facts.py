@@ -48,12 +48,8 @@ Corner = tuple[
 ]
 
 
-class MeasuredExtent(msgspec.Struct):
-    corners_lat_lon: tuple[Corner, Corner, Corner, Corner]
-
-
-class KnownExtent(msgspec.Struct):
-    """The same, of a scan that may lie nowhere on the globe."""
+class Extent(msgspec.Struct):
+    """None: the scan lies nowhere on the globe."""
 
     corners_lat_lon: tuple[Corner, Corner, Corner, Corner] | None = None
 
@@ -63,29 +59,26 @@ class Ground(msgspec.Struct):
 
     times: Times
     finished: bool
-    coverage: MeasuredExtent | None = None
+    coverage: Extent | None = None
 
     @property
     def box(self) -> tuple[Corner, Corner] | None:
         """Lowest and highest latitude and longitude; None without a georeference."""
-        if self.coverage is None:
+        if self.coverage is None or self.coverage.corners_lat_lon is None:
             return None
         lat, lon = zip(*self.coverage.corners_lat_lon, strict=True)
         return (min(lat), min(lon)), (max(lat), max(lon))
 
 
-class Facts(msgspec.Struct):
+class Facts(Ground, kw_only=True):
     """The part of a summary that the list shows."""
 
-    times: Times
-    finished: bool
     counts: Annotated[dict[str, Count], msgspec.Meta(max_length=100)]
     quality: Annotated[dict[str, Figure | TrustFacts | None], msgspec.Meta(max_length=100)]
     notes: Annotated[list[Note], msgspec.Meta(max_length=1000)]
     origin: Origin | None = None
     newest: Count | None = None  # keyframe of a scan that has no files yet
     failed: Annotated[dict[str, Note], msgspec.Meta(max_length=100)] = {}
-    coverage: KnownExtent | None = None
 
     def shown(self) -> dict[str, Any]:
         plain: dict[str, Any] = msgspec.to_builtins(self)
