@@ -22,28 +22,18 @@ GROUND_STATION = (245, 190)
 POLL_S = 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class Order:
-    """The command that an action of ``ctl`` sends."""
-
-    number: int
-    component: int
-    params: tuple[float, ...] = ()
-    takes_metres: int = 0  # which parameter holds the metres given by the operator
-
-
-ORDERS: Mapping[str, Order] = {
-    "start": Order(START_SCAN, CAMERA),
-    "stop": Order(STOP_SCAN, CAMERA),
-    "photo": Order(CAPTURE, CAMERA, (0, 0, 1)),
-    "baseline": Order(BASELINE, CAMERA, takes_metres=1),
-    "pause": Order(USER_1, ONBOARD, (1,)),
-    "resume": Order(USER_1, ONBOARD, (2,)),
-    "clear": Order(USER_1, ONBOARD, (3,)),
-    "finalise": Order(USER_1, ONBOARD, (5,)),
-    "selftest": Order(USER_1, ONBOARD, (6,)),
+ORDERS: Mapping[str, tuple[int, int, tuple[float, ...]]] = {
+    "start": (START_SCAN, CAMERA, ()),
+    "stop": (STOP_SCAN, CAMERA, ()),
+    "photo": (CAPTURE, CAMERA, (0, 0, 1)),
+    "baseline": (BASELINE, CAMERA, ()),  # and the metres that are given
+    "pause": (USER_1, ONBOARD, (1,)),
+    "resume": (USER_1, ONBOARD, (2,)),
+    "clear": (USER_1, ONBOARD, (3,)),
+    "finalise": (USER_1, ONBOARD, (5,)),
+    "selftest": (USER_1, ONBOARD, (6,)),
 }
-"""Action to command. The next action is one line."""
+"""Action to command, component and parameters. The next action is one line."""
 
 RESULTS = (
     "accepted",
@@ -245,17 +235,13 @@ FIGURES = {
 
 def order(operator: Operator, action: str, metres: float | None) -> dict[str, Any]:
     """Give one of the orders; its result. OutsideError when the vehicle does not carry it out."""
-    wanted = ORDERS[action]
+    number, component, params = ORDERS[action]
     reasons: list[str] = []
-    params = list(wanted.params)
-    if wanted.takes_metres:
-        assert metres is not None
-        params = [metres]
     end = operator.subscribe(
         "STATUSTEXT", lambda _, fields: reasons.append(str(fields.get("text", "")))
     )
     try:
-        ack = operator.command(wanted.number, wanted.component, tuple(params))
+        ack = operator.command(number, component, params if metres is None else (metres,))
         if ack.result != 0:
             _wait(lambda: bool(reasons))
             why = f": {reasons[-1]}" if reasons else ""
