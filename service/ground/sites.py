@@ -83,7 +83,7 @@ class Sites:
 
 
 def _check_room(store: Path, limits: DroneLimits, members: Sequence[Path]) -> None:
-    """Raise QuotaError when a site of these scans does not fit the sites' share of the disk."""
+    """Raise OutsideError when a site of these scans does not fit the sites' share of the disk."""
     sizes = (path.stat().st_size for m in members for path in m.glob("scan.db*"))
     share = DiskShare(store / DRONE, limits.drone_share, limits.reserve_bytes)
     share.check(SIZES * sum(sizes))
@@ -100,7 +100,7 @@ def align_by_points(
     """Align the scan in ``folder``, which points place, with the scan or site ``other``.
 
     Returns the name of the site's file of ties. Raises InputError for points that place nothing,
-    QuotaError when the site does not fit the disk.
+    OutsideError when the site does not fit the disk.
     """
     from service.offline.site.alignment import align_site
 

@@ -35,10 +35,6 @@ RESERVE_SHARE, MAX_RESERVE_BYTES = 0.05, 2 << 30
 MEASURE_S = 60.0
 
 
-class QuotaError(OutsideError):
-    """A drone's share, or the disk without its reserve, is full; nothing was written."""
-
-
 class DiskShare:
     """Space that one drone may still use; use from one thread.
 
@@ -62,17 +58,17 @@ class DiskShare:
     def check(self, size_bytes: int, now: float | None = None) -> None:
         """Count ``size_bytes`` that are about to be written.
 
-        Raises QuotaError when they do not fit into the share, or would take from the reserve.
+        Raises OutsideError when they do not fit into the share, or would take from the reserve.
         """
         now = time.monotonic() if now is None else now
         self._look(now)
         if self._used_bytes + size_bytes > self._share * self._total_bytes:
-            raise QuotaError(
+            raise OutsideError(
                 f"{self._folder} has reached its share, {100 * self._share:g} % of the disk; "
                 "delete scans or give --drone-share"
             )
         if self._free_bytes - size_bytes < self._reserve():
-            raise QuotaError(
+            raise OutsideError(
                 f"the disk of {self._folder} is full but for its reserve of "
                 f"{self._reserve() / 1e6:.0f} MB; free some space or give --reserve-mb"
             )
@@ -194,14 +190,11 @@ def is_regular(path: Path) -> bool:
         return False
 
 
-def copy_files(
-    source: Path, target: Path, names: Iterable[str], room_bytes: int | None = None
-) -> set[str]:
+def copy_files(source: Path, target: Path, names: Iterable[str]) -> set[str]:
     """Copy the regular files called ``names`` from one folder to another; those there were.
 
-    ``room_bytes`` bounds the copy; by default a tenth of the disk, at most 2 GiB, stays free.
-    Raises InputError when ``source`` is not a folder, OutsideError for too little room and for a
-    failing disk.
+    Raises InputError when ``source`` is not a folder, OutsideError for too little room, see
+    :func:`check_room`, and for a failing disk.
     """
     try:
         folder = os.open(source, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -214,7 +207,7 @@ def copy_files(
             if handle is not None:
                 files[name] = handle
         sizes = {name: os.fstat(handle).st_size for name, handle in files.items()}
-        check_room(sum(sizes.values()), target, room_bytes)
+        check_room(sum(sizes.values()), target)
         for name, handle in files.items():
             _copy(handle, target / name, sizes[name])
     except OSError as error:
@@ -293,15 +286,13 @@ def take_in(
     store: Path,
     folder: Path,
     deliver: Callable[[Path, ScanStore, dict[str, Any]], object] = write_deliverables,
-    room_bytes: int | None = None,
 ) -> list[Path]:
     """The scan folders under ``store`` that now hold what those in ``folder`` hold.
 
     ``folder`` is a scan folder or a folder of them, such as a card's; nothing is written there.
     Items received before by radio or network are kept and completed. A damaged scan is left out
-    where there are others. ``deliver`` writes a scan's files; ``room_bytes`` bounds each copy, see
-    :func:`copy_files`. Raises InputError when there is not a scan, OutsideError when the disk is
-    full.
+    where there are others. ``deliver`` writes a scan's files. Raises InputError when there is not
+    a scan, OutsideError when the disk is full.
     """
     given = Path(os.path.realpath(folder))  # the operator's own link is followed
     paths = [given / STORE_FILES[0], *sorted(given.glob(f"*/{STORE_FILES[0]}"))]
@@ -311,7 +302,7 @@ def take_in(
     taken, faults = [], []
     for path in paths:
         try:
-            taken.append(_take(store, path.parent, deliver, room_bytes))
+            taken.append(_take(store, path.parent, deliver))
         except InputError as error:
             log.error("%s is not taken: %s", path.parent, error)
             faults.append(error)
@@ -320,11 +311,9 @@ def take_in(
     return taken
 
 
-def _take(
-    store: Path, folder: Path, deliver: Callable[..., object], room_bytes: int | None
-) -> Path:
+def _take(store: Path, folder: Path, deliver: Callable[..., object]) -> Path:
     with workplace(store) as place:
-        copy_files(folder, place, STORE_FILES, room_bytes)
+        copy_files(folder, place, STORE_FILES)
         with ScanStore.open(place / STORE_FILES[0]) as source:
             header = source.header
             drone, scan = check_name(header.drone, "drone"), check_name(header.name, "scan")

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from service.ground.storage import DiskShare, QuotaError, folder_bytes
+from service.errors import OutsideError
+from service.ground.storage import DiskShare, folder_bytes
 
 
 def test_share_and_reserve_hold_to_the_byte(tmp_path: Path) -> None:
@@ -22,14 +23,14 @@ def test_share_and_reserve_hold_to_the_byte(tmp_path: Path) -> None:
     share = share_of("red", 0.5, 500)
     share.check(900 - link_bytes, now=0.0)
     share.check(100, now=0.0)  # 5000 of 5000
-    with pytest.raises(QuotaError, match="share"):
+    with pytest.raises(OutsideError, match="share"):
         share.check(1, now=0.0)
     other = share_of("blue", 1.0, 500)
     other.check(2_500, now=0.0)  # 500 of 500 stay free
-    with pytest.raises(QuotaError, match="reserve"):
+    with pytest.raises(OutsideError, match="reserve"):
         other.check(1, now=0.5)
     other.check(1, now=1.5)  # the disk was measured again: somebody else freed some
     by_default = share_of("green", 1.0, None)
     by_default.check(2_500, now=0.0)  # 5 % of the disk
-    with pytest.raises(QuotaError):
+    with pytest.raises(OutsideError):
         by_default.check(1, now=0.0)

@@ -135,8 +135,11 @@ def test_a_damaged_scan_leaves_the_others_and_no_card_fills_the_disk(
     (card / "scan-2").symlink_to(tmp_path)
     (tmp_path / "link").symlink_to(card)  # the operator's own
     assert [path.name for path in received(tmp_path / "ground", tmp_path / "link")] == ["scan-1"]
+    (card / "scan-3").mkdir()
+    with open(card / "scan-3" / "scan.db", "wb") as sparse:
+        sparse.truncate(2 * shutil.disk_usage(tmp_path).total)
     with pytest.raises(OutsideError, match="has room for"):
-        received(tmp_path / "ground", card, room_bytes=10)
+        received(tmp_path / "ground", card)
     with pytest.raises(OutsideError, match="has room for"):  # some of the disk stays free
         check_room(shutil.disk_usage(tmp_path).free - 1_000_000, tmp_path)
 

@@ -13,7 +13,7 @@ from portal_client import ONE, Client, client, store
 
 from service.errors import OutsideError
 from service.ground.library import ConflictError, Library
-from service.ground.storage import copy_files
+from service.ground.storage import check_room, copy_files
 
 if TYPE_CHECKING:
     from house_flight import HouseFlight
@@ -89,8 +89,9 @@ def test_an_import_fits_the_room_or_is_refused(tmp_path: Path, card: Path) -> No
     (card / "cloud.ply").unlink()
     size = (card / "scan.db").stat().st_size
     with pytest.raises(OutsideError, match="room for"):
-        copy_files(card, out, names, size - 1)
-    assert copy_files(card, out, names, size) == {"scan.db"}
+        check_room(size, out, size - 1)
+    check_room(size, out, size)
+    assert copy_files(card, out, names) == {"scan.db"}
 
 
 def test_an_import_holds_no_lock_of_the_library(
