@@ -80,7 +80,7 @@ def volume_mesh(depths: Iterable[DepthMap], upper: Raster, largest_faces: int = 
     inside = outline(upper.known, sure.known, upper.grid.cell_m)
     low_m = terrain(sure, inside).everywhere_m
     upper = without_cells(completed(upper, low_m, inside, upper.known & ~sure.known), ~inside)
-    volume = _voted(upper, list(depths))
+    volume = _voted(upper, low_m, list(depths))
     vertices, faces = _extracted(volume)
     vertices, faces = reduced(
         vertices, faces, min(largest_faces, max(MIN_FACES, round(KEPT_FACES * len(faces))))
@@ -90,33 +90,39 @@ def volume_mesh(depths: Iterable[DepthMap], upper: Raster, largest_faces: int = 
     return Mesh(vertices, faces, None, rgb, _measured(volume, vertices))
 
 
-def _voted(upper: Raster, depths: Sequence[DepthMap]) -> Volume:
+def _voted(upper: Raster, ground_m: F32, depths: Sequence[DepthMap]) -> Volume:
     """The blocks that the surface passes through, with all votes.
 
     They are those around ``upper``, and others as far as images have moved the surface out of
-    these.
+    these, but not below the bare ground ``ground_m`` (rows, cols): stray depth alone goes there.
     """
     grid = upper.grid
     rows, cols = grid.shape
-    height = np.full(-(-np.array([rows, cols]) // SIDE) * SIDE, np.nan, np.float32)
-    height[:rows, :cols] = upper.height_m[::-1]
+    height, ground_m = (
+        np.pad(one[::-1], ((0, -rows % SIDE), (0, -cols % SIDE)), constant_values=np.nan)
+        for one in (upper.height_m, ground_m)
+    )
     if not np.isfinite(height).any():
         raise ValueError("the surface has no cell inside its outline")
     base_m = float(np.nanmin(height))
     origin = np.array(
         [grid.west_m + 0.5 * grid.cell_m, grid.north_m - (rows - 0.5) * grid.cell_m, base_m]
     )
-    tiles = height.reshape(height.shape[0] // SIDE, SIDE, -1, SIDE).transpose(0, 2, 1, 3)
-    inside = np.isfinite(tiles)
-    low_m = np.where(inside, tiles, np.inf).min(axis=(2, 3))
-    high_m = np.where(inside, tiles, -np.inf).max(axis=(2, 3))
-    near, span_m = np.ones((3, 3), np.uint8), SIDE * grid.cell_m
-    has = inside.any(axis=(2, 3))
+    inside, span_m = np.isfinite(_tiles(height)), SIDE * grid.cell_m
+    has, near = inside.any(axis=(2, 3)), np.ones((3, 3), np.uint8)
+    low_m, ground_m, high_m = (
+        pick(_tiles(one), axis=(2, 3), where=np.isfinite(_tiles(one)), initial=far)
+        for one, pick, far in (
+            (height, np.min, np.inf), (ground_m, np.min, np.inf), (height, np.max, -np.inf),
+        )
+    )  # fmt: skip
     low_m = np.where(has, cv2.erode(low_m, near, borderValue=np.inf), 0.0)
     high_m = np.where(has, cv2.dilate(high_m, near, borderValue=-np.inf), -np.inf)
-    lowest = np.floor((low_m - base_m) / span_m - 0.5)
-    highest = np.where(has, np.floor((high_m - base_m) / span_m + 0.5), lowest - 1)
-    lowest, highest = lowest.astype(np.int32), highest.astype(np.int32)
+    lowest, deepest = (
+        np.floor((one - base_m) / span_m - 0.5).astype(np.int32)
+        for one in (low_m, np.minimum(low_m, ground_m))
+    )
+    highest = np.where(has, np.floor((high_m - base_m) / span_m + 0.5), lowest - 1).astype(np.int32)
     truncation_m = _truncation(depths, grid.cell_m)
     added, parts = _blocks(lowest, highest), []
     if len(added) > LARGEST_BLOCKS:
@@ -128,7 +134,15 @@ def _voted(upper: Raster, depths: Sequence[DepthMap]) -> Volume:
         down, up = lowest.copy(), highest.copy()
         for one in parts:
             _leave(
-                one.block, one.distance, inside, lowest, highest, down, up, grown == GROWN_BLOCKS
+                one.block,
+                one.distance,
+                inside,
+                lowest,
+                highest,
+                deepest,
+                down,
+                up,
+                grown == GROWN_BLOCKS,
             )
         added = np.concatenate([_blocks(down, lowest - 1), _blocks(highest + 1, up)])
         lowest, highest = down, up
@@ -141,6 +155,11 @@ def _voted(upper: Raster, depths: Sequence[DepthMap]) -> Volume:
     return Volume(origin, grid.cell_m, inside, block, distance, weight)
 
 
+def _tiles(cells: F32) -> F32:
+    """(Y, X, SIDE, SIDE) of (rows, cols)."""
+    return cells.reshape(cells.shape[0] // SIDE, SIDE, -1, SIDE).transpose(0, 2, 1, 3)
+
+
 def _blocks(lowest: I32, highest: I32) -> I32:
     """(B, 3) of the columns (Y, X) from the lowest block to the highest."""
     count = np.maximum(highest - lowest + 1, 0)
@@ -151,11 +170,12 @@ def _blocks(lowest: I32, highest: I32) -> I32:
 
 @njit(cache=True, nogil=True)
 def _leave(
-    block: I32, distance: F32, inside: Bool, lowest: I32, highest: I32, down: I32, up: I32,
-    ends: bool,
+    block: I32, distance: F32, inside: Bool, lowest: I32, highest: I32, deepest: I32, down: I32,
+    up: I32, ends: bool,
 ) -> None:  # fmt: skip
     """Let columns of blocks reach ``down`` and ``up`` to where the surface leaves the blocks:
-    above a column is air, below it building. With ``ends`` the surface ends there instead."""
+    above a column is air, below it building. With ``ends``, and below the ``deepest`` block, the
+    surface ends there instead."""
     span = np.array([[0, 1], [0, SIDE], [SIDE - 1, SIDE]])
     for b in range(len(block)):
         x, y, z = block[b]
@@ -172,7 +192,7 @@ def _leave(
                     for i in range(span[dx + 1, 0], span[dx + 1, 1]):
                         if not inside[y, x, j, i] or (distance[b, k, j, i] > 0.0) == air:
                             continue
-                        if ends:
+                        if ends or w < deepest[v, u]:
                             distance[b, k, j, i] = 1.0 if air else -1.0
                         else:
                             down[v, u], up[v, u] = min(down[v, u], w), max(up[v, u], w)

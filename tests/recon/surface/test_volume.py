@@ -11,8 +11,8 @@ from house_flight import HouseFlight
 from recon.mapping.cloud_fusion import cloud_of
 from recon.surface.meshing import Mesh
 from recon.surface.raster import Raster, grid_over, rasterise, without_cells
-from recon.surface.volume import volume_mesh
-from recon.types import I64, DepthMap
+from recon.surface.volume import SIDE, volume_mesh
+from recon.types import F64, I64, DepthMap
 
 VOXEL_M = 0.3
 
@@ -41,16 +41,21 @@ def border(mesh: Mesh) -> I64:
     return np.unique(edges[count == 1])
 
 
+def from_outline(mesh: Mesh) -> F64:
+    """How far inside the box around the mesh each vertex of its border lies."""
+    places, xy_m = mesh.vertices_m[border(mesh), :2], mesh.vertices_m[:, :2]
+    inward: F64 = np.minimum(places - xy_m.min(axis=0), xy_m.max(axis=0) - places).min(axis=1)
+    return inward
+
+
 @pytest.fixture(scope="module")
 def mesh() -> Mesh:
     return volume_mesh(*seen(HouseFlight()))
 
 
 def test_it_is_open_at_the_outline_alone(mesh: Mesh) -> None:
-    places = mesh.vertices_m[border(mesh)]
-    low, high = mesh.vertices_m[:, :2].min(axis=0), mesh.vertices_m[:, :2].max(axis=0)
-    inward = np.minimum(places[:, :2] - low, high - places[:, :2]).min(axis=1)
-    assert len(places) and inward.max() < 2.0 * VOXEL_M
+    inward = from_outline(mesh)
+    assert len(inward) and inward.max() < 2.0 * VOXEL_M
 
 
 def test_roof_ground_and_walls_are_where_the_house_is(mesh: Mesh) -> None:
@@ -110,10 +115,15 @@ def test_it_is_closed_where_images_see_far_through_the_upper_surface() -> None:
     raised = (np.abs(x - 24.0) < 7.0) & (np.abs(y) < 9.0)
     height.ravel()[raised] = 9.0
     mesh = volume_mesh(depths, replace(upper, height_m=height))
-    places, low, high = (
-        one[:, :2] for one in (mesh.vertices_m[border(mesh)], mesh.vertices_m, mesh.vertices_m)
-    )
-    inward = np.minimum(places - low.min(axis=0), high.max(axis=0) - places).min(axis=1)
-    assert inward.max() < 2.0 * VOXEL_M
+    assert from_outline(mesh).max() < 2.0 * VOXEL_M
     middle = np.hypot(*(mesh.vertices_m[:, :2] - [24.0, 0.0]).T) < 4.0
     assert middle.any() and np.abs(mesh.vertices_m[middle, 2]).max() < 0.5
+
+
+def test_stray_depth_far_below_the_ground_digs_no_deep_hole() -> None:
+    (*_, last), upper = seen(HouseFlight())
+    depth = last.depth_m.copy()
+    depth[20:40, 90:120] = 60.0
+    mesh = volume_mesh([replace(last, depth_m=depth)], upper)
+    assert from_outline(mesh).max() < 2.0 * VOXEL_M
+    assert -2.0 * SIDE * VOXEL_M < mesh.vertices_m[:, 2].min() < -1.0
