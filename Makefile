@@ -65,7 +65,7 @@ trials: $(STAMP)
 
 # What commands write in docs: reports, configuration and pictures.
 pages: $(CORE)
-	for script in report configuration architecture concepts; do $(BIN)/python docs/$$script.py || exit; done
+	for script in report configuration architecture concepts growth; do $(BIN)/python docs/$$script.py || exit; done
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

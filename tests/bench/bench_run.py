@@ -20,6 +20,7 @@ DEVELOPMENT = {
     "codecs": "bench_codecs:run",
     "device": "bench_device:run",
     "graph": "bench_graph:run",
+    "growth": "bench_growth:run",
     "latency": "bench_latency:run",
     "map": "bench_map:run",
     "mavlink": "bench_mavlink:run",
@@ -35,7 +36,7 @@ DEVELOPMENT = {
 }
 """Name to ``module:function`` of this folder."""
 
-ASKED_FOR = ("board", "device", "middlebury", "real", "screen", "site")
+ASKED_FOR = ("board", "device", "growth", "middlebury", "real", "screen", "site")
 """Those that need a GPU, data or many minutes, and run by name only."""
 
 
