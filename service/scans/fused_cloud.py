@@ -185,7 +185,8 @@ def _strip(
 
 
 SCALE_M = 0.001
-CHUNK_POINTS = 200_000
+CHUNK_POINTS = 50_000
+"""Points that are converted at a time; float64 and LAS records take ten times their size."""
 
 
 def placed(cloud: PointCloud, frame: LocalFrame | None) -> F64:

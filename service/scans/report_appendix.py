@@ -13,6 +13,7 @@ import numpy as np
 from recon.surface.raster import Raster, grid_over
 from recon.types import F32, U8, PointCloud
 from service.scans.drawing import coloured, round_length
+from service.scans.fused_cloud import CHUNK_POINTS
 from service.scans.report_map import loop_pairs
 from service.scans.report_parts import figure, table
 from service.stream.records import PoseRecord
@@ -123,12 +124,13 @@ def _maps(cloud: PointCloud, raster: Raster | None) -> list[str]:
 
 def _per_cell(cloud: PointCloud, cell_m: float) -> tuple[F32, F32]:
     """Maximum views and minimum sigma of the points in each cell, NaN where there are none."""
-    xy = cloud.xyz_m[:, :2].astype(np.float64)
-    grid = grid_over(xy, cell_m)
-    at = np.ravel_multi_index(grid.cells(xy), grid.shape)
+    grid = grid_over(cloud.xyz_m[:, :2].astype(np.float64), cell_m)
     views, sigma = (np.full(grid.shape, far, np.float32) for far in (-np.inf, np.inf))
-    np.maximum.at(views.reshape(-1), at, cloud.views.astype(np.float32))
-    np.minimum.at(sigma.reshape(-1), at, cloud.sigma_m)
+    for first in range(0, len(cloud), CHUNK_POINTS):
+        some = slice(first, first + CHUNK_POINTS)
+        at = grid.cells(cloud.xyz_m[some, :2].astype(np.float64))
+        np.maximum.at(views, at, cloud.views[some].astype(np.float32))
+        np.minimum.at(sigma, at, cloud.sigma_m[some])
     nan = np.float32(np.nan)
     return np.where(np.isfinite(views), views, nan), np.where(np.isfinite(sigma), sigma, nan)
 
