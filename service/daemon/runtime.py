@@ -1,7 +1,7 @@
 """The life of the onboard service: heartbeats first, then the heavy imports, then scans.
 
 MAVLink starts first and on its own threads, so that its heartbeat does not wait for the heavy
-imports; the scan runs on one worker thread (:mod:`service.daemon.scan_run`).
+imports; the scan runs on one worker thread (:mod:`service.daemon.scanning`).
 """
 
 from __future__ import annotations

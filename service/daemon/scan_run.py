@@ -1,118 +1,95 @@
-"""One attempt at a scan: open the camera, scan, close the scan."""
+"""An attempt at a scan as the service sees it, and what is reported of it."""
 
 from __future__ import annotations
 
-import logging
 import os
 import threading
 import time
-from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from operator import sub
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mavlink.component.camera import KeyframeReport
+from mavlink.component.control import ACCEPTED, Answer, Result, Work
 from mavlink.component.status import WARNING
 from mavlink.telemetry.clock import agree, computer_offset_ns
-from service.config import Config, change
+from service.config import Config
 from service.daemon.load_shedding import GRACE_S, Level, MachineReadings, lowered
-from service.daemon.scan_state import FIRST_RETRY_S, LAST_RETRY_S, Event
-from service.errors import OutsideError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mavlink.component.vehicle import VehicleLink
-    from recon.backends import Backend
-    from recon.types import Camera, Frame, Keyframe
-    from service.cameras.source import CameraSource
+    from recon.types import F64, Frame, Keyframe
     from service.daemon.frame_gate import FrameGate
-    from service.flight.datalink import DaemonLink
-    from service.flight.scan import Scan, ScanInputs
+    from service.flight.scan import Scan
     from service.stream.store import ScanStore
-
-log = logging.getLogger(__name__)
+    from service.workers import Worker
 
 LATER, PHOTOS = "later", "photos"
 """Subfolders of a scan: images that are only stored, and those that operators asked for."""
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Equipment:
-    """What an attempt at a scan works with."""
-
-    config: Config
-    vehicle: VehicleLink
-    link: DaemonLink
-    camera: Camera | None  # the model; None before it is loaded
-    backend: Backend | None  # None before it is loaded
-    level: Level
-    paused: threading.Event  # set while no frames are taken
-    made: set[str]  # names of the scans of this process, each from before its store exists
-    report: Callable[[Event], object]  # events of this attempt
-    write_files: Callable[[Path, ScanStore], None]  # of a closed scan
+OTHERS = ("scan.db", "link.tlog")
 
 
+@dataclass(eq=False)
 class ScanRun:
     """One attempt at a scan, from opening the camera until its files are written."""
 
-    def __init__(
-        self,
-        equipment: Equipment,
-        is_asked: bool,
-        opener: Callable[[str], CameraSource] | None = None,
-        clock_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """``is_asked``: a command waits for this attempt; it is not a retry. ``opener`` opens
-        the camera (default: :func:`service.cameras.open_camera`)."""
-        self.stop = threading.Event()
-        self.scan: Scan | None = None
-        self.gate: FrameGate | None = None
-        self.store: ScanStore | None = None
-        self.thread_id = 0
-        self.started_s = self.progress_s = clock_s()
-        self._equipment, self._is_asked, self._opener = equipment, is_asked, opener
-        self._config, self._level, self._clock_s = equipment.config, equipment.level, clock_s
-        self._is_feeding = False  # frames go into the scan
-        self._has_grown = False
-        self._counted = MachineReadings()
-        self._warnings_reported = 0  # camera warnings reported so far
-        self._photos: set[int] = set()  # times of the frames that were reported as photos
+    is_asked: bool  # a command waits for it; it is not a retry
+    clock_s: Callable[[], float] = time.monotonic
+    folder: Path | None = None  # from before its store exists
+    scan: Scan | None = None  # like the gate and the store, once the camera is open
+    gate: FrameGate | None = None
+    store: ScanStore | None = None
+    is_feeding: bool = False  # frames go into the scan
+    has_grown: bool = False
+    stop: threading.Event = field(default_factory=threading.Event)
+    workers: list[Worker] = field(default_factory=list)  # its own, and that of its files
+    is_left: bool = False  # another scan did not wait for its files
+    work: Work | None = None  # of a command that waits for its end
+    warnings_reported: int = 0  # camera warnings reported so far
+    _photos: set[int] = field(default_factory=set)  # times of the frames reported as photos
+    _counted: tuple[int, ...] = (0, 0, 0, 0)
+
+    def __post_init__(self) -> None:
+        self.started_s = self.progress_s = self.clock_s()
 
     @property
     def busy_s(self) -> float:
         """Seconds spent on the current frame or view; 0 while waiting for the camera."""
         scan, gate = self.scan, self.gate
-        if scan is None or gate is None or not self._is_feeding:
+        if scan is None or gate is None or not self.is_feeding:
             return 0.0
         return max(gate.busy_s, scan.pipeline.busy_s)
 
-    def close_camera(self) -> None:
-        """Wake a scan that waits for a dead camera."""
-        scan = self.scan
-        if scan is not None:
-            scan.source.close()
-
     def alive(self) -> None:
-        self.progress_s = self._clock_s()
+        self.progress_s = self.clock_s()
 
     def new_camera_warnings(self) -> list[str]:
         """Camera warnings since the last call."""
         gate = self.gate
-        fresh = [] if gate is None else gate.warnings[self._warnings_reported :]
-        self._warnings_reported += len(fresh)
+        fresh = [] if gate is None else gate.warnings[self.warnings_reported :]
+        self.warnings_reported += len(fresh)
         return fresh
 
     def closing_marks(self) -> tuple[Any, ...]:
-        """Values that change when closing makes progress: uses of the store, keyframes."""
-        scan, store = self.scan, self.store
-        if scan is None or store is None:
-            return ()
-        return (store.database.uses[self.thread_id], scan.recorder.keyframes)
+        """Values that change when closing makes progress: uses of the store, keyframes, files."""
+        scan, store, folder = self.scan, self.store, self.folder
+        return (
+            None if scan is None else scan.recorder.keyframes,
+            None if store is None else [store.database.uses[worker.thread_id] for worker in self.workers],
+            None if folder is None else sizes(folder),
+        )
+
+    def finish(self, fault: str) -> None:
+        """Answer a command that waits for the end."""
+        if self.work is not None:
+            self.work.finish(Answer(Result.FAILED, fault) if fault else ACCEPTED)
 
     def configure(self, config: Config, level: Level) -> None:
         """Use the live keys of ``config``, reduced to a load level."""
-        self._config, self._level = config, level
         scan, gate = self.scan, self.gate
         if scan is not None and gate is not None:
             scan.pipeline.configure_baseline(config.scan)
@@ -125,19 +102,14 @@ class ScanRun:
         scan, gate = self.scan, self.gate
         if scan is None or gate is None:
             return MachineReadings()
-        before, dropped = self._counted, scan.pipeline.dropped
-        views, frames = scan.recorder.keyframes + dropped, gate.frames + gate.late
-        self._counted = now = MachineReadings(views, dropped, frames, gate.late, gate.age_s)
-        if self._clock_s() - self.started_s < GRACE_S:
+        dropped, late = scan.pipeline.dropped, gate.late
+        counted = scan.recorder.keyframes + dropped, dropped, gate.frames + late, late
+        views, late_views, frames, late_frames = map(sub, counted, self._counted)
+        self._counted = counted
+        if self.clock_s() - self.started_s < GRACE_S:
             return MachineReadings()
-        taken = gate.frames - (before.frames - before.late_frames)
-        return MachineReadings(
-            now.views - before.views,
-            now.late_views - before.late_views,
-            now.frames - before.frames,
-            now.late_frames - before.late_frames,
-            now.age_s if taken else 0.0,
-        )
+        age_s = gate.age_s if frames > late_frames else 0.0
+        return MachineReadings(views, late_views, frames, late_frames, age_s)
 
     def lag_figures(self) -> dict[str, float]:
         """Counts of late frames and views, and of images that were only stored."""
@@ -152,154 +124,63 @@ class ScanRun:
             "pictures_lost": gate.lost,
         }
 
-    # ---- on the scan's thread ----------------------------------------------------------------
+    # ---- reports to ground stations ----------------------------------------------------------
 
-    def carry_out(self) -> None:
-        """Scan until stopped or the recording ends, then close the scan."""
-        self.thread_id = threading.get_ident()
-        try:
-            source = self._open_camera()
-            if source is not None:
-                with closing(source):
-                    self._scan(source)
-        finally:
-            self.scan = self.gate = self.store = None
-
-    def _open_camera(self) -> CameraSource | None:
-        """The camera at its own pace, retried until it answers; None when stopped meanwhile."""
-        from service.cameras import open_camera
-        from service.cameras.source import Paced
-
-        wait_s, is_answer = FIRST_RETRY_S, self._is_asked
-        while not self.stop.is_set():
-            began_s = time.monotonic()
-            try:
-                source = (self._opener or open_camera)(self._config.camera.source)
-                return source if isinstance(source, Paced) else Paced(source)
-            except OutsideError as error:
-                log.warning("%s; trying again", error)
-                text = f"Camera: {error}"
-                self._equipment.vehicle.statustext(text, WARNING, is_answer=is_answer)
-                is_answer = False
-                # A source that listens for a sender is open again at once.
-                self.stop.wait(max(0.0, began_s + wait_s - time.monotonic()))
-                wait_s = min(2 * wait_s, LAST_RETRY_S)
-        return None
-
-    def _scan(self, source: CameraSource) -> None:
-        from service.flight.scan import Scan, create_store
-
-        vehicle, link = self._equipment.vehicle, self._equipment.link
-        inputs, gate = self._inputs(source)
-        store = create_store(inputs)
-        with ExitStack() as on_fault:  # nothing is sent or recorded of a scan that cannot begin
-            on_fault.callback(store.close)
-            scan = Scan(inputs, store)
-            on_fault.pop_all()
-        clocks = disagreement(inputs.unix_offset_ns)
-        gate.warnings += clocks
-        for text in (*inputs.notes, *clocks):
-            vehicle.statustext(text, WARNING)
-        self._warnings_reported = len(gate.warnings)
-        vehicle.record(inputs.folder / "link.tlog", inputs.unix_offset_ns)
-        link.begin_scan(store, self._config, vehicle)
-        self.store, self.gate, self.scan = store, gate, scan
-        self.configure(self._config, self._level)
-        vehicle.statustext(f"Scan {inputs.scan_id} started")
-        try:
-            self._feed(scan)
-        finally:
-            source.close()
-            vehicle.record(None)
-            try:
-                gate.warnings += set_since(inputs.unix_offset_ns, vehicle.unix_offset_ns())
-                self._close_scan(scan, store)
-            finally:
-                self._equipment.write_files(inputs.folder, store)
-
-    def _inputs(self, source: CameraSource) -> tuple[ScanInputs, FrameGate]:
-        from service.cameras.camera_file import seeks_readout
-        from service.cameras.lens import fitted
-        from service.daemon.camera_memory import measured
-        from service.daemon.frame_gate import FrameGate
-        from service.flight.scan import ScanInputs
-        from service.flight.vehicle_reports import OdometryReport
-
-        vehicle, config, backend = self._equipment.vehicle, self._config, self._equipment.backend
-        assert self._equipment.camera is not None and backend is not None
-        camera, notes = fitted(self._equipment.camera, source)
-        scans = Path(config.scan.folder)
-        earlier = measured(scans, source.description, source.size_px)
-        if earlier.shutter is not None and seeks_readout(camera, config.camera):
-            camera = replace(camera, shutter=earlier.shutter)
-            config = change(config, "camera.readout_ms", "auto")  # sought on from there
-        now_ns, start_ns = time.monotonic_ns(), source.start_monotonic_ns
-        zero_ns = now_ns if start_ns is None else start_ns
-        offset_ns = vehicle.unix_offset_ns()
-        odometry = OdometryReport(config.camera, vehicle.report_odometry).send
-        unix_s = 1e-9 * (now_ns + offset_ns)
-        folder = new_folder(scans, unix_s)
-        self._equipment.made.add(folder.name)
-        gate = FrameGate(
-            source, folder / LATER, zero_ns + offset_ns, self.alive, self._equipment.paused
-        )
-        inputs = ScanInputs(
-            gate,
-            camera,
-            config,
-            backend,
-            folder,
-            folder.name,
-            zero_ns,
-            unix_offset_ns=offset_ns,
-            notes=tuple(notes),
-            history=vehicle.history,
-            sigma_focal=camera.sigma_focal,
-            extra={"backend": backend.name, "source": source.description},
-            latency_ms=earlier.latency_ms,
-            warn=lambda text: vehicle.statustext(text, WARNING),
-            on_frame=odometry if config.mavlink.odometry else None,
-            on_keyframe=self._on_keyframe,
-            on_photo=self._on_photo,
-        )
-        return inputs, gate
-
-    def _feed(self, scan: Scan) -> None:
-        """Feed frames into the scan until it is stopped or the recording ends."""
-        event, self._is_feeding = Event.INTERRUPTED, True
-        try:
-            scan.run(self.stop, self._on_frame, self._equipment.paused)
-            event = Event.COMPLETED
-        finally:
-            self._is_feeding = False
-            self._equipment.report(event)
-
-    def _close_scan(self, scan: Scan, store: ScanStore) -> None:
-        """Finish the scan; if the pipeline fails, mark the stored part as interrupted."""
-        with ExitStack() as on_fault:
-            on_fault.callback(store.finish, {"interrupted": True})
-            summary = scan.close()
-            on_fault.pop_all()
-        self._equipment.vehicle.statustext(
-            f"Scan {scan.inputs.scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
-        )
-
-    def _on_frame(self, scan: Scan) -> None:
-        self.alive()
-        if scan.recorder.keyframes > 1 and not self._has_grown:
-            self._has_grown = True
-            self._equipment.report(Event.GROWN)
-
-    def _on_keyframe(self, keyframe: Keyframe) -> None:
+    def report_keyframe(self, vehicle: VehicleLink, keyframe: Keyframe) -> None:
+        """Report a keyframe at its current pose, unless it was a photo."""
         scan = self.scan
-        if scan is not None and keyframe.time_ns not in self._photos:
-            report_keyframe(self._equipment.vehicle, scan, keyframe)
+        if scan is None or keyframe.time_ns in self._photos:
+            return
+        state = vehicle.history.state_at(keyframe.time_ns)
+        T = keyframe.pose.T_world_camera
+        agl_m = None if state is None else state.alt_agl_m
+        vehicle.report_keyframe(_report(scan, keyframe.time_ns, T[:3, :3], T[:3, 3], agl_m))
 
-    def _on_photo(self, photo: Frame) -> None:
-        scan = self.scan
-        if scan is not None:
-            self._photos.add(photo.time_ns)
-            report_photo(self._equipment.vehicle, scan, photo)
+    def report_photo(self, vehicle: VehicleLink, photo: Frame) -> None:
+        """Store a photo and report it, or why that failed."""
+        from service.daemon.stored_image import image_name, store_image
+
+        scan, tag = self.scan, photo.prior
+        if scan is None:
+            return
+        self._photos.add(photo.time_ns)
+        name = f"{PHOTOS}/{image_name(photo.time_ns + scan.inputs.unix_offset_ns)}"
+        report = _report(
+            scan, photo.time_ns, tag.R_world_camera, tag.position_m, tag.agl_m,
+            f"{scan.inputs.scan_id}/{name}",
+        )  # fmt: skip
+        try:
+            store_image(scan.inputs.folder / name, photo.image, report)
+        except OSError as error:
+            why = f"photo failed: {error.strerror or error}"
+            vehicle.statustext(why, WARNING, is_answer=True)
+            report = KeyframeReport(ok=False)
+        vehicle.report_keyframe(report)
+
+
+def _report(
+    scan: Scan, time_ns: int, R_world_camera: F64 | None, position_m: F64 | None,
+    agl_m: float | None, file: str = "",
+) -> KeyframeReport:  # fmt: skip
+    from service.flight.vehicle_reports import keyframe_report
+
+    unix_ns, frame = time_ns + scan.inputs.unix_offset_ns, scan.rig.local_frame
+    return keyframe_report(unix_ns, R_world_camera, position_m, frame, agl_m, file)
+
+
+def sizes(folder: Path) -> tuple[tuple[str, int], ...]:
+    """Name and bytes of each file that closing writes into a scan's folder.
+
+    The store and the link's log are left out, because others write them too.
+    """
+    found = []
+    try:
+        for path in folder.iterdir():
+            if not path.name.startswith(OTHERS):
+                found.append((path.name, path.stat().st_size))
+    except OSError:
+        pass  # it is not there yet, or a file was renamed meanwhile
+    return tuple(sorted(found))
 
 
 def new_folder(scans: Path, unix_s: float) -> Path:
@@ -310,40 +191,6 @@ def new_folder(scans: Path, unix_s: float) -> Path:
         if not os.path.exists(folder):
             return folder
         unix_s += 1.0
-
-
-def report_keyframe(vehicle: VehicleLink, scan: Scan, keyframe: Keyframe) -> None:
-    """Report a keyframe to ground stations, at its current pose."""
-    from service.flight.vehicle_reports import keyframe_report
-
-    inputs = scan.inputs
-    state = vehicle.history.state_at(keyframe.time_ns)
-    agl_m = None if state is None else state.alt_agl_m
-    time_ns = keyframe.time_ns + inputs.unix_offset_ns
-    T = keyframe.pose.T_world_camera
-    report = keyframe_report(time_ns, T[:3, :3], T[:3, 3], scan.rig.local_frame, agl_m)
-    vehicle.report_keyframe(report)
-
-
-def report_photo(vehicle: VehicleLink, scan: Scan, photo: Frame) -> None:
-    """Store a photo and report it to ground stations, or why that failed."""
-    from service.daemon.stored_image import image_name, store_image
-    from service.flight.vehicle_reports import keyframe_report
-
-    inputs, tag = scan.inputs, photo.prior
-    time_ns = photo.time_ns + inputs.unix_offset_ns
-    path = inputs.folder / PHOTOS / image_name(time_ns)
-    report = keyframe_report(
-        time_ns, tag.R_world_camera, tag.position_m, scan.rig.local_frame, tag.agl_m,
-        f"{inputs.scan_id}/{PHOTOS}/{path.name}",
-    )  # fmt: skip
-    try:
-        store_image(path, photo.image, report)
-    except OSError as error:
-        why = f"photo failed: {error.strerror or error}"
-        vehicle.statustext(why, WARNING, is_answer=True)
-        report = KeyframeReport(ok=False)
-    vehicle.report_keyframe(report)
 
 
 def disagreement(offset_ns: int) -> list[str]:

@@ -1,6 +1,9 @@
 """One scan at a time: performs the effects of :class:`service.daemon.scan_state.ScanLife`.
 
-Only this module catches errors of the environment during a scan.
+The attempt at a scan runs on the worker ``scan``: open the camera, scan, close the scan. Its files
+are written on the worker ``files``, so that a flight that begins meanwhile does not wait for them;
+the stored data is safe by then, and the next start writes files that are missing. Only this module
+catches errors of the environment during a scan.
 """
 
 from __future__ import annotations
@@ -9,29 +12,46 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mavlink.component.control import ACCEPTED, Answer, Phase, Result, Work
+from mavlink.component.control import Phase, Work
 from mavlink.component.status import CRITICAL, WARNING
 from mavlink.component.vehicle import VehicleLink
-from service.config import Config
+from service.config import Config, change
 from service.daemon.load_shedding import Level
 from service.daemon.resumption import Resumption
-from service.daemon.scan_run import Equipment, ScanRun
-from service.daemon.scan_state import Effect, Event, ScanLife, State
+from service.daemon.scan_run import (
+    LATER,
+    ScanRun,
+    disagreement,
+    new_folder,
+    set_since,
+)
+from service.daemon.scan_state import (
+    FIRST_RETRY_S,
+    LAST_RETRY_S,
+    Effect,
+    Event,
+    ScanLife,
+    State,
+)
 from service.daemon.warm_up import is_warm
-from service.daemon.writing import Writings
-from service.errors import InputError, SkyreliefError
+from service.errors import InputError, OutsideError, SkyreliefError
 from service.flight.datalink import DaemonLink
 from service.memory import release_memory
 from service.scans.retention import Claim
-from service.workers import PROCESS, Worker, Workers
+from service.workers import PROCESS, Worker, Workers, guarded
 
 if TYPE_CHECKING:
     from recon.backends import Backend
     from recon.types import Camera
-    from service.flight.scan import Scan
+    from service.cameras.source import CameraSource
+    from service.daemon.frame_gate import FrameGate
+    from service.flight.scan import Scan, ScanInputs
     from service.stream.store import ScanStore
 
 log = logging.getLogger(__name__)
@@ -47,13 +67,16 @@ class Scanning:
         self,
         config: Config,
         *,
-        attempt: Callable[[Equipment, bool], ScanRun] = ScanRun,
+        attempt: Callable[[ScanRun], object] | None = None,
+        opener: Callable[[str], CameraSource] | None = None,
+        write: Callable[[Path, ScanStore, Any], object] | None = None,
         life: ScanLife | None = None,
         resumption: Resumption | None = None,
         workers: Workers = PROCESS,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``attempt`` makes a run from its equipment and whether a command waits for it."""
+        """``attempt`` carries out a run (default: a scan with the camera); ``opener`` opens the
+        camera (``service.cameras.open_camera``); ``write`` writes a scan's files (deliverables)."""
         self.config = config
         self.life = life or ScanLife()
         self.run: ScanRun | None = None
@@ -63,16 +86,15 @@ class Scanning:
         self.camera: Camera | None = None  # the model; None before it is loaded
         self.backend: Backend | None = None  # None before it is loaded
         self.link = DaemonLink()
-        self.made: set[str] = set()  # names of the scans of this process
+        self.made: set[str] = set()  # names of the scans of this process, before their stores exist
         self.resumption = resumption or Resumption(Path(config.scan.folder))
         self.claim = Claim()  # to the folder of scans; its holder manages earlier ones
         self.paused = threading.Event()  # set while no frames are taken
-        self._attempt, self._workers, self._clock_s = attempt, workers, clock_s
-        self._lock = threading.RLock()  # guards life, run, its closing, config and level
-        self._worker: Worker | None = None  # of the run
-        self._closing: Work | None = None  # ends with the run
-        self._writings = Writings(lambda text: self.vehicle.statustext(text, WARNING))
-        self._marks: tuple[Any, ...] | None = None  # of the closing, as seen last
+        self._attempt, self._opener, self._write = attempt or self._try, opener, write
+        self._workers, self._clock_s = workers, clock_s
+        self._lock = threading.RLock()  # guards life, run, its end, config and level
+        self._runs: list[ScanRun] = []  # those whose workers run, the newest last
+        self._marks: list[Any] | None = None  # of the closing, as seen last
         self._marked_s = 0.0  # when they changed
 
     def load(self) -> None:
@@ -102,8 +124,8 @@ class Scanning:
             run = self.run
             if event is Event.GROWN:
                 self.is_warm = True
-        if Effect.CLOSE in effects and run is not None:
-            run.close_camera()  # may take long
+        if Effect.CLOSE in effects and run is not None and run.scan is not None:
+            run.scan.source.close()  # wakes it where the camera is dead; may take long
         return before
 
     def _perform(self, effect: Effect) -> None:
@@ -142,11 +164,11 @@ class Scanning:
     def finalise(self) -> Work | None:
         """Stop; returns the work of writing everything, or None when nothing runs."""
         with self._lock:
-            if self.run is not None:
-                self._closing = self._closing or Work()
-            work = self._closing
+            run = self.run
+            if run is not None:
+                run.work = run.work or Work()
         self.handle(Event.STOP)
-        return work
+        return None if run is None else run.work
 
     def end(self, wait: Callable[[], None] = lambda: None) -> None:
         """Close the running scan, wait for all files, and start no other.
@@ -154,12 +176,9 @@ class Scanning:
         ``wait`` is called every second.
         """
         self.handle(Event.END)
-        worker = self._worker
-        while (worker is not None and not worker.is_done) or self._writings:
+        while workers := [w for run in self._runs for w in run.workers if not w.is_done]:
             wait()
-            if worker is not None:
-                worker.join(1.0)
-            self._writings.wait(1.0)
+            workers[0].join(1.0)
         self.link.end_backlog(self.config.datalink.drain_s, wait)
 
     # ---- state ------------------------------------------------------------------------------
@@ -193,12 +212,9 @@ class Scanning:
 
         Call it often: progress is any change since the last call.
         """
-        run, state = self.run, self.life.state
-        marks: tuple[Any, ...] | None = None
-        if run is not None and state.is_closing:
-            marks = (*run.closing_marks(), *self._writings.marks())
-        elif state is State.ENDED and self._writings:
-            marks = self._writings.marks()
+        runs, state, marks = self._live(), self.life.state, None
+        if runs and (state.is_closing or state is State.ENDED):
+            marks = [run.closing_marks() for run in runs]
         now_s = self._clock_s()
         if marks is None or marks != self._marks:
             self._marks, self._marked_s = marks, now_s
@@ -208,7 +224,10 @@ class Scanning:
     def in_the_making(self) -> set[str]:
         """Names of the scans that must not be deleted: the running one, and those whose files are
         being written."""
-        return {self.scan_id, *self._writings.names}
+        return {run.folder.name for run in self._live() if run.folder is not None}
+
+    def _live(self) -> list[ScanRun]:
+        return [run for run in self._runs if not all(w.is_done for w in run.workers)]
 
     # ---- changes in flight --------------------------------------------------------------------
 
@@ -218,17 +237,19 @@ class Scanning:
         Raises what ``change`` raises; then nothing is changed.
         """
         with self._lock:
-            self.config = config = change(self.config)
-            if self.run is not None:
-                self.run.configure(config, self.level)
-            self.link.configure(config)
+            self.config = change(self.config)
+            self._apply()
 
     def set_level(self, level: Level) -> None:
         """Change the load level, in this scan and in the next."""
         with self._lock:
             self.level = level
-            if self.run is not None:
-                self.run.configure(self.config, level)
+            self._apply()
+
+    def _apply(self) -> None:
+        if self.run is not None:
+            self.run.configure(self.config, self.level)
+        self.link.configure(self.config)
 
     def offer_backlog(self) -> None:
         """Send earlier scans that the ground lacks while no scan runs."""
@@ -240,29 +261,28 @@ class Scanning:
     def _open(self) -> None:
         """Start an attempt at the wanted scan."""
         self.fault = ""
-        equipment = Equipment(
-            self.config, self.vehicle, self.link, self.camera, self.backend, self.level,
-            self.paused, self.made, self.handle, self._write_files,
-        )  # fmt: skip
+        run = self.run = ScanRun(self.life.failures == 0, self._clock_s)
+        self._runs = [*self._live(), run]
         try:
-            run = self.run = self._attempt(equipment, self.life.failures == 0)
-            self._worker = self._workers.start(
+            worker = self._workers.start(
                 "scan", lambda _: self._carry_out(run), lag_s=lambda: run.busy_s
             )
+            run.workers.append(worker)
         except Exception as error:  # such as no room for another thread
-            self._end_run(_fault_of(error))
+            self._end_run(run, _fault_of(error))
 
     def _carry_out(self, run: ScanRun) -> None:
         """Carry out the run; a fault is reported, and retried while a scan is wanted."""
         fault = ""
         try:
-            run.carry_out()
+            self._attempt(run)
         except Exception as error:
             fault = _fault_of(error)
+        run.scan = run.gate = None
         release_memory(collect=True)
-        self._end_run(fault)
+        self._end_run(run, fault)
 
-    def _end_run(self, fault: str) -> None:
+    def _end_run(self, run: ScanRun, fault: str) -> None:
         with self._lock:
             if fault:
                 self.fault = fault
@@ -273,27 +293,175 @@ class Scanning:
             if fault and self.life.state.is_wanted:
                 log.warning("next attempt in %.1f s", self.life.due_s - self._clock_s())
             self.run = None
-            closing, self._closing = self._closing, None
-        if closing is not None:
-            closing.finish(Answer(Result.FAILED, fault) if fault else ACCEPTED)
+        if not run.is_left:
+            run.finish(fault)
 
-    def _write_files(self, folder: Path, store: ScanStore) -> None:
-        """Write a scan's files, in the background when another scan is wanted meanwhile."""
+    def _try(self, run: ScanRun) -> None:
+        """Scan until stopped or the recording ends, then close the scan and write its files."""
+        source = self._open_camera(run)
+        if source is not None:
+            with closing(source):
+                self._scan(run, source)
 
-        def end_sender() -> None:
-            is_last = self.life.state in (State.ENDING, State.ENDED)
-            self.link.end_scan(self.config, is_last=is_last)
+    def _open_camera(self, run: ScanRun) -> CameraSource | None:
+        """The camera at its own pace, retried until it answers; None when stopped meanwhile."""
+        from service.cameras import open_camera
+        from service.cameras.source import Paced
 
-        self._writings.write(
-            folder, store, lambda: self.life.state.is_wanted, end_sender, self._hand_over
+        wait_s, is_answer = FIRST_RETRY_S, run.is_asked
+        while not run.stop.is_set():
+            began_s = time.monotonic()
+            try:
+                source = (self._opener or open_camera)(self.config.camera.source)
+                return source if isinstance(source, Paced) else Paced(source)
+            except OutsideError as error:
+                log.warning("%s; trying again", error)
+                self.vehicle.statustext(f"Camera: {error}", WARNING, is_answer=is_answer)
+                is_answer = False
+                # A source that listens for a sender is open again at once.
+                run.stop.wait(max(0.0, began_s + wait_s - time.monotonic()))
+                wait_s = min(2 * wait_s, LAST_RETRY_S)
+        return None
+
+    def _scan(self, run: ScanRun, source: CameraSource) -> None:
+        from service.flight.scan import Scan, create_store
+
+        vehicle = self.vehicle
+        inputs, gate = self._inputs(run, source)
+        store = create_store(inputs)
+        with ExitStack() as on_fault:  # nothing is sent or recorded of a scan that cannot begin
+            on_fault.callback(store.close)
+            scan = Scan(inputs, store)
+            on_fault.pop_all()
+        clocks = disagreement(inputs.unix_offset_ns)
+        gate.warnings += clocks
+        for text in (*inputs.notes, *clocks):
+            vehicle.statustext(text, WARNING)
+        run.warnings_reported = len(gate.warnings)
+        vehicle.record(inputs.folder / "link.tlog", inputs.unix_offset_ns)
+        self.link.begin_scan(store, self.config, vehicle)
+        with self._lock:
+            run.store, run.gate, run.scan = store, gate, scan
+            self._apply()  # what was configured since
+        vehicle.statustext(f"Scan {inputs.scan_id} started")
+        try:
+            self._feed(run, scan)
+        finally:
+            source.close()
+            vehicle.record(None)
+            try:
+                gate.warnings += set_since(inputs.unix_offset_ns, vehicle.unix_offset_ns())
+                self._close_scan(scan, store)
+            finally:
+                self.write_files(run, store)
+
+    def _inputs(self, run: ScanRun, source: CameraSource) -> tuple[ScanInputs, FrameGate]:
+        from service.cameras.camera_file import seeks_readout
+        from service.cameras.lens import fitted
+        from service.daemon.camera_memory import measured
+        from service.daemon.frame_gate import FrameGate
+        from service.flight.scan import ScanInputs
+        from service.flight.vehicle_reports import OdometryReport
+
+        vehicle, config, backend = self.vehicle, self.config, self.backend
+        assert self.camera is not None and backend is not None
+        camera, notes = fitted(self.camera, source)
+        scans = Path(config.scan.folder)
+        earlier = measured(scans, source.description, source.size_px)
+        if earlier.shutter is not None and seeks_readout(camera, config.camera):
+            camera = replace(camera, shutter=earlier.shutter)
+            config = change(config, "camera.readout_ms", "auto")  # sought on from there
+        now_ns, start_ns = time.monotonic_ns(), source.start_monotonic_ns
+        zero_ns = now_ns if start_ns is None else start_ns
+        offset_ns = vehicle.unix_offset_ns()
+        odometry = OdometryReport(config.camera, vehicle.report_odometry).send
+        folder = run.folder = new_folder(scans, 1e-9 * (now_ns + offset_ns))
+        self.made.add(folder.name)
+        gate = FrameGate(source, folder / LATER, zero_ns + offset_ns, run.alive, self.paused)
+        inputs = ScanInputs(
+            gate,
+            camera,
+            config,
+            backend,
+            folder,
+            folder.name,
+            zero_ns,
+            unix_offset_ns=offset_ns,
+            notes=tuple(notes),
+            history=vehicle.history,
+            sigma_focal=camera.sigma_focal,
+            extra={"backend": backend.name, "source": source.description},
+            latency_ms=earlier.latency_ms,
+            warn=lambda text: vehicle.statustext(text, WARNING),
+            on_frame=odometry if config.mavlink.odometry else None,
+            on_keyframe=partial(run.report_keyframe, vehicle),
+            on_photo=partial(run.report_photo, vehicle),
+        )
+        return inputs, gate
+
+    def _feed(self, run: ScanRun, scan: Scan) -> None:
+        """Feed frames into the scan until it is stopped or the recording ends."""
+
+        def on_frame(_: Scan) -> None:
+            run.alive()
+            if scan.recorder.keyframes > 1 and not run.has_grown:
+                run.has_grown = True
+                self.handle(Event.GROWN)
+
+        event, run.is_feeding = Event.INTERRUPTED, True
+        try:
+            scan.run(run.stop, on_frame, self.paused)
+            event = Event.COMPLETED
+        finally:
+            run.is_feeding = False
+            self.handle(event)
+
+    def _close_scan(self, scan: Scan, store: ScanStore) -> None:
+        """Finish the scan; if the pipeline fails, mark the stored part as interrupted."""
+        with ExitStack() as on_fault:
+            on_fault.callback(store.finish, {"interrupted": True})
+            summary = scan.close()
+            on_fault.pop_all()
+        self.vehicle.statustext(
+            f"Scan {scan.inputs.scan_id}: {summary['clouds']} clouds, {summary['distance_m']:.0f} m"
         )
 
-    def _hand_over(self) -> Work | None:
-        """Release a scan whose files are being written; returns the work that ends with them."""
-        self.link.end_scan(self.config, is_next_wanted=True)
-        with self._lock:
-            work, self._closing = self._closing, None
-        return work
+    def write_files(self, run: ScanRun, store: ScanStore) -> None:
+        """Write a scan's files, and leave them to their worker when another scan is wanted
+        meanwhile.
+
+        Raises OutsideError when they cannot be written.
+        """
+        folder, is_written, fault = store.path.parent, threading.Event(), ""
+
+        def write(_: Worker) -> None:
+            nonlocal fault
+            from service.scans.folder import write_deliverables
+
+            files = partial(self._write or write_deliverables, folder, store, {})
+            fault = guarded(f"files of {folder.name}", files)
+            with self._lock:
+                is_written.set()
+            if run.is_left:
+                store.close()
+                if fault:
+                    text = f"Scan {folder.name} is stored, its files are not written: {fault}"
+                    self.vehicle.statustext(text, WARNING)
+                run.finish(fault)
+
+        run.workers.append(self._workers.start("files", write))
+        while not is_written.wait(0.1):
+            if self.life.state.is_wanted:
+                self.link.end_scan(self.config, is_next_wanted=True)
+                with self._lock:
+                    run.is_left = not is_written.is_set()
+                if run.is_left:
+                    return
+        is_last = self.life.state in (State.ENDING, State.ENDED)
+        self.link.end_scan(self.config, is_last=is_last)
+        store.close()
+        if fault:
+            raise OutsideError(fault)
 
 
 def _fault_of(error: Exception) -> str:

@@ -22,7 +22,7 @@ from service.cameras.camera_file import load_camera
 from service.cameras.source import CameraFrame, CameraSource
 from service.config import Config, load_config
 from service.daemon.runtime import Daemon
-from service.daemon.scan_run import Equipment, ScanRun
+from service.daemon.scan_run import ScanRun
 from service.daemon.scan_state import ScanLife
 from service.daemon.scanning import Scanning
 from service.flight.scan import Scan, ScanInputs, create_store
@@ -70,17 +70,6 @@ class FakeCamera(CameraSource):
         self.closed.set()
 
 
-class Scripted(ScanRun):
-    """An attempt that does what a test says."""
-
-    def __init__(self, script: Callable[[ScanRun], object], *given: Any, **seams: Any) -> None:
-        super().__init__(*given, **seams)
-        self._script = script
-
-    def carry_out(self) -> None:
-        self._script(self)
-
-
 class Onboard(Daemon):
     """A daemon with a :class:`HeardVehicle`, whose scans do what ``script`` does or get the camera
     of ``opener``; by default a scan fails at once and is retried at once."""
@@ -102,15 +91,8 @@ class Onboard(Daemon):
         outer: dict[str, Any] = {"link": HeardVehicle}
         outer |= {key: seams.pop(key) for key in ("clock_ns", "link") if key in seams}
 
-        clock_s = seams.get("clock_s", time.monotonic)
-
-        def attempt(equipment: Equipment, is_asked: bool) -> ScanRun:
-            if script is None:
-                return ScanRun(equipment, is_asked, opener, clock_s)
-            return Scripted(script, equipment, is_asked, clock_s=clock_s)
-
-        inner: dict[str, Any] = {"attempt": attempt, "life": ScanLife(0.0, 0.0)} | seams
-        super().__init__(config, scanning=of(config, **inner), **outer)
+        inner: dict[str, Any] = {"attempt": script, "opener": opener, "life": ScanLife(0.0, 0.0)}
+        super().__init__(config, scanning=of(config, **inner | seams), **outer)
 
     def equip(self) -> None:
         """Load what a scan needs, without configuration."""

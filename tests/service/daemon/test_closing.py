@@ -15,9 +15,8 @@ from paths import ROOT
 
 from mavlink.component.control import Phase
 from service.daemon import runtime
-from service.daemon.scan_run import ScanRun
+from service.daemon.scan_run import ScanRun, sizes
 from service.daemon.scan_state import Event
-from service.daemon.writing import sizes
 from service.memory import one_pool, release_memory
 
 
@@ -41,7 +40,6 @@ class Hung:
         self.closing, self.step, self.end = threading.Event(), threading.Event(), threading.Event()
 
     def __call__(self, run: ScanRun) -> None:
-        run.thread_id = threading.get_ident()
         run.scan, run.store = self.scan, self.store
         run.stop.wait(60.0)
         self.closing.set()

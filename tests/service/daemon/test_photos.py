@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from recon.types import Frame, PosePrior
 from service.cameras.exif import read_tags
 from service.cameras.source import CameraFrame
 from service.daemon.load_shedding import Level
-from service.daemon.scan_run import PHOTOS, report_photo
+from service.daemon.scan_run import PHOTOS, ScanRun
 from service.daemon.stored_image import image_name, store_image
 from service.flight.scan import Scan
 
@@ -64,9 +65,10 @@ class Hovering(VehicleHistory):
 def photos_in(folder: Path) -> tuple[Scan, OperatorEnd]:
     """A scan whose photos reach the operator."""
     operator: Any = OperatorEnd()
-    scan: Scan = real_scan(
+    run = ScanRun(is_asked=True)
+    scan = run.scan = real_scan(
         folder / "scan", history=Hovering(), unix_offset_ns=START_NS,
-        on_photo=lambda photo: report_photo(operator, scan, photo),
+        on_photo=partial(run.report_photo, operator),
     )  # fmt: skip
     return scan, operator
 

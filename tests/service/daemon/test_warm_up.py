@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from onboard import MODEL, Onboard, Scripted
+from onboard import MODEL, Onboard
 from paths import ROOT
 
 from mavlink.component.vehicle import VehicleLink
@@ -22,6 +22,7 @@ from service.config import load_config
 from service.daemon import runtime
 from service.daemon.frame_gate import FrameGate
 from service.daemon.runtime import COMPILING_S, HUNG_S
+from service.daemon.scan_run import ScanRun
 from service.daemon.warm_up import SyntheticGround, is_warm, warm_up, warm_up_command
 from service.progress import Progress
 from service.scans.writing import SUMMARY
@@ -161,7 +162,7 @@ def test_a_frame_at_work_is_timed_and_a_silent_camera_is_not(tmp_path: Path) -> 
     assert asked.is_set()
 
 
-class Busy(Scripted):
+class Busy(ScanRun):
     """An attempt that works on one frame for as long as a test says."""
 
     busy_s = 0.0
@@ -174,12 +175,10 @@ def test_the_watchdog_starves_on_a_hang_only(tmp_path: Path) -> None:
         return VehicleLink(config, control, first, lambda: time.monotonic_ns() + later_ns)
 
     daemon = Onboard(
-        tmp_path, attempt=lambda *given: Busy(lambda _: end.wait(60.0), *given),
-        clock_s=lambda: now_s, link=link,
+        tmp_path, script=lambda _: end.wait(60.0), clock_s=lambda: now_s, link=link
     )  # fmt: skip
     daemon.scanning.start()
-    run = daemon.scanning.run
-    assert isinstance(run, Busy)
+    run = daemon.scanning.run = Busy(is_asked=True)
     now_s += 1000.0  # no frame for long: the camera's fault, not ours
     assert daemon.is_progressing
     daemon.scanning.is_warm = False
