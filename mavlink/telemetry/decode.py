@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mavlink.telemetry.gimbal import frame_of_flags
-from mavlink.telemetry.quaternion import Vector, from_rpy, normalised
+from mavlink.telemetry.quaternion import Vector, from_degrees, from_rpy, normalised
 from mavlink.telemetry.samples import (
     RECEIVER_SIGMA_H_M,
     RECEIVER_SIGMA_V_M,
@@ -138,17 +138,12 @@ def _device_status(m: Any) -> GimbalSample | None:
 
 def _mount_orientation(m: Any) -> GimbalSample | None:
     """The sample in a MOUNT_ORIENTATION (265): degrees, earth yaw when it sends one."""
-    if not all(map(math.isfinite, (m.roll, m.pitch))):
-        return None
     absolute = float(getattr(m, "yaw_absolute", math.nan))
     # Senders of the short form leave the extension zero, whatever the heading.
     earth = math.isfinite(absolute) and absolute != 0.0
-    yaw = absolute if earth else m.yaw
-    if not math.isfinite(yaw):
-        return None
-    q = from_rpy(*map(math.radians, (m.roll, m.pitch, yaw)))
+    q = from_degrees(m.roll, m.pitch, absolute if earth else m.yaw)
     frame = GimbalFrame.EARTH if earth else GimbalFrame.VEHICLE
-    return GimbalSample(m.time_boot_ms, q, frame, m.get_srcComponent(), 1)
+    return None if q is None else GimbalSample(m.time_boot_ms, q, frame, m.get_srcComponent(), 1)
 
 
 def _mount_status(m: Any) -> GimbalSample | None:

@@ -53,6 +53,12 @@ def from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
     )
 
 
+def from_degrees(*rpy_deg: float | None) -> Quaternion | None:
+    """:func:`from_rpy` of roll, pitch and yaw in degrees; None where one is not known."""
+    roll, pitch, yaw = (math.nan if angle is None else math.radians(angle) for angle in rpy_deg)
+    return from_rpy(roll, pitch, yaw) if math.isfinite(roll + pitch + yaw) else None
+
+
 def to_rpy(q: Quaternion) -> tuple[float, float, float]:
     """(roll, pitch, yaw) in rad; at pitch +-90 degrees roll is zero and yaw holds the rotation."""
     w, x, y, z = q

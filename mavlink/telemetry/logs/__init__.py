@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from statistics import median_low
+from statistics import median, median_low
 from typing import Any
 
+import numpy as np
+
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
+from mavlink.telemetry.samples import F64, Sample
 
 READERS: dict[str, str] = {
     ".tlog": "mavlink.telemetry.logs.tlog:load",
@@ -61,19 +65,65 @@ MAX_APART_NS = 2_000_000_000
 """What a sample's own clock may differ from its packet's time, beyond a constant."""
 
 
-def by_own_clock(times_ns: Sequence[int], own_ns: Sequence[int | None]) -> tuple[list[int], int]:
-    """Times of samples by their own clock, and that clock at time 0 of the packets.
+class Track:
+    """Samples at the times of their packets, and at those of their own clock."""
 
-    ``times_ns``: those of their packets, which come late by what was in the way. The offset is the
-    median one. Where a sample states no time, or one that is far off, the packets' times, and 0.
-    """
-    stated = [own for own in own_ns if own is not None]
-    if not stated or len(stated) < len(times_ns):
-        return list(times_ns), 0
-    start_ns = median_low(own - at for at, own in zip(times_ns, stated, strict=True))
-    times = [own - start_ns for own in stated]
-    apart_ns = max(abs(a - b) for a, b in zip(times, times_ns, strict=True))
-    return (times, start_ns) if apart_ns < MAX_APART_NS else (list(times_ns), 0)
+    def __init__(self) -> None:
+        self.samples: list[list[Sample]] = []
+        self._times_ns: list[int] = []
+        self._own_ns: list[int | None] = []
+
+    def add(self, time_ns: int, own_ns: int | None, samples: list[Sample]) -> None:
+        """``own_ns`` is None where the samples state no time."""
+        self._times_ns.append(time_ns)
+        self._own_ns.append(own_ns)
+        self.samples.append(samples)
+
+    def fill(self, history: VehicleHistory) -> int:
+        """Add the samples to a history by their own clock; that clock at time 0 of the packets.
+
+        Packets come late by what was in the way, so the offset is the median one. Where a sample
+        states no time, or one that is far off, the packets' times count, and 0 is returned.
+        """
+        times_ns, start_ns = self._times_ns, 0
+        own_ns = [own for own in self._own_ns if own is not None]
+        if own_ns and len(own_ns) == len(times_ns):
+            offset_ns = median_low(own - at for at, own in zip(times_ns, own_ns, strict=True))
+            own_ns = [own - offset_ns for own in own_ns]
+            apart_ns = max(abs(a - b) for a, b in zip(own_ns, times_ns, strict=True))
+            if apart_ns < MAX_APART_NS:
+                times_ns, start_ns = own_ns, offset_ns
+        for time_ns, samples in zip(times_ns, self.samples, strict=True):
+            for sample in samples:
+                history.add(sample, time_ns)
+        return start_ns
+
+
+SAME_LENS = 0.02
+"""Relative tolerance of a lens that does not zoom."""
+
+
+def one_lens(values: list[float], unit: str, digits: int, warnings: list[str]) -> float | None:
+    """The median of a lens's figures; warns where it zooms. None without figures."""
+    if not values:
+        return None
+    low, high = min(values), max(values)
+    if high > (1.0 + SAME_LENS) * low:
+        warnings.append(
+            f"the lens zooms between {low:.{digits}f} and {high:.{digits}f} {unit}: one lens is "
+            "used for all, so shapes and scale are wrong"
+        )
+    return median(values)
+
+
+def values_near(times: Any, values: Any, at: Any, near: float) -> F64:
+    """(N,) values interpolated at the times ``at``; NaN where no sample is within ``near``."""
+    if not len(times):
+        return np.full(len(at), math.nan)
+    after = np.clip(np.searchsorted(times, at), 1, max(len(times) - 1, 1))
+    around = times[np.minimum([after - 1, after], len(times) - 1)]
+    is_near = np.abs(around - at).min(axis=0) <= near
+    return np.where(is_near, np.interp(at, times, values), math.nan)
 
 
 def finish(
@@ -82,9 +132,11 @@ def finish(
     counts: Mapping[str, int],
     warnings: list[str],
     clock: str = "unix",
+    **more: Any,
 ) -> TelemetryLog:
-    """The log of a filled history; ValueError when it contains no usable data."""
+    """The log of a filled history, with ``more`` of its fields; ValueError when it contains no
+    usable data."""
     first, last = history.first_ns, history.last_ns
     if first is None or last is None:
         raise ValueError(f"{path}: no attitude and no position of a vehicle in this log")
-    return TelemetryLog(history, clock, first, last, tuple(warnings), dict(counts))
+    return TelemetryLog(history, clock, first, last, tuple(warnings), dict(counts), **more)

@@ -22,8 +22,8 @@ from mavlink.telemetry.decode import (
     receiver_accuracy,
 )
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, finish
-from mavlink.telemetry.quaternion import Vector, from_rpy
+from mavlink.telemetry.logs import TelemetryLog, finish, values_near
+from mavlink.telemetry.quaternion import Vector, from_degrees
 from mavlink.telemetry.samples import (
     AccuracySample,
     AttitudeSample,
@@ -71,7 +71,7 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
         is_missing = not (counts["GPA"] if isinstance(fix, AccuracySample) else is_placed)
         if is_missing:
             history.add(fix, round(time_s * 1e9))
-    for attitude, time_s in reader.gyros.turning(attitudes):
+    for attitude, time_s in _turning(attitudes, reader.rates["RATE"] or reader.rates["IMU"]):
         history.add(attitude, round(time_s * 1e9))
     dated = (history.first_ns or 0) > UNIX_FROM_S * 1e9
     warnings = [] if dated else ["no GPS time in this log: its clock starts at boot"]
@@ -115,39 +115,20 @@ def _messages(path: Path, counts: Counter[str]) -> Iterator[Any]:
             yield message
 
 
-class _Gyros:
-    """Rates of the body: those of the attitude's filter (RATE), else those of its IMU.
+def _turning(
+    attitudes: list[tuple[AttitudeSample, float]], rates: list[tuple[float, ...]]
+) -> Iterator[tuple[AttitudeSample, float]]:
+    """Attitudes and their times in s, with the body's rates where they are known.
 
-    Copter before 3.6 states no unit of RATE, and it was another one before 3.4.
+    ``rates`` are rows of time in s and rad/s about three axes.
     """
-
-    def __init__(self) -> None:
-        self._samples: dict[str, list[tuple[float, ...]]] = {"RATE": [], "IMU": []}
-
-    def add(self, name: str, m: Any) -> None:
-        """A message RATE or IMU."""
-        if name == "RATE" and m.fmt.get_unit("R") == "deg/s":
-            self._samples[name].append((m._timestamp, *map(math.radians, (m.R, m.P, m.Y))))
-        elif name == "IMU" and getattr(m, "I", 0) == 0:
-            self._samples[name].append((m._timestamp, m.GyrX, m.GyrY, m.GyrZ))
-
-    def turning(
-        self, attitudes: list[tuple[AttitudeSample, float]]
-    ) -> Iterator[tuple[AttitudeSample, float]]:
-        """Attitudes and their times in s, with the rates where they are known."""
-        table = np.array(self._samples["RATE"] or self._samples["IMU"]).reshape(-1, 4)
-        table = table[(np.abs(table[:, 1:]) <= MAX_RATE_RAD_S).all(axis=1)]
-        times = np.array([time_s for _, time_s in attitudes])
-        if not len(table) or not len(times):
-            yield from attitudes
-            return
-        rates = np.column_stack([np.interp(times, table[:, 0], w) for w in table.T[1:]])
-        after = np.clip(np.searchsorted(table[:, 0], times), 1, max(len(table) - 1, 1))
-        around = table[np.minimum([after - 1, after], len(table) - 1), 0]
-        near = np.abs(around - times).min(axis=0) <= NEAR_S
-        for (attitude, time_s), rate, is_known in zip(attitudes, rates, near, strict=True):
-            x, y, z = rate.tolist()
-            yield (replace(attitude, rates_rad_s=(x, y, z)) if is_known else attitude), time_s
+    table = np.array(rates).reshape(-1, 4)
+    table = table[(np.abs(table[:, 1:]) <= MAX_RATE_RAD_S).all(axis=1)]
+    times = np.array([time_s for _, time_s in attitudes])
+    near = [values_near(table[:, 0], column, times, NEAR_S) for column in table.T[1:]]
+    for (attitude, time_s), x, y, z in zip(attitudes, *(n.tolist() for n in near), strict=True):
+        is_known = math.isfinite(x)
+        yield (replace(attitude, rates_rad_s=(x, y, z)) if is_known else attitude), time_s
 
 
 def _over_ground(m: Any) -> Vector | None:
@@ -163,7 +144,8 @@ class _Reader:
     """Messages into samples; remembers velocities and rates, which have their own messages."""
 
     def __init__(self) -> None:
-        self.gyros = _Gyros()
+        self.rates: dict[str, list[tuple[float, ...]]] = {"RATE": [], "IMU": []}
+        """Time in s and rates of the body: those of the attitude's filter, and those of its IMU."""
         self._velocity: tuple[float, tuple[float, float, float]] | None = None
         self._receiver = 0  # the one in use
         self._fix = True
@@ -178,13 +160,18 @@ class _Reader:
             return None  # a field is missing in this firmware version
 
     def _attitude(self, m: Any) -> Sample | None:
-        angles = (m.Roll, m.Pitch, m.Yaw)
-        if not all(map(math.isfinite, angles)):
-            return None
-        return AttitudeSample(None, from_rpy(*map(math.radians, angles)))
+        q = from_degrees(m.Roll, m.Pitch, m.Yaw)
+        return None if q is None else AttitudeSample(None, q)
 
-    def _rates(self, m: Any) -> Sample | None:
-        self.gyros.add(m.get_type(), m)
+    def _filter_rate(self, m: Any) -> Sample | None:
+        # Copter before 3.6 states no unit, and it was another one before 3.4.
+        if m.fmt.get_unit("R") == "deg/s":
+            self.rates["RATE"].append((m._timestamp, *map(math.radians, (m.R, m.P, m.Y))))
+        return None
+
+    def _imu(self, m: Any) -> Sample | None:
+        if getattr(m, "I", 0) == 0:
+            self.rates["IMU"].append((m._timestamp, m.GyrX, m.GyrY, m.GyrZ))
         return None
 
     def _ekf_velocity(self, m: Any) -> Sample | None:
@@ -237,16 +224,14 @@ class _Reader:
 
     def _mount(self, m: Any) -> Sample | None:
         earth = math.isfinite(m.YawE)
-        yaw = m.YawE if earth else m.YawB
-        if not all(map(math.isfinite, (m.Roll, m.Pitch, yaw))):
-            return None
-        q = from_rpy(*map(math.radians, (m.Roll, m.Pitch, yaw)))
-        return GimbalSample(None, q, GimbalFrame.EARTH if earth else GimbalFrame.VEHICLE, 1, 0)
+        q = from_degrees(m.Roll, m.Pitch, m.YawE if earth else m.YawB)
+        frame = GimbalFrame.EARTH if earth else GimbalFrame.VEHICLE
+        return None if q is None else GimbalSample(None, q, frame, 1, 0)
 
     TABLE: dict[str, Callable[[_Reader, Any], Sample | None]] = {  # noqa: RUF012
         "ATT": _attitude,
-        "RATE": _rates,
-        "IMU": _rates,
+        "RATE": _filter_rate,
+        "IMU": _imu,
         "XKF1": _ekf_velocity,
         "NKF1": _ekf_velocity,
         "POS": _position,

@@ -17,9 +17,9 @@ from __future__ import annotations
 import math
 import struct
 from bisect import bisect_left, bisect_right
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from itertools import accumulate
 from pathlib import Path
@@ -27,7 +27,7 @@ from statistics import median_low
 
 from mavlink.telemetry.decode import HDOP_TO_M, plausible_place, receiver_accuracy
 from mavlink.telemetry.history import HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, by_own_clock, finish
+from mavlink.telemetry.logs import TelemetryLog, Track, finish
 from mavlink.telemetry.quaternion import (
     Quaternion,
     Vector,
@@ -43,6 +43,7 @@ from mavlink.telemetry.samples import (
     PositionSample,
     Sample,
 )
+from mavlink.wire.first_beat import CAMERA
 
 Packet = tuple[int, int, bytes]
 """Time and duration in ns, and the bytes."""
@@ -71,8 +72,6 @@ UNKNOWN_DOP, MAX_OWN_S = 99.0, 1e10
 DRIFT_NS = 2_000_000_000
 """Gravity is averaged so long before and after: what else accelerates the camera averages out."""
 
-CAMERA = 100  # component id for the image's attitude
-
 
 @dataclass(slots=True)
 class _Stream:
@@ -85,19 +84,10 @@ class _Stream:
     utc_ns: int | None = None
 
 
-@dataclass(slots=True)
-class _Track:
-    """Samples of one item, at times in ns, and at those of their own clock where they have one."""
-
-    times_ns: list[int] = field(default_factory=list)
-    own_ns: list[int | None] = field(default_factory=list)
-    samples: list[list[Sample]] = field(default_factory=list)
-
-
 def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> TelemetryLog:
     """The history in the packets of a metadata track; ValueError where they give none."""
     history, counts = VehicleHistory(config), Counter[str]()
-    tracks: dict[bytes, _Track] = {}
+    tracks: dict[bytes, Track] = defaultdict(Track)
     turned: dict[bytes, dict[int, tuple[float, ...]]] = {b"CORI": {}, b"IORI": {}, b"GRAV": {}}
     dates_ns = list[int]()
     for time_ns, duration_ns, data in packets:
@@ -110,30 +100,22 @@ def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> 
                 turned[key] |= zip(times, rows, strict=True)
                 counts[key.decode("ascii")] += len(rows)
                 continue
-            track = tracks.setdefault(key, _Track())
             for i, row in enumerate(rows):
                 own_s, samples = READERS[key](row, stream)
-                track.times_ns.append(time_ns + i * duration_ns // len(rows))
+                at_ns = time_ns + i * duration_ns // len(rows)
                 known_s = math.inf if own_s is None else own_s
                 if key == b"GPS9" and _is_placed(samples) and 0.0 < known_s < MAX_OWN_S:
-                    zero_ns = YEAR_2000_UNIX_S * 10**9 - track.times_ns[-1]
-                    dates_ns.append(zero_ns + round(1e9 * known_s))
-                track.own_ns.append(round(1e9 * known_s) if abs(known_s) < MAX_OWN_S else None)
-                track.samples.append(samples)
+                    dates_ns.append(YEAR_2000_UNIX_S * 10**9 - at_ns + round(1e9 * known_s))
+                own_ns = round(1e9 * known_s) if abs(known_s) < MAX_OWN_S else None
+                tracks[key].add(at_ns, own_ns, samples)
                 counts[key.decode("ascii")] += 1
-    used = next(
-        (k for k in PLACES if k in tracks and any(map(_is_placed, tracks[k].samples))), None
-    )
+    used = next((k for k in PLACES if any(map(_is_placed, tracks[k].samples))), b"")
     for name in (used, b"GPRI") if used == b"GLPI" else (used,):
-        track = tracks.get(name or b"", _Track())
-        times_ns, _ = by_own_clock(track.times_ns, track.own_ns)
-        for time_ns, samples in zip(times_ns, track.samples, strict=True):
-            for sample in samples:
-                history.add(sample, time_ns)
+        tracks[name].fill(history)
     for time_ns, head in _heads(turned):
         history.add(GimbalSample(None, head, GimbalFrame.EARTH, CAMERA, 0, False), time_ns)
     start_ns = median_low(dates_ns) if dates_ns else None
-    return replace(finish(path, history, counts, []), clock="video", start_unix_ns=start_ns)
+    return finish(path, history, counts, [], "video", start_unix_ns=start_ns)
 
 
 def _heads(

@@ -13,15 +13,13 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
-from statistics import median
 
 from mavlink.telemetry.decode import plausible_place
 from mavlink.telemetry.history import MAX_AGL_M, HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, by_own_clock, finish
+from mavlink.telemetry.logs import TelemetryLog, Track, finish, one_lens
 from mavlink.telemetry.logs.gpmf import Packet
-from mavlink.telemetry.quaternion import from_rpy, multiply
+from mavlink.telemetry.quaternion import from_degrees, from_rpy, multiply
 from mavlink.telemetry.samples import (
     YEAR_2000_UNIX_S,
     AttitudeSample,
@@ -31,15 +29,13 @@ from mavlink.telemetry.samples import (
     Sample,
     TerrainSample,
 )
+from mavlink.wire.first_beat import CAMERA
 
 MARK = bytes.fromhex("060e2b34")
 LOCAL_SET = bytes.fromhex("060e2b34020b01010e01030101000000")
 UNIVERSAL_SET = bytes.fromhex("060e2b34020101010e01010201010000")
 MAX_ITEMS, CHECKSUM, STAMP = 256, 1, 2
 
-CAMERA = 100  # component id for the head's attitude
-SAME_VIEW = 0.02
-"""Relative tolerance of a field of view that does not zoom."""
 
 AGL_SHARE = 0.05
 """Relative sigma of the ground's height below, which is that of what the sensor sees."""
@@ -83,30 +79,21 @@ UNIVERSAL: dict[bytes, str] = {
 def of_packets(path: Path, packets: Iterable[Packet], config: HistoryConfig) -> TelemetryLog:
     """The history in the packets of a metadata stream; ValueError where they give none."""
     history, counts, views = VehicleHistory(config), Counter[str](), list[float]()
-    arrived_ns, stamps_ns, sets = list[int](), list[int | None](), list[list[Sample]]()
+    track, warnings = Track(), list[str]()
     for time_ns, _, data in packets:
         counts["packets"] += 1
         found = fields_of(data)
         views += [found["hfov"]] if 0.0 < found.get("hfov", 0.0) < 180.0 else []
         if samples := samples_of(found):
-            arrived_ns.append(time_ns)
-            stamps_ns.append(1000 * round(found["time_us"]) if "time_us" in found else None)
-            sets.append(samples)
+            own_ns = 1000 * round(found["time_us"]) if "time_us" in found else None
+            track.add(time_ns, own_ns, samples)
             counts.update(type(sample).__name__ for sample in samples)
-    times_ns, start_ns = by_own_clock(arrived_ns, stamps_ns)
-    for time_ns, samples in zip(times_ns, sets, strict=True):
-        for sample in samples:
-            history.add(sample, time_ns)
-    warnings = []
-    if views and max(views) > (1.0 + SAME_VIEW) * min(views):
-        warnings.append(
-            f"the lens zooms between {min(views):.2f} and {max(views):.2f} degrees: one lens is "
-            "used for all, so shapes and scale are wrong"
-        )
-    log = replace(finish(path, history, counts, warnings), clock="video")
-    view = median(views) if views else None
-    dated_ns = start_ns if start_ns >= YEAR_2000_UNIX_S * 10**9 else None
-    return replace(log, hfov_deg=view, start_unix_ns=dated_ns, may_lag=True)
+    start_ns = track.fill(history)
+    return finish(
+        path, history, counts, warnings, "video", may_lag=True,
+        hfov_deg=one_lens(views, "degrees", 2, warnings),
+        start_unix_ns=start_ns if start_ns >= YEAR_2000_UNIX_S * 10**9 else None,
+    )  # fmt: skip
 
 
 def fields_of(data: bytes) -> dict[str, float]:
@@ -184,25 +171,20 @@ def samples_of(found: dict[str, float]) -> list[Sample]:
     lat, lon = found.get("lat", math.nan), found.get("lon", math.nan)
     if plausible_place(lat, lon):
         out.append(PositionSample(None, lat, lon, found.get("alt"), None, None))
-    body = [found.get(name) for name in ("roll", "pitch", "heading")]
-    head, down = None, None
-    if None not in body:
-        q_body = from_rpy(*(math.radians(angle) for angle in body if angle is not None))
-        out.append(AttitudeSample(None, q_body))
-        relative = [found.get(name) for name in ("turned", "elevation", "azimuth")]
-        if None not in relative:
-            head = multiply(q_body, from_rpy(*(math.radians(a) for a in relative if a is not None)))
-            down = 2.0 * (head[1] * head[3] - head[0] * head[2])  # of the optical axis, x
+    head, down = None, 0.0  # down: of the optical axis
+    body = from_degrees(*(found.get(name) for name in ("roll", "pitch", "heading")))
+    on_body = from_degrees(*(found.get(name) for name in ("turned", "elevation", "azimuth")))
+    if body is not None:
+        out.append(AttitudeSample(None, body))
+    if body is not None and on_body is not None:
+        head = multiply(body, on_body)
+        down = 2.0 * (head[1] * head[3] - head[0] * head[2])
     if "north" in found and "obliquity" in found:
         # Some count the angle down from level, others up.
         depression = math.radians(abs(found["obliquity"]))
         head, down = from_rpy(0.0, -depression, math.radians(found["north"])), math.sin(depression)
     if head is not None:
         out.append(GimbalSample(None, head, GimbalFrame.EARTH, CAMERA, 0))
-    if (
-        down is not None
-        and down > 0.1
-        and 0.0 < (agl := found.get("slant", 0.0) * down) < MAX_AGL_M
-    ):
+    if down > 0.1 and 0.0 < (agl := found.get("slant", 0.0) * down) < MAX_AGL_M:
         out.append(TerrainSample(None, agl, AGL_SHARE * agl))
     return out

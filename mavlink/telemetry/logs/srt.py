@@ -16,15 +16,13 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
-from statistics import median
 from typing import TextIO
 
 from mavlink.telemetry.decode import plausible_place
 from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, finish
-from mavlink.telemetry.quaternion import from_rpy
+from mavlink.telemetry.logs import TelemetryLog, finish, one_lens
+from mavlink.telemetry.quaternion import from_degrees, from_rpy
 from mavlink.telemetry.samples import (
     RECEIVER_SIGMA_H_M,
     AccuracySample,
@@ -33,6 +31,7 @@ from mavlink.telemetry.samples import (
     GimbalSample,
     PositionSample,
 )
+from mavlink.wire.first_beat import CAMERA
 
 NUMBER = r"(-?\d{1,9}(?:\.\d+)?)"
 CUE = re.compile(r"(\d{1,4}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
@@ -53,11 +52,7 @@ RESTART_NS = 1_000_000_000
 UNIT_CROP, MAX_CROP = 1e4, 1e2
 """What some drones write where nothing is cropped; and no drone crops so far."""
 
-SAME_FOCAL = 0.02
-"""Relative tolerance of a focal length that does not zoom."""
-
 NAN = math.nan
-CAMERA = 100  # component id for the head's attitude
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:
@@ -107,13 +102,8 @@ def of_cues(path: Path, cues: Iterable[tuple[int, str]], config: HistoryConfig) 
         warnings.append(
             f"times begin again {counts['joined']} time(s): joined, the rest follows on"
         )
-    if focals and max(focals) > (1.0 + SAME_FOCAL) * min(focals):
-        warnings.append(
-            f"the lens zooms between {min(focals):.0f} and {max(focals):.0f} mm (35 mm equivalent):"
-            " one lens is used for all, so shapes and scale are wrong"
-        )
-    log = finish(path, history, counts, warnings, clock="video")
-    return replace(log, focal_35mm=median(focals) if focals else None)
+    focal = one_lens(focals, "mm (35 mm equivalent)", 0, warnings)
+    return finish(path, history, counts, warnings, "video", focal_35mm=focal)
 
 
 def _cue(
@@ -173,11 +163,8 @@ def _attitudes(history: VehicleHistory, text: str, fields: dict[str, float], tim
     for which, *angles in PRY.findall(text):
         pitch, roll, yaw = (math.radians(float(a)) for a in angles)
         q = from_rpy(roll, pitch, yaw)
-        if which == "F":
-            history.add(AttitudeSample(None, q), time_ns)
-        else:
-            history.add(GimbalSample(None, q, GimbalFrame.EARTH, CAMERA, 0), time_ns)
-    head = [fields.get(name) for name in ("gb_roll", "gb_pitch", "gb_yaw")]
-    if None not in head:
-        q = from_rpy(*(math.radians(a) for a in head if a is not None))
-        history.add(GimbalSample(None, q, GimbalFrame.EARTH, CAMERA, 0), time_ns)
+        head = GimbalSample(None, q, GimbalFrame.EARTH, CAMERA, 0)
+        history.add(AttitudeSample(None, q) if which == "F" else head, time_ns)
+    head = from_degrees(*(fields.get(name) for name in ("gb_roll", "gb_pitch", "gb_yaw")))
+    if head is not None:
+        history.add(GimbalSample(None, head, GimbalFrame.EARTH, CAMERA, 0), time_ns)

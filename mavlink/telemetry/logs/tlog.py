@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass, field
+from collections import Counter, defaultdict
 from pathlib import Path
 
 from mavlink.telemetry.clock import BootCounter, BootFit, fit_boot
@@ -21,13 +20,11 @@ HEARTBEAT = 0
 WANTED = numbers_of(READERS)
 
 
-@dataclass(slots=True)
-class _Session:
-    """Samples of one sender (system, component) in one boot session."""
+Key = tuple[int, int, int]
+"""System, component, boot session."""
 
-    stamps: list[int] = field(default_factory=list)
-    samples: list[Sample] = field(default_factory=list)
-    boots: list[float | None] = field(default_factory=list)
+Streams = dict[Key, list[tuple[int, float | None, Sample]]]
+"""Stamp in ns, unwrapped boot time in ms, and sample."""
 
 
 def load(path: Path, config: HistoryConfig) -> TelemetryLog:
@@ -36,10 +33,10 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     warnings: list[str] = []
     system = _vehicle(streams, {number for number, _ in autopilots}, warnings)
     history = VehicleHistory(config)
-    for key, stream in streams.items():
+    for key in streams:
         if key[0] == system:
             speaks = key[:2] in autopilots or not autopilots
-            _place(history, key, stream, streams, speaks, warnings)
+            _place(history, key, streams, speaks, warnings)
     restarts = max((n for *sender, n in streams if tuple(sender) in autopilots), default=0)
     if restarts:
         warnings.append(f"the autopilot rebooted {restarts} time(s) in this log")
@@ -48,14 +45,10 @@ def load(path: Path, config: HistoryConfig) -> TelemetryLog:
     return finish(path, history, counts, warnings)
 
 
-Key = tuple[int, int, int]
-"""System, component, boot session."""
-
-
-def _collect(path: Path, counts: Counter[str]) -> tuple[dict[Key, _Session], set[tuple[int, int]]]:
+def _collect(path: Path, counts: Counter[str]) -> tuple[Streams, set[tuple[int, int]]]:
     """The samples by sender and session, and the (system, component) of autopilots."""
     decoder = Decoder()
-    streams: dict[Key, _Session] = {}
+    streams: Streams = defaultdict(list)
     counters: dict[tuple[int, int], BootCounter] = {}
     autopilots: set[tuple[int, int]] = set()
     with path.open("rb") as file:
@@ -77,19 +70,16 @@ def _collect(path: Path, counts: Counter[str]) -> tuple[dict[Key, _Session], set
             counts[message.get_type()] += 1
             counter = counters.setdefault(sender, BootCounter())
             boot = None if sample.boot_ms is None else counter.unwrap(sample.boot_ms)
-            stream = streams.setdefault((*sender, counter.session), _Session())
-            stream.stamps.append(stamp_ns)
-            stream.samples.append(sample)
-            stream.boots.append(boot)
+            streams[(*sender, counter.session)].append((stamp_ns, boot, sample))
     return streams, autopilots
 
 
-def _vehicle(streams: dict[Key, _Session], autopilots: set[int], warnings: list[str]) -> int | None:
+def _vehicle(streams: Streams, autopilots: set[int], warnings: list[str]) -> int | None:
     """The system whose telemetry is used: the autopilot with the most attitude samples."""
     says: Counter[int] = Counter()
     for (system, _, _), stream in streams.items():
         if not autopilots or system in autopilots:
-            says[system] += sum(isinstance(s, AttitudeSample) for s in stream.samples)
+            says[system] += sum(isinstance(s, AttitudeSample) for *_, s in stream)
     if not says:
         return next((key[0] for key in streams), None)
     system = says.most_common(1)[0][0]
@@ -100,30 +90,24 @@ def _vehicle(streams: dict[Key, _Session], autopilots: set[int], warnings: list[
 
 
 def _place(
-    history: VehicleHistory,
-    key: Key,
-    stream: _Session,
-    streams: dict[Key, _Session],
-    speaks: bool,
-    warnings: list[str],
+    history: VehicleHistory, key: Key, streams: Streams, speaks: bool, warnings: list[str]
 ) -> None:
     """Add a stream's samples; those of the vehicle itself only when its autopilot sends them."""
-    fit = _fit(stream)
-    if fit is None:  # a sender without a boot clock uses the autopilot's
-        others = (_fit(s) for k, s in streams.items() if k[0] == key[0] and k != key)
-        fit = next((f for f in others if f is not None), None)
+    # A sender without a boot clock uses the autopilot's.
+    others = [stream for k, stream in streams.items() if k[0] == key[0] and k != key]
+    fit = next(filter(None, map(_fit, [streams[key], *others])), None)
     if fit is not None and not fit.is_real_time and speaks:
         warnings.append(
             f"the log's stamps ran at {1.0 / fit.rate:.2f} of the autopilot's clock; "
             "the autopilot's clock is used from the first stamp on"
         )
-    for stamp, boot, sample in zip(stream.stamps, stream.boots, stream.samples, strict=True):
+    for stamp_ns, boot_ms, sample in streams[key]:
         if speaks or not isinstance(sample, OF_AUTOPILOT):
-            history.add(sample, _time(fit, stamp, boot))
+            history.add(sample, _time(fit, stamp_ns, boot_ms))
 
 
-def _fit(stream: _Session) -> BootFit | None:
-    pairs = [(s, b) for s, b in zip(stream.stamps, stream.boots, strict=True) if b is not None]
+def _fit(stream: list[tuple[int, float | None, Sample]]) -> BootFit | None:
+    pairs = [(stamp_ns, boot_ms) for stamp_ns, boot_ms, _ in stream if boot_ms is not None]
     return fit_boot([s for s, _ in pairs], [b for _, b in pairs]) if pairs else None
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from mavlink.telemetry.decode import CLEARANCE_SIGMA_M, DOWNWARD, plausible_place, receiver_accuracy
 from mavlink.telemetry.gimbal import frame_of_flags
 from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
-from mavlink.telemetry.logs import TelemetryLog, finish
+from mavlink.telemetry.logs import TelemetryLog, finish, values_near
 from mavlink.telemetry.quaternion import Vector, normalised
 from mavlink.telemetry.samples import (
     F64,
@@ -107,13 +107,8 @@ def _at(
     for flag in flags:
         sound &= other.get(flag, 1) != 0
     order = np.argsort(other["timestamp"][sound], kind="stable")
-    times, values = other["timestamp"][sound][order].astype(np.float64), values[sound][order]
-    if not len(times):
-        return np.full(len(at), math.nan)
-    after = np.clip(np.searchsorted(times, at), 1, max(len(times) - 1, 1))
-    around = times[np.minimum([after - 1, after], len(times) - 1)]
-    near = np.abs(around - at).min(axis=0) <= near_us
-    return np.where(near, np.interp(at, times, values), math.nan)
+    times = other["timestamp"][sound][order].astype(np.float64)
+    return values_near(times, values[sound][order], at, near_us)
 
 
 def _topics(path: Path) -> tuple[dict[str, Columns], Counter[str], list[str]]:
