@@ -122,7 +122,7 @@ class AutopilotLink:
             return
         round_trip_ns = self.timesync.round_trip_of(message.ts1, now_ns)
         if round_trip_ns is not None:
-            self._presence.autopilots.answered(packet.system, packet.component, round_trip_ns)
+            self._presence.answered(packet.system, packet.component, round_trip_ns)
         if is_autopilot and self.timesync.answer(message.tc1, message.ts1, now_ns):
             clock = self._clocks.setdefault(packet.component, BootClock())
             clock.set_timesync(self.timesync.offset_ns)
@@ -133,7 +133,7 @@ class AutopilotLink:
         """Request the time and slow messages; report loss of telemetry."""
         autopilot, seen = self._presence.autopilot, self._presence.autopilot_seen_ns
         if autopilot is None or seen is None:
-            if self._presence.autopilots.others(now_ns):
+            if self._presence.others(now_ns):
                 self._ask_time(now_ns)
             return
         is_lost = now_ns - seen > LOST_NS
@@ -153,7 +153,7 @@ class AutopilotLink:
         """Send TIMESYNC to our autopilot, or to all while it is not clear which one is ours."""
         target, link = EVERYONE, None
         autopilot = self._presence.autopilot
-        if autopilot is not None and not self._presence.autopilots.others(now_ns):
+        if autopilot is not None and not self._presence.others(now_ns):
             target, link = Address(*autopilot), self.link
         request = self.timesync.request(now_ns, target)
         if request is not None:

@@ -126,7 +126,7 @@ class Companion:
     def receive(self, link: int, packet: Packet, now_ns: int) -> None:
         """Process one packet that arrived on a link at ``now_ns`` (monotonic)."""
         self._now_ns = max(self._now_ns, now_ns)
-        self.presence.autopilots.count(packet.system, packet.component)
+        self.presence.count(packet.system, packet.component)
         if packet.message_id == COMMAND_CANCEL:
             self._cancel(packet, now_ns)
             return
@@ -228,7 +228,7 @@ class Companion:
     def tick(self, now_ns: int) -> None:
         """Send what is due and evaluate what arrived."""
         self._now_ns = max(self._now_ns, now_ns)
-        self.presence.autopilots.look(now_ns)
+        self.presence.look(now_ns)
         self.autopilot.follow()
         for text in self.presence.take_news():
             self.say(texts.WARNING, text)

@@ -116,7 +116,7 @@ class LinkWatch:
         since_ns = self._start_ns if seen_ns is None else seen_ns
         if not self._is_stale(since_ns, self._config.wait_s, now_ns):
             return None
-        others = self._presence.autopilots.others(now_ns)
+        others = self._presence.others(now_ns)
         if not others:
             return Trouble("autopilot", SILENT)
         names = ", ".join(map(str, others))
@@ -145,7 +145,7 @@ class LinkWatch:
             text = UNANSWERED if is_asked and not self._is_ground_heard else NO_GROUND
             return Trouble("ground", text)
         is_late = self._is_stale(self._start_ns, ASK_WAIT_S, now_ns)
-        autopilot = self._presence.autopilots.followed
+        autopilot = self._presence.followed
         is_px4 = autopilot is not None and autopilot.firmware == PX4
         if asked_ns is None and is_late and is_px4:
             return Trouble("ground", NEVER_ASKED, is_grave=False)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:  # the first heartbeat does not wait for the dialect
 log = logging.getLogger(__name__)
 
 FILE = "mavlink.json"
+BROKEN = (OSError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 
 
 class Memory:
@@ -25,10 +26,10 @@ class Memory:
         self._path = None if folder is None else folder / FILE
         self._revision = 0
         self.system: int | None = None
-        self._written = self._text({}, 0, {})  # equivalent to no file
         self.parameters: dict[str, float] = {}
         self.signing_timestamp = 0
         self.signing_streams: StreamTimes = {}
+        self._written = self._text()  # equivalent to no file
         if self._path is None or not self._path.is_file():
             return
         try:
@@ -40,17 +41,8 @@ class Memory:
             self.signing_streams = {(a, b, c): time for a, b, c, time in streams}
             system = kept.get("system")
             self.system = system if type(system) is int and 1 <= system <= 255 else None
-            self._written = self._text(
-                self.parameters, self.signing_timestamp, self.signing_streams
-            )
-        except (
-            OSError,
-            ArithmeticError,
-            AttributeError,
-            LookupError,
-            TypeError,
-            ValueError,
-        ) as error:
+            self._written = self._text()
+        except BROKEN as error:
             log.warning("%s is not used: %s", self._path, error)
 
     def is_stale(self, revision: int, system: int | None) -> bool:
@@ -70,9 +62,9 @@ class Memory:
 
         A ``system`` of None keeps the known one.
         """
-        self._revision = revision
-        self.system = system or self.system
-        text = self._text(values, timestamp, streams)
+        self._revision, self.system = revision, system or self.system
+        self.parameters, self.signing_timestamp, self.signing_streams = values, timestamp, streams
+        text = self._text()
         if self._path is None or text == self._written:
             return
         fresh = self._path.with_suffix(".new")
@@ -84,12 +76,12 @@ class Memory:
         except OSError as error:
             log.error("parameters could not be kept: %s", error)
 
-    def _text(self, values: dict[str, float], timestamp: int, streams: StreamTimes) -> str:
+    def _text(self) -> str:
         kept = {
-            "parameters": values,
-            "signing_timestamp": timestamp,
+            "parameters": self.parameters,
+            "signing_timestamp": self.signing_timestamp,
             "signing_key": self._key,
-            "signing_streams": [(*stream, time) for stream, time in streams.items()],
+            "signing_streams": [(*stream, time) for stream, time in self.signing_streams.items()],
             "system": self.system,
         }
         return json.dumps(kept)

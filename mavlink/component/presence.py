@@ -18,6 +18,7 @@ from mavlink.wire.first_beat import CAMERA, NO_AUTOPILOT, ONBOARD, TYPES, is_aut
 from mavlink.wire.messages import OutgoingMessage
 
 S = 1_000_000_000
+MS = 1_000_000
 PERIOD_NS = S
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 RECENT_NS = 3 * S  # the autopilot's state is heard as often, or it is unknown
@@ -50,10 +51,38 @@ class PresenceConfig:
             raise ValueError("presence needs 0 < stale_s < dead_s")
 
 
-class Presence:
-    """Sends our heartbeats and reads those of others.
+AUTOPILOT1 = 1  # MAV_COMP_ID_AUTOPILOT1
+LOOK_NS = 3 * S  # how long evidence is collected before it is compared
+PRESENT_NS = 5 * S  # an autopilot heard within this time takes part in a comparison
+ENOUGH_ANSWERS = 2  # of TIMESYNC within one look
+NEARER, NEARER_NS = 3, 5 * MS  # a round trip shorter by this factor and this much decides
+LOUDER, LOUD = 4, 8  # this many times as many messages decide, from this count on
+PROVEN_LOOKS = 10  # consecutive evaluations against a proven autopilot before it is dropped
 
-    The heartbeats may be requested from another thread than the rest.
+
+@dataclass(slots=True)
+class Autopilot:
+    """One system's autopilot and its evidence in the current evaluation."""
+
+    system: int
+    component: int
+    firmware: int = 0  # MAV_AUTOPILOT
+    seen_ns: int = 0
+    is_armed: bool = False
+    messages: int = 0
+    answers: int = 0
+    round_trip_ns: int = 0  # the minimum
+
+    def forget_evidence(self) -> None:
+        """Start a new evaluation."""
+        self.messages = self.answers = self.round_trip_ns = 0
+
+
+class Presence:
+    """Our heartbeats, and who else is there: every autopilot heard, at most one per system id, and
+    the one that is followed.
+
+    One thread writes, others may read; heartbeats may be requested from another thread.
     """
 
     def __init__(
@@ -66,53 +95,40 @@ class Presence:
     ) -> None:
         """The first heartbeat is due at ``first_ns``, or now; ``remembered``: the last system."""
         self.config = config
+        self.is_ready = True  # the links provide what a flight needs
+        self.followed: Autopilot | None = None
+        self.remembered = remembered
+        self.is_proven = False  # no evidence for another vehicle
         self._token = token  # in custom_mode: distinguishes our echo from another companion
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # of the heartbeats
         self._health = Health.BOOT
         self._confirmed_ns = now_ns
         self._next_ns = now_ns if first_ns is None else first_ns
-        self.autopilots = Autopilots(config.system, remembered, config.latch_s)
-        self._intruder = False
-        self.is_ready = True  # the links provide what a flight needs
+        self._heard: dict[int, Autopilot] = {}
+        self._first_ns: int | None = None
+        self._look_ns = 0
+        self._against = 0  # consecutive evaluations in favour of another vehicle
+        self._is_unclear = self._has_namesake = False
         self._news: list[str] = []
 
-    @property
-    def system(self) -> int:
-        return self.autopilots.system
+    def take_news(self) -> list[str]:
+        """New messages for the operator, each once."""
+        news, self._news = self._news, []
+        return news
 
-    @property
-    def proven_system(self) -> int | None:
-        """The system id to remember; None until the evidence is sufficient."""
-        autopilots = self.autopilots
-        return autopilots.system if autopilots.is_proven else None
+    def hear(self, message: Any, now_ns: int) -> None:
+        """Process a heartbeat."""
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        if system and is_autopilot(component, message):  # system 0 is everybody
+            armed = bool(message.base_mode & ARMED)
+            self._hear_autopilot(system, component, armed, now_ns, message.autopilot)
+        elif system == self.system and component in TYPES and not self._has_namesake:
+            self._has_namesake = message.custom_mode != self._token
+            if self._has_namesake:
+                text = f"Another companion uses component {component} of this vehicle"
+                self._news.append(text)
 
-    @property
-    def autopilot(self) -> tuple[int, int] | None:
-        """(system, component) of our autopilot; None before it was heard."""
-        followed = self.autopilots.followed
-        return None if followed is None else (followed.system, followed.component)
-
-    @property
-    def autopilot_seen_ns(self) -> int | None:
-        followed = self.autopilots.followed
-        return None if followed is None else followed.seen_ns
-
-    @property
-    def is_certain(self) -> bool:
-        """False while our autopilot was merely the first one heard: it may be another vehicle's."""
-        return self.autopilots.is_certain
-
-    @property
-    def is_armed(self) -> bool:
-        followed = self.autopilots.followed
-        return followed is not None and followed.is_armed
-
-    def is_disarmed(self, since_ns: int) -> bool:
-        """True only where the autopilot, certainly ours, has reported it after ``since_ns``."""
-        followed = self.autopilots.followed
-        if followed is None or followed.is_armed or not self.is_certain:
-            return False
-        return followed.seen_ns > since_ns
+    # Our heartbeats.
 
     def confirm(self, health: Health, now_ns: int) -> None:
         """Confirm that the service is alive and in this state; repeat every few seconds."""
@@ -154,92 +170,62 @@ class Presence:
         """Time in ns of the next heartbeat."""
         return self._next_ns
 
-    def hear(self, message: Any, now_ns: int) -> None:
-        system, component = message.get_srcSystem(), message.get_srcComponent()
-        if system and is_autopilot(component, message):  # system 0 is everybody
-            armed = bool(message.base_mode & ARMED)
-            self.autopilots.hear(system, component, armed, now_ns, message.autopilot)
-        elif system == self.system and component in TYPES:
-            self._hear_namesake(component, message.custom_mode)
-
-    def _hear_namesake(self, component: int, token: int) -> None:
-        if token == self._token or self._intruder:
-            return
-        self._intruder = True
-        self._news.append(f"Another companion uses component {component} of this vehicle")
-
-    def take_news(self) -> list[str]:
-        """New messages for the operator, each once."""
-        news, self._news = self._news, []
-        return self.autopilots.take_news() + news
-
-
-MS = 1_000_000
-AUTOPILOT1 = 1  # MAV_COMP_ID_AUTOPILOT1
-LOOK_NS = 3 * S  # how long evidence is collected before it is compared
-PRESENT_NS = 5 * S  # an autopilot heard within this time takes part in a comparison
-ENOUGH_ANSWERS = 2  # of TIMESYNC within one look
-NEARER, NEARER_NS = 3, 5 * MS  # a round trip shorter by this factor and this much decides
-LOUDER, LOUD = 4, 8  # this many times as many messages decide, from this count on
-PROVEN_LOOKS = 10  # consecutive evaluations against a proven autopilot before it is dropped
-
-
-@dataclass(slots=True)
-class Autopilot:
-    """One system's autopilot and its evidence in the current evaluation."""
-
-    system: int
-    component: int
-    firmware: int = 0  # MAV_AUTOPILOT
-    seen_ns: int = 0
-    is_armed: bool = False
-    messages: int = 0
-    answers: int = 0
-    round_trip_ns: int = 0  # the minimum
-
-    def forget_evidence(self) -> None:
-        """Start a new evaluation."""
-        self.messages = self.answers = self.round_trip_ns = 0
-
-
-class Autopilots:
-    """Every autopilot heard, at most one per system id, and the one that is followed.
-
-    One thread writes; others may read.
-    """
-
-    def __init__(self, given: int | None, remembered: int | None, wait_s: float) -> None:
-        """``given`` is fixed; ``remembered`` is waited for ``wait_s`` before following others."""
-        self.given = given
-        self.remembered = remembered
-        self.followed: Autopilot | None = None
-        self.is_proven = False  # no evidence for another vehicle
-        self._wait_ns = round(wait_s * S)
-        self._heard: dict[int, Autopilot] = {}
-        self._first_ns: int | None = None
-        self._look_ns = 0
-        self._against = 0  # consecutive evaluations in favour of another vehicle
-        self._is_unclear = False
-        self._news: list[str] = []
+    # The autopilot.
 
     @property
     def system(self) -> int:
         """The system id to use: the one followed, or the most likely one."""
-        if self.followed is not None and self.given is None:
+        if self.followed is not None and self.config.system is None:
             return self.followed.system
-        return self.given or self.remembered or 1
+        return self.config.system or self.remembered or 1
+
+    @property
+    def proven_system(self) -> int | None:
+        """The system id to remember; None until the evidence is sufficient."""
+        return self.system if self.is_proven else None
+
+    @property
+    def autopilot(self) -> tuple[int, int] | None:
+        """(system, component) of our autopilot; None before it was heard."""
+        followed = self.followed
+        return None if followed is None else (followed.system, followed.component)
+
+    @property
+    def autopilot_seen_ns(self) -> int | None:
+        followed = self.followed
+        return None if followed is None else followed.seen_ns
 
     @property
     def is_certain(self) -> bool:
-        """False while the followed one was merely the first one heard."""
+        """False while our autopilot was merely the first one heard: it may be another vehicle's."""
         followed = self.followed
-        expected = followed is not None and followed.system in (self.given, self.remembered)
-        return followed is None or self.is_proven or expected
+        if followed is None or self.is_proven:
+            return True
+        return followed.system in (self.config.system, self.remembered)
 
-    def hear(
-        self, system: int, component: int, is_armed: bool, now_ns: int, firmware: int = 0
+    @property
+    def is_armed(self) -> bool:
+        followed = self.followed
+        return followed is not None and followed.is_armed
+
+    def is_disarmed(self, since_ns: int) -> bool:
+        """True only where the autopilot, certainly ours, has reported it after ``since_ns``."""
+        followed = self.followed
+        if followed is None or followed.is_armed or not self.is_certain:
+            return False
+        return followed.seen_ns > since_ns
+
+    def others(self, now_ns: int) -> list[int]:
+        """The systems of present autopilots that are not followed, ascending."""
+        return sorted(a.system for a in self._present(now_ns) if a is not self.followed)
+
+    def _present(self, now_ns: int) -> list[Autopilot]:
+        return [a for a in list(self._heard.values()) if now_ns - a.seen_ns < PRESENT_NS]
+
+    def _hear_autopilot(
+        self, system: int, component: int, is_armed: bool, now_ns: int, firmware: int
     ) -> None:
-        """Process an autopilot's heartbeat; component 1 is preferred within its system."""
+        """Component 1 is preferred within its system."""
         known = self._heard.get(system)
         if known is None or (known.component != component and component == AUTOPILOT1):
             fresh = self._heard[system] = Autopilot(system, component)
@@ -256,12 +242,12 @@ class Autopilots:
 
     def _may_follow(self, system: int, now_ns: int) -> bool:
         """True where the first heartbeat suffices."""
-        if self.given is not None:
-            return system == self.given
+        if self.config.system is not None:
+            return system == self.config.system
         if self._is_unclear or self._first_ns is None:
             return False
         expected = self.remembered in (None, system)
-        return expected or now_ns - self._first_ns >= self._wait_ns
+        return expected or now_ns - self._first_ns >= self.config.latch_s * S
 
     def count(self, system: int, component: int) -> None:
         """Count a message; only those of autopilots are evidence."""
@@ -279,11 +265,10 @@ class Autopilots:
 
     def look(self, now_ns: int) -> None:
         """Evaluate the evidence when due; follow another vehicle if it wins."""
-        if self.given is not None or self._first_ns is None or now_ns < self._look_ns:
+        if self.config.system is not None or self._first_ns is None or now_ns < self._look_ns:
             return
         self._look_ns = now_ns + LOOK_NS
-        present = [a for a in self._heard.values() if now_ns - a.seen_ns < PRESENT_NS]
-        if present:
+        if present := self._present(now_ns):
             self._decide(present)
         for autopilot in self._heard.values():
             autopilot.forget_evidence()
@@ -323,16 +308,6 @@ class Autopilots:
             names = ", ".join(str(a.system) for a in sorted(present, key=lambda a: a.system))
             self._news.append(f"Several autopilots ({names}): set mavlink.system_id")
         self._is_unclear = True
-
-    def take_news(self) -> list[str]:
-        """New messages for the operator, each once."""
-        news, self._news = self._news, []
-        return news
-
-    def others(self, now_ns: int) -> list[int]:
-        """The systems of present autopilots that are not followed, ascending."""
-        present = [a for a in list(self._heard.values()) if now_ns - a.seen_ns < PRESENT_NS]
-        return sorted(a.system for a in present if a is not self.followed)
 
 
 def clear_winner(present: Sequence[Autopilot]) -> Autopilot | None:

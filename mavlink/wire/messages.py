@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from mavlink.wire.dialect import dialect, x25crc
-from mavlink.wire.framing import SIGNED, Framer, Packet
+from mavlink.wire.dialect import dialect
+from mavlink.wire.framing import Framer, Packet
 from mavlink.wire.link import Link
 from mavlink.wire.signing import Signing
 
@@ -72,23 +72,15 @@ class Packer:
             if encoder is None:
                 encoder = self._encoders[key] = dialect.MAVLink(None, *key)
                 encoder.seq = self._sequence
+            if self._signing is not None:
+                self._signing.prepare(encoder, self._link, unix_ns)
             try:
                 data = bytes(outgoing.message.pack(encoder))
             except (struct.error, ValueError, TypeError, OverflowError) as error:
                 log.error("%s cannot be sent: %s", outgoing.message.get_type(), error)
                 return None
             encoder.seq = (encoder.seq + 1) % 256
-            if self._signing is None:
-                return data
-            flagged = _with_signed_flag(data, outgoing.message.crc_extra)
-            return self._signing.sign(flagged, self._link, unix_ns)
-
-
-def _with_signed_flag(data: bytes, crc_extra: int) -> bytes:
-    """The packet with the signed flag set and its checksum updated."""
-    body = data[:2] + bytes((data[2] | SIGNED,)) + data[3:-2]
-    crc: int = x25crc(body[1:] + bytes((crc_extra,))).crc
-    return body + crc.to_bytes(2, "little")
+            return data
 
 
 MAX_SUBSCRIBERS = 16  # of one message; the oldest makes room

@@ -230,26 +230,22 @@ def _ready(sockets: Sequence[socket.socket]) -> list[socket.socket]:
     return [numbered[number] for number, _ in poll.poll(1e3 * READ_S)]
 
 
-class LinesPort:
+class LinesPort(UdpPort):
     """Lines of NMEA or CSV on UDP, received as MAVLink; what is sent goes nowhere."""
-
-    is_quick = True
 
     def __init__(self, spec: LinkSpec) -> None:
         from mavlink.wire.lines import LineReader  # the dialect is slow to import
 
-        self._port, self._reader = UdpPort(spec), LineReader()
+        super().__init__(spec)
+        self._reader = LineReader()
 
     def read(self) -> bytes:
         """The packets of the next datagram."""
-        data = self._port.read()
+        data = super().read()
         return self._reader.packets(data, time.monotonic_ns()) if data else b""
 
     def write(self, data: bytes) -> None:
         """Drop it: nothing at the other end reads MAVLink."""
-
-    def close(self) -> None:
-        self._port.close()
 
 
 PORTS: dict[str, Callable[[LinkSpec], Port]] = {

@@ -12,6 +12,7 @@ import hashlib
 import hmac
 import threading
 from pathlib import Path
+from typing import Any
 
 from mavlink.wire.framing import SIGNATURE_LENGTH, Packet
 
@@ -54,16 +55,6 @@ def timestamp_of(unix_ns: int) -> int:
     return max(0, (unix_ns - EPOCH_UNIX_S * 10**9) // 10_000)
 
 
-def sign(packet: bytes, key: bytes, link: int, timestamp: int) -> bytes:
-    """The signed packet of one whose signed flag and checksum are already set."""
-    tail = bytes((link & 0xFF,)) + timestamp.to_bytes(6, "little")
-    return packet + tail + _digest(key, packet + tail)
-
-
-def _digest(key: bytes, data: bytes) -> bytes:
-    return hashlib.sha256(key + data).digest()[:6]
-
-
 class Signing:
     """One key, the times of the streams received with it, and our own time. Thread-safe."""
 
@@ -82,11 +73,14 @@ class Signing:
         with self._lock:
             return dict(self._streams)
 
-    def sign(self, packet: bytes, link: int, unix_ns: int) -> bytes:
-        """The packet with our signature; times increase strictly even when the clock steps back."""
+    def prepare(self, encoder: Any, link: int, unix_ns: int) -> None:
+        """Let an encoder of pymavlink sign its next packet; times increase strictly even when the
+        clock steps back."""
         with self._lock:
             self.timestamp = min(LARGEST, max(self.timestamp + 1, timestamp_of(unix_ns)))
-            return sign(packet, self._key, link, self.timestamp)
+            encoder.signing.timestamp = self.timestamp
+        encoder.signing.secret_key, encoder.signing.link_id = self._key, link & 0xFF
+        encoder.signing.sign_outgoing = True
 
     def accepts(self, packet: Packet) -> bool:
         with self._lock:
@@ -107,7 +101,8 @@ class Signing:
             return False
         if last is None and timestamp + LATE < self.timestamp:
             return False
-        if not hmac.compare_digest(_digest(self._key, data[:-6]), data[-6:]):
+        signature = hashlib.sha256(self._key + data[:-6]).digest()[:6]
+        if not hmac.compare_digest(signature, data[-6:]):
             return False
         if last is None and len(self._streams) >= MAX_STREAMS:
             return False

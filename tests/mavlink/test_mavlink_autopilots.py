@@ -179,7 +179,7 @@ def test_a_system_that_is_given_is_never_left() -> None:
     net = Net(Vehicle(2, 0.002), given=12)
     net.wait(20.0)
     assert net.presence.system == 12 and net.presence.autopilot is None
-    assert net.presence.autopilots.others(net.now_ns) == [2]
+    assert net.presence.others(net.now_ns) == [2]
 
 
 def test_answers_of_strangers_are_ignored() -> None:
