@@ -4,14 +4,12 @@ By its flags, GIMBAL_DEVICE_ATTITUDE_STATUS declares the reference of its quater
 protocol v2): bit 64 earth, bit 32 the vehicle's heading, neither: earth when yaw is locked
 (16), otherwise the vehicle's heading. Some senders declare it wrongly: ArduPilot's servo mounts
 send servo angles with flags 44, which declare the horizon. Therefore the configuration,
-:func:`steadiest_frame` (by telemetry alone) and :class:`FrameWatch` (by the images) can override
-the flags.
+:func:`steadiest_frame` (by telemetry alone) and :func:`frame_by_images` can override the flags.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,7 +19,6 @@ from mavlink.telemetry.quaternion import (
     conjugate,
     from_rpy,
     multiply,
-    normalised,
     to_rpy,
 )
 from mavlink.telemetry.samples import GimbalFrame
@@ -119,9 +116,7 @@ def _down(q: Quaternion) -> tuple[float, float, float]:
 
 SAME_RAD = math.radians(0.3)
 CLEAR_RAD = math.radians(0.05)
-MIN_TURNS = 20
-STEP_NS = 1_000_000_000  # rotations over shorter times are mostly noise
-KEPT = 120
+MIN_TURNS, KEPT = 20, 120
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +130,9 @@ class FrameVerdict:
 
 Ends = tuple[Quaternion, Quaternion]
 """A rotation at the first and at the second of two images."""
+
+Turn = tuple[int, int, Quaternion]
+"""Times in ns of two images, and ``q_head(first)_head(second)`` as seen, in the head's axes."""
 
 
 def judge_frame(
@@ -181,43 +179,19 @@ def _largest_angle(a: Sequence[Ends], b: Sequence[Ends]) -> float:
     )
 
 
-class FrameWatch:
-    """Collects rotations between frames and finds the reference frame of the gimbal."""
+def frame_by_images(
+    turns: Sequence[Turn],
+    claimed_at: Callable[[int], Ends | None],
+    latency_ms: float = 0.0,
+) -> FrameVerdict | None:
+    """The frame that agrees with the images; None with fewer than twenty rotations.
 
-    def __init__(self, claimed_at: Callable[[int], tuple[Quaternion, Quaternion] | None]) -> None:
-        """``claimed_at(time_ns)`` gives the gimbal's quaternion as sent, and ``q_ned_body``."""
-        self._claimed_at = claimed_at
-        self._turns: deque[tuple[int, int, Quaternion]] = deque(maxlen=KEPT)
-        self._open: tuple[int, int, Quaternion] | None = None  # a rotation still growing
-
-    def add(self, first_ns: int, second_ns: int, q_step: Quaternion) -> None:
-        """Take in ``q_head(first)_head(second)``, seen between two frames, in the head's axes.
-
-        Consecutive steps are joined to rotations over a second.
-        """
-        step = normalised(q_step)
-        if second_ns <= first_ns or step is None:
-            return
-        if self._open is not None and self._open[1] == first_ns:
-            start_ns, _, turned = self._open
-            step = normalised(multiply(turned, step)) or step
-            first_ns = start_ns
-        self._open = (first_ns, second_ns, step)
-        if second_ns - first_ns >= STEP_NS:
-            self._turns.append(self._open)
-            self._open = None
-
-    def verdict(self, latency_ms: float = 0.0) -> FrameVerdict | None:
-        """The frame that agrees with the images; None with fewer than twenty rotations."""
-        shift = round(latency_ms * 1e6)
-        sent: list[Ends] = []
-        bodies: list[Ends] = []
-        turns: list[Quaternion] = []
-        for first_ns, second_ns, turn in self._turns:
-            first = self._claimed_at(first_ns - shift)
-            second = self._claimed_at(second_ns - shift)
-            if first is not None and second is not None:
-                sent.append((first[0], second[0]))
-                bodies.append((first[1], second[1]))
-                turns.append(turn)
-        return judge_frame(sent, bodies, turns) if len(turns) >= MIN_TURNS else None
+    ``claimed_at(time_ns)`` gives the gimbal's quaternion as sent, and ``q_ned_body``.
+    """
+    shift = round(latency_ms * 1e6)
+    claims = [(claimed_at(a - shift), claimed_at(b - shift), seen) for a, b, seen in turns[-KEPT:]]
+    known = [(a, b, seen) for a, b, seen in claims if a is not None and b is not None]
+    if len(known) < MIN_TURNS:
+        return None
+    sent, bodies = ([(a[k], b[k]) for a, b, _ in known] for k in range(2))
+    return judge_frame(sent, bodies, [seen for *_, seen in known])

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from mavlink.telemetry.quaternion import Quaternion, multiply, normalised
+from mavlink.telemetry.quaternion import Quaternion, conjugate, multiply, normalised
 
 MIN_WINDOWS, MIN_SPAN_S = 12, 10.0  # non-overlapping, and their time together
 FITTED = 6  # windows that the rotation, the scatter and the time are worth
@@ -28,6 +28,7 @@ MAX_SIGMA_MS = 40.0  # maximum sigma of an estimate that is reported
 RIVAL = 1.3  # a second solution, further away than RIVAL_APART_S, must fit worse by this factor
 RIVAL_APART_S = 0.15
 KEPT = 2000
+LONG_NS = 1_000_000_000  # a turn over a shorter time is mostly noise
 REACH_S = 5.0  # latencies that are sought, either way: a range without the true one holds aliases
 COARSE_S, FINE_S, FINE_STEPS = 0.04, 0.004, 8
 MIN_SHARE = 0.5  # of the most windows that telemetry covers at any latency
@@ -90,6 +91,18 @@ class LatencyWatch:
             self._frames.append((self._run, first_ns, (1.0, 0.0, 0.0, 0.0)))
         turned = multiply(self._frames[-1][2], step)
         self._frames.append((self._run, second_ns, normalised(turned) or turned))
+
+    def long_turns(self) -> list[tuple[int, int, Quaternion]]:
+        """Rotations over a second or a little more, one after the other: the stamps of the first
+        and the second frame, and ``q_camera(first)_camera(second)``."""
+        found, start = [], None
+        for frame in self._frames:
+            if start is None or frame[0] != start[0]:
+                start = frame
+            elif frame[1] - start[1] >= LONG_NS:
+                found.append((start[1], frame[1], multiply(conjugate(start[2]), frame[2])))
+                start = frame
+        return found
 
     def since_ns(self, frames: int) -> int | None:
         """The stamp of the oldest of the newest ``frames``; None without any."""

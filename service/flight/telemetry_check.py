@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mavlink.telemetry.gimbal import FrameVerdict, FrameWatch
+from mavlink.telemetry.gimbal import FrameVerdict, frame_by_images
 from mavlink.telemetry.history import VehicleHistory
 from mavlink.telemetry.latency import LatencyEstimate, LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
@@ -63,7 +63,6 @@ class TelemetryCheck:
         self._camera = camera
         self.applied_ms = self._wanted_ms()
         self._turns = LatencyWatch()
-        self._frames = None if history is None or self._fixed else FrameWatch(history.claimed_at)
         self._last: tuple[int, int, F64] | None = None  # stamp, segment, R_odom_camera
         self._seen_ns: int | None = None
         self._next_ns: int | None = None
@@ -120,10 +119,7 @@ class TelemetryCheck:
     def _turn(self, first_ns: int, second_ns: int, R_first_second: F64) -> None:
         R = R_GIMBAL_CAMERA @ R_first_second @ R_GIMBAL_CAMERA.T  # in the head's axes
         w, x, y, z = (float(v) for v in quaternion_from_rotation(R))
-        q: Quaternion = (w, x, y, z)
-        self._turns.add(first_ns, second_ns, q)
-        if self._frames is not None:
-            self._frames.add(first_ns, second_ns, q)
+        self._turns.add(first_ns, second_ns, (w, x, y, z))
 
     @property
     def is_clock_sure(self) -> bool:
@@ -169,10 +165,11 @@ class TelemetryCheck:
         self.latency = found or self.latency
         if found is not None:
             self._report_latency(found)
-        if self._frames is not None:
+        if not self._fixed:
             settled = self.latency is not None and self.latency.is_settled
             latency = self.latency.latency_ms if settled and self.latency else self.applied_ms
-            self.frame = self._frames.verdict(latency) or self.frame
+            seen = frame_by_images(self._turns.long_turns(), history.claimed_at, latency)
+            self.frame = seen or self.frame
             self._judge_frame(history)
 
     def _report_latency(self, found: LatencyEstimate) -> None:

@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mavlink.telemetry import quaternion
 from mavlink.telemetry.gimbal import (
-    FrameWatch,
+    frame_by_images,
     frame_of_flags,
     judge_frame,
     steadiest_frame,
     to_earth,
 )
 from mavlink.telemetry.history import M_PER_DEG, SIGMA_TILT_RAD, HistoryConfig, VehicleHistory
+from mavlink.telemetry.latency import LatencyWatch
 from mavlink.telemetry.quaternion import Quaternion
 from mavlink.telemetry.samples import (
     F64,
@@ -464,7 +465,7 @@ def test_the_images_decide_between_frames() -> None:
     mount = Rotation.from_euler("Y", -1.2)
     heads = [body * mount for body in bodies]
     noise = [Rotation.from_rotvec(rng.normal(0, 1e-3, 3)) for _ in heads]
-    watch = FrameWatch((history := VehicleHistory()).claimed_at)
+    watch, history = LatencyWatch(), VehicleHistory()
     assert history.gimbal_frame() is None
     for k, body in enumerate(bodies):
         history.add(AttitudeSample(None, of_scipy(body)), T0 + k * 100 * MS)
@@ -472,11 +473,13 @@ def test_the_images_decide_between_frames() -> None:
         history.add(claimed, T0 + k * 100 * MS)
     for k in range(259):
         if k == 150:
-            assert watch.verdict() is None  # too few turns of a second
+            assert (
+                frame_by_images(watch.long_turns(), history.claimed_at) is None
+            )  # too few turns of a second
         step = of_scipy(heads[k].inv() * heads[k + 1] * noise[k])
         # The camera's stamps are 30 ms late.
         watch.add(T0 + (100 * k + 30) * MS, T0 + (100 * k + 130) * MS, step)
-    verdict = watch.verdict(30.0)
+    verdict = frame_by_images(watch.long_turns(), history.claimed_at, 30.0)
     assert verdict is not None and verdict.decided
     assert verdict.frame in (GimbalFrame.BODY, GimbalFrame.SERVO)
     assert set(verdict.refuted) == {GimbalFrame.EARTH, GimbalFrame.VEHICLE}
