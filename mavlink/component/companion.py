@@ -21,11 +21,13 @@ from mavlink.component.ftp import FileServer
 from mavlink.component.link_watch import TO_ONE, LinkWatch, WatchConfig
 from mavlink.component.metadata import (
     DEFINITION,
+    GENERAL,
     MODEL,
     VENDOR,
-    ComponentMetadata,
+    ComponentMetadataMessage,
     camera_definition,
     definition_version,
+    metadata_files,
 )
 from mavlink.component.metadata import NUMBER as METADATA
 from mavlink.component.parameters import YAW_FRAME, Parameters, with_defaults
@@ -103,8 +105,9 @@ class Companion:
         )
         table = self.parameters.table
         definition = camera_definition(VENDOR, MODEL, table)
-        self._metadata = ComponentMetadata(table)
-        self._files = FileServer({DEFINITION: definition, **self._metadata.files})
+        metadata = metadata_files(table)
+        self._general = metadata[GENERAL]
+        self._files = FileServer({DEFINITION: definition, **metadata})
         self.camera = CameraComponent(
             definition_version(table),
             control,
@@ -280,7 +283,7 @@ class Companion:
         if component == CAMERA:
             message = self.camera.message(number, index)
         elif number == METADATA:
-            message = self._metadata.message(self._boot_ms())
+            message = ComponentMetadataMessage(self._boot_ms(), self._general)
         elif number == LOAD_STATUS and self.load is not None:
             message = computer_status(self.load, self._unix_us(), self._boot_ms())
         else:

@@ -38,9 +38,10 @@ class ComponentMetadataMessage(dialect.MAVLink_message):  # type: ignore[misc]
     id, msgname, crc_extra = NUMBER, "COMPONENT_METADATA", CRC_EXTRA
     unpacker = struct.Struct(f"<II{URI}s")
 
-    def __init__(self, time_boot_ms: int, crc: int, uri: str) -> None:
+    def __init__(self, time_boot_ms: int, general: bytes) -> None:
+        """``general`` is the content of the file ``GENERAL``."""
         super().__init__(self.id, self.msgname)
-        self._values = (time_boot_ms, crc, uri.encode())
+        self._values = (time_boot_ms, file_crc(general), file_uri(ONBOARD, GENERAL).encode())
 
     def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
         """The packet; pymavlink calls this."""
@@ -49,32 +50,22 @@ class ComponentMetadataMessage(dialect.MAVLink_message):  # type: ignore[misc]
         return packet
 
 
-class ComponentMetadata:
-    def __init__(self, table: Sequence[Parameter]) -> None:
-        parameters = _packed(
-            {"version": FORMAT, "parameters": [_parameter(parameter) for parameter in table]}
-        )
-        general = _packed(
-            {
-                "version": FORMAT,
-                "vendorName": VENDOR,
-                "modelName": MODEL,
-                "firmwareVersion": ".".join(map(str, VERSION)),
-                "metadataTypes": [
-                    {
-                        "type": TYPE_PARAMETER,
-                        "uri": file_uri(ONBOARD, PARAMETERS),
-                        "fileCrc": file_crc(parameters),
-                    }
-                ],
-            }
-        )
-        self.files = {GENERAL: general, PARAMETERS: parameters}
-
-    def message(self, boot_ms: int) -> ComponentMetadataMessage:
-        """The address of the general file, and its checksum."""
-        crc = file_crc(self.files[GENERAL])
-        return ComponentMetadataMessage(boot_ms, crc, file_uri(ONBOARD, GENERAL))
+def metadata_files(table: Sequence[Parameter]) -> dict[str, bytes]:
+    """By name; :class:`ComponentMetadataMessage` gives the address of ``GENERAL``."""
+    parameters = _packed({"version": FORMAT, "parameters": [_parameter(p) for p in table]})
+    described = {
+        "type": TYPE_PARAMETER,
+        "uri": file_uri(ONBOARD, PARAMETERS),
+        "fileCrc": file_crc(parameters),
+    }
+    general = {
+        "version": FORMAT,
+        "vendorName": VENDOR,
+        "modelName": MODEL,
+        "firmwareVersion": ".".join(map(str, VERSION)),
+        "metadataTypes": [described],
+    }
+    return {GENERAL: _packed(general), PARAMETERS: parameters}
 
 
 def _packed(content: object) -> bytes:

@@ -74,7 +74,6 @@ class Autopilot:
     round_trip_ns: int = 0  # the minimum
 
     def forget_evidence(self) -> None:
-        """Start a new evaluation."""
         self.messages = self.answers = self.round_trip_ns = 0
 
 
@@ -103,7 +102,7 @@ class Presence:
         self._lock = threading.Lock()  # of the heartbeats
         self._health = Health.BOOT
         self._confirmed_ns = now_ns
-        self._next_ns = now_ns if first_ns is None else first_ns
+        self.next_ns = now_ns if first_ns is None else first_ns  # time of the next heartbeats
         self._heard: dict[int, Autopilot] = {}
         self._first_ns: int | None = None
         self._look_ns = 0
@@ -117,7 +116,6 @@ class Presence:
         return news
 
     def hear(self, message: Any, now_ns: int) -> None:
-        """Process a heartbeat."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         if system and is_autopilot(component, message):  # system 0 is everybody
             armed = bool(message.base_mode & ARMED)
@@ -153,10 +151,10 @@ class Presence:
     def due(self, now_ns: int) -> list[OutgoingMessage]:
         """The heartbeats to send now; the first call returns them at once."""
         with self._lock:
-            if now_ns < self._next_ns:
+            if now_ns < self.next_ns:
                 return []
-            late = now_ns - self._next_ns
-            self._next_ns = now_ns + PERIOD_NS - (late if late < PERIOD_NS else 0)
+            late = now_ns - self.next_ns
+            self.next_ns = now_ns + PERIOD_NS - (late if late < PERIOD_NS else 0)
             state = self._state(now_ns)
             if state is None:
                 return []
@@ -165,10 +163,6 @@ class Presence:
     def _heartbeat(self, component: int, state: Health) -> Any:
         kind = TYPES[component]
         return dialect.MAVLink_heartbeat_message(kind, NO_AUTOPILOT, 0, self._token, int(state), 3)
-
-    def next_timer(self) -> int:
-        """Time in ns of the next heartbeat."""
-        return self._next_ns
 
     # The autopilot.
 

@@ -307,7 +307,7 @@ class VehicleLink:
             due = self.presence.due(now_ns)
             if now_ns - self._alive_ns < STUCK_NS:  # otherwise nothing would answer: stay silent
                 self._record(self._links.send(self.presence.system, due), now_ns)
-            self._stop.wait(max(0.001, (self.presence.next_timer() - self._clock_ns()) / S))
+            self._stop.wait(max(0.001, (self.presence.next_ns - self._clock_ns()) / S))
 
     def _send(self, messages: list[OutgoingMessage]) -> None:
         if messages:

@@ -294,7 +294,6 @@ class TimesyncFilter:
         self._outliers = 0
         self._next_ns = 0
         self.resets = 0
-        self.rejected = 0
 
     @property
     def offset_ns(self) -> int | None:
@@ -336,11 +335,9 @@ class TimesyncFilter:
         self._sent.remove(ts1)
         round_trip = received_ns - ts1
         if not 0 <= round_trip <= LONGEST_ROUND_NS:
-            self.rejected += 1
             return False
         self._rounds.append(round_trip)
         if round_trip > max(GATE_NS, 2 * min(self._rounds)):
-            self.rejected += 1
             return False
         return self._update((ts1 + received_ns) // 2 - tc1)
 
@@ -352,7 +349,6 @@ class TimesyncFilter:
         sample = float(sample_ns - self._base_ns)
         if abs(sample - self._offset_ns) > OUTLIER_NS:
             self._outliers += 1
-            self.rejected += 1
             if self._outliers >= OUTLIERS_TO_RESET:
                 self.reset()
             return False

@@ -43,7 +43,6 @@ class Link:
         self._port: Port | None = None
         self._threads: list[threading.Thread] = []
         self.opened = 0  # how many times
-        self.sent_bytes = 0
         self.received_bytes = 0
         self.last_error = ""
 
@@ -79,7 +78,6 @@ class Link:
         port = self._port
         if port is not None and port.is_quick:
             port.write(data)
-            self.sent_bytes += len(data)
             return
         with self._wake:
             self._waiting.append(data)
@@ -141,7 +139,6 @@ class Link:
                 continue
             try:
                 port.write(data)
-                self.sent_bytes += len(data)
             except OSError as error:
                 self._complain(error)
                 with self._wake:

@@ -126,7 +126,6 @@ class LinkReport:
     is_up: bool
     opened: int  # how many times
     received_bytes: int
-    sent_bytes: int
     packets: dict[int, int]  # by system id
     skipped_bytes: int
     last_error: str
@@ -181,7 +180,6 @@ class Links:
                 link.is_up,
                 link.opened,
                 link.received_bytes,
-                link.sent_bytes,
                 dict(framer.packets),
                 framer.skipped_bytes,
                 link.last_error,

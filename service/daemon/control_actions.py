@@ -53,25 +53,26 @@ class ControlActions:
 
     def status(self) -> ScanStatus:
         scanning = self._scanning
+        run, scan, phase = scanning.run, scanning.scan, scanning.phase
         total_mib, free_mib = self._disk()
-        run, scan = scanning.run, scanning.scan
-        recorder = scan.recorder if scan is not None else None
-        latency = scan.check.latency if scan is not None else None
-        phase = scanning.phase
         recording_s = 0.0
         if run is not None and phase in (Phase.SCANNING, Phase.PAUSED):
             recording_s = time.monotonic() - run.started_s
+        recording_ms = int(1e3 * recording_s)
+        if scan is None:
+            return ScanStatus(phase, "", recording_ms, total_mib, free_mib)
+        recorder, latency = scan.recorder, scan.check.latency
         return ScanStatus(
-            phase=phase,
-            scan_id=scanning.scan_id,
-            recording_ms=int(1e3 * recording_s),
-            storage_total_mib=total_mib,
-            storage_free_mib=free_mib,
-            speed_m_s=recorder.speed_m_s if recorder is not None else math.nan,
-            distance_m=recorder.distance_m if recorder is not None else math.nan,
-            turn_rate_rad_s=recorder.turn_rate_rad_s if recorder is not None else math.nan,
-            camera_latency_ms=latency.latency_ms if latency is not None else math.nan,
-            camera_latency_sigma_ms=latency.sigma_ms if latency is not None else math.nan,
+            phase,
+            scan.inputs.scan_id,
+            recording_ms,
+            total_mib,
+            free_mib,
+            speed_m_s=recorder.speed_m_s,
+            distance_m=recorder.distance_m,
+            turn_rate_rad_s=recorder.turn_rate_rad_s,
+            camera_latency_ms=math.nan if latency is None else latency.latency_ms,
+            camera_latency_sigma_ms=math.nan if latency is None else latency.sigma_ms,
         )
 
     def _disk(self) -> tuple[float, float]:
@@ -106,12 +107,10 @@ class ControlActions:
         return ACCEPTED
 
     def stop_scan(self) -> Answer:
-        """Close the running scan and drop retries; its files are written after the answer."""
         self._scanning.handle(Event.STOP)
         return ACCEPTED
 
     def finalise(self) -> Handled:
-        """Stop, and answer when all files are written."""
         return self._scanning.finalise() or ACCEPTED
 
     def pause(self) -> Handled:
@@ -123,7 +122,6 @@ class ControlActions:
         return ACCEPTED if was_paused else Answer(Result.DENIED, "the scan is not paused")
 
     def capture_keyframe(self) -> Handled:
-        """Take the next frame as a photo; refused while no scan takes frames."""
         scan, phase = self._scanning.scan, self._scanning.phase
         if phase is not Phase.SCANNING:
             why = NO_PHOTO[Phase.FINALISING if self._scanning.life.state.is_closing else phase]
@@ -137,7 +135,6 @@ class ControlActions:
         return ACCEPTED
 
     def clear_map(self) -> Handled:
-        """Clear the map, so that every surface counts as new again."""
         scan = self._scanning.scan
         if scan is None:
             return Answer(Result.DENIED, "no scan is running")
@@ -145,7 +142,6 @@ class ControlActions:
         return ACCEPTED
 
     def self_test(self) -> Handled:
-        """Test camera and disk on a separate thread."""
         work = Work()
         PROCESS.start("self-test", lambda _: self._test(work))
         return work
@@ -163,7 +159,6 @@ class ControlActions:
         return _systemctl("reboot" if action is Power.REBOOT else "poweroff")
 
     def parameter_changed(self, name: str, value: float) -> Answer:
-        """Apply a new value of a parameter, or refuse it with the reason."""
         try:
             self._scanning.configure(lambda config: with_parameter(config, name, value))
         except InputError as error:

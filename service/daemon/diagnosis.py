@@ -17,6 +17,7 @@ from http.client import HTTPException
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.request import urlopen
@@ -90,26 +91,23 @@ def examine(config: Config, listen_s: float | None) -> Iterator[Finding]:
     Without seconds to listen on the links only what a desk needs: no camera, no vehicle, no
     datalink, but the packages of the products.
     """
+    yield from examine_software()
     if listen_s is None:
-        for check in (examine_software, _products, _clock, lambda: examine_compute(config)):
-            yield from check()
+        yield from chain(_products(), _clock(), examine_compute(config))
         return
     running = running_service(config.health.http) if config.health.http else None
-    checks: tuple[Callable[[], Iterator[Finding]], ...] = (
-        examine_software,
-        lambda: _machine(config),
-        _clock,
-        lambda: _folder(Path(config.scan.folder)),
-        lambda: examine_compute(config),
-        lambda: _camera(config, running),
-        lambda: examine_links(config, listen_s, running),
-        lambda: _datalink(config),
-        lambda: check_certificate(config),
-        lambda: _settings(config),
-        lambda: _service(running),
+    yield from chain(
+        _machine(config),
+        _clock(),
+        _folder(Path(config.scan.folder)),
+        examine_compute(config),
+        _camera(config, running),
+        examine_links(config, listen_s, running),
+        _datalink(config),
+        check_certificate(config),
+        _settings(config),
+        _service(running),
     )
-    for check in checks:
-        yield from check()
 
 
 def parent_of(package: str) -> str:
@@ -187,8 +185,7 @@ def _settings(config: Config) -> Iterator[Finding]:
     needed = [n for n in ("source", "model") if not getattr(config.camera, n)]
     if is_simulated(config):
         yield Finding("settings", GOOD, "nothing required: camera and autopilot are simulated")
-        return
-    if needed:
+    elif needed:
         names = " and ".join(f"camera.{n}" for n in needed)
         yield Finding("settings", BAD, f"set {names}; the service does not start without them")
     elif not config.mavlink.links:
@@ -201,13 +198,11 @@ def _settings(config: Config) -> Iterator[Finding]:
 
 def _clock() -> Iterator[Finding]:
     text = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
-    if time.time() < EARLIEST_UNIX_S:
-        hint = (
-            "was never set; names and times of scans are wrong until the autopilot sends the time"
-        )
-        yield Finding("clock", NOTE, f"{text} {hint}")
-    else:
+    if time.time() >= EARLIEST_UNIX_S:
         yield Finding("clock", GOOD, text)
+        return
+    hint = "was never set; names and times of scans are wrong until the autopilot sends the time"
+    yield Finding("clock", NOTE, f"{text} {hint}")
 
 
 def _folder(folder: Path) -> Iterator[Finding]:

@@ -6,6 +6,7 @@ figures are one dict; Prometheus' client, which registers each by name, would no
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import json
 import logging
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import OutsideError
-from service.listener import BoundedListener, ListenerLimits, host_name, is_loopback
+from service.listener import BoundedListener, ListenerLimits, host_name, is_loopback, parse_address
 from service.redaction import redacted
 from service.workers import PROCESS
 
@@ -37,16 +38,15 @@ class HealthServer:
 
     def __init__(self, address: str, snapshot: Snapshot) -> None:
         """Listen on HOST:PORT; raises OutsideError when it is in use."""
-        host, _, port = address.rpartition(":")
+        host, port = parse_address(address, "health.http")
         try:
-            listener = BoundedListener(host.strip("[]"), int(port), LIMITS)
+            listener = BoundedListener(host, port, LIMITS)
         except OSError as error:
             raise OutsideError(
                 f"health.http {address} cannot be served: {error.strerror}; give another port"
             ) from error
         self.port = int(listener.getsockname()[1])
-        is_local = is_loopback(host.strip("[]"))
-        self._server = _Server(listener, _handler(snapshot, is_local))
+        self._server = _Server(listener, _handler(snapshot, is_loopback(host)))
         self._worker = PROCESS.start("health", lambda _: self._server.serve_forever())
 
     def close(self) -> None:
@@ -64,16 +64,9 @@ def _is_own(header: str | None, is_local: bool) -> bool:
     name = "localhost" if header is None else host_name(header)
     if is_local or is_loopback(name):
         return is_loopback(name)
-    own = socket.gethostname().partition(".")[0].lower()
-    return _is_address(name) or name.partition(".")[0] == own
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
+    with contextlib.suppress(ValueError):
+        return bool(ipaddress.ip_address(name))
+    return name.partition(".")[0] == socket.gethostname().partition(".")[0].lower()
 
 
 class _Server(ThreadingHTTPServer):

@@ -146,10 +146,8 @@ class Daemon:
     def look(self) -> None:
         """Report to the operator, and follow the vehicle and the time."""
         self.vehicle.set_health(self._health())
-        self._follow_arming()
-        self._resume()
+        self._follow_flight()
         self._report_camera()
-        self._close_after_landing()
         self.scanning.handle(Event.TICK)
 
     def _wait_for_closing(self, notifier: Notifier) -> None:
@@ -330,28 +328,20 @@ class Daemon:
         elif was_silent and not self._is_silent and self.scanning.phase is Phase.SCANNING:
             self.vehicle.statustext("Camera images recovered", NOTICE)
 
-    def _resume(self) -> None:
-        """Resume a flight's scan that a fault of the service or a power cut ended."""
-        if self.config.scan.start != "on-command":
-            return
-        report = self.vehicle.report()
-        is_heard = report.autopilot is not None and report.is_certain
-        if self.scanning.start_again(is_heard, report.is_armed and report.is_certain):
-            self.vehicle.statustext("Scan resumed after a restart", WARNING)
-
-    def _follow_arming(self) -> None:
-        """Start and stop a scan with arming, if configured."""
-        report = self.vehicle.report()
-        was_armed, is_armed = self._was_armed, report.is_armed and report.is_certain
-        self._was_armed = is_armed
-        if self.config.scan.start == "on-arm" and is_armed != was_armed:
+    def _follow_flight(self) -> None:
+        """Start and end scans without a command: by arming, after a fault or a power cut in flight,
+        and after a landing, as a stop may have been lost."""
+        scan, presence, now_ns = self.config.scan, self.vehicle.presence, self._clock_ns()
+        is_armed = presence.is_armed and presence.is_certain
+        was_armed, self._was_armed = self._was_armed, is_armed
+        if scan.start == "on-arm" and is_armed != was_armed:
             answer = (self.actions.start_scan if is_armed else self.actions.stop_scan)()
             if answer.text:
                 self.vehicle.statustext(answer.text, NOTICE)
-
-    def _close_after_landing(self) -> None:
-        """Close a commanded scan after landing: the stop command may have been lost."""
-        scan, presence, now_ns = self.config.scan, self.vehicle.presence, self._clock_ns()
+        if scan.start == "on-command":
+            is_heard = presence.autopilot is not None and presence.is_certain
+            if self.scanning.start_again(is_heard, is_armed):
+                self.vehicle.statustext("Scan resumed after a restart", WARNING)
         landing = self._landing.look(
             self.scanning.life.state.is_wanted and scan.start == "on-command",
             presence.is_armed,

@@ -79,63 +79,36 @@ class Effect(Enum):
     OFFER = "send earlier scans"
 
 
+def _row(text: str) -> dict[Event, State]:
+    states = {state.text: state for state in State}
+    pairs = (pair.split(" > ") for pair in text.split(", ") if pair)
+    return {Event(event): states[after] for event, after in pairs}
+
+
 TRANSITIONS: dict[State, dict[Event, State]] = {
-    State.IDLE: {Event.START: State.WAITING, Event.END: State.ENDED},
-    State.WAITING: {
-        Event.TICK: State.SCANNING,
-        Event.STOP: State.IDLE,
-        Event.PAUSE: State.WAITING_PAUSED,
-        Event.END: State.ENDED,
-    },
-    State.WAITING_PAUSED: {
-        Event.TICK: State.PAUSED,
-        Event.START: State.WAITING,
-        Event.STOP: State.IDLE,
-        Event.RESUME: State.WAITING,
-        Event.END: State.ENDED,
-    },
-    State.SCANNING: {
-        Event.STOP: State.CLOSING,
-        Event.PAUSE: State.PAUSED,
-        Event.COMPLETED: State.CLOSING,
-        Event.INTERRUPTED: State.REOPENING,
-        Event.DONE: State.IDLE,
-        Event.FAILED: State.WAITING,
-        Event.END: State.ENDING,
-    },
-    State.PAUSED: {
-        Event.START: State.SCANNING,
-        Event.STOP: State.CLOSING,
-        Event.RESUME: State.SCANNING,
-        Event.COMPLETED: State.CLOSING,
-        Event.INTERRUPTED: State.REOPENING_PAUSED,
-        Event.DONE: State.IDLE,
-        Event.FAILED: State.WAITING_PAUSED,
-        Event.END: State.ENDING,
-    },
-    State.CLOSING: {
-        Event.START: State.REOPENING,
-        Event.DONE: State.IDLE,
-        Event.FAILED: State.IDLE,
-        Event.END: State.ENDING,
-    },
-    State.REOPENING: {
-        Event.STOP: State.CLOSING,
-        Event.PAUSE: State.REOPENING_PAUSED,
-        Event.DONE: State.WAITING,
-        Event.FAILED: State.WAITING,
-        Event.END: State.ENDING,
-    },
-    State.REOPENING_PAUSED: {
-        Event.START: State.REOPENING,
-        Event.STOP: State.CLOSING,
-        Event.RESUME: State.REOPENING,
-        Event.DONE: State.WAITING_PAUSED,
-        Event.FAILED: State.WAITING_PAUSED,
-        Event.END: State.ENDING,
-    },
-    State.ENDING: {Event.DONE: State.ENDED, Event.FAILED: State.ENDED},
-    State.ENDED: {},
+    State.IDLE: _row("start > waiting, end > ended"),
+    State.WAITING: _row("due > scanning, stop > idle, pause > waiting paused, end > ended"),
+    State.WAITING_PAUSED: _row(
+        "due > paused, start > waiting, stop > idle, resume > waiting, end > ended"
+    ),
+    State.SCANNING: _row(
+        "stop > closing, pause > paused, completed > closing, interrupted > reopening, "
+        "done > idle, failed > waiting, end > ending"
+    ),
+    State.PAUSED: _row(
+        "start > scanning, stop > closing, resume > scanning, completed > closing, "
+        "interrupted > reopening paused, done > idle, failed > waiting paused, end > ending"
+    ),
+    State.CLOSING: _row("start > reopening, done > idle, failed > idle, end > ending"),
+    State.REOPENING: _row(
+        "stop > closing, pause > reopening paused, done > waiting, failed > waiting, end > ending"
+    ),
+    State.REOPENING_PAUSED: _row(
+        "start > reopening, stop > closing, resume > reopening, done > waiting paused, "
+        "failed > waiting paused, end > ending"
+    ),
+    State.ENDING: _row("done > ended, failed > ended"),
+    State.ENDED: _row(""),
 }
 """The next state; an event that is not listed changes nothing."""
 

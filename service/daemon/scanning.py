@@ -193,12 +193,6 @@ class Scanning:
         return None if run is None else run.scan
 
     @property
-    def scan_id(self) -> str:
-        """Name of the running scan; empty without one."""
-        scan = self.scan
-        return scan.inputs.scan_id if scan is not None else ""
-
-    @property
     def silent_s(self) -> float:
         """Seconds since the last processed frame; 0 while no scan takes frames."""
         run = self.run

@@ -7,10 +7,10 @@ set to it. Options: ``sim:?size=640x360&fps=10&duration_s=30&seed=1``.
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from socket import SOCK_DGRAM
 
@@ -61,19 +61,19 @@ class SimulatedFlight:
         if not is_simulated(config):
             return config
         video, telemetry = self._ports
-        camera = dataclasses.replace(
-            config.camera,
-            source=f"stream:udp://127.0.0.1:{video}",
-            model=str(self.folder / "camera.yaml"),
-        )
+        source, model = f"stream:udp://127.0.0.1:{video}", str(self.folder / "camera.yaml")
         links = (*config.mavlink.links, f"udpin:127.0.0.1:{telemetry}", OPERATOR)
         scan = config.scan
         if scan.start == "on-command":
-            scan = dataclasses.replace(scan, start="on-boot")
+            scan = replace(scan, start="on-boot")
         if scan.folder == ScanConfig().folder and not _can_write(Path(scan.folder)):
-            scan = dataclasses.replace(scan, folder=str(self._state / "scans"))
-        mavlink = dataclasses.replace(config.mavlink, links=links)
-        return dataclasses.replace(config, camera=camera, mavlink=mavlink, scan=scan)
+            scan = replace(scan, folder=str(self._state / "scans"))
+        return replace(
+            config,
+            camera=replace(config.camera, source=source, model=model),
+            mavlink=replace(config.mavlink, links=links),
+            scan=scan,
+        )
 
     def start(self) -> Worker:
         """Play the flight until the worker is stopped; it is restarted when it fails."""

@@ -35,10 +35,11 @@ from mavlink.component.ftp import (
 from mavlink.component.metadata import (
     DEFINITION,
     DEFINITION_URI,
-    ComponentMetadata,
+    GENERAL,
     ComponentMetadataMessage,
     camera_definition,
     definition_version,
+    metadata_files,
 )
 from mavlink.component.parameters import PARAMETERS
 from mavlink.component.presence import Presence, PresenceConfig
@@ -325,9 +326,10 @@ def test_a_client_that_sends_the_whole_address_is_served() -> None:
 
 
 def test_the_metadata_describes_every_parameter() -> None:
-    metadata = ComponentMetadata(PARAMETERS)
-    client = Client(FileServer(metadata.files))
-    packet = bytes(metadata.message(1234).pack(dialect.MAVLink(None, 1, 191)))
+    files = metadata_files(PARAMETERS)
+    client = Client(FileServer(files))
+    message = ComponentMetadataMessage(1234, files[GENERAL])
+    packet = bytes(message.pack(dialect.MAVLink(None, 1, 191)))
     payload = packet[10:-2].ljust(108, b"\0")
     boot_ms, crc, raw = struct.unpack("<II100s", payload)
     uri = raw.partition(b"\0")[0].decode()
@@ -363,7 +365,7 @@ def test_the_message_has_the_checksum_of_its_definition() -> None:
     """CRC_EXTRA is made of the names and types of the fields."""
     crc = x25crc(b"COMPONENT_METADATA uint32_t time_boot_ms uint32_t file_crc char uri ")
     crc.accumulate(bytes((100,)))
-    message = ComponentMetadataMessage(0, 0, "")
+    message = ComponentMetadataMessage(0, b"")
     assert (crc.crc & 0xFF) ^ (crc.crc >> 8) == message.crc_extra
 
 
