@@ -22,7 +22,7 @@ from typing import TextIO
 from mavlink.telemetry.decode import plausible_place
 from mavlink.telemetry.history import M_PER_DEG, HistoryConfig, VehicleHistory
 from mavlink.telemetry.logs import TelemetryLog, finish, one_lens
-from mavlink.telemetry.quaternion import from_degrees, from_rpy
+from mavlink.telemetry.quaternion import from_degrees
 from mavlink.telemetry.samples import (
     RECEIVER_SIGMA_H_M,
     AccuracySample,
@@ -160,11 +160,14 @@ def _place(text: str, fields: dict[str, float]) -> tuple[PositionSample, Accurac
 
 
 def _attitudes(history: VehicleHistory, text: str, fields: dict[str, float], time_ns: int) -> None:
+    heads = []
     for which, *angles in PRY.findall(text):
-        pitch, roll, yaw = (math.radians(float(a)) for a in angles)
-        q = from_rpy(roll, pitch, yaw)
-        head = GimbalSample(None, q, GimbalFrame.EARTH, CAMERA, 0)
-        history.add(AttitudeSample(None, q) if which == "F" else head, time_ns)
-    head = from_degrees(*(fields.get(name) for name in ("gb_roll", "gb_pitch", "gb_yaw")))
-    if head is not None:
+        pitch, roll, yaw = map(float, angles)
+        q = from_degrees(roll, pitch, yaw)
+        if which == "F" and q is not None:
+            history.add(AttitudeSample(None, q), time_ns)
+        else:
+            heads.append(q)
+    heads.append(from_degrees(*(fields.get(name) for name in ("gb_roll", "gb_pitch", "gb_yaw"))))
+    for head in filter(None, heads):
         history.add(GimbalSample(None, head, GimbalFrame.EARTH, CAMERA, 0), time_ns)
