@@ -70,7 +70,8 @@ def _collect(path: Path, counts: Counter[str]) -> tuple[Streams, set[tuple[int, 
             counts[message.get_type()] += 1
             counter = counters.setdefault(sender, BootCounter())
             boot = None if sample.boot_ms is None else counter.unwrap(sample.boot_ms)
-            streams[(*sender, counter.session)].append((stamp_ns, boot, sample))
+            key = (*sender, counter.session)
+            streams[key].append((stamp_ns, boot, sample))
     return streams, autopilots
 
 
