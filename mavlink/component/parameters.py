@@ -11,6 +11,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from mavlink.component.control import Answer, Result
@@ -147,9 +148,8 @@ class Parameters:
 
         Returns the operator's answer for a message that sets a value, None for the rest.
         """
-        kind = message.get_type()
-        send = self._send_extended if kind.startswith("PARAM_EXT_") else self._send
-        names = list(self._table)
+        kind, names = message.get_type(), list(self._table)
+        send = partial(self._send, is_extended=kind.startswith("PARAM_EXT_"))
         if kind.endswith("_REQUEST_LIST"):
             for name in names:
                 send(name)
@@ -182,20 +182,14 @@ class Parameters:
         self._acknowledge(name, self[name], ACK_ACCEPTED if accepted else ACK_FAILED)
         return answer
 
-    def _send(self, name: str) -> None:
-        count, i = len(self._table), list(self._table).index(name)
-        message = dialect.MAVLink_param_value_message(name.encode(), self[name], REAL32, count, i)
-        self._outbox.put(ONBOARD, message)
-
-    def _send_extended(self, name: str) -> None:
-        message = dialect.MAVLink_param_ext_value_message(
-            name.encode(),
-            _packed(self[name]),
-            REAL32,
-            len(self._table),
-            list(self._table).index(name),
-        )
-        self._outbox.put(CAMERA, message)
+    def _send(self, name: str, is_extended: bool = False) -> None:
+        value, place = self[name], (REAL32, len(self._table), list(self._table).index(name))
+        if is_extended:
+            packed = _packed(value)
+            message = dialect.MAVLink_param_ext_value_message(name.encode(), packed, *place)
+        else:
+            message = dialect.MAVLink_param_value_message(name.encode(), value, *place)
+        self._outbox.put(CAMERA if is_extended else ONBOARD, message)
 
     def _acknowledge(self, name: str, value: float, result: int) -> None:
         raw = name.encode("ascii", "replace")[:16]

@@ -80,12 +80,12 @@ class StatusTexts:
 class ComputerLoad:
     """The companion's load as measured by the service; None where unknown."""
 
-    cpu_percent: tuple[int, ...] = ()  # per core, the first eight are sent
-    temperature_c: int | None = None
-    ram_used_mib: int | None = None
-    ram_total_mib: int | None = None
-    storage_used_mib: int | None = None
-    storage_total_mib: int | None = None
+    cpu_percent: tuple[float, ...] = ()  # per core, the first eight are sent
+    temperature_c: float | None = None
+    ram_used_mib: float | None = None
+    ram_total_mib: float | None = None
+    storage_used_mib: float | None = None
+    storage_total_mib: float | None = None
     throttled: bool = False
     disk_full: bool = False
 
@@ -93,12 +93,12 @@ class ComputerLoad:
 def computer_status(load: ComputerLoad, unix_us: int, uptime_ms: int) -> Any:
     u8, u32 = 255, 0xFFFFFFFF
 
-    def known(value: int | None) -> int:
-        return u32 if value is None else max(0, min(u32, value))
+    def known(value: float | None, low: int = 0, high: int = u32, unknown: int = u32) -> int:
+        return unknown if value is None else max(low, min(high, round(value)))
 
-    cores = [max(0, min(100, c)) for c in load.cpu_percent[:8]]
+    cores = [known(c, 0, 100) for c in load.cpu_percent[:8]]
     mean = round(sum(cores) / len(cores)) if cores else u8
-    temperature = 127 if load.temperature_c is None else max(-127, min(126, load.temperature_c))
+    temperature = known(load.temperature_c, -127, 126, 127)
     flags = (4 if load.throttled else 0) | (8 if load.disk_full else 0)
     return dialect.MAVLink_onboard_computer_status_message(
         unix_us,

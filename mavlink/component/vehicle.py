@@ -273,7 +273,10 @@ class VehicleLink:
             now_ns = self._alive_ns = self._clock_ns()
             self._guard(partial(self._companion.tick, now_ns))
             self._send(self._companion.take())
-            if (now_ns >= save_ns or self._is_stale()) and not self._is_saving:
+            is_stale = self._memory.is_stale(
+                self._companion.parameters.revision, self.presence.proven_system
+            )
+            if (now_ns >= save_ns or is_stale) and not self._is_saving:
                 save_ns = now_ns + every_ns
                 self._is_saving = True
                 self._disk.put(self._saving())
@@ -325,10 +328,6 @@ class VehicleLink:
             before, lost = lost, self._disk.dropped
             if lost > before:
                 log.warning("the telemetry log lacks %d packets: the disk stalled", lost - before)
-
-    def _is_stale(self) -> bool:
-        revision = self._companion.parameters.revision
-        return self._memory.is_stale(revision, self.presence.proven_system)
 
     def _flush(self, wait_s: float) -> None:
         packets, jobs = self._disk.take(wait_s)

@@ -69,10 +69,8 @@ class BootFit:
 
     boot_ns: F64  # (N,) knots, increasing
     offset_ns: F64  # (N,) relative to ``base_ns``
-    base_ns: int
+    base_ns: int  # the first stamp
     rate: float  # boot seconds per stamp second; 1 unless a simulation ran faster than real time
-    anchor_stamp_ns: int
-    anchor_boot_ns: float
 
     @property
     def is_real_time(self) -> bool:
@@ -88,8 +86,7 @@ class BootFit:
         """The time to use for a message without a boot time."""
         if self.is_real_time:
             return stamp_ns
-        passed = (stamp_ns - self.anchor_stamp_ns) * self.rate
-        return self.from_boot(self.anchor_boot_ns + passed)
+        return self.from_boot(float(self.boot_ns[0]) + (stamp_ns - self.base_ns) * self.rate)
 
 
 def fit_boot(stamp_ns: Sequence[int], boot_ms: Sequence[float]) -> BootFit:
@@ -104,15 +101,13 @@ def fit_boot(stamp_ns: Sequence[int], boot_ms: Sequence[float]) -> BootFit:
     stamps: F64 = (np.asarray(stamp_ns, dtype=np.int64) - base).astype(np.float64)
     boots: F64 = np.asarray(boot_ms, dtype=np.float64) * MS
     rate = _rate(stamps, boots)
-    anchor = (base, float(boots[0]))
     if rate != 1.0:
-        start = np.array([boots[0]])
-        return BootFit(start, -start, base, rate, *anchor)
+        return BootFit(boots[:1], -boots[:1], base, rate)
     knots, edge = _lower_edge(stamps, boots)
     line = _line(knots, edge)
     if np.median(np.abs(edge - line)) < 20 * MS:
         edge = line
-    return BootFit(knots, edge, base, 1.0, *anchor)
+    return BootFit(knots, edge, base, 1.0)
 
 
 def _rate(stamps: F64, boots: F64) -> float:

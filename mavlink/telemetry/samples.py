@@ -262,7 +262,7 @@ class TimeSeries(Generic[S]):
         return self._past_end(bool(i), time_ns, max_gap_ns, extrapolate_ns)
 
     def _past_end(self, late: bool, time_ns: int, max_gap: int, near: int) -> Bracket[S] | None:
-        times, samples = self._times, self._samples
+        times = self._times
         k = len(times) - 1 if late else 0
         beyond = abs(time_ns - times[k])
         if beyond > near:
@@ -273,15 +273,16 @@ class TimeSeries(Generic[S]):
         while 0 <= j < len(times) and abs(times[j] - times[k]) < beyond:
             j += step
         if beyond == 0 or not 0 <= j < len(times) or abs(times[j] - times[k]) > max_gap:
-            return Bracket(times[k], times[k], samples[k], samples[k], time_ns)
-        a, b = (j, k) if late else (k, j)
-        return Bracket(times[a], times[b], samples[a], samples[b], time_ns)
+            j = k
+        return self._between(min(j, k), max(j, k), time_ns)
 
     def _inside(self, i: int, time_ns: int, max_gap: int, near: int) -> Bracket[S] | None:
         before, after = self._times[i - 1], self._times[i]
         if after - before <= max_gap:
-            return Bracket(before, after, self._samples[i - 1], self._samples[i], time_ns)
+            return self._between(i - 1, i, time_ns)
         k = i - 1 if time_ns - before <= after - time_ns else i
-        if abs(time_ns - self._times[k]) > near:
-            return None
-        return Bracket(self._times[k], self._times[k], self._samples[k], self._samples[k], time_ns)
+        return None if abs(time_ns - self._times[k]) > near else self._between(k, k, time_ns)
+
+    def _between(self, i: int, j: int, time_ns: int) -> Bracket[S]:
+        times, samples = self._times, self._samples
+        return Bracket(times[i], times[j], samples[i], samples[j], time_ns)

@@ -50,20 +50,17 @@ class Machine:
 def computer_load(machine: Machine, cores: Sequence[float], keep_free_mib: float) -> ComputerLoad:
     """The readings, and the load of each ``cores`` in per cent, in the form sent over MAVLink."""
 
-    def used(free: float | None, total: float | None) -> int | None:
-        return None if free is None or total is None else round(total - free)
-
-    def whole(value: float | None) -> int | None:
-        return None if value is None else round(value)
+    def used(free: float | None, total: float | None) -> float | None:
+        return None if free is None or total is None else total - free
 
     free = machine.disk_free_mib
     return ComputerLoad(
-        cpu_percent=tuple(map(round, cores)),
-        temperature_c=whole(machine.temperature_c),
+        cpu_percent=tuple(cores),
+        temperature_c=machine.temperature_c,
         ram_used_mib=used(machine.memory_free_mib, machine.memory_total_mib),
-        ram_total_mib=whole(machine.memory_total_mib),
+        ram_total_mib=machine.memory_total_mib,
         storage_used_mib=used(free, machine.disk_total_mib),
-        storage_total_mib=whole(machine.disk_total_mib),
+        storage_total_mib=machine.disk_total_mib,
         throttled=bool(machine.throttled),
         disk_full=free is not None and free < max(100.0, 0.5 * keep_free_mib),
     )

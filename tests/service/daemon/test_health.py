@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect  # type: ignore[import-untyped]
 
+from mavlink.component.status import computer_status
 from service.config import Config, load_config, reload
 from service.daemon.health import DESCRIPTION, HealthServer, metrics_text
 from service.daemon.machine import Machine, computer_load, read_machine
@@ -272,7 +273,9 @@ def test_load_as_the_operator_sees_it() -> None:
         disk_total_mib=9000.0,
     )
     load = computer_load(machine, (74.9, 0.0), keep_free_mib=2048.0)
-    assert (load.cpu_percent, load.temperature_c) == ((75, 0), 62)
+    assert (load.cpu_percent, load.temperature_c) == ((74.9, 0.0), 61.6)
+    sent = computer_status(load, 0, 0)
+    assert (sent.cpu_cores[:3], sent.temperature_board) == ([75, 0, 255], 62)
     assert (load.ram_used_mib, load.ram_total_mib) == (3000, 4000)
     assert (load.storage_used_mib, load.storage_total_mib) == (8500, 9000)
     assert load.disk_full
