@@ -61,7 +61,9 @@ class AutopilotLink:
             if (packet.system, packet.component) == self._presence.autopilot:
                 self.link = link
         elif name == "SYSTEM_TIME":
-            self._hear_system_time(message, packet, now_ns)
+            if (packet.system, packet.component) == self._presence.autopilot:
+                self._rates.heard(name)
+                self.wall_time.hear(message.time_unix_usec, now_ns)
         elif name == "TIMESYNC":
             self._hear_timesync(message, packet, link, now_ns)
 
@@ -106,11 +108,6 @@ class AutopilotLink:
         self._start_over()
         self._restarted()
         self._say(texts.WARNING, "Autopilot restarted; telemetry starts over")
-
-    def _hear_system_time(self, message: Any, packet: Packet, now_ns: int) -> None:
-        if (packet.system, packet.component) == self._presence.autopilot:
-            self._rates.heard("SYSTEM_TIME")
-            self.wall_time.hear(message.time_unix_usec, now_ns)
 
     def _hear_timesync(self, message: Any, packet: Packet, link: int, now_ns: int) -> None:
         """Answer the autopilot's request, or process an answer to ours."""
@@ -159,10 +156,12 @@ class AutopilotLink:
         if request is not None:
             self._outbox.put(ONBOARD, request, link)
 
-    def boot_clock(self) -> BootClock | None:
-        """The autopilot's clock; None before it was heard."""
+    @property
+    def boot_offset_ns(self) -> int | None:
+        """Our clock minus the autopilot's boot clock; None before it was heard."""
         autopilot = self._presence.autopilot
-        return None if autopilot is None else self._clocks.get(autopilot[1])
+        clock = None if autopilot is None else self._clocks.get(autopilot[1])
+        return None if clock is None else clock.offset_ns
 
 
 WANTED_HZ: Mapping[str, float] = {

@@ -209,7 +209,7 @@ class Companion:
     def _parameter_changed(self, name: str, value: float) -> Answer:
         answer = self.control.parameter_changed(name, value)
         if name == YAW_FRAME and answer.result is Result.ACCEPTED:
-            self._set_yaw_frame(value)
+            self.history.set_yaw_frame(YAW_FRAMES[round(value)])
         return answer
 
     def announce_kept(self) -> None:
@@ -218,9 +218,6 @@ class Companion:
             answer = self._parameter_changed(name, value)
             if answer.result is not Result.ACCEPTED:
                 self.parameters.forget(name)
-
-    def _set_yaw_frame(self, value: float) -> None:
-        self.history.set_yaw_frame(YAW_FRAMES[round(value)])
 
     # Output.
 

@@ -14,7 +14,7 @@ from enum import IntEnum
 from typing import Any
 
 from mavlink.wire.dialect import dialect
-from mavlink.wire.first_beat import CAMERA, NO_AUTOPILOT, ONBOARD, TYPES, is_autopilot
+from mavlink.wire.first_beat import NO_AUTOPILOT, TYPES, is_autopilot
 from mavlink.wire.messages import OutgoingMessage
 
 S = 1_000_000_000
@@ -72,9 +72,6 @@ class Autopilot:
     messages: int = 0
     answers: int = 0
     round_trip_ns: int = 0  # the minimum
-
-    def forget_evidence(self) -> None:
-        self.messages = self.answers = self.round_trip_ns = 0
 
 
 class Presence:
@@ -158,11 +155,10 @@ class Presence:
             state = self._state(now_ns)
             if state is None:
                 return []
-            return [OutgoingMessage(c, self._heartbeat(c, state)) for c in (ONBOARD, CAMERA)]
-
-    def _heartbeat(self, component: int, state: Health) -> Any:
-        kind = TYPES[component]
-        return dialect.MAVLink_heartbeat_message(kind, NO_AUTOPILOT, 0, self._token, int(state), 3)
+            make, rest = dialect.MAVLink_heartbeat_message, (0, self._token, int(state), 3)
+            return [
+                OutgoingMessage(c, make(kind, NO_AUTOPILOT, *rest)) for c, kind in TYPES.items()
+            ]
 
     # The autopilot.
 
@@ -265,7 +261,7 @@ class Presence:
         if present := self._present(now_ns):
             self._decide(present)
         for autopilot in self._heard.values():
-            autopilot.forget_evidence()
+            autopilot.messages = autopilot.answers = autopilot.round_trip_ns = 0
 
     def _decide(self, present: Sequence[Autopilot]) -> None:
         best = clear_winner(present)

@@ -224,8 +224,7 @@ class VehicleLink:
 
     def boot_time_us(self, time_ns: int) -> int | None:
         """The autopilot's boot clock in us at one of our monotonic times; None when unknown."""
-        clock = self._companion.autopilot.boot_clock()
-        offset = None if clock is None else clock.offset_ns
+        offset = self._companion.autopilot.boot_offset_ns
         return None if offset is None else (time_ns - offset) // 1000
 
     @property

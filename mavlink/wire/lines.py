@@ -15,6 +15,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from functools import reduce
+from operator import xor
 from typing import Any
 
 from mavlink.wire.dialect import dialect
@@ -79,7 +81,7 @@ class LineReader:
     def _sentence(self, line: str) -> Values:
         """What an NMEA sentence with a correct checksum states."""
         whole = re.fullmatch(r"\$(..(...),([^*]*))\*([0-9A-Fa-f]{2})", line)
-        if whole is None or _checksum(whole[1]) != int(whole[4], 16):
+        if whole is None or reduce(xor, map(ord, whole[1])) != int(whole[4], 16):
             return {}
         fields = whole[3].split(",")
         if whole[2] == "GST" and len(fields) >= 8:
@@ -181,14 +183,6 @@ def _number(text: str) -> float:
     except ValueError:
         return NAN
     return value if abs(value) < 1e12 else NAN
-
-
-def _checksum(text: str) -> int:
-    """NMEA 0183: exclusive or of the characters between $ and *."""
-    total = 0
-    for letter in text:
-        total ^= ord(letter)
-    return total
 
 
 def _degrees(text: str, is_negative: bool) -> float:
