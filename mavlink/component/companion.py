@@ -13,7 +13,7 @@ from typing import Any
 
 from mavlink.component import status as texts
 from mavlink.component.autopilot_link import AutopilotLink
-from mavlink.component.camera import CAPTURE_STATUS, CameraComponent, KeyframeReport
+from mavlink.component.camera import CAPTURE_STATUS, CameraComponent
 from mavlink.component.command_desk import CommandDesk, decode_call
 from mavlink.component.commands import COMMANDS, is_stop
 from mavlink.component.control import Answer, Handled, Result, ScanControl, Work
@@ -262,10 +262,6 @@ class Companion:
 
     def _answer(self, severity: int, text: str) -> None:
         self.say(severity, text, is_answer=True)
-
-    def report(self, keyframe: KeyframeReport) -> int:
-        """Publish a keyframe; returns its index."""
-        return self.camera.report(keyframe)
 
     def send(self, message: Any) -> None:
         """Send a message of the onboard computer to everyone."""

@@ -170,7 +170,7 @@ class VehicleLink:
         self._inbox.put(lambda: self._companion.say(severity, text, is_answer))
 
     def report_keyframe(self, keyframe: KeyframeReport) -> None:
-        self._inbox.put(lambda: self._companion.report(keyframe))
+        self._inbox.put(lambda: self._companion.camera.report(keyframe))
 
     def send_tunnel(self, payload_type: int, payload: bytes) -> None:
         """Send up to 128 bytes to everyone by TUNNEL."""

@@ -41,11 +41,9 @@ def is_autopilot(component: int, heartbeat: Any) -> bool:
     )
 
 
-def heartbeat_packet(
-    sequence: int, system: int, component: int, token: int, state: int = BOOT
-) -> bytes:
-    """The MAVLink 2 packet of a HEARTBEAT of one of our components."""
-    payload = struct.pack("<IBBBBB", token, TYPES[component], NO_AUTOPILOT, 0, state, VERSION)
+def heartbeat_packet(sequence: int, system: int, component: int, token: int) -> bytes:
+    """The MAVLink 2 packet of a HEARTBEAT of one of our components that boots."""
+    payload = struct.pack("<IBBBBB", token, TYPES[component], NO_AUTOPILOT, 0, BOOT, VERSION)
     head = struct.pack("<BBBBBB", len(payload), 0, 0, sequence & 0xFF, system, component)
     body = head + HEARTBEAT.to_bytes(3, "little") + payload
     return b"\xfd" + body + _crc(body + bytes((CRC_EXTRA,))).to_bytes(2, "little")

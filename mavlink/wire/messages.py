@@ -38,8 +38,8 @@ class OutgoingMessage:
 class SendQueue:
     """Messages waiting to be packed; a full queue drops the oldest."""
 
-    def __init__(self, limit: int = 2000) -> None:
-        self._waiting: deque[OutgoingMessage] = deque(maxlen=limit)
+    def __init__(self) -> None:
+        self._waiting: deque[OutgoingMessage] = deque(maxlen=2000)
 
     def put(self, component: int, message: Any, link: int | None = None) -> None:
         self._waiting.append(OutgoingMessage(component, message, link))

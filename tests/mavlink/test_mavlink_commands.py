@@ -346,7 +346,7 @@ PHOTO = KeyframeReport(1_700_000_000_000_000, 47.3, 8.5, 512.25, 80.5, file="pho
 
 def shot(ends: Ends) -> list[Any]:
     """The service has taken the photo; what is sent then."""
-    ends.companion.report(PHOTO)
+    ends.companion.camera.report(PHOTO)
     return ends.pass_time(0.05)
 
 
@@ -496,7 +496,7 @@ def test_a_shot_that_never_comes_is_reported_as_failed(ends: Ends) -> None:
 
 def test_a_keyframe_that_nobody_asked_for_answers_no_request(ends: Ends) -> None:
     ends.command(2000, 100, 0, 0, 1)
-    ends.companion.report(replace(PHOTO, file=""))
+    ends.companion.camera.report(replace(PHOTO, file=""))
     heard = ends.pass_time(0.1)
     assert kinds(heard) == ["CAMERA_IMAGE_CAPTURED"]
     assert statuses(shot(ends))[-1].image_status == 0

@@ -419,7 +419,7 @@ def test_values_that_do_not_fit_are_dropped_not_raised() -> None:
         KeyframeReport(10**20, 1e30, -1e30, float("nan"), float("inf"), None, False),
         KeyframeReport(-5, None, None, None, None, (1.0, 0.0, 0.0, 0.0)),
     ):
-        station.companion.report(report)
+        station.companion.camera.report(report)
     for out in station.companion.take():
         packer.pack(1, out, 0)
     assert packer.pack(1, OutgoingMessage(191, beat()), 0) is not None
