@@ -79,7 +79,9 @@ class ScanRun:
         scan, store, folder = self.scan, self.store, self.folder
         return (
             None if scan is None else scan.recorder.keyframes,
-            None if store is None else [store.database.uses[worker.thread_id] for worker in self.workers],
+            None
+            if store is None
+            else [store.database.uses[worker.thread_id] for worker in self.workers],
             None if folder is None else sizes(folder),
         )
 
