@@ -11,6 +11,8 @@ leaves its scale open, block by block of keyframes.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -19,7 +21,7 @@ from recon import se3
 from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.ground_heights import height_ratio
 from recon.posegraph.pose_priors import MIN_FIX_M, dead_reckoned, has_fix
-from recon.posegraph.records import Node, PoseGraphConfig
+from recon.posegraph.records import Loop, Node, PoseGraphConfig
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_noise import bias_time_constant_s, inflation
 from recon.posegraph.smoother import NO_SCALE, Smoother, left_covariance
@@ -54,6 +56,12 @@ GATE_SIGMAS, HUBER_SIGMAS = 5.0, 1.5
 """Beyond so many sigmas from the prediction a reading is left out, as noise alone reaches that once
 in a million; and from so many of its residual on it loses weight."""
 
+FRAME_DRIFT = 0.003
+"""Share of the path flown by which a track may leave the frame of its segment."""
+
+SIGMA_LOOP_SCALE = 0.002
+"""Of the ratio of the depths at a loop's ends."""
+
 ALTITUDE_SLACK_M = 3.0
 """An altitude further beyond its gate has stepped: pressure by a climb or a gust is less."""
 
@@ -62,100 +70,228 @@ LINK_RAD, LINK_WITHOUT_HEADING_RAD, LINK_M, LINK_M_S = 0.3, 1.5, 5.0, 3.0
 and for each second: about what a drone's speed changes by."""
 
 
-class ReadingFactors:
-    """Adds a keyframe's readings to the smoother, and counts what it leaves out."""
+class GraphFactors:
+    """One build of the graph: the factors of its nodes and loops, and their solution."""
 
     def __init__(
-        self,
-        config: PoseGraphConfig,
-        smoother: Smoother,
-        counts: Counter[str],
-        keyframes: int,
-        span_s: float,
-        altitude_offset_m: float | None,
+        self, config: PoseGraphConfig, segments: Segments, nodes: Collection[Node]
     ) -> None:
-        """``keyframes`` are known so far over ``span_s``; ``altitude_offset_m`` is altitude less
-        world z; None: that of the first reading."""
-        self._config, self._smoother, self._counts = config, smoother, counts
-        self._keyframes, self._span_s = max(keyframes, 1), max(span_s, 1.0)
+        """How many readings share a sensor's bias follows from the ``nodes`` known so far."""
+        self._config, self._segments = config, segments
+        self.smoother = Smoother()
+        times_ns = [node.time_ns for node in nodes]
+        self._keyframes = max(len(times_ns), 1)
+        self._span_s = max((times_ns[-1] - times_ns[0]) * 1e-9 if times_ns else 0.0, 1.0)
         self._inflation = partial(inflation, self._keyframes, self._span_s)
-        self._offset_m = altitude_offset_m
+        self._altitude_offset_m = segments.altitude_offset()  # altitude less world z
+        self.left_out: Counter[str] = Counter()
+        self.sources: list[set[str]] = []  # of each node
+        self.path_m: list[float] = []  # flown up to each node
+        self.refuted: dict[int, int] = {}  # last keyframe after each refuted step's first
+        self.scale_of: list[int] = []  # key of each node's scale, or NO_SCALE
+        self._units: dict[int, int] = {}  # by segment, key of its first scale
+        # Of the newest segment: the first node of its last scale, the keyframes that this stands
+        # for, and the relative sigmas of vision's steps.
+        self._since, self._held, self._lengths = 0, 0, list[float]()
+        self._prior = PosePrior()  # of the newest node, without biases
 
-    def add(
-        self,
-        node: Node,
-        T: F64,
-        spread: F64,
-        drift_m: float | None,
-        noise: ReadingNoise | None = None,
-    ) -> set[str]:
-        """The sensors that took part; the keyframe is predicted at ``T`` +- ``spread``.
+    def add(self, node: Node, last: Node | None) -> None:
+        """A node's motion since the ``last`` one, and its readings."""
+        segment = self._segments[node.segment]
+        before, self._prior = self._prior, segment.without_biases(node)
+        self.scale_of.append(self._scale(node, last))
+        if last is None:
+            T, spread = self._first(node)
+            used, path_m = {"vision"}, 0.0
+        else:
+            T_last, spread_last = self.smoother.state(last.key)
+            motion, covariance, is_seen = self._motion(node, last, T_last, before)
+            used = {"vision" if is_seen else "dead reckoning"}
+            T = se3.project_to_so3(T_last @ motion)
+            path_m = self.path_m[-1] + float(np.linalg.norm(motion[:3, 3]))
+            spread = spread_last + left_covariance(T_last, covariance)
+        self.smoother.append_pose(T, spread)
+        self.path_m.append(path_m)
+        node = replace(node, prior=self._prior)
+        used |= {"attitude"} if self._attitude(node, T, spread) else set()
+        if segment.similarity is not None:
+            used |= {"gnss"} if self._position(node, T, spread) else set()
+            has_altitude, has_height = self._altitude(node, T), self._height(node)
+            used |= {"altitude"} if has_altitude or has_height else set()
+        self.sources.append(used)
 
-        ``drift_m`` is how far the segment's track may have left its frame. None while there is no
-        such frame; then only the attitude is used.
+    def add_loop(self, loop: Loop, a: Node, b: Node) -> None:
+        """A loop between two nodes, and the ratio of the depths there, where each has a scale."""
+        scale_m, other_m = (self._segments[end.segment].frame.scale for end in (a, b))
+        metric = loop.scaled(scale_m)
+        self.sources[b.key].add("loop")
+        scales = self.scale_of[a.key], self.scale_of[b.key]
+        unit = self._units.get(a.segment, NO_SCALE)
+        # Not robust: two loops agreed, and a late one with a large misclosure would lose weight.
+        self.smoother.add_motion(
+            "loop", (a.key, b.key), metric.T_a_b, metric.covariance, scales[0], unit
+        )
+        if scales[0] != scales[1] and NO_SCALE not in scales:
+            log = float(np.log(loop.ratio * scale_m / other_m))
+            self.smoother.add_scale("loop scale", scales, log, SIGMA_LOOP_SCALE, HUBER_SIGMAS)
+
+    # ---- motions -------------------------------------------------------------------------------
+
+    def _first(self, node: Node) -> tuple[F64, F64]:
+        """Pose and covariance of the first keyframe: loose where readings will follow.
+
+        The gauge that no reading ever fixes is held at the start.
         """
-        is_placed = drift_m is not None
-        used = {"attitude"} if self._attitude(node, T, spread, is_placed) else set()
-        if drift_m is not None:
-            place = np.diag(se3.about(T[:3, 3], spread))[3:]
-            used |= {"gnss"} if self._position(node, T, place, drift_m, noise) else set()
-            used |= {"altitude"} if self._altitude(node, T) else set()
-        return used
+        frame = self._segments[node.segment].frame
+        T = frame.pose(node.T_odom_camera)
+        sigma_t, sigma_r = 0.01, 1.0 if node.prior.R_world_camera is not None else 0.01
+        if "gnss" in frame.sources:  # places along a line leave the roll about it free
+            known = float(np.sqrt(np.linalg.eigvalsh(frame.covariance[:3, :3])[-1]))
+            sigma_t, sigma_r = 50.0, max(sigma_r, min(known, 1.0))
+        sigma = np.array([sigma_r] * 3 + [sigma_t] * 3)
+        self.smoother.add_turn("prior", node.key, T[:3, :3], sigma[:3])
+        self.smoother.add_place("prior place", node.key, T[:3, 3], sigma[3:])
+        return T, left_covariance(T, np.diag(sigma**2))
 
-    def height(self, node: Node, scale_key: int, scale: float) -> bool:
-        """True when the height above ground was taken as a reading of the scale."""
-        ratio = height_ratio(node)
-        if ratio is None or not node.prior.is_agl_measured:
-            return False
-        if node.lean == 0.0 and abs(ratio[0] - np.log(scale)) > HEIGHT_GATE:
-            self._counts["height off"] += 1  # a tree or a roof under the one sensor alone
-            return False
-        sigma = ratio[1] * float(np.sqrt(BLOCK * BLOCKS_PER_HEIGHT))
-        measured = ratio[0] - float(np.log(scale))
-        self._smoother.add_scale("height", (NO_SCALE, scale_key), measured, sigma, HUBER_SIGMAS)
-        return True
+    def _motion(
+        self, node: Node, last: Node, T_last: F64, before: PosePrior
+    ) -> tuple[F64, F64, bool]:
+        """T_last_node in metres, its (6, 6) covariance, left, in last's frame, and whether vision
+        gives it; now a factor. ``before`` is the prior of the last node without biases."""
+        is_seen, scale, unit = node.segment == last.segment, NO_SCALE, NO_SCALE
+        if is_seen:
+            motion, covariance = self._seen(node, last)
+            noise = self._segments[node.segment].noise
+            passed_s = (node.time_ns - last.time_ns) * 1e-9
+            if noise is not None and _is_refuted(
+                before, self._prior, passed_s, motion, covariance, noise
+            ):
+                self.refuted[last.seq] = node.seq
+                self.left_out["vision off"] += 1
+                is_seen = False
+        else:
+            self.left_out["stretch without vision"] += 1
+        if is_seen:
+            scale, unit = self.scale_of[node.key], self._units.get(node.segment, NO_SCALE)
+        else:
+            motion, covariance = self._link(node, last, T_last)
+        kind = "vision" if is_seen else "link"
+        self.smoother.add_motion(kind, (last.key, node.key), motion, covariance, scale, unit)
+        return motion, covariance, is_seen
 
-    def _attitude(self, node: Node, T: F64, spread: F64, is_placed: bool) -> bool:
+    def _scale(self, node: Node, last: Node | None) -> int:
+        """Key of the node's scale, made when missing; none before its segment is placed.
+
+        A new one begins every twenty keyframes, and where vision's scale may have changed.
+        """
+        segment = self._segments[node.segment]
+        if segment.similarity is None:
+            return NO_SCALE
+        if last is None or last.segment != node.segment:
+            before, self._lengths = NO_SCALE, []
+            sigma = float(np.clip(segment.frame.sigma_scale, KNOWN_SCALE, UNKNOWN_SCALE))
+        else:
+            before, jump = self.scale_of[last.key], self._jump(node, last)
+            if node.key - self._since < BLOCK and not jump:
+                self._held += node.weight
+                return before
+            walk = self._config.sigma_scale_walk * np.sqrt(max(1.0, self._held / BLOCK))
+            sigma = float(np.hypot(walk, jump))
+        key = self.smoother.append_scale(float(self.smoother.logs()[before]))
+        self.smoother.add_scale("scale", (before, key), 0.0, sigma)
+        self._units.setdefault(node.segment, key)
+        self._since, self._held = node.key, node.weight
+        return key
+
+    def _jump(self, node: Node, last: Node) -> float:
+        """Share by which vision's scale may have changed at a step."""
+        length = _length_sigma(node, last)
+        self._lengths.append(length)
+        return length if length > max(OPEN_LENGTH, OPEN_SHARE * np.median(self._lengths)) else 0.0
+
+    def _seen(self, node: Node, last: Node) -> tuple[F64, F64]:
+        frame = self._segments[node.segment].frame
+        motion = se3.inverse(frame.pose(last.T_odom_camera)) @ frame.pose(node.T_odom_camera)
+        units = np.array([1.0] * 3 + [frame.scale] * 3)
+        covariance = node.covariance * np.outer(units, units) + np.diag([1e-10] * 3 + [1e-6] * 3)
+        covariance[3:, 3:] += self._config.sigma_step**2 * np.outer(motion[:3, 3], motion[:3, 3])
+        return motion, covariance
+
+    def _link(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
+        """Dead reckoning where vision was lost: telemetry's motion, else the last one's, wide."""
+        passed_s = (node.time_ns - last.time_ns) * 1e-9
+        segment = self._segments[node.segment]
+        frame = segment.similarity
+        is_new = node.segment != last.segment
+        if is_new and frame is not None and segment.is_tied:
+            T = frame.pose(node.T_odom_camera)
+        elif node.T_prev_segment is not None:
+            T = T_last @ node.T_prev_segment
+        else:
+            priors = self._segments[last.segment].at_camera(last), segment.at_camera(node)
+            T = dead_reckoned(*priors, T_last, self._velocity(last, T_last), passed_s)
+        prior = node.prior
+        is_turn_known = prior.R_world_camera is not None and prior.sigma_yaw_rad < 1.0
+        sigma_r = LINK_RAD if is_turn_known else LINK_WITHOUT_HEADING_RAD
+        sigma_m = LINK_M_S * max(passed_s, 1.0) + LINK_M
+        motion = se3.inverse(T_last) @ T
+        # Translation and rotation are separate: an error of one does not rotate the other.
+        apart = np.diag(np.square([sigma_r] * 3 + [sigma_m] * 3))
+        return motion, left_covariance(motion, apart)
+
+    def _velocity(self, last: Node, T_last: F64) -> F64 | None:
+        """(3,) m/s at a segment's keyframe, over a second or more; None at its start, and where
+        no aircraft is so fast: a camera about to fail stamps images anyhow."""
+        for node in reversed(self._segments[last.segment].nodes):
+            passed_s = (last.time_ns - node.time_ns) * 1e-9
+            if node.key < last.key and passed_s >= VELOCITY_S:
+                velocity = (T_last[:3, 3] - self.smoother.pose(node.key)[:3, 3]) / passed_s
+                return velocity if np.linalg.norm(velocity) < FASTEST_M_S else None
+        return None
+
+    # ---- readings ------------------------------------------------------------------------------
+
+    def _attitude(self, node: Node, T: F64, spread: F64) -> bool:
         prior = node.prior
         if prior.R_world_camera is None:
             return False
         sigma = np.array([prior.sigma_tilt_rad, prior.sigma_tilt_rad, prior.sigma_yaw_rad])
         turn = _turn(T[:3, :3], prior.R_world_camera, prior.sigma_yaw_rad < 1.0)
         sure = np.diag(spread)[:3]
-        if is_placed:  # the frame rests on all attitudes: it is no worse than this
+        # The frame of a placed segment rests on all attitudes: it is no worse than this.
+        if self._segments[node.segment].similarity is not None:
             sure = np.minimum(sure, np.square(FRAME_SIGMA_RAD))
         allowed = GATE_SIGMAS * np.sqrt(sure + sigma**2)
         if abs(turn[2]) > allowed[2]:
-            self._counts["heading off"] += 1
+            self.left_out["heading off"] += 1
             turn, sigma[2] = _turn(T[:3, :3], prior.R_world_camera, False), np.pi
         if np.any(np.abs(turn[:2]) > allowed[:2]):
-            self._counts["view off" if prior.is_view_assumed else "tilt off"] += 1
+            self.left_out["view off" if prior.is_view_assumed else "tilt off"] += 1
             return False
         R = se3.so3_exp(turn) @ T[:3, :3]
         sigma = sigma * self._inflation(self._config.attitude_s)
-        self._smoother.add_turn("attitude", node.key, R, sigma, HUBER_SIGMAS)
+        self.smoother.add_turn("attitude", node.key, R, sigma, HUBER_SIGMAS)
         return True
 
-    def _position(
-        self, node: Node, T: F64, place: F64, drift_m: float, measured: ReadingNoise | None
-    ) -> bool:
-        prior = node.prior
+    def _position(self, node: Node, T: F64, spread: F64) -> bool:
+        prior, noise = node.prior, self._segments[node.segment].noise
         if prior.position_m is None or prior.sigma_position_m is None:
             return False
         sigma = np.maximum(prior.sigma_position_m, MIN_FIX_M)
         # The frame rests on all fixes: it is no worse than one of them.
-        sure = np.minimum(place, sigma**2 + drift_m**2)
+        drift_m = FRAME_DRIFT * self.path_m[node.key]
+        sure = np.minimum(np.diag(se3.about(T[:3, 3], spread))[3:], sigma**2 + drift_m**2)
         apart = np.abs(prior.position_m - T[:3, 3])
         if np.any(apart > GATE_SIGMAS * np.sqrt(sure + sigma**2)):
-            self._counts["position off"] += 1
+            self.left_out["position off"] += 1
             return False
-        if measured is not None and (known := measured.by_axis):
+        if noise is not None and (known := noise.by_axis):
             each = [one.effective_sigma(self._keyframes, self._span_s) for one in known]
             sigma = np.maximum(each, MIN_FIX_M)
         else:
             tau_s = bias_time_constant_s(float(sigma[0]), self._config.fix_s)
             sigma = sigma * self._inflation(tau_s)
-        self._smoother.add_place("position", node.key, prior.position_m, sigma, HUBER_SIGMAS)
+        self.smoother.add_place("position", node.key, prior.position_m, sigma, HUBER_SIGMAS)
         return True
 
     def _altitude(self, node: Node, T: F64) -> bool:
@@ -163,16 +299,29 @@ class ReadingFactors:
         prior = node.prior
         if prior.altitude_m is None:
             return False
-        if self._offset_m is None:
-            self._offset_m = prior.altitude_m - T[2, 3]
-        z, one = prior.altitude_m - self._offset_m, prior.sigma_altitude_m
+        if self._altitude_offset_m is None:
+            self._altitude_offset_m = prior.altitude_m - T[2, 3]
+        z, one = prior.altitude_m - self._altitude_offset_m, prior.sigma_altitude_m
         if abs(z - T[2, 3]) > GATE_SIGMAS * one + ALTITUDE_SLACK_M:
-            self._counts["altitude off"] += 1
-            self._offset_m = prior.altitude_m - T[2, 3]
+            self.left_out["altitude off"] += 1
+            self._altitude_offset_m = prior.altitude_m - T[2, 3]
             return False
         sigma = np.array([np.inf, np.inf, one * self._inflation(self._config.altitude_s)])
         place = np.array([0.0, 0.0, z])
-        self._smoother.add_place("altitude", node.key, place, sigma, HUBER_SIGMAS)
+        self.smoother.add_place("altitude", node.key, place, sigma, HUBER_SIGMAS)
+        return True
+
+    def _height(self, node: Node) -> bool:
+        """True when the height above ground was taken as a reading of the scale."""
+        ratio, log = height_ratio(node), np.log(self._segments[node.segment].frame.scale)
+        if ratio is None or not node.prior.is_agl_measured:
+            return False
+        if node.lean == 0.0 and abs(ratio[0] - log) > HEIGHT_GATE:
+            self.left_out["height off"] += 1  # a tree or a roof under the one sensor alone
+            return False
+        sigma = ratio[1] * float(np.sqrt(BLOCK * BLOCKS_PER_HEIGHT))
+        keys, measured = (NO_SCALE, self.scale_of[node.key]), ratio[0] - float(log)
+        self.smoother.add_scale("height", keys, measured, sigma, HUBER_SIGMAS)
         return True
 
 
@@ -211,141 +360,3 @@ def _is_refuted(
     sigma_m = np.sqrt(changed + np.trace(covariance[3:, 3:]) / 3.0)
     off_m = np.abs(R_a @ motion[:3, 3] - (to_m - from_m))
     return bool(np.any(off_m > GATE_SIGMAS * sigma_m))
-
-
-class MotionFactors:
-    """Adds the motions of one graph to its smoother, and keeps the scale of each keyframe."""
-
-    def __init__(
-        self, config: PoseGraphConfig, smoother: Smoother, segments: Segments, counts: Counter[str]
-    ) -> None:
-        """``counts`` takes in the stretches without vision."""
-        self._config, self._smoother = config, smoother
-        self._segments, self._counts = segments, counts
-        self.scale_of: list[int] = []  # key of each keyframe's scale, or NO_SCALE
-        self.refuted: dict[int, int] = {}  # last keyframe after each refuted step's first
-
-    def first(self, node: Node) -> tuple[F64, F64]:
-        """Pose and covariance of the first keyframe: loose where readings will follow.
-
-        The gauge that no reading ever fixes is held at the start.
-        """
-        frame = self._segments[node.segment].frame
-        T = frame.pose(node.T_odom_camera)
-        sigma_t, sigma_r = 0.01, 1.0 if node.prior.R_world_camera is not None else 0.01
-        if "gnss" in frame.sources:  # places along a line leave the roll about it free
-            known = float(np.sqrt(np.linalg.eigvalsh(frame.covariance[:3, :3])[-1]))
-            sigma_t, sigma_r = 50.0, max(sigma_r, min(known, 1.0))
-        sigma = np.array([sigma_r] * 3 + [sigma_t] * 3)
-        self._smoother.add_turn("prior", node.key, T[:3, :3], sigma[:3])
-        self._smoother.add_place("prior place", node.key, T[:3, 3], sigma[3:])
-        return T, left_covariance(T, np.diag(sigma**2))
-
-    def add(
-        self, node: Node, last: Node, T_last: F64, priors: tuple[PosePrior, PosePrior]
-    ) -> tuple[F64, F64, bool]:
-        """T_last_node in metres, its (6, 6) covariance, left, in last's frame, and whether vision
-        gives it; now a factor. The ``priors`` of last and node have no biases."""
-        is_seen = node.segment == last.segment
-        if is_seen:
-            motion, covariance = self._seen(node, last)
-            noise = self._segments[node.segment].noise
-            passed_s = (node.time_ns - last.time_ns) * 1e-9
-            if noise is not None and _is_refuted(*priors, passed_s, motion, covariance, noise):
-                self.refuted[last.seq] = node.seq
-                self._counts["vision off"] += 1
-                is_seen = False
-        else:
-            self._counts["stretch without vision"] += 1
-        if not is_seen:
-            motion, covariance = self._link(node, last, T_last)
-        self._connect(node, last, motion, covariance, is_seen)
-        return motion, covariance, is_seen
-
-    def scale_key(self, node: Node, jump: float = 0.0) -> int:
-        """Key of the node's scale; made when missing.
-
-        A new one begins every twenty keyframes, and where the scale may ``jump`` by that share.
-        """
-        segment = self._segments[node.segment]
-        scales = segment.scales
-        if scales.newest == NO_SCALE or node.key - scales.since >= BLOCK or jump:
-            before = scales.newest
-            log = float(self._smoother.logs()[before])
-            known = segment.frame.sigma_scale
-            sigma = float(np.clip(known, KNOWN_SCALE, UNKNOWN_SCALE))
-            if before != NO_SCALE:
-                walk = self._config.sigma_scale_walk * np.sqrt(max(1.0, scales.held / BLOCK))
-                sigma = float(np.hypot(walk, jump))
-            scales.newest, scales.since = self._smoother.append_scale(log), node.key
-            scales.held = 0
-            self._smoother.add_scale("scale", (before, scales.newest), 0.0, sigma)
-            if before == NO_SCALE:
-                scales.unit = scales.newest
-        if self.scale_of[node.key] != scales.newest:
-            scales.held += node.weight
-        self.scale_of[node.key] = scales.newest
-        return scales.newest
-
-    def _jump(self, node: Node, last: Node) -> float:
-        """Share by which vision's scale may have changed at a step."""
-        lengths = self._segments[node.segment].scales.lengths
-        lengths.append(_length_sigma(node, last))
-        usual = float(np.median(lengths))
-        return lengths[-1] if lengths[-1] > max(OPEN_LENGTH, OPEN_SHARE * usual) else 0.0
-
-    def add_loop(self, a: Node, b: Node, T_a_b: F64, covariance: F64) -> None:
-        """A motion (4, 4) seen between two nodes, in metres by a's frame, whose lengths grow with
-        a's scale; its covariance (6, 6) is of the left perturbation in a's frame."""
-        scale, unit = self.scale_of[a.key], self._segments[a.segment].scales.unit
-        # Not robust: two loops agreed, and a late one with a large misclosure would lose weight.
-        self._smoother.add_motion("loop", (a.key, b.key), T_a_b, covariance, scale, unit)
-
-    def _connect(self, node: Node, last: Node, motion: F64, covariance: F64, is_seen: bool) -> None:
-        """The motion between two keyframes; of an aligned segment, with its scale left open."""
-        kind, scale, unit = "vision" if is_seen else "link", NO_SCALE, NO_SCALE
-        if node.segment == last.segment and self._segments[node.segment].similarity is not None:
-            key = self.scale_key(node, self._jump(node, last))
-            if is_seen:
-                scale, unit = key, self._segments[node.segment].scales.unit
-        self._smoother.add_motion(kind, (last.key, node.key), motion, covariance, scale, unit)
-
-    def _seen(self, node: Node, last: Node) -> tuple[F64, F64]:
-        frame = self._segments[node.segment].frame
-        motion = se3.inverse(frame.pose(last.T_odom_camera)) @ frame.pose(node.T_odom_camera)
-        units = np.array([1.0] * 3 + [frame.scale] * 3)
-        covariance = node.covariance * np.outer(units, units) + np.diag([1e-10] * 3 + [1e-6] * 3)
-        covariance[3:, 3:] += self._config.sigma_step**2 * np.outer(motion[:3, 3], motion[:3, 3])
-        return motion, covariance
-
-    def _link(self, node: Node, last: Node, T_last: F64) -> tuple[F64, F64]:
-        """Dead reckoning where vision was lost: telemetry's motion, else the last one's, wide."""
-        passed_s = (node.time_ns - last.time_ns) * 1e-9
-        segment = self._segments[node.segment]
-        frame = segment.similarity
-        is_new = node.segment != last.segment
-        if is_new and frame is not None and segment.is_tied:
-            T = frame.pose(node.T_odom_camera)
-        elif node.T_prev_segment is not None:
-            T = T_last @ node.T_prev_segment
-        else:
-            priors = self._segments[last.segment].at_camera(last), segment.at_camera(node)
-            T = dead_reckoned(*priors, T_last, self._velocity(last, T_last), passed_s)
-        prior = node.prior
-        is_turn_known = prior.R_world_camera is not None and prior.sigma_yaw_rad < 1.0
-        sigma_r = LINK_RAD if is_turn_known else LINK_WITHOUT_HEADING_RAD
-        sigma_m = LINK_M_S * max(passed_s, 1.0) + LINK_M
-        motion = se3.inverse(T_last) @ T
-        # Translation and rotation are separate: an error of one does not rotate the other.
-        apart = np.diag(np.square([sigma_r] * 3 + [sigma_m] * 3))
-        return motion, left_covariance(motion, apart)
-
-    def _velocity(self, last: Node, T_last: F64) -> F64 | None:
-        """(3,) m/s at a segment's keyframe, over a second or more; None at its start, and where
-        no aircraft is so fast: a camera about to fail stamps images anyhow."""
-        for node in reversed(self._segments[last.segment].nodes):
-            passed_s = (last.time_ns - node.time_ns) * 1e-9
-            if node.key < last.key and passed_s >= VELOCITY_S:
-                velocity = (T_last[:3, 3] - self._smoother.pose(node.key)[:3, 3]) / passed_s
-                return velocity if np.linalg.norm(velocity) < FASTEST_M_S else None
-        return None

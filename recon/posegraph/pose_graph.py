@@ -16,20 +16,13 @@ from dataclasses import replace
 import numpy as np
 
 from recon import parallel, se3
-from recon.posegraph.factors import HUBER_SIGMAS, MotionFactors, ReadingFactors
+from recon.posegraph.factors import GraphFactors
 from recon.posegraph.loop_verification import LoopVerification, is_explained
 from recon.posegraph.pose_priors import is_frozen, sound
 from recon.posegraph.records import LOOP_WINDOW, Loop, Node, PoseGraphConfig, loops_agree
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_offsets import Constants
-from recon.posegraph.smoother import (
-    MANY_STEPS,
-    NO_SCALE,
-    STEPS,
-    Smoother,
-    left_covariance,
-    reversed_motion,
-)
+from recon.posegraph.smoother import MANY_STEPS, STEPS, reversed_motion
 from recon.posegraph.thinning import GONE_SHARE, thin
 from recon.types import F64, Pose, PosePrior
 
@@ -38,12 +31,6 @@ __all__ = ["PoseGraph", "PoseGraphConfig"]
 log = logging.getLogger(__name__)
 
 SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
-
-FRAME_DRIFT = 0.003
-"""Share of the path flown by which a track may leave the frame of its segment."""
-
-SIGMA_LOOP_SCALE = 0.002
-"""Of the ratio of the depths at a loop's ends."""
 
 
 class PoseGraph:
@@ -105,7 +92,7 @@ class PoseGraph:
         elif is_refitted:
             self.rebuild()
         else:
-            self._insert(node, last)
+            self._factors.add(node, last)
             self._solve()
         return self.pose(seq)
 
@@ -155,7 +142,7 @@ class PoseGraph:
     @property
     def counts(self) -> Counter[str]:
         """Readings and loops left out, by reason."""
-        return self._kept_counts + self.loops.counts + self._left_out
+        return self._kept_counts + self.loops.counts + self._factors.left_out
 
     @property
     def seqs(self) -> list[int]:
@@ -165,7 +152,7 @@ class PoseGraph:
     @property
     def refuted(self) -> dict[int, int]:
         """Steps of vision that attitude and positions contradict: the node after by that before."""
-        return self._motions.refuted
+        return self._factors.refuted
 
     def metric_loops(self) -> list[Loop]:
         return [loop.scaled(self.scale(loop.a)) for loop in self.loops.taken]
@@ -176,7 +163,7 @@ class PoseGraph:
         if segment is None:
             return 0.0
         keys = [node.key for node in segment.nodes]
-        return float(np.median(self._smoother.logs()[self._motions.scale_of][keys]))
+        return float(np.median(self._smoother.logs()[self._factors.scale_of][keys]))
 
     def constants(self) -> Constants:
         """Constant errors of the sensors, as known for the newest segment."""
@@ -201,7 +188,7 @@ class PoseGraph:
     def scale(self, seq: int) -> float:
         """Metres per unit of the odometry at keyframe ``seq``."""
         node = self._nodes[seq]
-        log = self._smoother.logs()[self._motions.scale_of[node.key]]
+        log = self._smoother.logs()[self._factors.scale_of[node.key]]
         return self.segments[node.segment].frame.scale * float(np.exp(log))
 
     @property
@@ -215,13 +202,13 @@ class PoseGraph:
 
     def sources(self, seq: int) -> tuple[str, ...]:
         """Names of the sources that keyframe ``seq`` rests on."""
-        used = self._sources[self._nodes[seq].key]
+        used = self._factors.sources[self._nodes[seq].key]
         return tuple(name for name in SOURCES if name in used)
 
     def scales(self) -> F64:
         """(N,) metres per unit of the odometry, in the order of the keyframes."""
         frames = [np.full(len(s.nodes), s.frame.scale) for s in self.segments]
-        logs = self._smoother.logs()[self._motions.scale_of]
+        logs = self._smoother.logs()[self._factors.scale_of]
         return np.asarray(np.concatenate(frames) * np.exp(logs))
 
     def residuals(self) -> dict[str, F64]:
@@ -235,19 +222,8 @@ class PoseGraph:
 
     def _start(self) -> None:
         self._built += 1
-        self._smoother = Smoother()
-        self.segments.restart()
-        self._left_out: Counter[str] = Counter()
-        times = [n.time_ns for n in self._nodes.values()]
-        span_s = (times[-1] - times[0]) * 1e-9 if times else 0.0
-        self._readings = ReadingFactors(
-            self.config, self._smoother, self._left_out, len(times), span_s,
-            self.segments.altitude_offset(),
-        )  # fmt: skip
-        self._motions = MotionFactors(self.config, self._smoother, self.segments, self._left_out)
-        self._sources: list[set[str]] = []
-        self._prior = PosePrior()  # of the newest node, without biases
-        self._path: list[float] = []  # m flown up to each keyframe
+        self._factors = GraphFactors(self.config, self.segments, self._nodes.values())
+        self._smoother = self._factors.smoother
 
     def rebuild(self) -> None:
         """Rebuild the graph from all readings and the segments' present frames."""
@@ -255,7 +231,7 @@ class PoseGraph:
         last: Node | None = None
         for node in self._nodes.values():
             parallel.release_gil()  # each takes about a millisecond
-            self._insert(node, last)
+            self._factors.add(node, last)
             last = node
         for loop in self.loops.taken:
             self._add_loop_factor(loop)
@@ -286,38 +262,11 @@ class PoseGraph:
         """Nodes whose fix was left out when the graph was built last."""
         return {
             node.seq
-            for node, used in zip(self._nodes.values(), self._sources, strict=False)
+            for node, used in zip(self._nodes.values(), self._factors.sources, strict=False)
             if node.prior.sigma_position_m is not None
             and "gnss" not in used
             and self.segments[node.segment].rests_on_fixes
         }
-
-    def _insert(self, node: Node, last: Node | None) -> None:
-        segment = self.segments[node.segment]
-        frame = segment.similarity
-        before, self._prior = self._prior, segment.without_biases(node)
-        self._sources.append({"vision"})
-        self._motions.scale_of.append(0)
-        self._path.append(self._path[-1] if self._path else 0.0)
-        if last is None:
-            T, spread = self._motions.first(node)
-        else:
-            T_last, spread_last = self._smoother.state(last.key)
-            priors = before, self._prior
-            motion, covariance, is_seen = self._motions.add(node, last, T_last, priors)
-            self._sources[-1] = {"vision" if is_seen else "dead reckoning"}
-            T = se3.project_to_so3(T_last @ motion)
-            self._path[-1] += float(np.linalg.norm(motion[:3, 3]))
-            spread = spread_last + left_covariance(T_last, covariance)
-        self._smoother.append_pose(T, spread)
-        drift_m = None if frame is None else FRAME_DRIFT * self._path[node.key]
-        node = replace(node, prior=self._prior)
-        used = self._readings.add(node, T, spread, drift_m, segment.noise)
-        if frame is not None and self._readings.height(
-            node, self._motions.scale_key(node), frame.scale
-        ):
-            used.add("altitude")
-        self._sources[node.key] |= used
 
     def _fresh(self, prior: PosePrior) -> PosePrior:
         """The prior without its position when the receiver repeats its last one."""
@@ -338,7 +287,7 @@ class PoseGraph:
         if a.segment != b.segment:
             return True
         T = se3.inverse(self._smoother.pose(a.key)) @ self._smoother.pose(b.key)
-        path_m = self._path[b.key] - self._path[a.key]
+        path_m = self._factors.path_m[b.key] - self._factors.path_m[a.key]
         return is_explained(loop.scaled(self.scale(loop.a)), T, path_m)
 
     def _agree(self, one: Loop, other: Loop) -> bool:
@@ -371,20 +320,7 @@ class PoseGraph:
         return True
 
     def _add_loop_factor(self, loop: Loop) -> None:
-        a, b = self._nodes[loop.a], self._nodes[loop.b]
-        metric = loop.scaled(self.segments[a.segment].frame.scale)
-        self._sources[b.key].add("loop")
-        self._motions.add_loop(a, b, metric.T_a_b, metric.covariance)
-        self._add_loop_scale(loop, a.key, b.key)
-
-    def _add_loop_scale(self, loop: Loop, a: int, b: int) -> None:
-        """The ratio of the depths at both ends, where each has a scale of its own."""
-        keys = self._motions.scale_of[a], self._motions.scale_of[b]
-        if keys[0] == keys[1] or NO_SCALE in keys:
-            return
-        frames = [self.segments[self._nodes[seq].segment].frame.scale for seq in loop.ends]
-        log = float(np.log(loop.ratio * frames[0] / frames[1]))
-        self._smoother.add_scale("loop scale", keys, log, SIGMA_LOOP_SCALE, HUBER_SIGMAS)
+        self._factors.add_loop(loop, self._nodes[loop.a], self._nodes[loop.b])
 
     def _newest(self) -> Node:
         return next(reversed(self._nodes.values()))

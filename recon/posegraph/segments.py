@@ -15,7 +15,6 @@ from recon.posegraph.ground_heights import GUESSED_SHARE, guessed_at
 from recon.posegraph.pose_priors import at_camera
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.sensor_offsets import Constants, Offsets, constants, offsets
-from recon.posegraph.smoother import NO_SCALE
 from recon.types import F64, PosePrior
 
 REFIT_GROWTH, SETTLED_GROWTH = 1.3, 1.6
@@ -33,17 +32,6 @@ HEADING_KNOWN_RAD, HEIGHT_KNOWN_M = 1.0, 20.0
 
 
 @dataclass(slots=True, eq=False)
-class ScaleBlocks:
-    """Keys of a segment's scales in one build of the graph."""
-
-    unit: int = NO_SCALE  # the first one, in which motions are measured
-    newest: int = NO_SCALE
-    since: int = 0  # key of the newest one's first node
-    held: int = 0  # keyframes that the newest one stands for
-    lengths: list[float] = field(default_factory=list)  # relative sigmas of vision's steps
-
-
-@dataclass(slots=True, eq=False)
 class Segment:
     """Keyframes tracked without interruption: what they share, and where they are in the world.
 
@@ -56,7 +44,6 @@ class Segment:
     similarity: Similarity | None = None  # once telemetry or a loop gives it
     constants: Constants = field(default_factory=Constants)  # errors it was fitted with
     offsets: Offsets | None = None  # of each sensor from the similarity
-    scales: ScaleBlocks = field(default_factory=ScaleBlocks)
     is_tied_by_loop: bool = False
     fitted: int = 0  # keyframes when the similarity was fitted last
     surface: list[int] = field(default_factory=list)  # its keyframes with depth
@@ -172,11 +159,6 @@ class Segments:
                 is_tied = segment.is_tied
                 segment.forget()
                 segment.keyframes, segment.is_tied_by_loop = 0, is_tied
-
-    def restart(self) -> None:
-        """Begin with no scale in any segment, as the graph is built again."""
-        for segment in self._all.values():
-            segment.scales = ScaleBlocks()
 
     def _placed(self) -> list[tuple[Segment, Similarity]]:
         return [(s, s.similarity) for s in self._all.values() if s.similarity is not None]

@@ -17,7 +17,7 @@ from trial_rig import Table
 from recon.posegraph import factors, loop_verification, records
 from recon.posegraph.alignment import HUBER as MIN_FIT_SIGMAS
 from recon.posegraph.alignment import WILD
-from recon.posegraph.pose_graph import SIGMA_LOOP_SCALE, PoseGraph, PoseGraphConfig
+from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.segments import REFIT_GROWTH, SETTLED_GROWTH
 from recon.posegraph.sensor_noise import PRECISE_TAU_S, TAUS_S
 from service.config import keys
@@ -101,7 +101,7 @@ def test_the_page_on_the_pose_graph_has_the_factors_and_numbers_of_the_code() ->
         f"\\sqrt{{{factors.BLOCK} \\cdot {factors.BLOCKS_PER_HEIGHT:.0f}}}",
         f"{config.sigma_scale_walk} for {factors.BLOCK} keyframes; the first "
         f"{factors.KNOWN_SCALE} to {factors.UNKNOWN_SCALE:.0f}",
-        f"depths at a loop's ends | {SIGMA_LOOP_SCALE} |",
+        f"depths at a loop's ends | {factors.SIGMA_LOOP_SCALE} |",
         f"{factors.LINK_RAD} rad ({factors.LINK_WITHOUT_HEADING_RAD} without a heading); "
         f"{factors.LINK_M:.0f} m and {factors.LINK_M_S:.0f} m",
         f"Huber's loss begins at {factors.HUBER_SIGMAS} sigmas",

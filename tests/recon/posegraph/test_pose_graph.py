@@ -619,7 +619,7 @@ def test_solved_at_once_it_is_the_same_and_tells_its_residuals() -> None:
 def test_a_rebuild_gives_way_to_threads_that_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     graph, _ = fly(flight(30))
     given: list[int] = []
-    monkeypatch.setattr(parallel, "release_gil", lambda: given.append(len(graph._motions.scale_of)))
+    monkeypatch.setattr(parallel, "release_gil", lambda: given.append(len(graph._factors.scale_of)))
     graph.rebuild()
     assert [n for n in given if n < 30] == list(range(30))  # before each keyframe
     assert given.count(30) > 1  # and each step of the solution
