@@ -21,16 +21,15 @@ from recon.mapping.exposure_compensation import ExposureCompensation
 from recon.mapping.voxel_map import VoxelMap, VoxelMapConfig, ground_sample_m
 from recon.pipeline.config import Baseline, MapperConfig, Timing, untimed
 from recon.pipeline.events import Event, FramePosed, KeyframeReady, PosesChanged
-from recon.pipeline.first_depth import FirstDepths
 from recon.pipeline.frame_poses import FramePoses
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
 from recon.pipeline.stages import (
-    PairStages,
-    Rectify,
+    DenseStereo,
     Register,
     Undistort,
     keyframe_of,
     plausible_depth,
+    without_false_surface,
 )
 from recon.pipeline.surface_map import SurfaceMap
 from recon.pipeline.views import StereoView, ViewSelection, VirtualStereoCamera
@@ -53,6 +52,9 @@ Reconstructed = GraphUpdate | Keyframe | None
 shows nothing."""
 
 Reconstruct = Callable[[StereoView], Reconstructed]
+
+COARSER, FIRST_BASE_TO_HEIGHT = 2, 0.02
+"""Images of a first depth are smaller by this factor, and its baseline may be shorter."""
 
 
 class Worker(Protocol):
@@ -137,8 +139,12 @@ class Mapper:
             UpsamplingConfig(),
             DepthFusionConfig(),
         )
-        self.rectify = Rectify(stereo, self.rejected, self.debug, timing)
-        self.stereo = PairStages(backend, dense, self.debug, timing)
+        self.stereo = DenseStereo(backend, stereo, dense, self.rejected, self.debug, timing)
+        self._first_stereo: DenseStereo | None = None
+        if config.first_depths:
+            first = replace(stereo, min_base_to_height=FIRST_BASE_TO_HEIGHT, guided=False,
+                            width_px=stereo.width_px // COARSER)  # fmt: skip
+            self._first_stereo = DenseStereo(backend, first, dense, Counter(), None, untimed)
         self.register = Register(backend, timing)
         trajectory = Trajectory(PoseGraph(PoseGraphConfig(max_nodes=config.graph_keyframes)))
         loops = LoopSearch(trajectory, max_views=config.loop_views) if config.loops else None
@@ -147,11 +153,6 @@ class Mapper:
             float(camera.K[0, 0]), trajectory.similarities, config.resolution_m, new_map
         )
         self.exposure = ExposureCompensation()
-        self.first_depths = (
-            FirstDepths(backend, stereo, dense, self.keyframes, self.surface, self.exposure, timing)
-            if config.first_depths
-            else None
-        )
         self.frames = FramePoses(self.keyframes, self.is_settled)
         self._lost: UndistortedFrame | None = None  # the last frame, where it has no pose
         self._kept: dict[int, Keyframe] | None = {} if keeps_cloud else None
@@ -191,7 +192,7 @@ class Mapper:
             return (*done, FramePosed(frame.seq, frame.time_ns, tracked, pose))
         for view in self.views.ready():
             self._worker.offer(view)  # to be reconstructed
-        if self.first_depths is not None and self._worker.is_free:
+        if self._first_stereo is not None and self._worker.is_free:
             first = self.views.first()
             if first is not None:
                 self._worker.offer(first)
@@ -236,28 +237,14 @@ class Mapper:
     def reconstruct(self, view: StereoView) -> Reconstructed:
         """One view: its depth from all its partners, its pose, and its new surface."""
         if view.is_first_depth:
-            assert self.first_depths is not None
-            return self.first_depths(view)
+            return self._first_depth(view)
         if self.debug is not None:
             self.debug.clear()
-        depth = None
-        grid = self.rectify.grid(view)
-        depths = self.stereo.carried(view, grid)  # by images that are matched already
-        pairs = self.rectify(view, depths)  # virtual stereo pairs, section 2.1
-        if pairs:
-            depth = self.stereo.whole_path(pairs.values(), grid)  # Eq. 1-3 at once, on a device
-        if depth is None and (pairs or depths):
-            for partner, pair in pairs.items():
-                disparity = self.stereo.match(pair)  # belief propagation, Eq. 1
-                disparity = self.stereo.upsample(disparity, pair)  # joint bilateral, Eq. 2
-                depths[partner] = self.stereo.reproject(disparity, pair, grid)  # Eq. 3
-            self.stereo.keep(view.seq, depths)
-            depth = self.stereo.fuse([*depths.values()], grid)
-        bgr = self.rectify.colours(view, grid)
+        depth, bgr = self.stereo(view)  # virtual stereo pairs, section 2.1; Eq. 1 to 3
         if depth is not None:  # nothing that cannot be
             segments = self.keyframes.graph.segments
             depth = plausible_depth(view, depth, bgr, segments, self.rejected)
-        self.rectify.learn(depth)  # how far the relief of the next pairs may reach
+        self.stereo.learn(depth)  # how far the relief of the next pairs may reach
         step, covariance = self.register(view, depth)  # ICP onto the keyframe before
         update = self.keyframes.add(view, step, covariance, depth)  # pose graph
         if depth is None or not update.is_plausible:
@@ -273,6 +260,26 @@ class Mapper:
             self.debug |= {"depth_m": metric.depth_m, "sigma_m": metric.sigma_m, "bgr": bgr}
         self.keyframes.add_surface(view, keyframe)
         return replace(update, keyframe=keyframe, stages=dict(self.debug or {}))
+
+    def _first_depth(self, view: StereoView) -> Keyframe | None:
+        """The new surface that the view's only partner shows, ahead of its whole depth, of which it
+        changes nothing; None where it shows none.
+
+        New ground is in no earlier image, so that the partner is a later frame.
+        """
+        predicted, stereo = self.keyframes.predicted(view), self._first_stereo
+        if predicted is None or stereo is None:
+            return None
+        with self._timing("first depth"):
+            depth, bgr = stereo(view)
+            if depth is not None:
+                depth = without_false_surface(view, depth, bgr)
+            stereo.learn(depth)
+            if depth is None or self.keyframes.graph.segments[view.segment].agreement < 0:
+                return None
+            T_odom, pose = predicted
+            sigma_m, fresh = self.surface.peek(depth, view.rows_share, T_odom)
+            return keyframe_of(view, depth, self.exposure.level(bgr), sigma_m, fresh, pose)
 
     def drain(self) -> tuple[Event, ...]:
         """The views still waiting for partners, up to one whose work failed."""
@@ -321,14 +328,14 @@ class Mapper:
         """Apply a new baseline from the next frame on."""
         selection = self.views.selection
         selection.set_baseline(baseline)
-        self.rectify.set_min_base_to_height(selection.min_base_to_height)
+        self.stereo.set_min_base_to_height(selection.min_base_to_height)
 
     def set_effort(self, pairs: int, stereo_width_px: int, upsample: bool) -> None:
         """Apply these from the next view on."""
         self.views.selection.set_partners(pairs)
-        self.rectify.set_effort(stereo_width_px, upsample)
-        if self.first_depths is not None:
-            self.first_depths.set_width(stereo_width_px)
+        self.stereo.set_effort(stereo_width_px, upsample)
+        if self._first_stereo is not None:
+            self._first_stereo.set_effort(stereo_width_px // COARSER, upsample=False)
 
     def take_next(self) -> None:
         """Make the next frame with a pose a view, whatever the baseline asks for."""
@@ -359,7 +366,7 @@ class Mapper:
 
     @property
     def pairs(self) -> int:
-        return self.rectify.pairs
+        return self.stereo.pairs
 
     def refusals(self) -> Counter[str]:
         """Frames, views and pairs not used, by reason."""

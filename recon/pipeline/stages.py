@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -47,14 +46,6 @@ MAX_TRACKING_WIDTH_PX = 1280
 """Wider images are made smaller for tracking, whose time grows with their area."""
 
 
-class ViewGrid(NamedTuple):
-    """Where a view's depth is: its pixels and its pose."""
-
-    K: F64  # (3, 3) px
-    size_px: tuple[int, int]  # (w, h)
-    T_odom_camera: F64  # (4, 4)
-
-
 class Undistort:
     """Images without distortion: in gray, as the odometry takes them, and views in colour."""
 
@@ -88,49 +79,71 @@ class Undistort:
             )
 
 
-class Rectify:
-    """A view and its partners as rectified pairs of a virtual stereo camera."""
+class DenseStereo:
+    """Depth of a view by all its partners: rectification, Eq. 1 to 3 and the fusion, each by the
+    backend or on the host.
+
+    Two images that were matched before, when the other one was the view, say the same when matched
+    again: of a keyframe's pairs that is one in four. Their depth is carried over. A device that
+    keeps the depth of pairs to itself matches them all.
+    """
 
     def __init__(
         self,
+        backend: Backend,
         config: VirtualStereoConfig,
+        dense: DenseStages,
         rejected: Counter[str],
         debug: dict[str, Array] | None,
         timing: Timing,
     ) -> None:
-        self._config, self._rejected, self._debug = config, rejected, debug
-        self._timing = timing
+        self._backend, self._config, self._dense = backend, config, dense
+        self._rejected, self._debug, self._timing = rejected, debug, timing
         self._relief_m = (0.0, 0.0)
+        self._kept: dict[tuple[int, int], PairDepth] = {}  # by view and partner
         self.pairs = 0
 
-    def grid(self, view: StereoView) -> ViewGrid:
-        image, width = view.image, self._config.width_px
-        H, W = image.gray.shape
-        w, h = width, round(width * H / W)
-        return ViewGrid(scaled_K(image.K, w / W, h / H), (w, h), image.T_odom_camera)
-
-    def colours(self, view: StereoView, grid: ViewGrid) -> U8:
-        """(h, w, 3) BGR of the view on the grid."""
-        bgr = at_middle_row(view.image, view.bgr)
-        return np.asarray(cv2.resize(bgr, grid.size_px, interpolation=cv2.INTER_AREA), np.uint8)
-
-    def __call__(self, view: StereoView, known: Collection[int]) -> dict[int, RectifiedPair]:
-        """The pairs that stereo can use by the number of the partner, which is not ``known``."""
+    def __call__(self, view: StereoView) -> tuple[DepthMap | None, U8]:
+        """Depth in units of the odometry, None where no pair can be used, and (h, w, 3) BGR."""
         config = self._config  # another thread may set it meanwhile
-        pairs: dict[int, RectifiedPair] = {}
+        H, W = view.image.gray.shape
+        w, h = size_px = config.width_px, round(config.width_px * H / W)
+        K = scaled_K(view.image.K, w / W, h / H)
+        T_odom_camera, depth = view.image.T_odom_camera, None
+        depths = self.carried(view, K, size_px)  # by images that are matched already
+        pairs = self._rectified(view, depths, config)  # virtual stereo pairs, section 2.1
+        self.pairs += len(pairs) + len(depths)
+        if pairs:
+            depth = self._whole_path([*pairs.values()], K, size_px, T_odom_camera)
+        if depth is None and (pairs or depths):
+            for partner, pair in pairs.items():
+                disparity = self._matched(pair)  # belief propagation, Eq. 1
+                disparity = self._upsampled(disparity, pair)  # joint bilateral, Eq. 2
+                depths[partner] = self._reprojected(disparity, pair, K, size_px)  # Eq. 3
+            self.keep(view.seq, depths)
+            with self._timing("fuse"):
+                depth = fuse([*depths.values()], K, T_odom_camera, self._dense.fusion)
+        bgr = cv2.resize(at_middle_row(view.image, view.bgr), size_px, interpolation=cv2.INTER_AREA)
+        return depth, np.asarray(bgr, np.uint8)
+
+    def carried(self, view: StereoView, K: F64, size_px: tuple[int, int]) -> dict[int, PairDepth]:
+        """Depth on the view's grid by images that are matched already, by the number of the
+        partner."""
+        found = dict[int, PairDepth]()
         for partner in view.partners:
-            if partner.seq in known:
-                continue
-            with self._timing("rectify"):
-                pair = rectify(view.image, partner, view.points, config, self._relief_m)
-            if isinstance(pair, str):
-                self._rejected[pair] += 1
-                continue
-            pairs[partner.seq] = pair
-            if self._debug is not None:
-                self._debug |= {"raw_left": view.bgr, "raw_right": partner.gray}
-        self.pairs += len(pairs) + len(known)
-        return pairs
+            pair = self._kept.get((partner.seq, view.seq))
+            if pair is not None and pair.depth_m.shape == size_px[::-1]:
+                with self._timing("carry"):
+                    T = se3.inverse(view.image.T_odom_camera) @ partner.T_odom_camera
+                    found[partner.seq] = carry(pair, K, T)
+        return found
+
+    def keep(self, seq: int, depths: Mapping[int, PairDepth]) -> None:
+        """Remember a view's depth by partners that are views later; what is past is dropped."""
+        if self._backend.keeps_pairs:
+            return
+        later = {(seq, partner): depth for partner, depth in depths.items() if partner > seq}
+        self._kept = {key: depth for key, depth in self._kept.items() if key[1] > seq} | later
 
     def learn(self, depth: DepthMap | None) -> None:
         """Make room for as much relief as the last view showed."""
@@ -145,81 +158,60 @@ class Rectify:
         """Reconstruct at another width, with or without upsampling, from the next view on."""
         self._config = replace(self._config, width_px=width_px, guided=upsample)
 
-
-class PairStages:
-    """Eq. 1 to 3 and the fusion, each by the backend or on the host.
-
-    Two images that were matched before, when the other one was the view, say the same when matched
-    again: of a keyframe's pairs that is one in four. Their depth is carried over. A device that
-    keeps the depth of pairs to itself matches them all.
-    """
-
-    def __init__(
-        self, backend: Backend, config: DenseStages, debug: dict[str, Array] | None, timing: Timing
-    ) -> None:
-        self._backend, self._config = backend, config
-        self._debug, self._timing = debug, timing
-        self._kept: dict[tuple[int, int], PairDepth] = {}  # by view and partner
-
-    def carried(self, view: StereoView, grid: ViewGrid) -> dict[int, PairDepth]:
-        """Depth on the view's grid by images that are matched already, by the number of the
-        partner."""
-        found = dict[int, PairDepth]()
+    def _rectified(
+        self, view: StereoView, known: Collection[int], config: VirtualStereoConfig
+    ) -> dict[int, RectifiedPair]:
+        """The pairs that stereo can use by the number of the partner, which is not ``known``."""
+        pairs: dict[int, RectifiedPair] = {}
         for partner in view.partners:
-            pair = self._kept.get((partner.seq, view.seq))
-            if pair is not None and pair.depth_m.shape == grid.size_px[::-1]:
-                with self._timing("carry"):
-                    T = se3.inverse(view.image.T_odom_camera) @ partner.T_odom_camera
-                    found[partner.seq] = carry(pair, grid.K, T)
-        return found
+            if partner.seq in known:
+                continue
+            with self._timing("rectify"):
+                pair = rectify(view.image, partner, view.points, config, self._relief_m)
+            if isinstance(pair, str):
+                self._rejected[pair] += 1
+                continue
+            pairs[partner.seq] = pair
+            self._show(raw_left=view.bgr, raw_right=partner.gray)
+        return pairs
 
-    def keep(self, seq: int, depths: Mapping[int, PairDepth]) -> None:
-        """Remember a view's depth by partners that are views later; what is past is dropped."""
-        if self._backend.keeps_pairs:
-            return
-        later = {(seq, partner): depth for partner, depth in depths.items() if partner > seq}
-        self._kept = {key: depth for key, depth in self._kept.items() if key[1] > seq} | later
-
-    def whole_path(self, pairs: Collection[RectifiedPair], grid: ViewGrid) -> DepthMap | None:
+    def _whole_path(
+        self, pairs: Sequence[RectifiedPair], K: F64, size_px: tuple[int, int], T_odom_camera: F64
+    ) -> DepthMap | None:
         """Eq. 1 to 3 without leaving the device; None where the stages must do it."""
         plain = [pair for pair in pairs if isinstance(pair, StereoPair)]  # as devices know them
         if not self._backend.keeps_pairs or len(plain) < len(pairs) or self._debug is not None:
             return None
         with self._timing("dense path"):
-            return self._backend.fused_depth(
-                plain, grid.K, grid.size_px, grid.T_odom_camera, self._config
-            )
+            return self._backend.fused_depth(plain, K, size_px, T_odom_camera, self._dense)
 
-    def match(self, pair: RectifiedPair) -> DisparityMap:
-        """Labels of the left view by belief propagation, Eq. 1."""
+    def _matched(self, pair: RectifiedPair) -> DisparityMap:
+        """Labels of the left view."""
         with self._timing("belief propagation"):
             coarse = self._backend.belief_propagation(
-                pair.left, pair.right, pair.labels, self._config.matching
+                pair.left, pair.right, pair.labels, self._dense.matching
             )
             coarse = drop_unseen(coarse, pair)
         self._show(rect_left=pair.left, rect_right=pair.right, disparity=coarse.px)
         return coarse
 
-    def upsample(self, coarse: DisparityMap, pair: RectifiedPair) -> DisparityMap:
-        """The labels at the size of the pair's guide, Eq. 2; as they are without one."""
+    def _upsampled(self, coarse: DisparityMap, pair: RectifiedPair) -> DisparityMap:
+        """The labels at the size of the pair's guide; as they are without one."""
         fine = coarse
         if pair.guide is not None:
             with self._timing("upsample"):
-                fine = self._backend.upsample(coarse, pair.guide, self._config.upsampling)
+                fine = self._backend.upsample(coarse, pair.guide, self._dense.upsampling)
         self._show(upsampled=fine.px)
         return fine
 
-    def reproject(self, disparity: DisparityMap, pair: RectifiedPair, grid: ViewGrid) -> PairDepth:
-        """The pair's depth on the view's grid, Eq. 3."""
+    def _reprojected(
+        self, disparity: DisparityMap, pair: RectifiedPair, K: F64, size_px: tuple[int, int]
+    ) -> PairDepth:
+        """The pair's depth on the view's grid."""
         with self._timing("reproject"):
             if isinstance(pair, PolarPair):
-                return reproject_polar(disparity, pair, grid.K, grid.size_px)
-            return reproject(disparity, pair, grid.K, grid.size_px)
-
-    def fuse(self, depths: Sequence[PairDepth], grid: ViewGrid) -> DepthMap:
-        """One depth map of all pairs, in units of the odometry."""
-        with self._timing("fuse"):
-            return fuse(depths, grid.K, grid.T_odom_camera, self._config.fusion)
+                return reproject_polar(disparity, pair, K, size_px)
+            return reproject(disparity, pair, K, size_px)
 
     def _show(self, **arrays: Array) -> None:
         if self._debug is not None:

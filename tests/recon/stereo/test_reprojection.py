@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from unittest.mock import Mock
 
 import cv2
@@ -13,8 +14,8 @@ from recon import se3
 from recon.backends import DenseStages
 from recon.backends.cpu import CpuBackend
 from recon.pipeline.config import untimed
-from recon.pipeline.stages import PairStages, ViewGrid
-from recon.stereo.posed_image import PosedImage
+from recon.pipeline.stages import DenseStereo
+from recon.stereo.posed_image import PosedImage, VirtualStereoConfig
 from recon.stereo.reprojection import LABEL_SIGMA_PX, PairDepth, carry, reproject
 from recon.types import F64, DisparityMap, StereoPair
 from service.compute.backend_choice import FallbackBackend
@@ -146,9 +147,11 @@ def test_a_pair_is_matched_once_on_a_backend_that_gives_its_depth() -> None:
     for keeps_pairs, found in ((False, [0]), (True, [])):
         own = CpuBackend()
         own.name, own.keeps_pairs = "onnx", keeps_pairs
-        stage = PairStages(FallbackBackend(own), Mock(DenseStages), None, untimed)
+        stage = DenseStereo(
+            FallbackBackend(own), VirtualStereoConfig(), Mock(DenseStages), Counter(), None, untimed
+        )
         stage.keep(0, {1: PairDepth(depth, 0.01 * depth)})
-        assert [*stage.carried(again, ViewGrid(K, (320, 180), T))] == found
+        assert [*stage.carried(again, K, (320, 180))] == found
 
 
 def test_the_nearer_surface_hides_what_is_behind_it() -> None:
