@@ -49,7 +49,7 @@ class KeyframeMap:
         self.trajectory, self._loops = trajectory, loops
         self._count = self._levelled = 0  # keyframes, and those whose ground is taken as level
         self._rejected, self._timing = rejected, timing
-        self._newest, self._T_chain = -1, np.eye(4)  # the last keyframe
+        self._newest = -1  # number of the last keyframe
 
     @property
     def graph(self) -> PoseGraph:
@@ -69,13 +69,10 @@ class KeyframeMap:
     def add(
         self, view: StereoView, step: F64 | None, covariance: F64, depth: DepthMap | None
     ) -> GraphUpdate:
-        """Append a view and look for loops.
-
-        ``step`` (4, 4) and ``covariance`` (6, 6) are those of
-        :class:`recon.pipeline.stages.Register`.
-        """
+        """Append a view with what :class:`recon.pipeline.stages.Register` gives, and look for
+        loops."""
         T_odom = view.image.T_odom_camera
-        self._T_chain = T_odom if step is None else self._T_chain @ step
+        T_chain = T_odom if step is None else self.trajectory.odom_pose(self._newest) @ step
         up = T_odom[2, :3]
         below = height_below(depth, up) if depth is not None else None
         height = (below, 0.0) if below is not None else height_above(view.points, up)
@@ -84,7 +81,7 @@ class KeyframeMap:
         self._count += 1
         self._levelled += prior is not view.prior
         self.trajectory.add(
-            view.seq, view.segment, self._T_chain, prior, height, view.time_ns, covariance
+            view.seq, view.segment, T_chain, prior, height, view.time_ns, covariance
         )
         if depth is not None and self._loops is not None:
             with self._timing("loops"):
@@ -96,9 +93,8 @@ class KeyframeMap:
         elif depth is not None:
             self._rejected["placed impossibly far away"] += 1
         is_placed = self.graph.segments[view.segment].similarity is not None
-        return GraphUpdate(
-            pose, is_placed, is_plausible, self.changed() if depth is not None else {}
-        )
+        changed = self.trajectory.moved() if depth is not None else {}
+        return GraphUpdate(pose, is_placed, is_plausible, changed)
 
     def predicted(self, view: StereoView) -> tuple[F64, Pose] | None:
         """A view that is not added yet: T_odom_camera (4, 4) in its segment's chain, and its pose
@@ -107,14 +103,8 @@ class KeyframeMap:
         if T_before is None or self.graph.segments[view.segment].similarity is None:
             return None
         step = se3.inverse(T_before) @ view.image.T_odom_camera
-        return self._T_chain @ step, carried(self.trajectory.pose(self._newest), step)
-
-    def changed(self, final: bool = False) -> dict[int, Pose]:
-        """Better poses of keyframes published before, which count as published from now on."""
-        found = self.trajectory.moved(final)
-        for seq, pose in found.items():
-            self.trajectory.publish(seq, pose)
-        return found
+        T_chain = self.trajectory.odom_pose(self._newest) @ step
+        return T_chain, carried(self.trajectory.pose(self._newest), step)
 
     def add_surface(self, view: StereoView, keyframe: Keyframe) -> None:
         """Count the surface of a view that became a keyframe."""

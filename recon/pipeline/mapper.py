@@ -296,7 +296,7 @@ class Mapper:
             self._worker.close()
             self.reset_map()
         self.frames.finish()
-        return (*events, *self._changed(self.keyframes.changed(final=True)))
+        return (*events, *self._changed(self.keyframes.trajectory.moved(final=True)))
 
     def _finished(self, everything: bool = False) -> Iterator[Event]:
         for view, update in self._worker.finished(everything):

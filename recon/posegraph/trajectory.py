@@ -215,7 +215,7 @@ class Trajectory:
 
     def moved(self, final: bool = False) -> dict[int, Pose]:
         """Keyframes, by number, whose world pose has changed since it was published by more than a
-        threshold.
+        threshold; their new poses count as published.
 
         In flight a change must exceed REPOSE_M and a tenth of the pose's own sigma, or
         each fix of a poor receiver would move the whole scan; of more than :data:`AT_ONCE`, those
@@ -226,6 +226,12 @@ class Trajectory:
             self.graph.solve()
         elif self._checked == self.graph.version:
             return {}
+        found = self._moved(final)
+        for seq, pose in found.items():
+            self.publish(seq, pose)
+        return found
+
+    def _moved(self, final: bool) -> dict[int, Pose]:
         at = np.flatnonzero(self._table.rows["is_published"])
         if not len(at):
             return {}

@@ -36,14 +36,12 @@ def sensed(
 def publish(trajectory: Trajectory, seq: int) -> None:
     """Publish a new keyframe, and those that have moved since they were."""
     trajectory.publish(seq, trajectory.pose(seq))
-    for other, pose in trajectory.moved().items():
-        trajectory.publish(other, pose)
+    trajectory.moved()
 
 
 def landed(trajectory: Trajectory, count: int) -> F64:
     """(count, 4, 4) where all keyframes are after the last correction, which is published."""
-    for seq, pose in trajectory.moved(final=True).items():
-        trajectory.publish(seq, pose)
+    trajectory.moved(final=True)
     return np.array([trajectory.pose(i).T_world_camera for i in range(count)])
 
 

@@ -124,7 +124,7 @@ def test_in_flight_a_frame_is_placed_by_what_came_with_the_newest_view() -> None
     found = frames.pose(frame, fallback)
     np.testing.assert_allclose(found.T_world_camera, known.T_world_camera @ step, atol=1e-12)
     keyframes.trajectory = trajectory
-    assert keyframes.changed(final=True) == {}
+    assert keyframes.trajectory.moved(final=True) == {}
     frames.finish()
     again = frames.pose(frame, fallback)
     np.testing.assert_allclose(again.T_world_camera, found.T_world_camera, atol=1e-9)
@@ -141,7 +141,7 @@ def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> N
         view, keyframes.add(view_at(5, view.T_odom_camera, prior=prior), None, np.eye(6), None)
     )
     in_flight = frames.place(prior, frame)
-    keyframes.changed(final=True)
+    keyframes.trajectory.moved(final=True)
     frames.finish()
     again = frames.pose(frame, pose_at(np.eye(4), fix, np.full(3, 5.0)))
     for pose in (in_flight, again):
