@@ -41,24 +41,8 @@ from recon.posegraph.sensor_noise import (
     drift_noise,
     gauss_markov_noise,
 )
+from recon.similarity import Similarity, umeyama
 from recon.types import F64, PosePrior
-
-
-def umeyama(source: F64, target: F64, weight: F64) -> tuple[float, F64, F64]:
-    """Scale, (3, 3) rotation about z and (3,) shift that best take ``source`` (N, 3) to ``target``.
-
-    Umeyama 1991, doi:10.1109/34.88573. ``weight`` (N,) is relative.
-    """
-    w = weight / weight.sum()
-    ms, mt = w @ source, w @ target
-    a, b = source - ms, target - mt
-    cross = (b * w[:, None]).T @ a
-    yaw = np.arctan2(cross[1, 0] - cross[0, 1], cross[0, 0] + cross[1, 1])
-    R = se3.so3_exp(np.array([0.0, 0.0, yaw]))
-    power = float(w @ np.sum(a**2, axis=1))
-    scale = float(np.sum(R * cross)) / max(power, 1e-12)
-    return scale, R, np.asarray(mt - scale * R @ ms)
-
 
 HUBER = 2.5
 """Whitened residuals beyond this lose weight."""
@@ -89,12 +73,9 @@ MIN_WALK = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Similarity:
+class Alignment(Similarity):
     """``x_world = scale * R @ x_odom + t``; covariance of (rotation, translation, log scale)."""
 
-    scale: float
-    R: F64  # (3, 3)
-    t: F64  # (3,) m
     covariance: F64  # (7, 7)
     sources: tuple[str, ...] = ()
     noise: ReadingNoise | None = None  # as measured by the fit; None without one
@@ -129,16 +110,6 @@ class Similarity:
             position = position - np.array([0.0, 0.0, drift_m])
         return replace(prior, R_world_camera=R, position_m=position)
 
-    def place(self, x_odom: F64) -> F64:
-        """(3,) m of a place (3,) in the odometry."""
-        return np.asarray(self.scale * self.R @ x_odom + self.t)
-
-    def pose(self, T_odom_camera: F64) -> F64:
-        """(4, 4) T_world_camera in metres of a pose of the odometry."""
-        return se3.compose(
-            self.R @ T_odom_camera[:3, :3], self.scale * self.R @ T_odom_camera[:3, 3] + self.t
-        )
-
 
 def fit(
     nodes: Sequence[Node],
@@ -146,7 +117,7 @@ def fit(
     attitude_s: float = ATTITUDE_S,
     slow_share: float = 1.0,
     usual: ReadingNoise | None = None,
-) -> Similarity | None:
+) -> Alignment | None:
     """The similarity that brings the nodes onto their priors, or None without any prior.
 
     The nodes stand in the order of time; ``fix_s`` and ``attitude_s`` are the usual time
@@ -193,7 +164,7 @@ def fit(
     if len(readings.fix) and fix_s > 0:
         mean, counted = noise.of_mean(readings.claimed, readings.fix_s, fix_s)
     at = best.at
-    similarity = Similarity(
+    similarity = Alignment(
         float(np.exp(at.log_scale)), at.R, at.t, covariance, _sources(readings), noise, mean,
         counted, at.mount, at.drift, readings.span_s, heights,
     )  # fmt: skip
@@ -202,7 +173,7 @@ def fit(
         return similarity
     lean = np.zeros((6, 6))
     lean[:2, :2] = covariance[:2, :2]
-    centre = similarity.place(readings.x.mean(axis=0))
+    centre = similarity.points(readings.x.mean(axis=0))
     return replace(similarity, lean=se3.about(-centre, lean))
 
 
@@ -306,7 +277,7 @@ Scale = tuple[float, float]
 """Metres per unit of the odometry by one kind of reading, and its relative sigma."""
 
 
-def scales(nodes: Sequence[Node], at: Similarity) -> tuple[Scale | None, Scale | None]:
+def scales(nodes: Sequence[Node], at: Alignment) -> tuple[Scale | None, Scale | None]:
     """The scale by position fixes alone and by measured heights alone; None where the track or the
     readings give none."""
     r = AlignmentReadings(nodes)
@@ -407,10 +378,10 @@ def _starts(nodes: Sequence[Node], readings: AlignmentReadings) -> list[Alignmen
     starts = [AlignmentState(R, np.asarray(np.median(readings.fix - x, axis=0)), 0.0)]
     if len(x) >= 4:
         weight = 1.0 / np.mean(readings.claimed**2, axis=1)
-        scale, turn, _ = umeyama(x, readings.fix, weight)
-        if scale > 0:
-            shift = np.asarray(np.median(readings.fix - scale * x @ turn.T, axis=0))
-            starts.append(AlignmentState(turn @ R, shift, float(np.log(scale))))
+        found = umeyama(x, readings.fix, weight, is_level=True)
+        if found is not None and found.scale > 0:
+            shift = np.asarray(np.median(readings.fix - found.scale * x @ found.R.T, axis=0))
+            starts.append(AlignmentState(found.R @ R, shift, float(np.log(found.scale))))
     return starts
 
 

@@ -17,7 +17,6 @@ import numpy as np
 from recon import se3
 from recon.posegraph.records import CHI2_LIMIT, LOOP_WINDOW, Loop, loops_agree
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S
-from recon.posegraph.site_alignment import ScanSimilarity
 from recon.posegraph.smoother import (
     NO_SCALE,
     Linear,
@@ -217,23 +216,6 @@ def consenting(surveyed_m: F64, mapped_m: F64, sigma_m: F64) -> Bool:
     agree = apart <= allowed
     best = max(range(len(agree)), key=lambda k: (int(agree[k].sum()), -float(apart[k].sum())))
     return np.asarray(agree[best])
-
-
-def placed_by_points(mapped_m: F64, surveyed_m: F64) -> ScanSimilarity | None:
-    """From the map to the survey, (N, 3) each.
-
-    Umeyama 1991, doi:10.1109/34.88573. None for fewer than three points or points in a line.
-    """
-    if len(mapped_m) < 3:
-        return None
-    a, b = mapped_m - mapped_m.mean(axis=0), surveyed_m - surveyed_m.mean(axis=0)
-    spread = np.linalg.svd(a, compute_uv=False)
-    if spread[1] < 0.05 * spread[0]:
-        return None
-    R = se3.nearest_rotation(b.T @ a)
-    scale = float(np.sum(b * (a @ R.T)) / np.sum(a**2))
-    shift = np.asarray(surveyed_m.mean(axis=0) - scale * R @ mapped_m.mean(axis=0))
-    return ScanSimilarity(R, shift, scale)
 
 
 def of_marks(rows: Rows, at: State) -> Linear:

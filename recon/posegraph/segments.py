@@ -9,7 +9,7 @@ import numpy as np
 
 from recon import se3
 from recon.posegraph import alignment
-from recon.posegraph.alignment import Scale, Similarity
+from recon.posegraph.alignment import Alignment, Scale
 from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.ground_heights import GUESSED_SHARE, guessed_at
 from recon.posegraph.pose_priors import at_camera
@@ -41,7 +41,7 @@ class Segment:
     number: int
     nodes: list[Node] = field(default_factory=list)  # keyframes in the graph, in order
     keyframes: int = 0  # in the graph or not
-    similarity: Similarity | None = None  # once telemetry or a loop gives it
+    similarity: Alignment | None = None  # once telemetry or a loop gives it
     constants: Constants = field(default_factory=Constants)  # errors it was fitted with
     offsets: Offsets | None = None  # of each sensor from the similarity
     is_tied_by_loop: bool = False
@@ -62,14 +62,14 @@ class Segment:
         return self.agreement <= 0
 
     @property
-    def frame(self) -> Similarity:
+    def frame(self) -> Alignment:
         """The similarity; until there is one, its own frame turned to the first attitude."""
         if self.similarity is not None:
             return self.similarity
         first = self.nodes[0]
         R = first.prior.R_world_camera
         turn = np.eye(3) if R is None else R @ first.T_odom_camera[:3, :3].T
-        return Similarity(1.0, turn, np.zeros(3), np.eye(7))
+        return Alignment(1.0, turn, np.zeros(3), np.eye(7))
 
     @property
     def noise(self) -> ReadingNoise | None:
@@ -126,7 +126,7 @@ class Segments:
         """Those that have nodes, in order."""
         return (segment for segment in self._all.values() if segment.nodes)
 
-    def similarity(self, number: int) -> Similarity | None:
+    def similarity(self, number: int) -> Alignment | None:
         """That of a segment; None before telemetry or a loop gives it."""
         segment = self._all.get(number)
         return None if segment is None else segment.similarity
@@ -160,7 +160,7 @@ class Segments:
                 segment.forget()
                 segment.keyframes, segment.is_tied_by_loop = 0, is_tied
 
-    def _placed(self) -> list[tuple[Segment, Similarity]]:
+    def _placed(self) -> list[tuple[Segment, Alignment]]:
         return [(s, s.similarity) for s in self._all.values() if s.similarity is not None]
 
     def largest(self) -> Segment | None:
@@ -192,7 +192,7 @@ class Segments:
         segment = self._all[number]
         before = segment.similarity
         covariance = np.eye(7) if before is None else before.covariance
-        placed = Similarity(scale, R, t, covariance, () if before is None else before.sources)
+        placed = Alignment(scale, R, t, covariance, () if before is None else before.sources)
         known = (found for _, found in self._placed() if found.sigma_fixes is not None)
         other = next(known, placed)  # one receiver places all that loops join
         segment.similarity = replace(
@@ -282,7 +282,7 @@ def _bend_rad(nodes: list[Node]) -> float:
     return float(np.sqrt(sum(np.trace(n.covariance[:3, :3]) for n in nodes[1:]) / 18.0))
 
 
-def _differ(before: Similarity, found: Similarity, nodes: list[Node]) -> bool:
+def _differ(before: Alignment, found: Alignment, nodes: list[Node]) -> bool:
     """True when two frames place a segment apart by more than half their sigma."""
     ends = (nodes[0], nodes[len(nodes) // 2], nodes[-1])
     shift = [before.pose(n.T_odom_camera) - found.pose(n.T_odom_camera) for n in ends]
@@ -290,7 +290,7 @@ def _differ(before: Similarity, found: Similarity, nodes: list[Node]) -> bool:
     return max(float(np.linalg.norm(s[:3, 3])) for s in shift) > 0.5 * sigma
 
 
-def _kept_in_place(found: Similarity, first: Node, T: F64) -> Similarity:
+def _kept_in_place(found: Alignment, first: Node, T: F64) -> Alignment:
     """A frame without fixes, moved so that its first keyframe stays at ``T``, and turned to the
     heading there when no compass gives one."""
     R = found.R

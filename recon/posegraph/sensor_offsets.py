@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from recon import se3
-from recon.posegraph.alignment import Similarity
+from recon.posegraph.alignment import Alignment
 from recon.posegraph.ground_heights import EXACT_HEIGHTS, height_ratios
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S
@@ -286,7 +286,7 @@ class Offsets:
         return replace(prior, R_world_camera=R, position_m=position, agl_m=agl)
 
 
-def offsets(nodes: Sequence[Node], frame: Similarity) -> Offsets:
+def offsets(nodes: Sequence[Node], frame: Alignment) -> Offsets:
     """The constants of all sensors over the nodes of one segment, robustly."""
     ratios, independent = height_ratios(nodes)
     is_exact = independent == EXACT_HEIGHTS
@@ -297,7 +297,7 @@ def offsets(nodes: Sequence[Node], frame: Similarity) -> Offsets:
     return Offsets(_turn(nodes, frame), log_height, *_fixes(nodes, frame), is_exact)
 
 
-def _turn(nodes: Sequence[Node], frame: Similarity) -> F64:
+def _turn(nodes: Sequence[Node], frame: Alignment) -> F64:
     """(3,) mean rotation from the attitudes to the frame; its heading only if they have one."""
     turns, sigma = [], []
     for a in nodes:
@@ -322,11 +322,11 @@ def _turn(nodes: Sequence[Node], frame: Similarity) -> F64:
     return turn if np.linalg.norm(turn) < 2.0 * PRIOR_SIGMA else np.zeros(3)
 
 
-def _fixes(nodes: Sequence[Node], frame: Similarity) -> tuple[F64, F64, F64, float]:
+def _fixes(nodes: Sequence[Node], frame: Alignment) -> tuple[F64, F64, F64, float]:
     """Centre, shift, warp (3, 3) and reach of the fixes, turned and stretched about the centre."""
     nothing = np.zeros(3), np.zeros(3), np.zeros((3, 3)), 0.0
     rows = [
-        (frame.place(a.place_of_fix), a.prior.position_m, a.prior.sigma_position_m)
+        (frame.points(a.place_of_fix), a.prior.position_m, a.prior.sigma_position_m)
         for a in nodes
         if a.prior.position_m is not None and a.prior.sigma_position_m is not None
     ]

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
+from recon.similarity import Similarity
 from recon.types import F64, Bool
 
 STEPS = 12
@@ -55,27 +56,10 @@ def alike(sigma: F64) -> F64:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ScanSimilarity:
-    """``p -> growth * R @ p + t``."""
-
-    R: F64  # (3, 3)
-    t: F64  # (3,) m
-    growth: float
-
-    def points(self, xyz_m: F64) -> F64:
-        """(N, 3) moved."""
-        return np.asarray(self.growth * xyz_m @ self.R.T + self.t)
-
-    def pose(self, T: F64) -> F64:
-        """(4, 4) pose of a camera moved along; its depths grow by ``growth``."""
-        return se3.compose(self.R @ T[:3, :3], self.points(T[None, :3, 3])[0])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class SiteAlignment:
     """Where all scans go, and how sure that is."""
 
-    moves: list[ScanSimilarity]
+    moves: list[Similarity]
     covariance: F64  # (7 S, 7 S) of the unknowns
     before_m: F64  # (T,) distance of the two ends of each tie
     after_m: F64  # (T,)
@@ -91,7 +75,7 @@ def align(ties: Sequence[Tie], centres_m: F64, sigma: F64) -> SiteAlignment:
     rad, m and share.
     """
     n = len(centres_m)
-    moves = [ScanSimilarity(np.eye(3), np.zeros(3), 1.0) for _ in centres_m]
+    moves = [Similarity(1.0, np.eye(3), np.zeros(3)) for _ in centres_m]
     before = _errors(ties, moves)
     state = np.zeros((n, UNKNOWNS))
     for _ in range(STEPS):
@@ -150,12 +134,12 @@ def _moved(x: F64, step: F64) -> F64:
     return np.concatenate([turn, x[3:] + step[3:]])
 
 
-def _similarity(x: F64, centre_m: F64) -> ScanSimilarity:
-    R, growth = se3.so3_exp(x[:3]), float(np.exp(x[6]))
-    return ScanSimilarity(R, centre_m + x[3:6] - growth * R @ centre_m, growth)
+def _similarity(x: F64, centre_m: F64) -> Similarity:
+    scale, R = float(np.exp(x[6])), se3.so3_exp(x[:3])
+    return Similarity(scale, R, centre_m + x[3:6] - scale * R @ centre_m)
 
 
-def _errors(ties: Sequence[Tie], moves: Sequence[ScanSimilarity]) -> list[F64]:
+def _errors(ties: Sequence[Tie], moves: Sequence[Similarity]) -> list[F64]:
     """(P, 3) of each tie, along the first scan's axes, which are those of its covariance: it does
     not fall because everything turns to where ties are less sure."""
     return [
@@ -164,9 +148,9 @@ def _errors(ties: Sequence[Tie], moves: Sequence[ScanSimilarity]) -> list[F64]:
     ]
 
 
-def _unit(tie: Tie, moves: Sequence[ScanSimilarity]) -> float:
+def _unit(tie: Tie, moves: Sequence[Similarity]) -> float:
     """Growth of both scans: in its units the error does not fall because everything shrinks."""
-    return float(np.sqrt(moves[tie.a].growth * moves[tie.b].growth))
+    return float(np.sqrt(moves[tie.a].scale * moves[tie.b].scale))
 
 
 def _lengths(errors: Sequence[F64]) -> F64:

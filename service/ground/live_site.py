@@ -159,7 +159,7 @@ def write_shown(store: Path, placed: list[PlacedScan]) -> None:
     """Replace the file in ``store``; OutsideError for the disk."""
     found = []
     for one in placed:
-        moved = se3.compose(one.move.growth * one.move.R, one.move.t)
+        moved = se3.compose(one.move.scale * one.move.R, one.move.t)
         matrices = (one.T_site_scan.ravel().tolist(), moved.ravel().tolist())
         sigma = (float(v) for v in np.minimum(one.sigma_m, 1e6))
         names = one.folder.parent.name, one.folder.name

@@ -29,7 +29,7 @@ from pyproj import Transformer
 from recon import se3
 from recon.camera_model import project, rays
 from recon.mapping.disagreement import NORMAL_MEDIAN
-from recon.posegraph.alignment import umeyama
+from recon.similarity import umeyama
 from recon.types import F64, DepthMap, Keyframe
 from service.bench import BenchResult
 from service.cameras import open_camera
@@ -356,8 +356,9 @@ def _flat_rms(mapped: dict[str, F64], surveyed: dict[str, tuple[SurveyPoint, F64
     ours = np.array([[*mapped[n][:2], 0.0] for n in names])
     true = np.array([[*surveyed[n][1], 0.0] for n in names])
     true -= true.mean(axis=0)
-    scale, R, t = umeyama(ours, true, np.ones(len(ours)))
-    off = scale * ours @ R.T + t - true
+    found = umeyama(ours, true, is_level=True)
+    assert found is not None
+    off = found.points(ours) - true
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 

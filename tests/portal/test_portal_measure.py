@@ -18,7 +18,7 @@ from person import Browser
 from portal_client import NEEDS, TOKEN, browser, flown_store, listing
 from site_scans import FRAME, Errors, leg, write_scan
 
-from recon.posegraph.site_alignment import ScanSimilarity
+from recon.similarity import Similarity
 from recon.types import F64, Keyframe
 from service.georeference import LocalFrame
 from service.ground.library import LABELS
@@ -338,7 +338,7 @@ def test_a_scan_without_georeference_is_placed_by_clicks_in_two_scans(
     assert np.linalg.norm(found[:, :2] - SPOTS, axis=1).max() < 0.5
 
 
-def click_spots(ruler: Ruler, errors: ScanSimilarity, button: str | None) -> F64:
+def click_spots(ruler: Ruler, errors: Similarity, button: str | None) -> F64:
     """Click SPOTS in the scan on the page, which has them off by ``errors``; (3, 3) m of the place
     that the clicks picked."""
     page = ruler.page
@@ -360,11 +360,11 @@ def click_spots(ruler: Ruler, errors: ScanSimilarity, button: str | None) -> F64
     return true
 
 
-def picked_there(ruler: Ruler, errors: ScanSimilarity, spots: F64) -> F64:
+def picked_there(ruler: Ruler, errors: Similarity, spots: F64) -> F64:
     """(N, 3) true places of what clicks at (N, 2) spots pick."""
     return inverse(errors, np.array([ruler.pick(float(x), float(y)) for x, y in spots]))
 
 
-def inverse(errors: ScanSimilarity, points: F64) -> F64:
+def inverse(errors: Similarity, points: F64) -> F64:
     """(N, 3) true places of the points of a scan that is off by ``errors``."""
-    return np.asarray((points - errors.t) @ errors.R / errors.growth)
+    return np.asarray((points - errors.t) @ errors.R / errors.scale)

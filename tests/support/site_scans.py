@@ -12,7 +12,7 @@ import scipy.ndimage as ndi
 
 from recon import se3
 from recon.camera_model import rays
-from recon.posegraph.site_alignment import ScanSimilarity
+from recon.similarity import Similarity
 from recon.types import F64, Bool, DepthMap, Keyframe, Pose
 from service.georeference import LocalFrame, between_frames
 from service.stream.codec import encode
@@ -62,11 +62,9 @@ class Errors:
     growth: float = 1.0
     bend_m: float = 0.0  # higher at both ends of the leg than in its middle
 
-    def as_similarity(self) -> ScanSimilarity:
+    def as_similarity(self) -> Similarity:
         """From the truth to where the scan has it, about 40 m below the cameras."""
-        return ScanSimilarity(
-            se3.so3_exp(np.array(self.turn_rad)), np.array(self.shift_m), self.growth
-        )
+        return Similarity(self.growth, se3.so3_exp(np.array(self.turn_rad)), np.array(self.shift_m))
 
 
 def leg(heading_rad: float, count: int = 6, step_m: float = 6.0) -> list[F64]:
@@ -142,7 +140,7 @@ def layers(
 
     one = view(seq, T, boxes, ground)
     d, wrong = one.depth, (errors or Errors()).as_similarity()
-    grown = np.float32(wrong.growth)
+    grown = np.float32(wrong.scale)
     lift = se3.compose(np.eye(3), np.array([0.0, 0.0, lift_m]))
     placed = between_frames(frame, truth) @ lift @ wrong.pose(T)
     depth = DepthMap(d.depth_m * grown, d.sigma_m * grown, d.views, d.K, placed)

@@ -33,7 +33,7 @@ from recon.calibration.tracks import pieces, with_distortion, without_distortion
 from recon.camera_model import project, rays
 from recon.parallel import run_parallel
 from recon.posegraph.ground_control import Adjusted, ControlPoint, KeyframeTrack, Mark, map_position
-from recon.posegraph.site_alignment import ScanSimilarity
+from recon.similarity import Similarity
 from recon.types import F64, Bool, Camera, Keyframe
 from service.errors import InputError
 from service.offline.refine import own_camera
@@ -173,7 +173,7 @@ def as_seen(
     return poses, moved
 
 
-def in_world(images: ImageNetwork, move: ScanSimilarity) -> ImageNetwork:
+def in_world(images: ImageNetwork, move: Similarity) -> ImageNetwork:
     """The network in the world that a similarity takes it to."""
     poses = np.array([move.pose(T) for T in images.poses])
     return replace(images, poses=poses, points=move.points(images.points))

@@ -11,9 +11,8 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import project
-from recon.posegraph.alignment import umeyama
-from recon.posegraph.ground_control import Mark, consenting, map_position, placed_by_points
-from recon.posegraph.site_alignment import ScanSimilarity
+from recon.posegraph.ground_control import Mark, consenting, map_position
+from recon.similarity import Similarity, umeyama
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -283,7 +282,7 @@ def _odd_one(voters: Sequence[Candidate]) -> tuple[Candidate, F64] | None:
     worst, by = None, 1.0
     for k, one in enumerate(voters):
         others = np.arange(len(voters)) != k
-        found = placed_by_points(mapped[others], surveyed[others])
+        found = umeyama(mapped[others], surveyed[others])
         if found is None:
             return None
         off = surveyed[k] - found.points(mapped[k])
@@ -343,7 +342,7 @@ def _metres(value: float) -> str:
     return f"{value / 1000:.0f} km" if value >= 10_000 else f"{value:.0f} m"
 
 
-def place_by_survey(candidates: Sequence[Candidate]) -> tuple[LocalFrame, ScanSimilarity]:
+def place_by_survey(candidates: Sequence[Candidate]) -> tuple[LocalFrame, Similarity]:
     """Origin of a scan without a place, and what moves it there, from three points or more.
 
     Points that the largest agreeing set contradicts are noted. Where a height is not known the
@@ -366,7 +365,7 @@ def place_by_survey(candidates: Sequence[Candidate]) -> tuple[LocalFrame, ScanSi
     best, most = None, np.zeros(len(voters), np.bool_)
     for triple in list(combinations(range(len(voters)), 3))[:MAX_TRIPLES]:
         found = _placed(mapped[list(triple)], surveyed[list(triple)], level)
-        if found is None or not 1e-3 < found.growth < 1e3:
+        if found is None or not 1e-3 < found.scale < 1e3:
             continue
         off = found.points(mapped) - surveyed
         away = np.linalg.norm(off[:, :2] if level else off, axis=1)
@@ -388,15 +387,14 @@ def place_by_survey(candidates: Sequence[Candidate]) -> tuple[LocalFrame, ScanSi
     return frame, best
 
 
-def _placed(mapped_m: F64, surveyed_m: F64, level: bool) -> ScanSimilarity | None:
+def _placed(mapped_m: F64, surveyed_m: F64, level: bool) -> Similarity | None:
     """From map to survey, each (N, 3); None where they leave it open.
 
     ``level``: not every height is known, so the map's own vertical holds, and its height of zero.
     """
     if not level:
-        return placed_by_points(mapped_m, surveyed_m)
+        return umeyama(mapped_m, surveyed_m)
     flat = np.array([1.0, 1.0, 0.0])
     if np.ptp(mapped_m[:, :2], axis=0).max() < 1e-6:
         return None
-    scale, R, t = umeyama(mapped_m * flat, surveyed_m * flat, np.ones(len(mapped_m)))
-    return ScanSimilarity(R, t, scale)
+    return umeyama(mapped_m * flat, surveyed_m * flat, is_level=True)

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from recon.camera_model import project, rays, scaled
-from recon.posegraph.site_alignment import ScanSimilarity
+from recon.similarity import Similarity
 from recon.types import F64, U8, Camera
 from service.errors import InputError, SkyreliefError
 from service.georeference import LocalFrame
@@ -107,9 +107,9 @@ class Marking:
             )
         return out
 
-    def _placed(self, candidates: Sequence[Candidate]) -> tuple[LocalFrame | None, ScanSimilarity]:
+    def _placed(self, candidates: Sequence[Candidate]) -> tuple[LocalFrame | None, Similarity]:
         """The frame of the survey, and what takes the map there; None while it is not known."""
-        same = ScanSimilarity(np.eye(3), np.zeros(3), 1.0)
+        same = Similarity(1.0, np.eye(3), np.zeros(3))
         if self._scan.frame is not None:
             screen(candidates, self._scan.frame)
             return self._scan.frame, same
@@ -122,11 +122,11 @@ class Marking:
         return frame, move
 
     def _expected(
-        self, point: SurveyPoint, frame: LocalFrame, to_survey: ScanSimilarity, usual: F64
+        self, point: SurveyPoint, frame: LocalFrame, to_survey: Similarity, usual: F64
     ) -> F64:
         """(3,) where the map should have a point, off as the marked ones are."""
         spot = _enu(point, frame) + usual
-        spot = to_survey.R.T @ (spot - to_survey.t) / to_survey.growth
+        spot = to_survey.R.T @ (spot - to_survey.t) / to_survey.scale
         if point.alt_amsl_m is None:
             spot[2] = self._ground_m(spot)
         return np.asarray(spot)
@@ -229,7 +229,7 @@ def _enu(point: SurveyPoint, frame: LocalFrame) -> F64:
     return np.asarray(frame.to_enu(np.array([[point.lat_deg, point.lon_deg, alt]]))[0])
 
 
-def _usual_offset(candidates: Sequence[Candidate], to_survey: ScanSimilarity) -> F64:
+def _usual_offset(candidates: Sequence[Candidate], to_survey: Similarity) -> F64:
     """(3,) by which the map has the marked points off, 0 without any."""
     offsets = [
         one.off_m(to_survey.points(one.before_m))

@@ -344,7 +344,7 @@ class _Refinement:
         self.frame, move = place_by_survey(candidates)
         if not any(c.has_height for c in candidates if c.usable):
             self.notes.append("no control point has a height: heights count from the scan's own 0")
-        self.grown = scale = move.growth
+        self.grown = scale = move.scale
         spread = np.diag([0.03**2] * 3 + [1.0] * 3)
         self.states = [
             replace(

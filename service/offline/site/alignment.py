@@ -20,11 +20,11 @@ from recon.camera_model import rays
 from recon.posegraph.ground_control import (
     KeyframeTrack,
     adjust,
-    placed_by_points,
     supported,
 )
 from recon.posegraph.records import Loop
 from recon.posegraph.site_alignment import SiteAlignment, Tie, align, alike
+from recon.similarity import umeyama
 from recon.types import F64, Keyframe
 from service.errors import InputError
 from service.offline.exports.clouds import VOXELS_MARGIN_M, points_of
@@ -245,7 +245,7 @@ def _bent(
     for loop, tie, used in zip(loops, ties, found.used, strict=True):
         if used:
             at_a, at_b = found.moves[tie.a].points(tie.at_a), found.moves[tie.b].points(tie.at_b)
-            fit = placed_by_points(at_b, at_a)
+            fit = umeyama(at_b, at_a)
             assert fit is not None  # four corners of a view
             D = se3.compose(fit.R, at_a.mean(axis=0) - fit.R @ at_b.mean(axis=0))
             T = se3.inverse(moved[loop.a]) @ D @ moved[loop.b]
@@ -321,7 +321,7 @@ def _reposes(
         for seq in member.seqs:
             if seq in adjusted:
                 now = store.repose(seq)
-                scale = move.growth * (1.0 if now is None else now.scale)
+                scale = move.scale * (1.0 if now is None else now.scale)
                 out.append(Repose(seq, ALIGNED, adjusted[seq][0], scale, adjusted[seq][1]))
     return out
 
@@ -382,7 +382,7 @@ def _scan(member: Member, found: SiteAlignment, centres_m: F64, k: int) -> dict[
         "placed": "aligned" if tied else f"by its {_by(member)}",
         "start": None if member.start is None else msgspec.to_builtins(member.start.pairs),
         "T_site_scan": np.round(move.pose(member.T_site_scan), 9).tolist(),
-        "scale": round(member.scale * move.growth, 6),
+        "scale": round(member.scale * move.scale, 6),
         "moved_m": [round(float(v), 3) for v in moved],
         "turned_deg": round(float(np.degrees(np.linalg.norm(se3.so3_log(move.R)))), 4),
         "sigma_m": [round(float(v), 3) for v in sigma[3:6]],

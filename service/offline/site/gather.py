@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from recon import se3
-from recon.posegraph.site_alignment import ScanSimilarity
+from recon.similarity import Similarity
 from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame, between_frames
@@ -49,7 +49,7 @@ class Member:
 
     def placed(self, T: F64) -> F64:
         """A (4, 4) pose of the scan in the site's frame."""
-        move = ScanSimilarity(self.T_site_scan[:3, :3], self.T_site_scan[:3, 3], self.scale)
+        move = Similarity(self.scale, self.T_site_scan[:3, :3], self.T_site_scan[:3, 3])
         return move.pose(T)
 
     @property
@@ -186,7 +186,7 @@ def _copied(
         start = starts[folder.resolve()]
         move, spread = start.placing(origin)
         T = se3.compose(move.R, move.t)
-        member = Member(title, folder, store.header, T, first, 0, move.growth, start)
+        member = Member(title, folder, store.header, T, first, 0, move.scale, start)
     reposes, new = [], member.first
     for seq in main_seqs(store):
         repose = store.repose(seq)

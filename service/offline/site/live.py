@@ -17,7 +17,7 @@ import numpy as np
 from recon import se3
 from recon.posegraph.ground_control import supported
 from recon.posegraph.records import Loop
-from recon.posegraph.site_alignment import ScanSimilarity, align, alike
+from recon.posegraph.site_alignment import Similarity, align, alike
 from recon.types import F64, Keyframe
 from service.errors import InputError, SkyreliefError
 from service.georeference import LocalFrame, between_frames
@@ -36,7 +36,7 @@ from service.scans.track import local_frame
 from service.stream import codec
 from service.stream.store import ScanStore
 
-UNMOVED = ScanSimilarity(np.eye(3), np.zeros(3), 1.0)
+UNMOVED = Similarity(1.0, np.eye(3), np.zeros(3))
 STRIDE = 20_000
 """Between the first keyframes' numbers of two scans; a scan takes part with so many at most."""
 
@@ -54,7 +54,7 @@ class PlacedScan:
     folder: Path
     started_unix_s: float
     T_site_scan: F64  # (4, 4) by the two origins alone
-    move: ScanSimilarity  # in the site
+    move: Similarity  # in the site
     sigma_m: F64  # (3,) east, north, up, of its middle
     ties: int
     group: int  # scans that ties join have one number

@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from recon.posegraph.ground_control import placed_by_points
-from recon.posegraph.site_alignment import ScanSimilarity
+from recon.similarity import Similarity, umeyama
 from recon.types import F64
 from service.errors import InputError
 from service.georeference import LocalFrame
@@ -49,7 +48,7 @@ class StartPoints:
 
     pairs: list[Pair]
 
-    def placing(self, site: LocalFrame) -> tuple[ScanSimilarity, F64]:
+    def placing(self, site: LocalFrame) -> tuple[Similarity, F64]:
         """From the scan's coordinates to the site's, and (6, 6) its left covariance there.
 
         Raises InputError for too few points, points in a line, and points that disagree.
@@ -65,11 +64,11 @@ class StartPoints:
             size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
             if not size[1] > LINE * size[0]:
                 raise InputError(f"the points {which} lie in a line; choose a triangle")
-        move = placed_by_points(here, there)
+        move = umeyama(here, there)
         assert move is not None  # they span a plane
         extent = float(np.linalg.norm(there - there.mean(axis=0), axis=1).max())
         miss = float(np.sqrt(np.mean(np.sum((move.points(here) - there) ** 2, axis=1))))
-        if move.growth <= 0.0 or miss > MAX_MISS * extent:
+        if move.scale <= 0.0 or miss > MAX_MISS * extent:
             raise InputError(
                 f"the points contradict each other by {miss:.1f} m; check their order and places"
             )

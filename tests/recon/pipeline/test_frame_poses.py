@@ -13,7 +13,7 @@ from recon import se3
 from recon.pipeline.config import untimed
 from recon.pipeline.frame_poses import FramePoses, pose_at
 from recon.pipeline.keyframe_map import GraphUpdate, KeyframeMap
-from recon.posegraph.alignment import Similarity
+from recon.posegraph.alignment import Alignment
 from recon.posegraph.trajectory import Trajectory
 from recon.poses import sigma_m
 from recon.tracking.frame import RelativePose
@@ -147,7 +147,7 @@ def test_frames_of_a_segment_too_short_to_be_aligned_stand_at_their_fixes() -> N
     for pose in (in_flight, again):
         np.testing.assert_allclose(pose.T_world_camera[:3, 3], fix)
         assert sigma_m(pose) == pytest.approx(5.0 * 3**0.5)
-    known = Similarity(1.0, np.eye(3), np.zeros(3), np.eye(7))
+    known = Alignment(1.0, np.eye(3), np.zeros(3), np.eye(7))
     keyframes.graph.segments[0].similarity = known
     carried = frames.pose(frame, pose_at(np.eye(4), fix, np.full(3, 5.0)))
     assert np.linalg.norm(carried.T_world_camera[:3, 3] - fix) > 1.0

@@ -10,6 +10,7 @@ from recon.posegraph import ground_control
 from recon.posegraph.ground_control import ControlPoint, KeyframeTrack, Mark, adjust, map_position
 from recon.posegraph.records import Loop
 from recon.posegraph.smoother import State
+from recon.similarity import umeyama
 from recon.types import F64, PosePrior
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -213,13 +214,13 @@ def test_a_similarity_from_three_points_or_none() -> None:
     a = rng.uniform(-30, 30, (4, 3))
     R = se3.so3_exp(np.array([0.1, -0.2, 2.0]))
     b = 1.7 * a @ R.T + [100.0, 20.0, -4.0]
-    found = ground_control.placed_by_points(a, b)
+    found = umeyama(a, b)
     assert found is not None
-    assert found.growth == pytest.approx(1.7) and np.allclose(found.R, R)
+    assert found.scale == pytest.approx(1.7) and np.allclose(found.R, R)
     assert np.allclose(found.t, [100.0, 20.0, -4.0])
     line = np.arange(4.0)[:, None] * np.array([1.0, 2.0, 0.1])
-    assert ground_control.placed_by_points(line, line) is None
-    assert ground_control.placed_by_points(a[:2], b[:2]) is None
+    assert umeyama(line, line) is None
+    assert umeyama(a[:2], b[:2]) is None
 
 
 def test_wrong_shapes_are_refused() -> None:

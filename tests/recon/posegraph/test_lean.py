@@ -9,7 +9,7 @@ import pytest
 from flown_track import node
 
 from recon import se3
-from recon.posegraph.alignment import Similarity, fit
+from recon.posegraph.alignment import Alignment, fit
 from recon.posegraph.level_ground import ASSUMED_TILT_RAD, LEVEL_SIGMA_RAD
 from recon.posegraph.records import Node
 from recon.posegraph.trajectory import Trajectory
@@ -26,7 +26,7 @@ class Stills:
     nodes: list[Node]
     level: F64  # (3, 3) world from odometry
 
-    def lean_deg(self, found: Similarity) -> float:
+    def lean_deg(self, found: Alignment) -> float:
         """Angle between what is taken as level and what is."""
         up = (found.R @ self.level.T)[2]
         return float(np.degrees(np.arccos(min(1.0, up[2]))))

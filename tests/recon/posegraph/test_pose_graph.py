@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from recon import parallel, se3
-from recon.posegraph.alignment import umeyama
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
 from recon.posegraph.smoother import NO_SCALE, Smoother, State, System
 from recon.posegraph.trajectory import Trajectory
+from recon.similarity import umeyama
 from recon.types import F64, Pose, PosePrior
 
 STEP_M = 6.0
@@ -110,10 +110,12 @@ def test_umeyama_recovers_any_level_similarity(scale: float, yaw: float, seed: i
     source = rng.normal(size=(12, 3)) * [30, 20, 5]
     R = Rotation.from_euler("z", yaw).as_matrix()
     t = rng.normal(size=3) * 100
-    found = umeyama(source, scale * source @ R.T + t, rng.uniform(0.5, 2, 12))
-    assert found[0] == pytest.approx(scale)
-    np.testing.assert_allclose(found[1], R, atol=1e-9)
-    np.testing.assert_allclose(found[2], t, atol=1e-6 * max(scale, 1) * 100)
+    for is_level in (True, False):
+        target = scale * source @ R.T + t
+        found = umeyama(source, target, rng.uniform(0.5, 2, 12), is_level)
+        assert found is not None and found.scale == pytest.approx(scale)
+        np.testing.assert_allclose(found.R, R, atol=1e-9)
+        np.testing.assert_allclose(found.t, t, atol=1e-6 * max(scale, 1) * 100)
 
 
 def test_umeyama_rotates_about_the_vertical_as_scipy_does() -> None:
@@ -126,7 +128,9 @@ def test_umeyama_rotates_about_the_vertical_as_scipy_does() -> None:
     a = (source - weight @ source / weight.sum()) * flat
     b = (target - weight @ target / weight.sum()) * flat
     oracle = Rotation.align_vectors(b, a, weights=weight)[0].as_matrix()
-    np.testing.assert_allclose(umeyama(source, target, weight)[1], oracle, atol=1e-9)
+    found = umeyama(source, target, weight, is_level=True)
+    assert found is not None
+    np.testing.assert_allclose(found.R, oracle, atol=1e-9)
 
 
 # ---- whole flights ---------------------------------------------------------------------------
@@ -566,7 +570,8 @@ def test_vision_and_loops_that_contradict_each_other_leave_the_scale_to_the_fixe
         graph.add_loop(i, 120 + i, T, spread)
     graph.solve()
     places, truth = graph.poses()[:, :3, 3], np.array(f.truth)[:, :3, 3]
-    assert umeyama(places, truth, np.ones(130))[0] == pytest.approx(1.0, abs=0.005)
+    found = umeyama(places, truth, is_level=True)
+    assert found is not None and found.scale == pytest.approx(1.0, abs=0.005)
 
 
 @pytest.mark.slow

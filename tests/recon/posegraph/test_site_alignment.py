@@ -7,12 +7,12 @@ import pytest
 
 from recon import se3
 from recon.posegraph.site_alignment import (
-    ScanSimilarity,
     SiteAlignment,
     Tie,
     align,
     alike,
 )
+from recon.similarity import Similarity
 from recon.types import F64
 
 SIGMA = np.array([0.005] * 3 + [1.0, 1.0, 1.5, 0.005])
@@ -23,15 +23,15 @@ def priors(count: int) -> tuple[F64, F64]:
     return np.tile(CENTRE, (count, 1)), np.tile(SIGMA, (count, 1))
 
 
-def drawn(rng: np.random.Generator) -> ScanSimilarity:
+def drawn(rng: np.random.Generator) -> Similarity:
     """How wrongly a scan is placed, by the sigmas of its prior."""
     x = rng.normal(size=7) * SIGMA
     R, growth = se3.so3_exp(x[:3]), float(np.exp(x[6]))
-    return ScanSimilarity(R, CENTRE + x[3:6] - growth * R @ CENTRE, growth)
+    return Similarity(growth, R, CENTRE + x[3:6] - growth * R @ CENTRE)
 
 
 def ties_between(
-    a: int, b: int, wrong: list[ScanSimilarity], rng: np.random.Generator, count: int = 8
+    a: int, b: int, wrong: list[Similarity], rng: np.random.Generator, count: int = 8
 ) -> list[Tie]:
     """Ties of places on the ground with noise of 3 cm."""
     out = []
@@ -43,7 +43,7 @@ def ties_between(
     return out
 
 
-def placed(move: ScanSimilarity, wrong: ScanSimilarity, places: F64) -> F64:
+def placed(move: Similarity, wrong: Similarity, places: F64) -> F64:
     return move.points(wrong.points(places)) - places
 
 
@@ -73,7 +73,7 @@ def test_ties_that_disagree_do_not_shrink_the_site() -> None:
                 wander = rng.normal(size=3) * 0.2
                 ties.append(Tie(a, b, one.at_a + wander, one.at_b, one.covariance))
     found = align(ties, *priors(4))
-    scales = [move.growth * w.growth for move, w in zip(found.moves, wrong, strict=True)]
+    scales = [move.scale * w.scale for move, w in zip(found.moves, wrong, strict=True)]
     assert np.mean(scales) == pytest.approx(1.0, abs=0.015)
 
 

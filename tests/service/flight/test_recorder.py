@@ -14,7 +14,7 @@ import pytest
 from recon import se3
 from recon.camera_model import scaled_K
 from recon.pipeline.events import FramePosed, KeyframeReady, PosesChanged
-from recon.posegraph.alignment import Scale, Similarity
+from recon.posegraph.alignment import Alignment, Scale
 from recon.posegraph.pose_graph import PoseGraph
 from recon.posegraph.segments import Segments
 from recon.poses import sigma_m
@@ -153,7 +153,7 @@ def test_the_scale_names_what_measured_it(
     sources: tuple[str, ...], sigma: float, by: str, tmp_path: Path
 ) -> None:
     covariance = np.diag([0.0] * 6 + [sigma**2])
-    found = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
+    found = Alignment(1.0, np.eye(3), np.zeros(3), covariance, sources)
     graph = Mock(PoseGraph, segments=Mock(Segments))
     graph.segments.largest.return_value.frame = found
     with ScanStore.create(tmp_path / "scan.db", ScanHeader("s", "drone", 0)) as store:

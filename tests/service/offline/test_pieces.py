@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from recon.calibration.global_bundle import Sightings
 from recon.calibration.tracks import MIN_COMMON
 from recon.posegraph import pieces
-from recon.posegraph.alignment import Similarity
+from recon.posegraph.alignment import Alignment
 from recon.posegraph.records import Loop, PoseGraphConfig
 from recon.posegraph.segments import Segment, Segments
 from recon.types import F64, PosePrior
@@ -59,7 +59,7 @@ class Ties:
         scale = self.sigma_scale.get(number, 0.01)
         covariance = np.diag([1.0] * 5 + [self.sigma_m**2, scale**2])
         sources = ("gnss",) if number in self.fixed else ("altitude",)
-        out.similarity = Similarity(1.0, np.eye(3), np.zeros(3), covariance, sources)
+        out.similarity = Alignment(1.0, np.eye(3), np.zeros(3), covariance, sources)
         if self.against_m is not None:
             heights = self.against_m / 2**0.5, 0.0, 0.0
             out.similarity = replace(out.similarity, heights=heights)
