@@ -326,20 +326,19 @@ class Mapper:
 
     def set_baseline(self, baseline: Baseline) -> None:
         """Apply a new baseline from the next frame on."""
-        selection = self.views.selection
-        selection.set_baseline(baseline)
-        self.stereo.set_min_base_to_height(selection.min_base_to_height)
+        self.views.selection.baseline = baseline
+        self.stereo.set_min_base_to_height(self.views.selection.min_base_to_height)
 
     def set_effort(self, pairs: int, stereo_width_px: int, upsample: bool) -> None:
         """Apply these from the next view on."""
-        self.views.selection.set_partners(pairs)
+        self.views.selection.max_partners = pairs
         self.stereo.set_effort(stereo_width_px, upsample)
         if self._first_stereo is not None:
             self._first_stereo.set_effort(stereo_width_px // COARSER, upsample=False)
 
     def take_next(self) -> None:
         """Make the next frame with a pose a view, whatever the baseline asks for."""
-        self.views.selection.take_next()
+        self.views.selection.takes_next = True
 
     def reset_map(self) -> None:
         """Reset the map: all surface counts as unseen."""

@@ -100,60 +100,45 @@ class ViewSelection:
     def __init__(
         self, baseline: Baseline | None = None, partners: int = 4, all_known: bool = False
     ) -> None:
-        """At most ``partners`` of the last :data:`KEPT` views pair up with one of them.
+        """At most ``partners`` of the last :data:`KEPT` views pair up with one of them, where the
+        baseline is "auto".
 
         ``all_known``: the poses are final, and views wait for those on their far side.
 
         With more partners than the neighbouring views can be, tracked frames between them
         become partners too.
         """
+        self.baseline = baseline or Baseline()
+        self.max_partners = partners
+        self.takes_next = False  # the next frame with a pose, whatever the baseline asks for
         self._all_known = all_known
-        self._kept: deque[UndistortedFrame] = deque(maxlen=KNOWN_KEPT if all_known else KEPT)
-        self._between: deque[UndistortedFrame] = deque(
-            maxlen=8 * partners if partners > KEPT - 2 else 0
-        )
-        self._recent: deque[UndistortedFrame] = deque(maxlen=6)  # a quarter of a step apart
-        self._extra: tuple[UndistortedFrame, list[UndistortedFrame]] | None = (
-            None  # a last view's partner
-        )
-        self._max_partners = partners
+        self._kept = deque[UndistortedFrame](maxlen=KNOWN_KEPT if all_known else KEPT)
+        self._between = deque[UndistortedFrame](maxlen=8 * partners if partners > KEPT - 2 else 0)
+        self._recent = deque[UndistortedFrame](maxlen=6)  # a quarter of a step apart
+        # A last view, and its partner.
+        self._extra: tuple[UndistortedFrame, list[UndistortedFrame]] | None = None
         self._views_of: Counter[int] = Counter()  # views by segment, kept or not
-        self._take_next = False
-        self.set_baseline(baseline or Baseline())
 
-    def set_baseline(self, baseline: Baseline) -> None:
-        """Follow another baseline from the next frame on."""
-        self._mode, self._amount = baseline.mode, baseline.amount
-        self._stride = 0
-        if self._mode == "frames":
-            self._stride = frames_apart(int(self._amount), baseline.every)
-        self._partners = self._max_partners if self._mode == "auto" else 1
-
-    def set_partners(self, most: int) -> None:
-        """Pair each view with at most ``most`` others from now on, where the baseline is "auto"."""
-        self._max_partners = most
-        self._partners = most if self._mode == "auto" else 1
-
-    def take_next(self) -> None:
-        """Make the next frame with a pose a view, whatever the baseline asks for."""
-        self._take_next = True
+    @property
+    def _is_auto(self) -> bool:
+        return self.baseline.mode == "auto"
 
     @property
     def frames_per_step(self) -> float:
         """Frames between two keyframes that are needed: as many as pair up, or all of them."""
-        if self._mode != "auto" or self._take_next:
+        if not self._is_auto or self.takes_next:
             return np.inf
-        return max(MIN_FRAMES_PER_STEP, self._partners / PARTNER_SPAN)
+        return max(MIN_FRAMES_PER_STEP, self.max_partners / PARTNER_SPAN)
 
     @property
     def min_base_to_height(self) -> float:
         """The shortest baseline that stereo should accept: an operator's choice is kept."""
-        return 0.03 if self._mode == "auto" else 0.002
+        return 0.03 if self._is_auto else 0.002
 
     def offer(self, frame: UndistortedFrame, tracked: Tracked) -> bool:
         """True when the frame is to be a view."""
-        if self._take_next or self._wants(frame.seq, tracked):
-            self._take_next = False
+        if self.takes_next or self._wants(frame.seq, tracked):
+            self.takes_next = False
             self._keep(frame)
             return True
         if self._between.maxlen:
@@ -194,9 +179,7 @@ class ViewSelection:
     def _step(self, segment: int) -> float | None:
         """Distance between the last two views; None unless they are automatic and of it."""
         same = [v for v in self._kept if v.segment == segment]
-        if self._mode != "auto" or len(same) < 2:
-            return None
-        return _apart(same[-1], same[-2])
+        return _apart(same[-1], same[-2]) if self._is_auto and len(same) >= 2 else None
 
     def _moved_on(self, frame: UndistortedFrame) -> bool:
         """True a quarter of a step after the last frame that was remembered."""
@@ -214,13 +197,14 @@ class ViewSelection:
         if tracked.state is Tracking.STARTED or not self._kept:
             return tracked.state in (Tracking.STARTED, Tracking.KEYFRAME)
         last = self._kept[-1]
-        if self._mode == "auto" or last.segment != tracked.segment:
+        amount = self.baseline.amount
+        if self._is_auto or last.segment != tracked.segment:
             return tracked.state is Tracking.KEYFRAME
-        if self._mode == "frames":
-            return seq - last.seq >= self._stride
+        if self.baseline.mode == "frames":
+            return seq - last.seq >= frames_apart(int(amount), self.baseline.every)
         assert tracked.T_odom_camera is not None
         moved = tracked.T_odom_camera[:3, 3] - last.T_odom_camera[:3, 3]
-        return bool(np.linalg.norm(moved) >= self._amount)
+        return bool(np.linalg.norm(moved) >= amount)
 
     def ready(self, view: UndistortedFrame) -> bool:
         """True when the view has two neighbours to pair with, or its segment is over."""
@@ -230,7 +214,7 @@ class ViewSelection:
             return True
         if self._kept[-1].row_motion.is_awaited:
             return False
-        if self._mode != "auto":
+        if not self._is_auto:
             return True
         if self._all_known:
             return sum(v.seq > view.seq for v in self._kept) >= AHEAD
@@ -242,7 +226,7 @@ class ViewSelection:
         Clouds in the sky or a false first motion would otherwise become surface. A baseline
         that the operator fixed pairs each view once and is not checked.
         """
-        return self._mode != "auto" or self._views_of[view.segment] >= 3
+        return not self._is_auto or self._views_of[view.segment] >= 3
 
     def partners(self, view: UndistortedFrame) -> list[UndistortedFrame]:
         """The views to pair it with, the best first.
@@ -250,39 +234,26 @@ class ViewSelection:
         Automatic: those nearest to the wanted base-to-height, from both sides; a fixed
         baseline: the neighbour after it, or before it at the end of a segment.
         """
-        candidates = [*self._kept, *self._between]
-        segment = view.segment
-        others = [v for v in candidates if v.segment == segment and not v.is_blurred]
-        others = [v for v in others if v is not view]
-        if self._mode != "auto":
+        others = [
+            v for v in [*self._kept, *self._between]
+            if v.segment == view.segment and not v.is_blurred and v is not view
+        ]  # fmt: skip
+        if not self._is_auto:
             others.sort(key=lambda v: (v.seq < view.seq, abs(v.seq - view.seq)))
             return others[:1]
         others.sort(key=lambda v: _apart(v, view))
         if self._all_known:
-            return self._wide(view, others)
+            # Of all baselines that stereo can bridge; the nearest where there are none.
+            widest = WIDEST * median_depth(view.keyframe)
+            good = [v for v in others if _apart(v, view) <= widest]
+            return _evenly(good, KNOWN_PARTNERS * self.max_partners) or others[: self.max_partners]
         if not self._between:
             extra = self._extra[1] if self._extra and self._extra[0] is view else []
-            return [*extra, *others[: self._partners]]
-        return self._spread(view, others)
-
-    def _wide(
-        self, view: UndistortedFrame, others: list[UndistortedFrame]
-    ) -> list[UndistortedFrame]:
-        """Partners of all baselines that stereo can bridge; the nearest where there are none."""
-        widest = WIDEST * median_depth(view.keyframe)
-        good = [v for v in others if _apart(v, view) <= widest]
-        return _evenly(good, KNOWN_PARTNERS * self._partners) or others[: self._partners]
-
-    def _spread(
-        self, view: UndistortedFrame, others: list[UndistortedFrame]
-    ) -> list[UndistortedFrame]:
-        """Partners between half and twice the keyframes' spacing, evenly spread."""
-        base = [_apart(v, view) for v in others]
-        steps = [b for v, b in zip(others, base, strict=True) if v in self._kept]
-        spacing = steps[0] if steps else 0.0
+            return [*extra, *others[: self.max_partners]]
+        # Between half and twice the keyframes' spacing, evenly spread.
+        spacing = next((_apart(v, view) for v in others if v in self._kept), 0.0)
         near, far = NEAREST_PARTNER * spacing, FARTHEST_PARTNER * spacing
-        good = [v for v, b in zip(others, base, strict=True) if near <= b <= far]
-        return _evenly(good, self._partners)
+        return _evenly([v for v in others if near <= _apart(v, view) <= far], self.max_partners)
 
 
 def _evenly(views: list[UndistortedFrame], count: int) -> list[UndistortedFrame]:

@@ -24,7 +24,6 @@ from recon.posegraph.alignment_readings import (
     AlignmentState,
     Heights,
     ReadingNoise,
-    from_middle,
 )
 from recon.posegraph.ground_heights import GUESSED_SHARE, INDEPENDENT_HEIGHTS
 from recon.posegraph.level_ground import ASSUMED_TILT_RAD
@@ -42,7 +41,7 @@ from recon.posegraph.sensor_noise import (
     gauss_markov_noise,
 )
 from recon.similarity import Similarity, umeyama
-from recon.types import F64, PosePrior
+from recon.types import F64
 
 HUBER = 2.5
 """Whitened residuals beyond this lose weight."""
@@ -99,16 +98,6 @@ class Alignment(Similarity):
         if self.lean is None:
             return None
         return float(np.sqrt(np.linalg.eigvalsh(self.lean[:2, :2])[-1] + self.bend_rad**2))
-
-    def applied(self, prior: PosePrior, time_s: float) -> PosePrior:
-        """The prior without the turn of an assumed view's mount and the drift of altitudes."""
-        R, position = prior.R_world_camera, prior.position_m
-        if R is not None and prior.is_view_assumed:
-            R = R @ se3.so3_exp(self.mount_rad)
-        if position is not None:
-            drift_m = self.drift_m * float(from_middle(time_s, *self.span_s))
-            position = position - np.array([0.0, 0.0, drift_m])
-        return replace(prior, R_world_camera=R, position_m=position)
 
 
 def fit(

@@ -14,7 +14,7 @@ from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.ground_heights import GUESSED_SHARE, guessed_at
 from recon.posegraph.pose_priors import at_camera
 from recon.posegraph.records import Node, PoseGraphConfig
-from recon.posegraph.sensor_offsets import Constants, Offsets, constants, offsets
+from recon.posegraph.sensor_offsets import Constants, constants, with_offsets
 from recon.types import F64, PosePrior
 
 REFIT_GROWTH, SETTLED_GROWTH = 1.3, 1.6
@@ -43,7 +43,7 @@ class Segment:
     keyframes: int = 0  # in the graph or not
     similarity: Alignment | None = None  # once telemetry or a loop gives it
     constants: Constants = field(default_factory=Constants)  # errors it was fitted with
-    offsets: Offsets | None = None  # of each sensor from the similarity
+    offsets: Constants | None = None  # those with each sensor's own from the similarity
     is_tied_by_loop: bool = False
     fitted: int = 0  # keyframes when the similarity was fitted last
     surface: list[int] = field(default_factory=list)  # its keyframes with depth
@@ -92,10 +92,8 @@ class Segment:
 
     def without_biases(self, node: Node) -> PosePrior:
         """A node's prior without its sensors' constants, its fix brought to the camera."""
-        prior = self.constants.applied(node.prior)
-        if self.offsets is not None and self.similarity is not None:
-            prior = self.similarity.applied(prior, node.time_s)
-            prior = self.offsets.applied(prior, node.lean)
+        known = self.offsets or self.constants
+        prior = known.applied(node.prior, node.time_s, node.lean)
         return self.at_camera(replace(node, prior=prior))
 
     def at_camera(self, node: Node) -> PosePrior:
@@ -227,8 +225,7 @@ class Segments:
         if before is not None and is_settled and not _differ(before, found, nodes):
             return False  # the graph itself follows such small changes
         segment.similarity, segment.constants = found, fresh
-        readings = [replace(n, prior=found.applied(n.prior, n.time_s)) for n in readings]
-        segment.offsets = offsets(readings, found)
+        segment.offsets = with_offsets(fresh, readings, found)
         return True
 
     def _newest_constants(self) -> Constants:

@@ -8,12 +8,13 @@ bend it. So the constants are removed from the readings before they enter the gr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from recon import se3
 from recon.posegraph.alignment import Alignment
+from recon.posegraph.alignment_readings import from_middle
 from recon.posegraph.ground_heights import EXACT_HEIGHTS, height_ratios
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S
@@ -45,33 +46,58 @@ NOTABLE_M, NOTABLE_RAD = 0.1, 0.003
 """Changes of the constants of a whole flight that the map must follow."""
 
 
+ZERO, NO_WARP, SIGMA_TURN = np.zeros(3), np.zeros((3, 3)), np.full(3, SIGMA_RAD)
+"""Of a sensor of which nothing is known."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Constants:
-    """Constant errors of a whole flight's sensors, whatever becomes of the track.
+    """Constant errors of sensors: of a whole flight, whatever becomes of the track, and of one
+    segment against its alignment.
 
     The boresight: ``R_world_camera = R_reported @ exp(turn)``. The altitudes' datum: ``up_m`` is to
     be added to them.
     """
 
-    turn: F64 = field(default_factory=lambda: np.zeros(3))  # rad, in the camera's frame
-    sigma_turn: F64 = field(default_factory=lambda: np.full(3, SIGMA_RAD))
+    turn: F64 = ZERO  # rad, in the camera's frame
+    sigma_turn: F64 = SIGMA_TURN
     up_m: float = 0.0
     sigma_up_m: float = float("inf")  # of what is then left of the constant
     slow_share: float = 1.0  # of the receiver's variance; the rest is new in each fix
+    # Of one segment.
+    mount_rad: F64 = ZERO  # turns assumed views
+    drift_m: float = 0.0  # by which altitudes are too high in the end, and too low at first
+    span_s: tuple[float, float] = (0.0, 1.0)  # of the drift: the middle, and half its length
+    turn_world: F64 = ZERO  # rad, takes attitudes to the alignment
+    log_height: float = 0.0  # log of the alignment's scale over that of the heights
+    centre_m: F64 = ZERO  # of the fixes
+    shift_m: F64 = ZERO  # takes fixes to the alignment
+    warp: F64 = NO_WARP  # likewise, per metre off centre
+    reach_m: float = 0.0  # off centre to which the warp is known; it grows no further
+    is_exact: bool = False  # only heights of the ground exactly below count
 
     @property
     def is_turn_sure(self) -> bool:
         """True when the boresight is significant; otherwise it is not applied."""
         return float(np.sum(np.square(self.turn / self.sigma_turn))) > SURE
 
-    def applied(self, prior: PosePrior) -> PosePrior:
-        """The prior without them."""
-        R, position = prior.R_world_camera, prior.position_m
-        if self.up_m != 0.0 and position is not None:
-            prior = replace(prior, position_m=position + np.array([0.0, 0.0, self.up_m]))
-        if self.is_turn_sure and R is not None:
-            prior = replace(prior, R_world_camera=R @ se3.so3_exp(self.turn))
-        return prior
+    def applied(self, prior: PosePrior, time_s: float = 0.0, lean: float = 0.0) -> PosePrior:
+        """A prior without them; ``lean`` is that of the ground whose height vision measures."""
+        R, position, agl = prior.R_world_camera, prior.position_m, prior.agl_m
+        if R is not None:
+            R = R @ se3.so3_exp(self.turn) if self.is_turn_sure else R
+            R = R @ se3.so3_exp(self.mount_rad) if prior.is_view_assumed else R
+            R = se3.so3_exp(self.turn_world) @ R
+        if position is not None:
+            drift_m = self.drift_m * float(from_middle(time_s, *self.span_s))
+            position = position + np.array([0.0, 0.0, self.up_m]) - np.array([0.0, 0.0, drift_m])
+            off = position - self.centre_m
+            off = off * min(1.0, self.reach_m / max(float(np.linalg.norm(off)), 1e-9))
+            position = position + self.shift_m + self.warp @ off
+        if agl is not None:
+            is_relief = self.is_exact and lean > 0.0
+            agl = None if is_relief else agl * float(np.exp(self.log_height))
+        return replace(prior, R_world_camera=R, position_m=position, agl_m=agl)
 
     def differ(self, other: Constants) -> bool:
         """True when the other's would notably move the map."""
@@ -255,46 +281,21 @@ def constants(
     return replace(datum, turn=turned.turn, sigma_turn=turned.sigma_turn)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Offsets:
-    """Constants of one segment's sensors against its frame."""
-
-    turn: F64 = field(default_factory=lambda: np.zeros(3))  # rad, takes attitudes to the frame
-    log_height: float = 0.0  # log of the frame's scale over that of the heights
-    centre_m: F64 = field(default_factory=lambda: np.zeros(3))  # of the fixes
-    shift_m: F64 = field(default_factory=lambda: np.zeros(3))  # takes fixes to the frame
-    warp: F64 = field(default_factory=lambda: np.zeros((3, 3)))  # likewise, per metre off centre
-    reach_m: float = 0.0  # off centre to which the warp is known; it grows no further
-    is_exact: bool = False  # only heights of the ground exactly below count
-
-    def applied(self, prior: PosePrior, lean: float) -> PosePrior:
-        """The prior's attitude, position and height without their constants.
-
-        ``lean`` is that of the ground whose height vision measures.
-        """
-        R, position, agl = prior.R_world_camera, prior.position_m, prior.agl_m
-        if R is not None:
-            R = se3.so3_exp(self.turn) @ R
-        if position is not None:
-            off = position - self.centre_m
-            off = off * min(1.0, self.reach_m / max(float(np.linalg.norm(off)), 1e-9))
-            position = position + self.shift_m + self.warp @ off
-        if agl is not None and self.is_exact and lean > 0.0:
-            agl = None
-        elif agl is not None:
-            agl = agl * float(np.exp(self.log_height))
-        return replace(prior, R_world_camera=R, position_m=position, agl_m=agl)
-
-
-def offsets(nodes: Sequence[Node], frame: Alignment) -> Offsets:
-    """The constants of all sensors over the nodes of one segment, robustly."""
+def with_offsets(known: Constants, nodes: Sequence[Node], frame: Alignment) -> Constants:
+    """The same with those of one segment, robustly over its nodes, which are without ``known``."""
+    drift = Constants(mount_rad=frame.mount_rad, drift_m=frame.drift_m, span_s=frame.span_s)
+    nodes = [replace(n, prior=drift.applied(n.prior, n.time_s)) for n in nodes]
     ratios, independent = height_ratios(nodes)
-    is_exact = independent == EXACT_HEIGHTS
     log_height = 0.0
     if ratios:
         mean = np.average([r[0] for r in ratios], weights=[r[1] ** -2 for r in ratios])
         log_height = float(np.log(frame.scale) - mean)
-    return Offsets(_turn(nodes, frame), log_height, *_fixes(nodes, frame), is_exact)
+    centre_m, shift_m, warp, reach_m = _fixes(nodes, frame)
+    return replace(
+        known, mount_rad=frame.mount_rad, drift_m=frame.drift_m, span_s=frame.span_s,
+        turn_world=_turn(nodes, frame), log_height=log_height, centre_m=centre_m, shift_m=shift_m,
+        warp=warp, reach_m=reach_m, is_exact=independent == EXACT_HEIGHTS,
+    )  # fmt: skip
 
 
 def _turn(nodes: Sequence[Node], frame: Alignment) -> F64:
