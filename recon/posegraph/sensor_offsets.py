@@ -8,7 +8,7 @@ bend it. So the constants are removed from the readings before they enter the gr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,10 +46,6 @@ NOTABLE_M, NOTABLE_RAD = 0.1, 0.003
 """Changes of the constants of a whole flight that the map must follow."""
 
 
-ZERO, NO_WARP, SIGMA_TURN = np.zeros(3), np.zeros((3, 3)), np.full(3, SIGMA_RAD)
-"""Of a sensor of which nothing is known."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Constants:
     """Constant errors of sensors: of a whole flight, whatever becomes of the track, and of one
@@ -59,20 +55,22 @@ class Constants:
     be added to them.
     """
 
-    turn: F64 = ZERO  # rad, in the camera's frame
-    sigma_turn: F64 = SIGMA_TURN
+    turn: F64 = field(default_factory=lambda: np.zeros(3))  # rad, in the camera's frame
+    sigma_turn: F64 = field(default_factory=lambda: np.full(3, SIGMA_RAD))
     up_m: float = 0.0
     sigma_up_m: float = float("inf")  # of what is then left of the constant
     slow_share: float = 1.0  # of the receiver's variance; the rest is new in each fix
     # Of one segment.
-    mount_rad: F64 = ZERO  # turns assumed views
+    mount_rad: F64 = field(default_factory=lambda: np.zeros(3))  # turns assumed views
     drift_m: float = 0.0  # by which altitudes are too high in the end, and too low at first
     span_s: tuple[float, float] = (0.0, 1.0)  # of the drift: the middle, and half its length
-    turn_world: F64 = ZERO  # rad, takes attitudes to the alignment
+    turn_world: F64 = field(
+        default_factory=lambda: np.zeros(3)
+    )  # rad, takes attitudes to the alignment
     log_height: float = 0.0  # log of the alignment's scale over that of the heights
-    centre_m: F64 = ZERO  # of the fixes
-    shift_m: F64 = ZERO  # takes fixes to the alignment
-    warp: F64 = NO_WARP  # likewise, per metre off centre
+    centre_m: F64 = field(default_factory=lambda: np.zeros(3))  # of the fixes
+    shift_m: F64 = field(default_factory=lambda: np.zeros(3))  # takes fixes to the alignment
+    warp: F64 = field(default_factory=lambda: np.zeros((3, 3)))  # per metre off centre
     reach_m: float = 0.0  # off centre to which the warp is known; it grows no further
     is_exact: bool = False  # only heights of the ground exactly below count
 
