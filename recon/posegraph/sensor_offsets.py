@@ -64,12 +64,10 @@ class Constants:
     mount_rad: F64 = field(default_factory=lambda: np.zeros(3))  # turns assumed views
     drift_m: float = 0.0  # by which altitudes are too high in the end, and too low at first
     span_s: tuple[float, float] = (0.0, 1.0)  # of the drift: the middle, and half its length
-    turn_world: F64 = field(
-        default_factory=lambda: np.zeros(3)
-    )  # rad, takes attitudes to the alignment
+    turn_world: F64 = field(default_factory=lambda: np.zeros(3))  # takes attitudes to it
     log_height: float = 0.0  # log of the alignment's scale over that of the heights
     centre_m: F64 = field(default_factory=lambda: np.zeros(3))  # of the fixes
-    shift_m: F64 = field(default_factory=lambda: np.zeros(3))  # takes fixes to the alignment
+    shift_m: F64 = field(default_factory=lambda: np.zeros(3))  # takes fixes to it
     warp: F64 = field(default_factory=lambda: np.zeros((3, 3)))  # per metre off centre
     reach_m: float = 0.0  # off centre to which the warp is known; it grows no further
     is_exact: bool = False  # only heights of the ground exactly below count
