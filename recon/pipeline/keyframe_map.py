@@ -113,7 +113,7 @@ class KeyframeMap:
 
     def apart(self) -> list[tuple[int, int]]:
         """First and last keyframe of each stretch that nothing ties to the rest of the scan."""
-        return apart(self.graph.segments, self.graph.loops.taken)
+        return apart(self.graph.segments, self.graph.loops)
 
     def false(self) -> list[tuple[int, int]]:
         """First and last keyframe of each stretch in which vision is wrong, and its depth, too."""

@@ -17,13 +17,12 @@ import numpy as np
 
 from recon import parallel, se3
 from recon.posegraph.factors import GraphFactors
-from recon.posegraph.loop_verification import LoopVerification, is_explained
 from recon.posegraph.pose_priors import is_frozen, sound
 from recon.posegraph.records import LOOP_WINDOW, Loop, Node, PoseGraphConfig, loops_agree
 from recon.posegraph.segments import Segments
 from recon.posegraph.sensor_offsets import Constants
 from recon.posegraph.smoother import MANY_STEPS, STEPS, reversed_motion
-from recon.posegraph.thinning import GONE_SHARE, thin
+from recon.posegraph.thinning import GONE_SHARE, moved_loops, thin
 from recon.types import F64, Pose, PosePrior
 
 __all__ = ["PoseGraph", "PoseGraphConfig"]
@@ -32,12 +31,20 @@ log = logging.getLogger(__name__)
 
 SOURCES = ("vision", "attitude", "altitude", "gnss", "loop", "dead reckoning")
 
+DRIFT, SLACK_M, MAX_TURN_RAD = 0.05, 2.0, 0.5
+"""A loop off by more than this share of the path between its ends and so many metres, or by such a
+turn, is impossible: vision drifts by less."""
+
+MAX_PENDING = 50
+"""Loops that wait for one that agrees; older ones are forgotten."""
+
 
 class PoseGraph:
     """Keyframe poses in the world, corrected as evidence comes in.
 
-    ``segments`` holds each segment's similarity to the world, ``loops`` those offered. Poses,
-    motions and covariances use this package's conventions (left perturbations).
+    ``segments`` holds each segment's similarity to the world, ``loops`` those that the map rests
+    on, ``pending`` those for which none that agrees was found yet. Poses, motions and covariances
+    use this package's conventions (left perturbations).
     """
 
     def __init__(self, config: PoseGraphConfig | None = None) -> None:
@@ -48,7 +55,8 @@ class PoseGraph:
         self.entered = 0  # keyframes, whether they are nodes or not
         self.generation = 0  # how often nodes were thinned out
         self.segments = Segments(self.config)
-        self.loops = LoopVerification()
+        self.loops: list[Loop] = []
+        self.pending: list[Loop] = []
         self._built = 0
         self._start()
 
@@ -111,11 +119,16 @@ class PoseGraph:
         ratio = growth * self.scale(b) / scale
         loop = Loop(a, b, T_a_b, covariance, ratio).scaled(1.0 / scale)
         if not self._is_possible(loop):
-            self.loops.counts["loop impossible"] += 1
+            self._kept_counts["loop impossible"] += 1
             return False
-        fresh = self.loops.offer(loop, self._agree)
-        if not fresh:
+        support = [other for other in self.pending + self.loops if self._agree(loop, other)]
+        if not support:
+            self.pending = [*self.pending, loop][-MAX_PENDING:]
+            self._kept_counts["loop waits"] += 1
             return False
+        fresh = [loop, *(other for other in support if other in self.pending)]
+        self.pending = [other for other in self.pending if other not in support]
+        self.loops += fresh
         if self._tie(loop):
             self.rebuild()
             return True
@@ -129,7 +142,7 @@ class PoseGraph:
         for segment in self.segments:
             segment.forget()
             self.segments.refit(segment, self._smoother.pose)
-            loops = [one for one in self.loops.taken if self._enters(one, segment.number)]
+            loops = [one for one in self.loops if self._enters(one, segment.number)]
             if loops and not segment.is_tied:
                 self.rebuild()  # so that the segments before are where they belong
                 for loop in loops:
@@ -142,7 +155,7 @@ class PoseGraph:
     @property
     def counts(self) -> Counter[str]:
         """Readings and loops left out, by reason."""
-        return self._kept_counts + self.loops.counts + self._factors.left_out
+        return self._kept_counts + self._factors.left_out
 
     @property
     def seqs(self) -> list[int]:
@@ -155,7 +168,7 @@ class PoseGraph:
         return self._factors.refuted
 
     def metric_loops(self) -> list[Loop]:
-        return [loop.scaled(self.scale(loop.a)) for loop in self.loops.taken]
+        return [loop.scaled(self.scale(loop.a)) for loop in self.loops]
 
     def largest_growth(self) -> float:
         """Log of the largest segment's scale by all factors over its scale by its own readings."""
@@ -233,7 +246,7 @@ class PoseGraph:
             parallel.release_gil()  # each takes about a millisecond
             self._factors.add(node, last)
             last = node
-        for loop in self.loops.taken:
+        for loop in self.loops:
             self._add_loop_factor(loop)
         self._solve(now=True, steps=MANY_STEPS)
 
@@ -253,7 +266,10 @@ class PoseGraph:
         self._kept_counts["keyframe dropped"] += len(dropped)
         self._nodes = {node.seq: node for node in nodes}
         self.segments.thin(nodes)
-        self.loops.thin(marginalised, dropped, len(nodes))
+        self.loops, self.pending = (
+            moved_loops(loops, marginalised, dropped, len(nodes))
+            for loops in (self.loops, self.pending)
+        )
         self._thin_at = max(self.config.max_nodes, int(len(nodes) * (1.0 + GONE_SHARE)))
         self.generation += 1
         self.rebuild()
@@ -287,8 +303,10 @@ class PoseGraph:
         if a.segment != b.segment:
             return True
         T = se3.inverse(self._smoother.pose(a.key)) @ self._smoother.pose(b.key)
+        apart = se3.log(se3.inverse(loop.scaled(self.scale(loop.a)).T_a_b) @ T)
+        turned, moved = float(np.linalg.norm(apart[:3])), float(np.linalg.norm(apart[3:]))
         path_m = self._factors.path_m[b.key] - self._factors.path_m[a.key]
-        return is_explained(loop.scaled(self.scale(loop.a)), T, path_m)
+        return moved < SLACK_M + DRIFT * path_m and turned < MAX_TURN_RAD
 
     def _agree(self, one: Loop, other: Loop) -> bool:
         """True when two loops, joined by the track between their ends, close on themselves."""

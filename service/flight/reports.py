@@ -128,7 +128,7 @@ def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
     step = max(1, -(-len(accepted) // MAX_LOOPS))
     pairs = [
         [*loop.ends, taken]
-        for loops, taken in ((graph.loops.taken, True), (graph.loops.pending, False))
+        for loops, taken in ((graph.loops, True), (graph.pending, False))
         for loop in loops
     ]
     return {
@@ -143,8 +143,8 @@ def graph_figures(graph: PoseGraph) -> dict[str, Any] | None:
             if rows.size
         },
         "loops": {
-            "used": len(graph.loops.taken),
-            "waiting": len(graph.loops.pending),
+            "used": len(graph.loops),
+            "waiting": len(graph.pending),
             "pairs": pairs[-2 * MAX_LOOPS :],
             "motions": [
                 [

@@ -14,7 +14,7 @@ from doc_pages import FENCE, PAGES, text_of
 from paths import ROOT
 from trial_rig import Table
 
-from recon.posegraph import factors, loop_verification, records
+from recon.posegraph import factors, pose_graph, records
 from recon.posegraph.alignment import HUBER as MIN_FIT_SIGMAS
 from recon.posegraph.alignment import WILD
 from recon.posegraph.pose_graph import PoseGraph, PoseGraphConfig
@@ -107,8 +107,8 @@ def test_the_page_on_the_pose_graph_has_the_factors_and_numbers_of_the_code() ->
         f"Huber's loss begins at {factors.HUBER_SIGMAS} sigmas",
         f"more than {factors.GATE_SIGMAS:.0f} sigmas from the prediction",
         f"{factors.ALTITUDE_SLACK_M:.0f} m further off",
-        f"{loop_verification.SLACK_M:.0f} m and {loop_verification.DRIFT * 100:.0f} % of the path",
-        f"{loop_verification.MAX_TURN_RAD} rad; and",
+        f"{pose_graph.SLACK_M:.0f} m and {pose_graph.DRIFT * 100:.0f} % of the path",
+        f"{pose_graph.MAX_TURN_RAD} rad; and",
         f"within {records.LOOP_WINDOW} keyframes",
         f"below {records.CHI2_LIMIT}",
         f"from {TAUS_S[0]:.0f} to {TAUS_S[-1]:.0f} s",

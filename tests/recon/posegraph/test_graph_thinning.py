@@ -73,7 +73,7 @@ def test_a_thinned_graph_is_as_near_to_the_truth_as_the_whole_one() -> None:
     assert apart.max() < 0.6 and np.sqrt(np.mean(apart**2)) < 0.25
     turned = np.linalg.norm((poses - whole())[:, :3, :3], axis=(1, 2))
     assert turned.max() < 0.01
-    assert 5 < len(graph.loops.taken) <= MOST - len(graph.loops.pending)
+    assert 5 < len(graph.loops) <= MOST - len(graph.pending)
 
 
 @cache
