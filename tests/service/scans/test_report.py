@@ -178,7 +178,7 @@ def test_accepted_loops_come_back_with_motion_and_covariance() -> None:
         """A graph of known records."""
 
         entered = 2
-        loops = PoseGraph().loops
+        loops, pending = PoseGraph().loops, PoseGraph().pending
         counts: dict[str, int] = {"loop waits": 1}  # noqa: RUF012
 
         def __len__(self) -> int:
