@@ -144,7 +144,7 @@ def test_a_baseline_in_metres_is_kept_and_may_change_in_flight() -> None:
     views = ViewSelection(Baseline("metres", 2.0))
     taken = [i for i in range(20) if offer(views, i, 0.5 * i, "keyframe" if i == 0 else "tracked")]
     assert taken == [0, 4, 8, 12, 16]
-    views.set_baseline(Baseline("metres", 1.0))
+    views.baseline = Baseline("metres", 1.0)
     more = [i for i in range(20, 26) if offer(views, i, 0.5 * i, "tracked")]
     assert more == [20, 22, 24]
 
@@ -153,7 +153,7 @@ def test_the_operator_can_ask_for_the_next_frame() -> None:
     views = ViewSelection(Baseline())
     offer(views, 0, 0.0, "started")
     assert offer(views, 1, 0.1, "tracked") is None
-    views.take_next()
+    views.takes_next = True
     assert offer(views, 2, 0.2, "tracked") is not None
     assert offer(views, 3, 0.3, "tracked") is None
 
@@ -168,7 +168,7 @@ def test_fewer_partners_from_now_on() -> None:
     middle = kept[2]
     assert middle is not None
     assert len(views.partners(middle)) == 4
-    views.set_partners(2)
+    views.max_partners = 2
     assert sorted(v.seq for v in views.partners(middle)) == [1, 3]
 
 
@@ -202,7 +202,7 @@ def test_all_frames_count_where_the_operator_chose_the_baseline_or_wants_the_nex
     assert ViewSelection(Baseline("metres", 2.0)).frames_per_step == np.inf
     assert ViewSelection(Baseline("frames", 2, 10)).frames_per_step == np.inf
     views = ViewSelection(Baseline())
-    views.take_next()
+    views.takes_next = True
     assert views.frames_per_step == np.inf
 
 
