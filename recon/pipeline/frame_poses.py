@@ -87,7 +87,7 @@ class FramePoses:
         """True when the segment has a similarity to the world; in flight, of the newest one."""
         if self._newest is not None:
             return segment == self._aligned
-        return self._map.graph.segments.similarity(segment) is not None
+        return self._map.graph.segments[segment].similarity is not None
 
     def pose(self, frame: RelativePose, fallback: Pose) -> Pose:
         """A frame in the world, carried by the view at or before it where it can.

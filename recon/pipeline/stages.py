@@ -230,7 +230,7 @@ def plausible_depth(
     """``depth`` :func:`without_false_surface`; None with nothing left, or where the motion of the
     view's segment is false."""
     kept = without_false_surface(view, depth, bgr)
-    segment = segments.opened(view.segment)
+    segment = segments[view.segment]
     segment.agreement += -1 if kept is None else 1
     if kept is not None and not segment.is_false:
         return kept

@@ -150,17 +150,14 @@ def supported(loops: Sequence[Loop], poses: F64 | Mapping[int, F64]) -> list[Loo
     out = []
     for one in loops:
         for other in loops:
-            apart = max(abs(one.a - other.a), abs(one.b - other.b))
-            if 0 < apart <= LOOP_WINDOW and _agree(one, other, poses):
+            if not 0 < max(abs(one.a - other.a), abs(one.b - other.b)) <= LOOP_WINDOW:
+                continue
+            T_a_a = se3.inverse(poses[one.a]) @ poses[other.a]
+            T_b_b = se3.inverse(poses[other.b]) @ poses[one.b]
+            if loops_agree(one, other, T_a_a, T_b_b):
                 out.append(one)
                 break
     return out
-
-
-def _agree(one: Loop, other: Loop, poses: F64 | Mapping[int, F64]) -> bool:
-    T_a_a = se3.inverse(poses[one.a]) @ poses[other.a]
-    T_b_b = se3.inverse(poses[other.b]) @ poses[one.b]
-    return loops_agree(one, other, T_a_a, T_b_b)
 
 
 def map_position(poses: F64, scales: F64, marks: Sequence[Mark]) -> tuple[F64, float] | None:

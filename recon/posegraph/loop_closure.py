@@ -18,7 +18,7 @@ from recon.camera_model import project, rays
 from recon.mapping.registration import agreed_motion, register_projective
 from recon.tracking import matching, pnp
 from recon.tracking.sift_features import FEATURE_SHARES, features, match_features
-from recon.types import F32, F64, U8, Bool, DepthMap
+from recon.types import F32, F64, I64, U8, Bool, DepthMap
 
 MIN_RAD, MIN_SHARE = 2e-4, 0.1
 """A loop's sigmas are no less than this, and than this share of its depths' sigma: what the
@@ -159,16 +159,24 @@ def _by_features(
 def landmarks(end: LoopEnd, config: matching.MatchingConfig) -> tuple[F64, F64]:
     """(N, 2) corners with a known depth and their (N, 3) points in the camera frame."""
     corners = matching.harris_grid(end.gray, config)[:, :2].astype(np.float64)
+    points, place, known = on_surface(end, corners)
+    known &= ~_at_edge(end.depth.depth_m, place)
+    return corners[known], points[known]
+
+
+def on_surface(end: LoopEnd, uv: F64) -> tuple[F64, I64, Bool]:
+    """(N, 3) surface points at pixels (N, 2) of the image, their pixels (N, 2) of the depth, and
+    where there is a surface."""
     h, w = end.depth.depth_m.shape
     H, W = end.gray.shape
-    place = np.rint((corners + 0.5) * [w / W, h / H] - 0.5).astype(np.int64)
-    place = np.clip(place, 0, [w - 1, h - 1])
-    depth = end.depth.depth_m[place[:, 1], place[:, 0]].astype(np.float64)
-    known = np.isfinite(depth) & ~_at_edge(end.depth.depth_m, place)
-    return corners[known], rays(end.K, corners[known]) * depth[known, None]
+    at = np.rint((uv + 0.5) * [w / W, h / H] - 0.5)
+    inside = ((at >= 0) & (at <= [w - 1, h - 1])).all(axis=1)
+    place = np.clip(np.nan_to_num(at), 0, [w - 1, h - 1]).astype(np.int64)
+    z = end.depth.depth_m[place[:, 1], place[:, 0]].astype(np.float64)
+    return rays(end.K, uv) * z[:, None], place, np.asarray(inside & np.isfinite(z))
 
 
-def _at_edge(depth: F32, place: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Bool:
+def _at_edge(depth: F32, place: I64) -> Bool:
     """(N,) True next to a depth edge or a hole, where a corner's depth is anyone's guess."""
     h, w = depth.shape
     here = depth[place[:, 1], place[:, 0]]

@@ -42,7 +42,7 @@ def apart(segments: Segments, loops: Sequence[Loop]) -> list[tuple[int, int]]:
         if segments[number] is not main_segment
         and segments[number].frame.sigma_scale >= SCALE_KNOWN
     }
-    loose = {number for number in unsure if not _agrees(segments, number)} | of_any_size
+    loose = {n for n in unsure if segments.sigma_height_m(n) >= HEIGHTS_AGREE_M} | of_any_size
     placed = {segment.number for segment in known if segment.is_fixed} - of_any_size
     fixed = [number for number in pieces if number in placed or number in heights.keys() - loose]
     for number in fixed[1:]:
@@ -65,10 +65,3 @@ def apart(segments: Segments, loops: Sequence[Loop]) -> list[tuple[int, int]]:
 def _segment_of(known: Sequence[Segment], seq: int) -> int | None:
     at = bisect_right(known, seq, key=lambda one: one.first) - 1
     return known[at].number if at >= 0 and seq <= known[at].surface[-1] else None
-
-
-def _agrees(segments: Segments, number: int) -> bool:
-    """True when the height is known against the largest segment's: what all fixes of a flight err
-    by lays none on another."""
-    sigma_m = segments.sigma_height_m(number)
-    return sigma_m is not None and sigma_m < HEIGHTS_AGREE_M

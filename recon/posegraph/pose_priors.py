@@ -70,14 +70,6 @@ def is_frozen(prior: PosePrior, before: PosePrior) -> bool:
     return float(np.abs(before.position_m - prior.position_m).max()) <= 1e-6
 
 
-def at_camera(prior: PosePrior, R_world_camera: F64, scale: float) -> PosePrior:
-    """The prior with its fix brought to where the camera is, by the track's ``scale``."""
-    if prior.fix_offset is None or prior.position_m is None:
-        return prior
-    off = scale * R_world_camera @ prior.fix_offset
-    return replace(prior, position_m=prior.position_m - off, fix_offset=None)
-
-
 @dataclass(slots=True, eq=False)
 class FixAverage:
     """Takes every tracked frame; gives a keyframe the mean of what came since the one before."""

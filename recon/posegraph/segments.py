@@ -12,7 +12,6 @@ from recon.posegraph import alignment
 from recon.posegraph.alignment import Alignment, Scale
 from recon.posegraph.alignment_readings import ReadingNoise
 from recon.posegraph.ground_heights import GUESSED_SHARE, guessed_at
-from recon.posegraph.pose_priors import at_camera
 from recon.posegraph.records import Node, PoseGraphConfig
 from recon.posegraph.sensor_offsets import Constants, constants, with_offsets
 from recon.types import F64, PosePrior
@@ -98,8 +97,11 @@ class Segment:
 
     def at_camera(self, node: Node) -> PosePrior:
         """The prior of a node of it, with its fix brought to where the camera is."""
-        frame = self.frame
-        return at_camera(node.prior, frame.R @ node.T_odom_camera[:3, :3], frame.scale)
+        prior, frame = node.prior, self.frame
+        if prior.fix_offset is None or prior.position_m is None:
+            return prior
+        off = frame.scale * (frame.R @ node.T_odom_camera[:3, :3]) @ prior.fix_offset
+        return replace(prior, position_m=prior.position_m - off, fix_offset=None)
 
     def add_surface(self, seq: int, points: int, prior: PosePrior) -> None:
         """Count the new points of a keyframe with depth."""
@@ -111,23 +113,18 @@ class Segment:
 
 
 class Segments:
-    """The segments of one flight, by number."""
+    """The segments of one flight, by number; each begins when it is asked for first."""
 
     def __init__(self, config: PoseGraphConfig) -> None:
         self._all: dict[int, Segment] = {}
         self._bias_tau_s = config.fix_s, config.attitude_s
 
     def __getitem__(self, number: int) -> Segment:
-        return self._all[number]
+        return self._all.setdefault(number, Segment(number))
 
     def __iter__(self) -> Iterator[Segment]:
         """Those that have nodes, in order."""
         return (segment for segment in self._all.values() if segment.nodes)
-
-    def similarity(self, number: int) -> Alignment | None:
-        """That of a segment; None before telemetry or a loop gives it."""
-        segment = self._all.get(number)
-        return None if segment is None else segment.similarity
 
     def with_surface(self) -> list[Segment]:
         """Those that keyframes with depth belong to, in order."""
@@ -137,11 +134,8 @@ class Segments:
         """Those with surface that contradicts itself."""
         return [segment for segment in self.with_surface() if segment.is_false]
 
-    def opened(self, number: int) -> Segment:
-        return self._all.setdefault(number, Segment(number))
-
     def add(self, node: Node) -> Segment:
-        segment = self.opened(node.segment)
+        segment = self[node.segment]
         segment.nodes.append(node)
         segment.keyframes += 1
         return segment
@@ -173,11 +167,12 @@ class Segments:
         largest = max(known, key=lambda segment: segment.keyframes, default=None)
         return None if largest is None else largest.noise
 
-    def sigma_height_m(self, number: int) -> float | None:
-        """Sigma of a segment's height against the largest one of known heights; None without."""
+    def sigma_height_m(self, number: int) -> float:
+        """Sigma of a segment's height against the largest one of known heights: what all fixes of
+        a flight err by is no part of it. Infinite where none is known."""
         known = {s.number: found.heights for s, found in self._placed() if found.heights}
         if number not in known:
-            return None
+            return float("inf")
         main = max(known, key=lambda one: self._all[one].keyframes)
         if number == main:
             return 0.0

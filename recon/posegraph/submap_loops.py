@@ -18,7 +18,15 @@ import numpy as np
 
 from recon import se3
 from recon.camera_model import project, rays
-from recon.posegraph.loop_closure import MIN_RAD, MIN_SHARE, LoopClosure, LoopEnd, landmarks, warps
+from recon.posegraph.loop_closure import (
+    MIN_RAD,
+    MIN_SHARE,
+    LoopClosure,
+    LoopEnd,
+    landmarks,
+    on_surface,
+    warps,
+)
 from recon.tracking import matching
 from recon.types import F32, F64, I64, Bool, DepthMap, Keyframe
 
@@ -64,7 +72,7 @@ def verify_surfaces(a: LoopEnd, b: LoopEnd, T_a_b_guess: F64) -> LoopClosure | N
 def _fitted(
     a: LoopEnd, b: LoopEnd, points: F64, found: matching.Matches, guess: F64
 ) -> LoopClosure | None:
-    there, known = _on_surface(b, found.uv_px.astype(np.float64))
+    there, _, known = on_surface(b, found.uv_px.astype(np.float64))
     ok = found.ok & known
     if np.count_nonzero(ok) < MIN_MATCHES:
         return None
@@ -80,17 +88,6 @@ def _fitted(
     size = [np.linalg.norm(p[inside] - p[inside].mean(axis=0)) for p in (here, there)]
     covariance = _covariance(T, here, there, sigma, inside)
     return T, covariance, float(size[0] / size[1])
-
-
-def _on_surface(one: LoopEnd, uv: F64) -> tuple[F64, Bool]:
-    """(N, 3) surface points at pixels (N, 2) of the image, and where there is one."""
-    h, w = one.depth.depth_m.shape
-    H, W = one.gray.shape
-    at = np.rint((uv + 0.5) * [w / W, h / H] - 0.5)
-    inside = ((at >= 0) & (at <= [w - 1, h - 1])).all(axis=1)
-    at = np.clip(np.nan_to_num(at), 0, [w - 1, h - 1]).astype(np.int64)
-    z = one.depth.depth_m[at[:, 1], at[:, 0]].astype(np.float64)
-    return rays(one.K, uv) * z[:, None], np.asarray(inside & np.isfinite(z))
 
 
 def _sigma(one: LoopEnd, points: F64) -> F64:

@@ -131,7 +131,7 @@ def test_poses_say_that_all_may_lean() -> None:
         for k in (0, len(flown.nodes) // 2)
         if (placed := trajectory.pose(k))
     ]
-    found = trajectory.graph.segments.similarity(0)
+    found = trajectory.graph.segments[0].similarity
     assert found is not None and found.sigma_lean_rad is not None
     min_m = 0.5 * STRIP_M * found.sigma_lean_rad
     assert np.hypot(min_m, sigma_m[1]) == pytest.approx(sigma_m[0], rel=0.25)
@@ -175,7 +175,7 @@ def test_altitudes_that_drift_lay_no_segment_on_another() -> None:
 def test_what_is_level_is_as_unsure_as_vision_bends() -> None:
     flown = stills(4, 0.0)
     straight, bent = (
-        settled(flown, turn_rad=turn).graph.segments.similarity(0) for turn in (1e-6, 1e-3)
+        settled(flown, turn_rad=turn).graph.segments[0].similarity for turn in (1e-6, 1e-3)
     )
     assert straight is not None and straight.sigma_lean_rad is not None
     assert bent is not None and bent.sigma_lean_rad is not None

@@ -55,7 +55,7 @@ class Ties:
 
     def segment(self, segments: Segments, number: int) -> Segment:
         """A segment with its similarity."""
-        out = segments.opened(number)
+        out = segments[number]
         scale = self.sigma_scale.get(number, 0.01)
         covariance = np.diag([1.0] * 5 + [self.sigma_m**2, scale**2])
         sources = ("gnss",) if number in self.fixed else ("altitude",)
