@@ -1,9 +1,8 @@
 """From the odometry's own frame to the world: one similarity from all telemetry.
 
 Vision alone leaves scale, heading, position and (weakly) tilt open. They are fitted over
-the whole flown stretch at once, so that single bad fixes and compass errors average out;
-GNSS is never forced on single poses (Umeyama 1991, doi:10.1109/34.88573, with attitude,
-height and robust weights added, solved by Gauss-Newton).
+the whole flown stretch at once, so that single bad fixes and compass errors average out:
+Gauss-Newton over the readings of docs/pose-graph.md.
 """
 
 from __future__ import annotations
@@ -209,10 +208,9 @@ def _of_fixes(
 ) -> ReadingNoise:
     """The noise of fixes and of assumed views, by their residuals to a track.
 
-    A slow difference may be vision's own drift, so a wander is bounded by what the sensor claims.
-    Its white part is not: from one fix to the next vision does not err by as much. Altitudes whose
-    accuracy nothing states wander as they are seen to, and by a share of their drift: none is
-    steady.
+    A slow difference may be vision's own drift, so a wander is bounded by what the sensor claims;
+    its white part is not. Altitudes whose accuracy nothing states wander as they are seen to, and
+    by a share of their drift: none is steady.
     """
     fix_s, attitude_s = bias_tau_s
     if len(fixes.fix) < MIN_READINGS:
@@ -329,11 +327,8 @@ def _solve(readings: AlignmentReadings, at: AlignmentState, settled: float) -> _
 
 
 def _centred(readings: AlignmentReadings, at: AlignmentState, weight: F64) -> AlignmentState:
-    """The state whose track lies in the mean of the fixes, so that their mean error is its shift.
-
-    What is best for the slope of a wander rests on the first and last of them. ``weight``
-    (groups,) is less for outliers.
-    """
+    """The state whose track lies in the mean of the fixes by ``weight`` (groups,), so that their
+    mean error is its shift: what is best for a wander's slope rests on the first and last."""
     if not len(readings.fix):
         return at
     each = weight[readings.of_fixes, None] / readings.sigma_fix**2
@@ -351,11 +346,8 @@ def _leave_out(readings: AlignmentReadings, norms: F64, kept: F64) -> bool:
 
 
 def _starts(nodes: Sequence[Node], readings: AlignmentReadings) -> list[AlignmentState]:
-    """To begin with: by the attitude, and by the track.
-
-    The second matters when the compass is far off or there is none: then only the track of
-    the fixes determines the heading.
-    """
+    """To begin with: by the attitude, and by the track of the fixes, which alone determines the
+    heading when the compass is far off or there is none."""
     R = np.eye(3)
     for a in nodes:
         if a.prior.R_world_camera is not None:

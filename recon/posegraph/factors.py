@@ -1,11 +1,6 @@
 """Factors of the pose graph: telemetry of a keyframe, and motions from one keyframe to the next.
 
-Each sensor has a bias that wanders: readings closer in time than its time constant err together.
-All readings of a first-order Gauss-Markov error with time constant tau over a time T count as
-1 + T / (2 tau) of them; each gets the sigma that makes it so.
-
-A motion is vision's, or telemetry's where vision has none. A segment that has a frame in the world
-leaves its scale open, block by block of keyframes.
+A motion is vision's, or telemetry's where vision has none. docs/pose-graph.md lists all kinds.
 """
 
 from __future__ import annotations

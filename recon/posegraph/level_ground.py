@@ -50,11 +50,8 @@ def levelled(prior: PosePrior, points: F64) -> PosePrior:
 
 
 def plane_normal(points: F64) -> F64 | None:
-    """(3,) unit normal, towards the origin, of the plane through points (N, 3).
-
-    The direction of minimum spread, without points far off; None for too few, or where the
-    points lie on no plane.
-    """
+    """(3,) unit normal, towards the origin, of the plane through points (N, 3); None for too few,
+    or where they lie on no plane."""
     if len(points) < MIN_POINTS:
         return None
     near, spread, normal = plane_through(points)

@@ -2,8 +2,7 @@
 
 Verification is independent of the pose graph: corners of one keyframe with their depths are
 matched in the other's image (ZSSD), give a pose by EPnP, and the two depth maps must then
-agree by ICP. Whether a loop that passes may bend the map is for
-:meth:`recon.posegraph.pose_graph.PoseGraph.add_loop` to say.
+agree by ICP.
 """
 
 from __future__ import annotations

@@ -1,10 +1,6 @@
 """One consistent trajectory: vision, attitude, altitude, GNSS and loops in one pose graph.
 
-A pose per keyframe, in the world and in metres. Vision gives the motion between keyframes; a
-segment's frame is brought to the world by one similarity from all its telemetry
-(:mod:`recon.posegraph.alignment`), because a frame with a wrong heading or scale would be sheared
-by single readings. About that similarity the graph bends the track as far as the readings, each
-with its own bias, and the loops outweigh vision.
+A pose per keyframe, in the world and in metres; docs/pose-graph.md has the derivation.
 """
 
 from __future__ import annotations

@@ -2,12 +2,10 @@
 
 A keyframe speaks for what came since the one before it: for frames that are no keyframes
 (:class:`FixAverage`), and for keyframes that are no nodes any more (:func:`averaged`). The mean of
-fixes is the fix of the mean place, in whatever frame and scale vision has it, so nothing but the
-track itself is needed to bring them together.
+fixes is the fix of the mean place, in whatever frame and scale vision has it.
 
-Between two instants of one run the difference of two travels is the displacement, with an error
-that grows with time only. That gives the scale of the odometry better than fixes, whose error
-wanders (:mod:`recon.posegraph.alignment`).
+The difference of two travels of one run errs by the time between them only, and so gives the scale
+of the odometry better than fixes, whose error wanders.
 """
 
 from __future__ import annotations

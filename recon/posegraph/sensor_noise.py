@@ -1,9 +1,8 @@
 """How much a sensor errs along one flight, from its residuals against vision.
 
 A receiver's error has a part that is new in each reading (white) and a bias that wanders
-(first-order Gauss-Markov). The variogram D(h), the mean square of the change of the residual over
-a lag h, separates them: D(h) = 2 white^2 + 2 bias^2 (1 - exp(-h / tau)) (Cressie, Statistics
-for Spatial Data, 1993, section 2.3.1). Medians stand for means, so that jumps do not count.
+(first-order Gauss-Markov), which the variogram separates (docs/pose-graph.md, Noise). Medians stand
+for means, so that jumps do not count.
 """
 
 from __future__ import annotations

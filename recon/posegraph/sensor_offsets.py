@@ -1,8 +1,7 @@
 """Constant difference of each sensor from the similarity that places a segment.
 
-The similarity weighs the sensors against each other over the whole segment. The constant rotation,
-scale or shift that remains of each sensor is settled by that; only variation along the track may
-bend it. So the constants are removed from the readings before they enter the graph.
+The similarity settles the constants of each sensor, so they are removed from its readings before
+these enter the graph: only variation along the track may bend it.
 """
 
 from __future__ import annotations
@@ -125,9 +124,8 @@ def boresight(
 ) -> Constants:
     """The boresight by all stretches of a flight of ``span_s``; small where turns are missing.
 
-    Vision turns with the camera, telemetry with the gimbal or the body. Between flights' headings
-    the two differ by one rotation in the world (the odometry's frame) and one in the camera (the
-    boresight); turns separate them, as in hand-eye calibration (Park and Martin 1994,
+    Vision and telemetry differ by one rotation in the world (the odometry's frame) and one in the
+    camera (the boresight); turns separate them, as in hand-eye calibration (Park and Martin 1994,
     doi:10.1109/70.326576). About the vertical they stay one as long as the camera only turns about
     it: a boresight in heading is then a compass error, which the track of the fixes takes out.
 

@@ -1,12 +1,8 @@
 """Poses and drifting scales that fit all factors best: sparse Gauss-Newton over arrays.
 
-All factors of one kind are rows of one array, so a step is a few array operations and one sparse
-factorisation (SuperLU), during which other threads run. A step that does not lower the cost is
-halved. Nothing is incremental: new poses are predicted until they are solved, and more may wait the
-more is held, so that the mean cost of a pose stays flat. Huber's loss weighs factors again at each
-step.
-
-A pose is perturbed by a rotation about its own camera and a shift, both in world axes.
+Nothing is incremental: new poses are predicted until they are solved, and more may wait the more
+is held, so that the mean cost of a pose stays flat. docs/pose-graph.md has the errors and their
+Jacobians. A pose is perturbed by a rotation about its own camera and a shift, both in world axes.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """A pose graph's keyframes thinned out: fewer nodes over the same track.
 
-A keyframe that stops being a node hands its motion to the next one: motions are composed, and
-so are their covariances (Barfoot, State Estimation for Robotics, 2017, section 7.3). Loops that
-ended at it end at the node before it, moved there by vision. Its fix goes into the mean of the
-next node's; other readings of it go. Readings are weighed by how many of them there are in the
-time flown (:mod:`recon.posegraph.factors`), so those that stay then weigh more.
+A keyframe that stops being a node hands its motion to the next one, its loops to the node before
+it, and its fix to the mean of the next node's (docs/pose-graph.md, Thinning). Its other readings
+go; those that stay weigh more, by how many there are in the time flown.
 
 Where segments are so many and short that this finds too few, whole segments are dropped, those
 first that leave the smallest holes. Their keyframes stay where they were published; their

@@ -1,8 +1,4 @@
-"""The keyframes' poses: chained from vision and ICP, placed in the world by the pose graph.
-
-A scan may break into segments (tracking was lost and started again elsewhere). Each segment has a
-chain of its own; the graph (:mod:`recon.posegraph.pose_graph`) holds them all in one frame.
-"""
+"""The keyframes' poses: chained from vision and ICP, placed in the world by the pose graph."""
 
 from __future__ import annotations
 
@@ -74,10 +70,7 @@ class Trajectory:
         time_ns: int,
         covariance: F64,
     ) -> None:
-        """Append a keyframe to its segment.
-
-        The arguments are those of :meth:`recon.posegraph.pose_graph.PoseGraph.add_keyframe`.
-        """
+        """As :meth:`recon.posegraph.pose_graph.PoseGraph.add_keyframe`."""
         self.graph.add_keyframe(seq, time_ns, segment, T_odom_camera, covariance, prior, height)
         row = np.zeros(1, KEYFRAME)
         row["seq"], row["segment"], row["T_odom_camera"] = seq, segment, T_odom_camera
