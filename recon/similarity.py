@@ -27,6 +27,13 @@ class Similarity:
         return se3.compose(self.R @ T[:3, :3], self.points(T[:3, 3]))
 
 
+def lever(points: F64) -> F64:
+    """(N, 3, 7) motion of ``points`` (N, 3) by a rotation, a shift and a logarithm of scale about
+    the origin."""
+    shift = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    return np.concatenate([-se3.hat(points), shift, points[:, :, None]], axis=2)
+
+
 def umeyama(
     source: F64, target: F64, weight: F64 | None = None, is_level: bool = False
 ) -> Similarity | None:

@@ -244,9 +244,7 @@ class AlignmentReadings:
         drifted = np.outer(self.along * at.drift, [0.0, 0.0, 1.0])
         y = np.concatenate([fix + self.fix - drifted - at.t, way + self.way])
         of = J[self._scaled].reshape(-1, 3, UNKNOWNS)
-        of[:, 0, 1], of[:, 1, 2], of[:, 2, 0] = y[:, 2], y[:, 0], y[:, 1]
-        of[:, 0, 2], of[:, 1, 0], of[:, 2, 1] = -y[:, 1], -y[:, 2], -y[:, 0]
-        of[:, :, 6] = y
+        of[:, :, :3], of[:, :, 6] = -se3.hat(y), y
         J[: self._turned, 7:10] = of_mount.reshape(-1, 3)
         height, common = at.log_scale - self.log_ratio, np.r_[at.mount, at.drift]
         r = np.concatenate([turn.ravel(), fix.ravel(), way.ravel(), height, common])

@@ -17,6 +17,7 @@ from recon.posegraph.alignment_readings import from_middle
 from recon.posegraph.ground_heights import EXACT_HEIGHTS, height_ratios
 from recon.posegraph.records import Node
 from recon.posegraph.sensor_noise import ATTITUDE_S, FIX_S
+from recon.similarity import lever
 from recon.types import F64, PosePrior
 
 SIGMA_RAD = np.radians(2.0)
@@ -334,14 +335,9 @@ def _fixes(nodes: Sequence[Node], frame: Alignment) -> tuple[F64, F64, F64, floa
     apart, weight = (track - fixes)[near], 1.0 / sigma[near]
     centre = fixes[near].mean(axis=0)
     p = fixes[near] - centre
-    A = np.zeros((len(p), 3, 7))  # shift, turn, stretch
-    A[:, :, :3] = np.eye(3)
-    A[:, 0, 4], A[:, 0, 5] = p[:, 2], -p[:, 1]
-    A[:, 1, 3], A[:, 1, 5] = -p[:, 2], p[:, 0]
-    A[:, 2, 3], A[:, 2, 4] = p[:, 1], -p[:, 0]
-    A[:, :, 6] = p
-    rows_A = (A * weight[:, :, None]).reshape(-1, 7)
-    H = rows_A.T @ rows_A + np.diag([0.0] * 3 + [PRIOR_SIGMA**-2] * 4)
-    x = np.linalg.solve(H, rows_A.T @ (apart * weight).ravel())
+    A = lever(p)[:, :, [3, 4, 5, 0, 1, 2, 6]]  # shift, turn, stretch
+    A = (A * weight[:, :, None]).reshape(-1, 7)
+    H = A.T @ A + np.diag([0.0] * 3 + [PRIOR_SIGMA**-2] * 4)
+    x = np.linalg.solve(H, A.T @ (apart * weight).ravel())
     reach_m = float(np.linalg.norm(p, axis=1).max())
     return centre, x[:3], se3.hat(x[3:6]) + x[6] * np.eye(3), reach_m

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon import se3
-from recon.similarity import Similarity
+from recon.similarity import Similarity, lever
 from recon.types import F64, Bool
 
 STEPS = 12
@@ -109,8 +109,8 @@ def _equations(ties: Sequence[Tie], centres_m: F64, sigma: F64, state: F64) -> t
         ends = ((tie.a, tie.at_a, 1.0), (tie.b, tie.at_b, -1.0))
         for side, (scan, points, sign) in enumerate(ends):
             centre = centres_m[scan] + state[scan, 3:6]
-            lever = _lever(moves[scan].points(points) - centre).reshape(-1, 3, 7)
-            sides[:, :, side] = sign * R.T @ lever / _unit(tie, moves)
+            moved = lever(moves[scan].points(points) - centre)
+            sides[:, :, side] = sign * R.T @ moved / _unit(tie, moves)
             sides[:, :, side, 6] -= 0.5 * error
         sides[:, :, 0, :3] += R.T @ se3.hat(error @ R.T)
         J = sides.reshape(len(error), 3, 2 * UNKNOWNS)
@@ -118,15 +118,6 @@ def _equations(ties: Sequence[Tie], centres_m: F64, sigma: F64, state: F64) -> t
         H[np.ix_(rows, rows)] += np.einsum("pki,pkl,plj->ij", J, W, J)
         g[rows] += np.einsum("pki,pkl,pl->i", J, W, error)
     return H, g
-
-
-def _lever(from_centre: F64) -> F64:
-    """(3 P, 7) motion of points (P, 3), counted from the centre, by the unknowns."""
-    out = np.zeros((len(from_centre), 3, UNKNOWNS))
-    out[:, :, :3] = -se3.hat(from_centre)
-    out[:, :, 3:6] = np.eye(3)
-    out[:, :, 6] = from_centre
-    return out.reshape(-1, UNKNOWNS)
 
 
 def _moved(x: F64, step: F64) -> F64:
