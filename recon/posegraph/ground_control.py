@@ -27,7 +27,7 @@ from recon.posegraph.smoother import (
     scale_columns,
 )
 from recon.table import Rows
-from recon.types import F64, Bool, PosePrior
+from recon.types import F64, I64, Bool, PosePrior
 
 STEPS = 60
 """Maximum number of steps of the solution."""
@@ -130,15 +130,19 @@ def adjust(
     """
     if len(track.poses) < 2:
         raise ValueError(f"expected two poses (N, 4, 4) or more, got {track.poses.shape}")
-    sigma_scales = sigma_scale, sigma_scale_walk
-    loops = list(range(len(track.loops)))
-    problem = _Batch(track, loops, points, marks, sigma_scales)
-    chi2 = np.sum(problem.residuals().get("loop", np.zeros((0, 6))) ** 2, axis=1)
-    refused = tuple(k for k, value in zip(loops, chi2, strict=True) if value > CHI2_LIMIT)
+    args, n = (points, marks, sigma_scale, sigma_scale_walk), len(track.poses)
+    smoother, refused = _solved(track, track.loops, *args), tuple[int, ...]()
+    if track.loops:
+        chi2 = np.sum(smoother.residuals()["loop"] ** 2, axis=1)
+        refused = tuple(np.flatnonzero(chi2 > CHI2_LIMIT).tolist())
     if refused:
-        loops = [k for k in loops if k not in refused]
-        problem = _Batch(track, loops, points, marks, sigma_scales)
-    return Adjusted(*problem.states(), problem.residuals(), refused)
+        kept = [loop for k, loop in enumerate(track.loops) if k not in refused]
+        smoother = _solved(track, kept, *args)
+    poses, spread = zip(*(smoother.state(key) for key in range(n)), strict=True)
+    scales = np.exp(smoother.logs()[_scale_key(np.arange(n))])
+    found = smoother.residuals()  # without the robust losses
+    residuals = {kind: rows for kind, rows in found.items() if kind not in (HELD, HELD_PLACE)}
+    return Adjusted(np.array(poses), np.array(spread), scales, residuals, refused)
 
 
 def supported(loops: Sequence[Loop], poses: F64 | Mapping[int, F64]) -> list[Loop]:
@@ -239,108 +243,91 @@ def of_marks(rows: Rows, at: State) -> Linear:
     return error * rows["weight"], J, np.hstack(columns)
 
 
-class _Batch:
-    """The factors of one adjustment and its solution.
+def _scale_key(keyframes: I64) -> I64:
+    return np.asarray(UNIT + keyframes // STRETCH)
+
+
+def _solved(
+    track: KeyframeTrack, loops: Sequence[Loop], points: Sequence[ControlPoint],
+    marks: Sequence[Mark], sigma: float, sigma_walk: float,
+) -> Smoother:  # fmt: skip
+    """All factors of one adjustment, solved.
 
     Keys of the smoother: keyframes, then the world itself, then points, whose turns are held.
     """
+    smoother, n = Smoother(), len(track.poses)
+    scale_key = _scale_key(np.arange(n)).tolist()
+    for T, spread in zip(track.poses, track.covariances, strict=True):
+        smoother.append_pose(T, spread)
+    for key in range(UNIT, scale_key[-1] + 1):
+        smoother.append_scale(0.0)
+        smoother.add_scale("scale", (key - 1, key), 0.0, sigma if key == UNIT else sigma_walk)
+    for key in range(1, n):
+        kind, motion, spread = _step(track, key)
+        smoother.add_motion(kind, (key - 1, key), motion, spread, scale_key[key - 1], UNIT)
+    _add_telemetry(smoother, track) if track.priors else _add_placing(smoother, track)
+    for one in loops:
+        smoother.add_motion(
+            "loop", one.ends, one.T_a_b, one.covariance, scale_key[one.a], UNIT, 1.5
+        )
+    seen = _add_points(smoother, n, points, marks)
+    for mark in marks:
+        R_camera_key = mark.T_key_camera[:3, :3].T
+        far = 0.0 if mark.depth_m is None else 1.0 / mark.sigma_depth_m
+        row = (
+            mark.keyframe, seen[mark.point], scale_key[mark.keyframe], mark.ray,
+            mark.depth_m or 0.0, R_camera_key, mark.T_key_camera[:3, 3],
+            (1.0 / mark.sigma, 1.0 / mark.sigma, far),
+        )  # fmt: skip
+        smoother.add(of_marks, MARK, "control", row, 2.5)
+    smoother.update(now=True, steps=STEPS)
+    return smoother
 
-    def __init__(
-        self, track: KeyframeTrack, loops: Sequence[int], points: Sequence[ControlPoint],
-        marks: Sequence[Mark], sigma_scales: tuple[float, float],
-    ) -> None:  # fmt: skip
-        self._track, self._smoother = track, Smoother()
-        for T, spread in zip(track.poses, track.covariances, strict=True):
-            self._smoother.append_pose(T, spread)
-        self._add_scales(*sigma_scales)
-        for key in range(1, len(track.poses)):
-            self._add_step(key)
-        self._add_telemetry() if track.priors else self._add_placing()
-        for k in loops:
-            one = track.loops[k]
-            self._smoother.add_motion(
-                "loop", (one.a, one.b), one.T_a_b, one.covariance, self._scale_key(one.a), UNIT, 1.5
-            )
-        self._add_points(points, marks)
-        self._smoother.update(now=True, steps=STEPS)
 
-    def states(self) -> tuple[F64, F64, F64]:
-        """Poses (N, 4, 4), left covariances (N, 6, 6) and scales (N,)."""
-        keys = range(len(self._track.poses))
-        poses, spread = zip(*(self._smoother.state(key) for key in keys), strict=True)
-        logs = self._smoother.logs()[[self._scale_key(key) for key in keys]]
-        return np.array(poses), np.array(spread), np.exp(logs)
+def _hold(smoother: Smoother, key: int, T: F64, sigma_rad: float, sigma_m: float) -> None:
+    smoother.add_turn(HELD, key, T[:3, :3], np.full(3, sigma_rad))
+    smoother.add_place(HELD_PLACE, key, T[:3, 3], np.full(3, sigma_m))
 
-    def residuals(self) -> dict[str, F64]:
-        """Whitened residuals by kind, without the robust losses."""
-        found = self._smoother.residuals()
-        return {kind: rows for kind, rows in found.items() if kind not in (HELD, HELD_PLACE)}
 
-    # ---- factors ---------------------------------------------------------------------------
+def _step(track: KeyframeTrack, key: int) -> tuple[str, F64, F64]:
+    """Kind, motion and covariance from the keyframe before, as vision and ICP measured it."""
+    motion = se3.inverse(track.poses[key - 1]) @ track.poses[key]
+    length = float(np.linalg.norm(motion[:3, 3]))
+    turn, shift, kind = SIGMA_TURN_RAD, SIGMA_STEP * length + SIGMA_STEP_M, "vision"
+    pause = float(track.times_s[key] - track.times_s[key - 1])
+    if pause > BREAK_S:
+        turn, shift, kind = SIGMA_BREAK_RAD, SIGMA_BREAK_M * pause / BREAK_S, "link"
+    right = np.diag([turn**2] * 3 + [shift**2] * 3)
+    return kind, motion, left_covariance(motion, right)
 
-    def _scale_key(self, key: int) -> int:
-        return UNIT + key // STRETCH
 
-    def _add_scales(self, sigma: float, sigma_walk: float) -> None:
-        for key in range(UNIT, self._scale_key(len(self._track.poses) - 1) + 1):
-            self._smoother.append_scale(0.0)
-            before = key - 1
-            self._smoother.add_scale("scale", (before, key), 0.0, sigma)
-            sigma = sigma_walk
+def _add_placing(smoother: Smoother, track: KeyframeTrack) -> None:
+    """The poses' own covariances: they err together, so each counts one N-th."""
+    n, floor = len(track.poses), np.diag([1e-8] * 3 + [1e-6] * 3)
+    for key, (T, spread) in enumerate(zip(track.poses, track.covariances, strict=True)):
+        smoother.add_motion("placing", (n, key), T, n * (spread + floor))
 
-    def _hold(self, key: int, T: F64, sigma_rad: float, sigma_m: float) -> None:
-        self._smoother.add_turn(HELD, key, T[:3, :3], np.full(3, sigma_rad))
-        self._smoother.add_place(HELD_PLACE, key, T[:3, 3], np.full(3, sigma_m))
 
-    def _add_step(self, key: int) -> None:
-        """The motion from the keyframe before, as vision and ICP measured it."""
-        track = self._track
-        motion = se3.inverse(track.poses[key - 1]) @ track.poses[key]
-        length = float(np.linalg.norm(motion[:3, 3]))
-        turn, shift, kind = SIGMA_TURN_RAD, SIGMA_STEP * length + SIGMA_STEP_M, "vision"
-        pause = float(track.times_s[key] - track.times_s[key - 1])
-        if pause > BREAK_S:
-            turn, shift, kind = SIGMA_BREAK_RAD, SIGMA_BREAK_M * pause / BREAK_S, "link"
-        right = np.diag([turn**2] * 3 + [shift**2] * 3)
-        spread = left_covariance(motion, right)
-        scale = self._scale_key(key - 1)
-        self._smoother.add_motion(kind, (key - 1, key), motion, spread, scale, UNIT)
+def _add_telemetry(smoother: Smoother, track: KeyframeTrack) -> None:
+    _hold(smoother, 0, track.poses[0], 2.0, 1e4)
+    readings = zip(*track.readings(), strict=True)
+    for key, (place, sigma_m, R, sigma_rad) in enumerate(readings):
+        if np.isfinite(R).all():
+            smoother.add_turn("attitude", key, R, sigma_rad, 1.5)
+        if np.isfinite(place).all():
+            smoother.add_place("position", key, place, sigma_m, cauchy=2.0)
 
-    def _add_placing(self) -> None:
-        """The poses' own covariances: they err together, so each counts one N-th."""
-        n = len(self._track.poses)
-        floor = np.diag([1e-8] * 3 + [1e-6] * 3)
-        for key, (T, spread) in enumerate(
-            zip(self._track.poses, self._track.covariances, strict=True)
-        ):
-            self._smoother.add_motion("placing", (n, key), T, n * (spread + floor))
 
-    def _add_telemetry(self) -> None:
-        self._hold(0, self._track.poses[0], 2.0, 1e4)
-        readings = zip(*self._track.readings(), strict=True)
-        for key, (place, sigma_m, R, sigma_rad) in enumerate(readings):
-            if np.isfinite(R).all():
-                self._smoother.add_turn("attitude", key, R, sigma_rad, 1.5)
-            if np.isfinite(place).all():
-                self._smoother.add_place("position", key, place, sigma_m, cauchy=2.0)
-
-    def _add_points(self, points: Sequence[ControlPoint], marks: Sequence[Mark]) -> None:
-        """The world at key N, and the points that images see behind it."""
-        world = len(self._track.poses)
-        self._smoother.append_pose(np.eye(4), np.zeros((6, 6)))
-        self._hold(world, np.eye(4), HELD_SIGMA, HELD_SIGMA)
-        seen = sorted({m.point for m in marks})
-        for key, k in enumerate(seen, world + 1):
-            self._smoother.append_pose(se3.compose(np.eye(3), points[k].position_m), np.eye(6))
-            self._smoother.add_turn(HELD, key, np.eye(3), np.full(3, HELD_SIGMA))
-            sigma = np.maximum(points[k].sigma_m, 1e-3)
-            self._smoother.add_place("survey", key, points[k].position_m, sigma)
-        for mark in marks:
-            R_camera_key = mark.T_key_camera[:3, :3].T
-            far = 0.0 if mark.depth_m is None else 1.0 / mark.sigma_depth_m
-            row = (
-                mark.keyframe, world + 1 + seen.index(mark.point), self._scale_key(mark.keyframe),
-                mark.ray, mark.depth_m or 0.0, R_camera_key, mark.T_key_camera[:3, 3],
-                (1.0 / mark.sigma, 1.0 / mark.sigma, far),
-            )  # fmt: skip
-            self._smoother.add(of_marks, MARK, "control", row, 2.5)
+def _add_points(
+    smoother: Smoother, world: int, points: Sequence[ControlPoint], marks: Sequence[Mark]
+) -> dict[int, int]:
+    """The ``world`` by its key and the points that images see after it; their keys by number."""
+    smoother.append_pose(np.eye(4), np.zeros((6, 6)))
+    _hold(smoother, world, np.eye(4), HELD_SIGMA, HELD_SIGMA)
+    seen = {k: key for key, k in enumerate(sorted({m.point for m in marks}), world + 1)}
+    for k, key in seen.items():
+        smoother.append_pose(se3.compose(np.eye(3), points[k].position_m), np.eye(6))
+        smoother.add_turn(HELD, key, np.eye(3), np.full(3, HELD_SIGMA))
+        sigma = np.maximum(points[k].sigma_m, 1e-3)
+        smoother.add_place("survey", key, points[k].position_m, sigma)
+    return seen
