@@ -7,7 +7,7 @@ agree by ICP.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,8 +26,8 @@ points of one depth map have in common does not average out."""
 SEARCH_SHARE = 0.12
 """Search radius about the places that the graph predicts, as a share of the image's width."""
 
-MIN_MATCHES, MIN_INLIERS = 40, 30
-"""Corners found again, and those of them that the pose explains."""
+MIN_MATCHES, MIN_INLIERS, MIN_INLIER_SHARE = 40, 30, 0.5
+"""Corners found again, and those of them that the pose explains, and their share."""
 
 MATCHING = matching.MatchingConfig()
 
@@ -126,33 +126,34 @@ def verify(a: LoopEnd, b: LoopEnd, T_a_b_guess: F64) -> LoopClosure | None:
     uv, points = landmarks(a, MATCHING)
     if len(uv) < MIN_MATCHES:
         return None
-    pyramids = tuple(matching.build_pyramid(v.gray) for v in (a, b))
+    pyramids = [matching.build_pyramid(v.gray) for v in (a, b)]
     T_b_a = se3.inverse(T_a_b_guess)
-    predicted = project(b.K, se3.transform(T_b_a, points))
-    warp = warps(a.K, b.K, T_b_a, uv, points)
-    solved = _pose(pyramids, uv, points, predicted, warp, b, T_b_a, SEARCH_SHARE)
-    if solved is None:
-        solved = _by_features(pyramids, uv, points, a, b)
-    if solved is None:
-        return None
-    T_a_b = se3.inverse(solved.T_camera_points)
-    A = se3.adjoint(T_a_b)
-    return _with_icp(a, b, T_a_b, A @ solved.covariance @ A.T)
-
-
-def _by_features(
-    pyramids: tuple[matching.Pyramid, ...], uv: F64, points: F64, a: LoopEnd, b: LoopEnd
-) -> pnp.PnpResult | None:
-    """As :func:`_pose`, by the features that both images share."""
-    shared = match_features(features(a.gray), features(b.gray))
-    if shared is None:
-        return None
-    there, warp = shared.predict(uv)
-    for share in FEATURE_SHARES:
-        solved = _pose(pyramids, uv, points, there, warp, b, None, share)
-        if solved is not None:
-            return solved
+    for predicted, warp, prior, share in _predictions(a, b, T_b_a, uv, points):
+        radius = share * b.gray.shape[1]
+        found = matching.match(pyramids[0], uv, pyramids[1], predicted, radius, warp, MATCHING)
+        if np.count_nonzero(found.ok) < MIN_MATCHES:
+            continue
+        seen = found.uv_px[found.ok].astype(np.float64)
+        solved = pnp.solve(points[found.ok], seen, b.K, prior, min_inliers=MIN_INLIERS)
+        if solved is not None and solved.inlier_share >= MIN_INLIER_SHARE:
+            T_a_b = se3.inverse(solved.T_camera_points)
+            A = se3.adjoint(T_a_b)
+            return _with_icp(a, b, T_a_b, A @ solved.covariance @ A.T)
     return None
+
+
+def _predictions(
+    a: LoopEnd, b: LoopEnd, T_b_a: F64, uv: F64, points: F64
+) -> Iterator[tuple[F64, F64, F64 | None, float]]:
+    """Where b may see a's landmarks (N, 2), how offsets about them change (N, 2, 2), b's pose if it
+    is known, and the search radius as a share of the width; made when it is asked for."""
+    predicted, warp = project(b.K, se3.transform(T_b_a, points)), warps(a.K, b.K, T_b_a, uv, points)
+    yield predicted, warp, T_b_a, SEARCH_SHARE
+    shared = match_features(features(a.gray), features(b.gray))
+    if shared is not None:
+        there, warp = shared.predict(uv)
+        for share in FEATURE_SHARES:
+            yield there, warp, None, share
 
 
 def landmarks(end: LoopEnd, config: matching.MatchingConfig) -> tuple[F64, F64]:
@@ -202,22 +203,6 @@ def warps(K_a: F64, K_b: F64, T_b_a: F64, uv: F64, points: F64) -> F64:
         stepped = ways * (level / np.where(np.abs(slope) > 1e-6, slope, np.nan))[:, None]
         out[:, :, axis] = (project(K_b, se3.transform(T_b_a, stepped)) - here) / 8.0
     return out
-
-
-def _pose(
-    pyramids: tuple[matching.Pyramid, ...], uv: F64, points: F64, predicted: F64, warp: F64,
-    b: LoopEnd, prior: F64 | None, search_share: float,
-) -> pnp.PnpResult | None:  # fmt: skip
-    """EPnP pose of b from a's landmarks found in it."""
-    radius = search_share * b.gray.shape[1]
-    found = matching.match(pyramids[0], uv, pyramids[1], predicted, radius, warp, MATCHING)
-    if np.count_nonzero(found.ok) < MIN_MATCHES:
-        return None
-    seen = found.uv_px[found.ok].astype(np.float64)
-    solved = pnp.solve(points[found.ok], seen, b.K, prior, min_inliers=MIN_INLIERS)
-    if solved is None or solved.inlier_share < 0.5:
-        return None
-    return solved
 
 
 def _with_icp(a: LoopEnd, b: LoopEnd, T_a_b: F64, covariance: F64) -> LoopClosure | None:
